@@ -18,14 +18,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from splatting.sfm.colmap import LENS_MODELS, Program, Pycolmap, Settings
-from splatting.sfm.layout import FEWEST, Layout, find_photos, refuse_foreign_results, scene_folder
+from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder
 from splatting.sfm.programs import refuse_while_working
 from splatting.sfm.report import summary
 from splatting.sfm.stages import (
     Stage,
     StageRecord,
+    image_stage,
     model_state,
-    photo_stage,
     reconstruction_stages,
     resize_stage,
     undistortion_stage,
@@ -37,23 +37,24 @@ from utils.system_utils import UserError, run_cli
 def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> None:
     """Run the stages that are not done; print how many photos were placed, and advice about the others."""
     masks = _masks(args.mask_path)
-    names = [] if args.video else find_photos(layout)
+    names = [] if args.video else find_images(layout)
     refuse_while_working(layout.log)
     record = StageRecord(layout.stages)
     refuse_foreign_results(layout, record.begun("undistortion"), record.begun("photos"), args.skip_matching)
     kept = []
     if args.video:
         kept = record.run([_video(layout, record, args)])
-        names = find_photos(layout)
+        names = find_images(layout)
     if args.skip_matching:
         stages = []
         program = "--skip_matching: the model that was in distorted/sparse"
         made_from = [names, model_state(layout)]
     else:
-        backend = Program(args.colmap_executable, settings) if args.colmap_executable else Pycolmap()
+        program = args.colmap_executable
+        backend = Program(program, layout, settings) if program else Pycolmap(layout, settings)
         program, made_from = backend.identity, None
-        stages = [photo_stage(layout, names, masks)]
-        stages += reconstruction_stages(layout, backend, settings, masks is not None)
+        stages = [image_stage(layout, names, masks)]
+        stages += reconstruction_stages(backend, masks is not None)
     made = {"camera": settings.camera, "mapper": settings.mapper, "matcher": settings.matcher, "program": program}
     stages.append(undistortion_stage(layout, settings, made_from, **made))
     if args.resize:

@@ -13,8 +13,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from splatting.diagnosis import environment
-from splatting.diagnosis.lines import Line
+from splatting.diagnosis import Line, environment
 
 
 def diagnose(source: str | None, images: str | None, model: str | None, iteration: int) -> int:

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
-from gaussian_renderer.importance import blending_weights, most_important
+from gaussian_renderer.blending import blending_weights, most_important
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import change_on_views
 from scene.gaussian_model import GaussianModel
@@ -39,22 +39,22 @@ from utils.general_utils import safe_state
 from utils.system_utils import UserError, compute_device, run_cli
 
 if TYPE_CHECKING:  # SciPy takes a while to import
-    from splatting.camera_paths.moments import TimedPath
+    from splatting.camera_paths.keyframes import TimedPath
     from splatting.camera_paths.poses import Poses
 
 
-def load(args: argparse.Namespace, options: argparse.Namespace, want_views: bool) -> tuple[Splats, Scene | None]:
+def load(args: argparse.Namespace, options: argparse.Namespace, needs_views: bool) -> tuple[Splats, Scene | None]:
     """The splats that the command line names, and the scene if views are wanted.
 
     options: the model options. UserError if there is nothing to load, or views are wanted of a model without a scene.
     """
     if args.ply:
-        if want_views:
+        if needs_views:
             raise UserError(f"--max_splats and pages need training views, which {args.ply} has not; give a model by -m")
         splats = read_splats(args.ply)
         return replace(splats, antialiasing=splats.antialiasing or bool(args.antialiasing)), None
-    if want_views:
-        options.images_to_load = 1  # each photo is used once or twice
+    if needs_views:
+        options.images_to_load = 1  # each image is used once or twice
         scene = load_saved(options, args.iteration)
         return splats_of(scene.gaussians, args.antialiasing), scene
     path = saved_ply(options.model_path, find_iteration(options.model_path, args.iteration))
@@ -105,14 +105,15 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     """Write the file that the command line asks for. UserError if there is nothing to load or to write."""
     make_path = _path_maker(args.path, entry)
     entry.check(args.to)
-    splats, scene = load(args, options, want_views=bool(args.max_splats) or entry.of_scene)
+    splats, scene = load(args, options, needs_views=bool(args.max_splats) or entry.of_scene)
     degree = splats.sh_degree if args.typed_sh_degree is None else min(args.typed_sh_degree, splats.sh_degree)
     keep = choose(splats, args.crop, args.min_opacity)
     if scene is not None and args.max_splats:
         keep = thin_out(scene, keep, degree, args.max_splats, pipe, options)
     chosen = tidy(with_sh_degree(selected(splats, keep), degree))
     start = time.perf_counter()
-    entry.write(args.to, chosen, *((scene, options.white_background, make_path) if entry.of_scene else ()))
+    background = (1.0, 1.0, 1.0) if options.white_background else (0.0, 0.0, 0.0)
+    entry.write(args.to, chosen, *((scene.getTrainCameras(), make_path, background) if entry.of_scene else ()))
     size, seconds = Path(args.to).stat().st_size, time.perf_counter() - start
     what = f"{len(chosen)} of {len(splats)} Gaussians, SH degree {degree}"
     print(
@@ -126,7 +127,7 @@ def _path_maker(path: str | None, entry: Format) -> Callable[[Poses], TimedPath]
         return None
     if not entry.of_scene:
         raise UserError(f"--path is the animation of a page; leave it out for {entry.ending}, or end --to with .html")
-    from splatting.camera_paths.request import path_maker
+    from splatting.camera_paths.render_path import path_maker
 
     return path_maker(path)
 

@@ -22,18 +22,17 @@ from typing import Any
 
 import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 
-from splatting.evaluation import stages
+from splatting.evaluation import plan, stages
 from splatting.evaluation.configs import check_options, read_configs, shipped
-from splatting.evaluation.document import cheapest_table, result_blocks
+from splatting.evaluation.error_curve import peers_of
 from splatting.evaluation.machine import machine
-from splatting.evaluation.peers import peers_of
+from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.report import make_report, write_report
-from splatting.evaluation.results import joined, joined_peers, read_earlier, read_run
-from splatting.evaluation.runs import Run, check_folders, check_nesting, check_outside_scenes, plan_runs
-from splatting.evaluation.scenes import SceneEntry, check_names, dataset_scenes, finished_scenes, folder_scenes
+from splatting.evaluation.results import read_earlier, read_run
 from splatting.evaluation.stages import Failure, StageFailed
-from splatting.files.lock import locked
-from splatting.files.markdown_table import markdown_table
+from splatting.evaluation.tables import Table, cheapest_table, result_tables
+from splatting.files.folders import locked
+from splatting.files.listing import markdown_table
 from utils.system_utils import UserError, mkdir_p, run_cli
 
 EXPOSURE = (
@@ -88,13 +87,13 @@ def _parser() -> ArgumentParser:
 
 def _scenes(args: Namespace) -> list[SceneEntry]:
     groups = ("mipnerf360", "tanksandtemples", "deepblending")
-    scenes = [entry for group in groups if (root := getattr(args, group)) for entry in dataset_scenes(group, root)]
-    scenes += folder_scenes(args.scenes)
+    scenes = [entry for group in groups if (root := getattr(args, group)) for entry in plan.dataset_scenes(group, root)]
+    scenes += plan.folder_scenes(args.scenes)
     if not scenes and args.skip_training and args.skip_rendering:
-        scenes = finished_scenes(args.output_path)
+        scenes = plan.finished_scenes(args.output_path)
     if not scenes:
         raise UserError("no scenes given; pass data sets as -m360, -tat, -db, or folders as --scenes")
-    check_names(scenes)
+    plan.check_names(scenes)
     return scenes
 
 
@@ -111,11 +110,11 @@ def _plan(args: Namespace, more: Sequence[str]) -> list[Run]:
     common += [*([] if args.iterations is None else ["--iterations", str(args.iterations)]), *more]
     if args.seeds and any(word.split("=")[0] == "--seed" for word in (*common, *sum(configs.values(), ()))):
         raise UserError("--seed is given twice; omit it when --seeds is given")
-    runs = plan_runs(_scenes(args), args.output_path.resolve(), common, configs, args.seeds)
-    check_outside_scenes(runs)
-    check_nesting(runs, args.output_path.resolve())
+    runs = plan.plan_runs(_scenes(args), args.output_path.resolve(), common, configs, args.seeds)
+    plan.check_outside_scenes(runs)
+    plan.check_nesting(runs, args.output_path.resolve())
     if not args.skip_training:
-        check_folders(runs)
+        plan.check_folders(runs)
     return runs
 
 
@@ -154,7 +153,8 @@ def _report(
     If none has, a report with scores stays as it is.
     """
     earlier = read_earlier(output)
-    results = [read_run(run, output, failure) for run, failure in joined(earlier, runs, failures)]
+    every = earlier["runs"] | {run.model: (run, failures.get(run)) for run in runs}  # of both, that of this call
+    results = [read_run(run, output, failure) for run, failure in every.values()]
     models = {os.path.relpath(run.model, output) for run in runs}
     scored = any(result["final_iteration"] is not None for result in results if result["model"] in models)
     if not scored:
@@ -163,18 +163,19 @@ def _report(
         if earlier["scored"]:
             return False
     scenes = {result["scene"] for result in results}
-    report = make_report(command, results, joined_peers(earlier, peers, scenes), earlier["commands"])
+    named = {(peer["scene"], peer["name"]): peer for peer in (*earlier["peers"], *peers) if peer["scene"] in scenes}
+    report = make_report(command, results, list(named.values()), earlier["commands"])
     write_report(report, output)
-    for block in result_blocks(report["summary"]) if report["summary"] else []:
-        print(f"\n{block}" if isinstance(block, str) else _text(block))
+    for table in result_tables(report["summary"]):
+        print(f"\n{table.title}\n{_text(table)}" if table.title else _text(table))
     for scene, rows in report["cheapest"].items():
         print(f"\n{scene}: cheapest option set for a given error\n{_text(cheapest_table(rows))}")
     print(f"\nreport: {output / 'report.html'}")
     return scored
 
 
-def _text(table: dict[str, Any]) -> str:
-    return markdown_table(table["header"], table["rows"])
+def _text(table: Table) -> str:
+    return markdown_table(table.header, table.rows)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -24,9 +24,8 @@ from fused_ssim import fused_ssim
 from tqdm import tqdm
 
 from arguments import read_cfg_args
-from splatting.evaluation.earlier_lpips import keep_lpips
 from splatting.files.image_files import UNREADABLE, open_render
-from splatting.files.json_files import write_json
+from splatting.files.json_files import read_json, write_json
 from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, PerceptualDistance
 from utils.system_utils import UserError, compute_device, run_cli
 
@@ -44,6 +43,7 @@ MASKED = {
     "SSIM": "other pixels are 0 in both images, as beyond the border; 1 - SSIM is divided by the share that counts",
     "LPIPS": "other pixels of the render are the ground truth's; the mean of the map over the pixels that count",
 }
+_SAME = 1e-9  # of SSIM, whose sum may differ in its last bits
 Metric = Callable[[np.ndarray, np.ndarray, np.ndarray | None], float | None]
 Scores = dict[str, dict[str, float | None]]
 
@@ -237,6 +237,31 @@ def evaluate(
         _score_model(model, methods, metrics)
 
 
+def keep_lpips(model: Path, method: str, scores: Scores) -> list[str]:
+    """Add the LPIPS that model/per_view.json has of a method to new scores that lack it; return its metrics.
+
+    None are added unless every view has the same PSNR and SSIM as then, which other pictures would change.
+    """
+    views = scores["PSNR"].keys()
+    try:
+        earlier = read_json(model / "per_view.json")[method]
+        pairs = [(scores[name][view], earlier[name][view]) for name in ("PSNR", "SSIM") for view in views]
+        if earlier["PSNR"].keys() != views or not all(new == old or abs(new - old) < _SAME for new, old in pairs):
+            return []
+        kept = [
+            name
+            for name, values in earlier.items()
+            if name.startswith("LPIPS")
+            and set(scores.get(name, {}).values()) <= {None}
+            and values.keys() == views
+            and all(type(value) is float and math.isfinite(value) for value in values.values())
+        ]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return []  # there is none, or nobody can use it
+    scores |= {name: {view: earlier[name][view] for view in views} for name in kept}
+    return kept
+
+
 def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str, Metric]) -> None:
     held_out = trained_with_eval(model)
     if held_out is False:
@@ -264,23 +289,15 @@ def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str,
 
 def main() -> None:
     parser = ArgumentParser(description="Score rendered test views: PSNR, SSIM, LPIPS.")
-    parser.add_argument("-m", "--model_paths", type=Path, nargs="+", required=True,
-                        help="model folders to score (default: none, must be given)")  # fmt: skip
-    parser.add_argument(
-        "--lpips_net",
-        choices=("vgg", "alex", "both"),
-        default="vgg",
-        help="LPIPS backbone: vgg for LPIPS (as in published tables) and LPIPS_vgg, alex for LPIPS_alex (default: vgg)",
-    )
-    parser.add_argument(
-        "--lpips_weights",
-        type=Path,
-        nargs="+",
-        default=[],
-        metavar="FILE",
+    add = parser.add_argument
+    add("-m", "--model_paths", type=Path, nargs="+", required=True,
+        help="model folders to score (default: none, must be given)")  # fmt: skip
+    add("--lpips_net", choices=("vgg", "alex", "both"), default="vgg",
+        help="LPIPS backbone: vgg for LPIPS (as in published tables) and LPIPS_vgg, alex for LPIPS_alex (default: "
+        "vgg)")  # fmt: skip
+    add("--lpips_weights", type=Path, nargs="+", default=[], metavar="FILE",
         help="state dicts of torchvision's vgg16 or alexnet; replace torch's cache and download (default: torch's "
-        "cache, or else a download into it)",
-    )
+        "cache, or else a download into it)")  # fmt: skip
     args = parser.parse_args()
     evaluate(args.model_paths, args.lpips_net, args.lpips_weights)
 

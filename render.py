@@ -7,7 +7,7 @@ python render.py -s SCENE -m OUT --ply FILE
 Writes MODEL/{train,test}/ours_N/{renders,gt}/00000.png ..., numbered by the views' sorted order, masks/ for views of
 which not every pixel counts, and render_times.json beside these folders: the time of each view without I/O. The device
 is idle before the clock starts, and done when it stops. --depth and --alpha write inverse depth and alpha into folders
-of these names, 16-bit PNGs with their scale in a text chunk (splatting/files/plane_files.py).
+of these names, 16-bit PNGs with their scale in a text chunk (splatting/files/image_files.py).
 
 With --path, writes MODEL/videos/ours_N/NAME.mp4 instead (splatting/camera_paths/render_path.py).
 """
@@ -29,31 +29,20 @@ from PIL import Image
 from tqdm import tqdm
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
+from gaussian_renderer.blending import PLANES, view_planes
 from gaussian_renderer.memory_errors import memory_errors_explained
 from gaussian_renderer.scored_views import ScoredViews
-from gaussian_renderer.view_planes import PLANES, view_planes
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
 from scene.scene import Scene
-from splatting.camera_paths.request import add_path_options, path_request, wants_path
-from splatting.evaluation import render_times
+from splatting.camera_paths.render_path import add_path_options, path_request, render_path
+from splatting.evaluation.renders import TIMES, summarise_times
 from splatting.exports.in_scene import load_file
-from splatting.files.numbered_pngs import remove_leftovers, save_png
-from splatting.files.plane_files import write_plane
+from splatting.files.image_files import remove_leftovers, save_png, write_plane
+from splatting.files.json_files import write_json
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p, run_cli
-
-
-def save_mask(mask: torch.Tensor, path: Path) -> None:
-    """Write a mask (1, H, W) bool as a grey PNG, white where pixels count."""
-    with atomic_write(path) as temporary:
-        Image.fromarray(mask[0].to(torch.uint8).mul(255).cpu().numpy()).save(temporary)
-
-
-def save_plane(values: torch.Tensor, path: Path, plane: str) -> None:
-    """Write a plane (1, H, W) of PLANES. White is 1 for alpha, and the nearest value of the view for depth."""
-    write_plane(path, values[0].cpu().numpy(), 1.0 if plane == "alpha" else None)
 
 
 def write_views(
@@ -93,9 +82,12 @@ def write_views(
         save_png(scored.target(view), folder / "gt" / f"{index:05d}.png")
         for plane, values in view_planes(view, gaussians, pipe).items() if planes else ():
             if plane in planes:
-                save_plane(scored.part(values), folder / plane / f"{index:05d}.png", plane)
-        if (mask := scored.mask(view)) is not None:
-            save_mask(mask, folder / "masks" / f"{index:05d}.png")
+                # White is 1 for alpha, and the nearest value of the view for depth.
+                path, white = folder / plane / f"{index:05d}.png", 1.0 if plane == "alpha" else None
+                write_plane(path, scored.part(values)[0].cpu().numpy(), white)
+        if (mask := scored.mask(view)) is not None:  # white where pixels count
+            with atomic_write(folder / "masks" / f"{index:05d}.png") as temporary:
+                Image.fromarray(mask[0].to(torch.uint8).mul(255).cpu().numpy()).save(temporary)
     return seconds
 
 
@@ -124,7 +116,7 @@ def render_set(
     reference; the SH bands are always passed separately. planes: those of PLANES to write, too.
     """
     folder = Path(model_path) / name / f"ours_{iteration}"
-    (folder / render_times.NAME).unlink(missing_ok=True)  # times of an interrupted run do not count
+    (folder / TIMES).unlink(missing_ok=True)  # times of an interrupted run do not count
     with memory_errors_explained(gaussians, views):
         seconds = write_views(folder, views, gaussians, pipeline, background, train_test_exp, planes)
     if not seconds:
@@ -132,8 +124,8 @@ def render_set(
         return
     sizes = [(view.image_width, view.image_height) for view in views]
     antialiasing = getattr(pipeline, "antialiasing", False)  # options of 2023 lack it
-    times = render_times.summarise(seconds, sizes, len(gaussians), antialiasing, background.device)
-    render_times.write(folder, times)
+    times = summarise_times(seconds, sizes, len(gaussians), antialiasing, background.device)
+    write_json(folder / TIMES, times)
     median = f"median {times['median_ms']:.2f} ms a view ({times['fps']:.1f} frames per second)"
     print(f"{name}: {len(views)} views, {median}")
 
@@ -195,10 +187,8 @@ def main() -> None:
     options, pipeline = model_params.extract(args), pipeline_params.extract(args)
     safe_state(args.quiet)
     warn_of_background(options)
-    if wants_path(args):
-        from splatting.camera_paths.render_path import render_path  # SciPy takes a while to import
-
-        request = path_request(args)
+    request = path_request(args)
+    if request:
         scene, background = _loaded(options, args.iteration, args.typed_sh_degree, args.ply, pipeline)
         render_path(scene, pipeline, background, request)
         return

@@ -16,8 +16,7 @@ import torch
 
 from arguments import ModelParams, OptimizationParams, OptionParser, PipelineParams, write_cfg_args, write_model_json
 from gaussian_renderer import network_gui
-from splatting.distributed.ranks import ranks
-from splatting.evaluation.event_writer import EventWriter as SummaryWriter
+from splatting.evaluation.training_log import EventWriter as SummaryWriter
 from splatting.training.agreement import agree_on_options
 from splatting.training.launch import add_launch_options, launch_options
 from splatting.training.loop import run_training
@@ -42,11 +41,11 @@ def train(
     dataset.model_path = dataset.model_path or new_folder()
     print(f"Optimizing {dataset.model_path}")
     run = Run(dataset, opt, pipe, launch)
-    # No rank of several can draw a view for the remote viewer by itself.
-    address = None if launch.disable_viewer or ranks().several else (launch.ip, launch.port)
+    # No process of several can draw a view for the remote viewer by itself.
+    address = None if launch.disable_viewer or run.group.several else (launch.ip, launch.port)
     # Write nothing before every input check has passed: a mistyped option must not overwrite a finished model.
     with own_folder(dataset.model_path), network_gui.listening(address):
-        writer = prepare_output_and_logger(run.options, **run.entries) if ranks().first else None
+        writer = prepare_output_and_logger(run.options, **run.entries) if run.group.first else None
         run.begin()
         run_training(run, standard_observers(run, writer, training_report))
 
@@ -110,8 +109,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     safe_state(args.quiet, opt.seed)
     agree_on_options(args)
     torch.autograd.set_detect_anomaly(args.detect_anomaly)
-    if checked_address(args.viewer_host, args.viewer) and ranks().several:
-        raise UserError("--viewer needs a training of one process; leave it out, or start train.py without torchrun")
+    checked_address(args.viewer_host, args.viewer)
     args.save_iterations = [*args.save_iterations, opt.iterations]
     train(dataset, opt, pipe, args)
     print("Training complete.")

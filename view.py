@@ -12,9 +12,8 @@ import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
 from scene.saved_model import load_saved
-from splatting.viewer.options import PORT, add_host_option
 from splatting.viewer.page import serve_saved
-from splatting.viewer.server import checked_address
+from splatting.viewer.server import PORT, add_host_option, checked_address
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, run_cli
 

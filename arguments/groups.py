@@ -6,7 +6,6 @@ from collections.abc import Collection
 
 from arguments.param_group import (
     CFG_ARGS,
-    MODEL_JSON,
     GroupParams,
     Option,
     OptionTable,
@@ -16,6 +15,7 @@ from arguments.param_group import (
     within,
 )
 from arguments.strategies import STRATEGY_OPTIONS
+from splatting.files.json_files import MODEL_JSON
 from utils.system_utils import UserError
 
 

@@ -6,11 +6,10 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from splatting.files import model_json
 from utils.system_utils import UserError
 
 Value = bool | int | float | str
-CFG_ARGS, MODEL_JSON = "cfg_args", model_json.NAME  # files of a model folder: the reference's, and ours
+CFG_ARGS = "cfg_args"  # the file of options in a model folder of the reference
 
 
 @dataclass(frozen=True)
@@ -74,9 +73,9 @@ class Option:
             raise UserError(f"--{self.name} must be True or False, got {value!r}")
         if isinstance(value, float) and not math.isfinite(value):
             raise UserError(f"--{self.name} must be a finite number, got {value}")
-        wanted = self.check(value) if self.check else None
-        if wanted:
-            raise UserError(f"--{self.name} must be {wanted}, got {value!r}")
+        valid = self.check(value) if self.check else None
+        if valid:
+            raise UserError(f"--{self.name} must be {valid}, got {value!r}")
 
 
 class OptionParser(argparse.ArgumentParser):

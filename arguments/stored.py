@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from arguments.groups import OPTIONS, ModelParams
-from arguments.param_group import CFG_ARGS, MODEL_JSON, Value
-from splatting.files import model_json
-from splatting.files.model_json import OFFSET
+from arguments.param_group import CFG_ARGS, Value
+from splatting.files import json_files
+from splatting.files.json_files import MODEL_JSON, OFFSET
 from splatting.files.plain_files import plain_text
-from splatting.host.version import VERSION
+from splatting.host.machine import VERSION
 from utils.system_utils import UserError, atomic_write
 
 _IN_CFG_ARGS = {option.name: option.default for option in OPTIONS if option.stored == CFG_ARGS}
@@ -61,8 +61,8 @@ def read_cfg_args(model_path: str | os.PathLike) -> dict[str, Value]:
 def _check_types(path: Path, values: Mapping[str, Any], defaults: Mapping[str, Value]) -> None:
     for name, default in defaults.items():
         if name in values and type(values[name]) is not type(default):
-            wanted = type(default).__name__
-            raise UserError(f"{path}: {name} must be {wanted}, got {values[name]!r}; restore the file")
+            kind = type(default).__name__
+            raise UserError(f"{path}: {name} must be {kind}, got {values[name]!r}; restore the file")
 
 
 def write_model_json(
@@ -85,17 +85,17 @@ def write_model_json(
             record[name] = value
     if any(world_offset):
         record[OFFSET] = list(world_offset)
-    model_json.write_model_json(model_path, record | more)
+    json_files.write_model_json(model_path, record | more)
 
 
 def add_to_model_json(model_path: str | os.PathLike, **entries: Any) -> None:
     """Add entries to `model.json`, or replace those of the same names."""
-    model_json.write_model_json(model_path, read_model_json(model_path) | entries)
+    json_files.write_model_json(model_path, read_model_json(model_path) | entries)
 
 
 def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
-    """Do as splatting.files.model_json.read_model_json; UserError also for an option of the wrong type."""
-    record = model_json.read_model_json(model_path)
+    """Do as splatting.files.json_files.read_model_json; UserError also for an option of the wrong type."""
+    record = json_files.read_model_json(model_path)
     _check_types(Path(model_path) / MODEL_JSON, record, _IN_MODEL_JSON)
     return record
 

@@ -1,6 +1,7 @@
 """Options of the strategies: how many Gaussians there are, and where, and how a run is paced."""
 
-from arguments.param_group import MODEL_JSON, Option, above, at_least, one_of, within
+from arguments.param_group import Option, above, at_least, one_of, within
+from splatting.files.json_files import MODEL_JSON
 
 _PAPER = "ours, from the MCMC paper"
 _RELEASED = "ours, from the release of the MCMC paper"

@@ -2,25 +2,29 @@
 
 import argparse
 import math
-from collections.abc import Callable
-from functools import cache, partial
+from functools import cache
 
 import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings, decisive, rasterize
+from diff_gaussian_rasterization import GaussianRasterizationSettings
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.gaussians import Gaussians
-from diff_gaussian_rasterization.ops import Rasterized
-from diff_gaussian_rasterization.scene import scene_arguments
+from diff_gaussian_rasterization.scene import Drawing, Scene, scene_arguments
+from diff_gaussian_rasterization.scene import draw as rasterize_scene
 from torch import Tensor
 
 from scene.cameras import Camera, MiniCam
+from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.exposure import apply_exposure
 from scene.gaussians.parameters import GaussianParameters
-from splatting.distributed.rendering.band import decisive_in, draw_view
-from splatting.distributed.rendering.models import ranks_of
-from splatting.distributed.rendering.rasterize import rasterize_over
+from splatting.distributed.rendering.divided import (
+    DividedDrawn,
+    KnownBands,
+    draw_divided,
+    gradient_of_colors,
+    rasterizer_of,
+)
 from utils.general_utils import check_flags
 from utils.sh_utils import eval_sh
 
@@ -62,22 +66,19 @@ def render(
     if torch.is_tensor(separate_sh):
         separate_sh, override_color = False, separate_sh
     check_flags(use_trained_exp=use_trained_exp, clamp=clamp)
-    xyz = pc.get_xyz
-    geometry, raw = _geometry(pc, pipe.compute_cov3D_python, scaling_modifier)
-    colors = _colors(pc, pipe.convert_SHs_python, viewpoint_camera, separate_sh, override_color)
-    if pc.active_sh_degree == 0 and not want_inactive_bands:
-        colors = _without_rest(colors)
-    viewspace_points = _screen_points(xyz, *geometry.values(), *colors.values())
-    result = _rasterizer(pc)(
-        xyz,
-        viewspace_points,
+    gaussians, raw = model_inputs(viewpoint_camera, pc, pipe, scaling_modifier, separate_sh, override_color)
+    if gaussians.sh_rest is not None and pc.active_sh_degree == 0 and not want_inactive_bands:
+        gaussians = gaussians._replace(sh_rest=gaussians.sh_rest.detach()[:, :0])
+    viewspace_points = _screen_points(*gaussians)
+    result = rasterizer_of(pc)(
+        means2d=viewspace_points,
         settings=rasterizer_settings(viewpoint_camera, pc, pipe, bg_color, scaling_modifier),
         want_inverse_depth=want_depth,
         want_absolute_gradient=want_absolute_gradient,
         raw=raw,
-        **(geometry | colors),
+        **gaussians._asdict(),
     )
-    color = _exposed(result.color, viewpoint_camera, pc) if use_trained_exp else result.color
+    color = exposed(result.color, viewpoint_camera, pc) if use_trained_exp else result.color
     return {
         "render": color.clamp(0, 1) if clamp else color,
         "viewspace_points": viewspace_points,
@@ -87,15 +88,11 @@ def render(
     }
 
 
-def _rasterizer(pc: GaussianModel) -> Callable[..., Rasterized]:
-    """The rasterizer, or that of the ranks among which a model is divided."""
-    return partial(rasterize_over, ranks) if (ranks := ranks_of(pc)).several else rasterize
-
-
-def _screen_points(xyz: Tensor, *others: Tensor) -> Tensor:
+def _screen_points(xyz: Tensor, *others: Tensor | None) -> Tensor:
     """Zeros (N, 3) that take a gradient if one of the tensors does."""
     points = _zero(xyz.device, xyz.dtype).expand_as(xyz)
-    return points.requires_grad_(torch.is_grad_enabled() and any(x.requires_grad for x in (xyz, *others)))
+    differentiated = any(x is not None and x.requires_grad for x in (xyz, *others))
+    return points.requires_grad_(torch.is_grad_enabled() and differentiated)
 
 
 @cache
@@ -104,16 +101,76 @@ def _zero(device: torch.device, dtype: torch.dtype) -> Tensor:
         return torch.zeros((), device=device, dtype=dtype)
 
 
+class Drawn:
+    """A view's image (3, H, W), its inverse depth (1, H, W) if requested, and the way back from their gradients.
+
+    Both may be given `requires_grad`. blend_depth: (H, W) int32, how far down its tile's list a pixel goes. What ranks
+    draw together has the same attributes and methods. band: None where the whole image is right.
+    """
+
+    band = None
+
+    def __init__(self, drawing: Drawing, scene: Scene, background: Tensor, want_depth: bool) -> None:
+        self.image, self.depth = drawing.color, drawing.inverse_depth if want_depth else None
+        self.radii, self.blend_depth = drawing.radii, drawing.last
+        self._drawing, self._scene, self._background = drawing, scene, background
+
+    def decisive(self) -> Tensor:
+        """Gaussians that the image depends on (`decisive` of diff_gaussian_rasterization): (N,) bool."""
+        it = self._drawing
+        return OPERATORS.decisive(it.splats, it.instances, it.ranges, it.last)
+
+    def color_gradient(self, image_gradient: Tensor) -> Tensor:
+        """The gradient of the Gaussians' colours (N, 3), whether these were given or came from SH bands."""
+        return gradient_of_colors(self._scene, self._drawing.kept(self._background), (image_gradient, None, None))
+
+    def step(
+        self,
+        adam: FusedAdam,
+        image_gradient: Tensor,
+        depth_gradient: Tensor | None,
+        observe: bool,
+        absolute: bool = False,
+        now: Tensor | None = None,
+    ) -> None:
+        """Take the optimiser's step of every Gaussian, without a gradient of a parameter in memory.
+
+        Values, averages and statistics get the same bits as by `render`, backward, `observe` and the optimiser's step.
+        observe: add the view to the statistics of density control. absolute: with the lengths of absolute gradients
+        (`rasterize` of diff_gaussian_rasterization). now: (NOW_WORDS,) int64 on the Gaussians' device of
+        `FusedAdam.write_now`, for a step that is captured.
+        """
+        source, planes = self._drawing.kept(self._background), (image_gradient, None, depth_gradient)
+        adam.apply(self._scene, source, planes, self.radii, observe, absolute and observe, now)
+
+
 @torch.no_grad()
+def draw(
+    camera: Camera | MiniCam,
+    pc: GaussianModel,
+    pipe: argparse.Namespace,
+    background: Tensor,
+    want_depth: bool = False,
+    scaling: float = 1.0,
+    by_bands: bool = False,
+    bands: KnownBands | None = None,
+) -> Drawn | DividedDrawn:
+    """Render a view without autograd, to go back from the image by the methods of what it returns.
+
+    Of a model that is divided among processes: by_bands: each needs no more of the image than the loss of its band.
+    bands: those of earlier steps, in which the camera's uid stands for the view.
+    """
+    gaussians, raw = model_inputs(camera, pc, pipe, scaling)
+    scene = scene_arguments(gaussians, rasterizer_settings(camera, pc, pipe, background, scaling), raw)
+    divided = draw_divided(pc, scene, background, want_depth, by_bands, bands, camera)
+    if divided is not None:
+        return divided
+    return Drawn(rasterize_scene(scene, background, want_depth), scene, background, want_depth)
+
+
 def decisive_for(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace) -> Tensor:
     """Gaussians that the image of `render` depends on, over any background (`decisive`): (N,) bool."""
-    background = pc.get_xyz.new_zeros(3)
-    geometry, raw, colors = model_inputs(camera, pc, pipe)
-    settings = rasterizer_settings(camera, pc, pipe, background)
-    if (ranks := ranks_of(pc)).several:
-        scene = scene_arguments(Gaussians(pc.get_xyz, **geometry, **colors), settings, raw)
-        return decisive_in(draw_view(ranks, scene, background, want_depth=False, train=True))
-    return decisive(pc.get_xyz, settings=settings, raw=raw, **geometry, **colors)
+    return draw(camera, pc, pipe, pc.get_xyz.detach().new_zeros(3), by_bands=True).decisive()
 
 
 @torch.no_grad()
@@ -128,11 +185,17 @@ def visible_rows(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Nam
 
 
 def model_inputs(
-    camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace
-) -> tuple[dict[str, Tensor], bool, dict[str, Tensor]]:
-    """The rasterizer's inputs for a view of a model, by name: shapes and opacities, whether these are raw, colours."""
-    geometry, raw = _geometry(pc, pipe.compute_cov3D_python, 1.0)
-    return geometry, raw, _colors(pc, pipe.convert_SHs_python, camera, False, None)
+    camera: Camera | MiniCam,
+    pc: GaussianModel,
+    pipe: argparse.Namespace,
+    scaling: float = 1.0,
+    separate_sh: bool = False,
+    override_color: Tensor | None = None,
+) -> tuple[Gaussians, bool]:
+    """The rasterizer's inputs for a view of a model, and whether they are raw. Arguments as for `render`."""
+    geometry, raw = _geometry(pc, pipe.compute_cov3D_python, scaling)
+    colors = _colors(pc, pipe.convert_SHs_python, camera, separate_sh, override_color)
+    return Gaussians(pc.get_xyz, **geometry, **colors), raw
 
 
 def rasterizer_settings(
@@ -156,7 +219,8 @@ def rasterizer_settings(
     )
 
 
-def _exposed(color: Tensor, camera: Camera | MiniCam, pc: GaussianModel) -> Tensor:
+def exposed(color: Tensor, camera: Camera | MiniCam, pc: GaussianModel) -> Tensor:
+    """The image (3, H, W) with the trained exposure of the view's photo; a view without a photo has none."""
     name = getattr(camera, "exposure_name", None)
     name = getattr(camera, "image_name", None) if name is None else name
     return color if name is None else apply_exposure(color, pc.get_exposure_from_name(name))
@@ -192,8 +256,3 @@ def _colors(
         features = pc.get_features
         dc, rest = features[:, :1], features[:, 1:]
     return {"sh_dc": dc, "sh_rest": rest}
-
-
-def _without_rest(colors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The colours without the bands above 0, for which no gradient then has to be written."""
-    return {**colors, "sh_rest": colors["sh_rest"].detach()[:, :0]} if "sh_rest" in colors else colors

@@ -1,4 +1,4 @@
-"""A view from any pose, without a photo."""
+"""Views without a photo: from any pose, and between neighbouring cameras, where a visitor of the scene may stand."""
 
 import math
 from collections.abc import Sequence
@@ -6,8 +6,12 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from scene.cameras import ZFAR, ZNEAR, MiniCam
-from utils.graphics_utils import projection, world_to_camera
+from scene.cameras import ZFAR, ZNEAR, Camera, MiniCam
+from utils.graphics_utils import focal2fov, projection, world_to_camera
+
+NEAREST = 3  # neighbours of each camera; in a sequence and in a ring its two sides are among them
+FRACTIONS = (0.2, 0.4, 0.6, 0.8)  # of the way from a camera to its neighbour
+WIDER = 1.5  # size of a view between, in sizes of its cameras: a visitor may look elsewhere than they did
 
 
 def free_view(
@@ -18,9 +22,22 @@ def free_view(
     wxyz: unit quaternion that turns camera axes (x right, y down, z forward) into world axes.
     """
     fov_x = 2 * math.atan(math.tan(fov_y / 2) * width / height)
-    turn = rotation_matrix(wxyz)
-    view = torch.from_numpy(world_to_camera(turn, -turn.T @ np.asarray(position, np.float64)))
     project = projection(ZNEAR, ZFAR, fov_x, fov_y)
+    return _view(width, height, fov_y, fov_x, rotation_matrix(wxyz), np.asarray(position, np.float64), project, device)
+
+
+def _view(
+    width: int,
+    height: int,
+    fov_y: float,
+    fov_x: float,
+    turn: np.ndarray,
+    center: np.ndarray,
+    project: torch.Tensor,
+    device: torch.device | str,
+) -> MiniCam:
+    """turn: from camera axes to world axes. project: the projection matrix."""
+    view = torch.from_numpy(world_to_camera(turn, -turn.T @ center))
     matrices = [m.T.to(device, torch.float32).contiguous() for m in (view, project @ view)]
     return MiniCam(width, height, fov_y, fov_x, ZNEAR, ZFAR, *matrices)
 
@@ -35,3 +52,70 @@ def rotation_matrix(wxyz: Sequence[float]) -> np.ndarray:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def neighbours(cameras: Sequence[Camera], nearest: int = NEAREST) -> list[tuple[int, int]]:
+    """Pairs (i, j), i < j, of cameras to walk between, by their index; ascending.
+
+    A pair's distance is that of the centres plus the angle between the orientations, each in units of its median over
+    all pairs. Each camera is paired with its `nearest` ones. The minimum spanning tree comes on top, so that groups of
+    cameras far from each other are joined, too. Memory: some 50 bytes for each two cameras.
+    """
+    from scipy.sparse.csgraph import minimum_spanning_tree  # SciPy takes a while to import
+
+    count = len(cameras)
+    if count < 2:
+        return []
+    distances = _distances(cameras)
+    tree = minimum_spanning_tree(1 + distances)  # a weight of 0 would be no edge
+    pairs = {(min(i, j), max(i, j)) for i, j in np.argwhere(tree.toarray()).tolist()}
+    np.fill_diagonal(distances, np.inf)
+    for i, order in enumerate(np.argsort(distances, axis=1, kind="stable")[:, : min(nearest, count - 1)].tolist()):
+        pairs |= {(min(i, j), max(i, j)) for j in order}
+    return sorted(pairs)
+
+
+def _distances(cameras: Sequence[Camera]) -> np.ndarray:
+    """(N, N) distances of `neighbours`."""
+    centers = np.array([_center(camera) for camera in cameras])
+    turns = np.array([camera.R for camera in cameras]).reshape(-1, 9)
+    far = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+    turned = np.arccos(np.clip((turns @ turns.T - 1) / 2, -1, 1))  # the trace of Ra^T Rb is 1 + 2 cos(angle)
+    total = np.zeros_like(far)
+    above = np.triu_indices(len(cameras), 1)
+    for part in (far, turned):
+        if (unit := np.median(part[above])) > 0:
+            total += part / unit
+    return total
+
+
+def views_between(first: Camera, second: Camera) -> list[MiniCam]:
+    """A view at each of FRACTIONS of the way between two cameras, WIDER than they are.
+
+    Positions, focal lengths and principal points are interpolated linearly, orientations along the shortest rotation
+    (slerp). Where the sizes differ, the larger width and height count.
+    """
+    return [_between(first, second, fraction) for fraction in FRACTIONS]
+
+
+def _between(first: Camera, second: Camera, fraction: float) -> MiniCam:
+    from scipy.spatial.transform import Rotation, Slerp
+
+    def mixed(one: float, other: float) -> float:
+        return (1 - fraction) * one + fraction * other
+
+    turn = Slerp([0, 1], Rotation.from_matrix([first.R, second.R]))(fraction).as_matrix()
+    center = mixed(_center(first), _center(second))
+    width, height = (
+        math.ceil(WIDER * max(getattr(first, side), getattr(second, side))) for side in ("image_width", "image_height")
+    )
+    fovx, fovy = focal2fov(mixed(first.fx, second.fx), width), focal2fov(mixed(first.fy, second.fy), height)
+    # Offsets of the principal point from the image's centre stay what they are in pixels.
+    shift_x = mixed(first.cx - first.image_width / 2, second.cx - second.image_width / 2)
+    shift_y = mixed(first.cy - first.image_height / 2, second.cy - second.image_height / 2)
+    project = projection(ZNEAR, ZFAR, fovx, fovy, 2 * shift_x / width, 2 * shift_y / height)
+    return _view(width, height, fovy, fovx, turn, center, project, first.device)
+
+
+def _center(camera: Camera) -> np.ndarray:
+    return -camera.R @ camera.T

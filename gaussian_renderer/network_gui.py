@@ -25,7 +25,7 @@ from gaussian_renderer.network_transfer import (
     set_up,
 )
 from scene.cameras import MiniCam
-from splatting.host.device import compute_device
+from splatting.host.machine import compute_device
 from utils.system_utils import UserError
 
 PATIENCE = 30.0  # seconds that `read` waits for a viewer that lets training go on, or has not asked for anything yet

@@ -58,7 +58,7 @@ def decode(text: bytes) -> dict[str, Any]:
 
 
 def parse(message: dict[str, Any]) -> Request | None:
-    """The request that a message holds; None if a resolution is 0, when no frame is wanted and no other field is read.
+    """The request that a message holds; None if a resolution is 0, when no other field is read.
 
     BadMessage for a field that is missing, of another type, not finite or out of range, and for a view matrix that is
     singular, mirrored or sheared. A scale of it is divided out.

@@ -12,7 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gaussian_renderer import decisive_for
-from gaussian_renderer.between import FRACTIONS, NEAREST, neighbours, views_between
+from gaussian_renderer.free_view import FRACTIONS, NEAREST, neighbours, views_between
 from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
@@ -28,23 +28,15 @@ KEPT, TOO_LONG, FEW, DONE = "not wanted", "too long", "too few", "done"  # ends 
 
 @dataclass
 class Search:
-    """What a search for unseen Gaussians found."""
+    """What a search for unseen Gaussians found, and what was then left out."""
 
     keep: Tensor  # (N,) bool
     faint: int = 0  # Gaussians of an opacity below 1/255
     views: int = 0  # looked at; for TOO_LONG, those that it would have taken
     end: str = KEPT
-
-
-@dataclass
-class Trimmed:
-    """A model without what it does not need, and a record of what was removed."""
-
-    gaussians: GaussianModel
-    unseen: int  # Gaussians left out, those of `search.faint` included
-    cut_bounds: list[float]  # by degree: bound on a colour's change if all SH bands above the degree are cut
-    seconds: float  # that the search took
-    search: Search
+    unseen: int = 0  # Gaussians left out, the faint included
+    cut_bounds: Sequence[float] = ()  # by degree: bound on a colour's change if all SH bands above it are cut
+    seconds: float = 0.0  # that it took
 
 
 def decisive_for_any(cameras: Sequence[Camera | MiniCam], gaussians: GaussianModel, pipe: argparse.Namespace) -> Tensor:
@@ -75,7 +67,7 @@ def search_unseen(
     """Find the Gaussians that no one sees who walks from camera to camera.
 
     Those below FAINT are in no image at all. Of the others, those are unseen that neither the cameras nor the views
-    between neighbouring ones depend on (gaussian_renderer/between.py). If they are fewer than WORTH, or if looking
+    between neighbouring ones depend on (gaussian_renderer/free_view.py). If they are fewer than WORTH, or if looking
     takes more than a view for ITERATIONS_PER_VIEW of the `iterations` trained, they are kept.
     """
     keep = gaussians.raw("opacity").detach()[:, 0] >= FAINT
@@ -105,12 +97,12 @@ def trim(
     keep_unseen: bool,
     prune_sh: float,
     iterations: int,
-) -> Trimmed:
-    """Leave out what the training views `cameras` and those between them do not need. `gaussians` does not change.
+) -> tuple[GaussianModel, Search]:
+    """Leave out what the training views `cameras` and those between them do not need: the model, and what was found.
 
-    keep_unseen: leave no Gaussian out. prune_sh: by how much cut SH bands may change a colour (in [0, 1]); -1 cuts
-    none, 0 those that are zero. iterations: of the training. Unless bands that are not zero are cut, the renders of
-    `cameras` keep every bit, or on a GPU change by rounding (see `decisive`).
+    `gaussians` does not change. keep_unseen: leave no Gaussian out. prune_sh: by how much cut SH bands may change a
+    colour (in [0, 1]); -1 cuts none, 0 those that are zero. iterations: of the training. Unless bands that are not zero
+    are cut, the renders of `cameras` keep every bit, or on a GPU change by rounding (see `decisive`).
     """
     start = time.perf_counter()
     every = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.get_xyz.device)
@@ -118,13 +110,14 @@ def trim(
     ranks = gaussians.shards.ranks
     if not summed(search.keep, ranks):  # never an empty model
         search = Search(every, end=FEW)
-    unseen = summed(~search.keep, ranks)
-    rest = gaussians.get_features_rest.detach()
-    bounds = cut_bounds(rest[search.keep] if unseen else rest, ranks)
-    degree = gaussians.max_sh_degree if prune_sh < 0 else needed_degree(bounds, prune_sh)
-    if unseen or degree < gaussians.max_sh_degree:
-        gaussians = gaussians.part(search.keep if unseen else slice(None), degree)
-    return Trimmed(gaussians, unseen, bounds, time.perf_counter() - start, search)
+    search.unseen = summed(~search.keep, ranks)
+    kept = search.keep if search.unseen else slice(None)
+    search.cut_bounds = cut_bounds(gaussians.get_features_rest.detach()[kept], ranks)
+    degree = gaussians.max_sh_degree if prune_sh < 0 else needed_degree(search.cut_bounds, prune_sh)
+    if search.unseen or degree < gaussians.max_sh_degree:
+        gaussians = gaussians.part(kept, degree)
+    search.seconds = time.perf_counter() - start
+    return gaussians, search
 
 
 @torch.no_grad()

@@ -1,18 +1,17 @@
 """Datasets and models.
 
 scene                        Scene: the views of a dataset and the Gaussians that belong to them
-cameras, half_images         a view with its matrices and photo; which half of it trains (--train_test_exp)
+cameras, half_images         Camera: a view with its matrices and photo; which half of it trains (--train_test_exp)
 gaussian_model               GaussianModel, built of the modules in gaussians/
 gaussians/                   parameters of the Gaussians: start, optimiser, density control, exposures, PLY, checkpoint
-dataset_readers, readers/    a folder's dataset as plain records: COLMAP, Blender, nerfstudio; points, depth maps
-pictures/                    image files: finding, lenses, masks, decoding, keeping
-views/                       records that cameras are made of: from datasets, or from the reference's arguments
-options                      defaults of the options that code for the reference lacks
+dataset_readers, readers/    a folder's dataset as CameraInfos: COLMAP, Blender, nerfstudio; points, depth maps
+colmap_loader                COLMAP's files as records
+images/                      image files: finding, lenses, masks, decoding, keeping
 saved_iterations, saved_model  the saves in a model folder, and loading one with its scene
 export_world                 a command: a model in the world's coordinates
 
-gaussians/ and pictures/ import nothing else from here, readers/ only pictures/, and nothing here imports `arguments`,
-because other people's code may have its own package of that name. The names below are imported on first
+gaussians/ and images/ import nothing else from here, readers/ only images/ and colmap_loader, and nothing here imports
+`arguments`, because other people's code may have its own package of that name. The names below are imported on first
 use, so that `import scene.gaussian_model` loads no reader of datasets.
 """
 

@@ -5,24 +5,28 @@ Matrices are transposed, so that they multiply row vectors from the right. Camer
 
 import copy
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from fused_ssim import composite
 from torch import Tensor, nn
 
-from scene.images.handing import AT_HAND, Handed
-from scene.images.in_memory import InMemory
-from scene.images.shrink import shrink_mask, shrink_photo, shrink_values
-from scene.images.store import ImageStore, Picture, Source, usable_device
-from scene.views.forms import SIGNATURE, view_of
-from splatting.host.device import compute_device
+from scene.images.masks import TRANSPARENT, Cutout
+from scene.images.sizes import shrink_mask, shrink_photo, shrink_values
+from scene.images.store import ImageStore, InMemory, Picture, Size, Source, at_hand, image_device
+from scene.readers.depth_maps import depth_fit
+from scene.readers.info import CameraInfo
+from splatting.compat.camera_forms import SIGNATURE, of_either_form
+from splatting.host.machine import compute_device
 from utils.graphics_utils import camera_center, fov2focal, projection, world_to_camera
 
 ZNEAR = 0.01  # ZNEAR and ZFAR only shape the clip depth and cull nothing
 ZFAR = 100.0
 _OF_TARGET = frozenset(("original_image", "alpha_mask"))
 _OF_EACH_COPY = ("_assigned", "_made", "_parameters", "_buffers", "_modules")
+_NOT_MOVED = np.zeros(3)
 _EDITED = -1  # stands for the version of a tensor that was changed in place; torch counts from 0
 
 
@@ -47,7 +51,8 @@ def _assignable(compute: Callable[["Camera"], Any]) -> property:
 class Camera(nn.Module):
     """One view at training resolution.
 
-    Made of a scene.views.view.View, or of the arguments of either release of the reference (scene/views/forms.py).
+    Made of a CameraInfo and the further arguments of `_begin`, or of the arguments of either release of the reference
+    (splatting/compat/camera_forms.py).
 
     uid: index in its list; colmap_id: intrinsics id. R (3,3) camera-to-world, T (3,) world-to-camera, NumPy float64;
     a scale of R is divided out of both, and UserError is raised where R is sheared or mirrored.
@@ -68,29 +73,47 @@ class Camera(nn.Module):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__()
-        view = view_of(*args, **kwargs)
-        self.uid, self.colmap_id = view.uid, view.colmap_id
-        self.R, self.T = view.R, view.T
-        self.FoVx, self.FoVy = view.FoVx, view.FoVy
-        self.image_name = view.image_name
+        if not (args and isinstance(args[0], CameraInfo)):
+            args, kwargs = of_either_form(*args, **kwargs)
+        self._begin(*args, **kwargs)
+
+    def _begin(
+        self,
+        info: CameraInfo,
+        size: Size,
+        uid: int,
+        columns: slice | None = None,
+        trans: np.ndarray = _NOT_MOVED,
+        scale: float = 1.0,
+        data_device: str = "cuda",
+    ) -> None:
+        """The view of a record at a size (width, height). The rest: as the attributes."""
+        self.uid, self.colmap_id = uid, info.uid
+        self.R, self.T = info.R, info.T
+        self.FoVx, self.FoVy = info.FovX, info.FovY
+        self.image_name = info.image_name
         self.exposure_name: str | None = None
-        self.image_path = view.image_path
-        self.columns = view.columns
-        self.image_width, self.image_height = self._size = view.size
-        self.fx, self.fy = fov2focal(view.FoVx, view.size[0]), fov2focal(view.FoVy, view.size[1])
-        self.cx, self.cy = ((offset + 1) * pixels / 2 for offset, pixels in zip(view.offset, view.size, strict=True))
+        self.image_path = Path(info.image_path) if info.image_path else None
+        self.columns = columns
+        self.image_width, self.image_height = self._size = size
+        self.fx, self.fy = fov2focal(info.FovX, size[0]), fov2focal(info.FovY, size[1])
+        offset = 2 * info.cx / info.width - 1, 2 * info.cy / info.height - 1
+        self.cx, self.cy = ((off + 1) * pixels / 2 for off, pixels in zip(offset, size, strict=True))
         self.znear, self.zfar = ZNEAR, ZFAR
-        self.trans, self.scale = view.trans, view.scale
+        self.trans, self.scale = trans, scale
         self.device = compute_device()
-        self.data_device = self._photo_device = usable_device(view.data_device, self.device)
+        self.data_device = self._photo_device = image_device(data_device, self.device)
         self._images: ImageStore | None = None
-        self._source, self._mask, self._depth = self._placed(view.source), view.mask, self._placed(view.depth)
-        self._ignore_alpha = view.ignore_alpha
-        self._reliable = view.depth_reliable
+        self._source, self._mask = self._placed(info.image) or self.image_path, info.mask
+        if self._mask and self._mask.meaning == TRANSPARENT:
+            self._source, self._mask = Cutout(self.image_path, info.mask), None
+        self._ignore_alpha = info.ignore_alpha
+        self._depth = self._placed(info.depth)
+        self._reliable = self._depth is not None and depth_fit(info.depth_params).reliable
         self._assigned: dict[str, Any] = {}
         self._made: dict[str, Tensor] = {}
         self._made_version = 0
-        self._set_matrices(view.offset)
+        self._set_matrices(offset)
 
     def _placed(self, source: Source | InMemory | None) -> Source | InMemory | None:
         return InMemory(source.pixels.to(self._photo_device)) if isinstance(source, InMemory) else source
@@ -143,8 +166,8 @@ class Camera(nn.Module):
     def at_size(self, size: tuple[int, int]) -> "Camera":
         """This view at a smaller size (width, height), with pictures that are area averages of its own.
 
-        They are decoded and computed now, and lie in the copy on `device`; of a picture that ranks share, one of them
-        does so later (Handed.changed). Columns that count in it cover no other. What was assigned is left out of it.
+        They are decoded and computed now, and lie in the copy on `device`; of an image that processes share, one of
+        them does so later (Sharing). Columns that count in it cover no other. What was assigned is left out of it.
         """
         twin, (old, _) = copy.copy(self), self._size
         twin.image_width, twin.image_height = twin._size = size
@@ -159,13 +182,11 @@ class Camera(nn.Module):
         twin._depth = self._changed(self._depth, lambda depth: shrink_values(depth, size))
         return twin
 
-    def _changed(
-        self, source: Source | InMemory | Handed | None, change: Callable[[Tensor], Tensor]
-    ) -> InMemory | Handed | None:
+    def _changed(self, source: Source | InMemory | None, change: Callable[[Tensor], Tensor]) -> InMemory | None:
         def on_device(pixels: Tensor) -> Tensor:
             return change(pixels.to(self.device, non_blocking=True))
 
-        if source is None or isinstance(source, AT_HAND):
+        if source is None or at_hand(source):
             return source and source.changed(on_device)
         return self.images.changed(source, self._size, on_device)
 
@@ -192,12 +213,12 @@ class Camera(nn.Module):
         Empty if they were given as pixels.
         """
         sources = (self._source, self._mask, self._depth)
-        return [(s, self._size) for s in sources if s is not None and not isinstance(s, AT_HAND)]
+        return [(s, self._size) for s in sources if s is not None and not at_hand(s)]
 
-    def _stored(self, source: Source | InMemory | Handed) -> Tensor:
-        return source.pixels if isinstance(source, AT_HAND) else self.images.get(source, self._size)
+    def _stored(self, source: Source | InMemory) -> Tensor:
+        return source.pixels if at_hand(source) else self.images.get(source, self._size)
 
-    def _decoded(self, source: Source | InMemory | Handed) -> Tensor:
+    def _decoded(self, source: Source | InMemory) -> Tensor:
         return self._stored(source).to(self.device, non_blocking=True)
 
     def _pixels(self) -> Tensor:

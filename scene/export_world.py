@@ -14,7 +14,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from scene.gaussians.ply import read_vertices
-from splatting.files.model_json import OFFSET, read_model_json
+from splatting.files.json_files import OFFSET, read_model_json
 from utils.system_utils import UserError, atomic_write, run_cli, searchForMaxIteration
 
 _AXES = ("x", "y", "z")

@@ -1,10 +1,11 @@
 """Adam's tensors as the rasterizer's backward takes them, so that it steps the Gaussians itself."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 from diff_gaussian_rasterization.backend import OPERATORS
+from diff_gaussian_rasterization.scene import Scene
 from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
@@ -60,10 +61,24 @@ class FusedAdam:
             iteration,
         )
 
+    def apply(
+        self,
+        scene: Scene,
+        source: Sequence[Tensor],
+        planes: Sequence[Tensor | None],
+        radii: Tensor,
+        observe: bool,
+        absolute: bool,
+        now: Tensor | None,
+    ) -> None:
+        """Step from the gradients of a view: scene, source, planes as for `gradients_of`, radii (N,) int32 pixels."""
+        # By place: names would cost the operator microseconds.
+        OPERATORS.apply_gradients_(*scene.lists, source, planes, [], radii, *self.arguments(observe), now, absolute)
+
     def write_now(self, now: Tensor, iteration: int) -> None:
         """Write what the next step stands for, (NOW_WORDS,) int64 on the CPU, and advance the step counters.
 
-        A step that was recorded with a copy of it on the GPU (`view_step.step`) then takes the step of `iteration`.
+        A step that was recorded with a copy of it on the GPU (`Drawn.step`) then takes the step of `iteration`.
         """
         stepping = list(self._stepping())
         attributes, steps = [one.attribute for one in stepping], [one.state["step"] for one in stepping]

@@ -18,7 +18,7 @@ from scene.gaussians.parameters import GaussianParameters, raw_rows
 from scene.gaussians.start import start_rows
 from scene.gaussians.table import trainable
 from scene.readers.info import exposure_names
-from splatting.host.device import compute_device
+from splatting.host.machine import compute_device
 from utils.general_utils import get_expon_lr_func, inverse_sigmoid
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError

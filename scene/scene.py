@@ -6,43 +6,26 @@ import random
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 import scene
 from scene.cameras import Camera
-from scene.dataset_readers import read_by_callback, read_scene
-from scene.half_images import mark_halves, train_on_all
+from scene.dataset_readers import read_scene, replaced_reader
+from scene.half_images import half, train_on_all
 from scene.images.masks import MaskOptions, refuse_nothing_to_ignore
-from scene.images.store import ImageStore, Picture, picture_device
+from scene.images.store import ImageStore, Picture, Sharing, image_device
 from scene.readers.depth_maps import with_depth_maps
-from scene.readers.info import CameraInfo, SceneInfo
+from scene.readers.info import CameraInfo, SceneInfo, exposure_names, photo_size
 from scene.readers.point_cloud import write_point_cloud
+from scene.readers.scene_folder import kind_of
 from scene.saved_iterations import find_iteration, saved_ply
-from scene.views.of_info import file_size
-from splatting.distributed.ranks import ALONE, Ranks
-from splatting.files.model_json import OFFSET, read_model_json
-from splatting.host.device import compute_device
-from utils.graphics_utils import BasicPointCloud
+from splatting.compat.models import SceneGaussians, load_model, save_exposures
+from splatting.compat.readers import scene_by
+from splatting.files.json_files import OFFSET, read_model_json
+from splatting.host.machine import compute_device
 from utils.system_utils import UserError, atomic_write
-
-
-class SceneGaussians(Protocol):
-    """The part of GaussianModel that a scene needs, or the reference's class of that name.
-
-    A scene sets `world_offset`, and calls `load_exposures(folder, cam_infos)` and `save_exposures(folder)` with
-    train_test_exp if there are such methods. Else it calls `load_ply(path, True)`, and writes exposure.json from
-    `exposure_mapping` and `get_exposure_from_name(name)`, as the reference does.
-    """
-
-    def create_from_pcd(
-        self, pcd: BasicPointCloud, cam_infos: Sequence[CameraInfo], spatial_lr_scale: float
-    ) -> None: ...
-
-    def load_ply(self, path: str) -> None: ...
-
-    def save_ply(self, path: str) -> None: ...
 
 
 class Scene:
@@ -53,7 +36,7 @@ class Scene:
     the last saved iteration, N that one. shuffle: mix the order of the views (always the same way). resolution_scales:
     factors by which views are made smaller, one list of cameras each. train_cameras, test_cameras: these lists by
     scale, which may be replaced. info: the dataset as read. cameras_extent: E in world units, from the training views.
-    images: the store of the decoded photos. sharing: ranks that divide these photos (ImageStore).
+    images: the store of the decoded photos. sharing: processes that divide them (ImageStore).
     """
 
     def __init__(
@@ -64,7 +47,7 @@ class Scene:
         shuffle: bool = True,
         resolution_scales: Sequence[float] = (1.0,),
         start: bool = True,
-        sharing: Ranks = ALONE,
+        sharing: Sharing | None = None,
     ) -> None:
         self.model_path = args.model_path
         self.gaussians = gaussians
@@ -74,7 +57,7 @@ class Scene:
         self.cameras_extent = self.info.extent
 
         device = compute_device()
-        place = picture_device(args.data_device, device)
+        place = image_device(args.data_device, device, warn=True)
         self.images = ImageStore(getattr(args, "images_to_load", None) or 0, place, device, sharing)
         self.train_cameras = {scale: self._cameras(args, scale, shuffle, False) for scale in resolution_scales}
         self.test_cameras = {scale: self._cameras(args, scale, shuffle, True) for scale in resolution_scales}
@@ -82,7 +65,9 @@ class Scene:
 
         gaussians.world_offset = tuple(self.info.offset.tolist())
         if self.loaded_iter is not None:
-            self._load_gaussians()
+            print(f"Loading trained model at iteration {self.loaded_iter}")
+            exposed = self.info.train_cameras if self._halves else None
+            load_model(gaussians, self.model_path, saved_ply(self.model_path, self.loaded_iter), exposed)
         elif start:
             self.create_gaussians()
             self.write_inputs()
@@ -93,9 +78,9 @@ class Scene:
         if fresh:
             _refuse_dataset_folder(args)
         depths = getattr(args, "depths", None) or ""
-        info = read_by_callback(args.source_path, args.images, args.white_background, depths, args.eval, self._halves)
-        if info is not None:
-            return info
+        kind = kind_of(args.source_path)
+        if read := replaced_reader(kind):
+            return scene_by(read, kind, args, depths, self._halves)
         masks = MaskOptions(**_given(args, folder="masks", invert="invert_masks", meaning="mask_meaning"))
         info = read_scene(
             args.source_path,
@@ -104,6 +89,7 @@ class Scene:
             want_cloud=fresh,
             masks=masks,
             offset=None if fresh else read_model_json(self.model_path).get(OFFSET, (0, 0, 0)),
+            kind=kind,
             **_given(args, init_pcd_path="init_pcd_path", init_type="init_type"),
         )
         if fresh:
@@ -114,17 +100,6 @@ class Scene:
         if depths and fresh:
             info = with_depth_maps(info, Path(args.source_path), depths)
         return info
-
-    def _load_gaussians(self) -> None:
-        print(f"Loading trained model at iteration {self.loaded_iter}")
-        path = str(saved_ply(self.model_path, self.loaded_iter))
-        load_exposures = getattr(self.gaussians, "load_exposures", None)
-        if self._halves and load_exposures is None:
-            self.gaussians.load_ply(path, True)
-            return
-        self.gaussians.load_ply(path)
-        if self._halves:
-            load_exposures(self.model_path, self.info.train_cameras)
 
     def getTrainCameras(self, scale: float = 1.0) -> list[Camera]:
         """Training views at a resolution scale that the scene was made with."""
@@ -146,21 +121,12 @@ class Scene:
         """
         (self.gaussians if gaussians is None else gaussians).save_ply(str(saved_ply(self.model_path, iteration)))
         if self._halves:
-            save_exposures = getattr(self.gaussians, "save_exposures", None)
-            (save_exposures or self._write_exposures)(self.model_path)
-
-    def _write_exposures(self, folder: str) -> None:
-        """Write the exposures of a model that cannot do so itself."""
-        maps = self.gaussians
-        table = {name: maps.get_exposure_from_name(name).tolist() for name in getattr(maps, "exposure_mapping", ())}
-        if table:
-            with atomic_write(Path(folder) / "exposure.json") as path:
-                path.write_text(json.dumps(table, indent=2), encoding="utf-8")
+            save_exposures(self.gaussians, self.model_path)
 
     def training_pixels(self) -> tuple[int, int]:
         """Pixels of all training views: at training size, and in the photos."""
         trained = sum(camera.image_width * camera.image_height for camera in self.getTrainCameras())
-        return trained, sum(width * height for width, height in map(file_size, self.info.train_cameras))
+        return trained, sum(width * height for width, height in map(photo_size, self.info.train_cameras))
 
     def create_gaussians(self) -> None:
         """Start from the dataset's points."""
@@ -184,15 +150,25 @@ class Scene:
         views = self.info.test_cameras if test else self.info.train_cameras
         # By names of the package, because code of others may replace them there or in utils.camera_utils.
         cameras = list(scene.cameraList_from_camInfos(views, scale, args, self.info.is_nerf_synthetic, test))
-        for camera in cameras:
-            if isinstance(camera, Camera):
-                camera.images = self.images
+        ours = [(camera, view) for camera, view in zip(cameras, views, strict=False) if isinstance(camera, Camera)]
+        for camera, _ in ours:
+            camera.images = self.images
         if self._halves:
-            mark_halves(cameras, views, self.info, test)
+            self._mark_halves(ours, test)
         if shuffle:
             # A generator of its own: a resumed run must get the same order, whatever drew random numbers before.
             random.Random(0).shuffle(cameras)
         return cameras
+
+    def _mark_halves(self, cameras: Sequence[tuple[Camera, CameraInfo]], in_test_list: bool) -> None:
+        """Set the columns that count in cameras of views, and exposure names where the views' names clash."""
+        training, tested = self.info.train_cameras, {view.image_path for view in self.info.test_cameras}
+        names = dict(zip([view.image_path for view in training], exposure_names(training), strict=True))
+        for camera, view in cameras:
+            if (name := names.get(view.image_path, view.image_name)) != view.image_name:
+                camera.exposure_name = name
+            if view.image_path in tested:
+                camera.columns = half(camera.image_width, in_test_list)
 
     def _pictures(self, lists: dict[float, list[Camera]]) -> list[Picture]:
         cameras = [camera for cameras in lists.values() for camera in cameras]

@@ -3,6 +3,7 @@
 import os
 import shutil
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -46,6 +47,14 @@ def hangups() -> None:
     """Programs under test see SIGHUP, also where the tests themselves run under nohup."""
     if hasattr(signal, "SIGHUP"):
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
+@pytest.fixture(autouse=True)
+def stdout() -> Iterator[None]:
+    """Restore stdout after each test: training stamps it, and may silence it."""
+    before = sys.stdout
+    yield
+    sys.stdout = before
 
 
 @pytest.fixture(scope="session")

@@ -22,8 +22,8 @@ import torch
 
 import splatting.distributed.watch
 import train
+from splatting.training.iteration import Iteration
 from splatting.training.run import Run
-from splatting.training.step import Step
 from utils.system_utils import UserError, run_cli
 
 splatting.distributed.watch.PATIENCE = 3.0
@@ -75,7 +75,7 @@ _FAULTS = {
 }
 
 
-def _prepare(run: Run, step: Step) -> None:
+def _prepare(run: Run, step: Iteration) -> None:
     prepare(run, step)
     if mine and step.iteration == iteration and fault in _FAULTS:
         _FAULTS[fault](run)

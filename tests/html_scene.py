@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
-from splatting.camera_paths.poses import facing, to_wxyz
+from splatting.camera_paths.poses import facing
 from splatting.exports.splats import Splats
 from utils.sh_utils import C0
 
@@ -27,7 +27,7 @@ def balls(degree: int = 1, each: int = 300) -> Splats:
     sh = rng.normal(scale=0.15, size=(count, (degree + 1) ** 2, 3))
     colours = np.where(upper[:, None], [0.9, 0.1, 0.1], [0.1, 0.1, 0.9]) + rng.normal(scale=0.1, size=(count, 3))
     sh[:, 0] = (colours - 0.5) / C0
-    rotations = to_wxyz(Rotation.random(count, random_state=1))
+    rotations = Rotation.random(count, random_state=1).as_quat(scalar_first=True)
     values = (
         CENTRE + points + np.where(upper, 0.5, -0.5)[:, None] * UP,
         np.log(rng.uniform(0.06, 0.15, size=(count, 3))),
@@ -47,7 +47,7 @@ def cameras(count: int = 8, rolls: tuple[float, ...] = (12.0,)) -> list[MiniCam]
         offset = 3.5 * (math.cos(angle) * across[0] + math.sin(angle) * across[1]) + 1.2 * UP
         roll = rolls[number] if number < len(rolls) else 0.0
         turn = facing(-offset, UP) @ Rotation.from_euler("z", roll, degrees=True).as_matrix()
-        wxyz = to_wxyz(Rotation.from_matrix(turn)).tolist()
+        wxyz = Rotation.from_matrix(turn).as_quat(scalar_first=True).tolist()
         camera = free_view(*SIZE, math.radians(FOV), (CENTRE + offset).tolist(), wxyz, "cpu")
         camera.image_name = f"photo_{number}.jpg"
         found.append(camera)

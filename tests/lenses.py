@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scene.images.lens import Lens
-from scene.images.pycolmap_import import import_pycolmap
+from scene.images.lens import Lens, import_pycolmap
 from splatting.demo.tracer import View, normalize
 
 # Extra parameters in COLMAP's order. At a focal length of 0.75 widths they move the corners by a twentieth or more.

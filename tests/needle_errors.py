@@ -4,7 +4,7 @@ import math
 
 import torch
 from diff_gaussian_rasterization import Gaussians, rasterize, reference
-from diff_gaussian_rasterization.ops import scene_arguments
+from diff_gaussian_rasterization.scene import scene_arguments
 from torch import Tensor
 
 from benchmarks.workloads import textbook

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from splatting.exports.formats import format_of
 from splatting.exports.splats import Splats, tidy
 
+COUNT, FAR = 2000, 7  # splats of `cube`, and the number of the one that lies apart
 _PACKAGES = {".spz": "zstandard", ".usdz": "pxr"}
 
 
@@ -68,3 +70,23 @@ def empty_spz(version: int, count: int, degree: int = 0) -> bytes:
 def _zeros(size: int) -> Iterator[bytes]:
     """Pieces of so many zero bytes."""
     return (bytes(min(1 << 20, size - begin)) for begin in range(0, size, 1 << 20))
+
+
+def cube(x: float | None = None, color: float | None = None) -> Splats:
+    """Splats in a cube of half size 1, of which one has another x or SH0."""
+    random = np.random.default_rng(0)
+    some = splats(COUNT, 0)
+    some.means[:] = random.uniform(-1, 1, (COUNT, 3))
+    some.opacity_logits[:] = 0
+    if x is not None:
+        some.means[FAR] = [x, 0, 0]
+    if color is not None:
+        some.sh[FAR] = color
+    return some
+
+
+def moved(some: Splats, read: Splats) -> np.ndarray:
+    """(COUNT - 1,) how far each of the others is from the nearest splat that was read and is seen."""
+    seen = read.means[read.opacity_logits > -5].astype(np.float64)
+    assert len(seen) <= COUNT
+    return KDTree(seen).query(np.delete(some.means, FAR, axis=0))[0]

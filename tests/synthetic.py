@@ -1,5 +1,6 @@
 """Tiny scenes for the tests: a COLMAP model made by pycolmap and a Blender folder, with photos of coloured discs."""
 
+import argparse
 import json
 import math
 from pathlib import Path
@@ -11,6 +12,7 @@ WIDTH, HEIGHT = 96, 64
 FOCAL = 110.0
 CENTER = (45.0, 34.5)  # off the middle on purpose
 VIEWS = 17
+BROWN = (FOCAL, FOCAL, *CENTER, -0.2, 0.03, 0.004, -0.003)  # of a lens that distorts
 
 
 def make_colmap_scene(
@@ -86,6 +88,26 @@ def make_blender_scene(folder: Path, *, views: int = 4, size: tuple[int, int] = 
         (folder / f"transforms_{split}.json").write_text(json.dumps(content))
 
 
+def make_nerfstudio_scene(folder: Path, *, distorted: bool = False, views: int = 17) -> None:
+    """A COLMAP scene with a transforms.json written from pycolmap's poses."""
+    from scene.readers.point_cloud import write_point_cloud
+
+    model, params = ("OPENCV", BROWN) if distorted else ("PINHOLE", BROWN[:4])
+    reconstruction = make_colmap_scene(folder, model=model, params=params, views=views)
+    frames = []
+    for image in reconstruction.images.values():
+        pose = np.eye(4)
+        pose[:3] = image.cam_from_world().inverse().matrix()
+        pose[:, 1:3] *= -1  # y up, z backward
+        frames.append({"file_path": f"./images/{image.name}", "transform_matrix": pose.tolist(), "colmap_im_id": 1})
+    content = {"w": 96, "h": 64, "fl_x": 110.0, "fl_y": 110.0, "cx": 45.0, "cy": 34.5, "frames": frames}
+    if distorted:
+        content |= dict(zip(("k1", "k2", "p1", "p2"), BROWN[4:], strict=True), camera_model="OPENCV")
+    points = np.array([point.xyz for point in reconstruction.points3D.values()])
+    write_point_cloud(folder / "sparse_pc.ply", points, np.full((len(points), 3), 90))
+    (folder / "transforms.json").write_text(json.dumps(content | {"ply_file_path": "sparse_pc.ply"}))
+
+
 class FakeGaussians:
     """A stand-in for the model in tests of data alone; keeps what the scene passes to it."""
 
@@ -107,3 +129,29 @@ def folder_state(folder: Path) -> dict[str, tuple[int, bytes]]:
         for path in sorted(folder.rglob("*"))
         if path.is_file()
     }
+
+
+def as_text(scene: Path) -> None:
+    """Convert the COLMAP model of a scene to text."""
+    import pycolmap
+
+    sparse = scene / "sparse" / "0"
+    model = pycolmap.Reconstruction(str(sparse))
+    for path in sparse.iterdir():
+        path.unlink()
+    model.write_text(str(sparse))
+
+
+def options_of(scene: Path | str, out: Path, **changes: object) -> argparse.Namespace:
+    """Model options of a scene and an output folder."""
+    from arguments import ModelParams
+
+    given = argparse.Namespace(source_path=str(scene), model_path=str(out), **changes)
+    return ModelParams(argparse.ArgumentParser()).extract(given)
+
+
+def read(scene: Path, hold_out: bool = False, init_pcd_path: str = "", **options: object):
+    """Read a scene whose photos are in the folder images."""
+    from scene.dataset_readers import read_scene
+
+    return read_scene(scene, "images", hold_out, init_pcd_path, **options)

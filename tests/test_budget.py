@@ -20,7 +20,7 @@ from skimage.metrics import structural_similarity
 
 import train
 from gaussian_renderer import model_inputs, rasterizer_settings
-from gaussian_renderer.weighted_sums import weighted_sums
+from gaussian_renderer.blending import weighted_sums
 from scene.cameras import MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.budget import count_after, fade, remove_useless, split_in_two
@@ -29,11 +29,10 @@ from scene.readers.point_cloud import write_point_cloud
 from splatting.deterministic.counter_rng import Stream
 from splatting.deterministic.weighted_choice import weighted_choice
 from splatting.distributed.rows import WHOLE
-from splatting.training.error_maps import error_map
-from splatting.training.error_scores import ErrorScores
 from splatting.training.objective import Objective
-from splatting.training.schedule.pace import Block, Paced, Schedule
+from splatting.training.schedule import Block, Decided, DecidedSchedule
 from splatting.training.strategies import budget
+from splatting.training.strategies.error_scores import error_map, error_scores
 from utils.graphics_utils import getProjectionMatrix
 from utils.loss_utils import photometric_loss
 from utils.system_utils import UserError
@@ -67,15 +66,15 @@ class View(MiniCam):
 
 def _weights(camera: View, gaussians: GaussianModel) -> tuple[np.ndarray, np.ndarray]:
     """The oracle's image over GREY (3, H, W), and the blending weight of each Gaussian at each pixel (N, H, W)."""
-    geometry, raw, colors = model_inputs(camera, gaussians, pipeline())
-    settings, xyz = rasterizer_settings(camera, gaussians, pipeline(), GREY), gaussians.get_xyz
-    shapes = {name: geometry[name] for name in ("scales", "rotations")}
+    inputs, raw = model_inputs(camera, gaussians, pipeline())
+    settings = rasterizer_settings(camera, gaussians, pipeline(), GREY)
+    screen, black = torch.zeros_like(inputs.means), settings._replace(bg=torch.zeros(3))
     with torch.no_grad():
-        place = torch.zeros_like(xyz), geometry["opacities"]
-        image = oracle(xyz, *place, settings, raw=raw, **shapes, **colors).color
-        black = settings._replace(bg=torch.zeros(3))
-        single = torch.eye(len(xyz))[:, :, None].expand(-1, -1, 3)  # one Gaussian is white
-        weights = [oracle(xyz, *place, black, raw=raw, **shapes, colors=one.contiguous()).color[0] for one in single]
+        image = oracle(means2d=screen, settings=settings, raw=raw, **inputs._asdict()).color
+        weights = []
+        for one in torch.eye(len(screen))[:, :, None].expand(-1, -1, 3):  # one Gaussian is white
+            white = inputs._replace(colors=one.contiguous(), sh_dc=None, sh_rest=None)
+            weights.append(oracle(means2d=screen, settings=black, raw=raw, **white._asdict()).color[0])
     return image.numpy(), torch.stack(weights).numpy()
 
 
@@ -87,7 +86,7 @@ def test_scores_are_those_of_a_slow_sum_over_pixels(case):
         gaussians.start_exposures([SimpleNamespace(image_name="photo")])
         with torch.no_grad():
             gaussians.exposures.values += 0.2 * torch.randn(1, 3, 4, generator=torch.Generator().manual_seed(1))
-    scores = ErrorScores(gaussians, pipeline(), case == "exposure", options()).of_view(camera, GREY)
+    scores = error_scores(gaussians, pipeline(), case == "exposure", options(), [camera], GREY)
     image, weights = _weights(camera, gaussians)
     if case == "exposure":
         matrix = gaussians.get_exposure_from_name("photo").detach().double().numpy()
@@ -122,15 +121,16 @@ def test_black_gaussians_have_scores_and_channels_are_apart():
 @pytest.mark.parametrize("changes", [{"convert_SHs_python": True}, {"compute_cov3D_python": True}])
 def test_scores_of_a_model_drawn_in_python(changes):
     gaussians, camera = model(14, seed=3), View()
-    ours, other = (ErrorScores(gaussians, pipe, False, options()) for pipe in (pipeline(), pipeline(**changes)))
-    torch.testing.assert_close(ours.of_view(camera, GREY), other.of_view(camera, GREY), rtol=1e-4, atol=1e-7)
+    pipes = pipeline(), pipeline(**changes)
+    ours, other = (error_scores(gaussians, pipe, False, options(), [camera], GREY) for pipe in pipes)
+    torch.testing.assert_close(ours, other, rtol=1e-4, atol=1e-7)
 
 
 def test_views_are_joined_by_sum_or_maximum():
     gaussians, views = model(14, seed=3), [View(seed=seed) for seed in range(3)]
-    single = [ErrorScores(gaussians, pipeline(), False, options()).of_view(view, GREY) for view in views]
+    single = [error_scores(gaussians, pipeline(), False, options(), [view], GREY) for view in views]
     for join, expected in (("sum", sum(single)), ("max", torch.stack(single).amax(dim=0))):
-        scores = ErrorScores(gaussians, pipeline(), False, options(score_join=join)).of_views(views, GREY)
+        scores = error_scores(gaussians, pipeline(), False, options(score_join=join), views, GREY)
         assert torch.equal(scores, expected)
 
 
@@ -212,7 +212,7 @@ def test_a_high_power_takes_the_highest_of_small_scores():
     control._opt = SimpleNamespace(score_power=200.0, seed=0)
     control._scored_views = lambda iteration: []
     scores = 1e-6 * torch.arange(20, dtype=torch.float64)
-    control._scores = SimpleNamespace(of_views=lambda views, background: scores)
+    control._scores = lambda views, background: scores
     step = SimpleNamespace(iteration=1, background=None)
     assert control._chosen(step, 3).tolist() == [17, 18, 19]
     scores = torch.zeros(20, dtype=torch.float64)
@@ -250,7 +250,9 @@ def test_a_pace_that_quickens_before_the_last_densification_leaves_none_missing(
     control = object.__new__(budget.BudgetControl)
     # The window begins so early that the interval stays.
     control._opt = SimpleNamespace(densification_interval=10, densify_from_iter=-1700, densify_until_iter=1000)
-    control.pace = Paced(Schedule(2000, [Block(80, 0.0, 11 / 2000, 0.0), Block(160, 0.44, 13 / 2000, 0.0)], None, 9.0))
+    control.schedule = DecidedSchedule(
+        Decided(2000, [Block(80, 0.0, 11 / 2000, 0.0), Block(160, 0.44, 13 / 2000, 0.0)], None, 9.0)
+    )
     now, changes = 100, [t for t in range(1, 160) if control.changes(t)]
     for iteration in changes:
         now = count_after(now, 1000, control._remaining(iteration), 1.0)
@@ -342,12 +344,6 @@ GROWING = [
     "--growth_power", 2, "--score_views", 4, "--disable_viewer",
 ]  # fmt: skip
 SMALL = ["-r", 48, "--test_iterations", -1, "--no_curve"]
-
-
-@pytest.fixture(autouse=True)
-def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Restore stdout, which training stamps and may silence."""
-    monkeypatch.setattr(sys, "stdout", sys.stdout)
 
 
 def _train(scene: Path, out: Path, *more: object, iterations: int = 160) -> Path:
@@ -476,9 +472,9 @@ def test_the_default_budget_follows_the_iterations_that_the_clock_allows():
         run = SimpleNamespace(opt=options(max_num_splats=given), pipe=None, gaussians=None)
         run.dataset = SimpleNamespace(train_test_exp=False)
         run.scene = SimpleNamespace(getTrainCameras=lambda: cameras)
-        run.pace = Paced(Schedule(30_000, [Block(15_000, 0.0, stride / 30_000, 0.0)], None, 9.0))
+        run.schedule = DecidedSchedule(Decided(30_000, [Block(15_000, 0.0, stride / 30_000, 0.0)], None, 9.0))
         control = budget.BudgetControl(run)
-        control.pace = run.pace
+        control.schedule = run.schedule
         return control._aim(10_000, int(14_999 / stride))
 
     assert (aim(0, 10.0), aim(0, 2.0), aim(0, 1.0)) == (25 * 3000, 25 * 15_000, 400_000)

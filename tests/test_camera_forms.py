@@ -6,6 +6,7 @@ import math
 import pickle
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from scene.gaussians.exposure import Exposures
 from scene.images.masks import Mask
 from scene.images.store import ImageStore
 from scene.readers.info import CameraInfo
-from scene.views.of_info import view_of_info
+from utils.camera_utils import loadCam
 from utils.system_utils import UserError
 
 WIDTH, HEIGHT = 40, 24
@@ -54,7 +55,7 @@ def _older(image: torch.Tensor, alpha: torch.Tensor | None = None, **changes) ->
 def _of_file(path: Path, size: tuple[int, int] = (WIDTH, HEIGHT), **changes) -> Camera:
     focal = {"fx": 50.0, "fy": 50.0, "cx": WIDTH / 2, "cy": HEIGHT / 2, "width": WIDTH, "height": HEIGHT}
     info = CameraInfo(uid=1, R=R, T=T, **focal, image_path=path, image_name=path.name, file_size=size, **changes)
-    return Camera(view_of_info(info, 0, size))
+    return Camera(info, size, 0)
 
 
 def _wanted_matrices(center_moved_by: np.ndarray, scale: float) -> dict[str, np.ndarray]:
@@ -93,7 +94,7 @@ def test_both_forms_have_the_references_attributes(newer, trans, scale):
 def _by_record(**changes) -> Camera:
     values = {"uid": 3, "R": R, "T": T, "FovY": FOV_Y, "FovX": FOV_X, "width": WIDTH, "height": HEIGHT}
     info = CameraInfo(**{**values, **changes}, image_name="a", image=_photo())
-    return Camera(view_of_info(info, 3, (WIDTH, HEIGHT)))
+    return loadCam(SimpleNamespace(resolution=1, data_device="cuda"), 3, info, 1.0)
 
 
 MAKERS = {"newer": _newer, "older": partial(_older, torch.zeros(3, HEIGHT, WIDTH)), "record": _by_record}
@@ -191,12 +192,6 @@ def test_a_pil_image_is_seen_as_its_file_is(tmp_path, kind, size):
     assert torch.equal(given.original_image, of_file.original_image)
     assert torch.equal(given.alpha_mask, of_file.alpha_mask) and (given.alpha_mask == 1).all() == (kind != "rgba")
     assert given.pictures == [] and of_file.pictures == [(path, size)]
-
-
-def test_resized_by_pillow():
-    photo = _photo()
-    wanted = np.asarray(photo.resize((17, 11))).transpose(2, 0, 1) / np.float32(255)
-    np.testing.assert_array_equal(_newer(photo, resolution=(17, 11)).original_image.cpu().numpy(), wanted)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """Cameras of records: loadCam and the lists that a scene makes with it, also when other code has replaced them."""
 
-import argparse
 import math
 import sys
 from pathlib import Path
@@ -12,11 +11,10 @@ import torch
 from PIL import Image
 from reference_records import CameraOf2024
 from scipy.spatial.transform import Rotation
-from synthetic import FakeGaussians, make_colmap_scene
+from synthetic import FakeGaussians, make_colmap_scene, options_of
 
 import scene as scene_package
 import train
-from arguments import ModelParams
 from scene import Scene
 from scene.cameras import Camera
 from utils import camera_utils
@@ -38,11 +36,6 @@ def record(tmp_path: Path) -> CameraOf2024:
 
 def _args(**changes: object) -> SimpleNamespace:
     return SimpleNamespace(**{"resolution": 2, "data_device": "cuda"} | changes)
-
-
-def _options(scene: Path, out: Path, **changes: object) -> argparse.Namespace:
-    given = argparse.Namespace(source_path=str(scene), model_path=str(out), **changes)
-    return ModelParams(argparse.ArgumentParser()).extract(given)
 
 
 def test_a_record_of_the_reference_becomes_a_camera(record):
@@ -156,7 +149,9 @@ def test_cameras_of_a_replaced_loader_train_the_same_model(tmp_path, monkeypatch
 def test_a_scene_leaves_cameras_of_another_class_as_they_are(colmap_scene, tmp_path, monkeypatch):
     foreign = SimpleNamespace(image_width=3, image_height=2)
     monkeypatch.setattr(camera_utils, "loadCam", lambda *_: foreign)
-    made = Scene(_options(colmap_scene, tmp_path / "out", eval=True, train_test_exp=True), FakeGaussians(), start=False)
+    made = Scene(
+        options_of(colmap_scene, tmp_path / "out", eval=True, train_test_exp=True), FakeGaussians(), start=False
+    )
     assert made.getTrainCameras() == [foreign] * 17 and made.getTestCameras() == [foreign] * 3
     assert vars(foreign) == {"image_width": 3, "image_height": 2}
     made.prefetch(made.getTrainCameras())
@@ -172,7 +167,7 @@ def test_a_scene_calls_what_replaces_our_functions(colmap_scene, tmp_path, monke
     }
     for name, function in theirs.items():
         monkeypatch.setitem(vars(place), name, function)
-    made = Scene(_options(colmap_scene, tmp_path / "out"), FakeGaussians(), resolution_scales=[1.0, 2.0])
+    made = Scene(options_of(colmap_scene, tmp_path / "out"), FakeGaussians(), resolution_scales=[1.0, 2.0])
     assert [(a[1], *a[3:]) for a in calls] == [(1.0, False, False), (2.0, False, False), (1.0, False, True),
                                               (2.0, False, True)]  # fmt: skip
     assert made.getTrainCameras(2.0) == [("camera", 17)] and made.getTestCameras() == [("camera", 0)]
@@ -180,7 +175,7 @@ def test_a_scene_calls_what_replaces_our_functions(colmap_scene, tmp_path, monke
 
 
 def test_cameras_made_alone_see_what_the_scenes_see(colmap_scene, tmp_path):
-    options = _options(colmap_scene, tmp_path / "out", resolution=2)
+    options = options_of(colmap_scene, tmp_path / "out", resolution=2)
     made = Scene(options, FakeGaussians(), shuffle=False, start=False)
     for info, camera in zip(made.info.train_cameras, made.getTrainCameras(), strict=True):
         alone = camera_utils.loadCam(options, camera.uid, info, 1.0)

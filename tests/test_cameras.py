@@ -14,8 +14,6 @@ from synthetic import FOCAL, make_colmap_scene
 from scene.cameras import Camera, MiniCam
 from scene.dataset_readers import CameraInfo
 from scene.readers.colmap import read_colmap
-from scene.views.of_info import view_of_info
-from utils.camera_utils import camera_to_JSON
 from utils.graphics_utils import (
     focal2fov,
     fov2focal,
@@ -47,7 +45,7 @@ def _info(path: Path = Path("none.png"), **changes) -> CameraInfo:
 
 
 def _camera(info: CameraInfo, size: tuple[int, int] | None = None) -> Camera:
-    return Camera(view_of_info(info, 3, size or info.file_size))
+    return Camera(info, size or info.file_size, 3)
 
 
 def _pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -98,8 +96,9 @@ def test_a_camera_is_moved_and_scaled_about_the_origin(size):
     pose = np.linalg.inv(V)
     pose[:3, 3] = (pose[:3, 3] + translate) * scale
     np.testing.assert_allclose(getWorld2View2(R, info.T, translate, scale), np.linalg.inv(pose), rtol=1e-6, atol=1e-6)
-    for moved, there in ((Camera(replace(view_of_info(info, 0, (8, 6)), R=R, trans=translate, scale=scale)), pose),
-                         (Camera(replace(view_of_info(info, 0, (8, 6)), R=R)), np.linalg.inv(V))):  # fmt: skip
+    info = replace(info, R=R)
+    for moved, there in ((Camera(info, (8, 6), 0, trans=translate, scale=scale), pose),
+                         (Camera(info, (8, 6), 0), np.linalg.inv(V))):  # fmt: skip
         np.testing.assert_allclose(moved.camera_center.numpy(), there[:3, 3], rtol=1e-6)
         rigid = np.linalg.inv(there) / [[size], [size], [size], [1]]  # a camera divides the scale of its pose out
         np.testing.assert_allclose(moved.world_view_transform.T.numpy(), rigid, rtol=1e-6, atol=1e-6)
@@ -196,13 +195,3 @@ def test_a_mini_camera_on_a_gpu_needs_no_library_of_solvers(monkeypatch):
     view[3, :3] = torch.tensor([1.0, 2.0, 3.0])
     mini = MiniCam(160, 120, 0.6, 0.9, 0.01, 100.0, view, view)
     assert inverted == ["cpu"] and mini.camera_center.tolist() == [-1, -2, -3] and mini.camera_center.is_cuda
-
-
-def test_json_entry_has_the_known_keys_and_full_size_values():
-    info = _info()
-    entry = camera_to_JSON(4, info)
-    assert list(entry) == ["id", "img_name", "width", "height", "position", "rotation", "fy", "fx"]
-    assert (entry["id"], entry["img_name"], entry["width"], entry["height"]) == (4, "none.png", 160, 120)
-    assert (entry["fx"], entry["fy"]) == (210.0, 190.0)
-    np.testing.assert_allclose(entry["position"], -info.R @ info.T)
-    np.testing.assert_array_equal(entry["rotation"], info.R)

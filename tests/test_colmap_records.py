@@ -1,8 +1,11 @@
 """Single files of a COLMAP model against pycolmap, for all of its camera models, and what is said of broken files."""
 
+import importlib.util
 import io
 import shutil
 import struct
+import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +25,7 @@ from scene.colmap_loader import (
     read_colmap_bin_array,
     read_extrinsics_binary,
     read_extrinsics_text,
+    read_images,
     read_intrinsics_binary,
     read_intrinsics_text,
     read_next_bytes,
@@ -30,9 +34,8 @@ from scene.colmap_loader import (
     rotmat2qvec,
 )
 from scene.dataset_readers import readColmapCameras
-from scene.images import pycolmap_import
-from scene.readers import colmap_model
-from scene.readers.colmap_text import read_poses_text
+from scene.images import lens
+from scene.readers.colmap import ColmapModel, read_model
 from utils.system_utils import UserError
 
 MODELS = [model for model in pycolmap.CameraModelId.__members__.values() if int(model) >= 0]
@@ -130,21 +133,22 @@ def test_a_models_views_and_points_are_those_of_pycolmap(model, folder, tmp_path
     """To the bit, and whether the rigs and frames of COLMAP 4 are there or not."""
     for name in ("cameras", "images", "points3D", "rigs", "frames")[: 5 if whole else 3]:
         shutil.copy(folder / f"{name}.{suffix}", tmp_path)
-    _assert_equal(colmap_model.read_model(tmp_path), model)
+    _assert_equal(read_model(tmp_path), model)
 
 
-def _assert_equal(got: colmap_model.ColmapModel, wanted: pycolmap.Reconstruction) -> None:
-    assert len(got.views) == wanted.num_reg_images() > 0
-    for view, image_id in zip(got.views, sorted(wanted.reg_image_ids()), strict=True):
+def _assert_equal(got: ColmapModel, wanted: pycolmap.Reconstruction) -> None:
+    assert len(got.images) == wanted.num_reg_images() > 0
+    for photo, image_id in zip(got.images, sorted(wanted.reg_image_ids()), strict=True):
         image = wanted.images[image_id]
         camera, pose = wanted.cameras[image.camera_id], image.cam_from_world().matrix()
-        assert (view.name, view.camera_id) == (image.name, image.camera_id)
-        assert view.lens == (camera.model_name, tuple(camera.params), camera.width, camera.height)
-        np.testing.assert_array_equal(np.column_stack([view.rotation, view.translation]), pose)
+        assert (photo.name, photo.camera_id) == (image.name, image.camera_id)
+        read = got.cameras[photo.camera_id]
+        assert (read.model, read.width, read.height) == (camera.model_name, camera.width, camera.height)
+        np.testing.assert_array_equal(read.params, camera.params)
+        np.testing.assert_array_equal(np.column_stack([qvec2rotmat(photo.qvec), photo.tvec]), pose)
     points = [wanted.points3D[point_id] for point_id in sorted(wanted.points3D)]
-    np.testing.assert_array_equal(got.points, [point.xyz for point in points])
-    np.testing.assert_array_equal(got.colors, [point.color for point in points])
-    assert (got.points.dtype, got.colors.dtype) == (np.float64, np.uint8)
+    np.testing.assert_array_equal(got.points.xyz, [point.xyz for point in points])
+    np.testing.assert_array_equal(got.points.rgb, [point.color for point in points])
 
 
 @pytest.mark.parametrize("suffix", ["bin", "txt"])
@@ -154,7 +158,7 @@ def test_rigs_of_several_cameras_and_frames_without_a_pose(tmp_path, suffix):
     wanted = pycolmap.synthesize_dataset(options)
     wanted.deregister_frame(wanted.reg_frame_ids()[0])
     (wanted.write_binary if suffix == "bin" else wanted.write_text)(str(tmp_path))
-    _assert_equal(colmap_model.read_model(tmp_path), pycolmap.Reconstruction(str(tmp_path)))
+    _assert_equal(read_model(tmp_path), pycolmap.Reconstruction(str(tmp_path)))
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt"])
@@ -162,7 +166,7 @@ def test_rigs_of_several_cameras_and_frames_without_a_pose(tmp_path, suffix):
 def test_real_models_are_those_of_pycolmap(shared_dir, tmp_path, name, kind):
     wanted = pycolmap.Reconstruction(str(shared_dir / "scenes" / name / "sparse" / "0"))
     (wanted.write_binary if kind == "bin" else wanted.write_text)(str(tmp_path))
-    _assert_equal(colmap_model.read_model(tmp_path), wanted)
+    _assert_equal(read_model(tmp_path), wanted)
 
 
 @pytest.mark.parametrize("suffix", ["bin", "txt"])
@@ -190,21 +194,19 @@ def test_quaternions_of_any_length_are_normalised(tmp_path, suffix):
             )
         (sparse / "images.bin").write_bytes(content)
     wanted = {image.name: image.cam_from_world().matrix() for image in reconstruction.images.values()}
-    views = colmap_model.read_model(sparse).views
-    got = {view.name: np.column_stack([view.rotation, view.translation]) for view in views}
     extrinsics = READERS["images"][suffix == "txt"](sparse / f"images.{suffix}")
     intrinsics = READERS["cameras"][suffix == "txt"](sparse / f"cameras.{suffix}")
     infos = readColmapCameras(extrinsics, intrinsics, None, str(tmp_path / "images"), "", [])
     published = {info.image_name: np.column_stack([info.R.T, info.T]) for info in infos}
     for name, pose in wanted.items():
-        np.testing.assert_allclose(got[name], pose, atol=1e-14)
         np.testing.assert_allclose(published[name], pose, atol=1e-14)
 
 
 def test_without_pycolmap_what_needs_it_is_said(monkeypatch):
-    monkeypatch.setattr(pycolmap_import, "has_pycolmap", lambda: False)
+    monkeypatch.delitem(sys.modules, "pycolmap")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(UserError, match="pycolmap is not installed, .*undistort the photos on another machine"):
-        pycolmap_import.import_pycolmap()
+        lens.import_pycolmap()
 
 
 def test_an_empty_model_has_no_records(tmp_path):
@@ -225,7 +227,7 @@ def test_photos_without_their_second_lines_are_refused(tmp_path):
     """Else every second photo would be read as the points of the one before."""
     lines = [f"{i} 1 0 0 0 {i} 0 0 1 a photo {i}.jpg" for i in (1, 2, 3, 4)]
     (tmp_path / "images.txt").write_text("\n".join(lines))
-    for reader in (read_extrinsics_text, read_poses_text):
+    for reader in (read_extrinsics_text, partial(read_images, binary=False, with_points=False)):
         with pytest.raises(UserError, match="line 2"):
             reader(tmp_path / "images.txt")
 

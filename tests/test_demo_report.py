@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from splatting.demo import report
+from splatting.evaluation.renders import GAIN, GAP, HEADER, contact_sheet
 from utils.system_utils import UserError
 
 RESULTS = {"ours_30": {"SSIM": 0.5, "PSNR": 20.0, "LPIPS": None}}
@@ -79,3 +80,15 @@ def test_missing_and_damaged_pictures_are_named(run, model, damage):
     damage(model / "test" / "ours_30" / "gt" / "00001.png")
     with pytest.raises(UserError, match="gt/00001.png is missing or damaged; run render.py"):
         run()
+
+
+def test_contact_sheet_shows_truth_render_and_amplified_error():
+    truth = Image.new("RGB", (40, 30), (100, 100, 100))
+    render = Image.new("RGB", (40, 30), (110, 90, 100))
+    sheet = contact_sheet([("a", truth, render), ("b", truth, truth)])
+    assert sheet.size == (3 * (40 + GAP) + GAP, HEADER + 2 * (30 + GAP))
+    bottom = HEADER + 29  # below the label
+    assert sheet.getpixel((GAP + 39, bottom)) == (100, 100, 100)
+    assert sheet.getpixel((2 * GAP + 40 + 39, bottom)) == (110, 90, 100)
+    assert sheet.getpixel((3 * GAP + 80 + 39, bottom)) == (10 * GAIN, 10 * GAIN, 0)
+    assert sheet.getpixel((3 * GAP + 80 + 39, bottom + 30 + GAP)) == (0, 0, 0)

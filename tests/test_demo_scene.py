@@ -10,10 +10,8 @@ from splatting.demo import make_scene as maker
 from splatting.demo.make_scene import make_scene
 from splatting.demo.objects import Box, Ground, Shape, Sphere, Torus, demo_scene
 from splatting.demo.tracer import render_view, ring_views
-from splatting.evaluation.contact_sheet import GAIN, GAP, HEADER, contact_sheet
 from utils.system_utils import UserError
 
-ROOT = Path(__file__).parents[1]
 VIEWS, WIDTH, HEIGHT, POINTS = 12, 80, 60, 600
 
 SPHERE = Sphere((0.2, -0.4, 0.3), 0.7)
@@ -180,10 +178,10 @@ def test_same_seed_same_bytes_and_another_seed_another_scene(tmp_path):
 
 def test_other_processes_give_the_same_pictures(monkeypatch):
     views = ring_views(4, 24, 18, np.random.default_rng(0))
-    alone = maker._pictures(views)
+    alone = maker._images(views)
     monkeypatch.setattr(maker, "PIXELS_PER_PROCESS", 24 * 18)
     monkeypatch.setattr(maker, "cores", lambda: 2)
-    assert np.array_equal(maker._pictures(views), alone)
+    assert np.array_equal(maker._images(views), alone)
 
 
 @pytest.mark.parametrize(
@@ -223,15 +221,3 @@ def test_absurd_numbers_end_with_a_sentence(tmp_path, monkeypatch, words, said):
     with pytest.raises(UserError, match=f"^{said}$"):
         maker.main()
     assert not (tmp_path / "out").exists()
-
-
-def test_contact_sheet_shows_truth_render_and_amplified_error():
-    truth = Image.new("RGB", (40, 30), (100, 100, 100))
-    render = Image.new("RGB", (40, 30), (110, 90, 100))
-    sheet = contact_sheet([("a", truth, render), ("b", truth, truth)])
-    assert sheet.size == (3 * (40 + GAP) + GAP, HEADER + 2 * (30 + GAP))
-    bottom = HEADER + 29  # below the label
-    assert sheet.getpixel((GAP + 39, bottom)) == (100, 100, 100)
-    assert sheet.getpixel((2 * GAP + 40 + 39, bottom)) == (110, 90, 100)
-    assert sheet.getpixel((3 * GAP + 80 + 39, bottom)) == (10 * GAIN, 10 * GAIN, 0)
-    assert sheet.getpixel((3 * GAP + 80 + 39, bottom + 30 + GAP)) == (0, 0, 0)

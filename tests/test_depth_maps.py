@@ -7,14 +7,12 @@ import sys
 import zlib
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from gaussians import pipeline
 from PIL import Image
-from scipy.ndimage import map_coordinates
 from synthetic import FakeGaussians
 
 import train
@@ -24,9 +22,10 @@ from scene import Scene
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.readers import depth_maps
-from scene.readers.colmap_model import Sightings, read_sightings
+from scene.readers.colmap import read_model, read_model_of_kind
 from scene.readers.depth_maps import DepthMap, read_values, resize, with_depth_maps
-from scene.readers.depth_scale import fit_line, fit_picture, make_depth_params
+from scene.readers.depth_scale import fit_image, fit_line, make_depth_params, sightings
+from scene.readers.info import CameraInfo
 from utils.loss_utils import inverse_depth_loss
 from utils.system_utils import UserError
 
@@ -71,17 +70,13 @@ def test_what_is_no_depth_map_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("size", [(12, 9), (5, 4), (31, 40), (1, 1), (24, 3)])
-def test_resampling_against_torch_and_scipy(size):
+def test_resampling_against_torch(size):
     values = np.random.default_rng(0).random((9, 12))
     ours = resize(values, size)
     theirs = torch.nn.functional.interpolate(
         torch.from_numpy(values)[None, None], size[::-1], mode="bilinear", align_corners=False
     )[0, 0].numpy()
     np.testing.assert_allclose(ours, theirs, atol=1e-14)
-    at = np.meshgrid(
-        (np.arange(size[1]) + 0.5) * 9 / size[1] - 0.5, (np.arange(size[0]) + 0.5) * 12 / size[0] - 0.5, indexing="ij"
-    )
-    np.testing.assert_allclose(ours, map_coordinates(values, at, order=1, mode="nearest"), atol=1e-14)
     for lone in (values[:1], values[:, :1]):
         assert resize(lone, size).shape == size[::-1]
 
@@ -103,7 +98,7 @@ def test_scale_and_offset_in_double(tmp_path):
 @pytest.fixture
 def scene(colmap_scene: Path) -> Path:
     """The COLMAP scene with a depth map for each photo, all with the same fit."""
-    names = [view.name for view in read_sightings(colmap_scene / "sparse/0", "bin")]
+    names = [image.name for image in read_model(colmap_scene / "sparse/0").images]
     for name in names:
         _save(_random((32, 48), np.uint16), (colmap_scene / "depths" / name).with_suffix(".png"))
     _write_params(colmap_scene, {name[: -len(".png")]: {"scale": 1.0, "offset": 0.0} for name in names})
@@ -136,8 +131,8 @@ def test_every_picture_has_its_map(scene, capsys):
 @pytest.mark.parametrize("median", [{}, {"med_scale": 1.0}, {"med_scale": 0.0}])
 def test_readers_and_cameras_have_one_rule_for_scales(scale, median):
     params = {"scale": scale, "offset": 0.5, **median}
-    info = SimpleNamespace(depth_path="a.png", depth_params=params)
-    named, fit = depth_maps.named_depth_map(info, 1.0), depth_maps.depth_fit(params)
+    view = CameraInfo(0, np.eye(3), np.zeros(3), 1.0, 1.0, width=4, height=3)
+    named, fit = depth_maps.with_map(view, "a.png", params, 1.0).depth, depth_maps.depth_fit(params)
     reliable = scale > 0 and (not median or (median["med_scale"] == 1 and 0.2 <= scale <= 5))
     assert (named is not None) == fit.reliable == reliable
     if named:
@@ -230,7 +225,7 @@ def test_points_are_looked_up_where_colmap_sees_them():
     depths = 1 / (0.1 + 0.02 * pixels[:, 0])
     pixels[0], pixels[1], depths[2] = (-3, 5), (5, 41), -1
     ramp = np.repeat((np.arange(80)[None] + 0.5) / 2 / 100, 80, axis=0)
-    scale, offset = fit_picture(Sightings("a.png", 40, 40, pixels, depths), ramp)
+    scale, offset = fit_image(pixels, depths, (40, 40), ramp)
     assert (scale, offset) == pytest.approx((2.0, 0.1), abs=1e-9)
 
 
@@ -239,10 +234,12 @@ def test_the_command_makes_a_file_that_training_takes(colmap_scene, tmp_path, mo
     monkeypatch.setattr(sys, "stdout", sys.stdout)
     wanted = {}
     rng = np.random.default_rng(0)
-    for view in read_sightings(colmap_scene / "sparse/0", "bin"):
+    model = read_model_of_kind(colmap_scene / "sparse/0", "bin", with_2d_points=True)
+    for view in model.images:
         scale, offset = rng.uniform(0.5, 1.5), rng.uniform(-0.02, 0.02)
-        values = np.zeros((view.height * 8, view.width * 8))
-        for (x, y), z in zip(view.pixels * 8, view.depths, strict=True):
+        camera, (pixels, depths) = model.cameras[view.camera_id], sightings(view, model.points, "")
+        values = np.zeros((camera.height * 8, camera.width * 8))
+        for (x, y), z in zip(pixels * 8, depths, strict=True):
             values[max(int(y) - 1, 0) : int(y) + 2, max(int(x) - 1, 0) : int(x) + 2] = (1 / z - offset) / scale
         assert values.max() < 1
         _save((values * 65535).round().astype(np.uint16), (tmp_path / "maps" / view.name).with_suffix(".png"))

@@ -1,7 +1,6 @@
 """NaN and infinities in a training: the step that is not taken, the model that is saved, and the message."""
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,12 +19,6 @@ from utils.system_utils import UserError
 BETAS, EPS, RATE = (0.9, 0.999), 1e-15, 0.01
 SMALL = ["-r", "24", "--test_iterations", "-1", "--no_curve"]
 INF, NAN = float("inf"), float("nan")
-
-
-@pytest.fixture(autouse=True)
-def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Restore stdout, which training stamps and may silence."""
-    monkeypatch.setattr(sys, "stdout", sys.stdout)
 
 
 # The operators

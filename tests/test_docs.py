@@ -1,31 +1,133 @@
-"""README and docs: the length of lines, links, and the pages of the site."""
+"""README and docs: links, navigation, copied figures, and every command and flag that a page shows."""
 
+import ast
+import contextlib
+import functools
+import io
 import re
+import runpy
+import sys
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 from urllib.parse import unquote
 
 import pytest
-from doc_pages import PAGES, ROOT, name_of, prose
 
-MOST_LINES, MOST_COLUMNS = 130, 120
-LINK = re.compile(r"\]\(([^()\s]+)\)")
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md", "benchmarks/README.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+MOST_LINES, MOST_COLUMNS, MOST_WORDS = 130, 120, 2500
+# What benchmarks/device.sh runs by its first word.
+DEVICE = {
+    "kernels": "benchmarks.kernels.rasterizer",
+    "accuracy": "benchmarks.accuracy.oracle",
+    "train": "benchmarks.scenes.training",
+}
+FORWARDING = ("benchmarks.scenes.step_profile", "benchmarks.scenes.training")  # unknown words go to train.py
+FOREIGN = {"--eval_steps", "--save_steps", "--nnodes", "--shutdown_timeout"}  # flags of other programs
 
 
-def test_readme_is_short():
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= MOST_LINES
+class Command(NamedTuple):
+    """A command of ours that a page shows."""
+
+    page: str
+    program: str  # train.py, or a module as benchmarks.kernels.rasterizer
+    words: tuple[str, ...]
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if "results" not in page.parts], ids=name_of)
-def test_lines_are_short(page):
-    """Tables and figures have no other form. Code keeps its layout in the docs, but not in the README."""
-    free = ("|", "![") if page.parent == ROOT else ("|", "![", "    ")
-    lines = prose(page).splitlines()
-    assert [line for line in lines if len(line) > MOST_COLUMNS and not line.startswith(free)] == []
+def _name(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+def _prose(page: Path) -> str:
+    """The page without its fenced blocks."""
+    return FENCE.sub("", page.read_text(encoding="utf-8"))
+
+
+def _commands(page: Path) -> Iterator[Command]:
+    """The commands in a page's code: fenced, indented, within sentences. A backslash continues a line."""
+    prose = _prose(page)
+    code = [block for kind, block in FENCE.findall(page.read_text(encoding="utf-8")) if kind != "diff"]
+    lines = [line for block in code for line in re.sub(r"\\\n\s*", "", block).splitlines()]
+    lines += re.findall(r"^    .*", re.sub(r"\\\n\s*", "", prose), re.MULTILINE) + re.findall(r"`([^`\n]+)`", prose)
+    for line in lines:
+        for part in re.split(r"&&|\|\||;", re.sub(r"(^|\s)#.*", "", line)):
+            words = [word.strip("[]'\",") for word in part.split()]
+            while words and (re.fullmatch(r"\w+=.*", words[0]) or words[0] == "do"):
+                del words[0]
+            if words and (found := _program(words)):
+                yield Command(_name(page), found[0], tuple(found[1:]))
+
+
+def _program(words: list[str]) -> list[str] | None:
+    """Program and words of a command line; None for a command of others (pytest, pip)."""
+    if words[0] == "benchmarks/device.sh" and len(words) > 1 and words[1] in DEVICE:
+        return [DEVICE[words[1]], *words[2:]]
+    python = re.fullmatch(r"(\S*/)?python3?", words[0]) is not None
+    rest = words[python:]
+    if python and rest[:1] == ["-m"] and re.fullmatch(r"(benchmarks|splatting|scene)[a-z._]*", rest[1]):
+        return rest[1:]
+    return rest if rest and rest[0].endswith(".py") and (python or len(rest) > 1) else None
+
+
+COMMANDS = sorted({command for page in PAGES for command in _commands(page)})
+PROGRAMS = sorted({command.program for command in COMMANDS})
+
+
+@functools.cache
+def _flags(program: str) -> frozenset[str]:
+    """Every option that `-h` lists. In this process, as importing torch takes seconds."""
+    said, argv, path = io.StringIO(), sys.argv, sys.path.copy()
+    sys.argv = [program, "-h"]
+    try:
+        with contextlib.redirect_stdout(said), warnings.catch_warnings(), pytest.raises(SystemExit) as ended:
+            warnings.simplefilter("ignore")  # a module may be loaded already
+            if program.endswith(".py"):
+                runpy.run_path(str(ROOT / program), run_name="__main__")
+            else:
+                runpy.run_module(program, run_name="__main__")
+    finally:
+        sys.argv, sys.path[:] = argv, path
+    assert not ended.value.code, said.getvalue()
+    return frozenset(re.findall(r"(?<![\w-])--?[A-Za-z][\w-]*", said.getvalue()))
+
+
+def test_every_benchmark_is_shown_and_shows_how_it_is_run():
+    for path in (ROOT / "benchmarks").glob("*/*.py"):
+        text, name = path.read_text(encoding="utf-8"), f"benchmarks.{path.parent.name}.{path.stem}"
+        if '__name__ == "__main__"' in text:
+            name = name.removesuffix(".__main__")
+            assert name in PROGRAMS and f"python -m {name} " in ast.get_docstring(ast.parse(text))
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_every_flag_shown_is_known(program):
+    unknown = []
+    for page, _, words in (command for command in COMMANDS if command.program == program):
+        known = _flags(program) | (_flags("train.py") if program in FORWARDING else frozenset())
+        for word in words:
+            if word == "--":  # full_eval.py hands what follows to train.py
+                known = _flags("train.py")
+            elif re.match(r"--?[A-Za-z]", word) and word.split("=")[0] not in known:
+                unknown.append((page, word))
+    assert unknown == []
+
+
+def test_every_flag_in_prose_is_known():
+    assert {"train.py", "render.py", "metrics.py", "full_eval.py", "convert.py", "doctor.py"} <= set(PROGRAMS)
+    known = frozenset().union(FOREIGN, *map(_flags, PROGRAMS))
+    shown = {(_name(page), flag) for page in PAGES for flag in re.findall(r"`(--[a-z]\w+)[^`]*`", _prose(page))}
+    assert {(page, flag) for page, flag in shown if flag not in known} == set()
 
 
 def _anchors(page: Path) -> set[str]:
     """The anchors of a page's headings, as forges and MkDocs make them."""
-    titles = re.findall(r"^#+ (.+)$", prose(page), re.MULTILINE)
+    titles = re.findall(r"^#+ (.+)$", _prose(page), re.MULTILINE)
     plain = (re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", title) for title in titles)
     return {re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", title).strip().lower()) for title in plain}
 
@@ -38,28 +140,42 @@ def _dead(page: Path, link: str) -> bool:
     return bool(anchor) and anchor not in _anchors(target)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_relative_links_resolve(page):
-    links = [link for link in LINK.findall(prose(page)) if not re.match(r"[a-z]+:", link)]
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_links_resolve_and_pages_are_short(page):
+    """Tables and figures may have long lines. Code keeps its layout in the docs, but not in the README."""
+    links = [link for link in re.findall(r"\]\(([^()\s]+)\)", _prose(page)) if not re.match(r"[a-z]+:", link)]
     assert [link for link in links if _dead(page, link)] == []
+    assert len(page.read_text(encoding="utf-8").split()) <= MOST_WORDS
+    free = ("|", "![") if page.parent == ROOT else ("|", "![", "    ")
+    long = [line for line in _prose(page).splitlines() if len(line) > MOST_COLUMNS and not line.startswith(free)]
+    assert long == [] or "results" in page.parts
 
 
 def test_every_page_is_in_the_navigation():
     listed = re.findall(r"^\s+- .+: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
     docs = ROOT / "docs"
     pages = [page.relative_to(docs).as_posix() for page in PAGES if page.is_relative_to(docs)]
-    assert sorted(listed) == sorted(
-        [*pages, "benchmarks.md", "changelog.md", "contributing.md", "security.md"]
-    )  # docs/hooks.py
+    added = ["benchmarks.md", "changelog.md", "contributing.md", "security.md"]  # by docs/hooks.py
+    assert sorted(listed) == sorted([*pages, *added])
 
 
-def test_figures_of_the_readme_stand_in_the_results():
+def test_the_readme_is_short_and_its_figures_stand_in_the_results():
     """README copies rows of generated tables. A table made anew must not leave the copy behind."""
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    readme = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert len(readme) <= MOST_LINES
     results = (ROOT / "docs" / "results" / "training.md").read_text(encoding="utf-8").splitlines()
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in readme.splitlines()]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in readme]
     scored = [row for row in rows if row[0] in ("CPU", "GPU")]
     assert len(scored) == 6
-    for _, scene, iterations, *figures in scored:
-        wanted = {scene, iterations, *figures}
-        assert any(wanted <= {cell.strip() for cell in line.split("|")} for line in results), scene
+    for _, *cells in scored:
+        assert any(set(cells) <= {cell.strip() for cell in line.split("|")} for line in results), cells
+
+
+def test_module_docstrings_begin_with_a_noun_or_a_verb():
+    """A clause without a head neither names the subject of its module nor says what it does."""
+    made = ("build", "eval", "output")  # folders of make, full_eval.py and the demo
+    paths = [path.relative_to(ROOT) for path in ROOT.rglob("*.py")]
+    paths = [path for path in paths if not any(part in made or part.startswith(".") for part in path.parts)]
+    assert len(paths) > 100
+    said = {path: ast.get_docstring(ast.parse((ROOT / path).read_text(encoding="utf-8"))) or "" for path in paths}
+    assert [path for path in paths if re.match(r"(What|Which|How|Where|Whether)\b", said[path])] == []

@@ -4,11 +4,13 @@ import argparse
 import dataclasses
 import json
 import re
+import shutil
 from pathlib import Path
 
 import diff_gaussian_rasterization
 import numpy as np
 import pytest
+import simple_knn
 import torch
 from gaussians import pipeline
 from PIL import Image
@@ -21,9 +23,8 @@ from gaussian_renderer import render
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
-from splatting.diagnosis import environment
+from splatting.diagnosis import Line, environment
 from splatting.diagnosis.dataset import check_cloud, check_dataset, check_extent, check_lenses
-from splatting.diagnosis.lines import Line
 from splatting.diagnosis.model import check_model
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
@@ -54,11 +55,9 @@ def test_exit_statuses(healthy, colmap_scene, tmp_path, capsys):
     assert exit_status("-s", str(colmap_scene)) == 1
     out = capsys.readouterr().out
     assert "PROBLEM only 17 photos -> " in out and "PROBLEM only 300 points" in out and out.endswith("2 problems\n")
-    for option in ("-s", "-m"):
-        with pytest.raises(UserError, match=f"no folder .*nowhere; pass an existing folder as {option}"):
-            doctor.main([option, str(tmp_path / "nowhere")])
-        with pytest.raises(UserError, match=f"no folder ''; pass an existing folder as {option}"):
-            doctor.main([option, ""])
+    for option, folder in ((option, folder) for option in ("-s", "-m") for folder in (tmp_path / "nowhere", "''")):
+        with pytest.raises(UserError, match=f"no folder .*{folder}; pass an existing folder as {option}"):
+            doctor.main([option, str(folder).strip("'")])
 
 
 def test_missing_packages_end_it(monkeypatch, colmap_scene, capsys):
@@ -75,38 +74,27 @@ def test_pycolmap_is_missed_only_where_it_has_a_wheel(monkeypatch, system, machi
     monkeypatch.setattr(environment.sys, "platform", system)
     monkeypatch.setattr(environment.platform, "machine", lambda: machine)
     monkeypatch.setattr(environment, "_version", lambda name: None if name == "pycolmap" else "1.0")
-    (line,) = environment.check_packages()
-    assert bool(line.finding) == missed
-
-
-def _sources(root: Path, version: str = "0.1.0") -> Path:
-    """A repository with the installed Python part of simple-knn."""
-    package = root / "submodules" / "simple-knn" / "simple_knn"
-    package.mkdir(parents=True)
-    (root / "version.txt").write_text(f"{version}\n")
-    import simple_knn
-
-    for path in Path(simple_knn.__file__).parent.glob("*.py"):
-        (package / path.name).write_bytes(path.read_bytes())
-    return package
+    assert [line.finding for line in environment.check_packages()] == [missed]
 
 
 def test_extensions_that_do_not_fit(monkeypatch, tmp_path):
-    def check() -> list[str]:
-        return problems([environment._check_extension("simple-knn", "simple_knn")])
-
-    package = _sources(tmp_path)
-    monkeypatch.setattr(environment, "ROOT", tmp_path)
-    assert check() == []
+    """The extension simple-knn, against a repository with the Python part that is installed."""
+    package = tmp_path / "submodules" / "simple-knn" / "simple_knn"
+    shutil.copytree(Path(simple_knn.__file__).parent, package, ignore=shutil.ignore_patterns("*.so", "__pycache__"))
     versions = {"gaussian-splatting": "0.1.0+cu13"}  # all three in one
+
+    def check(version: str = "0.1.0") -> str:
+        (tmp_path / "version.txt").write_text(f"{version}\n")
+        return str(environment._check_extension("simple-knn", "simple_knn"))
+
+    monkeypatch.setattr(environment, "ROOT", tmp_path)
     monkeypatch.setattr(environment, "_version", versions.get)
-    assert check() == []
+    assert check() == "ok      extension simple-knn 0.1.0+cu13"
     (package / "ops.py").write_text("changed")
-    assert "installed from other sources than these (ops.py) -> run `pip install ./submodules/simple-knn`" in check()[0]
-    (tmp_path / "version.txt").write_text("0.2.0\n")
-    assert "is version 0.1.0+cu13, but this code is 0.2.0" in check()[0]
+    assert "installed from other sources than these (ops.py) -> run `pip install ./submodules/simple-knn`" in check()
+    assert "is version 0.1.0+cu13, but this code is 0.2.0" in check("0.2.0")
     versions.clear()
-    assert "simple-knn is not installed" in check()[0]
+    assert "PROBLEM the extension simple-knn is not installed" in check()
 
 
 def test_the_rasterizer_is_tried(monkeypatch):
@@ -240,15 +228,13 @@ def moved(factor: float, offset: float = 0.0):
     [
         (lambda gaussians: gaussians._scaling[5, 1].fill_(np.nan),
          "1 of 300 Gaussians have a scale that is not finite -> resume from an earlier checkpoint"),
+        (lambda gaussians: gaussians._scaling[:50].fill_(3), "16.7% of the Gaussians are larger than the extent"),
         (filled(opacity=-7), "renders of the training views are black: the Gaussians are almost transparent -> "),
-        (moved(1, 500), "black: no Gaussian is in view, because the cameras face away -> check the poses"),
         (filled(opacity=3, features_dc=-5), "black: the Gaussians themselves are black -> check whether the training"),
-        (lambda gaussians: gaussians._scaling[:50].fill_(3),
-         "16.7% of the Gaussians are larger than the extent of the cameras"),
-        (filled(opacity=np.log(0.01 / 0.99)),
-         "100% of the opacities are near 0.01, as a reset leaves them, and nothing was trained after it"),
+        (filled(opacity=np.log(0.01 / 0.99)), "100% of the opacities are near 0.01, as a reset leaves them"),
         (filled(scaling=np.log(1e-9)), "the Gaussians are too small for these cameras: their median size is "),
         (filled(scaling=np.log(1e4)), "the Gaussians are too large for these cameras: their median size is "),
+        (moved(1, 500), "black: no Gaussian is in view, because the cameras face away -> check the poses"),
         (moved(1e4), "the positions of the Gaussians spread over "),
         (moved(1e-4), "the positions of the Gaussians spread over "),
     ],

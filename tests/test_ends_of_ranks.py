@@ -14,7 +14,7 @@ from splatting.distributed.alike import refuse_differences
 from splatting.distributed.board import here, is_gone
 from splatting.distributed.ending import DONE, FAULT, HANG, LOST, SIGNAL, End, verdict
 from splatting.distributed.ranks import Ranks, using
-from splatting.host import threads, torchrun
+from splatting.host import machine, torchrun
 from splatting.training.restart import newest_checkpoint, what_stands
 from utils.system_utils import UserError, atomic_write, run_cli
 
@@ -37,11 +37,11 @@ def in_torchrun(monkeypatch):
 def test_the_environment_of_torchrun_is_whole_or_none(in_torchrun):
     assert (torchrun.rank(), torchrun.size(), torchrun.local_rank(), torchrun.local_size()) == (3, 4, 1, 2)
     in_torchrun.setattr(os, "sched_getaffinity", lambda pid: set(range(8)), raising=False)
-    in_torchrun.setattr(threads, "_quota", lambda: float("inf"))
-    assert threads.cores() == 4
+    in_torchrun.setattr(machine, "_quota", lambda: float("inf"))
+    assert machine.cores() == 4
     in_torchrun.delenv("LOCAL_RANK")  # as on a cluster that sets some of these names itself
     assert (torchrun.rank(), torchrun.size(), torchrun.local_size()) == (0, 1, 1)
-    assert threads.cores() == 8
+    assert machine.cores() == 8
 
 
 def test_a_command_for_one_process_refuses_several(in_torchrun, capsys):

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 import train
-from splatting.evaluation.event_writer import EventWriter
-from splatting.evaluation.tensorboard_scalars import read_scalars
+from splatting.evaluation.peer_curve import read_scalars
+from splatting.evaluation.training_log import EventWriter
+from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
-from splatting.training.observers import progress
+from splatting.training.observers import report
 from splatting.training.observers.report import Report
-from splatting.training.step import Step
 
 
 def _train(scene: Path, out: Path, *more: str) -> None:
@@ -79,12 +79,12 @@ def test_every_tenth_iteration_has_its_own_losses(colmap_scene, tmp_path, monkey
     """They are kept until something is due, and read together."""
     measured, plain = {}, Report.measured
 
-    def measure(self: Report, step: Step, losses: Losses) -> None:
+    def measure(self: Report, step: Iteration, losses: Losses) -> None:
         measured[step.iteration] = losses.l1.item(), losses.total.item()
         plain(self, step, losses)
 
     monkeypatch.setattr(Report, "measured", measure)
-    monkeypatch.setattr(progress, "BAR_SECONDS", math.inf)  # nothing but the tests is due
+    monkeypatch.setattr(report, "BAR_SECONDS", math.inf)  # nothing but the tests is due
     _train(colmap_scene, tmp_path, "--iterations", "40", "--test_iterations", "30")
     scalars = _Writer.last.scalars
     for place, name in enumerate(("l1_loss", "total_loss")):

@@ -12,12 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from small_splats import splats, written
-from test_exports_extremes import cube, moved
+from small_splats import cube, moved, splats, written
 
-from benchmarks.exports.read_back import read_back, read_by_splat_transform
-from benchmarks.exports.sizes import decibels, renders
-from benchmarks.workloads.orbit import orbit
+from benchmarks.exports.sizes import decibels, orbit, read_back, read_by_splat_transform, renders
 from splatting.exports.splats import Splats, half_turned, with_sh_degree
 
 FOREIGN = Path(__file__).parent / "foreign"
@@ -45,9 +42,9 @@ def _scene(degree: int, antialiasing: bool = False) -> Splats:
 def _loss(some: Splats, read: Splats) -> float:
     """PSNR of the renders from 5 views, of which none may be empty."""
     cameras = orbit(some.means, 5, 64)
-    wanted = renders(some, cameras)
-    assert wanted.flatten(1).std(dim=1).min() > 0.05
-    return decibels(renders(Splats(**{**vars(read), "antialiasing": some.antialiasing}), cameras), wanted)
+    expected = renders(some, cameras)
+    assert expected.flatten(1).std(dim=1).min() > 0.05
+    return decibels(renders(Splats(**{**vars(read), "antialiasing": some.antialiasing}), cameras), expected)
 
 
 @pytest.mark.parametrize("degree", range(4))

@@ -316,12 +316,6 @@ def test_columns_that_do_not_count_are_cut_off():
 # The half-image protocol
 
 
-@pytest.fixture(autouse=True)
-def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Restore stdout, which training stamps."""
-    monkeypatch.setattr(sys, "stdout", sys.stdout)
-
-
 OPTIONS = [
     "-r", "32", "--eval", "--train_test_exp", "--test_iterations", "-1", "--densify_from_iter", "50",
     "--densification_interval", "40", "--densify_grad_threshold", "1e-4", "--max_num_splats", "450",

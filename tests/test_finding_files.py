@@ -10,8 +10,7 @@ import pycolmap
 import pytest
 import torch
 from PIL import EpsImagePlugin, Image
-from synthetic import HEIGHT, WIDTH, FakeGaussians, folder_state, make_colmap_scene
-from test_colmap_scene import _options, _read
+from synthetic import HEIGHT, WIDTH, FakeGaussians, folder_state, make_colmap_scene, options_of, read
 
 from scene import Scene
 from utils.system_utils import UserError
@@ -45,21 +44,21 @@ def _model(folder: Path, views: int) -> None:
 @pytest.mark.parametrize("text", [False, True])
 def test_names_with_spaces_and_letters_of_all_sorts(colmap_scene, text):
     names = ["der Wald/Föhn  7 .png", "森/写真 1.png", "a b.png", "12 34.png"]
-    olds = [camera.image_name for camera in _read(colmap_scene).train_cameras]
+    olds = [camera.image_name for camera in read(colmap_scene).train_cameras]
     _rename(colmap_scene, dict(zip(olds, names, strict=False)), text)
-    read = [camera.image_name for camera in _read(colmap_scene).train_cameras]
-    assert set(names) < set(read) and len(read) == 17
+    found = [camera.image_name for camera in read(colmap_scene).train_cameras]
+    assert set(names) < set(found) and len(found) == 17
 
 
 def test_names_that_are_not_utf8(colmap_scene):
     path = colmap_scene / "sparse" / "0" / "images.bin"
     path.write_bytes(path.read_bytes().replace(b"left/v02", b"left/\xe902"))
     with pytest.raises(UserError, match=r"the name of photo [0-9]+ in .*images.bin is not UTF-8; rename it"):
-        _read(colmap_scene)
+        read(colmap_scene)
 
 
 def test_names_that_match_but_for_case_accents_or_slashes(colmap_scene, capsys):
-    olds = [camera.image_name for camera in _read(colmap_scene).train_cameras]
+    olds = [camera.image_name for camera in read(colmap_scene).train_cameras]
     composed = unicodedata.normalize("NFC", "é.png")
     _rename(colmap_scene, {olds[0]: composed})
     pictures = colmap_scene / "images"
@@ -67,7 +66,7 @@ def test_names_that_match_but_for_case_accents_or_slashes(colmap_scene, capsys):
     (pictures / "RIGHT").mkdir()
     (pictures / olds[1]).rename(pictures / olds[1].upper())
     capsys.readouterr()
-    cameras = {camera.image_name: camera.image_path for camera in _read(colmap_scene).train_cameras}
+    cameras = {camera.image_name: camera.image_path for camera in read(colmap_scene).train_cameras}
     assert len(cameras) == 17 and all(path.is_file() for path in cameras.values())
     assert cameras[olds[1]].name == Path(olds[1]).name.upper()
     said = capsys.readouterr().err
@@ -78,16 +77,16 @@ def test_names_that_match_but_for_case_accents_or_slashes(colmap_scene, capsys):
     # Two similar names, neither of them the exact one: the reader must not guess.
     shutil.copyfile(pictures / olds[1].upper(), pictures / olds[1].upper().replace("PNG", "Png"))
     with pytest.raises(UserError, match="1 of 17 photos"):
-        _read(colmap_scene)
+        read(colmap_scene)
 
 
 def test_the_largest_of_several_models(colmap_scene, capsys):
-    whole = _read(colmap_scene)
+    whole = read(colmap_scene)
     assert capsys.readouterr().err == ""
     sparse = colmap_scene / "sparse"
     _model(sparse / "1", 5)
     shutil.copytree(sparse / "0", sparse / "2")
-    _read(colmap_scene)
+    read(colmap_scene)
     assert (
         capsys.readouterr().err
         == f"{sparse / '0'} registers 17 photos and is used; {sparse / '1'} 5, {sparse / '2'} 17\n"
@@ -96,11 +95,11 @@ def test_the_largest_of_several_models(colmap_scene, capsys):
     (sparse / "1").rename(sparse / "large")
     (sparse / "0").rename(sparse / "1")
     (sparse / "large").rename(sparse / "0")
-    assert len(_read(colmap_scene).train_cameras) == len(whole.train_cameras)
+    assert len(read(colmap_scene).train_cameras) == len(whole.train_cameras)
     assert capsys.readouterr().err == f"{sparse / '1'} registers 17 photos and is used; {sparse / '0'} 5\n"
 
     (sparse / "1" / "images.bin").write_bytes(b"broken")
-    assert len(_read(colmap_scene).train_cameras) == 5
+    assert len(read(colmap_scene).train_cameras) == 5
     assert "images.bin ends within photo 1 of 1, or is no such file" in capsys.readouterr().err
 
 
@@ -124,7 +123,7 @@ def test_several_cameras_and_sizes(tmp_path):
     (sparse / "images.txt").write_text("\n".join(lines) + "\n")
     with Image.open(small) as image:
         image.resize((48, 32)).save(small)
-    cameras = {camera.uid: camera for camera in _read(tmp_path).train_cameras}
+    cameras = {camera.uid: camera for camera in read(tmp_path).train_cameras}
     assert set(cameras) == {1, 7}
     assert (cameras[1].width, cameras[1].file_size) == (WIDTH, (WIDTH, HEIGHT))
     assert cameras[7].fx == 55 and cameras[7].file_size == (cameras[7].width, cameras[7].height)
@@ -152,7 +151,7 @@ def test_pictures_of_any_kind(tmp_path, kind, model):
     folder = tmp_path / "scene"
     make_colmap_scene(folder, model=model, params=params, views=1)
     (path,) = (folder / "images").rglob("*.png")
-    options = _options(folder, tmp_path / "out")
+    options = options_of(folder, tmp_path / "out")
     (camera,) = Scene(options, FakeGaussians()).getTrainCameras()
     plain = camera.target(torch.zeros(3)).float()
     with Image.open(path) as image:
@@ -176,7 +175,7 @@ def test_what_is_no_file_is_no_photo(colmap_scene, make):
     path.unlink()
     make(path)
     with pytest.raises(UserError, match=r"photos .*left/v02.png \(it is there, but a link to nothing or no file"):
-        _read(colmap_scene)
+        read(colmap_scene)
 
 
 def test_a_photo_in_postscript_is_never_run(colmap_scene, monkeypatch):
@@ -186,4 +185,4 @@ def test_a_photo_in_postscript_is_never_run(colmap_scene, monkeypatch):
     shutil.move(path.with_suffix(".eps"), path)
     monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *_, **__: pytest.fail("Ghostscript was started"))
     with pytest.raises(UserError, match="cannot read .*left/v02.png .*cannot identify image file"):
-        _read(colmap_scene)
+        read(colmap_scene)

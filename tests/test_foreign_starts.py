@@ -15,7 +15,7 @@ from small_splats import splats, written
 import export
 import render
 import train
-from gaussian_renderer.importance import blending_weights, most_important
+from gaussian_renderer.blending import blending_weights, most_important
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.ply import read_ply, stored_sh_degree
 from scene.readers.point_cloud import read_point_cloud

@@ -1,7 +1,5 @@
 """Fused calls of a training step against the same step in plain parts: the trajectory is equal byte for byte."""
 
-import sys
-
 import numpy as np
 import pytest
 import torch
@@ -52,7 +50,6 @@ def _adam(values, gradients, means, squares, steps, rates, beta1, beta2, eps, co
 
 @pytest.mark.parametrize("background", [["--random_background"], ["-w"]], ids=["random", "white"])
 def test_fused_and_plain_steps_go_the_same_way(blender_scene, tmp_path, monkeypatch, background):
-    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
     monkeypatch.setattr("splatting.training.run.SH_INTERVAL", 25)
     random = np.random.default_rng(0)
     write_point_cloud(blender_scene / "points3d.ply", random.uniform(-1, 1, (300, 3)), random.random((300, 3)))

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.gate import __main__ as gate
 from benchmarks.gate import baseline, trainings
-from benchmarks.gate.judging import judge_quality, judge_time
+from benchmarks.gate.baseline import judge_quality, judge_time
 from utils.system_utils import UserError
 
 STORED = [

@@ -4,7 +4,6 @@ import argparse
 import json
 import re
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,7 @@ from synthetic import folder_state
 import train
 from arguments import read_model_json, read_stored_options, write_cfg_args, write_model_json
 from splatting.evaluation.error_curve import COLUMNS, read_curve, write_curve
-from splatting.training.history import check_folder, continue_records
+from splatting.training.checks import check_folder, continue_records
 from utils.system_utils import UserError
 
 CURVE, LOG = "error_vs_time.csv", "train_log.json"
@@ -21,12 +20,6 @@ MODEL_OPTIONS = {
     "sh_degree": 3, "source_path": "/scene", "model_path": "out", "images": "images", "depths": "", "resolution": -1,
     "white_background": False, "train_test_exp": False, "data_device": "cuda", "eval": False,
 }  # fmt: skip
-
-
-@pytest.fixture(autouse=True)
-def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Restore stdout, which training stamps and may silence."""
-    monkeypatch.setattr(sys, "stdout", sys.stdout)
 
 
 def _train(scene: Path, out: Path, *more: object, iterations: int) -> bytes:

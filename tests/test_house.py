@@ -19,32 +19,34 @@ CSRC = ROOT / "submodules"
 LONGEST = 60  # lines of a function
 # Most lines of code and of tests, without blanks, comments and docstrings, files of code, and words of Markdown. A new
 # capability that needs more says so in its commit, and what it let go.
-MOST = {"code": 36_100, "files": 560, "tests": 35_200, "words": 38_950}
+MOST = {"code": 34_180, "files": 443, "tests": 33_800, "words": 37_500}
 
 # What a room may import besides itself and what serves them all: prefixes of module names. The room of a module is its
 # longest prefix here.
 BASE = ("utils", *(f"splatting.{name}" for name in ("deterministic", "distributed", "files", "host")))
 MAY_IMPORT = {
     **dict.fromkeys(BASE, ()),
-    "utils.camera_utils": ("scene.cameras", "scene.views", "scene.images", "scene.readers"),
+    "utils.camera_utils": ("scene", "splatting.compat"),
     "utils.make_depth_scale": ("scene.readers.depth_scale",),  # a command of the reference
     "arguments": (),
     "lpipsPyTorch": (),  # a name of the reference
     "scene.images": (),
-    "scene.readers": ("scene.images",),
+    "scene.colmap_loader": (),
+    "scene.readers": ("scene.images", "scene.colmap_loader"),
     "scene.gaussians": (),
     "scene.gaussian_model": ("scene.gaussians", "scene.readers.info"),
-    "scene.dataset_readers": ("scene.readers", "scene.images"),
-    "scene.views": ("scene.readers.depth_maps", "scene.readers.info", "scene.images"),
-    "scene.cameras": ("scene.views", "scene.images"),
+    "scene.dataset_readers": ("scene.readers", "scene.images", "splatting.compat"),
+    "scene.cameras": ("scene.readers", "scene.images", "splatting.compat"),
+    "scene.scene": ("scene", "splatting.compat"),
     "scene": (),  # not arguments: a client's own package of that name may be found first
     "gaussian_renderer": ("scene",),
+    "splatting.compat": ("scene",),
     "splatting.distributed.rendering": ("gaussian_renderer", "scene"),
     "splatting.camera_paths": ("gaussian_renderer", "scene"),
     "splatting.exports": ("splatting.camera_paths", "scene"),
     "splatting.evaluation": ("arguments", "scene.saved_iterations", "scene.readers.info"),
     "splatting.training": (
-        *("splatting.evaluation", "splatting.exports", "splatting.viewer.options"),
+        *("splatting.evaluation", "splatting.exports", "splatting.viewer.server"),
         *("arguments", "gaussian_renderer", "scene"),
     ),
     "splatting.viewer": ("splatting.camera_paths", "gaussian_renderer", "scene"),
@@ -53,7 +55,7 @@ MAY_IMPORT = {
     "splatting.demo": ("arguments", "splatting.evaluation"),
     "splatting": (),
     "benchmarks": (),
-    "benchmarks.workloads": ("scene.cameras",),
+    "benchmarks.workloads": (),
     "benchmarks.harness": ("benchmarks.workloads",),
     "benchmarks.strategies": ("benchmarks.harness",),
 }
@@ -286,7 +288,7 @@ def test_what_users_import_is_there():
 from arguments import GroupParams, ModelParams, OptimizationParams, ParamGroup, PipelineParams, get_combined_args
 from scene import GaussianModel, Scene, cameras, searchForMaxIteration
 from scene import cameraList_from_camInfos as listed, camera_to_JSON as entry, sceneLoadTypeCallbacks as callbacks
-from scene.colmap_loader import read_model
+from scene.colmap_loader import read_extrinsics_text
 from scene.cameras import Camera, MiniCam
 from scene.dataset_readers import CameraInfo, SceneInfo, sceneLoadTypeCallbacks
 from scene.gaussian_model import GaussianModel as same

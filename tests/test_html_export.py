@@ -9,7 +9,6 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,14 +20,12 @@ from scipy.spatial.transform import Rotation
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
 from splatting.camera_paths.generated import Ellipse
-from splatting.camera_paths.keyframes import CameraPath, Keyframe
-from splatting.camera_paths.moments import KeyframePath
+from splatting.camera_paths.keyframes import CameraPath, Keyframe, KeyframePath
 from splatting.camera_paths.poses import Poses, facing, poses_of
 from splatting.exports import html, vendor
-from splatting.exports.html import write_html, write_scene_html
+from splatting.exports.html import BOOKMARKS, lean, settings, turn_upright, turned, up_of, write_html
 from splatting.exports.in_scene import model_of
 from splatting.exports.ply import read_compressed_ply
-from splatting.exports.viewer_world import BOOKMARKS, lean, settings, turn_upright, turned, up_of
 from utils.system_utils import UserError
 
 # Addresses in the viewer's code. It asks for none of them here: those of PlayCanvas and Khronos are in texts, SVG is a
@@ -97,8 +94,8 @@ def test_vendored_files_are_those_of_the_record():
 
 def test_vendor_writes_nothing_that_differs_from_the_record(tmp_path, monkeypatch):
     (tmp_path / "LICENSE").write_text("other")
-    replaced = {"ROOT": tmp_path, "FOLDER": tmp_path / "viewer", "_unpacked": lambda *_: tmp_path}
-    replaced |= {"_minifier": lambda *_: Path("esbuild"), "_output": lambda *_: b"code"}
+    replaced = {"ROOT": tmp_path, "FOLDER": tmp_path / "viewer", "_output": lambda *_: b"code"}
+    replaced |= {"_installed": lambda *_: (tmp_path, Path("esbuild"))}
     for name, value in replaced.items():
         monkeypatch.setattr(vendor, name, value)
     monkeypatch.setattr("shutil.which", lambda _: "npm")
@@ -226,20 +223,22 @@ def test_bookmarks_are_few_and_spread():
 
 def test_the_animation_follows_the_camera_path():
     poses = poses_of(cameras())
-    names = [""] * len(poses)
+
+    def track(path) -> dict:
+        content = settings(poses, [""] * len(poses), np.eye(3), path, (0, 0, 0))
+        assert content["startMode"] == "animTrack"
+        return content["animTracks"][0]
+
     keys = [Keyframe(s, (s, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 40 + s) for s in (0.0, 2.0, 4.0)]
-    content = settings(poses, names, np.eye(3), KeyframePath(CameraPath(tuple(keys))), (0, 0, 0))
-    (track,) = content["animTracks"]
-    values = track["keyframes"]["values"]
-    assert content["startMode"] == "animTrack" and track["loopMode"] == "none" and track["duration"] == 4
-    assert track["keyframes"]["times"] == list(range(41)) and track["frameRate"] == 10
-    assert np.reshape(values["position"], (-1, 3))[20] == pytest.approx([-2, 0, 0])
-    towards = np.reshape(values["target"], (-1, 3)) - np.reshape(values["position"], (-1, 3))
-    assert (towards[:, 2] > 1).all() and np.abs(towards[:, :2]).max() < 1e-9
-    assert values["fov"][30] == pytest.approx(43)
-    (closed,) = settings(poses, names, np.eye(3), Ellipse(poses, 600.0), (0, 0, 0))["animTracks"]
+    open_track, closed = track(KeyframePath(CameraPath(tuple(keys)))), track(Ellipse(poses, 600.0))
+    assert (open_track["loopMode"], open_track["duration"], open_track["frameRate"]) == ("none", 4, 10)
+    assert open_track["keyframes"]["times"] == list(range(41))
+    values = open_track["keyframes"]["values"]
+    position, target = (np.reshape(values[name], (-1, 3)) for name in ("position", "target"))
+    assert position[20] == pytest.approx([-2, 0, 0]) and values["fov"][30] == pytest.approx(43)
+    assert ((target - position)[:, 2] > 1).all() and np.abs((target - position)[:, :2]).max() < 1e-9
     times = closed["keyframes"]["times"]
-    assert closed["loopMode"] == "repeat" and len(times) == 999 and closed["duration"] == 600
+    assert (closed["loopMode"], len(times), closed["duration"]) == ("repeat", 999, 600)
     assert (times[-1] + 1) / closed["frameRate"] == pytest.approx(600)
 
 
@@ -260,9 +259,8 @@ def test_a_lone_camera_turns_about_the_model(tmp_path):
     assert math.dist(camera["position"], camera["target"]) == pytest.approx(distance)
 
 
-def test_the_page_of_a_scene(tmp_path):
-    scene = SimpleNamespace(getTrainCameras=cameras)
-    write_scene_html(tmp_path / "scene.html", balls(each=2), scene, white_background=True, make_path=Ellipse)
+def test_a_path_is_made_of_the_training_cameras(tmp_path):
+    write_html(tmp_path / "scene.html", balls(each=2), cameras(), Ellipse, (1.0, 1.0, 1.0))
     content = _settings(tmp_path / "scene.html")
     assert content["background"]["color"] == [1.0, 1.0, 1.0] and content["startMode"] == "animTrack"
 

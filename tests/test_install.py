@@ -176,32 +176,6 @@ LANES = {"x86_64": {"avx2": 8, "avx512": 16}, "aarch64": {"neon": 5}}
 LANES |= {"AMD64": LANES["x86_64"], "arm64": LANES["aarch64"]}
 
 
-def test_a_library_has_every_instruction_set_and_the_same_bytes_wherever_it_is_built(tmp_path: Path) -> None:
-    libraries = []
-    for name in ("one", "another_one"):
-        folder = tmp_path / name / "toy"
-        folder.mkdir(parents=True)
-        write_extension(folder, KERNEL)
-        done = build_extension(folder)
-        assert done.returncode == 0, done.stderr
-        libraries.append(folder / "toy" / "_backend.so")
-    assert libraries[0].read_bytes() == libraries[1].read_bytes()
-    library = ctypes.CDLL(str(libraries[0]))
-    library.place_baseline.restype = ctypes.c_char_p
-    assert library.place_baseline() == b"./toy/csrc/cpu/kernel_isa.cpp"
-    for isa, lanes in {"baseline": 4, **LANES.get(platform.machine(), {})}.items():
-        assert library[f"lanes_{isa}"]() == lanes
-
-
-def test_compile_error_ends_without_traceback(tmp_path: Path) -> None:
-    write_extension(tmp_path, "int broken() { return no_such_name; }")
-    done = build_extension(tmp_path)
-    assert done.returncode == 1
-    assert "kernel_isa.cpp:1:23: error:" in done.stderr  # the compiler's own message
-    assert "Traceback" not in done.stderr
-    assert not (tmp_path / "toy" / "_backend.so").exists()
-
-
 def wheel_of(folder: Path) -> tuple[str, list[str], list[str]]:
     """Build the wheel of a folder by setuptools' backend: its name, the names in it, what its metadata requires."""
     code = "from setuptools import build_meta; print(build_meta.build_wheel('.'))"
@@ -216,12 +190,33 @@ def wheel_of(folder: Path) -> tuple[str, list[str], list[str]]:
     return name, names, [line.partition(": ")[2] for line in lines if line.startswith("Requires-Dist: ")]
 
 
-def test_a_wheel_serves_every_python_and_leaves_torch_alone(tmp_path: Path) -> None:
-    """Even with --force-reinstall, for which pip installs every requirement again."""
-    write_extension(tmp_path, "")
-    name, names, requires = wheel_of(tmp_path)
-    assert "-cp310-abi3-" in name and "toy/_backend.so" in names
-    assert requires == []
+def test_a_build_has_every_instruction_set_and_the_same_bytes_wherever_it_is_made(tmp_path: Path) -> None:
+    """Its wheel serves every Python, and leaves torch alone: pip --force-reinstall would install requirements again."""
+    folders = [tmp_path / name / "toy" for name in ("one", "another_one")]
+    for folder in folders:
+        folder.mkdir(parents=True)
+        write_extension(folder, KERNEL)
+    done = build_extension(folders[0])
+    assert done.returncode == 0, done.stderr
+    name, names, requires = wheel_of(folders[1])
+    assert "-cp310-abi3-" in name and "toy/_backend.so" in names and requires == []
+    path = folders[0] / "toy" / "_backend.so"
+    with zipfile.ZipFile(folders[1] / name) as wheel:
+        assert wheel.read("toy/_backend.so") == path.read_bytes()
+    library = ctypes.CDLL(str(path))
+    library.place_baseline.restype = ctypes.c_char_p
+    assert library.place_baseline() == b"./toy/csrc/cpu/kernel_isa.cpp"
+    for isa, lanes in {"baseline": 4, **LANES.get(platform.machine(), {})}.items():
+        assert library[f"lanes_{isa}"]() == lanes
+
+
+def test_compile_error_ends_without_traceback(tmp_path: Path) -> None:
+    write_extension(tmp_path, "int broken() { return no_such_name; }")
+    done = build_extension(tmp_path)
+    assert done.returncode == 1
+    assert "kernel_isa.cpp:1:23: error:" in done.stderr  # the compiler's own message
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "toy" / "_backend.so").exists()
 
 
 def copy_modules(package: Path, to: Path) -> None:

@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import sys
 from argparse import Namespace
 from types import SimpleNamespace
 
@@ -12,11 +11,10 @@ import torch
 
 import train
 from splatting.evaluation.training_log import TrainingLog
-from splatting.training import loop
+from splatting.training import strategies
 from splatting.training.density import DensityControl
 from splatting.training.observer import Announcer, Observer
 from splatting.training.observers.standard import standard_observers
-from splatting.training.strategies import choose
 from splatting.training.strategies.adc import AdaptiveDensityControl
 
 ITERATIONS = 24
@@ -49,11 +47,6 @@ class Recorder(Observer):
 
     def ended(self, error) -> None:
         self._note("ended" if error is None else type(error).__name__, 0)
-
-
-@pytest.fixture(autouse=True)
-def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
 
 
 def _train(scene, out, monkeypatch, observers, *options: object) -> None:
@@ -143,7 +136,7 @@ def test_another_strategy_is_another_object(colmap_scene, tmp_path, monkeypatch)
             assert self._gaussians.get_xyz.grad is None
             calls.append(("after_step", step.iteration))
 
-    monkeypatch.setattr(choose, "AdaptiveDensityControl", Strategy)
+    monkeypatch.setattr(strategies, "AdaptiveDensityControl", Strategy)
     told = []
     _train(colmap_scene, tmp_path, monkeypatch, lambda *_: [Recorder(told)])
     steps = range(1, ITERATIONS + 1)
@@ -160,11 +153,16 @@ def test_a_strategy_may_do_nothing():
     assert issubclass(AdaptiveDensityControl, DensityControl)
 
 
-def test_backward_runs_on_the_callers_thread():
+def test_backward_runs_on_the_callers_thread(colmap_scene, tmp_path, monkeypatch):
+    found = []
+
+    class Threads(Observer):
+        def measured(self, step, losses) -> None:
+            found.append(torch.autograd.is_multithreading_enabled())
+
     before = torch.autograd.is_multithreading_enabled()
-    with loop._backward_on_this_thread():
-        assert not torch.autograd.is_multithreading_enabled()
-    assert torch.autograd.is_multithreading_enabled() is before
+    _train(colmap_scene, tmp_path, monkeypatch, lambda *_: [Threads()])
+    assert not any(found) and torch.autograd.is_multithreading_enabled() is before
 
 
 def test_a_signal_while_the_curve_is_drawn_ends_the_program_at_once(colmap_scene, tmp_path, monkeypatch):
@@ -173,7 +171,7 @@ def test_a_signal_while_the_curve_is_drawn_ends_the_program_at_once(colmap_scene
     def draw(*_: object) -> None:
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("splatting.evaluation.curve_figure.CurveDrawer.finish", draw)
+    monkeypatch.setattr("splatting.evaluation.curve_recorder.CurveDrawer.finish", draw)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
     try:
         with pytest.raises(KeyboardInterrupt):

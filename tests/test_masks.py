@@ -10,8 +10,7 @@ import pytest
 import torch
 from fused_ssim.reference import ssim_map
 from PIL import Image
-from synthetic import HEIGHT, WIDTH, FakeGaussians, folder_state
-from test_colmap_scene import _options, _read
+from synthetic import HEIGHT, WIDTH, FakeGaussians, folder_state, options_of, read
 from torch import Tensor
 
 import metrics
@@ -20,7 +19,7 @@ import train
 from scene import Scene
 from scene.images.decode import decode
 from scene.images.masks import IGNORE, TRANSPARENT, Mask
-from splatting.training.observers.masks import MaskWatch
+from splatting.training.observers.guards import MaskWatch
 from utils.image_utils import pixels_that_count
 from utils.loss_utils import photometric_loss
 from utils.system_utils import UserError
@@ -143,7 +142,7 @@ def test_a_mask_may_be_the_alpha_of_a_picture(tmp_path):
 @pytest.fixture
 def masked_scene(colmap_scene) -> Path:
     """Write masks for all 17 photos, named in several ways, whose left third is black."""
-    for index, camera in enumerate(_read(colmap_scene).train_cameras):
+    for index, camera in enumerate(read(colmap_scene).train_cameras):
         name = Path(camera.image_name)
         grey = np.full((HEIGHT, WIDTH), 255, np.uint8)
         grey[:, : WIDTH // 3] = 0
@@ -153,7 +152,7 @@ def masked_scene(colmap_scene) -> Path:
 
 
 def _views(scene: Path, **options) -> list:
-    return Scene(_options(scene, scene.parent / "out", **options), FakeGaussians(), shuffle=False).getTrainCameras()
+    return Scene(options_of(scene, scene.parent / "out", **options), FakeGaussians(), shuffle=False).getTrainCameras()
 
 
 def test_masks_are_found_by_the_names_of_the_pictures(masked_scene, capsys):
@@ -196,7 +195,7 @@ def test_a_transparent_mask_is_alpha(masked_scene):
 
 
 def test_alpha_is_background_unless_it_is_to_be_ignored(colmap_scene):
-    name = _read(colmap_scene).train_cameras[0].image_name
+    name = read(colmap_scene).train_cameras[0].image_name
     pixels = np.asarray(Image.open(colmap_scene / "images" / name).convert("RGBA")).copy()
     pixels[:20, :, 3], pixels[20, :, 3] = 0, 128
     Image.fromarray(pixels).save(colmap_scene / "images" / name)
@@ -302,7 +301,7 @@ def test_training_rendering_and_scores_ignore_what_is_masked(masked_scene, tmp_p
 
 
 def test_a_view_that_is_masked_whole_has_no_score(masked_scene, tmp_path):
-    cameras = _read(masked_scene).train_cameras
+    cameras = read(masked_scene).train_cameras
     _save(next((masked_scene / "masks").glob(f"{cameras[0].image_name}*")), np.zeros((HEIGHT, WIDTH), np.uint8))
     _train(masked_scene, tmp_path / "out", "--masks", "masks", "--test_iterations", 40)
     scores = json.loads((tmp_path / "out" / "train_log.json").read_text())[-1]

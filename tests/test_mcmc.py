@@ -1,7 +1,6 @@
 """Training by --strategy mcmc: the same bytes by every way to take a step, resuming, growth and its limit."""
 
 import argparse
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,17 +13,12 @@ import train
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from splatting.training.density import DensityControl
-from splatting.training.steps import ahead, run_ahead
+from splatting.training.steps import captured, speculative
 from splatting.training.strategies.mcmc import MarkovChain
 from utils.system_utils import UserError
 
 # Within so few iterations no Gaussian fades, so the thresholds are at the opacities of the start.
 ACTIVE = ("--mcmc_noise", 5e4, "--mcmc_gate_opacity", 0.5, "--mcmc_min_opacity", 0.45)
-
-
-@pytest.fixture(autouse=True)
-def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
 
 
 def _train(source: Path, out: Path, *options: object, iterations: int = 60) -> Path:
@@ -56,11 +50,11 @@ def test_a_step_that_halts_is_moved_once(scene, tmp_path, monkeypatch, options, 
     """With room for what the last visit of a view needed, and no more, many steps halt and are repeated."""
     options = ("--strategy", "mcmc", *ACTIVE, *options)
     plain = trained(scene, tmp_path / "plain", "--plain_step", *options)
-    halts, repeat = [], run_ahead.RunAhead._repeat
-    monkeypatch.setattr(run_ahead.RunAhead, "_repeat", lambda *x: (halts.append(1), repeat(*x)))
-    monkeypatch.setattr(run_ahead, "_with_spare", lambda count: count)
+    halts, repeat = [], speculative.Speculation._replay
+    monkeypatch.setattr(speculative.Speculation, "_replay", lambda *x: (halts.append(1), repeat(*x)))
+    monkeypatch.setattr(speculative, "_with_spare", lambda count: count)
     for name, least in (("_INSTANCES", 0), ("_SLOTS", 0), ("_LEAST", 1)):
-        monkeypatch.setattr(ahead, name, least)
+        monkeypatch.setattr(captured, name, least)
     assert differences(trained(scene, tmp_path / "halting", *options), plain) == []
     assert len(halts) > 5
 

@@ -22,19 +22,14 @@ from splatting.host import memory
 from splatting.host.memory import free_memory, gib, is_out_of_memory, shortage
 from splatting.training import memory_estimate
 from splatting.training.memory_estimate import training_bytes
-from splatting.training.steps import fused, plain, recorded
+from splatting.training.steps import fused, plain
+from splatting.training.steps.captured import Graphs
 from utils.system_utils import UserError, run_cli
 
 ROOT = Path(__file__).parents[1]
 HUGE = 1 << 60
 # torch's message on a full GPU.
 ON_A_GPU = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has a total capacity of ...")
-
-
-@pytest.fixture(autouse=True)
-def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Restore stdout, which training stamps."""
-    monkeypatch.setattr(sys, "stdout", sys.stdout)
 
 
 def _raised(call) -> Exception:
@@ -329,7 +324,7 @@ def test_a_full_gpu_saves_the_model(colmap_scene, tmp_path, monkeypatch):
         return draw(*args, **kwargs)
 
     monkeypatch.setattr(fused, "draw", greedy)
-    monkeypatch.setattr(recorded.RecordedStep, "take", lambda *_: None)  # a recorded step calls nothing
+    monkeypatch.setattr(Graphs, "launch", lambda *_: None)  # a captured step calls nothing
     with pytest.raises(UserError, match="GiB asked for, .* GiB free on the GPU.*chkpnt3.pth"):
         _train(colmap_scene, tmp_path)
     assert load_checkpoint(tmp_path / "chkpnt3.pth")[1] == 3

@@ -7,7 +7,6 @@ import re
 import signal
 import socket
 import struct
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -20,6 +19,7 @@ import torch
 from gaussians import model, pipeline
 from rasterizer_tools import CPU_AND_GPU
 from test_network_message import mutated
+from trainings import train_on, whole_result
 from viewer_client import Viewer, as_bytes, packed, request
 from waiting import LIMIT, wait_for
 
@@ -28,7 +28,7 @@ from gaussian_renderer import network_gui, network_transfer, render
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
 from splatting.training.observer import Observer
-from splatting.training.observers.network_viewer import NetworkViewer
+from splatting.training.observers.viewers import NetworkViewer
 from utils.system_utils import UserError
 
 ITERATIONS = 60
@@ -43,7 +43,6 @@ RESET = struct.pack("ii", 1, 0)  # of SO_LINGER: closing drops what is on its wa
 
 @pytest.fixture(autouse=True)
 def _tidy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
     # A busy machine may keep a viewer of these tests from the next byte for longer than the real limits.
     monkeypatch.setattr(network_transfer, "SILENCE", LIMIT)
     monkeypatch.setattr(network_transfer, "LONGEST", LIMIT)
@@ -51,25 +50,11 @@ def _tidy(monkeypatch: pytest.MonkeyPatch) -> None:
     network_gui.close()
 
 
-def trained(scene: Path, out: Path, *options: object) -> tuple[bytes, list]:
-    """Train; the bytes of the PLY, and the numbers of the checkpoint."""
-    words = ["-s", scene, "-m", out, "--eval", "-r", 48, "--iterations", ITERATIONS, "--test_iterations", -1]
-    words += ["--densify_from_iter", 10, "--densification_interval", 20, "--opacity_reset_interval", 30]
-    words += ["--no_curve", "--checkpoint_iterations", ITERATIONS, *options]
-    train.main([*map(str, words)])
-    values = torch.load(out / f"chkpnt{ITERATIONS}.pth", weights_only=False)
-    ply = (out / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply").read_bytes()
-    return ply, flat(values)
-
-
-def flat(value: object) -> list:
-    if torch.is_tensor(value):
-        return [value.shape, value.detach().cpu().numpy().tobytes()]
-    if isinstance(value, dict):
-        return [leaf for pair in value.items() for leaf in (pair[0], *flat(pair[1]))]
-    if isinstance(value, list | tuple):
-        return [leaf for item in value for leaf in flat(item)]
-    return [value]
+def trained(scene: Path, out: Path, *options: object) -> dict[str, bytes | list]:
+    words = "--eval", "-r", 48, "--iterations", ITERATIONS, "--test_iterations", -1, "--densify_from_iter", 10
+    words += "--densification_interval", 20, "--opacity_reset_interval", 30, "--no_curve"
+    train_on(scene, out, *words, "--checkpoint_iterations", ITERATIONS, *options)
+    return whole_result(out, ITERATIONS)
 
 
 def valid(**changes: object) -> dict[str, object]:
@@ -106,7 +91,7 @@ class Watched(Observer):
     def go(self) -> None:
         self._go.set()
 
-    def __call__(self, *words: object) -> tuple[bytes, list]:
+    def __call__(self, *words: object) -> dict[str, bytes | list]:
         """Train with words as `trained`, at a free port; the errors of the script are raised."""
         with ThreadPoolExecutor(1) as pool, pytest.MonkeyPatch.context() as patch:
             patch.setattr(train, "run_training", self._train)
@@ -385,7 +370,7 @@ def test_a_frame_that_cannot_be_rendered_ends_the_connection(monkeypatch, capfd)
     def fail(*arguments: object) -> None:
         raise MemoryError("no room for\nthis")
 
-    monkeypatch.setattr("splatting.training.observers.network_viewer.frame_bytes", fail)
+    monkeypatch.setattr("splatting.training.observers.viewers.frame_bytes", fail)
     with Endless():
         viewer = Viewer(network_gui.port)
         viewer.say(valid())

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from splatting.files.lock import locked
-from splatting.files.temporary_files import remove_temporary_files
+from splatting.files.folders import locked, remove_temporary_files
 from splatting.training.output_folder import own_folder
 from utils.system_utils import UserError, atomic_write
 
@@ -90,7 +89,7 @@ def test_the_names_of_temporary_files_are_known(tmp_path, monkeypatch, name):
     with atomic_write(tmp_path / name) as temporary:
         temporary.touch()
         assert not remove_temporary_files(tmp_path)  # this process lives
-        monkeypatch.setattr("splatting.files.temporary_files._runs", lambda process: process != os.getpid())
+        monkeypatch.setattr("splatting.files.folders._runs", lambda process: process != os.getpid())
         assert remove_temporary_files(tmp_path) == [temporary]
         temporary.touch()
 

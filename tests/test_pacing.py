@@ -1,16 +1,16 @@
-"""Paced training: it ends when its seconds are over, goes through the whole schedule, and can be repeated."""
+"""Training by the clock: it ends when its seconds are over, goes through the whole schedule, and can be repeated."""
 
 import argparse
 import json
 import math
 import random
 import re
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from trainings import train_on
 
 import train
 from scene.gaussian_model import GaussianModel
@@ -19,39 +19,35 @@ from scene.gaussians.checkpoint import load_checkpoint
 from splatting.evaluation.training_log import Stopwatch
 from splatting.training import loop
 from splatting.training.observer import Announcer
-from splatting.training.observers import target
-from splatting.training.observers.progress import ProgressBar
-from splatting.training.observers.schedule import ScheduleFile
-from splatting.training.schedule.clocked import Clocked
-from splatting.training.schedule.pace import Block, Pace, Paced, Schedule, Settling
-from splatting.training.schedule.resolution import Resolution
-from splatting.training.schedule.schedule_file import read_schedule, write_schedule
+from splatting.training.observers import report
+from splatting.training.observers.report import ProgressBar
+from splatting.training.observers.saves import ScheduleFile
+from splatting.training.resolution import Resolution
+from splatting.training.schedule import Block, Decided, DecidedSchedule, Schedule, SettlingSchedule, TimeBudget
+from splatting.training.schedule_file import read_schedule, write_schedule
 from utils.system_utils import UserError
 
 OPTIONS = ["-r", 24, "--eval", "--no_curve", "--test_iterations", -1, "--densify_grad_threshold", 1e-4,
            "--densification_interval", 5, "--max_num_splats", 400, "--iterations", 3000]  # fmt: skip
 
 
-@pytest.fixture(autouse=True)
-def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
+def _fresh(length: int, budget: float) -> TimeBudget:
+    return TimeBudget(Decided(length, [], None, budget, levels=()))
 
 
-def _fresh(length: int, budget: float) -> Clocked:
-    return Clocked(Schedule(length, [], None, budget, levels=()))
-
-
-def _run(pace: Pace, cost: Callable[[int, int], float], first: int = 0, seconds: float = 0.0) -> tuple[int, float]:
-    """Take iterations of cost(iteration, nominal) seconds until the last: its number, and the seconds then."""
+def _run(
+    schedule: Schedule, cost: Callable[[int, int], float], first: int = 0, seconds: float = 0.0
+) -> tuple[int, float]:
+    """Take iterations of cost(iteration, step) seconds until the last: its number, and the seconds then."""
     iteration = first
-    while not iteration or not pace.is_last(iteration):
+    while not iteration or not schedule.is_last(iteration):
         iteration += 1
-        pace.reach(iteration, seconds)
-        seconds += cost(iteration, pace.nominal(iteration))
+        schedule.reach(iteration, seconds)
+        seconds += cost(iteration, schedule.schedule_step(iteration))
     return iteration, seconds
 
 
-def _noisy(iteration: int, nominal: int) -> float:
+def _noisy(iteration: int, step: int) -> float:
     return 0.01 * random.Random(iteration).uniform(0.5, 1.5)
 
 
@@ -67,30 +63,30 @@ COSTS = {
 }
 
 
-def _factors(pace: Pace, last: int) -> list[float]:
-    sizes = Resolution(pace, None)
-    return [sizes.factor_at(pace.nominal(t)) for t in range(1, last + 1)]
+def _factors(schedule: Schedule, last: int) -> list[float]:
+    sizes = Resolution(schedule, None)
+    return [sizes.factor_at(schedule.schedule_step(t)) for t in range(1, last + 1)]
 
 
 @pytest.mark.parametrize(("cost", "name"), [(0.02, "pyramid"), (0.005, "none")])
 def test_a_budget_of_few_iterations_takes_smaller_views_at_first(cost, name):
     """Its schedule repeats them, also those before the decision; a run that has begun otherwise stays as it is."""
-    pace = Clocked(Schedule(30_000, [], None, 30.0, "auto"))
+    schedule = TimeBudget(Decided(30_000, [], None, 30.0, "auto"))
     seen: list[float] = []
 
-    def seconds(iteration: int, nominal: int) -> float:
-        seen.append(Resolution(pace, None).factor_at(nominal))
+    def seconds(iteration: int, step: int) -> float:
+        seen.append(Resolution(schedule, None).factor_at(step))
         return cost / seen[-1]
 
-    last, _ = _run(pace, seconds)
-    recorded = pace.recorded(last, last=True)
-    assert recorded.resolution_schedule == pace.sizes == name and _factors(Paced(recorded), last) == seen
+    last, _ = _run(schedule, seconds)
+    recorded = schedule.recorded(last, last=True)
+    assert recorded.resolution_schedule == schedule.sizes == name and _factors(DecidedSchedule(recorded), last) == seen
     assert list(dict.fromkeys(seen)) == ([1.0, 4.0, 2.0] if name == "pyramid" else [1.0])  # at last whole again
     assert seen[0] == seen[-1] == 1.0
-    resumed = Clocked(Paced(recorded).up_to(last // 2)._replace(time_budget=30.0))
+    resumed = TimeBudget(DecidedSchedule(recorded).up_to(last // 2)._replace(time_budget=30.0))
     _run(resumed, lambda t, n: 0.1, first=last // 2, seconds=15.0)
-    assert resumed.levels == pace.levels
-    late = Clocked(Schedule(30_000, [Block(6_000, 0.0, 1 / 30_000, 0.0)], None, 30.0, "auto"))
+    assert resumed.levels == schedule.levels
+    late = TimeBudget(Decided(30_000, [Block(6_000, 0.0, 1 / 30_000, 0.0)], None, 30.0, "auto"))
     _run(late, lambda t, n: 0.1, first=6_000)
     assert late.levels == () and late.sizes == "none"
 
@@ -98,27 +94,27 @@ def test_a_budget_of_few_iterations_takes_smaller_views_at_first(cost, name):
 @pytest.mark.parametrize("budget", [5.0, 20.0])
 @pytest.mark.parametrize("name", COSTS)
 def test_it_ends_within_three_percent_and_goes_through_the_whole_schedule(name, budget):
-    pace = _fresh(30_000, budget)
-    last, seconds = _run(pace, COSTS[name])
+    schedule = _fresh(30_000, budget)
+    last, seconds = _run(schedule, COSTS[name])
     assert seconds == pytest.approx(budget, rel=0.03)
-    nominals = [pace.nominal(t) for t in range(last + 1)]
-    assert nominals == sorted(nominals) and nominals[0] == 0 and nominals[-1] == 30_000 > nominals[-2]
-    spans = [t for iteration in range(1, last + 1) for t in pace.span(iteration)]
+    steps = [schedule.schedule_step(t) for t in range(last + 1)]
+    assert steps == sorted(steps) and steps[0] == 0 and steps[-1] == 30_000 > steps[-2]
+    spans = [t for iteration in range(1, last + 1) for t in schedule.span(iteration)]
     assert spans == list(range(1, 30_001))  # each iteration of the schedule once
-    assert len(pace.blocks) < 420
+    assert len(schedule.blocks) < 420
 
 
 def test_progress_follows_the_seconds_that_are_left():
     """Half of the schedule is done in half of the seconds, also where iterations become dearer or start slowly."""
     for name in ("constant", "growth", "a slow start"):
-        pace, halfway = _fresh(30_000, 20.0), []
+        schedule, halfway = _fresh(30_000, 20.0), []
         seconds = 0.0
         for iteration in range(1, 100_000):
-            pace.reach(iteration, seconds)
-            if pace.nominal(iteration) >= 15_000:
+            schedule.reach(iteration, seconds)
+            if schedule.schedule_step(iteration) >= 15_000:
                 halfway.append(seconds)
                 break
-            seconds += COSTS[name](iteration, pace.nominal(iteration))
+            seconds += COSTS[name](iteration, schedule.schedule_step(iteration))
         assert halfway[0] == pytest.approx(10.0, abs=0.7), name
 
 
@@ -127,17 +123,17 @@ def test_progress_follows_the_seconds_that_are_left():
 )
 def test_lost_seconds_do_not_make_an_iteration_do_more_than_twice_its_part(capsys, at, lost, total):
     """Its part is a thousandth, as it takes 0.01 s of 10. What is left undone then takes half of its usual seconds."""
-    pace = _fresh(30_000, 10.0)
-    last, seconds = _run(pace, lambda t, n: 0.01 + lost * (t == at))
-    assert max(pace.stride(t) for t in range(1, last + 1)) <= 2 * 30_000 / 1000 * 1.001
-    assert pace.nominal(last) == 30_000 and len(pace.blocks) < 420
+    schedule = _fresh(30_000, 10.0)
+    last, seconds = _run(schedule, lambda t, n: 0.01 + lost * (t == at))
+    assert max(schedule.stride(t) for t in range(1, last + 1)) <= 2 * 30_000 / 1000 * 1.001
+    assert schedule.schedule_step(last) == 30_000 and len(schedule.blocks) < 420
     assert seconds == pytest.approx(total, abs=0.1)
     assert capsys.readouterr().err.count("so long that the training needs about") == (total > 10)
 
 
 def test_an_iteration_that_takes_longer_than_the_budget_is_followed_by_the_last(capsys):
-    pace = _fresh(30_000, 1.0)
-    assert _run(pace, lambda t, n: 5.0) == (2, 10.0)
+    schedule = _fresh(30_000, 1.0)
+    assert _run(schedule, lambda t, n: 5.0) == (2, 10.0)
     assert "--time_budget 1 is too short for 3 iterations" in capsys.readouterr().err
     assert _run(_fresh(1, 1.0), lambda t, n: 5.0)[0] == 2
     assert _run(_fresh(1, 1.0), lambda t, n: 0.1)[0] == 10
@@ -145,13 +141,13 @@ def test_an_iteration_that_takes_longer_than_the_budget_is_followed_by_the_last(
 
 
 def test_a_schedule_replays_every_iteration(tmp_path):
-    pace = _fresh(30_000, 5.0)
-    last, _ = _run(pace, _noisy)
-    write_schedule(tmp_path / "schedule.json", pace.recorded(last, True))
-    again = Paced(read_schedule(tmp_path / "schedule.json"))
+    schedule = _fresh(30_000, 5.0)
+    last, _ = _run(schedule, _noisy)
+    write_schedule(tmp_path / "schedule.json", schedule.recorded(last, True))
+    again = DecidedSchedule(read_schedule(tmp_path / "schedule.json"))
     assert again.ends == last and again.is_last(last) and not again.is_last(last - 1)
     for t in range(1, last + 1):
-        assert (again.span(t), again.stride(t)) == (pace.span(t), pace.stride(t))
+        assert (again.span(t), again.stride(t)) == (schedule.span(t), schedule.stride(t))
 
 
 def test_a_resumed_run_goes_on_from_its_place_with_the_seconds_that_are_left(tmp_path):
@@ -165,25 +161,25 @@ def test_a_resumed_run_goes_on_from_its_place_with_the_seconds_that_are_left(tmp
     write_schedule(tmp_path / "schedule.json", whole.recorded(at, False))
     before = read_schedule(tmp_path / "schedule.json")
     assert before.ended is None
-    pace = Clocked(before)
-    last, ended = _run(pace, lambda t, n: 2 * _noisy(t, n), at, seconds)
+    schedule = TimeBudget(before)
+    last, ended = _run(schedule, lambda t, n: 2 * _noisy(t, n), at, seconds)
     assert ended == pytest.approx(10.0, rel=0.03) and 250 < last - at < 350
-    assert [pace.span(t) for t in range(1, at + 1)] == [whole.span(t) for t in range(1, at + 1)]
-    assert pace.nominal(at + 1) - pace.nominal(at) < 200
-    late = Clocked(before)  # nothing is left
+    assert [schedule.span(t) for t in range(1, at + 1)] == [whole.span(t) for t in range(1, at + 1)]
+    assert schedule.schedule_step(at + 1) - schedule.schedule_step(at) < 200
+    late = TimeBudget(before)  # nothing is left
     assert _run(late, _noisy, at, 11.0)[0] == at + 1
 
 
 def test_the_end_of_a_repeated_schedule_is_known():
-    repeated = Paced(Schedule(100, [Block(20, 0.0, 0.05, 0.0)], 20, 9.0))
+    repeated = DecidedSchedule(Decided(100, [Block(20, 0.0, 0.05, 0.0)], 20, 9.0))
     assert repeated.known([50, 100]) == [20] and repeated.known([50]) == [] == _fresh(100, 9.0).known([50, 100])
 
 
-def test_the_steady_pace_changes_nothing():
-    pace = Pace(7)
-    assert [list(pace.span(t)) for t in range(1, 8)] == [[t] for t in range(1, 8)]
-    assert [t for t in range(1, 9) if pace.is_last(t)] == [7] and pace.is_over(7) and not pace.is_over(6)
-    assert pace.known([3, 7, 8]) == [3, 7]
+def test_the_steady_schedule_changes_nothing():
+    schedule = Schedule(7)
+    assert [list(schedule.span(t)) for t in range(1, 8)] == [[t] for t in range(1, 8)]
+    assert [t for t in range(1, 9) if schedule.is_last(t)] == [7] and schedule.is_over(7) and not schedule.is_over(6)
+    assert schedule.known([3, 7, 8]) == [3, 7]
 
 
 GOOD = {
@@ -239,13 +235,13 @@ def _options(**changed: object) -> argparse.Namespace:
 
 
 def test_windows_and_resets_are_of_the_schedule_and_densifications_of_the_run():
-    pace = Paced(Schedule(30_000, [Block(15_000, 0.0, 1 / 15_000, 0.0)], 15_000, 0.0))  # two at a time
-    todo = {t: rules.actions(t, _options(), False, pace.span(t), pace.stride(t)) for t in range(1, 15_001)}
+    schedule = DecidedSchedule(Decided(30_000, [Block(15_000, 0.0, 1 / 15_000, 0.0)], 15_000, 0.0))  # two at a time
+    todo = {t: rules.actions(t, _options(), False, schedule.span(t), schedule.stride(t)) for t in range(1, 15_001)}
     assert [t for t in todo if todo[t].densify] == list(range(300, 7500, 100))
     assert [t for t in todo if todo[t].reset_opacity] == [1500, 3000, 4500, 6000]
     assert min(t for t in todo if todo[t].limit_size) == 1501
     assert max(t for t in todo if todo[t].observe) == 7499
-    white = {t: rules.actions(t, _options(densify_from_iter=501), True, pace.span(t), 2.0) for t in range(1, 1000)}
+    white = {t: rules.actions(t, _options(densify_from_iter=501), True, schedule.span(t), 2.0) for t in range(1, 1000)}
     assert [t for t in white if white[t].reset_opacity] == [251]
 
 
@@ -264,9 +260,9 @@ def test_a_run_of_few_steps_still_densifies_twenty_times():
 def test_a_short_run_does_without_resets_that_it_would_not_recover_from():
     def resets(stride: int, **changed: int) -> int:
         count = 30_000 // stride
-        pace = Paced(Schedule(30_000, [Block(count, 0.0, 1 / count, 0.0)], count, 0.0))
+        schedule = DecidedSchedule(Decided(30_000, [Block(count, 0.0, 1 / count, 0.0)], count, 0.0))
         return sum(
-            rules.actions(t, _options(**changed), True, pace.span(t), pace.stride(t)).reset_opacity
+            rules.actions(t, _options(**changed), True, schedule.span(t), schedule.stride(t)).reset_opacity
             for t in range(1, count + 1)
         )
 
@@ -277,7 +273,7 @@ def test_a_short_run_does_without_resets_that_it_would_not_recover_from():
 
 @pytest.mark.parametrize("strategy", ["mcmc", "budget"])
 def test_strategies_grow_within_windows_of_the_schedule(colmap_scene, tmp_path, monkeypatch, strategy):
-    two_at_a_time = Schedule(120, [Block(60, 0.0, 1 / 60, 0.0)], 60, 9.0, levels=())
+    two_at_a_time = Decided(120, [Block(60, 0.0, 1 / 60, 0.0)], 60, 9.0, levels=())
     write_schedule(tmp_path / "two.json", two_at_a_time)
     counts, begins = [], ProgressBar.begins
 
@@ -299,7 +295,7 @@ def test_strategies_grow_within_windows_of_the_schedule(colmap_scene, tmp_path, 
 
 def test_few_steps_have_larger_rates(colmap_scene, tmp_path, monkeypatch):
     path = tmp_path / "few.json"
-    write_schedule(path, Schedule(120, [Block(60, 0.0, 1 / 60, 0.0)], 60, 9.0, levels=()))
+    write_schedule(path, Decided(120, [Block(60, 0.0, 1 / 60, 0.0)], 60, 9.0, levels=()))
     rates = _rates(monkeypatch, colmap_scene, tmp_path / "out", "--schedule", path, "--iterations", 120)
     assert len(rates) == 60
     before, later = rates[0], rates[30]  # those of an iteration are set after it is told
@@ -332,29 +328,22 @@ def _rates(monkeypatch: pytest.MonkeyPatch, scene: Path, out: Path, *words: obje
     return rates
 
 
-@pytest.mark.parametrize(("steps", "factor"), [(7000, 2 * math.sqrt(30 / 7)), (30_000, 2.0), (120_000, 1.0)])
-def test_steps_that_follow_the_number_of_iterations(steps, factor):
-    pace = Settling(steps)
-    assert pace.rate_factor(1) == pace.rate_factor(int(0.7 * steps)) == pytest.approx(factor)
-    assert pace.rate_factor(int(0.85 * steps)) == pytest.approx(0.55 * factor, abs=0.01 * factor)
-    assert pace.rate_factor(steps) == pytest.approx(0.1 * factor)
-
-
 @pytest.mark.parametrize("length", [30_000, 7000])
 @pytest.mark.parametrize(
-    ("steps", "factor"), [(3000, math.sqrt(40)), (15_000, math.sqrt(8)), (30_000, 2.0), (240_000, 1.0)]
+    ("steps", "factor"),
+    [(3000, math.sqrt(40)), (7000, 2 * math.sqrt(30 / 7)), (15_000, math.sqrt(8)), (30_000, 2.0), (240_000, 1.0)],
 )
 def test_rates_fall_to_a_tenth_at_the_end(length, steps, factor):
     """Whatever --iterations counts: the rates of a run follow the number of its own."""
-    pace = Paced(Schedule(length, [Block(steps, 0.0, 1 / steps, 0.0)], steps, 9.0, levels=()))
+    schedule = DecidedSchedule(Decided(length, [Block(steps, 0.0, 1 / steps, 0.0)], steps, 9.0, levels=()))
     percents = range(steps // 100, steps + 1, steps // 100)
-    factors = [pace.rate_factor(iteration) for iteration in percents]
+    factors = [schedule.rate_factor(iteration) for iteration in percents]
     held = int(0.7 * len(factors))
     assert factors[:held] == pytest.approx([factor] * held) and factors[-1] == pytest.approx(0.1 * factor)
     falling = factors[held:]
     assert falling == sorted(falling, reverse=True) and falling[0] > 0.98 * factor
-    assert pace.rate_factor(int(0.85 * steps)) == pytest.approx(0.55 * factor, abs=0.01 * factor)
-    assert factors == pytest.approx([Settling(steps).rate_factor(iteration) for iteration in percents])
+    assert schedule.rate_factor(int(0.85 * steps)) == pytest.approx(0.55 * factor, abs=0.01 * factor)
+    assert factors == pytest.approx([SettlingSchedule(steps).rate_factor(iteration) for iteration in percents])
 
 
 def _timed(monkeypatch: pytest.MonkeyPatch, cost: Callable[[int], float]) -> None:
@@ -383,9 +372,7 @@ def _timed(monkeypatch: pytest.MonkeyPatch, cost: Callable[[int], float]) -> Non
 
 
 def _train(scene: Path, out: Path, *more: object) -> dict[int, bytes]:
-    """Train; the PLYs by iteration."""
-    train.main(list(map(str, ["-s", scene, "-m", out, "--disable_viewer", *OPTIONS, *more])))
-    return {int(ply.parent.name[10:]): ply.read_bytes() for ply in out.glob("point_cloud/*/*.ply")}
+    return train_on(scene, out, "--disable_viewer", *OPTIONS, *more)
 
 
 def _last_record(out: Path) -> dict:
@@ -433,8 +420,8 @@ def test_a_short_training_by_the_clock_begins_with_smaller_views_and_replays(col
 
 
 def test_training_stops_at_the_target_with_the_model_that_was_scored(colmap_scene, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(target, "EVERY", 10)
-    monkeypatch.setattr(target, "PER_VIEW", 1)
+    monkeypatch.setattr(report, "EVERY", 10)
+    monkeypatch.setattr(report, "PER_VIEW", 1)
     whole, stopped, again = (tmp_path / name for name in ("whole", "stopped", "again"))
     more = "--iterations", 120, "--prune_sh", -1, "--keep_unseen", "--save_iterations", *range(10, 120, 10)
     saved = _train(colmap_scene, whole, *more, "--target_psnr", 99)
@@ -459,8 +446,8 @@ def test_training_stops_at_the_target_with_the_model_that_was_scored(colmap_scen
 
 
 def test_a_target_may_leave_an_earlier_models_last_iteration(colmap_scene, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(target, "EVERY", 5)
-    monkeypatch.setattr(target, "PER_VIEW", 1)
+    monkeypatch.setattr(report, "EVERY", 5)
+    monkeypatch.setattr(report, "PER_VIEW", 1)
     _train(colmap_scene, tmp_path, "--iterations", 20)
     assert "of an earlier training" not in capsys.readouterr().err
     assert set(_train(colmap_scene, tmp_path, "--iterations", 20, "--target_psnr", 1)) == {5, 20}
@@ -468,7 +455,7 @@ def test_a_target_may_leave_an_earlier_models_last_iteration(colmap_scene, tmp_p
 
 
 def test_a_repeated_schedule_names_its_own_resolution_schedule(colmap_scene, tmp_path, capsys):
-    schedule = Schedule(100, [Block(20, 0.0, 0.05, 0.0)], 20, 5.0, "pyramid", ((0.0, 4.0), (0.5, 1.0)))
+    schedule = Decided(100, [Block(20, 0.0, 0.05, 0.0)], 20, 5.0, "pyramid", ((0.0, 4.0), (0.5, 1.0)))
     write_schedule(tmp_path / "schedule.json", schedule)
     words = "--iterations", 100, "--schedule", tmp_path / "schedule.json"
     _train(colmap_scene, tmp_path / "out", *words, "--checkpoint_iterations", 50)
@@ -509,6 +496,7 @@ def test_what_contradicts_itself_is_refused(colmap_scene, tmp_path):
 
 def test_a_checkpoint_finds_its_place_or_is_refused(colmap_scene, tmp_path, monkeypatch, capsys):
     steady, clocked = tmp_path / "steady", tmp_path / "clocked"
+    _timed(monkeypatch, lambda t: 0.0)  # a busy machine's seconds would be missing below
     _train(colmap_scene, steady, "--iterations", 60, "--checkpoint_iterations", 30)
     start = "--start_checkpoint", steady / "chkpnt30.pth"
     _timed(monkeypatch, lambda t: 0.1)
@@ -543,11 +531,11 @@ def test_a_slow_start_does_not_end_a_short_run():
     assert seconds == pytest.approx(1.0, rel=0.03) and last > 300
 
 
-def test_a_paced_run_goes_through_rates_degrees_and_windows(colmap_scene, tmp_path, monkeypatch):
+def test_a_decided_run_goes_through_rates_degrees_and_windows(colmap_scene, tmp_path, monkeypatch):
     """40 iterations stand for 4000: the first tenth of the run for the first 400."""
     path, rates, seen = tmp_path / "schedule.json", [], []
     blocks = [Block(20, 0.0, 0.02, 0.0), Block(40, 0.4, 0.03, 0.0)]
-    write_schedule(path, Schedule(4000, blocks, 40, 0.0, levels=()))
+    write_schedule(path, Decided(4000, blocks, 40, 0.0, levels=()))
     update, begin = GaussianModel.update_learning_rate, GaussianModel.densify_and_prune
 
     def rate(self, iteration: int) -> float:
@@ -584,8 +572,8 @@ def test_a_checkpoint_comes_with_its_schedule_and_the_last_one_is_the_end(colmap
 
 
 def test_an_iteration_that_becomes_the_last_takes_no_step(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(target, "EVERY", 7)
-    monkeypatch.setattr(target, "PER_VIEW", 1)
+    monkeypatch.setattr(report, "EVERY", 7)
+    monkeypatch.setattr(report, "PER_VIEW", 1)
     states = []
     for name in ("fused", "plain"):
         more = ["--plain_step"] if name == "plain" else []
@@ -607,7 +595,7 @@ def test_a_steady_run_leaves_the_schedule_of_a_folder_where_it_goes_on(colmap_sc
     _train(colmap_scene, out, *more, late)
     assert "this one has none" in capsys.readouterr().err
     left = read_schedule(path)
-    assert left == Paced(before).up_to(on) and (left.ended, left.blocks[-1].last) == (None, on)
+    assert left == DecidedSchedule(before).up_to(on) and (left.ended, left.blocks[-1].last) == (None, on)
     with pytest.raises(UserError, match="is of a run that did not end"):
         _train(colmap_scene, tmp_path / "a", "--iterations", 60, "--schedule", path)
     # A checkpoint of the steady run is of no run with a budget, and one from before still is.
@@ -617,7 +605,7 @@ def test_a_steady_run_leaves_the_schedule_of_a_folder_where_it_goes_on(colmap_sc
     with pytest.raises(UserError, match=f"ends before iteration {on + 10} of .*, so it is of another run"):
         _train(colmap_scene, tmp_path / "b", "--iterations", 60, "--time_budget", 5, "--start_checkpoint", steady)
     _train(colmap_scene, out, "--iterations", 60, "--time_budget", 5, "--start_checkpoint", early)
-    first = Paced(before).up_to(int(early.stem[6:])).blocks
+    first = DecidedSchedule(before).up_to(int(early.stem[6:])).blocks
     assert read_schedule(path).blocks[: len(first)] == first and len(first) > 3
 
 
@@ -649,7 +637,7 @@ def test_a_late_reset_of_a_run_with_a_time_budget(colmap_scene, tmp_path, monkey
 def test_a_late_reset_of_a_recorded_schedule_counts_its_own_iterations(colmap_scene, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(rules, "RECOVERY", 50)
     blocks = [Block(200, 0.0, 1 / 200, 0.0)]  # 18 iterations of the schedule at a time
-    write_schedule(tmp_path / "schedule.json", Schedule(3600, blocks, 200, 20.0, levels=()))
+    write_schedule(tmp_path / "schedule.json", Decided(3600, blocks, 200, 20.0, levels=()))
     words = "--iterations", 3600, "--schedule", tmp_path / "schedule.json", "--densify_until_iter", 3500
     _train(colmap_scene, tmp_path / "a", *words, "--opacity_reset_interval", 3000)
     told = "opacities are reset in iteration 167, and 33 iterations are too few to recover from that; change --opacity_"

@@ -12,8 +12,8 @@ from test_masks import masked_scene  # noqa: F401  (a fixture)
 import train
 from scene.gaussians.density_rules import actions
 from splatting.distributed.ranks import ranks
-from splatting.training.schedule.batched import Batched
-from splatting.training.view_order import ViewOrder
+from splatting.training.iteration import ViewOrder
+from splatting.training.schedule import BatchSchedule
 from utils.system_utils import UserError
 
 EVERYTHING = (
@@ -114,10 +114,10 @@ def test_batches_of_views_can_be_resumed_by_as_many_ranks(masked_scene, tmp_path
 
 
 def test_a_batch_goes_through_the_schedule_by_views():
-    pace = Batched(30_000, 4)
-    assert pace.ends == 7500 and pace.nominal(7500) == 30_000 and list(pace.span(2)) == [5, 6, 7, 8]
+    pace = BatchSchedule(30_000, 4)
+    assert pace.ends == 7500 and pace.schedule_step(7500) == 30_000 and list(pace.span(2)) == [5, 6, 7, 8]
     assert pace.rate_factor(1) == 2.0 and pace.known([7000, 30_000, 40_000]) == [1750, 7500]
-    assert Batched(10, 4).ends == 3 and list(Batched(10, 4).span(3)) == [9, 10]
+    assert BatchSchedule(10, 4).ends == 3 and list(BatchSchedule(10, 4).span(3)) == [9, 10]
     opt = options(densify_until_iter=15_000)
     found = [t for t in range(1, 7501) if actions(t, opt, False, pace.span(t), 4.0, 4).densify]
     assert found[:2] == [150, 175] and found[-1] == 3725  # every 100 views

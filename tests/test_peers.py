@@ -7,14 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from matplotlib.figure import Figure
 
 from splatting.evaluation import peer_curve
-from splatting.evaluation.error_curve import COLUMNS as OURS
-from splatting.evaluation.error_curve import write_curve
-from splatting.evaluation.figures import draw_curves
-from splatting.evaluation.peers import COLUMNS, peers_of, read_peer, write_peer
-from splatting.evaluation.tensorboard_scalars import read_scalars
+from splatting.evaluation.error_curve import COLUMNS, PEER_COLUMNS, peers_of, read_peer, write_curve, write_peer
+from splatting.evaluation.peer_curve import read_scalars
 from utils.system_utils import UserError
 
 
@@ -27,18 +23,15 @@ def written(path: Path, *lines: str) -> Path:
 def test_a_curve_may_have_few_columns_in_any_order(tmp_path):
     file = written(tmp_path / "a.csv", "test_psnr,colour,seconds", "21.5,red,20", "", "20.0,,7")
     rows = read_peer(file)
-    assert [set(row) for row in rows] == [set(COLUMNS)] * 2
+    assert [set(row) for row in rows] == [set(PEER_COLUMNS)] * 2
     assert [(row["seconds"], row["test_psnr"], row["test_ssim"]) for row in rows] == [(7, 20, None), (20, 21.5, None)]
     write_peer(tmp_path / "b.csv", rows)
     assert (tmp_path / "b.csv").read_text() == "seconds,test_psnr\n7,20\n20,21.5\n"
     assert read_peer(tmp_path / "b.csv") == rows
 
-
-def test_a_curve_of_train_py_is_one(tmp_path):
-    row = dict.fromkeys(OURS) | {"iteration": 7, "seconds": 1.5, "test_psnr": 20.0, "gaussians": 5}
-    write_curve(tmp_path / "a.csv", [row])
-    (found,) = read_peer(tmp_path / "a.csv")
-    assert {name: found[name] for name in row if name in found} == {name: row[name] for name in row if name in found}
+    ours = dict.fromkeys(COLUMNS) | {"iteration": 7, "seconds": 1.5, "test_psnr": 20.0, "gaussians": 5}
+    write_curve(tmp_path / "a.csv", [ours])  # a curve of train.py is one
+    assert read_peer(tmp_path / "a.csv") == [{name: ours.get(name) for name in PEER_COLUMNS}]
 
 
 @pytest.mark.parametrize(
@@ -70,22 +63,6 @@ def test_a_peer_belongs_to_a_scene(tmp_path):
             peers_of([[name, str(file)] for name in names], ["attic", "brick"])
     with pytest.raises(UserError, match="is given twice"):
         peers_of([["other", str(file)]] * 2, ["attic"])
-
-
-def test_a_peer_is_drawn_beside_ours_and_is_in_no_front(tmp_path, monkeypatch):
-    figures, plain = [], Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (figures.append(self), plain(self, *a, **k)))
-    points = (1.0, 20.0, 0.6), (9.0, 25.0, 0.8)
-    curve = [dict.fromkeys(OURS) | dict(zip(("seconds", "test_psnr", "test_ssim"), row, strict=True)) for row in points]
-    runs = [{"apart": False, "config": name, "curve": curve} for name in ("base", "sh1")]
-    best = [dict.fromkeys(COLUMNS) | {"seconds": 0.5, "test_psnr": 40.0}]  # would be the whole front
-    assert draw_curves(tmp_path / "a.png", "attic", runs, [{"name": "other", "curve": best}])
-    left, right = figures[0].axes
-    lines = {line.get_label(): line.get_xydata().tolist() for line in left.lines}
-    assert lines["other (another program)"] == [[0.5, 40.0]] and [0.5, 40.0] not in lines["Pareto front"]
-    said = [axes.get_xlabel().endswith("(other programs: as they count)") for axes in (left, right)]
-    assert said == [True, False]  # it has no SSIM
-    assert "other (another program)" not in [line.get_label() for line in right.lines]
 
 
 def _result_of_gsplat(folder: Path) -> Path:

@@ -15,14 +15,13 @@ from scene.gaussians.exposure import read_pretrained
 from scene.images.decode import picture_size
 from scene.readers.point_cloud import read_point_cloud
 from splatting.camera_paths.keyframes import read_camera_path
-from splatting.camera_paths.request import path_maker
+from splatting.camera_paths.render_path import path_maker
 from splatting.evaluation.configs import read_configs
-from splatting.evaluation.error_curve import read_curve
-from splatting.evaluation.peers import read_peer
+from splatting.evaluation.error_curve import read_curve, read_peer
 from splatting.evaluation.training_log import read_log
+from splatting.files.image_files import read_plane
 from splatting.files.plain_files import MOST
-from splatting.files.plane_files import read_plane
-from splatting.training.schedule.schedule_file import read_schedule
+from splatting.training.schedule_file import read_schedule
 from utils.lpips_utils import _load_state
 from utils.system_utils import UserError
 

@@ -14,7 +14,7 @@ import train
 from scene import Scene
 from scene.gaussians.adam import GaussianAdam, undecorated
 from scene.images import store
-from splatting.host import cuda_start
+from splatting.host import start
 from splatting.training import run as training_run
 
 ROOT = Path(__file__).parents[1]
@@ -29,12 +29,6 @@ import train
 train.main(sys.argv[2:])
 print("loaded:", *sorted(set(sys.argv[1].split(",")) & (set(sys.modules) - before)), file=sys.__stdout__)
 """
-
-
-@pytest.fixture(autouse=True)
-def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Restore stdout, which training stamps and may silence."""
-    monkeypatch.setattr(sys, "stdout", sys.stdout)
 
 
 def _train(scene: Path, out: Path, *more: object, iterations: int = 3) -> dict:
@@ -173,23 +167,23 @@ def test_the_gpus_context_is_made_in_a_thread(monkeypatch, driver, calls):
             raise OSError("no such library")
         return driver
 
-    monkeypatch.setattr(cuda_start.ctypes, "CDLL", load)
-    monkeypatch.setattr(cuda_start, "_computes_on_a_gpu", lambda: True)
-    thread = cuda_start.begin()
+    monkeypatch.setattr(start.ctypes, "CDLL", load)
+    monkeypatch.setattr(start, "_computes_on_a_gpu", lambda: True)
+    thread = start.begin_cuda()
     thread.join()
     assert driver is None or driver.calls == calls
     assert not thread.daemon  # the driver must not be left in the middle of it
 
 
 def test_an_installation_for_the_cpu_leaves_the_driver_alone(monkeypatch):
-    monkeypatch.setattr(cuda_start, "_computes_on_a_gpu", lambda: False)
-    assert cuda_start.begin() is None
+    monkeypatch.setattr(start, "_computes_on_a_gpu", lambda: False)
+    assert start.begin_cuda() is None
 
 
 def test_what_was_built_with_cuda_is_known_before_torch_is_there(tmp_path):
     """In a fresh process, as the extension is found without being imported."""
-    code = "import sys\nfrom splatting.host import cuda_start\n"
-    code += "print(cuda_start._computes_on_a_gpu(), 'torch' in sys.modules)"
+    code = "import sys\nfrom splatting.host import start\n"
+    code += "print(start._computes_on_a_gpu(), 'torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     from diff_gaussian_rasterization import has_cuda_kernels
 

@@ -23,7 +23,8 @@ from arguments import ModelParams, read_cfg_args, read_model_json, write_cfg_arg
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
-from scene.readers.colmap_model import read_model, read_sightings
+from scene.readers.colmap import read_model, read_model_of_kind
+from scene.readers.depth_scale import sightings
 from scene.readers.point_cloud import read_point_cloud, write_point_cloud
 from utils.system_utils import UserError
 
@@ -209,14 +210,15 @@ def test_colmap_model(colmap_files, name, suffix, data):
     try:
         path.write_bytes(data.draw(damaged(whole)))
         model = ends_well(lambda: read_model(path.parent))
-        sightings = ends_well(lambda: read_sightings(path.parent, suffix))
+        whole_model = ends_well(lambda: read_model_of_kind(path.parent, suffix, with_2d_points=True))
     finally:
         path.write_bytes(whole)
     if model is not None:
-        assert model.points.shape == model.colors.shape and model.colors.dtype == np.uint8
-        assert all(view.rotation.shape == (3, 3) and view.translation.shape == (3,) for view in model.views)
-    if sightings is not None:
-        assert all(len(seen.pixels) == len(seen.depths) for seen in sightings)
+        assert model.points.xyz.shape == model.points.rgb.shape == (len(model.points.ids), 3)
+        assert all(image.qvec.shape == (4,) and image.tvec.shape == (3,) for image in model.images)
+    for image in whole_model.images if whole_model else ():
+        seen = ends_well(lambda image=image: sightings(image, whole_model.points, "the model"))
+        assert seen is None or len(seen[0]) == len(seen[1])
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 import argparse
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,7 +24,7 @@ from gaussian_renderer.free_view import free_view
 from splatting.camera_paths import render_path, video
 from splatting.camera_paths.keyframes import CameraPath, Keyframe
 from splatting.camera_paths.poses import poses_of
-from splatting.camera_paths.video import video_writer
+from splatting.camera_paths.video import write_video
 from utils.system_utils import UserError
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="no imageio-ffmpeg: pip install '.[video]'")
@@ -42,21 +43,12 @@ def decoded(path: Path) -> tuple[dict, list[np.ndarray]]:
     return known, [np.frombuffer(data, np.uint8).reshape(height, width, 3) for data in frames]
 
 
-@pytest.fixture(scope="session")
-def _model_master(tmp_path_factory: pytest.TempPathFactory, _colmap_master: Path) -> Path:
-    folder = tmp_path_factory.mktemp("paths") / "model"
-    model(60, seed=3).save_ply(str(folder / "point_cloud" / "iteration_7" / "point_cloud.ply"))
-    (folder / "cfg_args").write_text(f"Namespace(sh_degree=3, source_path={str(_colmap_master)!r}, eval=True)")
-    return folder
-
-
 @pytest.fixture
-def out(tmp_path: Path, _model_master: Path) -> Path:
+def out(tmp_path: Path, _colmap_master: Path) -> Path:
     """A model folder with 60 Gaussians."""
     folder = tmp_path / "model"
-    (folder / "point_cloud").parent.mkdir()
-    (folder / "point_cloud").symlink_to(_model_master / "point_cloud")
-    (folder / "cfg_args").write_bytes((_model_master / "cfg_args").read_bytes())
+    model(60, seed=3).save_ply(str(folder / "point_cloud" / "iteration_7" / "point_cloud.ply"))
+    (folder / "cfg_args").write_text(f"Namespace(sh_degree=3, source_path={str(_colmap_master)!r}, eval=True)")
     return folder
 
 
@@ -100,13 +92,13 @@ def patches(count: int, width: int = 64, height: int = 48) -> Iterator[np.ndarra
 def test_the_video_of_a_file_shows_its_frames(run, tmp_path, capsys):
     PATH.write(tmp_path / "my tour.json")
     folder = run("--path", tmp_path / "my tour.json", "--fps", 20, "--frames")
-    pictures = [f"my tour/{n:05d}.png" for n in range(21)]
-    assert written(folder) == ["my tour.mp4", *pictures]
+    names = [f"my tour/{n:05d}.png" for n in range(21)]
+    assert written(folder) == ["my tour.mp4", *names]
     known, frames = decoded(folder / "my tour.mp4")
     assert (known["fps"], known["size"], known["duration"]) == (20, (96, 64), 1.05)
     assert known["codec"] == "h264" and known["pix_fmt"] == "yuv420p(tv, bt709, progressive)"
     assert len(frames) == 21
-    scores = [psnr(frame, read(folder / name)) for frame, name in zip(frames, pictures, strict=True)]
+    scores = [psnr(frame, read(folder / name)) for frame, name in zip(frames, names, strict=True)]
     assert min(scores) >= 35, scores
     assert "my tour.mp4: 21 frames of 96 x 64, 1.05 s, " in capsys.readouterr().out
     assert not any((folder.parents[1] / name).exists() for name in ("train", "test"))
@@ -118,9 +110,7 @@ def test_a_second_decoder_sees_neither_levels_nor_colours_shifted(tmp_path, monk
     monkeypatch.setattr(video, "CRF", 1)
     columns, rows = np.meshgrid(np.arange(96), np.arange(64))
     given = np.stack([2 * columns, 40 + 0 * rows, 3 * rows], axis=-1).astype(np.uint8)
-    with video_writer(tmp_path / "a.mp4", 96, 64, 24) as writer:
-        for _ in range(12):
-            writer.write(given)
+    write_video(tmp_path / "a.mp4", [given] * 12, 96, 64, 24)
     with av.open(str(tmp_path / "a.mp4")) as container:
         stream = container.streams.video[0]
         assert (stream.average_rate, stream.frames, stream.duration * stream.time_base) == (24, 12, 0.5)
@@ -145,11 +135,8 @@ def test_each_generated_path_has_its_name_size_and_length(run, name, size, count
     known, frames = decoded(folder / f"{name}.mp4")
     assert known["size"] == (size or (96, 64)) and len(frames) == count
     assert np.std(frames[0]) > 5 and written(folder) == [f"{name}.mp4"]  # something is seen
-
-
-@pytest.mark.parametrize(("size", "even"), [((97, 64), (96, 64)), ((96, 65), (96, 64)), ((1, 1), (2, 2))])
-def test_the_size_of_odd_photos_is_made_even(size, even):
-    assert render_path.even_size(SimpleNamespace(image_width=size[0], image_height=size[1])) == even
+    for odd, even in (((97, 64), (96, 64)), ((96, 65), (96, 64)), ((1, 1), (2, 2))):
+        assert render_path.even_size(SimpleNamespace(image_width=odd[0], image_height=odd[1])) == even
 
 
 def test_the_background_is_the_models_and_exposures_are_not_applied(run, out, tmp_path, _colmap_master):
@@ -220,52 +207,46 @@ def test_memory_does_not_grow_with_the_length(run, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("--fps", "5"), "^--fps is for a path; leave it out, or pass --path, too$"),
-        (("--path", "ellipse", "--depth"), "^--depth is for the train and test views; leave it out, or --path$"),
-        (("--path", "ellipse", "--fps", "0"), "^--fps must be 1 to 240, got 0$"),
-        (("--path", "ellipse", "--fps", "241"), "^--fps must be 1 to 240, got 241$"),
-        (("--path", "ellipse", "--size", "401", "300"), "odd side.* use --size 400 300$"),
-        (("--path", "ellipse", "--size", "0", "4"), "^--size must be two even numbers of 2 to 16384 pixels, got 0 4$"),
-        (("--path", "ellipse", "--size", "4", "16386"), "^--size must be two even numbers"),
-        (("--path", "ellipse", "--seconds", "0"), "^--seconds must be 0.1 to 3600, got 0$"),
-        (("--path", "ellipse", "--seconds", "nan"), "^--seconds must be 0.1 to 3600, got nan$"),
+        ("--fps 5", "^--fps is for a path; leave it out, or pass --path, too$"),
+        ("--path ellipse --depth", "^--depth is for the train and test views; leave it out, or --path$"),
+        ("--path ellipse --fps 0", "^--fps must be 1 to 240, got 0$"),
+        ("--path ellipse --fps 241", "^--fps must be 1 to 240, got 241$"),
+        ("--path ellipse --size 401 300", "odd side.* use --size 400 300$"),
+        ("--path ellipse --size 0 4", "^--size must be two even numbers of 2 to 16384 pixels, got 0 4$"),
+        ("--path ellipse --size 4 16386", "^--size must be two even numbers"),
+        ("--path ellipse --seconds 0", "^--seconds must be 0.1 to 3600, got 0$"),
+        ("--path ellipse --seconds nan", "^--seconds must be 0.1 to 3600, got nan$"),
+        ("--path elipse", "^--path must be interpolate, ellipse, spiral or a file of keyframes; there is no file"),
+        ("--path=", "^--path must be .*there is no file $"),
+        ("--path " + "x" * 5000, "^--path must be .*there is no file xxx"),
+        ("--path spiral", "^--path spiral needs training cameras that face one way"),
+        ("--path broken.json", "broken.json is not JSON"),
         (
-            ("--path", "elipse"),
-            "^--path must be interpolate, ellipse, spiral or a file of keyframes; there is no file",
+            "--path good.json --seconds 3",
+            "^--seconds is for interpolate, ellipse, spiral; the times of .* stand in it$",
         ),
-        (("--path", ""), "^--path must be .*there is no file $"),
-        (("--path", "x" * 5000), "^--path must be .*there is no file xxx"),
-        (("--path", "spiral"), "^--path spiral needs training cameras that face one way"),
+        ("--path 4000.json", "lasts 4000 s, and a path lasts 0.1 to 3600; give the keyframes'"),
+        ("--path 5e-324.json", "lasts 4.94066e-324 s, and a path lasts 0.1 to 3600; give the keyframes'"),
     ],
-    ids=lambda value: " ".join(value)[:40] if isinstance(value, tuple) else "",
+    ids=lambda value: value[:40],
 )
-def test_a_wrong_option_is_refused(run, out, words, sentence):
+def test_a_wrong_option_or_file_is_refused(run, out, tmp_path, monkeypatch, words, sentence):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "broken.json").write_text("{")
+    for name, seconds in (("good", 1.0), ("4000", 4000.0), ("5e-324", 5e-324)):
+        keyframes = PATH.keyframes[0], replace(PATH.keyframes[-1], seconds=seconds)
+        CameraPath(keyframes).write(tmp_path / f"{name}.json")
     before = written(out)
     with pytest.raises(UserError, match=sentence) as refused:
-        run(*words)
+        run(*words.split())
     assert "\n" not in str(refused.value) and written(out) == before
-
-
-def test_a_wrong_file_is_refused(run, out, tmp_path):
-    file = tmp_path / "path.json"
-    file.write_text("{")
-    with pytest.raises(UserError, match="path.json is not JSON"):
-        run("--path", file)
-    PATH.write(file)
-    with pytest.raises(UserError, match="^--seconds is for interpolate, ellipse, spiral; the times of .* stand in it$"):
-        run("--path", file, "--seconds", 3)
-    for seconds in (4000.0, 5e-324):
-        CameraPath((PATH.keyframes[0], replace(PATH.keyframes[-1], seconds=seconds))).write(file)
-        with pytest.raises(UserError, match=f"lasts {seconds:g} s, and a path lasts 0.1 to 3600; give the keyframes'"):
-            run("--path", file)
-    assert not (out / "videos").exists()
 
 
 def test_a_missing_ffmpeg_is_said_before_the_model_is_read(run, out, tmp_path, monkeypatch):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "none"))
     with pytest.raises(UserError, match=r"^cannot start .*none \(No such file or directory\); `pip install "):
         run("--path", "ellipse")
-    (out / "point_cloud").unlink()
+    shutil.rmtree(out / "point_cloud")
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: (_ for _ in ()).throw(RuntimeError("No ffmpeg exe")))
     with pytest.raises(UserError, match="has no ffmpeg program for this machine; install ffmpeg, and name it in"):
         run("--path", "ellipse")
@@ -316,13 +297,17 @@ def test_a_video_that_cannot_be_placed_is_refused(run, out):
     assert written(out / "videos") == []
 
 
-def test_an_interrupted_video_leaves_nothing(tmp_path):
+def test_an_interrupted_video_leaves_nothing(tmp_path, monkeypatch):
     started: list[subprocess.Popen] = []
-    with pytest.raises(KeyboardInterrupt), video_writer(tmp_path / "a.mp4", 64, 48, 30) as writer:
-        started.append(writer._process)
-        for frame in patches(3):
-            writer.write(frame)
+    popen = subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", lambda *a, **k: (started.append(popen(*a, **k)), started[0])[1])
+
+    def frames() -> Iterator[np.ndarray]:
+        yield from patches(3)
         raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_video(tmp_path / "a.mp4", frames(), 64, 48, 30)
     assert started[0].returncode is not None and list(tmp_path.iterdir()) == []
 
 
@@ -343,8 +328,6 @@ def test_a_command_that_is_told_to_end_leaves_no_file(out, sent):
 def test_names_that_ffmpeg_would_take_for_something_else(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("-y.mp4", "a:b.mp4", "pipe:1.mp4", "%d.mp4", "ä ü.mp4"):
-        with video_writer(Path(name), 64, 48, 30) as writer:
-            for frame in patches(2):
-                writer.write(frame)
+        write_video(Path(name), patches(2), 64, 48, 30)
         assert len(decoded(Path.cwd() / name)[1]) == 2
     assert len(list(tmp_path.iterdir())) == 5

@@ -1,7 +1,6 @@
 """Coarse to fine: smaller views, their pictures, and when they are taken."""
 
 import argparse
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,26 +8,20 @@ import pytest
 import torch
 from gaussians import pipeline
 from PIL import Image
+from trainings import train_on
 
-import train
 from arguments import ModelParams
 from gaussian_renderer import render
 from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from scene.images.in_memory import InMemory
-from scene.images.shrink import shrink_mask, shrink_photo, shrink_values
-from scene.views.view import View
+from scene.images.sizes import shrink_mask, shrink_photo, shrink_values
+from scene.images.store import InMemory
+from scene.readers.info import CameraInfo
 from splatting.training import loop
-from splatting.training.schedule.pace import PYRAMID, Pace
-from splatting.training.schedule.resolution import Resolution, smaller
-from splatting.training.schedule.spectrum import FACTORS, UNTIL, levels_of
+from splatting.training.resolution import FACTORS, LEVELS, UNTIL, Resolution, smaller, spectrum_levels
+from splatting.training.schedule import PYRAMID, Schedule
 from utils.system_utils import UserError
-
-
-@pytest.fixture(autouse=True)
-def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
 
 
 def _scene(folder: Path, out: Path, **options: object) -> tuple[Scene, GaussianModel]:
@@ -39,11 +32,11 @@ def _scene(folder: Path, out: Path, **options: object) -> tuple[Scene, GaussianM
     return Scene(args, gaussians, shuffle=False), gaussians
 
 
-def _pace(length: int) -> Pace:
-    """A steady pace with smaller views at first."""
-    pace = Pace(length)
-    pace.levels = PYRAMID
-    return pace
+def _schedule(length: int) -> Schedule:
+    """A steady schedule with smaller views at first."""
+    schedule = Schedule(length)
+    schedule.levels = PYRAMID
+    return schedule
 
 
 def _slow_average(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -136,7 +129,7 @@ def test_masks_depth_maps_and_columns_are_smaller_too(colmap_scene, tmp_path):
 def test_levels_are_of_the_schedule_and_small_views_stay():
     levels = ((0.0, 4.0), (0.1, 2.0), (0.25, 1.0))
     assert levels == PYRAMID
-    sizes = Resolution(_pace(1000), None)
+    sizes = Resolution(_schedule(1000), None)
     factors = [sizes.factor_at(t) for t in range(1, 1001)]
     assert [factors.index(f) + 1 for f in (4.0, 2.0, 1.0)] == [1, 100, 250] and factors == sorted(factors)[::-1]
     assert [t for t in range(2, 1001) if sizes.changes(t - 1, t)] == [100, 250]
@@ -148,42 +141,43 @@ def test_levels_are_of_the_schedule_and_small_views_stay():
 def test_views_are_made_once_a_level_and_assigned_pictures_are_left_alone(colmap_scene, tmp_path):
     scene, _ = _scene(colmap_scene, tmp_path, resolution=1)
     first, second, third = scene.getTrainCameras()[:3]
-    sizes = Resolution(_pace(1000), scene.images)
+    sizes = Resolution(_schedule(1000), scene.images)
     third.original_image = torch.zeros(3, 64, 96)
     small = sizes.view(first, 1)
     assert small._size == (48, 32) and small is sizes.view(first, 2) and sizes.view(third, 2) is third
     assert not sizes.needs(first) and sizes.needs(second)
     assert sizes.view(first, 250) is first and sizes.needs(first)
     limited, _ = _scene(colmap_scene, tmp_path / "limited", resolution=1, images_to_load=3)
-    sizes, view = Resolution(_pace(1000), limited.images), limited.getTrainCameras()[0]
+    sizes, view = Resolution(_schedule(1000), limited.images), limited.getTrainCameras()[0]
     assert sizes.view(view, 1) is not sizes.view(view, 1) and sizes.needs(view)
 
 
 def _photo(cycles: float, depth: InMemory | None = None) -> Camera:
     """A view whose photo is a wave of so many cycles per pixel."""
     wave = torch.sin(2 * torch.pi * cycles * torch.arange(96).float()).expand(3, 64, 96) / 4 + 0.5
-    given = {"source": InMemory(wave.contiguous()), "depth": depth, "depth_reliable": depth is not None}
-    return Camera(View(0, 0, np.eye(3), np.zeros(3), 1.0, 1.0, "a", (96, 64), **given))
+    place = {"uid": 0, "R": np.eye(3), "T": np.zeros(3), "FovX": 1.0, "FovY": 1.0, "width": 96, "height": 64}
+    info = CameraInfo(**place, image_name="a", image=InMemory(wave.contiguous()), depth=depth)
+    return Camera(info, (96, 64), 0)
 
 
 def test_a_factor_beyond_all_sizes_makes_the_smallest_views(colmap_scene, tmp_path):
     scene, _ = _scene(colmap_scene, tmp_path, resolution=1)
-    pace = _pace(10)
-    pace.levels = ((0.0, 1e300),)
-    assert Resolution(pace, scene.images).view(scene.getTrainCameras()[0], 1)._size == (48, 32)
+    schedule = _schedule(10)
+    schedule.levels = ((0.0, 1e300),)
+    assert Resolution(schedule, scene.images).view(scene.getTrainCameras()[0], 1)._size == (48, 32)
 
 
 def test_levels_by_the_spectrum_last_as_long_as_they_keep_detail():
     # Kept by the factors 4, 3, 2, 1.5, 1: cycles up to 1/8, 1/6, 1/4, 1/3, 1/2.
-    assert levels_of([_photo(1 / 12)]) == ((0.0, 4.0), (UNTIL, 1.0))
-    assert levels_of([_photo(3 / 8)]) == ((0.0, 1.0),)
-    assert levels_of([_photo(1 / 12), _photo(3 / 16)]) == ((0.0, 4.0), (0.5 * UNTIL, 2.0), (UNTIL, 1.0))
+    assert spectrum_levels([_photo(1 / 12)]) == ((0.0, 4.0), (UNTIL, 1.0))
+    assert spectrum_levels([_photo(3 / 8)]) == ((0.0, 1.0),)
+    assert spectrum_levels([_photo(1 / 12), _photo(3 / 16)]) == ((0.0, 4.0), (0.5 * UNTIL, 2.0), (UNTIL, 1.0))
     flat = _photo(0.0)
-    assert levels_of([flat]) == ((0.0, 4.0), (UNTIL, 1.0)) and levels_of([]) == ()
+    assert spectrum_levels([flat]) == ((0.0, 4.0), (UNTIL, 1.0)) and spectrum_levels([]) == ()
     generator = torch.Generator().manual_seed(0)
     noise = _photo(0.0)
     noise._source.pixels.copy_(torch.rand(3, 64, 96, generator=generator))
-    starts = dict((factor, start) for start, factor in levels_of([noise]))
+    starts = dict((factor, start) for start, factor in spectrum_levels([noise]))
     assert list(starts) == list(FACTORS)
     for factor, after in zip(FACTORS, FACTORS[1:], strict=False):  # white noise: as much as there are frequencies
         assert starts[after] == pytest.approx(UNTIL / factor**2, abs=0.03)
@@ -194,8 +188,7 @@ OPTIONS = ["--eval", "--no_curve", "--test_iterations", -1, "--iterations", 60, 
 
 
 def _train(scene: Path, out: Path, *more: object) -> dict[int, bytes]:
-    train.main(list(map(str, ["-s", scene, "-m", out, "--disable_viewer", *OPTIONS, *more])))
-    return {int(ply.parent.name[10:]): ply.read_bytes() for ply in out.glob("point_cloud/*/*.ply")}
+    return train_on(scene, out, "--disable_viewer", *OPTIONS, *more)
 
 
 @pytest.mark.parametrize("schedule", ["pyramid", "spectrum"])
@@ -229,5 +222,5 @@ def test_exposures_and_depths_are_trained_on_smaller_views(colmap_scene, tmp_pat
 
 
 def test_a_wrong_resolution_schedule_is_refused(colmap_scene, tmp_path):
-    with pytest.raises(UserError, match="^--resolution_schedule must be auto or none or pyramid or spectrum"):
+    with pytest.raises(UserError, match=f"^--resolution_schedule must be {' or '.join(['auto', *LEVELS])}"):
         _train(colmap_scene, tmp_path, "--resolution_schedule", "fine")

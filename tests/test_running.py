@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # Prints the seconds that the clock counts for each line that it reads.
 CLOCK = """
 import sys
-from splatting.host.running import running_seconds
+from splatting.host.clock import running_seconds
 WORK = {"hold the lock": lambda: sum(range(2 * 10**8)), "read": input}
 began = running_seconds()
 print("ready", flush=True)

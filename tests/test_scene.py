@@ -22,7 +22,7 @@ from arguments import ModelParams
 from scene import Scene
 from scene.dataset_readers import read_scene, sceneLoadTypeCallbacks
 from scene.gaussian_model import GaussianModel
-from splatting.files.model_json import OFFSET
+from splatting.files.json_files import OFFSET
 from splatting.training import run
 from utils.system_utils import UserError
 

@@ -130,7 +130,7 @@ def _budget(gaussians: GaussianModel) -> None:
         SimpleNamespace(gaussians=gaussians, opt=opt, scene=scene, pipe=None, dataset=SimpleNamespace(train_test_exp=0))
     )
     scores = "scores"
-    density._scores.of_views = lambda *_: _random(gaussians, scores).double().clamp_min(0.0)
+    density._scores = lambda *_: _random(gaussians, scores).double().clamp_min(0.0)
     _train(gaussians, density)
     density.most_gaussians = gaussians.total - 10
     _train(gaussians, density, (14900,))

@@ -2,15 +2,17 @@
 
 import tracemalloc
 import zipfile
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from synthetic import FakeGaussians
-from test_colmap_scene import _options, _read
+from synthetic import FakeGaussians, options_of, read
 
 from scene import Scene
 from scene.readers.point_cloud import read_point_cloud, write_point_cloud
+from scene.readers.start_cloud import random_in_frusta
 from utils.system_utils import UserError
 
 POINTS = np.array([[0.25, -1.5, 3.0], [4.0, 5.5, -6.0]])
@@ -77,6 +79,15 @@ def test_bad_files(tmp_path, name, content, said):
     assert str(tmp_path / name) in str(error.value)
 
 
+def _refused_in_little_memory(path: Path) -> None:
+    tracemalloc.start()
+    with pytest.raises(UserError, match="not a readable npz .*save points and colors .* by numpy.savez"):
+        read_point_cloud(path)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 2_000_000
+
+
 @pytest.mark.parametrize(
     "arrays",
     [
@@ -90,24 +101,14 @@ def test_bad_files(tmp_path, name, content, said):
 def test_bad_arrays(tmp_path, arrays):
     """Also those that pack to a few bytes, of which little is unpacked."""
     np.savez_compressed(tmp_path / "a.npz", **{name: np.array(value) for name, value in arrays.items()})
-    tracemalloc.start()
-    with pytest.raises(UserError, match="not a readable npz .*save points and colors .* by numpy.savez"):
-        read_point_cloud(tmp_path / "a.npz")
-    most = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert most < 2_000_000
+    _refused_in_little_memory(tmp_path / "a.npz")
 
 
 def test_an_array_of_a_long_header_is_refused_before_it_is_unpacked(tmp_path):
     """NumPy unpacks as many bytes as its format 2 says, up to 4 GiB."""
     with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("points.npy", b"\x93NUMPY\x02\x00" + (20_000_000).to_bytes(4, "little") + bytes(20_000_000))
-    tracemalloc.start()
-    with pytest.raises(UserError, match="not a readable npz"):
-        read_point_cloud(tmp_path / "a.npz")
-    most = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert most < 2_000_000
+    _refused_in_little_memory(tmp_path / "a.npz")
 
 
 def test_points_that_pack_well_are_read(tmp_path):
@@ -121,7 +122,7 @@ def test_points_that_pack_well_are_read(tmp_path):
 def test_a_scene_starts_from_such_a_file(colmap_scene, tmp_path):
     (tmp_path / "a.xyz").write_text("0.25 -1.5 3 255 0 51\n4 5.5 -6 102 255 204\n")
     gaussians = FakeGaussians()
-    Scene(_options(colmap_scene, tmp_path / "out", init_pcd_path=str(tmp_path / "a.xyz")), gaussians)
+    Scene(options_of(colmap_scene, tmp_path / "out", init_pcd_path=str(tmp_path / "a.xyz")), gaussians)
     np.testing.assert_array_equal(gaussians.pcd.points, np.float32(POINTS))
     written = read_point_cloud(tmp_path / "out" / "input.ply")
     np.testing.assert_array_equal(written.points, gaussians.pcd.points)
@@ -129,7 +130,7 @@ def test_a_scene_starts_from_such_a_file(colmap_scene, tmp_path):
 
 
 def test_random_points_lie_where_cameras_look(colmap_scene):
-    info = _read(colmap_scene, init_type="random")
+    info = read(colmap_scene, init_type="random")
     points = info.point_cloud.points.astype(np.float64)
     assert points.shape == (100_000, 3) and (info.point_cloud.colors == np.float32(127 / 255)).all()
     seen = np.zeros(len(points), int)
@@ -141,20 +142,16 @@ def test_random_points_lie_where_cameras_look(colmap_scene):
         seen += (z > 0) & (abs(u - 48) <= 48 + margin) & (abs(v - 32) <= 32 + margin)
     assert seen.min() >= 1 and seen.max() > 1
     # The cameras face the cube of the points from all sides, so the random ones are densest there.
-    cloud = _read(colmap_scene).point_cloud.points
+    cloud = read(colmap_scene).point_cloud.points
     middle, radius = cloud.mean(axis=0), np.linalg.norm(cloud - cloud.mean(axis=0), axis=1).max()
     near = (np.linalg.norm(points - middle, axis=1) < radius).mean()
     ball = 4 / 3 * np.pi * radius**3
     assert near / ball > 3 / np.prod(np.ptp(points, axis=0))
-    np.testing.assert_array_equal(_read(colmap_scene, init_type="random").point_cloud.points, info.point_cloud.points)
+    np.testing.assert_array_equal(read(colmap_scene, init_type="random").point_cloud.points, info.point_cloud.points)
 
 
 def test_random_points_of_cameras_side_by_side(colmap_scene):
-    from dataclasses import replace
-
-    from scene.readers.start_cloud import random_in_frusta
-
-    camera = _read(colmap_scene).train_cameras[0]
+    camera = read(colmap_scene).train_cameras[0]
     row = [replace(camera, T=camera.T + (0.1 * step, 0, 0)) for step in range(5)]
     points = random_in_frusta(row).points
     depth = (points @ camera.R + camera.T)[:, 2]
@@ -164,8 +161,8 @@ def test_random_points_of_cameras_side_by_side(colmap_scene):
 
 def test_random_points_of_a_blender_scene_are_the_references_cube(blender_scene):
     write_point_cloud(blender_scene / "points3d.ply", POINTS, BYTES)
-    assert len(_read(blender_scene).point_cloud.points) == 2
-    info = _read(blender_scene, init_type="random")
+    assert len(read(blender_scene).point_cloud.points) == 2
+    info = read(blender_scene, init_type="random")
     assert info.ply_path is None and np.abs(info.point_cloud.points).max() <= np.float32(1.3)
 
 
@@ -173,6 +170,6 @@ def test_no_points_at_all(colmap_scene, tmp_path):
     (tmp_path / "none.ply").write_bytes(b"")
     write_point_cloud(colmap_scene / "sparse" / "0" / "points3D.ply", np.zeros((0, 3)), np.zeros((0, 3)))
     with pytest.raises(UserError, match="has no points; start from random points with --init_type random, or from a f"):
-        Scene(_options(colmap_scene, tmp_path / "out"), FakeGaussians())
-    scene = Scene(_options(colmap_scene, tmp_path / "out", init_type="random"), FakeGaussians())
+        Scene(options_of(colmap_scene, tmp_path / "out"), FakeGaussians())
+    scene = Scene(options_of(colmap_scene, tmp_path / "out", init_type="random"), FakeGaussians())
     assert scene.getTrainCameras()[0].target(torch.zeros(3)).shape == (3, 64, 96)

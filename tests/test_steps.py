@@ -14,16 +14,15 @@ import pytest
 import torch
 from PIL import Image
 from rasterizer_tools import GPU_MARKS
+from trainings import train_on, whole_result
 
-import train
+from gaussian_renderer import Drawn
 from splatting.training import run
-from splatting.training.objective import Objective
-from splatting.training.steps import ahead, recorded, run_ahead
-from splatting.training.steps.ahead import AheadStep
-from splatting.training.steps.choose import step_taker
+from splatting.training.objective import Losses, Objective
+from splatting.training.steps import captured, speculative, step_taker
+from splatting.training.steps.captured import CapturedStep, Graphs
 from splatting.training.steps.fused import FusedStep
 from splatting.training.steps.plain import PlainStep
-from splatting.training.steps.recorded import RecordedStep
 from utils.system_utils import UserError
 
 ITERATIONS = 60
@@ -36,12 +35,13 @@ OPTIONS = {
     "masks": ("--masks", "masks"),
     "degree 0": ("--sh_degree", 0),
     "absgrad": ("--absgrad", "--absgrad_threshold", 2e-4, "--split", "long_axis"),
+    "white": ("-w", "--antialiasing"),
+    "two phases": ("--densify_until_iter", 30),  # so that two phases have steps to capture
 }
-
-
-@pytest.fixture(autouse=True)
-def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
+# Densification, resets of opacities and the last iteration are plain. Over white there is a reset before the first.
+CHANGING = {"white": (10, 20, 30, 40), "two phases": (20,)}
+WITHOUT_GRAPHS = ("exposure", "depth", "masks")  # whose steps are queued one call after the other
+GPU = [pytest.param(None, marks=GPU_MARKS)]
 
 
 @pytest.fixture
@@ -63,55 +63,123 @@ def scene(colmap_scene: Path) -> Path:
 
 def trained(scene: Path, out: Path, *options: object) -> dict[str, bytes | list]:
     """Train; the bytes of the PLY, and the tensors and numbers of the checkpoint."""
-    words = ["-s", scene, "-m", out, "--eval", "-r", 48, "--iterations", ITERATIONS, *DENSITY, "--no_curve", "--quiet"]
-    train.main(list(map(str, [*words, "--test_iterations", -1, "--checkpoint_iterations", ITERATIONS, *options])))
-    leaves = []
-
-    def collect(value: object) -> None:
-        if torch.is_tensor(value):
-            leaves.append((value.shape, value.detach().cpu().numpy().tobytes()))
-        elif isinstance(value, dict):
-            for key, item in value.items():
-                leaves.append(key)
-                collect(item)
-        elif isinstance(value, list | tuple):
-            for item in value:
-                collect(item)
-        else:
-            leaves.append(value)
-
-    collect(torch.load(out / f"chkpnt{ITERATIONS}.pth", weights_only=False))
-    return {"ply": (out / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply").read_bytes(), "checkpoint": leaves}
+    words = "--eval", "-r", 48, "--iterations", ITERATIONS, *DENSITY, "--no_curve", "--quiet"
+    train_on(scene, out, *words, "--test_iterations", -1, "--checkpoint_iterations", ITERATIONS, *options)
+    return whole_result(out, ITERATIONS)
 
 
 def differences(one: dict[str, bytes | list], other: dict[str, bytes | list]) -> list[str]:
     """What differs between two results of `trained`, in few words."""
-    leaves = zip(one["checkpoint"], other["checkpoint"], strict=True)
-    found = [f"leaf {n}: {str(a)[:60]} and {str(b)[:60]}" for n, (a, b) in enumerate(leaves) if a != b]
+    pairs = zip(one["checkpoint"], other["checkpoint"], strict=True)
+    found = [f"leaf {n}: {str(a)[:60]} and {str(b)[:60]}" for n, (a, b) in enumerate(pairs) if a != b]
     return found + (["ply"] if one["ply"] != other["ply"] else [])
 
 
 def fused_iterations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """A list to which every iteration that is not taken plainly will be appended."""
-    fused, advance, take = [], FusedStep.advance, RecordedStep.take
+    fused, advance, launch = [], FusedStep.advance, Graphs.launch
     monkeypatch.setattr(FusedStep, "advance", lambda self, at, *x: (fused.append(at.iteration), advance(self, at, *x)))
 
     def noted(self, at):
-        losses = take(self, at)
+        losses = launch(self, at)
         fused.extend([at.iteration] if losses else [])
         return losses
 
-    monkeypatch.setattr(RecordedStep, "take", noted)
+    monkeypatch.setattr(Graphs, "launch", noted)
     return fused
 
 
+class Immediate:
+    """Stands for Speculation where there is no GPU: every step is done at once."""
+
+    def __init__(self, *_: object) -> None:
+        self.drain = self.throttle = self.discard = lambda: None
+        self.add = lambda *_: None
+        self.abort = lambda: 0
+
+    def capacity(self, at: object) -> AbstractContextManager:
+        return nullcontext()
+
+
+class Rerun:
+    """Stands for Recorder where there is no GPU: a launch runs the function once more, which reads what lies there."""
+
+    made: list["Rerun"] = []
+    tight = False
+
+    def __init__(self, *_: object) -> None:
+        self.launches = self.records = self.released = 0
+        Rerun.made.append(self)
+
+    def capture(self, body: Callable[[], torch.Tensor]) -> tuple[Callable[[], None], torch.Tensor]:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Drawn, "step", lambda *_: None)  # to capture a step does not take it
+            result = body()
+        self.records += 1
+
+        def launch() -> None:
+            self.launches += 1
+            result.copy_(body())
+
+        return launch, result
+
+    def is_tight(self) -> bool:
+        return self.tight
+
+    def release(self) -> None:
+        self.released += 1
+
+
+WAYS = {"fused": FusedStep, "queued": CapturedStep, "captured": CapturedStep}
+
+
+@pytest.fixture
+def take_as(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Lets steps be taken in a way of WAYS, as on a GPU, or plainly."""
+    Rerun.made.clear()
+    monkeypatch.setattr(captured, "Speculation", Immediate)
+    monkeypatch.setattr(captured, "Recorder", Rerun)
+
+    def choose(way: str) -> None:
+        monkeypatch.setattr("splatting.training.loop.step_taker", WAYS.get(way, PlainStep))
+        if way == "queued":
+            monkeypatch.setattr(Graphs, "_is_usual", lambda *_: False)
+
+    return choose
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+@pytest.mark.parametrize("way", WAYS)
+def test_a_fast_step_gives_the_bytes_of_the_plain_one(scene, tmp_path, monkeypatch, take_as, way, name):
+    plain = trained(scene, tmp_path / "plain", "--plain_step", *OPTIONS[name])
+    take_as(way)
+    fused, find, kinds = fused_iterations(monkeypatch), Graphs._graph_for, []
+    monkeypatch.setattr(Graphs, "_graph_for", lambda self, at: (find(self, at), kinds.append({*self._graphs}))[0])
+    assert not differences(trained(scene, tmp_path / way, *OPTIONS[name]), plain)
+    assert fused == [t for t in range(1, ITERATIONS) if t not in CHANGING.get(name, (20, 30, 40))]
+    launches = sum(made.launches for made in Rerun.made)
+    if way != "captured" or name in WITHOUT_GRAPHS:
+        assert launches == 0
+        return
+    assert launches > 40
+    assert Rerun.made[0].records >= 3  # tensors that density control has replaced are captured anew
+    assert all(len({kind[-2:] for kind in known}) <= 1 for known in kinds)  # graphs of another phase go
+    assert len(set().union(*kinds)) == (2 if name == "two phases" else 1)
+
+
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
-def test_the_fused_step_gives_the_bytes_of_the_plain_one(scene, tmp_path, monkeypatch, options):
+@pytest.mark.parametrize("_", GPU)
+def test_a_host_that_runs_ahead_without_capacity_gives_the_same_bytes(scene, tmp_path, monkeypatch, options, _):
+    """Capacity for one instance at first, and never for more than the last visit needed: many steps overflow."""
     plain = trained(scene, tmp_path / "plain", "--plain_step", *options)
-    fused = fused_iterations(monkeypatch)
-    assert trained(scene, tmp_path / "fused", *options) == plain
-    # Densification, the resets of opacities and the last iteration change rows, or take no step.
-    assert sorted({*fused}) == [t for t in range(1, ITERATIONS) if t not in (20, 30, 40)]  # some are repeated
+    assert trained(scene, tmp_path / "ahead", *options) == plain
+    overflows, replay = [], speculative.Speculation._replay
+    monkeypatch.setattr(speculative.Speculation, "_replay", lambda *x: (overflows.append(1), replay(*x)))
+    monkeypatch.setattr(speculative, "_with_spare", lambda count: count)
+    for name, least in {"_INSTANCES": 0, "_SLOTS": 0, "_LEAST": 1}.items():
+        monkeypatch.setattr(captured, name, least)
+    assert trained(scene, tmp_path / "overflowing", *options) == plain
+    assert len(overflows) > 5
 
 
 def test_losses_that_are_kept_keep_no_image(scene, tmp_path, monkeypatch):
@@ -136,239 +204,110 @@ def test_what_may_want_gradients_takes_the_plain_step(scene, tmp_path, monkeypat
         pass
 
     trained(scene, tmp_path / "a")
-    trained(scene, tmp_path / "b", "--detect_anomaly")
+    for pipe in ("--compute_cov3D_python", "--convert_SHs_python", "--detect_anomaly"):
+        trained(scene, tmp_path / "b", pipe)
     torch.autograd.set_detect_anomaly(False)
     monkeypatch.setattr(run, "Objective", WithFurtherTerm)
     trained(scene, tmp_path / "c")
-    fast = AheadStep if torch.cuda.is_available() else FusedStep
-    assert [type(one) for one in taken] == [fast, PlainStep, PlainStep]
+    fast = CapturedStep if torch.cuda.is_available() else FusedStep
+    assert [type(one) for one in taken] == [fast, *[PlainStep] * 4]
 
 
-def test_a_term_that_was_added_to_our_objective_is_not_lost(scene, tmp_path, monkeypatch):
-    """Its gradients go past the image, so the steps from there on are plain."""
-    call, fused, advance = Objective.__call__, [], FusedStep.advance
-    models = []
-
-    def with_term(self, package, step):
-        losses = call(self, package, step)
-        return losses if step.iteration < 15 else losses._replace(total=losses.total + models[-1]._scaling.exp().mean())
-
-    make = run.GaussianModel
-    monkeypatch.setattr(run, "GaussianModel", lambda *x: (models.append(make(*x)), models[-1])[1])
-    plain = trained(scene, tmp_path / "without")
-    monkeypatch.setattr(Objective, "__call__", with_term)
-    wanted = trained(scene, tmp_path / "plain", "--plain_step")
-    monkeypatch.setattr(FusedStep, "advance", lambda self, at, *x: (fused.append(at.iteration), advance(self, at, *x)))
-    assert trained(scene, tmp_path / "fused") == wanted != plain
-    assert fused == list(range(1, 15))  # none is recorded, as the objective is not ours any more
+def test_debug_takes_the_plain_step(scene, tmp_path, monkeypatch):
+    fused = fused_iterations(monkeypatch)
+    trained(scene, tmp_path / "a", "--debug_from", 15)
+    assert fused == list(range(1, 16))
 
 
-class Immediate:
-    """Stands for RunAhead where there is no GPU: every step is done at once."""
-
-    def __init__(self, *_: object) -> None:
-        self.settle = self.make_way = lambda: None
-        self.give_up = lambda: 0
-
-    def take(self, view: int, step: Callable[[], bool], *_: object) -> bool:
-        return step()
-
-    def room(self, view: int | None) -> AbstractContextManager:
-        return nullcontext()
+def of_scales(losses: Losses, package: dict, step: object, scales: torch.Tensor) -> torch.Tensor:
+    return losses.total + scales.exp().mean()
 
 
-class Rerun:
-    """Stands for Recorder where there is no GPU: a launch runs the function once more, which reads what lies there."""
-
-    def __init__(self, *_: object) -> None:
-        self.launches = self.records = self.released = 0
-        MADE.append(self)
-
-    def record(self, body: Callable[[], torch.Tensor]) -> tuple[Callable[[], None], torch.Tensor]:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(recorded, "step", lambda *_: None)  # to record a step does not take it
-            result = body()
-        self.records += 1
-
-        def launch() -> None:
-            self.launches += 1
-            result.copy_(body())
-
-        return launch, result
-
-    def is_tight(self) -> bool:
-        return False
-
-    def release(self) -> None:
-        self.released += 1
+def of_image(losses: Losses, package: dict, *_: object) -> torch.Tensor:
+    return losses.total + 0.1 * package["render"].square().mean()
 
 
-MADE: list[Rerun] = []
-
-
-@pytest.fixture
-def queued(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Steps are taken as on a GPU."""
-    MADE.clear()
-    monkeypatch.setattr(ahead, "RunAhead", Immediate)
-    monkeypatch.setattr(recorded, "Recorder", Rerun)
-    monkeypatch.setattr("splatting.training.loop.step_taker", AheadStep)
-
-
-ENDS_EARLY = ("--densify_until_iter", 30)  # so that two phases have steps to record
-
-
-@pytest.mark.parametrize(
-    "options",
-    [(), OPTIONS["sparse"], ("-w", "--antialiasing"), ENDS_EARLY, OPTIONS["degree 0"], OPTIONS["absgrad"]],
-    ids=["default", "sparse", "white", "two phases", "degree 0", "absgrad"],
-)
-def test_steps_that_are_recorded_give_the_same_bytes(scene, tmp_path, queued, monkeypatch, options):
-    record, kinds = RecordedStep._record, []
-    monkeypatch.setattr(RecordedStep, "_record", lambda self, at: (record(self, at), kinds.append({*self._records}))[0])
-    taken = trained(scene, tmp_path / "recorded", *options)
-    assert MADE[0].launches > 40
-    assert MADE[0].records >= 3  # tensors that density control has replaced are recorded anew
-    assert all(len({kind[-2:] for kind in known}) <= 1 for known in kinds)  # records of another phase go
-    assert len(set().union(*kinds)) == (2 if options == ENDS_EARLY else 1)
-    monkeypatch.setattr("splatting.training.loop.step_taker", PlainStep)
-    assert not differences(taken, trained(scene, tmp_path / "plain", *options))
-
-
-def test_records_give_their_memory_back_where_it_is_short(scene, tmp_path, queued, monkeypatch):
-    taken = trained(scene, tmp_path / "plenty")
-    monkeypatch.setattr(Rerun, "is_tight", lambda self: True)
-    assert not differences(taken, trained(scene, tmp_path / "short"))
-    assert MADE[0].released == 0 and MADE[1].released > 2
-
-
-OWN_TERMS = {
-    "of the image": (True, lambda losses, package, step: losses.total + 0.1 * package["render"].square().mean()),
-    "of the iteration": (False, lambda losses, package, step: losses.total * (1 + step.iteration / 100)),
-    "of the photo's name": (False, lambda losses, package, step: losses.total * (1 + len(step.camera.image_name))),
+# Terms that somebody adds to our objective after so many of its calls, and how many steps are then not plain. The
+# objective is called in the first step, and in the second to capture it.
+TERMS = {
+    "past the image": ("fused", 14, 14, of_scales),
+    "past the image, queued": ("queued", 14, 14, of_scales),
+    "past the image from the first step on": ("captured", 0, 0, of_scales),
+    "past the image when it is captured": ("captured", 1, 1, of_scales),
+    "of the image": ("captured", 0, 56, of_image),
+    "of the iteration": ("captured", 0, 56, lambda losses, _, at, *__: losses.total * at.iteration),
+    "of the photo's name": ("captured", 0, 56, lambda losses, _, at, *__: losses.total * len(at.camera.image_name)),
 }
 
 
-@pytest.mark.parametrize("own", OWN_TERMS.values(), ids=OWN_TERMS.keys())
-def test_a_loss_that_was_changed_is_recorded_only_if_it_is_the_same_in_every_step(
-    scene, tmp_path, queued, monkeypatch, own
+@pytest.mark.parametrize(("way", "late", "fused", "term"), TERMS.values(), ids=TERMS.keys())
+def test_a_term_that_was_added_to_our_objective_is_not_lost(
+    scene, tmp_path, monkeypatch, take_as, way, late, fused, term
 ):
-    recordable, term = own
-    call = Objective.__call__
-
-    def changed(self, package, step):
-        losses = call(self, package, step)
-        return losses._replace(total=term(losses, package, step))
-
-    monkeypatch.setattr(Objective, "__call__", changed)
-    taken = trained(scene, tmp_path / "queued")
-    assert (MADE[0].launches > 40) == recordable and (MADE[0].launches == 0) != recordable
-    monkeypatch.setattr("splatting.training.loop.step_taker", PlainStep)
-    assert not differences(taken, trained(scene, tmp_path / "plain"))
-
-
-@pytest.mark.parametrize("term", [False, True], ids=["ours", "with a further term"])
-def test_steps_that_are_queued_give_the_same_bytes(scene, tmp_path, monkeypatch, term):
-    call, models, make = Objective.__call__, [], run.GaussianModel
-
-    def with_term(self, package, step):
-        losses = call(self, package, step)
-        return losses._replace(total=losses.total + models[-1]._scaling.exp().mean()) if step.iteration > 14 else losses
-
-    monkeypatch.setattr(run, "GaussianModel", lambda *x: (models.append(make(*x)), models[-1])[1])
-    if term:
-        monkeypatch.setattr(Objective, "__call__", with_term)
-    plain = trained(scene, tmp_path / "plain", "--plain_step")
-    monkeypatch.setattr(ahead, "RunAhead", Immediate)
-    monkeypatch.setattr(recorded, "Recorder", Rerun)
-    monkeypatch.setattr(RecordedStep, "take", lambda *_: None)
-    monkeypatch.setattr("splatting.training.loop.step_taker", AheadStep)
-    taken, queue = [], AheadStep._queue
-    monkeypatch.setattr(AheadStep, "_queue", lambda self, step, x: (taken.append(queue(self, step, x)), taken[-1])[1])
-    assert trained(scene, tmp_path / "ahead", *OPTIONS["default"]) == plain
-    assert sum(taken) > (10 if term else 40)
-
-
-def test_a_term_that_appears_when_a_step_is_recorded_is_not_lost(scene, tmp_path, queued, monkeypatch):
+    """Gradients past the image make the steps from there on plain; what asks for more than an image is not captured."""
     call, make, models, calls = Objective.__call__, run.GaussianModel, [], []
 
-    def with_term(self, package, step):
+    def with_term(self, package, at):
+        losses = call(self, package, at)
         calls.append(1)
-        losses = call(self, package, step)
-        return losses if len(calls) == 1 else losses._replace(total=losses.total + models[-1]._scaling.exp().mean())
+        return losses if len(calls) <= late else losses._replace(total=term(losses, package, at, models[-1]._scaling))
 
     monkeypatch.setattr(run, "GaussianModel", lambda *x: (models.append(make(*x)), calls.clear(), models[-1])[2])
+    without = trained(scene, tmp_path / "without", "--plain_step")
     monkeypatch.setattr(Objective, "__call__", with_term)
-    taken = trained(scene, tmp_path / "queued")
-    assert MADE[0].launches == 0
-    monkeypatch.setattr("splatting.training.loop.step_taker", PlainStep)
-    assert not differences(taken, trained(scene, tmp_path / "plain"))
+    take_as("plain")
+    plain = trained(scene, tmp_path / "plain")
+    take_as(way)
+    taken = fused_iterations(monkeypatch)
+    assert not differences(trained(scene, tmp_path / "fast"), plain) and plain != without
+    assert len(taken) == fused
+    assert bool(sum(made.launches for made in Rerun.made)) == (term is of_image)
 
 
-@pytest.mark.parametrize("pipe", ["--compute_cov3D_python", "--convert_SHs_python", "--debug"])
-def test_options_that_the_operator_does_not_know_take_the_plain_step(scene, tmp_path, monkeypatch, pipe):
-    monkeypatch.setattr(FusedStep, "advance", lambda *_: pytest.fail("fused"))
-    trained(scene, tmp_path / "a", pipe)
+def test_graphs_give_their_memory_back_where_it_is_short(scene, tmp_path, take_as, monkeypatch):
+    take_as("captured")
+    plenty = trained(scene, tmp_path / "plenty")
+    monkeypatch.setattr(Rerun, "tight", True)
+    assert not differences(plenty, trained(scene, tmp_path / "short"))
+    assert Rerun.made[0].released == 0 and Rerun.made[1].released > 2
 
 
-@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
-@pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
-def test_a_host_that_runs_ahead_without_room_gives_the_same_bytes(scene, tmp_path, monkeypatch, options, _):
-    """Room for one instance at first, and never for more than the last visit needed: many steps halt."""
-    plain = trained(scene, tmp_path / "plain", "--plain_step", *options)
-    assert trained(scene, tmp_path / "ahead", *options) == plain
-    halts, repeat = [], run_ahead.RunAhead._repeat
-    monkeypatch.setattr(run_ahead.RunAhead, "_repeat", lambda *x: (halts.append(1), repeat(*x)))
-    monkeypatch.setattr(run_ahead, "_with_spare", lambda count: count)
-    for name in ("_INSTANCES", "_SLOTS"):
-        monkeypatch.setattr(ahead, name, 0)
-    monkeypatch.setattr(ahead, "_LEAST", 1)
-    assert trained(scene, tmp_path / "halting", *options) == plain
-    assert len(halts) > 5
-
-
-@pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
+@pytest.mark.parametrize("_", GPU)
 @pytest.mark.parametrize("fails", [1, 99])
-def test_without_memory_for_a_record_steps_are_queued_one_call_after_the_other(scene, tmp_path, monkeypatch, fails, _):
-    wanted = trained(scene, tmp_path / "recorded")
-    body, asked, taken = RecordedStep._body, [], []
+def test_without_memory_for_a_graph_steps_are_queued_one_call_after_the_other(scene, tmp_path, monkeypatch, fails, _):
+    wanted = trained(scene, tmp_path / "captured")
+    body, launch, asked, taken = Graphs._body, Graphs.launch, [], []
 
-    def lacking(self, iteration, still):
+    def lacking(self, iteration, placeholder):
         asked.append(iteration)
-        losses = body(self, iteration, still)
+        losses = body(self, iteration, placeholder)
         if len(asked) <= fails:
             raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.")
         return losses
 
-    take = RecordedStep.take
-    monkeypatch.setattr(RecordedStep, "_body", lacking)
-    monkeypatch.setattr(RecordedStep, "take", lambda self, at: (taken.append(take(self, at)), taken[-1])[1])
+    monkeypatch.setattr(Graphs, "_body", lacking)
+    monkeypatch.setattr(Graphs, "launch", lambda self, at: (taken.append(launch(self, at)), taken[-1])[1])
     assert trained(scene, tmp_path / "queued") == wanted
     assert len(asked) == 2 if fails == 99 else len(asked) > 2
     assert any(taken) == (fails == 1)
 
 
-def _exact_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Room for what the last visit of a view needed, and no more, so that many steps halt."""
-    monkeypatch.setattr(run_ahead, "_with_spare", lambda count: count)
-
-
-@pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
-@pytest.mark.parametrize("repeated", [0, 1, 3])
-def test_memory_that_runs_out_while_room_is_made_leaves_the_last_whole_step(scene, tmp_path, monkeypatch, repeated, _):
-    """After so many steps of a halted queue were repeated."""
+@pytest.mark.parametrize("_", GPU)
+@pytest.mark.parametrize("replayed", [0, 1, 3])
+def test_memory_that_runs_out_in_a_replay_leaves_the_last_whole_step(scene, tmp_path, monkeypatch, replayed, _):
+    """After so many steps of a queue that overflowed were replayed."""
     wanted = trained(scene, tmp_path / "whole")
-    again, left = AheadStep._repeat, [repeated]
+    replay, left = CapturedStep.replay, [replayed]
 
-    def repeat(self, step, first):
-        if step.iteration > 40 and left[0] == 0:
+    def again(self, at, first):
+        if at.iteration > 40 and left[0] == 0:
             raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.")
-        left[0] -= step.iteration > 40
-        again(self, step, first)
+        left[0] -= at.iteration > 40
+        replay(self, at, first)
 
     with monkeypatch.context() as patch:
-        _exact_room(patch)
-        patch.setattr(AheadStep, "_repeat", repeat)
+        patch.setattr(speculative, "_with_spare", lambda count: count)  # so that many steps overflow
+        patch.setattr(CapturedStep, "replay", again)
         with pytest.raises(UserError, match="the model after iteration .* is saved") as caught:
             trained(scene, tmp_path / "out")
     saved = int(re.search(r"after iteration (\d+) is saved", str(caught.value))[1])
@@ -377,25 +316,25 @@ def test_memory_that_runs_out_while_room_is_made_leaves_the_last_whole_step(scen
     assert not differences(trained(scene, tmp_path / "out", *start), wanted)
 
 
-@pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
-def test_lists_that_are_too_long_for_any_room_end_the_run_with_the_reason(scene, tmp_path, monkeypatch, _):
+@pytest.mark.parametrize("_", GPU)
+def test_lists_that_are_too_long_for_any_capacity_end_the_run_with_the_reason(scene, tmp_path, monkeypatch, _):
     """The step is rendered by a host that waits, whose operator says so. 10 stands for 2^31."""
-    repeat, measure, halted = run_ahead.RunAhead._repeat, FusedStep.measure, []
+    replay, measure, halted = speculative.Speculation._replay, FusedStep.measure, []
 
-    def refusing(self, step):
+    def refusing(self, at):
         if halted:
             raise RuntimeError("more than 10 instances")
-        return measure(self, step)
+        return measure(self, at)
 
-    monkeypatch.setattr(run_ahead.RunAhead, "_repeat", lambda *x: (halted.append(1), repeat(*x)))
+    monkeypatch.setattr(speculative.Speculation, "_replay", lambda *x: (halted.append(1), replay(*x)))
     monkeypatch.setattr(FusedStep, "measure", refusing)
-    monkeypatch.setattr(run_ahead, "_MOST", 10)
+    monkeypatch.setattr(speculative, "_MOST", 10)
     with pytest.raises(RuntimeError, match="more than 10 instances"):
         trained(scene, tmp_path / "a")
 
 
-@pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
-def test_a_run_that_is_killed_right_after_a_halt_resumes_to_the_same_bytes(scene, tmp_path, monkeypatch, _):
+@pytest.mark.parametrize("_", GPU)
+def test_a_run_that_is_killed_right_after_an_overflow_resumes_to_the_same_bytes(scene, tmp_path, _):
     wanted = trained(scene, tmp_path / "whole")
     program = """
 import os, signal, sys
@@ -403,16 +342,16 @@ sys.path[:0] = ["tests", "."]
 import splatting.host.openmp
 from pathlib import Path
 import test_steps
-from splatting.training.steps import run_ahead
-repeat = run_ahead.RunAhead._repeat
+from splatting.training.steps import speculative
+replay = speculative.Speculation._replay
 
-def repeat_and_die(self, report):
-    repeat(self, report)
+def replay_and_die(self, report):
+    replay(self, report)
     if self._done > 30:
         os.kill(os.getpid(), signal.SIGKILL)
 
-run_ahead._with_spare = lambda count: count
-run_ahead.RunAhead._repeat = repeat_and_die
+speculative._with_spare = lambda count: count
+speculative.Speculation._replay = replay_and_die
 test_steps.trained(Path(sys.argv[1]), Path(sys.argv[2]), "--checkpoint_iterations", 25)
 """
     words = [sys.executable, "-c", program, scene, tmp_path / "out"]

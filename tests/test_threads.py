@@ -4,15 +4,15 @@ import os
 
 import pytest
 
-from splatting.host import threads
+from splatting.host import machine
 
 
 @pytest.fixture
-def machine(monkeypatch, tmp_path):
+def made(monkeypatch, tmp_path):
     """A function that simulates a machine of 64 processors, of which the process may use some; limits by cgroup."""
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
-    monkeypatch.setattr(threads, "_CGROUPS", tmp_path)
-    monkeypatch.setattr(threads, "_OWN_CGROUPS", tmp_path / "own")
+    monkeypatch.setattr(machine, "_CGROUPS", tmp_path)
+    monkeypatch.setattr(machine, "_OWN_CGROUPS", tmp_path / "own")
 
     def make(affinity: int, own: str = "/", **limits: str) -> None:
         monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(affinity)), raising=False)
@@ -24,11 +24,11 @@ def machine(monkeypatch, tmp_path):
     return make
 
 
-def test_affinity(machine):
-    machine(2)
-    assert threads.cores() == threads.threads() == 2
-    machine(64)
-    assert threads.cores() == 64 and threads.threads() == threads.MOST_THREADS and threads.threads(5) == 5
+def test_affinity(made):
+    made(2)
+    assert machine.cores() == machine.threads() == 2
+    made(64)
+    assert machine.cores() == 64 and machine.threads() == machine.MOST_THREADS and machine.threads(5) == 5
 
 
 @pytest.mark.parametrize(
@@ -40,14 +40,14 @@ def test_affinity(machine):
         ("x", "5000 100000", 1),
     ],
 )
-def test_quota_of_the_group_and_those_around_it(machine, outer, inner, count):
-    machine(8, "/outer/inner", outer=outer, outer_inner=inner)
-    assert threads.cores() == count
+def test_quota_of_the_group_and_those_around_it(made, outer, inner, count):
+    made(8, "/outer/inner", outer=outer, outer_inner=inner)
+    assert machine.cores() == count
 
 
-def test_without_cgroups_or_affinity(machine, monkeypatch, tmp_path):
-    machine(8)
+def test_without_cgroups_or_affinity(made, monkeypatch, tmp_path):
+    made(8)
     (tmp_path / "own").unlink()
-    assert threads.cores() == 8
+    assert machine.cores() == 8
     monkeypatch.delattr(os, "sched_getaffinity")
-    assert threads.cores() == 64
+    assert machine.cores() == 64

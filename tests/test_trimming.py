@@ -20,7 +20,7 @@ import render as render_script
 import train
 from arguments import ModelParams, read_cfg_args
 from gaussian_renderer import decisive_for, render, trimming
-from gaussian_renderer.between import FRACTIONS, NEAREST, WIDER, neighbours, views_between
+from gaussian_renderer.free_view import FRACTIONS, NEAREST, WIDER, neighbours, views_between
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import DONE, FAINT, FEW, TOO_LONG, change_on_views, decisive_for_any, trim, walk
 from scene import Scene
@@ -155,7 +155,6 @@ def test_bands_that_are_zero_are_cut_and_the_model_is_read_again(runs):
 
 
 def test_a_resumed_training_has_the_bands_that_the_last_save_left_out(runs, _colmap_master, tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "stdout", sys.stdout)
     monkeypatch.setattr(trimming, "ITERATIONS_PER_VIEW", 1e-3)
     cloud = runs.cut.parent / "cloud.ply"
     for degree, again in (("--prune_sh", -1), runs.trimmed), ((), runs.cut):
@@ -166,7 +165,6 @@ def test_a_resumed_training_has_the_bands_that_the_last_save_left_out(runs, _col
 
 def test_without_options_a_short_training_saves_all_it_drew(runs, _colmap_master, tmp_path, monkeypatch):
     """Its search would take too long; bands that are zero go all the same."""
-    monkeypatch.setattr(sys, "stdout", sys.stdout)
     _train(_colmap_master, tmp_path, runs.cut.parent / "cloud.ply", "--test_iterations", -1)
     assert len(_ply(tmp_path)) == 600 and len(_ply(tmp_path).dtype) == 17
     record = json.loads((tmp_path / "model.json").read_text())["left_out"]
@@ -174,7 +172,6 @@ def test_without_options_a_short_training_saves_all_it_drew(runs, _colmap_master
 
 
 def test_saves_before_the_cut_are_read_with_the_bands_they_have(runs, monkeypatch):
-    monkeypatch.setattr(sys, "stdout", sys.stdout)
 
     def render_iteration(*options: object) -> None:
         command = ["render.py", "-m", runs.cut, "--skip_train", "--quiet", "--iteration", *options]
@@ -203,18 +200,16 @@ def test_colours_move_by_no_more_than_asked(runs):
     with torch.no_grad():
         gaussians._features_rest *= 0.02
     before = parameters(gaussians)
-    whole = trim(gaussians, cameras, pipeline(), keep_unseen=True, prune_sh=-1.0, iterations=1)
-    assert whole.gaussians is gaussians and whole.unseen == 0
+    whole, search = trim(gaussians, cameras, pipeline(), keep_unseen=True, prune_sh=-1.0, iterations=1)
+    assert whole is gaussians and search.unseen == 0
     for degree in (2, 1, 0):
-        bound = whole.cut_bounds[degree]
-        cut = trim(gaussians, cameras, pipeline(), keep_unseen=True, prune_sh=bound, iterations=1)
-        assert cut.gaussians.max_sh_degree == cut.gaussians.active_sh_degree == degree
-        assert cut.gaussians._features_rest.shape[1] == (degree + 1) ** 2 - 1 and len(cut.gaussians) == 200
-        moved = change_on_views(gaussians, cut.gaussians, cameras, ScoredViews(pipeline(), BLACK, False), scored=False)[
-            "largest"
-        ]
-        assert 0.05 * bound < moved <= bound
-        assert trim(gaussians, cameras, pipeline(), True, 0.99 * bound, 1).gaussians.max_sh_degree > degree
+        bound = search.cut_bounds[degree]
+        cut, _ = trim(gaussians, cameras, pipeline(), keep_unseen=True, prune_sh=bound, iterations=1)
+        assert cut.max_sh_degree == cut.active_sh_degree == degree
+        assert cut._features_rest.shape[1] == (degree + 1) ** 2 - 1 and len(cut) == 200
+        moved = change_on_views(gaussians, cut, cameras, ScoredViews(pipeline(), BLACK, False), scored=False)
+        assert 0.05 * bound < moved["largest"] <= bound
+        assert trim(gaussians, cameras, pipeline(), True, 0.99 * bound, 1)[0].max_sh_degree > degree
     assert all(torch.equal(values, before[name]) for name, values in parameters(gaussians).items())
 
 
@@ -223,7 +218,7 @@ def test_a_model_that_no_view_sees_is_kept(runs):
     gaussians = model(5)
     with torch.no_grad():
         gaussians._opacity.fill_(-50.0)
-    assert trim(gaussians, cameras, pipeline(), False, -1.0, iterations=10**6).gaussians is gaussians
+    assert trim(gaussians, cameras, pipeline(), False, -1.0, iterations=10**6)[0] is gaussians
 
 
 def test_faint_gaussians_go_without_a_look(runs, monkeypatch):
@@ -235,10 +230,10 @@ def test_faint_gaussians_go_without_a_look(runs, monkeypatch):
         gaussians._opacity[50:60] = -math.log(254) + 1e-3
         gaussians._scaling[:60] += 3
     monkeypatch.setattr(trimming, "decisive_for", None)  # is not called
-    trimmed = trim(gaussians, cameras, pipeline(), False, -1.0, iterations=10)
-    assert trimmed.search.end == TOO_LONG and trimmed.unseen == trimmed.search.faint == 50
+    trimmed, search = trim(gaussians, cameras, pipeline(), False, -1.0, iterations=10)
+    assert search.end == TOO_LONG and search.unseen == search.faint == 50
     for camera in _walked(_load(runs.whole)[0])[::20]:
-        assert torch.equal(_image(camera, gaussians), _image(camera, trimmed.gaussians))
+        assert torch.equal(_image(camera, gaussians), _image(camera, trimmed))
         assert not decisive_for(camera, gaussians, pipeline())[:50].any()
         assert decisive_for(camera, gaussians, pipeline())[50:60].any()
 
@@ -250,12 +245,12 @@ def test_few_unseen_ones_are_kept_without_looking_further(runs):
         # Just below what a pixel takes, and just above what counts as faint.
         gaussians._opacity[:1] = FAINT + 5e-5
     assert not decisive_for_any(cameras, gaussians, pipeline())[0]
-    kept = trim(gaussians, cameras, pipeline(), False, -1.0, iterations=10**6)
-    assert kept.search.end == FEW and kept.gaussians is gaussians and kept.search.views == len(cameras)
+    kept, search = trim(gaussians, cameras, pipeline(), False, -1.0, iterations=10**6)
+    assert search.end == FEW and kept is gaussians and search.views == len(cameras)
     with torch.no_grad():
         gaussians._opacity[:2] = FAINT + 5e-5
-    gone = trim(gaussians, cameras, pipeline(), False, -1.0, iterations=10**6)
-    assert gone.search.end == DONE and gone.unseen == 2 and gone.search.faint == 0
+    gone, search = trim(gaussians, cameras, pipeline(), False, -1.0, iterations=10**6)
+    assert search.end == DONE and search.unseen == 2 and search.faint == 0
 
 
 def test_many_cameras_have_fewer_neighbours(runs):
@@ -386,7 +381,6 @@ def test_the_short_line():
 
 
 def test_training_says_them(colmap_scene, tmp_path, capfd, monkeypatch):
-    monkeypatch.setattr(sys, "stdout", sys.stdout)
     for short in (2000, 0):
         monkeypatch.setattr("splatting.training.left_out.SHORT", short)
         train.main(["-s", str(colmap_scene), "-m", str(tmp_path), "-r", "24", "--iterations", "2"])

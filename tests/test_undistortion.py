@@ -3,19 +3,24 @@
 The reference is pycolmap's own projection of each model.
 """
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pycolmap
 import pytest
 import torch
 from lenses import DISTORTED, DISTORTIONS, colmap_camera, make_lens
 from PIL import Image
-from synthetic import FakeGaussians, folder_state, make_colmap_scene
-from test_colmap_scene import _options, _read
+from synthetic import FakeGaussians, folder_state, make_colmap_scene, options_of, read
 
 from scene import Scene
+from scene.images.decode import picture_size
 from scene.images.lens import WIDEST, Lens, pinhole_of, shown_pixels, undistortion
 from scene.images.masks import TRANSPARENT, Mask
-from scene.images.undistortion import Photo, undistort
+from scene.readers.info import CameraInfo
+from scene.readers.pinholes import camera_info
+from scene.readers.undistortion import undistort
 from utils.system_utils import UserError
 
 WIDTH, HEIGHT, FOCAL = 200, 150, 150.0
@@ -23,6 +28,12 @@ WIDTH, HEIGHT, FOCAL = 200, 150, 150.0
 
 def _lens(model: str, focal: float = FOCAL) -> Lens:
     return make_lens(model, focal, WIDTH, HEIGHT)
+
+
+def _view(path: Path, lens: Lens, mask: Mask | None = None, ignore_alpha: bool = False) -> CameraInfo:
+    """A view of a photo that is to be undistorted."""
+    view = camera_info(0, path.name, path, lens, np.eye(3), np.zeros(3), mask, ignore_alpha)
+    return replace(view, file_size=picture_size(path))
 
 
 def _dot(at: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -53,8 +64,8 @@ def test_things_are_where_the_pinhole_sees_them(tmp_path, model):
         picture = _dot(colmap_camera(lens).img_from_cam(ray), WIDTH, HEIGHT)
         path = tmp_path / f"{index}.png"
         Image.fromarray(np.uint8(255 * picture.round(3))).convert("RGB").save(path)
-        (result,) = undistort([Photo(path, (WIDTH, HEIGHT), lens)])
-        with Image.open(result.path) as image:
+        (result,) = undistort([_view(path, lens)])
+        with Image.open(result.image_path) as image:
             assert image.size == (width, height)
             seen = np.asarray(image, dtype=np.float64)[..., 0]
         # A round spot becomes an oval, whose middle is off by the distortion's second derivative: 0.1 pixels here.
@@ -111,70 +122,71 @@ def _photo(path, color=(200, 100, 50), size=(WIDTH, HEIGHT), mode="RGB"):
 def test_the_cache_is_keyed_by_content(tmp_path, cache_folder, capsys):
     lens = _lens("OPENCV")
     path = _photo(tmp_path / "a.png")
-    photo = Photo(path, (WIDTH, HEIGHT), lens)
+    photo = _view(path, lens)
     (first,) = undistort([photo])
     said = capsys.readouterr().err
     assert f"are kept in {cache_folder / 'undistorted'}" in said and "GS_CACHE" in said
-    assert first.path.is_relative_to(cache_folder) and sorted(p.name for p in tmp_path.iterdir()) == ["a.png"]
+    assert first.image_path.is_relative_to(cache_folder) and sorted(p.name for p in tmp_path.iterdir()) == ["a.png"]
     before = folder_state(cache_folder)
 
     copy = tmp_path / "b.png"
     copy.write_bytes(path.read_bytes())
-    again, other = undistort([photo, photo._replace(path=copy)])
-    assert again.path == other.path == first.path
+    again, other = undistort([photo, replace(photo, image_path=copy)])
+    assert again.image_path == other.image_path == first.image_path
     assert folder_state(cache_folder) == before and "are kept" not in capsys.readouterr().err
 
-    first.path.write_bytes(first.path.read_bytes()[:-30])  # as after a full disk
+    first.image_path.write_bytes(first.image_path.read_bytes()[:-30])  # as after a full disk
     undistort([photo])
-    assert first.path.read_bytes() == before[str(first.path.relative_to(cache_folder))][1]
+    assert first.image_path.read_bytes() == before[str(first.image_path.relative_to(cache_folder))][1]
 
     others = [
-        photo._replace(lens=lens._replace(params=(*lens.params[:-1], 0.001))),
-        photo._replace(mask=Mask(_photo(tmp_path / "m.png", mode="L"))),
-        photo._replace(mask=Mask(tmp_path / "m.png", inverted=True)),
+        replace(photo, lens=lens._replace(params=(*lens.params[:-1], 0.001))),
+        replace(photo, mask=Mask(_photo(tmp_path / "m.png", mode="L"))),
+        replace(photo, mask=Mask(tmp_path / "m.png", inverted=True)),
     ]
     _photo(path, color=(10, 20, 30))
-    assert len({result.path for result in undistort([photo, *others])} | {first.path}) == 5
+    assert len({result.image_path for result in undistort([photo, *others])} | {first.image_path}) == 5
 
 
 def test_a_cache_that_cannot_be_written_is_named(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("GS_CACHE", str(tmp_path / "file" / "cache"))
     with pytest.raises(UserError, match="cannot create the folder .*file/cache/undistorted .*set GS_CACHE to use"):
-        undistort([Photo(_photo(tmp_path / "a.png"), (WIDTH, HEIGHT), _lens("OPENCV"))])
+        undistort([_view(_photo(tmp_path / "a.png"), _lens("OPENCV"))])
 
 
 def test_a_broken_picture_is_named(tmp_path):
     path = _photo(tmp_path / "a.png")
     path.write_bytes(path.read_bytes()[:-4000])
     with pytest.raises(UserError, match="cannot read .*a.png"):
-        undistort([Photo(path, (WIDTH, HEIGHT), _lens("OPENCV"))])
+        _view(path, _lens("OPENCV"))
 
 
 def test_pictures_smaller_than_their_lens(tmp_path):
     whole = undistortion(_lens("OPENCV_FISHEYE"), WIDTH, HEIGHT).pinhole
-    half = undistort([Photo(_photo(tmp_path / "a.png", size=(100, 75)), (100, 75), _lens("OPENCV_FISHEYE"))])[0].pinhole
-    np.testing.assert_allclose(half[:4], np.array(whole[:4]) / 2, atol=0.5)  # sizes are whole pixels
+    # Sizes are whole pixels.
+    half = undistort([_view(_photo(tmp_path / "a.png", size=(100, 75)), _lens("OPENCV_FISHEYE"))])[0]
+    np.testing.assert_allclose((half.fx, half.fy, half.cx, half.cy), np.array(whole[:4]) / 2, atol=0.5)
     assert abs(half.width - whole.width / 2) <= 1
 
 
-def _masked(tmp_path, meaning: str, **photo):
+def _masked(tmp_path, meaning: str):
     grey = np.full((HEIGHT, WIDTH), 255, np.uint8)
     grey[:, : WIDTH // 2] = 0
     Image.fromarray(grey).save(tmp_path / "mask.png")
     mask = Mask(tmp_path / "mask.png", meaning=meaning)
-    (result,) = undistort([Photo(_photo(tmp_path / "a.png"), (WIDTH, HEIGHT), _lens("OPENCV"), mask, **photo)])
-    with Image.open(result.path) as image:
+    (result,) = undistort([_view(_photo(tmp_path / "a.png"), _lens("OPENCV"), mask)])
+    with Image.open(result.image_path) as image:
         return result, np.asarray(image)
 
 
 def test_a_mask_is_undistorted_with_its_picture(tmp_path):
     result, pixels = _masked(tmp_path, "ignore")
     assert pixels.shape[2] == 3
-    counts = result.mask.decode((result.pinhole.width, result.pinhole.height))[0].numpy()
+    counts = result.mask.decode((result.width, result.height))[0].numpy()
     camera = colmap_camera(_lens("OPENCV"))
     rows, columns = np.nonzero(counts == 255)
-    x = [(columns + 0.5 - result.pinhole.cx) / result.pinhole.fx, (rows + 0.5 - result.pinhole.cy) / result.pinhole.fy]
+    x = [(columns + 0.5 - result.cx) / result.fx, (rows + 0.5 - result.cy) / result.fy]
     seen = camera.img_from_cam(np.column_stack([*x, np.ones(len(rows))]))
     assert seen[:, 0].min() >= WIDTH / 2  # masked pixels do not mix into pixels that count
     assert len(rows) == pytest.approx(0.5 * counts.size, rel=0.1)
@@ -208,14 +220,14 @@ def test_alpha_is_undistorted_or_ignored(tmp_path):
     pixels = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
     pixels[:, WIDTH // 2 :] = (200, 100, 50, 255)
     Image.fromarray(pixels).save(tmp_path / "a.png")
-    photo = Photo(tmp_path / "a.png", (WIDTH, HEIGHT), _lens("OPENCV"))
-    kept, ignored = undistort([photo, photo._replace(ignore_alpha=True)])
-    with Image.open(kept.path) as image:
+    photo = _view(tmp_path / "a.png", _lens("OPENCV"))
+    kept, ignored = undistort([photo, replace(photo, ignore_alpha=True)])
+    with Image.open(kept.image_path) as image:
         alpha = np.asarray(image)[..., 3]
         assert np.asarray(image)[alpha > 0][:, 0].min() >= 198  # not darkened by the hidden black
-    with Image.open(ignored.path) as image:
+    with Image.open(ignored.image_path) as image:
         assert image.mode == "RGB"
-    counts = ignored.mask.decode((ignored.pinhole.width, ignored.pinhole.height))[0].numpy()
+    counts = ignored.mask.decode((ignored.width, ignored.height))[0].numpy()
     assert kept.mask is None and ((counts == 255) <= (alpha == 255)).all() and (counts == 255).any()
 
 
@@ -229,7 +241,7 @@ def test_a_distorted_scene_shows_its_points_where_they_are(tmp_path, model, cach
     folder = tmp_path / "scene"
     reconstruction = make_colmap_scene(folder, model=model, params=params, views=5)
     before = folder_state(folder)
-    scene = Scene(_options(folder, tmp_path / "out"), FakeGaussians(), shuffle=False)
+    scene = Scene(options_of(folder, tmp_path / "out"), FakeGaussians(), shuffle=False)
     hits = tried = 0
     for camera in scene.getTrainCameras():
         assert camera.mask is None
@@ -253,7 +265,7 @@ def test_a_distorted_scene_shows_its_points_where_they_are(tmp_path, model, cach
 def test_real_distorted_scenes(shared_dir, tmp_path):
     for name, views, model_points in (("fox_raw", 12, 5115), ("monstree_raw", 9, 5400)):
         folder = shared_dir / "scenes" / name
-        info = _read(folder)
+        info = read(folder)
         assert len(info.train_cameras) == views and len(info.point_cloud.points) == model_points
         for camera in info.train_cameras:
             assert camera.mask is None and camera.file_size == (camera.width, camera.height)
@@ -266,8 +278,8 @@ def test_a_wide_lens_in_a_scene(tmp_path, capsys):
     """Pixels that the photo does not show do not count."""
     folder = tmp_path / "scene"
     make_colmap_scene(folder, model="RADIAL", params=(25.0, 45.0, 34.5, 0.05, -0.02), views=2)
-    for camera in _read(folder).train_cameras:
+    for camera in read(folder).train_cameras:
         assert camera.mask is not None
     assert "2 photos, the first is v" in capsys.readouterr().err
-    for view in Scene(_options(folder, tmp_path / "out"), FakeGaussians()).getTrainCameras():
+    for view in Scene(options_of(folder, tmp_path / "out"), FakeGaussians()).getTrainCameras():
         assert view.mask.shape == (1, view.image_height, view.image_width) and 0.3 < view.mask.float().mean() < 1

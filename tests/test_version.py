@@ -15,7 +15,7 @@ from gaussians import model, options, parameters, take_steps
 from arguments import VERSION, write_model_json
 from scene.gaussians.checkpoint import WRITTEN_BY, load_checkpoint, save_checkpoint
 from splatting.diagnosis.environment import EXTENSIONS
-from splatting.host.version import VERSION as WRITTEN
+from splatting.host.machine import VERSION as WRITTEN
 
 ROOT = Path(__file__).resolve().parents[1]
 WRITTEN_IN = (".py", ".toml", ".yml", ".sh")

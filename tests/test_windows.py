@@ -15,11 +15,11 @@ from pathlib import Path
 import pytest
 from test_house import ROOMS
 
-from scene.images.find import find_pictures
+from scene.images.find import find_images
 from scene.readers.info import exposure_names
 from splatting.evaluation import child
-from splatting.files import lock, relative
-from splatting.host import session
+from splatting.files import folders, plain_files
+from splatting.host import interrupt
 from splatting.viewer import server
 from utils import system_utils
 from utils.system_utils import UserError, atomic_write
@@ -76,15 +76,15 @@ def locking(descriptor: int, mode: int, size: int) -> None:
 
 
 def test_a_folder_is_locked(tmp_path, monkeypatch):
-    monkeypatch.setattr(lock, "fcntl", None)
-    monkeypatch.setattr(lock, "msvcrt", types.SimpleNamespace(locking=locking, LK_NBLCK=2), raising=False)
+    monkeypatch.setattr(folders, "fcntl", None)
+    monkeypatch.setattr(folders, "msvcrt", types.SimpleNamespace(locking=locking, LK_NBLCK=2), raising=False)
     monkeypatch.setattr(Path, "unlink", lambda path: (_ for _ in ()).throw(in_use()))  # the file is open
     arguments = (tmp_path, "train.py", "another train.py (process {process})", "-m")
     for _ in range(2):
-        with lock.locked(*arguments):
+        with folders.locked(*arguments):
             assert (tmp_path / ".train.lock").read_text() == f"{os.getpid()}\n"
             refused = pytest.raises(UserError, match=rf"another train.py \(process {os.getpid()}\) is at work in")
-            with refused, lock.locked(*arguments):
+            with refused, folders.locked(*arguments):
                 pass
 
 
@@ -97,7 +97,7 @@ def test_a_child_gets_ctrl_c_from_the_terminal_alone(monkeypatch):
     monkeypatch.setattr(child.os, "name", "nt")
     child._hand_on(KeyboardInterrupt, process)
     monkeypatch.setattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 512, raising=False)
-    assert sent == [signal.SIGINT] and session.own_session() == {"creationflags": 512}
+    assert sent == [signal.SIGINT] and interrupt.own_session() == {"creationflags": 512}
 
 
 def test_a_childs_messages_are_read_without_waiting_for_a_pipe(monkeypatch, capsys):
@@ -115,7 +115,7 @@ def test_paths_on_two_drives(monkeypatch, tmp_path):
 
     monkeypatch.setattr(os.path, "relpath", no_way)
     monkeypatch.setattr(os.path, "commonpath", no_way)
-    assert relative.relative_to(tmp_path / "a.png", tmp_path) == tmp_path / "a.png"
+    assert plain_files.relative_to(tmp_path / "a.png", tmp_path) == tmp_path / "a.png"
     views = [types.SimpleNamespace(image_name="a", image_path=str(tmp_path / drive / "a.png")) for drive in "CD"]
     assert exposure_names(views) == [(tmp_path / drive / "a.png").as_posix() for drive in "CD"]
 
@@ -126,7 +126,7 @@ def test_photos_that_a_model_of_windows_names(tmp_path):
     for name in ("left/IMG_1.JPG", "left/IMG_2.JPG"):
         (tmp_path / name).touch()
     names = [r"left\IMG_1.JPG", r"LEFT\img_2.jpg"]
-    found = find_pictures(tmp_path, names, "images.bin", "copy them")
+    found = find_images(tmp_path, names, "images.bin", "copy them")
     assert [path.name for path in found] == ["IMG_1.JPG", "IMG_2.JPG"]
 
 

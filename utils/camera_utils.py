@@ -6,10 +6,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from scene.cameras import Camera
-from scene.images.resolution import training_size
-from scene.readers.info import CameraInfo
-from scene.views.of_info import file_size, view_of_info
-from scene.views.view import half
+from scene.half_images import half
+from scene.images.sizes import training_size
+from scene.readers.info import CameraInfo, photo_size
+from splatting.compat.camera_forms import of_record
 from utils.graphics_utils import camera_center, fov2focal, rigid_pose
 
 __all__ = ["Camera", "cameraList_from_camInfos", "camera_to_JSON", "loadCam"]
@@ -29,12 +29,10 @@ def loadCam(
     with the reference's fields. is_nerf_synthetic: depth maps named by `depth_path` have Blender's unit.
     is_test_dataset: the view is in the test list. UserError for a photo or depth map that cannot be read.
     """
-    size = training_size(*file_size(cam_info), args.resolution, resolution_scale)
-    view = view_of_info(cam_info, id, size, is_nerf_synthetic)
-    view.data_device = args.data_device
-    if getattr(args, "train_test_exp", False) and getattr(cam_info, "is_test", False):
-        view.columns = half(size[0], is_test_dataset)
-    return Camera(view)
+    size = training_size(*photo_size(cam_info), args.resolution, resolution_scale)
+    halved = getattr(args, "train_test_exp", False) and getattr(cam_info, "is_test", False)
+    columns = half(size[0], is_test_dataset) if halved else None
+    return Camera(of_record(cam_info, size, is_nerf_synthetic), size, id, columns, data_device=args.data_device)
 
 
 def cameraList_from_camInfos(

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from splatting.distributed.ranks import ranks
 from splatting.host import start, torchrun
-from splatting.host.device import compute_device
 from splatting.host.errors import UserError, first_line
 from splatting.host.interrupt import Terminated
+from splatting.host.machine import compute_device
 from splatting.host.memory import is_out_of_memory, shortage
 
 __all__ = [
@@ -113,6 +113,11 @@ def _outcome(main: Callable[[], object]) -> tuple[int, str]:
     return 0, ""
 
 
+def writes_files() -> bool:
+    """Whether this process writes the files of a training: of several that train together, only the first does."""
+    return ranks().first
+
+
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike, every_rank: bool = False) -> Iterator[Path]:
     """Yield a temporary path beside `path`, with its suffix; rename it to `path` if the block succeeds, else delete it.
@@ -121,7 +126,7 @@ def atomic_write(path: str | os.PathLike, every_rank: bool = False) -> Iterator[
     of the block or of renaming (disk full, `path` is a folder) becomes a UserError. Of ranks that train together, only
     the first writes, and the others' writing leads nowhere. every_rank: each of them writes, as into a cache.
     """
-    if not (every_rank or ranks().first):
+    if not (every_rank or writes_files()):
         yield Path(os.devnull)
         return
     target = Path(path)

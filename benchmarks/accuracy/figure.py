@@ -7,7 +7,7 @@ import argparse
 import json
 from pathlib import Path
 
-from benchmarks.harness.environment import require_matplotlib
+from benchmarks.harness.measuring import require_matplotlib
 from utils.system_utils import atomic_write, run_cli
 
 COLORS = {"CPU float32": "tab:blue", "CPU float64": "tab:green", "CUDA float32": "tab:red"}

@@ -25,8 +25,7 @@ from tqdm import tqdm
 from benchmarks.accuracy.figure import draw
 from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT, ORACLE, Backend, kernels, run
 from benchmarks.harness.calls import Calls
-from benchmarks.harness.environment import describe, print_table, require_matplotlib
-from benchmarks.harness.timing import cpu_milliseconds, gpu_milliseconds
+from benchmarks.harness.measuring import cpu_milliseconds, describe, gpu_milliseconds, print_table, require_matplotlib
 from benchmarks.workloads.splat_scenes import KINDS
 from benchmarks.workloads.stability_cases import Problem, all_stiff
 from splatting.files.json_files import write_json
@@ -38,7 +37,7 @@ TIMED_SIZES = {
     "huge and tiny": (3_000, 1200, 900),
 }
 CPU_REPEATS = 5
-# Wanted bound on the error of CUDA float over the error of CPU float, both measured against CPU double.
+# Allowed bound on the error of CUDA float over the error of CPU float, both measured against CPU double.
 MOST = 3.0
 # Errors below this are a few units in the last place, where a single rounding changes the ratio.
 SMALL = 1e-6
@@ -75,9 +74,9 @@ def milliseconds(case: Case, kernel: Backend) -> float:
     return gpu_milliseconds(call) if kernel.device == "cuda" else cpu_milliseconds(call, CPU_REPEATS)
 
 
-def error(got: Tensor, wanted: Tensor) -> tuple[float, float]:
-    """Return the largest and the median |difference|, both divided by the largest |wanted|."""
-    difference, scale = (got - wanted).abs(), wanted.abs().max().clamp_min(1e-300)
+def error(got: Tensor, expected: Tensor) -> tuple[float, float]:
+    """Return the largest and the median |difference|, both divided by the largest |expected|."""
+    difference, scale = (got - expected).abs(), expected.abs().max().clamp_min(1e-300)
     return float(difference.max() / scale), float(difference.median() / scale)
 
 
@@ -86,7 +85,7 @@ def measure(times: bool) -> tuple[list[dict], Runs]:
     records, runs = [], {}
     for case in tqdm(CASES, unit="scene", leave=False):
         truth = run(problem(case), ORACLE, cut=CUT)
-        wanted, keep = tensors(*truth), truth[2]
+        expected, keep = tensors(*truth), truth[2]
         for kernel in kernels():
             found = runs[case, kernel] = tensors(*run(problem(case), kernel, keep=keep))
             records.append(
@@ -94,7 +93,7 @@ def measure(times: bool) -> tuple[list[dict], Runs]:
                     "scene": case.kind,
                     "antialiasing": case.antialiasing,
                     "kernel": kernel.name,
-                    "errors": {name: error(found[name], value) for name, value in wanted.items()},
+                    "errors": {name: error(found[name], value) for name, value in expected.items()},
                     "pixels left out": int((~keep).sum()),
                     "milliseconds": milliseconds(case, kernel) if times else None,
                 }
@@ -123,8 +122,8 @@ def print_ratios(runs: Runs) -> None:
     for name in next(iter(runs.values())):
         row = [name]
         for case in CASES:
-            wanted = runs[case, CPU_DOUBLE][name]
-            cuda, cpu = (error(runs[case, kernel][name], wanted)[0] for kernel in (CUDA_FLOAT, CPU_FLOAT))
+            expected = runs[case, CPU_DOUBLE][name]
+            cuda, cpu = (error(runs[case, kernel][name], expected)[0] for kernel in (CUDA_FLOAT, CPU_FLOAT))
             ratios.append((cuda / max(cpu, 1e-300), max(cuda, cpu)))
             row.append(f"{cuda:.1e} / {cpu:.1e} = {ratios[-1][0]:.2f}")
         rows.append(row)
@@ -132,7 +131,7 @@ def print_ratios(runs: Runs) -> None:
     print_table(["", *(f"{case.kind}{', antialiased' if case.antialiasing else ''}" for case in CASES)], rows)
     notable = [ratio for ratio, larger in ratios if larger > SMALL]
     print(f"Largest ratio: {max(ratio for ratio, _ in ratios):.2f}", end="; ")
-    print(f"where either error exceeds {SMALL:.0e}: {max(notable, default=0):.2f} (at most {MOST:g} wanted)")
+    print(f"where either error exceeds {SMALL:.0e}: {max(notable, default=0):.2f} (at most {MOST:g} allowed)")
 
 
 def main() -> None:

@@ -28,7 +28,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks.accuracy.runs import CPU_DOUBLE, CUDA_FLOAT, ORACLE, TEXTBOOK, Backend, kernels, run
-from benchmarks.harness.environment import describe, print_table
+from benchmarks.harness.measuring import describe, print_table
 from benchmarks.workloads.stability_cases import CASES, PLAIN, Case, Problem
 from utils.system_utils import run_cli
 
@@ -84,10 +84,10 @@ class Judged:
         stiff = self.problem.stiff
         by_plane = {
             name: {
-                "ordinary": _error(planes[name], wanted, ~self.reached.expand_as(wanted) & self.keep),
-                "stiff": _error(planes[name], wanted, self.reached.expand_as(wanted) & self.keep),
+                "ordinary": _error(planes[name], expected, ~self.reached.expand_as(expected) & self.keep),
+                "stiff": _error(planes[name], expected, self.reached.expand_as(expected) & self.keep),
             }
-            for name, wanted in self.planes.items()
+            for name, expected in self.planes.items()
         }
         by_name = {
             name: {part: _error(gradients[name], g, stiff == (part == "stiff")) for part in PARTS}
@@ -138,12 +138,12 @@ def _spread(rows: Tensor, where: Tensor) -> Tensor:
     return out
 
 
-def _error(got: Tensor, wanted: Tensor, where: Tensor) -> float:
-    """The largest |difference| of the part `where`, over its largest |wanted|; NaN if the part is empty."""
-    difference = (got - wanted).abs().nan_to_num(nan=math.inf, posinf=math.inf)[where]
+def _error(got: Tensor, expected: Tensor, where: Tensor) -> float:
+    """The largest |difference| of the part `where`, over its largest |expected|; NaN if the part is empty."""
+    difference = (got - expected).abs().nan_to_num(nan=math.inf, posinf=math.inf)[where]
     if not difference.numel():
         return math.nan
-    scale, whole = float(wanted[where].abs().max()), float(wanted.abs().max())
+    scale, whole = float(expected[where].abs().max()), float(expected.abs().max())
     return float(difference.max()) / ((whole if scale < 1e-9 * whole else scale) or 1.0)
 
 

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, TEXTBOOK
 from benchmarks.accuracy.stability import ROUNDING, Judged, Result
-from benchmarks.harness.environment import describe, require_matplotlib
+from benchmarks.harness.measuring import describe, require_matplotlib
 from benchmarks.workloads.stability_cases import PLAIN, Case, Problem, at_depths, needles, needles_of
 from utils.system_utils import atomic_write, run_cli
 

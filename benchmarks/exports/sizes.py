@@ -7,23 +7,105 @@ views around the model's middle, float32 and unrounded. Those of a format withou
 """
 
 import argparse
+import json
+import shutil
+import struct
+import subprocess
 import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from arguments import OptionParser, PipelineParams
-from benchmarks.exports.read_back import read_back
-from benchmarks.harness.environment import describe, print_table
-from benchmarks.workloads.orbit import orbit
+from benchmarks.harness.measuring import describe, print_table
 from gaussian_renderer import render
-from scene.cameras import MiniCam
+from scene.cameras import ZFAR, ZNEAR, MiniCam
 from splatting.exports.formats import FORMATS, read_splats
 from splatting.exports.in_scene import model_of
-from splatting.exports.splats import Splats, drawable, selected
+from splatting.exports.scene_formats import PRIM
+from splatting.exports.splats import Splats, drawable, logits, selected
+from splatting.exports.web import PROGRAM
+from utils.graphics_utils import projection, world_to_camera
 from utils.system_utils import UserError, compute_device, run_cli
+
+
+def read_back(path: Path) -> Splats:
+    """The splats of a file that export.py wrote, in the axes of the model."""
+    readers = {".glb": _read_glb, ".usdz": _read_usdz, ".sog": read_by_splat_transform}
+    return readers.get(path.suffix, read_splats)(path)
+
+
+def read_by_splat_transform(path: Path) -> Splats:
+    """The splats of a file as PlayCanvas' program reads them, which writes them as PLY. UserError without it."""
+    program = shutil.which(PROGRAM)
+    if program is None:
+        raise UserError(f"{path} is read by {PROGRAM}; run npm ci in tests/foreign, and add its .bin folder to PATH")
+    with tempfile.TemporaryDirectory() as folder:
+        model = Path(folder) / "model.ply"
+        subprocess.run([program, "--quiet", str(path), str(model)], check=True, capture_output=True)
+        return read_splats(model)
+
+
+def _read_glb(path: Path) -> Splats:
+    content = path.read_bytes()
+    (length,) = struct.unpack_from("<I", content, 12)
+    document, binary = json.loads(content[20 : 20 + length]), content[28 + length :]
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    values = {}
+    for name, index in attributes.items():
+        accessor = document["accessors"][index]
+        if accessor["componentType"] == 5126:
+            view = document["bufferViews"][accessor["bufferView"]]
+            flat = np.frombuffer(binary, "<f4", view["byteLength"] // 4, view["byteOffset"])
+            values[name.split(":")[-1]] = flat.reshape(accessor["count"], -1).copy()
+    names = sorted((name for name in values if name.startswith("SH_")), key=lambda name: name.split("_")[2::2])
+    sh = np.stack([values[name] for name in names], axis=1)
+    rotations = np.roll(values["ROTATION"], 1, axis=1)
+    return Splats(values["POSITION"], np.log(values["SCALE"]), rotations, logits(values["OPACITY"][:, 0], 1e-7), sh)
+
+
+def _read_usdz(path: Path) -> Splats:
+    from pxr import Usd
+
+    stage = Usd.Stage.Open(str(path))  # a prim does not keep its stage alive
+    prim = stage.GetPrimAtPath(PRIM)
+
+    def value(name: str) -> np.ndarray:
+        return np.array(prim.GetAttribute(name).Get(), dtype=np.float32)
+
+    turns = prim.GetAttribute("orientations").Get()
+    rotations = np.array([[turn.GetReal(), *turn.GetImaginary()] for turn in turns], dtype=np.float32)
+    sh = value("radiance:sphericalHarmonicsCoefficients").reshape(len(turns), -1, 3)
+    return Splats(value("positions"), np.log(value("scales")), rotations, logits(value("opacities"), 1e-7), sh)
+
+
+_FOV = 0.9  # radians, in both directions
+_UP = 0.3  # height of the cameras, in distances from the middle
+
+
+def orbit(means: np.ndarray, count: int, side: int) -> list[MiniCam]:
+    """Square views of `side` pixels on a circle around the middle of positions (N, 3), looking at it, -y up.
+
+    The circle's radius is 2.5 times the median distance from the middle.
+    """
+    middle = np.median(means, axis=0).astype(np.float64)
+    radius = 2.5 * float(np.median(np.linalg.norm(means - middle, axis=1))) + 1e-6
+    views = []
+    for angle in np.arange(count) * 2 * np.pi / count + 0.3:
+        offset = np.array([np.sin(angle), -_UP, np.cos(angle)])
+        forward = -offset / np.linalg.norm(offset)
+        right = np.cross([0.0, 1.0, 0.0], forward)
+        right /= np.linalg.norm(right)
+        turn = np.stack([right, np.cross(forward, right), forward], axis=1)  # camera to world
+        view = torch.from_numpy(world_to_camera(turn, -turn.T @ (middle + radius * offset)))
+        project = projection(ZNEAR, ZFAR, _FOV, _FOV)
+        matrices = [matrix.T.to(torch.float32).contiguous() for matrix in (view, project @ view)]
+        views.append(MiniCam(side, side, _FOV, _FOV, ZNEAR, ZFAR, *matrices))
+    return views
+
 
 VIEWS, SIDE = 5, 256
 
@@ -49,7 +131,7 @@ def measure(model: Path) -> list[list[str]]:
     for camera in cameras:
         for name in ("world_view_transform", "full_proj_transform", "camera_center"):
             setattr(camera, name, getattr(camera, name).to(compute_device()))
-    wanted, rows = renders(splats, cameras), []
+    expected, rows = renders(splats, cameras), []
     plain = 4 * (17 + 3 * (splats.sh.shape[1] - 1))
     with tempfile.TemporaryDirectory() as folder:
         for entry in FORMATS:
@@ -66,7 +148,7 @@ def measure(model: Path) -> list[list[str]]:
                 continue
             read = Splats(**{**vars(read), "antialiasing": splats.antialiasing})
             size = path.stat().st_size / len(splats)
-            loss = decibels(renders(read, cameras), wanted)
+            loss = decibels(renders(read, cameras), expected)
             rows.append(
                 [f"`{entry.ending}`", f"{size:.1f}", f"{100 * size / plain:.0f} %", f"{seconds:.2f}", f"{loss:.1f}"]
             )

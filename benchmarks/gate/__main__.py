@@ -15,10 +15,20 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from benchmarks.gate.baseline import FILE, machine_kind, read_baseline, write_baseline
-from benchmarks.gate.judging import HEADER, MOST_TIME, QUANTITIES, Row, judge_quality, judge_time
+from benchmarks.gate.baseline import (
+    FILE,
+    HEADER,
+    MOST_TIME,
+    QUANTITIES,
+    Row,
+    judge_quality,
+    judge_time,
+    machine_kind,
+    read_baseline,
+    write_baseline,
+)
 from benchmarks.gate.trainings import Build, Task, head, older_build, scored, tasks, timed
-from benchmarks.harness.environment import describe, print_table
+from benchmarks.harness.measuring import describe, print_table
 from utils.system_utils import compute_device, run_cli
 
 SEEDS, STORED_SEEDS = (0, 1), (0, 1, 2, 3, 4)

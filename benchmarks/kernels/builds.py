@@ -18,8 +18,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from benchmarks.harness.environment import add_device, chosen_device, describe, print_table
-from benchmarks.harness.timing import cpu_milliseconds, gpu_milliseconds
+from benchmarks.harness.measuring import (
+    add_device,
+    chosen_device,
+    cpu_milliseconds,
+    describe,
+    gpu_milliseconds,
+    print_table,
+)
 from benchmarks.workloads.splat_scenes import CPU_WORKLOADS, GPU_WORKLOADS, frustum
 from utils.system_utils import UserError, run_cli
 

@@ -12,13 +12,12 @@ from scene.spilled_model import SpilledGaussians
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch
 from splatting.host.interrupt import DeferredInterrupt
-from splatting.training.loss_watch import LossWatch
-from splatting.training.objective import Objective
+from splatting.training.iteration import ViewOrder
+from splatting.training.objective import LossWatch, Objective
+from splatting.training.resolution import Resolution
 from splatting.training.run import Run
-from splatting.training.schedule.choose import pace_of
-from splatting.training.schedule.resolution import Resolution
-from splatting.training.strategies.choose import density_control
-from splatting.training.view_order import ViewOrder
+from splatting.training.schedule_file import schedule_of
+from splatting.training.strategies import density_control
 from utils.general_utils import get_expon_lr_func
 from utils.system_utils import compute_device
 
@@ -35,14 +34,14 @@ class WorkloadRun(Run):
     """
 
     def __init__(self, workload: Workload, parallel: str, steps: int, still: bool, spill: bool = False) -> None:
-        here = ranks()
+        here = self.group = ranks()
         views = here.size if parallel == "views" else 1
         words = ["-s", ".", "--iterations", str(steps * views), "--densify_from_iter", "10000", *_STILL * still]
         words += ["--parallel", parallel, *["--spill"] * spill]
         self.launch, self.dataset, self.opt, self.pipe = train.parse(words)
         self.lost = self.first_iteration = 0
         self.interrupt, self.device = DeferredInterrupt(), compute_device()
-        self.pace = pace_of(self.opt, None, 0, views)
+        self.schedule = schedule_of(self.opt, None, 0, views)
         self.gaussians = _model(workload, self.opt, self.device)
         if views > 1:
             self.gaussians.optimizer.set_betas(0.9**views, 0.999**views)
@@ -50,11 +49,11 @@ class WorkloadRun(Run):
         images = SimpleNamespace(ahead=0)
         self.scene = SimpleNamespace(cameras_extent=_EXTENT, images=images, prefetch=lambda _: None, model_path=".")
         self.views = ViewOrder(cameras, self.opt.seed, views, here.rank if views > 1 else 0)
-        self.resolution = Resolution(self.pace, images)
+        self.resolution = Resolution(self.schedule, images)
         self.background = torch.zeros(3, device=self.device)
         self.objective = Objective(self.opt)
         self.density = density_control(self)
-        self.density.pace = self.pace
+        self.density.schedule = self.schedule
         self._depth_weight = get_expon_lr_func(0.0, 0.0)
 
     def begin(self) -> None:

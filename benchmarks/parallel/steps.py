@@ -30,16 +30,16 @@ from typing import Any
 
 import torch
 
-from benchmarks.harness.environment import describe, print_table
+from benchmarks.harness.measuring import describe, print_table
 from benchmarks.parallel.run import WorkloadRun
 from benchmarks.parallel.workload import ALL
 from scene.gaussian_model import GaussianModel
 from splatting.distributed.ranks import ranks
-from splatting.host.process import peak_memory_mib
+from splatting.host.memory import peak_memory_mib
+from splatting.training.iteration import Iteration
 from splatting.training.loop import run_training
 from splatting.training.observer import Observer
 from splatting.training.observers.divergence import DivergenceWatch
-from splatting.training.step import Step
 from utils.system_utils import UserError, compute_device, run_cli
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -58,14 +58,14 @@ class Timing(Observer):
         self._ends: list[float] = []
         self.peak_mib = 0.0  # before the last step
 
-    def due(self, step: Step) -> bool:
+    def due(self, step: Iteration) -> bool:
         return False
 
-    def begins(self, step: Step) -> None:
+    def begins(self, step: Iteration) -> None:
         if step.last:
             self.peak_mib = peak_memory_mib(self._device) or 0.0
 
-    def stepped(self, step: Step) -> None:
+    def stepped(self, step: Iteration) -> None:
         done = step.iteration - self._first
         if done >= 0 and done % _BLOCK == 0 and not step.last:
             if self._device.type == "cuda":

@@ -10,8 +10,8 @@ from torch import Tensor
 from benchmarks.workloads.city import city, look
 from benchmarks.workloads.splat_scenes import FOV, GPU_WORKLOADS, frustum
 from scene.cameras import Camera
-from scene.images.in_memory import InMemory
-from scene.views.view import View
+from scene.images.store import InMemory
+from scene.readers.info import CameraInfo
 from splatting.distributed.rows import bound
 from utils.graphics_utils import focal2fov, fov2focal
 
@@ -69,7 +69,10 @@ class Workload:
         fovx, fovy = (focal2fov(fov2focal(FOV, self.width), pixels) for pixels in size)
         photo = InMemory(_photo(*size))
         poses = [look(i) if self.name == "city" else (np.eye(3), np.zeros(3)) for i in range(VIEWS)]
-        return [Camera(View(i, 0, *pose, fovx, fovy, f"{i}", size, photo)) for i, pose in enumerate(poses)]
+        infos = [
+            CameraInfo(0, *pose, fovy, fovx, None, "", f"{i}", "", *size, image=photo) for i, pose in enumerate(poses)
+        ]
+        return [Camera(info, size, i) for i, info in enumerate(infos)]
 
 
 XL = Workload("XL", *GPU_WORKLOADS["XL"])

@@ -16,8 +16,7 @@ import tempfile
 from pathlib import Path
 from statistics import median
 
-from benchmarks.harness.environment import describe, print_table
-from benchmarks.harness.timing import short_name
+from benchmarks.harness.measuring import describe, print_table, short_name
 from utils.system_utils import UserError, compute_device, run_cli
 
 PROGRAM = Path(__file__).with_name("step_profile_program.py")

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.harness.environment import require_matplotlib
+from benchmarks.harness.measuring import require_matplotlib
 from benchmarks.strategies.tables import BUDGET, DEFAULT, at, joined
 from utils.system_utils import UserError, atomic_write, run_cli
 

@@ -12,7 +12,7 @@ import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
-from splatting.files.markdown_table import markdown_table
+from splatting.files.listing import markdown_table
 from utils.system_utils import UserError, run_cli
 
 DEFAULT = "adc"

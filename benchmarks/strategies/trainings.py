@@ -23,7 +23,7 @@ from queue import Queue
 
 from tqdm import tqdm
 
-from benchmarks.harness.environment import describe
+from benchmarks.harness.measuring import describe
 from benchmarks.strategies.tables import print_tables
 from utils.system_utils import UserError, atomic_write, compute_device, run_cli
 

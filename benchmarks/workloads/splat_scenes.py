@@ -127,7 +127,7 @@ def frustum(
     """Draw Gaussians uniformly in the frustum at depths 2 to 10.
 
     The median size is sigma_px, sizes are log-normal (0.8). On a GPU with seed 0, this order of draws gives the tensors
-    that the other implementations in kernels/published.py were measured on.
+    that the other implementations in kernels/rasterizer.py were measured on.
     """
     draw = Draw(seed, device)
     focal = width / (2 * math.tan(FOV / 2))

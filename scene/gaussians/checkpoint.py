@@ -19,7 +19,7 @@ from scene.gaussians.parameters import GaussianParameters
 from scene.gaussians.statistics import NAMES, Statistics
 from splatting.distributed.ranks import ranks
 from splatting.files.tensor_files import read_tensors
-from splatting.host.version import VERSION
+from splatting.host.machine import VERSION
 from utils.system_utils import UserError, atomic_write
 
 _LARGEST = 1e15  # extent; learning rates are multiples of it

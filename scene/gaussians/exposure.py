@@ -14,7 +14,7 @@ from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.table import trainable
 from splatting.distributed.ranks import Ranks
 from splatting.files.plain_files import plain_text
-from splatting.host.device import compute_device
+from splatting.host.machine import compute_device
 from utils.general_utils import get_expon_lr_func
 from utils.system_utils import UserError, atomic_write
 

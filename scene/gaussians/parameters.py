@@ -15,7 +15,7 @@ from scene.gaussians.statistics import NAMES, Statistics
 from scene.gaussians.table import GaussianTable
 from splatting.distributed.ranks import Ranks
 from splatting.distributed.rows import WHOLE, Divided, Shards
-from splatting.host.device import compute_device
+from splatting.host.machine import compute_device
 from utils.general_utils import build_scaling_rotation, inverse_sigmoid, strip_symmetric
 from utils.system_utils import UserError
 

@@ -9,8 +9,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from splatting.files.file_kinds import not_the_file
 from splatting.files.image_files import UNREADABLE, open_image
+from splatting.files.plain_files import not_the_file
 from utils.system_utils import UserError
 
 _TAIL = 4096

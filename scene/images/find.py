@@ -55,7 +55,7 @@ def _folded(name: str) -> str:
     return name.replace(os.sep, "/")
 
 
-def find_pictures(
+def find_images(
     folder: Path,
     names: Sequence[str],
     listed_by: str,

@@ -5,13 +5,20 @@ has border rays that no pinhole can project; then `WIDEST` decides.
 """
 
 import functools
+import importlib.util
 import math
+import signal
+import sys
+import threading
 from collections.abc import Sequence
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from scene.images.pycolmap_import import import_pycolmap
+# Pillow's zlib must be in the process before pycolmap's, or writing a PNG aborts (pycolmap 4.2.1, Pillow 13.0).
+from PIL import Image  # noqa: F401
+
 from utils.system_utils import UserError
 
 WIDEST = 60.0  # degrees to either side; farther out, a pinhole stretches the photo more than fourfold
@@ -162,3 +169,23 @@ def _seen_once(camera: Any, pinhole: Any) -> np.ndarray:
         back = camera.cam_from_img(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
         missed = np.linalg.norm(back - rays, axis=1) * pinhole.mean_focal_length()
     return (missed < _ROUND_TRIP).reshape(y.shape)
+
+
+def import_pycolmap() -> ModuleType:
+    """The module `pycolmap`, whose import takes time and loads libraries that a Blender scene does not need.
+
+    UserError where it is not installed: it has no wheel for Linux on 64-bit Arm.
+    """
+    if "pycolmap" not in sys.modules and importlib.util.find_spec("pycolmap") is None:
+        raise UserError(
+            "pycolmap is not installed, which convert.py and photos with lens distortion need (pip install pycolmap); "
+            "where it has no wheel, as on Linux for Arm, convert and undistort the photos on another machine"
+        )
+    import pycolmap
+
+    # The import makes glog answer SIGTERM with a stack dump. Python still reports its own handler, and setting that
+    # again restores it.
+    handler = signal.getsignal(signal.SIGTERM)
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
+    return pycolmap

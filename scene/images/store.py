@@ -3,22 +3,18 @@
 import os
 import sys
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from scene.images.decode import decode
-from scene.images.device_copies import DeviceCopies
-from scene.images.handing import Handed, holders
-from scene.images.in_memory import InMemory
-from splatting.distributed.ranks import ALONE, Ranks
+from splatting.host.machine import threads
 from splatting.host.memory import free_memory
-from splatting.host.threads import threads
 
 GPU_SHARE = 0.25  # of a GPU's free memory at the start that images may take; the model needs the rest
 COPIES_AHEAD = 2  # images copied to the GPU ahead of their use; a copy takes less than an iteration
@@ -37,9 +33,55 @@ class Decodable(Protocol):
     def decode(self, size: Size) -> Tensor: ...
 
 
+@dataclass(frozen=True, eq=False)
+class InMemory:
+    """An image that was given as pixels at training size, and needs no decoding.
+
+    A photo (3,H,W), or (4,H,W) with alpha: uint8 with straight alpha, as `scene.images.decode.decode` gives it, or
+    float in [0,1] with colours that are multiplied by alpha already. A depth map: (1,H,W) float32.
+    """
+
+    pixels: Tensor
+
+    def changed(self, change: Callable[[Tensor], Tensor]) -> "InMemory":
+        """Another image, made of this one now."""
+        return InMemory(change(self.pixels))
+
+    def __deepcopy__(self, memo: dict) -> "InMemory":
+        return self  # never changed in place, so that copies of a camera can share it
+
+
+def at_hand(source: Any) -> bool:
+    """Whether an image has its pixels, in memory or shared by processes, so that no store has to look for it."""
+    return hasattr(source, "pixels")
+
+
 Source = Path | Decodable
 Picture = tuple[Source, Size]
 Key = tuple[str | Decodable, Size]  # files by name, which is faster to hash than a Path
+
+
+class Sharing:
+    """Processes that divide images among themselves; by itself, a process decodes them all.
+
+    splatting/distributed/shared_images.py has the form of several.
+    """
+
+    size = 1
+
+    def anyone(self, fact: bool) -> bool:
+        """Whether a fact holds in any of the processes."""
+        return fact
+
+    def divide(
+        self, sizes: Mapping[Key, int], own: Callable[[Key], Tensor], device: torch.device
+    ) -> tuple[set[Key], dict[Key, "InMemory"]]:
+        """Those of the images, given with their bytes, that this process decodes, and all that others have a part in.
+
+        own: the image of a key, on `device`. An image that is shared has the attributes of InMemory; all processes read
+        its pixels together.
+        """
+        return set(sizes), {}
 
 
 class ImageStore:
@@ -50,8 +92,8 @@ class ImageStore:
     is a GPU, images lie in pinned memory and are copied without waiting. Threads exist only while there is something to
     decode ahead. Call all methods from one thread.
 
-    sharing: ranks that have the same `plan`. Each decodes and keeps a part of it, and hands an image of it to the
-    others whenever it is read: all have to read the same images in the same order. The limit counts for each rank.
+    sharing: processes that have the same `plan`. Each decodes and keeps a part of it, and gives an image of it to the
+    others whenever it is read: all have to read the same images in the same order. The limit counts for each.
     """
 
     def __init__(
@@ -59,29 +101,30 @@ class ImageStore:
         limit: int = 0,
         keep_on: torch.device | str = "cpu",
         device: torch.device | str | None = None,
-        sharing: Ranks = ALONE,
+        sharing: Sharing | None = None,
     ) -> None:
         self.limit = limit
-        self.sharing = sharing
+        self.sharing = sharing or Sharing()
         self.keep_on = torch.device(keep_on)
         self.device = torch.device(keep_on if device is None else device)
         self._kept: OrderedDict[Key, Tensor | Future[Tensor]] = OrderedDict()  # in order of use
         self._planned: set[Key] = set()
         self._awaited: set[Key] = set()  # planned for training, and not decoded yet
-        self._handed: dict[Key, Handed] = {}  # all that ranks share
+        self._shared: dict[Key, InMemory] = {}
         self._workers = threads()
         self._room_for_floats = True
         self._threads: ThreadPoolExecutor | None = None
         self._copies: DeviceCopies | None = None
 
     def plan(self, training: Iterable[Picture], others: Iterable[Picture] = ()) -> None:
-        """Announce all images, before the first is asked for; ranks that share them get a part of the bytes each.
+        """Announce all images, before the first is asked for.
 
         If the images kept at once exceed GPU_SHARE of a GPU's free memory, the CPU keeps them. A limit that all images
         fit into is dropped.
         """
         training = dict.fromkeys(_key(source, size) for source, size in training)
-        self._planned = self._own_part([*training, *(_key(source, size) for source, size in others)])
+        keys = dict.fromkeys([*training, *(_key(source, size) for source, size in others)])
+        self._planned, self._shared = self.sharing.divide({key: _bytes(*key) for key in keys}, self._own, self.device)
         self._awaited = self._planned & training.keys()
         if self.limit >= len(self._planned):
             self.limit = 0
@@ -93,23 +136,14 @@ class ImageStore:
         if self.device.type == "cuda" and self.keep_on.type == "cpu":
             self._copies = DeviceCopies(self.device)
 
-    def _own_part(self, keys: Iterable[Key]) -> set[Key]:
-        """Those of the images that this rank decodes; by itself, all."""
-        keys, ranks = list(dict.fromkeys(keys)), self.sharing
-        if not ranks.several:
-            return set(keys)
-        chosen = dict(zip(keys, holders((_bytes(*key) for key in keys), ranks.size), strict=True))
-        self._handed = {key: Handed(ranks, chosen[key], partial(self._own, key), self.device) for key in keys}
-        return {key for key in keys if chosen[key] == ranks.rank}
-
     @property
     def planned(self) -> int:
-        """Number of the images of `plan` that this rank decodes."""
+        """Number of the images of `plan` that this process decodes."""
         return len(self._planned)
 
     @property
     def planned_bytes(self) -> int:
-        """Upper bound on the bytes of the images of `plan` that this rank keeps at once."""
+        """Upper bound on the bytes of the images of `plan` that this process keeps at once."""
         sizes = sorted((_bytes(*key) for key in self._planned), reverse=True)
         if self._copies:
             sizes = [1 << (size - 1).bit_length() for size in sizes]  # torch pins memory in powers of two
@@ -118,7 +152,7 @@ class ImageStore:
     @property
     def keeps_floats(self) -> bool:
         """Whether images may also be kept as float32, four times as large, on the device of --data_device."""
-        return not self.limit and self._room_for_floats and not self.sharing.several
+        return not self.limit and self._room_for_floats and self.sharing.size == 1
 
     def get(self, source: Source, size: Size) -> Tensor:
         """Image (3 or 4,H,W) uint8 of a photo, or the tensor that another source decodes to, on the store's device.
@@ -126,13 +160,12 @@ class ImageStore:
         UserError as `decode`.
         """
         key = _key(source, size)
-        handed = self._handed.get(key)
-        return self._own(key) if handed is None else handed.pixels
+        return self._shared[key].pixels if key in self._shared else self._own(key)
 
-    def changed(self, source: Source, size: Size, change: Callable[[Tensor], Tensor]) -> InMemory | Handed:
-        """A picture made of an image, of which the store keeps nothing: now, or by one rank for those that share it."""
-        handed = self._handed.get(_key(source, size))
-        return InMemory(change(self.get(source, size))) if handed is None else handed.changed(change)
+    def changed(self, source: Source, size: Size, change: Callable[[Tensor], Tensor]) -> InMemory:
+        """An image made of another, of which the store keeps nothing: now, or by one process for all that share it."""
+        shared = self._shared.get(_key(source, size))
+        return InMemory(change(self.get(source, size))) if shared is None else shared.changed(change)
 
     def _own(self, key: Key) -> Tensor:
         picture = self._kept.get(key)
@@ -145,7 +178,7 @@ class ImageStore:
     def ahead(self) -> int:
         """Number of images that `prefetch` can use, the current one included; 0 when it has nothing to do.
 
-        Those of other ranks count as well, though it leaves them out.
+        Those of other processes count as well, though it leaves them out.
         """
         count = 1 + COPIES_AHEAD if self._copies else 0
         if self.limit or self._awaited:
@@ -159,7 +192,7 @@ class ImageStore:
         An image that cannot be decoded raises its error in `get`.
         """
         keys = dict.fromkeys(_key(source, size) for source, size in coming)
-        keys = [key for key in keys if key not in self._handed or key in self._planned][: self.limit or None]
+        keys = [key for key in keys if key not in self._shared or key in self._planned][: self.limit or None]
         for key in keys:
             if key in self._kept:
                 self._kept.move_to_end(key)
@@ -208,6 +241,39 @@ class ImageStore:
                 wait([oldest])  # a thread is decoding it, and holds as much memory as a kept image
 
 
+class DeviceCopies:
+    """Copies on a stream of their own: they wait for no kernel, and kernels wait only for the image they need."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._stream = torch.cuda.Stream(device)
+        self._sent: dict[Hashable, tuple[Tensor, torch.cuda.Event]] = {}
+
+    def send(self, key: Hashable, image: Tensor) -> None:
+        """Start to copy a pinned image, unless its copy was started before."""
+        if key in self._sent:
+            return
+        with torch.cuda.stream(self._stream):
+            copy = image.to(self._device, non_blocking=True)
+            ready = torch.cuda.Event()
+            ready.record(self._stream)
+        self._sent[key] = copy, ready
+
+    def take(self, key: Hashable, image: Tensor) -> Tensor:
+        """The copy, for use on the current stream. The stream waits for it, the host does not."""
+        self.send(key, image)
+        copy, ready = self._sent.pop(key)
+        current = torch.cuda.current_stream(self._device)
+        current.wait_event(ready)
+        copy.record_stream(current)  # keeps its memory until that stream is done with it
+        return copy
+
+    def keep_only(self, keys: Collection[Hashable]) -> None:
+        """Drop the untaken copies of all other keys."""
+        for key in self._sent.keys() - set(keys):
+            del self._sent[key]
+
+
 def _key(source: Source, size: Size) -> Key:
     return os.fspath(source) if isinstance(source, Path) else source, size
 
@@ -220,30 +286,22 @@ def _bytes(source: str | Decodable, size: Size) -> int:
     return channels * size[0] * size[1]
 
 
-def picture_device(data_device: str, fallback: torch.device) -> torch.device:
+def image_device(data_device: str, fallback: torch.device, warn: bool = False) -> torch.device:
     """Device that keeps the images: that of the option --data_device if it can be used, else the one that computes.
 
-    A message says when the option is not followed, except for plain `cuda` when no GPU computes.
+    warn: say so when the option is not followed, except for plain `cuda` when no GPU computes.
     """
-    device, reason = _choice(data_device, fallback)
-    if reason:
-        print(f"warning: --data_device {data_device} {reason}; photos are kept on {fallback}", file=sys.stderr)
-    return device
-
-
-def usable_device(data_device: str, fallback: torch.device) -> torch.device:
-    """Do as `picture_device`, without a message."""
-    return _choice(data_device, fallback)[0]
-
-
-def _choice(data_device: str, fallback: torch.device) -> tuple[torch.device, str | None]:
-    """The device, and the reason why it is not the wanted one, if that needs a message."""
     try:
-        wanted = torch.device(data_device)
+        requested = torch.device(data_device)
     except RuntimeError:
-        wanted = None
-    if wanted is None or wanted.type not in ("cpu", "cuda"):
-        return fallback, "is neither cpu nor cuda"
-    if wanted.type == "cpu" or (fallback.type == "cuda" and (wanted.index or 0) < torch.cuda.device_count()):
-        return wanted, None
-    return fallback, None if wanted.index is None else "is not available"
+        requested = None
+    fault = None
+    if requested is None or requested.type not in ("cpu", "cuda"):
+        fault = "is neither cpu nor cuda"
+    elif requested.type == "cpu" or (fallback.type == "cuda" and (requested.index or 0) < torch.cuda.device_count()):
+        return requested
+    elif requested.index is not None:
+        fault = "is not available"
+    if fault and warn:
+        print(f"warning: --data_device {data_device} {fault}; photos are kept on {fallback}", file=sys.stderr)
+    return fallback

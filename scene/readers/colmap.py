@@ -1,20 +1,36 @@
-"""COLMAP scenes: a model in the folder sparse, photos in a folder beside it."""
+"""COLMAP scenes: a model in the folder sparse, photos in a folder beside it.
+
+rigs and frames of COLMAP 4 are not read: its images file has the poses that follow from them.
+"""
 
 import os
 import sys
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from scene.images.find import find_pictures
-from scene.images.masks import NO_MASKS, MaskOptions, find_masks
-from scene.readers import colmap_model
-from scene.readers.info import SceneInfo, normalization, split_by_order
+from scene.colmap_loader import Camera, Image, Points, qvec2rotmat, read_cameras, read_images, read_points
+from scene.images.find import find_images
+from scene.images.lens import Lens
+from scene.images.masks import NO_MASKS, Mask, MaskOptions, find_masks
+from scene.readers.info import CameraInfo, SceneInfo, split_by_order
+from scene.readers.pinholes import camera_info, finished
 from scene.readers.point_cloud import check_finite, read_point_cloud
-from scene.readers.source_views import SourceView, make_cameras
-from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, choose_start, random_in_frusta
+from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, random_in_frusta, scene_info
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
+
+AGAIN = "copy all three files of the model again from where they were made"
+
+
+class ColmapModel(NamedTuple):
+    """Cameras by their ids; photos in the order of theirs; points in the order of theirs."""
+
+    cameras: dict[int, Camera]
+    images: list[Image]
+    points: Points
 
 
 def read_colmap(
@@ -28,45 +44,112 @@ def read_colmap(
 
     Arguments and errors as for `scene.dataset_readers.read_scene`; start None: without points.
     """
-    model_folder, model = colmap_model.find_model(folder)
-    if not model.views:
+    model_folder, model = find_model(folder)
+    if not model.images:
         raise UserError(f"the COLMAP model in {model_folder} has no registered photo; reconstruct the scene again")
-    views = sorted(model.views, key=lambda view: os.fsencode(view.name))
-    names = [view.name for view in views]
+    photos = sorted(model.images, key=lambda image: os.fsencode(image.name))
+    names = [photo.name for photo in photos]
     listed_by = f"the COLMAP model in {model_folder}"
-    paths = find_pictures(folder / images, names, listed_by, "put them there, or name their folder with -i")
+    paths = find_images(folder / images, names, listed_by, "put them there, or name their folder with -i")
     found = find_masks(folder, names, masks)
-    cameras = make_cameras(
-        [
-            SourceView(view.name, path, view.camera_id, view.lens, view.rotation, view.translation, mask)
-            for view, path, mask in zip(views, paths, found, strict=True)
-        ],
-        masks.ignore_alpha,
-    )
-    train, test = split_by_order(cameras, hold_out, folder)
-    if start is None:
-        return SceneInfo(None, train, test, normalization(train), None)
-    cloud, ply_path = choose_start(
-        start, lambda: _own_cloud(model_folder, model), lambda: random_in_frusta(train), f"{listed_by} has no points"
-    )
-    return SceneInfo(cloud, train, test, normalization(train, cloud.points), ply_path)
+    cameras = [
+        colmap_camera(photo, model.cameras[photo.camera_id], path, mask, masks.ignore_alpha)
+        for photo, path, mask in zip(photos, paths, found, strict=True)
+    ]
+    views = split_by_order(finished(cameras), hold_out, folder)
+    own, lacking = partial(_own_cloud, model_folder, model), f"{listed_by} has no points"
+    return scene_info(views, start, own, partial(random_in_frusta, views[0]), lacking)
 
 
-def _own_cloud(model_folder: Path, model: colmap_model.ColmapModel) -> StartCloud:
-    ply_path = _fresh_ply(model_folder)
-    if ply_path:
-        return StartCloud(read_point_cloud(ply_path), ply_path)
-    check_finite(model.points, colmap_model.points_file(model_folder))
-    colors = model.colors.astype(np.float32) / 255
-    return StartCloud(BasicPointCloud(model.points, colors, np.zeros_like(colors)), None)
+def colmap_camera(
+    photo: Image, camera: Camera, path: Path, mask: Mask | None = None, ignore_alpha: bool = False
+) -> CameraInfo:
+    """The view of a photo that COLMAP registered."""
+    lens = Lens(camera.model, tuple(map(float, camera.params)), camera.width, camera.height)
+    rotation, translation = qvec2rotmat(photo.qvec).T.copy(), np.asarray(photo.tvec, dtype=np.float64)
+    return camera_info(camera.id, photo.name, path, lens, rotation, translation, mask, ignore_alpha)
 
 
-def _fresh_ply(model_folder: Path) -> Path | None:
+def _own_cloud(model_folder: Path, model: ColmapModel) -> StartCloud:
+    source = next(path for path in (model_folder / "points3D.bin", model_folder / "points3D.txt") if path.is_file())
     ply = model_folder / "points3D.ply"
-    if not ply.is_file():
-        return None
-    source = colmap_model.points_file(model_folder)
-    if ply.stat().st_mtime >= source.stat().st_mtime:
-        return ply
-    print(f"{ply} is older than {source.name} and is not used; to use it, give --init_pcd_path {ply}", file=sys.stderr)
-    return None
+    if ply.is_file():
+        if ply.stat().st_mtime >= source.stat().st_mtime:
+            return StartCloud(read_point_cloud(ply), ply)
+        remedy = f"to use it, give --init_pcd_path {ply}"
+        print(f"{ply} is older than {source.name} and is not used; {remedy}", file=sys.stderr)
+    check_finite(model.points.xyz, source)
+    colors = model.points.rgb.astype(np.uint8).astype(np.float32) / 255
+    return StartCloud(BasicPointCloud(model.points.xyz, colors, np.zeros_like(colors)), None)
+
+
+def find_model(scene: Path) -> tuple[Path, ColmapModel]:
+    """Folder and contents of the COLMAP model with the most registered photos, in `sparse` or one of its sub-folders.
+
+    Among equals `sparse/0` comes first, then `sparse`. A message says which of several models is used. UserError saying
+    what was found when there is no model, or none that can be read.
+    """
+    sparse = scene / "sparse"
+    inside = sorted(path for path in sparse.iterdir() if path.is_dir())
+    folders = [folder for folder in dict.fromkeys([sparse / "0", sparse, *inside]) if _kinds(folder)]
+    if not folders:
+        found = sorted(str(path.relative_to(scene)) for path in sparse.glob("**/*"))[:8]
+        raise UserError(
+            f"no COLMAP model in {sparse / '0'}, {sparse} or its other folders: looked for cameras, images and "
+            f"points3D as .bin or .txt, found {', '.join(found) or 'nothing'}; copy the whole model there"
+        )
+    models, errors = {}, []
+    for folder in folders:
+        try:
+            models[folder] = read_model(folder)
+        except UserError as error:
+            errors.append(error)
+    if not models:
+        raise errors[0]
+    for error in errors:
+        print(f"{error}; another model is used", file=sys.stderr)
+    best = max(models, key=lambda folder: len(models[folder].images))  # the first among equals
+    if len(models) > 1:
+        others = ", ".join(f"{folder} {len(models[folder].images)}" for folder in models if folder != best)
+        print(f"{best} registers {len(models[best].images)} photos and is used; {others}", file=sys.stderr)
+    return best, models[best]
+
+
+def read_model(folder: Path) -> ColmapModel:
+    """Read a binary model, or a text model if that is missing or broken. UserError when neither can be read."""
+    errors = [UserError(f"no COLMAP model in {folder}; copy the whole model there")]
+    for suffix in _kinds(folder):
+        try:
+            return read_model_of_kind(folder, suffix)
+        except UserError as error:
+            errors.append(error)
+    raise errors[:2][-1]
+
+
+def read_model_of_kind(folder: Path, suffix: str, with_2d_points: bool = False) -> ColmapModel:
+    """Read a model in .bin or .txt files. UserError where one cannot be read or a photo's camera is missing."""
+    if suffix not in _kinds(folder):
+        raise UserError(f"no COLMAP model in {folder} as .{suffix}; choose the other kind with --model_type")
+    binary = suffix == "bin"
+    try:
+        cameras = read_cameras(folder / f"cameras.{suffix}", binary)
+        images = read_images(folder / f"images.{suffix}", binary, with_2d_points)
+        points = read_points(folder / f"points3D.{suffix}", binary)
+    except OSError as error:
+        raise UserError(f"cannot read {error.filename} ({error.strerror}); fix its permissions, or {AGAIN}") from error
+    for image in images.values():
+        if image.camera_id not in cameras:
+            raise UserError(
+                f"the photo {image.name} in {folder / f'images.{suffix}'} has the camera {image.camera_id}, which is "
+                f"not in cameras.{suffix}; {AGAIN}"
+            )
+    order = np.argsort(points.ids, kind="stable")
+    return ColmapModel(
+        cameras, [image for _, image in sorted(images.items())], Points(*(part[order] for part in points))
+    )
+
+
+def _kinds(folder: Path) -> list[str]:
+    """Suffixes of the models in a folder, the binary one first."""
+    names = ("cameras", "images", "points3D")
+    return [kind for kind in ("bin", "txt") if all((folder / f"{name}.{kind}").is_file() for name in names)]

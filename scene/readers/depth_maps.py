@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from scene.images.decode import picture_size
-from scene.readers import colmap_model
+from scene.readers.colmap import find_model
 from scene.readers.info import CameraInfo, SceneInfo
+from splatting.files.folders import cache_folder
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.listing import some
 from splatting.files.plain_files import plain_text
-from splatting.host.cache_folder import cache_folder
 from utils.system_utils import UserError
 
 PARAMS = "depth_params.json"
@@ -87,27 +87,19 @@ def with_depth_maps(info: SceneInfo, scene: Path, depths: str) -> SceneInfo:
     if (scene / "sparse").is_dir():
         cameras = _with_colmap_maps(info.train_cameras, scene, folder)
     else:
-        cameras = [_with_map(c, _blender_file(c, scene, folder), None, BLENDER_UNIT) for c in info.train_cameras]
+        cameras = [with_map(c, _blender_file(c, scene, folder), None, BLENDER_UNIT) for c in info.train_cameras]
     _check_files([camera.depth.path for camera in cameras if camera.depth])
     return replace(info, train_cameras=cameras)
 
 
-def named_depth_map(camera: CameraInfo, unit: float) -> DepthMap | None:
-    """The map that a view names by depth_path and depth_params; None without one, or if its scale is unreliable.
+def with_map(camera: CameraInfo, path: str | Path, params: Mapping[str, float] | None, unit: float) -> CameraInfo:
+    """The view with a depth map's file and parameters, and with the map itself if its scale is reliable.
 
     unit: COLMAP_UNIT or BLENDER_UNIT. A map without parameters is taken as it is, as in the reference.
     """
-    fit = depth_fit(camera.depth_params)
-    if not camera.depth_path or not fit.reliable:
-        return None
-    return DepthMap(Path(camera.depth_path), unit, fit.scale, fit.offset)
-
-
-def _with_map(camera: CameraInfo, path: Path, params: dict[str, float] | None, unit: float) -> CameraInfo:
-    """The view with its map, or unchanged if the map is unreliable."""
-    named = replace(camera, depth_path=str(path), depth_params=params)
-    depth = named_depth_map(named, unit)
-    return replace(named, depth=depth) if depth else camera
+    fit = depth_fit(params)
+    depth = DepthMap(Path(path), unit, fit.scale, fit.offset) if fit.reliable else None
+    return replace(camera, depth_path=str(path), depth_params=params, depth=depth)
 
 
 def read_values(path: Path) -> np.ndarray:
@@ -142,32 +134,19 @@ def _is_16_bit_color(path: Path) -> bool:
 
 def resize(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """(h, w) resampled to size (width, height): bilinear between four pixel centres, not antialiased."""
-    rows, columns = (_centers(count, new) for count, new in zip(values.shape, size[::-1], strict=True))
-    return sample(values, columns[None, :], rows[:, None])
-
-
-def _centers(count: int, new: int) -> np.ndarray:
-    """Positions of `new` pixel centres of an axis among `count` old ones, which lie at 0, 1, ..."""
-    return (np.arange(new) + 0.5) * count / new - 0.5
+    y, x = ((np.arange(new) + 0.5) * old / new - 0.5 for new, old in zip(size[::-1], values.shape, strict=True))
+    return sample(values, *np.meshgrid(x, y))
 
 
 def sample(values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Bilinear values of (h, w) at columns x and rows y, pixel centres at integers; outside, the border's values."""
+    from scipy.ndimage import map_coordinates  # takes time to load, and most trainings have no depth maps
 
-    def split(at: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        at = np.clip(at, 0, count - 1)
-        low = np.minimum(at.astype(np.int64), max(count - 2, 0))
-        return low, np.minimum(low + 1, count - 1), at - low
-
-    left, right, u = split(x, values.shape[1])
-    top, bottom, v = split(y, values.shape[0])
-    upper = values[top, left] * (1 - u) + values[top, right] * u
-    lower = values[bottom, left] * (1 - u) + values[bottom, right] * u
-    return upper * (1 - v) + lower * v
+    return map_coordinates(values, [y, x], order=1, mode="nearest")
 
 
 def _with_colmap_maps(cameras: Sequence[CameraInfo], scene: Path, folder: Path) -> list[CameraInfo]:
-    path = colmap_model.find_model(scene)[0] / PARAMS
+    path = find_model(scene)[0] / PARAMS
     make = _MAKE.format(scene=scene, depths=folder)
     if not path.is_file():
         raise UserError(f"no {path}, which depth maps need; create it with `{make}`")
@@ -176,11 +155,10 @@ def _with_colmap_maps(cameras: Sequence[CameraInfo], scene: Path, folder: Path) 
     unknown, unreliable = [], []
     for camera in cameras:
         name = Path(camera.image_name).with_suffix("").as_posix()
-        if name in table:
-            camera = _with_map(camera, folder / f"{name}.png", table[name], COLMAP_UNIT)
-        if not camera.depth:
+        named = with_map(camera, folder / f"{name}.png", table[name], COLMAP_UNIT) if name in table else camera
+        if not named.depth:
             (unreliable if name in table else unknown).append(camera.image_name)
-        found.append(camera)
+        found.append(named if named.depth else camera)
     reasons = [
         f"{len(names)} {what} ({some(names)})"
         for names, what in ((unknown, f"not in {path}"), (unreliable, "with an unreliable scale there"))

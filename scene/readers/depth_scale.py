@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from scene.readers.colmap_model import Sightings, find_model, read_sightings
+from scene.colmap_loader import Image, Points, qvec2rotmat
+from scene.readers.colmap import AGAIN, find_model, read_model_of_kind
 from scene.readers.depth_maps import PARAMS, read_values, sample
 from utils.system_utils import UserError, atomic_write
 
@@ -27,28 +28,47 @@ def make_depth_params(scene: Path, depths: Path, model_type: str) -> tuple[dict[
             f"no folder sparse in {scene}: maps are fitted to the points of a COLMAP model; name a COLMAP scene "
             "(--base_dir), or train a Blender scene (transforms_train.json) without a fit"
         )
-    model, _ = find_model(scene)
-    table, pictures = {}, read_sightings(model, model_type)
-    for sightings in tqdm(pictures, desc="Fitting depth maps", unit="map"):
-        name = Path(sightings.name).with_suffix("").as_posix()
-        path = depths / f"{name}.png"
+    folder, _ = find_model(scene)
+    model = read_model_of_kind(folder, model_type, with_2d_points=True)
+    table = {}
+    for image in tqdm(model.images, desc="Fitting depth maps", unit="map"):
+        pixels, z = sightings(image, model.points, f"{folder} as .{model_type}")
+        name = Path(image.name).with_suffix("").as_posix()
+        path, camera = depths / f"{name}.png", model.cameras[image.camera_id]
         if path.is_file():
-            scale, offset = fit_picture(sightings, read_values(path) / UNIT)
+            scale, offset = fit_image(pixels, z, (camera.width, camera.height), read_values(path) / UNIT)
             table[name] = {"scale": scale, "offset": offset}
     if not table:
-        raise UserError(f"no depth map in {depths} belongs to a photo of {model}; name maps like the photos, with .png")
-    with atomic_write(model / PARAMS) as path:
+        raise UserError(
+            f"no depth map in {depths} belongs to a photo of {folder}; name maps like the photos, with .png"
+        )
+    with atomic_write(folder / PARAMS) as path:
         path.write_text(json.dumps(table, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    return table, len(pictures)
+    return table, len(model.images)
 
 
-def fit_picture(sightings: Sightings, depth: np.ndarray) -> tuple[float, float]:
-    """Scale and offset of a map (h, w) of any resolution, from the points in front of the camera and in the photo."""
-    x, y = sightings.pixels.T
-    inside = (x >= 0) & (y >= 0) & (x < sightings.width) & (y < sightings.height) & (sightings.depths > 0)
-    height, width = depth.shape
-    x, y = x[inside] * width / sightings.width - 0.5, y[inside] * height / sightings.height - 0.5
-    return fit_line(sample(depth, x, y), 1 / sightings.depths[inside])
+def sightings(image: Image, points: Points, model: str) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (n,2), centres at .5, and depths z (n,) of the points that a photo sees, of all points sorted by id.
+
+    UserError, naming the model, for a point that is not among them.
+    """
+    seen = image.point3D_ids >= 0
+    ids = image.point3D_ids[seen]
+    places = np.searchsorted(points.ids, ids)
+    if (places == np.searchsorted(points.ids, ids, side="right")).any():
+        raise UserError(f"the photo {image.name} in {model} sees a point that is not in points3D; {AGAIN}")
+    return image.xys[seen], points.xyz[places] @ qvec2rotmat(image.qvec)[2] + image.tvec[2]
+
+
+def fit_image(pixels: np.ndarray, z: np.ndarray, size: tuple[int, int], depth: np.ndarray) -> tuple[float, float]:
+    """Scale and offset of a map (h, w) of any resolution, from the points in front of the camera and in the photo.
+
+    pixels (n,2) of a photo of a size (width, height), and depths z (n,), as of `sightings`.
+    """
+    x, y = pixels.T
+    inside = (x >= 0) & (y >= 0) & (x < size[0]) & (y < size[1]) & (z > 0)
+    x, y = x[inside] * depth.shape[1] / size[0] - 0.5, y[inside] * depth.shape[0] / size[1] - 0.5
+    return fit_line(sample(depth, x, y), 1 / z[inside])
 
 
 def fit_line(mono: np.ndarray, colmap: np.ndarray) -> tuple[float, float]:

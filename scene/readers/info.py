@@ -11,9 +11,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from scene.images.decode import picture_size
+from scene.images.lens import Lens
 from scene.images.masks import Mask
-from scene.images.store import Decodable
-from splatting.files.relative import relative_to
+from scene.images.store import Decodable, InMemory
+from splatting.files.plain_files import relative_to
 from utils.graphics_utils import BasicPointCloud, camera_center, focal2fov, fov2focal, rigid_pose
 from utils.system_utils import UserError
 
@@ -42,29 +43,6 @@ class _LikeNamedTuple:
         return tuple(self)[index]
 
 
-class _FileSize:
-    """`CameraInfo.file_size`: as given, else from the photo when it is first asked for."""
-
-    def __get__(self, camera: "CameraInfo | None", owner: type) -> tuple[int, int] | None:
-        if camera is None:
-            return None  # the field's default
-        if camera.__dict__["file_size"] is None:
-            camera.__dict__["file_size"] = _size_of_photo(camera)
-        return camera.__dict__["file_size"]
-
-    def __set__(self, camera: "CameraInfo", size: tuple[int, int] | None) -> None:
-        camera.__dict__["file_size"] = size
-
-
-def _size_of_photo(camera: "CameraInfo") -> tuple[int, int]:
-    if camera.image is not None:
-        return camera.image.size
-    try:
-        return picture_size(Path(camera.image_path))
-    except UserError:
-        return camera.width, camera.height
-
-
 @dataclass(frozen=True)
 class CameraInfo(_LikeNamedTuple):
     """One view. The fields up to is_test are the reference's; the others are given by name.
@@ -77,10 +55,11 @@ class CameraInfo(_LikeNamedTuple):
 
     fx, fy, cx, cy: pixels of that image, pixel centres at .5. Either FovX and FovY or fx and fy must be given; the
     others follow from them. Where they disagree, fx and fy count. The principal point is the middle by default.
-    file_size: (width, height) of the photo, read from the file when first asked for; width, height if that fails.
-    mask: of the photo's shape, None if all pixels count. ignore_alpha: transparent pixels of the photo do not count.
-    depth: inverse depth of a training view that has a map (scene/readers/depth_maps.py). image: the photo as a PIL
-    image, as the 2023 release gave it; readers leave it out.
+    file_size: (width, height) of the photo, None: not read yet. lens: of a photo that has to be undistorted first, else
+    None (scene/readers/pinholes.py). mask: of the photo's shape, None if all pixels count. ignore_alpha: transparent
+    pixels of the photo do not count. depth: inverse depth of a training view that has a map
+    (scene/readers/depth_maps.py). image: the photo in memory, which readers leave out: a PIL image, as the 2023 release
+    gave it, or pixels at training size.
     """
 
     uid: int
@@ -100,10 +79,11 @@ class CameraInfo(_LikeNamedTuple):
     fy: float | None = None
     cx: float | None = None
     cy: float | None = None
-    file_size: tuple[int, int] = _FileSize()
+    file_size: tuple[int, int] | None = None
+    lens: Lens | None = None
     mask: Mask | None = None
     ignore_alpha: bool = False
-    depth: Decodable | None = None
+    depth: Decodable | InMemory | None = None
     image: Any = None
 
     _fields: ClassVar[tuple[str, ...]] = (
@@ -131,7 +111,7 @@ class CameraInfo(_LikeNamedTuple):
         A change of FovX changes fx, and the other way round. A change of width keeps FovX, as in the reference, and the
         principal point's place in the image. Another photo has its own file_size. Likewise for the vertical.
         """
-        values = {item.name: self.__dict__[item.name] for item in fields(self)}
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
         for fov, focal, center, side in _AXES:
             if fov in changes or side in changes:
                 values[focal] = None
@@ -198,6 +178,19 @@ def split_by_order(
 def held_out(cameras: Sequence[CameraInfo]) -> list[CameraInfo]:
     """The views, marked as test views."""
     return [replace(camera, is_test=True) for camera in cameras]
+
+
+def photo_size(view: CameraInfo) -> tuple[int, int]:
+    """Size (width, height) of the photo of a record. Where it cannot be read, a CameraInfo's own; else UserError."""
+    size, image = getattr(view, "file_size", None), getattr(view, "image", None)
+    if size or image is not None:
+        return size or image.size
+    try:
+        return picture_size(Path(view.image_path))
+    except UserError:
+        if not isinstance(view, CameraInfo):
+            raise
+        return view.width, view.height
 
 
 def exposure_names(cameras: Sequence[CameraInfo]) -> list[str]:

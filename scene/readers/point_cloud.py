@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from splatting.files.packed import check_packed_rows
+from splatting.files.plain_files import check_packed_rows
 from splatting.files.ply_header import read_elements
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError, atomic_write
@@ -170,7 +170,8 @@ def check_finite(points: np.ndarray, path: Path) -> None:
         bad = ~np.isfinite(points.astype(np.float32)).all(axis=1)
     if bad.any():
         raise UserError(
-            f"{bad.sum()} of {len(bad)} points in {path} are not finite (first: number {bad.argmax()}); remove them"
+            f"{bad.sum()} of {len(bad)} points in {path} are not finite (first: number {bad.argmax()}); "
+            "remove them from the cloud"
         )
 
 

@@ -1,5 +1,6 @@
 """Kinds of dataset folders, and hints at the right folder for a user who gave another one."""
 
+import os
 from pathlib import Path
 
 from splatting.files.listing import some
@@ -10,8 +11,11 @@ _PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 _MODEL = ("cameras.bin", "cameras.txt")
 
 
-def kind_of(folder: Path) -> str:
+def kind_of(source_path: str | os.PathLike) -> str:
     """COLMAP, BLENDER or NERFSTUDIO. UserError saying what was looked for and found, and where the scene may be."""
+    if not str(source_path):
+        raise UserError("no scene folder given; name it with -s")
+    folder = Path(source_path)
     if not folder.exists():
         raise UserError(f"no scene folder {folder}; name an existing one with -s")
     if not folder.is_dir():

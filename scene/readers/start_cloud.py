@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scene.readers.info import CameraInfo, scene_extent
+from scene.readers.info import CameraInfo, SceneInfo, normalization, scene_extent
 from scene.readers.point_cloud import is_ply, read_point_cloud
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
@@ -32,14 +32,30 @@ OWN_POINTS = StartOptions()
 class StartCloud(NamedTuple):
     """Points, and the PLY they come from; None for points of another kind of file or of none."""
 
-    cloud: BasicPointCloud
+    cloud: BasicPointCloud | None
     ply_path: Path | None
 
 
-def choose_start(
+def scene_info(
+    views: tuple[list[CameraInfo], list[CameraInfo]],
+    options: StartOptions | None,
+    own: Callable[[], StartCloud | None],
+    random: Callable[[], BasicPointCloud],
+    lacking: str,
+    is_nerf_synthetic: bool = False,
+) -> SceneInfo:
+    """The dataset of training and test views with its start cloud; options None: without one.
+
+    own: reads the scene's points, if it has any; lacking: start of the message when it has none. random: makes others.
+    """
+    start = StartCloud(None, None) if options is None else _choose(options, own, random, lacking)
+    points = None if start.cloud is None else start.cloud.points
+    return SceneInfo(start.cloud, *views, normalization(views[0], points), start.ply_path, is_nerf_synthetic)
+
+
+def _choose(
     options: StartOptions, own: Callable[[], StartCloud | None], random: Callable[[], BasicPointCloud], lacking: str
 ) -> StartCloud:
-    """The start cloud. own: reads the scene's points, if it has any; lacking: start of the message when it has none."""
     if isinstance(options.points, BasicPointCloud):
         return StartCloud(options.points, None)
     if options.points:

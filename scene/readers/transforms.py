@@ -2,45 +2,35 @@
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from scene.images.decode import picture_size
-from scene.images.find import find_pictures
+from scene.images.find import find_images
+from scene.images.lens import Lens
 from scene.images.masks import NO_MASKS, Mask, MaskOptions, find_masks
-from scene.readers.info import CameraInfo, SceneInfo, held_out, normalization, split_by_order
+from scene.readers.info import CameraInfo, SceneInfo, held_out, split_by_order
+from scene.readers.pinholes import camera_info, finished
 from scene.readers.point_cloud import read_point_cloud
-from scene.readers.source_views import SourceView, make_cameras
 from scene.readers.start_cloud import (
     OWN_POINTS,
     StartCloud,
     StartOptions,
-    choose_start,
     random_in_cube,
     random_in_frusta,
+    scene_info,
 )
-from scene.readers.transforms_lens import lens_of
 from splatting.files.image_files import SUFFIXES
-from splatting.files.plain_files import plain_text
-from splatting.files.relative import relative_to
+from splatting.files.plain_files import plain_text, relative_to
+from utils.graphics_utils import fov2focal
 from utils.system_utils import UserError
 
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
-
-
-class _Frame(NamedTuple):
-    file_path: str
-    world_to_camera: np.ndarray
-    fields: dict[str, Any]
-
-
-class _CameraFile(NamedTuple):
-    path: Path
-    fields: dict[str, Any]
-    frames: list[_Frame]
+_BROWN = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+_FISHEYE = ("FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 
 
 def read_blender(
@@ -64,20 +54,18 @@ def read_blender(
     train, test = (train, held_out(test)) if hold_out else (train + test, [])
     if not train:
         raise UserError(f"{files[0]} lists no frames; export the scene again")
-    if start is None:
-        return SceneInfo(None, train, test, normalization(train), None, is_nerf_synthetic=True)
 
     def own() -> StartCloud:
         ply = folder / "points3d.ply"
         return StartCloud(read_point_cloud(ply), ply) if ply.is_file() else StartCloud(random_in_cube(), None)
 
-    cloud, ply_path = choose_start(start, own, random_in_cube, f"{folder / 'points3d.ply'} has no points")
-    return SceneInfo(cloud, train, test, normalization(train, cloud.points), ply_path, is_nerf_synthetic=True)
+    lacking = f"{folder / 'points3d.ply'} has no points"
+    return scene_info((train, test), start, own, random_in_cube, lacking, is_nerf_synthetic=True)
 
 
 def read_frames(path: Path, masks: MaskOptions = NO_MASKS, suffixes: Sequence[str] = SUFFIXES) -> list[CameraInfo]:
     """The views of one of a Blender scene's two files, in its order."""
-    return _cameras(_read(path), masks, suffixes, by_stem=True)
+    return _cameras(path, _read(path), masks, suffixes, by_stem=True)
 
 
 def read_nerfstudio(
@@ -89,47 +77,39 @@ def read_nerfstudio(
     8th view. Frames may name masks, which --masks replaces. Points come from the file's ply_file_path. Arguments and
     errors as for `scene.dataset_readers.read_scene`; images has no effect.
     """
-    content = _read(folder / "transforms.json")
-    cameras = sorted(
-        _cameras(content, masks, SUFFIXES, by_stem=False), key=lambda camera: os.fsencode(camera.image_name)
-    )
+    path = folder / "transforms.json"
+    content = _read(path)
+    cameras = _cameras(path, content, masks, SUFFIXES, by_stem=False)
+    cameras.sort(key=lambda camera: os.fsencode(camera.image_name))
     if not cameras:
-        raise UserError(f"{content.path} lists no frames; export the scene again")
-    train, test = _own_split(content, cameras, hold_out) or split_by_order(cameras, hold_out, folder)
-    if start is None:
-        return SceneInfo(None, train, test, normalization(train), None)
+        raise UserError(f"{path} lists no frames; export the scene again")
+    views = _own_split(path, content, cameras, hold_out) or split_by_order(cameras, hold_out, folder)
 
     def own() -> StartCloud | None:
-        name = content.fields.get("ply_file_path")
+        name = content.get("ply_file_path")
         return StartCloud(read_point_cloud(folder / str(name)), folder / str(name)) if name else None
 
-    lacking = f"{content.path} names no points (ply_file_path)"
-    cloud, ply_path = choose_start(start, own, lambda: random_in_frusta(train), lacking)
-    return SceneInfo(cloud, train, test, normalization(train, cloud.points), ply_path)
+    return scene_info(views, start, own, lambda: random_in_frusta(views[0]), f"{path} names no points (ply_file_path)")
 
 
-def _read(path: Path) -> _CameraFile:
+def _read(path: Path) -> dict[str, Any]:
+    """A camera file's content, with a list of frames that have a file_path and a transform_matrix."""
     try:
         content = json.loads(plain_text(path))
-        listed = list(content["frames"])
+        content["frames"] = list(content["frames"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise _no_camera_file(path, error) from error
-    return _CameraFile(path, content, [_frame(path, number, frame) for number, frame in enumerate(listed, start=1)])
-
-
-def _frame(path: Path, number: int, frame: Any) -> _Frame:
-    name = f" ({frame['file_path']})" if isinstance(frame, dict) and "file_path" in frame else ""
-    where = f"frame {number}{name:.80} of {path}"
-    try:
-        lacking = [key for key in ("file_path", "transform_matrix") if key not in frame]
+    for number, frame in enumerate(content["frames"], start=1):
+        lacking = [key for key in ("file_path", "transform_matrix") if not isinstance(frame, dict) or key not in frame]
         if lacking:
-            raise UserError(f"{where} has no {' and no '.join(lacking)}; fix the frame, or take it out")
-        return _Frame(str(frame["file_path"]), _world_to_camera(frame["transform_matrix"]), dict(frame))
-    except (ValueError, TypeError, OverflowError, np.linalg.LinAlgError) as error:
-        raise UserError(
-            f"{where} has no usable pose ({type(error).__name__}: {error}); it needs a transform_matrix of 4x4 finite "
-            "numbers that can be inverted"
-        ) from error
+            fault = f"has no {' and no '.join(lacking)}; fix the frame, or take it out"
+            raise UserError(f"{_where(path, number, frame)} {fault}")
+    return content
+
+
+def _where(path: Path, number: int, frame: Any) -> str:
+    name = f" ({frame['file_path']})" if isinstance(frame, dict) and "file_path" in frame else ""
+    return f"frame {number}{name:.80} of {path}"
 
 
 def _no_camera_file(path: Path, error: Exception) -> UserError:
@@ -139,48 +119,66 @@ def _no_camera_file(path: Path, error: Exception) -> UserError:
     )
 
 
-def _cameras(file: _CameraFile, masks: MaskOptions, suffixes: Sequence[str], by_stem: bool) -> list[CameraInfo]:
+def _cameras(
+    path: Path, content: dict[str, Any], masks: MaskOptions, suffixes: Sequence[str], by_stem: bool
+) -> list[CameraInfo]:
     """The views in the order of the frames, named by the stems or by the relative paths of their files."""
-    folder = file.path.parent
-    listed = [frame.file_path for frame in file.frames]
-    paths = find_pictures(folder, listed, str(file.path), "put them there", suffixes)
-    names = [_relative(path, folder) for path in paths]
-    views = []
-    for index, (frame, path, mask) in enumerate(zip(file.frames, paths, _masks(file, names, masks), strict=True)):
+    frames = content["frames"]
+    poses = [_pose(path, number, frame) for number, frame in enumerate(frames, start=1)]
+    listed = [str(frame["file_path"]) for frame in frames]
+    photos = find_images(path.parent, listed, str(path), "put them there", suffixes)
+    names = [relative_to(photo, path.parent).as_posix() for photo in photos]
+    found = _masks(path, frames, names, masks)
+    cameras = []
+    for index, (frame, photo, mask, (R, T)) in enumerate(zip(frames, photos, found, poses, strict=True)):
         try:
-            lens = lens_of(frame.fields, file.fields, picture_size(path), file.path)
+            lens = lens_of(frame, content, picture_size(photo), path)
         except (ValueError, TypeError, OverflowError) as error:
-            raise _no_camera_file(file.path, error) from error
-        pose = frame.world_to_camera
-        name = path.stem if by_stem else names[index]
-        views.append(SourceView(name, path, index, lens, pose[:3, :3], pose[:3, 3], mask))
-    return make_cameras(views, masks.ignore_alpha)
+            raise _no_camera_file(path, error) from error
+        name = photo.stem if by_stem else names[index]
+        cameras.append(camera_info(index, name, photo, lens, R, T, mask, masks.ignore_alpha))
+    return finished(cameras)
 
 
-def _relative(path: Path, folder: Path) -> str:
-    return relative_to(path, folder).as_posix()
+def _pose(path: Path, number: int, frame: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Camera-to-world rotation (3,3) and world-to-camera translation (3,), y down and z forward.
+
+    The file has an OpenGL camera-to-world matrix (y up, z backward).
+    """
+    try:
+        matrix = np.array(frame["transform_matrix"], dtype=np.float64)
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+            raise ValueError(f"transform_matrix must be 4x4 finite numbers, got shape {matrix.shape}")
+        matrix[:3, 1:3] *= -1
+        inverse = np.linalg.inv(matrix)
+        if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-3:
+            raise ValueError(f"the last row of transform_matrix must be 0 0 0 1, got {matrix[3]}")
+    except (ValueError, TypeError, OverflowError, np.linalg.LinAlgError) as error:
+        raise UserError(
+            f"{_where(path, number, frame)} has no usable pose ({type(error).__name__}: {error}); it needs a "
+            "transform_matrix of 4x4 finite numbers that can be inverted"
+        ) from error
+    return inverse[:3, :3].T.copy(), inverse[:3, 3].copy()
 
 
-def _masks(file: _CameraFile, names: list[str], masks: MaskOptions) -> list[Mask | None]:
-    folder = file.path.parent
-    listed = [frame.fields.get("mask_path") for frame in file.frames]
+def _masks(path: Path, frames: list[dict[str, Any]], names: list[str], masks: MaskOptions) -> list[Mask | None]:
+    listed = [frame.get("mask_path") for frame in frames]
     if masks.folder or not any(listed):
-        return find_masks(folder, names, masks)
+        return find_masks(path.parent, names, masks)
     named = [str(name) for name in listed if name]
-    found = find_pictures(folder, named, str(file.path), "put them there", kind="masks")
-    paths = iter(found)
+    paths = iter(find_images(path.parent, named, str(path), "put them there", kind="masks"))
     return [masks.mask(next(paths)) if name else None for name in listed]
 
 
 def _own_split(
-    file: _CameraFile, cameras: list[CameraInfo], hold_out: bool
+    path: Path, content: dict[str, Any], cameras: list[CameraInfo], hold_out: bool
 ) -> tuple[list[CameraInfo], list[CameraInfo]] | None:
     """Training and test views by the file's lists; None without hold_out or without such lists."""
     lists = []
     for name in SPLITS:
-        listed = file.fields.get(name) or []
+        listed = content.get(name) or []
         if not isinstance(listed, list):
-            raise UserError(f"{name} in {file.path} must be a list of file names; fix it, or leave it out")
+            raise UserError(f"{name} in {path} must be a list of file names; fix it, or leave it out")
         lists.append({os.path.normpath(str(entry)) for entry in listed})
     train_names, test_names = lists[0], lists[2] or lists[1]
     if not hold_out or not test_names:
@@ -194,19 +192,54 @@ def _own_split(
             train.append(camera)
     if not test or not train:
         raise UserError(
-            f"of the photos in {file.path}, {len(train)} are in train_filenames and {len(test)} in test_filenames (or "
+            f"of the photos in {path}, {len(train)} are in train_filenames and {len(test)} in test_filenames (or "
             "val_filenames), but each list needs at least one; fix the lists or leave --eval out"
         )
     return train, held_out(test)
 
 
-def _world_to_camera(rows: list[list[float]]) -> np.ndarray:
-    """World-to-camera matrix (4,4), y down and z forward, of an OpenGL camera-to-world matrix (y up, z backward)."""
-    matrix = np.array(rows, dtype=np.float64)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise ValueError(f"transform_matrix must be 4x4 finite numbers, got shape {matrix.shape}")
-    matrix[:3, 1:3] *= -1
-    inverse = np.linalg.inv(matrix)
-    if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-3:
-        raise ValueError(f"the last row of transform_matrix must be 0 0 0 1, got {matrix[3]}")
-    return inverse
+def lens_of(frame: Mapping[str, Any], shared: Mapping[str, Any], size: tuple[int, int], file: Path) -> Lens:
+    """The lens of a frame: each value from the frame's own fields, else from those of the whole file.
+
+    Fields: fl_x, fl_y in pixels, or camera_angle_x, camera_angle_y in radians (a missing y equals x); cx, cy (default:
+    the middle); w, h (default: `size`, the photo's width and height); camera_model, or is_fisheye; k1 ... k6, p1, p2 as
+    in OpenCV. UserError for a lens that cannot be used; TypeError, ValueError, OverflowError for a value that is not a
+    number.
+    """
+    fields = {**shared, **frame}
+
+    def number(name: str, default: float) -> float:
+        value = fields.get(name)
+        return default if value is None else float(value)
+
+    width, height = int(number("w", size[0])), int(number("h", size[1]))
+    for name in ("camera_angle_x", "camera_angle_y"):
+        if not 0 < number(name, 1.0) < np.pi:
+            raise UserError(f"{name} in {file} must lie between 0 and pi, got {number(name, 1.0)}; give it in radians")
+    if fields.get("fl_x") is None and fields.get("camera_angle_x") is None:
+        raise UserError(f"{file} has neither camera_angle_x nor fl_x; export the cameras with one of them")
+    fx = number("fl_x", fov2focal(number("camera_angle_x", 1.0), width))
+    angle_y = fields.get("camera_angle_y")
+    fy = number("fl_y", fx if angle_y is None or fields.get("fl_x") is not None else fov2focal(float(angle_y), height))
+    pinhole = (fx, fy, number("cx", width / 2), number("cy", height / 2))
+    k1, k2, k3, k4, k5, k6, p1, p2 = (number(name, 0.0) for name in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"))
+
+    model = str(fields.get("camera_model") or ("FISHEYE" if fields.get("is_fisheye") else "PERSPECTIVE")).upper()
+    if model in _FISHEYE:
+        return Lens("OPENCV_FISHEYE", (*pinhole, k1, k2, k3, k4), width, height)
+    if model not in _BROWN:
+        raise UserError(
+            f"the camera_model {model} in {file} cannot be used, only {', '.join(_BROWN + _FISHEYE)}; convert the "
+            "photos to one of these"
+        )
+    if not any((k1, k2, k3, k4, k5, k6, p1, p2)):
+        return Lens("PINHOLE", pinhole, width, height)
+    if model != "FULL_OPENCV" and any((k4, k5, k6)):
+        # OpenCV divides by 1 + k4 r^2 + ..., nerfstudio adds k4 r^8, and the file does not say which one is meant.
+        raise UserError(
+            f"{file} has k4, k5 or k6 for the camera_model {model}, on whose meaning programs disagree; set them to 0, "
+            "or camera_model to FULL_OPENCV if they are OpenCV's"
+        )
+    if any((k3, k4, k5, k6)):
+        return Lens("FULL_OPENCV", (*pinhole, k1, k2, p1, p2, k3, k4, k5, k6), width, height)
+    return Lens("OPENCV", (*pinhole, k1, k2, p1, p2), width, height)

@@ -1,6 +1,6 @@
 """Paths of a camera through a scene, for videos and viewers.
 
-keyframes, moments, poses       a path's file, its pose at each moment, cameras as arrays
-interpolated, generated         paths made from the training cameras
-request, render_path, video     a video of a path
+keyframes, poses        a path's file and its pose at each moment, cameras as arrays
+generated               paths made from the training cameras
+render_path, video      a video of a path
 """

@@ -51,7 +51,7 @@ class Poses:
     @property
     def quaternions(self) -> np.ndarray:
         """The turns as unit quaternions (N,4) wxyz."""
-        return to_wxyz(Rotation.from_matrix(self.turns))
+        return Rotation.from_matrix(self.turns).as_quat(scalar_first=True)
 
 
 def poses_of(cameras: Sequence[Camera]) -> Poses:
@@ -60,11 +60,6 @@ def poses_of(cameras: Sequence[Camera]) -> Poses:
     positions = -np.linalg.solve(views[:, :3, :3], views[:, :3, 3:])[..., 0]
     turns = Rotation.from_matrix(views[:, :3, :3].transpose(0, 2, 1)).as_matrix()
     return Poses(positions, turns, np.degrees([float(camera.FoVy) for camera in cameras]))
-
-
-def to_wxyz(rotation: Rotation) -> np.ndarray:
-    """Quaternions with the real part first; SciPy has it last."""
-    return np.roll(rotation.as_quat(), 1, axis=-1)
 
 
 def unit(vector: np.ndarray) -> np.ndarray:
@@ -84,7 +79,8 @@ def facing(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 def keyframe(seconds: float, position: np.ndarray, turn: np.ndarray, fov: float) -> Keyframe:
     """A pose with a turn (3,3) as a Keyframe."""
-    return Keyframe(seconds, tuple(position.tolist()), tuple(to_wxyz(Rotation.from_matrix(turn)).tolist()), float(fov))
+    wxyz = Rotation.from_matrix(turn).as_quat(scalar_first=True)
+    return Keyframe(seconds, tuple(position.tolist()), tuple(wxyz.tolist()), float(fov))
 
 
 def focus_point(poses: Poses) -> np.ndarray | None:

@@ -4,13 +4,13 @@ import contextlib
 import re
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 
-from splatting.host.session import own_session
+from splatting.host.interrupt import own_session
 from utils.system_utils import UserError, atomic_write
 
 # Of x264, 0 to 51, smaller is better. At 16 a render keeps 35 dB and more; what is lost is colour at edges, as yuv420p
@@ -34,48 +34,12 @@ def find_ffmpeg() -> str:
         ) from error
 
 
-class VideoWriter:
-    """A running ffmpeg that takes frames. `write` raises UserError with its last line if it has died."""
+def write_video(path: Path, frames: Iterable[np.ndarray], width: int, height: int, fps: int) -> None:
+    """Write frames (H,W,3) uint8 sRGB, of an even width and height, as a video of `fps` frames a second.
 
-    def __init__(self, process: subprocess.Popen, said: IO[bytes], path: Path) -> None:
-        self._process, self._said, self._path, self._frames = process, said, path, 0
-
-    def write(self, frame: np.ndarray) -> None:
-        """Add a frame (H,W,3) uint8 sRGB."""
-        try:
-            self._process.stdin.write(np.ascontiguousarray(frame).data)
-        except OSError as error:
-            raise self._failure() from error
-        self._frames += 1
-
-    def finish(self) -> None:
-        """End the file. UserError if ffmpeg could not write it."""
-        try:
-            self._process.stdin.close()
-        except OSError as error:
-            raise self._failure() from error
-        if self._process.wait():
-            raise self._failure()
-
-    def _failure(self) -> UserError:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(_WAIT)
-        self._said.seek(0)
-        lines = self._said.read().decode("utf-8", "replace").strip().splitlines()
-        # Without the part of ffmpeg that says it, "[out#0/mp4 @ 0x5609]".
-        reason = re.sub(r"^\[[^\]]*\] ", "", lines[-1]) if lines else f"it ended with {self._process.returncode}"
-        return UserError(
-            f"ffmpeg could not write {self._path}, after {self._frames} frames ({reason}); free space there, or "
-            "choose another --size or place"
-        )
-
-
-@contextlib.contextmanager
-def video_writer(path: Path, width: int, height: int, fps: int) -> Iterator[VideoWriter]:
-    """Open a video of `fps` frames a second, of an even width and height, for writing.
-
-    H.264 in yuv420p, limited range, flagged as BT.709, at the constant quality CRF. The file appears whole when the
-    block ends, or not at all. Memory does not depend on the number of frames. UserError if ffmpeg is missing or fails.
+    H.264 in yuv420p, limited range, flagged as BT.709, at the constant quality CRF. The file appears whole or not at
+    all. Memory does not depend on the number of frames. UserError if ffmpeg is missing, or with its last line if it
+    fails.
     """
     program = find_ffmpeg()
     with atomic_write(path) as temporary, tempfile.TemporaryFile() as said:
@@ -89,16 +53,41 @@ def video_writer(path: Path, width: int, height: int, fps: int) -> Iterator[Vide
                 f"cannot start {program} ({error.strerror}); `pip install --force-reinstall imageio-ffmpeg` brings it "
                 "back, or name another ffmpeg in the environment variable IMAGEIO_FFMPEG_EXE"
             ) from error
-        writer = VideoWriter(process, said, path)
+        count = 0
         try:
-            yield writer
-            writer.finish()
+            for frame in frames:
+                if not _accepted(process.stdin.write, np.ascontiguousarray(frame).data):
+                    raise _failure(process, said, path, count)
+                count += 1
+            if not _accepted(process.stdin.close) or process.wait():
+                raise _failure(process, said, path, count)
         finally:
             if process.poll() is None:
                 process.kill()
                 process.wait()
-            with contextlib.suppress(OSError):
-                process.stdin.close()
+            _accepted(process.stdin.close)
+
+
+def _accepted(act: Callable[..., object], *values: object) -> bool:
+    """Whether ffmpeg takes its input: it may have ended."""
+    try:
+        act(*values)
+    except OSError:
+        return False
+    return True
+
+
+def _failure(process: subprocess.Popen, said: IO[bytes], path: Path, count: int) -> UserError:
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(_WAIT)
+    said.seek(0)
+    lines = said.read().decode("utf-8", "replace").strip().splitlines()
+    # Without the part of ffmpeg that says it, "[out#0/mp4 @ 0x5609]".
+    reason = re.sub(r"^\[[^\]]*\] ", "", lines[-1]) if lines else f"it ended with {process.returncode}"
+    return UserError(
+        f"ffmpeg could not write {path}, after {count} frames ({reason}); free space there, or "
+        "choose another --size or place"
+    )
 
 
 def _arguments(width: int, height: int, fps: int) -> list[str]:

@@ -1,14 +1,15 @@
-"""Make the demo scene: ray-traced photos of analytic shapes, and a COLMAP model of them.
+"""Make the demo scene: ray-traced images of analytic shapes, and a COLMAP model of them.
+
+The points on the surfaces are noisy and coloured and have their tracks, as structure from motion would find them.
 
 python -m splatting.demo.make_scene OUT [--views 60] [--size 400 300] [--points 8000] [--seed 0]
 """
-
-from __future__ import annotations
 
 import os
 import shutil
 from argparse import ArgumentParser
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -17,29 +18,121 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from splatting.demo.objects import demo_scene
-from splatting.demo.points import MIN_TRACK, sample_points, write_model
-from splatting.demo.tracer import View, render_view, ring_views
-from splatting.host.threads import cores
+from splatting.demo.objects import Thing, demo_scene
+from splatting.demo.tracer import View, render_view, ring_views, trace
+from splatting.host.machine import cores
 from utils.system_utils import UserError, mkdir_p, run_cli
 
 PIXELS_PER_PROCESS = 1_000_000  # with fewer, starting another process (2 s) costs more time than it saves
+POSITION_NOISE = 0.004  # standard deviation of a point, as a fraction of its distance from the view that found it
+PIXEL_NOISE = 0.3  # standard deviation of an observation in pixels
+MIN_TRACK = 3  # least number of views that see a point
 
 
-def _demo_picture(view: View) -> np.ndarray:
+def _demo_image(view: View) -> np.ndarray:
     return render_view(demo_scene(), view)
 
 
-def _pictures(views: list[View]) -> list[np.ndarray]:
+def _images(views: list[View]) -> list[np.ndarray]:
     """Ray-trace the views to photos, (H, W, 3) uint8 each, on several cores if that saves time."""
     pixels = sum(view.width * view.height for view in views)
     workers = min(cores(), 1 + pixels // PIXELS_PER_PROCESS)
     bar = partial(tqdm, total=len(views), desc="Ray tracing", unit="view")
     if workers == 1:
-        return list(bar(map(_demo_picture, views)))
+        return list(bar(map(_demo_image, views)))
     # Use processes, because numpy holds the interpreter's lock most of the time on blocks this small.
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        return list(bar(pool.map(_demo_picture, views)))
+        return list(bar(pool.map(_demo_image, views)))
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Coloured points and their observations in the views."""
+
+    xyz: np.ndarray  # (N, 3), world units
+    rgb: np.ndarray  # (N, 3) uint8
+    seen: list[np.ndarray]  # for each view, the indices (K,) of the points that it sees
+    keypoints: list[np.ndarray]  # for each view, their observed positions (K, 2) in pixels; pixel centres are at .5
+
+
+def _found_by_views(
+    things: list[Thing], views: list[View], count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return surface points (3, count) under random pixels of random views, and their distances (count,)."""
+    owner = np.sort(rng.integers(len(views), size=count))
+    u, v = rng.uniform(size=(2, count))
+    points = np.empty((3, count))
+    distance = np.empty(count)
+    for k, view in enumerate(views):
+        mine = np.flatnonzero(owner == k)
+        direction = view.rays(u[mine] * view.width, v[mine] * view.height)
+        origin = view.center.reshape(3, 1)
+        distance[mine], _ = trace(things, origin.astype(np.float32), direction)
+        points[:, mine] = origin + distance[mine] * direction
+    return points, distance
+
+
+def _visible(things: list[Thing], view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices (K,) of the surface points (3, N) that a view sees, and their image positions (K, 2)."""
+    x, y, z = view.project(points)
+    inside = np.flatnonzero((z > 0) & (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height))
+    origin = view.center.reshape(3, 1)
+    offset = points[:, inside] - origin
+    distance = np.linalg.norm(offset, axis=0)
+    hit, _ = trace(things, origin.astype(np.float32), (offset / distance).astype(np.float32))
+    # Hits on a slanted surface move by far more than float32's rounding. All objects are much thicker than 0.02.
+    near = hit > distance - 0.02
+    return inside[near], np.stack([x, y], axis=1)[inside[near]]
+
+
+def sample_points(
+    things: list[Thing], views: list[View], images: list[np.ndarray], count: int, rng: np.random.Generator
+) -> SurfacePoints:
+    """Sample about `count` surface points with true visibility; drop points that fewer than MIN_TRACK views see.
+
+    images: the views' photos, (H, W, 3) uint8. A point's colour is its mean over the photos that see it, so it does
+    not depend on the view.
+    """
+    points, distance = _found_by_views(things, views, count, rng)
+    seen, exact = zip(*(_visible(things, view, points) for view in views), strict=True)
+    track = np.bincount(np.concatenate(seen), minlength=count)
+    colour = np.zeros((count, 3))
+    for index, place, image in zip(seen, exact, images, strict=True):
+        column, row = place.astype(int).T
+        colour[index] += image[row, column]
+    keep = track >= MIN_TRACK
+    renumber = np.cumsum(keep) - 1
+    xyz = points.T + rng.normal(size=(count, 3)) * (POSITION_NOISE * distance)[:, None]
+    noisy = [place + rng.normal(scale=PIXEL_NOISE, size=place.shape) for place in exact]
+    return SurfacePoints(
+        xyz=xyz[keep],
+        rgb=np.floor(colour[keep] / track[keep, None] + 0.5).astype(np.uint8),
+        seen=[renumber[index[keep[index]]] for index in seen],
+        keypoints=[place[keep[index]] for index, place in zip(seen, noisy, strict=True)],
+    )
+
+
+def write_model(folder: Path, names: list[str], views: list[View], points: SurfacePoints) -> None:
+    """Make `folder` with a binary COLMAP model: one PINHOLE camera, an image per view, points with their tracks."""
+    import pycolmap
+
+    first = views[0]
+    model = pycolmap.Reconstruction()
+    params = [first.focal, first.focal, first.width / 2, first.height / 2]
+    camera = pycolmap.Camera(model="PINHOLE", width=first.width, height=first.height, params=params, camera_id=1)
+    model.add_camera_with_trivial_rig(camera)
+    tracks = [pycolmap.Track() for _ in points.xyz]
+    for image_id, (name, view) in enumerate(zip(names, views, strict=True), 1):
+        image = pycolmap.Image(name=name, keypoints=points.keypoints[image_id - 1], camera_id=1, image_id=image_id)
+        translation = -view.rotation @ view.center
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(view.rotation), translation))
+        for place, index in enumerate(points.seen[image_id - 1]):
+            tracks[index].add_element(image_id, place)
+    for xyz, track, rgb in zip(points.xyz, tracks, points.rgb, strict=True):
+        model.add_point3D(xyz, track, rgb)
+    model.update_point_3d_errors()
+    folder.mkdir(parents=True)
+    model.write_binary(folder)
 
 
 def make_scene(out: Path, views: int, width: int, height: int, points: int, seed: int) -> int:
@@ -60,10 +153,10 @@ def make_scene(out: Path, views: int, width: int, height: int, points: int, seed
     work = out.with_name(f".{out.name}.{os.getpid()}.tmp")
     try:
         (work / "images").mkdir(parents=True)
-        pictures = _pictures(cameras)
-        for name, picture in zip(names, pictures, strict=True):
-            Image.fromarray(picture).save(work / "images" / name)
-        cloud = sample_points(demo_scene(), cameras, pictures, points, rng)
+        images = _images(cameras)
+        for name, image in zip(names, images, strict=True):
+            Image.fromarray(image).save(work / "images" / name)
+        cloud = sample_points(demo_scene(), cameras, images, points, rng)
         if not len(cloud.xyz):
             raise UserError(f"none of {points} points is visible in {MIN_TRACK} views; raise --points or --views")
         write_model(work / "sparse" / "0", names, cameras, cloud)

@@ -5,28 +5,20 @@ COLMAP camera, so that "up" is -y. A ray without a hit has distance infinity.
 
 A texture is a function from surface points (3, R) to diffuse colours (3, R) in [0, 1]. All textures are smooth or
 soft-edged at the scale of a pixel, so that supersampling is enough against aliasing.
+
+A shape has two methods. `intersect` returns distances (R,) to the first hit beyond NEAR; origin (3, R) or (3, 1), unit
+direction (3, R). `normal` returns unit normals (3, R) at surface points (3, R), pointing out of the solid.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 Texture = Callable[[np.ndarray], np.ndarray]
 NEAR = np.float32(1e-3)  # rays that start on a surface must not hit it again
-
-
-class Shape(Protocol):
-    """The interface of a shape for the tracer."""
-
-    def intersect(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return distances (R,) to the first hit beyond NEAR; origin (3, R) or (3, 1), unit direction (3, R)."""
-
-    def normal(self, points: np.ndarray) -> np.ndarray:
-        """Return unit normals (3, R) at surface points (3, R), pointing out of the solid."""
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -39,7 +31,7 @@ def normalize(v: np.ndarray) -> np.ndarray:
     return v / np.sqrt(dot(v, v))
 
 
-def _column(values: tuple[float, float, float]) -> np.ndarray:
+def _column(*values: float) -> np.ndarray:
     return np.asarray(values, np.float32).reshape(3, 1)
 
 
@@ -58,7 +50,7 @@ class Ground:
         return np.where(hit, t, np.float32(np.inf))
 
     def normal(self, points: np.ndarray) -> np.ndarray:
-        return np.broadcast_to(_column((0, -1, 0)), points.shape)
+        return np.broadcast_to(_column(0, -1, 0), points.shape)
 
 
 @dataclass(frozen=True)
@@ -70,7 +62,7 @@ class Sphere:
     inside: bool = False
 
     def intersect(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        oc = origin - _column(self.center)
+        oc = origin - _column(*self.center)
         b = dot(oc, direction)
         discriminant = b * b - (dot(oc, oc) - np.float32(self.radius**2))
         with np.errstate(invalid="ignore"):
@@ -80,7 +72,7 @@ class Sphere:
             return np.where(t > NEAR, t, np.float32(np.inf))
 
     def normal(self, points: np.ndarray) -> np.ndarray:
-        n = (points - _column(self.center)) / np.float32(self.radius)
+        n = (points - _column(*self.center)) / np.float32(self.radius)
         return -n if self.inside else n
 
 
@@ -95,8 +87,8 @@ class Torus:
 
     def _local(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return offset from the centre (3, R), height over the torus' plane (R,) and distance from its axis (R,)."""
-        offset = points - _column(self.center)
-        height = dot(offset, normalize(_column(self.axis)))
+        offset = points - _column(*self.center)
+        height = dot(offset, normalize(_column(*self.axis)))
         return offset, height, np.sqrt(np.maximum(dot(offset, offset) - height * height, np.float32(1e-12)))
 
     def distance(self, points: np.ndarray) -> np.ndarray:
@@ -106,7 +98,7 @@ class Torus:
 
     def intersect(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
         bound = self.radius + self.tube
-        oc = origin - _column(self.center)
+        oc = origin - _column(*self.center)
         b = dot(oc, direction)
         discriminant = b * b - (dot(oc, oc) - np.float32(bound**2))
         result = np.full(b.shape, np.inf, np.float32)
@@ -128,7 +120,7 @@ class Torus:
 
     def normal(self, points: np.ndarray) -> np.ndarray:
         offset, height, ring = self._local(points)
-        axis = normalize(_column(self.axis))
+        axis = normalize(_column(*self.axis))
         ring_point = (offset - height * axis) * (np.float32(self.radius) / ring)
         return normalize(offset - ring_point)
 
@@ -151,12 +143,12 @@ class Box:
 
     def local(self, points: np.ndarray) -> np.ndarray:
         """Return points (3, R) in the box's own frame, in units of its half sizes: the surface is at max |.| = 1."""
-        return self._to_local(points - _column(self.center)) / _column(self.half)
+        return self._to_local(points - _column(*self.center)) / _column(*self.half)
 
     def intersect(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        o = self._to_local(origin - _column(self.center))
+        o = self._to_local(origin - _column(*self.center))
         d = self._to_local(direction)
-        half = _column(self.half)
+        half = _column(*self.half)
         with np.errstate(divide="ignore", invalid="ignore"):
             middle, reach = -o / d, np.abs(half / d)
             enter = (middle - reach).max(axis=0)
@@ -173,6 +165,9 @@ class Box:
         return self._to_world(n)
 
 
+Shape = Ground | Sphere | Torus | Box
+
+
 @dataclass(frozen=True)
 class Thing:
     """One object: its shape, its diffuse texture, and how glossy it is."""
@@ -183,10 +178,6 @@ class Thing:
     highlight: float = 0.0  # strength of the sun's highlight
     exponent: float = 40.0  # Blinn-Phong exponent of that highlight
     emissive: bool = False  # true for the backdrop, which is shown as painted, without light and shadow
-
-
-def _rgb(*values: float) -> np.ndarray:
-    return _column(values)
 
 
 def _mix(a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -214,16 +205,16 @@ def ground_texture(p: np.ndarray) -> np.ndarray:
     """Return mottled two-tone tiles with soft seams, which fade to plain sand away from the middle."""
     tile = np.float32(np.pi / 0.55)
     check = _edge(np.sin(tile * p[0]) * np.sin(tile * p[2]), 0.25)
-    colour = _mix(_rgb(0.72, 0.63, 0.50), _rgb(0.34, 0.42, 0.46), check)
-    colour = _mix(_rgb(0.62, 0.58, 0.50), colour, _edge(np.float32(2.6) - np.hypot(p[0], p[2]), 0.5))
+    colour = _mix(_column(0.72, 0.63, 0.50), _column(0.34, 0.42, 0.46), check)
+    colour = _mix(_column(0.62, 0.58, 0.50), colour, _edge(np.float32(2.6) - np.hypot(p[0], p[2]), 0.5))
     return colour * (1 + np.float32(0.45) * _waves(p, 5.0, 1) + np.float32(0.25) * _waves(p, 17.0, 2))
 
 
 def backdrop_texture(p: np.ndarray) -> np.ndarray:
     """Return a sky from haze to blue with broad soft clouds."""
     up = np.clip(-p[1] / np.float32(9), 0, 1)
-    colour = _mix(_rgb(0.86, 0.84, 0.80), _rgb(0.36, 0.54, 0.80), np.sqrt(up))
-    return _mix(colour, _rgb(0.95, 0.95, 0.96), _edge(_waves(p, 0.9, 3), 0.5) * np.float32(0.6))
+    colour = _mix(_column(0.86, 0.84, 0.80), _column(0.36, 0.54, 0.80), np.sqrt(up))
+    return _mix(colour, _column(0.95, 0.95, 0.96), _edge(_waves(p, 0.9, 3), 0.5) * np.float32(0.6))
 
 
 def stripes(axis: int, frequency: float, light: np.ndarray, dark: np.ndarray) -> Texture:
@@ -252,8 +243,8 @@ def panels(box: Box) -> Texture:
     def texture(p: np.ndarray) -> np.ndarray:
         q = np.sort(np.abs(box.local(p)), axis=0)
         frame = _edge(q[1] - np.float32(0.78), 0.08)
-        filling = _mix(_rgb(0.75, 0.32, 0.20), _rgb(0.90, 0.66, 0.30), _edge(_waves(p, 12.0, 5), 0.4))
-        return _mix(filling, _rgb(0.22, 0.16, 0.14), frame)
+        filling = _mix(_column(0.75, 0.32, 0.20), _column(0.90, 0.66, 0.30), _edge(_waves(p, 12.0, 5), 0.4))
+        return _mix(filling, _column(0.22, 0.16, 0.14), frame)
 
     return texture
 
@@ -266,7 +257,7 @@ def ring_stripes(torus: Torus, count: int, light: np.ndarray, dark: np.ndarray) 
     second = np.cross(axis, first)
 
     def texture(p: np.ndarray) -> np.ndarray:
-        offset = p - _column(torus.center)
+        offset = p - _column(*torus.center)
         angle = np.arctan2(second.astype(np.float32) @ offset, first.astype(np.float32) @ offset)
         return _mix(light, dark, _edge(np.sin(np.float32(count) * angle), 0.3))
 
@@ -285,19 +276,19 @@ def demo_scene() -> list[Thing]:
         Thing(Ground(9.0), ground_texture),
         Thing(
             Sphere((-0.95, -0.55, -0.15), 0.55),
-            stripes(1, 14.0, _rgb(0.80, 0.20, 0.16), _rgb(0.92, 0.82, 0.66)),
+            stripes(1, 14.0, _column(0.80, 0.20, 0.16), _column(0.92, 0.82, 0.66)),
             mirror=0.05,
             highlight=0.5,
             exponent=50,
         ),
         Thing(
             Sphere((0.30, -0.42, -0.75), 0.42),
-            marble(_rgb(0.16, 0.45, 0.52), _rgb(0.80, 0.88, 0.85), 6),
+            marble(_column(0.16, 0.45, 0.52), _column(0.80, 0.88, 0.85), 6),
             mirror=0.16,
             highlight=0.35,
             exponent=25,
         ),
-        Thing(Sphere((1.25, -0.24, -0.55), 0.24), marble(_rgb(0.42, 0.55, 0.22), _rgb(0.75, 0.80, 0.40), 8)),
-        Thing(torus, ring_stripes(torus, 9, _rgb(0.93, 0.78, 0.28), _rgb(0.25, 0.22, 0.42)), highlight=0.4),
+        Thing(Sphere((1.25, -0.24, -0.55), 0.24), marble(_column(0.42, 0.55, 0.22), _column(0.75, 0.80, 0.40), 8)),
+        Thing(torus, ring_stripes(torus, 9, _column(0.93, 0.78, 0.28), _column(0.25, 0.22, 0.42)), highlight=0.4),
         Thing(box, panels(box)),
     ]

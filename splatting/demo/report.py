@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from arguments import read_cfg_args
-from splatting.evaluation.contact_sheet import contact_sheet
-from splatting.evaluation.model_folder import count_gaussians, load_scores, picture, training_seconds
+from splatting.evaluation.model_folder import count_gaussians, load_scores, training_seconds
+from splatting.evaluation.renders import contact_sheet, image_of
 from utils.system_utils import UserError, atomic_write, run_cli, searchForMaxIteration
 
 
@@ -38,8 +38,8 @@ def main() -> None:
     picked = [names[k] for k in np.linspace(0, len(names) - 1, min(args.views, len(names))).round().astype(int)]
     rows = []
     for name in picked:
-        pictures = [picture(model / "test" / method / side / name) for side in ("gt", "renders")]
-        rows.append((f"test view {Path(name).stem}: {_shown(per_view['PSNR'][name], 2, ' dB')}", *pictures))
+        images = [image_of(model / "test" / method / side / name) for side in ("gt", "renders")]
+        rows.append((f"test view {Path(name).stem}: {_shown(per_view['PSNR'][name], 2, ' dB')}", *images))
     count = count_gaussians(model, iteration)
     sheet = model / "contact_sheet.png"
     with atomic_write(sheet) as temporary:

@@ -120,16 +120,16 @@ def shade(things: list[Thing], origin: np.ndarray, direction: np.ndarray, bounce
 
 
 def render_view(things: list[Thing], view: View, samples: int = 3) -> np.ndarray:
-    """Render the photo (H, W, 3) uint8 of a view, the mean of samples x samples rays per pixel."""
+    """Render the image (H, W, 3) uint8 of a view, the mean of samples x samples rays per pixel."""
     origin = view.center.astype(np.float32).reshape(3, 1)
     steps = (np.arange(samples) + 0.5) / samples
     columns = (np.arange(view.width)[:, None] + steps).reshape(-1)
     rows_at_once = max(1, BLOCK // (columns.size * samples))
-    picture = np.empty((view.height, view.width, 3), np.uint8)
+    image = np.empty((view.height, view.width, 3), np.uint8)
     for top in range(0, view.height, rows_at_once):
         rows = np.arange(top, min(top + rows_at_once, view.height))
         y, x = np.meshgrid((rows[:, None] + steps).reshape(-1), columns, indexing="ij")
         colour = np.clip(shade(things, origin, view.rays(x.reshape(-1), y.reshape(-1))), 0, 1)
         block = colour.reshape(3, rows.size, samples, view.width, samples).mean(axis=(2, 4))
-        picture[rows] = np.floor(block * 255 + 0.5).astype(np.uint8).transpose(1, 2, 0)
-    return picture
+        image[rows] = np.floor(block * 255 + 0.5).astype(np.uint8).transpose(1, 2, 0)
+    return image

@@ -11,7 +11,7 @@ import numpy as np
 
 from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
 from scene.readers.info import APART, standing_apart
-from splatting.diagnosis.lines import Line, from_error
+from splatting.diagnosis import Line, from_error
 from splatting.files.json_files import read_json
 from splatting.files.listing import some
 from utils.system_utils import UserError

@@ -13,7 +13,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from splatting.diagnosis.lines import Line
+from splatting.diagnosis import Line
 
 ROOT = Path(__file__).resolve().parents[2]
 EXTENSIONS = {  # folder and distribution: package

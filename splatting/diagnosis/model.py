@@ -17,8 +17,8 @@ from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
+from splatting.diagnosis import Line, from_error
 from splatting.diagnosis.dataset import check_dataset
-from splatting.diagnosis.lines import Line, from_error
 from splatting.evaluation.error_curve import NAME as CURVE
 from splatting.evaluation.error_curve import read_curve
 from splatting.evaluation.training_log import NAME as LOG

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from splatting.distributed import quiet
 from splatting.distributed.board import Board, is_gone
 from splatting.distributed.quiet import names
-from splatting.host.running import running_seconds
+from splatting.host.clock import running_seconds
 
 DONE, FAULT, HANG, SIGNAL, LOST = "done", "fault", "hang", "signal", "lost"
 NO_WORD = "error: the ranks lost each other"  # and none says more

@@ -11,7 +11,7 @@ from torch import Tensor
 from splatting.distributed.gathering import in_order, whole
 from splatting.distributed.ranks import ALONE, Ranks
 from splatting.distributed.selection import largest, lowest
-from splatting.host.device import compute_device
+from splatting.host.machine import compute_device
 
 _PART, _RANK = 43, 32  # bits of a key below the number of a part, and below the rank or piece in it
 

@@ -19,9 +19,8 @@ from splatting.distributed.ranks import using
 from splatting.distributed.watch import Watch
 from splatting.distributed.watched import TIMEOUT, RankLost, WatchedRanks
 from splatting.host import interrupt, torchrun
-from splatting.host.device import compute_device
 from splatting.host.errors import UserError, first_line
-from splatting.host.threads import cores
+from splatting.host.machine import compute_device, cores
 
 _SIGNALS = (130, 143)  # exit statuses
 

@@ -8,7 +8,7 @@ from splatting.distributed.board import Board, is_gone
 from splatting.distributed.ending import DONE, HANG, LOST, NO_WORD, End, Ending
 from splatting.distributed.quiet import names
 from splatting.distributed.watched import WatchedRanks
-from splatting.host.running import running_seconds
+from splatting.host.clock import running_seconds
 
 _BEAT = 0.5  # seconds between two beats
 _SILENT = 12.0  # seconds without a beat after which a rank is gone

@@ -14,8 +14,8 @@ from torch import Tensor
 from splatting.distributed import quiet
 from splatting.distributed.ranks import Value
 from splatting.distributed.several import SeveralRanks
+from splatting.host.clock import running_seconds
 from splatting.host.memory import is_out_of_memory
-from splatting.host.running import running_seconds
 
 # Of a collective call. It has to be longer than any work of one rank that the others wait for, as rank 0 writing tens
 # of gigabytes to a slow disk. A rank that is gone or hangs is noticed by others means and within seconds (watch.py).

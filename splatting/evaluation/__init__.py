@@ -1,12 +1,17 @@
-"""The parts of full_eval.py, which trains, renders and scores a table of scenes, and writes one report.
+"""Measurements of trainings, and full_eval.py, which trains, renders and scores a table of scenes.
 
-scenes, configs, runs    the plan: scene folders, options, model folders and their records; sets/ has option sets to use
-child, stages            its execution: each stage is a subprocess
-model_folder, results    readers of model folders, and of the report of earlier calls
-summary, option_sets     spread over seeds; option sets beside each other: seconds to a PSNR, fronts, the cheapest
-published, peers         published tables, and curves of other programs (peer_curve makes their files)
-document, pages, report  the report's content as plain data, its HTML and Markdown, all its files
-figures, contact_sheet   its figures, and pictures of test views
-machine                  description of the machine
-results_page             tables of docs/results/training.md from report.json
+Within a training:
+training_log, error_curve   its records and its events for TensorBoard; its curve, and curves of other programs
+curve_recorder, figures     scoring of the curve's points; drawings of it, which the report uses, too
+what_to_try                 advice from both
+
+From runs to the report:
+plan, configs               scene folders, options, model folders and their records; sets/ has option sets to use
+stages, child               execution of the plan: each stage is a subprocess
+model_folder, renders       readers of model folders, and of the sets of views rendered there
+results, comparison         a run's numbers; those of several: spread, option sets, published tables (published.json)
+tables, report              numbers as tables of text; report.json, its pages (report.jinja in two forms) and figures
+machine                     description of the machine
+
+Commands: peer_curve makes CSV files of other programs' output, results_page writes docs/results/training.md.
 """

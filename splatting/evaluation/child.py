@@ -30,17 +30,10 @@ class Finished:
     """The end of a subprocess."""
 
     status: int  # exit status; negative: the signal that killed it
-    lines: list[str]  # last lines of stderr
-    seconds: float  # wall clock
+    lines: list[str]  # last lines of stderr; what ended it, if nothing else tells
+    wall_seconds: float
     cpu_seconds: float | None  # of all its threads; None where the system does not tell
     interrupt: type[KeyboardInterrupt] | None  # the interrupt that this process got meanwhile
-
-    @property
-    def reason(self) -> str:
-        """The last message, or the exit status, in one line."""
-        if self.status < 0:
-            return f"killed by {signal.Signals(-self.status).name}"
-        return self.lines[-1] if self.lines else f"exit status {self.status}"
 
 
 def run_child(command: Sequence[str], **environment: str) -> Finished:
@@ -77,7 +70,10 @@ def run_child(command: Sequence[str], **environment: str) -> Finished:
                 child.stderr.close()
         requested = interrupt.requested
     cpu = None if cpu_before is None else _children_cpu_seconds() - cpu_before
-    return Finished(status, _lines(tail), time.perf_counter() - start, cpu, requested)
+    lines = _lines(tail)
+    if status < 0:
+        lines.append(f"killed by {signal.Signals(-status).name}")
+    return Finished(status, lines or [f"exit status {status}"], time.perf_counter() - start, cpu, requested)
 
 
 def _read(child: subprocess.Popen, tail: bytearray) -> None:

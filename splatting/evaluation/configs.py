@@ -75,11 +75,8 @@ def check_options(words: Sequence[str], where: str, parse: Parse | None) -> None
         )
         if taken:
             raise UserError(f"{where}: full_eval.py sets {word} itself; omit it")
-    if words and parse:
-        _try(parse, words, where)
-
-
-def _try(parse: Parse, words: Sequence[str], where: str) -> None:
+    if not words or not parse:
+        return
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):

@@ -1,6 +1,8 @@
 """Recorder of a model's error against its run time of training; it changes no bit of the model."""
 
+import contextlib
 import random
+import subprocess
 import sys
 from collections.abc import Callable, Container, Iterable, Sequence
 from pathlib import Path
@@ -9,21 +11,20 @@ from typing import TypeVar
 import torch
 from tqdm import tqdm
 
-from splatting.distributed.ranks import ranks
-from splatting.evaluation.curve_figure import CurveDrawer
 from splatting.evaluation.error_curve import COLUMNS, FIGURE, NAME, SUBSET, Row, write_curve
 from splatting.evaluation.training_log import SHORT, TrainingLog
 from splatting.evaluation.what_to_try import peak_advice
-from splatting.host.process import wall_seconds
-from splatting.host.running import running_seconds
-from splatting.host.threads import cores
-from utils.system_utils import UserError
+from splatting.host.clock import running_seconds, wall_seconds
+from splatting.host.interrupt import own_session
+from splatting.host.machine import cores
+from utils.system_utils import UserError, writes_files
 
 AHEAD, MANY_CORES = 2.0, 4  # seconds before the end at which drawing gets ready, where that takes no core from training
 SHORTEST = 200  # iterations of a training that is scored between, too
 GRIDS = ((4, 32), (2, 12))  # points while the number of iterations doubles, and their number before the last iteration
 SHARE = 0.025  # of a training that scoring may take by its estimate; 0.05 is promised, and early points may be dearer
 VIEW_COST = 0.5  # of scoring a view, in iterations: it takes no gradient and no step
+_ROOT = Path(__file__).resolve().parents[2]
 View = TypeVar("View")
 
 
@@ -58,6 +59,56 @@ def drawn(views: Sequence[View], count: int) -> list[View]:
     indices = list(range(len(views)))
     random.Random(0).shuffle(indices)
     return [views[index] for index in sorted(indices[:count])]
+
+
+class CurveDrawer:
+    """A process that draws the curve of a folder: matplotlib takes a second, and training has other things to do.
+
+    `begin`, `draw`, `finish` in that order; `abandon` at any time.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder.resolve()
+        self._process: subprocess.Popen | None = None
+
+    def begin(self) -> None:
+        """Start the process, unless that was done, so that it imports matplotlib meanwhile."""
+        if self._process is not None:
+            return
+        files = [str(self._folder / name) for name in (NAME, FIGURE)]
+        with contextlib.suppress(OSError):  # `finish` says so
+            self._process = subprocess.Popen(
+                [sys.executable, "-X", "utf8", "-m", "splatting.evaluation.figures", *files, self._folder.name],
+                cwd=_ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8",
+                **own_session(),  # Ctrl-C is for the training, which ends this process if need be
+            )  # fmt: skip
+
+    def draw(self) -> None:
+        """Draw what the file has now."""
+        self.begin()
+        if self._process is not None:
+            with contextlib.suppress(OSError):  # it has ended, and `finish` says so
+                self._process.stdin.write("draw\n")
+                self._process.stdin.close()
+
+    def finish(self) -> str | None:
+        """Wait until it is drawn. Returns what went wrong, None if nothing did."""
+        if self._process is None:
+            return "no process can be started to draw it"
+        try:
+            said, status = self._process.stdout.read().strip(), self._process.wait()
+        finally:
+            self.abandon()  # if a signal has interrupted the waiting
+        return said or (f"the process that draws it ended with status {status}" if status else None)
+
+    def abandon(self) -> None:
+        """End the process, if there is one."""
+        if self._process is not None:
+            self._process.kill()
+            for pipe in (self._process.stdin, self._process.stdout):
+                with contextlib.suppress(OSError):
+                    pipe.close()
+            self._process.wait()
 
 
 class CurveRecorder:
@@ -114,7 +165,7 @@ class CurveRecorder:
         if not span:
             return False
         left, done = self._iterations - span[-1], span[-1] - first
-        if ranks().first and seconds * left <= self._ahead * done:
+        if writes_files() and seconds * left <= self._ahead * done:
             self._drawer.begin()
         due = self.point(span) is not None
         if due and self._device.type == "cuda":
@@ -144,7 +195,7 @@ class CurveRecorder:
         self._scored += 1
         self.rows.append(row)
         self._timed("writing", self._write)
-        if iteration == self._iterations and ranks().first:
+        if iteration == self._iterations and writes_files():
             self._drawer.draw()
 
     def _timed(self, part: str, call: Callable[[], object]) -> None:
@@ -172,7 +223,7 @@ class CurveRecorder:
         The log's last record gets the costs: `curve_scoring_seconds`, `curve_writing_seconds` (of the file),
         `curve_drawing_seconds` (of waiting), and `curve_loading_seconds` (of photos, before the first scoring).
         """
-        if ranks().first:
+        if writes_files():
             self._timed("drawing", self._draw)
         costs = {f"curve_{part}_seconds": round(taken, 4) for part, taken in self._spent.items()}
         self._log.add(self.rows[-1]["iteration"], seconds, **costs)

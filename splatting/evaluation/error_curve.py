@@ -1,12 +1,13 @@
-"""error_vs_time.csv: the error of a model in training against its time, one row per scored iteration."""
+"""Curves, error against time: error_vs_time.csv of a training, and the CSV files of other programs (`--peer`)."""
 
 import contextlib
 import csv
 import math
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from splatting.files.plain_files import plain
 from utils.system_utils import UserError, atomic_write
@@ -16,14 +17,17 @@ FIGURE = "error_vs_time.png"
 SUBSET = "subset"
 COUNTS = ("iteration", "gaussians", SUBSET)
 SCORES = tuple(f"{views}_{score}" for views in ("test", "train") for score in ("l1", "psnr", "ssim"))
-COLUMNS = ("iteration", "seconds", "wall_seconds", "gaussians", "peak_memory_mib", *SCORES, SUBSET)
+COSTS = ("iteration", "seconds", "wall_seconds", "gaussians", "peak_memory_mib")
+COLUMNS = (*COSTS, *SCORES, SUBSET)
 _HEADERS = (list(COLUMNS), list(COLUMNS[:-1]))  # older files have no subsets
+PEER_COLUMNS = (*COSTS, *SCORES[:3], "test_lpips", *SCORES[3:])
+PEER_REQUIRED = ("seconds", "test_psnr")
 
 Row = dict[str, float | None]
 
 
 def read_curve(path: str | os.PathLike) -> list[Row]:
-    """Rows of a curve's file in ascending iterations; each has all COLUMNS, None for an empty field.
+    """Rows of a training's curve in ascending iterations; each has all COLUMNS, None for an empty field.
 
     seconds: of training, without evaluation and saving, over all resumed parts. wall_seconds: since the start of the
     process, with those of earlier parts. peak_memory_mib: the most of all parts so far, of the GPU if it trains.
@@ -31,11 +35,10 @@ def read_curve(path: str | os.PathLike) -> list[Row]:
     each set that were scored, the same ones in all such rows; None: all. UserError if the file is missing or damaged.
     """
     try:
-        with open(plain(path), encoding="utf-8", newline="") as file:
-            lines = list(csv.reader(file, strict=True))
-        if not lines or lines[0] not in _HEADERS:
+        header, *lines = _lines(path)
+        if header not in _HEADERS:
             raise ValueError("its columns are different")
-        rows = [_row(lines[0], line) for line in lines[1:]]
+        rows = [_row(header, line, COLUMNS, ("iteration", "seconds"), COUNTS) for line in lines]
         iterations = [row["iteration"] for row in rows]
         if iterations != sorted(set(iterations)):
             raise ValueError("its iterations do not ascend")
@@ -46,26 +49,36 @@ def read_curve(path: str | os.PathLike) -> list[Row]:
     return rows
 
 
-def _row(names: list[str], fields: list[str]) -> Row:
-    row: Row = {SUBSET: None}
-    for name, field in zip(names, fields, strict=True):
-        value = None if field == "" else int(field) if name in COUNTS else float(field)
-        if value is None and name in ("iteration", "seconds"):
+def _lines(path: str | os.PathLike) -> list[list[str]]:
+    """Lines of a CSV file, stripped fields, the header first."""
+    with open(plain(path), encoding="utf-8", newline="") as file:
+        return [[field.strip() for field in line] for line in csv.reader(file, strict=True) if line] or [[]]
+
+
+def _row(
+    header: Sequence[str], line: Sequence[str], columns: Sequence[str], required: Sequence[str], counts: Sequence[str]
+) -> Row:
+    """A line's values of `columns`; None for empty ones, of which none may be required. counts: whole numbers."""
+    fields, row = dict(zip(header, line, strict=True)), {}
+    for name in columns:
+        text = fields.get(name, "")
+        row[name] = None if not text else int(text) if name in counts else float(text)
+        if row[name] is None and name in required:
             raise ValueError(f"a row without {name}")
-        if value is not None and not math.isfinite(value):
-            raise ValueError(f"a value is {field}")
-        row[name] = value
+        if not math.isfinite(row[name] or 0):
+            raise ValueError(f"{name} is {text}")
     return row
+
+
+def _write(path: str | os.PathLike, columns: Sequence[str], lines: Iterable[Sequence[Any]]) -> None:
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([columns, *lines])
 
 
 def write_curve(path: str | os.PathLike, rows: list[Row]) -> None:
     """Write rows that have all COLUMNS. A value that is None or not finite (PSNR of equal images) is left empty."""
-    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        for row in rows:
-            values = [row[name] for name in COLUMNS]
-            writer.writerow([value if value is not None and math.isfinite(value) else "" for value in values])
+    values = ((row[name] for name in COLUMNS) for row in rows)
+    _write(path, COLUMNS, [["" if x is None or not math.isfinite(x) else x for x in line] for line in values])
 
 
 def continue_curve(
@@ -103,3 +116,57 @@ def best_test(rows: Iterable[Row]) -> Row | None:
     """The whole-set row with the highest PSNR of the test views, the first of equals; None if no row has one."""
     scored = [row for row in whole_sets(rows) if row["test_psnr"] is not None]
     return max(scored, key=lambda row: row["test_psnr"], default=None)
+
+
+def read_peer(path: Path) -> list[Row]:
+    """Read another program's curve: rows in the order of their seconds, with all PEER_COLUMNS, None if not known.
+
+    The first line names the columns, in any order; only PEER_REQUIRED must be there, and other names are ignored.
+    UserError for anything else.
+    """
+    try:
+        header, *lines = _lines(path)
+        if missing := [name for name in PEER_REQUIRED if name not in header]:
+            raise ValueError(f"it has no column {missing[0]}")
+        rows = [_row(header, line, PEER_COLUMNS, PEER_REQUIRED, ()) for line in lines]
+        if not rows:
+            raise ValueError("it has no points")
+        if (least := min(row["seconds"] for row in rows)) <= 0:
+            raise ValueError(f"seconds are {least:g}, and must be above 0")
+    except OSError as error:
+        raise UserError(f"cannot read {path} ({error.strerror}); --peer takes a name and a CSV file") from error
+    except (ValueError, csv.Error) as error:
+        raise UserError(
+            f"{path} is not a curve ({error}); its columns must be {' and '.join(PEER_REQUIRED)}, others may follow: "
+            f"{', '.join(name for name in PEER_COLUMNS if name not in PEER_REQUIRED)}"
+        ) from error
+    return sorted(rows, key=lambda row: row["seconds"])
+
+
+def write_peer(path: Path, rows: Sequence[Row]) -> None:
+    """Write another program's curve with the PEER_COLUMNS that any row has."""
+    columns = [name for name in PEER_COLUMNS if any(row.get(name) is not None for row in rows)]
+    values = ((row.get(name) for name in columns) for row in rows)
+    _write(path, columns, [["" if x is None else f"{x:.10g}" for x in line] for line in values])
+
+
+def peers_of(given: Sequence[Sequence[str]], scenes: Sequence[str]) -> list[dict[str, Any]]:
+    """Read the peers that the command line names, as report.json lists them: scene, name, file, curve.
+
+    given: (name, file) of each --peer. Where there are several scenes, a name is SCENE/NAME. UserError for other names
+    and unreadable files.
+    """
+    peers: dict[tuple[str, str], dict[str, Any]] = {}
+    for title, file in given:
+        scene, slash, name = title.rpartition("/")
+        if not slash and len(scenes) == 1:
+            scene = scenes[0]
+        if scene not in scenes or not name:
+            raise UserError(
+                f"--peer {title}: name the scene, too, as in --peer {scenes[0]}/{name or 'NAME'} {file}; the scenes "
+                f"are {', '.join(scenes)}"
+            )
+        if (scene, name) in peers:
+            raise UserError(f"--peer {title} is given twice; give each curve a name of its own")
+        peers[scene, name] = {"scene": scene, "name": name, "file": str(Path(file)), "curve": read_peer(Path(file))}
+    return list(peers.values())

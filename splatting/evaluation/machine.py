@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import platform
 import subprocess
 import sys
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +30,7 @@ def machine() -> dict[str, Any]:
 def _describe() -> dict[str, Any]:
     import torch
 
-    from splatting.host.machine import commit, cpu_name, gpu_name, instruction_set
-    from splatting.host.version import VERSION
+    from splatting.host.machine import VERSION, commit, cpu_name, gpu_name, instruction_set
     from utils.system_utils import compute_device
 
     device = compute_device().type
@@ -42,19 +41,12 @@ def _describe() -> dict[str, Any]:
         "device": device,
         "gpu": gpu_name() if device == "cuda" else None,
         "instruction_set": instruction_set(),
-        "packages": {name: _version(name) for name in _PACKAGES},
+        "packages": {name: next((one.version for one in distributions(name=name)), None) for name in _PACKAGES},
         "python": platform.python_version(),
         "system": platform.platform(),
         "threads": torch.get_num_threads(),
         "version": VERSION,
     }
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def one_line(facts: dict[str, Any]) -> str:

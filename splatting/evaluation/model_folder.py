@@ -1,22 +1,16 @@
-"""Readers of a model folder: number of Gaussians, times, scores, rendered images."""
+"""Readers of a model folder: number of Gaussians, log, scores."""
 
 from __future__ import annotations
 
-import hashlib
 import re
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from PIL import Image
 
 from arguments.stored import read_model_json, read_stored_options
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
 from splatting.evaluation.what_to_try import schedules_follow_length
-from splatting.files.image_files import UNREADABLE, open_render
 from splatting.files.json_files import read_json
 from splatting.files.plain_files import plain
 from utils.system_utils import UserError, saved_iterations
@@ -116,70 +110,3 @@ def closing_lines(model: Path) -> list[str]:
     """Read what train.py said at its end: costs of the curve, what it left out; none if it logged nothing."""
     lines = next(reversed(logged(model).values()), {}).get("lines")
     return list(map(str, lines)) if isinstance(lines, list) else []
-
-
-def picture(file: Path) -> Image.Image:
-    """Read a render or a ground truth, RGB."""
-    return _opened(file, lambda image: image.convert("RGB"))
-
-
-def picture_size(file: Path) -> tuple[int, int]:
-    """Read width and height in pixels from the file's header."""
-    return _opened(file, lambda image: image.size)
-
-
-def _opened(file: Path, read: Callable[[Image.Image], Any]) -> Any:
-    try:
-        with open_render(file) as image:
-            return read(image)
-    except UNREADABLE as error:
-        raise UserError(f"{file} is missing or damaged; run render.py and metrics.py again") from error
-
-
-def view_names(folder: Path) -> list[str]:
-    """List the names of a folder's PNGs, sorted; none if there is no folder."""
-    return sorted(file.name for file in folder.glob("*.png") if not file.name.startswith("."))
-
-
-def _mask(method: Path, name: str) -> np.ndarray | None:
-    """Read which pixels of a view count for metrics.py, (H, W) bool; None: all. method: the folder `ours_N`."""
-    file = method / "masks" / name
-    return np.asarray(picture(file))[..., 0] > 0 if file.is_file() else None
-
-
-def counted_picture(method: Path, side: str, name: str) -> Image.Image:
-    """Read a view's `gt` or `renders`, RGB, white where pixels do not count. method: the folder `ours_N`."""
-    image, mask = picture(method / side / name), _mask(method, name)
-    if mask is None:
-        return image
-    return Image.fromarray(np.where(mask[..., None], np.asarray(image), np.uint8(255)))
-
-
-def picture_namer(model: Path) -> Callable[[str], str]:
-    """Return a function that names the photo of a rendered test view, by cameras.json, which has test views first."""
-    cameras = json_or_none(model / "cameras.json")
-
-    def name(file: str) -> str:
-        try:
-            return str(cameras[int(Path(file).stem)]["img_name"])
-        except (ValueError, IndexError, KeyError, TypeError):
-            return file
-
-    return name
-
-
-def ground_truth_digest(model: Path, method: str) -> str:
-    """Return the SHA-256 of the test views' ground truth, in order: sizes, pixels, masks.
-
-    Scores can be compared only if it is the same. It changes with split, resolution, resize filter, background, masks.
-    """
-    digest = hashlib.sha256()
-    folder = model / "test" / method
-    for name in view_names(folder / "gt"):
-        image = picture(folder / "gt" / name)
-        digest.update(f"{image.width}x{image.height}".encode())
-        digest.update(np.asarray(image).tobytes())
-        if (mask := _mask(folder, name)) is not None:
-            digest.update(b"mask")
-            digest.update(mask.tobytes())
-    return digest.hexdigest()

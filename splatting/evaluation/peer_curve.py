@@ -1,27 +1,28 @@
 """A CSV file for `full_eval.py --peer`, made from the output of another program.
 
-python -m ....peer_curve gsplat RESULT_DIR FILE.csv       result folder of gsplat's simple_trainer.py
-python -m ....peer_curve reference MODEL_OR_LOG FILE.csv  model folder with TensorBoard's files, or a saved
-                                                                 console output, of the reference's train.py
+python -m splatting.evaluation.peer_curve gsplat RESULT_DIR FILE.csv       result folder of gsplat's simple_trainer.py
+python -m splatting.evaluation.peer_curve reference MODEL_OR_LOG FILE.csv  model folder with TensorBoard's files, or a
+                                                                 saved console output, of the reference's train.py
 
 Says what the seconds contain.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import statistics
+import struct
 from argparse import ArgumentParser
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from splatting.evaluation.peers import PeerRow, write_peer
-from splatting.evaluation.tensorboard_scalars import Scalar, read_scalars
-from splatting.files.plain_files import plain_text
+from splatting.evaluation.error_curve import Row, write_peer
+from splatting.files.plain_files import plain, plain_text
 from utils.system_utils import UserError, run_cli
 
 WITH_PAUSES = (
@@ -43,7 +44,7 @@ _COLUMNS = {
 }
 
 
-def from_gsplat(folder: Path) -> list[PeerRow]:
+def from_gsplat(folder: Path) -> list[Row]:
     """Read stats/val_stepN.json (scores) and stats/train_stepN_rank0.json (seconds, memory, Gaussians) of a result.
 
     Steps count from 0 there. `ellipse_time` is the seconds since the first step in the second file; in the first one
@@ -78,7 +79,7 @@ def _json(path: Path) -> dict[str, Any]:
         raise UserError(f"{path} cannot be read ({error}); train again") from error
 
 
-def from_log(path: Path) -> list[PeerRow]:
+def from_log(path: Path) -> list[Row]:
     """Read a saved console output of the reference's train.py, whose lines end with the time, to a second.
 
     Training begins after the last line before the first score. UserError if there are no scores.
@@ -87,7 +88,7 @@ def from_log(path: Path) -> list[PeerRow]:
         lines = plain_text(path, errors="replace").splitlines()
     except OSError as error:
         raise UserError(f"cannot read {path} ({error.strerror}); give a saved console output") from error
-    rows: dict[int, PeerRow] = {}
+    rows: dict[int, Row] = {}
     begin = now = None
     for line in lines:
         stamp = _STAMP.search(line)
@@ -117,14 +118,14 @@ def _later(before: datetime | None, stamp: re.Match[str]) -> datetime:
     return now if before is None or now >= before - timedelta(days=1) else now.replace(year=now.year + 1)
 
 
-def from_events(folder: Path) -> list[PeerRow]:
+def from_events(folder: Path) -> list[Row]:
     """Read TensorBoard's files of the reference's train.py. UserError if there are no scores.
 
     Seconds are those between the times at which `iter_time` was written. Where an iteration was scored between two of
     them, the median of the gaps near it counts instead.
     """
     scalars = read_scalars(folder)
-    rows: dict[int, PeerRow] = {}
+    rows: dict[int, Row] = {}
     for tag, column in _COLUMNS.items():
         for scalar in scalars.get(tag, ()):
             rows.setdefault(scalar.step, {"iteration": scalar.step})[column] = scalar.value
@@ -157,14 +158,88 @@ def _training_seconds(clock: Sequence[Scalar], scored: Sequence[int]) -> dict[in
     return {step: total[max(bisect_right(steps, step) - 1, 0)] for step in scored}
 
 
-def _scored(rows: Sequence[PeerRow], source: Path) -> list[PeerRow]:
+class Scalar(NamedTuple):
+    """A value of TensorBoard's files at a step, and the seconds since 1970 at which it was written."""
+
+    step: int
+    wall: float
+    value: float
+
+
+def read_scalars(folder: Path) -> dict[str, list[Scalar]]:
+    """Read the scalars of all event files in a folder by tag, in the order of their steps. It needs no TensorBoard.
+
+    Of several at one step the one written last counts. A file that is cut short gives what is whole. Checksums are not
+    compared. UserError for a damaged file.
+    """
+    found: dict[str, dict[int, Scalar]] = {}
+    for path in sorted(folder.glob("events.out.tfevents.*")):
+        try:
+            scalars = [pair for event in _events(plain(path).read_bytes()) for pair in _scalars(event)]
+        except (LookupError, OSError, TypeError, ValueError, struct.error) as error:
+            raise UserError(f"the TensorBoard files in {folder} are damaged ({error}); train again") from error
+        for tag, scalar in sorted(scalars, key=lambda pair: pair[1].wall):
+            before = found.setdefault(tag, {}).get(scalar.step)
+            if before is None or before.wall <= scalar.wall:
+                found[tag][scalar.step] = scalar
+    return {tag: [steps[step] for step in sorted(steps)] for tag, steps in found.items()}
+
+
+def _events(data: bytes) -> Iterator[bytes]:
+    """Contents of a file's records: each is its length (8 bytes), a checksum (4), the content, a checksum (4)."""
+    at = 0
+    while at + 12 <= len(data) and (end := at + 12 + struct.unpack_from("<Q", data, at)[0]) + 4 <= len(data):
+        yield data[at + 12 : end]
+        at = end + 4
+
+
+def _scalars(event: bytes) -> Iterator[tuple[str, Scalar]]:
+    """Scalars of an `Event`, whose fields are 1 wall_time, 2 step, 5 summary.
+
+    A summary has values (field 1) of tag (1) and simple_value (2).
+    """
+    fields = dict(_fields(event))
+    for _, value in _fields(fields.get(5, b"")):
+        parts = dict(_fields(value))
+        if isinstance(parts.get(1), bytes) and isinstance(parts.get(2), bytes) and len(parts[2]) == 4:
+            wall, number = struct.unpack("<df", fields.get(1, bytes(8)) + parts[2])
+            yield parts[1].decode("utf-8", "replace"), Scalar(int(fields.get(2, 0)), wall, number)
+
+
+def _fields(message: bytes) -> Iterator[tuple[int, int | bytes]]:
+    """Number and content of each field of a protocol buffer: an integer, or bytes. ValueError if it is cut."""
+    stream = io.BytesIO(message)
+    while stream.tell() < len(message):
+        key = _varint(stream)
+        if key & 7 == 0:
+            yield key >> 3, _varint(stream)
+            continue
+        size = {1: 8, 2: None, 5: 4}[key & 7]
+        size = _varint(stream) if size is None else size
+        content = stream.read(size)
+        if len(content) < size:
+            raise ValueError("a field is cut")
+        yield key >> 3, content
+
+
+def _varint(stream: io.BytesIO) -> int:
+    value = 0
+    for shift in range(0, 64, 7):
+        (byte,) = stream.read(1) or [128]
+        value |= (byte & 127) << shift
+        if byte < 128:
+            return value
+    raise ValueError("a number is cut")
+
+
+def _scored(rows: Sequence[Row], source: Path) -> list[Row]:
     scored = [row for row in rows if row.get("test_psnr") is not None]
     if not scored:
         raise UserError(f"{source} has no scores of test views; train with --eval and --test_iterations")
     return sorted(scored, key=lambda row: row["iteration"])
 
 
-def curve_of(kind: str, source: Path) -> tuple[list[PeerRow], str]:
+def curve_of(kind: str, source: Path) -> tuple[list[Row], str]:
     """Read a peer's output, kind `gsplat` or `reference`; return its rows and what their seconds contain."""
     if not source.exists():
         raise UserError(f"there is no {source}; give the output of the other program")

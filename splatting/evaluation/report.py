@@ -1,20 +1,28 @@
-"""Files of the report: report.json, report.md, report.html, the figures and timing.txt."""
+"""The report: report.json of all runs, its pages report.md and report.html, the figures and timing.txt."""
 
 from __future__ import annotations
 
+import base64
+import io
+import os
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
-from splatting.evaluation.contact_sheet import comparisons, draw_worst_views
-from splatting.evaluation.document import Block, document, run_title, scenes_of
+import jinja2
+from markupsafe import Markup
+from PIL import Image
+
+from splatting.evaluation import comparison, tables
+from splatting.evaluation.comparison import Sets
 from splatting.evaluation.figures import draw_curves, draw_fronts
-from splatting.evaluation.option_sets import Sets, cheapest, comparable_sets, fronts, reached, stand_apart
-from splatting.evaluation.pages import to_html, to_markdown
-from splatting.evaluation.published import compare
-from splatting.evaluation.summary import dataset_means, summarise
+from splatting.evaluation.machine import one_line
+from splatting.evaluation.renders import comparisons, draw_worst_views
 from splatting.files.json_files import write_json
+from splatting.files.listing import markdown_table
 from utils.system_utils import UserError, atomic_write
 
 TITLE = "3D Gaussian Splatting: evaluation"
@@ -22,8 +30,13 @@ SHORTEST = 10.0  # seconds of a process whose share of the processors says somet
 EVEN = 0.8  # share of the best that trainings get on a machine of their own
 OF_A_RUN, OF_A_REPORT = 24, 96  # test views at most in the HTML file, at about 0.1 MB each
 RESIZE_FILTER = "Pillow, bicubic, antialiased where it shrinks; 8-bit pictures"
+_PHOTOGRAPHIC = 1 << 18  # bytes of a PNG above which a JPEG replaces it
+_QUALITY = 90
+_MEANT = re.compile(r"[\\`*\[\]<>&]")  # characters that begin or end Markdown's links, emphasis, code and HTML
+_ENTITIES = {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
 
 Run = dict[str, Any]
+Pictures = Mapping[str, Sequence[Mapping[str, Any]]]  # by scene: figures (path, text), views (`renders.comparisons`)
 
 
 def make_report(
@@ -34,16 +47,16 @@ def make_report(
 ) -> dict[str, Any]:
     """Make the content of report.json.
 
-    command: words of the command line; runs: results of `results.read_run`; peers: as `peers.peers_of` returns them;
-    earlier_commands: those of calls that made other runs.
+    command: words of the command line; runs: results of `results.read_run`; peers: as `error_curve.peers_of` returns
+    them; earlier_commands: those of calls that made other runs.
     """
-    runs = stand_apart(runs)
-    rows = summarise(runs)
-    means = dataset_means(rows)
+    runs = comparison.stand_apart(runs)
+    rows = comparison.summarise(runs)
+    means = comparison.dataset_means(rows)
     return {
-        "cheapest": _of_scenes(runs, cheapest),
+        "cheapest": _of_scenes(runs, comparison.cheapest),
         "dataset_means": means,
-        "fronts": _of_scenes(runs, fronts),
+        "fronts": _of_scenes(runs, comparison.fronts),
         "manifest": {
             "command": list(command),
             "earlier_commands": [list(words) for words in earlier_commands if list(words) != list(command)],
@@ -51,30 +64,27 @@ def make_report(
             "resize_filter": RESIZE_FILTER,
         },
         "peers": list(peers),
-        "published": compare(runs, rows, means),
-        "reached": _of_scenes(runs, reached),
+        "published": comparison.compare(runs, rows, means),
+        "reached": _of_scenes(runs, comparison.reached),
         "runs": runs,
         "summary": rows,
         "warnings": _warnings(runs, rows),
     }
 
 
-def _by_scene(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    scenes: dict[str, list[Run]] = {}
-    for run in runs:
-        scenes.setdefault(run["scene"], []).append(run)
-    return scenes
-
-
 def _of_scenes(runs: Sequence[Run], of_sets: Callable[[Sets], Any]) -> dict[str, Any]:
     """Return what a function says of the option sets of each scene that can be compared, if it says anything."""
-    return {scene: found for scene in _by_scene(runs) if (found := of_sets(comparable_sets(runs, scene)))}
+    return {
+        scene: found
+        for scene in comparison.grouped(runs, "scene")
+        if (found := of_sets(comparison.comparable_sets(runs, scene)))
+    }
 
 
 def _warnings(runs: Sequence[Run], rows: Sequence[dict[str, Any]]) -> list[str]:
     """Return the reasons why numbers of this report cannot be compared."""
     lines = []
-    for scene, members in _by_scene(runs).items():
+    for scene, members in comparison.grouped(runs, "scene").items():
         if len({run["ground_truth_sha256"] for run in members} - {None}) > 1:
             apart = dict.fromkeys(run["config"] or "-" for run in members if run["apart"])
             lines.append(
@@ -102,25 +112,21 @@ def _warnings(runs: Sequence[Run], rows: Sequence[dict[str, Any]]) -> list[str]:
 
 def write_report(report: Mapping[str, Any], output: Path) -> None:
     """Write all files of the report into `output`."""
+    runs = comparison.grouped(report["runs"], "scene")
     shown = len({(run["scene"], run["config"]) for run in report["runs"]})
     each = max(1, min(OF_A_RUN, OF_A_REPORT // max(1, shown)))
-    runs = _by_scene(report["runs"])
-    pictures, drawn = {}, {}
-    for scene in scenes_of(report):
+    pictures, of_fronts = {}, {}
+    for scene, members in runs.items():
         peers = [peer for peer in report["peers"] if peer["scene"] == scene]
-        path, said = output / "figures" / f"{scene}_curves.png", "error of the test views against seconds of training"
-        pictures[scene] = _figure(path, scene, "curves", said, draw_curves, runs[scene], peers)
-        pictures[scene] += _views(output, scene, runs[scene], each)
+        text = f"{scene}: error of the test views against seconds of training"
+        pictures[scene] = _figure(output / "figures" / f"{scene}_curves.png", text, draw_curves, scene, members, peers)
+        pictures[scene] += _views(output, scene, members, each)
     for scene, found in report["fronts"].items():
         names = list(dict.fromkeys(run["config"] for run in runs[scene]))
-        path, said = output / "figures" / f"{scene}_fronts.png", "PSNR of each option set at its end, against seconds"
-        drawn[scene] = _figure(path, scene, "fronts", f"{said}, Gaussians and megabytes", draw_fronts, found, names)
-    sections = document(report, pictures, drawn)
-    texts = {
-        "report.md": to_markdown(TITLE, sections, output),
-        "report.html": to_html(TITLE, sections),
-        "timing.txt": _timing(report["runs"]),
-    }
+        text = f"{scene}: PSNR of each option set at its end, against seconds, Gaussians and megabytes"
+        of_fronts[scene] = _figure(output / "figures" / f"{scene}_fronts.png", text, draw_fronts, scene, found, names)
+    texts = {f"report.{kind}": render(kind, report, pictures, of_fronts, output) for kind in ("md", "html")}
+    texts["timing.txt"] = _timing(report["runs"])
     write_json(output / "report.json", report)
     for name, text in texts.items():
         with atomic_write(output / name) as temporary:
@@ -128,18 +134,18 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
             temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
-def _figure(path: Path, scene: str, what: str, said: str, draw: Callable[..., bool], *content: Any) -> list[Block]:
-    """Draw a figure of a scene; return it as a block, none if there is nothing to draw."""
+def _figure(path: Path, text: str, draw: Callable[..., bool], *content: Any) -> list[dict[str, Any]]:
+    """Draw a figure; return it as a picture, none if there is nothing to draw."""
     try:
-        return [{"picture": path, "text": f"{scene}: {said}"}] if draw(path, scene, *content) else []
+        return [{"path": path, "text": text}] if draw(path, *content) else []
     except ImportError as error:
-        print(f"warning: no figure of {scene}'s {what}: matplotlib cannot be imported ({error})", file=sys.stderr)
+        print(f"warning: no figure {path.name}: matplotlib cannot be imported ({error})", file=sys.stderr)
         return []
 
 
-def _views(output: Path, scene: str, runs: Sequence[Run], each: int) -> list[Block]:
+def _views(output: Path, scene: str, runs: Sequence[Run], each: int) -> list[dict[str, Any]]:
     """Show views of each option set's first run that succeeded: the worst on a sheet, and up to `each` to compare."""
-    blocks: list[Block] = []
+    pictures: list[dict[str, Any]] = []
     seen = set()
     for run in runs:
         if run["failure"] or run["config"] in seen:
@@ -147,18 +153,112 @@ def _views(output: Path, scene: str, runs: Sequence[Run], each: int) -> list[Blo
         path = output / "figures" / f"{scene}{'_' + run['config'] if run['config'] else ''}_worst_views.png"
         try:
             if draw_worst_views(path, run, output):
-                sheet = {"picture": path, "text": f"{run_title(run)}: the test views with the lowest PSNR"}
-                blocks += [sheet, *comparisons(run, output, each)]
+                text = f"{run_title(run)}: the test views with the lowest PSNR"
+                pictures += [{"path": path, "text": text}, *comparisons(run, output, each)]
                 seen.add(run["config"])
         except UserError as error:
             print(f"warning: no pictures of the test views of {run_title(run)}: {error}", file=sys.stderr)
-    return blocks
+    return pictures
 
 
 def _timing(runs: Sequence[Run]) -> str:
     """Return the wall-clock minutes of train.py for each group of scenes, as text."""
-    minutes: dict[str, float] = {}
-    for run in runs:
-        if run["wall_seconds"] is not None:
-            minutes[run["group"]] = minutes.get(run["group"], 0.0) + run["wall_seconds"] / 60
+    timed = comparison.grouped((run for run in runs if run["wall_seconds"] is not None), "group")
+    minutes = {group: sum(run["wall_seconds"] for run in members) / 60 for group, members in timed.items()}
     return "".join(f"{group}: {value:.2f} minutes\n" for group, value in minutes.items())
+
+
+def run_title(run: Mapping[str, Any]) -> str:
+    """Name a run by scene, option set and seed."""
+    seed = None if run["seed"] is None else f"seed {run['seed']}"
+    return ", ".join(part for part in (run["scene"], run["config"], seed) if part)
+
+
+def render(kind: str, report: Mapping[str, Any], figures: Pictures, of_fronts: Pictures, folder: Path) -> str:
+    """Render report.jinja as a page of a kind, "md" or "html".
+
+    figures: those of each scene and its comparisons; of_fronts: of its fronts. folder: of the page, for links.
+    """
+    scenes = comparison.grouped(report["runs"], "scene")
+    text = environment(kind, folder).get_template("report.jinja").render(
+        facts=_facts(report), figures=figures, form=f"page.{kind}.jinja", fronts=of_fronts, report=report,
+        published=comparison.published_tables(), scenes=scenes, tables=tables, title=TITLE,
+    )  # fmt: skip
+    return (re.sub(r"\n{2,}", "\n\n", text) if kind == "md" else text).strip() + "\n"
+
+
+def environment(kind: str, folder: Path) -> jinja2.Environment:
+    """Make what renders the templates of a kind of page, which will lie in a folder."""
+    made = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True, finalize=_escaped if kind == "md" else None,
+    )  # fmt: skip
+    made.filters |= {
+        "data_uri": _data_uri, "indented": _indented, "jpeg": _uri, "markdown": markdown, "no_list": _no_list,
+        "number": tables.number, "one_line": lambda text: Markup(" ".join(text.split())),
+        "relative": lambda path: os.path.relpath(path, folder), "run_title": run_title,
+        "url": lambda path: quote(os.fsencode(path)),
+    }  # fmt: skip
+    return made
+
+
+def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
+    """What decides which remarks a page has."""
+    rows, runs = report["summary"], report["runs"]
+
+    def known(name: str, key: str = "mean") -> bool:
+        return any(row[name][key] is not None for row in rows)
+
+    def seeds(part: str, name: str) -> bool:
+        return any(one[name]["std"] is not None for found in report[part].values() for one in found["sets"].values())
+
+    return {
+        "cpu_known": known("cpu_seconds"),
+        "fronts_of_seeds": seeds("fronts", "PSNR"),
+        "left_out": any(row["gaussians"]["mean"] != row["gaussians_saved"]["mean"] for row in rows),
+        "machines": sorted({one_line(run["machine"]) for run in runs if run["machine"]}),
+        "open_ended": any(row["open_ended"] for row in rows),
+        "reached_by_seeds": seeds("reached", "final"),
+        "several_seeds": known("PSNR", "std"),
+        "timed": known("seconds"),
+        "unfinished": [run for run in runs if not run["finished"] and not run["failure"]],
+        "without_lpips": bool(rows) and not known("LPIPS"),
+    }
+
+
+def _data_uri(path: Path) -> str:
+    """Return a figure as a data: URI; large ones become JPEG."""
+    content = path.read_bytes()
+    if len(content) <= _PHOTOGRAPHIC:
+        return _uri(content, "png")
+    buffer = io.BytesIO()
+    with Image.open(path) as image:
+        image.convert("RGB").save(buffer, "JPEG", quality=_QUALITY)
+    return _uri(buffer.getvalue())
+
+
+def _uri(content: bytes, kind: str = "jpeg") -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def markdown(table: tables.Table) -> Markup:
+    """A table in Markdown, its cells escaped."""
+    header, *rows = [[str(_escaped(cell)) for cell in row] for row in (table.header, *table.rows)]
+    return Markup(markdown_table(header, rows))
+
+
+def _escaped(text: Any) -> Markup:
+    """Escape a text for Markdown, so that names in it appear as they are: no link, no HTML, no second line."""
+    if isinstance(text, Markup):
+        return text
+    safe = _MEANT.sub(lambda match: _ENTITIES.get(match[0], f"\\{match[0]}"), str(text))
+    return Markup(" ".join(safe.splitlines()))
+
+
+def _no_list(text: str) -> Markup:
+    """Let a paragraph be no heading and no list, whatever it begins with."""
+    return Markup(re.sub(r"^\s*([#+=~-])", r"\\\1", text))
+
+
+def _indented(texts: Sequence[str]) -> Markup:
+    return Markup("\n".join(f"    {line}" for text in texts for line in text.splitlines()))

@@ -5,18 +5,17 @@ from __future__ import annotations
 import dataclasses
 import os
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from scene.readers.info import HOLD
 from splatting.evaluation import model_folder as folder_of
+from splatting.evaluation.comparison import SCORES
 from splatting.evaluation.error_curve import NAME as CURVE
 from splatting.evaluation.error_curve import Row, read_curve
-from splatting.evaluation.runs import Record, Run, is_model
-from splatting.evaluation.scenes import SceneEntry
+from splatting.evaluation.plan import Record, Run, SceneEntry, is_model
+from splatting.evaluation.renders import TIMES, image_size, photo_namer, view_names
 from splatting.evaluation.stages import Failure, page_file
-from splatting.evaluation.summary import SCORES
 from splatting.evaluation.what_to_try import peak
 from splatting.files.json_files import read_json
 from utils.system_utils import UserError
@@ -99,13 +98,13 @@ def _views(model: Path, last: int) -> dict[str, Any]:
     [width, height] in pixels, ascending; views: training views and scored test views.
     """
     truth = model / "test" / f"ours_{last}" / "gt"
-    held_out, cameras = folder_of.view_names(truth), folder_of.json_or_none(model / "cameras.json")
+    held_out, cameras = view_names(truth), folder_of.json_or_none(model / "cameras.json")
     scores = folder_of.load_scores(model, f"ours_{last}")[1]["PSNR"]
     worst = sorted((value, name) for name, value in scores.items() if value is not None)[:WORST]
-    picture_name = folder_of.picture_namer(model)
+    picture_name = photo_namer(model)
     return {
         "split": _split(cameras, len(held_out)),
-        "test_sizes": [list(size) for size in sorted({folder_of.picture_size(truth / name) for name in held_out})],
+        "test_sizes": [list(size) for size in sorted({image_size(truth / name) for name in held_out})],
         "views": {"test": len(scores), "train": len(cameras) - len(held_out) if isinstance(cameras, list) else None},
         "worst_views": [{"PSNR": value, "file": name, "picture": picture_name(name)} for value, name in worst],
     }
@@ -133,7 +132,7 @@ def _iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, Any]:
     except UserError:
         means, per_view, times = {}, {"PSNR": {}}, {}
     else:
-        times = folder_of.json_or_none(model / "test" / method / "render_times.json") or {}
+        times = folder_of.json_or_none(model / "test" / method / TIMES) or {}
     seconds = folder_of.training_seconds(model, iteration)
     return {
         **{key: means.get(key) for key in SCORES},
@@ -183,14 +182,3 @@ def _run(content: dict[str, Any], output: Path) -> tuple[Run, Failure | None]:
     options, added = tuple(content["options"] or ()), tuple(content["added_options"] or ())
     run = Run(scene, content["config"], content["seed"], output / content["model"], options, added)
     return run, Failure(**content["failure"]) if content["failure"] else None
-
-
-def joined(earlier: dict[str, Any], runs: Sequence[Run], failures: dict[Run, Failure]) -> list[tuple]:
-    """Return earlier runs and those of this call, with their failures; a run of both is that of this call."""
-    return list((earlier["runs"] | {run.model: (run, failures.get(run)) for run in runs}).values())
-
-
-def joined_peers(earlier: dict[str, Any], peers: Sequence[dict[str, Any]], scenes: set[str]) -> list[dict[str, Any]]:
-    """Return earlier peers of the scenes and those of this call; a peer of both is that of this call."""
-    every = {(peer["scene"], peer["name"]): peer for peer in (*earlier["peers"], *peers)}
-    return [peer for peer in every.values() if peer["scene"] in scenes]

@@ -8,15 +8,15 @@ Replaces the text between the page's two marker lines by one table for each repo
 from __future__ import annotations
 
 import os
-import re
 from argparse import ArgumentParser
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from splatting.evaluation.document import result_blocks
+from splatting.evaluation.comparison import with_values
 from splatting.evaluation.machine import one_line
-from splatting.evaluation.pages import table_text
+from splatting.evaluation.report import markdown
+from splatting.evaluation.tables import result_tables
 from splatting.files.json_files import read_json
 from utils.system_utils import UserError, atomic_write, run_cli
 
@@ -27,36 +27,26 @@ PAGE = Path("docs/results/training.md")
 
 def results_text(report: Mapping[str, Any]) -> str:
     """The table of a report, the options of its runs, and the machine and commit of its trainings."""
-    parts = [block if isinstance(block, str) else table_text(block) for block in result_blocks(report["summary"])]
+    parts = [text for table in result_tables(report["summary"]) for text in (table.title, str(markdown(table))) if text]
     options = {run["config"] or "": list(run["added_options"] or ()) for run in report["runs"]}
     if any(options.values()):
-        parts.append(_options_text(options))
+        parts += _options_text(options)
     if machines := sorted({one_line(run["machine"]) for run in report["runs"] if run["machine"]}):
         parts.append("\n".join(f"Machine: {machine}." for machine in machines))
     return "\n\n".join(parts)
 
 
-def _options_text(options: Mapping[str, Sequence[str]]) -> str:
-    """The options of train.py that all option sets share, then a list of those that each set adds."""
-    shared = _shared_words(list(options.values()))
-    every = f"Options of every run: `{' '.join(shared)}`." if shared else ""
-    if len(options) == 1:
-        return every
-    added = {name: " ".join(words[len(shared) :]) for name, words in options.items()}
-    listed = "\n".join(f"- {name}: `{words}`" if words else f"- {name}: nothing" for name, words in added.items())
-    return "\n\n".join(filter(None, [every, "Each option set adds:", listed]))
-
-
-def _shared_words(sets: Sequence[Sequence[str]]) -> Sequence[str]:
-    """The longest common beginning of the sets that cuts no option from its values."""
-    shared = os.path.commonprefix(sets)
-    while shared and any(len(words) > len(shared) and not _is_option(words[len(shared)]) for words in sets):
-        shared = shared[:-1]
-    return shared
-
-
-def _is_option(word: str) -> bool:
-    return re.match("--?[a-zA-Z]", word) is not None
+def _options_text(options: Mapping[str, Sequence[str]]) -> list[str]:
+    """The options of train.py that all option sets begin with, then a list of those that each set adds."""
+    # An option and its values are one part: a common beginning must not cut them.
+    sets = {name: with_values(words) for name, words in options.items()}
+    shared = os.path.commonprefix(list(sets.values()))
+    added = {name: " ".join(parts[len(shared) :]) for name, parts in sets.items()}
+    text = [f"Options of every run: `{' '.join(shared)}`."] if any(shared) else []
+    if len(options) > 1:
+        listed = [f"- {name}: `{words}`" if words else f"- {name}: nothing" for name, words in added.items()]
+        text += ["Each option set adds:", "\n".join(listed)]
+    return text
 
 
 def replace_results(page: str, reports: Sequence[Mapping[str, Any]]) -> str:

@@ -12,21 +12,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from splatting.evaluation import render_times
 from splatting.evaluation.child import Finished, run_child
-from splatting.evaluation.model_folder import (
-    ground_truth_digest,
-    load_scores,
-    logged,
-    ply_file,
-    trained_iterations,
-    view_names,
-)
-from splatting.evaluation.runs import Record, Run
+from splatting.evaluation.model_folder import load_scores, logged, ply_file, trained_iterations
+from splatting.evaluation.plan import Record, Run
+from splatting.evaluation.renders import TIMES, ground_truth_digest, view_names
 from utils.system_utils import UserError, mkdir_p
 
 _ROOT = Path(__file__).resolve().parents[2]
-_OFFLINE = {"GS_DOWNLOAD": "0"}
 
 
 @dataclass(frozen=True)
@@ -53,30 +45,25 @@ def train(run: Run, machine: dict[str, Any]) -> None:
     training then starts from the beginning. `runs.check_folders` has made sure that nothing in the model folder was
     made with other options.
     """
-    if run.scene.source is None:
-        raise StageFailed(Failure("train", [], [f"no scene folder was given for {run.scene.name}"]))
-    if not run.scene.source.is_dir():
-        raise StageFailed(Failure("train", [], [f"no such scene folder: {run.scene.source}"]))
+    if (source := run.scene.source) is None or not source.is_dir():
+        reason = f"no such scene folder: {source}" if source else f"no scene folder was given for {run.scene.name}"
+        raise StageFailed(Failure("train", [], [reason]))
     record = Record(run.model)
     if _trained(run, record):
         return
     record.start(run.key)
-    before = record.stage("train_interrupted") or {}
-    before = before if before.get("checkpoint") in [path.name for path in _checkpoints(run)] else {}
-    checkpoint = run.model / before["checkpoint"] if before else None
-    resume = ("--start_checkpoint", str(checkpoint)) if checkpoint else ()
-    command = _script("train.py", "-s", str(run.scene.source), "-m", str(run.model), "--disable_viewer", "--quiet")
-    command += [*run.options, *resume]
-    _say("training" + _from_where(checkpoint, record))
     there = _checkpoints(run)
+    before = record.stage("train_interrupted") or {}
+    before = before if before.get("checkpoint") in there else {}
+    command = _script("train.py", "-s", str(source), "-m", str(run.model), "--disable_viewer", "--quiet")
+    command += [*run.options, *(("--start_checkpoint", str(run.model / before["checkpoint"])) if before else ())]
+    _say("training" + _from_where(before, record))
     done = run_child(command)
     spent = _sum(before, done)
-    if done.status:
-        left = [path for path, stamp in _checkpoints(run).items() if stamp != there.get(path)]
-        if left:
-            stopped = done.interrupt and done.status in (128 + signal.SIGINT, 128 + signal.SIGTERM)
-            name = max(left, key=_iteration_of).name
-            record.note("train_interrupted" if stopped else "train_failed", checkpoint=name, **spent)
+    if done.status and (left := [name for name, stamp in _checkpoints(run).items() if stamp != there.get(name)]):
+        stopped = done.interrupt and done.status in (128 + signal.SIGINT, 128 + signal.SIGTERM)
+        latest = max(left, key=_iteration_of)
+        record.note("train_interrupted" if stopped else "train_failed", checkpoint=latest, **spent)
     _expect_success("train", command, done)
     iterations = trained_iterations(run.model)
     if (run.iterations or max(logged(run.model), default=None)) not in iterations:
@@ -87,11 +74,10 @@ def train(run: Run, machine: dict[str, Any]) -> None:
 
 def _sum(before: dict[str, Any], done: Finished) -> dict[str, float | None]:
     """Return the seconds of a training with those of its parts before; CPU seconds None if not known."""
-    sums = {}
-    for name, seconds in (("wall_seconds", done.seconds), ("cpu_seconds", done.cpu_seconds)):
-        earlier = before.get(name) if before else 0.0
-        sums[name] = None if None in (earlier, seconds) else round(earlier + seconds, 3)
-    return sums
+    parts = {
+        name: (before.get(name) if before else 0.0, getattr(done, name)) for name in ("wall_seconds", "cpu_seconds")
+    }
+    return {name: None if None in both else round(sum(both), 3) for name, both in parts.items()}
 
 
 def _trained(run: Run, record: Record) -> bool:
@@ -101,19 +87,19 @@ def _trained(run: Run, record: Record) -> bool:
     return all(ply_file(run.model, iteration).is_file() for iteration in done["iterations"])
 
 
-def _checkpoints(run: Run) -> dict[Path, list[int]]:
-    """Return the checkpoints in the model folder before the last iteration, each with its `_stamp`."""
+def _checkpoints(run: Run) -> dict[str, list[int]]:
+    """Return the names of checkpoints in the model folder before the last iteration, each with its `_stamp`."""
     found = [path for path in run.model.glob("chkpnt*.pth") if re.fullmatch(r"\d+", path.stem[6:])]
-    return {path: _stamp(path) for path in found if _iteration_of(path) < (run.iterations or math.inf)}
+    return {path.name: _stamp(path) for path in found if _iteration_of(path.name) < (run.iterations or math.inf)}
 
 
-def _iteration_of(checkpoint: Path) -> int:
-    return int(checkpoint.stem[6:])
+def _iteration_of(checkpoint: str) -> int:
+    return int(checkpoint[6:-4])
 
 
-def _from_where(checkpoint: Path | None, record: Record) -> str:
-    if checkpoint:
-        return f" from {checkpoint.name}"
+def _from_where(before: dict[str, Any], record: Record) -> str:
+    if before:
+        return f" from {before['checkpoint']}"
     if failed := record.stage("train_failed"):
         return (
             f" from the start ({failed['checkpoint']} was left by a training that failed after "
@@ -149,7 +135,7 @@ def _once(
     there = found()
     if there is None:
         raise StageFailed(Failure(stage, command, ["the scene has no test views, so there is nothing to score"]))
-    record.note(name, **wanted, **there, **also(), wall_seconds=round(done.seconds, 3))
+    record.note(name, **wanted, **there, **also(), wall_seconds=round(done.wall_seconds, 3))
     _stop_if_asked(done)
 
 
@@ -189,13 +175,15 @@ def score(run: Run, download: bool = True) -> bool:
     methods = [f"ours_{iteration}" for iteration in trained_iterations(model) if _rendered(model, iteration)]
     if not methods:
         raise StageFailed(Failure("metrics", [], [f"{model} has no rendered test views; render them first"]))
-    renders = {method: _times_stamp(model, method) for method in methods}
+    times = {method: model / "test" / method / TIMES for method in methods}  # render.py writes these last
+    renders = {method: _stamp(path) if path.is_file() else None for method, path in times.items()}
     if None in renders.values() or not _scored(model, methods):
         record.forget("metrics")
     before = record.stage("metrics")
+    environment = {} if download else {"GS_DOWNLOAD": "0"}
     _once(
         record, "metrics", "scoring", _script("metrics.py", "-m", str(model)), {"renders": renders}, dict,
-        lambda: {"ground_truth_sha256": ground_truth_digest(model, methods[-1])}, **({} if download else _OFFLINE),
+        lambda: {"ground_truth_sha256": ground_truth_digest(model / "test" / methods[-1])}, **environment,
     )  # fmt: skip
     if record.stage("metrics") is before:
         return download
@@ -221,12 +209,6 @@ def page(run: Run, output: Path, options: Sequence[str]) -> None:
     _once(Record(run.model), "html", say, command, wanted, lambda: {} if file.is_file() else None)
 
 
-def _times_stamp(model: Path, method: str) -> list[int] | None:
-    """Return the `_stamp` of the file that render.py writes last, to tell whether renders changed; None without it."""
-    times = model / "test" / method / render_times.NAME
-    return _stamp(times) if times.is_file() else None
-
-
 def _scored(model: Path, methods: Sequence[str]) -> bool:
     try:
         return all(load_scores(model, method) for method in methods)
@@ -246,9 +228,7 @@ def _expect_success(stage: str, command: list[str], done: Finished) -> None:
     if not done.status:
         return
     _stop_if_asked(done)
-    raise StageFailed(
-        Failure(stage, command, [*done.lines, done.reason] if done.status < 0 else done.lines or [done.reason])
-    )
+    raise StageFailed(Failure(stage, command, done.lines))
 
 
 def _stop_if_asked(done: Finished) -> None:

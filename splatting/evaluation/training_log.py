@@ -1,20 +1,25 @@
-"""train_log.json: error against run time, one record per tested or saved iteration and checkpoint."""
+"""Records of a training: train_log.json, one for each tested or saved iteration and checkpoint, by a clock of training;
+and events for TensorBoard."""
 
 import math
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from splatting.distributed.ranks import ranks
+from tqdm import tqdm
+
 from splatting.files.json_files import read_json, write_json
-from splatting.host.process import peak_memory_mib, wall_seconds
-from splatting.host.running import running_seconds
+from splatting.host.clock import running_seconds, wall_seconds
+from splatting.host.memory import peak_memory_mib
 from utils.system_utils import UserError, compute_device
 
 NAME = "train_log.json"
 SHORT = 2000  # iterations; after trainings up to this length, what training says at its end is short
+_FLUSHED = 10  # seconds until events are in the file at the latest
 _FINITE = ("loss", "peak_memory_mib", "wall_seconds", "max_num_splats", "default_budget")  # if present
 
 
@@ -22,9 +27,11 @@ class Stopwatch:
     """Seconds since its construction, without those inside `paused()` or of a stopped process, where it stands still.
 
     spent: the seconds inside, by their purpose. Of a pause in another one, they count for the inner purpose.
+    busy: what else happens in a pause, as a context.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, busy: Callable[[], AbstractContextManager] = nullcontext) -> None:
+        self._busy = busy
         self._start = running_seconds()
         self._stopped: float | None = None  # when the outermost pause began
         self.spent: dict[str, float] = {}
@@ -38,7 +45,7 @@ class Stopwatch:
         before, outer, others = running_seconds(), self._stopped, sum(self.spent.values())
         self._stopped = before if outer is None else outer
         try:
-            with ranks().busy():
+            with self._busy():
                 yield
         finally:
             taken = running_seconds() - before
@@ -91,7 +98,7 @@ class TrainingLog:
         return (self.records[-1].get("loss") if self.records else None) or 0.0
 
     def peak_memory_mib(self) -> float | None:
-        """Most memory held so far, by this run or those it resumes (host/process.py); None if not known."""
+        """Most memory held so far, by this run or those it resumes (host/memory.py); None if not known."""
         peaks = [peak for peak in (self._peak_before, peak_memory_mib(compute_device())) if peak is not None]
         return round(max(peaks), 1) if peaks else None
 
@@ -149,3 +156,32 @@ def _read(path: Path) -> list[dict]:
     except UserError as error:
         print(f"warning: {str(error).partition('; ')[0]}; a new one is started", file=sys.stderr)
         return []
+
+
+class EventWriter:
+    """A SummaryWriter of torch, all of whose methods can be called. ImportError without TensorBoard.
+
+    If one fails, as on a full disk, one warning says so, and nothing more is written.
+    """
+
+    def __init__(self, log_dir: str) -> None:
+        from torch.utils.tensorboard import SummaryWriter  # takes 0.3 s to import
+
+        self._folder, self._failed = log_dir, False
+        self._writer = self._guarded(SummaryWriter, log_dir, flush_secs=_FLUSHED)
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return partial(self._guarded, getattr(self._writer, name, None))
+
+    def _guarded(self, method: Callable[..., Any], *given: Any, **named: Any) -> Any:
+        if self._failed:
+            return None
+        try:
+            return method(*given, **named)
+        except Exception as error:  # whatever it is, the training goes on
+            self._failed = True
+            fault = f"cannot write TensorBoard's events into {self._folder} ({error})"
+            tqdm.write(f"warning: {fault}; training continues without them", file=sys.stderr)
+            return None

@@ -3,63 +3,54 @@
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from splatting.exports.ply import is_compressed_ply, read_compressed_ply, read_plain_ply
+from splatting.exports.ply import read_compressed_ply, read_plain_ply, write_compressed_ply, write_plain_ply
+from splatting.exports.scene_formats import find_pxr, write_glb, write_usdz
 from splatting.exports.splats import Splats, tidy
-from splatting.exports.spz import read_spz
-from splatting.exports.web import read_splat
+from splatting.exports.spz import find_zstandard, read_spz, write_spz
+from splatting.exports.web import find_program, read_splat, write_sog, write_splat
 from splatting.files.ply_header import header_lines
 from utils.system_utils import UserError
 
 READABLE = "PLY, compressed PLY, SPZ or .splat"
+_SPZ = (b"NGSP", b"\x1f\x8b")  # how its files begin
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format. ending: of its files' names; where: module and function that writes it; what: for people.
+    """A format. ending: of its files' names; what: for people.
 
-    of_scene: its writer also takes what `write_scene_html` does. needs: function of the same module that finds the
-    package or program without which nothing can be written.
+    write: writes a file of splats, whole or not at all. UserError if it cannot be written. of_scene: it also takes the
+    further arguments of `write_html`. check: raises UserError if a package or program that the file needs is missing.
     """
 
     ending: str
-    where: tuple[str, str]
+    write: Callable[..., None]
     what: str
     of_scene: bool = False
-    needs: str | None = None
+    check: Callable[[str | os.PathLike], Any] = lambda path: None
 
-    def check(self, path: str | os.PathLike) -> None:
-        """UserError if what a file of this name needs is not installed."""
-        if self.needs:
-            getattr(import_module(self.where[0]), self.needs)(path)
 
-    def write(self, path: str | os.PathLike, splats: Splats, *of_scene: Any) -> None:
-        """Write a file, whole or not at all. of_scene: further arguments of the writer. UserError as from it."""
-        module, name = self.where
-        writer: Callable[..., None] = getattr(import_module(module), name)  # only now, as each has its own packages
-        writer(path, splats, *of_scene)
+def _write_html(*arguments: Any) -> None:
+    from splatting.exports.html import write_html  # SciPy and jinja2 take a while to import
+
+    write_html(*arguments)
 
 
 # An ending that ends with another one comes before it.
 FORMATS = (
-    Format(".compressed.ply", ("splatting.exports.ply", "write_compressed_ply"), "PlayCanvas, SuperSplat"),
-    Format(".ply", ("splatting.exports.ply", "write_plain_ply"), "float32, everything kept"),
-    Format(".splat", ("splatting.exports.web", "write_splat"), "antimatter15, 32 bytes a splat, no SH bands"),
-    Format(".spz", ("splatting.exports.spz", "write_spz"), "Niantic, version 4", needs="find_zstandard"),
-    Format(
-        ".sog",
-        ("splatting.exports.web", "write_sog"),
-        "PlayCanvas, through splat-transform",
-        needs="find_program",
-    ),
-    Format(".glb", ("splatting.exports.scene_formats", "write_glb"), "glTF with KHR_gaussian_splatting, float32"),
-    Format(".usdz", ("splatting.exports.scene_formats", "write_usdz"), "OpenUSD, float32", needs="find_pxr"),
-    Format(".html", ("splatting.exports.html", "write_scene_html"), "a page with a viewer", of_scene=True),
+    Format(".compressed.ply", write_compressed_ply, "PlayCanvas, SuperSplat"),
+    Format(".ply", write_plain_ply, "float32, everything kept"),
+    Format(".splat", write_splat, "antimatter15, 32 bytes a splat, no SH bands"),
+    Format(".spz", write_spz, "Niantic, version 4", check=find_zstandard),
+    Format(".sog", write_sog, "PlayCanvas, through splat-transform", check=find_program),
+    Format(".glb", write_glb, "glTF with KHR_gaussian_splatting, float32"),
+    Format(".usdz", write_usdz, "OpenUSD, float32", check=find_pxr),
+    Format(".html", _write_html, "a page with a viewer", of_scene=True),
 )
 
 
@@ -77,12 +68,17 @@ def is_point_cloud(path: str | os.PathLike) -> bool:
     """Whether a file has points instead of splats: a PLY without their properties, or a file of another kind."""
     if not os.path.isfile(path) or Path(path).suffix.lower() in (".splat", ".spz"):
         return False
-    lines = header_lines(path)
-    if not lines:
+    names = _properties(path)
+    if names is None:
         with open(path, "rb") as file:
-            return not file.read(4).startswith((b"NGSP", b"\x1f\x8b"))
-    names = {words[-1] for words in map(str.split, lines) if words[:1] == ["property"]}
+            return not file.read(4).startswith(_SPZ)
     return not names & {"f_dc_0", "opacity", "scale_0", "rot_0", "packed_position"}
+
+
+def _properties(path: str | os.PathLike) -> set[str] | None:
+    """The names of a PLY's properties, None for another file."""
+    lines = [line.split() for line in header_lines(path)]
+    return {words[-1] for words in lines if words[:1] == ["property"]} if lines else None
 
 
 @np.errstate(over="ignore", invalid="ignore")  # what float32 cannot hold becomes Inf or NaN, which is not drawn
@@ -96,9 +92,11 @@ def read_splats(path: str | os.PathLike) -> Splats:
     except OSError as error:
         raise UserError(f"cannot read {path} ({error.strerror}); fix its permissions") from error
     if begin.startswith(b"ply"):
-        return tidy(read_compressed_ply(path) if is_compressed_ply(path) else read_plain_ply(path))
-    if begin == b"NGSP" or begin.startswith(b"\x1f\x8b"):
-        return tidy(read_spz(path))
-    if Path(path).suffix.lower() == ".splat":  # it has no sign of its own
-        return tidy(read_splat(path))
-    raise UserError(f"{path} is no model that this program reads; give {READABLE}")
+        read = read_compressed_ply if "packed_position" in (_properties(path) or ()) else read_plain_ply
+    elif begin.startswith(_SPZ):
+        read = read_spz
+    elif Path(path).suffix.lower() == ".splat":  # it has no sign of its own
+        read = read_splat
+    else:
+        raise UserError(f"{path} is no model that this program reads; give {READABLE}")
+    return tidy(read(path))

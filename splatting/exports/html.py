@@ -1,4 +1,8 @@
-"""A model as one HTML file, with a viewer: it opens from disk, without network and without other programs."""
+"""A model as one HTML file, with a viewer: it opens from disk, without network and without other programs.
+
+The viewer's axes are x right, y up, z backwards, and its camera has no roll, so the model is turned upright. The form
+of its settings is that of its settings.json, version 2 (docs/api.md and dist/settings.d.ts of the npm package).
+"""
 
 import base64
 import gzip
@@ -6,46 +10,66 @@ import io
 import json
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jinja2
 import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
 
 from scene.cameras import Camera
-from scene.scene import Scene
-from splatting.camera_paths.moments import TimedPath
-from splatting.camera_paths.poses import Poses, poses_of
+from splatting.camera_paths.keyframes import TimedPath
+from splatting.camera_paths.poses import Poses, focus_point, poses_of
 from splatting.exports.ply import packed_ply
 from splatting.exports.splats import Splats
 from splatting.exports.vendor import FOLDER, RECORD, VIEWER
-from splatting.exports.viewer_world import settings, turn_upright, turned, up_of
 from splatting.files.json_files import read_json
+from utils.sh_utils import sh_basis
 from utils.system_utils import UserError, atomic_write
 
 LONGEST = 500_000_000  # letters of a page's text; Chromium's strings end at 2^29
 _NAME = "scene.compressed.ply"  # its ending tells the viewer the format
+UP = np.array([0.0, -1.0, 0.0])  # of the turned model, as in a usual capture
+_MEAN_UP = 0.01  # weight of the mean up beside the cameras' horizons
+_DIRECTIONS = 64  # more than the 25 coefficients that they determine
+BOOKMARKS = 25  # the viewer's own limit of annotations
+_TITLE = 60  # and of letters in their titles
+_KEYS_A_SECOND = 10
+_MOST_KEYS = 1000
+_VIEWER_AXES = np.diag([-1.0, -1.0, 1.0])  # the viewer turns each model by half a turn about z
+_OFF = {"enabled": False}
+_NO_EFFECTS = {  # the viewer's post effects
+    "sharpness": {**_OFF, "amount": 0},
+    "bloom": {**_OFF, "intensity": 0.1, "blurLevel": 2},
+    "grading": {**_OFF, "brightness": 1, "contrast": 1, "saturation": 1, "tint": [1, 1, 1]},
+    "vignette": {**_OFF, "intensity": 0.5, "inner": 0.3, "outer": 0.75, "curvature": 1},
+    "fringing": {**_OFF, "intensity": 0.5},
+}
 
 
 def write_html(
     path: str | os.PathLike,
     splats: Splats,
     cameras: Sequence[Camera],
-    camera_path: TimedPath | None = None,
-    title: str | None = None,
+    make_path: Callable[[Poses], TimedPath] | None = None,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    title: str | None = None,
 ) -> None:
     """Write the page, whole or not at all.
 
     cameras: the training views, the first of which is where the page begins; up to 25 of them become bookmarks.
-    camera_path: the animation, None: the viewer's own, which goes around the model, or sways where the first camera is
-    in the model's box. title: None: the file's name. background: RGB in [0,1].
-    UserError without a camera.
+    make_path: makes the animation from their poses, as of splatting/camera_paths/render_path.py. None: the viewer's
+    own, which goes around the model, or sways where the first camera is in the model's box. background: RGB in [0,1].
+    title: None: the file's name. UserError without a camera.
     """
     if not cameras:
         raise UserError("a page needs at least one training camera, from which it shows the model; the scene has none")
     poses = poses_of(cameras)
     turn = turn_upright(up_of(poses))
     names = [str(camera.image_name) for camera in cameras]
+    camera_path = make_path(poses) if make_path else None
     # The median distance of the Gaussians from the first camera.
     distance = float(np.median(np.linalg.norm(splats.means - poses.positions[0], axis=1))) if len(splats) else 1.0
     page = {
@@ -53,7 +77,14 @@ def write_html(
         "name": _NAME,
         "settings": settings(poses, names, turn, camera_path, background, distance),
     }
-    content = _template().render(
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    content = environment.get_template("page.html.jinja").render(
         background=", ".join(f"{255 * value:.0f}" for value in background),
         css=(FOLDER / "viewer.css").read_text(encoding="utf-8"),
         licence=(FOLDER / "LICENSE").read_text(encoding="utf-8"),
@@ -67,32 +98,6 @@ def write_html(
     with atomic_write(path) as temporary:
         # Names that are not UTF-8 have surrogates, which appear as numbers.
         temporary.write_text(content, encoding="utf-8", errors="backslashreplace")
-
-
-def write_scene_html(
-    path: str | os.PathLike,
-    splats: Splats,
-    scene: Scene,
-    white_background: bool = False,
-    make_path: Callable[[Poses], TimedPath] | None = None,
-) -> None:
-    """Write the page of splats from a scene's model, with its training views, as `write_html` does.
-
-    white_background: whether it was trained with -w. make_path: the animation from the training views' poses, as of
-    splatting/camera_paths/request.py.
-    """
-    cameras = scene.getTrainCameras()
-    camera_path = make_path(poses_of(cameras)) if make_path and cameras else None
-    background = (1.0, 1.0, 1.0) if white_background else (0.0, 0.0, 0.0)
-    write_html(path, splats, cameras, camera_path, background=background)
-
-
-def _template() -> jinja2.Template:
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    environment = jinja2.Environment(
-        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return environment.get_template("page.html.jinja")
 
 
 def _in_base64(content: bytes) -> str:
@@ -109,3 +114,136 @@ def _packed_model(splats: Splats) -> str:
             f"MB, and browsers read at most {LONGEST / 1e6:.0f}; export fewer by --max_splats or --sh_degree"
         )
     return packed
+
+
+def up_of(poses: Poses) -> np.ndarray:
+    """The direction (3,), of length 1, that is up for most cameras: the one in which their rolls are least.
+
+    A level camera has its x axis at right angles to up, however far it looks down. So up is the eigenvector of the
+    least eigenvalue of the mean of x x^T; where cameras face one way and leave it open, their mean up decides.
+    """
+    mean, across = poses.up, poses.turns[:, :, 0]
+    mean = mean / max(float(np.linalg.norm(mean)), 1e-9)
+    matrix = across.T @ across / len(poses) + _MEAN_UP * (np.eye(3) - np.outer(mean, mean))
+    up = np.linalg.eigh(matrix)[1][:, 0]
+    return up if up @ mean >= 0 else -up
+
+
+def turn_upright(up: np.ndarray) -> np.ndarray:
+    """The least rotation (3,3) that takes a direction to UP."""
+    axis, cosine = np.cross(up, UP), float(up @ UP)
+    sine = float(np.linalg.norm(axis))
+    axis = axis / sine if sine > 1e-9 else np.array([0.0, 0.0, 1.0])
+    return Rotation.from_rotvec(axis * np.arctan2(sine, cosine)).as_matrix()
+
+
+def turned(splats: Splats, turn: np.ndarray) -> Splats:
+    """The same Gaussians in a world turned by a rotation (3,3); its offset is not kept."""
+    rotation = Rotation.from_matrix(turn) * Rotation.from_quat(splats.rotations, scalar_first=True)
+    return replace(
+        splats,
+        means=(splats.means @ turn.T).astype(np.float32),
+        rotations=rotation.as_quat(scalar_first=True).astype(np.float32),
+        sh=np.einsum("jk,nkc->njc", _sh_turn(splats.sh_degree, turn).astype(np.float32), splats.sh),
+        world_offset=(0.0, 0.0, 0.0),
+    )
+
+
+def _sh_turn(degree: int, turn: np.ndarray) -> np.ndarray:
+    """The matrix (K,K) of SH coefficients: the new function at a direction d is the old one at turn^T d."""
+    directions = torch.randn(_DIRECTIONS, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    directions = torch.nn.functional.normalize(directions)
+    new, old = sh_basis(degree, directions), sh_basis(degree, directions @ torch.from_numpy(turn))
+    return torch.linalg.lstsq(new, old).solution.numpy()
+
+
+def settings(
+    poses: Poses,
+    names: Sequence[str],
+    turn: np.ndarray,
+    path: TimedPath | None,
+    background: tuple[float, float, float],
+    distance: float = 1.0,
+) -> dict[str, Any]:
+    """The settings of a model that was turned by `turn` (3,3).
+
+    poses, names: of the training cameras before that, the first of which is where the viewer begins. path: the
+    animation, in the same frame. background: RGB in [0,1]. distance: of the model, about which cameras that are all in
+    one place turn. Opening angles are vertical, in degrees.
+    """
+    axes = _VIEWER_AXES @ turn
+    focus = focus_point(poses)
+    depths = _depths(poses, focus, distance)
+    cameras = [_look(axes, *camera) for camera in zip(poses.positions, poses.turns, depths, poses.fov, strict=True)]
+    marked = np.unique(np.linspace(0, len(cameras) - 1, BOOKMARKS).round().astype(int)).tolist()
+    return {
+        "version": 2,
+        "tonemapping": "none",
+        "highPrecisionRendering": False,
+        "background": {"color": list(background)},
+        "postEffectSettings": _NO_EFFECTS,
+        "animTracks": [] if path is None else [_track(path, axes, float(np.median(depths)))],
+        "cameras": [{"initial": cameras[0]}],
+        "annotations": [_bookmark(names[n], cameras[n], lean(axes @ poses.turns[n])) for n in marked],
+        "startMode": "default" if path is None else "animTrack",
+    }
+
+
+def _depths(poses: Poses, focus: np.ndarray | None, distance: float) -> np.ndarray:
+    """How far along each axis the point about which that camera turns lies: at the focus, or near it."""
+    if focus is None:
+        return np.full(len(poses), max(poses.spread or distance, 1e-3))
+    ahead = ((focus - poses.positions) * poses.forward).sum(axis=1)
+    return np.where(ahead > 0, ahead, np.median(ahead))
+
+
+def lean(turn: np.ndarray) -> float:
+    """Degrees by which a camera with axes `turn` (3,3) in the viewer's world must be rolled from a level one.
+
+    About its backward axis, and level as the viewer's cameras are: turned about y, then about their own x.
+    """
+    yaw = np.arctan2(-turn[0, 2], -turn[2, 2])
+    level = np.array([np.cos(yaw), 0, -np.sin(yaw)])
+    return float(np.degrees(np.arctan2(turn[:, 1] @ level, turn[:, 0] @ level)))
+
+
+def _look(axes: np.ndarray, position: np.ndarray, turn: np.ndarray, depth: float, fov: float) -> dict[str, Any]:
+    target = position + depth * turn[:, 2]
+    return {"position": (axes @ position).tolist(), "target": (axes @ target).tolist(), "fov": float(fov)}
+
+
+def _bookmark(name: str, camera: dict[str, Any], degrees: float) -> dict[str, Any]:
+    """An annotation at the camera's own place. The viewer's cameras are level, so our page adds the lean."""
+    title = name if len(name) <= _TITLE else "…" + name[1 - _TITLE :]
+    return {
+        "position": camera["position"],
+        "title": title,
+        "text": "",
+        "camera": {"initial": camera},
+        "extras": {"lean": degrees},
+    }
+
+
+def _track(path: TimedPath, axes: np.ndarray, depth: float) -> dict[str, Any]:
+    count = max(2, min(_MOST_KEYS, round(path.seconds * _KEYS_A_SECOND) + 1))
+    rate = (count - 1) / path.seconds
+    frames = range(count - path.closed)  # the end of a closed path is its beginning
+    keys = [path.at(min(frame / rate, path.seconds)) for frame in frames]
+    turns = Rotation.from_quat([key.wxyz for key in keys], scalar_first=True).as_matrix()
+    looks = [_look(axes, np.array(k.position), turn, depth, k.fov) for k, turn in zip(keys, turns, strict=True)]
+    return {
+        "name": "camera path",
+        "duration": path.seconds,
+        "frameRate": rate,
+        "loopMode": "repeat" if path.closed else "none",
+        "interpolation": "spline",
+        "smoothness": 1,
+        "keyframes": {
+            "times": list(frames),
+            "values": {
+                "position": [value for look in looks for value in look["position"]],
+                "target": [value for look in looks for value in look["target"]],
+                "fov": [look["fov"] for look in looks],
+            },
+        },
+    }

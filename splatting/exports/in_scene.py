@@ -7,6 +7,7 @@ import argparse
 import copy
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,7 +15,6 @@ import torch
 from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import attributes
-from splatting.distributed.ranks import ALONE, Ranks
 from splatting.exports.formats import is_point_cloud, read_splats
 from splatting.exports.ply import columns_of
 from splatting.exports.splats import Splats, base_colors, drawable, selected
@@ -65,18 +65,18 @@ def fill_model(gaussians: GaussianModel, splats: Splats) -> None:
 
 
 def scene_with(
-    path: str | None, options: argparse.Namespace, gaussians: GaussianModel, sharing: Ranks = ALONE
+    path: str | None, options: argparse.Namespace, gaussians: GaussianModel, **of_scene: Any
 ) -> tuple[Scene, Splats | None]:
     """A scene whose points are a file's, and the file's splats in the scene's frame; None for a point cloud.
 
     The model stays empty. path: None or empty: the points are the dataset's own. options: the model options. Positions
-    in the file are those of the world, unless our comment world_offset tells their origin. sharing: as of Scene.
-    UserError for a file without splats that are drawn, and as from Scene.
+    in the file are those of the world, unless our comment world_offset tells their origin. of_scene: further
+    arguments of Scene. UserError for a file without splats that are drawn, and as from Scene.
     """
     options = copy.copy(options)
     if not path or is_point_cloud(path):
         options.init_pcd_path = path or getattr(options, "init_pcd_path", "")
-        return Scene(options, gaussians, shuffle=False, start=False, sharing=sharing), None
+        return Scene(options, gaussians, shuffle=False, start=False, **of_scene), None
     splats = read_splats(path)
     splats = selected(splats, drawable(splats))
     if not len(splats):
@@ -85,7 +85,7 @@ def scene_with(
     colors = np.clip(base_colors(splats), 0, 1)
     # The scene moves them into its frame, as it does any points.
     options.init_pcd_path = BasicPointCloud(points, colors, np.zeros_like(colors))
-    scene = Scene(options, gaussians, shuffle=False, start=False, sharing=sharing)
+    scene = Scene(options, gaussians, shuffle=False, start=False, **of_scene)
     means = np.ascontiguousarray(scene.info.point_cloud.points, dtype=np.float32)
     return scene, replace(splats, means=means, world_offset=tuple(scene.info.offset.tolist()))
 

@@ -26,7 +26,7 @@ from scene.gaussians.ply import offset_comments, read_ply, read_vertices, write_
 from scene.readers.world_offset import origin_near
 from splatting.exports.packing import morton_order, pack, smallest_three, spread, unpack, whole_quaternions
 from splatting.exports.splats import Splats, base_colors, logits, opacities, selected
-from splatting.files.model_json import LARGEST_OFFSET
+from splatting.files.json_files import LARGEST_OFFSET
 from splatting.files.ply_header import header_lines, read_elements
 from utils.sh_utils import C0
 from utils.system_utils import UserError, atomic_write
@@ -135,11 +135,6 @@ def _near_origin(path: str | os.PathLike, means: np.ndarray) -> tuple[np.ndarray
         return means, origin
     print(f"{path}: positions are taken relative to {' '.join(map(repr, origin.tolist()))}, for float32's sake")
     return (places - origin).astype(np.float32), origin
-
-
-def is_compressed_ply(path: str | os.PathLike) -> bool:
-    """Whether the header of a PLY names packed positions."""
-    return any(line.split()[-1:] == ["packed_position"] for line in header_lines(path))
 
 
 def write_compressed_ply(path: str | os.PathLike, splats: Splats) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 
 from splatting.exports.packing import morton_order, smallest_three, spread, to_bytes, whole_quaternions
 from splatting.exports.splats import Splats, half_turned, logits, opacities, selected
-from splatting.files.packed import check_packed_rows
+from splatting.files.plain_files import check_packed_rows
 from utils.system_utils import UserError, atomic_write
 
 MAGIC = 0x5053474E

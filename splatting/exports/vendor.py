@@ -36,11 +36,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     if not shutil.which("npm"):
         raise UserError("npm is not installed; install Node 20 or later, which brings it")
     with temporary_folder() as folder:
-        package = _unpacked(record, folder)
-        minifier = _minifier(record, folder)
+        package, minifier = _installed(record, folder)
         files = {"LICENSE": (package / "LICENSE").read_bytes()}
         for name, source in _SOURCES.items():
-            files[name] = _output([minifier, package / source, "--minify", "--charset=utf8", *_banner(name, record)])
+            # The words that put name and licence into the file's first line.
+            banner = f"/*! {record['package']} {record['version']}, {record['license']}: see LICENSE */"
+            options = ["--minify", "--charset=utf8", f"--banner:{name.rpartition('.')[2]}={banner}"]
+            files[name] = _output([minifier, package / source, *options])
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in sorted(files.items())}
     if digests != record["sha256"]:
         raise UserError(f"the files differ from those of {RECORD}; after a look at them, enter {json.dumps(digests)}")
@@ -51,28 +53,18 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(f"{FOLDER / name}: {len(content):,} bytes")
 
 
-def _unpacked(record: dict, folder: Path) -> Path:
-    """The package's folder. UserError if its archive is not the recorded one."""
-    wanted = f"{record['package']}@{record['version']}"
-    archive = folder / _output(["npm", "pack", "--silent", wanted], folder).decode().split()[-1]
+def _installed(record: dict, folder: Path) -> tuple[Path, Path]:
+    """The package's folder, and the minifier. UserError if the package's archive is not the recorded one."""
+    named = f"{record['package']}@{record['version']}"
+    archive = folder / _output(["npm", "pack", "--silent", named], folder).decode().split()[-1]
     digest = "sha512-" + base64.b64encode(hashlib.sha512(archive.read_bytes()).digest()).decode()
     if digest != record["integrity"]:
-        raise UserError(f"npm gave another archive of {wanted} than {RECORD} names: its integrity is {digest}")
+        raise UserError(f"npm gave another archive of {named} than {RECORD} names: its integrity is {digest}")
     with tarfile.open(archive) as tar:
         tar.extractall(folder, filter="data")
-    return folder / "package"
-
-
-def _minifier(record: dict, folder: Path) -> Path:
     install = ["npm", "install", "--silent", "--ignore-scripts", "--no-save", "--prefix", folder]
     _output([*install, f"esbuild@{record['esbuild']}"])
-    return folder / "node_modules" / ".bin" / "esbuild"
-
-
-def _banner(name: str, record: dict) -> list[str]:
-    """The words that put name and licence into the file's first line."""
-    kind = name.rpartition(".")[2]
-    return [f"--banner:{kind}=/*! {record['package']} {record['version']}, {record['license']}: see LICENSE */"]
+    return folder / "package", folder / "node_modules" / ".bin" / "esbuild"
 
 
 def _output(command: list[str | Path], folder: Path | None = None) -> bytes:

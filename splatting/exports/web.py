@@ -75,17 +75,14 @@ def write_sog(path: str | os.PathLike, splats: Splats) -> None:
         model, packed = folder / "model.ply", folder / "model.sog"
         write_plain_ply(model, splats)
         # Without a GPU, as its results differ from machine to machine.
+        options = [os.environ.get("NODE_OPTIONS", ""), f"--import=data:text/javascript,{quote(_SEEDED)}"]
+        environment = {**os.environ, "NODE_OPTIONS": " ".join(options).strip()}
         command = [program, "--quiet", "--overwrite", "--gpu", "cpu", str(model), str(packed)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, env=_environment())
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
         if done.returncode or not packed.is_file():
             said = (done.stderr or done.stdout).strip().splitlines() or ["it said nothing"]
             raise UserError(f"{PROGRAM} could not write {path} ({said[-1]}); choose another format, or update it")
         _copy_without_dates(packed, temporary)
-
-
-def _environment() -> dict[str, str]:
-    options = [os.environ.get("NODE_OPTIONS", ""), f"--import=data:text/javascript,{quote(_SEEDED)}"]
-    return {**os.environ, "NODE_OPTIONS": " ".join(options).strip()}
 
 
 def _copy_without_dates(source: Path, target: Path) -> None:

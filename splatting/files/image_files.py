@@ -1,12 +1,25 @@
-"""Image files: suffixes and formats, exceptions of reading them, and opening of photos and of renders of any size."""
+"""Image files: formats, reading of photos and of renders of any size, 8-bit PNGs, and 16-bit PNGs of one plane.
 
+torch is imported on first use: not every program needs it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
 import struct
 import warnings
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from PIL import Image
+import numpy as np
+from PIL import Image, PngImagePlugin
 
 from splatting.files.plain_files import plain
+from utils.system_utils import UserError, atomic_write
+
+if TYPE_CHECKING:
+    import torch
 
 MOST_PIXELS = 1 << 28  # 16384 a side, the largest training size; Pillow's default limit is lower
 UNREADABLE = (
@@ -17,6 +30,8 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 # What photos come in. Pillow knows more formats, and hands some of them, as PostScript, to other programs, whatever the
 # file's name is.
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "JPEG2000", "TGA")
+SCALE = "scale"  # key of a plane's text chunk: value = pixel * scale
+_STEPS = 65535
 
 
 def open_image(path: Path) -> Image.Image:
@@ -36,3 +51,50 @@ def open_render(path: Path) -> Image.Image:
         raise Image.DecompressionBombError(str(error)) from error
     finally:
         Image.MAX_IMAGE_PIXELS = usual
+
+
+def to_bytes(image: torch.Tensor) -> torch.Tensor:
+    """An image (3, H, W), float in [0, 1] or already uint8, as (H, W, 3) uint8, halves rounded up."""
+    import torch
+
+    if image.dtype != torch.uint8:
+        image = (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+    return image.permute(1, 2, 0).contiguous().cpu()
+
+
+def save_png(image: torch.Tensor, path: Path) -> None:
+    """Write an image as `to_bytes` takes it; the file is written whole or not at all."""
+    with atomic_write(path) as temporary:
+        Image.fromarray(to_bytes(image).numpy()).save(temporary)
+
+
+def remove_leftovers(folder: Path, count: int) -> None:
+    """Delete numbered PNGs beyond the first `count`, which an earlier run with more views has left."""
+    for file in folder.glob("*.png"):
+        if re.fullmatch(r"\d{5,}", file.stem) and int(file.stem) >= count:
+            file.unlink()
+
+
+def write_plane(path: str | os.PathLike, values: np.ndarray, largest: float | None = None) -> None:
+    """Write values (H, W), at least 0, as a 16-bit PNG; whole or not at all.
+
+    Values are rounded to the nearest of 65,536 steps up to `largest`.
+
+    largest: the value of the brightest pixel; None: the largest of the values.
+    """
+    top = float(values.max(initial=0.0)) if largest is None else largest
+    scale = (top or 1.0) / _STEPS
+    steps = np.clip(np.round(values.astype(np.float64) / scale), 0, _STEPS).astype(np.uint16)
+    text = PngImagePlugin.PngInfo()
+    text.add_text(SCALE, repr(scale))
+    with atomic_write(path) as temporary:
+        Image.fromarray(steps).save(temporary, pnginfo=text)
+
+
+def read_plane(path: str | os.PathLike) -> np.ndarray:
+    """Read what `write_plane` wrote: (H, W) float64, each within half a step. UserError for a file that is no plane."""
+    try:
+        with Image.open(plain(path)) as image:
+            return np.asarray(image, dtype=np.float64) * float(image.text[SCALE])
+    except (*UNREADABLE, AttributeError, KeyError, ValueError) as error:
+        raise UserError(f"cannot read {path} as a plane of numbers ({error}); render.py writes such files") from error

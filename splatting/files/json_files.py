@@ -1,11 +1,19 @@
-"""Reading and writing of the JSON files of this project."""
+"""JSON files, and `model.json` of a model folder: entries that the reference's `cfg_args` has no place for.
+
+arguments/stored.py says which options are in it.
+"""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
 from splatting.files.plain_files import plain_text
-from utils.system_utils import atomic_write
+from utils.system_utils import UserError, atomic_write
+
+MODEL_JSON = "model.json"
+OFFSET = "world_offset"  # (3,) world coordinates of the origin of the model's frame (scene/readers/world_offset.py)
+LARGEST_OFFSET = 1e15  # beyond, the steps of doubles are larger than 0.1
 
 
 def read_json(path: Path) -> Any:
@@ -19,3 +27,34 @@ def write_json(path: Path, content: Any, sort_keys: bool = True) -> None:
     with atomic_write(path) as temporary:
         # File names that are not UTF-8 have surrogates, which JSON escapes as Python does.
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+
+
+def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
+    """Read `model.json`; {} if there is none, as in a model of another program.
+
+    UserError if it is no JSON object, or if its antialiasing or world_offset is broken.
+    """
+    path = Path(model_path) / MODEL_JSON
+    if not path.is_file():
+        return {}
+    try:
+        record = read_json(path)
+    except (OSError, ValueError, RecursionError) as error:
+        raise UserError(f"{path} is not JSON; restore it, or remove it and pass --antialiasing yourself") from error
+    if not isinstance(record, dict) or not isinstance(record.get("antialiasing", False), bool):
+        raise UserError(f"{path}: antialiasing must be true or false; restore the file, or remove it")
+    offset = record.get(OFFSET, [0, 0, 0])
+    if not isinstance(offset, list) or len(offset) != 3 or not all(_fits(value) for value in offset):
+        raise UserError(
+            f"{path}: {OFFSET} must be three numbers to {LARGEST_OFFSET:g}, got {offset!r:.40}; restore the file"
+        )
+    return record
+
+
+def write_model_json(model_path: str | os.PathLike, record: dict[str, Any]) -> None:
+    """Write `model.json` with sorted keys, whole or not at all."""
+    write_json(Path(model_path) / MODEL_JSON, record)
+
+
+def _fits(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) <= LARGEST_OFFSET

@@ -1,4 +1,4 @@
-"""Lists of names in messages."""
+"""Lists of names in messages, and tables in Markdown."""
 
 from collections.abc import Sequence
 
@@ -9,3 +9,21 @@ def some(names: Sequence[str], most: int = 5) -> str:
         return "nothing"
     rest = len(names) - most
     return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]], right: bool = True) -> str:
+    """Markdown table of text cells, padded to be readable in a terminal, too.
+
+    right: align all columns but the first to the right, as for numbers.
+    """
+    lines = [[cell.replace("|", "\\|").replace("\n", " ") for cell in line] for line in (header, *rows)]
+    widths = [max(3, *map(len, column)) for column in zip(*lines, strict=True)]
+    rule = ["-" * (width - 1) + ":" if right and i else "-" * width for i, width in enumerate(widths)]
+    padded = [
+        [
+            cell.rjust(width) if right and i else cell.ljust(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ]
+        for line in (lines[0], rule, *lines[1:])
+    ]
+    return "\n".join("| " + " | ".join(line) + " |" for line in padded)

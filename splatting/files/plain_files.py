@@ -1,4 +1,4 @@
-"""Files that a user or a dataset names, refused where a read might never end: devices, pipes, endless texts."""
+"""Files that a user or a dataset names: devices, pipes, endless texts and failed downloads are refused."""
 
 import errno
 import os
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TypeVar
 
 MOST = 1 << 28  # bytes of a text
+_FREE = 1 << 16  # rows that any file may have: some 50 MB as splats
 Name = TypeVar("Name", str, os.PathLike)
 
 
@@ -29,3 +30,37 @@ def plain_text(path: str | os.PathLike, errors: str = "strict") -> str:
     if os.path.getsize(plain(path)) > MOST:
         raise OSError(errno.EFBIG, f"it has more than {MOST >> 20} MiB", os.fspath(path))
     return Path(path).read_text(encoding="utf-8", errors=errors)
+
+
+def not_the_file(path: str | os.PathLike) -> str | None:
+    """Words for a file that is empty, a Git LFS pointer or a web page; None for any other file."""
+    try:
+        with open(plain(path), "rb") as file:
+            head = file.read(256)
+    except OSError:
+        return None
+    if not head:
+        return "empty"
+    if head.startswith(b"version https://git-lfs"):
+        return "a Git LFS pointer (git lfs pull downloads its content)"
+    if head.lstrip()[:9].lower().startswith((b"<!doctype", b"<html")):
+        return "a web page, likely from a wrong address"
+    return None
+
+
+def check_packed_rows(count: int, size: int) -> None:
+    """ValueError if a compressed file of `size` bytes promises more splats or points than honest ones have.
+
+    Beyond 65,536 it may have one for each byte: trained splats take 10 bytes or more, and a lattice of equal ones, as
+    well as one can compress it, 0.95.
+    """
+    if count > size + _FREE:
+        raise ValueError(f"it promises {count:,} rows in {size:,} bytes, which no honest file does")
+
+
+def relative_to(path: Path, folder: str | os.PathLike) -> Path:
+    """The way from a folder to a path, through parent folders if need be; the path itself if on another drive."""
+    try:
+        return Path(os.path.relpath(path, folder))
+    except ValueError:  # there is no way from one drive to another
+        return path

@@ -1,5 +1,5 @@
-"""`cuda_start.begin()` on import. A command that computes on a GPU imports this, and only where it is the program."""
+"""`start.begin_cuda()` on import. A command that computes on a GPU imports this, and only where it is the program."""
 
-from splatting.host.cuda_start import begin
+from splatting.host.start import begin_cuda
 
-begin()
+begin_cuda()

@@ -1,11 +1,13 @@
-"""Ctrl-C, SIGTERM and SIGHUP as exceptions, at once or deferred until the program can stop cleanly."""
+"""Ctrl-C, SIGTERM and SIGHUP as exceptions, at once or deferred to a safe moment; children that Ctrl-C spares."""
 
 import contextlib
 import os
 import signal
+import subprocess
 import threading
 from collections.abc import Iterable
 from types import FrameType, TracebackType
+from typing import Any
 
 _HANGUP = getattr(signal, "SIGHUP", None)  # Windows has none
 
@@ -92,3 +94,10 @@ def _leave_closed_terminal() -> None:
                 nowhere = os.open(os.devnull, os.O_WRONLY)
                 os.dup2(nowhere, descriptor)
                 os.close(nowhere)
+
+
+def own_session() -> dict[str, Any]:
+    """Options of subprocess.Popen that give the child a session of its own, on Windows a process group."""
+    if os.name == "nt":
+        return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+    return {"start_new_session": True}

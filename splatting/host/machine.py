@@ -1,11 +1,76 @@
-"""Description of the machine of a measurement: processor, GPU, instruction set, commit."""
+"""This machine and this code: the device that computes, processors, names and the commit for reports.
 
+torch is imported on first use: not every program needs it.
+"""
+
+from __future__ import annotations
+
+import math
 import os
 import platform
 import subprocess
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import torch
+from splatting.host import torchrun
+
+if TYPE_CHECKING:
+    import torch
+
+_ROOT = Path(__file__).resolve().parents[2]
+_VERSION = _ROOT / "version.txt"  # the one place where the version is written by hand
+VERSION = _VERSION.read_text(encoding="utf-8").strip() if _VERSION.is_file() else "unknown"  # only the code was copied
+MOST_THREADS = 16  # for work on image files: more threads only wait for memory and disk
+_CGROUPS = Path("/sys/fs/cgroup")
+_OWN_CGROUPS = Path("/proc/self/cgroup")
+
+
+def compute_device() -> torch.device:
+    """`cuda` when a GPU is visible and the rasterizer was built with its CUDA kernels, else `cpu`."""
+    import torch
+
+    return torch.device("cuda" if torch.cuda.is_available() and _has_cuda_kernels() else "cpu")
+
+
+def _has_cuda_kernels() -> bool:
+    try:
+        from diff_gaussian_rasterization import has_cuda_kernels
+    except ImportError:  # metrics.py and doctor.py work without the extension
+        return False
+    return has_cuda_kernels()
+
+
+def cores() -> int:
+    """Processors allowed by affinity (taskset, Slurm) and by the quota of the process's cgroups (Docker's --cpus).
+
+    Processes that train together on this host share them evenly.
+    """
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, math.ceil(min(count, _quota())) // torchrun.local_size())
+
+
+def threads(most: int = MOST_THREADS) -> int:
+    """Number of threads for work that releases Python's lock: one for each of `cores`, `most` at most."""
+    return min(cores(), most)
+
+
+def _quota() -> float:
+    """Processors that the cgroup and those around it may use (cpu.max of version 2); infinite without a limit."""
+    try:
+        own = next(line[3:] for line in _OWN_CGROUPS.read_text().splitlines() if line.startswith("0::"))
+    except (OSError, StopIteration):
+        return math.inf
+    folder = _CGROUPS / own.lstrip("/")
+    found = math.inf
+    for group in (folder, *folder.parents):
+        if not group.is_relative_to(_CGROUPS):
+            break
+        try:
+            quota, period = (group / "cpu.max").read_text().split()
+            found = min(found, int(quota) / int(period))
+        except (OSError, ValueError):  # the root has none; "max" is no limit
+            continue
+    return found
 
 
 def cpu_name() -> str:
@@ -19,21 +84,27 @@ def cpu_name() -> str:
 
 def device_name(device: torch.device) -> str:
     """The name of the GPU or of the processor that `device` stands for."""
+    import torch
+
     return torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name()
 
 
 def instruction_set() -> str:
     """Instruction set that the CPU backends use here; the environment variable GS_ISA narrows it."""
+    import torch
+
     if platform.machine() in ("aarch64", "arm64", "ARM64"):
         return "baseline" if os.environ.get("GS_ISA") == "baseline" else "neon"
     capability = {"AVX512": "avx512", "AVX2": "avx2"}.get(torch.backends.cpu.get_cpu_capability(), "baseline")
     order = ["baseline", "avx2", "avx512"]
-    wanted = os.environ.get("GS_ISA", capability)
-    return min(capability, wanted, key=order.index) if wanted in order else capability
+    requested = os.environ.get("GS_ISA", capability)
+    return min(capability, requested, key=order.index) if requested in order else capability
 
 
 def gpu_name() -> str:
     """Name of the current GPU, with driver and clocks from nvidia-smi."""
+    import torch
+
     fields = "driver_version,clocks.sm,clocks.mem"
     index = f"--id={torch.cuda.current_device()}"
     state = _output("nvidia-smi", index, f"--query-gpu={fields}", "--format=csv,noheader")
@@ -52,7 +123,7 @@ def commit() -> str:
 def _output(*command: str) -> str:
     """Output of a program; empty if it is missing or fails."""
     try:
-        done = subprocess.run(command, cwd=Path(__file__).resolve().parent, capture_output=True, text=True)
+        done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True)
     except OSError:
         return ""
     return done.stdout.strip() if done.returncode == 0 else ""

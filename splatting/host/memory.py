@@ -1,4 +1,4 @@
-"""Free memory, and recognition of errors that mean there is too little of it.
+"""Free and used memory, and recognition of errors that mean there is too little of it.
 
 torch is imported on first use: not every program needs it.
 """
@@ -67,6 +67,20 @@ def free_memory(device: torch.device | str) -> int | None:
         return torch.cuda.mem_get_info(device)[0] + held
     known = [value for value in (_available(), _group_limit(), _process_limit()) if value is not None]
     return min(known, default=None)
+
+
+def peak_memory_mib(device: torch.device) -> float | None:
+    """Peak memory so far in MiB: torch's on a GPU, else the resident memory; None if the system does not say."""
+    import torch
+
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 2**20
+    try:
+        # getrusage would also count the peak of the process that started this one, because exec keeps it.
+        status = Path("/proc/self/status").read_text()
+        return int(status.partition("VmHWM:")[2].split()[0]) / 2**10  # kB
+    except (OSError, ValueError, IndexError):
+        return None
 
 
 def _available() -> int | None:

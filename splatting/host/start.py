@@ -1,20 +1,26 @@
-"""Start of a command: Ctrl-C and garbage while its modules are imported, outputs that are closed or refuse letters, and
-memory that the process keeps.
+"""Start of a command: signals, garbage, outputs, kept memory and the GPU's context, before its imports.
 
 Importing torch makes half a million objects that stay. Python's collector would go through them several times meanwhile
 and once more at the end, which takes a third of the seconds of a process that does nothing else.
 """
 
+import ctypes
 import gc
+import importlib.util
 import io
 import os
 import signal
 import sys
 import threading
+from pathlib import Path
 
+from splatting.host import torchrun
 from splatting.host.interrupt import raise_on_signals
-from splatting.host.kept_memory import keep_freed_memory
 
+_TRIM, _SEPARATE = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of mallopt
+_KEPT = 256 << 20  # bytes that may lie free
+_LARGE = 32 << 20  # bytes of an allocation that is given back as soon as it is freed; glibc allows no more
+_DRIVER = "libcuda.so.1"
 _waiting = False  # whether the collector is
 
 
@@ -60,3 +66,53 @@ def open_outputs() -> None:
             setattr(sys, f"__{name}__", nowhere)
         elif isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
             stream.reconfigure(errors="backslashreplace")
+
+
+def keep_freed_memory() -> None:
+    """Keep freed memory for the next allocation; by default glibc returns it to the system.
+
+    A step on the CPU frees as much memory as the next one takes, which the system would have to clear again: up to a
+    tenth of a training (docs/results/tried.md). Nothing changes without glibc, or where the environment sets limits.
+    """
+    if any(name.startswith("MALLOC_") or name == "GLIBC_TUNABLES" for name in os.environ):
+        return
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):
+        return
+    mallopt(_SEPARATE, _LARGE)
+    mallopt(_TRIM, _KEPT)
+
+
+def begin_cuda() -> threading.Thread | None:
+    """Make the context that torch will find there, in a thread; None if this installation computes on the CPU.
+
+    The driver's calls leave Python's lock to the imports. Without a driver or a GPU nothing happens, and torch says
+    what there is to say. The program ends after the thread.
+    """
+    if not _computes_on_a_gpu():
+        return None
+    thread = threading.Thread(target=_make_context, name="cuda start")
+    thread.start()
+    return thread
+
+
+def _computes_on_a_gpu() -> bool:
+    """Whether the rasterizer was built with CUDA kernels: its library then asks torch for a stream."""
+    found = importlib.util.find_spec("diff_gaussian_rasterization")
+    library = found and found.origin and Path(found.origin).with_name("_backend.so")
+    try:
+        return bool(library) and b"aoti_torch_get_current_cuda_stream" in library.read_bytes()
+    except OSError:
+        return False
+
+
+def _make_context() -> None:
+    """Retain the primary context of the visible GPU that torch will compute on."""
+    try:
+        driver = ctypes.CDLL(_DRIVER)
+        device, context = ctypes.c_int(), ctypes.c_void_p()
+        if driver.cuInit(0) == 0 and driver.cuDeviceGet(ctypes.byref(device), torchrun.local_rank()) == 0:
+            driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), device)
+    except (OSError, AttributeError):  # no driver, or another one of that name
+        pass

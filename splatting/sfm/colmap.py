@@ -9,7 +9,7 @@ import sqlite3
 import subprocess
 import sys
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -40,54 +40,58 @@ class Settings:
     no_gpu: bool
 
 
-def _mapped(layout: Layout, settings: Settings) -> Path:
-    return layout.calibrated if settings.mapper == "global" else layout.database
-
-
 def worker_command(layout: Layout, step: str, **job: Any) -> Command:
-    """Return the command for one step of worker.py. The job is passed in a file, since there can be many photos."""
+    """Return the command for one step of worker.py. The job is passed in a file, since there can be many images."""
     path = layout.work / "jobs" / f"{step}.json"
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps({"step": step, **job}), encoding="utf-8")
     return [sys.executable, str(_WORKER), str(path)]
 
 
-class Pycolmap:
-    """The pycolmap package, which the project requires anyway.
+class Backend:
+    """What computes features, matches and models. identity: program and version; another's results are not resumed.
 
-    identity: program and version; the results of another program are not resumed. groups: lists of photo names; the
-    photos of a list have one size and share a camera.
+    Each step is a list of commands. groups: lists of names; the images of a list have one size and share a camera.
     """
 
-    def __init__(self) -> None:
+    identity: str
+
+    def __init__(self, layout: Layout, settings: Settings) -> None:
+        self.layout, self.settings = layout, settings
+        self.mapped = layout.calibrated if settings.mapper == "global" else layout.database
+
+
+class Pycolmap(Backend):
+    """The pycolmap package, which the project requires anyway."""
+
+    def __init__(self, layout: Layout, settings: Settings) -> None:
+        super().__init__(layout, settings)
         self.identity = f"pycolmap {version('pycolmap')}"
 
-    def features(self, layout: Layout, settings: Settings, groups: list[list[str]], masks: bool) -> list[Command]:
-        job = {"groups": groups, "masks": str(layout.masks) if masks else ""}
-        job |= {"camera": settings.camera, "max_num_features": settings.max_num_features}
-        return self._commands(layout, settings, "features", **job)
+    def features(self, groups: list[list[str]], masks: bool) -> list[Command]:
+        return self._command("features", groups=groups, masks=str(self.layout.masks) if masks else "")
 
-    def matching(self, layout: Layout, settings: Settings) -> list[Command]:
-        return self._commands(layout, settings, "matching", matcher=settings.matcher)
+    def matching(self) -> list[Command]:
+        return self._command("matching")
 
-    def mapping(self, layout: Layout, settings: Settings) -> list[Command]:
-        job = {"models": str(layout.models), "mapper": settings.mapper, "tolerance": TOLERANCE}
-        return self._commands(layout, settings, "mapping", database=str(_mapped(layout, settings)), **job)
+    def mapping(self) -> list[Command]:
+        return self._command("mapping", database=str(self.mapped), tolerance=TOLERANCE)
 
-    @staticmethod
-    def _commands(layout: Layout, settings: Settings, step: str, **job: Any) -> list[Command]:
-        common = {"database": str(layout.database), "photos": str(layout.photos), "no_gpu": settings.no_gpu}
-        return [worker_command(layout, step, **{**common, **job})]
+    def _command(self, step: str, **job: Any) -> list[Command]:
+        places = {"database": self.layout.database, "images": self.layout.prepared, "models": self.layout.models}
+        common = {**asdict(self.settings), **{name: str(path) for name, path in places.items()}}
+        return [worker_command(self.layout, step, **{**common, **job})]
 
 
-class Program:
-    """A COLMAP program, with the methods of Pycolmap.
+class Program(Backend):
+    """A COLMAP program, which the user names.
 
     Before any step runs, its own help gives the names of options that differ between versions.
     UserError if it cannot be run, is not COLMAP, or lacks a command that the settings need.
     """
 
-    def __init__(self, executable: str, settings: Settings) -> None:
+    def __init__(self, executable: str, layout: Layout, settings: Settings) -> None:
+        super().__init__(layout, settings)
         self._executable = executable
         named = [line for line in (self._output("help") or "").splitlines() if line.startswith("COLMAP")]
         if not named:
@@ -99,10 +103,8 @@ class Program:
         self._matcher = f"{settings.matcher}_matcher"
         switch = "0" if settings.no_gpu else "1"
         # COLMAP 3.12 renamed these options when it got features other than SIFT.
-        names = "--FeatureExtraction.use_gpu", "--SiftExtraction.use_gpu"
-        self._gpu_for_features = [self._known("feature_extractor", *names), switch]
-        names = "--FeatureMatching.use_gpu", "--SiftMatching.use_gpu"
-        self._gpu_for_matching = [self._known(self._matcher, *names), switch]
+        self._gpu_for_features = [self._known("feature_extractor", "Extraction.use_gpu"), switch]
+        self._gpu_for_matching = [self._known(self._matcher, "Matching.use_gpu"), switch]
         commands = ("view_graph_calibrator", "global_mapper") if settings.mapper == "global" else ()
         if any(self._output(command, "-h") is None for command in commands):
             raise UserError(
@@ -110,45 +112,45 @@ class Program:
                 "--colmap_executable to use pycolmap's global mapper"
             )
 
-    def features(self, layout: Layout, settings: Settings, groups: list[list[str]], masks: bool) -> list[Command]:
+    def features(self, groups: list[list[str]], masks: bool) -> list[Command]:
         commands = []
         for number, names in enumerate(groups):
-            listed = layout.work / "jobs" / f"photos_{number}.txt"
+            listed = self.layout.work / "jobs" / f"photos_{number}.txt"
             with atomic_write(listed) as temporary:
                 temporary.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
             command = [
-                *self._start("feature_extractor", layout.database),
-                *("--image_path", str(layout.photos)),
+                *self._start("feature_extractor", self.layout.database),
+                *("--image_path", str(self.layout.prepared)),
                 *("--image_list_path", str(listed)),
-                *("--ImageReader.camera_model", settings.camera),
+                *("--ImageReader.camera_model", self.settings.camera),
                 *("--ImageReader.single_camera", "1"),
-                *("--SiftExtraction.max_num_features", str(settings.max_num_features)),
+                *("--SiftExtraction.max_num_features", str(self.settings.max_num_features)),
             ]
-            command += ["--ImageReader.mask_path", str(layout.masks)] if masks else []
+            command += ["--ImageReader.mask_path", str(self.layout.masks)] if masks else []
             commands.append(command + self._gpu_for_features)
         return commands
 
-    def matching(self, layout: Layout, settings: Settings) -> list[Command]:
-        return [self._start(self._matcher, layout.database) + self._gpu_for_matching]
+    def matching(self) -> list[Command]:
+        return [self._start(self._matcher, self.layout.database) + self._gpu_for_matching]
 
-    def mapping(self, layout: Layout, settings: Settings) -> list[Command]:
-        layout.models.mkdir(parents=True)
-        paths = ["--image_path", str(layout.photos), "--output_path", str(layout.models)]
-        database = _mapped(layout, settings)
-        if settings.mapper == "global":
-            calibrate = self._start("view_graph_calibrator", database)
-            return [calibrate, [*self._start("global_mapper", database), *paths]]
-        return [[*self._start("mapper", database), *paths, "--Mapper.ba_global_function_tolerance", str(TOLERANCE)]]
+    def mapping(self) -> list[Command]:
+        self.layout.models.mkdir(parents=True)
+        paths = ["--image_path", str(self.layout.prepared), "--output_path", str(self.layout.models)]
+        if self.settings.mapper == "global":
+            calibrate = self._start("view_graph_calibrator", self.mapped)
+            return [calibrate, [*self._start("global_mapper", self.mapped), *paths]]
+        return [[*self._start("mapper", self.mapped), *paths, "--Mapper.ba_global_function_tolerance", str(TOLERANCE)]]
 
     def _start(self, name: str, database: Path) -> Command:
         return [self._executable, name, "--database_path", str(database)]
 
-    def _known(self, name: str, *options: str) -> str:
-        """Return the first of the options that the help of a command lists. UserError if it lists none."""
+    def _known(self, name: str, option: str) -> str:
+        """Return an option of features or of SIFT, as the help of a command lists it. UserError if it lists none."""
+        options = f"--Feature{option}", f"--Sift{option}"
         text = self._output(name, "-h") or ""
-        for option in options:
-            if option in text:
-                return option
+        for known in options:
+            if known in text:
+                return known
         raise UserError(
             f"`{self._executable} {name} -h` lists neither {' nor '.join(options)}, so this version of COLMAP is not "
             "supported; omit --colmap_executable to use pycolmap"
@@ -165,9 +167,6 @@ class Program:
                 "to use pycolmap"
             ) from error
         return done.stdout + done.stderr if done.returncode == 0 else None
-
-
-Backend = Pycolmap | Program
 
 
 def count_rows(database: Path, table: str) -> int:

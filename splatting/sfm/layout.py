@@ -19,7 +19,7 @@ class Layout:
         self.input, self.images, self.sparse = scene / "input", scene / "images", scene / "sparse"
         self.report = scene / "convert_report.json"
         self.work = work = scene / "distorted"
-        self.photos = work / "photos"  # for COLMAP: upright, in formats that it reads
+        self.prepared = work / "photos"  # for COLMAP: upright, in formats that it reads
         self.masks, self.undistorted = work / "masks", work / "undistorted"
         self.models = work / "sparse"  # one sub-folder per model of the mapper: 0, 1, ...
         self.database = work / "database.db"
@@ -49,7 +49,7 @@ def scene_folder(given: str, made: bool = False) -> Path:
     return folder.absolute()
 
 
-def find_photos(layout: Layout) -> list[str]:
+def find_images(layout: Layout) -> list[str]:
     """List the photos below `input`, with its sub-folders, sorted.
 
     UserError if there are too few, if some have a format that cannot be read, or if they are in another folder.
@@ -57,7 +57,7 @@ def find_photos(layout: Layout) -> list[str]:
     if not layout.input.is_dir():
         raise UserError(_no_input(layout))
     files = [path for path in sorted(layout.input.rglob("*")) if path.is_file()]
-    names = picture_names(layout.input)
+    names = image_names(layout.input)
     foreign = [path for path in files if path.suffix.lower() in _FOREIGN]
     if foreign:
         raise UserError(
@@ -74,16 +74,16 @@ def find_photos(layout: Layout) -> list[str]:
     return names
 
 
-def picture_names(folder: Path) -> list[str]:
+def image_names(folder: Path) -> list[str]:
     """List the photos below a folder, without hidden files, by the names that COLMAP gives them, sorted."""
-    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if _is_picture(path))
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if _is_image(path))
 
 
 def _no_input(layout: Layout) -> str:
     scene = layout.scene
     if scene.name == "input":
         return f"{scene} is the folder of the photos itself; pass its parent folder as -s: {scene.parent}"
-    beside = sum(map(_is_picture, scene.iterdir()))
+    beside = sum(map(_is_image, scene.iterdir()))
     if beside:
         return (
             f"no folder input in {scene}, but {beside} photos directly in it; make {layout.input}, move them there, "
@@ -94,7 +94,7 @@ def _no_input(layout: Layout) -> str:
     return f"no folder input in {scene}; make it and put the photos there, or pass a video as --video"
 
 
-def _is_picture(path: Path) -> bool:
+def _is_image(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
@@ -104,17 +104,17 @@ def refuse_foreign_results(layout: Layout, scene_made: bool, work_made: bool, sk
     scene_made, work_made: whether an earlier run here began to write the scene, or into the work folder.
     """
     there = [] if scene_made else [path.name for path in (layout.images, layout.sparse) if path.exists()]
-    ours = (
+    owned = (
         work_made
         or skip_matching
         or not layout.work.exists()
         or {path.name for path in layout.work.iterdir()} <= {layout.stages.name}
     )
-    if not ours:
+    if not owned:
         there.append(layout.work.name)
     if there:
         raise UserError(
             f"{layout.scene} already has {' and '.join(there)}, which convert.py did not make and will not overwrite; "
             "move them away, or convert in another folder"
-            + ("; --skip_matching uses the model in distorted/sparse" if layout.models.is_dir() and not ours else "")
+            + ("; --skip_matching uses the model in distorted/sparse" if layout.models.is_dir() and not owned else "")
         )

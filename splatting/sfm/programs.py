@@ -25,7 +25,7 @@ _ORPHAN_PATIENCE = 2.0  # seconds that a worker gets to notice that its caller w
 
 
 def run_programs(
-    commands: Sequence[Sequence[str]], log: Path, title: str, total: int, done: Callable[[], int], hint: str = ""
+    log: Path, commands: Sequence[Sequence[str]], title: str, total: int, done: Callable[[], int], hint: str = ""
 ) -> None:
     """Run commands one after the other, append their output to `log`, and show `done()` of `total` as a bar.
 

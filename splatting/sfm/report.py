@@ -30,7 +30,7 @@ def read_survey(path: Path) -> list[Model]:
     return sorted(models, key=lambda model: (-len(model.registered), -model.points, model.folder))
 
 
-def refuse_nothing(models: Sequence[Model], photos: Sequence[str], partners: dict[str, int], matcher: str) -> None:
+def refuse_nothing(models: Sequence[Model], images: Sequence[str], partners: dict[str, int], matcher: str) -> None:
     """Raise UserError with the likeliest reason if no model has a registered photo."""
     if models and models[0].registered:
         return
@@ -42,22 +42,22 @@ def refuse_nothing(models: Sequence[Model], photos: Sequence[str], partners: dic
     remedy = "take sharp, evenly lit photos that overlap by 60 to 80 %, from places some steps apart"
     if matcher == "sequential":
         remedy += ", or use --matcher exhaustive"
-    raise UserError(f"none of {len(photos)} photos could be placed: {reason}; {remedy}")
+    raise UserError(f"none of {len(images)} photos could be placed: {reason}; {remedy}")
 
 
 def advice(
-    models: Sequence[Model], photos: Sequence[str], partners: dict[str, int], matcher: str, at_limit: int = 0
+    models: Sequence[Model], images: Sequence[str], partners: dict[str, int], matcher: str, at_limit: int = 0
 ) -> list[str]:
     """Return one line for each weakness of the chosen model, models[0], that training will show.
 
     at_limit: --max_num_features if a photo reached it, else 0.
     """
     chosen = models[0]
-    out = sorted(set(photos) - set(chosen.registered))
+    out = sorted(set(images) - set(chosen.registered))
     lines = []
     if out:
         lonely = sum(partners.get(name, 0) == 0 for name in out)
-        text = f"{len(out)} of {len(photos)} photos were left out ({some(out)})"
+        text = f"{len(out)} of {len(images)} photos were left out ({some(out)})"
         if lonely:
             text += f", and {lonely} of them match no other photo"
         remedy = "take more photos between them and their neighbours, or remove them if they are blurred"
@@ -97,7 +97,7 @@ def summary(report: dict[str, Any]) -> str:
 
 
 def write_report(
-    path: Path, models: Sequence[Model], photos: Sequence[str], partners: dict[str, int], lines: list[str], **made: Any
+    path: Path, models: Sequence[Model], images: Sequence[str], partners: dict[str, int], lines: list[str], **made: Any
 ) -> None:
     """Write convert_report.json: photos placed and left out, models, cameras, settings (`made`), advice (`lines`)."""
     chosen = models[0]
@@ -105,12 +105,12 @@ def write_report(
         **made,
         "advice": lines,
         "cameras": chosen.cameras,
-        "left_out": {name: {"partners": partners.get(name, 0)} for name in set(photos) - set(chosen.registered)},
+        "left_out": {name: {"partners": partners.get(name, 0)} for name in set(images) - set(chosen.registered)},
         "mean_error_px": round(chosen.error, 4),
         "mean_track_length": round(chosen.track_length, 4),
         "model": chosen.folder,
         "models": [{"folder": m.folder, "photos": len(m.registered), "points": m.points} for m in models],
-        "photos": len(photos),
+        "photos": len(images),
         "points": chosen.points,
         "registered": len(chosen.registered),
     }

@@ -9,13 +9,14 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from splatting.files.json_files import read_json, write_json
-from splatting.sfm import colmap, photos, report
+from splatting.sfm import colmap, images, report
 from splatting.sfm.colmap import Backend, Settings, worker_command
-from splatting.sfm.layout import Layout, picture_names
+from splatting.sfm.layout import Layout, image_names
 from splatting.sfm.programs import run_programs
 from utils.system_utils import UserError, mkdir_p
 
@@ -97,17 +98,17 @@ def video_stage(layout: Layout, video: Path, count: int) -> Stage:
     """Make the stage that writes frames of a video into `input`."""
 
     def reset() -> None:
-        for frame in layout.input.glob(photos.PATTERN):
+        for frame in layout.input.glob(images.PATTERN):
             frame.unlink()
 
     def work() -> None:
         mkdir_p(layout.input)
-        photos.extract_frames(video, layout.input, count)
+        images.extract_frames(video, layout.input, count)
 
-    return Stage("video", [_state(video), count], reset, work, check=photos.find_decoder)
+    return Stage("video", [_state(video), count], reset, work, check=images.find_decoder)
 
 
-def photo_stage(layout: Layout, names: list[str], masks: Path | None) -> Stage:
+def image_stage(layout: Layout, names: list[str], masks: Path | None) -> Stage:
     """Make the stage that puts upright photos and masks into the work folder."""
     made_from = [[name, _state(layout.input / name)] for name in names]
     if masks:
@@ -116,54 +117,45 @@ def photo_stage(layout: Layout, names: list[str], masks: Path | None) -> Stage:
     return Stage(
         "photos",
         made_from,
-        reset=lambda: _remove(layout.photos, layout.masks),
-        work=lambda: photos.prepare_photos(layout, names, masks),
-        check=lambda: photos.check_photos(layout, names, masks),
+        reset=lambda: _remove(layout.prepared, layout.masks),
+        work=lambda: images.prepare_images(layout, names, masks),
+        check=lambda: images.check_images(layout, names, masks),
     )
 
 
-def reconstruction_stages(layout: Layout, backend: Backend, settings: Settings, masks: bool) -> list[Stage]:
+def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
     """Make the stages features, matching and mapping."""
+    layout, settings = backend.layout, backend.settings
     hint = "" if settings.no_gpu else "; --no_gpu may help if the GPU or the display is the reason"
 
+    rows = partial(colmap.count_rows, layout.database)
+    run = partial(run_programs, layout.log)
+
     def features() -> None:
-        groups = photos.sizes(layout)
+        groups = images.sizes(layout)
         if len(groups) > 1:
             listed = ", ".join(f"{w} x {h} ({len(names)})" for (w, h), names in groups.items())
             print(f"photos have {len(groups)} sizes; each size gets its own camera: {listed}")
-        commands = backend.features(layout, settings, list(groups.values()), masks)
         total = sum(map(len, groups.values()))
-        run_programs(
-            commands, layout.log, "Features", total, lambda: colmap.count_rows(layout.database, "keypoints"), hint
-        )
-
-    def forget_features() -> None:
-        for suffix in ("", "-wal", "-shm", "-journal"):
-            layout.database.with_name(layout.database.name + suffix).unlink(missing_ok=True)
-
-    def forget_models() -> None:
-        _remove(layout.models)
-        layout.calibrated.unlink(missing_ok=True)
+        run(backend.features(list(groups.values()), masks), "Features", total, partial(rows, "keypoints"), hint)
 
     def matching() -> None:
-        count = colmap.count_rows(layout.database, "images")
+        count = rows("images")
         steps = range(1, count) if settings.matcher == "exhaustive" else _NEIGHBOURS
         pairs = sum(max(count - step, 0) for step in steps)
-        done = lambda: colmap.count_rows(layout.database, "matches")  # noqa: E731
-        run_programs(backend.matching(layout, settings), layout.log, "Matching", pairs, done, hint)
+        run(backend.matching(), "Matching", pairs, partial(rows, "matches"), hint)
 
     def mapping() -> None:
-        total = colmap.count_rows(layout.database, "images")
-        done = _registered_since(layout.log)
         if settings.mapper == "global":
             colmap.copy_database(layout.database, layout.calibrated)
-        run_programs(backend.mapping(layout, settings), layout.log, "Mapping", total, done)
+        run(backend.mapping(), "Mapping", rows("images"), _registered_since(layout.log))
 
+    files = [layout.database.with_name(layout.database.name + end) for end in ("", "-wal", "-shm", "-journal")]
     features_from = [backend.identity, settings.camera, settings.max_num_features, settings.no_gpu]
     return [
-        Stage("features", features_from, forget_features, features),
+        Stage("features", features_from, lambda: _remove(*files), features),
         Stage("matching", [settings.matcher], lambda: colmap.forget_matches(layout.database), matching, resumable=True),
-        Stage("mapping", [settings.mapper], forget_models, mapping),
+        Stage("mapping", [settings.mapper], lambda: _remove(layout.models, layout.calibrated), mapping),
     ]
 
 
@@ -176,29 +168,28 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
     def work() -> None:
         out = layout.work / "survey.json"
         survey = worker_command(layout, "survey", models=str(layout.models), out=str(out))
-        run_programs([survey], layout.log, "Reading models", 1, out.exists)
+        run_programs(layout.log, [survey], "Reading models", 1, out.exists)
         models = report.read_survey(out)
-        root = layout.photos if layout.photos.is_dir() else layout.input
-        names = picture_names(root)
+        root = layout.prepared if layout.prepared.is_dir() else layout.input
+        names = image_names(root)
         matches = colmap.partners(layout.database)
         report.refuse_nothing(models, names, matches, settings.matcher)
         chosen = models[0]
-        job = {"model": str(layout.models / chosen.folder), "photos": str(root), "out": str(layout.undistorted)}
-        command = worker_command(layout, "undistort", **job, jpeg_quality=photos.JPEG_QUALITY)
-        images = layout.undistorted / "images"
+        job = {"model": str(layout.models / chosen.folder), "images": str(root), "out": str(layout.undistorted)}
+        command = worker_command(layout, "undistort", **job, jpeg_quality=images.JPEG_QUALITY)
+        written = layout.undistorted / "images"
         total = len(chosen.registered)
-        run_programs([command], layout.log, "Undistorting", total, lambda: sum(p.is_file() for p in images.rglob("*")))
-        missing = [name for name in chosen.registered if not (images / name).is_file()]
+        run_programs(layout.log, [command], "Undistorting", total, lambda: sum(p.is_file() for p in written.rglob("*")))
+        missing = [name for name in chosen.registered if not (written / name).is_file()]
         if missing:
             raise UserError(
                 f"{len(missing)} photos of the model in {layout.models / chosen.folder} are not in {root}, the first "
                 f"is {missing[0]}; put them there under the names that they have in the model"
             )
-        _remove(layout.images, layout.sparse, *map(layout.resized, FACTORS))
-        layout.report.unlink(missing_ok=True)
+        _remove(layout.images, layout.sparse, layout.report, *map(layout.resized, FACTORS))
         mkdir_p(layout.sparse)
         (layout.undistorted / "sparse").rename(layout.sparse / "0")
-        images.rename(layout.images)
+        written.rename(layout.images)
         _remove(layout.undistorted)
         limit = settings.max_num_features
         at_limit = limit if colmap.most_features(layout.database) >= limit else 0
@@ -214,7 +205,7 @@ def resize_stage(layout: Layout) -> Stage:
     def work() -> None:
         for factor in FACTORS:
             _remove(layout.resized(factor))
-            photos.resize_images(layout, factor)
+            images.resize_images(layout, factor)
 
     # No reset: undistortion removes the copies when it replaces the photos that they were made from.
     return Stage("resize", list(FACTORS), lambda: None, work)
@@ -254,7 +245,9 @@ def _state(path: Path) -> list[Any]:
     return [path.name, stat.st_size, stat.st_mtime_ns]
 
 
-def _remove(*folders: Path) -> None:
-    for folder in folders:
-        if folder.is_dir():
-            shutil.rmtree(folder)
+def _remove(*paths: Path) -> None:
+    for path in paths:
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)

@@ -28,9 +28,9 @@ def features(job: dict[str, Any]) -> None:
     pycolmap.Database.open(job["database"]).close()
     for names in job["groups"]:
         # Import the photos first, in order: threads would number them in the order in which they happen to finish.
-        pycolmap.import_images(job["database"], job["photos"], pycolmap.CameraMode.SINGLE, names, reader)
+        pycolmap.import_images(job["database"], job["images"], pycolmap.CameraMode.SINGLE, names, reader)
         pycolmap.extract_features(
-            job["database"], job["photos"], names, pycolmap.CameraMode.SINGLE, reader, options, _device(job)
+            job["database"], job["images"], names, pycolmap.CameraMode.SINGLE, reader, options, _device(job)
         )
 
 
@@ -50,13 +50,13 @@ def mapping(job: dict[str, Any]) -> None:
         pycolmap.calibrate_view_graph(job["database"])
         options = pycolmap.GlobalPipelineOptions()
         options.random_seed = SEED
-        pycolmap.global_mapping(job["database"], job["photos"], job["models"], options)
+        pycolmap.global_mapping(job["database"], job["images"], job["models"], options)
         return
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = SEED
     options.ba_global_function_tolerance = job["tolerance"]
     options.min_model_size = 3  # a small model is better than none; the report shows its size
-    pycolmap.incremental_mapping(job["database"], job["photos"], job["models"], options)
+    pycolmap.incremental_mapping(job["database"], job["images"], job["models"], options)
 
 
 def survey(job: dict[str, Any]) -> None:
@@ -90,7 +90,7 @@ def survey(job: dict[str, Any]) -> None:
 
 def undistort(job: dict[str, Any]) -> None:
     """Write photos and model without lens distortion, in COLMAP's layout, into the folder `out`."""
-    pycolmap.undistort_images(job["out"], job["model"], job["photos"], jpeg_quality=job["jpeg_quality"])
+    pycolmap.undistort_images(job["out"], job["model"], job["images"], jpeg_quality=job["jpeg_quality"])
 
 
 def _device(job: dict[str, Any]) -> pycolmap.Device:

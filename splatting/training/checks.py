@@ -1,18 +1,25 @@
-"""Checks made before training, so that a hopeless scene fails at once."""
+"""Checks made before training, so that a hopeless one fails at once: of the scene, and of traces of earlier runs."""
 
 import argparse
+import contextlib
+import os
 import sys
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
+from arguments import OPTIONS, read_model_json, read_stored_options
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.readers.info import APART, NEAREST, SceneInfo, camera_centers, standing_apart
+from splatting.evaluation import training_log
+from splatting.evaluation.error_curve import Row, continue_curve
+from splatting.evaluation.training_log import TrainingLog
 from splatting.files.listing import some
 from splatting.training.density import DensityControl
-from splatting.training.schedule.clocked import Clocked
-from splatting.training.schedule.pace import Pace
-from utils.system_utils import UserError
+from splatting.training.schedule import Schedule, TimeBudget
+from utils.system_utils import UserError, saved_iterations
 
 _SAMPLE = 16  # cameras whose depths are checked
 _FEWEST_BEYOND = 0.01  # share of the points in front of them that must lie beyond the nearest depth
@@ -55,6 +62,12 @@ def _report_cameras_apart(info: SceneInfo) -> None:
         )
 
 
+def check_page(port: int | None, several: bool) -> None:
+    """Refuse a page that shows a training of several processes (UserError)."""
+    if several and port is not None:
+        raise UserError("--viewer needs a training of one process; leave it out, or start train.py without torchrun")
+
+
 def check_target(target_psnr: float, test_views: int) -> None:
     """Refuse a target for test views that are not there (UserError)."""
     if target_psnr and not test_views:
@@ -69,27 +82,28 @@ def check_exposures(gaussians: GaussianModel, train_test_exp: bool, checkpoint: 
         print(f"{checkpoint} has no exposures: all photos start without a correction")
 
 
-def warn_of_late_reset(opt: argparse.Namespace, white_background: bool, pace: Pace) -> None:
+def warn_of_late_reset(opt: argparse.Namespace, white_background: bool, schedule: Schedule) -> None:
     """Warn if adaptive density control resets opacities so late that the model cannot recover.
 
     Iterations are those of the run. A run with a time budget does not know them yet: `late_reset` then tells.
     """
-    if opt.strategy != "adc" or pace.ends is None:
+    if opt.strategy != "adc" or schedule.ends is None:
         return
-    last = range(max(1, pace.ends - rules.RECOVERY + 1), pace.ends)
-    due = [t for t in last if rules.actions(t, opt, white_background, pace.span(t), pace.stride(t)).reset_opacity]
+    last = range(max(1, schedule.ends - rules.RECOVERY + 1), schedule.ends)
+    resets = [rules.actions(t, opt, white_background, schedule.span(t), schedule.stride(t)).reset_opacity for t in last]
+    due = [t for t, is_reset in zip(last, resets, strict=True) if is_reset]
     if due:
-        remedy = "--iterations or --opacity_reset_interval" if pace.ends == pace.length else "--opacity_reset_interval"
+        longer = "--iterations or " if schedule.ends == schedule.length else ""
         print(
-            f"warning: opacities are reset in iteration {due[-1]}, and {pace.ends - due[-1]} iterations are "
-            f"too few to recover from that; change {remedy}"
+            f"warning: opacities are reset in iteration {due[-1]}, and {schedule.ends - due[-1]} iterations are "
+            f"too few to recover from that; change {longer}--opacity_reset_interval"
         )
 
 
-def late_reset(iteration: int, pace: Pace) -> str | None:
+def late_reset(iteration: int, schedule: Schedule) -> str | None:
     """The warning for a reset in an iteration of a run with a time budget, by its speed; None if it is in time."""
-    left = (pace.length - pace.nominal(iteration)) / pace.stride(iteration)
-    if not isinstance(pace, Clocked) or left >= rules.RECOVERY:
+    left = (schedule.length - schedule.schedule_step(iteration)) / schedule.stride(iteration)
+    if not isinstance(schedule, TimeBudget) or left >= rules.RECOVERY:
         return None
     return (
         f"warning: opacities are reset in iteration {iteration}, and about {left:.0f} iterations that are left of "
@@ -102,18 +116,18 @@ def warn_of_fewer(density: DensityControl, opt: argparse.Namespace, count: int, 
 
     count: of Gaussians, now; first: the next iteration. Not known of a run with a time budget.
     """
-    pace, aim = density.pace, density.most_gaussians
+    schedule, aim = density.schedule, density.most_gaussians
     # The number that mcmc takes where none is given is a limit, nothing to reach.
-    if pace.ends is None or (opt.strategy == "mcmc" and not opt.max_num_splats):
+    if schedule.ends is None or (opt.strategy == "mcmc" and not opt.max_num_splats):
         return
-    if pace.nominal(first) >= density.ends > 0:
+    if schedule.schedule_step(first) >= density.ends > 0:
         return  # a resumed run has no say in it any more
-    most = density.most_after(count, first, pace.ends)
+    most = density.most_after(count, first, schedule.ends)
     if most >= aim:
         return
     if opt.strategy == "mcmc":
         why = f"--mcmc_growth {opt.mcmc_growth:g} adds too few each time; raise it, or lower --densification_interval"
-    elif pace.length < density.ends:
+    elif schedule.length < density.ends:
         why = f"--densify_until_iter {opt.densify_until_iter} is not before the end; lower it"
     else:
         why = "they at most double each time; lower --densification_interval, or raise --densify_until_iter"
@@ -121,3 +135,105 @@ def warn_of_fewer(density: DensityControl, opt: argparse.Namespace, count: int, 
         f"warning: --strategy {opt.strategy} gets to {most:,} of {aim:,} Gaussians at the most, as {why}",
         file=sys.stderr,
     )
+
+
+VIEWS = "views_per_iteration"  # entry of model.json, where it is not 1
+
+
+def check_folder(
+    model_path: str, source_path: str, saving_iterations: Sequence[int], checkpoint: str | None, first_iteration: int
+) -> None:
+    """Refuse a folder with a model of another scene (UserError): training would mix both.
+
+    Warn of iterations that an earlier training of this scene has saved and this one does not overwrite.
+    """
+    folder = Path(model_path)
+    saved = saved_iterations(folder / "point_cloud")
+    if not lies_in(checkpoint, folder) and (saved or any(folder.glob("chkpnt*.pth"))):
+        trained_on = _options_of(folder).get("source_path")
+        if trained_on and not _same_place(trained_on, source_path):
+            raise UserError(
+                f"{model_path} holds a model of another scene, {trained_on}; name another folder with -m, or remove "
+                "that one"
+            )
+    stay = [iteration for iteration in saved if iteration > first_iteration and iteration not in saving_iterations]
+    if stay:
+        print(
+            f"warning: {folder / 'point_cloud'} keeps iteration {', '.join(map(str, stay))} of an earlier training, "
+            "and render.py takes the highest unless --iteration is given; remove the old ones, or name another folder "
+            "with -m",
+            file=sys.stderr,
+        )
+
+
+def lies_in(checkpoint: str | None, folder: str | os.PathLike) -> bool:
+    """Whether a checkpoint, if there is one, lies in a model folder."""
+    return checkpoint is not None and _same_place(Path(checkpoint).parent, folder)
+
+
+def check_views(checkpoint: str, views: int) -> None:
+    """UserError if the run that wrote a checkpoint had another number of views in each iteration than this run."""
+    then = read_model_json(str(Path(checkpoint).parent)).get(VIEWS, 1)
+    if then != views:
+        how = f"--parallel views and {then} processes" if then > 1 else "--parallel tiles"
+        raise UserError(
+            f"{checkpoint} is of a run that had {then} views in each iteration, and this one would have {views}; "
+            f"resume it with {how}"
+        )
+
+
+def report_changes(checkpoint: str, now: argparse.Namespace) -> None:
+    """Warn if the run that wrote a checkpoint had other options than this run, `now`.
+
+    now: all options. Those that the checkpoint's folder does not record are not compared.
+    """
+    folder = Path(checkpoint).parent
+    then = _options_of(folder)
+    names = [option.name for option in OPTIONS if option.compared and option.name in then]
+    changed = [name for name in names if not _equal(name, then[name], getattr(now, name))]
+    if changed:
+        before, after = (" ".join(_typed(n, of[n]) for n in changed) for of in (then, vars(now)))
+        print(f"warning: {folder} was trained with {before}, this run has {after}", file=sys.stderr)
+
+
+def continue_records(model_path: str, checkpoint: str | None, first_iteration: int) -> tuple[TrainingLog, list[Row]]:
+    """The log of a training and the rows of its curve up to `first_iteration`; none for a training from the start.
+
+    Both are read from the checkpoint's folder if that has a log, else from model_path. This run continues them
+    in model_path.
+    """
+    before = Path(model_path)
+    if checkpoint and (Path(checkpoint).parent / training_log.NAME).is_file():
+        before = Path(checkpoint).parent
+    log, rows = TrainingLog(model_path, first_iteration, before), continue_curve(model_path, first_iteration, before)
+    if rows:  # after a rescue the curve has rows beyond the log's last record
+        log.not_before(rows[-1])
+    elif checkpoint and not log.records:
+        print(
+            f"there is no {training_log.NAME} beside {checkpoint}: seconds count from iteration {first_iteration}, "
+            "in the curve too",
+            file=sys.stderr,
+        )
+    return log, rows
+
+
+def _options_of(folder: Path) -> dict[str, object]:
+    """Training options that a folder records; none if they cannot be read, as in a folder without a model."""
+    with contextlib.suppress(UserError, OSError):
+        return read_stored_options(folder)
+    return {}
+
+
+def _equal(name: str, then: object, now: object) -> bool:
+    return _same_place(then, now) if name == "source_path" else then == now
+
+
+def _same_place(one: str | os.PathLike, other: str | os.PathLike) -> bool:
+    return os.path.realpath(one) == os.path.realpath(other)
+
+
+def _typed(name: str, value: object) -> str:
+    """Format an option as it is typed on a command line."""
+    if isinstance(value, bool):
+        return f"--{name}" if value else f"no --{name}"
+    return f"--{name} {value if value != '' else repr(value)}"

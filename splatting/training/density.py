@@ -6,8 +6,9 @@ from typing import ClassVar
 from torch import Tensor
 
 from scene.gaussians.mcmc import NO_PENALTY
-from splatting.training.schedule.pace import STEADY, Pace
-from splatting.training.step import Step
+from splatting.training.iteration import Iteration
+from splatting.training.schedule import STEADY, Schedule
+from utils.system_utils import UserError
 
 
 class DensityControl:
@@ -21,8 +22,8 @@ class DensityControl:
     absolute_gradients: whether the statistics take the lengths of absolute gradients (Ye et al. 2024); for the whole
     run. clamps: whether the loss takes renders clamped to [0, 1], as the reference's does; then Gaussians brighter than
     white cost nothing before a white background. ends: the iteration of the schedule from which it changes no rows.
-    pace: tells how far the schedule is in an iteration (training/schedule/pace.py). Rules that are windows of the
-    schedule ask it; rules that count steps take the iteration itself.
+    schedule: tells how far it is in an iteration (training/schedule.py). Rules that are windows of the schedule ask it;
+    rules that count steps take the iteration itself.
     """
 
     fusable: ClassVar[bool] = False
@@ -32,7 +33,7 @@ class DensityControl:
     absolute_gradients = False
     clamps: ClassVar[bool] = True
     ends = math.inf
-    pace: Pace = STEADY
+    schedule: Schedule = STEADY
 
     def started(self) -> None:
         """Called before the first iteration of a model that was made from points, not read from a file."""
@@ -49,14 +50,23 @@ class DensityControl:
         return False
 
     def most_after(self, count: int, first: int, last: int) -> int:
-        """The most that `count` Gaussians can become from iteration `first` to `last`, both known to the pace.
+        """The most that `count` Gaussians can become from iteration `first` to `last`, both known to the schedule.
 
         `most_gaussians` where the strategy has no number to reach.
         """
         return self.most_gaussians
 
-    def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:
+    def after_backward(self, step: Iteration, package: dict[str, Tensor]) -> None:
         """Called with the gradients computed, before the optimiser's step. package: the result of `render`."""
 
-    def after_step(self, step: Step) -> None:
+    def after_step(self, step: Iteration) -> None:
         """Called after the optimiser's step, so not in the last iteration, which takes none."""
+
+
+def refuse_empty(iteration: int, is_empty: bool, remedy: str, what: str = "after the densification of") -> None:
+    """UserError if a strategy has left no Gaussian."""
+    if is_empty:
+        raise UserError(
+            f"no Gaussian was left {what} iteration {iteration}: the views do not agree with the points, or show "
+            f"nothing but the background; check the scene, or {remedy}"
+        )

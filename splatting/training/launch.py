@@ -1,9 +1,9 @@
-"""Options of train.py besides the three groups: when to score and save, where to begin, ranks, viewers."""
+"""Options of train.py besides the three groups: when to score and save, where to begin, several processes, viewers."""
 
 import argparse
 from typing import Any
 
-from splatting.viewer.options import add_viewer_options
+from splatting.viewer.server import add_viewer_options
 
 
 # fmt: off

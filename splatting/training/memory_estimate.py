@@ -27,15 +27,17 @@ GROWTH = 20  # photo scenes grow 10- to 100-fold in 7,000 iterations (docs/resul
 _REMEDY = "--images_to_load, or lower --resolution (-r) or --sh_degree"
 
 
-def announce_memory(scene: Scene, gaussians: GaussianModel, max_splats: int, absolute: bool = False) -> None:
+def announce_memory(
+    scene: Scene, gaussians: GaussianModel, max_splats: int, absolute: bool = False, size: int = 1
+) -> None:
     """Print the memory that photos and Gaussians need and what is free; warn, with a remedy, if they do not fit.
 
     max_splats: limit of the number of Gaussians. Without a limit (0), the estimate is for GROWTH times the number now.
-    absolute: with absolute gradients. Of several ranks, each says what itself needs.
+    absolute: with absolute gradients. size: of processes that train together; each says what itself needs.
     """
     images, device = scene.images, gaussians.get_xyz.device
     pixels = max(camera.image_width * camera.image_height for camera in scene.getTrainCameras())
-    now, size = gaussians.total, gaussians.shards.ranks.size
+    now = gaussians.total
     later = max(max_splats, now) if max_splats else GROWTH * now
     why = "--max_num_splats" if max_splats else f"scenes often grow {GROWTH}-fold"
     per_rank = [-(-count // size) for count in (now, later)]

@@ -3,10 +3,11 @@
 import argparse
 from typing import Any, NamedTuple
 
+import torch
 from fused_ssim import photometric_loss_by_bands
 from torch import Tensor
 
-from splatting.training.step import Step
+from splatting.training.iteration import Iteration
 from utils.loss_utils import inverse_depth_loss, photometric_loss
 
 
@@ -28,14 +29,14 @@ class Objective:
     def __init__(self, opt: argparse.Namespace, clamp: bool = True) -> None:
         self._lambda_dssim, self._clamp = opt.lambda_dssim, clamp
 
-    def takes_bands(self, step: Step) -> bool:
+    def takes_bands(self, step: Iteration) -> bool:
         """Whether the loss of a step needs of the image no more than each rank's band and what surrounds it."""
         return step.depth_weight == 0 and step.camera.counts_all and step.camera.columns is None
 
-    def __call__(self, package: dict[str, Any], step: Step) -> Losses:
+    def __call__(self, package: dict[str, Any], step: Iteration) -> Losses:
         """package: of `render`, with `depth` where step.depth_weight is above 0.
 
-        With a `band` (splatting/distributed/rendering/band.py) the gradient is right in its rows only.
+        Gradients are valid only inside a `band`.
         """
         camera = step.camera
         target, mask = camera.ground_truth(step.background)
@@ -49,3 +50,32 @@ class Objective:
             depth = step.depth_weight * error
             total = total + depth
         return Losses(total, l1, depth, mask)
+
+
+NEWEST = 0.4  # weight of the newest loss in the running mean, as in the reference
+
+
+class LossWatch:
+    """Collects one loss per iteration without waiting for the device; `read` waits once for all of them.
+
+    mean: exponential running mean of all losses read, starting at the given value.
+    """
+
+    def __init__(self, mean: float = 0.0) -> None:
+        self.mean = mean
+        self._losses: dict[int, Tensor] = {}
+
+    def add(self, iteration: int, loss: Tensor) -> None:
+        """Note the scalar loss of an iteration."""
+        self._losses[iteration] = loss.detach()
+
+    def read(self) -> dict[int, float]:
+        """Losses by iteration since the last read."""
+        if not self._losses:
+            return {}
+        values = torch.stack(list(self._losses.values())).tolist()
+        read = dict(zip(self._losses, values, strict=True))
+        self._losses.clear()
+        for value in values:
+            self.mean = NEWEST * value + (1 - NEWEST) * self.mean
+        return read

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import TypeAlias
 
+from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
-from splatting.training.step import Step
 
 Error: TypeAlias = BaseException | None
 
@@ -13,7 +13,7 @@ Error: TypeAlias = BaseException | None
 class Observer:
     """Base of all observers. A hook that a class does not override costs nothing."""
 
-    def due(self, step: Step) -> bool:
+    def due(self, step: Iteration) -> bool:
         """Whether this iteration reads the model or a loss, or writes something. Asked once, when it begins.
 
         If so, all steps before it are done by then, and every loss so far is checked first in `measured`. Otherwise the
@@ -21,13 +21,13 @@ class Observer:
         """
         raise NotImplementedError
 
-    def begins(self, step: Step) -> None:
+    def begins(self, step: Iteration) -> None:
         """The iteration begins, with its view."""
 
-    def measured(self, step: Step, losses: Losses) -> None:
+    def measured(self, step: Iteration, losses: Losses) -> None:
         """The losses are computed. If the iteration is due, the model is still the one that was rendered."""
 
-    def stepped(self, step: Step) -> None:
+    def stepped(self, step: Iteration) -> None:
         """Density control and optimiser are done; the model is that of the next iteration."""
 
     def ended(self, error: Error) -> None:
@@ -46,23 +46,23 @@ class Announcer:
             overridden, ("due", "begins", "measured", "stepped", "ended")
         )
 
-    def begins(self, step: Step) -> None:
+    def begins(self, step: Iteration) -> None:
         # A list, so that each observer is asked in every iteration, whatever the others answer.
         step.due = any([step.changes, *[due(step) for due in self._due]])
-        for tell in self._begins:
-            tell(step)
+        for notify in self._begins:
+            notify(step)
 
-    def measured(self, step: Step, losses: Losses) -> None:
-        for tell in self._measured:
-            tell(step, losses)
+    def measured(self, step: Iteration, losses: Losses) -> None:
+        for notify in self._measured:
+            notify(step, losses)
 
-    def stepped(self, step: Step) -> None:
-        for tell in self._stepped:
-            tell(step)
+    def stepped(self, step: Iteration) -> None:
+        for notify in self._stepped:
+            notify(step)
 
     def ended(self, error: Error = None) -> None:
-        for tell in self._ended:
-            tell(error)
+        for notify in self._ended:
+            notify(error)
 
     def __enter__(self) -> "Announcer":
         return self

@@ -8,9 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from splatting.distributed.ranks import ranks
+from splatting.files.folders import locked, remove_temporary_files
 from splatting.files.listing import some
-from splatting.files.lock import locked
-from splatting.files.temporary_files import remove_temporary_files
 from utils.system_utils import mkdir_p
 
 _INPUTS = ("cfg_args", "model.json", "cameras.json", "input.ply")

@@ -5,9 +5,8 @@ import re
 import time
 from pathlib import Path
 
-from splatting.distributed.ranks import ranks
 from splatting.host import torchrun
-from splatting.host.process import seconds_since_start
+from splatting.host.clock import seconds_since_start
 
 _CHECKPOINT = re.compile(r"chkpnt(\d+)\.pth")
 
@@ -15,12 +14,12 @@ _CHECKPOINT = re.compile(r"chkpnt(\d+)\.pth")
 def resumed(start: str | None, folder: str, iterations: int) -> str | None:
     """The checkpoint to begin with: `start`, or after a restart (--max-restarts) the newest one of this training.
 
-    folder: of the output. A checkpoint that leaves nothing to do is none. Rank 0 decides.
+    folder: of the output. A checkpoint that leaves nothing to do is none.
     """
     newest = newest_checkpoint(folder, iterations) if torchrun.restarts() else None
     if newest:
         print(f"Restarted by torchrun: resuming {newest}")
-    return ranks().shared(newest or start)
+    return newest or start
 
 
 def newest_checkpoint(folder: str, below: float = float("inf")) -> str | None:

@@ -14,38 +14,22 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.spilled_model import SpilledGaussians
 from splatting.deterministic.counter_rng import Stream, uniform
-from splatting.distributed.ranks import ALONE, ranks
+from splatting.distributed.ranks import ranks
+from splatting.distributed.shared_images import SharedImages
 from splatting.evaluation.training_log import Stopwatch
 from splatting.exports.in_scene import scene_with, start_from
 from splatting.exports.splats import Splats
+from splatting.host.clock import seconds_since_start
 from splatting.host.interrupt import DeferredInterrupt
-from splatting.host.process import seconds_since_start
+from splatting.training import checks, schedule_file
 from splatting.training.agreement import agree_on_scene
-from splatting.training.checks import (
-    check_exposures,
-    check_scene,
-    check_target,
-    warn_of_fewer,
-    warn_of_late_reset,
-)
-from splatting.training.history import (
-    VIEWS,
-    check_folder,
-    check_views,
-    continue_records,
-    lies_in,
-    report_changes,
-)
-from splatting.training.loss_watch import LossWatch
+from splatting.training.iteration import Iteration, ViewOrder
 from splatting.training.memory_estimate import announce_memory
-from splatting.training.objective import Objective
+from splatting.training.objective import LossWatch, Objective
+from splatting.training.resolution import resolution_of
 from splatting.training.restart import resumed
-from splatting.training.schedule import schedule_file
-from splatting.training.schedule.choose import pace_of, resolution_of
-from splatting.training.schedule.pace import Paced
-from splatting.training.step import Step
-from splatting.training.strategies.choose import density_control
-from splatting.training.view_order import ViewOrder
+from splatting.training.schedule import DecidedSchedule
+from splatting.training.strategies import density_control
 from utils.general_utils import get_expon_lr_func
 from utils.system_utils import compute_device
 
@@ -55,12 +39,12 @@ SH_INTERVAL = 1000  # iterations between raises of the active SH degree
 class Run:
     """The objects that the loop and its observers share.
 
-    scene, gaussians, views (by iteration), objective, density, pace; dataset, opt, pipe, launch: the options; start: a
-    chkpntN.pth that is resumed, or None; background: (3,) of the scene; first_iteration: done before this run. From
-    `begin` on: log, rows (of the curve so far), losses (running mean of the total) and clock (seconds of training).
-    lost: steps that an error has taken back. first_done: seconds from the process's start to the end of its first
-    iteration, None if the system does not say. interrupt: a signal that asks the loop to stop; an observer that waits
-    has to look at it.
+    scene, gaussians, views (by iteration), objective, density, schedule; dataset, opt, pipe, launch: the options;
+    group: the processes that train together; start: a chkpntN.pth that is resumed, or None; background: (3,) of the
+    scene; first_iteration: done before this run. From `begin` on: log, rows (of the curve so far), losses (running mean
+    of the total) and clock (seconds of training). lost: steps that an error has taken back. first_done: seconds from
+    the process's start to the end of its first iteration, None if the system does not say. interrupt: a signal that
+    asks the loop to stop; an observer that waits has to look at it.
     """
 
     first_done: float | None = None
@@ -73,26 +57,28 @@ class Run:
         launch: the options of splatting/training/launch.py.
         """
         self.dataset, self.opt, self.pipe, self.launch = dataset, opt, pipe, launch
-        self.start = resumed(launch.start_checkpoint, dataset.model_path, opt.iterations)
+        self.group = ranks()
+        checks.check_page(launch.viewer, self.group.several)
+        self.start = self.group.shared(resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
         self.lost = 0
         self.interrupt = DeferredInterrupt()
         self.device = compute_device()
-        place = "cpu" if ranks().several or opt.spill else self.device  # a part of it is kept there
+        place = "cpu" if self.group.several or opt.spill else self.device  # a part of it is kept there
         capture, self.first_iteration = load_checkpoint(self.start, place) if self.start else (None, 0)
-        views = ranks().size if launch.parallel == "views" else 1
-        self.pace = pace_of(opt, self.start, self.first_iteration, views)
-        warn_of_late_reset(opt, dataset.white_background, self.pace)
+        views = self.group.size if launch.parallel == "views" else 1
+        self.schedule = schedule_file.schedule_of(opt, self.start, self.first_iteration, views, self.group.shared)
+        checks.warn_of_late_reset(opt, dataset.white_background, self.schedule)
         kind = SpilledGaussians if opt.spill else GaussianModel
         self.gaussians = kind(dataset.sh_degree, opt.optimizer_type)
-        self.gaussians.divide(ranks())
-        sharing = ranks() if views == 1 else ALONE  # all ranks read the same pictures in the same order
+        self.gaussians.divide(self.group)
+        sharing = SharedImages(self.group) if views == 1 else None  # all read the same images in the same order
         init_ply = None if self.start else getattr(dataset, "init_ply", None)
         self.scene, first = scene_with(init_ply, dataset, self.gaussians, sharing=sharing)
-        check_scene(self.scene.info)
-        check_target(opt.target_psnr, len(self.scene.getTestCameras()))
-        agree_on_scene(self.scene, self.start)  # before a picture is shared
-        self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed, views, ranks().rank if views > 1 else 0)
-        self.resolution = resolution_of(opt, self.pace, self.scene.getTrainCameras(), self.scene.images)
+        checks.check_scene(self.scene.info)
+        checks.check_target(opt.target_psnr, len(self.scene.getTestCameras()))
+        agree_on_scene(self.scene, self.start)  # before an image is shared
+        self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed, views, self.group.rank if views > 1 else 0)
+        self.resolution = resolution_of(opt, self.schedule, self.scene.getTrainCameras(), self.scene.images)
         self._decode_ahead(self.first_iteration + 1)
         self._begin_model(capture, first)
         self._check_records()
@@ -102,18 +88,18 @@ class Run:
         self._depth_weight = get_expon_lr_func(
             opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
         )
-        self.density.pace = self.pace
-        warn_of_fewer(self.density, opt, self.gaussians.total, self.first_iteration + 1)
+        self.density.schedule = self.schedule
+        checks.warn_of_fewer(self.density, opt, self.gaussians.total, self.first_iteration + 1)
         if capture is None and first is None:
             self.density.started()
-        ranks().tell_notes()
+        self.group.tell_notes()
 
     def _begin_model(self, capture: tuple | None, first: Splats | None) -> None:
         """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""
         if capture is not None:
             self.gaussians.start_exposures(self.scene.info.train_cameras)
             self.gaussians.restore(capture, self.opt)
-            check_exposures(self.gaussians, self.dataset.train_test_exp, self.start)
+            checks.check_exposures(self.gaussians, self.dataset.train_test_exp, self.start)
         else:
             if first is None:
                 self.scene.create_gaussians()
@@ -121,29 +107,29 @@ class Run:
                 start_from(first, self.scene, self.gaussians)
             self.gaussians.training_setup(self.opt)
         self.gaussians.limit_columns()
-        if (views := self.pace.views) > 1:
+        if (views := self.schedule.views) > 1:
             self.gaussians.optimizer.set_betas(0.9**views, 0.999**views)
 
     def _check_records(self) -> None:
         """Compare this run with those before it, in its folder and beside its checkpoint."""
         dataset, start = self.dataset, self.start
         # A target may come before any of the iterations that are planned.
-        saves = [] if self.opt.target_psnr else self.pace.known(self.launch.save_iterations)
-        check_folder(dataset.model_path, dataset.source_path, saves, start, self.first_iteration)
+        saves = [] if self.opt.target_psnr else self.schedule.known(self.launch.save_iterations)
+        checks.check_folder(dataset.model_path, dataset.source_path, saves, start, self.first_iteration)
         if start:
-            check_views(start, self.pace.views)
-            report_changes(start, self.options)
+            checks.check_views(start, self.schedule.views)
+            checks.report_changes(start, self.options)
 
     @property
     def options(self) -> argparse.Namespace:
         """All options of the three groups; resolution_schedule is the one in force."""
         groups = vars(self.dataset) | vars(self.opt) | vars(self.pipe)
-        return argparse.Namespace(**groups | {"resolution_schedule": self.pace.sizes})
+        return argparse.Namespace(**groups | {"resolution_schedule": self.schedule.sizes})
 
     @property
     def entries(self) -> dict[str, Any]:
         """Entries of model.json besides the options (`write_model_json`)."""
-        views = {VIEWS: self.pace.views} if self.pace.views > 1 else {}
+        views = {checks.VIEWS: self.schedule.views} if self.schedule.views > 1 else {}
         return {"world_offset": self.gaussians.world_offset} | views
 
     def begin(self) -> None:
@@ -151,32 +137,33 @@ class Run:
         folder, start = self.scene.model_path, self.start
         if not start or not (Path(folder) / "cameras.json").exists():
             self.scene.write_inputs()
-        if not isinstance(self.pace, Paced) and ranks().first:
-            schedule_file.leave_schedule(Path(folder), self.first_iteration if lies_in(start, folder) else 0)
+        if not isinstance(self.schedule, DecidedSchedule) and self.group.first:
+            schedule_file.leave_schedule(Path(folder), self.first_iteration if checks.lies_in(start, folder) else 0)
         density = self.density
-        announce_memory(self.scene, self.gaussians, density.most_gaussians, density.absolute_gradients)
-        self.log, self.rows = continue_records(folder, start, self.first_iteration)
+        wants = density.most_gaussians, density.absolute_gradients
+        announce_memory(self.scene, self.gaussians, *wants, self.group.size)
+        self.log, self.rows = checks.continue_records(folder, start, self.first_iteration)
         self.losses = LossWatch(self.log.loss)
-        self.clock = Stopwatch()
+        self.clock = Stopwatch(ranks().busy)
 
-    def steps(self) -> Iterator[Step]:
+    def iterations(self) -> Iterator[Iteration]:
         """The iterations of this run."""
         for iteration in count(self.first_iteration + 1):
-            seconds, pace = self.clock.seconds, self.pace
-            pace.reach(iteration, self.log.seconds_before + seconds)
-            camera = self.resolution.view(self.views[iteration], pace.nominal(iteration))
-            step = Step(
+            seconds, schedule = self.clock.seconds, self.schedule
+            schedule.reach(iteration, self.log.seconds_before + seconds)
+            camera = self.resolution.view(self.views[iteration], schedule.schedule_step(iteration))
+            step = Iteration(
                 iteration,
                 last=False,
                 camera=camera,
                 background=self._background(self.views.own(iteration)),
-                depth_weight=self._depth_weight(pace.nominal(iteration)) if camera.depth_reliable else 0.0,
+                depth_weight=self._depth_weight(schedule.schedule_step(iteration)) if camera.depth_reliable else 0.0,
                 changes=self._changes(iteration),
                 started=seconds,
-                span=pace.span(iteration),
+                span=schedule.span(iteration),
             )
-            if pace.is_last(iteration):
-                step.end(pace.length)
+            if schedule.is_last(iteration):
+                step.end(schedule.length)
             yield step
             if iteration == self.first_iteration + 1:
                 self.first_done = seconds_since_start()
@@ -184,19 +171,18 @@ class Run:
                 return
 
     def _changes(self, iteration: int) -> bool:
-        resizes = self.resolution.changes(*map(self.pace.nominal, (iteration - 1, iteration)))
+        resizes = self.resolution.changes(*map(self.schedule.schedule_step, (iteration - 1, iteration)))
         return self.density.changes(iteration) or self._raises_degree(iteration) > 0 or resizes
 
     def _raises_degree(self, iteration: int) -> int:
         """How often the SH degree is raised in an iteration."""
-        before, now = (self.pace.nominal(t) // SH_INTERVAL for t in (iteration - 1, iteration))
+        before, now = (self.schedule.schedule_step(t) // SH_INTERVAL for t in (iteration - 1, iteration))
         return now - before
 
     def batch(self, iteration: int) -> list[tuple[Camera, Tensor]]:
-        """All views of an iteration, of which each rank shows its own, and their backgrounds (3,)."""
-        nominal = self.pace.nominal(iteration)
-        numbers = self.views.numbers(iteration)
-        return [(self.resolution.view(self.views.of(n), nominal), self._background(n)) for n in numbers]
+        """All views of an iteration, of which each process shows its own, and their backgrounds (3,)."""
+        step, numbers = self.schedule.schedule_step(iteration), self.views.numbers(iteration)
+        return [(self.resolution.view(self.views.of(n), step), self._background(n)) for n in numbers]
 
     def _background(self, view: int) -> Tensor:
         """view: the number of a view, which is its iteration where an iteration has one."""
@@ -205,7 +191,7 @@ class Run:
         draws = uniform(self.opt.seed, Stream.BACKGROUND, view, torch.zeros(1, dtype=torch.int64))
         return draws[0, :3].to(self.device)
 
-    def prepare(self, step: Step) -> None:
+    def prepare(self, step: Iteration) -> None:
         """Set learning rates and SH degree, and begin to decode the photos of the next views."""
         self.set_rates(step)
         for _ in range(self._raises_degree(step.iteration)):
@@ -215,19 +201,19 @@ class Run:
             self.pipe.debug = True
         self._decode_ahead(step.iteration)
 
-    def set_rates(self, step: Step) -> None:
+    def set_rates(self, step: Iteration) -> None:
         """Set the learning rates of a step, which may be one that is repeated."""
-        self.gaussians.update_learning_rate(self.pace.nominal(step.iteration))
-        if (factor := self.pace.rate_factor(step.iteration)) is not None:
+        self.gaussians.update_learning_rate(self.schedule.schedule_step(step.iteration))
+        if (factor := self.schedule.rate_factor(step.iteration)) is not None:
             self.gaussians.scale_rates(factor)
 
     def _decode_ahead(self, iteration: int) -> None:
         ahead = self.scene.images.ahead
-        if (last := self.pace.ends) is not None:
+        if (last := self.schedule.ends) is not None:
             ahead = min(ahead, last - iteration + 1)
         self.scene.prefetch(list(filter(self.resolution.needs, self.views.coming(iteration, ahead))))
 
-    def render_options(self, step: Step) -> dict[str, bool]:
+    def render_options(self, step: Iteration) -> dict[str, bool]:
         """Options of `render` that make it compute what this step's loss needs, and no more."""
         return {
             "use_trained_exp": self.dataset.train_test_exp,

@@ -2,10 +2,10 @@
 
 from splatting.distributed.ranks import ranks
 from splatting.host.interrupt import Terminated
+from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Observer
 from splatting.training.run import Run
-from splatting.training.step import Step
 
 _SIGNALS = (None, KeyboardInterrupt, Terminated)
 _WARM = 2  # iterations of a run after which a step takes as long as the others
@@ -25,11 +25,11 @@ class Together(Observer):
             self._ranks.flag = None if guard is None else guard.stopped
         self._asked: type[KeyboardInterrupt] | None = None
 
-    def begins(self, step: Step) -> None:
+    def begins(self, step: Iteration) -> None:
         self._ranks.post(int(step.due), _SIGNALS.index(self._run.interrupt.requested))
         self._ranks.prompt = step.iteration - self._run.first_iteration > _WARM
 
-    def measured(self, step: Step, losses: Losses) -> None:
+    def measured(self, step: Iteration, losses: Losses) -> None:
         due, signal = self._ranks.heard()
         step.due, self._asked = bool(due), _SIGNALS[signal]
 

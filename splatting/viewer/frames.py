@@ -1,4 +1,4 @@
-"""The image of a frame: what the settings ask for, from a pose."""
+"""The image of a frame: what the settings ask for, from a pose; and the colours of depth, counts and errors."""
 
 import argparse
 import copy
@@ -9,34 +9,28 @@ import torch
 from torch import Tensor
 
 from gaussian_renderer import render
+from gaussian_renderer.blending import blend_depth, view_planes
 from gaussian_renderer.free_view import free_view
-from gaussian_renderer.view_planes import blend_depth, view_planes
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
-from splatting.viewer import colormaps
-from splatting.viewer.scene_cameras import SceneCameras, canvas
-from splatting.viewer.settings import (
-    ALONE,
-    BESIDE,
-    COLOUR,
-    COUNT,
-    DEPTH,
-    ERROR,
-    OPACITY,
-    Pose,
-    Settings,
-    Vector,
-)
+from splatting.files.image_files import to_bytes
+from splatting.viewer import views
+from splatting.viewer.views import Pose, SceneCameras, Settings, Vector, canvas
 from utils.image_utils import as_float
 
 LONGEST = 1600  # pixels of a frame's longer side, at most
 COARSE = 2  # a frame of a moving camera has a quarter of the pixels
-_BORDER = 0.15  # grey around a photo that does not fill the window
+_BORDER = 0.15  # grey around a target that does not fill the window
 _LINE = 2  # pixels of the slider's line
+ERROR_GAIN = 5  # as in the contact sheets
+_FEW, _MOST = 0.02, 0.98  # quantiles of the depths of a frame that get the darkest and the brightest colour
+_SAMPLE = 20_000  # pixels that the quantiles are taken from
+# From dark to bright, so that a grey print keeps the order.
+_STOPS = ((0.00, 0.00, 0.05), (0.25, 0.05, 0.42), (0.70, 0.18, 0.38), (0.97, 0.50, 0.16), (0.99, 1.00, 0.70))
 
 
 class Frames:
-    """Draws frames of a model. with_exposures: as `use_trained_exp` of `render`, for an image beside its photo.
+    """Draws frames of a model. with_exposures: as `use_trained_exp` of `render`, for an image beside its target.
 
     Used by one thread. Nothing of the model changes.
     """
@@ -54,61 +48,54 @@ class Frames:
     def draw(self, settings: Settings, pose: Pose, coarse: bool, version: int = 0) -> np.ndarray:
         """A frame (H, W, 3) uint8, of the window's aspect.
 
-        version: changes with the model, because a photo and its render are kept while a slider moves.
+        version: changes with the model, because an image and its render are kept while a slider moves.
         """
         camera = self.compared(settings, pose)
         if camera is None:
-            return _bytes(self._free(settings, pose, coarse))
-        key = replace(settings, slider=0, comparison=ALONE), version
+            scale = min(1.0, LONGEST / max(pose.width, pose.height)) / (COARSE if coarse else 1)
+            width, height = (max(1, round(side * scale)) for side in (pose.width, pose.height))
+            view = free_view(width, height, pose.fov, pose.position, pose.wxyz, self._gaussians.get_xyz.device)
+            return to_bytes(self._image(settings, view)).numpy()
+        key = replace(settings, slider=0, comparison=views.ALONE), version
         if self._compared[0] != key:
-            self._compared = key, self._pair(settings, camera)
-        return _bytes(_fitted(_composed(settings, *self._compared[1]), pose))
+            target = as_float(camera.target(self._background(settings)))
+            self._compared = key, (target, self._image(settings, camera, target))
+        return to_bytes(_fitted(_composed(settings, *self._compared[1]), pose)).numpy()
 
     def compared(self, settings: Settings, pose: Pose) -> Camera | None:
-        """The scene's camera whose photo this frame shows, None: no photo."""
+        """The scene's camera whose target this frame shows, None: no target."""
         camera = self._cameras.by_name.get(settings.camera)
-        wanted = camera is not None and (settings.comparison != ALONE or settings.mode == ERROR)
-        return camera if wanted and self._cameras.stands_at(pose, camera) else None
-
-    def _free(self, settings: Settings, pose: Pose, coarse: bool) -> Tensor:
-        scale = min(1.0, LONGEST / max(pose.width, pose.height)) / (COARSE if coarse else 1)
-        width, height = (max(1, round(side * scale)) for side in (pose.width, pose.height))
-        view = free_view(width, height, pose.fov, pose.position, pose.wxyz, self._gaussians.get_xyz.device)
-        return self._image(settings, view)
-
-    def _pair(self, settings: Settings, camera: Camera) -> tuple[Tensor, Tensor]:
-        """The photo and the image beside it, (3, H, W) in [0, 1]."""
-        photo = as_float(camera.target(self._background(settings)))
-        return photo, self._image(settings, camera, photo)
+        requested = camera is not None and (settings.comparison != views.ALONE or settings.mode == views.ERROR)
+        return camera if requested and self._cameras.stands_at(pose, camera) else None
 
     def _background(self, settings: Settings) -> Tensor:
         return self._gaussians.get_xyz.new_tensor(settings.background)
 
-    def _image(self, settings: Settings, view: Camera | MiniCam, photo: Tensor | None = None) -> Tensor:
-        """The mode's image (3, H, W) in [0, 1]. Without a photo there is no error, and the colour is drawn."""
+    def _image(self, settings: Settings, view: Camera | MiniCam, target: Tensor | None = None) -> Tensor:
+        """The mode's image (3, H, W) in [0, 1]. Without a target there is no error, and the colour is drawn."""
         part = shown_part(self._gaussians, settings)
-        if settings.mode == COUNT:
-            return colormaps.count_colors(blend_depth(view, part, self._pipe, settings.scaling))
-        if settings.mode in (DEPTH, OPACITY):
+        if settings.mode == views.COUNT:
+            return count_colors(blend_depth(view, part, self._pipe, settings.scaling))
+        if settings.mode in (views.DEPTH, views.OPACITY):
             planes = view_planes(view, part, self._pipe, settings.scaling)
-            return colormaps.depth_colors(**planes) if settings.mode == DEPTH else planes["alpha"].expand(3, -1, -1)
-        exposed = self._with_exposures and photo is not None
+            return depth_colors(**planes) if settings.mode == views.DEPTH else planes["alpha"].expand(3, -1, -1)
+        exposed = self._with_exposures and target is not None
         options = {"want_depth": False, "want_visibility": False, "use_trained_exp": exposed}
         colour = render(view, part, self._pipe, self._background(settings), settings.scaling, **options)["render"]
-        return colormaps.error_image(photo, colour) if settings.mode == ERROR and photo is not None else colour
+        return error_image(target, colour) if settings.mode == views.ERROR and target is not None else colour
 
 
-def _composed(settings: Settings, photo: Tensor, image: Tensor) -> Tensor:
-    if settings.comparison == ALONE:
+def _composed(settings: Settings, target: Tensor, image: Tensor) -> Tensor:
+    if settings.comparison == views.ALONE:
         return image
-    if settings.comparison == BESIDE:
-        panels = [photo, image]
-        if settings.mode == COLOUR:
-            panels.append(colormaps.error_image(photo, image))
+    if settings.comparison == views.BESIDE:
+        panels = [target, image]
+        if settings.mode == views.COLOUR:
+            panels.append(error_image(target, image))
         return torch.cat(panels, dim=2)
-    width = photo.shape[2]
+    width = target.shape[2]
     column = round(min(max(settings.slider, 0.0), 1.0) * width)
-    composed = torch.cat([photo[:, :, :column], image[:, :, column:]], dim=2)
+    composed = torch.cat([target[:, :, :column], image[:, :, column:]], dim=2)
     if 0 < column < width:
         composed[:, :, max(0, column - _LINE // 2) : column + _LINE // 2] = 1.0
     return composed
@@ -126,10 +113,6 @@ def _fitted(image: Tensor, pose: Pose) -> Tensor:
     top, left = (high - height) // 2, (wide - width) // 2
     fitted[:, top : top + height, left : left + width] = image
     return fitted
-
-
-def _bytes(image: Tensor) -> np.ndarray:
-    return (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()
 
 
 @torch.no_grad()
@@ -150,3 +133,36 @@ def inside(positions: Tensor, one: Vector, other: Vector) -> Tensor:
     """(N,) bool: which positions (N, 3) lie in the box with these opposite corners."""
     corners = positions.new_tensor([one, other])
     return ((positions >= corners.amin(0)) & (positions <= corners.amax(0))).all(1)
+
+
+def colored(values: Tensor) -> Tensor:
+    """Colours (3, H, W) of values (H, W) in [0, 1], linear between the stops; others are clamped."""
+    stops = torch.tensor(_STOPS, dtype=values.dtype, device=values.device)
+    place = values.clamp(0, 1) * (len(_STOPS) - 1)
+    below = place.long().clamp_max(len(_STOPS) - 2)
+    return torch.lerp(stops[below], stops[below + 1], (place - below)[..., None]).permute(2, 0, 1)
+
+
+def depth_colors(depth: Tensor, alpha: Tensor) -> Tensor:
+    """Colours (3, H, W) of the planes of `view_planes`, (1, H, W) each; depth is inverse: near is bright.
+
+    Where less than half of a pixel is covered there is no depth, and the colour is black.
+    """
+    there = alpha[0] >= 0.5
+    values = depth[0] / alpha[0].clamp_min(1e-6)
+    known = values[there]
+    if not len(known):
+        return torch.zeros_like(alpha).expand(3, -1, -1)
+    known = known[:: max(1, len(known) // _SAMPLE)]
+    far, near = torch.quantile(known, torch.tensor([_FEW, _MOST], dtype=known.dtype, device=known.device))
+    return torch.where(there, colored((values - far) / (near - far).clamp_min(1e-9)), 0.0)
+
+
+def count_colors(counts: Tensor) -> Tensor:
+    """Colours (3, H, W) of counts (H, W): linear, the largest of the image is the brightest."""
+    return colored(counts.float() / counts.max().clamp_min(1))
+
+
+def error_image(target: Tensor, render: Tensor) -> Tensor:
+    """The difference (3, H, W) of two images in [0, 1], times ERROR_GAIN."""
+    return ((target - render).abs() * ERROR_GAIN).clamp(0, 1)

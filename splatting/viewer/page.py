@@ -13,11 +13,11 @@ from scene.scene import Scene
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.viewer import server as servers
 from splatting.viewer.frames import LONGEST, Frames
-from splatting.viewer.options import Address
-from splatting.viewer.scene_cameras import SceneCameras, center
-from splatting.viewer.settings import Settings, as_utf8, pose_of
-from splatting.viewer.tabs import PathTab, PhotosTab, ViewTab
+from splatting.viewer.server import Address
+from splatting.viewer.tabs import ImagesTab, PathTab, ViewTab
+from splatting.viewer.views import SceneCameras, Settings, as_utf8, pose_of
 from splatting.viewer.watchers import Watchers, Wish
+from utils.graphics_utils import camera_center
 from utils.system_utils import first_line
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class Page:
         self._cameras = SceneCameras(scene.getTrainCameras(), scene.getTestCameras())
         self._frames = Frames(gaussians, self._cameras, pipe, with_exposures)
         self.watchers = Watchers()
-        self._fault = ""  # the last one that was told
+        self._fault = ""  # the last one that was shown
         self.server, self.url = servers.serve(address, as_utf8(Path(scene.model_path).resolve().name))
         gui = self.server.gui
         self.iteration = gui.add_text("Iteration", str(scene.loaded_iter or 0), disabled=True)
@@ -54,7 +54,7 @@ class Page:
             background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
             self.view = ViewTab(self.server, self.watchers.changed, positions, degree, background)
         with self.tabs.add_tab("Photos"):
-            self.photos = PhotosTab(self.server, self.watchers.changed, self._cameras)
+            self.images = ImagesTab(self.server, self.watchers.changed, self._cameras)
         with self.tabs.add_tab("Path"):
             self.path = PathTab(self.server, Path(scene.model_path))
         self._begin_at_first_camera()
@@ -62,11 +62,11 @@ class Page:
         self.server.on_client_disconnect(self._left)
 
     def _begin_at_first_camera(self) -> None:
-        self.server.scene.set_up_direction(self._cameras.up())
-        camera, initial = self._cameras.first, self.server.initial_camera
+        self.server.scene.set_up_direction(tuple(self._cameras.up.tolist()))
+        camera, initial = next(iter(self._cameras.by_name.values()), None), self.server.initial_camera
         if camera is not None:
-            initial.position = center(camera)
-            initial.look_at = center(camera) + camera.R[:, 2] * self._cameras.depth(camera)
+            initial.position = place = camera_center(camera.R, camera.T)
+            initial.look_at = place + camera.R[:, 2] * self._cameras.depth(camera)
             initial.up = self._cameras.up_at(camera)
             initial.fov = camera.FoVy
         initial.near, initial.far = 1e-3 * self._cameras.size, 1e3 * self._cameras.size
@@ -86,7 +86,7 @@ class Page:
 
     def settings(self) -> Settings:
         """What the controls say now."""
-        return self.photos.read(self.view.read())
+        return self.images.read(self.view.read())
 
     def fulfil(self, wish: Wish, version: int = 0) -> None:
         """Draw and send the frame of a wish. One that cannot be drawn ends nothing. version: of the model."""
@@ -96,8 +96,8 @@ class Page:
             client = self.server.get_clients().get(wish.client)
             if client is not None:  # it has not left
                 self._send(client, image, wish.coarse)
-        except Exception as error:  # memory, a photo that is gone
-            self._tell_fault(wish, first_line(error))
+        except Exception as error:  # memory, an image that is gone
+            self._notify_fault(wish, first_line(error))
 
     @staticmethod
     def _send(client: "viser.ClientHandle", image: np.ndarray, coarse: bool) -> None:
@@ -106,7 +106,7 @@ class Page:
         quality = _COARSE_QUALITY if coarse else _FULL_QUALITY
         client.scene.set_background_image(image, "jpeg", jpeg_quality=quality)
 
-    def _tell_fault(self, wish: Wish, fault: str) -> None:
+    def _notify_fault(self, wish: Wish, fault: str) -> None:
         if fault == self._fault:
             return
         self._fault = fault
@@ -119,7 +119,7 @@ class Page:
         """Show the iteration and the number of Gaussians."""
         self.iteration.value, self.count.value = f"{iteration:,}", f"{gaussians:,}"
 
-    def tell(self, title: str, body: str) -> None:
+    def notify(self, title: str, body: str) -> None:
         """Show a notification to all, and wait until it has probably been sent."""
         clients = self.server.get_clients().values()
         for client in clients:

@@ -1,5 +1,6 @@
-"""The start of a viser server behind the authorization, without its own messages."""
+"""Address of the page, and the start of a viser server behind the authorization, without its own messages."""
 
+import argparse
 import contextlib
 import errno
 import io
@@ -12,21 +13,39 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from tqdm import tqdm
 
-from splatting.viewer.options import Address
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
     import viser
 
+HOST, PORT = "127.0.0.1", 8080
 _TRIED = 100  # ports, from the requested one on
 _TAKEN = errno.EADDRINUSE
 
 
-class Served(NamedTuple):
-    """A server that listens, and its address with the token that it may need."""
+class Address(NamedTuple):
+    """Where the page listens. port 0: any that is free."""
 
-    server: "viser.ViserServer"
-    url: str
+    host: str = HOST
+    port: int = PORT
+
+
+def add_host_option(parser: argparse.ArgumentParser) -> None:
+    """--viewer_host."""
+    parser.add_argument(
+        "--viewer_host", type=str, default=HOST, metavar="HOST",
+        help=f"address at which the page listens; others than {HOST} can be reached from outside, and then the page "
+        f"needs the token that is printed (default: {HOST})",
+    )  # fmt: skip
+
+
+def add_viewer_options(parser: argparse.ArgumentParser) -> None:
+    """--viewer and --viewer_host of train.py."""
+    parser.add_argument(
+        "--viewer", type=int, nargs="?", const=PORT, default=None, metavar="PORT",
+        help=f"serve a web page that shows the training and controls it, at this port or {PORT} (default: no page)",
+    )  # fmt: skip
+    add_host_option(parser)
 
 
 def checked_address(host: str, port: int | None) -> Address | None:
@@ -40,10 +59,11 @@ def checked_address(host: str, port: int | None) -> Address | None:
     return Address(host, port)
 
 
-def serve(address: Address, label: str) -> Served:
+def serve(address: Address, label: str) -> tuple["viser.ViserServer", str]:
     """Start a server, at the next free port if the requested one is taken, and say on stderr where it listens.
 
-    UserError without viser, and for an address that cannot be listened at.
+    Returns the server, and its address with the token that it may need. UserError without viser, and for an
+    address that cannot be listened at.
     """
     viser = _import_viser()
     from splatting.viewer.auth import Auth
@@ -57,9 +77,9 @@ def serve(address: Address, label: str) -> Served:
     if not auth.stands:
         stop(server)
         raise UserError("this release of viser cannot be guarded; install the one that setup.py names: '.[viewer]'")
-    auth.connections.control = server.gui._gui_input_handle_from_uuid.get
+    auth.control = server.gui._gui_input_handle_from_uuid.get
     server.gui.configure_theme(show_logo=False, show_share_button=False)
-    return Served(server, _announce(address, server.get_port(), auth.token))
+    return server, _announce(address, server.get_port(), auth.token)
 
 
 def stop(server: "viser.ViserServer") -> None:

@@ -1,9 +1,13 @@
-"""The tabs of every page: what is drawn, the scene's cameras, and a recorded camera path."""
+"""The tabs of the page: what is drawn, the scene's cameras, a recorded camera path, and the training.
+
+The training's buttons make requests, which the training fulfils between two iterations.
+"""
 
 import contextlib
 import math
 import re
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,8 +17,18 @@ import torch
 from torch import Tensor
 
 from splatting.camera_paths.keyframes import EASINGS, CameraPath, Keyframe
-from splatting.viewer.scene_cameras import SceneCameras, center, fov_of_canvas
-from splatting.viewer.settings import COMPARISONS, MODES, Settings, Vector, as_utf8, pose_of, window_of
+from splatting.viewer.views import (
+    COMPARISONS,
+    MODES,
+    SceneCameras,
+    Settings,
+    Vector,
+    as_utf8,
+    fov_of_canvas,
+    pose_of,
+    window_of,
+)
+from utils.graphics_utils import camera_center
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
@@ -28,6 +42,7 @@ _DRAWN_SIZE = 0.06  # of a drawn camera, by the scene's size
 FOLDER = "camera_paths"  # in the model's folder
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _LONGEST_WAIT = 3600.0  # seconds between keyframes
+_NO_CURVE = "There is no curve yet: it needs test views (`--eval`), and two scorings of them."
 
 
 def serialized(call: Callable[[Any], object]) -> Callable[[Any], Any]:
@@ -103,7 +118,7 @@ def first_box(positions: Tensor) -> tuple[Vector, Vector]:
     return tuple(tuple(round(x, digits) for x in corner.tolist()) for corner in (low, high))
 
 
-class PhotosTab:
+class ImagesTab:
     """Controls for the scene's cameras. changed(dragging): called when what is shown changes."""
 
     def __init__(self, server: "viser.ViserServer", changed: Callable[[bool], None], cameras: SceneCameras) -> None:
@@ -134,7 +149,7 @@ class PhotosTab:
         camera = self._cameras.by_name.get(name)
         if client is None or camera is None:
             return
-        place, (width, height) = center(camera), window_of(client.camera)
+        place, (width, height) = camera_center(camera.R, camera.T), window_of(client.camera)
         with client.atomic():
             with contextlib.suppress(ValueError):  # of a browser that says that it looks at its own place
                 client.camera.position = place
@@ -155,7 +170,7 @@ class PhotosTab:
                 scale=_DRAWN_SIZE * self._cameras.size,
                 color=_COLOURS[name.split()[0]],
                 wxyz=SO3.from_matrix(np.asarray(camera.R)).wxyz,
-                position=center(camera),
+                position=camera_center(camera.R, camera.T),
                 cast_shadow=False,
                 receive_shadow=False,
             )
@@ -221,3 +236,103 @@ class PathTab:
         while (self._folder / f"path{number}.json").exists():
             number += 1
         return f"path{number}"
+
+
+class Requests:
+    """What the page's buttons have asked for. asked: called after each request.
+
+    any: whether there is something to do in this iteration. Every method may be called from any thread.
+    """
+
+    def __init__(self, asked: Callable[[], None]) -> None:
+        self._asked, self._lock = asked, threading.RLock()
+        self._steps, self._checkpoints = 0, 0
+        self.paused = self.stopped = False
+        self.any = False  # read without the lock, in every iteration
+
+    def _set(self, **values: object) -> None:
+        with self._lock:
+            vars(self).update(values)
+            self.any = self.paused or self._checkpoints > 0 or self.stopped
+            self._asked()
+
+    def _take(self, name: str) -> bool:
+        with self._lock:
+            count = getattr(self, name)
+            self._set(**{name: max(0, count - 1)})
+        return count > 0
+
+    def pause(self) -> None:
+        """Wait after this iteration, until `resume` or `step`."""
+        self._set(paused=True)
+
+    def resume(self) -> None:
+        """Go on, and forget steps that were asked for."""
+        self._set(paused=False, _steps=0)
+
+    def step(self) -> None:
+        """Take one iteration, then wait. A training that is not paused waits after its next one."""
+        with self._lock:
+            self._set(_steps=self._steps + self.paused, paused=True)
+
+    def save(self) -> None:
+        """Save a checkpoint after this iteration."""
+        self._set(_checkpoints=1)
+
+    def stop(self) -> None:
+        """Save a checkpoint after this iteration, and end."""
+        self._set(stopped=True)
+
+    def take_step(self) -> bool:
+        """Whether a paused training may take one iteration; if so, that request is fulfilled."""
+        return self._take("_steps")
+
+    def take_checkpoint(self) -> bool:
+        """Whether to save a checkpoint; if so, that request is fulfilled."""
+        return self._take("_checkpoints")
+
+
+class TrainingTab:
+    """Buttons that make requests; iterations a second, loss, and the error against time."""
+
+    def __init__(self, server: "viser.ViserServer", requests: Requests) -> None:
+        gui = server.gui
+        self._requests = requests
+        self.speed = gui.add_text("Iterations a second", "", disabled=True)
+        self.loss = gui.add_text("Loss", "", disabled=True)
+        self.pause, step = gui.add_button("Pause"), gui.add_button("One step")
+        save, stop = gui.add_button("Save a checkpoint"), gui.add_button("Stop and save", color="red")
+        self.note = gui.add_markdown(_NO_CURVE)
+        axes = ({"label": "seconds of training"}, {"label": "test PSNR (dB)"})
+        self.curve = gui.add_uplot(
+            (np.zeros(1), np.zeros(1)),
+            ({"label": "seconds"}, {"label": "PSNR", "stroke": "#1c7ed6", "width": 2, "points": {"show": True}}),
+            scales={"x": {"time": False}},
+            axes=axes,
+            aspect=1.4,
+            visible=False,
+        )
+        self._rows = 0
+        self.pause.on_click(serialized(lambda _: self._turn()))
+        step.on_click(serialized(lambda _: (requests.step(), self._label())))
+        save.on_click(lambda _: requests.save())
+        stop.on_click(lambda _: requests.stop())
+
+    def _turn(self) -> None:
+        (self._requests.resume if self._requests.paused else self._requests.pause)()
+        self._label()
+
+    def _label(self) -> None:
+        self.pause.label = "Resume" if self._requests.paused else "Pause"
+
+    def show(self, speed: float | None, loss: float, rows: Sequence[dict[str, float | None]]) -> None:
+        """Show iterations a second (None: not known), the loss, and the curve's rows so far."""
+        self.speed.value = "" if speed is None else f"{speed:.3g}"
+        self.loss.value = f"{loss:.5f}"
+        if len(rows) != self._rows:
+            self._rows = len(rows)
+            points = [(row["seconds"], row["test_psnr"]) for row in rows if row.get("test_psnr") is not None]
+            points = [point for point in points if all(map(math.isfinite, point))]
+            if len(points) > 1:
+                self.curve.data = tuple(np.array(values, dtype=np.float64) for values in zip(*points, strict=True))
+                self.curve.visible, self.note.visible = True, False

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from splatting.viewer.settings import Pose
+from splatting.viewer.views import Pose
 
 STILL = 0.15  # share of the time for frames while no camera moves
 MOVING = 0.30  # while somebody moves one, or changes what is shown

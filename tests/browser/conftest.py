@@ -1,4 +1,4 @@
-"""Fixtures for tests in a real Chromium: the browser, a tab, and what goes wrong or out in it."""
+"""A tab in a real Chromium, whose test fails for an error in it or a request to elsewhere."""
 
 import shutil
 from collections.abc import Iterator
@@ -13,19 +13,13 @@ if TYPE_CHECKING:
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome")
 # WebGL on the processor; without a sandbox, which containers do not allow.
 OPTIONS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-SIZE = {"width": 900, "height": 600}
-
-
-def chromium() -> str | None:
-    """The path of a Chromium, None if there is none."""
-    return next(filter(None, map(shutil.which, PROGRAMS)), None)
 
 
 @pytest.fixture(scope="session")
 def browser() -> "Iterator[Browser]":
     """A headless Chromium with software WebGL; skips where playwright or a Chromium is missing."""
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
-    program = chromium()
+    program = next(filter(None, map(shutil.which, PROGRAMS)), None)
     if program is None:
         pytest.skip(f"none of {', '.join(PROGRAMS)} is on PATH: apt-get install chromium")
     with api.sync_playwright() as playwright:
@@ -35,35 +29,21 @@ def browser() -> "Iterator[Browser]":
 
 
 @pytest.fixture
-def tab(browser: "Browser") -> "Iterator[Page]":
-    """An empty tab of 900 x 600 pixels with a memory of its own."""
-    context = browser.new_context(viewport=SIZE)
-    yield context.new_page()
+def tab(browser: "Browser", request: pytest.FixtureRequest) -> "Iterator[Page]":
+    """An empty tab of the module's WINDOW (width, height), with a memory of its own.
+
+    It, its frames and its workers may ask nobody but the host of the page, or load one file.
+    """
+    width, height = request.module.WINDOW
+    context = browser.new_context(viewport={"width": width, "height": height})
+    page, errors, asked = context.new_page(), [], []
+    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("websocket", lambda socket: asked.append(socket.url))
+    context.on("request", lambda asking: asked.append(asking.url))
+    yield page
     context.close()
-
-
-@pytest.fixture
-def page_errors(tab: "Page") -> list[str]:
-    """Errors of the tab's console and uncaught exceptions, as they come."""
-    errors: list[str] = []
-    tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-    tab.on("pageerror", lambda error: errors.append(str(error)))
-    return errors
-
-
-@pytest.fixture
-def requests(tab: "Page") -> list[str]:
-    """The address of everything that the tab, its frames and its workers ask for, websockets among them."""
-    asked: list[str] = []
-    tab.context.on("request", lambda request: asked.append(request.url))
-    tab.on("websocket", lambda socket: asked.append(socket.url))
-    return asked
-
-
-def outside(addresses: list[str], own: str = "") -> list[str]:
-    """Those addresses that lie neither in the page itself nor at the host and port `own`."""
-    return [
-        address
-        for address in addresses
-        if not address.startswith(("blob:", "data:", "about:")) and urlsplit(address).netloc != own
-    ]
+    assert not errors
+    loaded = [urlsplit(url) for url in asked if not url.startswith(("blob:", "data:", "about:"))]
+    assert len({url.netloc for url in loaded}) == 1, asked
+    assert sum(url.scheme == "file" for url in loaded) <= 1, asked

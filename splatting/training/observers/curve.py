@@ -7,11 +7,11 @@ from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
 from splatting.evaluation.curve_recorder import CurveRecorder, evenly_spread
 from splatting.evaluation.what_to_try import schedules_follow_length
+from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
 from splatting.training.run import Run
-from splatting.training.schedule.pace import Paced, Settling
-from splatting.training.step import Step
+from splatting.training.schedule import DecidedSchedule, SettlingSchedule
 from utils.system_utils import saved_iterations
 
 
@@ -33,7 +33,7 @@ class Curve(Observer):
             lambda cameras: self._load(cameras, views),
             lambda cameras: views.scores(cameras, run.gaussians),
             run.device,
-            not isinstance(run.pace, Paced),
+            not isinstance(run.schedule, DecidedSchedule),
         )
         self._due = False
         self._seconds = 0.0
@@ -43,12 +43,12 @@ class Curve(Observer):
         for camera in cameras:
             views.load(camera)
 
-    def due(self, step: Step) -> bool:
-        first = self._run.pace.nominal(self._run.first_iteration)
+    def due(self, step: Iteration) -> bool:
+        first = self._run.schedule.schedule_step(self._run.first_iteration)
         self._due = self._recorder.due(step.span, first, self._run.clock.seconds)
         return self._due
 
-    def measured(self, step: Step, losses: Losses) -> None:
+    def measured(self, step: Iteration, losses: Losses) -> None:
         if self._due or step.last:
             self._seconds = step.scored_at = self._run.clock.seconds
             point = self._recorder.point(step.span) or step.span[-1]
@@ -61,9 +61,15 @@ class Curve(Observer):
             return
         run = self._run
         there = saved_iterations(Path(run.scene.model_path) / "point_cloud")
-        saved, lr_max_steps = {*run.pace.known(run.launch.save_iterations)} & {*there}, run.opt.position_lr_max_steps
-        follows_length = schedules_follow_length(
-            bool(run.dataset.depths), run.dataset.train_test_exp, run.pace.sizes, isinstance(run.pace, Settling)
+        saved, lr_max_steps = (
+            {*run.schedule.known(run.launch.save_iterations)} & {*there},
+            run.opt.position_lr_max_steps,
         )
-        steady = not isinstance(run.pace, Paced)
-        self._recorder.finish(self._seconds, saved, lr_max_steps if steady else None, follows_length)
+        follows_length = schedules_follow_length(
+            bool(run.dataset.depths),
+            run.dataset.train_test_exp,
+            run.schedule.sizes,
+            isinstance(run.schedule, SettlingSchedule),
+        )
+        lr_max_steps = None if isinstance(run.schedule, DecidedSchedule) else run.opt.position_lr_max_steps
+        self._recorder.finish(self._seconds, saved, lr_max_steps, follows_length)

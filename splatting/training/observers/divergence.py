@@ -11,10 +11,10 @@ from tqdm import tqdm
 from scene.gaussians.adam import StepGuard
 from scene.gaussians.checkpoint import save_checkpoint
 from splatting.distributed.ranks import ranks
+from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
 from splatting.training.run import Run
-from splatting.training.step import Step
 from utils.system_utils import UserError
 
 _SHOWN = 5  # rows that a message names
@@ -41,7 +41,7 @@ class DivergenceWatch(Observer):
         self._earliest: list[float] = []
         self._latest: deque[float] = deque(maxlen=_COMPARED)
 
-    def measured(self, step: Step, losses: Losses) -> None:
+    def measured(self, step: Iteration, losses: Losses) -> None:
         self._losses.add(step.iteration, losses.total)
         self._guard.watch(step.iteration, losses.total)
         self._sh_degrees = [self._sh_degrees[1], self._gaussians.active_sh_degree]

@@ -1,6 +1,8 @@
-"""Scores in testing iterations, the events for TensorBoard, and what to try after the training."""
+"""Scores, numbers and records of a training: what a user reads while it runs, and after it."""
 
+import math
 import sys
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,15 +14,55 @@ from gaussian_renderer import render
 from gaussian_renderer.scored_views import ScoredViews
 from scene import Scene
 from scene.cameras import Camera
-from scene.gaussian_model import GaussianModel
 from splatting.evaluation.what_to_try import BUDGET, CAP, PLANNED, STRATEGY, what_to_try
-from splatting.training.objective import Losses
+from splatting.training.iteration import Iteration
+from splatting.training.objective import Losses, LossWatch
 from splatting.training.observer import Error, Observer
 from splatting.training.run import Run
-from splatting.training.step import Step
 from splatting.training.strategies.budget import default_budget
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.loss_utils import l1_loss
+
+BAR_INTERVAL = 10  # iterations between updates, at least
+BAR_SECONDS = 0.2  # between updates, at least: each reads the losses, and so waits for the GPU
+
+
+class ProgressBar(Observer):
+    """Shows running means. At the end of a training it says how long that took."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._depth = LossWatch()
+        self._shown = {"Loss": run.losses} | ({"Depth Loss": self._depth} if run.dataset.depths else {})
+        self._updated, self._done = -math.inf, run.first_iteration
+        first = run.schedule.schedule_step(run.first_iteration)
+        self._bar = tqdm(initial=first, total=run.schedule.length, desc="Training progress", dynamic_ncols=True)
+
+    def due(self, step: Iteration) -> bool:
+        shown = step.iteration % BAR_INTERVAL == 0 and time.monotonic() - self._updated >= BAR_SECONDS
+        return step.last or shown
+
+    def measured(self, step: Iteration, losses: Losses) -> None:
+        if losses.depth is not None:
+            self._depth.add(step.iteration, losses.depth)
+        if not step.due:
+            return
+        for loss in self._shown.values():
+            loss.read()
+        means = {name: f"{loss.mean:.7f}" for name, loss in self._shown.items()}
+        if step.span.stop - 1 != step.iteration:  # the bar counts iterations of the schedule
+            means["Iterations"] = f"{step.iteration:,}"
+        # As text: tqdm would round the number to three digits.
+        self._bar.set_postfix(means, Gaussians=f"{self._run.gaussians.total:,}", refresh=False)
+        self._bar.update(step.span.stop - 1 - self._bar.n)
+        self._updated, self._done = time.monotonic(), step.iteration
+
+    def ended(self, error: Error) -> None:
+        self._bar.close()
+        if error is None:
+            count = self._done - self._run.first_iteration
+            print(f"Trained {count} iterations in {self._run.clock.seconds:.1f} s, without tests and saving")
+
 
 LOG_INTERVAL = 10  # iterations between TensorBoard's losses: reading one waits for the GPU
 SHOWN = 5  # views of a set whose images TensorBoard gets
@@ -33,12 +75,12 @@ class Report(Observer):
         self._run = run
         self._writer = writer
         self._report = report
-        self._later: list[tuple[Step, Losses, float]] = []
+        self._later: list[tuple[Iteration, Losses, float]] = []
 
-    def due(self, step: Step) -> bool:
+    def due(self, step: Iteration) -> bool:
         return self._report is not training_report or step.takes(self._run.launch.test_iterations)
 
-    def measured(self, step: Step, losses: Losses) -> None:
+    def measured(self, step: Iteration, losses: Losses) -> None:
         seconds = self._run.clock.seconds - step.started
         if step.due or (self._writer and step.iteration % LOG_INTERVAL == 0):
             self._later.append((step, losses, seconds))
@@ -49,14 +91,14 @@ class Report(Observer):
                 for one in self._read():
                     self._tell(*one)
 
-    def _read(self) -> list[tuple[Step, Tensor, Tensor, float]]:
+    def _read(self) -> list[tuple[Iteration, Tensor, Tensor, float]]:
         """Take what is kept, its L1 and total losses on the host: one wait for a GPU instead of two for each."""
         kept, self._later = self._later, []
         values = torch.stack([loss.detach() for _, losses, _ in kept for loss in (losses.l1, losses.total)]).cpu()
         pairs = values.view(-1, 2)
         return [(step, l1, total, seconds) for (step, _, seconds), (l1, total) in zip(kept, pairs, strict=True)]
 
-    def _tell(self, step: Step, l1: Tensor, total: Tensor, seconds: float) -> None:
+    def _tell(self, step: Iteration, l1: Tensor, total: Tensor, seconds: float) -> None:
         run = self._run
         tested = [step.iteration if t in step.span else -1 for t in run.launch.test_iterations]
         scores = self._report(
@@ -118,8 +160,12 @@ def training_report(
     sets = {"test": scene.getTestCameras(), "train": [train[i % len(train)] for i in range(5, 30, 5)]}
     scores = {}
     for name, cameras in sets.items():
-        show = _shown_by(tb_writer, name, iteration, iteration == testing_iterations[0])
-        if means := _means(views, cameras, scene.gaussians, l1_loss, show):
+
+        def show(camera: Camera, what: str, image: Tensor, name: str = name) -> None:
+            if tb_writer:
+                tb_writer.add_image(f"{name}_view_{camera.image_name}/{what}", image, global_step=iteration)
+
+        if means := _means(views, scene, cameras, l1_loss, show, iteration == testing_iterations[0]):
             l1_mean, psnr_mean = means
             tqdm.write(f"[ITER {iteration}] Evaluating {name}: L1 {l1_mean} PSNR {psnr_mean}", file=sys.stdout)
             if tb_writer:
@@ -135,33 +181,99 @@ def training_report(
 @torch.no_grad()
 def _means(
     views: ScoredViews,
+    scene: Scene,
     cameras: Sequence[Camera],
-    gaussians: GaussianModel,
     l1_loss: Callable[[Tensor, Tensor], Tensor],
-    show: Callable[[int, Camera, Tensor, Tensor], None],
+    show: Callable[[Camera, str, Tensor], None],
+    photos: bool,
 ) -> list[float]:
-    """Mean L1, and mean PSNR of the channels, over the views with a pixel that counts; nothing without any."""
+    """Mean L1, and mean PSNR of the channels, over the views with a pixel that counts; nothing without any.
+
+    show: gets the renders of the first views, and with `photos` their photos.
+    """
     scores = []
     for index, camera in enumerate(cameras):
-        image, target, mask = views.compared(camera, gaussians)
+        image, target, mask = views.compared(camera, scene.gaussians)
         if mask is not None and not mask.any():
             continue
         target = as_float(target)
         counted = [pixels_that_count(x, mask) for x in (image, target)]
         scores.append((l1_loss(*counted).item(), psnr(*counted).mean().item()))
-        show(index, camera, image, target)
+        if index < SHOWN:
+            show(camera, "render", image)
+            if photos:
+                show(camera, "ground_truth", target)
     return [sum(values) / len(values) for values in zip(*scores, strict=True)]
 
 
-def _shown_by(writer: Any | None, name: str, iteration: int, first: bool) -> Callable[..., None]:
-    """Gives TensorBoard, if there, the render of a set's first views, and at the first testing their photos."""
+EVERY = 100  # iterations between scorings, at least
+PER_VIEW = 20  # iterations for each test view: to score one costs half of an iteration, so all cost some 2.5 %
 
-    def show(index: int, camera: Camera, image: Tensor, target: Tensor) -> None:
-        if writer is None or index >= SHOWN:
+
+class Target(Observer):
+    """Scores all test views at fixed iterations, and ends the training with the one that reaches the target.
+
+    The iterations follow from the number of views, so the same command ends with the same one, whatever the clock says.
+    The model that was scored is the one that is saved. train_log.json gets the scores as `test_views_psnr`
+    (gaussian_renderer/scored_views.py).
+    """
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._cameras = run.scene.getTestCameras()
+        self._views = ScoredViews(run.pipe, run.background, run.dataset.train_test_exp)
+        self._every = max(EVERY, PER_VIEW * len(self._cameras))
+        self._psnr: float | None = None
+
+    def due(self, step: Iteration) -> bool:
+        return step.last or step.iteration % self._every == 0
+
+    def measured(self, step: Iteration, losses: Losses) -> None:
+        if not self.due(step):
             return
-        tag = f"{name}_view_{camera.image_name}"
-        writer.add_image(f"{tag}/render", image, global_step=iteration)
-        if first:
-            writer.add_image(f"{tag}/ground_truth", target, global_step=iteration)
+        run, target = self._run, self._run.opt.target_psnr
+        with run.clock.paused("scoring"):
+            run.scene.prefetch(self._cameras)
+            self._psnr = run.group.shared(self._views.scores(self._cameras, run.gaussians).get("psnr"))
+        if self._psnr is None:  # masks leave no pixel of the views
+            return
+        step.record = (step.record or {}) | {"test_views_psnr": self._psnr}
+        if self._psnr >= target:
+            tqdm.write(
+                f"[ITER {step.iteration}] Test views have {self._psnr:.3f} dB, and --target_psnr is {target:g}",
+                file=sys.stdout,
+            )
+            step.end(run.schedule.length)
 
-    return show
+    def ended(self, error: Error) -> None:
+        target = self._run.opt.target_psnr
+        if error is None and not (self._psnr or 0.0) >= target:
+            what = "have no pixel to score" if self._psnr is None else f"have {self._psnr:.3f} dB"
+            self._run.log.tell(f"Test views {what}, and --target_psnr {target:g} was not reached")
+
+
+class Records(Observer):
+    """Writes what other observers have put into the step's record, once all of it is there."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._seconds = 0.0
+
+    def measured(self, step: Iteration, losses: Losses) -> None:
+        if step.record is None:
+            return
+        run = self._run
+        self._seconds = seconds = run.clock.seconds if step.scored_at is None else step.scored_at
+        with run.clock.paused("saving"):
+            run.log.add(step.iteration, seconds, gaussians=run.gaussians.total, loss=run.losses.mean, **step.record)
+
+    def ended(self, error: Error) -> None:
+        """Note the seconds of this process: up to its first iteration, of training, of scoring and of saving."""
+        if error is not None:
+            return
+        first, spent = self._run.first_done, self._run.clock.spent
+        parts = {"training": self._seconds, "scoring": 0.0, "saving": 0.0} | spent
+        self._run.log.note(
+            first_iteration_seconds=None if first is None else round(first, 3),
+            **{f"{part}_seconds": round(seconds, 3) for part, seconds in parts.items()},
+        )

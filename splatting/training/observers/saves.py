@@ -1,19 +1,21 @@
-"""Saves of the model as PLY, and checkpoints that a training can be resumed from."""
+"""Saves of the model as PLY, checkpoints that a training can be resumed from, and schedule.json."""
 
 import sys
 from pathlib import Path
 
 from tqdm import tqdm
 
+from arguments import add_to_model_json
 from scene.gaussians.checkpoint import save_checkpoint
-from splatting.training.last_save import save_last
-from splatting.training.left_out import LeftOut, lines
+from splatting.host.clock import wall_seconds
+from splatting.training.iteration import Iteration
+from splatting.training.left_out import LeftOut, lines, save_last
 from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
 from splatting.training.observers.divergence import DivergenceWatch
-from splatting.training.observers.schedule import save_schedule
 from splatting.training.run import Run
-from splatting.training.step import Step
+from splatting.training.schedule import DecidedSchedule
+from splatting.training.schedule_file import NAME, write_schedule
 
 
 class Saves(Observer):
@@ -27,10 +29,10 @@ class Saves(Observer):
         self._test_in_memory = test_in_memory
         self._left_out: LeftOut | None = None
 
-    def due(self, step: Step) -> bool:
+    def due(self, step: Iteration) -> bool:
         return step.takes(self._run.launch.save_iterations)
 
-    def measured(self, step: Step, losses: Losses) -> None:
+    def measured(self, step: Iteration, losses: Losses) -> None:
         if not step.takes(self._run.launch.save_iterations):
             return
         run = self._run
@@ -56,14 +58,14 @@ class Checkpoints(Observer):
         self._run = run
         self._watch = watch
 
-    def due(self, step: Step) -> bool:
+    def due(self, step: Iteration) -> bool:
         return step.takes(self._run.launch.checkpoint_iterations)
 
-    def stepped(self, step: Step) -> None:
+    def stepped(self, step: Iteration) -> None:
         if step.stopping or step.takes(self._run.launch.checkpoint_iterations):
             self.save(step)
 
-    def save(self, step: Step) -> None:
+    def save(self, step: Iteration) -> None:
         """Write a checkpoint after an iteration that is due, and say how to resume if the training stops."""
         run = self._run
         self._watch.look(step.iteration, stepped=not step.last)
@@ -77,3 +79,38 @@ class Checkpoints(Observer):
             run.log.add(step.iteration, seconds, gaussians=run.gaussians.total, loss=run.losses.mean)
         if step.stopping:
             tqdm.write(f"resume with --start_checkpoint {path}", file=sys.stderr)
+
+
+def save_schedule(run: Run, step: Iteration) -> None:
+    """Write what the schedule has decided up to an iteration, if anything, and the sizes of views to model.json."""
+    if isinstance(run.schedule, DecidedSchedule):
+        folder = run.scene.model_path
+        write_schedule(Path(folder) / NAME, run.schedule.recorded(step.iteration, step.last))
+        if run.opt.time_budget:
+            add_to_model_json(folder, resolution_schedule=run.schedule.sizes)
+
+
+class ScheduleFile(Observer):
+    """Writes schedule.json when the training ends, also by an error whose rescue has saved a checkpoint."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._step: Iteration | None = None
+        self._seconds = 0.0
+
+    def stepped(self, step: Iteration) -> None:
+        self._step = step
+        if step.last:
+            self._seconds = self._run.log.seconds_before + self._run.clock.seconds
+
+    def ended(self, error: Error) -> None:
+        run = self._run
+        if self._step is None:
+            return
+        save_schedule(run, self._step)
+        if error is None and run.opt.time_budget:
+            run.log.tell(
+                f"Trained {self._seconds:.2f} s in {self._step.iteration} iterations for --time_budget "
+                f"{run.opt.time_budget:g}; the whole process, with reading, scoring and saving, took "
+                f"{run.log.wall_seconds_before + wall_seconds():.1f} s"
+            )

@@ -4,22 +4,15 @@ from collections.abc import Callable
 from typing import Any
 
 from gaussian_renderer import network_gui
-from splatting.distributed.ranks import ranks
 from splatting.training.observer import Observer
 from splatting.training.observers.curve import Curve
 from splatting.training.observers.divergence import DivergenceWatch
-from splatting.training.observers.masks import MaskWatch
-from splatting.training.observers.memory import MemoryGuard
-from splatting.training.observers.network_viewer import NetworkViewer
-from splatting.training.observers.page import PageObserver
-from splatting.training.observers.progress import ProgressBar
-from splatting.training.observers.records import Records
-from splatting.training.observers.report import Report
-from splatting.training.observers.saves import Checkpoints, Saves
-from splatting.training.observers.schedule import ScheduleFile
-from splatting.training.observers.target import Target
+from splatting.training.observers.guards import MaskWatch, MemoryGuard
+from splatting.training.observers.report import ProgressBar, Records, Report, Target
+from splatting.training.observers.saves import Checkpoints, Saves, ScheduleFile
+from splatting.training.observers.viewers import NetworkViewer, PageObserver
 from splatting.training.run import Run
-from splatting.training.schedule.pace import Paced
+from splatting.training.schedule import DecidedSchedule
 
 
 def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[str, float]]) -> list[Observer]:
@@ -30,7 +23,7 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
     checkpoints = Checkpoints(run, watch)
     return [
         watch,  # first: observers that write rely on all losses so far being finite
-        *([ProgressBar(run)] if ranks().first else []),  # reads the losses that the watch has checked
+        *([ProgressBar(run)] if run.group.first else []),  # reads the losses that the watch has checked
         MaskWatch(run.scene.getTrainCameras()),  # may refuse the scene before anything is written
         *([Target(run)] if run.opt.target_psnr else []),  # may make this iteration the last, which others look at
         *([Curve(run)] if with_curve else []),  # the scores are those of the model saved at the same iteration
@@ -40,6 +33,6 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
         *([NetworkViewer(run)] if network_gui.listener else []),  # after all that write: it may make training wait
         MemoryGuard(run),  # from `measured` to `stepped` the model changes; otherwise it is whole
         checkpoints,  # writes the whole state after the step
-        *([ScheduleFile(run)] if isinstance(run.pace, Paced) else []),
+        *([ScheduleFile(run)] if isinstance(run.schedule, DecidedSchedule) else []),
         *([PageObserver(run, checkpoints)] if run.launch.viewer is not None else []),  # last: may let the training wait
     ]

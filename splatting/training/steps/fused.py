@@ -3,105 +3,98 @@
 import torch
 from torch import Tensor
 
-from gaussian_renderer.view_step import Drawn, draw, step
+from gaussian_renderer import Drawn, KnownBands, draw, exposed
 from scene.fused_adam import FusedAdam
-from scene.gaussians.exposure import apply_exposure
-from splatting.distributed.ranks import ranks
-from splatting.distributed.rendering.bands import KnownBands
+from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses, Objective
 from splatting.training.observer import Announcer
 from splatting.training.run import Run
-from splatting.training.step import Step
 from splatting.training.steps.plain import PlainStep
 
+Measured = tuple[Drawn, Losses, tuple[Tensor, Tensor | None]]
 
-class FusedStep:
-    """Takes steps in which nothing but the optimiser uses the gradients, with the bytes of `PlainStep`.
+
+class FusedStep(PlainStep):
+    """Takes steps whose gradients only the optimiser needs, with the bytes of `PlainStep`, and that where others do.
 
     Autograd differentiates the loss by the image only, so any loss of image and depth will do, and exposures.
     """
 
     def __init__(self, run: Run) -> None:
-        self._run = run
-        self.plain = PlainStep(run)
+        super().__init__(run)
         self._adam = FusedAdam(run.gaussians, run.density.penalty)
         self._bands = KnownBands()
-        self._further_terms = False
+        self._is_known = False  # whether the model is one that the operator steps
+        self._has_further_terms = False
 
     @staticmethod
     def suits(run: Run) -> bool:
-        """Whether the run's objective is ours, and its density control wants no gradient of a parameter."""
-        return type(run.objective) is Objective and vars(type(run.density)).get("fusable", False)
+        """Whether nobody else needs gradients. Own objectives and density controls may, and options that ask autograd.
 
-    def takes(self, step: Step) -> bool:
-        """Whether this step can be fused."""
-        return self.is_usual(step) and FusedAdam.takes(self._run.gaussians)
-
-    def is_usual(self, step: Step) -> bool:
-        """Whether it can be as far as the model does not matter.
-
-        The last step, and one that changes the Gaussians' rows, use the gradients.
+        What an objective or a strategy says of itself is not inherited; subclasses opt in.
         """
-        pipe = self._run.pipe
-        in_python = pipe.compute_cov3D_python or pipe.convert_SHs_python or pipe.debug
-        return not (step.changes or step.last or in_python or self._further_terms)
+        own = type(run.objective) is Objective and vars(type(run.density)).get("fusable", False)
+        by_autograd = run.launch.plain_step or run.pipe.compute_cov3D_python or run.pipe.convert_SHs_python
+        return own and not (by_autograd or torch.is_anomaly_enabled())
 
-    def take(self, step: Step, tell: Announcer) -> None:
+    def take(self, at: Iteration, observers: Announcer) -> None:
         """Take a step; the observers are told once the loss is known."""
-        if self.takes(step):
-            drawn, losses, gradients = self.measure(step)
-            if not self.finds_further_terms():
-                tell.measured(step, losses)
-                return None if step.last else self.advance(step, drawn, gradients)
-        self.plain.take(step, tell)
+        if self._fuses(at):
+            drawn, losses, gradients = self.measure(at)
+            if not self.drop_further_terms():
+                observers.measured(at, losses)
+                return None if at.last else self.advance(at, drawn, gradients)
+        super().take(at, observers)
 
-    def make_ready(self, step: Step) -> None:
-        """Nothing is ever pending."""
+    def _fuses(self, at: Iteration) -> bool:
+        """Whether this step can be fused. The last one, and one that changes the Gaussians' rows, use gradients."""
+        if at.changes or at.last or self._run.pipe.debug or self._has_further_terms:
+            self._is_known = False
+            return False
+        if at.due or not self._is_known:
+            if not self._knows_model():
+                return False
+            # Only where something is due may somebody replace the model's tensors, or wait for gradients.
+            self._is_known = not at.due
+        return True
 
-    def settle(self) -> None:
-        """Nothing is ever pending."""
+    def _knows_model(self) -> bool:
+        return FusedAdam.takes(self._run.gaussians)
 
-    def give_up(self) -> int:
-        """Nothing is ever pending, so no step has to be taken back: 0."""
-        return 0
-
-    def measure(self, step: Step) -> tuple[Drawn, Losses, tuple[Tensor, Tensor | None]]:
+    def measure(self, at: Iteration) -> Measured:
         """Render: what was drawn, the losses, and their gradients of image and depth."""
         run = self._run
-        exposed = run.dataset.train_test_exp
-        by_bands = ranks().several and not exposed and run.objective.takes_bands(step)
-        want_depth = step.depth_weight > 0
-        drawn = draw(step.camera, run.gaussians, run.pipe, step.background, want_depth, by_bands, self._bands)
+        exposures, objective = run.dataset.train_test_exp, run.objective
+        by_bands = run.group.several and not exposures and objective.takes_bands(at)
+        wants = {"want_depth": at.depth_weight > 0, "by_bands": by_bands, "bands": self._bands}
+        drawn = draw(at.camera, run.gaussians, run.pipe, at.background, **wants)
         with torch.enable_grad():
             image, depth = drawn.image.requires_grad_(), drawn.depth
             if depth is not None:
                 depth.requires_grad_()
-            rendered = image
-            if exposed and (name := step.camera.exposure_name or step.camera.image_name) is not None:
-                rendered = apply_exposure(image, run.gaussians.get_exposure_from_name(name))
-            losses = run.objective({"render": rendered, "depth": depth, "band": drawn.band}, step)
+            color = exposed(image, at.camera, run.gaussians) if exposures else image
+            losses = objective({"render": color, "depth": depth, "band": drawn.band}, at)
             losses.total.backward()
         # Observers keep losses for a while, which must not keep the image and its gradient.
-        losses = losses._replace(
-            **{name: value.detach() for name, value in losses._asdict().items() if value is not None}
-        )
+        losses = losses._make(None if value is None else value.detach() for value in losses)
         return drawn, losses, (image.grad, None if depth is None else depth.grad)
 
-    def finds_further_terms(self) -> bool:
+    def drop_further_terms(self) -> bool:
         """Whether the loss of the last `measure` depends on a parameter by another way than the image.
 
-        Somebody has added a term to it. Its gradients are dropped, and from now on no step can be fused.
+        Somebody has added a term to it. Its gradients are dropped, and from now on all steps are plain.
         """
-        params = [self._run.gaussians.raw(name) for name in self._run.gaussians._attributes]
-        self._further_terms = any([param.grad is not None for param in params])
-        if self._further_terms:
+        gaussians = self._run.gaussians
+        params = [gaussians.raw(name) for name in gaussians._attributes]
+        self._has_further_terms = any([param.grad is not None for param in params])
+        if self._has_further_terms:
             for param in params:
                 param.grad = None
-        return self._further_terms
+        return self._has_further_terms
 
-    def advance(self, at: Step, drawn: Drawn, gradients: tuple[Tensor, Tensor | None]) -> None:
+    def advance(self, at: Iteration, drawn: Drawn, gradients: tuple[Tensor, Tensor | None]) -> None:
         """Take the step of the Gaussians, and that of the exposures."""
-        run = self._run
-        step(drawn, self._adam, *gradients, run.density.observes(at.iteration), run.density.absolute_gradients)
+        run, density = self._run, self._run.density
+        drawn.step(self._adam, *gradients, density.observes(at.iteration), density.absolute_gradients)
         run.gaussians.exposures.step()
-        run.density.after_step(at)
+        density.after_step(at)

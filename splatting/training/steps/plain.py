@@ -1,61 +1,98 @@
 """The plain step: autograd, with every gradient of every parameter there for whoever wants it."""
 
+from typing import Protocol
+
+import torch
 from torch import Tensor
 
-from gaussian_renderer import render
-from scene.gaussian_model import GaussianModel
+from gaussian_renderer import render, visible_rows
+from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Announcer
 from splatting.training.run import Run
-from splatting.training.step import Step
+
+Package = dict[str, Tensor | None]
 
 
-class PlainStep:
-    """Renders a view, compares it with its photo, follows the gradient, controls density, steps the optimisers."""
+class Views(Protocol):
+    """What an iteration renders, by the model that there is."""
+
+    def render(self, at: Iteration) -> Package:
+        """The result of `render`, with what the loss needs."""
+
+    def collect(self, package: Package, losses: Losses) -> tuple[Package, Losses]:
+        """Called after backward: give the model its gradients; the package of all its rows, and the losses to show."""
+
+
+class OneView:
+    """The iteration's view of the whole model."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
 
-    def take(self, step: Step, tell: Announcer) -> None:
-        """Take a step; the observers are told once the gradients are there."""
-        package, losses = self.backward(step)
-        tell.measured(step, losses)
-        self.advance(step, package)
-
-    def make_ready(self, step: Step) -> None:
-        """Nothing is ever pending."""
-
-    def settle(self) -> None:
-        """Nothing is ever pending."""
-
-    def give_up(self) -> int:
-        """Nothing is ever pending, so no step has to be taken back: 0."""
-        return 0
-
-    def backward(self, step: Step) -> tuple[dict[str, Tensor], Losses]:
-        """Render and differentiate: the result of `render`, and the losses."""
+    def render(self, at: Iteration) -> Package:
         run = self._run
-        package = self.render(step, run.gaussians)
-        losses = run.objective(package, step)
-        package = self.follow(losses, package)
-        if any(run.density.penalty):
-            run.gaussians.penalise(run.density.penalty)
+        return render(at.camera, run.gaussians, run.pipe, at.background, **run.render_options(at))
+
+    def collect(self, package: Package, losses: Losses) -> tuple[Package, Losses]:
         return package, losses
 
-    def render(self, step: Step, gaussians: GaussianModel) -> dict[str, Tensor]:
-        """The result of `render`, with what the loss needs."""
-        run = self._run
-        return render(step.camera, gaussians, run.pipe, step.background, **run.render_options(step))
 
-    def follow(self, losses: Losses, package: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Compute the gradients. Returns the result of `render`."""
-        losses.total.backward()
+class SpilledView(OneView):
+    """The iteration's view of a `SpilledGaussians`: only the rows that it sees are on the GPU."""
+
+    def render(self, at: Iteration) -> Package:
+        run = self._run
+        gaussians, pipe = run.gaussians, run.pipe
+        seen = gaussians.fetch(visible_rows(at.camera, gaussians, pipe))
+        package = render(at.camera, seen, pipe, at.background, **run.render_options(at))
+        if not (at.last or at.changes):  # after a change of rows, copies would be in vain
+            # As it would see them now; what the step moves into view is copied late.
+            gaussians.fetch_ahead(visible_rows(run.views[at.iteration + 1], gaussians, pipe))
         return package
 
-    def advance(self, step: Step, package: dict[str, Tensor]) -> None:
-        """Let density control and the optimisers use the gradients."""
+    def collect(self, package: Package, losses: Losses) -> tuple[Package, Losses]:
+        gaussians = self._run.gaussians
+        rows, count = gaussians.take_gradients(), len(gaussians)
+        points = package["viewspace_points"]
+        radii = package["radii"].new_zeros(count).index_copy_(0, rows, package["radii"])
+        every = torch.zeros(count, 3, dtype=points.dtype, device=points.device)
+        every.grad = torch.zeros_like(every).index_copy_(0, rows, points.grad)
+        return package | {"viewspace_points": every, "radii": radii}, losses
+
+
+class PlainStep:
+    """Renders a view, compares it with its photo, follows the gradient, controls density, steps the optimisers.
+
+    A faster step is a subclass, and falls back on this one. Where steps are queued on a GPU, `throttle` waits until
+    another may be, `drain` until all are done, and `abort` takes back those that cannot be done after an error, and
+    returns their number. A plain step leaves nothing pending.
+    """
+
+    def __init__(self, run: Run, views: Views | None = None) -> None:
+        self._run = run
+        self._views = OneView(run) if views is None else views
+
+    def take(self, at: Iteration, observers: Announcer) -> None:
+        """Take a step; the observers are told once the gradients are there."""
         run = self._run
-        run.density.after_backward(step, package)
-        if not step.last:  # as in the reference, the last iteration takes no step
+        package = self._views.render(at)
+        losses = run.objective(package, at)
+        losses.total.backward()
+        package, losses = self._views.collect(package, losses)
+        if any(run.density.penalty):
+            run.gaussians.penalise(run.density.penalty.times(run.schedule.views))
+        observers.measured(at, losses)
+        run.density.after_backward(at, package)
+        if not at.last:  # as in the reference, the last iteration takes no step
             run.gaussians.step(package["radii"])
-            run.density.after_step(step)
+            run.density.after_step(at)
+
+    def throttle(self, at: Iteration) -> None:
+        pass
+
+    def drain(self) -> None:
+        pass
+
+    def abort(self) -> int:
+        return 0

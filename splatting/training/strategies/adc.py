@@ -13,9 +13,8 @@ from tqdm import tqdm
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from splatting.training.checks import late_reset
-from splatting.training.density import DensityControl
-from splatting.training.step import Step
-from utils.system_utils import UserError
+from splatting.training.density import DensityControl, refuse_empty
+from splatting.training.iteration import Iteration
 
 
 class AdaptiveDensityControl(DensityControl):
@@ -45,7 +44,7 @@ class AdaptiveDensityControl(DensityControl):
         """Whether the view of this iteration counts in the statistics."""
         return self._actions(iteration).observe
 
-    def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:
+    def after_backward(self, step: Iteration, package: dict[str, Tensor]) -> None:
         todo = self._actions(step.iteration)
         if todo.observe:
             observe = self._gaussians.observe_absolute if self.absolute_gradients else self._gaussians.observe
@@ -53,13 +52,13 @@ class AdaptiveDensityControl(DensityControl):
         if todo.densify:
             self._densify(step.iteration, todo.limit_size)
         if todo.reset_opacity:
-            if warning := late_reset(step.iteration, self.pace):
+            if warning := late_reset(step.iteration, self.schedule):
                 tqdm.write(warning, file=sys.stderr)
             self._gaussians.reset_opacity()
 
     def _actions(self, iteration: int) -> rules.Actions:
-        pace = self.pace
-        place = pace.span(iteration), pace.stride(iteration), pace.views
+        schedule = self.schedule
+        place = schedule.span(iteration), schedule.stride(iteration), schedule.views
         return rules.actions(iteration, self._opt, self._white_background, *place)
 
     def _densify(self, iteration: int, limit_size: bool) -> None:
@@ -73,9 +72,4 @@ class AdaptiveDensityControl(DensityControl):
             max_splats=self._opt.max_num_splats,
             long_axis=self._opt.split == "long_axis",
         )
-        if self._gaussians.total == 0:
-            raise UserError(
-                f"no Gaussian was left after the densification of iteration {iteration}: the views do not agree "
-                "with the points, or show nothing but the background; check the scene, or raise "
-                "--opacity_reset_interval"
-            )
+        refuse_empty(iteration, self._gaussians.total == 0, "raise --opacity_reset_interval")

@@ -9,6 +9,7 @@ factor, where Rota Bulo et al. subtract a constant.
 """
 
 import math
+from functools import partial
 from typing import TYPE_CHECKING
 
 from torch import Tensor
@@ -20,11 +21,10 @@ from splatting.deterministic.counter_rng import Stream, permutation
 from splatting.deterministic.portable_math import exp, log
 from splatting.deterministic.weighted_choice import weighted_choice
 from splatting.distributed.selection import largest
-from splatting.training.density import DensityControl
-from splatting.training.error_scores import ErrorScores
-from splatting.training.schedule.pace import Paced
-from splatting.training.step import Step
-from utils.system_utils import UserError
+from splatting.training.density import DensityControl, refuse_empty
+from splatting.training.iteration import Iteration
+from splatting.training.schedule import DecidedSchedule
+from splatting.training.strategies.error_scores import error_scores
 
 if TYPE_CHECKING:
     from splatting.training.run import Run
@@ -48,15 +48,15 @@ class BudgetControl(DensityControl):
         self._gaussians, self._opt = run.gaussians, run.opt
         self._cameras = run.scene.getTrainCameras()
         self.ends = run.opt.densify_until_iter
-        self._scores = ErrorScores(run.gaussians, run.pipe, run.dataset.train_test_exp, run.opt)
+        self._scores = partial(error_scores, run.gaussians, run.pipe, run.dataset.train_test_exp, run.opt)
         self.most_gaussians = run.opt.max_num_splats or default_budget(self._cameras)
-        self._follows_clock = not run.opt.max_num_splats and isinstance(run.pace, Paced)
+        self._follows_clock = not run.opt.max_num_splats and isinstance(run.schedule, DecidedSchedule)
 
     def changes(self, iteration: int) -> bool:
-        in_time = self.pace.nominal(iteration) < self._opt.densify_until_iter
+        in_time = self.schedule.schedule_step(iteration) < self._opt.densify_until_iter
         return in_time and iteration % self._interval(iteration) == 0
 
-    def after_step(self, step: Step) -> None:
+    def after_step(self, step: Iteration) -> None:
         if not self.changes(step.iteration):
             return
         self._gaussians.check_steps()  # before rows change, so that an error finds the rows of the step
@@ -65,7 +65,7 @@ class BudgetControl(DensityControl):
         if grows:
             aim = self._aim(now, step.iteration)
         remove_useless(self._gaussians, self._opt.prune_opacity, max(aim, 1))
-        self._check_rest(step.iteration)
+        refuse_empty(step.iteration, self._gaussians.total == 0, "lower --prune_opacity")
         if grows:
             if aim > self._gaussians.total:
                 split_in_two(self._gaussians, self._chosen(step, aim - self._gaussians.total))
@@ -79,29 +79,31 @@ class BudgetControl(DensityControl):
 
     def _aim(self, now: int, iteration: int) -> int:
         """How many Gaussians there are to be after the densification of an iteration, `now` before it."""
-        most, stride = self.most_gaussians, self.pace.stride(iteration)
+        most, stride = self.most_gaussians, self.schedule.stride(iteration)
         if self._follows_clock and stride > 1:
-            most = min(most, max(int(AN_ITERATION * self.pace.length / stride), 1))
+            most = min(most, max(int(AN_ITERATION * self.schedule.length / stride), 1))
         return count_after(now, most, self._remaining(iteration), self._opt.growth_power)
 
     def _grows(self, iteration: int) -> bool:
-        return self.pace.nominal(iteration) > self._opt.densify_from_iter
+        return self.schedule.schedule_step(iteration) > self._opt.densify_from_iter
 
     def _remaining(self, iteration: int) -> int:
-        """How many densifications follow that of this iteration, at its pace."""
-        opt, stride = self._opt, self.pace.stride(iteration)
-        ahead = (opt.densify_until_iter - self.pace.nominal(iteration)) / (self._interval(iteration) * stride)
+        """How many densifications follow that of this iteration, at its schedule."""
+        opt, stride = self._opt, self.schedule.stride(iteration)
+        ahead = (opt.densify_until_iter - self.schedule.schedule_step(iteration)) / (self._interval(iteration) * stride)
         if stride != 1:
-            ahead -= 0.5  # the pace changes, so one that just comes in time may not come
+            ahead -= 0.5  # the stride changes, so one that just comes in time may not come
         return max(math.ceil(ahead) - 1, 0)
 
     def _interval(self, iteration: int) -> int:
-        return rules.interval(self._opt, self._opt.densify_until_iter, self.pace.stride(iteration), self.pace.views)
+        return rules.interval(
+            self._opt, self._opt.densify_until_iter, self.schedule.stride(iteration), self.schedule.views
+        )
 
-    def _chosen(self, step: Step, count: int) -> Tensor:
-        """Indices of this rank's Gaussians to split, ascending; those of all ranks are at most `count`."""
+    def _chosen(self, step: Iteration, count: int) -> Tensor:
+        """Indices of this process's Gaussians to split, ascending; those of all processes are at most `count`."""
         opt, shards = self._opt, self._gaussians.shards
-        scores = self._scores.of_views(self._scored_views(step.iteration), step.background)
+        scores = self._scores(self._scored_views(step.iteration), step.background)
         # The power of a score itself may be too small a number.
         relative = scores / largest(scores, shards.ranks).clamp_min(_SMALLEST)
         weights = exp(opt.score_power * log(relative)) * (scores > 0)
@@ -111,13 +113,6 @@ class BudgetControl(DensityControl):
     def _scored_views(self, iteration: int) -> list[Camera]:
         order = permutation(self._opt.seed, Stream.SCORED_VIEWS, iteration, len(self._cameras))
         return [self._cameras[index] for index in order[: self._opt.score_views]]
-
-    def _check_rest(self, iteration: int) -> None:
-        if self._gaussians.total == 0:
-            raise UserError(
-                f"no Gaussian was left after the densification of iteration {iteration}: the views do not agree "
-                "with the points, or show nothing but the background; check the scene, or lower --prune_opacity"
-            )
 
 
 def default_budget(cameras: list[Camera]) -> int:

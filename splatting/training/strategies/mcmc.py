@@ -13,9 +13,8 @@ from torch import Tensor
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.gaussians.mcmc import Penalty
-from splatting.training.density import DensityControl
-from splatting.training.step import Step
-from utils.system_utils import UserError
+from splatting.training.density import DensityControl, refuse_empty
+from splatting.training.iteration import Iteration
 
 MOST_GAUSSIANS = 1_000_000  # where --max_num_splats is 0
 
@@ -40,21 +39,21 @@ class MarkovChain(DensityControl):
 
     def changes(self, iteration: int) -> bool:
         opt = self._opt
-        within = opt.densify_from_iter < self.pace.nominal(iteration) < opt.mcmc_until_iter
-        stride = self.pace.stride(iteration)
-        return within and iteration % rules.interval(opt, opt.mcmc_until_iter, stride, self.pace.views) == 0
+        within = opt.densify_from_iter < self.schedule.schedule_step(iteration) < opt.mcmc_until_iter
+        stride = self.schedule.stride(iteration)
+        return within and iteration % rules.interval(opt, opt.mcmc_until_iter, stride, self.schedule.views) == 0
 
     def most_after(self, count: int, first: int, last: int) -> int:
         for _ in filter(self.changes, range(first, last + 1)):
             count = max(count, self._grown(count))
         return count
 
-    def after_backward(self, step: Step, package: dict[str, Tensor]) -> None:
+    def after_backward(self, step: Iteration, package: dict[str, Tensor]) -> None:
         if self.changes(step.iteration):
             self._relocate(step.iteration)
             self._grow(step.iteration)
 
-    def after_step(self, step: Step) -> None:
+    def after_step(self, step: Iteration) -> None:
         """Add the noise of the random walk (the paper's update by Langevin dynamics)."""
         opt = self._opt
         rate = self._gaussians.position_rate * opt.mcmc_noise
@@ -65,11 +64,8 @@ class MarkovChain(DensityControl):
         """Move what nobody sees (the paper's relocation of dead Gaussians)."""
         least, parts, seed = self._opt.mcmc_min_opacity, self._opt.mcmc_parts, self._opt.seed
         dead = self._gaussians.relocate(least, parts, seed=seed, iteration=iteration)
-        if dead == self._gaussians.total:
-            raise UserError(
-                f"no Gaussian was left with an opacity above {least} in iteration {iteration}: the views do not agree "
-                "with the points, or show nothing but the background; check the scene, or lower --mcmc_opacity_reg"
-            )
+        empty = dead == self._gaussians.total
+        refuse_empty(iteration, empty, "lower --mcmc_opacity_reg", f"with an opacity above {least} in")
 
     def _grow(self, iteration: int) -> None:
         """Grow to `_grown`."""

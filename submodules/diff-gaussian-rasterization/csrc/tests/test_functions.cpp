@@ -144,8 +144,6 @@ void test_row_lanes() {
       }
 }
 
-double& entry(Quat<double>& q, int k) { return k == 0 ? q.w : k == 1 ? q.x : k == 2 ? q.y : q.z; }
-
 template <class T>
 void test_degenerate_quaternions() {
   T norm;

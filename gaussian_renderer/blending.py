@@ -1,0 +1,79 @@
+"""Sums of blending weights of Gaussians, over a view's pixels or over its Gaussians.
+
+An image is linear in the Gaussians' colours, and a blending weight, alpha times transmittance, is its derivative. So
+the backward of the rasterizer sums weights over pixels, and an image of other colours sums them over Gaussians.
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from gaussian_renderer import draw, render
+from scene.cameras import Camera, MiniCam
+from scene.gaussian_model import GaussianModel
+
+PLANES = ("depth", "alpha")
+
+
+@torch.no_grad()
+def weighted_sums(
+    camera: Camera | MiniCam,
+    gaussians: GaussianModel,
+    pipe: argparse.Namespace,
+    background: Tensor,
+    value: Callable[[Tensor], Tensor],
+) -> Tensor:
+    """Sum over the pixels of each Gaussian's blending weight times three values: (N, 3).
+
+    value: takes the image (3, H, W), not clamped, over background (3,), and returns values (3, H, W) float32.
+    """
+    drawn = draw(camera, gaussians, pipe, background)
+    return drawn.color_gradient(value(drawn.image))
+
+
+def blending_weights(gaussians: GaussianModel, cameras: Sequence[Camera | MiniCam], pipe: argparse.Namespace) -> Tensor:
+    """Sum of each Gaussian's blending weights over all pixels of all views: (N,) float64."""
+    black = gaussians.get_xyz.detach().new_zeros(3)
+    sums = torch.zeros(len(gaussians), dtype=torch.float64, device=black.device)
+    for camera in tqdm(cameras, desc="Weighing Gaussians", unit="view", leave=False):
+        sums += weighted_sums(camera, gaussians, pipe, black, torch.ones_like)[:, 0]
+    return sums
+
+
+def most_important(weights: Tensor, count: int) -> Tensor:
+    """(N,) bool: the `count` Gaussians of the largest weights, and of equal ones the first."""
+    order = torch.argsort(weights, descending=True, stable=True)
+    keep = torch.zeros(len(weights), dtype=torch.bool, device=weights.device)
+    keep[order[:count]] = True
+    return keep
+
+
+@torch.no_grad()
+def view_planes(
+    camera: Camera | MiniCam, gaussians: GaussianModel, pipe: argparse.Namespace, scaling: float = 1.0
+) -> dict[str, Tensor]:
+    """`depth` and `alpha` of a view, (1, H, W) float32 each, by the weights w_i of the image's Gaussians.
+
+    depth: inverse depth, the sum of w_i / z_i, per world unit; z_i is the depth of a mean. Where alpha is below 1 it is
+    that much smaller, so divide it by alpha to get that of what is there. alpha: the sum of w_i, in [0, 1].
+    scaling: factor of all scales.
+    """
+    white = gaussians.get_xyz.new_ones(len(gaussians), 3)
+    black = gaussians.get_xyz.new_zeros(3)
+    options = {"override_color": white, "want_depth": True, "want_visibility": False}
+    drawn = render(camera, gaussians, pipe, black, scaling, **options)
+    return {"depth": drawn["depth"], "alpha": drawn["render"][:1]}
+
+
+def blend_depth(
+    camera: Camera | MiniCam, gaussians: GaussianModel, pipe: argparse.Namespace, scaling: float = 1.0
+) -> Tensor:
+    """(H, W) int32: how far down its tile's list a pixel goes, up to the last Gaussian that is blended into it.
+
+    This is the work of the pixel. Gaussians of the tile that miss the pixel count, those behind the last one do not.
+    scaling: factor of all scales.
+    """
+    return draw(camera, gaussians, pipe, gaussians.get_xyz.new_zeros(3), scaling=scaling).blend_depth

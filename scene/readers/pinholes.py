@@ -1,0 +1,91 @@
+"""Views of any lens as pinhole views: their records, what they are checked for, and their undistortion."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from scene.images.decode import picture_size
+from scene.images.lens import Lens, pinhole_of, undistortion
+from scene.images.masks import Mask
+from scene.readers.info import CameraInfo
+from scene.readers.undistortion import undistort
+from utils.system_utils import UserError
+
+FARTHEST = 1e12  # from the origin, beyond which lie damaged files; there a double has steps of 1e-4
+
+
+def camera_info(
+    uid: int,
+    name: str,
+    path: Path,
+    lens: Lens,
+    R: np.ndarray,
+    T: np.ndarray,
+    mask: Mask | None = None,
+    ignore_alpha: bool = False,
+) -> CameraInfo:
+    """The view of a photo with any lens. The photo is only read if its lens distorts.
+
+    UserError names a view that cannot be used: its lens, its pose, or the photo.
+    """
+    pinhole = straight = pinhole_of(lens, name)
+    if straight is None:
+        pinhole = undistortion(lens, *picture_size(path)).pinhole
+    camera = CameraInfo(
+        uid=uid,
+        R=R,
+        T=T,
+        **pinhole._asdict(),
+        image_path=path,
+        image_name=name,
+        lens=lens if straight is None else None,
+        mask=mask,
+        ignore_alpha=ignore_alpha,
+    )
+    if max(np.abs(camera.T).max(), np.abs(camera.center).max()) > FARTHEST:
+        raise UserError(
+            f"the camera of {name} is more than {FARTHEST:g} from the origin; take the photo out of the scene, or "
+            "move the scene to its origin"
+        )
+    return camera
+
+
+def finished(cameras: Sequence[CameraInfo]) -> list[CameraInfo]:
+    """The views with the sizes of their photos, all of them pinholes: photos of other lenses are undistorted.
+
+    A message says which photos have another shape than their camera. UserError for a photo or mask that cannot be used.
+    """
+    cameras = [replace(camera, file_size=picture_size(camera.image_path)) for camera in cameras]
+    _warn_of_other_shapes(cameras)
+    for camera in cameras:
+        if camera.mask is not None:
+            _check_mask(camera.mask.path, camera.file_size)
+    distorted = [index for index, camera in enumerate(cameras) if camera.lens]
+    for index, camera in zip(distorted, undistort([cameras[index] for index in distorted]), strict=True):
+        cameras[index] = camera
+    return cameras
+
+
+def _check_mask(mask: Path, size: tuple[int, int]) -> None:
+    mask_size = picture_size(mask)
+    if abs(size[0] * mask_size[1] / mask_size[0] - size[1]) > 1:
+        raise UserError(
+            f"the mask {mask} is {mask_size[0]} x {mask_size[1]} pixels and its photo {size[0]} x {size[1]}; "
+            "make masks of the same shape as the photos"
+        )
+
+
+def _warn_of_other_shapes(cameras: Sequence[CameraInfo]) -> None:
+    shapes = [(camera, camera.file_size, camera.lens or camera) for camera in cameras]
+    others = [
+        (camera.image_name, f"{size[0]} x {size[1]}, camera {shape.width} x {shape.height}")
+        for camera, size, shape in shapes
+        if abs(size[0] * shape.height / shape.width - size[1]) > 1
+    ]
+    if others:
+        (name, sizes), count = others[0], f"{len(others)} of {len(cameras)} photos"
+        fault = "do not have the aspect ratio of their camera and will be stretched"
+        print(f"{count} {fault}; the first is {name} ({sizes})", file=sys.stderr)

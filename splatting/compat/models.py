@@ -1,0 +1,51 @@
+"""The part of a model that a scene needs: of ours, or of the reference's class of that name."""
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+from scene.readers.info import CameraInfo
+from utils.graphics_utils import BasicPointCloud
+from utils.system_utils import atomic_write
+
+
+class SceneGaussians(Protocol):
+    """The part of GaussianModel that a scene needs, or the reference's class of that name.
+
+    A scene sets `world_offset`, and calls `load_exposures(folder, cam_infos)` and `save_exposures(folder)` with
+    train_test_exp if there are such methods. Else it calls `load_ply(path, True)`, and writes exposure.json from
+    `exposure_mapping` and `get_exposure_from_name(name)`, as the reference does.
+    """
+
+    def create_from_pcd(
+        self, pcd: BasicPointCloud, cam_infos: Sequence[CameraInfo], spatial_lr_scale: float
+    ) -> None: ...
+
+    def load_ply(self, path: str) -> None: ...
+
+    def save_ply(self, path: str) -> None: ...
+
+
+def load_model(
+    gaussians: SceneGaussians, folder: str | os.PathLike, ply: Path, exposed: Sequence[CameraInfo] | None
+) -> None:
+    """Load a PLY of a model folder. exposed: the views whose exposures are loaded, too; None: none are."""
+    load_exposures = getattr(gaussians, "load_exposures", None)
+    if exposed is not None and load_exposures is None:
+        gaussians.load_ply(str(ply), True)
+        return
+    gaussians.load_ply(str(ply))
+    if exposed is not None:
+        load_exposures(folder, exposed)
+
+
+def save_exposures(gaussians: SceneGaussians, folder: str | os.PathLike) -> None:
+    """Write exposure.json into a model folder, also for a model that cannot do so itself."""
+    if save := getattr(gaussians, "save_exposures", None):
+        save(folder)
+    elif names := list(getattr(gaussians, "exposure_mapping", ())):
+        table = {name: gaussians.get_exposure_from_name(name).tolist() for name in names}
+        with atomic_write(Path(folder) / "exposure.json") as path:
+            path.write_text(json.dumps(table, indent=2), encoding="utf-8")

@@ -1,0 +1,91 @@
+"""Views of a model that is divided among ranks, for the renderer, which need not ask how many there are."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+from diff_gaussian_rasterization import rasterize
+from diff_gaussian_rasterization.ops import Rasterized, gradients_of
+from diff_gaussian_rasterization.scene import GRADIENTS, Scene
+from torch import Tensor
+
+from scene.cameras import Camera, MiniCam
+from scene.fused_adam import FusedAdam
+from splatting.distributed.rendering.band import (
+    View,
+    decisive_in,
+    draw_view,
+    gradient_rows,
+    surroundings,
+    whole_image,
+)
+from splatting.distributed.rendering.bands import KnownBands as KnownBands
+from splatting.distributed.rendering.models import ranks_of
+from splatting.distributed.rendering.rasterize import rasterize_over
+
+_ONLY_COLORS = [name == "colors" for name in GRADIENTS]
+
+
+def gradient_of_colors(scene: Scene, source: Sequence[Tensor], planes: Sequence[Tensor | None]) -> Tensor:
+    """Gradient (N, 3) of the Gaussians' colours, whether these were given or came from SH bands (`gradients_of`)."""
+    given = scene._replace(colors=scene.means, sh_dc=None, sh_rest=None)  # any colours, as the image is linear in them
+    return gradients_of(given, source, planes, _ONLY_COLORS)[_ONLY_COLORS.index(True)]
+
+
+def rasterizer_of(model: Any) -> Callable[..., Rasterized]:
+    """`rasterize`, or that of the ranks among which a model is divided."""
+    return partial(rasterize_over, ranks) if (ranks := ranks_of(model)).several else rasterize
+
+
+def draw_divided(
+    model: Any,
+    scene: Scene,
+    background: Tensor,
+    want_depth: bool,
+    by_bands: bool,
+    bands: KnownBands | None,
+    camera: Camera | MiniCam,
+) -> "DividedDrawn | None":
+    """`draw` of the renderer for a divided model, of which each rank gives its own part; None for a whole one."""
+    if not (ranks := ranks_of(model)).several:
+        return None
+    find = bands and partial(bands.find, camera.uid)
+    view = draw_view(ranks, scene, background, want_depth, train=True, find=find)
+    if bands:
+        bands.drawn(camera.uid, view.last)
+    return DividedDrawn(surroundings(view) if by_bands else whole_image(view), scene, want_depth, by_bands)
+
+
+class DividedDrawn:
+    """`Drawn` of the renderer. band: None where every rank has the whole image, or where else it is right.
+
+    The image's gradient needs no more rows than the image has.
+    """
+
+    def __init__(self, view: View, scene: Scene, want_depth: bool, by_bands: bool) -> None:
+        self.image, self.depth, self.radii = view.color, view.inverse_depth if want_depth else None, view.radii
+        self.band = view.band if by_bands else None
+        self._view, self._scene = view, scene
+
+    def decisive(self) -> Tensor:
+        return decisive_in(self._view)
+
+    def color_gradient(self, image_gradient: Tensor) -> Tensor:
+        return gradient_of_colors(self._scene, self._source((image_gradient, None, None), absolute=False), ())
+
+    def step(
+        self,
+        adam: FusedAdam,
+        image_gradient: Tensor,
+        depth_gradient: Tensor | None,
+        observe: bool,
+        absolute: bool = False,
+        now: None = None,
+    ) -> None:
+        absolute &= observe
+        source = self._source((image_gradient, None, depth_gradient), absolute)
+        adam.apply(self._scene, source, (), self.radii, observe, absolute, now)
+
+    def _source(self, planes: tuple[Tensor | None, ...], absolute: bool) -> tuple[Tensor, ...]:
+        view = self._view
+        return view.splats, view.tile_counts, *gradient_rows(view, planes, absolute)

@@ -1,0 +1,403 @@
+"""Runs beside each other: spread over seeds, means of data sets, option sets of a scene, published tables.
+
+Everything is made of the `runs` of report.json, and becomes a part of it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import statistics
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from splatting.evaluation.error_curve import Row, whole_sets
+from splatting.evaluation.plan import DATASETS
+from splatting.files.json_files import read_json
+
+SCORES = ("PSNR", "SSIM", "LPIPS")
+QUANTITIES = (
+    *(*SCORES, "seconds", "process_seconds", "cpu_seconds", "gaussians", "gaussians_saved", "peak_memory_mib"),
+    *("render_ms", "fps", "ply_mb"),
+)
+COMPARED = (*SCORES, "gaussians")  # with published numbers
+DEFAULT = ("adc", "default", "defaults", "base")  # names of the set that others are compared with, the first there is
+COSTS = ("seconds", "gaussians", "ply_mb")
+DIGITS = 1e6  # of a PSNR in a curve
+STEPS = (0, 1, 2, 4, 8)  # below the highest level, times the step
+DROPS = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0)  # dB below the best; dense where the last tenths get expensive
+WIDEST_STEP = 2.0  # largest ratio of the seconds of two points to interpolate between; a wider gap tells too little
+DECIDING = {  # options of train.py that decide what test views show, and which of their pixels count
+    *("--resolution", "-r", "--images", "-i", "--white_background", "-w", "--train_test_exp"),
+    *("--masks", "--invert_masks", "--mask_meaning"),
+}
+
+Run = Mapping[str, Any]
+Sets = Mapping[str, Sequence[Run]]  # option set -> its runs, one for each seed
+Ends = Mapping[str, Any]  # spreads of PSNR and COSTS
+
+
+def spread(values: Iterable[float | None]) -> dict[str, Any]:
+    """Return the mean, the sample standard deviation (with n - 1; None for one value) and the values.
+
+    The mean is None if any value is: a mean over fewer seeds could not be compared.
+    """
+    numbers = list(values)
+    known = bool(numbers) and None not in numbers
+    return {
+        "mean": statistics.fmean(numbers) if known else None,
+        "std": statistics.stdev(numbers) if known and len(numbers) > 1 else None,
+        "values": numbers,
+    }
+
+
+def grouped(items: Iterable[dict[str, Any]], *names: str) -> dict[Any, list[dict[str, Any]]]:
+    """Group items by their value of a name, or values of several names, in the order of first occurrence."""
+    groups: dict[Any, list[dict[str, Any]]] = {}
+    for item in items:
+        key = tuple(item[name] for name in names) if len(names) > 1 else item[names[0]]
+        groups.setdefault(key, []).append(item)
+    return groups
+
+
+def summarise(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the spread of QUANTITIES over the seeds, for each scene, option set and scored iteration.
+
+    Rows are in the order of `runs`. Seeds whose run failed are left out and listed as `failed_seeds`. Where the seeds
+    were scored on different ground truth, scores have no mean. apart: see `stand_apart`. iteration: the
+    mean of `iterations`, which are several where each seed ended by itself (`open_ended`).
+    """
+    rows = []
+    for (scene, config), members in grouped(runs, "scene", "config").items():
+        for at in _moments([run for run in members if not run["failure"]]):
+            there = [run for run, _ in at]
+            row = {name: spread(run["iterations"][str(t)][name] for run, t in at) for name in QUANTITIES}
+            iterations = sorted({t for _, t in at})
+            one = len({run["ground_truth_sha256"] for run in there}) == 1
+            if not one:
+                row |= {name: row[name] | {"mean": None, "std": None} for name in SCORES}
+            row |= {
+                "apart": any(run["apart"] for run in there),
+                "config": config,
+                "failed_seeds": [run["seed"] for run in members if run["failure"]],
+                "group": members[0]["group"],
+                "iteration": round(statistics.fmean(t for _, t in at)),
+                "iterations": iterations,
+                "open_ended": any(run["open_ended"] for run in there),
+                "one_ground_truth": one,
+                "scene": scene,
+                "seeds": [run["seed"] for run in there],
+                "why_apart": next((run["why_apart"] for run in there if run["apart"]), None),
+            }
+            rows.append(row)
+    return rows
+
+
+def _moments(runs: Sequence[dict[str, Any]]) -> list[list[tuple[dict[str, Any], int]]]:
+    """Return what the rows of an option set are about: in each, runs with a scored iteration.
+
+    It is the same iteration of all, and the last one of runs that ended by themselves.
+    """
+    fixed = [run for run in runs if not run["open_ended"]]
+    scored = {int(n) for run in fixed for n, values in run["iterations"].items() if values["views"]}
+    rows = [[(run, n) for run in fixed if run["iterations"].get(str(n), {}).get("views")] for n in sorted(scored)]
+    ended = [(run, run["final_iteration"]) for run in runs if run["open_ended"] and run["finished"]]
+    return [*rows, *([ended] if ended else [])]
+
+
+def dataset_means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return means over the scenes of a data set, for each option set and iteration that all its scenes have.
+
+    iteration: null where the trainings ended by themselves.
+    """
+    rows = [row | {"iteration": None} if row["open_ended"] else row for row in rows if row["group"] in DATASETS]
+    means = []
+    for (group, config, iteration), members in grouped(rows, "group", "config", "iteration").items():
+        if {row["scene"] for row in members} == DATASETS[group].keys():
+            mean = {name: spread(row[name]["mean"] for row in members)["mean"] for name in QUANTITIES}
+            means.append({**mean, "config": config, "group": group, "iteration": iteration})
+    return means
+
+
+def stand_apart(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the runs with `apart`, whether rankings and fronts of the scene must leave the run out, and `why_apart`.
+
+    Where a scene was scored on several ground truths, the one of most runs counts, the first of equals. An option set
+    stands apart if any of its runs has another one, or none that is known.
+    """
+    scenes, sets, marked = grouped(runs, "scene"), grouped(runs, "scene", "config"), []
+    for run in runs:
+        known = Counter(filter(None, (other["ground_truth_sha256"] for other in scenes[run["scene"]])))
+        seeds = {other["ground_truth_sha256"] for other in sets[run["scene"], run["config"]]}
+        marked.append({**run, "apart": len(known) > 1 and seeds != {max(known, key=known.__getitem__)}})
+    return [{**run, "why_apart": _why(run, marked) if run["apart"] else None} for run in marked]
+
+
+def _why(run: Run, runs: Sequence[Run]) -> str:
+    """Return in what a run's test views differ from those of the comparable runs of its scene, as far as is known."""
+    if run["ground_truth_sha256"] is None:
+        return "its ground truth is not known"
+    members = [other for other in runs if other["scene"] == run["scene"]]
+    if len({other["ground_truth_sha256"] for other in members if other["config"] == run["config"]}) > 1:
+        return "its seeds were scored on different ground truth"
+    pair = run, next(other for other in members if not other["apart"])
+    (size, other_size), (count, other_count), (words, other_words) = (
+        (" ".join(f"{w}x{h}" for w, h in one["test_sizes"]) for one in pair),
+        (one["views"]["test"] for one in pair),
+        (" ".join(filter(_decides, with_values(one["options"] or ()))) or "the defaults" for one in pair),
+    )
+    reasons = [f"its test views have {size} pixels, the others' {other_size}"] if size != other_size else []
+    reasons += [f"it has {count} test views, the others {other_count}"] if count != other_count else []
+    reasons = reasons or ["the pixels of its test views differ, or which of them count"]
+    return "; ".join(reasons + ([f"{words} instead of {other_words}"] if words != other_words else []))
+
+
+def with_values(words: Sequence[str]) -> list[str]:
+    """Return each option of a command line with its values, as one text."""
+    return re.split(r" (?=--?[a-zA-Z])", " ".join(words))
+
+
+def _decides(option: str) -> bool:
+    return re.split("[ =]", option)[0] in DECIDING
+
+
+def comparable_sets(runs: Sequence[Run], scene: str) -> dict[str, list[Run]]:
+    """Return the finished runs of a scene by option set, without sets that stand apart; none if there is but one."""
+    known = (run for run in runs if run["config"] and run["finished"] and not run["apart"])
+    sets = grouped((run for run in known if run["scene"] == scene), "config")
+    return sets if len(sets) > 1 else {}
+
+
+def default_set(sets: Sets) -> str:
+    """Return the name of the set that others are compared with: the first of DEFAULT, else the first set."""
+    return next((name for name in DEFAULT if name in sets), next(iter(sets)))
+
+
+def _scored(run: Run) -> list[Row]:
+    """Return the points of a run's curve that score all test views."""
+    return [row for row in whole_sets(run["curve"]) if row["test_psnr"] is not None]
+
+
+def seconds_to_reach(curve: Sequence[Row], level: float) -> float | None:
+    """Return the seconds of training until the test PSNR first reaches `level` (dB); None if it never does.
+
+    curve: of scored rows. Between two, PSNR is taken as linear in the logarithm of the seconds. If the seconds more
+    than double between them, and for the first one, the time of the iteration that reaches `level` counts instead.
+    """
+    index = next((i for i, row in enumerate(curve) if row["test_psnr"] >= level), None)
+    if index is None:
+        return None
+    row, before = curve[index], curve[index - 1] if index else None
+    if before is None or before["seconds"] <= 0 or row["seconds"] > WIDEST_STEP * before["seconds"]:
+        return row["seconds"]
+    part = (level - before["test_psnr"]) / (row["test_psnr"] - before["test_psnr"])
+    return math.exp((1 - part) * math.log(before["seconds"]) + part * math.log(row["seconds"]))
+
+
+def round_levels(finals: Sequence[float]) -> list[float]:
+    """Return a few round PSNRs (dB, descending) around the final ones of several sets.
+
+    The first is the best final one, rounded down; the others lie below it, denser near it, down to the first that all
+    sets end above. The step is 0.1, 0.5 or 1 dB, as the final ones differ by less than 0.5, less than 5, or more.
+    """
+    low, high = min(finals), max(finals)
+    parts = 10 if high - low < 0.5 else 2 if high - low < 5 else 1  # of a dB
+    levels = [(math.floor(high * parts) - step) / parts for step in STEPS]
+    return levels[: sum(level > low for level in levels) + 1]
+
+
+def reached(sets: Sets) -> dict[str, Any] | None:
+    """Return the table of a scene's sets; None if fewer than two have a curve to their end.
+
+    default: the set that others are compared with. levels: `psnr`, and `of_default`: it is the mean final PSNR of that
+    set. sets: by name `final` (spread of PSNR) and `cells`, one for each level (`_cell`), with `ratio`: its mean
+    seconds as a part of the default's.
+    """
+    ends = {name: [rows[-1]["test_psnr"] if (rows := _scored(run)) else None for run in runs]
+            for name, runs in sets.items()}  # fmt: skip
+    finals = {name: spread(values) for name, values in ends.items() if None not in values}
+    if len(finals) < 2:
+        return None
+    default = default_set(finals)
+    own = math.floor(finals[default]["mean"] * DIGITS) / DIGITS  # a mean of equal numbers may exceed them by a bit
+    round_ones = [level for level in round_levels([x["mean"] for x in finals.values()]) if abs(level - own) >= 0.005]
+    levels = [{"psnr": level, "of_default": level == own} for level in sorted([*round_ones, own], reverse=True)]
+    table = {
+        name: {"final": final, "cells": [_cell(sets[name], **level, is_default=name == default) for level in levels]}
+        for name, final in finals.items()
+    }
+    for entry in table.values():
+        for cell, theirs in zip(entry["cells"], table[default]["cells"], strict=True):
+            both = cell["seconds"]["mean"], theirs["seconds"]["mean"]
+            cell["ratio"] = None if both[0] is None or not both[1] else both[0] / both[1]
+    return {"default": default, "levels": levels, "sets": table}
+
+
+def _cell(runs: Sequence[Run], psnr: float, of_default: bool, is_default: bool) -> dict[str, Any]:
+    """Return what the seeds of a set take to reach a level: spreads of seconds, Gaussians and megabytes.
+
+    Seeds that do not reach it have null, and so has the mean then. reached: the number of seeds that do; at_least:
+    whether seconds are a lower bound. That is so only for the default's own final PSNR: a seed of it that ends below
+    the mean counts with all its seconds, which is too few, so that no ratio flatters the others. A PLY is taken to have
+    as many bytes for each Gaussian as the run's last one.
+    """
+    curves = [_scored(run) for run in runs]
+    rows = [next((row for row in curve if row["test_psnr"] >= psnr), None) for curve in curves]
+    at_least = of_default and is_default and None in rows
+    seconds, counts, megabytes = [], [], []
+    for run, curve, row in zip(runs, curves, rows, strict=True):
+        last = run["iterations"][str(run["final_iteration"])]
+        of_end = at_least and row is None
+        count = (curve[-1] if of_end else row or {}).get("gaussians")
+        seconds.append(curve[-1]["seconds"] if of_end else seconds_to_reach(curve, psnr))
+        counts.append(count)
+        known = count is not None and last["gaussians_saved"]
+        megabytes.append(count * last["ply_mb"] / last["gaussians_saved"] if known else None)
+    return {
+        "at_least": at_least,
+        "gaussians": spread(counts),
+        "mb": spread(megabytes),
+        "reached": sum(row is not None for row in rows),
+        "seconds": spread(seconds),
+    }
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Return the indices of the points (cost, error) that no other beats in both, by ascending cost.
+
+    Of equal points it keeps the first.
+    """
+    front: list[int] = []
+    for index in sorted(range(len(points)), key=lambda i: (*points[i], i)):
+        if not front or points[index][1] < points[front[-1]][1]:
+            front.append(index)
+    return front
+
+
+def fronts(sets: Sets) -> dict[str, Any] | None:
+    """Return where each set ended, and which sets no other one beats; None if fewer than two sets have scores.
+
+    sets: by name the spreads over the seeds of PSNR (dB, of metrics.py), seconds of training, Gaussians trained and
+    ply_mb, at the last iteration. beaten: for each cost and set, None if it is on the front, else `by` and `clearly` of
+    `_beaten_by`.
+    """
+    points: dict[str, Ends] = {}
+    for name, runs in sets.items():
+        ends = [run["iterations"][str(run["final_iteration"])] for run in runs]
+        point = {key: spread(end[key] for end in ends) for key in ("PSNR", *COSTS)}
+        if all(numbers["mean"] is not None for numbers in point.values()):
+            points[name] = point
+    if len(points) < 2:
+        return None
+    beaten = {cost: {name: _beaten_by(points, name, cost) for name in points} for cost in COSTS}
+    return {"beaten": beaten, "sets": points}
+
+
+def _beaten_by(points: Mapping[str, Ends], name: str, cost: str) -> dict[str, Any] | None:
+    """Return the set that beats one, by the means: no worse in PSNR and cost, and better in one of them. None: none.
+
+    by: of several, the one with the highest PSNR. clearly: whether one of them is better in PSNR or cost by more than
+    the root of the sum of both squared standard deviations; null where one of these is not known, as with one seed.
+    """
+    rivals, clear = [], []
+    for other, theirs in points.items():
+        gains = [sign * (theirs[key]["mean"] - points[name][key]["mean"]) for key, sign in (("PSNR", 1), (cost, -1))]
+        if min(gains) < 0 or max(gains) <= 0:
+            continue
+        rivals.append(other)
+        pairs = [(theirs[key]["std"], points[name][key]["std"]) for key in ("PSNR", cost)]
+        unknown = any(None in pair for pair in pairs)
+        clear.append(None if unknown else any(g > math.hypot(*pair) for g, pair in zip(gains, pairs, strict=True)))
+    if not rivals:
+        return None
+    best = max(rivals, key=lambda other: (points[other]["PSNR"]["mean"], -points[other][cost]["mean"]))
+    return {"by": best, "clearly": True if True in clear else None if None in clear else False}
+
+
+def gaussians_to_reach(curve: Sequence[Row], level: float) -> float | None:
+    """Return the least number of Gaussians of a scored iteration that reaches `level` (dB); None if none does."""
+    counts = [row["gaussians"] for row in curve if row["test_psnr"] >= level]
+    return min((count for count in counts if count is not None), default=None)
+
+
+def cheapest(sets: Sets) -> list[dict[str, Any]]:
+    """Return, for each of a few PSNRs, the set that reaches it in the fewest seconds, and that with fewest Gaussians.
+
+    With several seeds, all must reach the level, and their mean counts; std is their sample standard deviation. The
+    first level is the best that all seeds of some option set reach, rounded down to a tenth. The others are DROPS below
+    it, down to the lowest PSNR at which a curve starts.
+    """
+    curves = {name: [_scored(run) for run in runs] for name, runs in sets.items()}
+    scored = [[[row["test_psnr"] for row in curve] for curve in seeds] for seeds in curves.values()]
+    top = max((min(max(psnrs, default=-math.inf) for psnrs in seeds) for seeds in scored), default=-math.inf)
+    if not math.isfinite(top):
+        return []
+    lowest, tenths = min(psnrs[0] for seeds in scored for psnrs in seeds if psnrs), math.floor(top * 10)
+    rows = []
+    for level in ((tenths - round(10 * drop)) / 10 for drop in DROPS):
+        if level <= lowest:
+            break
+        row: dict[str, Any] = {"psnr": level}
+        for name, measure in (("seconds", seconds_to_reach), ("gaussians", gaussians_to_reach)):
+            spreads = {config: spread(measure(curve, level) for curve in seeds) for config, seeds in curves.items()}
+            costs = {config: found["mean"] for config, found in spreads.items() if found["mean"] is not None}
+            best = min(costs, key=costs.__getitem__, default=None)
+            std = spreads[best]["std"] if best else None
+            row[name] = {"all": costs, "config": best, "std": std, "value": costs.get(best)}
+        rows.append(row)
+    return rows
+
+
+def published_tables() -> list[dict[str, Any]]:
+    """Read the published tables.
+
+    A table has name, source, hardware and note. `groups` and `requires` tell which runs can be compared with it.
+    `scenes` and `means` (of a group) have numbers by iteration. LPIPS: VGG on [0, 1]; seconds: on that hardware.
+    """
+    return read_json(Path(__file__).parent / "published.json")["tables"]
+
+
+def compare(
+    runs: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]], means: Sequence[dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Compare our numbers with each published one of the same scene (or mean of a data set) and iteration.
+
+    runs, rows, means: those of report.json (`runs`, `summary`, `dataset_means`). In the result, `other_options` has the
+    options of our training that the table's did not have (null: not known); they may explain a difference.
+    """
+    compared = []
+    for table in published_tables():
+        for row in rows:
+            run = next(run for run in runs if (run["scene"], run["config"]) == (row["scene"], row["config"]))
+            theirs = table["scenes"].get(row["scene"], {}).get(str(None if row["open_ended"] else row["iteration"]))
+            if theirs and row["group"] in table["groups"] and _meets(run, table.get("requires", {})):
+                ours = {name: row[name]["mean"] for name in COMPARED}
+                compared.append(_comparison(table, row | ours, row["scene"], theirs, run))
+        for mean in means:
+            theirs = table["means"].get(mean["group"], {}).get(str(mean["iteration"]))
+            if theirs:
+                run = next(run for run in runs if (run["group"], run["config"]) == (mean["group"], mean["config"]))
+                compared.append(_comparison(table, mean, f"mean of {mean['group']}", theirs, run))
+    return compared
+
+
+def _meets(run: dict[str, Any], wanted: dict[str, Any]) -> bool:
+    return (
+        run["test_sizes"] == wanted.get("test_sizes", run["test_sizes"])
+        and run["views"]["test"] == wanted.get("test_views", run["views"]["test"])
+        and set(wanted.get("options", ())) <= set(run["options"] or ())
+    )
+
+
+def _comparison(
+    table: dict[str, Any], ours: dict[str, Any], scene: str, theirs: dict[str, float], run: dict[str, Any]
+) -> dict[str, Any]:
+    numbers = {
+        name: {"difference": ours[name] - theirs[name], "ours": ours[name], "published": theirs[name]}
+        for name in COMPARED
+        if name in theirs and ours[name] is not None
+    }
+    facts = {"config": ours["config"], "iteration": ours["iteration"], "other_options": run["added_options"]}
+    return facts | {"numbers": numbers, "scene": scene, "table": table["name"]}

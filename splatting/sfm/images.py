@@ -1,0 +1,244 @@
+"""Photos for COLMAP: upright, in a readable format, with their masks; and frames of a video as photos."""
+
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageOps
+from tqdm import tqdm
+
+from scene.images.decode import picture_size
+from splatting.files.image_files import UNREADABLE, open_image
+from splatting.host.machine import threads
+from splatting.sfm.layout import Layout, image_names
+from utils.system_utils import UserError
+
+JPEG_QUALITY = 95
+PATTERN = "frame_[0-9][0-9][0-9][0-9][0-9].jpg"  # of a video's frames
+_STEP = 4  # sharpness is computed on every 4th row and column
+_ORIENTATION = 0x0112  # EXIF tag; 1 or absent: upright
+_LYING = (5, 6, 7, 8)  # values of the tag that exchange width and height
+_MOST_NAMED = 20
+
+
+def prepare_images(layout: Layout, names: Sequence[str], masks: Path | None) -> None:
+    """Fill `layout.prepared`, and `layout.masks` if a folder of masks is given.
+
+    A photo is linked, or copied if links are impossible. A photo that its EXIF orientation turns, or whose format
+    COLMAP cannot read, is rewritten, with upright pixels and the other EXIF data kept. Masks: see `_prepare_mask`.
+    `check_images` must have passed before; UserError for files whose pixels turn out to be broken.
+    """
+    with_mask = find_masks(names, masks) if masks else {}
+
+    def prepare(name: str) -> None:
+        prepared = _prepare_image(layout.input / name, layout.prepared / name)
+        if masks:
+            mask = layout.masks / prepared.relative_to(layout.prepared)
+            _prepare_mask(with_mask.get(name), mask.with_name(f"{mask.name}.png"), prepared)
+
+    _in_threads(prepare, names, "Preparing photos")
+
+
+def check_images(layout: Layout, names: Sequence[str], masks: Path | None) -> None:
+    """Raise a UserError that names every photo and mask that is broken or does not fit; decode no intact one."""
+    with_mask = find_masks(names, masks) if masks else {}
+
+    def check(name: str) -> None:
+        size = _upright_size(layout.input / name)
+        if name in with_mask:
+            _check_mask(with_mask[name], name, size)
+
+    _in_threads(check, names, "Checking photos")
+
+
+def find_masks(names: Sequence[str], folder: Path) -> dict[str, Path]:
+    """Return the masks by name of photo. A mask is called `<name>.png` as in COLMAP, `<name>`, or has the suffix .png.
+
+    UserError if no photo has a mask.
+    """
+    found = {}
+    for name in names:
+        candidates = (folder / f"{name}.png", folder / name, (folder / name).with_suffix(".png"))
+        mask = next((path for path in candidates if path.is_file()), None)
+        if mask:
+            found[name] = mask
+    if not found:
+        raise UserError(
+            f"none of {len(names)} photos has a mask in {folder}; looked for names like {names[0]}.png and "
+            f"{Path(names[0]).with_suffix('.png')}"
+        )
+    return found
+
+
+def sizes(layout: Layout) -> dict[tuple[int, int], list[str]]:
+    """Return the names of the prepared photos by size (width, height), in order."""
+    groups: dict[tuple[int, int], list[str]] = {}
+    for name in image_names(layout.prepared):
+        groups.setdefault(picture_size(layout.prepared / name), []).append(name)
+    return groups
+
+
+def resize_images(layout: Layout, factor: int) -> None:
+    """Fill `images_<factor>` from `images` by Pillow's bicubic filter; sides are divided by the factor and rounded."""
+
+    def resize(name: str) -> None:
+        with open_image(layout.images / name) as image:
+            size = tuple(max(1, round(side / factor)) for side in image.size)
+            _save(image.resize(size, Image.Resampling.BICUBIC), layout.resized(factor) / name, image)
+
+    _in_threads(resize, image_names(layout.images), f"Resizing to 1/{factor}")
+
+
+def _prepare_image(source: Path, target: Path) -> Path:
+    """Write the prepared photo and return its path: `target`, with .png appended if the format had to change."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with open_image(source) as image:
+            webp = image.format == "WEBP"
+            if image.getexif().get(_ORIENTATION, 1) in (0, 1) and not webp:
+                _link(source, target)
+                return target
+            upright = ImageOps.exif_transpose(image)
+            target = target.with_name(f"{target.name}.png") if webp else target
+            _save(upright, target, image, exif=upright.getexif())
+            return target
+    except UNREADABLE as error:
+        raise UserError(f"cannot turn the photo {source} upright ({error}); replace or remove it") from error
+
+
+def _upright_size(photo: Path) -> tuple[int, int]:
+    width, height = picture_size(photo)  # UserError for a truncated file or one of another kind
+    try:
+        with open_image(photo) as image:
+            lies = image.getexif().get(_ORIENTATION, 1) in _LYING
+    except UNREADABLE as error:
+        raise UserError(f"cannot read the EXIF data of {photo} ({error}); replace or remove the photo") from error
+    return (height, width) if lies else (width, height)
+
+
+def _check_mask(mask: Path, name: str, size: tuple[int, int]) -> None:
+    found = picture_size(mask)
+    if found != size:
+        raise UserError(
+            f"the mask {mask} has {found[0]} x {found[1]} pixels, but its photo {name} has {size[0]} x {size[1]} when "
+            "it is upright; make masks from the photos as they are displayed"
+        )
+
+
+def _prepare_mask(source: Path | None, target: Path, photo: Path) -> None:
+    """Write a mask as 8-bit grey PNG, in which black (0) is masked.
+
+    Without a source, write a white mask: COLMAP skips photos without a mask if others have one.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if source is None:
+        Image.new("L", picture_size(photo), 255).save(target)
+        return
+    try:
+        with open_image(source) as image:
+            mask = image.convert("L")
+    except UNREADABLE as error:
+        raise UserError(f"cannot read the mask {source} ({error}); replace or remove it") from error
+    mask.save(target)
+
+
+def _save(image: Image.Image, target: Path, like: Image.Image, **options: object) -> None:
+    """Save in the format and with the colour profile of the photo `like` that the image was made from."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if profile := like.info.get("icc_profile"):
+        options["icc_profile"] = profile
+    if like.format in ("JPEG", "MPO"):
+        image.save(target, "JPEG", quality=JPEG_QUALITY, subsampling=0, **options)
+    else:
+        image.save(target, "PNG" if like.format == "WEBP" else like.format, **options)
+
+
+def _link(source: Path, target: Path) -> None:
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+
+
+def _in_threads(work: Callable[[str], None], names: Sequence[str], title: str) -> None:
+    """Do the work for all names. If it raises UserError for any, raise one UserError that lists them."""
+
+    def attempt(name: str) -> UserError | None:
+        try:
+            work(name)
+        except UserError as error:
+            return error
+        return None
+
+    with ThreadPoolExecutor(threads()) as pool:
+        try:
+            attempts = tqdm(pool.map(attempt, names), total=len(names), desc=title, dynamic_ncols=True)
+            faults = [fault for fault in attempts if fault]
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    if len(faults) == 1:
+        raise faults[0]
+    if faults:
+        # List what is wrong with each, without the remedy, which is the same for all.
+        listed = "; ".join(str(fault).partition("; ")[0] for fault in faults[:_MOST_NAMED])
+        more = f"; and {len(faults) - _MOST_NAMED} more" if len(faults) > _MOST_NAMED else ""
+        raise UserError(f"{len(faults)} of {len(names)} photos cannot be used: {listed}{more}; replace or remove them")
+
+
+def extract_frames(video: Path, folder: Path, count: int) -> None:
+    """Write at most `count` upright frames into `folder` as frame_00001.jpg, ...; UserError if that fails.
+
+    Reads every frame, and keeps the one in each of `count` equal spans of time whose neighbouring pixels differ most,
+    since parts of hand-held videos are blurred.
+    """
+    decoder = find_decoder()
+    try:
+        total, _ = decoder.count_frames_and_secs(str(video))
+        total = max(total, 1)
+        spans = min(count, total)
+        frames = enumerate(tqdm(_frames(decoder, video), total=total, desc="Reading video", unit="frame"))
+        by_span = groupby(frames, lambda entry: min(entry[0] * spans // total, spans - 1))
+        for number, (_, entries) in enumerate(by_span, 1):
+            sharpest = max((frame for _, frame in entries), key=sharpness)
+            path = folder / f"frame_{number:05d}.jpg"
+            Image.fromarray(sharpest).save(path, quality=JPEG_QUALITY, subsampling=0)
+    except (OSError, RuntimeError) as error:
+        reason = str(error).strip().splitlines()
+        raise UserError(
+            f"cannot read the video {video} ({reason[-1] if reason else type(error).__name__}); pass another file as "
+            f"--video, or put frames of it as JPEG into {folder}"
+        ) from error
+
+
+def sharpness(frame: np.ndarray) -> float:
+    """Return the mean squared difference of neighbouring green values along both axes of a frame (H, W, 3) uint8."""
+    rows, columns = frame[::_STEP, :, 1].astype(np.int16), frame[:, ::_STEP, 1].astype(np.int16)
+    return sum(
+        float(np.mean(np.square(np.diff(lines, axis=axis), dtype=np.float64)))
+        for axis, lines in ((1, rows), (0, columns))
+    )
+
+
+def _frames(decoder: Any, video: Path) -> Iterator[np.ndarray]:
+    frames = decoder.read_frames(str(video))
+    width, height = next(frames)["size"]
+    for data in frames:
+        yield np.frombuffer(data, np.uint8).reshape(height, width, 3)
+
+
+def find_decoder() -> Any:
+    """Return the package that reads videos. UserError if it is not installed."""
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise UserError(
+            "--video needs the package imageio-ffmpeg; `pip install imageio-ffmpeg`, or put frames of the video into "
+            "the folder input yourself"
+        ) from error
+    return imageio_ffmpeg

@@ -1,0 +1,82 @@
+"""One iteration of training, as the loop, the losses, density control and the observers know it, and its view."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from scene.cameras import Camera
+from splatting.deterministic.counter_rng import Stream, permutation
+from utils.system_utils import UserError
+
+
+@dataclass(slots=True)
+class Iteration:
+    """One iteration, counted from 1. Run.steps makes it; only the fields `due` to `stopping` and its end change later.
+
+    An observer that is asked before those that save may end the training with this iteration (`end`), in `measured`.
+    """
+
+    iteration: int
+    last: bool  # nothing comes after it, so it takes no step
+    camera: Camera
+    background: Tensor  # (3,), random or that of the scene
+    depth_weight: float  # of the depth loss, 0 if the view has no reliable depth map
+    changes: bool  # rows of the Gaussians, the SH degree or the size of views change in this iteration
+    started: float  # seconds of training before it
+    due: bool = False  # the model is read, written or changed, so every loss so far must be checked first
+    record: dict[str, float] | None = None  # what train_log.json gets of this iteration; None: no record
+    scored_at: float | None = None  # seconds of training when the curve scored it, for all records of the same score
+    stopping: type[KeyboardInterrupt] | None = None  # raised once the step is complete
+    span: range = None  # steps of the schedule that it stands for (training/schedule.py), itself by default
+
+    def __post_init__(self) -> None:
+        if self.span is None:
+            self.span = range(self.iteration, self.iteration + 1)
+
+    def takes(self, planned: Collection[int]) -> bool:
+        """Whether what is planned for an iteration of the schedule is to be done in it."""
+        return any(iteration in planned for iteration in self.span)
+
+    def end(self, length: int) -> None:
+        """Make it the last one; what is planned for the rest of the schedule, of a length, is done in it."""
+        self.last, self.span = True, range(self.span.start, length + 1)
+
+
+class ViewOrder:
+    """Training cameras by iteration, counted from 1: each once per epoch, in an order drawn from seed and epoch.
+
+    batch: views of an iteration, one for each process; place: of this one's view among them.
+    """
+
+    def __init__(self, cameras: list[Camera], seed: int, batch: int = 1, place: int = 0) -> None:
+        if not cameras:
+            raise UserError("the scene has no training views; without --eval all views train")
+        self._cameras = cameras
+        self._seed = seed
+        self._batch, self._place = batch, place
+        self._orders: dict[int, list[int]] = {}
+
+    def numbers(self, iteration: int) -> range:
+        """The views of an iteration, as they are counted from 1 over all iterations."""
+        return range((iteration - 1) * self._batch + 1, iteration * self._batch + 1)
+
+    def own(self, iteration: int) -> int:
+        """The one of these that this process shows."""
+        return self.numbers(iteration)[self._place]
+
+    def of(self, number: int) -> Camera:
+        """The camera of a view, by its number."""
+        epoch, position = divmod(number - 1, len(self._cameras))
+        if epoch not in self._orders:
+            # Two at most: prefetching at the end of an epoch alternates between it and the next.
+            order = permutation(self._seed, Stream.VIEW_ORDER, epoch, len(self._cameras))
+            self._orders = {epoch: order} | {e: o for e, o in self._orders.items() if e == epoch - 1}
+        return self._cameras[self._orders[epoch][position]]
+
+    def __getitem__(self, iteration: int) -> Camera:
+        return self.of(self.own(iteration))
+
+    def coming(self, iteration: int, count: int) -> list[Camera]:
+        """The cameras of `count` iterations, this one first; at most one epoch of them."""
+        return [self[t] for t in range(iteration, iteration + min(count, len(self._cameras)))]

@@ -1,0 +1,210 @@
+"""Viewers of a training: the web page that shows and controls it, and the remote viewer of the reference."""
+
+import argparse
+import sys
+import time
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from gaussian_renderer import network_gui, render
+from gaussian_renderer.network_message import Request
+from gaussian_renderer.network_transfer import ViewerLost
+from scene.gaussian_model import GaussianModel
+from splatting.training.iteration import Iteration
+from splatting.training.objective import Losses
+from splatting.training.observer import Error, Observer
+from splatting.training.observers.saves import Checkpoints
+from splatting.training.run import Run
+from splatting.viewer.page import Page
+from splatting.viewer.server import Address
+from splatting.viewer.tabs import Requests, TrainingTab
+from splatting.viewer.watchers import MOVING, STILL, Budget, Wish
+from utils.system_utils import UserError, first_line
+
+_NUMBERS_EVERY = 0.5  # seconds
+_WAIT = 0.2  # seconds until a paused training notices a signal
+
+
+class PageObserver(Observer):
+    """Draws frames for the page between two iterations, and does what its buttons ask for.
+
+    While nobody watches it asks one variable in each iteration. The time it takes is not that of training. It comes
+    last, so that a paused training has done all else that belongs to its iteration.
+    """
+
+    def __init__(self, run: Run, checkpoints: Checkpoints) -> None:
+        """Start the page at the address of --viewer. UserError as from `Page`."""
+        self._run, self._checkpoints = run, checkpoints
+        address = Address(run.launch.viewer_host, run.launch.viewer)
+        self._page = Page(address, run.scene, run.pipe, run.dataset.white_background, run.dataset.train_test_exp)
+        self._requests = Requests(self._page.watchers.wake)
+        with self._page.tabs.add_tab("Training"):
+            self._tab = TrainingTab(self._page.server, self._requests)
+        self.budget = Budget()
+        self._wish: Wish | None = None
+        self._numbers = (0.0, 0, 0.0)  # when they were shown, the iteration, and its seconds of training
+
+    def due(self, step: Iteration) -> bool:
+        self._wish = None
+        if self._page.watchers.any:
+            wish = self._page.watchers.next(step.iteration)
+            if wish is not None and self.budget.allows(MOVING if wish.urgent else STILL):
+                self._wish = wish
+        return self._wish is not None or self._requests.any
+
+    def stepped(self, step: Iteration) -> None:
+        if step.due and not step.stopping and (self._wish is not None or self._requests.any):
+            with self._run.clock.paused("viewing"):
+                self._act(step)
+        if self._page.watchers.any and time.perf_counter() - self._numbers[0] >= _NUMBERS_EVERY:
+            self._show_numbers(step.iteration)
+
+    def _act(self, step: Iteration) -> None:
+        if self._wish is not None:
+            self._draw(self._wish, step.iteration)
+        if self._requests.any and not step.last:
+            self._obey(step)
+
+    def _draw(self, wish: Wish, version: int) -> None:
+        began = time.perf_counter()
+        self._page.fulfil(wish, version)
+        self.budget.spent(began, time.perf_counter() - began)
+
+    def _obey(self, step: Iteration) -> None:
+        """Do what was asked for, and return when the training is to go on, or with `step.stopping` set."""
+        run, requests = self._run, self._requests
+        if requests.paused:
+            self._show_numbers(step.iteration)
+        while True:
+            if requests.stopped or run.interrupt.requested:
+                step.stopping = run.interrupt.requested or KeyboardInterrupt
+                self._checkpoints.save(step)
+                return
+            if requests.take_checkpoint():
+                self._save(step)
+            if not requests.paused or requests.take_step():
+                return
+            wish = self._page.watchers.next(step.iteration)
+            if wish is None:
+                self._page.watchers.wait(_WAIT)
+            else:
+                self._draw(wish, step.iteration)
+
+    def _save(self, step: Iteration) -> None:
+        """Save a checkpoint. A disk that is full is told, and ends nothing."""
+        try:
+            self._checkpoints.save(step)
+        except UserError as error:
+            if not isinstance(error.__cause__, OSError):  # such as a loss that is not finite
+                raise
+            tqdm.write(f"warning: {error}", file=sys.stderr)
+            self._page.notify("Not saved", str(error))
+        else:
+            self._page.notify("Saved", f"chkpnt{step.iteration}.pth")
+
+    def _show_numbers(self, iteration: int) -> None:
+        run, now = self._run, time.perf_counter()
+        _, before, seconds = self._numbers
+        if iteration == before:  # a pause has shown it
+            return
+        self._numbers = now, iteration, run.clock.seconds
+        took = run.clock.seconds - seconds
+        speed = (iteration - before) / took if before and took > 0 else None
+        self._page.show_numbers(iteration, run.gaussians.total)
+        self._tab.show(speed, run.losses.mean, run.rows)
+
+    def ended(self, error: Error) -> None:
+        if error is None:
+            self._page.notify("The training is done", f"See it by python view.py -m {self._run.scene.model_path}")
+        else:
+            self._page.notify("The training has stopped", "Its terminal says why, and how to resume it")
+        self._page.stop()
+
+
+_TICK = 0.1  # seconds between looks whether a signal asks to stop
+_LAST = 1.0  # seconds that a finished training waits for one more request
+
+
+class NetworkViewer(Observer):
+    """Serves the viewer of gaussian_renderer/network_gui.py.
+
+    Training waits only while the viewer says so. Otherwise a request is answered when it is there, one an iteration.
+    The last iteration's are answered after everything is written, and keep_alive holds the process there.
+    """
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._asked = False
+
+    def due(self, step: Iteration) -> bool:
+        if network_gui.conn is None:
+            network_gui.try_connect()
+        self._asked = network_gui.is_asked() and not step.last
+        return self._asked
+
+    def measured(self, step: Iteration, losses: Losses) -> None:
+        if self._asked:
+            with self._run.clock.paused("viewing"):
+                self._serve(last=False)
+
+    def ended(self, error: Error) -> None:
+        if error is None:
+            if network_gui.conn is None:
+                network_gui.try_connect()
+            if network_gui.holds(last=True):
+                print("The model is saved; the viewer keeps this process until it leaves, or Ctrl-C")
+            self._serve(last=True)
+        network_gui.disconnect()
+
+    def _serve(self, last: bool) -> None:
+        """Answer until the viewer lets training go on, leaves, or a signal asks to stop."""
+        while self._waits(last) and self._answer():
+            if not network_gui.holds(last):
+                return
+
+    def _waits(self, last: bool) -> bool:
+        """Whether a request is there, after waiting for it if the viewer wants that."""
+        while network_gui.holds(last) and not self._run.interrupt.requested:
+            if network_gui.is_asked(_TICK):
+                return True
+        return network_gui.is_asked(_LAST if last else 0.0) and not self._run.interrupt.requested
+
+    def _answer(self) -> bool:
+        """Answer one request; whether the viewer is still there."""
+        try:
+            request = network_gui.receive_request()
+            frame = None if request is None else self._frame(request)
+            network_gui.send(frame, self._run.dataset.source_path)
+        except ViewerLost:
+            return False
+        return True
+
+    def _frame(self, request: Request) -> memoryview:
+        run = self._run
+        try:
+            return frame_bytes(request, run.gaussians, run.pipe, run.background)
+        except Exception as error:  # such as a frame that memory does not suffice for: no reason to end a training
+            fault = f"its frame cannot be rendered ({first_line(error)})"
+            network_gui.disconnect(fault)
+            raise ViewerLost(fault) from error
+
+
+@torch.no_grad()
+def frame_bytes(request: Request, gaussians: GaussianModel, pipe: argparse.Namespace, background: Tensor) -> memoryview:
+    """RGB bytes (H, W, 3) of the model as `render` shows it: 255 times the colour, truncated.
+
+    pipe: options of the training, which stay as they are; for the frame, the request's two switches count instead.
+    """
+    switches = {"convert_SHs_python": request.shs_python, "compute_cov3D_python": request.rot_scale_python}
+    image = render(
+        request.camera(background.device),
+        gaussians,
+        argparse.Namespace(**vars(pipe) | switches),
+        background,
+        request.scaling_modifier,
+        want_depth=False,
+        want_visibility=False,
+    )["render"]
+    return memoryview((image * 255).byte().permute(1, 2, 0).contiguous().cpu().numpy())

@@ -1,0 +1,321 @@
+"""The captured step: a fused step that is one launch, taken by a host that runs ahead of its GPU.
+
+A step has some fifty launches, which cost the host more than the GPU computes for, and the GPU a gap each. Most steps
+differ only in numbers: the camera, the photo, Adam's constants, the iteration. A captured step reads these from fixed
+places in the GPU's memory, which the host fills by a copy. All else is the code of training/steps/fused.py, and the
+kernels are the same, so the bytes are those of any other way to take the step.
+
+A graph is good for one kind of step (size and angle of the image, SH degree, statistics or not) until the Gaussians'
+tensors are replaced, as density control does, or their lists outgrow its capacity (training/steps/speculative.py).
+"""
+
+from collections.abc import Callable, Hashable
+from contextlib import AbstractContextManager, nullcontext, suppress
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scene.cameras import Camera
+from scene.fused_adam import NOW_WORDS, FusedAdam
+from splatting.training.iteration import Iteration
+from splatting.training.objective import Losses
+from splatting.training.observer import Announcer
+from splatting.training.run import Run
+from splatting.training.steps.fused import FusedStep
+from splatting.training.steps.plain import PlainStep
+from splatting.training.steps.speculative import Speculation
+
+_INSTANCES = 8  # of a Gaussian, for the capacity of the first step
+_SLOTS = 16
+_LEAST = 1 << 16
+_ROWS = 16  # of page-locked memory for numbers of steps; more than are ever pending
+_MOST_KINDS = 4  # photos of more sizes or angles would cost more to capture than they save
+_CAMERA = 16 + 16 + 3  # numbers: two matrices and the centre
+
+Kind = tuple[Hashable, ...]
+
+
+class CapturedStep(FusedStep):
+    """Takes steps as `FusedStep` does, but does not wait for the GPU unless something reads or changes the model.
+
+    An error leaves the model as it was after the last step that was done.
+    """
+
+    def __init__(self, run: Run) -> None:
+        super().__init__(run)
+        count = len(run.gaussians)
+        lists = max(_INSTANCES * count, _LEAST)
+        self._ahead = Speculation(run.device, (lists, max(_SLOTS * count, _LEAST), lists), self)
+        self._graphs = Graphs(run, self, self._adam, self._ahead.capacity)
+
+    def take(self, at: Iteration, observers: Announcer) -> None:
+        """Queue a step, unless something is due in it."""
+        run = self._run
+        if not self._is_queued(at):
+            self._ahead.drain()  # nothing is pending, unless --debug_from has just come into force
+            run.set_rates(at)
+            return super().take(at, observers)
+        losses = self._queue(at)
+        if losses is None:
+            self._ahead.discard()
+            run.set_rates(at)
+            return PlainStep.take(self, at, observers)
+        self._ahead.add(at, losses)
+        return observers.measured(at, losses)
+
+    def throttle(self, at: Iteration) -> None:
+        if self._is_queued(at):
+            self._ahead.throttle()
+        else:
+            self._ahead.drain()
+            self._graphs.save_memory()
+
+    def drain(self) -> None:
+        self._ahead.drain()
+
+    def abort(self) -> int:
+        return self._ahead.abort()
+
+    def _is_queued(self, at: Iteration) -> bool:
+        return not at.due and self._fuses(at)
+
+    def _knows_model(self) -> bool:
+        knows = super()._knows_model()
+        if knows:
+            self._graphs.check()
+        return knows
+
+    def _queue(self, at: Iteration) -> Losses | None:
+        """Queue a step. Returns its losses, or None if these have further terms."""
+        run, density = self._run, self._run.density
+        losses = self._graphs.launch(at)
+        if losses is not None:
+            with self._ahead.capacity(at) if density.queues else nullcontext():
+                density.after_step(at)
+            return losses
+        with self._ahead.capacity(at):
+            drawn, losses, gradients = self.measure(at)
+            if self.drop_further_terms():
+                return None
+            run.gaussians.guard_loss(at.iteration, losses.total)
+            self.advance(at, drawn, gradients)
+        return losses
+
+    # What speculation asks for, of steps that overflowed
+
+    def replay(self, at: Iteration, first: Losses) -> None:
+        """Queue a step once more; the losses that the observers hold get its values."""
+        self._run.set_rates(at)
+        losses = self._queue(at)
+        with torch.no_grad():
+            for new, old in zip(losses[:3], first[:3], strict=True):
+                if old is not None:
+                    old.detach().copy_(new)
+
+    def rewind(self, steps: int) -> None:
+        """Take back what the host has counted for steps that will be replayed."""
+        self._run.gaussians.rewind(steps)
+        self._graphs.clear()
+
+
+@dataclass
+class _Graph:
+    launch: Callable[[], None]
+    target: Tensor  # the photo's place
+    losses: Tensor  # (2,): total and L1 of the last step
+
+
+class Graphs:
+    """Takes fused steps by one launch, where it can. capacity: that of any view (`Speculation.capacity`)."""
+
+    def __init__(
+        self, run: Run, fused: FusedStep, adam: FusedAdam, capacity: Callable[[None], AbstractContextManager]
+    ) -> None:
+        self._run, self._fused, self._adam, self._capacity = run, fused, adam, capacity
+        self._recorder = Recorder(run.device)
+        words = NOW_WORDS + (_CAMERA + 1) // 2
+        self._host = torch.zeros(_ROWS, words, dtype=torch.int64, pin_memory=run.device.type == "cuda")
+        self._host_cameras = [row.numpy() for row in self._host[:, NOW_WORDS:].view(torch.float32)[:, :_CAMERA]]
+        self._inputs = torch.zeros(words, dtype=torch.int64, device=run.device)
+        self._background, self._copied = torch.empty_like(run.background), None
+        self._cameras: dict[int, tuple] = {}  # by uid
+        self._kinds: set[Kind] = set()
+        self._graphs: dict[Kind, _Graph] = {}
+        self._baked: tuple = ()
+        self._able = True  # whether the objective can be captured, and memory is there
+        self._taken = 0
+
+    def launch(self, at: Iteration) -> Losses | None:
+        """Take a step of the run, or do nothing and return None where it has to be taken in another way."""
+        graph = self._graph_for(at) if self._is_usual(at) else None
+        if graph is None:
+            return None
+        target, _ = at.camera.ground_truth(at.background)
+        if (target.shape, target.dtype) != (graph.target.shape, graph.target.dtype):
+            return None
+        # Nothing below asks for memory or may fail in another way once the optimiser's counters are advanced.
+        numbers, losses = self._numbers_of(at.camera), torch.empty_like(graph.losses)  # observers keep them
+        graph.target.copy_(target, non_blocking=True)
+        if at.background is not self._copied:
+            self._copied = at.background
+            self._background.copy_(at.background, non_blocking=True)
+        row = self._taken % _ROWS
+        self._taken += 1
+        self._host_cameras[row][:] = numbers
+        self._adam.write_now(self._host[row, :NOW_WORDS], at.iteration)
+        self._inputs.copy_(self._host[row], non_blocking=True)
+        graph.launch()
+        total, l1 = losses.copy_(graph.losses).unbind()
+        return Losses(total, l1, None, None)
+
+    def clear(self) -> None:
+        """Forget the graphs: their capacity was too small."""
+        self._graphs.clear()
+
+    def check(self) -> None:
+        """Forget the graphs if something that they took for fixed has changed."""
+        run, optimizer = self._run, self._run.gaussians.optimizer
+        columns = optimizer.active_columns("f_rest")
+        used = run.objective, run.density, run.pipe.antialiasing, type(optimizer), optimizer.guard, columns
+        used = *used, run.resolution.factor
+        baked = self._adam.places(), used
+        if baked != self._baked:
+            self._graphs.clear()
+            self._baked = baked
+
+    def save_memory(self) -> None:
+        """Give memory back, if most of it is taken, before something else asks for it."""
+        if self._graphs and self._recorder.is_tight():
+            self._release()
+
+    def _release(self) -> None:
+        self._graphs.clear()
+        self._recorder.release()
+
+    def _is_usual(self, at: Iteration) -> bool:
+        """Whether the step has a photo whose pixels all count, and nothing else."""
+        plain = at.depth_weight == 0 and not self._run.dataset.train_test_exp
+        return self._able and plain and at.camera.columns is None and at.camera.counts_all
+
+    def _graph_for(self, at: Iteration) -> _Graph | None:
+        """The graph for a step, made if it is worth it. The first step of a kind is not, as it may load kernels."""
+        camera, run = at.camera, self._run
+        phase = run.density.observes(at.iteration), run.gaussians.active_sh_degree
+        kind = (camera.image_height, camera.image_width, camera.FoVx, camera.FoVy, *phase)
+        graph = self._graphs.get(kind)
+        if graph is not None:
+            return graph
+        if kind not in self._kinds:
+            self._kinds.add(kind)
+            return None
+        self._graphs = {k: known for k, known in self._graphs.items() if k[-2:] == phase}
+        if len(self._graphs) < _MOST_KINDS:
+            graph = self._captured(at)
+            if graph is not None:
+                self._graphs[kind] = graph
+        return graph
+
+    def _captured(self, at: Iteration) -> _Graph | None:
+        """Capture a step. None, for good, where memory or the objective does not allow it."""
+        try:
+            try:
+                return self._capture(at)
+            except torch.OutOfMemoryError:
+                # While it captures, torch cannot give back what it keeps for later, which may be enough.
+                self._release()
+                return self._capture(at)
+        except (RuntimeError, AttributeError):
+            self._able = False
+            self._release()
+            return None
+
+    def _capture(self, at: Iteration) -> _Graph | None:
+        camera, target = at.camera, torch.empty_like(at.camera.ground_truth(at.background)[0])
+        numbers = self._inputs[NOW_WORDS:].view(torch.float32)
+        # Stand for any iteration of the kind. An objective that asks for more than this cannot be captured.
+        any_camera = SimpleNamespace(
+            image_height=camera.image_height,
+            image_width=camera.image_width,
+            FoVx=camera.FoVx,
+            FoVy=camera.FoVy,
+            world_view_transform=numbers[:16].view(4, 4),
+            full_proj_transform=numbers[16:32].view(4, 4),
+            camera_center=numbers[32:35],
+            columns=None,  # all count
+            ground_truth=lambda _: (target, None),  # the photo on the step's background, and no mask
+        )
+        placeholder = SimpleNamespace(camera=any_camera, background=self._background, depth_weight=0.0)
+        with self._capacity(None):
+            launch, losses = self._recorder.capture(lambda: self._body(at.iteration, placeholder))
+        if self._fused.drop_further_terms():
+            self._able = False
+            return None
+        return _Graph(launch, target, losses)
+
+    @torch.no_grad()
+    def _body(self, iteration: int, placeholder: Any) -> Tensor:
+        run = self._run
+        drawn, losses, gradients = self._fused.measure(placeholder)
+        run.gaussians.guard_loss(iteration, losses.total)
+        density = run.density
+        observed = density.observes(iteration), density.absolute_gradients
+        drawn.step(self._adam, *gradients, *observed, self._inputs[:NOW_WORDS])
+        return torch.stack([losses.total, losses.l1])
+
+    def _numbers_of(self, camera: Camera) -> np.ndarray:
+        """The camera's numbers (35,) on the host, read from the GPU once."""
+        tensors = camera.world_view_transform, camera.full_proj_transform, camera.camera_center
+        state = [(id(tensor), tensor._version) for tensor in tensors]
+        kept = self._cameras.get(camera.uid)
+        if kept is None or kept[0] != state:
+            numbers = torch.cat([tensor.detach().reshape(-1).float() for tensor in tensors]).cpu().numpy()
+            kept = self._cameras[camera.uid] = state, numbers, tensors  # which are kept, as an id may be given again
+        return kept[1]
+
+
+class Recorder:
+    """Captures on a stream of its own, on which nothing ever runs. All graphs share one pool of memory."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device, self._stream = device, torch.cuda.Stream(device)
+        self._keeper: torch.cuda.CUDAGraph | None = None
+
+    def capture(self, body: Callable[[], Tensor]) -> tuple[Callable[[], None], Tensor]:
+        """Capture what a function queues: a function that queues it, and the result, which each launch overwrites.
+
+        RuntimeError, torch.OutOfMemoryError among them, if it cannot be captured.
+        """
+        if self._keeper is None:
+            self._pool, self._word = torch.cuda.graph_pool_handle(), torch.zeros(1, device=self._device)
+            # Torch gives the pool's memory back once no graph uses it; the next capture would wait for it.
+            self._keeper, _ = self._graph_of(self._word.zero_)
+        graph, result = self._graph_of(body)
+        return graph.replay, result
+
+    def release(self) -> None:
+        """Give back the memory of graphs that nobody has any more, and what torch keeps for later."""
+        self._keeper = None
+        torch.cuda.empty_cache()
+
+    def is_tight(self) -> bool:
+        """Whether most of the GPU's memory is taken, so that what is kept for later should be given back."""
+        free, total = torch.cuda.mem_get_info(self._device)
+        return free < total / 4
+
+    def _graph_of(self, body: Callable[[], Tensor]) -> tuple[torch.cuda.CUDAGraph, Tensor]:
+        graph = torch.cuda.CUDAGraph()
+        self._stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(self._stream):
+            graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
+            try:
+                result = body()
+            except BaseException:
+                with suppress(RuntimeError):  # which tells of the capture, not of its cause
+                    graph.capture_end()
+                raise
+            graph.capture_end()
+        return graph, result

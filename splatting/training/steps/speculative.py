@@ -1,0 +1,172 @@
+"""Speculative list capacities: a host that runs ahead of its GPU replays the steps that overflow.
+
+A step needs memory for lists whose lengths only the GPU knows. To wait for them in every step would leave the GPU idle
+while the host prepares the next launches. So the host guesses from what the view needed before, and does not wait. A
+kernel that finds too little capacity halts: neither it nor any later kernel changes anything (gs::Queue::halted in
+submodules/common/include/gs/cuda_queue.h). Some steps later the host reads that in a report which the GPU writes into
+the host's memory. It then raises the capacity, and replays the steps from the halted one on, in their order. So no
+value depends on the guesses, only the time does. The GPU counts the steps itself, so that a step can be captured.
+
+Streams: everything that a step computes is queued on torch's current stream, in the order of the calls. Photos that
+the CPU keeps are copied on a stream of their own, and the current stream waits for the event of the one it needs
+(scene/images/device_copies.py). A step is captured on a third stream, on which nothing ever runs; its launch is
+queued on the current stream like any other. The reports go straight into page-locked memory. The host reads them
+without a call to the GPU, and waits for the whole stream before it replays steps or lets anybody read the model.
+"""
+
+import time
+from collections import deque
+from collections.abc import Hashable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from diff_gaussian_rasterization.backend import OPERATORS
+
+from splatting.training.iteration import Iteration
+from splatting.training.objective import Losses
+
+AHEAD = 8  # steps; enough to hide a pause of the host, and few to replay
+_REPORTS = 2 * AHEAD
+_SPARE = 1.25  # times what a view needed before: Gaussians move and multiply until its next visit
+_LEAST = 1024
+_MOST = 2**31 - 1
+_NAP = 1e-4  # seconds; steps of less than this are queued in numbers anyway
+
+Capacity = tuple[int, int, int]  # of instances, slots and gradient rows (gs::Room)
+
+
+class Steps(Protocol):
+    """What queues the steps of a speculation."""
+
+    def measure(self, at: Iteration) -> object:
+        """Render the iteration's view so that the host waits."""
+
+    def replay(self, at: Iteration, first: Losses) -> None:
+        """Queue a step once more, with the same values. first: its losses, which the observers hold."""
+
+    def rewind(self, steps: int) -> None:
+        """Take back what the host has counted for steps that will be replayed, or that an error has ended."""
+
+
+@dataclass
+class _Pending:
+    at: Iteration
+    losses: Losses
+    counted: bool = True  # whether the host counts the step among those that it has queued
+
+
+class Speculation:
+    """The steps that a GPU has yet to do. first: the capacity of the first step."""
+
+    def __init__(self, device: torch.device, first: Capacity, steps: Steps) -> None:
+        self._words = torch.zeros(5, dtype=torch.int64, device=device)
+        self._reports = torch.zeros(_REPORTS, 5, dtype=torch.int64, pin_memory=True)
+        self._numbers = list(self._reports.numpy())  # the same memory
+        self._stream = torch.cuda.current_stream(device)
+        self._first, self._steps = first, steps
+        self._needed: dict[Hashable, Capacity] = {}
+        self._pending: deque[_Pending] = deque()
+        self._done = 0  # steps, as far as the host knows
+        self.overflows = 0  # so far
+
+    def add(self, at: Iteration, losses: Losses) -> None:
+        """Take note of a step that was queued with its `capacity`."""
+        self._pending.append(_Pending(at, losses))
+
+    def discard(self) -> None:
+        """Forget what was queued of a step that is taken in another way, once all steps before it are done."""
+        self._collect(0)
+        self._stream.synchronize()
+        self._words[0] = 0  # what was queued in vain may have overflowed
+        self._done = int(self._words[4])
+
+    def throttle(self) -> None:
+        """Wait until another step can be queued."""
+        self._collect(AHEAD - 1)
+
+    def drain(self) -> None:
+        """Wait until all steps are done."""
+        self._collect(0)
+
+    def abort(self) -> int:
+        """Drop the steps that overflowed, after an error. Returns their number; they changed nothing."""
+        self._stream.synchronize()
+        while self._pending and (report := self._report()) and not report[3]:
+            self._finish(report)
+        lost = len(self._pending)
+        self._steps.rewind(sum(pending.counted for pending in self._pending))
+        self._pending.clear()
+        return lost
+
+    @contextmanager
+    def capacity(self, at: Iteration | None) -> Iterator[None]:
+        """Within it, operators take what the view of an iteration needed before, or with None what any view needed."""
+        OPERATORS.run_ahead_(self._words, self._capacity_of(at and _view(at)), self._reports)
+        try:
+            yield
+        finally:
+            OPERATORS.run_ahead_(None, [], None)
+
+    def _capacity_of(self, view: Hashable | None) -> Capacity:
+        """What a view needed before, and some spare; a new view gets that of the largest."""
+        if not self._needed:
+            return self._first
+        needed = self._needed.get(view) or tuple(map(max, zip(*self._needed.values(), strict=True)))
+        instances, slots, rows = map(_with_spare, needed)
+        return min(instances, _MOST), slots, min(rows, _MOST)
+
+    def _report(self) -> list[int] | None:
+        """Of the first pending step: instances, slots, rows, halted; None until the GPU has written them."""
+        number = self._done + 1
+        numbers = self._numbers[number % _REPORTS]
+        return numbers[:4].tolist() if numbers[4] == number else None
+
+    def _finish(self, report: list[int]) -> None:
+        """Strike the first pending step off."""
+        self._needed[_view(self._pending.popleft().at)] = tuple(report[:3])
+        self._done += 1
+
+    def _collect(self, most: int) -> None:
+        """Take back the reports that are there, and wait until at most so many steps are pending."""
+        while self._pending:
+            report = self._report()
+            if report is None:
+                if len(self._pending) <= most:
+                    return
+                time.sleep(_NAP)
+            elif report[3]:
+                self._replay(report)
+            else:
+                self._finish(report)
+
+    def _replay(self, report: list[int]) -> None:
+        """Raise the capacity of the step that was halted, and replay it and all later ones."""
+        self.overflows += 1
+        self._stream.synchronize()
+        self._words[0] = 0
+        self._numbers[(self._done + 1) % _REPORTS][4] = 0  # the halted step's report will come once more
+        self._steps.rewind(len(self._pending))
+        for pending in self._pending:
+            pending.counted = False
+        instances, slots, rows, _ = report
+        if instances > _MOST:
+            self._steps.measure(self._pending[0].at)  # raises an error: its lists are too long for any capacity
+        # A step that overflowed with instances did not count its rows, of which there are no more.
+        self._needed[_view(self._pending[0].at)] = instances, slots, rows or instances
+        for pending in self._pending:
+            self._steps.replay(pending.at, pending.losses)
+            pending.counted = True
+
+
+def _with_spare(count: int) -> int:
+    """A little more, in few different sizes, so that torch's allocator finds them again."""
+    requested = max(int(_SPARE * count), _LEAST)
+    unit = 1 << max(requested.bit_length() - 4, 0)
+    return -(-requested // unit) * unit
+
+
+def _view(at: Iteration) -> Hashable:
+    """What the capacity that a step needs depends on."""
+    return at.camera.uid, at.camera.image_width

@@ -1,0 +1,135 @@
+"""Contents of a frame: its settings, the pose of a browser's camera, which is checked, and the scene's cameras."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gaussian_renderer.free_view import rotation_matrix
+from scene.cameras import Camera
+from utils.graphics_utils import camera_center
+
+if TYPE_CHECKING:
+    import viser
+
+COLOUR, DEPTH, OPACITY, COUNT, ERROR = MODES = ("Colour", "Depth", "Opacity", "Gaussians a pixel", "Error")
+ALONE, SLIDER, BESIDE = COMPARISONS = ("Render alone", "Slider", "Side by side")
+
+Vector = tuple[float, float, float]
+_WIDEST = 8192  # pixels of a window's side
+_SLIMMEST = 10  # ratio of its sides
+_NEAR = 1e-3  # of the scene's size: a page's camera that close stands at the scene's camera
+_TURNED = 2e-3  # radians
+_MARGIN = 1.1  # of the scene's size, to the distance of the outermost camera
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A camera of the page and the size of its window.
+
+    position: world. wxyz: unit quaternion, camera axes (x right, y down, z forward) to world. fov: vertical, radians.
+    """
+
+    position: Vector
+    wxyz: tuple[float, float, float, float]
+    fov: float
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Settings:
+    """mode: of MODES. scaling: factor of all scales. sh_degree: highest that is drawn. background: RGB in [0, 1].
+
+    crop: opposite corners of the box outside of which nothing is drawn, world coordinates, or None. camera: name of the
+    chosen camera, None: none. comparison: of COMPARISONS. slider: share of the width that is the scene's image.
+    """
+
+    mode: str = COLOUR
+    scaling: float = 1.0
+    sh_degree: int = 3
+    background: Vector = (0.0, 0.0, 0.0)
+    crop: tuple[Vector, Vector] | None = None
+    camera: str | None = None
+    comparison: str = ALONE
+    slider: float = 0.5
+
+
+def pose_of(camera: "viser.CameraHandle") -> Pose | None:
+    """The pose and window of a browser's camera, None for one that cannot be drawn."""
+    position, wxyz = [float(x) for x in camera.position], [float(x) for x in camera.wxyz]
+    fov, length = float(camera.fov), math.hypot(*wxyz)
+    if not all(map(math.isfinite, (*position, *wxyz, fov))) or not 0 < fov < math.pi or not 1e-6 < length < 1e6:
+        return None
+    return Pose(tuple(position), tuple(x / length for x in wxyz), fov, *window_of(camera))
+
+
+def window_of(camera: "viser.CameraHandle") -> tuple[int, int]:
+    """Width and height, in pixels, of a browser's window; sides that cannot be drawn count as the nearest that can."""
+    width, height = (min(max(int(side), 1), _WIDEST) for side in (camera.image_width, camera.image_height))
+    return max(width, height // _SLIMMEST), max(height, width // _SLIMMEST)
+
+
+def as_utf8(text: str) -> str:
+    """A text that can be sent: names of files that are not UTF-8 have surrogates, which appear as numbers."""
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+class SceneCameras:
+    """by_name: the cameras, training ones first, with names such as `train 3: IMG_0007`.
+
+    up: their mean upward direction, unit length: images are mostly taken upright. size: of the scene.
+    """
+
+    def __init__(self, train: Sequence[Camera], test: Sequence[Camera]) -> None:
+        from splatting.camera_paths.poses import focus_point, poses_of, unit  # SciPy takes a while to import
+
+        self.by_name: dict[str, Camera] = {
+            as_utf8(f"{of_set} {index}: {camera.image_name}"): camera
+            for of_set, cameras in (("train", train), ("test", test))
+            for index, camera in enumerate(cameras)
+        }
+        self._target, self.up, self.size = None, np.array([0.0, -1.0, 0.0]), 1.0
+        if self.by_name:
+            poses = poses_of([*train, *test])
+            self._target = focus_point(poses)
+            self.up = unit(poses.up) if np.linalg.norm(poses.up) > 1e-6 else self.up
+            offsets = poses.positions - poses.positions.mean(axis=0)
+            self.size = float(np.linalg.norm(offsets, axis=1).max()) * _MARGIN or 1.0
+
+    def up_at(self, camera: Camera) -> Vector:
+        """An upward direction with which a camera looks as its image does, as near to that of all as can be.
+
+        A browser turns around this direction, so that of a camera that looks down would tilt the horizon.
+        """
+        right, own = camera.R[:, 0], -camera.R[:, 1]
+        upright = self.up - (self.up @ right) * right
+        return tuple((upright if upright @ own > 0.05 else own).tolist())
+
+    def depth(self, camera: Camera) -> float:
+        """Distance of what a camera looks at: of the point nearest to all optical axes, if that is in front of it."""
+        ahead = 0.0
+        if self._target is not None:
+            ahead = float((self._target - camera_center(camera.R, camera.T)) @ camera.R[:, 2])
+        return ahead if ahead > 0.1 * self.size else self.size
+
+    def stands_at(self, pose: Pose, camera: Camera) -> bool:
+        """Whether a page's camera has the place and the direction of a scene's camera."""
+        apart = np.linalg.norm(np.asarray(pose.position) - camera_center(camera.R, camera.T))
+        cosine = (np.trace(rotation_matrix(pose.wxyz).T @ camera.R) - 1) / 2
+        return bool(apart <= _NEAR * self.size and math.acos(float(np.clip(cosine, -1, 1))) <= _TURNED)
+
+
+def canvas(width: int, height: int, aspect: float) -> tuple[int, int]:
+    """The smallest (width, height) of an aspect in which an image fits."""
+    if width < aspect * height:
+        return max(width, round(height * aspect)), height
+    return width, max(height, round(width / aspect))
+
+
+def fov_of_canvas(camera: Camera, aspect: float) -> float:
+    """Vertical opening angle, radians, of a window of this aspect that shows all of a camera's image."""
+    _, height = canvas(camera.image_width, camera.image_height, aspect)
+    return 2 * math.atan(math.tan(camera.FoVy / 2) * height / camera.image_height)

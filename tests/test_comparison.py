@@ -1,0 +1,355 @@
+"""Runs beside each other: spread, levels and fronts of option sets, published tables, and the tables of them."""
+
+import ast
+import json
+import statistics
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import train
+from splatting.evaluation import configs
+from splatting.evaluation.comparison import (
+    QUANTITIES,
+    cheapest,
+    comparable_sets,
+    compare,
+    default_set,
+    fronts,
+    gaussians_to_reach,
+    pareto_front,
+    published_tables,
+    reached,
+    round_levels,
+    seconds_to_reach,
+    spread,
+    stand_apart,
+    summarise,
+)
+from splatting.evaluation.configs import read_configs, shipped
+from splatting.evaluation.error_curve import COLUMNS
+from splatting.evaluation.plan import DATASETS
+from splatting.evaluation.report import make_report, render
+from splatting.evaluation.results_page import BEGIN, END, replace_results, results_text
+from splatting.evaluation.tables import front_table, reached_table, result_tables
+from splatting.evaluation.what_to_try import peak
+from splatting.files.listing import markdown_table
+from utils.system_utils import UserError
+
+ROOT = Path(__file__).parents[1]
+
+
+def curve(*points: tuple[float, float | None, float]) -> list[dict]:
+    """Rows of (seconds, test PSNR, Gaussians)."""
+    return [
+        dict.fromkeys(COLUMNS) | {"iteration": 10 * i, "seconds": s, "test_psnr": p, "gaussians": n}
+        for i, (s, p, n) in enumerate(points, 1)
+    ]
+
+
+def _run(config: str | None, seed: int, *points: tuple[float, float, int], **more) -> dict:
+    """A finished run of "attic" with a curve, saved at 100 bytes a Gaussian."""
+    end, (seconds, psnr, gaussians) = 10 * len(points), points[-1]
+    values = dict.fromkeys(QUANTITIES) | {
+        "PSNR": psnr, "seconds": seconds, "gaussians": gaussians, "gaussians_saved": gaussians,
+        "ply_mb": gaussians / 1e4, "views": 2,
+    }  # fmt: skip
+    return {
+        "added_options": [], "apart": False, "config": config, "conventions": {}, "cpu_seconds": None,
+        "curve": curve(*points), "failure": None, "final_iteration": end, "finished": True, "group": "scenes",
+        "ground_truth_sha256": "a" * 64, "iterations": {str(end): values}, "lines": [], "machine": {},
+        "model": f"attic/{config}/{seed}", "open_ended": False, "options": [], "page": None, "peak": None,
+        "scene": "attic", "seed": seed, "source": None, "split": None, "test_sizes": [[96, 64]],
+        "views": {"test": 2, "train": 7}, "wall_seconds": None, "worst_views": [],
+    } | more  # fmt: skip
+
+
+def _runs() -> list[dict]:
+    """Three sets of two seeds: `fast` gets there in half the seconds, `small` in none, but it has few Gaussians."""
+    return [
+        *(_run("adc", i, (10, 20.0, 100), (20, 30.0, 200), (40, end, 300)) for i, end in enumerate((31.0, 31.4))),
+        *(_run("fast", i, (5, 20.0, 100), (10, 30.0, 400), (20, end, 500)) for i, end in enumerate((32.2, 32.2))),
+        *(_run("small", i, (10, 20.0, 50), (30, 29.0, 60), (50, end, 70)) for i, end in enumerate((30.0, 30.8))),
+    ]
+
+
+def test_spread():
+    std = pytest.approx(statistics.stdev([1, 2, 4]))
+    assert spread([1.0, 2.0, 4.0]) == {"mean": pytest.approx(7 / 3), "std": std, "values": [1.0, 2.0, 4.0]}
+    assert spread([5.0])["std"] is None and spread([5.0])["mean"] == 5.0
+    assert spread([5.0, None])["mean"] is None and spread([])["mean"] is None
+
+
+@given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), max_size=30))
+def test_pareto_front_is_what_nothing_beats(points):
+    front = pareto_front(points)
+    beaten = {p for p in points for q in points if q != p and q[0] <= p[0] and q[1] <= p[1]}
+    assert {points[i] for i in front} == set(points) - beaten
+    assert len({points[i] for i in front}) == len(front) and front == sorted(front, key=lambda i: points[i])
+
+
+def test_seconds_to_reach_between_points():
+    rows = curve((1, 10, 100), (100, 20, 300), (200, 19, 250), (300, 30, 400))
+    assert [seconds_to_reach(rows, level) for level in (9, 20, 31)] == [1, 100, None]
+    assert seconds_to_reach(rows, 15) == 100  # too far from the point before to interpolate
+    assert seconds_to_reach(rows, 24.5) == pytest.approx((200 * 300) ** 0.5)  # halfway in the logarithm
+    assert [gaussians_to_reach(rows, level) for level in (20, 18, 31)] == [300, 250, None]
+
+
+def test_cheapest_needs_every_seed_and_takes_the_mean():
+    sets = {
+        "slow": [curve((10, 20, 50), (100, 30.07, 60)), curve((10, 20, 50), (100, 30.07, 60))],
+        "fast": [curve((1, 20, 80), (2, 29, 90)), curve((3, 20, 70), (30, 28, 90))],
+    }
+    rows = {row["psnr"]: row for row in cheapest({name: [{"curve": x} for x in seeds] for name, seeds in sets.items()})}
+    assert cheapest({}) == [] == cheapest({"a": [{"curve": []}], "b": [{"curve": curve((1, None, 2))}]})
+    assert list(rows) == [30.0, 29.9, 29.8, 29.5, 29.0, 28.0, 27.0, 25.0, 22.0]
+    assert rows[29.0]["seconds"]["config"] == "slow" and set(rows[29.0]["seconds"]["all"]) == {"slow"}
+    seconds = rows[28.0]["seconds"]
+    assert seconds["config"] == "fast" and set(seconds["all"]) == {"slow", "fast"}
+    assert seconds["value"] == pytest.approx((2 ** (8 / 9) + 30) / 2)
+    assert seconds["std"] == pytest.approx((30 - 2 ** (8 / 9)) / 2**0.5)
+    assert rows[28.0]["gaussians"] == {"all": {"slow": 60, "fast": 90}, "config": "slow", "std": 0.0, "value": 60}
+
+
+def test_subsets_are_no_peak():
+    part = [row | {"subset": 2} for row in curve((1, 35, 10), (2, 36, 10))]
+    whole = curve((3, 20, 10), (4, 20.05, 10))
+    late = [part[0] | {"test_psnr": 1.0}]
+    assert peak(part + whole + late) is peak(part + whole[::-1]) is peak(part) is None  # 0.05 dB is not clear
+    best, lost = peak([*part, *whole, whole[0] | {"iteration": 80, "test_psnr": 19.0}])
+    assert best["iteration"] == 20 and lost == pytest.approx(1.05)
+
+
+def test_a_failed_seed_is_left_out_and_named():
+    runs = [_run(None, seed, (1, 1.0 + seed, 9), failure=[None, {"stage": "train"}][seed == 1]) for seed in range(3)]
+    (row,) = summarise(runs)
+    assert row["PSNR"] == {"mean": 2.0, "std": pytest.approx(2**0.5), "values": [1.0, 3.0]}
+    assert row["seeds"] == [0, 2] and row["failed_seeds"] == [1]
+
+
+@pytest.mark.parametrize(
+    ("finals", "levels"),
+    [
+        ([30.43, 30.11], [30.4, 30.3, 30.2, 30.0]),
+        ([30.3, 29.8], [30.0, 29.5]),
+        ([30.43, 27.1], [30.0, 29.5, 29.0, 28.0, 26.0]),
+        ([30.43, 20.0], [30.0, 29.0, 28.0, 26.0, 22.0]),
+        ([30.1, 30.1], [30.1]),
+    ],
+)
+def test_levels_are_round_and_lie_around_the_final_ones(finals, levels):
+    assert round_levels(finals) == levels
+
+
+def test_seconds_gaussians_and_megabytes_to_reach_a_level():
+    found = reached(comparable_sets(_runs(), "attic"))
+    levels = [(level["psnr"], level["of_default"]) for level in found["levels"]]
+    assert levels == [(32.0, False), (31.5, False), (pytest.approx(31.2, abs=2e-6), True), (31.0, False), (30.0, False)]
+    own, fast, small = (found["sets"][name]["cells"] for name in ("adc", "fast", "small"))
+    assert fast[4]["seconds"]["values"] == [pytest.approx(10.0)] * 2 and fast[4]["seconds"]["std"] == 0
+    assert fast[4]["gaussians"]["mean"] == 400 and fast[4]["mb"]["mean"] == pytest.approx(0.04)
+    assert fast[4]["ratio"] == pytest.approx(0.5) and own[4]["ratio"] == 1.0
+    assert small[4]["reached"] == 2 and small[4]["ratio"] > 2
+    assert small[3]["reached"] == 0 and small[3]["seconds"]["mean"] is None and small[3]["ratio"] is None
+    # In logarithmic time: 32.0 lies 10/11 of the way from 30.0 to 32.2.
+    assert fast[0]["seconds"]["mean"] == pytest.approx(10 * 2 ** (2.0 / 2.2)) and fast[0]["gaussians"]["mean"] == 500
+    # Seed 0 of adc ends at 31.0, below the mean 31.2, so its 40 s are a lower bound; seed 1 gets there after 36.6 s.
+    assert own[2]["at_least"] and own[2]["reached"] == 1 and not fast[2]["at_least"]
+    assert own[2]["seconds"]["values"] == [40.0, pytest.approx(20 * 2 ** (1.2 / 1.4), rel=1e-5)]
+    assert fast[2]["ratio"] == pytest.approx(fast[2]["seconds"]["mean"] / own[2]["seconds"]["mean"])
+
+    table = reached_table(found)
+    assert table.header == ["options", "final PSNR (dB)", "32.0 dB", "31.5 dB", "31.20 dB (final PSNR of adc)",
+                            "31.0 dB", "30.0 dB"]  # fmt: skip
+    adc, fast, small = table.rows
+    assert adc[:3] == ["adc", "31.20 ± 0.28", "not reached"] and adc[4] == "\u2265 38.1 ± 2.7 s (300; 0.0 MB)"
+    assert fast[6] == "10.0 ± 0.0 s (400; 0.0 MB), 0.50 of adc's" and small[5] == "not reached"
+    assert adc[5] == "36.4 ± 5.1 s (300; 0.0 MB)"  # the end of one seed, and between points of the other
+    runs = _runs()
+    runs[-1]["curve"][-1]["test_psnr"] = 31.1
+    small = reached_table(reached(comparable_sets(runs, "attic"))).rows[2]
+    assert small[-2].startswith("1 of 2 seeds: ") and "adc's" not in small[-2]
+
+
+def test_equal_seeds_reach_their_own_mean():
+    """The mean of three equal numbers may be a bit above them."""
+    points = (1, 20.0, 1), (2, 29.839999999999996, 2)
+    runs = [_run(name, seed, *points) for name in ("base", "other") for seed in range(3)]
+    cells = reached(comparable_sets(runs, "attic"))["sets"]["other"]["cells"]
+    assert [cell["reached"] for cell in cells] == [3] * len(cells)
+
+
+def test_what_cannot_be_compared_is_left_out():
+    runs = _runs()
+    assert comparable_sets(runs[:2], "attic") == {} == comparable_sets(runs, "cellar")  # one set alone
+    runs[2]["finished"] = False
+    runs[4]["apart"] = runs[5]["apart"] = True
+    assert {name: len(found) for name, found in comparable_sets(runs, "attic").items()} == {"adc": 2, "fast": 1}
+    for row in runs[3]["curve"]:
+        row["subset"] = 3
+    assert reached(comparable_sets(runs, "attic")) is None
+    assert fronts(comparable_sets(runs, "attic")) is not None  # these numbers are of metrics.py
+
+
+def test_fronts_say_who_beats_whom_and_whether_clearly():
+    found = fronts(comparable_sets(_runs(), "attic"))
+    # fast: 20 s, 32.2 dB, 500; adc: 40 s, 31.2 dB, 300; small: 50 s, 30.4 dB, 70.
+    by_fast, nobody = {"by": "fast", "clearly": True}, dict.fromkeys(("adc", "fast", "small"))
+    assert found["beaten"] == {
+        "seconds": nobody | {"adc": by_fast, "small": by_fast}, "gaussians": nobody, "ply_mb": nobody,
+    }  # fmt: skip
+    adc, fast, _ = front_table(found).rows
+    assert adc[:4] == ["adc", "31.20 ± 0.28", "40.0 ± 0.0", "no: fast"] and fast[3] == "yes"
+
+    def beaten(*runs: dict) -> tuple:
+        found = fronts(comparable_sets(runs, "attic"))
+        return found["beaten"]["seconds"]["adc"], front_table(found).rows[0][3]
+
+    adc, near = _runs()[:2], [_run("near", seed, (seconds, 31.25, 300)) for seed, seconds in enumerate((36, 43.5))]
+    assert beaten(*adc, *near) == ({"by": "near", "clearly": False}, "no: near, within the spread")
+    assert beaten(adc[0], _run("near", 0, (39, 31.25, 300))) == ({"by": "near", "clearly": None}, "no: near")
+    assert beaten(adc[0], adc[0] | {"config": "twin"}) == (None, "yes")
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"test_sizes": [[48, 32]], "options": ["-r", "2", "--sh_degree", "1"]},
+         "its test views have 48x32 pixels, the others' 96x64; -r 2 instead of the defaults"),
+        ({"test_sizes": [[48, 64]], "options": ["--sh_degree", "1", "--train_test_exp"]},
+         "its test views have 48x64 pixels, the others' 96x64; --train_test_exp instead of the defaults"),
+        ({"options": ["--masks", "foreground"]},
+         "the pixels of its test views differ, or which of them count; --masks foreground instead of the defaults"),
+        ({"views": {"test": 3, "train": 6}}, "it has 3 test views, the others 2"),
+        ({"ground_truth_sha256": None}, "its ground truth is not known"),
+    ],
+)  # fmt: skip
+def test_a_set_that_stands_apart_is_told_why(change, why):
+    other = {"ground_truth_sha256": "b" * 64}
+    runs = _runs()
+    runs[4:] = [run | other | change for run in runs[4:]]
+    if None in change.values():
+        runs[2:4] = [runs[2] | other]
+    marked = stand_apart(runs)
+    assert {run["config"] for run in marked if run["apart"]} >= {"small"}
+    assert marked[-1]["why_apart"] == why and marked[0]["why_apart"] is None
+    report = make_report(["full_eval.py"], runs)
+    assert "small" not in str(report["reached"]) and "small" not in str(report["fronts"])
+    _, table = result_tables(report["summary"])
+    assert f"attic, small: {why}." in table.title and "small" in [row[1] for row in table.rows]
+
+
+def test_seeds_of_different_ground_truth_are_told_so():
+    runs = _runs()
+    runs[5]["ground_truth_sha256"] = "b" * 64
+    assert {run["why_apart"] for run in stand_apart(runs)[4:]} == {"its seeds were scored on different ground truth"}
+
+
+def test_one_option_set_has_no_comparisons(tmp_path):
+    pages = [render("md", make_report(["x"], runs), {}, {}, tmp_path) for runs in (_runs(), _runs()[:2])]
+    for part in ("## Seconds to reach a test PSNR\n\nattic, compared with adc:", "## Pareto fronts of option sets"):
+        assert [part in page for page in pages] == [True, False]
+
+
+def test_seeds_that_end_by_themselves_share_a_row():
+    runs = []
+    for seed, points in enumerate((2, 4, 9)):
+        curve = [(10 * i, 20.0 + i, 100) for i in range(1, points + 1)]
+        runs.append(_run("adc-20s", seed, *curve, open_ended=True, finished=seed < 2))
+        runs[-1]["iterations"]["5"] = runs[-1]["iterations"][str(10 * points)] | {"PSNR": 15.0}  # saved on the way
+    rows = make_report(["x"], [*_runs(), *runs])["summary"]
+    (row,) = (row for row in rows if row["config"] == "adc-20s")
+    assert row["iterations"] == [20, 40] and row["iteration"] == 30 and row["seeds"] == [0, 1]
+    assert row["PSNR"]["values"] == [22.0, 24.0]
+    (table,) = result_tables(rows)
+    assert dict(zip(table.header, table.rows[-1], strict=True))["iteration"] == "20 to 40"
+
+
+def test_published_scenes_add_up_to_the_published_means():
+    """Two tables of the paper were transcribed by hand: each mean over scenes must be the printed mean."""
+    table = published_tables()[0]
+    assert set(table["scenes"]) == {name for scenes in DATASETS.values() for name in scenes}
+    for group, by_iteration in table["means"].items():
+        for iteration, means in by_iteration.items():
+            for metric, half in (("PSNR", 0.005), ("SSIM", 0.0005), ("LPIPS", 0.0005)):
+                mean = statistics.fmean(table["scenes"][name][iteration][metric] for name in DATASETS[group])
+                # The mean is rounded, and so are the numbers that it is computed from here.
+                assert abs(mean - means[metric]) <= 1.5 * half + 1e-12, (group, iteration, metric)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{}, {"test_sizes": [[400, 400]]}, {"views": {"test": 25, "train": 100}}, {"options": ["--eval"]}],
+)
+def test_synthetic_scenes_compare_at_full_size_over_white_only(change):
+    of_table = {"options": ["--eval", "-w"], "test_sizes": [[800, 800]], "views": {"test": 200, "train": 100}}
+    run = _run(None, None, (1, 35.0, 9), scene="lego", **of_table | change)
+    run["iterations"] = {"30000": run["iterations"]["10"]}
+    found = compare([run], summarise([run]), [])
+    assert bool(found) == (not change)
+    if found:
+        assert found[0]["numbers"] == {"PSNR": {"ours": 35.0, "published": 35.78, "difference": pytest.approx(-0.78)}}
+
+
+def test_markdown_keeps_columns_apart():
+    table = ["a", "b"], [["x|y", "1"], ["z", "22"]]
+    right = ["| a    |   b |", "| ---- | --: |", "| x\\|y |   1 |", "| z    |  22 |"]
+    left = ["| a    | b   |", "| ---- | --- |", "| x\\|y | 1   |", "| z    | 22  |"]
+    assert [markdown_table(*table).splitlines(), markdown_table(*table, right=False).splitlines()] == [right, left]
+
+
+def test_nothing_imports_the_benchmarks():
+    """The benchmarks measure the project, which must run without them."""
+    outside = ("benchmarks", "tests", "build", "output")
+    folders = [path for path in ROOT.iterdir() if path.name not in outside and not path.name.startswith(".")]
+    ours = [file for path in folders for file in ([path] if path.suffix == ".py" else path.glob("**/*.py"))]
+    assert len(ours) > 100
+    for path in ours:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            assert not [name for name in names if name.split(".")[0] == "benchmarks"], path
+
+
+@pytest.mark.parametrize("text", ["", BEGIN, f"{END}\n{BEGIN}", f"{BEGIN}{BEGIN}{END}"])
+def test_a_page_without_marks_is_left_alone(text):
+    with pytest.raises(UserError, match="one line <!-- results: begin"):
+        replace_results(text, [])
+
+
+@pytest.mark.parametrize(
+    ("sets", "text"),
+    [
+        ({None: "--iterations 40"}, "Options of every run: `--iterations 40`."),
+        ({"base": "--iterations 40", "long": "--iterations 50"},
+         "Each option set adds:\n\n- base: `--iterations 40`\n- long: `--iterations 50`"),
+        ({"base": "--test_iterations -1 -w", "sh1": "--test_iterations -1 -w --sh_degree 1"},
+         "Options of every run: `--test_iterations -1 -w`.\n\nEach option set adds:\n\n- base: nothing\n"
+         "- sh1: `--sh_degree 1`"),
+        ({"base": "", "sh1": "--sh_degree 1"}, "Each option set adds:\n\n- base: nothing\n- sh1: `--sh_degree 1`"),
+    ],
+)  # fmt: skip
+def test_options_that_all_runs_share_are_written_once(sets, text):
+    runs = [_run(name, 0, (1, 2, 3), added_options=words.split()) for name, words in sets.items()]
+    assert results_text({"summary": summarise(runs), "runs": runs}).split("\n\n", 1)[1] == text
+
+
+def test_shipped_sets_are_options_of_training(tmp_path, monkeypatch):
+    assert "strategies" in shipped()
+    guide = (ROOT / "docs" / "guide" / "many_scenes.md").read_text().splitlines()
+    described = {name for line in guide if line.startswith("| `") for name in line.split("|")[1].split("`")[1::2]}
+    for name in shipped():
+        sets = read_configs(Path(name), train.parse)
+        assert read_configs(configs.SHIPPED / f"{name}.json", train.parse) == sets and len(sets) > 1
+        assert set(sets) <= described, "many_scenes.md does not tell what these are for"
+    assert default_set(read_configs(Path("strategies"), None)) == "adc" == default_set({"defaults": [], "adc": []})
+    assert default_set({"fast": [], "defaults": []}) == "defaults" and default_set({"x": [], "y": []}) == "x"
+    assert read_configs(Path("strategies"), None)["adc"] == ()
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "strategies").write_text(json.dumps({"mine": []}))  # a file comes first
+    assert list(read_configs(Path("strategies"), None)) == ["mine"]
+    with pytest.raises(UserError, match="cannot read strategy .*or strategies"):
+        read_configs(Path("strategy"), None)

@@ -1,0 +1,182 @@
+"""LPIPS: the values of the `lpips` package by both of our ways to it, where weights come from, and errors."""
+
+import importlib
+import socket
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+import lpipsPyTorch
+import metrics
+from lpipsPyTorch import lpips
+from lpipsPyTorch.modules.lpips import LPIPS
+from utils import lpips_utils
+from utils.lpips_utils import NETS, LpipsUnavailable, PerceptualDistance, import_lpips
+from utils.system_utils import UserError
+
+CPU = torch.device("cpu")
+
+
+class Judges(NamedTuple):
+    """A home of torch, whose cache has stand-in weights by net, and the package's models with these weights."""
+
+    home: Path
+    files: dict[str, Path]
+    models: dict[str, torch.nn.Module]
+
+
+@pytest.fixture(scope="module")
+def judges(tmp_path_factory) -> Judges:
+    package, made = import_lpips(), Judges(tmp_path_factory.mktemp("torch_home"), {}, {})
+    torchvision = importlib.import_module("torchvision.models")
+    cache = made.home / "hub" / "checkpoints"
+    cache.mkdir(parents=True)
+    for net, name in NETS.items():
+        torch.manual_seed(7)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torchvision's about an argument that lpips still uses
+            made.models[net] = package.LPIPS(net=net, pnet_rand=True, verbose=False).eval().requires_grad_(False)
+        state = {f"features.{key.split('.', 1)[1]}": value for key, value in made.models[net].net.state_dict().items()}
+        made.files[net] = cache / torchvision.get_model_weights(name).IMAGENET1K_V1.url.rsplit("/", 1)[1]
+        torch.save({**state, "classifier.6.bias": torch.zeros(1000)}, made.files[net])
+    return made
+
+
+@pytest.fixture(autouse=True)
+def _cache_of_torch(judges, monkeypatch) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(judges.home))
+    monkeypatch.setattr(lpips_utils, "_network_failed", False)
+    lpipsPyTorch._network.cache_clear()
+
+
+def images(count: int = 1) -> list[torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    return [torch.rand(count, 3, 48, 40, generator=generator) for _ in range(2)]
+
+
+@pytest.mark.parametrize("net", NETS)
+def test_values_are_the_packages(net, judges):
+    x, y = images()
+    plain, mapped = (judges.models[net](x, y, normalize=normalize).item() for normalize in (False, True))
+    distance = lpips(x, y, net_type=net)
+    assert distance.shape == (1, 1, 1, 1) and distance.item() == plain > 0 and plain != mapped
+    assert torch.equal(LPIPS(net, "0.1")(x, y), distance)
+    if net == "squeeze":  # which metrics.py does not have
+        return
+    for paths in ([], [judges.files[net]], [judges.files["vgg"], judges.files["alex"]]):  # the one that fits is found
+        ours = PerceptualDistance(net, paths, CPU)
+        assert [ours(x[0], y[0], unit_range=unit_range) for unit_range in (True, False)] == [plain, mapped]
+
+
+def test_under_a_mask_it_is_the_mean_of_the_packages_map(judges):
+    (x, y), judge = images(), judges.models["alex"]
+    mask = torch.zeros(48, 40, dtype=torch.bool)
+    mask[10:40, 5:30] = True
+    judge.spatial = True
+    expected, everywhere = judge(x, y)[0, 0][mask].mean().item(), judge(x, y).mean().item()
+    judge.spatial = False
+    distance = PerceptualDistance("alex", [], CPU)
+    assert distance(x[0], y[0], unit_range=True, mask=mask) == expected
+    plain = distance(x[0], y[0], unit_range=True)
+    assert plain != expected
+    assert plain == pytest.approx(everywhere, rel=0.05)  # each layer's map is stretched to the image
+
+    metric = metrics._lpips_metric(distance, True, CPU)
+    shown, truth = ((image[0].permute(1, 2, 0) * 255).byte().numpy() for image in (x, y))
+    hidden = np.where(mask.numpy()[..., None], shown, 255 - shown)
+    assert metric(hidden, truth, mask.numpy()) == metric(shown, truth, mask.numpy()) < metric(shown, truth)
+
+
+def test_the_default_is_alex_and_a_batch_is_summed():
+    x, y = images(3)
+    each = [lpips(a, b) for a, b in zip(x, y, strict=True)]
+    assert each[0].shape == (1, 1, 1, 1) and torch.equal(each[0], lpips(x[:1], y[:1], "alex", "0.1"))
+    torch.testing.assert_close(lpips(x, y), sum(each))
+    assert lpips(x, x).item() == 0
+
+
+def test_gradients_flow_to_images_and_not_to_the_network_which_is_kept_in_evaluation(monkeypatch):
+    made, load = [], lpips_utils.load_network
+    monkeypatch.setattr("lpipsPyTorch.modules.lpips.load_network", lambda *args: made.append(args[0]) or load(*args))
+    x, y = images()
+    with torch.inference_mode():
+        lpips(x, y)  # which makes the network
+    x.requires_grad_()
+    lpips(x, y).mean().backward()
+    assert x.grad.isfinite().all() and x.grad.any()
+    lpips(x, y, net_type="squeeze")
+    assert made == ["alex", "squeeze"]
+    network = LPIPS()
+    assert isinstance(network, torch.nn.Module) and not any(value.requires_grad for value in network.parameters())
+    assert torch.equal(network.train()(x, y), network(x, y)) and not network.training
+
+
+def test_other_versions_and_nets_are_refused():
+    with pytest.raises(ValueError, match=r"version 0.1 here, got '0.0'"):
+        lpips(*images(), version="0.0")
+    with pytest.raises(ValueError, match="one of alex, vgg, squeeze, got 'resnet'"):
+        lpips(*images(), net_type="resnet")
+
+
+def test_downloaded_weights_are_kept_with_a_checked_digest(judges, tmp_path, monkeypatch):
+    def download(url, to, hash_prefix):
+        assert url.endswith(f"-{hash_prefix}.pth") and len(hash_prefix) == 8
+        Path(to).write_bytes(judges.files["alex"].read_bytes())
+
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr(torch.hub, "download_url_to_file", download)
+    PerceptualDistance("alex", [], CPU)
+    (kept,) = (tmp_path / "hub" / "checkpoints").iterdir()
+    assert kept.read_bytes() == judges.files["alex"].read_bytes()
+
+
+@pytest.mark.parametrize(("forbidden", "attempts"), [("", 1), ("0", 0)])
+def test_without_weights_it_is_refused_after_one_attempt(tmp_path, monkeypatch, forbidden, attempts):
+    tried = []
+
+    def download(url, *_, **__):
+        tried.append(url)
+        raise OSError("no network")
+
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setenv("GS_DOWNLOAD", forbidden)
+    monkeypatch.setattr(torch.hub, "download_url_to_file", download)
+    for net, name in NETS.items():
+        for make in (lambda net: PerceptualDistance(net, [], CPU), LPIPS):
+            with pytest.raises(
+                LpipsUnavailable, match=f"missing; put .*/{name}-.* at {tmp_path}/hub/checkpoints/{name}"
+            ):
+                make(net)
+    assert len(tried) == attempts
+
+
+def test_a_network_that_never_answers_is_given_up(tmp_path, monkeypatch):
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+        monkeypatch.setenv("https_proxy", f"http://127.0.0.1:{silent.getsockname()[1]}")
+        monkeypatch.setattr(lpips_utils, "_DOWNLOAD_TIMEOUT", 0.3)
+        with pytest.raises(LpipsUnavailable):
+            PerceptualDistance("alex", [], CPU)
+    assert socket.getdefaulttimeout() is None
+
+
+def test_weights_of_the_wrong_kind(judges, tmp_path):
+    def refused(content: object, net: str = "vgg") -> str:
+        torch.save(content, tmp_path / "weights.pth")
+        with pytest.raises((UserError, LpipsUnavailable)) as caught:
+            PerceptualDistance(net, [tmp_path / "weights.pth"], CPU)
+        return str(caught.value)
+
+    vgg = torch.load(judges.files["vgg"], weights_only=True)
+    assert "torchvision's vgg16 or alexnet" in refused({"something": torch.zeros(3)})
+    assert "features.28.weight" in refused({name: value for name, value in vgg.items() if "28.weight" not in name})
+    assert "list" in refused([1, 2]) and "alexnet" in refused(vgg, "alex")
+    assert "which are never run" in refused({"features.0.weight": bytearray(9)})
+    (tmp_path / "garbage.pth").write_bytes(b"no weights at all")
+    for file in ("garbage.pth", "missing.pth"):
+        with pytest.raises(UserError, match=file):
+            PerceptualDistance("vgg", [tmp_path / file], CPU)

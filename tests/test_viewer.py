@@ -1,0 +1,300 @@
+"""The viewer's frames, and when they are drawn: no server, no browser."""
+
+import math
+from argparse import ArgumentParser, Namespace
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from gaussians import model, parameters, pipeline
+from scipy.spatial.transform import Rotation
+from synthetic import make_colmap_scene
+
+from arguments import ModelParams
+from gaussian_renderer import render
+from gaussian_renderer.blending import blend_depth
+from gaussian_renderer.free_view import free_view
+from scene import Scene
+from scene.gaussian_model import GaussianModel
+from splatting.camera_paths.keyframes import read_camera_path
+from splatting.viewer import views
+from splatting.viewer.frames import LONGEST, Frames, inside, shown_part
+from splatting.viewer.tabs import PathTab, first_box
+from splatting.viewer.views import Pose, SceneCameras, Settings, canvas, fov_of_canvas, pose_of
+from splatting.viewer.watchers import MOVING, STILL, STILL_AFTER, Budget, Watchers
+from utils.graphics_utils import camera_center
+from utils.system_utils import UserError
+
+FRONT = Pose((0.0, 0.0, -4.0), (1.0, 0.0, 0.0, 0.0), 0.8, 96, 64)
+PLAIN = Settings()
+BLACK = torch.zeros(3)
+
+
+class Clock:
+    """A clock that stands still until it is moved."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def gaussians():
+    return model(200)
+
+
+@pytest.fixture(scope="module")
+def scene_cameras(tmp_path_factory) -> SceneCameras:
+    folder = tmp_path_factory.mktemp("cameras")
+    make_colmap_scene(folder / "scene")
+    given = Namespace(source_path=str(folder / "scene"), model_path=str(folder / "out"), eval=True)
+    scene = Scene(ModelParams(ArgumentParser()).extract(given), GaussianModel(0), shuffle=False, start=False)
+    return SceneCameras(scene.getTrainCameras(), scene.getTestCameras())
+
+
+def drawn(gaussians, pose=FRONT, cameras=None, coarse=False, **settings) -> np.ndarray:
+    frames = Frames(gaussians, cameras or SceneCameras([], []), pipeline(), False)
+    return frames.draw(replace(PLAIN, **settings), pose, coarse)
+
+
+def rendered(gaussians, view=None, scaling=1.0, background=BLACK, **options) -> np.ndarray:
+    """Our render (H, W, 3) uint8, from the front by default."""
+    view = view or free_view(96, 64, FRONT.fov, FRONT.position, FRONT.wxyz, "cpu")
+    with torch.no_grad():
+        image = render(view, gaussians, pipeline(), background, scaling, **options)["render"]
+    return (image * 255 + 0.5).to(torch.uint8).permute(1, 2, 0).numpy()
+
+
+def at(camera, width=300, height=100) -> Pose:
+    wxyz = Rotation.from_matrix(camera.R).as_quat(scalar_first=True)
+    fov = fov_of_canvas(camera, width / height)
+    return Pose(tuple(camera_center(camera.R, camera.T)), tuple(wxyz), fov, width, height)
+
+
+def test_a_frame_is_the_render_of_its_pose(gaussians):
+    assert drawn(gaussians).std() > 10
+    np.testing.assert_array_equal(drawn(gaussians), rendered(gaussians))
+    red = drawn(gaussians, background=(1.0, 0.0, 0.0), scaling=0.5)
+    np.testing.assert_array_equal(red, rendered(gaussians, scaling=0.5, background=torch.tensor([1.0, 0.0, 0.0])))
+    # A moving camera gets a quarter of the pixels, and a large window not all.
+    assert drawn(gaussians, coarse=True).shape == (32, 48, 3)
+    assert drawn(gaussians, replace(FRONT, width=8000, height=40)).shape == (8, LONGEST, 3)
+
+
+def test_modes_show_what_they_say(gaussians):
+    white = rendered(gaussians, override_color=torch.ones(200, 3))
+    np.testing.assert_array_equal(drawn(gaussians, mode=views.OPACITY), white)
+    depth = drawn(gaussians, mode=views.DEPTH)
+    assert not depth[white[..., 0] < 127].any() and depth[white[..., 0] > 128].any(axis=1).all()
+    # Without an image of the scene there is no error to show.
+    np.testing.assert_array_equal(drawn(gaussians, mode=views.ERROR), rendered(gaussians))
+    # The count of a pixel is that of its tile's list up to the last one blended.
+    view = free_view(96, 64, FRONT.fov, FRONT.position, FRONT.wxyz, "cpu")
+    counts = blend_depth(view, gaussians, pipeline())
+    with torch.no_grad():
+        alpha = render(view, gaussians, pipeline(), BLACK, override_color=torch.ones(200, 3))["render"][0]
+    assert torch.equal(counts > 0, alpha > 0) and 0 < counts.max() <= 200
+    assert blend_depth(view, model(1), pipeline()).max() == 1
+
+
+def test_the_crop_box_leaves_gaussians_out_and_the_model_alone(gaussians):
+    before = {name: values.clone() for name, values in parameters(gaussians).items()}
+    box = (1.0, 1.0, 0.0), (-1.0, -0.2, -1.0)  # opposite corners in any order
+    x, y, z = gaussians.get_xyz.T
+    keep = (x.abs() <= 1) & (y >= -0.2) & (y <= 1) & (z >= -1) & (z <= 0)
+    assert 0 < keep.sum() < 200
+    np.testing.assert_array_equal(drawn(gaussians, crop=box), rendered(gaussians.part(keep, 3)))
+    assert len(gaussians) == 200 and gaussians.optimizer is not None
+    assert all(torch.equal(values, before[name]) for name, values in parameters(gaussians).items())
+    assert not drawn(gaussians, crop=((9.0,) * 3, (8.0,) * 3)).any()
+
+
+def test_the_sh_degree_of_a_frame_is_not_that_of_the_model(gaussians):
+    low = shown_part(gaussians, replace(PLAIN, sh_degree=1))
+    assert low.active_sh_degree == 1 and gaussians.active_sh_degree == 3
+    assert shown_part(gaussians, replace(PLAIN, sh_degree=9)) is gaussians
+    plain = drawn(gaussians, sh_degree=0)
+    gaussians.active_sh_degree = 0
+    np.testing.assert_array_equal(plain, rendered(gaussians))
+
+
+@pytest.mark.parametrize("size", [(300, 100), (96, 64), (60, 200)])
+def test_left_of_the_slider_is_the_scenes_image_and_right_of_it_the_render(gaussians, scene_cameras, size):
+    name, camera = next(iter(scene_cameras.by_name.items()))
+    shown = drawn(gaussians, at(camera, *size), scene_cameras, camera=name, comparison=views.SLIDER, slider=0.25)
+    wide, high = canvas(96, 64, size[0] / size[1])
+    top, left = (high - 64) // 2, (wide - 96) // 2
+    assert shown.shape == (high, wide, 3)
+    inner = shown[top : top + 64, left : left + 96]
+    np.testing.assert_array_equal(inner[:, :23], camera.target(BLACK).permute(1, 2, 0).numpy()[:, :23])
+    np.testing.assert_array_equal(inner[:, 26:], rendered(gaussians, camera)[:, 26:])
+    assert (inner[:, 23:25] == 255).all()  # the slider's line
+
+
+def test_side_by_side_are_image_render_and_error(gaussians, scene_cameras):
+    name, camera = next(iter(scene_cameras.by_name.items()))
+    shown = drawn(gaussians, at(camera), scene_cameras, camera=name, comparison=views.BESIDE).astype(int)
+    top, left = (shown.shape[0] - 64) // 2, (shown.shape[1] - 3 * 96) // 2
+    target, image, error = np.split(shown[top : top + 64, left : left + 3 * 96], 3, axis=1)
+    assert abs(error - np.minimum(abs(target - image) * 5, 255)).max() <= 4  # rounded before the difference
+    alone = drawn(gaussians, at(camera), scene_cameras, camera=name, mode=views.ERROR).astype(int)
+    assert abs(alone[:64, (alone.shape[1] - 96) // 2 :][:, :96] - error).max() <= 1
+
+
+def test_an_image_is_shown_only_where_it_was_taken_and_drawn_once(gaussians, scene_cameras, monkeypatch):
+    name, camera = list(scene_cameras.by_name.items())[3]
+    frames, pose = Frames(gaussians, scene_cameras, pipeline(), False), at(camera)
+    asked = replace(PLAIN, camera=name, comparison=views.SLIDER)
+    assert frames.compared(asked, pose) is camera
+    moved = tuple(np.asarray(pose.position) + [0.02 * scene_cameras.size, 0, 0])
+    turned = Rotation.from_matrix(camera.R) * Rotation.from_rotvec([0, 0.005, 0])
+    for other in (replace(pose, position=moved), replace(pose, wxyz=tuple(turned.as_quat(scalar_first=True)))):
+        assert frames.compared(asked, other) is None
+    for change in ({"camera": "no such"}, {"comparison": views.ALONE}):
+        assert frames.compared(replace(asked, **change), pose) is None
+    calls = []
+    monkeypatch.setattr("splatting.viewer.frames.render", lambda *a, **k: (calls.append(1), render(*a, **k))[1])
+    for slider, version in ((0.1, 1), (0.2, 1), (0.9, 1), (0.9, 2)):
+        frames.draw(replace(asked, slider=slider), pose, False, version)
+    assert len(calls) == 2  # until the model changes
+
+
+@pytest.mark.parametrize("share", [STILL, MOVING])
+@pytest.mark.parametrize("cost", [0.001, 0.05, 2.0])
+def test_frames_take_no_more_than_their_share_of_the_time(share, cost):
+    clock, spent, count = Clock(), 0.0, 0
+    budget, step = Budget(clock), 0.004
+    end = clock.now + 60
+    while clock.now < end:
+        clock.now += step
+        if budget.allows(share):
+            began = clock.now
+            clock.now += cost
+            budget.spent(began, cost)
+            spent, count = spent + cost, count + 1
+    assert spent <= share * 60 + cost
+    assert count <= 30 * 60 + 1
+    assert spent >= 0.8 * min(share * 60, 25 * 60 * cost)  # nor much less than may be taken
+
+
+def test_a_browser_that_moves_gets_coarse_frames_and_then_a_sharp_one():
+    watchers = Watchers(clock := Clock())
+    assert not watchers.any and watchers.next() is None
+    watchers.moved(7, FRONT)
+    first = watchers.next()
+    assert watchers.any and first.urgent and not first.coarse
+    watchers.moved(7, replace(FRONT, fov=0.9))
+    watchers.drew(first)
+    assert watchers.next().pose.fov == 0.9  # it moved while the frame was drawn
+    clock.now += 1
+    watchers.moved(7, replace(FRONT, fov=0.7))
+    for wait, coarse in ((0, True), (STILL_AFTER + 0.01, False)):
+        clock.now += wait
+        wish = watchers.next()
+        assert wish.coarse == coarse and wish.urgent and wish.pose.fov == 0.7
+        watchers.drew(wish)
+        assert watchers.next() is None
+    watchers.left(7)
+    assert not watchers.any
+
+
+def test_a_model_that_changes_is_shown_to_all_who_look_and_nobody_waits_for_it():
+    watchers = Watchers(clock := Clock())
+    for client in (1, 2):
+        watchers.moved(client, FRONT)
+        watchers.drew(watchers.next(5), 5)
+        clock.now += 1
+    assert watchers.next(5) is None
+    wish = watchers.next(6)
+    assert wish.client == 1 and not wish.urgent and not wish.coarse
+    watchers.drew(wish, 6)
+    assert watchers.next(6).client == 2
+    watchers.moved(1, replace(FRONT, fov=0.1))
+    assert watchers.next(6).client == 1  # who waits comes first
+    watchers.drew(watchers.next(6), 6)
+    watchers.changed()
+    assert watchers.next(6).urgent
+
+
+def test_what_a_browser_sends_is_checked():
+    sound = {"position": [1, 2, 3], "wxyz": [2, 0, 0, 0], "fov": 1.0, "image_width": 800, "image_height": 600}
+    pose = pose_of(SimpleNamespace(**sound))
+    assert pose == Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), 1.0, 800, 600)
+    for wrong in (
+        {"position": [math.nan, 0, 0]}, {"position": [math.inf, 0, 0]}, {"wxyz": [0, 0, 0, 0]}, {"fov": 0.0},
+        {"wxyz": [1e300, 0, 0, 0]}, {"fov": math.pi}, {"fov": math.nan}, {"fov": -1.0},
+    ):  # fmt: skip
+        assert pose_of(SimpleNamespace(**sound | wrong)) is None, wrong
+    for width, height in ((10**9, 10**9), (10**9, 1), (0, 0), (-5, 10**6)):
+        pose = pose_of(SimpleNamespace(**sound | {"image_width": width, "image_height": height}))
+        assert 1 <= pose.width <= 8192 and 1 <= pose.height <= 8192
+        assert 0.09 < pose.width / pose.height < 11
+
+
+def test_cameras_are_named_and_the_view_begins_upright(scene_cameras):
+    assert len(scene_cameras.by_name) == 17
+    assert {name.split()[0] for name in scene_cameras.by_name} == {"train", "test"}
+    assert math.isclose(np.linalg.norm(scene_cameras.up), 1)
+    for camera in scene_cameras.by_name.values():
+        up = np.asarray(scene_cameras.up_at(camera))
+        assert up @ -camera.R[:, 1] > 0 and abs(up @ camera.R[:, 0]) < 1e-9
+        assert scene_cameras.depth(camera) > 0
+
+
+def test_the_crop_box_begins_around_most_gaussians():
+    positions = torch.randn(5000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 5.0, 0.1])
+    positions[0], positions[1] = 1e6, math.nan
+    low, high = (torch.tensor(corner) for corner in first_box(positions))
+    share = inside(positions, low.tolist(), high.tolist()).float().mean()
+    assert 0.85 < share < 0.95 and high.max() < 15
+    for nowhere in (torch.zeros(0, 3), torch.full((3, 3), math.nan)):
+        assert first_box(nowhere) == ((-1.0,) * 3, (1.0,) * 3)
+
+
+class Gui:
+    """A stand-in for viser's controls."""
+
+    def __getattr__(self, name: str):
+        def add(label: str, *values: object, **_: object) -> SimpleNamespace:
+            return SimpleNamespace(value=values[0] if values else None, on_click=lambda call: None)
+
+        return add
+
+
+@pytest.fixture
+def path_tab(tmp_path) -> PathTab:
+    tab = PathTab(SimpleNamespace(gui=Gui()), tmp_path)
+    tab.easing.value = "smooth"
+    return tab
+
+
+def _client(**changes: object) -> SimpleNamespace:
+    camera = {"position": [1, 2, 3], "wxyz": [0, 1, 0, 0], "fov": 1.0, "image_width": 4, "image_height": 3}
+    return SimpleNamespace(camera=SimpleNamespace(**camera | changes))
+
+
+def test_a_recorded_path_is_read_by_what_renders_it(path_tab, tmp_path):
+    path_tab.add(_client())
+    with pytest.raises(UserError, match="at least 2 keyframes"):
+        path_tab.save("short")
+    path_tab.seconds.value = 1.5
+    path_tab.add(_client(position=[4, 5, 6]))
+    path_tab.add(_client(position=[math.nan] * 3))  # cannot be drawn, so is no keyframe
+    path = read_camera_path(path_tab.save("fly_1-a"))
+    assert path.seconds == 1.5 and path.easing == "smooth"
+    assert [frame.position for frame in path.keyframes] == [(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)]
+    assert math.isclose(path.keyframes[0].fov, math.degrees(1.0)) and path.keyframes[0].wxyz == (0.0, 1.0, 0.0, 0.0)
+    assert [file.name for file in tmp_path.rglob("*.json")] == ["fly_1-a.json"]
+
+
+@pytest.mark.parametrize("name", ["", "..", "../a", "a/b", "a\\b", "/etc/x", "a.json", "a\0b", "ä", "a\n", "x" * 65])
+def test_no_name_leads_out_of_the_folder(path_tab, tmp_path, name):
+    for _ in range(2):
+        path_tab.add(_client())
+    with pytest.raises(UserError, match="the name of a path"):
+        path_tab.save(name)
+    assert not list(tmp_path.rglob("*"))

@@ -1,0 +1,532 @@
+"""The viewer's server: who may connect and send what, what a request can reach, and the page over a websocket."""
+
+import argparse
+import contextlib
+import http.client
+import math
+import re
+import secrets
+import select
+import socket
+import sys
+import threading
+import time
+import warnings
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from gaussians import model, pipeline
+from synthetic import make_colmap_scene
+
+viser = pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
+
+import msgspec  # noqa: E402
+from viser_client import Client, get  # noqa: E402
+from waiting import LIMIT, wait_for  # noqa: E402
+from websockets.asyncio.server import serve as serve_websockets  # noqa: E402
+from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
+from websockets.sync.client import connect  # noqa: E402
+
+from arguments import ModelParams  # noqa: E402
+from scene import Scene  # noqa: E402
+from splatting.viewer import auth, watchers  # noqa: E402
+from splatting.viewer import server as servers  # noqa: E402
+from splatting.viewer.auth import Auth, is_accepted  # noqa: E402
+from splatting.viewer.page import Page, answer  # noqa: E402
+from splatting.viewer.server import Address  # noqa: E402
+from utils.graphics_utils import camera_center  # noqa: E402
+from utils.system_utils import UserError  # noqa: E402
+
+ANY = Address("127.0.0.1", 0)
+
+
+class Served:
+    """A server for a block. port, url: where it listens."""
+
+    def __init__(self, host: str = "127.0.0.1", port: int = 0) -> None:
+        self.server, self.url = servers.serve(Address(host, port), "test")
+        self.port = self.server.get_port()
+
+    def __enter__(self) -> "Served":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        servers.stop(self.server)
+
+
+@pytest.fixture(scope="module")
+def local():
+    with Served() as served:
+        yield served
+
+
+@pytest.fixture(scope="module")
+def public():
+    """A server on all addresses, which needs a token."""
+    with Served("0.0.0.0") as served:
+        yield served
+
+
+def test_the_page_is_served_and_may_ask_nobody_else(local):
+    status, headers, body = get(local.port, "/")
+    assert status == 200 and b"<html" in body
+    policy = headers["Content-Security-Policy"]
+    own = rf"(ws|wss)://127\.0\.0\.1:{local.port}"
+    sources = {word for part in policy.split(";") for word in part.split()[1:]}
+    outside = {word for word in sources if not re.fullmatch(rf"'[a-z-]+'|data:|blob:|{own}", word)}
+    assert "default-src 'self'" in policy and not outside
+    assert headers["Referrer-Policy"] == "no-referrer"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../../etc/passwd", "/..%2f..%2f..%2f..%2f..%2f..%2fetc/passwd", "/%2e%2e/%2e%2e/%2e%2e/%2e%2e/etc/passwd",
+        "//etc/passwd", "/%2fetc%2fpasswd", "/..\\..\\etc\\passwd", "/%2e%2e%5c%2e%2e%5cetc%5cpasswd",
+        "/....//....//etc/passwd", "/%252e%252e/etc/passwd", "/./.././../etc/passwd", "/etc/passwd%00", "/\x00",
+        "http://127.0.0.1/../../etc/passwd", "/index.html/../../../_viser.py", "/assets/../../../_viser.py",
+        "/index.html%00.png", "/?../../etc/passwd=1",
+    ],
+)  # fmt: skip
+def test_no_request_reads_a_file_but_the_page(local, path):
+    try:
+        status, _, body = get(local.port, path)
+    except (http.client.HTTPException, OSError):
+        return  # the connection was closed without an answer
+    page = get(local.port, "/")[2]
+    assert status != 200 or body == page
+    assert b"root:" not in body and b"import " not in body[:2000]
+
+
+def test_nobody_else_than_this_machine_is_served_on_loopback(local):
+    port = local.port
+    for host, status in (
+        (f"127.0.0.1:{port}", 200), ("localhost:9999", 200), ("[::1]:1", 200), ("evil.example", 403),
+        (f"evil.example:{port}", 403), ("127.0.0.1.evil.example", 403), ("", 403), ("[", 403), (":80", 403),
+        ("127.0.0.1:x", 403), ("127.0.0.1:99999", 403), ("localhost@evil.example", 403),
+        ("127.0.0.1 evil.example", 403),
+    ):  # fmt: skip
+        assert get(port, "/", Host=host)[0] == status, host
+
+
+def test_pages_of_other_origins_open_no_websocket(local):
+    for origin in (local.url.rstrip("/"), None):
+        with Client(local.url, origin) as client:
+            assert client.messages()
+    for origin in ("http://evil.example", "null", "http://127.0.0.1:1"):
+        with pytest.raises(InvalidStatus, match="403"):
+            Client(local.url, origin)
+
+
+def test_other_addresses_need_the_token(public, capfd):
+    port, token = public.port, public.url.split("token=")[1]
+    url = f"http://127.0.0.1:{port}/"
+    for path in ("/", "/?token=", f"/?token={token[:-1]}", f"/?token={token}x", f"/{token}", "/index.html?token=1"):
+        status, headers, body = get(port, path)
+        assert status == 403 and token.encode() not in body and headers["Set-Cookie"] is None, path
+    for cookie in ("", f"viewer_token_{port}=no", f"viewer_token_1={token}", f"other={token}", "a;b=;;"):
+        with pytest.raises(InvalidStatus, match="403"):
+            Client(url, headers={"Cookie": cookie})
+    status, headers, _ = get(port, f"/?token={token}")
+    assert status == 200
+    cookie = headers["Set-Cookie"]
+    assert "HttpOnly" in cookie and "SameSite=Strict" in cookie
+    with Client(url, headers={"Cookie": cookie.split(";")[0]}) as client:
+        assert client.messages()
+    # Browsers send a cookie of this host to all its ports, whichever port the page that asks comes from.
+    with pytest.raises(InvalidStatus, match="403"):
+        Client(url, "http://127.0.0.1:1", headers={"Cookie": cookie.split(";")[0]})
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.3.2.1", "::1", "localhost"])
+def test_only_other_addresses_than_loopback_have_a_token(host):
+    assert Auth(host).token is None
+    assert all(Auth(other).token for other in ("0.0.0.0", "::", "", "192.168.0.1", f"{host}.evil.example"))
+
+
+def test_a_taken_port_is_passed_over_and_told(capfd):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with Served(port=port) as served:
+            assert served.port > port
+    assert f":{served.port}/ (port {port} is taken)" in capfd.readouterr().err
+    with contextlib.ExitStack() as taking:
+        with contextlib.suppress(OSError):  # another program may have it already
+            taking.enter_context(socket.create_server(("127.0.0.1", 65535)))
+        with pytest.raises(UserError, match="port 65535 .* taken"):
+            servers.checked_address("127.0.0.1", 65535)
+
+
+@pytest.mark.parametrize(
+    ("host", "port", "reason"),
+    [
+        ("no.such.host.invalid", 8080, "cannot listen at no.such.host.invalid"),
+        ("198.51.100.7", 8080, "cannot listen at 198.51.100.7"),
+        ("a" * 80, 8080, "cannot listen"),
+        ("127.0.0.1", 70000, "between 0 .any. and 65535, got 70000"),
+        ("127.0.0.1", -1, "between 0"),
+    ],
+)
+def test_an_address_that_cannot_be_listened_at_is_refused_at_once(host, port, reason):
+    with pytest.raises(UserError, match=reason):
+        servers.checked_address(host, port)
+
+
+def test_without_viser_a_sentence_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(UserError, match=re.escape("pip install '.[viewer]'")):
+        servers.checked_address("127.0.0.1", 8080)
+    assert servers.checked_address("127.0.0.1", None) is None
+
+
+def test_a_server_that_asks_no_gate_does_not_stay(monkeypatch):
+    stopped = []
+    monkeypatch.setattr("splatting.viewer.auth.Auth.in_front_of_viser", lambda self: threading.Lock())
+    monkeypatch.setattr(servers, "stop", lambda server, stop=servers.stop: (stopped.append(server), stop(server)))
+    with pytest.raises(UserError, match="cannot be guarded"):
+        servers.serve(ANY, "test")
+    assert len(stopped) == 1
+
+
+VALUES = {
+    "text": "a", "number": 1.0, "whole": 1, "switch": False, "vector": (0.0, 0.0, 0.0), "nested": ((0, 1), (2, 3)),
+}  # fmt: skip
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0.5, 0], "fov": 0.8, "near": 0.01, "far": 9,
+    "image_height": 64, "image_width": 96, "look_at": [0, 0, 0], "up_direction": [0, -1, 0],
+}  # fmt: skip
+CLICK = {
+    "type": "SceneNodeClickMessage", "name": "/cameras/0", "instance_index": None, "ray_origin": [0, 0, 0],
+    "ray_direction": [0, 0, 1], "screen_pos": [0.5, 0.5], "modifier": None, "owner": "",
+}  # fmt: skip
+
+
+def _control(uuid: str) -> SimpleNamespace | None:
+    return SimpleNamespace(value=VALUES[uuid], disabled=False) if uuid in VALUES else None
+
+
+def _update(uuid: object, value: object, **more: object) -> dict[str, object]:
+    return {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value} | more}
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        CAMERA, CLICK, _update("text", "b"), _update("number", 2), _update("whole", 3), _update("switch", True),
+        _update("vector", [1, 2.5, 3]), _update("whole", -(2**53)), _update("nested", [[1, 2], [2**53, 4]]),
+    ],
+)  # fmt: skip
+def test_what_a_browser_sends_is_heard(message):
+    assert is_accepted(msgspec.msgpack.encode(message), _control)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        *[CAMERA | wrong for wrong in (
+            {"position": [0.0, 0.0]}, {"position": "abc"}, {"position": [[1], [2], [3]]}, {"wxyz": [1.0, 0.0, 0.0]},
+            {"position": [math.nan] * 3}, {"position": [1e300, 0, 0]}, {"fov": math.inf}, {"fov": None},
+            {"image_width": math.inf}, {"image_width": "x"}, {"up_direction": [1]}, {"more": 1},
+            {"up_direction": [0, 0, 0]}, {"up_direction": [0, 1e-200, 0]},
+        )],
+        CLICK | {"name": 5}, CLICK | {"ray_origin": []},
+        *[_update(uuid, value) for uuid, value in (
+            ("text", 1), ("text", ["a"]), ("number", "1"), ("number", math.nan), ("number", math.inf), ("number", True),
+            ("whole", [1]), ("switch", 1), ("switch", "yes"), ("vector", []), ("vector", [1, 2]), ("vector", [1] * 4),
+            ("vector", "123"), ("vector", [1, 2, math.nan]), ("vector", 1), ("none", 1), (5, 1), ("number", 1e300),
+            ("whole", 1e300), ("whole", 2**53 + 1), ("whole", -(2**63)), ("vector", [1e300, 0, 0]),
+            ("nested", [[1, 2], [1e300, 4]]), ("nested", [1, 2]),
+        )],
+        _update("number", 1, removed=True), _update("number", 1) | {"updates": {"update_cb": [5]}},
+        _update("number", 1) | {"updates": 5}, {"type": "ShareUrlRequest"}, {"type": 5}, {"type": "Message"}, {}, [], 5,
+        {"type": "FileTransferStartUpload", "source_component_uuid": "number", "transfer_uuid": "t", "filename": "f",
+         "mime_type": "m", "part_count": 1, "size_bytes": 3},
+    ],
+)  # fmt: skip
+def test_nothing_else_is_heard(message):
+    assert not is_accepted(msgspec.msgpack.encode(message), _control)
+
+
+def test_what_is_no_message_is_not_heard_and_what_only_shows_something_takes_no_value():
+    for raw in (b"", b"\xff" * 10, "text", b"\x80", b"\x91" * 60_000, b"a" * 100):
+        assert not is_accepted(raw, _control), raw[:20]
+    message = msgspec.msgpack.encode(_update("text", "b"))
+    assert not is_accepted(message, lambda uuid: SimpleNamespace(value="a", disabled=True))
+
+
+def _attack(client: Client, uuid: str) -> None:
+    """All that once made viser's controls raise in the thread that trains, and a wish for a tunnel to the outside."""
+    for update in ({"update_cb": [5]}, {"sync_cb": 5}, {"gui_api": 5}, {"removed": True}, {"uuid": 5}):
+        client.send("GuiUpdateMessage", uuid=uuid, updates=update)
+    client.send(
+        "FileTransferStartUpload",
+        source_component_uuid=uuid, transfer_uuid="t", filename="f", mime_type="m", part_count=1, size_bytes=3,
+    )  # fmt: skip
+    client.send("FileTransferPart", source_component_uuid=uuid, transfer_uuid="t", part_index=0, content=b"abc")
+    client.send("ShareUrlRequest")
+
+
+def test_no_message_takes_a_control_from_the_program_or_opens_a_tunnel(local, monkeypatch, capfd):
+    opened = []
+    monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *_: opened.append(1))
+    heard = local.server.gui.add_checkbox("heard", False)
+    shown, field = local.server.gui.add_text("Iteration", "0", disabled=True), local.server.gui.add_number("n", 1.0)
+    with Client(local.url) as client:
+        client.look()
+        for handle in (shown, field):
+            _attack(client, handle._impl.uuid)
+        client._socket.send("text")
+        client._socket.send(b"\xff")
+        client.look((0.0, 0.0))
+        client.send("GuiUpdateMessage", uuid=heard._impl.uuid, updates={"value": True})
+        wait_for(lambda: heard.value)
+    shown.value, field.value = "17", 2.0
+    assert (shown.value, field.value) == ("17", 2.0) and not opened
+    said = capfd.readouterr()
+    assert "Traceback" not in said.err and "warn" not in said.err.lower()
+
+
+def test_a_long_message_ends_its_connection(local):
+    protocol = f"viser-v{viser.__version__}"
+    with connect(local.url.replace("http", "ws"), subprotocols=[protocol], compression=None) as one:
+        one.send(b"a" * (auth.LARGEST + 1))
+        with pytest.raises(ConnectionClosed, match="1009"):
+            while True:
+                one.recv(LIMIT)
+
+
+def test_many_connections_leave_the_process_its_files(local, monkeypatch):
+    """Each takes a file descriptor, also one that asks for nothing; a training without one cannot save."""
+    monkeypatch.setattr(auth, "MOST", 4)
+    taken = [socket.create_connection(("127.0.0.1", local.port), LIMIT) for _ in range(12)]
+    wait_for(lambda: len(select.select(taken, [], [], 0)[0]) >= 8)  # nothing but an end can have come
+    ended = select.select(taken, [], [], 0)[0]
+    for one in taken:
+        if one not in ended:
+            one.sendall(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{local.port}\r\n\r\n".encode())
+    answers = [one.recv(12) for one in taken if one not in ended]
+    assert 1 <= answers.count(b"HTTP/1.1 200") == len(answers) <= 4  # one of an earlier test may still be there
+    for one in taken:
+        one.close()
+    wait_for(lambda: get(local.port)[0] == 200)
+
+
+def test_who_asks_for_nothing_does_not_keep_others_out(local, monkeypatch):
+    """The oldest goes that has said nothing, then the oldest that waits for an answer; an open page stays."""
+    monkeypatch.setattr(auth, "MOST", 4)
+    with Client(local.url) as page:
+        page.look()
+        silent = [socket.create_connection(("127.0.0.1", local.port), LIMIT) for _ in range(10)]
+        for _ in range(5):
+            assert get(local.port)[0] == 200
+        wait_for(lambda: len(select.select(silent, [], [], 0)[0]) >= 7)
+        page.look((0.0, 0.0, -5.0))
+        wait_for(lambda: [c for c in local.server.get_clients().values() if c.camera.position[2] == -5.0])
+        for one in silent:
+            one.close()
+
+
+@pytest.mark.parametrize("pings", [True, False], ids=["pings", "is silent"])
+def test_a_browser_that_does_not_read_is_let_go(local, monkeypatch, capfd, caplog, pings):
+    """Answers to its pings pile up without a limit of websockets, and the ping that would miss it waits behind them."""
+    monkeypatch.setattr(auth, "PATIENCE", LIMIT if pings else 0.5)
+    monkeypatch.setattr(auth, "UNREAD", (1 << 18) if pings else (1 << 30))
+    with socket.socket() as one:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        one.settimeout(LIMIT)
+        one.connect(("127.0.0.1", local.port))
+        one.sendall(_opening(local.port))
+        shown = local.server.gui.add_text("much", secrets.token_hex(0 if pings else 4 << 20))
+        frames = 2000 * (b"\x89\xfd" + bytes(4 + 125)) if pings else b"\x8a\x80" + bytes(4)  # pings, or a pong
+        with pytest.raises(ConnectionError):
+            for _ in range(10_000):
+                one.sendall(frames)
+                time.sleep(0 if pings else 0.01)
+        shown.remove()
+    assert get(local.port)[0] == 200
+    assert capfd.readouterr().err == "" and not caplog.records
+
+
+def test_nonsense_is_refused_without_a_word(local, capfd):
+    for raw in (b"\r\n\r\n", b"\x16\x03\x01" * 50 + b"\n", b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n", b""):
+        with socket.create_connection(("127.0.0.1", local.port), LIMIT) as one:
+            one.sendall(raw)
+            one.shutdown(socket.SHUT_WR)
+            one.recv(1000)
+    assert get(local.port)[0] == 200
+    assert capfd.readouterr().err == ""
+
+
+def _opening(port: int) -> bytes:
+    """A request for a websocket."""
+    asks = [
+        "GET / HTTP/1.1", f"Host: 127.0.0.1:{port}", "Upgrade: websocket", "Connection: Upgrade",
+        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", "Sec-WebSocket-Version: 13",
+        f"Sec-WebSocket-Protocol: viser-v{viser.__version__}", "", "",
+    ]  # fmt: skip
+    return "\r\n".join(asks).encode()
+
+
+def test_a_browser_that_answers_nothing_does_not_hold_the_end(monkeypatch):
+    monkeypatch.setitem(
+        serve_websockets.__init__.__kwdefaults__, "close_timeout", 3600
+    )  # which is not to be waited for
+    own = Served()
+    with socket.create_connection(("127.0.0.1", own.port), LIMIT) as one:
+        one.sendall(_opening(own.port))
+        assert b"101" in one.recv(100)
+        servers.stop(own.server)  # which itself waits for a thread that is held for seconds only
+        wait_for(lambda: not own.server._websock_server._server_thread.is_alive())
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """A page whose model and first photo have names that are not UTF-8."""
+    folder = tmp_path_factory.mktemp("page")
+    make_colmap_scene(folder / "scene")
+    given = argparse.Namespace(source_path=str(folder / "scene"), model_path=str(folder / "a\udcff"), eval=True)
+    scene = Scene(ModelParams(argparse.ArgumentParser()).extract(given), model(200), shuffle=False, start=False)
+    scene.getTrainCameras()[0].image_name = "b\udcff.png"
+    shown = Page(ANY, scene, pipeline(), False, False)
+    yield shown
+    shown.stop()
+
+
+def _answered(page: Page, client: Client):
+    """The picture that a client gets when it is the page's turn."""
+    wait_for(lambda: answer(page))
+    return client.picture()
+
+
+def test_pictures_follow_the_camera_of_each_browser(page, monkeypatch):
+    monkeypatch.setattr(watchers, "STILL_AFTER", 3600.0)  # seconds, so that no machine is too slow to see a movement
+    with Client(page.url) as one, Client(page.url) as other:
+        one.look(size=(120, 80))
+        first = _answered(page, one)
+        assert first.shape == (160, 240, 3) and first.std() > 5
+        other.look((0.5, 0.0, -4.0), size=(60, 60))
+        assert _answered(page, other).shape == (120, 120, 3)
+        one.look((1.5, 0.0, -4.0), size=(120, 80))
+        coarse = _answered(page, one)
+        assert coarse.shape == (40, 60, 3)
+        monkeypatch.setattr(watchers, "STILL_AFTER", 0.0)
+        sharp = _answered(page, one)
+        assert sharp.shape == (160, 240, 3) and abs(sharp.astype(int) - first).mean() > 3
+    wait_for(lambda: not page.watchers.any)
+
+
+def test_hostile_messages_neither_stop_the_page_nor_make_large_pictures(page):
+    with Client(page.url) as client:
+        client.look(size=(10**6, 10**6))
+        assert max(_answered(page, client).shape) <= 1600
+        for wrong in ({"position": [float("nan")] * 3}, {"fov": 0.0}, {"wxyz": [0.0] * 4}):
+            client.look(**wrong)
+        client.look((0.0, 0.0, -5.0), size=(64, 64))
+        assert _answered(page, client).shape[0] in (32, 128)
+    page.view.scaling.value = float("nan")
+    page.view.background.value = (999, -5, 0)
+    page.view.mode.value = "no such mode"
+    settings = page.settings()
+    assert settings.scaling == 1.0 and settings.background == (1.0, 0.0, 0.0)
+    page.view.scaling.value, page.view.mode.value, page.view.background.value = 1.0, "Colour", (0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *({"size": size} for size in ((0, 64), (96, 0), (0, 0), (-5, 1e18))),
+        {"position": (0.0, 0.0, 0.0)},  # which is what it looks at
+        {"position": (1e18, 0.0, 0.0)},
+    ],
+    ids=str,
+)
+def test_a_browser_of_any_window_and_place_goes_to_a_camera(page, capfd, wrong):
+    name = next(iter(page.images._cameras.by_name))
+    page.images.camera.value = next(reversed(page.images._cameras.by_name))
+    with Client(page.url) as client:
+        client.look(**wrong)
+        wait_for(page.server.get_clients)
+        client.send("GuiUpdateMessage", uuid=page.images.camera._impl.uuid, updates={"value": name})
+        camera = page.images._cameras.by_name[name]
+        place = camera_center(camera.R, camera.T)
+        heard = {}
+        while not {"SetCameraPositionMessage", "SetCameraFovMessage"} <= heard.keys():
+            heard |= {message["type"]: message for message in client.messages() if not message.get("initial")}
+        assert heard["SetCameraPositionMessage"]["position"] == pytest.approx(place)
+        assert 0 < heard["SetCameraFovMessage"]["fov"] < math.pi
+    wait_for(lambda: not page.watchers.any)
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_a_crop_box_that_many_drag_is_drawn_once(page, capfd):
+    crop, corner = page.view.crop._impl.uuid, page.view.corners[0]._impl.uuid
+    with Client(page.url) as one, Client(page.url) as other:
+        for client in (one, other):
+            client.look()
+        for step in range(200):
+            one.send("GuiUpdateMessage", uuid=crop, updates={"value": step % 2 == 0})
+            other.send("GuiUpdateMessage", uuid=corner, updates={"value": [-float(step + 1), -1.0, -1.0]})
+        wait_for(lambda: page.view.corners[0].value[0] == -200.0 and not page.view.crop.value)
+        one.send("GuiUpdateMessage", uuid=crop, updates={"value": True})
+        wait_for(lambda: page.view._box is not None)
+        one.send("GuiUpdateMessage", uuid=crop, updates={"value": False})
+        wait_for(lambda: page.view._box is None)
+    assert "/crop box" not in page.server.scene._handle_from_node_name
+    assert "rror" not in capfd.readouterr().err
+
+
+def test_a_frame_that_cannot_be_drawn_is_told_once_and_ends_nothing(page, monkeypatch, capfd):
+    with Client(page.url) as client:
+        with monkeypatch.context() as broken:
+            broken.setattr(page._frames, "draw", lambda *_: (_ for _ in ()).throw(OSError("no file a\udcff.png")))
+            client.look(size=(60, 60))
+            client.until("BackgroundImageMessage")  # of a server that has been reset
+            for step in (1.0, 2.0):
+                client.look((step, 0.0, -4.0), size=(60, 60))
+                wait_for(lambda: answer(page))
+        assert "no file a\\udcff.png" in client.until("NotificationShowMessage")["props"]["body"]
+        client.look((0.0, 0.0, -4.0), size=(60, 60))
+        assert _answered(page, client).shape[2] == 3
+    assert capfd.readouterr().err.count("could not draw a frame (no file") == 1
+
+
+def test_a_browser_that_leaves_while_its_frame_is_drawn_is_not_worth_a_word():
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        with Served() as served:
+            clients = served.server.get_clients
+            with Client(served.url) as client:
+                client.look()
+                wait_for(clients)
+                handle = next(iter(clients().values()))
+            wait_for(lambda: not clients())
+            handle.scene.set_background_image(np.zeros((2, 2, 3), np.uint8))
+    assert not heard
+
+
+def test_names_that_are_not_utf8_are_shown(page):
+    with Client(page.url) as client:
+        sent, texts = "", (r"a\udcff", r"train 0: b\udcff.png")
+        while not all(repr(text) in sent for text in texts):
+            sent += repr(client.messages())
+
+
+@pytest.mark.parametrize(
+    ("host", "address"),
+    [("127.0.0.1", r"127\.0\.0\.1:PORT/"), ("::1", r"\[::1\]:PORT/"), ("0.0.0.0", r".+:PORT/\?token=.{40,}")],
+)
+def test_one_line_says_where_the_page_is_and_another_warns_of_a_network(host, address, capfd):
+    try:
+        socket.create_server((host, 0), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
+    except OSError:
+        pytest.skip(f"this machine has no {host}")
+    served = [Served(host) for _ in range(2)]
+    said = capfd.readouterr()
+    assert not said.out and served[0].url.split("=")[-1] != served[1].url.split("=")[-1]
+    for one in served:
+        servers.stop(one.server)
+        assert re.fullmatch("http://" + address.replace("PORT", str(one.port)), one.url)
+        assert f"viewer: {one.url}\n" in said.err
+    assert said.err.count("every machine that reaches 0.0.0.0") == 2 * ("token" in address)
+    assert said.err.count("\n") == (4 if "token" in address else 2)

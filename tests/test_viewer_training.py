@@ -1,0 +1,235 @@
+"""The viewer during a training: it draws within its share, does what the buttons ask for, and changes no byte."""
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
+
+from rasterizer_tools import CPU_AND_GPU  # noqa: E402
+from viser_client import Client  # noqa: E402
+from waiting import wait_for  # noqa: E402
+
+import train  # noqa: E402
+from scene.gaussians.checkpoint import load_checkpoint  # noqa: E402
+from splatting.training.observers import viewers as observed  # noqa: E402
+from utils.system_utils import UserError  # noqa: E402
+
+ITERATIONS = 120
+
+
+@pytest.fixture(autouse=True)
+def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
+
+
+class Watched:
+    """A training whose observer tests can reach. acts: what is done in iterations, before anything else of them.
+
+    frames: iteration and mode of each frame. paused: the iterations in which it has waited.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, acts: dict[int, Callable[["Watched"], None]]) -> None:
+        self.frames: list[tuple[int, str]] = []
+        self.paused: list[int] = []
+        self.clients: list[Client] = []
+        watched = self
+
+        class Observer(observed.PageObserver):
+            def __init__(self, *given: object) -> None:
+                super().__init__(*given)
+                watched.observer, watched.page, watched.requests = self, self._page, self._requests
+
+            def due(self, step) -> bool:
+                if step.iteration in acts:
+                    acts[step.iteration](watched)
+                return super().due(step)
+
+            def _draw(self, wish, version) -> None:
+                watched.frames.append((version, self._page.view.mode.value))
+                super()._draw(wish, version)
+
+            def _show_numbers(self, iteration) -> None:
+                super()._show_numbers(iteration)
+                if self._requests.paused and iteration not in watched.paused:
+                    watched.paused.append(iteration)
+
+            def ended(self, error) -> None:
+                for client in watched.clients:
+                    client.__exit__()
+                super().ended(error)
+
+        monkeypatch.setattr("splatting.training.observers.standard.PageObserver", Observer)
+
+    def connect(self) -> None:
+        """Let a browser look."""
+        self.clients.append(Client(self.page.url))
+        self.look()
+
+    def look(self, x: float = 0.0) -> None:
+        """Let the browser move its camera, and wait until that is known."""
+        self.clients[-1].look((x, 0.0, -4.0))
+        wait_for(lambda: [w.pose.position[0] for w in self.page.watchers._watchers.values()] == [pytest.approx(x)])
+
+    def pause(self, *acts: Callable[[], object]) -> None:
+        """Pause, and do one thing in each iteration that the training then waits in, from another thread."""
+        self.requests.pause()
+
+        def play() -> None:
+            try:
+                for number, act in enumerate(acts):
+                    wait_for(lambda number=number: len(self.paused) > number)
+                    act()
+            except BaseException:
+                self.requests.resume()  # so that the test ends
+                raise
+
+        threading.Thread(target=play).start()
+
+
+def _train(scene: Path, out: Path, *options: object, viewer: bool = True) -> Path:
+    words = ["-s", scene, "-m", out, "-r", 24, "--iterations", ITERATIONS, "--eval", "--densify_from_iter", 20,
+             "--densification_interval", 20, "--densify_grad_threshold", 1e-6, *options]  # fmt: skip
+    train.main([*map(str, words), *(["--viewer", "0"] if viewer else [])])
+    return out / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply"
+
+
+def _after(seconds: float, *calls: Callable[[], object]) -> Callable[[], None]:
+    """Does something after so many seconds at least."""
+    return lambda: (time.sleep(seconds), *(call() for call in calls))
+
+
+@CPU_AND_GPU
+@pytest.mark.parametrize("plain", [[], ["--plain_step"]])
+def test_watching_changes_no_byte_of_the_model(colmap_scene, tmp_path, monkeypatch, plain, device):
+    expected = _train(colmap_scene, tmp_path / "alone", *plain, viewer=False).read_bytes()
+
+    def connect(watched: Watched) -> None:
+        watched.observer.budget.allows = lambda share: True  # so that each mode gets its frames, however slow they are
+        watched.connect()
+
+    def look_at(mode: str, **more: object) -> Callable[[Watched], None]:
+        def act(watched: Watched) -> None:
+            watched.page.view.mode.value = mode
+            for name, value in more.items():
+                getattr(watched.page.view, name).value = value
+            watched.look(0.1 * len(watched.frames))
+
+        return act
+
+    def pause(watched: Watched) -> None:
+        watched.pause(_after(0.2, watched.requests.step), watched.requests.resume)
+
+    acts = {10: connect, 15: look_at("Depth"), 25: look_at("Gaussians a pixel", scaling=0.5), 60: pause}
+    acts |= {40: look_at("Colour", crop=True, degree=0), 80: look_at("Opacity"), 100: lambda w: w.requests.save()}
+    watched = Watched(monkeypatch, acts)
+    assert _train(colmap_scene, tmp_path / "watched", *plain).read_bytes() == expected
+    assert {mode for _, mode in watched.frames} == {"Depth", "Gaussians a pixel", "Colour", "Opacity"}
+    assert {15, 25, 40, 80} <= {iteration for iteration, _ in watched.frames} and watched.paused == [60, 61]
+    log = json.loads((tmp_path / "watched/train_log.json").read_text())
+    assert log[-1]["viewing_seconds"] > 0.15  # the pause: no time of training
+    assert (tmp_path / "watched/chkpnt100.pth").exists()
+
+
+def test_nothing_is_drawn_while_nobody_looks(colmap_scene, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("splatting.viewer.watchers.Watchers.next", lambda *_: asked.append(1))
+    watched = Watched(monkeypatch, {})
+    _train(colmap_scene, tmp_path / "out", "--no_curve")
+    assert not watched.frames and not asked
+    assert "viewing_seconds" not in json.loads((tmp_path / "out/train_log.json").read_text())[-1]
+
+
+def test_a_paused_training_waits_takes_single_steps_and_shows_how_it_goes(colmap_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(observed, "_NUMBERS_EVERY", 0.0)
+    reached, seen = [], []
+
+    def drive(watched: Watched) -> None:
+        step, resume = watched.requests.step, watched.requests.resume
+
+        def reach() -> None:
+            reached.append(int(watched.page.iteration.value))
+
+        watched.pause(_after(0.3, reach, step), _after(0.3, reach, step), _after(0.3, reach, resume))
+
+    def note(watched: Watched) -> None:
+        tab = watched.observer._tab
+        seen.append((int(watched.page.iteration.value), float(tab.speed.value), len(tab.curve.data[0])))
+
+    watched = Watched(monkeypatch, {2: Watched.connect, 30: drive, 33: note, 34: note, 60: note, 115: note})
+    _train(colmap_scene, tmp_path / "out", "--test_iterations", *range(10, 120, 10))
+    assert reached == watched.paused == [30, 31, 32]
+    iterations, speeds, points = zip(*seen, strict=True)
+    assert iterations == (32, 33, 59, 114) and min(speeds) > 0 and 1 < points[2] < points[3]
+    tab = watched.observer._tab
+    seconds, psnr = tab.curve.data
+    assert (seconds[1:] >= seconds[:-1]).all() and tab.curve.visible and 5 < psnr.mean() < 60 and float(tab.loss.value)
+
+
+def test_stop_saves_a_checkpoint_that_can_be_resumed(colmap_scene, tmp_path, monkeypatch, capfd):
+    Watched(monkeypatch, {33: lambda w: w.requests.stop()})
+    with pytest.raises(KeyboardInterrupt):
+        _train(colmap_scene, tmp_path / "out", "--no_curve")
+    assert load_checkpoint(str(tmp_path / "out/chkpnt33.pth"), "cpu")[1] == 33
+    assert "resume with --start_checkpoint" in capfd.readouterr().err
+    monkeypatch.undo()
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+    resumed = _train(colmap_scene, tmp_path / "out", "--start_checkpoint", tmp_path / "out/chkpnt33.pth", viewer=False)
+    assert resumed.read_bytes() == _train(colmap_scene, tmp_path / "alone", viewer=False).read_bytes()
+
+
+@pytest.mark.parametrize("end", ["stop", "signal"])
+def test_a_paused_training_that_ends_is_saved_and_the_pause_is_no_time_of_it(colmap_scene, tmp_path, monkeypatch, end):
+    before: list[float] = []
+    leap, clock = [0.0], time.perf_counter
+    monkeypatch.setattr("splatting.evaluation.training_log.running_seconds", lambda: clock() + leap[0])
+
+    def pause(watched: Watched) -> None:
+        before.append(watched.observer._run.clock.seconds)
+
+        def stop() -> None:
+            leap[0] = 1000.0  # seconds
+            watched.requests.stop() if end == "stop" else os.kill(os.getpid(), signal.SIGINT)
+
+        watched.pause(stop)
+
+    Watched(monkeypatch, {12: pause})
+    with pytest.raises(KeyboardInterrupt):
+        _train(colmap_scene, tmp_path / "out", "--no_curve")
+    log = json.loads((tmp_path / "out/train_log.json").read_text())
+    assert before[0] < log[-1]["seconds"] < before[0] + 500
+    assert (tmp_path / "out/chkpnt12.pth").exists()
+
+
+def test_neither_a_checkpoint_nor_a_frame_that_fails_ends_a_training(colmap_scene, tmp_path, monkeypatch, capfd):
+    told = []
+
+    def save(watched: Watched) -> None:
+        watched.page.notify = lambda title, body: told.append((title, body))
+        watched.requests.save()
+
+    def broken(*_: object) -> None:
+        raise RuntimeError("no memory for a frame")
+
+    watched = Watched(monkeypatch, {5: Watched.connect, 10: save, 20: save})
+    monkeypatch.setattr("splatting.viewer.frames.Frames.draw", broken)
+    (tmp_path / "out/chkpnt10.pth").mkdir(parents=True)
+    expected = _train(colmap_scene, tmp_path / "alone", "--no_curve", viewer=False).read_bytes()
+    assert _train(colmap_scene, tmp_path / "out", "--no_curve").read_bytes() == expected
+    assert (tmp_path / "out/chkpnt20.pth").is_file() and watched.frames
+    assert [title for title, _ in told] == ["Not saved", "Saved", "The training is done"]
+    said = capfd.readouterr().err
+    assert "warning: cannot write" in said and said.count("no memory for a frame") == 1
+
+
+def test_a_wrong_address_is_refused_before_a_file_is_written(colmap_scene, tmp_path):
+    with pytest.raises(UserError, match="cannot listen"):
+        _train(colmap_scene, tmp_path / "out", "--viewer_host", "no.such.host.invalid")
+    assert not (tmp_path / "out").exists()
