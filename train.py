@@ -16,8 +16,8 @@ import torch
 
 from arguments import ModelParams, OptimizationParams, OptionParser, PipelineParams, write_cfg_args, write_model_json
 from gaussian_renderer import network_gui
+from splatting.distributed.consistency import agree_on_options
 from splatting.evaluation.training_log import EventWriter as SummaryWriter
-from splatting.training.agreement import agree_on_options
 from splatting.training.launch import add_launch_options, launch_options
 from splatting.training.loop import run_training
 from splatting.training.observers.report import training_report

@@ -17,7 +17,6 @@ from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.sh_bands import cut_bounds, needed_degree
-from splatting.distributed.selection import summed
 
 FAINT = -math.log(254) - 1e-4  # logit of opacity 1/255, below which no pixel draws a Gaussian, less some rounding
 WORTH = 0.01  # share of the Gaussians; fewer unseen ones stay, because leaving them out saves little and is a risk
@@ -71,8 +70,8 @@ def search_unseen(
     takes more than a view for ITERATIONS_PER_VIEW of the `iterations` trained, they are kept.
     """
     keep = gaussians.raw("opacity").detach()[:, 0] >= FAINT
-    ranks = gaussians.shards.ranks
-    search = Search(keep, faint=summed(~keep, ranks))
+    shards = gaussians.shards
+    search = Search(keep, faint=shards.marked(~keep))
     pairs, search.views = walk(cameras, iterations / ITERATIONS_PER_VIEW)
     if search.views > iterations / ITERATIONS_PER_VIEW:
         search.end = TOO_LONG
@@ -80,11 +79,11 @@ def search_unseen(
     seen, search.views = decisive_for_any(cameras, gaussians, pipe), len(cameras)
     walks = chain.from_iterable(views_between(cameras[i], cameras[j]) for i, j in pairs)
     for camera in tqdm(walks, desc="Looking between", total=len(FRACTIONS) * len(pairs), unit="view", leave=False):
-        if summed(keep & ~seen, ranks) < WORTH * gaussians.total:
+        if shards.marked(keep & ~seen) < WORTH * gaussians.total:
             break
         seen |= decisive_for(camera, gaussians, pipe)
         search.views += 1
-    few = summed(keep & ~seen, ranks) < WORTH * gaussians.total
+    few = shards.marked(keep & ~seen) < WORTH * gaussians.total
     search.end = FEW if few else DONE
     search.keep = keep if few else keep & seen
     return search
@@ -107,12 +106,12 @@ def trim(
     start = time.perf_counter()
     every = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.get_xyz.device)
     search = Search(every) if keep_unseen else search_unseen(gaussians, cameras, pipe, iterations)
-    ranks = gaussians.shards.ranks
-    if not summed(search.keep, ranks):  # never an empty model
+    shards = gaussians.shards
+    if not shards.marked(search.keep):  # never an empty model
         search = Search(every, end=FEW)
-    search.unseen = summed(~search.keep, ranks)
+    search.unseen = shards.marked(~search.keep)
     kept = search.keep if search.unseen else slice(None)
-    search.cut_bounds = cut_bounds(gaussians.get_features_rest.detach()[kept], ranks)
+    search.cut_bounds = cut_bounds(gaussians.get_features_rest.detach()[kept], shards)
     degree = gaussians.max_sh_degree if prune_sh < 0 else needed_degree(search.cut_bounds, prune_sh)
     if search.unseen or degree < gaussians.max_sh_degree:
         gaussians = gaussians.part(kept, degree)

@@ -27,8 +27,8 @@ from scene.gaussians.budget import count_after, fade, remove_useless, split_in_t
 from scene.gaussians.long_axis import long_axis_children
 from scene.readers.point_cloud import write_point_cloud
 from splatting.deterministic.counter_rng import Stream
-from splatting.deterministic.weighted_choice import weighted_choice
 from splatting.distributed.rows import WHOLE
+from splatting.distributed.selection import weighted_choice
 from splatting.training.objective import Objective
 from splatting.training.schedule import Block, Decided, DecidedSchedule
 from splatting.training.strategies import budget

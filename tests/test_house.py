@@ -19,7 +19,7 @@ CSRC = ROOT / "submodules"
 LONGEST = 60  # lines of a function
 # Most lines of code and of tests, without blanks, comments and docstrings, files of code, and words of Markdown. A new
 # capability that needs more says so in its commit, and what it let go.
-MOST = {"code": 34_180, "files": 443, "tests": 33_800, "words": 37_500}
+MOST = {"code": 34_181, "files": 442, "tests": 33_806, "words": 37_500}
 
 # What a room may import besides itself and what serves them all: prefixes of module names. The room of a module is its
 # longest prefix here.
@@ -41,6 +41,7 @@ MAY_IMPORT = {
     "scene": (),  # not arguments: a client's own package of that name may be found first
     "gaussian_renderer": ("scene",),
     "splatting.compat": ("scene",),
+    "splatting.distributed.consistency": ("scene", "splatting.training.restart"),
     "splatting.distributed.rendering": ("gaussian_renderer", "scene"),
     "splatting.camera_paths": ("gaussian_renderer", "scene"),
     "splatting.exports": ("splatting.camera_paths", "scene"),

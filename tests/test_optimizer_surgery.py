@@ -74,6 +74,21 @@ def test_pruned_rows_train_on_as_if_they_had_always_been_alone(name):
 
 
 @pytest.mark.parametrize("name", OPTIMIZERS)
+def test_permuted_rows_train_on_as_in_the_order_before(name):
+    order = torch.randperm(30, generator=torch.Generator().manual_seed(5))
+    gaussians, still = _with(OPTIMIZERS[name]), _with(OPTIMIZERS[name])
+    gaussians.max_radii2D, gaussians.tmp_radii = torch.arange(30.0), torch.arange(30)
+    _step(gaussians, 0, torch.arange(30))
+    _step(still, 0, torch.arange(30))
+    gaussians.table.permute(order)
+    assert gaussians.max_radii2D.tolist() == gaussians.tmp_radii.tolist() == order.tolist()
+    _step(gaussians, 1, order)
+    _step(still, 1, torch.arange(30))
+    for group, values in parameters(still).items():
+        assert torch.equal(parameters(gaussians)[group], values[order]), group
+
+
+@pytest.mark.parametrize("name", OPTIMIZERS)
 def test_appended_rows_start_with_averages_of_zero(name):
     gaussians = _with(OPTIMIZERS[name])
     _step(gaussians, 0, torch.arange(30))

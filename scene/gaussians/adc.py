@@ -11,7 +11,7 @@ from scene.gaussians.attributes import Rows
 from scene.gaussians.long_axis import long_axis_children
 from scene.gaussians.parameters import GaussianParameters
 from scene.gaussians.statistics import NAMES
-from splatting.distributed.rows import changes_rows
+from scene.gaussians.table import changes_rows
 
 _STANDARD = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")  # the order of densification_postfix
 
@@ -177,7 +177,7 @@ def _make_children(
         rows["opacity"][first:] = gaussians.raw_opacity(children["opacity"])
     else:
         if seed is None:
-            seed = gaussians.shards.ranks.shared(int(torch.randint(2**62, ())))
+            seed = gaussians.shards.shared(int(torch.randint(2**62, ())))
         items = gaussians.shards.items(parents)
         sampled = [
             rules.split_children(*shapes, items, child, count=count, seed=seed, iteration=iteration)
@@ -190,7 +190,7 @@ def _make_children(
 def append_rows(gaussians: GaussianParameters, rows: Rows, *origins: Tensor) -> None:
     """Append rows by `densification_postfix`, or what overrides it, with the radii of their origins if set.
 
-    origins: (n,) of the rows of each part, which over all ranks follow each other part by part.
+    origins: (n,) of the rows of each part, which follow each other part by part over all processes.
     """
     standard = [rows.pop(name) for name in _STANDARD]
     if gaussians.tmp_radii is not None:

@@ -1,16 +1,16 @@
 """Per-Gaussian parameters, in one table that the optimiser, density control, PLY and checkpoints iterate over."""
 
 import argparse
+import math
 from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
 from torch import Tensor
 
-from scene.gaussians.density_rules import logit
-
 Rows = dict[str, Tensor]  # raw values (N, *shape), float32, by optimiser group
 INITIAL_OPACITY = 0.1
+_INITIAL_LOGIT = math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY))
 
 
 class Attribute(NamedTuple):
@@ -36,7 +36,7 @@ def attributes(sh_degree: int) -> dict[str, Attribute]:
         "f_rest": Attribute(
             "_features_rest", (bands, 3), _numbered("f_rest", 3 * bands), lambda opt, _: opt.feature_lr / 20.0
         ),
-        "opacity": Attribute("_opacity", (1,), ["opacity"], lambda opt, _: opt.opacity_lr, logit(INITIAL_OPACITY)),
+        "opacity": Attribute("_opacity", (1,), ["opacity"], lambda opt, _: opt.opacity_lr, _INITIAL_LOGIT),
         "scaling": Attribute("_scaling", (3,), _numbered("scale", 3), lambda opt, _: opt.scaling_lr),
         "rotation": Attribute("_rotation", (4,), _numbered("rot", 4), lambda opt, _: opt.rotation_lr),
     }

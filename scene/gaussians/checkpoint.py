@@ -17,10 +17,9 @@ from scene.gaussians.attributes import IN_CHECKPOINT, Attribute, Rows
 from scene.gaussians.finite import check_finite
 from scene.gaussians.parameters import GaussianParameters
 from scene.gaussians.statistics import NAMES, Statistics
-from splatting.distributed.ranks import ranks
 from splatting.files.tensor_files import read_tensors
 from splatting.host.machine import VERSION
-from utils.system_utils import UserError, atomic_write
+from utils.system_utils import UserError, atomic_write, writes_files
 
 _LARGEST = 1e15  # extent; learning rates are multiples of it
 _ENTRIES = 12  # the reference's; the values of further attributes may follow
@@ -63,7 +62,7 @@ def capture(gaussians: GaussianParameters) -> tuple:
     """Everything a resumed training needs, as tensors and numbers; `pack` gives the order.
 
     Values of Gaussians are parameters: the reference trains on with the very tensors that a checkpoint holds. Of
-    several ranks, all of which must call it, the first has the whole state, on the CPU, and others have no rows.
+    several processes, all of which must call it, the first has the whole state, on the CPU, and others have no rows.
     """
     raw = {name: getattr(gaussians, a.field) for name, a in gaussians._attributes.items()}
     gaussians.shards.match(gaussians.optimizer)
@@ -173,7 +172,7 @@ def _check_rows(rows: Rows, table: dict[str, Attribute], max_sh_degree: int) -> 
 
 def save_checkpoint(path: str | os.PathLike, capture: tuple, iteration: int) -> None:
     """Write (capture, iteration), on the rank that writes; the whole file or none."""
-    if not ranks().first:
+    if not writes_files():
         return
     # To an open file, as torch would write a path's name into the archive, and the temporary one is never the same.
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
@@ -196,14 +195,16 @@ def _reason(temporary: Path) -> OSError:
     return OSError("no space is left, or the file is larger than allowed")
 
 
-def load_checkpoint(path: str | os.PathLike, device: torch.device | str = "cpu") -> tuple[tuple, int]:
+def load_checkpoint(
+    path: str | os.PathLike, device: torch.device | str = "cpu", mapped: bool = False
+) -> tuple[tuple, int]:
     """Read (capture, iteration), ours or the reference's. UserError for any other file.
 
-    Where several ranks read it, tensors on the CPU stay in the file until somebody reads a part of them.
+    mapped: tensors on the CPU stay in the file until somebody reads a part of them.
     """
     _refuse_other_kinds(path)
     try:
-        content = read_tensors(path, device, mapped=ranks().several)
+        content = read_tensors(path, device, mapped=mapped)
     except ValueError as error:
         raise UserError(f"{path} is not a checkpoint of train.py: {error}; give a chkpntN.pth") from error
     try:

@@ -12,8 +12,8 @@ import torch
 from diff_gaussian_rasterization.density import split_positions
 from torch import Tensor
 
+from scene.gaussians.table import WHOLE, Shards
 from splatting.deterministic.counter_rng import Stream
-from splatting.distributed.rows import WHOLE, Shards
 
 SHRINK = 0.8  # N children of a split have 1 / (0.8 N) of the parent's scale: 1 / 1.6 for two (paper, section 5.2)
 PRUNE_EXTENT = 0.1  # a Gaussian wider than this part of the scene's extent is removed, once sizes are limited
@@ -96,9 +96,9 @@ def mean_gradient(accumulated: Tensor, count: Tensor) -> Tensor:
 
 
 def limit_growth(gradient: Tensor, threshold: float, room: int, shards: Shards = WHOLE) -> Tensor:
-    """Zero the gradients of all ranks' candidates (>= threshold) except the `room` largest, ties by index: (N,)."""
+    """Zero the gradients of all candidates (>= threshold) except the `room` largest, ties by index: (N,)."""
     candidates = (gradient >= threshold).nonzero().reshape(-1)
-    if shards.ranks.before(len(candidates))[1] <= room:
+    if shards.before(len(candidates))[1] <= room:
         return gradient
     grow = candidates[shards.lowest(gradient[candidates], room, highest=True)]
     return gradient.index_fill(0, candidates, 0.0).index_copy_(0, grow, gradient[grow])

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.table import trainable
-from splatting.distributed.ranks import Ranks
 from splatting.files.plain_files import plain_text
 from splatting.host.machine import compute_device
 from utils.general_utils import get_expon_lr_func
@@ -92,11 +91,6 @@ class Exposures:
         if self.optimizer is not None and self.values.grad is not None:
             self.optimizer.step()
             self.optimizer.zero_grad(set_to_none=True)
-
-    def add_gradients(self, ranks: Ranks) -> None:
-        """Give every rank the sum of all ranks' gradients."""
-        own = torch.zeros_like(self.values) if self.values.grad is None else self.values.grad
-        self.values.grad = ranks.table(own).sum(0)
 
     def capture(self) -> dict[str, Any]:
         """State that a resumed training needs, as plain values."""

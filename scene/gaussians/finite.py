@@ -5,7 +5,7 @@ import sys
 import torch
 
 from scene.gaussians.attributes import Rows
-from splatting.distributed.rows import WHOLE, Shards
+from scene.gaussians.table import WHOLE, Shards
 from utils.system_utils import UserError
 
 _PART = 1 << 16  # rows checked at a time, as there may be little memory left
@@ -14,12 +14,12 @@ _PART = 1 << 16  # rows checked at a time, as there may be little memory left
 def check_finite(rows: Rows, where: str, remedy: str, shards: Shards = WHOLE) -> None:
     """UserError naming the first attribute with values that are not finite, how many Gaussians, and the first one.
 
-    shards: the place of the rows among those of all ranks, which are told the same.
+    shards: the place of the rows among those of all processes, which raise the same.
     """
     for name, values in rows.items():
         finite = torch.cat([part.isfinite().flatten(1).all(dim=1) for part in values.split(_PART)])
-        if shards.ranks.anyone(not finite.all()):
-            bad = shards.ranks.gather(shards.items((~finite).nonzero().reshape(-1)))
+        if shards.anyone(not finite.all()):
+            bad = shards.places(~finite)
             raise UserError(
                 f"{name} of {len(bad)} of {shards.total(len(values))} Gaussians in {where} is not finite "
                 f"(the first is Gaussian {int(bad[0])}); {remedy}"

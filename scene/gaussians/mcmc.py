@@ -16,10 +16,9 @@ from torch import Tensor
 from scene.gaussians.adc import append_rows
 from scene.gaussians.density_rules import logit
 from scene.gaussians.parameters import GaussianParameters
+from scene.gaussians.table import WHOLE, Shards, changes_rows
 from splatting.deterministic.counter_rng import Stream, random_bits
 from splatting.deterministic.portable_math import exp, log
-from splatting.distributed.ranks import ALONE, Ranks
-from splatting.distributed.rows import changes_rows
 
 MOST_PARTS = 51  # of one Gaussian (paper): itself and 50 copies
 _UNITS = 2**24  # of opacity 1, where Gaussians are drawn in proportion to it
@@ -65,7 +64,7 @@ def relocate(gaussians: GaussianParameters, min_opacity: float, most_parts: int,
     """
     live = gaussians.opacity_logits().reshape(-1) > logit(min_opacity)
     dead = (~live).nonzero().reshape(-1)
-    counts = gaussians.shards.ranks.numbers(len(dead))[:, 0]
+    counts = gaussians.shards.counts(len(dead))
     count = int(counts.sum())
     if 0 < count < gaussians.total:
         draws, origins = _divide(gaussians, live, count, most_parts, seed, iteration, _RELOCATION)
@@ -126,7 +125,7 @@ def _divide(
     logits = gaussians.opacity_logits().reshape(-1)
     units = torch.where(live, opacity_units(logits), 0)
     numbers = {"seed": seed, "iteration": iteration, "draw": which}
-    draws, origins = draw(units, count, **numbers, ranks=gaussians.shards.ranks)
+    draws, origins = draw(units, count, **numbers, shards=gaussians.shards)
     sources, copies = origins.unique(return_counts=True)
     opacities, larger = divided(logits[sources], (copies + 1).clamp_max(most))
     log_scales = gaussians.log_scales()[sources] + larger[:, None]
@@ -140,22 +139,22 @@ def opacity_units(logits: Tensor) -> Tensor:
 
 
 def draw(
-    units: Tensor, count: int, *, seed: int, iteration: int, draw: int, ranks: Ranks = ALONE
+    units: Tensor, count: int, *, seed: int, iteration: int, draw: int, shards: Shards = WHOLE
 ) -> tuple[Tensor, Tensor]:
-    """`count` draws with replacement among all ranks, in proportion to `units` (N,), whole numbers of a sum above 0.
+    """`count` draws with replacement among all rows, in proportion to `units` (N,), whole numbers of a sum above 0.
 
-    Returns which of the draws, (n,) ascending, fell on this rank's items, and on which of them, (n,). seed, iteration
-    and draw decide the random numbers.
+    Returns which of the draws, (n,) ascending, fell on this process's items, and on which of them, (n,). seed,
+    iteration and draw decide the random numbers.
     """
     ends = units.cumsum(0)
     items = torch.arange(count, device=units.device)
     bits = random_bits(seed, Stream.RELOCATION, iteration, items, draw)
     share = ((bits[:, 0] >> 5) << 26 | bits[:, 1] >> 6).to(torch.float64) * 2.0**-53
-    if not ranks.several:
+    if shards is WHOLE:
         tickets = (share * ends[-1]).to(torch.int64)
         return items, torch.searchsorted(ends, torch.minimum(tickets, ends[-1] - 1), right=True)
     own = int(units.sum())
-    below, total = ranks.before(own)
+    below, total = shards.before(own)
     tickets = (share * total).to(torch.int64).clamp_max(total - 1) - below
     mine = ((tickets >= 0) & (tickets < own)).nonzero().reshape(-1)
     return mine, torch.searchsorted(ends, tickets[mine], right=True)

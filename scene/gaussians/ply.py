@@ -10,10 +10,9 @@ from plyfile import PlyParseError
 from torch import Tensor
 
 from scene.gaussians.attributes import Rows, attributes
-from splatting.distributed.ranks import ranks
-from splatting.distributed.rows import WHOLE, Shards
+from scene.gaussians.table import WHOLE, Shards
 from splatting.files.ply_header import read_elements
-from utils.system_utils import UserError, atomic_write
+from utils.system_utils import UserError, atomic_write, writes_files
 
 _NORMALS = ["nx", "ny", "nz"]  # zeros after the positions, as in the reference's files
 
@@ -31,7 +30,7 @@ def write_ply(
     world_offset: world coordinates of the origin, written as a comment unless they are zero. comments: further ones.
     shards: the place of the rows among those that together make the file. Every rank must call it; the first writes.
     """
-    if shards is WHOLE and not ranks().first:
+    if shards is WHOLE and not writes_files():
         return
     count = len(rows["xyz"])
     header = ["ply", "format binary_little_endian 1.0"]
@@ -39,7 +38,7 @@ def write_ply(
     header += [f"element vertex {shards.total(count)}"]
     header += [f"property float {name}" for name in column_names(sh_degree)]
     pieces = shards.pieces(count, lambda part: _table(rows, sh_degree, part))
-    if not ranks().first:
+    if not writes_files():
         return deque(pieces, maxlen=0).clear()
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join([*header, "end_header\n"]).encode("ascii"))

@@ -5,21 +5,20 @@ import math
 import torch
 from torch import Tensor
 
-from splatting.distributed.ranks import ALONE, Ranks
-from splatting.distributed.selection import largest
+from scene.gaussians.table import WHOLE, Shards
 
 
-def cut_bounds(f_rest: Tensor, ranks: Ranks = ALONE) -> list[float]:
+def cut_bounds(f_rest: Tensor, shards: Shards = WHOLE) -> list[float]:
     """By degree d = 0..D: the most a colour can change, in any direction, when all bands above d are cut.
 
-    f_rest: (N, (D+1)^2 - 1, 3) of this rank's Gaussians; the bounds are of all ranks'. With c_l the coefficients of
+    f_rest: (N, (D+1)^2 - 1, 3) of this process's Gaussians; the bounds are of all's. With c_l the coefficients of
     band l, the bound is the sum over l > d of |c_l| sqrt((2l+1) / 4 pi), the largest of all Gaussians and channels. It
     follows from Cauchy-Schwarz and from Unsoeld's theorem: the basis functions of a band have the same length in every
     direction.
     The bound holds for images, too: a pixel's weights sum to at most 1, and clamping never increases a difference.
     """
     degree = math.isqrt(f_rest.shape[1] + 1) - 1
-    if not ranks.before(len(f_rest))[1]:
+    if not shards.before(len(f_rest))[1]:
         return [0.0] * (degree + 1)
     total = f_rest.new_zeros(len(f_rest), 3, dtype=torch.float64)
     bounds = [0.0]
@@ -27,7 +26,7 @@ def cut_bounds(f_rest: Tensor, ranks: Ranks = ALONE) -> list[float]:
         coefficients = f_rest[:, band**2 - 1 : (band + 1) ** 2 - 1]
         length = torch.linalg.vector_norm(coefficients, dim=1, dtype=torch.float64)
         total += length * math.sqrt((2 * band + 1) / (4 * math.pi))
-        bounds.append(float(largest(total.amax(dim=1), ranks)))
+        bounds.append(float(shards.largest(total.amax(dim=1))))
     return bounds[::-1]
 
 

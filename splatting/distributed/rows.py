@@ -8,9 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from splatting.deterministic.counter_rng import Stream
 from splatting.distributed.gathering import in_order, whole
 from splatting.distributed.ranks import ALONE, Ranks
-from splatting.distributed.selection import largest, lowest
+from splatting.distributed.selection import largest, lowest, weighted_choice
 from splatting.host.machine import compute_device
 
 _PART, _RANK = 43, 32  # bits of a key below the number of a part, and below the rank or piece in it
@@ -55,6 +56,35 @@ class Shards:
     def together(self, found: dict[str, Tensor], names: Iterable[str]) -> dict[str, Tensor]:
         """Indices (n,) among all rows that any rank has found, by some of the names; of those without any nothing."""
         return found
+
+    def anyone(self, fact: bool) -> bool:
+        """Whether a fact holds on any rank."""
+        return self.ranks.anyone(fact)
+
+    def shared(self, value: int) -> int:
+        """The first rank's value."""
+        return self.ranks.shared(value)
+
+    def before(self, count: int) -> tuple[int, int]:
+        """The sum of all counts of lower ranks, and of all ranks."""
+        return self.ranks.before(count)
+
+    def counts(self, count: int) -> Tensor:
+        """Each rank's count: (size,) int64 on the CPU."""
+        return self.ranks.numbers(count)[:, 0]
+
+    def marked(self, mask: Tensor) -> int:
+        """How many values of all masks (N,) bool are true."""
+        return self.ranks.before(int(mask.sum()))[1]
+
+    def places(self, mask: Tensor) -> Tensor:
+        """Indices (n,) among all rows, of those that any rank marks by a mask (N,) bool."""
+        return self.ranks.gather(self.items(mask.nonzero().reshape(-1)))
+
+    def choose(self, weights: Tensor, count: int, *, seed: int, stream: Stream, iteration: int) -> Tensor:
+        """Own rows, (n,) int64 ascending, of `count` that are drawn among all by `weighted_choice`."""
+        numbers = {"seed": seed, "stream": stream, "iteration": iteration}
+        return weighted_choice(weights, count, **numbers, first=self.first, ranks=self.ranks)
 
     def lowest(self, values: Tensor, count: int, *, highest: bool = False) -> Tensor:
         """Indices of this rank's values (n,) that are among the `count` lowest, or highest, of all; ties by place."""

@@ -14,6 +14,7 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.spilled_model import SpilledGaussians
 from splatting.deterministic.counter_rng import Stream, uniform
+from splatting.distributed.consistency import agree_on_scene
 from splatting.distributed.ranks import ranks
 from splatting.distributed.shared_images import SharedImages
 from splatting.evaluation.training_log import Stopwatch
@@ -22,7 +23,6 @@ from splatting.exports.splats import Splats
 from splatting.host.clock import seconds_since_start
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.training import checks, schedule_file
-from splatting.training.agreement import agree_on_scene
 from splatting.training.iteration import Iteration, ViewOrder
 from splatting.training.memory_estimate import announce_memory
 from splatting.training.objective import LossWatch, Objective
@@ -64,7 +64,9 @@ class Run:
         self.interrupt = DeferredInterrupt()
         self.device = compute_device()
         place = "cpu" if self.group.several or opt.spill else self.device  # a part of it is kept there
-        capture, self.first_iteration = load_checkpoint(self.start, place) if self.start else (None, 0)
+        capture, self.first_iteration = (
+            load_checkpoint(self.start, place, self.group.several) if self.start else (None, 0)
+        )
         views = self.group.size if launch.parallel == "views" else 1
         self.schedule = schedule_file.schedule_of(opt, self.start, self.first_iteration, views, self.group.shared)
         checks.warn_of_late_reset(opt, dataset.white_background, self.schedule)
@@ -144,7 +146,7 @@ class Run:
         announce_memory(self.scene, self.gaussians, *wants, self.group.size)
         self.log, self.rows = checks.continue_records(folder, start, self.first_iteration)
         self.losses = LossWatch(self.log.loss)
-        self.clock = Stopwatch(ranks().busy)
+        self.clock = Stopwatch(self.group.busy)
 
     def iterations(self) -> Iterator[Iteration]:
         """The iterations of this run."""

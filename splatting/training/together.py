@@ -1,6 +1,5 @@
-"""Agreement of the ranks of a training in each iteration, without an exchange of its own."""
+"""Agreement of the processes of a training in each iteration, without an exchange of its own."""
 
-from splatting.distributed.ranks import ranks
 from splatting.host.interrupt import Terminated
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
@@ -14,34 +13,34 @@ _WARM = 2  # iterations of a run after which a step takes as long as the others
 class Together(Observer):
     """Shares whether an iteration is due, which signal asks to stop, and where the guard has stopped the optimisers.
 
-    These go with the numbers that ranks exchange to render the iteration's view (Ranks.agree), and are known when its
-    losses are. A signal counts for the iteration that begins after it, on all ranks, whichever has got it.
+    These go with the numbers that they exchange to render the iteration's view (`agree`), and are known when its
+    losses are. A signal counts for the iteration that begins after it, on all, whichever has got it.
     """
 
     def __init__(self, run: Run) -> None:
-        self._run, self._ranks = run, ranks()
-        if self._ranks.several:
+        self._run, self._group = run, run.group
+        if self._group.several:
             guard = getattr(run.gaussians.optimizer, "guard", None)
-            self._ranks.flag = None if guard is None else guard.stopped
+            self._group.flag = None if guard is None else guard.stopped
         self._asked: type[KeyboardInterrupt] | None = None
 
     def begins(self, step: Iteration) -> None:
-        self._ranks.post(int(step.due), _SIGNALS.index(self._run.interrupt.requested))
-        self._ranks.prompt = step.iteration - self._run.first_iteration > _WARM
+        self._group.post(int(step.due), _SIGNALS.index(self._run.interrupt.requested))
+        self._group.prompt = step.iteration - self._run.first_iteration > _WARM
 
     def measured(self, step: Iteration, losses: Losses) -> None:
-        due, signal = self._ranks.heard()
+        due, signal = self._group.heard()
         step.due, self._asked = bool(due), _SIGNALS[signal]
 
     @property
     def stopping(self) -> type[KeyboardInterrupt] | None:
         """What asks to stop after this iteration."""
-        return self._asked if self._ranks.several else self._run.interrupt.requested
+        return self._asked if self._group.several else self._run.interrupt.requested
 
     def wait(self) -> None:
-        """Wait for all ranks, as until the first has written a checkpoint."""
-        self._ranks.anyone(False)
+        """Wait for all, as until the first has written a checkpoint."""
+        self._group.anyone(False)
 
     def finish(self) -> None:
         """Let the others wait as long as it takes from now on."""
-        self._ranks.prompt = False
+        self._group.prompt = False

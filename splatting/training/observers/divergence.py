@@ -10,7 +10,6 @@ from tqdm import tqdm
 
 from scene.gaussians.adam import StepGuard
 from scene.gaussians.checkpoint import save_checkpoint
-from splatting.distributed.ranks import ranks
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
@@ -59,7 +58,7 @@ class DivergenceWatch(Observer):
         self._latest.extend(losses.values())
         self._iteration = iteration
         bad = next((t for t, loss in losses.items() if not math.isfinite(loss)), _NEVER)
-        bad, stopped = ranks().numbers(bad, self._guard.stopped_in() or _NEVER).amin(0).tolist()
+        bad, stopped = self._run.group.numbers(bad, self._guard.stopped_in() or _NEVER).amin(0).tolist()
         if bad == stopped == _NEVER:
             return
         first = min(bad, stopped)
@@ -89,10 +88,9 @@ class DivergenceWatch(Observer):
                 file=sys.stderr,
             )
 
-    @staticmethod
-    def _value_of(loss: float) -> float:
-        """The loss of an iteration that was not finite, on whatever rank."""
-        return next((value for value in ranks().everyone(loss) if not math.isfinite(value)), loss)
+    def _value_of(self, loss: float) -> float:
+        """The loss of an iteration that was not finite, in whatever process."""
+        return next((value for value in self._run.group.everyone(loss) if not math.isfinite(value)), loss)
 
     def _unstepped(self) -> str:
         parts = []
@@ -102,15 +100,17 @@ class DivergenceWatch(Observer):
         return " and ".join(parts)
 
     def _rescue(self, iteration: int) -> str:
-        """Save the model, all ranks together, if it is whole on each. Return what was saved, and what to do."""
+        """Save the model, all processes together, if it is whole on each. Return what was saved, and what to do."""
         if iteration == self._run.first_iteration:
             return "no iteration was trained before it; lower the learning rates"
         path = Path(self._run.scene.model_path) / f"chkpnt{iteration}.pth"
-        fault = next(filter(None, ranks().everyone(self._fault(lambda: self._gaussians.check_finite(iteration)))), None)
+        fault = next(
+            filter(None, self._run.group.everyone(self._fault(lambda: self._gaussians.check_finite(iteration)))), None
+        )
         if fault is None:
             self._gaussians.drop_broken_statistics()
             state = self._gaussians.capture()
-            fault = ranks().shared(self._fault(lambda: save_checkpoint(path, state, iteration)))
+            fault = self._run.group.shared(self._fault(lambda: save_checkpoint(path, state, iteration)))
         if fault is not None:
             return f"and the model could not be saved ({fault}); resume an earlier checkpoint"
         return (

@@ -19,8 +19,6 @@ from scene.gaussians import density_rules as rules
 from scene.gaussians.budget import count_after, fade, remove_useless, split_in_two
 from splatting.deterministic.counter_rng import Stream, permutation
 from splatting.deterministic.portable_math import exp, log
-from splatting.deterministic.weighted_choice import weighted_choice
-from splatting.distributed.selection import largest
 from splatting.training.density import DensityControl, refuse_empty
 from splatting.training.iteration import Iteration
 from splatting.training.schedule import DecidedSchedule
@@ -105,10 +103,10 @@ class BudgetControl(DensityControl):
         opt, shards = self._opt, self._gaussians.shards
         scores = self._scores(self._scored_views(step.iteration), step.background)
         # The power of a score itself may be too small a number.
-        relative = scores / largest(scores, shards.ranks).clamp_min(_SMALLEST)
+        relative = scores / shards.largest(scores).clamp_min(_SMALLEST)
         weights = exp(opt.score_power * log(relative)) * (scores > 0)
         numbers = {"seed": opt.seed, "stream": Stream.DENSIFY, "iteration": step.iteration}
-        return weighted_choice(weights, count, **numbers, first=shards.first, ranks=shards.ranks)
+        return shards.choose(weights, count, **numbers)
 
     def _scored_views(self, iteration: int) -> list[Camera]:
         order = permutation(self._opt.seed, Stream.SCORED_VIEWS, iteration, len(self._cameras))
