@@ -55,6 +55,7 @@ def test_signals_leave_no_half_written_file(tmp_path, sent, status, said):
     script = (
         "import os, signal, sys\n"
         "from utils.system_utils import atomic_write, run_cli\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a background job's child inherits it ignored
         "def main():\n"
         "    with atomic_write(sys.argv[1]) as path:\n"
         "        path.write_text('half')\n"
