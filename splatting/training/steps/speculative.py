@@ -9,7 +9,7 @@ value depends on the guesses, only the time does. The GPU counts the steps itsel
 
 Streams: everything that a step computes is queued on torch's current stream, in the order of the calls. Photos that
 the CPU keeps are copied on a stream of their own, and the current stream waits for the event of the one it needs
-(scene/images/device_copies.py). A step is captured on a third stream, on which nothing ever runs; its launch is
+(scene/images/store.py). A step is captured on a third stream, on which nothing ever runs; its launch is
 queued on the current stream like any other. The reports go straight into page-locked memory. The host reads them
 without a call to the GPU, and waits for the whole stream before it replays steps or lets anybody read the model.
 """
