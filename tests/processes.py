@@ -8,6 +8,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
+from torch.multiprocessing.spawn import start_processes
 
 from splatting.distributed.ranks import using
 from splatting.distributed.several import SeveralRanks
@@ -21,9 +22,11 @@ def in_ranks(size: int, function: Callable[..., Any], *args: Any) -> list[Any]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    with mp.get_context("spawn").Manager() as manager:
+    # One process imports torch and the code; the others are its forks.
+    mp.get_context("forkserver").set_forkserver_preload(["train", "splatting.distributed.several"])
+    with mp.get_context("forkserver").Manager() as manager:
         results = manager.dict()
-        mp.spawn(_run, (size, port, function, args, results), nprocs=size)
+        start_processes(_run, (size, port, function, args, results), nprocs=size, start_method="forkserver")
         return [results[rank] for rank in range(size)]
 
 

@@ -3,8 +3,6 @@
 import json
 import math
 import re
-import subprocess
-import sys
 from itertools import permutations
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,7 +23,6 @@ from scene.cameras import MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.budget import count_after, fade, remove_useless, split_in_two
 from scene.gaussians.long_axis import long_axis_children
-from scene.readers.point_cloud import write_point_cloud
 from splatting.deterministic.counter_rng import Stream
 from splatting.distributed.rows import WHOLE
 from splatting.distributed.selection import weighted_choice
@@ -412,16 +409,6 @@ def test_a_scene_with_nothing_to_densify(colmap_scene, tmp_path, counts):
     assert {count for _, count in counts} == {300}
 
 
-def test_resume_equals_uninterrupted_and_the_plain_step_changes_nothing(colmap_scene, tmp_path):
-    more = ["--max_num_splats", 700, "--random_background", "--seed", 5]
-    whole = _train(colmap_scene, tmp_path / "a", *more, "--checkpoint_iterations", 60)
-    start = ["--start_checkpoint", tmp_path / "a" / "chkpnt60.pth"]
-    resumed = _train(colmap_scene, tmp_path / "b", *more, *start)
-    assert whole.read_bytes() == resumed.read_bytes()
-    assert _train(colmap_scene, tmp_path / "c", *more, "--plain_step").read_bytes() == whole.read_bytes()
-    assert _train(colmap_scene, tmp_path / "d", *more[:-1], 6).read_bytes() != whole.read_bytes()
-
-
 # So short a training multiplies rates by 8. At 0.2, with sparse Adam, Gaussians vanish faster than they double.
 @pytest.mark.parametrize("more", [["--optimizer_type", "sparse_adam", "--opacity_lr", 0.0125],
                                   ["--train_test_exp", "--eval"],
@@ -429,27 +416,6 @@ def test_resume_equals_uninterrupted_and_the_plain_step_changes_nothing(colmap_s
 def test_with_other_options(colmap_scene, tmp_path, more):
     ply = _train(colmap_scene, tmp_path / "out", "--max_num_splats", 500, *more)
     assert _count(ply) == 500
-
-
-THREADED = "import sys, torch; torch.set_num_threads(int(sys.argv[1])); import train; train.main(sys.argv[2:])"
-
-
-def test_any_number_of_threads_gives_the_same_bytes(colmap_scene, tmp_path):
-    rng = np.random.default_rng(0)
-    # torch divides loops between two threads from 32,768 values on.
-    write_point_cloud(tmp_path / "cloud.ply", rng.normal(size=(40_003, 3)), rng.integers(0, 255, (40_003, 3)))
-    runs = []
-    for threads in (1, 2):
-        out = tmp_path / str(threads)
-        command = [
-            sys.executable, "-c", THREADED, threads, "-s", colmap_scene, "-m", out, "--init_pcd_path",
-            tmp_path / "cloud.ply", "--iterations", 34, *GROWING, "--densify_from_iter", 5, "--densification_interval",
-            10, "--score_error", "loss", "--max_num_splats", 60_000, "-r", 160, "--test_iterations", -1,
-        ]  # fmt: skip
-        done = subprocess.run(list(map(str, command)), cwd=ROOT, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        runs.append((out / "point_cloud/iteration_34/point_cloud.ply").read_bytes())
-    assert runs[0] == runs[1]
 
 
 def test_an_empty_model_is_an_error(colmap_scene, tmp_path):

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from rasterizer_tools import GPU_MARKS
-from test_steps import OPTIONS, differences, fused_iterations, trained
-from test_steps import scene as scene  # a fixture
+from trainings import OPTIONS, differences, trained
 
 import train
 from scene.gaussian_model import GaussianModel
@@ -19,6 +18,11 @@ from utils.system_utils import UserError
 
 # Within so few iterations no Gaussian fades, so the thresholds are at the opacities of the start.
 ACTIVE = ("--mcmc_noise", 5e4, "--mcmc_gate_opacity", 0.5, "--mcmc_min_opacity", 0.45)
+
+
+@pytest.fixture
+def scene(colmap_scene: Path) -> Path:
+    return colmap_scene
 
 
 def _train(source: Path, out: Path, *options: object, iterations: int = 60) -> Path:
@@ -33,15 +37,6 @@ def _raw(out: Path, iteration: int) -> GaussianModel:
     gaussians = GaussianModel(3)
     gaussians.load_ply(out / f"point_cloud/iteration_{iteration}/point_cloud.ply")
     return gaussians
-
-
-@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
-def test_the_fused_step_gives_the_bytes_of_the_plain_one(scene, tmp_path, monkeypatch, options):
-    plain = trained(scene, tmp_path / "plain", "--plain_step", "--strategy", "mcmc", *ACTIVE, *options)
-    fused = fused_iterations(monkeypatch)
-    assert differences(trained(scene, tmp_path / "fused", "--strategy", "mcmc", *ACTIVE, *options), plain) == []
-    # Relocations and the last iteration; there are no resets.
-    assert sorted({*fused}) == [t for t in range(1, 60) if t not in (20, 40)]
 
 
 @pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])

@@ -17,18 +17,11 @@ from splatting.training.schedule import BatchSchedule
 from utils.system_utils import UserError
 
 EVERYTHING = (
-    *("--eval", "--iterations", 300, "--checkpoint_iterations", 150, "--save_iterations", 150, "--random_background"),
-    *("--densify_from_iter", 20, "--densification_interval", 40, "--densify_until_iter", 260, "-r", 2),
-    *("--opacity_reset_interval", 130, "--test_iterations", -1, "--densify_grad_threshold", 0.0004),
+    *("--eval", "--iterations", 200, "--checkpoint_iterations", 100, "--save_iterations", 100, "--random_background"),
+    *("--densify_from_iter", 20, "--densification_interval", 40, "--densify_until_iter", 190, "-r", 2),
+    *("--opacity_reset_interval", 85, "--test_iterations", -1, "--densify_grad_threshold", 0.0004),
 )
-LAST = "point_cloud/iteration_300/point_cloud.ply"
-OTHERS = {
-    "mcmc": ("--strategy", "mcmc", "--max_num_splats", 400, "--densification_interval", 10),
-    "budget": ("--strategy", "budget", "--max_num_splats", 330),
-    "sparse": ("--optimizer_type", "sparse_adam", "--absgrad", "--antialiasing"),
-    "plain": ("--plain_step", "--train_test_exp"),
-    "tiny": ("-r", 8),  # images of one tile
-}
+LAST = "point_cloud/iteration_200/point_cloud.ply"
 SHORT = (
     *("--iterations", 60, "--densify_until_iter", 55, "--save_iterations", -1, "--test_iterations", -1, "--eval"),
     *("--densify_from_iter", 5, "--densification_interval", 20),
@@ -59,38 +52,24 @@ def _curve(folder: Path) -> dict[str, dict[str, str]]:
 
 def _assert_same_curves(one: dict, other: dict) -> None:
     both = one.keys() & other.keys()
-    assert {"300"} < both and len(both) > 4
+    assert {"200"} < both and len(both) > 4
     assert [one[iteration] for iteration in both] == [other[iteration] for iteration in both]
 
 
-def _all(scene: Path, folder: Path, others: bool) -> dict[str, dict[str, str]]:
-    """All trainings, or the long one alone, in the same processes."""
+def _whole(scene: Path, folder: Path, *options: object) -> dict[str, str]:
     torch.set_num_threads(1)
-    folder = folder / str(ranks().size)
-    results = {"everything": _train(scene, folder / "everything", *EVERYTHING)}
-    for name, changes in OTHERS.items() if others else ():
-        results[name] = _train(scene, folder / name, *SHORT, *changes)
-    return results
+    return _train(scene, folder / str(ranks().size), *EVERYTHING, *options)
 
 
-def _resume(scene: Path, folder: Path, checkpoint: Path) -> dict[str, str]:
-    torch.set_num_threads(1)
-    return _train(scene, folder / f"by_{ranks().size}", *EVERYTHING, "--start_checkpoint", checkpoint)
-
-
-def test_ranks_write_the_bytes_of_one_process(masked_scene, tmp_path):  # noqa: F811
-    one, two, three = (in_ranks(size, _all, masked_scene, tmp_path, size != 2)[0] for size in (1, 2, 3))
-    for several in (two, three):
-        for name, files in several.items():
-            assert files == one[name], name
-    assert len(three) == len(one) == len(OTHERS) + 1
-    assert {"chkpnt150.pth", LAST} < one["everything"].keys()
-    assert len({str(result) for result in one.values()}) == len(one)
-    folders = [tmp_path / str(size) / "everything" for size in (1, 2, 3)]
-    for size in (1, 3):  # a checkpoint is resumed by any number of ranks
-        resumed = in_ranks(size, _resume, masked_scene, tmp_path, folders[1] / "chkpnt150.pth")[0]
-        assert resumed[LAST] == two["everything"][LAST]
-        folders.append(tmp_path / f"by_{size}")
+def test_ranks_write_the_files_of_one_process(masked_scene, tmp_path):  # noqa: F811
+    """The checkpoints' bytes and the points of the curve, too; a checkpoint is resumed by any number of ranks."""
+    one, two = (in_ranks(size, _whole, masked_scene, tmp_path)[0] for size in (1, 2))
+    assert one == two and {"chkpnt100.pth", LAST} < one.keys()
+    start = "--start_checkpoint", tmp_path / "2" / "chkpnt100.pth"
+    folders = [tmp_path / "1", tmp_path / "2"]
+    for size in (1, 3):
+        folders.append(tmp_path / "resumed" / str(size))
+        assert in_ranks(size, _whole, masked_scene, tmp_path / "resumed", *start)[0][LAST] == two[LAST]
     for folder in folders[1:]:
         _assert_same_curves(_curve(folders[0]), _curve(folder))
 

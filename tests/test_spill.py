@@ -1,50 +1,26 @@
 """--spill: rows that step late, in the host's memory, give the bytes of rows that step in time."""
 
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 from diff_gaussian_rasterization.optim import adam_, catch_up_
 from gaussians import model
-from processes import in_ranks
-from synthetic import FOCAL, make_colmap_scene
-from test_steps import ITERATIONS, differences, trained
+from trainings import OPTIONS, differences, narrow_scene, trained
 
-import train
 from scene import spilled_model
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
-from scene.spilled_model import SpilledGaussians
-from splatting.training import memory_estimate, objective, run
+from splatting.training import memory_estimate, objective
 from splatting.training.memory_estimate import spilled_bytes, training_bytes
 from utils.system_utils import UserError
 
 BETAS, EPS = (0.9, 0.999), 1e-15
-MCMC = ("--strategy", "mcmc", "--mcmc_noise", 5e4, "--mcmc_gate_opacity", 0.5, "--mcmc_min_opacity", 0.45)
-OPTIONS = {
-    "adc": (),
-    "sparse": ("--optimizer_type", "sparse_adam", "--random_background"),
-    "mcmc": MCMC,
-    "budget": ("--strategy", "budget", "--max_num_splats", 500, "--densify_until_iter", 50),
-    "exposure": ("--train_test_exp", "--antialiasing", "--white_background"),
-    "degree 1": ("--sh_degree", 1, "--absgrad", "--absgrad_threshold", 2e-4),
-    "python": ("--convert_SHs_python",),
-}
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene of which a view sees a part."""
-    folder = tmp_path_factory.mktemp("narrow") / "scene"
-    make_colmap_scene(folder, params=(5 * FOCAL, 5 * FOCAL, 48.0, 32.0))
-    return folder
-
-
-@pytest.fixture(autouse=True)
-def _raised_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Raise the SH degree every 12 iterations, between those that change rows."""
-    monkeypatch.setattr(run, "SH_INTERVAL", 12)
+    return narrow_scene(tmp_path_factory.mktemp("spill") / "scene")
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
@@ -91,45 +67,11 @@ def test_what_does_not_fit_is_refused():
     assert all((t == 1).all() for t in state)
 
 
-@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
-def test_a_training_writes_the_same_files(scene, tmp_path, monkeypatch, options):
-    usual = trained(scene, tmp_path / "usual", *options)
-    late, steps = [], SpilledGaussians._take_missed
-
-    def noted(self, missed, taken, *others):
-        late.append(len(missed.steps) - int(taken.min()))
-        return steps(self, missed, taken, *others)
-
-    monkeypatch.setattr(SpilledGaussians, "_take_missed", noted)
-    assert differences(trained(scene, tmp_path / "spilled", "--spill", *options), usual) == []
-    assert bool(late) == ("sparse_adam" not in options)
-    assert not late or max(late) >= 5
-
-
 @pytest.mark.parametrize("most", [1, 4])
 def test_a_long_list_of_missed_steps_is_cut(scene, tmp_path, monkeypatch, most):
     usual = trained(scene, tmp_path / "usual")
     monkeypatch.setattr(spilled_model, "_MOST_MISSED", most)
     assert differences(trained(scene, tmp_path / "spilled", "--spill"), usual) == []
-
-
-@pytest.mark.parametrize("kind", ["adc", "sparse", "mcmc"])
-def test_resuming_from_either_way_to_the_other(scene, tmp_path, kind):
-    whole = trained(scene, tmp_path / "whole", *OPTIONS[kind])
-    for first, then in (((), ("--spill",)), (("--spill",), ())):
-        out = tmp_path / f"{len(first)}"
-        trained(scene, out / "a", *OPTIONS[kind], *first, "--checkpoint_iterations", 33, ITERATIONS)
-        words = "--start_checkpoint", out / "a" / "chkpnt33.pth", *then
-        assert differences(trained(scene, out / "b", *OPTIONS[kind], *words), whole) == []
-
-
-def test_looking_at_the_model_changes_nothing(scene, tmp_path):
-    looks = "--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44, "--checkpoint_iterations", 21, ITERATIONS
-    usual = trained(scene, tmp_path / "usual", *looks)
-    assert differences(trained(scene, tmp_path / "spilled", "--spill", *looks), usual) == []
-    for iteration in (9, 44):
-        ply = f"point_cloud/iteration_{iteration}/point_cloud.ply"
-        assert (tmp_path / "usual" / ply).read_bytes() == (tmp_path / "spilled" / ply).read_bytes()
 
 
 def _stopped(scene: Path, out: Path, *options: object) -> tuple[str, list[object]]:
@@ -148,7 +90,7 @@ def _equal(a: object, b: object) -> bool:
     return torch.equal(a, b) if torch.is_tensor(a) else a == b
 
 
-@pytest.mark.parametrize("kind", ["adc", "sparse"])
+@pytest.mark.parametrize("kind", ["default", "sparse"])
 @pytest.mark.parametrize("what", ["loss", "f_rest", "xyz"])
 def test_a_guard_leaves_the_same_model_and_marks(scene, tmp_path, monkeypatch, what, kind):
     """From iteration 34 on, which is found out in 36, where the SH degree is raised."""
@@ -178,25 +120,6 @@ def test_a_guard_leaves_the_same_model_and_marks(scene, tmp_path, monkeypatch, w
     (said, usual), (told, spilled) = results
     assert said == told and ("became nan" if what == "loss" else f"{what} of 1 of") in said
     assert all(map(_equal, spilled, usual))
-
-
-def _trained_together(scene: Path, out: Path, *options: object) -> None:
-    run.SH_INTERVAL = 12
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "stdout", sys.stdout)
-        words = ["-s", scene, "-m", out, "-r", 48, "--iterations", 30, "--densify_from_iter", 5, "--no_curve"]
-        words += ["--densification_interval", 8, "--test_iterations", -1, "--quiet", "--disable_viewer"]
-        words += ["--checkpoint_iterations", 30, *options]
-        train.main(list(map(str, words)))
-
-
-def test_ranks_each_spill_their_part(scene, tmp_path):
-    _trained_together(scene, tmp_path / "alone")
-    in_ranks(2, _trained_together, scene, tmp_path / "two", "--spill")
-    ply = "point_cloud/iteration_30/point_cloud.ply"
-    assert (tmp_path / "two" / ply).read_bytes() == (tmp_path / "alone" / ply).read_bytes()
-    two, alone = (load_checkpoint(tmp_path / name / "chkpnt30.pth")[0] for name in ("two", "alone"))
-    assert all(map(_equal, (*two[:10], two[10]["state"]), (*alone[:10], alone[10]["state"])))
 
 
 def test_the_estimate_leaves_out_what_lies_in_the_hosts_memory():

@@ -1,22 +1,17 @@
 """The ways to take a step of training: the fast ones give the bytes of the plain one."""
 
-import json
 import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 from rasterizer_tools import GPU_MARKS
-from trainings import train_on, whole_result
+from step_ways import Rerun, fused_iterations, take_as  # noqa: F401  (a fixture)
+from trainings import ITERATIONS, OPTIONS, differences, narrow_scene, trained
 
-from gaussian_renderer import Drawn
 from splatting.training import run
 from splatting.training.objective import Losses, Objective
 from splatting.training.steps import captured, speculative, step_taker
@@ -25,146 +20,12 @@ from splatting.training.steps.fused import FusedStep
 from splatting.training.steps.plain import PlainStep
 from utils.system_utils import UserError
 
-ITERATIONS = 60
-DENSITY = ("--densify_from_iter", 10, "--densification_interval", 20, "--opacity_reset_interval", 30)
-OPTIONS = {
-    "default": (),
-    "sparse": ("--optimizer_type", "sparse_adam", "--random_background"),
-    "exposure": ("--train_test_exp", "--antialiasing"),
-    "depth": ("-d", "depths", "--depth_l1_weight_init", 1.0),
-    "masks": ("--masks", "masks"),
-    "degree 0": ("--sh_degree", 0),
-    "absgrad": ("--absgrad", "--absgrad_threshold", 2e-4, "--split", "long_axis"),
-    "white": ("-w", "--antialiasing"),
-    "two phases": ("--densify_until_iter", 30),  # so that two phases have steps to capture
-}
-# Densification, resets of opacities and the last iteration are plain. Over white there is a reset before the first.
-CHANGING = {"white": (10, 20, 30, 40), "two phases": (20,)}
-WITHOUT_GRAPHS = ("exposure", "depth", "masks")  # whose steps are queued one call after the other
 GPU = [pytest.param(None, marks=GPU_MARKS)]
 
 
-@pytest.fixture
-def scene(colmap_scene: Path) -> Path:
-    """The COLMAP scene with a mask and an inverse depth map for each photo."""
-    images = colmap_scene / "images"
-    photos = [photo.relative_to(images) for photo in images.rglob("*") if photo.is_file()]
-    mask = np.full((64, 96), 255, np.uint8)
-    mask[:, :20] = 0
-    depth = np.linspace(0, 2**15, 64 * 96).astype(np.uint16).reshape(64, 96)
-    for photo in photos:
-        for pixels, path in ((mask, f"masks/{photo}.png"), (depth, f"depths/{photo.with_suffix('.png')}")):
-            (colmap_scene / path).parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(pixels).save(colmap_scene / path)
-    scales = {str(photo.with_suffix("")): {"scale": 1.0, "offset": 0.0} for photo in photos}
-    (colmap_scene / "sparse/0/depth_params.json").write_text(json.dumps(scales))
-    return colmap_scene
-
-
-def trained(scene: Path, out: Path, *options: object) -> dict[str, bytes | list]:
-    """Train; the bytes of the PLY, and the tensors and numbers of the checkpoint."""
-    words = "--eval", "-r", 48, "--iterations", ITERATIONS, *DENSITY, "--no_curve", "--quiet"
-    train_on(scene, out, *words, "--test_iterations", -1, "--checkpoint_iterations", ITERATIONS, *options)
-    return whole_result(out, ITERATIONS)
-
-
-def differences(one: dict[str, bytes | list], other: dict[str, bytes | list]) -> list[str]:
-    """What differs between two results of `trained`, in few words."""
-    pairs = zip(one["checkpoint"], other["checkpoint"], strict=True)
-    found = [f"leaf {n}: {str(a)[:60]} and {str(b)[:60]}" for n, (a, b) in enumerate(pairs) if a != b]
-    return found + (["ply"] if one["ply"] != other["ply"] else [])
-
-
-def fused_iterations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """A list to which every iteration that is not taken plainly will be appended."""
-    fused, advance, launch = [], FusedStep.advance, Graphs.launch
-    monkeypatch.setattr(FusedStep, "advance", lambda self, at, *x: (fused.append(at.iteration), advance(self, at, *x)))
-
-    def noted(self, at):
-        losses = launch(self, at)
-        fused.extend([at.iteration] if losses else [])
-        return losses
-
-    monkeypatch.setattr(Graphs, "launch", noted)
-    return fused
-
-
-class Immediate:
-    """Stands for Speculation where there is no GPU: every step is done at once."""
-
-    def __init__(self, *_: object) -> None:
-        self.drain = self.throttle = self.discard = lambda: None
-        self.add = lambda *_: None
-        self.abort = lambda: 0
-
-    def capacity(self, at: object) -> AbstractContextManager:
-        return nullcontext()
-
-
-class Rerun:
-    """Stands for Recorder where there is no GPU: a launch runs the function once more, which reads what lies there."""
-
-    made: list["Rerun"] = []
-    tight = False
-
-    def __init__(self, *_: object) -> None:
-        self.launches = self.records = self.released = 0
-        Rerun.made.append(self)
-
-    def capture(self, body: Callable[[], torch.Tensor]) -> tuple[Callable[[], None], torch.Tensor]:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(Drawn, "step", lambda *_: None)  # to capture a step does not take it
-            result = body()
-        self.records += 1
-
-        def launch() -> None:
-            self.launches += 1
-            result.copy_(body())
-
-        return launch, result
-
-    def is_tight(self) -> bool:
-        return self.tight
-
-    def release(self) -> None:
-        self.released += 1
-
-
-WAYS = {"fused": FusedStep, "queued": CapturedStep, "captured": CapturedStep}
-
-
-@pytest.fixture
-def take_as(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Lets steps be taken in a way of WAYS, as on a GPU, or plainly."""
-    Rerun.made.clear()
-    monkeypatch.setattr(captured, "Speculation", Immediate)
-    monkeypatch.setattr(captured, "Recorder", Rerun)
-
-    def choose(way: str) -> None:
-        monkeypatch.setattr("splatting.training.loop.step_taker", WAYS.get(way, PlainStep))
-        if way == "queued":
-            monkeypatch.setattr(Graphs, "_is_usual", lambda *_: False)
-
-    return choose
-
-
-@pytest.mark.parametrize("name", OPTIONS)
-@pytest.mark.parametrize("way", WAYS)
-def test_a_fast_step_gives_the_bytes_of_the_plain_one(scene, tmp_path, monkeypatch, take_as, way, name):
-    plain = trained(scene, tmp_path / "plain", "--plain_step", *OPTIONS[name])
-    take_as(way)
-    fused, find, kinds = fused_iterations(monkeypatch), Graphs._graph_for, []
-    monkeypatch.setattr(Graphs, "_graph_for", lambda self, at: (find(self, at), kinds.append({*self._graphs}))[0])
-    assert not differences(trained(scene, tmp_path / way, *OPTIONS[name]), plain)
-    assert fused == [t for t in range(1, ITERATIONS) if t not in CHANGING.get(name, (20, 30, 40))]
-    launches = sum(made.launches for made in Rerun.made)
-    if way != "captured" or name in WITHOUT_GRAPHS:
-        assert launches == 0
-        return
-    assert launches > 40
-    assert Rerun.made[0].records >= 3  # tensors that density control has replaced are captured anew
-    assert all(len({kind[-2:] for kind in known}) <= 1 for known in kinds)  # graphs of another phase go
-    assert len(set().union(*kinds)) == (2 if name == "two phases" else 1)
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return narrow_scene(tmp_path_factory.mktemp("steps") / "scene")
 
 
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
@@ -216,7 +77,7 @@ def test_what_may_want_gradients_takes_the_plain_step(scene, tmp_path, monkeypat
 def test_debug_takes_the_plain_step(scene, tmp_path, monkeypatch):
     fused = fused_iterations(monkeypatch)
     trained(scene, tmp_path / "a", "--debug_from", 15)
-    assert fused == list(range(1, 16))
+    assert fused == [*range(1, 12), 13, 14, 15]  # the SH degree is raised in 12
 
 
 def of_scales(losses: Losses, package: dict, step: object, scales: torch.Tensor) -> torch.Tensor:
@@ -230,19 +91,26 @@ def of_image(losses: Losses, package: dict, *_: object) -> torch.Tensor:
 # Terms that somebody adds to our objective after so many of its calls, and how many steps are then not plain. The
 # objective is called in the first step, and in the second to capture it.
 TERMS = {
-    "past the image": ("fused", 14, 14, of_scales),
-    "past the image, queued": ("queued", 14, 14, of_scales),
+    "past the image": ("fused", 14, 13, of_scales),
+    "past the image, queued": ("queued", 14, 13, of_scales),
     "past the image from the first step on": ("captured", 0, 0, of_scales),
     "past the image when it is captured": ("captured", 1, 1, of_scales),
-    "of the image": ("captured", 0, 56, of_image),
-    "of the iteration": ("captured", 0, 56, lambda losses, _, at, *__: losses.total * at.iteration),
-    "of the photo's name": ("captured", 0, 56, lambda losses, _, at, *__: losses.total * len(at.camera.image_name)),
+    "of the image": ("captured", 0, 52, of_image),
+    "of the iteration": ("captured", 0, 52, lambda losses, _, at, *__: losses.total * at.iteration),
+    "of the photo's name": ("captured", 0, 52, lambda losses, _, at, *__: losses.total * len(at.camera.image_name)),
 }
 
 
 @pytest.mark.parametrize(("way", "late", "fused", "term"), TERMS.values(), ids=TERMS.keys())
 def test_a_term_that_was_added_to_our_objective_is_not_lost(
-    scene, tmp_path, monkeypatch, take_as, way, late, fused, term
+    scene,
+    tmp_path,
+    monkeypatch,
+    take_as,
+    way,
+    late,
+    fused,
+    term,  # noqa: F811
 ):
     """Gradients past the image make the steps from there on plain; what asks for more than an image is not captured."""
     call, make, models, calls = Objective.__call__, run.GaussianModel, [], []
@@ -264,7 +132,7 @@ def test_a_term_that_was_added_to_our_objective_is_not_lost(
     assert bool(sum(made.launches for made in Rerun.made)) == (term is of_image)
 
 
-def test_graphs_give_their_memory_back_where_it_is_short(scene, tmp_path, take_as, monkeypatch):
+def test_graphs_give_their_memory_back_where_it_is_short(scene, tmp_path, take_as, monkeypatch):  # noqa: F811
     take_as("captured")
     plenty = trained(scene, tmp_path / "plenty")
     monkeypatch.setattr(Rerun, "tight", True)

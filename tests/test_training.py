@@ -49,39 +49,6 @@ def _steps(checkpoint: Path) -> list[float]:
     return [state[i]["step"].item() if i in state else float("nan") for i in range(6)]
 
 
-RESUMED = [
-    "--densify_from_iter", 100, "--densification_interval", 50, "--densify_grad_threshold", 1e-4,
-    "--opacity_reset_interval", 220, "--random_background", "--max_num_splats", 500, "--seed", 5,
-]  # fmt: skip
-
-
-def test_resume_equals_uninterrupted(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(training_run, "SH_INTERVAL", 130)  # so that three degrees come into play in 600 iterations
-    whole = _train(colmap_scene, tmp_path / "a", *RESUMED, "--checkpoint_iterations", 300, iterations=600)
-    checkpoint = tmp_path / "a" / "chkpnt300.pth"
-    resumed = _train(colmap_scene, tmp_path / "b", *RESUMED, "--start_checkpoint", checkpoint, iterations=600)
-    assert whole.read_bytes() == resumed.read_bytes()
-    assert len(_raw(whole)) != load_checkpoint(checkpoint)[0][1].shape[0]  # densification continued after 300
-    seeds = {name: [*RESUMED[:-1], seed] for name, seed in (("c", 5), ("d", 5), ("e", 6))}
-    same, again, other = (_train(colmap_scene, tmp_path / n, *seeds[n], iterations=100).read_bytes() for n in seeds)
-    assert same == again != other
-
-
-@pytest.mark.parametrize(
-    "option", [("--absgrad", "--absgrad_threshold", 4e-4), ("--split", "long_axis")], ids=["absgrad", "long axis"]
-)
-def test_options_of_density_control_resume_and_matter(colmap_scene, tmp_path, option):
-    """Each by itself: the bytes of an uninterrupted run, other ones than without it, and the cap is held."""
-    options = [*RESUMED, "--percent_dense", 0.001]  # so that some are split
-    whole = _train(colmap_scene, tmp_path / "a", *options, *option, "--checkpoint_iterations", 140, iterations=220)
-    start = "--start_checkpoint", tmp_path / "a" / "chkpnt140.pth"
-    resumed = _train(colmap_scene, tmp_path / "b", *options, *option, *start, iterations=220)
-    assert whole.read_bytes() == resumed.read_bytes()
-    plain = _train(colmap_scene, tmp_path / "c", *options, iterations=220)
-    assert plain.read_bytes() != whole.read_bytes()
-    assert len(load_checkpoint(start[1])[0][1]) < len(_raw(whole)) <= 500
-
-
 def test_order_of_a_step(colmap_scene, tmp_path):
     """A save precedes the step. The last iteration and densifications take no step, nor do opacities in a reset."""
     every = [str(t) for t in range(1, 13)]
@@ -119,36 +86,6 @@ def test_every_view_once_an_epoch():
     assert seen[:7] != seen[7:14]
     late = ViewOrder(cameras, seed=3)
     assert [late[t] for t in (18, 3, 21)] == [seen[17], seen[2], seen[20]]
-
-
-THREADED = """
-import sys, torch
-torch.set_num_threads(int(sys.argv[1]))
-import train
-train.SH_INTERVAL = 12
-train.main(sys.argv[2:])
-"""
-
-
-def test_any_number_of_threads_gives_the_same_bytes(colmap_scene, tmp_path):
-    rng = np.random.default_rng(0)
-    # torch divides loops between two threads from 32,768 values on; so many points and photos 160 pixels wide exceed
-    # that. (With torch's sigmoid for the opacities instead of the kernel's, this test fails.)
-    count = 40_003
-    write_point_cloud(tmp_path / "cloud.ply", rng.normal(size=(count, 3)), rng.integers(0, 255, (count, 3)))
-    runs = []
-    for threads in (1, 2):
-        out = tmp_path / str(threads)
-        command = [
-            sys.executable, "-c", THREADED, threads, "-s", colmap_scene, "-m", out, "--init_pcd_path",
-            tmp_path / "cloud.ply", "--iterations", 40, "--densify_from_iter", 10, "--densification_interval", 15,
-            "--densify_grad_threshold", 5e-5, "--opacity_reset_interval", 25, "-r", 160, "--test_iterations", -1,
-        ]  # fmt: skip
-        done = subprocess.run(list(map(str, command)), cwd=ROOT, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        runs.append((out / "point_cloud/iteration_40/point_cloud.ply").read_bytes())
-    assert runs[0] == runs[1]
-    assert len(_raw(tmp_path / "1/point_cloud/iteration_40/point_cloud.ply")) > count
 
 
 def test_learning_and_what_is_said(colmap_scene, tmp_path, capfd):

@@ -1,16 +1,72 @@
 """Trainings by train.py in the process of a test, and what they leave."""
 
+import json
+import sys
 from pathlib import Path
 
+import numpy as np
+import pytest
 import torch
+from PIL import Image
+from synthetic import FOCAL, make_colmap_scene
 
 import train
+from splatting.training import run
+
+ITERATIONS = 60
+MCMC = ("--strategy", "mcmc", "--mcmc_noise", 5e4, "--mcmc_gate_opacity", 0.5, "--mcmc_min_opacity", 0.45)
+BUDGET = ("--strategy", "budget", "--max_num_splats", 500, "--densify_until_iter", 50)
+OPTIONS = {
+    "default": (),
+    "sparse": ("--optimizer_type", "sparse_adam", "--random_background"),
+    "exposure": ("--train_test_exp", "--antialiasing"),
+    "depth": ("-d", "depths", "--depth_l1_weight_init", 1.0),
+    "masks": ("--masks", "masks"),
+    "degree 0": ("--sh_degree", 0),
+    "absgrad": ("--absgrad", "--absgrad_threshold", 2e-4, "--max_num_splats", 400),
+    "long axis": ("--split", "long_axis", "--percent_dense", 0.001),  # so that some are split
+    "white": ("-w", "--antialiasing"),
+    "two phases": ("--densify_until_iter", 30),  # so that two phases have steps to capture
+    "tiny": ("-r", 8),  # images of one tile
+    "mcmc": MCMC,
+    "mcmc sparse": (*MCMC, "--optimizer_type", "sparse_adam", "--antialiasing"),
+    "budget": BUDGET,
+    "budget errors": (*BUDGET, "--score_error", "loss", "--score_join", "max", "--score_power", 2, "--train_test_exp"),
+}
+
+
+def narrow_scene(folder: Path) -> Path:
+    """Make a COLMAP scene of which a view sees a part, with a mask and an inverse depth map for each photo."""
+    make_colmap_scene(folder, params=(5 * FOCAL, 5 * FOCAL, 48.0, 32.0))
+    images = folder / "images"
+    photos = [photo.relative_to(images) for photo in images.rglob("*") if photo.is_file()]
+    mask = np.full((64, 96), 255, np.uint8)
+    mask[:, :20] = 0
+    depth = np.linspace(0, 2**15, 64 * 96).astype(np.uint16).reshape(64, 96)
+    for photo in photos:
+        for pixels, path in ((mask, f"masks/{photo}.png"), (depth, f"depths/{photo.with_suffix('.png')}")):
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(pixels).save(folder / path)
+    scales = {str(photo.with_suffix("")): {"scale": 1.0, "offset": 0.0} for photo in photos}
+    (folder / "sparse/0/depth_params.json").write_text(json.dumps(scales))
+    return folder
 
 
 def train_on(scene: Path, out: Path, *words: object) -> dict[int, bytes]:
     """Train; the PLYs in the output folder by iteration."""
     train.main([*map(str, ("-s", scene, "-m", out, *words))])
     return {int(ply.parent.name[10:]): ply.read_bytes() for ply in out.glob("point_cloud/*/*.ply")}
+
+
+def trained(scene: Path, out: Path, *options: object) -> dict[str, bytes | list]:
+    """Train for 60 iterations, in which rows and the SH degree change; see whole_result."""
+    words = ["--eval", "-r", 48, "--iterations", ITERATIONS, "--densify_from_iter", 10, "--densification_interval", 20]
+    words += ["--opacity_reset_interval", 30, "--test_iterations", -1, "--checkpoint_iterations", ITERATIONS]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stdout", sys.stdout)  # training stamps it
+        patch.setattr(run, "SH_INTERVAL", 12)  # between the iterations that change rows
+        train_on(scene, out, *words, "--no_curve", "--quiet", "--disable_viewer", *options)
+    return whole_result(out, ITERATIONS)
 
 
 def leaves(value: object) -> list:
@@ -29,3 +85,10 @@ def whole_result(out: Path, iteration: int) -> dict[str, bytes | list]:
     checkpoint = torch.load(out / f"chkpnt{iteration}.pth", weights_only=False)
     ply = out / f"point_cloud/iteration_{iteration}/point_cloud.ply"
     return {"ply": ply.read_bytes(), "checkpoint": leaves(checkpoint)}
+
+
+def differences(one: dict[str, bytes | list], other: dict[str, bytes | list]) -> list[str]:
+    """What differs between two results, in few words."""
+    pairs = zip(one["checkpoint"], other["checkpoint"], strict=True)
+    found = [f"leaf {n}: {str(a)[:60]} and {str(b)[:60]}" for n, (a, b) in enumerate(pairs) if a != b]
+    return found + (["ply"] if one["ply"] != other["ply"] else [])

@@ -1,0 +1,86 @@
+"""Ways to take a step of training, those of a GPU on any machine, and notes of which steps took them."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+
+import pytest
+import torch
+
+from gaussian_renderer import Drawn
+from splatting.training.steps import captured
+from splatting.training.steps.captured import CapturedStep, Graphs
+from splatting.training.steps.fused import FusedStep
+from splatting.training.steps.plain import PlainStep
+
+
+def fused_iterations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """A list to which every iteration that is not taken plainly will be appended."""
+    fused, advance, launch = [], FusedStep.advance, Graphs.launch
+    monkeypatch.setattr(FusedStep, "advance", lambda self, at, *x: (fused.append(at.iteration), advance(self, at, *x)))
+
+    def noted(self, at):
+        losses = launch(self, at)
+        fused.extend([at.iteration] if losses else [])
+        return losses
+
+    monkeypatch.setattr(Graphs, "launch", noted)
+    return fused
+
+
+class Immediate:
+    """Stands for Speculation where there is no GPU: every step is done at once."""
+
+    def __init__(self, *_: object) -> None:
+        self.drain = self.throttle = self.discard = lambda: None
+        self.add = lambda *_: None
+        self.abort = lambda: 0
+
+    def capacity(self, at: object) -> AbstractContextManager:
+        return nullcontext()
+
+
+class Rerun:
+    """Stands for Recorder where there is no GPU: a launch runs the function once more, which reads what lies there."""
+
+    made: list["Rerun"] = []
+    tight = False
+
+    def __init__(self, *_: object) -> None:
+        self.launches = self.records = self.released = 0
+        Rerun.made.append(self)
+
+    def capture(self, body: Callable[[], torch.Tensor]) -> tuple[Callable[[], None], torch.Tensor]:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Drawn, "step", lambda *_: None)  # to capture a step does not take it
+            result = body()
+        self.records += 1
+
+        def launch() -> None:
+            self.launches += 1
+            result.copy_(body())
+
+        return launch, result
+
+    def is_tight(self) -> bool:
+        return self.tight
+
+    def release(self) -> None:
+        self.released += 1
+
+
+WAYS = {"fused": FusedStep, "queued": CapturedStep, "captured": CapturedStep}
+
+
+@pytest.fixture
+def take_as(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Lets steps be taken in a way of WAYS, as on a GPU, or plainly."""
+    Rerun.made.clear()
+    monkeypatch.setattr(captured, "Speculation", Immediate)
+    monkeypatch.setattr(captured, "Recorder", Rerun)
+
+    def choose(way: str) -> None:
+        monkeypatch.setattr("splatting.training.loop.step_taker", WAYS.get(way, PlainStep))
+        if way == "queued":
+            monkeypatch.setattr(Graphs, "_is_usual", lambda *_: False)
+
+    return choose

@@ -1,0 +1,147 @@
+"""A training has the same bytes by every way to take its steps: each of trainings.OPTIONS, each way, any ranks."""
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from processes import in_ranks
+from rasterizer_tools import GPU_MARKS
+from step_ways import WAYS, Rerun, fused_iterations, take_as  # noqa: F401  (a fixture)
+from trainings import ITERATIONS, OPTIONS, differences, narrow_scene, trained
+
+from scene.readers.point_cloud import write_point_cloud
+from scene.spilled_model import SpilledGaussians
+from splatting.distributed.ranks import ranks
+from splatting.training.steps.captured import Graphs
+
+Result = dict[str, bytes | list]
+EVERY = pytest.mark.parametrize("name", OPTIONS)
+LOOKS = ("--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44, "--checkpoint_iterations", 21, ITERATIONS)
+# Steps that change rows, reset opacities or raise the SH degree are plain, and so is the last. Over white there is a
+# reset before the first.
+CHANGING = {"white": {10, 20, 30, 40}, "two phases": {20}, "mcmc": {20, 40}, "budget": {20, 40}}
+RAISING = {12, 24, 36, 48}
+WITHOUT_GRAPHS = ("exposure", "depth", "masks", "budget errors")  # whose steps are queued one call after the other
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return narrow_scene(tmp_path_factory.mktemp("bytes") / "scene")
+
+
+@pytest.fixture(scope="module")
+def plain(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Result]:
+    """Trains by plain steps with the options of a name, once."""
+    folder = tmp_path_factory.mktemp("plain")
+    return cache(lambda name: trained(scene, folder / name, "--plain_step", *OPTIONS[name]))
+
+
+def test_each_training_is_another(scene, tmp_path, plain):
+    results = [plain(name)["ply"] for name in OPTIONS] + [trained(scene, tmp_path, "--seed", 6)["ply"]]
+    assert len(set(results)) == len(OPTIONS) + 1
+
+
+@EVERY
+@pytest.mark.parametrize("way", WAYS)
+def test_fast_steps(scene, tmp_path, monkeypatch, take_as, plain, way, name):  # noqa: F811
+    expected = plain(name)
+    take_as(way)
+    fused, find, kinds = fused_iterations(monkeypatch), Graphs._graph_for, []
+    monkeypatch.setattr(Graphs, "_graph_for", lambda self, at: (find(self, at), kinds.append({*self._graphs}))[0])
+    assert not differences(trained(scene, tmp_path, *OPTIONS[name]), expected)
+    changing = next((CHANGING[kind] for kind in (name, name.split()[0]) if kind in CHANGING), {20, 30, 40})
+    assert fused == [t for t in range(1, ITERATIONS) if t not in changing | RAISING]
+    launches = sum(made.launches for made in Rerun.made)
+    if way != "captured" or name in WITHOUT_GRAPHS:
+        assert launches == 0
+        return
+    assert launches > 40
+    assert Rerun.made[0].records >= 3  # tensors that density control has replaced are captured anew
+    assert all(len({kind[-2:] for kind in known}) <= 1 for known in kinds)  # graphs of another phase go
+    assert len(set().union(*kinds)) == {"degree 0": 1, "two phases": 5}.get(name, 4)  # four SH degrees
+
+
+@EVERY
+@pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
+def test_steps_of_a_gpu(scene, tmp_path, name, _):
+    expected = trained(scene, tmp_path / "plain", "--plain_step", *OPTIONS[name])
+    assert not differences(trained(scene, tmp_path / "captured", *OPTIONS[name]), expected)
+
+
+@EVERY
+def test_spilled_rows(scene, tmp_path, monkeypatch, plain, name):
+    late, steps = [], SpilledGaussians._take_missed
+
+    def noted(self, missed, taken, *others):
+        late.append(len(missed.steps) - int(taken.min()))
+        return steps(self, missed, taken, *others)
+
+    monkeypatch.setattr(SpilledGaussians, "_take_missed", noted)
+    assert not differences(trained(scene, tmp_path, "--spill", *OPTIONS[name]), plain(name))
+    sparse = "sparse_adam" in OPTIONS[name]
+    assert bool(late) != (sparse or name == "degree 0"), name
+    assert not late or max(late) >= 5
+
+
+@pytest.mark.parametrize(
+    ("name", "first", "then"),
+    [*((name, (), ()) for name in OPTIONS)]
+    + [(name, *ways) for name in ("default", "sparse", "mcmc") for ways in (((), ("--spill",)), (("--spill",), ()))],
+)
+def test_resumed(scene, tmp_path, plain, name, first, then):
+    trained(scene, tmp_path / "a", *OPTIONS[name], *first, "--checkpoint_iterations", 33, ITERATIONS)
+    start = "--start_checkpoint", tmp_path / "a" / "chkpnt33.pth"
+    assert not differences(trained(scene, tmp_path / "b", *OPTIONS[name], *then, *start), plain(name))
+
+
+@pytest.mark.parametrize("way", [(), ("--spill",), ("--plain_step",)])
+def test_scores_and_saves_between_change_nothing(scene, tmp_path, plain, way):
+    assert not differences(trained(scene, tmp_path, *way, *LOOKS), plain("default"))
+    between = trained(scene, tmp_path / "plain", "--plain_step", "--save_iterations", 9, 44)
+    assert not differences(between, plain("default"))
+    for iteration in (9, 44):
+        ply = f"point_cloud/iteration_{iteration}/point_cloud.ply"
+        assert (tmp_path / ply).read_bytes() == (tmp_path / "plain" / ply).read_bytes()
+
+
+def _all(scene: Path, folder: Path, kinds: list[tuple[str, tuple[str, ...]]]) -> list[Result]:
+    """All trainings in the same processes; results of the first rank."""
+    results = []
+    for name, more in kinds:
+        out = folder / "_".join([name, *more])
+        try:
+            results.append(trained(scene, out, *OPTIONS[name], *more))
+        except FileNotFoundError:
+            if ranks().first:
+                raise
+    return results
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_ranks(scene, tmp_path, plain, size):
+    kinds = [(name, ()) for name in OPTIONS]
+    kinds += [("default", ("--spill",)), ("exposure", ("--plain_step",))] if size == 2 else []
+    found = in_ranks(size, _all, scene, tmp_path, kinds)[0]
+    for (name, more), result in zip(kinds, found, strict=True):
+        assert not differences(result, plain(name)), (name, more)
+
+
+@pytest.mark.parametrize("strategy", ["adc", "mcmc", "budget"])
+def test_any_number_of_threads(scene, tmp_path, strategy):
+    """With as many points and pixels as torch divides loops between threads: from 32,768 values on."""
+    rng, count = np.random.default_rng(0), 40_003
+    write_point_cloud(tmp_path / "cloud.ply", rng.normal(size=(count, 3)), rng.integers(0, 255, (count, 3)))
+    more = "--strategy", strategy, "--init_pcd_path", tmp_path / "cloud.ply", "--densify_grad_threshold", 5e-5
+    more += "--max_num_splats", 50_000, "-r", 160
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            results.append(trained(scene, tmp_path / str(threads), *more))
+    finally:
+        torch.set_num_threads(before)
+    assert not differences(*results)
+    assert len(results[0]["ply"]) > count * 4 * 14
