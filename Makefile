@@ -21,7 +21,7 @@ CHECK_PYTHON := import sys; sys.exit(sys.version_info < (3, 10) and "Python 3.10
 EXTENSIONS := simple-knn fused-ssim diff-gaussian-rasterization
 CXX_TESTS := $(patsubst submodules/%.cpp,build/%,$(wildcard submodules/*/csrc/tests/*.cpp))
 CXX_TEST_OBJECTS := $(patsubst submodules/%.cpp,build/%.o,$(wildcard submodules/*/csrc/cpu/*.cpp))
-CORES := $(shell getconf _NPROCESSORS_ONLN)
+CORES := $(shell nproc 2> /dev/null || getconf _NPROCESSORS_ONLN)
 CXX_TEST_FLAGS := -std=c++17 -O1 -g1 -Wall -Wextra -Werror -fsanitize=address,undefined -fno-sanitize-recover=all -pthread
 
 CXX_SOURCES := $(shell find submodules -name build -prune -o \( -name '*.cpp' -o -name '*.cu*' -o -name '*.h' \) -print)
@@ -55,7 +55,7 @@ output/demo_scene: | install
 	$(BIN)/python -m splatting.demo.make_scene $@
 
 test: install lint cpp-test
-	$(BIN)/python -m pytest -m 'not browser' --numprocesses auto --maxprocesses 4 --dist worksteal
+	$(BIN)/python -m pytest -m 'not browser' --numprocesses $(shell expr $(CORES) + 1) --maxprocesses 5 --dist worksteal
 
 test-aarch64 test-windows test-macos:
 	$(PYTHON) .ci/cross.py $(@:test-%=%)

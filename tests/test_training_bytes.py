@@ -122,7 +122,8 @@ def _all(scene: Path, folder: Path, kinds: list[tuple[str, tuple[str, ...]]]) ->
 
 @pytest.mark.parametrize("size", [2, 3])
 def test_ranks(scene, tmp_path, plain, size):
-    kinds = [(name, ()) for name in OPTIONS]
+    names = OPTIONS if size == 2 else ("sparse", "masks", "tiny", "mcmc", "budget")
+    kinds = [(name, ()) for name in names]
     kinds += [("default", ("--spill",)), ("exposure", ("--plain_step",))] if size == 2 else []
     found = in_ranks(size, _all, scene, tmp_path, kinds)[0]
     for (name, more), result in zip(kinds, found, strict=True):
