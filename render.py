@@ -82,9 +82,8 @@ def write_views(
         save_png(scored.target(view), folder / "gt" / f"{index:05d}.png")
         for plane, values in view_planes(view, gaussians, pipe).items() if planes else ():
             if plane in planes:
-                # White is 1 for alpha, and the nearest value of the view for depth.
-                path, white = folder / plane / f"{index:05d}.png", 1.0 if plane == "alpha" else None
-                write_plane(path, scored.part(values)[0].cpu().numpy(), white)
+                path = folder / plane / f"{index:05d}.png"
+                write_plane(path, scored.part(values)[0].cpu().numpy(), PLANES[plane].white)
         if (mask := scored.mask(view)) is not None:  # white where pixels count
             with atomic_write(folder / "masks" / f"{index:05d}.png") as temporary:
                 Image.fromarray(mask[0].to(torch.uint8).mul(255).cpu().numpy()).save(temporary)
@@ -179,8 +178,9 @@ def main() -> None:
         help="render this model of any tool in the views of -s, as -m has none of its own (default: none)")  # fmt: skip
     parser.add_argument("--skip_train", action="store_true", help="leave the training views out (default: off)")
     parser.add_argument("--skip_test", action="store_true", help="leave the test views out (default: off)")
-    for plane, what in (("depth", "inverse depth"), ("alpha", "alpha")):
-        parser.add_argument(f"--{plane}", action="store_true", help=f"also write {what}, 16-bit PNGs (default: off)")
+    for name, plane in PLANES.items():
+        help_text = f"also write {plane.what}, 16-bit PNGs (default: off)"
+        parser.add_argument(f"--{name}", action="store_true", help=help_text)
     add_path_options(parser)
     parser.add_argument("--quiet", action="store_true", help="print nothing to stdout (default: off)")
     args = get_combined_args(parser)

@@ -6,6 +6,7 @@ the backward of the rasterizer sums weights over pixels, and an image of other c
 
 import argparse
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,7 +16,15 @@ from gaussian_renderer import draw, render
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 
-PLANES = ("depth", "alpha")
+
+class Plane(NamedTuple):
+    """A plane of `view_planes` that render.py writes as 16-bit PNGs."""
+
+    what: str  # in the option's help
+    white: float | None  # value of white; None: the largest of each view
+
+
+PLANES = {"depth": Plane("inverse depth", None), "alpha": Plane("alpha", 1.0)}
 
 
 @torch.no_grad()

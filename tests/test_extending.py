@@ -26,6 +26,7 @@ from gaussian_renderer import render
 from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
+from splatting.files.image_files import read_plane
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "inside" / "extending.md"
@@ -61,7 +62,7 @@ gaussians = GaussianModel(3)
 gaussians.load_ply(whole + last)
 gaussians.save_ply(whole + "/again.ply")
 for iteration in ("1", "600"):
-    sys.argv = ["render.py", "-m", whole, "--iteration", iteration, "--quiet"]
+    sys.argv = ["render.py", "-m", whole, "--iteration", iteration, "--thermal", "--quiet"]
     render.main()
 loaded = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(source_path=scene, model_path=whole))
 for view in Scene(loaded, gaussians, load_iteration=-1).getTrainCameras():
@@ -103,7 +104,7 @@ def _extend(folder: Path) -> None:
         else:
             shutil.copyfile(ROOT / name, folder / name)
     diffs = re.findall(r"^```diff\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
-    assert len(diffs) == 7
+    assert len(diffs) == 4
     # Without the ceiling git would take a repository around the folder for the one to apply to.
     environment = os.environ | {"GIT_CEILING_DIRECTORIES": str(folder.parent)}
     done = subprocess.run(
@@ -149,8 +150,8 @@ def _image_error(runs: Runs, iteration: int) -> float:
     """Mean absolute difference of the rendered temperatures from the truth."""
     errors = []
     for index, truth in enumerate(runs.truth):
-        image = Image.open(runs.whole / "train" / f"ours_{iteration}" / "thermal" / f"{index:05d}.png")
-        errors.append(np.abs(np.asarray(image)[..., 0] / 255 - truth / 255).mean())
+        image = read_plane(runs.whole / "train" / f"ours_{iteration}" / "thermal" / f"{index:05d}.png")
+        errors.append(np.abs(image - truth / 255).mean())
     return float(np.mean(errors))
 
 

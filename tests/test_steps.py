@@ -106,7 +106,7 @@ def test_a_term_that_was_added_to_our_objective_is_not_lost(
     scene,
     tmp_path,
     monkeypatch,
-    take_as,
+    take_as,  # noqa: F811
     way,
     late,
     fused,

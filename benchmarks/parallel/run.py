@@ -51,7 +51,7 @@ class WorkloadRun(Run):
         self.views = ViewOrder(cameras, self.opt.seed, views, here.rank if views > 1 else 0)
         self.resolution = Resolution(self.schedule, images)
         self.background = torch.zeros(3, device=self.device)
-        self.objective = Objective(self.opt)
+        self.objective = Objective(self)
         self.density = density_control(self)
         self.density.schedule = self.schedule
         self._depth_weight = get_expon_lr_func(0.0, 0.0)

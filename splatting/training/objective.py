@@ -1,7 +1,6 @@
 """The loss of a render: photometric, and inverse depth where a depth map supervises. Further terms belong here."""
 
-import argparse
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from fused_ssim import photometric_loss_by_bands
@@ -9,6 +8,9 @@ from torch import Tensor
 
 from splatting.training.iteration import Iteration
 from utils.loss_utils import inverse_depth_loss, photometric_loss
+
+if TYPE_CHECKING:
+    from splatting.training.run import Run
 
 
 class Losses(NamedTuple):
@@ -23,11 +25,11 @@ class Losses(NamedTuple):
 class Objective:
     """`(1 - lambda_dssim) L1 + lambda_dssim (1 - SSIM)` (Kerbl et al. 2023, Eq. 7), and the weighted depth loss.
 
-    clamp: compare renders clamped to [0, 1].
+    Strategies say whether renders are compared clamped to [0, 1] (DensityControl.clamps).
     """
 
-    def __init__(self, opt: argparse.Namespace, clamp: bool = True) -> None:
-        self._lambda_dssim, self._clamp = opt.lambda_dssim, clamp
+    def __init__(self, run: "Run") -> None:
+        self._run = run
 
     def takes_bands(self, step: Iteration) -> bool:
         """Whether the loss of a step needs of the image no more than each rank's band and what surrounds it."""
@@ -40,10 +42,11 @@ class Objective:
         """
         camera = step.camera
         target, mask = camera.ground_truth(step.background)
+        image, weight, clamp = package["render"], self._run.opt.lambda_dssim, self._run.density.clamps
         if (band := package.get("band")) is not None:
-            total, l1 = photometric_loss_by_bands(package["render"], target, self._lambda_dssim, *band, self._clamp)
+            total, l1 = photometric_loss_by_bands(image, target, weight, *band, clamp)
             return Losses(total, l1, depth=None, mask=None)
-        total, l1 = photometric_loss(package["render"], target, self._lambda_dssim, mask, camera.columns, self._clamp)
+        total, l1 = photometric_loss(image, target, weight, mask, camera.columns, clamp)
         depth = None
         if step.depth_weight > 0:
             error = inverse_depth_loss(package["depth"], camera.inverse_depth, camera.columns, mask)

@@ -86,7 +86,7 @@ class Run:
         self._check_records()
         self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
         self.density = density_control(self)
-        self.objective = Objective(opt, self.density.clamps)
+        self.objective = Objective(self)
         self._depth_weight = get_expon_lr_func(
             opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
         )

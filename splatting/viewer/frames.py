@@ -78,7 +78,8 @@ class Frames:
             return count_colors(blend_depth(view, part, self._pipe, settings.scaling))
         if settings.mode in (views.DEPTH, views.OPACITY):
             planes = view_planes(view, part, self._pipe, settings.scaling)
-            return depth_colors(**planes) if settings.mode == views.DEPTH else planes["alpha"].expand(3, -1, -1)
+            depth, alpha = planes["depth"], planes["alpha"]
+            return depth_colors(depth, alpha) if settings.mode == views.DEPTH else alpha.expand(3, -1, -1)
         exposed = self._with_exposures and target is not None
         options = {"want_depth": False, "want_visibility": False, "use_trained_exp": exposed}
         colour = render(view, part, self._pipe, self._background(settings), settings.scaling, **options)["render"]

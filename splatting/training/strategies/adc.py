@@ -6,6 +6,7 @@ splits and for clones. --split long_axis splits along the longest axis (scene/ga
 
 import argparse
 import sys
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 from tqdm import tqdm
@@ -15,6 +16,9 @@ from scene.gaussians import density_rules as rules
 from splatting.training.checks import late_reset
 from splatting.training.density import DensityControl, refuse_empty
 from splatting.training.iteration import Iteration
+
+if TYPE_CHECKING:
+    from splatting.training.run import Run
 
 
 class AdaptiveDensityControl(DensityControl):
@@ -73,3 +77,8 @@ class AdaptiveDensityControl(DensityControl):
             long_axis=self._opt.split == "long_axis",
         )
         refuse_empty(iteration, self._gaussians.total == 0, "raise --opacity_reset_interval")
+
+
+def of_run(run: "Run") -> AdaptiveDensityControl:
+    """The control of a run."""
+    return AdaptiveDensityControl(run.gaussians, run.opt, run.dataset.white_background, run.scene.cameras_extent)

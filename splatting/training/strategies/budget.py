@@ -117,3 +117,8 @@ def default_budget(cameras: list[Camera]) -> int:
     """The number of Gaussians where --max_num_splats is 0: one for PIXELS pixels, from FEWEST to MOST."""
     pixels = sum(camera.image_width * camera.image_height for camera in cameras)
     return min(max(pixels // PIXELS, FEWEST), MOST)
+
+
+def of_run(run: "Run") -> BudgetControl:
+    """The control of a run."""
+    return BudgetControl(run)

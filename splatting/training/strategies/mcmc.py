@@ -7,6 +7,7 @@ into more than `--mcmc_parts` is corrected for so many.
 """
 
 import argparse
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
@@ -15,6 +16,9 @@ from scene.gaussians import density_rules as rules
 from scene.gaussians.mcmc import Penalty
 from splatting.training.density import DensityControl, refuse_empty
 from splatting.training.iteration import Iteration
+
+if TYPE_CHECKING:
+    from splatting.training.run import Run
 
 MOST_GAUSSIANS = 1_000_000  # where --max_num_splats is 0
 
@@ -78,3 +82,8 @@ class MarkovChain(DensityControl):
         """The number after a growth: more by a part of it (the paper's rule of adding Gaussians), at least by one."""
         growth = self._opt.mcmc_growth
         return min(max(int((1 + growth) * count), count + (growth > 0)), self.most_gaussians)
+
+
+def of_run(run: "Run") -> MarkovChain:
+    """The control of a run."""
+    return MarkovChain(run.gaussians, run.opt)
