@@ -13,12 +13,13 @@ def _between(value: float) -> str | None:
 
 # fmt: off
 STRATEGY_OPTIONS: tuple[Option, ...] = (
-    Option("strategy", "adc", origin="ours", check=one_of("adc", "mcmc", "budget"), stored=MODEL_JSON,
-        help="how many Gaussians there are, and where. adc: adaptive density control, the method's own; mcmc: "
-             "Gaussians that nobody sees are moved to others, and positions get noise; budget: growth to "
-             "--max_num_splats Gaussians, where the error is; 0: one for 64 training pixels, 100,000 to 1,000,000, or "
-             "fewer if --time_budget allows few iterations. budget has larger learning rates of colour, opacity, scale "
-             "and rotation, the fewer --iterations there are"),
+    Option("strategy", "auto", origin="ours", check=one_of("auto", "adc", "mcmc", "budget"), stored=MODEL_JSON,
+        help="how many Gaussians there are, and where. auto: adc; with --time_budget budget, or on a GPU mcmc for at "
+             "most 50 photos and 0.25 seconds or more for each; a resumed run keeps its own. adc: adaptive density "
+             "control, the method's own; mcmc: Gaussians that nobody sees are moved to others, and positions get "
+             "noise; budget: growth to --max_num_splats Gaussians, where the error is; 0: one for 64 training pixels, "
+             "100,000 to 1,000,000. budget has larger learning rates of colour, opacity, scale and rotation, the fewer "
+             "--iterations there are. With --time_budget all grow to at most 25 Gaussians for each iteration"),
 
     Option("absgrad", False, origin="ours",
         help="adc: densify by the sum of the pixels' absolute gradients (AbsGS), which do not cancel out where a "
@@ -50,8 +51,9 @@ STRATEGY_OPTIONS: tuple[Option, ...] = (
         help="mcmc: weight of the mean scale (world units) in the loss; higher: smaller Gaussians"),
     Option("mcmc_init_opacity", 0.5, origin=_RELEASED, check=_between,
         help="mcmc: opacity of the Gaussians that are made from points"),
-    Option("mcmc_init_scale", 0.1, origin=_RELEASED, check=above(0),
-        help="mcmc: scale of the Gaussians that are made from points, as a part of the distance to their neighbours"),
+    Option("mcmc_init_scale", 0.0, origin=_RELEASED, check=at_least(0),
+        help="mcmc: scale of the Gaussians that are made from points, as a part of the distance to their neighbours; "
+             "0: 0.1, or 1 with --time_budget"),
 
     Option("growth_power", 1.0, origin="ours; 2 in Taming 3DGS", check=above(0),
         help="budget: how early the Gaussians multiply. The part of the densifications that is left, to this power, "

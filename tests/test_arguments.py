@@ -42,12 +42,12 @@ OPTIMISATION = {
 OURS = {
     "init_pcd_path": "", "init_ply": "", "init_type": "sfm", "masks": "", "invert_masks": False,
     "mask_meaning": "auto", "images_to_load": 0, "spill": False, "max_num_splats": 0, "keep_unseen": False,
-    "prune_sh": 0.0, "seed": 0, "strategy": "adc", "absgrad": False, "absgrad_threshold": 8e-4, "split": "sample",
+    "prune_sh": 0.0, "seed": 0, "strategy": "auto", "absgrad": False, "absgrad_threshold": 8e-4, "split": "sample",
     "growth_power": 1.0, "score_views": 10, "score_error": "l1", "score_join": "sum", "score_power": 1.0,
     "opacity_decay": 0.98, "prune_opacity": 0.005, "mcmc_until_iter": 25000, "mcmc_growth": 0.05,
     "mcmc_min_opacity": 0.005, "mcmc_parts": 51, "mcmc_noise": 500000.0, "mcmc_gate_steepness": 100.0,
     "mcmc_gate_opacity": 0.005, "mcmc_opacity_reg": 0.01, "mcmc_scale_reg": 0.01, "mcmc_init_opacity": 0.5,
-    "mcmc_init_scale": 0.1, "time_budget": 0.0, "resolution_schedule": "auto", "target_psnr": 0.0, "schedule": "",
+    "mcmc_init_scale": 0.0, "time_budget": 0.0, "resolution_schedule": "auto", "target_psnr": 0.0, "schedule": "",
 }
 LAUNCH = (
     "ip port debug_from detect_anomaly test_iterations save_iterations checkpoint_iterations start_checkpoint quiet "
@@ -62,7 +62,7 @@ ABSURD = {
     "score_power": "-0.5 100.5", "opacity_decay": "1.01 0.4", "prune_opacity": "0.6 -0.1", "mcmc_until_iter": "-1",
     "mcmc_growth": "-0.1 1.1", "mcmc_min_opacity": "0 1", "mcmc_parts": "1 52", "mcmc_noise": "-1 inf 1e300",
     "mcmc_gate_steepness": "-1 10001", "mcmc_gate_opacity": "1.5", "mcmc_opacity_reg": "-0.01",
-    "mcmc_scale_reg": "-0.01", "mcmc_init_opacity": "1", "mcmc_init_scale": "0", "resolution_schedule": "fine",
+    "mcmc_scale_reg": "-0.01", "mcmc_init_opacity": "1", "mcmc_init_scale": "-0.1", "resolution_schedule": "fine",
     "target_psnr": "-3", "time_budget": "-1 inf", "exposure_lr_init": "-0.1", "exposure_lr_delay_steps": "-1",
     "exposure_lr_delay_mult": "1.5", "depth_l1_weight_final": "-1",
 }
@@ -300,7 +300,7 @@ def test_model_json_has_what_is_stored_there_with_sorted_keys(tmp_path):
     assert list(record) == sorted(record) and record.pop("version")
     assert record == {
         "antialiasing": True, "invert_masks": True, "optimizer_type": "default", "resolution_schedule": "auto",
-        "seed": 7, "strategy": "adc",
+        "seed": 7, "strategy": "auto",
     }  # fmt: skip
     write_cfg_args(tmp_path, argparse.Namespace())
     assert read_stored_options(tmp_path) == {**MODEL, **record, "masks": "", "mask_meaning": "auto"}

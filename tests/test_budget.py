@@ -26,6 +26,7 @@ from scene.gaussians.long_axis import long_axis_children
 from splatting.deterministic.counter_rng import Stream
 from splatting.distributed.rows import WHOLE
 from splatting.distributed.selection import weighted_choice
+from splatting.training.density import default_budget
 from splatting.training.objective import Objective
 from splatting.training.schedule import Block, Decided, DecidedSchedule
 from splatting.training.strategies import budget
@@ -425,7 +426,7 @@ def test_an_empty_model_is_an_error(colmap_scene, tmp_path):
 
 def test_the_default_budget_follows_the_pixels():
     def budget_of(views: int, width: int) -> int:
-        return budget.default_budget([SimpleNamespace(image_width=width, image_height=500)] * views)
+        return default_budget([SimpleNamespace(image_width=width, image_height=500)] * views)
 
     assert (budget_of(7, 500), budget_of(40, 300), budget_of(100, 4000)) == (100_000, 100_000, 1_000_000)
 

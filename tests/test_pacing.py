@@ -25,6 +25,7 @@ from splatting.training.observers.saves import ScheduleFile
 from splatting.training.resolution import Resolution
 from splatting.training.schedule import Block, Decided, DecidedSchedule, Schedule, SettlingSchedule, TimeBudget
 from splatting.training.schedule_file import read_schedule, write_schedule
+from splatting.training.strategies import of_clock
 from utils.system_utils import UserError
 
 OPTIONS = ["-r", 24, "--eval", "--no_curve", "--test_iterations", -1, "--densify_grad_threshold", 1e-4,
@@ -618,29 +619,61 @@ def test_a_steady_run_from_elsewhere_removes_the_schedule_of_its_folder(colmap_s
     assert not (tmp_path / "b" / "schedule.json").exists()
 
 
-@pytest.mark.parametrize(("seconds", "reset", "late"), [(20, 3000, True), (20, 1000, False), (300, 3000, False)])
-def test_a_late_reset_of_a_run_with_a_time_budget(colmap_scene, tmp_path, monkeypatch, capsys, seconds, reset, late):
-    """3000 of 3600 iterations of the schedule: some 33 or 500 of the run are left. The shorter run leaves out resets
-    that it would not recover from before the next one; these come once.
-    """
+@pytest.mark.parametrize(("seconds", "reset", "resets"), [(20, 3000, 0), (20, 1000, 2), (300, 3000, 1)])
+def test_a_reset_too_late_to_recover_from_is_left_out(colmap_scene, tmp_path, monkeypatch, seconds, reset, resets):
+    """Of 3600 iterations of the schedule, 600 are left after 3000: some 33 or 500 of the run, and 50 are needed."""
     monkeypatch.setattr(rules, "RECOVERY", 50)
     _timed(monkeypatch, lambda t: 0.1)
+    done, reset_opacity = [], GaussianModel.reset_opacity
+    monkeypatch.setattr(GaussianModel, "reset_opacity", lambda self: (done.append(1), reset_opacity(self)))
     words = "--opacity_reset_interval", reset, "--densify_until_iter", reset + 500, "--iterations", 3600
-    _train(colmap_scene, tmp_path, *words, "--time_budget", seconds)
-    out, err = capsys.readouterr()
-    told = re.findall(r"opacities are reset in iteration (\d+), and about (\d+) iterations that are left of", err)
-    assert bool(told) == late and "are too few" not in out
-    if late:
-        assert [int(number) for number in told[0]] == [pytest.approx(167, abs=3), pytest.approx(33, abs=3)]
+    if reset == 1000:
+        words = (*words[:3], 3500, *words[4:])
+    _train(colmap_scene, tmp_path / "a", *words, "--time_budget", seconds, "--strategy", "adc")
+    assert len(done) == resets
+    _train(colmap_scene, tmp_path / "b", *words, "--schedule", tmp_path / "a" / "schedule.json")
+    assert len(done) == 2 * resets
 
 
-def test_a_late_reset_of_a_recorded_schedule_counts_its_own_iterations(colmap_scene, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(rules, "RECOVERY", 50)
-    blocks = [Block(200, 0.0, 1 / 200, 0.0)]  # 18 iterations of the schedule at a time
-    write_schedule(tmp_path / "schedule.json", Decided(3600, blocks, 200, 20.0, levels=()))
-    words = "--iterations", 3600, "--schedule", tmp_path / "schedule.json", "--densify_until_iter", 3500
-    _train(colmap_scene, tmp_path / "a", *words, "--opacity_reset_interval", 3000)
-    told = "opacities are reset in iteration 167, and 33 iterations are too few to recover from that; change --opacity_"
-    assert told in capsys.readouterr().out
-    _train(colmap_scene, tmp_path / "b", *words, "--opacity_reset_interval", 2500)  # 139: 61 are left
-    assert "too few" not in capsys.readouterr().out
+def _stored_strategy(out: Path) -> str:
+    return json.loads((out / "model.json").read_text())["strategy"]
+
+
+def test_a_time_budget_takes_the_strategy_that_is_best_in_it(colmap_scene, tmp_path, monkeypatch, capsys):
+    _timed(monkeypatch, lambda t: 0.1)
+    words = "--time_budget", 6, "--checkpoint_iterations", 1800
+    first = _train(colmap_scene, tmp_path / "a", *words)
+    out = capsys.readouterr().out
+    assert out.count("--time_budget takes --strategy budget, which is best here; name another one to compare") == 1
+    assert _stored_strategy(tmp_path / "a") == read_schedule(tmp_path / "a" / "schedule.json").strategy == "budget"
+    repeated = _train(colmap_scene, tmp_path / "b", "--schedule", tmp_path / "a" / "schedule.json")
+    assert list(repeated.values()) == [first[max(first)]]
+    (checkpoint,) = (tmp_path / "a").glob("chkpnt*.pth")
+    _train(colmap_scene, tmp_path / "c", *words, "--start_checkpoint", checkpoint)
+    assert _stored_strategy(tmp_path / "b") == _stored_strategy(tmp_path / "c") == "budget"
+    _train(colmap_scene, tmp_path / "d", "--iterations", 20)
+    _train(colmap_scene, tmp_path / "e", "--iterations", 20, "--strategy", "mcmc", "--checkpoint_iterations", 10)
+    start = "--start_checkpoint", tmp_path / "e" / "chkpnt10.pth"
+    _train(colmap_scene, tmp_path / "f", "--iterations", 30, *start)
+    assert (_stored_strategy(tmp_path / "d"), _stored_strategy(tmp_path / "f")) == ("adc", "mcmc")
+
+
+@pytest.mark.parametrize(
+    ("views", "seconds", "device", "strategy"),
+    [(43, 10, "cpu", "budget"), (43, 10, "cuda", "budget"), (43, 11, "cuda", "mcmc"), (60, 90, "cuda", "budget")],
+)
+def test_few_photos_and_much_time_on_a_gpu_take_mcmc(views, seconds, device, strategy):
+    opt = argparse.Namespace(time_budget=seconds)
+    assert of_clock(opt, [None] * views, torch.device(device)) == strategy
+
+
+@pytest.mark.parametrize("strategy", ["adc", "mcmc"])
+def test_no_strategy_grows_beyond_what_the_clock_can_train(colmap_scene, tmp_path, monkeypatch, strategy):
+    """Some 60 iterations train 1,500 Gaussians; without the clock there are more."""
+    _timed(monkeypatch, lambda t: 0.1)
+    words = "--strategy", strategy, "--densify_grad_threshold", 1e-7, "--mcmc_growth", 0.1, "--max_num_splats", 0
+    by_clock = _train(colmap_scene, tmp_path / "a", *words, "--time_budget", 6)
+    without = _train(colmap_scene, tmp_path / "b", *words, "--iterations", 60, "--densification_interval", 2,
+                     "--densify_from_iter", 2)  # fmt: skip
+    counts = [int(re.search(rb"element vertex (\d+)", plies[max(plies)])[1]) for plies in (by_clock, without)]
+    assert 300 < counts[0] <= 25 * 75 < counts[1]

@@ -18,7 +18,7 @@ from splatting.evaluation.error_curve import Row, continue_curve
 from splatting.evaluation.training_log import TrainingLog
 from splatting.files.listing import some
 from splatting.training.density import DensityControl
-from splatting.training.schedule import Schedule, TimeBudget
+from splatting.training.schedule import DecidedSchedule, Schedule
 from utils.system_utils import UserError, saved_iterations
 
 _SAMPLE = 16  # cameras whose depths are checked
@@ -85,30 +85,18 @@ def check_exposures(gaussians: GaussianModel, train_test_exp: bool, checkpoint: 
 def warn_of_late_reset(opt: argparse.Namespace, white_background: bool, schedule: Schedule) -> None:
     """Warn if adaptive density control resets opacities so late that the model cannot recover.
 
-    Iterations are those of the run. A run with a time budget does not know them yet: `late_reset` then tells.
+    A run with a time budget leaves such resets out.
     """
-    if opt.strategy != "adc" or schedule.ends is None:
+    if opt.strategy != "adc" or isinstance(schedule, DecidedSchedule):
         return
     last = range(max(1, schedule.ends - rules.RECOVERY + 1), schedule.ends)
     resets = [rules.actions(t, opt, white_background, schedule.span(t), schedule.stride(t)).reset_opacity for t in last]
     due = [t for t, is_reset in zip(last, resets, strict=True) if is_reset]
     if due:
-        longer = "--iterations or " if schedule.ends == schedule.length else ""
         print(
             f"warning: opacities are reset in iteration {due[-1]}, and {schedule.ends - due[-1]} iterations are "
-            f"too few to recover from that; change {longer}--opacity_reset_interval"
+            "too few to recover from that; change --iterations or --opacity_reset_interval"
         )
-
-
-def late_reset(iteration: int, schedule: Schedule) -> str | None:
-    """The warning for a reset in an iteration of a run with a time budget, by its speed; None if it is in time."""
-    left = (schedule.length - schedule.schedule_step(iteration)) / schedule.stride(iteration)
-    if not isinstance(schedule, TimeBudget) or left >= rules.RECOVERY:
-        return None
-    return (
-        f"warning: opacities are reset in iteration {iteration}, and about {left:.0f} iterations that are left of "
-        "--time_budget are too few to recover from that; raise it, or change --opacity_reset_interval"
-    )
 
 
 def warn_of_fewer(density: DensityControl, opt: argparse.Namespace, count: int, first: int) -> None:
@@ -215,6 +203,11 @@ def continue_records(model_path: str, checkpoint: str | None, first_iteration: i
             file=sys.stderr,
         )
     return log, rows
+
+
+def strategy_of(checkpoint: str) -> str:
+    """The strategy of the run that wrote a checkpoint; adc if its folder does not say."""
+    return str(_options_of(Path(checkpoint).parent).get("strategy", "adc"))
 
 
 def _options_of(folder: Path) -> dict[str, object]:

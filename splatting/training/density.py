@@ -1,14 +1,20 @@
 """The hooks by which a strategy of density control acts on a training (strategies: training/strategies)."""
 
 import math
+from collections.abc import Sequence
 from typing import ClassVar
 
 from torch import Tensor
 
+from scene.cameras import Camera
 from scene.gaussians.mcmc import NO_PENALTY
 from splatting.training.iteration import Iteration
-from splatting.training.schedule import STEADY, Schedule
+from splatting.training.schedule import STEADY, DecidedSchedule, Schedule
 from utils.system_utils import UserError
+
+PIXELS = 64  # training pixels of all views for each Gaussian of the default budget
+FEWEST, MOST = 100_000, 1_000_000  # Gaussians of the default budget
+AN_ITERATION = 25  # Gaussians for each iteration, at most, where the clock sets the number of iterations
 
 
 class DensityControl:
@@ -56,11 +62,25 @@ class DensityControl:
         """
         return self.most_gaussians
 
+    def most(self, iteration: int, limit: int) -> int:
+        """`limit`, 0: none; with a time budget, not more than so few iterations can train. 0: no limit."""
+        stride = self.schedule.stride(iteration)
+        if not isinstance(self.schedule, DecidedSchedule) or stride <= 1:
+            return limit
+        trained = max(int(AN_ITERATION * self.schedule.length / stride), 1)
+        return min(limit, trained) if limit else trained
+
     def after_backward(self, step: Iteration, package: dict[str, Tensor]) -> None:
         """Called with the gradients computed, before the optimiser's step. package: the result of `render`."""
 
     def after_step(self, step: Iteration) -> None:
         """Called after the optimiser's step, so not in the last iteration, which takes none."""
+
+
+def default_budget(cameras: Sequence[Camera]) -> int:
+    """The number of Gaussians to reach where --max_num_splats is 0: one for PIXELS pixels, from FEWEST to MOST."""
+    pixels = sum(camera.image_width * camera.image_height for camera in cameras)
+    return min(max(pixels // PIXELS, FEWEST), MOST)
 
 
 def refuse_empty(iteration: int, is_empty: bool, remedy: str, what: str = "after the densification of") -> None:

@@ -1,6 +1,7 @@
 """A training run: scene, model, objective and density control, made and checked before a file is written."""
 
 import argparse
+import copy
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
@@ -29,7 +30,7 @@ from splatting.training.objective import LossWatch, Objective
 from splatting.training.resolution import resolution_of
 from splatting.training.restart import resumed
 from splatting.training.schedule import DecidedSchedule
-from splatting.training.strategies import density_control
+from splatting.training.strategies import AUTO, USUAL, density_control, of_clock
 from utils.general_utils import get_expon_lr_func
 from utils.system_utils import compute_device
 
@@ -56,10 +57,13 @@ class Run:
 
         launch: the options of splatting/training/launch.py.
         """
+        opt = copy.copy(opt)  # of which the strategy is decided here
         self.dataset, self.opt, self.pipe, self.launch = dataset, opt, pipe, launch
         self.group = ranks()
         checks.check_page(launch.viewer, self.group.several)
         self.start = self.group.shared(resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
+        if opt.strategy == AUTO and (self.start or not (opt.time_budget or opt.schedule)):
+            opt.strategy = checks.strategy_of(self.start) if self.start else USUAL
         self.lost = 0
         self.interrupt = DeferredInterrupt()
         self.device = compute_device()
@@ -85,6 +89,9 @@ class Run:
         self._begin_model(capture, first)
         self._check_records()
         self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
+        if opt.strategy == AUTO:
+            opt.strategy = self._strategy_by_the_clock()
+        self.schedule.strategy = opt.strategy
         self.density = density_control(self)
         self.objective = Objective(self)
         self._depth_weight = get_expon_lr_func(
@@ -95,6 +102,13 @@ class Run:
         if capture is None and first is None:
             self.density.started()
         self.group.tell_notes()
+
+    def _strategy_by_the_clock(self) -> str:
+        if self.opt.schedule:
+            return self.schedule.strategy or USUAL
+        strategy = of_clock(self.opt, self.scene.getTrainCameras(), self.device)
+        print(f"--time_budget takes --strategy {strategy}, which is best here; name another one to compare")
+        return strategy
 
     def _begin_model(self, capture: tuple | None, first: Splats | None) -> None:
         """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""

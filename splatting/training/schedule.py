@@ -38,11 +38,13 @@ class Schedule:
 
     length: of the schedule, in iterations. ends: the last iteration of the run, None: not known yet. views: of each
     iteration. sizes: the schedule of the views' sizes that is in force (--resolution_schedule); levels: of that.
+    strategy: the one in force (--strategy).
     """
 
     views = 1
     sizes = "none"
     levels: Levels = ()
+    strategy = ""
 
     def __init__(self, length: int) -> None:
         self.length = length
@@ -148,6 +150,7 @@ class Decided(NamedTuple):
     time_budget: float  # seconds
     resolution_schedule: str = "none"
     levels: Levels = ()
+    strategy: str = ""  # that trained; empty in files of older versions
 
 
 class DecidedSchedule(Schedule):
@@ -158,7 +161,7 @@ class DecidedSchedule(Schedule):
         self._decided = decided
         self.blocks = list(decided.blocks)
         self.ends = decided.ended
-        self.sizes, self.levels = decided.resolution_schedule, decided.levels
+        self.sizes, self.levels, self.strategy = decided.resolution_schedule, decided.levels, decided.strategy
 
     def progress(self, iteration: int) -> float:
         """Part of the schedule that is done after an iteration, 0 to 1."""
@@ -193,7 +196,8 @@ class DecidedSchedule(Schedule):
         """The schedule of a run that went no further than an iteration."""
         index, block = self._block(iteration)
         blocks = [*self.blocks[:index], block._replace(last=iteration)]
-        return self._decided._replace(blocks=blocks, ended=None, resolution_schedule=self.sizes, levels=self.levels)
+        decided = {"resolution_schedule": self.sizes, "levels": self.levels, "strategy": self.strategy}
+        return self._decided._replace(blocks=blocks, ended=None, **decided)
 
     def _block(self, iteration: int) -> tuple[int, Block]:
         index = bisect_left(self.blocks, iteration, key=lambda block: block.last)

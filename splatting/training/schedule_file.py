@@ -82,7 +82,7 @@ def _decided(content: Any) -> Decided:
     levels = [(_number(part, 0.0), _number(factor, 1.0)) for part, factor in content["levels"]]
     if levels != sorted(levels):
         raise ValueError("its levels do not ascend")
-    named = str(content["resolution_schedule"]), levels
+    named = str(content["resolution_schedule"]), levels, str(content.get("strategy", ""))
     decided = Decided(length, blocks, ended, _number(content["time_budget"], 0.0), *named)
     if max(map(DecidedSchedule(decided).progress, lasts)) > 1 + 1e-6:
         raise ValueError("its progress goes beyond its end")

@@ -15,11 +15,11 @@ from gaussian_renderer.scored_views import ScoredViews
 from scene import Scene
 from scene.cameras import Camera
 from splatting.evaluation.what_to_try import BUDGET, CAP, PLANNED, STRATEGY, what_to_try
+from splatting.training.density import default_budget
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses, LossWatch
 from splatting.training.observer import Error, Observer
 from splatting.training.run import Run
-from splatting.training.strategies.budget import default_budget
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.loss_utils import l1_loss
 

@@ -1,12 +1,28 @@
 """Strategies: how many Gaussians there are, and where. Each is a file, whose name is that of --strategy."""
 
+import argparse
+from collections.abc import Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+import torch
+
+from scene.cameras import Camera
 from splatting.training.density import DensityControl
 
 if TYPE_CHECKING:
     from splatting.training.run import Run
+
+AUTO, USUAL = "auto", "adc"
+# By the clock `budget` is best, but mcmc with few photos and the time for 250 iterations of each on a GPU. See
+# docs/guide/strategies.md.
+FEW, SECONDS = 50, 0.25  # training photos; seconds for each
+
+
+def of_clock(opt: argparse.Namespace, cameras: Sequence[Camera], device: torch.device) -> str:
+    """The strategy that --strategy auto takes for a new run with --time_budget."""
+    few = len(cameras) <= FEW and opt.time_budget >= SECONDS * len(cameras)
+    return "mcmc" if few and device.type == "cuda" else "budget"
 
 
 def density_control(run: "Run") -> DensityControl:

@@ -5,17 +5,15 @@ splits and for clones. --split long_axis splits along the longest axis (scene/ga
 """
 
 import argparse
-import sys
 from typing import TYPE_CHECKING
 
 from torch import Tensor
-from tqdm import tqdm
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
-from splatting.training.checks import late_reset
 from splatting.training.density import DensityControl, refuse_empty
 from splatting.training.iteration import Iteration
+from splatting.training.schedule import DecidedSchedule
 
 if TYPE_CHECKING:
     from splatting.training.run import Run
@@ -55,10 +53,14 @@ class AdaptiveDensityControl(DensityControl):
             observe(package["viewspace_points"], package["radii"])
         if todo.densify:
             self._densify(step.iteration, todo.limit_size)
-        if todo.reset_opacity:
-            if warning := late_reset(step.iteration, self.schedule):
-                tqdm.write(warning, file=sys.stderr)
+        if todo.reset_opacity and not self._ends_too_soon(step.iteration):
             self._gaussians.reset_opacity()
+
+    def _ends_too_soon(self, iteration: int) -> bool:
+        """Whether a run by the clock has too few iterations left to recover from a reset of opacities."""
+        schedule = self.schedule
+        left = (schedule.length - schedule.schedule_step(iteration)) / schedule.stride(iteration)
+        return isinstance(schedule, DecidedSchedule) and left < rules.RECOVERY
 
     def _actions(self, iteration: int) -> rules.Actions:
         schedule = self.schedule
@@ -73,7 +75,7 @@ class AdaptiveDensityControl(DensityControl):
             rules.MAX_SCREEN_SIZE if limit_size else None,
             seed=self._opt.seed,
             iteration=iteration,
-            max_splats=self._opt.max_num_splats,
+            max_splats=self.most(iteration, self.most_gaussians),
             long_axis=self._opt.split == "long_axis",
         )
         refuse_empty(iteration, self._gaussians.total == 0, "raise --opacity_reset_interval")

@@ -19,17 +19,13 @@ from scene.gaussians import density_rules as rules
 from scene.gaussians.budget import count_after, fade, remove_useless, split_in_two
 from splatting.deterministic.counter_rng import Stream, permutation
 from splatting.deterministic.portable_math import exp, log
-from splatting.training.density import DensityControl, refuse_empty
+from splatting.training.density import DensityControl, default_budget, refuse_empty
 from splatting.training.iteration import Iteration
-from splatting.training.schedule import DecidedSchedule
 from splatting.training.strategies.error_scores import error_scores
 
 if TYPE_CHECKING:
     from splatting.training.run import Run
 
-PIXELS = 64  # training pixels of all views for each Gaussian of the default budget
-FEWEST, MOST = 100_000, 1_000_000  # Gaussians of the default budget
-AN_ITERATION = 25  # Gaussians of the default budget for each iteration, at most, where the clock sets their number
 _SMALLEST = 1e-300
 
 
@@ -48,7 +44,6 @@ class BudgetControl(DensityControl):
         self.ends = run.opt.densify_until_iter
         self._scores = partial(error_scores, run.gaussians, run.pipe, run.dataset.train_test_exp, run.opt)
         self.most_gaussians = run.opt.max_num_splats or default_budget(self._cameras)
-        self._follows_clock = not run.opt.max_num_splats and isinstance(run.schedule, DecidedSchedule)
 
     def changes(self, iteration: int) -> bool:
         in_time = self.schedule.schedule_step(iteration) < self._opt.densify_until_iter
@@ -77,9 +72,7 @@ class BudgetControl(DensityControl):
 
     def _aim(self, now: int, iteration: int) -> int:
         """How many Gaussians there are to be after the densification of an iteration, `now` before it."""
-        most, stride = self.most_gaussians, self.schedule.stride(iteration)
-        if self._follows_clock and stride > 1:
-            most = min(most, max(int(AN_ITERATION * self.schedule.length / stride), 1))
+        most = self.most_gaussians if self._opt.max_num_splats else self.most(iteration, self.most_gaussians)
         return count_after(now, most, self._remaining(iteration), self._opt.growth_power)
 
     def _grows(self, iteration: int) -> bool:
@@ -111,12 +104,6 @@ class BudgetControl(DensityControl):
     def _scored_views(self, iteration: int) -> list[Camera]:
         order = permutation(self._opt.seed, Stream.SCORED_VIEWS, iteration, len(self._cameras))
         return [self._cameras[index] for index in order[: self._opt.score_views]]
-
-
-def default_budget(cameras: list[Camera]) -> int:
-    """The number of Gaussians where --max_num_splats is 0: one for PIXELS pixels, from FEWEST to MOST."""
-    pixels = sum(camera.image_width * camera.image_height for camera in cameras)
-    return min(max(pixels // PIXELS, FEWEST), MOST)
 
 
 def of_run(run: "Run") -> BudgetControl:

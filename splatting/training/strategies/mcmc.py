@@ -14,13 +14,15 @@ from torch import Tensor
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.gaussians.mcmc import Penalty
-from splatting.training.density import DensityControl, refuse_empty
+from splatting.training.density import DensityControl, default_budget, refuse_empty
 from splatting.training.iteration import Iteration
+from splatting.training.schedule import DecidedSchedule
 
 if TYPE_CHECKING:
     from splatting.training.run import Run
 
 MOST_GAUSSIANS = 1_000_000  # where --max_num_splats is 0
+INIT_SCALES = (0.1, 1.0)  # of the paper's long trainings, and of those by the clock, which are too short for it
 
 
 class MarkovChain(DensityControl):
@@ -30,16 +32,17 @@ class MarkovChain(DensityControl):
     clamps = False
     queues = True
 
-    def __init__(self, gaussians: GaussianModel, opt: argparse.Namespace) -> None:
+    def __init__(self, gaussians: GaussianModel, opt: argparse.Namespace, most: int = MOST_GAUSSIANS) -> None:
         self._gaussians = gaussians
         self._opt = opt
-        self.most_gaussians = opt.max_num_splats or MOST_GAUSSIANS
+        self.most_gaussians = opt.max_num_splats or most
         self.penalty = Penalty(opt.mcmc_opacity_reg, opt.mcmc_scale_reg)
         self.ends = opt.mcmc_until_iter
 
     def started(self) -> None:
-        """Make Gaussians more opaque and smaller than adaptive density control wants them (as the authors' release)."""
-        self._gaussians.start_as(self._opt.mcmc_init_opacity, self._opt.mcmc_init_scale)
+        """Make Gaussians more opaque and smaller than those of adaptive density control (as the authors' release)."""
+        scale = self._opt.mcmc_init_scale or INIT_SCALES[isinstance(self.schedule, DecidedSchedule)]
+        self._gaussians.start_as(self._opt.mcmc_init_opacity, scale)
 
     def changes(self, iteration: int) -> bool:
         opt = self._opt
@@ -48,8 +51,8 @@ class MarkovChain(DensityControl):
         return within and iteration % rules.interval(opt, opt.mcmc_until_iter, stride, self.schedule.views) == 0
 
     def most_after(self, count: int, first: int, last: int) -> int:
-        for _ in filter(self.changes, range(first, last + 1)):
-            count = max(count, self._grown(count))
+        for iteration in filter(self.changes, range(first, last + 1)):
+            count = max(count, self._grown(count, iteration))
         return count
 
     def after_backward(self, step: Iteration, package: dict[str, Tensor]) -> None:
@@ -74,16 +77,17 @@ class MarkovChain(DensityControl):
     def _grow(self, iteration: int) -> None:
         """Grow to `_grown`."""
         count, opt = self._gaussians.total, self._opt
-        new = self._grown(count) - count
+        new = self._grown(count, iteration) - count
         if new > 0:
             self._gaussians.grow(new, opt.mcmc_parts, seed=opt.seed, iteration=iteration)
 
-    def _grown(self, count: int) -> int:
+    def _grown(self, count: int, iteration: int) -> int:
         """The number after a growth: more by a part of it (the paper's rule of adding Gaussians), at least by one."""
         growth = self._opt.mcmc_growth
-        return min(max(int((1 + growth) * count), count + (growth > 0)), self.most_gaussians)
+        return min(max(int((1 + growth) * count), count + (growth > 0)), self.most(iteration, self.most_gaussians))
 
 
 def of_run(run: "Run") -> MarkovChain:
     """The control of a run."""
-    return MarkovChain(run.gaussians, run.opt)
+    timed = isinstance(run.schedule, DecidedSchedule)
+    return MarkovChain(run.gaussians, run.opt, *[default_budget(run.scene.getTrainCameras())] * timed)
