@@ -50,7 +50,7 @@ MAY_IMPORT = {
         *("splatting.evaluation", "splatting.exports", "splatting.viewer.server"),
         *("arguments", "gaussian_renderer", "scene"),
     ),
-    "splatting.viewer": ("splatting.camera_paths", "gaussian_renderer", "scene"),
+    "splatting.viewer": ("splatting.camera_paths", "splatting.exports", "gaussian_renderer", "scene"),
     "splatting.diagnosis": ("arguments", "gaussian_renderer", "splatting.evaluation", "scene"),
     "splatting.sfm": ("scene.readers", "scene.images"),
     "splatting.demo": ("arguments", "splatting.evaluation"),

@@ -1,5 +1,6 @@
 """The viewer's frames, and when they are drawn: no server, no browser."""
 
+import contextlib
 import math
 from argparse import ArgumentParser, Namespace
 from dataclasses import replace
@@ -19,9 +20,12 @@ from gaussian_renderer.free_view import free_view
 from scene import Scene
 from scene.gaussian_model import GaussianModel
 from splatting.camera_paths.keyframes import read_camera_path
-from splatting.viewer import views
-from splatting.viewer.frames import LONGEST, Frames, inside, shown_part
-from splatting.viewer.tabs import PathTab, first_box
+from splatting.exports.formats import read_splats
+from splatting.viewer import frusta, legend, path_tab, views
+from splatting.viewer.frames import LONGEST, Frame, Frames, inside, shown_part
+from splatting.viewer.page import write_crop
+from splatting.viewer.path_tab import PathTab
+from splatting.viewer.tabs import FileName, first_box
 from splatting.viewer.views import Pose, SceneCameras, Settings, canvas, fov_of_canvas, pose_of
 from splatting.viewer.watchers import MOVING, STILL, STILL_AFTER, Budget, Watchers
 from utils.graphics_utils import camera_center
@@ -56,9 +60,13 @@ def scene_cameras(tmp_path_factory) -> SceneCameras:
     return SceneCameras(scene.getTrainCameras(), scene.getTestCameras())
 
 
-def drawn(gaussians, pose=FRONT, cameras=None, coarse=False, **settings) -> np.ndarray:
+def frame(gaussians, pose=FRONT, cameras=None, coarse=False, **settings) -> Frame:
     frames = Frames(gaussians, cameras or SceneCameras([], []), pipeline(), False)
     return frames.draw(replace(PLAIN, **settings), pose, coarse)
+
+
+def drawn(*given, **settings) -> np.ndarray:
+    return frame(*given, **settings).image
 
 
 def rendered(gaussians, view=None, scaling=1.0, background=BLACK, **options) -> np.ndarray:
@@ -99,6 +107,41 @@ def test_modes_show_what_they_say(gaussians):
         alpha = render(view, gaussians, pipeline(), BLACK, override_color=torch.ones(200, 3))["render"][0]
     assert torch.equal(counts > 0, alpha > 0) and 0 < counts.max() <= 200
     assert blend_depth(view, model(1), pipeline()).max() == 1
+
+
+def test_a_scale_names_the_depths_and_counts_of_its_colours(gaussians):
+    distances = torch.linspace(2.0, 40.0, 2000).reshape(1, 20, 100)
+    alpha = torch.full_like(distances, 0.8)
+    alpha[0, 0, 0] = 0.4  # too thin to have a depth
+    colours, scale = legend.depth_colors(alpha / distances, alpha)
+    assert not colours[:, 0, 0].any() and list(scale.numbers) == sorted(scale.numbers, reverse=True)
+    assert scale.numbers[0] == pytest.approx(float(torch.quantile(distances, 0.98)), rel=0.01)
+    for number, stop in zip(scale.numbers, legend._STOPS, strict=True):
+        y, x = divmod(int((distances[0] - number).abs().argmin()), 100)
+        np.testing.assert_allclose(colours[:, y, x], stop, atol=0.01)
+    counts = torch.tensor([[0, 10, 20, 30, 40]])
+    colours, scale = legend.count_colors(counts)
+    assert scale.numbers == (0, 10, 20, 30, 40)
+    np.testing.assert_allclose(colours[:, 0].T, legend._STOPS, atol=1e-6)
+    assert "<span>40</span>" in scale.html() and "<span>1,100</span>" in scale._replace(numbers=(1100.0,)).html()
+    for mode in (views.DEPTH, views.COUNT):
+        assert len(frame(gaussians, mode=mode).legend.numbers) == 5
+    assert frame(gaussians).legend.html() == frame(gaussians, mode=views.OPACITY).legend.html() == ""
+
+
+def test_a_frame_that_lacks_its_photo_says_so(gaussians, scene_cameras):
+    name, camera = next(iter(scene_cameras.by_name.items()))
+    for settings in (
+        {"mode": views.ERROR},
+        {"comparison": views.SLIDER},
+        {"mode": views.DEPTH, "comparison": "Slider"},
+    ):
+        there = frame(gaussians, at(camera), scene_cameras, camera=name, **settings).legend
+        away = frame(gaussians, FRONT, scene_cameras, camera=name, **settings).legend
+        assert not there.warning and "No photo was taken from here" in away.html()
+        assert away.numbers == () or settings["mode"] == views.DEPTH
+    assert frame(gaussians, at(camera), scene_cameras, camera=name, mode=views.ERROR).legend.numbers[-1] == 51
+    assert not frame(gaussians, FRONT, scene_cameras, camera=name).legend.html()
 
 
 def test_the_crop_box_leaves_gaussians_out_and_the_model_alone(gaussians):
@@ -240,9 +283,9 @@ def test_cameras_are_named_and_the_view_begins_upright(scene_cameras):
     assert {name.split()[0] for name in scene_cameras.by_name} == {"train", "test"}
     assert math.isclose(np.linalg.norm(scene_cameras.up), 1)
     for camera in scene_cameras.by_name.values():
-        up = np.asarray(scene_cameras.up_at(camera))
+        up, place = np.asarray(scene_cameras.up_at(camera.R)), camera_center(camera.R, camera.T)
         assert up @ -camera.R[:, 1] > 0 and abs(up @ camera.R[:, 0]) < 1e-9
-        assert scene_cameras.depth(camera) > 0
+        assert (scene_cameras.target_of(place, camera.R) - place) @ camera.R[:, 2] > 0
 
 
 def test_the_crop_box_begins_around_most_gaussians():
@@ -260,41 +303,101 @@ class Gui:
 
     def __getattr__(self, name: str):
         def add(label: str, *values: object, **_: object) -> SimpleNamespace:
-            return SimpleNamespace(value=values[0] if values else None, on_click=lambda call: None)
+            first = values[0] if values else None
+            control = {"on_click": lambda call: None, "on_update": lambda call: None, "visible": True}
+            if name == "add_dropdown":
+                control |= {"options": first, "value": first[0]}
+            return SimpleNamespace(**{"value": first} | control)
 
         return add
 
 
 @pytest.fixture
-def path_tab(tmp_path) -> PathTab:
-    tab = PathTab(SimpleNamespace(gui=Gui()), tmp_path)
+def server() -> SimpleNamespace:
+    return SimpleNamespace(gui=Gui())
+
+
+@pytest.fixture
+def recorded(server, tmp_path, scene_cameras) -> PathTab:
+    tab = PathTab(server, tmp_path / "paths", scene_cameras)
     tab.easing.value = "smooth"
     return tab
 
 
 def _client(**changes: object) -> SimpleNamespace:
     camera = {"position": [1, 2, 3], "wxyz": [0, 1, 0, 0], "fov": 1.0, "image_width": 4, "image_height": 3}
-    return SimpleNamespace(camera=SimpleNamespace(**camera | changes))
+    return SimpleNamespace(camera=SimpleNamespace(**camera | changes), atomic=contextlib.nullcontext)
 
 
-def test_a_recorded_path_is_read_by_what_renders_it(path_tab, tmp_path):
-    path_tab.add(_client())
+def test_a_recorded_path_is_read_by_what_renders_it(recorded, tmp_path):
+    recorded.file.field.value = "fly_1-a"
+    recorded.add(_client())
     with pytest.raises(UserError, match="at least 2 keyframes"):
-        path_tab.save("short")
-    path_tab.seconds.value = 1.5
-    path_tab.add(_client(position=[4, 5, 6]))
-    path_tab.add(_client(position=[math.nan] * 3))  # cannot be drawn, so is no keyframe
-    path = read_camera_path(path_tab.save("fly_1-a"))
+        recorded.save()
+    recorded.seconds.value = 1.5
+    recorded.add(_client(position=[4, 5, 6]))
+    recorded.add(_client(position=[math.nan] * 3))  # cannot be drawn, so is no keyframe
+    path = read_camera_path(recorded.save())
     assert path.seconds == 1.5 and path.easing == "smooth"
     assert [frame.position for frame in path.keyframes] == [(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)]
     assert math.isclose(path.keyframes[0].fov, math.degrees(1.0)) and path.keyframes[0].wxyz == (0.0, 1.0, 0.0, 0.0)
     assert [file.name for file in tmp_path.rglob("*.json")] == ["fly_1-a.json"]
 
 
+def test_keyframes_are_listed_gone_to_and_deleted_anywhere(recorded, monkeypatch):
+    for x in (1.0, 2.0, 3.0, 4.0):
+        recorded.add(_client(position=[x, 0, 0]))
+    assert recorded.chosen.options == ("1: at 0 s", "2: at 2 s", "3: at 4 s", "4: at 6 s")
+    assert recorded.chosen.value == "4: at 6 s"
+    recorded.chosen.value = "2: at 2 s"
+    recorded.go(client := _client(fov=0.3))
+    assert client.camera.position.tolist() == [2.0, 0.0, 0.0] and math.isclose(client.camera.fov, 1.0)
+    assert client.camera.look_at[2] < 0 and client.camera.up_direction[1] > 0  # wxyz is half a turn about x
+    for chosen, options, places in (
+        ("2: at 2 s", ("1: at 0 s", "2: at 4 s", "3: at 6 s"), [1, 3, 4]),
+        ("1: at 0 s", ("1: at 0 s", "2: at 2 s"), [3, 4]),  # a path begins at 0
+        ("no such", ("1: at 0 s", "2: at 2 s"), [3, 4]),
+        ("2: at 2 s", ("1: at 0 s",), [3]),
+        ("1: at 0 s", (path_tab._NONE,), []),
+        (path_tab._NONE, (path_tab._NONE,), []),
+    ):
+        recorded.chosen.value = chosen
+        recorded.delete()
+        assert recorded.chosen.options == options and recorded.chosen.value in (*options, "no such")
+        assert [key.position[0] for key in recorded.keyframes] == places
+    recorded.go(_client())
+    monkeypatch.setattr(path_tab, "_MOST", 3)
+    for _ in range(5):
+        recorded.add(_client())
+    assert len(recorded.keyframes) == 3
+
+
 @pytest.mark.parametrize("name", ["", "..", "../a", "a/b", "a\\b", "/etc/x", "a.json", "a\0b", "ä", "a\n", "x" * 65])
-def test_no_name_leads_out_of_the_folder(path_tab, tmp_path, name):
-    for _ in range(2):
-        path_tab.add(_client())
-    with pytest.raises(UserError, match="the name of a path"):
-        path_tab.save(name)
-    assert not list(tmp_path.rglob("*"))
+def test_no_name_leads_out_of_the_folder(server, tmp_path, name):
+    file = FileName(server, tmp_path, "crop", ".ply")
+    assert file.path() == tmp_path / "crop1.ply"
+    file.field.value = name
+    with pytest.raises(UserError, match="choose another one"):
+        file.path()
+    (tmp_path / "crop1.ply").touch()
+    assert FileName(server, tmp_path, "crop", ".ply").path() == tmp_path / "crop2.ply"
+
+
+def test_a_crop_is_written_as_any_program_reads_it(gaussians, tmp_path):
+    gaussians.active_sh_degree, gaussians.world_offset = 1, (10.0, 20.0, 30.0)
+    box = (0.5, 0.4, 0.3), (-0.5, -0.4, -2.0)
+    keep = inside(gaussians.get_xyz, *box)
+    assert 0 < write_crop(tmp_path / "a/crop.ply", gaussians, box, antialiasing=True) == keep.sum() < 200
+    splats = read_splats(tmp_path / "a/crop.ply")
+    np.testing.assert_array_equal(splats.means, gaussians.get_xyz[keep].detach())
+    assert splats.sh_degree == 1 and splats.antialiasing and splats.world_offset == gaussians.world_offset
+    with pytest.raises(UserError, match="no Gaussians; move its corners"):
+        write_crop(tmp_path / "b.ply", gaussians, ((9.0,) * 3, (8.0,) * 3), antialiasing=False)
+    assert not (tmp_path / "b.ply").exists()
+
+
+def test_drawn_cameras_fade_near_the_browsers_own():
+    distances = np.array([0.0, 1.9, 3.0, 5.0, 7.0, 8.0, 1e9])
+    opacities = frusta.faded(distances)
+    assert opacities[:2].max() == 0 and opacities[-2:].min() == 1
+    assert (np.diff(opacities) >= 0).all() and len(set(opacities[1:6])) == 5

@@ -35,6 +35,8 @@ from splatting.viewer import server as servers  # noqa: E402
 from splatting.viewer.auth import Auth, is_accepted  # noqa: E402
 from splatting.viewer.page import Page, answer  # noqa: E402
 from splatting.viewer.server import Address  # noqa: E402
+from splatting.viewer.tabs import first_box  # noqa: E402
+from splatting.viewer.views import Settings  # noqa: E402
 from utils.graphics_utils import camera_center  # noqa: E402
 from utils.system_utils import UserError  # noqa: E402
 
@@ -197,7 +199,7 @@ CAMERA = {
     "image_height": 64, "image_width": 96, "look_at": [0, 0, 0], "up_direction": [0, -1, 0],
 }  # fmt: skip
 CLICK = {
-    "type": "SceneNodeClickMessage", "name": "/cameras/0", "instance_index": None, "ray_origin": [0, 0, 0],
+    "type": "SceneNodeClickMessage", "name": "/cameras", "instance_index": None, "ray_origin": [0, 0, 0],
     "ray_direction": [0, 0, 1], "screen_pos": [0.5, 0.5], "modifier": None, "owner": "",
 }  # fmt: skip
 
@@ -476,19 +478,22 @@ def test_a_crop_box_that_many_drag_is_drawn_once(page, capfd):
     assert "rror" not in capfd.readouterr().err
 
 
-def test_a_frame_that_cannot_be_drawn_is_told_once_and_ends_nothing(page, monkeypatch, capfd):
+def test_a_frame_that_cannot_be_drawn_is_told_once_until_one_can_and_ends_nothing(page, monkeypatch, capfd):
+    def broken(*_: object) -> None:
+        raise OSError("no file a\udcff.png")
+
     with Client(page.url) as client:
-        with monkeypatch.context() as broken:
-            broken.setattr(page._frames, "draw", lambda *_: (_ for _ in ()).throw(OSError("no file a\udcff.png")))
-            client.look(size=(60, 60))
-            client.until("BackgroundImageMessage")  # of a server that has been reset
-            for step in (1.0, 2.0):
-                client.look((step, 0.0, -4.0), size=(60, 60))
-                wait_for(lambda: answer(page))
-        assert "no file a\\udcff.png" in client.until("NotificationShowMessage")["props"]["body"]
-        client.look((0.0, 0.0, -4.0), size=(60, 60))
-        assert _answered(page, client).shape[2] == 3
-    assert capfd.readouterr().err.count("could not draw a frame (no file") == 1
+        client.look(size=(60, 60))
+        for told in (1, 2):
+            with monkeypatch.context() as patched:
+                patched.setattr(page._frames, "draw", broken)
+                for step in (1.0, 2.0):
+                    client.look((step, 0.0, -4.0), size=(60, 60))
+                    wait_for(lambda: answer(page))
+            assert "no file a\\udcff.png" in client.until("NotificationShowMessage")["props"]["body"]
+            client.look((0.0, 0.0, -4.0), size=(60, 60))
+            assert _answered(page, client).shape[2] == 3
+            assert capfd.readouterr().err.count("could not draw a frame (no file") == 1, told
 
 
 def test_a_browser_that_leaves_while_its_frame_is_drawn_is_not_worth_a_word():
@@ -530,3 +535,115 @@ def test_one_line_says_where_the_page_is_and_another_warns_of_a_network(host, ad
         assert f"viewer: {one.url}\n" in said.err
     assert said.err.count("every machine that reaches 0.0.0.0") == 2 * ("token" in address)
     assert said.err.count("\n") == (4 if "token" in address else 2)
+
+
+def _set(client: Client, handle: object, value: object) -> None:
+    client.send("GuiUpdateMessage", uuid=handle._impl.uuid, updates={"value": value})
+
+
+def _button(page: Page, label: str) -> object:
+    return next(h for h in page.server.gui._gui_input_handle_from_uuid.values() if getattr(h, "label", "") == label)
+
+
+@contextlib.contextmanager
+def _restored(page: Page):
+    """The page, whose controls get their values back."""
+    controls = page.server.gui._gui_input_handle_from_uuid.values()
+    before = [(handle, handle.value) for handle in controls if not handle._impl.is_button]
+    yield
+    for handle, value in before:
+        handle.value = value
+
+
+def test_each_browser_reads_the_scale_of_its_own_frame(page):
+    def until(words: str, different: int) -> None:
+        def holds() -> bool:
+            answer(page)
+            texts = [shown.content for shown in page._legends.values() if shown.visible]
+            return len(texts) == 2 == sum(words in text for text in texts) and len(set(texts)) == different
+
+        wait_for(holds)
+
+    with Client(page.url) as near, Client(page.url) as far, _restored(page):
+        for client, z in ((near, -2.0), (far, -8.0)):
+            client.look((0.0, 0.0, z))
+            _answered(page, client)
+        assert len(page._legends) == 2 and not any(shown.visible for shown in page._legends.values())
+        _set(near, page.view.mode, "Depth")
+        until("Depth", 2)
+        _set(near, page.view.mode, "Error")
+        until("No photo", 1)
+    wait_for(lambda: not page._legends)
+
+
+def test_a_crop_is_written_into_the_models_folder_and_nowhere_else(page, tmp_path, capfd):
+    view, folder = page.view, page.view.crop_file.folder
+    with Client(page.url) as client, _restored(page):
+        client.look()
+        for name in ("../../outside", str(tmp_path / "outside"), "", "a/b", "mine"):
+            _set(client, view.crop_file.field, name)
+            _set(client, view.corners[0], [-0.5, -0.5, -0.5])
+            _set(client, view.corners[1], [0.5, 0.5, 0.5])
+            _set(client, _button(page, "Export the crop"), True)
+            wait_for(lambda: page.requests.any)
+            assert view.crop_file.field.value == name
+            answer(page)
+            assert not page.requests.any
+            heard = client.until("NotificationShowMessage")["props"]
+            assert heard["title"] == ("Exported" if name == "mine" else "Not exported")
+            assert 0 < heard["auto_close_seconds"] < 60  # so that messages do not pile up
+    assert folder.parent.name == "a\udcff" and [file.name for file in folder.iterdir()] == ["mine.ply"]
+    assert not list(folder.parent.parent.rglob("outside*")) and not list(tmp_path.iterdir())
+    said = capfd.readouterr()
+    assert said.err.count("warning: the crop is not exported") == 4 and "of 200 Gaussians to" in said.out
+
+
+def test_reset_gives_the_view_its_first_values(page):
+    view, first = page.view, Settings(sh_degree=3)
+    view.mode.value, view.scaling.value, view.background.value = "Depth", 0.3, (9, 9, 9)
+    view.crop.value, view.corners[0].value = True, (7.0, 7.0, 7.0)
+    wait_for(lambda: view.crop_file.field.visible)
+    with Client(page.url) as client:
+        client.look()
+        _set(client, _button(page, "Reset"), True)
+        wait_for(lambda: view.read() == first and not view.crop_file.field.visible)
+    assert tuple(corner.value for corner in view.corners) == first_box(page._gaussians.get_xyz)
+
+
+def test_browsers_begin_at_the_chosen_camera_and_render_alone_leads_nowhere(page):
+    images, cameras = page.images, page.images._cameras.by_name
+    name = list(cameras)[5]
+    place = camera_center(cameras[name].R, cameras[name].T)
+    with Client(page.url) as client, _restored(page):
+        client.look()
+        wait_for(page.server.get_clients)
+        _set(client, images.camera, name)
+        wait_for(lambda: np.allclose(page.server.initial_camera.position, place))
+        _set(client, images.comparison, "Slider")
+        wait_for(lambda: images.slider.visible)
+        client.look((7.0, 7.0, 7.0))
+        wait_for(lambda: next(iter(page.server.get_clients().values())).camera.position[0] == 7.0)
+        _set(client, images.comparison, "Render alone")
+        _set(client, page.view.mode, "Depth")  # it is heard after that
+        wait_for(lambda: page.view.mode.value == "Depth")
+        assert not images.slider.visible
+        assert next(iter(page.server.get_clients().values())).camera.position[0] == 7.0
+
+
+def test_cameras_near_a_browser_are_not_drawn_and_a_click_on_another_leads_there(page):
+    frusta, cameras = page.images.frusta, page.images._cameras.by_name
+    with Client(page.url) as client, _restored(page):
+        places = [camera_center(camera.R, camera.T) for camera in cameras.values()]
+        client.look(places[0])
+        wait_for(lambda: frusta._drawn)
+        (drawn,) = frusta._drawn.values()
+        wait_for(lambda: drawn.batched_opacities[0] == 0)
+        assert not drawn.batched_scales[0].any() and drawn.batched_opacities.max() == 1
+        client.look(places[3])
+        wait_for(lambda: drawn.batched_opacities[3] == 0 and drawn.batched_scales[0].all())
+        for index in (None, -1, 10**6, 2):
+            click = CLICK | {"instance_index": index, "owner": drawn._impl.api._owner_id}
+            client._socket.send(msgspec.msgpack.encode(click))
+        wait_for(lambda: page.images.camera.value == list(cameras)[2])
+        page.images.camera.value = next(iter(cameras))
+    wait_for(lambda: not frusta._drawn)

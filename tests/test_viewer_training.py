@@ -9,7 +9,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
 
@@ -18,8 +20,11 @@ from viser_client import Client  # noqa: E402
 from waiting import wait_for  # noqa: E402
 
 import train  # noqa: E402
+from scene.gaussian_model import GaussianModel  # noqa: E402
 from scene.gaussians.checkpoint import load_checkpoint  # noqa: E402
+from scene.gaussians.ply import stored_sh_degree  # noqa: E402
 from splatting.training.observers import viewers as observed  # noqa: E402
+from splatting.viewer.page import serve  # noqa: E402
 from utils.system_utils import UserError  # noqa: E402
 
 ITERATIONS = 120
@@ -94,10 +99,10 @@ class Watched:
         threading.Thread(target=play).start()
 
 
-def _train(scene: Path, out: Path, *options: object, viewer: bool = True) -> Path:
+def _train(scene: Path, out: Path, *options: object, viewer: bool = True, stays: bool = False) -> Path:
     words = ["-s", scene, "-m", out, "-r", 24, "--iterations", ITERATIONS, "--eval", "--densify_from_iter", 20,
              "--densification_interval", 20, "--densify_grad_threshold", 1e-6, *options]  # fmt: skip
-    train.main([*map(str, words), *(["--viewer", "0"] if viewer else [])])
+    train.main([*map(str, words), *(["--viewer", "0"] if viewer else []), *(["--viewer_exit"] * (not stays))])
     return out / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply"
 
 
@@ -127,11 +132,11 @@ def test_watching_changes_no_byte_of_the_model(colmap_scene, tmp_path, monkeypat
     def pause(watched: Watched) -> None:
         watched.pause(_after(0.2, watched.requests.step), watched.requests.resume)
 
-    acts = {10: connect, 15: look_at("Depth"), 25: look_at("Gaussians a pixel", scaling=0.5), 60: pause}
+    acts = {10: connect, 15: look_at("Depth"), 25: look_at("Gaussians per pixel", scaling=0.5), 60: pause}
     acts |= {40: look_at("Colour", crop=True, degree=0), 80: look_at("Opacity"), 100: lambda w: w.requests.save()}
     watched = Watched(monkeypatch, acts)
     assert _train(colmap_scene, tmp_path / "watched", *plain).read_bytes() == expected
-    assert {mode for _, mode in watched.frames} == {"Depth", "Gaussians a pixel", "Colour", "Opacity"}
+    assert {mode for _, mode in watched.frames} == {"Depth", "Gaussians per pixel", "Colour", "Opacity"}
     assert {15, 25, 40, 80} <= {iteration for iteration, _ in watched.frames} and watched.paused == [60, 61]
     log = json.loads((tmp_path / "watched/train_log.json").read_text())
     assert log[-1]["viewing_seconds"] > 0.15  # the pause: no time of training
@@ -208,6 +213,99 @@ def test_a_paused_training_that_ends_is_saved_and_the_pause_is_no_time_of_it(col
     assert (tmp_path / "out/chkpnt12.pth").exists()
 
 
+class _Staying(Watched):
+    """A training whose page stays. visit: what is done, in a thread of its own, when the training is over."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, acts: dict, visit: Callable[["_Staying"], object]) -> None:
+        super().__init__(monkeypatch, acts)
+        self.seen: list[object] = []
+        self.ends: list[object] = []  # what `serve` has returned
+
+        def staying(page) -> None:
+            def call() -> None:
+                try:
+                    self.seen.append(visit(self))
+                finally:
+                    page.requests.stop()  # so that the test ends
+
+            visitor = threading.Thread(target=call)
+            visitor.start()
+            self.ends.append(serve(page))
+            visitor.join()
+
+        monkeypatch.setattr(observed, "serve", staying)
+
+    def picture(self) -> np.ndarray:
+        with Client(self.page.url) as client:
+            client.look((0.0, 0.0, -3.0))
+            return client.picture()
+
+    def closes(self) -> None:
+        """Press the button."""
+        tab = self.observer._tab
+        assert tab.close.visible and not tab.pause.visible and not tab.note.visible
+        with Client(self.page.url) as client:
+            client.look()
+            client.send("GuiUpdateMessage", uuid=tab.close._impl.uuid, updates={"value": True})
+            wait_for(lambda: self.requests.stopped)
+
+
+def _saved(path: Path) -> GaussianModel:
+    gaussians = GaussianModel(stored_sh_degree(path))
+    gaussians.load_ply(path)
+    return gaussians
+
+
+def test_the_page_stays_after_its_training_and_shows_the_saved_model(colmap_scene, tmp_path, monkeypatch, capfd):
+    def visit(watched: _Staying) -> tuple:
+        shown, picture = watched.page._gaussians, watched.picture()
+        watched.closes()
+        return shown, picture, watched.page.count.value
+
+    watched = _Staying(monkeypatch, {5: lambda w: w.requests.pause() or w.requests.resume()}, visit)
+    # The last iteration is one of densification, after the model is saved.
+    path = _train(colmap_scene, tmp_path / "out", "--no_curve", stays=True)
+    shown, picture, count = watched.seen[0]
+    saved = _saved(path)
+    assert len(watched.observer._run.gaussians) > len(saved) == len(shown) == int(count.replace(",", ""))
+    assert torch.equal(shown.get_xyz, saved.get_xyz) and picture.std() > 5
+    said = capfd.readouterr().err
+    assert f"The page stays open at {watched.page.url}" in said and "--viewer_exit" in said
+
+
+def test_a_training_that_the_page_stops_can_be_looked_at(colmap_scene, tmp_path, monkeypatch):
+    def visit(watched: _Staying) -> np.ndarray:
+        picture = watched.picture()
+        watched.closes()
+        return picture
+
+    watched = _Staying(monkeypatch, {33: lambda w: w.requests.stop()}, visit)
+    with pytest.raises(KeyboardInterrupt):
+        _train(colmap_scene, tmp_path / "out", "--no_curve", stays=True)
+    assert watched.seen[0].std() > 5 and watched.page.iteration.value == "33"
+    assert (tmp_path / "out/chkpnt33.pth").exists()
+
+
+def test_a_signal_ends_the_page_of_a_training_that_is_over(colmap_scene, tmp_path, monkeypatch):
+    def visit(watched: _Staying) -> None:
+        watched.picture()  # now it is served
+        os.kill(os.getpid(), signal.SIGINT)
+        wait_for(lambda: watched.ends)
+
+    watched = _Staying(monkeypatch, {}, visit)
+    _train(colmap_scene, tmp_path / "out", "--no_curve", stays=True)  # and goes on as after any training
+    assert watched.ends == [KeyboardInterrupt]
+
+
+def test_a_signal_that_ends_the_training_ends_the_page(colmap_scene, tmp_path, monkeypatch):
+    watched = _Staying(monkeypatch, {33: lambda w: os.kill(os.getpid(), signal.SIGINT)}, lambda _: None)
+    with pytest.raises(KeyboardInterrupt):
+        _train(colmap_scene, tmp_path / "out", "--no_curve", stays=True)
+    assert not watched.seen
+    with pytest.raises(OSError):
+        Client(watched.page.url)
+
+
 def test_neither_a_checkpoint_nor_a_frame_that_fails_ends_a_training(colmap_scene, tmp_path, monkeypatch, capfd):
     told = []
 
@@ -224,7 +322,7 @@ def test_neither_a_checkpoint_nor_a_frame_that_fails_ends_a_training(colmap_scen
     expected = _train(colmap_scene, tmp_path / "alone", "--no_curve", viewer=False).read_bytes()
     assert _train(colmap_scene, tmp_path / "out", "--no_curve").read_bytes() == expected
     assert (tmp_path / "out/chkpnt20.pth").is_file() and watched.frames
-    assert [title for title, _ in told] == ["Not saved", "Saved", "The training is done"]
+    assert [title for title, _ in told] == ["Not saved", "Saved", "The training is over"]
     said = capfd.readouterr().err
     assert "warning: cannot write" in said and said.count("no memory for a frame") == 1
 

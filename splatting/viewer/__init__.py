@@ -1,7 +1,8 @@
 """The web page that shows a model, during its training or from its folder.
 
-views, frames       a frame: what the controls ask for, from which camera, and the image for it
-watchers            when to draw: cameras of the browsers, share of time
-server, auth        where the page listens, who may connect, and what a browser may send
-page, tabs          the page and its controls
+views, frames, legend        a frame: what the controls ask for, from which camera, its image, and what its colours mean
+watchers                     when to draw: cameras of the browsers, share of time
+server, auth                 where the page listens, who may connect, and what a browser may send
+page                         the page, and what it writes
+tabs, path_tab, training_tab its controls; frusta: the scene's cameras as a browser draws them
 """

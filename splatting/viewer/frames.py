@@ -1,8 +1,9 @@
-"""The image of a frame: what the settings ask for, from a pose; and the colours of depth, counts and errors."""
+"""The image of a frame: what the settings ask for, from a pose."""
 
 import argparse
 import copy
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 from splatting.files.image_files import to_bytes
 from splatting.viewer import views
+from splatting.viewer.legend import ERROR_SCALE, Legend, count_colors, depth_colors, error_image
 from splatting.viewer.views import Pose, SceneCameras, Settings, Vector, canvas
 from utils.image_utils import as_float
 
@@ -22,11 +24,14 @@ LONGEST = 1600  # pixels of a frame's longer side, at most
 COARSE = 2  # a frame of a moving camera has a quarter of the pixels
 _BORDER = 0.15  # grey around a target that does not fill the window
 _LINE = 2  # pixels of the slider's line
-ERROR_GAIN = 5  # as in the contact sheets
-_FEW, _MOST = 0.02, 0.98  # quantiles of the depths of a frame that get the darkest and the brightest colour
-_SAMPLE = 20_000  # pixels that the quantiles are taken from
-# From dark to bright, so that a grey print keeps the order.
-_STOPS = ((0.00, 0.00, 0.05), (0.25, 0.05, 0.42), (0.70, 0.18, 0.38), (0.97, 0.50, 0.16), (0.99, 1.00, 0.70))
+_NO_PHOTO = "No photo was taken from here. “Go to the camera” (tab Photos) leads to one."
+
+
+class Frame(NamedTuple):
+    """image: (H, W, 3) uint8. legend: what its colours mean, or what it lacks."""
+
+    image: np.ndarray
+    legend: Legend
 
 
 class Frames:
@@ -38,15 +43,15 @@ class Frames:
     def __init__(
         self, gaussians: GaussianModel, cameras: SceneCameras, pipe: argparse.Namespace, with_exposures: bool
     ) -> None:
-        self._gaussians = gaussians
+        self.gaussians = gaussians
         self._cameras = cameras
         self._pipe = pipe
         self._with_exposures = with_exposures
-        self._compared: tuple[object, tuple[Tensor, Tensor]] = (None, ())
+        self._compared: tuple[object, tuple[Tensor, Tensor, Legend]] = (None, ())
 
     @torch.no_grad()
-    def draw(self, settings: Settings, pose: Pose, coarse: bool, version: int = 0) -> np.ndarray:
-        """A frame (H, W, 3) uint8, of the window's aspect.
+    def draw(self, settings: Settings, pose: Pose, coarse: bool, version: int = 0) -> Frame:
+        """A frame of the window's aspect.
 
         version: changes with the model, because an image and its render are kept while a slider moves.
         """
@@ -54,36 +59,44 @@ class Frames:
         if camera is None:
             scale = min(1.0, LONGEST / max(pose.width, pose.height)) / (COARSE if coarse else 1)
             width, height = (max(1, round(side * scale)) for side in (pose.width, pose.height))
-            view = free_view(width, height, pose.fov, pose.position, pose.wxyz, self._gaussians.get_xyz.device)
-            return to_bytes(self._image(settings, view)).numpy()
+            view = free_view(width, height, pose.fov, pose.position, pose.wxyz, self.gaussians.get_xyz.device)
+            image, words = self._image(settings, view)
+            return Frame(to_bytes(image).numpy(), words._replace(warning=_NO_PHOTO if _needs_photo(settings) else ""))
         key = replace(settings, slider=0, comparison=views.ALONE), version
         if self._compared[0] != key:
             target = as_float(camera.target(self._background(settings)))
-            self._compared = key, (target, self._image(settings, camera, target))
-        return to_bytes(_fitted(_composed(settings, *self._compared[1]), pose)).numpy()
+            self._compared = key, (target, *self._image(settings, camera, target))
+        target, image, words = self._compared[1]
+        return Frame(to_bytes(_fitted(_composed(settings, target, image), pose)).numpy(), words)
 
     def compared(self, settings: Settings, pose: Pose) -> Camera | None:
         """The scene's camera whose target this frame shows, None: no target."""
         camera = self._cameras.by_name.get(settings.camera)
-        requested = camera is not None and (settings.comparison != views.ALONE or settings.mode == views.ERROR)
-        return camera if requested and self._cameras.stands_at(pose, camera) else None
+        return camera if camera and _needs_photo(settings) and self._cameras.stands_at(pose, camera) else None
 
     def _background(self, settings: Settings) -> Tensor:
-        return self._gaussians.get_xyz.new_tensor(settings.background)
+        return self.gaussians.get_xyz.new_tensor(settings.background)
 
-    def _image(self, settings: Settings, view: Camera | MiniCam, target: Tensor | None = None) -> Tensor:
+    def _image(self, settings: Settings, view: Camera | MiniCam, target: Tensor | None = None) -> tuple[Tensor, Legend]:
         """The mode's image (3, H, W) in [0, 1]. Without a target there is no error, and the colour is drawn."""
-        part = shown_part(self._gaussians, settings)
+        part = shown_part(self.gaussians, settings)
         if settings.mode == views.COUNT:
             return count_colors(blend_depth(view, part, self._pipe, settings.scaling))
         if settings.mode in (views.DEPTH, views.OPACITY):
             planes = view_planes(view, part, self._pipe, settings.scaling)
-            depth, alpha = planes["depth"], planes["alpha"]
-            return depth_colors(depth, alpha) if settings.mode == views.DEPTH else alpha.expand(3, -1, -1)
+            if settings.mode == views.DEPTH:
+                return depth_colors(planes["depth"], planes["alpha"])
+            return planes["alpha"].expand(3, -1, -1), Legend()
         exposed = self._with_exposures and target is not None
         options = {"want_depth": False, "want_visibility": False, "use_trained_exp": exposed}
         colour = render(view, part, self._pipe, self._background(settings), settings.scaling, **options)["render"]
-        return error_image(target, colour) if settings.mode == views.ERROR and target is not None else colour
+        if settings.mode == views.ERROR and target is not None:
+            return error_image(target, colour), ERROR_SCALE
+        return colour, Legend()
+
+
+def _needs_photo(settings: Settings) -> bool:
+    return settings.comparison != views.ALONE or settings.mode == views.ERROR
 
 
 def _composed(settings: Settings, target: Tensor, image: Tensor) -> Tensor:
@@ -134,36 +147,3 @@ def inside(positions: Tensor, one: Vector, other: Vector) -> Tensor:
     """(N,) bool: which positions (N, 3) lie in the box with these opposite corners."""
     corners = positions.new_tensor([one, other])
     return ((positions >= corners.amin(0)) & (positions <= corners.amax(0))).all(1)
-
-
-def colored(values: Tensor) -> Tensor:
-    """Colours (3, H, W) of values (H, W) in [0, 1], linear between the stops; others are clamped."""
-    stops = torch.tensor(_STOPS, dtype=values.dtype, device=values.device)
-    place = values.clamp(0, 1) * (len(_STOPS) - 1)
-    below = place.long().clamp_max(len(_STOPS) - 2)
-    return torch.lerp(stops[below], stops[below + 1], (place - below)[..., None]).permute(2, 0, 1)
-
-
-def depth_colors(depth: Tensor, alpha: Tensor) -> Tensor:
-    """Colours (3, H, W) of the planes of `view_planes`, (1, H, W) each; depth is inverse: near is bright.
-
-    Where less than half of a pixel is covered there is no depth, and the colour is black.
-    """
-    there = alpha[0] >= 0.5
-    values = depth[0] / alpha[0].clamp_min(1e-6)
-    known = values[there]
-    if not len(known):
-        return torch.zeros_like(alpha).expand(3, -1, -1)
-    known = known[:: max(1, len(known) // _SAMPLE)]
-    far, near = torch.quantile(known, torch.tensor([_FEW, _MOST], dtype=known.dtype, device=known.device))
-    return torch.where(there, colored((values - far) / (near - far).clamp_min(1e-9)), 0.0)
-
-
-def count_colors(counts: Tensor) -> Tensor:
-    """Colours (3, H, W) of counts (H, W): linear, the largest of the image is the brightest."""
-    return colored(counts.float() / counts.max().clamp_min(1))
-
-
-def error_image(target: Tensor, render: Tensor) -> Tensor:
-    """The difference (3, H, W) of two images in [0, 1], times ERROR_GAIN."""
-    return ((target - render).abs() * ERROR_GAIN).clamp(0, 1)

@@ -4,21 +4,27 @@ import argparse
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tqdm import tqdm
 
+from scene.gaussian_model import GaussianModel
 from scene.scene import Scene
+from splatting.exports.in_scene import splats_of
+from splatting.exports.ply import write_plain_ply
+from splatting.exports.splats import drawable, selected, tidy
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.viewer import server as servers
-from splatting.viewer.frames import LONGEST, Frames
+from splatting.viewer.frames import LONGEST, Frames, inside
+from splatting.viewer.legend import Legend
+from splatting.viewer.path_tab import PathTab
 from splatting.viewer.server import Address
-from splatting.viewer.tabs import ImagesTab, PathTab, ViewTab
-from splatting.viewer.views import SceneCameras, Settings, as_utf8, pose_of
+from splatting.viewer.tabs import ImagesTab, ViewTab, serialized
+from splatting.viewer.training_tab import Requests
+from splatting.viewer.views import SceneCameras, Settings, Vector, as_utf8, pose_of
 from splatting.viewer.watchers import Watchers, Wish
-from utils.graphics_utils import camera_center
-from utils.system_utils import first_line
+from utils.system_utils import UserError, first_line
 
 if TYPE_CHECKING:
     import viser
@@ -27,24 +33,29 @@ _SENT = 0.1  # seconds in which a message is sent
 _COARSE_QUALITY, _FULL_QUALITY = 70, 95  # of the JPEG
 _BETWEEN = 1 / 60  # seconds from frame to frame, at least
 _WAIT = 0.5  # seconds until a signal is noticed
+_READ = 10.0  # seconds after which a message vanishes
+PATHS, CROPS = "camera_paths", "crops"  # in the model's folder, which is where a browser can write
 
 
 class Page:
     """A web page that shows the model of a scene. watchers: who looks, and which frame comes next.
 
-    tabs: the group of tabs, to which others can be added.
+    requests: of its buttons. tabs: the group of tabs, to which others can be added.
     """
 
     def __init__(
         self, address: Address, scene: Scene, pipe: argparse.Namespace, white: bool, with_exposures: bool
     ) -> None:
         """Start to listen. UserError if that cannot be done. white: the background at first, else black."""
-        gaussians = scene.gaussians
+        gaussians, folder = scene.gaussians, Path(scene.model_path)
+        self._gaussians, self._antialiasing = gaussians, pipe.antialiasing
         self._cameras = SceneCameras(scene.getTrainCameras(), scene.getTestCameras())
         self._frames = Frames(gaussians, self._cameras, pipe, with_exposures)
         self.watchers = Watchers()
-        self._fault = ""  # the last one that was shown
-        self.server, self.url = servers.serve(address, as_utf8(Path(scene.model_path).resolve().name))
+        self.requests = Requests(self.watchers.wake)
+        self._faults: dict[int, str] = {}  # of the browsers' last frames
+        self._legends: dict[int, viser.GuiHtmlHandle] = {}
+        self.server, self.url = servers.serve(address, as_utf8(folder.resolve().name))
         gui = self.server.gui
         self.iteration = gui.add_text("Iteration", str(scene.loaded_iter or 0), disabled=True)
         self.count = gui.add_text("Gaussians", f"{len(gaussians):,}", disabled=True)
@@ -52,24 +63,18 @@ class Page:
         positions, degree = gaussians.get_xyz, gaussians.max_sh_degree
         with self.tabs.add_tab("View"):
             background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
-            self.view = ViewTab(self.server, self.watchers.changed, positions, degree, background)
+            calls = self.watchers.changed, self.requests.crop
+            self.view = ViewTab(self.server, *calls, folder / CROPS, positions, degree, background)
         with self.tabs.add_tab("Photos"):
             self.images = ImagesTab(self.server, self.watchers.changed, self._cameras)
         with self.tabs.add_tab("Path"):
-            self.path = PathTab(self.server, Path(scene.model_path))
-        self._begin_at_first_camera()
+            self.path = PathTab(self.server, folder / PATHS, self._cameras)
+        self.path.saved.on_click(serialized(lambda event: self._save_path(event.client, folder)))
+        self.server.scene.set_up_direction(tuple(self._cameras.up.tolist()))
+        self.server.initial_camera.near = 1e-3 * self._cameras.size
+        self.server.initial_camera.far = 1e3 * self._cameras.size
         self.server.on_client_connect(self._came)
         self.server.on_client_disconnect(self._left)
-
-    def _begin_at_first_camera(self) -> None:
-        self.server.scene.set_up_direction(tuple(self._cameras.up.tolist()))
-        camera, initial = next(iter(self._cameras.by_name.values()), None), self.server.initial_camera
-        if camera is not None:
-            initial.position = place = camera_center(camera.R, camera.T)
-            initial.look_at = place + camera.R[:, 2] * self._cameras.depth(camera)
-            initial.up = self._cameras.up_at(camera)
-            initial.fov = camera.FoVy
-        initial.near, initial.far = 1e-3 * self._cameras.size, 1e3 * self._cameras.size
 
     # Coroutines, so that viser calls them one after the other: a browser that has left stays away.
     async def _came(self, client: "viser.ClientHandle") -> None:
@@ -77,12 +82,23 @@ class Page:
             pose = pose_of(camera)
             if pose is not None:
                 self.watchers.moved(client.client_id, pose)
+                self.images.frusta.moved(client)
 
+        self._legends[client.client_id] = client.gui.add_html("", order=self.count.order + 0.5, visible=False)
+        self.images.frusta.came(client)
         await moved(client.camera)
         client.camera.on_update(moved)
 
     async def _left(self, client: "viser.ClientHandle") -> None:
         self.watchers.left(client.client_id)
+        self.images.frusta.left(client.client_id)
+        self._legends.pop(client.client_id, None)
+        self._faults.pop(client.client_id, None)
+
+    def show_model(self, gaussians: GaussianModel, iteration: int) -> None:
+        """Show another model from now on. Called by the thread that draws."""
+        self._gaussians = self._frames.gaussians = gaussians
+        self.show_numbers(iteration, len(gaussians))
 
     def settings(self) -> Settings:
         """What the controls say now."""
@@ -92,12 +108,14 @@ class Page:
         """Draw and send the frame of a wish. One that cannot be drawn ends nothing. version: of the model."""
         try:
             self.watchers.drew(wish, version)
-            image = self._frames.draw(self.settings(), wish.pose, wish.coarse, version)
+            image, legend = self._frames.draw(self.settings(), wish.pose, wish.coarse, version)
             client = self.server.get_clients().get(wish.client)
             if client is not None:  # it has not left
                 self._send(client, image, wish.coarse)
+                self._explain(wish.client, legend)
+            self._faults.pop(wish.client, None)
         except Exception as error:  # memory, an image that is gone
-            self._notify_fault(wish, first_line(error))
+            self._notify_fault(wish.client, first_line(error))
 
     @staticmethod
     def _send(client: "viser.ClientHandle", image: np.ndarray, coarse: bool) -> None:
@@ -106,14 +124,22 @@ class Page:
         quality = _COARSE_QUALITY if coarse else _FULL_QUALITY
         client.scene.set_background_image(image, "jpeg", jpeg_quality=quality)
 
-    def _notify_fault(self, wish: Wish, fault: str) -> None:
-        if fault == self._fault:
-            return
-        self._fault = fault
-        tqdm.write(f"warning: the viewer could not draw a frame ({fault})", file=sys.stderr)
-        client = self.server.get_clients().get(wish.client)
+    def _explain(self, client: int, legend: Legend) -> None:
+        shown, text = self._legends.get(client), legend.html()
+        if shown is not None and shown.content != text:
+            shown.content, shown.visible = text, bool(text)
+
+    def _notify_fault(self, client: int, fault: str) -> None:
+        if fault != self._faults.get(client):
+            self._faults[client] = fault
+            tqdm.write(f"warning: the viewer could not draw a frame ({fault})", file=sys.stderr)
+            self._tell(self.server.get_clients().get(client), "No picture", fault, color="red")
+
+    @staticmethod
+    def _tell(client: "viser.ClientHandle | None", title: str, body: str, **look: Any) -> None:
+        """Show a message to a browser, unless it has left."""
         if client is not None:
-            client.add_notification("No picture", as_utf8(fault), color="red")
+            client.add_notification(title, as_utf8(body), auto_close_seconds=_READ, **look)
 
     def show_numbers(self, iteration: int, gaussians: int) -> None:
         """Show the iteration and the number of Gaussians."""
@@ -123,30 +149,74 @@ class Page:
         """Show a notification to all, and wait until it has probably been sent."""
         clients = self.server.get_clients().values()
         for client in clients:
-            client.add_notification(title, as_utf8(body))
+            self._tell(client, title, body)
             client.flush()
         if clients:
             time.sleep(_SENT)
+
+    def export_crop(self) -> None:
+        """Write the Gaussians in the crop box into the model's folder. Called by the thread that changes the model."""
+        box = tuple(corner.value for corner in self.view.corners)
+        try:
+            file = self.view.crop_file.path()
+            count = write_crop(file, self._gaussians, box, self._antialiasing)
+        except Exception as error:  # as for a frame; a full disk
+            tqdm.write(f"warning: the crop is not exported ({first_line(error)})", file=sys.stderr)
+            self.notify("Not exported", first_line(error))
+        else:
+            what = f"{count:,} of {len(self._gaussians):,} Gaussians"
+            tqdm.write(as_utf8(f"Exported {what} to {file}"), file=sys.stdout)
+            self.notify("Exported", f"{what}: {CROPS}/{file.name}")
+
+    def _save_path(self, client: "viser.ClientHandle | None", folder: Path) -> None:
+        try:
+            file = self.path.save()
+        except UserError as error:
+            self._tell(client, "Not saved", str(error))
+        else:
+            tqdm.write(as_utf8(f"Saved {file}; its video: render.py -m {folder} --path {file}"), file=sys.stdout)
+            self._tell(client, "Saved", f"{PATHS}/{file.name}; the terminal shows how to make its video")
 
     def stop(self) -> None:
         """Stop to listen."""
         servers.stop(self.server)
 
 
+def write_crop(path: Path, gaussians: GaussianModel, box: tuple[Vector, Vector], antialiasing: bool) -> int:
+    """Write the Gaussians in a box, given by opposite corners, as export.py does; how many. UserError without any."""
+    part = gaussians.part(inside(gaussians.get_xyz, *box), gaussians.active_sh_degree)
+    splats = splats_of(part, antialiasing)
+    splats = tidy(selected(splats, drawable(splats)))
+    if not len(splats):
+        raise UserError("the crop box has no Gaussians; move its corners")
+    write_plain_ply(path, splats)
+    return len(splats)
+
+
 def serve_saved(address: Address, scene: Scene, pipe: argparse.Namespace, white: bool, with_exposures: bool) -> None:
     """Serve the page until a signal comes, and raise that. white, with_exposures: as for `Page`."""
     page = Page(address, scene, pipe, white, with_exposures)
     try:
-        with DeferredInterrupt() as interrupt:
-            while not interrupt.requested:
-                answer(page)
-        raise interrupt.requested
+        raise serve(page)
     finally:
         page.stop()
 
 
+def serve(page: Page) -> type[KeyboardInterrupt] | None:
+    """Do what browsers ask for until a signal comes, which is returned, or until one of them closes the page."""
+    with DeferredInterrupt() as interrupt:
+        while not interrupt.requested and not page.requests.stopped:
+            answer(page)
+    return interrupt.requested
+
+
 def answer(page: Page) -> bool:
-    """Draw and send the next frame that somebody waits for, or wait a little. Whether there was one."""
+    """Do what a button asked for, draw and send the next frame that somebody waits for, or wait a little.
+
+    Whether there was a frame.
+    """
+    if page.requests.take_crop():
+        page.export_crop()
     wish = page.watchers.next()
     if wish is None:
         page.watchers.wait(_WAIT if not page.watchers.any else _BETWEEN)

@@ -1,5 +1,6 @@
 """Contents of a frame: its settings, the pose of a browser's camera, which is checked, and the scene's cameras."""
 
+import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from utils.graphics_utils import camera_center
 if TYPE_CHECKING:
     import viser
 
-COLOUR, DEPTH, OPACITY, COUNT, ERROR = MODES = ("Colour", "Depth", "Opacity", "Gaussians a pixel", "Error")
+COLOUR, DEPTH, OPACITY, COUNT, ERROR = MODES = ("Colour", "Depth", "Opacity", "Gaussians per pixel", "Error")
 ALONE, SLIDER, BESIDE = COMPARISONS = ("Render alone", "Slider", "Side by side")
 
 Vector = tuple[float, float, float]
@@ -99,21 +100,30 @@ class SceneCameras:
             offsets = poses.positions - poses.positions.mean(axis=0)
             self.size = float(np.linalg.norm(offsets, axis=1).max()) * _MARGIN or 1.0
 
-    def up_at(self, camera: Camera) -> Vector:
-        """An upward direction with which a camera looks as its image does, as near to that of all as can be.
+    def up_at(self, axes: np.ndarray) -> Vector:
+        """An upward direction with which a camera with these axes looks as its image does, near that of all.
 
         A browser turns around this direction, so that of a camera that looks down would tilt the horizon.
         """
-        right, own = camera.R[:, 0], -camera.R[:, 1]
+        right, own = axes[:, 0], -axes[:, 1]
         upright = self.up - (self.up @ right) * right
         return tuple((upright if upright @ own > 0.05 else own).tolist())
 
-    def depth(self, camera: Camera) -> float:
-        """Distance of what a camera looks at: of the point nearest to all optical axes, if that is in front of it."""
+    def target_of(self, place: np.ndarray, axes: np.ndarray) -> np.ndarray:
+        """The point that a camera looks at: as far away as the point nearest to all optical axes, if that is ahead."""
         ahead = 0.0
         if self._target is not None:
-            ahead = float((self._target - camera_center(camera.R, camera.T)) @ camera.R[:, 2])
-        return ahead if ahead > 0.1 * self.size else self.size
+            ahead = float((self._target - place) @ axes[:, 2])
+        return place + axes[:, 2] * (ahead if ahead > 0.1 * self.size else self.size)
+
+    def move(self, client: "viser.ClientHandle", place: np.ndarray, axes: np.ndarray, fov: float) -> None:
+        """Move a browser's camera. axes: to the world, as of a camera."""
+        with client.atomic():
+            with contextlib.suppress(ValueError):  # of a browser that says that it looks at its own place
+                client.camera.position = place
+            client.camera.look_at = self.target_of(place, axes)
+            client.camera.up_direction = self.up_at(axes)
+            client.camera.fov = fov
 
     def stands_at(self, pose: Pose, camera: Camera) -> bool:
         """Whether a page's camera has the place and the direction of a scene's camera."""

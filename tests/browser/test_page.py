@@ -1,5 +1,6 @@
 """The viewer's page in a real browser, while a training runs on the CPU in another process."""
 
+import contextlib
 import io
 import json
 import os
@@ -26,9 +27,15 @@ SECONDS = 60  # until something must have happened
 @pytest.fixture(scope="module")
 def training(tmp_path_factory) -> Iterator[tuple[str, Path]]:
     """A training in another process: the address of its page, and its scene."""
-    folder = tmp_path_factory.mktemp("page")
+    with _training(tmp_path_factory.mktemp("page"), 30_000) as (address, scene, _):
+        yield address, scene
+
+
+@contextlib.contextmanager
+def _training(folder: Path, iterations: int) -> Iterator[tuple[str, Path, subprocess.Popen]]:
     make_colmap_scene(folder / "scene")
-    words = ["train.py", "-s", folder / "scene", "-m", folder / "out", "--eval", "--iterations", 30_000, "--viewer", 0]
+    words = ["train.py", "-s", folder / "scene", "-m", folder / "out", "--eval", "--viewer", 0]
+    words += ["--iterations", iterations]
     command = [sys.executable, *map(str, words)]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}  # the browser needs a core, too
     process = subprocess.Popen(
@@ -44,7 +51,7 @@ def training(tmp_path_factory) -> Iterator[tuple[str, Path]]:
             pytest.fail(said)
         # Read on, so that the progress bar never waits for a reader.
         threading.Thread(target=process.stderr.read, daemon=True).start()
-        yield found[1], folder / "scene"
+        yield found[1], folder / "scene", process
     finally:
         process.kill()
         process.wait()
@@ -131,15 +138,20 @@ def test_every_kind_of_control_is_heard(tab, training):
     address, scene = training
     _open(tab, address)
     tab.get_by_role("tab", name="Path").click()
-    _type(tab, "Seconds to the next", "3")
+    _type(tab, "Seconds to next keyframe", "3")
     _type(tab, "Name", "typed")
-    for count in ("1", "2"):
+    keyframes = tab.get_by_role("combobox", name="Keyframes")
+    for listed in ("1: at 0 s", "2: at 3 s", "3: at 6 s"):
         tab.get_by_role("button", name="Add this view").click()
-        _until(lambda count=count: _field(tab, "Keyframes").input_value() == count, "no keyframe was added")
-    tab.get_by_role("button", name="Save path").click()
+        _until(lambda listed=listed: keyframes.input_value() == listed, "no keyframe was added")
+    keyframes.click()
+    tab.get_by_role("option", name="2: at 3 s").click()
+    tab.get_by_role("button", name="Delete the keyframe").click()
+    _until(lambda: keyframes.input_value() == "2: at 6 s", "the keyframe was not deleted")
+    tab.get_by_role("button", name="Save the path").click()
     path = scene.parent / "out/camera_paths/typed.json"
     _until(path.is_file, "the path was not saved")
-    assert [keyframe["seconds"] for keyframe in json.loads(path.read_text())["keyframes"]] == [0, 3]
+    assert [keyframe["seconds"] for keyframe in json.loads(path.read_text())["keyframes"]] == [0, 6]
     tab.get_by_role("tab", name="View").click()
     tab.get_by_role("checkbox", name="Crop box").click()
     _type(tab, "Corner 1", "900")
@@ -150,7 +162,8 @@ def test_every_kind_of_control_is_heard(tab, training):
     _until(lambda: abs(np.median(_picture(tab)[150:], (0, 1)) - red).max() < 5, "the crop box was not heard")
     tab.get_by_role("checkbox", name="Crop box").click()
     _until(lambda: abs(np.median(_picture(tab)[150:], (0, 1)) - red).max() > 20, "the crop box stays")
-    _type(tab, "Background", "rgb(0, 0, 0)")
+    tab.get_by_role("button", name="Reset").click()
+    _until(lambda: _field(tab, "Background").input_value() == "rgb(0, 0, 0)", "the background stays")
 
 
 def test_the_slider_shows_the_photo(tab, training):
@@ -171,10 +184,58 @@ def test_the_slider_shows_the_photo(tab, training):
         small = np.asarray(shown.resize((columns, 64), Image.Resampling.BOX)).astype(float)
         return abs(small - photo[:, :columns])[2:-2, 2:-2].mean()
 
-    field = _field(tab, "Photo's share")
+    field = _field(tab, "Slider")
     field.fill("1")
     field.press("Enter")
     _until(lambda: error() < 10, "the photo is not shown")
     field.fill("0")
     field.press("Enter")
     _until(lambda: error() > 30, "the render's opacity is not shown")
+    tab.get_by_role("tab", name="View").click()
+    tab.get_by_role("combobox", name="Show").click()
+    tab.get_by_role("option", name="Error").click()
+    tab.get_by_text("Difference of photo and render").wait_for()
+    tab.mouse.move(300, 400)
+    tab.mouse.wheel(0, 300)
+    tab.get_by_text("No photo was taken from here").wait_for()
+
+
+def test_the_page_outlives_its_training_and_is_closed_by_its_button(tab, tmp_path):
+    with _training(tmp_path, 300) as (address, _, process):
+        _open(tab, address)
+        tab.get_by_role("tab", name="Training").click()
+        tab.get_by_text("The training is complete.").wait_for(timeout=1000 * SECONDS)
+        assert not tab.get_by_role("button", name="Pause").is_visible()
+        tab.get_by_role("tab", name="View").click()
+        for mode, title in (("Depth", "Depth, far to near, in units of the scene"), 2 * ("Gaussians per pixel",)):
+            tab.get_by_role("combobox", name="Show").click()
+            tab.get_by_role("option", name=mode).click()
+            numbers = tab.locator(f'div:text-is("{title}") ~ div span')
+            _until(lambda numbers=numbers: len(numbers.all_inner_texts()) == 5, f"{mode} has no scale")
+            assert all(float(number.replace(",", "")) >= 0 for number in numbers.all_inner_texts())
+        before = _picture(tab)
+        tab.mouse.move(300, 400)
+        tab.mouse.wheel(0, 600)
+        _until(lambda: abs(_picture(tab) - before).mean() > 4, "the picture does not follow the mouse")
+        tab.get_by_role("tab", name="Training").click()
+        tab.get_by_role("button", name="Close the page").click()
+        assert process.wait(SECONDS) == 0
+
+
+def test_a_click_on_a_drawn_camera_leads_there(tab, training):
+    address, scene = training
+    cameras = json.loads((scene.parent / "out/cameras.json").read_text())
+    camera = cameras[-1]
+    _, down, ahead = np.array(camera["rotation"]).T
+    # From behind it and above.
+    place, target = camera["position"] - 3 * ahead - down, camera["position"] + 0.1 * ahead
+    words = [",".join(map(str, point.tolist())) for point in (place, target)]
+    _open(tab, f"{address}?initialCameraPosition={words[0]}&initialCameraLookAt={words[1]}")
+    tab.get_by_role("tab", name="Photos").click()
+    chosen = tab.get_by_role("combobox", name="Camera")
+    tab.get_by_role("checkbox", name="Draw cameras").click()
+    middle = WINDOW[0] / 2, WINDOW[1] / 2
+    tab.mouse.move(*middle)
+    time.sleep(1.0)
+    tab.mouse.click(*middle, delay=50)
+    _until(lambda: camera["img_name"] in chosen.input_value(), "the click leads nowhere")

@@ -12,14 +12,16 @@ from gaussian_renderer import network_gui, render
 from gaussian_renderer.network_message import Request
 from gaussian_renderer.network_transfer import ViewerLost
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.ply import stored_sh_degree
+from scene.saved_iterations import saved_ply
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
 from splatting.training.observers.saves import Checkpoints
 from splatting.training.run import Run
-from splatting.viewer.page import Page
+from splatting.viewer.page import Page, serve
 from splatting.viewer.server import Address
-from splatting.viewer.tabs import Requests, TrainingTab
+from splatting.viewer.training_tab import TrainingTab
 from splatting.viewer.watchers import MOVING, STILL, Budget, Wish
 from utils.system_utils import UserError, first_line
 
@@ -39,12 +41,13 @@ class PageObserver(Observer):
         self._run, self._checkpoints = run, checkpoints
         address = Address(run.launch.viewer_host, run.launch.viewer)
         self._page = Page(address, run.scene, run.pipe, run.dataset.white_background, run.dataset.train_test_exp)
-        self._requests = Requests(self._page.watchers.wake)
+        self._requests = self._page.requests
         with self._page.tabs.add_tab("Training"):
             self._tab = TrainingTab(self._page.server, self._requests)
         self.budget = Budget()
         self._wish: Wish | None = None
         self._numbers = (0.0, 0, 0.0)  # when they were shown, the iteration, and its seconds of training
+        self._step: Iteration | None = None
 
     def due(self, step: Iteration) -> bool:
         self._wish = None
@@ -55,6 +58,7 @@ class PageObserver(Observer):
         return self._wish is not None or self._requests.any
 
     def stepped(self, step: Iteration) -> None:
+        self._step = step
         if step.due and not step.stopping and (self._wish is not None or self._requests.any):
             with self._run.clock.paused("viewing"):
                 self._act(step)
@@ -84,6 +88,8 @@ class PageObserver(Observer):
                 return
             if requests.take_checkpoint():
                 self._save(step)
+            if requests.take_crop():
+                self._page.export_crop()
             if not requests.paused or requests.take_step():
                 return
             wish = self._page.watchers.next(step.iteration)
@@ -116,11 +122,39 @@ class PageObserver(Observer):
         self._tab.show(speed, run.losses.mean, run.rows)
 
     def ended(self, error: Error) -> None:
-        if error is None:
-            self._page.notify("The training is done", f"See it by python view.py -m {self._run.scene.model_path}")
-        else:
-            self._page.notify("The training has stopped", "Its terminal says why, and how to resume it")
-        self._page.stop()
+        """Let the page stay, unless an error or a signal ended the training, or --viewer_exit closes it."""
+        run = self._run
+        by_button = isinstance(error, KeyboardInterrupt) and self._requests.stopped and not run.interrupt.requested
+        try:
+            if error is not None and not by_button:
+                self._page.notify("The training has stopped", "Its terminal says why, and how to resume it")
+            elif run.launch.viewer_exit:
+                self._page.notify("The training is over", f"See its model by python view.py -m {run.scene.model_path}")
+            else:
+                self._stay("stopped" if by_button else "complete")
+        finally:
+            self._page.stop()
+
+    def _stay(self, how: str) -> None:
+        """Serve the page until it is closed or a signal comes; all of the training is written by now."""
+        run, step = self._run, self._step
+        self._show_numbers(step.iteration)
+        if step.last and step.takes(run.launch.save_iterations):
+            self._show_saved(step.iteration)  # the last step has changed the model after that
+        self._requests.reset()
+        self._tab.end(f"The training is {how}. This page stays until it is closed here, or by Ctrl-C in its terminal.")
+        self._page.notify(f"The training is {how}", "The page stays open")
+        sys.stdout.flush()  # which may be a pipe
+        line = f"The page stays open at {self._page.url} until it is closed there, or Ctrl-C (--viewer_exit closes it)"
+        tqdm.write(line, file=sys.stderr)
+        serve(self._page)
+
+    def _show_saved(self, iteration: int) -> None:
+        run, path = self._run, saved_ply(self._run.scene.model_path, iteration)
+        gaussians = GaussianModel(stored_sh_degree(path))
+        gaussians.load_ply(path, run.dataset.train_test_exp)
+        gaussians.world_offset = run.gaussians.world_offset
+        self._page.show_model(gaussians, iteration)
 
 
 _TICK = 0.1  # seconds between looks whether a signal asks to stop

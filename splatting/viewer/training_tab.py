@@ -1,0 +1,139 @@
+"""The tab of a training, and the requests of the page's buttons, which are fulfilled between two iterations."""
+
+import math
+import threading
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from splatting.viewer.tabs import serialized
+
+if TYPE_CHECKING:
+    import viser
+
+_NO_CURVE = "There is no curve yet: it needs test views (`--eval`), and two scorings of them."
+
+
+class Requests:
+    """What the page's buttons have asked for. asked: called after each request.
+
+    any: whether there is something to do. stopped: the training is to end, or without one the page. Every method may be
+    called from any thread.
+    """
+
+    def __init__(self, asked: Callable[[], None]) -> None:
+        self._asked, self._lock = asked, threading.RLock()
+        self._steps = self._checkpoints = self._crops = 0
+        self.paused = self.stopped = False
+        self.any = False  # read without the lock, in every iteration of a training
+
+    def _set(self, **values: object) -> None:
+        with self._lock:
+            vars(self).update(values)
+            self.any = self.paused or self._checkpoints > 0 or self._crops > 0 or self.stopped
+            self._asked()
+
+    def _take(self, name: str) -> bool:
+        with self._lock:
+            count = getattr(self, name)
+            self._set(**{name: max(0, count - 1)})
+        return count > 0
+
+    def pause(self) -> None:
+        """Wait after this iteration, until `resume` or `step`."""
+        self._set(paused=True)
+
+    def resume(self) -> None:
+        """Go on, and forget steps that were asked for."""
+        self._set(paused=False, _steps=0)
+
+    def step(self) -> None:
+        """Take one iteration, then wait. A training that is not paused waits after its next one."""
+        with self._lock:
+            self._set(_steps=self._steps + self.paused, paused=True)
+
+    def save(self) -> None:
+        """Save a checkpoint after this iteration."""
+        self._set(_checkpoints=1)
+
+    def crop(self) -> None:
+        """Export the Gaussians in the crop box."""
+        self._set(_crops=1)
+
+    def stop(self) -> None:
+        """Save a checkpoint after this iteration, and end the training; without a training, close the page."""
+        self._set(stopped=True)
+
+    def take_step(self) -> bool:
+        """Whether a paused training may take one iteration; if so, that request is fulfilled."""
+        return self._take("_steps")
+
+    def take_checkpoint(self) -> bool:
+        """Whether to save a checkpoint; if so, that request is fulfilled."""
+        return self._take("_checkpoints")
+
+    def take_crop(self) -> bool:
+        """Whether to export the crop box; if so, that request is fulfilled."""
+        return self._take("_crops")
+
+    def reset(self) -> None:
+        """Forget what a training that is over was asked for, except for a crop."""
+        self._set(paused=False, stopped=False, _steps=0, _checkpoints=0)
+
+
+class TrainingTab:
+    """Buttons that make requests; iterations a second, loss, and the error against time."""
+
+    def __init__(self, server: "viser.ViserServer", requests: Requests) -> None:
+        gui = server.gui
+        self._requests = requests
+        self.speed = gui.add_text("Iterations per second", "", disabled=True)
+        self.loss = gui.add_text("Loss", "", disabled=True)
+        self.state = gui.add_markdown("", visible=False)
+        self.pause, step = gui.add_button("Pause"), gui.add_button("One step")
+        save, stop = gui.add_button("Save a checkpoint"), gui.add_button("Stop and save", color="red")
+        self._buttons = self.pause, step, save, stop
+        self.close = gui.add_button("Close the page", hint="ends the program that serves it", visible=False)
+        self.note = gui.add_markdown(_NO_CURVE)
+        axes = ({"label": "seconds of training"}, {"label": "test PSNR (dB)"})
+        self.curve = gui.add_uplot(
+            (np.zeros(1), np.zeros(1)),
+            ({"label": "seconds"}, {"label": "PSNR", "stroke": "#1c7ed6", "width": 2, "points": {"show": True}}),
+            scales={"x": {"time": False}},
+            axes=axes,
+            aspect=1.4,
+            visible=False,
+        )
+        self._rows = 0
+        self.pause.on_click(serialized(lambda _: self._turn()))
+        step.on_click(serialized(lambda _: (requests.step(), self._label())))
+        save.on_click(lambda _: requests.save())
+        for end in (stop, self.close):
+            end.on_click(lambda _: requests.stop())
+
+    def _turn(self) -> None:
+        (self._requests.resume if self._requests.paused else self._requests.pause)()
+        self._label()
+
+    def _label(self) -> None:
+        self.pause.label = "Resume" if self._requests.paused else "Pause"
+
+    def show(self, speed: float | None, loss: float, rows: Sequence[dict[str, float | None]]) -> None:
+        """Show iterations a second (None: not known), the loss, and the curve's rows so far."""
+        self.speed.value = "" if speed is None else f"{speed:.3g}"
+        self.loss.value = f"{loss:.5f}"
+        if len(rows) != self._rows:
+            self._rows = len(rows)
+            points = [(row["seconds"], row["test_psnr"]) for row in rows if row.get("test_psnr") is not None]
+            points = [point for point in points if all(map(math.isfinite, point))]
+            if len(points) > 1:
+                self.curve.data = tuple(np.array(values, dtype=np.float64) for values in zip(*points, strict=True))
+                self.curve.visible, self.note.visible = True, False
+
+    def end(self, text: str) -> None:
+        """Show that the training is over. text: what came of it."""
+        for button in self._buttons:
+            button.visible = False
+        self.note.visible = False
+        self.state.content, self.state.visible, self.close.visible = text, True, True
