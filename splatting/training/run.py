@@ -30,7 +30,7 @@ from splatting.training.objective import LossWatch, Objective
 from splatting.training.resolution import resolution_of
 from splatting.training.restart import resumed
 from splatting.training.schedule import DecidedSchedule
-from splatting.training.strategies import AUTO, USUAL, density_control, of_clock
+from splatting.training.strategies import AUTO, USUAL, density_control, end_in_time, of_clock
 from utils.general_utils import get_expon_lr_func
 from utils.system_utils import compute_device
 
@@ -73,6 +73,8 @@ class Run:
         )
         views = self.group.size if launch.parallel == "views" else 1
         self.schedule = schedule_file.schedule_of(opt, self.start, self.first_iteration, views, self.group.shared)
+        if isinstance(self.schedule, DecidedSchedule):
+            end_in_time(opt)
         checks.warn_of_late_reset(opt, dataset.white_background, self.schedule)
         kind = SpilledGaussians if opt.spill else GaussianModel
         self.gaussians = kind(dataset.sh_degree, opt.optimizer_type)

@@ -25,6 +25,16 @@ def of_clock(opt: argparse.Namespace, cameras: Sequence[Camera], device: torch.d
     return "mcmc" if few and device.type == "cuda" else "budget"
 
 
+def end_in_time(opt: argparse.Namespace) -> None:
+    """Let rows change no longer than by default, 1/2 or 5/6 of the schedule, where that is to go on to its end.
+
+    A run by the clock has few iterations, and needs the last ones for what it has.
+    """
+    for name, part in (("densify_until_iter", 1 / 2), ("mcmc_until_iter", 5 / 6)):
+        if getattr(opt, name) >= opt.iterations:
+            setattr(opt, name, int(part * opt.iterations))
+
+
 def density_control(run: "Run") -> DensityControl:
     """The strategy that --strategy names, for the model and the scene of a run: `of_run` of the file of that name."""
     return import_module(f"{__name__}.{run.opt.strategy}").of_run(run)
