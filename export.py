@@ -26,15 +26,12 @@ from arguments import ModelParams, OptionParser, PipelineParams, get_combined_ar
 from gaussian_renderer.blending import blending_weights, most_important
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import change_on_views
-from scene.gaussian_model import GaussianModel
-from scene.gaussians.ply import stored_sh_degree
-from scene.saved_iterations import find_iteration, saved_ply
-from scene.saved_model import load_saved
+from scene.saved_model import find_save, load_saved, read_model
 from scene.scene import Scene
 from splatting.exports.formats import FORMATS, READABLE, Format, format_of, read_splats
 from splatting.exports.in_scene import splats_of
-from splatting.exports.ply import stored_offset
 from splatting.exports.splats import Splats, drawable, opacities, selected, tidy, with_sh_degree, within_box
+from splatting.files.json_files import OFFSET, read_model_json
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, compute_device, run_cli
 
@@ -57,11 +54,9 @@ def load(args: argparse.Namespace, options: argparse.Namespace, needs_views: boo
         options.images_to_load = 1  # each image is used once or twice
         scene = load_saved(options, args.iteration)
         return splats_of(scene.gaussians, args.antialiasing), scene
-    path = saved_ply(options.model_path, find_iteration(options.model_path, args.iteration))
-    degree = stored_sh_degree(path)
-    gaussians = GaussianModel(options.sh_degree if degree is None else degree)
-    gaussians.load_ply(path)
-    gaussians.world_offset = stored_offset(path)
+    _, path = find_save(options.model_path, args.iteration)
+    gaussians = read_model(path)
+    gaussians.world_offset = tuple(read_model_json(options.model_path).get(OFFSET, (0.0, 0.0, 0.0)))
     return splats_of(gaussians, args.antialiasing), None
 
 

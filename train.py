@@ -39,8 +39,11 @@ def train(
     launch: the options of splatting/training/launch.py.
     """
     dataset.model_path = dataset.model_path or new_folder()
-    print(f"Optimizing {dataset.model_path}")
+    if not launch.start_checkpoint:
+        print(f"Optimizing {dataset.model_path}")
     run = Run(dataset, opt, pipe, launch)
+    if run.start:
+        print(f"Resuming {dataset.model_path} at iteration {run.first_iteration}")
     # No process of several can draw a view for the remote viewer by itself.
     address = None if launch.disable_viewer or run.group.several else (launch.ip, launch.port)
     # Write nothing before every input check has passed: a mistyped option must not overwrite a finished model.

@@ -1,23 +1,75 @@
-"""A saved model, loaded with its scene.
+"""The saves of a model folder: the PLYs of iterations, and checkpoints, which an ended training may leave alone.
 
-The SH degree is read from the PLY, not from cfg_args, because --prune_sh changes the last save alone.
+The SH degree is that of the file, not of cfg_args, because the last save may leave bands out.
 """
 
 import argparse
+import os
+import re
+from pathlib import Path
 
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.ply import stored_sh_degree
-from scene.saved_iterations import find_iteration, saved_ply
+from scene.gaussians.checkpoint import load_checkpoint, unpack
+from scene.gaussians.finite import tell_of_undrawn
+from scene.gaussians.ply import read_ply
+from scene.saved_iterations import saved_ply
 from scene.scene import Scene
+from utils.system_utils import UserError, saved_iterations
+
+_CHECKPOINT = re.compile(r"chkpnt(\d+)\.pth")
+
+
+def find_save(model_path: str | os.PathLike, iteration: int) -> tuple[int, Path]:
+    """The iteration, -1: the newest one, and its PLY, or its checkpoint where it has none.
+
+    UserError if the folder has no save of it.
+    """
+    folder = Path(model_path)
+    matches = [(_CHECKPOINT.fullmatch(path.name), path) for path in sorted(folder.glob("chkpnt*.pth"))]
+    saves = {int(match[1]): path for match, path in matches if match}
+    saves |= {n: path for n in saved_iterations(folder / "point_cloud") if (path := saved_ply(folder, n)).is_file()}
+    if not saves:
+        raise UserError(f"no saved model in {folder}; train it first, or name its folder by -m")
+    if iteration != -1 and iteration not in saves:
+        there = ", ".join(map(str, sorted(saves)))
+        raise UserError(f"iteration {iteration} was never saved in {folder}; give one of {there}")
+    found = max(saves) if iteration == -1 else iteration
+    return found, saves[found]
+
+
+def read_model(path: Path, sh_degree: int | None = None) -> GaussianModel:
+    """The Gaussians of a PLY or checkpoint, opened once; all SH bands are active.
+
+    sh_degree: that the file must have, None: any. UserError as from read_ply and load_checkpoint.
+    """
+    if path.suffix == ".pth":
+        capture, _ = load_checkpoint(path)
+        degree = _degree(capture[3].shape[1])  # of f_rest
+        gaussians = GaussianModel(degree if sh_degree is None else sh_degree)
+        rows = unpack(capture, gaussians._attributes, gaussians.max_sh_degree).rows
+    else:
+        rows = read_ply(path, sh_degree)
+        gaussians = GaussianModel(_degree(rows["f_rest"].shape[1]))
+    tell_of_undrawn(rows, path)
+    gaussians.take_whole(rows)
+    gaussians.active_sh_degree = gaussians.max_sh_degree
+    return gaussians
+
+
+def _degree(coefficients: int) -> int:
+    """SH degree of so many coefficients above band 0."""
+    return round((coefficients + 1) ** 0.5) - 1
 
 
 def load_saved(options: argparse.Namespace, iteration: int, sh_degree: int | None = None) -> Scene:
-    """Scene of the model options, whose `gaussians` are those of a saved iteration, -1: the last one.
+    """Scene of the model options, whose `gaussians` are those of a saved iteration, -1: the newest one.
 
-    sh_degree: degree that the PLY must have, None: any. UserError as from Scene and GaussianModel.load_ply.
+    sh_degree: degree that the file must have, None: any. UserError as from Scene and the functions above.
     """
-    iteration = find_iteration(options.model_path, iteration)
-    if sh_degree is None:
-        sh_degree = stored_sh_degree(saved_ply(options.model_path, iteration))
-    gaussians = GaussianModel(options.sh_degree if sh_degree is None else sh_degree)
-    return Scene(options, gaussians, load_iteration=iteration, shuffle=False)
+    iteration, path = find_save(options.model_path, iteration)
+    gaussians = read_model(path, sh_degree)
+    scene = Scene(options, gaussians, load_iteration=iteration, shuffle=False, start=False)
+    print(f"Loaded the model of iteration {iteration}" + (f" from {path}" if path.suffix == ".pth" else ""))
+    if getattr(options, "train_test_exp", False):
+        gaussians.load_exposures(options.model_path, scene.info.train_cameras)
+    return scene

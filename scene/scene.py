@@ -32,10 +32,10 @@ class Scene:
     """Views and model of one run.
 
     args: model options, as ModelParams.extract gives them; the reference's of 2023 suffice. load_iteration:
-    None calls `create_gaussians` and `write_inputs`, unless `start` is False, which leaves them to the caller; -1 loads
-    the last saved iteration, N that one. shuffle: mix the order of the views (always the same way). resolution_scales:
-    factors by which views are made smaller, one list of cameras each. train_cameras, test_cameras: these lists by
-    scale, which may be replaced. info: the dataset as read. cameras_extent: E in world units, from the training views.
+    None calls `create_gaussians` and `write_inputs`; -1 loads the last saved iteration, N that one. start: False leaves
+    all of this to the caller. shuffle: mix the order of the views (always the same way). resolution_scales: factors by
+    which views are made smaller, one list of cameras each. train_cameras, test_cameras: these lists by scale, which may
+    be replaced. info: the dataset as read. cameras_extent: E in world units, from the training views.
     images: the store of the decoded photos. sharing: processes that divide them (ImageStore).
     """
 
@@ -51,7 +51,9 @@ class Scene:
     ) -> None:
         self.model_path = args.model_path
         self.gaussians = gaussians
-        self.loaded_iter = None if load_iteration is None else find_iteration(self.model_path, load_iteration)
+        self.loaded_iter = load_iteration
+        if load_iteration is not None and start:
+            self.loaded_iter = find_iteration(self.model_path, load_iteration)
         self._halves = bool(getattr(args, "train_test_exp", False))
         self.info = self._read(args)
         self.cameras_extent = self.info.extent
@@ -64,11 +66,13 @@ class Scene:
         self.images.plan(self._pictures(self.train_cameras), self._pictures(self.test_cameras))
 
         gaussians.world_offset = tuple(self.info.offset.tolist())
+        if not start:
+            return
         if self.loaded_iter is not None:
             print(f"Loading trained model at iteration {self.loaded_iter}")
             exposed = self.info.train_cameras if self._halves else None
             load_model(gaussians, self.model_path, saved_ply(self.model_path, self.loaded_iter), exposed)
-        elif start:
+        else:
             self.create_gaussians()
             self.write_inputs()
 

@@ -17,9 +17,9 @@ import render
 import train
 from gaussian_renderer.blending import blending_weights, most_important
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.ply import read_ply, stored_sh_degree
+from scene.gaussians.ply import read_ply
 from scene.readers.point_cloud import read_point_cloud
-from scene.saved_model import load_saved
+from scene.saved_model import load_saved, read_model
 from splatting.camera_paths.keyframes import CameraPath, Keyframe
 from splatting.exports.formats import format_of, is_point_cloud, read_splats
 from splatting.exports.in_scene import model_of, splats_of
@@ -78,10 +78,7 @@ def _export_options(*argv: object) -> tuple:
 def _train(scene: Path, out: Path, *argv: object) -> GaussianModel:
     train.main(["-s", str(scene), "-m", str(out), "--iterations", "1", "--no_curve", "--keep_unseen",
                 "--prune_sh", "-1", *map(str, argv)])  # fmt: skip
-    path = out / "point_cloud/iteration_1/point_cloud.ply"
-    gaussians = GaussianModel(stored_sh_degree(path))
-    gaussians.load_ply(path)
-    return gaussians
+    return read_model(out / "point_cloud/iteration_1/point_cloud.ply")
 
 
 @pytest.mark.parametrize(

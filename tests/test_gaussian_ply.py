@@ -7,8 +7,8 @@ from gaussians import model, parameters
 from plyfile import PlyData, PlyElement
 
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.ply import stored_sh_degree
 from scene.readers.point_cloud import read_point_cloud
+from scene.saved_model import read_model
 from splatting.exports.formats import read_splats
 from utils.system_utils import UserError
 
@@ -150,7 +150,7 @@ def test_a_header_that_promises_more_rows_than_the_file_has(tmp_path, kind, coun
     model(2).save_ply(tmp_path / "a.ply")
     content = (tmp_path / "a.ply").read_bytes().replace(b"element vertex 2", f"element vertex {count}".encode())
     (tmp_path / "a.ply").write_bytes(content.replace(b"binary_little_endian", kind.encode()))
-    for read in (stored_sh_degree, _loaded, read_splats):
+    for read in (read_model, _loaded, read_splats):
         with pytest.raises(UserError, match=PROMISES):
             read(tmp_path / "a.ply")
 
@@ -177,7 +177,7 @@ def test_rows_are_counted_however_the_header_is_written(tmp_path, old, new):
     header, path = "ply\nformat ascii 1.0\nelement vertex 1\nproperty double x\nend_header\n", tmp_path / "a.ply"
     many = header if "junk" in new else header.replace("vertex 1", "vertex 100000000000")
     path.write_bytes((many.replace(old, new) + "0\n").encode())
-    for read in (stored_sh_degree, _loaded, read_splats, read_point_cloud):
+    for read in (read_model, _loaded, read_splats, read_point_cloud):
         with pytest.raises(UserError, match=PROMISES):
             read(path)
 

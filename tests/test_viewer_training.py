@@ -20,9 +20,8 @@ from viser_client import Client  # noqa: E402
 from waiting import wait_for  # noqa: E402
 
 import train  # noqa: E402
-from scene.gaussian_model import GaussianModel  # noqa: E402
 from scene.gaussians.checkpoint import load_checkpoint  # noqa: E402
-from scene.gaussians.ply import stored_sh_degree  # noqa: E402
+from scene.saved_model import read_model  # noqa: E402
 from splatting.training.observers import viewers as observed  # noqa: E402
 from splatting.viewer.page import serve  # noqa: E402
 from utils.system_utils import UserError  # noqa: E402
@@ -250,12 +249,6 @@ class _Staying(Watched):
             wait_for(lambda: self.requests.stopped)
 
 
-def _saved(path: Path) -> GaussianModel:
-    gaussians = GaussianModel(stored_sh_degree(path))
-    gaussians.load_ply(path)
-    return gaussians
-
-
 def test_the_page_stays_after_its_training_and_shows_the_saved_model(colmap_scene, tmp_path, monkeypatch, capfd):
     def visit(watched: _Staying) -> tuple:
         shown, picture = watched.page._gaussians, watched.picture()
@@ -266,7 +259,7 @@ def test_the_page_stays_after_its_training_and_shows_the_saved_model(colmap_scen
     # The last iteration is one of densification, after the model is saved.
     path = _train(colmap_scene, tmp_path / "out", "--no_curve", stays=True)
     shown, picture, count = watched.seen[0]
-    saved = _saved(path)
+    saved = read_model(path)
     assert len(watched.observer._run.gaussians) > len(saved) == len(shown) == int(count.replace(",", ""))
     assert torch.equal(shown.get_xyz, saved.get_xyz) and picture.std() > 5
     said = capfd.readouterr().err

@@ -71,14 +71,6 @@ def offset_comments(world_offset: Sequence[float]) -> list[str]:
     return [f"world_offset {' '.join(map(repr, world_offset))}"] if any(world_offset) else []
 
 
-def stored_sh_degree(path: str | os.PathLike) -> int | None:
-    """SH degree by the f_rest properties of a Gaussian PLY; None when they fit no known degree.
-
-    UserError when the file is missing or cannot be read.
-    """
-    return _degree(read_vertices(path).dtype.names or ())
-
-
 def _degree(names: Iterable[str]) -> int | None:
     rest = sum(name.startswith("f_rest_") for name in names)
     return next((degree for degree in range(4) if 3 * ((degree + 1) ** 2 - 1) == rest), None)

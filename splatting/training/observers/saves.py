@@ -52,7 +52,7 @@ class Saves(Observer):
 
 
 class Checkpoints(Observer):
-    """Writes chkpntN.pth when planned, and when a signal stops the training."""
+    """Writes chkpntN.pth when planned, and when a signal stops the training, which also saves the PLY."""
 
     def __init__(self, run: Run, watch: DivergenceWatch) -> None:
         self._run = run
@@ -77,8 +77,11 @@ class Checkpoints(Observer):
             save_schedule(run, step)  # first: a checkpoint never lacks its place in the schedule
             save_checkpoint(path, run.gaussians.capture(), step.iteration)
             run.log.add(step.iteration, seconds, gaussians=run.gaussians.total, loss=run.losses.mean)
+            if step.stopping:
+                run.scene.save(step.iteration)
         if step.stopping:
-            tqdm.write(f"resume with --start_checkpoint {path}", file=sys.stderr)
+            look = f"stopped at iteration {step.iteration}; look at the model with view.py -m {run.scene.model_path}"
+            tqdm.write(f"{look}, resume with --start_checkpoint {path}", file=sys.stderr)
 
 
 def save_schedule(run: Run, step: Iteration) -> None:

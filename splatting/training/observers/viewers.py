@@ -12,8 +12,8 @@ from gaussian_renderer import network_gui, render
 from gaussian_renderer.network_message import Request
 from gaussian_renderer.network_transfer import ViewerLost
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.ply import stored_sh_degree
 from scene.saved_iterations import saved_ply
+from scene.saved_model import read_model
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
@@ -151,8 +151,9 @@ class PageObserver(Observer):
 
     def _show_saved(self, iteration: int) -> None:
         run, path = self._run, saved_ply(self._run.scene.model_path, iteration)
-        gaussians = GaussianModel(stored_sh_degree(path))
-        gaussians.load_ply(path, run.dataset.train_test_exp)
+        gaussians = read_model(path)
+        if run.dataset.train_test_exp:
+            gaussians.load_exposures(run.scene.model_path, run.scene.info.train_cameras)
         gaussians.world_offset = run.gaussians.world_offset
         self._page.show_model(gaussians, iteration)
 

@@ -1,0 +1,100 @@
+"""What a model folder has: the newest of its PLYs and checkpoints is loaded, and opened once."""
+
+import argparse
+import shutil
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+from gaussians import model, parameters
+from trainings import train_on
+
+import export
+import render
+from arguments import ModelParams
+from scene.gaussians import ply
+from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
+from scene.saved_model import find_save, load_saved, read_model
+from splatting.training import loop
+from utils.system_utils import UserError
+
+WORDS = ("--eval", "-r", 24, "--no_curve", "--disable_viewer", "--test_iterations", -1, "--quiet")
+
+
+def _save(folder: Path, iteration: int, checkpoint: bool = False) -> None:
+    gaussians = model(5, degree=2, seed=iteration)
+    if checkpoint:
+        save_checkpoint(folder / f"chkpnt{iteration}.pth", gaussians.capture(), iteration)
+    else:
+        gaussians.save_ply(folder / f"point_cloud/iteration_{iteration}/point_cloud.ply")
+
+
+def test_the_newest_of_plys_and_checkpoints(tmp_path):
+    with pytest.raises(UserError, match="no saved model in"):
+        find_save(tmp_path, -1)
+    _save(tmp_path, 30)
+    _save(tmp_path, 7, checkpoint=True)
+    _save(tmp_path, 30, checkpoint=True)
+    assert [find_save(tmp_path, n)[1].suffix for n in (-1, 7, 30)] == [".ply", ".pth", ".ply"]
+    _save(tmp_path, 200, checkpoint=True)
+    (tmp_path / "chkpnt300.pth.tmp").write_bytes(b"")
+    assert find_save(tmp_path, -1) == (200, tmp_path / "chkpnt200.pth")
+    with pytest.raises(UserError, match="iteration 8 was never saved .*give one of 7, 30, 200"):
+        find_save(tmp_path, 8)
+
+
+def test_both_kinds_have_the_same_gaussians(tmp_path):
+    _save(tmp_path, 7)
+    _save(tmp_path, 7, checkpoint=True)
+    of_ply, of_checkpoint = (
+        read_model(tmp_path / name) for name in ("point_cloud/iteration_7/point_cloud.ply", "chkpnt7.pth")
+    )
+    for name, values in parameters(of_ply).items():
+        assert torch.equal(values, parameters(of_checkpoint)[name]), name
+    assert of_checkpoint.active_sh_degree == of_checkpoint.max_sh_degree == 2
+    with pytest.raises(UserError, match="--sh_degree"):
+        read_model(tmp_path / "chkpnt7.pth", 3)
+
+
+def test_a_ply_is_opened_once_to_be_rendered(colmap_scene, tmp_path, monkeypatch):
+    train_on(colmap_scene, tmp_path, *WORDS, "--iterations", 2)
+    opened, read = [], ply.read_elements
+    monkeypatch.setattr(ply, "read_elements", lambda path: (opened.append(path), read(path))[1])
+    options = argparse.Namespace(source_path=str(colmap_scene), model_path=str(tmp_path))
+    load_saved(ModelParams(argparse.ArgumentParser()).extract(options), -1)
+    assert len(opened) == 1
+
+
+def test_an_interrupted_training_can_be_looked_at(colmap_scene, tmp_path, monkeypatch, capfd):
+    taker = loop.step_taker
+
+    def interrupting(run):
+        taken = taker(run)
+        take = taken.take
+
+        def at(step, tell) -> None:
+            take(step, tell)
+            if step.iteration == 20:
+                signal.raise_signal(signal.SIGINT)
+
+        taken.take = at
+        return taken
+
+    monkeypatch.setattr(loop, "step_taker", interrupting)
+    with pytest.raises(KeyboardInterrupt):
+        train_on(colmap_scene, tmp_path, *WORDS, "--iterations", 40)
+    said = capfd.readouterr().err
+    assert f"stopped at iteration 20; look at the model with view.py -m {tmp_path}, resume with" in said
+    path = tmp_path / "point_cloud/iteration_20/point_cloud.ply"
+    assert torch.equal(read_model(path).get_xyz, load_checkpoint(tmp_path / "chkpnt20.pth")[0][1])
+    monkeypatch.undo()
+    start = "--start_checkpoint", tmp_path / "chkpnt20.pth"
+    train_on(colmap_scene, tmp_path / "resumed", *WORDS[:-1], "--iterations", 21, *start)
+    assert f"Resuming {tmp_path / 'resumed'} at iteration 20" in capfd.readouterr().out
+
+    shutil.rmtree(tmp_path / "point_cloud")  # as after a crash: a checkpoint alone
+    for command, words in ((render, ("--skip_train",)), (export, ("--to", tmp_path / "a.splat"))):
+        monkeypatch.setattr("sys.argv", ["command", "-m", str(tmp_path), "--quiet", *map(str, words)])
+        command.main()
+    assert list((tmp_path / "test/ours_20/renders").iterdir()) and (tmp_path / "a.splat").stat().st_size > 1000
