@@ -663,8 +663,7 @@ def test_a_time_budget_takes_the_strategy_that_is_best_in_it(colmap_scene, tmp_p
     [(43, 10, "cpu", "budget"), (43, 10, "cuda", "budget"), (43, 11, "cuda", "mcmc"), (60, 90, "cuda", "budget")],
 )
 def test_few_photos_and_much_time_on_a_gpu_take_mcmc(views, seconds, device, strategy):
-    opt = argparse.Namespace(time_budget=seconds)
-    assert of_clock(opt, [None] * views, torch.device(device)) == strategy
+    assert of_clock(seconds, [None] * views, torch.device(device)) == strategy
 
 
 @pytest.mark.parametrize("strategy", ["adc", "mcmc"])

@@ -108,7 +108,7 @@ class Run:
     def _strategy_by_the_clock(self) -> str:
         if self.opt.schedule:
             return self.schedule.strategy or USUAL
-        strategy = of_clock(self.opt, self.scene.getTrainCameras(), self.device)
+        strategy = of_clock(self.opt.time_budget, self.scene.getTrainCameras(), self.device)
         print(f"--time_budget takes --strategy {strategy}, which is best here; name another one to compare")
         return strategy
 

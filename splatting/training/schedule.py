@@ -162,6 +162,7 @@ class DecidedSchedule(Schedule):
         self.blocks = list(decided.blocks)
         self.ends = decided.ended
         self.sizes, self.levels, self.strategy = decided.resolution_schedule, decided.levels, decided.strategy
+        self.seconds = decided.time_budget
 
     def progress(self, iteration: int) -> float:
         """Part of the schedule that is done after an iteration, 0 to 1."""
@@ -224,7 +225,6 @@ class TimeBudget(DecidedSchedule):
         self._open = self.sizes == "auto"
         if self._open:
             self.sizes = "none"
-        self._budget = decided.time_budget
         self._speed: float | None = None  # seconds of an iteration
         self._speeds: list[float] = []  # of the last three blocks
         self._measured = 0  # blocks of this run
@@ -235,7 +235,7 @@ class TimeBudget(DecidedSchedule):
         if not self.blocks or iteration > self.blocks[-1].last:
             seconds = self._share(seconds)
             self._measure(seconds)
-            if self._open and self._measured > 2 and seconds > _KNOWN * self._budget:
+            if self._open and self._measured > 2 and seconds > _KNOWN * self.seconds:
                 self._choose_sizes(iteration - 1, seconds)
             self._decide(seconds)
 
@@ -258,7 +258,7 @@ class TimeBudget(DecidedSchedule):
         """Take smaller views if few iterations are possible: from the next one on, and all of that is recorded."""
         self._open = False
         now = (self.schedule_step(done) + 0.5) / self.length
-        possible = done + max(self._budget - seconds, 0.0) / self._speed
+        possible = done + max(self.seconds - seconds, 0.0) / self._speed
         short = self.length / possible >= SHORT and now < PYRAMID[1][0]
         self.sizes = "pyramid" if short else "none"
         self.levels = ((now, PYRAMID[0][1]), *PYRAMID[1:]) if short else ()
@@ -279,26 +279,26 @@ class TimeBudget(DecidedSchedule):
         self.blocks.append(Block(before + count, done, step, round(seconds, 6)))
         if final and self._measured <= 1:
             tqdm.write(
-                f"warning: --time_budget {self._budget:g} is too short for {self.ends + 1} iterations, so training "
+                f"warning: --time_budget {self.seconds:g} is too short for {self.ends + 1} iterations, so training "
                 f"ends with iteration {self.ends}; give more seconds, or lower --resolution (-r)",
                 file=sys.stderr,
             )
 
     def _iterations(self, seconds: float, undone: float) -> float:
         """Iterations that the run has yet to take, infinite where no speed is known. undone: part of the schedule."""
-        left = max(self._budget - seconds, 0.0)
+        left = max(self.seconds - seconds, 0.0)
         if self._speed is None:
             return math.inf if left else 0.0
         if not self._speeds:
             return left / self._speed
-        if not self._told and seconds + undone * self._budget / _MOST_SHARE > _TOLD * self._budget:
+        if not self._told and seconds + undone * self.seconds / _MOST_SHARE > _TOLD * self.seconds:
             self._told = True
             tqdm.write(
                 "warning: some iterations took so long that the training needs about "
-                f"{seconds + undone * self._budget / _MOST_SHARE:.0f} s, not the {self._budget:g} s of --time_budget",
+                f"{seconds + undone * self.seconds / _MOST_SHARE:.0f} s, not the {self.seconds:g} s of --time_budget",
                 file=sys.stderr,
             )
-        usual = statistics.median_low(self._speeds) / self._budget  # part of the schedule, of an iteration
+        usual = statistics.median_low(self._speeds) / self.seconds  # part of the schedule, of an iteration
         return max(left / self._speed, math.ceil(undone / (_MOST_SHARE * usual)))
 
     def _count(self, iterations: float) -> tuple[int, bool]:
@@ -310,7 +310,7 @@ class TimeBudget(DecidedSchedule):
         if self._measured == 1:
             return 1, iterations < 0.5
         previous = self.blocks[-1].last - self._last(len(self.blocks) - 1)
-        block = max(1.0, min(_MOST_GROWTH * previous, PART * self._budget / self._speed))
+        block = max(1.0, min(_MOST_GROWTH * previous, PART * self.seconds / self._speed))
         if iterations < _LAST * block:
             return max(1, int(iterations + 0.5)), True
         return int(block), False

@@ -19,9 +19,9 @@ AUTO, USUAL = "auto", "adc"
 FEW, SECONDS = 50, 0.25  # training photos; seconds for each
 
 
-def of_clock(opt: argparse.Namespace, cameras: Sequence[Camera], device: torch.device) -> str:
-    """The strategy that --strategy auto takes for a new run with --time_budget."""
-    few = len(cameras) <= FEW and opt.time_budget >= SECONDS * len(cameras)
+def of_clock(seconds: float, cameras: Sequence[Camera], device: torch.device) -> str:
+    """The strategy that is best in so many seconds, which --strategy auto takes for a new run with --time_budget."""
+    few = len(cameras) <= FEW and seconds >= SECONDS * len(cameras)
     return "mcmc" if few and device.type == "cuda" else "budget"
 
 
