@@ -30,7 +30,7 @@ from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.report import make_report, write_report
 from splatting.evaluation.results import read_earlier, read_run
 from splatting.evaluation.stages import Failure, StageFailed
-from splatting.evaluation.tables import Table, cheapest_table, result_tables
+from splatting.evaluation.tables import MAIN, Table, reached_table, result_tables
 from splatting.files.folders import locked
 from splatting.files.listing import markdown_table
 from utils.system_utils import UserError, mkdir_p, run_cli
@@ -70,8 +70,8 @@ def _parser() -> ArgumentParser:
     add("--seeds", type=int, nargs="+", default=[], metavar="N",
         help="train with each of these seeds and report mean and standard deviation (default: once)")  # fmt: skip
     add("--configs", type=Path, metavar="FILE",
-        help='train with each option set of a JSON file, {"name": ["--sh_degree", "1"], ...}, and report which is '
-        f"cheapest for a given error; {' or '.join(shipped())} names a file that comes with this program "
+        help='train with each option set of a JSON file, {"name": ["--sh_degree", "1"], ...}, and report the '
+        f"seconds that each takes to a given error; {' or '.join(shipped())} names a file that comes with this program "
         "(default: once)")  # fmt: skip
     add("--peer", nargs=2, action="append", default=[], metavar=("NAME", "FILE"),
         help="draw another program's error against time beside ours, from a CSV file with the columns seconds and "
@@ -166,10 +166,10 @@ def _report(
     named = {(peer["scene"], peer["name"]): peer for peer in (*earlier["peers"], *peers) if peer["scene"] in scenes}
     report = make_report(command, results, list(named.values()), earlier["commands"])
     write_report(report, output)
-    for table in result_tables(report["summary"]):
+    for table in result_tables(report["summary"], MAIN):
         print(f"\n{table.title}\n{_text(table)}" if table.title else _text(table))
-    for scene, rows in report["cheapest"].items():
-        print(f"\n{scene}: cheapest option set for a given error\n{_text(cheapest_table(rows))}")
+    for scene, found in report["reached"].items():
+        print(f"\n{scene}: seconds of training to reach a test PSNR\n{_text(reached_table(found))}")
     print(f"\nreport: {output / 'report.html'}")
     return scored
 

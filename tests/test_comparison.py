@@ -8,17 +8,15 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from report_runs import curve, run_of, set_runs
 
 import train
 from splatting.evaluation import configs
 from splatting.evaluation.comparison import (
-    QUANTITIES,
-    cheapest,
     comparable_sets,
     compare,
     default_set,
     fronts,
-    gaussians_to_reach,
     pareto_front,
     published_tables,
     reached,
@@ -29,7 +27,6 @@ from splatting.evaluation.comparison import (
     summarise,
 )
 from splatting.evaluation.configs import read_configs, shipped
-from splatting.evaluation.error_curve import COLUMNS
 from splatting.evaluation.plan import DATASETS
 from splatting.evaluation.report import make_report, render
 from splatting.evaluation.results_page import BEGIN, END, replace_results, results_text
@@ -39,40 +36,6 @@ from splatting.files.listing import markdown_table
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]
-
-
-def curve(*points: tuple[float, float | None, float]) -> list[dict]:
-    """Rows of (seconds, test PSNR, Gaussians)."""
-    return [
-        dict.fromkeys(COLUMNS) | {"iteration": 10 * i, "seconds": s, "test_psnr": p, "gaussians": n}
-        for i, (s, p, n) in enumerate(points, 1)
-    ]
-
-
-def _run(config: str | None, seed: int, *points: tuple[float, float, int], **more) -> dict:
-    """A finished run of "attic" with a curve, saved at 100 bytes a Gaussian."""
-    end, (seconds, psnr, gaussians) = 10 * len(points), points[-1]
-    values = dict.fromkeys(QUANTITIES) | {
-        "PSNR": psnr, "seconds": seconds, "gaussians": gaussians, "gaussians_saved": gaussians,
-        "ply_mb": gaussians / 1e4, "views": 2,
-    }  # fmt: skip
-    return {
-        "added_options": [], "apart": False, "config": config, "conventions": {}, "cpu_seconds": None,
-        "curve": curve(*points), "failure": None, "final_iteration": end, "finished": True, "group": "scenes",
-        "ground_truth_sha256": "a" * 64, "iterations": {str(end): values}, "lines": [], "machine": {},
-        "model": f"attic/{config}/{seed}", "open_ended": False, "options": [], "page": None, "peak": None,
-        "scene": "attic", "seed": seed, "source": None, "split": None, "test_sizes": [[96, 64]],
-        "views": {"test": 2, "train": 7}, "wall_seconds": None, "worst_views": [],
-    } | more  # fmt: skip
-
-
-def _runs() -> list[dict]:
-    """Three sets of two seeds: `fast` gets there in half the seconds, `small` in none, but it has few Gaussians."""
-    return [
-        *(_run("adc", i, (10, 20.0, 100), (20, 30.0, 200), (40, end, 300)) for i, end in enumerate((31.0, 31.4))),
-        *(_run("fast", i, (5, 20.0, 100), (10, 30.0, 400), (20, end, 500)) for i, end in enumerate((32.2, 32.2))),
-        *(_run("small", i, (10, 20.0, 50), (30, 29.0, 60), (50, end, 70)) for i, end in enumerate((30.0, 30.8))),
-    ]
 
 
 def test_spread():
@@ -92,26 +55,9 @@ def test_pareto_front_is_what_nothing_beats(points):
 
 def test_seconds_to_reach_between_points():
     rows = curve((1, 10, 100), (100, 20, 300), (200, 19, 250), (300, 30, 400))
-    assert [seconds_to_reach(rows, level) for level in (9, 20, 31)] == [1, 100, None]
-    assert seconds_to_reach(rows, 15) == 100  # too far from the point before to interpolate
+    assert [seconds_to_reach(rows, level) for level in (9, 31)] == [None, None]  # before the first point; never
+    assert seconds_to_reach(rows, 15) is None  # too far from the point before to interpolate
     assert seconds_to_reach(rows, 24.5) == pytest.approx((200 * 300) ** 0.5)  # halfway in the logarithm
-    assert [gaussians_to_reach(rows, level) for level in (20, 18, 31)] == [300, 250, None]
-
-
-def test_cheapest_needs_every_seed_and_takes_the_mean():
-    sets = {
-        "slow": [curve((10, 20, 50), (100, 30.07, 60)), curve((10, 20, 50), (100, 30.07, 60))],
-        "fast": [curve((1, 20, 80), (2, 29, 90)), curve((3, 20, 70), (30, 28, 90))],
-    }
-    rows = {row["psnr"]: row for row in cheapest({name: [{"curve": x} for x in seeds] for name, seeds in sets.items()})}
-    assert cheapest({}) == [] == cheapest({"a": [{"curve": []}], "b": [{"curve": curve((1, None, 2))}]})
-    assert list(rows) == [30.0, 29.9, 29.8, 29.5, 29.0, 28.0, 27.0, 25.0, 22.0]
-    assert rows[29.0]["seconds"]["config"] == "slow" and set(rows[29.0]["seconds"]["all"]) == {"slow"}
-    seconds = rows[28.0]["seconds"]
-    assert seconds["config"] == "fast" and set(seconds["all"]) == {"slow", "fast"}
-    assert seconds["value"] == pytest.approx((2 ** (8 / 9) + 30) / 2)
-    assert seconds["std"] == pytest.approx((30 - 2 ** (8 / 9)) / 2**0.5)
-    assert rows[28.0]["gaussians"] == {"all": {"slow": 60, "fast": 90}, "config": "slow", "std": 0.0, "value": 60}
 
 
 def test_subsets_are_no_peak():
@@ -124,7 +70,7 @@ def test_subsets_are_no_peak():
 
 
 def test_a_failed_seed_is_left_out_and_named():
-    runs = [_run(None, seed, (1, 1.0 + seed, 9), failure=[None, {"stage": "train"}][seed == 1]) for seed in range(3)]
+    runs = [run_of(None, seed, (1, 1.0 + seed, 9), failure=[None, {"stage": "train"}][seed == 1]) for seed in range(3)]
     (row,) = summarise(runs)
     assert row["PSNR"] == {"mean": 2.0, "std": pytest.approx(2**0.5), "values": [1.0, 3.0]}
     assert row["seeds"] == [0, 2] and row["failed_seeds"] == [1]
@@ -133,24 +79,23 @@ def test_a_failed_seed_is_left_out_and_named():
 @pytest.mark.parametrize(
     ("finals", "levels"),
     [
-        ([30.43, 30.11], [30.4, 30.3, 30.2, 30.0]),
-        ([30.3, 29.8], [30.0, 29.5]),
+        ([30.43, 30.11], [30.0, 29.5, 29.0, 28.0]),
         ([30.43, 27.1], [30.0, 29.5, 29.0, 28.0, 26.0]),
-        ([30.43, 20.0], [30.0, 29.0, 28.0, 26.0, 22.0]),
-        ([30.1, 30.1], [30.1]),
+        ([30.43, 20.0], [30.0, 29.5, 29.0, 28.0, 26.0, 22.0, 14.0]),
+        ([30.5, 26.5], [30.5, 30.0, 29.5, 28.5, 26.5, 22.5]),
     ],
 )
 def test_levels_are_round_and_lie_around_the_final_ones(finals, levels):
     assert round_levels(finals) == levels
 
 
-def test_seconds_gaussians_and_megabytes_to_reach_a_level():
-    found = reached(comparable_sets(_runs(), "attic"))
+def test_seconds_and_gaussians_to_reach_a_level():
+    found = reached(comparable_sets(set_runs(), "attic"))
     levels = [(level["psnr"], level["of_default"]) for level in found["levels"]]
     assert levels == [(32.0, False), (31.5, False), (pytest.approx(31.2, abs=2e-6), True), (31.0, False), (30.0, False)]
-    own, fast, small = (found["sets"][name]["cells"] for name in ("adc", "fast", "small"))
+    own, fast, small = (found["sets"][name] for name in ("adc", "fast", "small"))
     assert fast[4]["seconds"]["values"] == [pytest.approx(10.0)] * 2 and fast[4]["seconds"]["std"] == 0
-    assert fast[4]["gaussians"]["mean"] == 400 and fast[4]["mb"]["mean"] == pytest.approx(0.04)
+    assert fast[4]["gaussians"]["mean"] == 400
     assert fast[4]["ratio"] == pytest.approx(0.5) and own[4]["ratio"] == 1.0
     assert small[4]["reached"] == 2 and small[4]["ratio"] > 2
     assert small[3]["reached"] == 0 and small[3]["seconds"]["mean"] is None and small[3]["ratio"] is None
@@ -162,28 +107,39 @@ def test_seconds_gaussians_and_megabytes_to_reach_a_level():
     assert fast[2]["ratio"] == pytest.approx(fast[2]["seconds"]["mean"] / own[2]["seconds"]["mean"])
 
     table = reached_table(found)
-    assert table.header == ["options", "final PSNR (dB)", "32.0 dB", "31.5 dB", "31.20 dB (final PSNR of adc)",
-                            "31.0 dB", "30.0 dB"]  # fmt: skip
+    assert table.header == ["options", "32.0 dB", "31.5 dB", "adc's end", "31.0 dB", "30.0 dB"]
     adc, fast, small = table.rows
-    assert adc[:3] == ["adc", "31.20 ± 0.28", "not reached"] and adc[4] == "\u2265 38.1 ± 2.7 s (300; 0.0 MB)"
-    assert fast[6] == "10.0 ± 0.0 s (400; 0.0 MB), 0.50 of adc's" and small[5] == "not reached"
-    assert adc[5] == "36.4 ± 5.1 s (300; 0.0 MB)"  # the end of one seed, and between points of the other
-    runs = _runs()
+    assert adc[:2] == ["adc", "not reached"] and adc[3] == "\u2265 38.1 ± 2.7 s"
+    assert fast[5] == "10.0 ± 0.0 s (50 %)" and small[4] == "not reached"
+    assert adc[4] == "36.4 ± 5.1 s"  # the end of one seed, and between points of the other
+    runs = set_runs()
     runs[-1]["curve"][-1]["test_psnr"] = 31.1
-    small = reached_table(reached(comparable_sets(runs, "attic"))).rows[2]
-    assert small[-2].startswith("1 of 2 seeds: ") and "adc's" not in small[-2]
+    runs[2]["curve"][1] |= {"subset": 3, "estimated": 1}  # a point at 10 s of the first seed of fast
+    table = reached_table(reached(comparable_sets(runs, "attic")))
+    assert table.rows[2][4] == "48.8 s, 1 of 2 seeds"
+    assert [cell.startswith("~ ") for cell in table.rows[1][1:]] == [True] * 5 and "~" not in str(table.rows[0])
+
+
+def test_no_level_repeats_the_seconds_of_the_end():
+    """Of curves that know only their end, or little before it, nothing is told."""
+    runs = [run_of(name, 0, (40, 31.0 + i, 300)) for i, name in enumerate(("adc", "other"))]
+    assert reached(comparable_sets(runs, "attic")) is None
+    runs = [run_of(name, 0, (1, 15.0, 300), (40, 31.0 + i, 300)) for i, name in enumerate(("adc", "other"))]
+    found = reached(comparable_sets(runs, "attic"))
+    assert {cell["seconds"]["mean"] for cells in found["sets"].values() for cell in cells} == {None}
+    assert reached_table(found).rows[1] == ["other", *["not known"] * len(found["levels"])]
 
 
 def test_equal_seeds_reach_their_own_mean():
     """The mean of three equal numbers may be a bit above them."""
     points = (1, 20.0, 1), (2, 29.839999999999996, 2)
-    runs = [_run(name, seed, *points) for name in ("base", "other") for seed in range(3)]
-    cells = reached(comparable_sets(runs, "attic"))["sets"]["other"]["cells"]
+    runs = [run_of(name, seed, *points) for name in ("base", "other") for seed in range(3)]
+    cells = reached(comparable_sets(runs, "attic"))["sets"]["other"]
     assert [cell["reached"] for cell in cells] == [3] * len(cells)
 
 
 def test_what_cannot_be_compared_is_left_out():
-    runs = _runs()
+    runs = set_runs()
     assert comparable_sets(runs[:2], "attic") == {} == comparable_sets(runs, "cellar")  # one set alone
     runs[2]["finished"] = False
     runs[4]["apart"] = runs[5]["apart"] = True
@@ -195,23 +151,28 @@ def test_what_cannot_be_compared_is_left_out():
 
 
 def test_fronts_say_who_beats_whom_and_whether_clearly():
-    found = fronts(comparable_sets(_runs(), "attic"))
+    found = fronts(comparable_sets(set_runs(), "attic"))
     # fast: 20 s, 32.2 dB, 500; adc: 40 s, 31.2 dB, 300; small: 50 s, 30.4 dB, 70.
     by_fast, nobody = {"by": "fast", "clearly": True}, dict.fromkeys(("adc", "fast", "small"))
     assert found["beaten"] == {
         "seconds": nobody | {"adc": by_fast, "small": by_fast}, "gaussians": nobody, "ply_mb": nobody,
     }  # fmt: skip
-    adc, fast, _ = front_table(found).rows
-    assert adc[:4] == ["adc", "31.20 ± 0.28", "40.0 ± 0.0", "no: fast"] and fast[3] == "yes"
+    table = front_table(found)
+    assert table.header == ["options", "training (s)", "Gaussians", "PLY (MB)"]  # their numbers are in the results
+    assert table.rows[0] == ["adc", "beaten by fast", "on the front", "on the front"]
+    assert table.rows[1][1:] == ["on the front"] * 3
 
     def beaten(*runs: dict) -> tuple:
         found = fronts(comparable_sets(runs, "attic"))
-        return found["beaten"]["seconds"]["adc"], front_table(found).rows[0][3]
+        return found["beaten"]["seconds"]["adc"], front_table(found).rows[0][1]
 
-    adc, near = _runs()[:2], [_run("near", seed, (seconds, 31.25, 300)) for seed, seconds in enumerate((36, 43.5))]
-    assert beaten(*adc, *near) == ({"by": "near", "clearly": False}, "no: near, within the spread")
-    assert beaten(adc[0], _run("near", 0, (39, 31.25, 300))) == ({"by": "near", "clearly": None}, "no: near")
-    assert beaten(adc[0], adc[0] | {"config": "twin"}) == (None, "yes")
+    adc, near = (
+        set_runs()[:2],
+        [run_of("near", seed, (seconds, 31.25, 300)) for seed, seconds in enumerate((36, 43.5))],
+    )
+    assert beaten(*adc, *near) == ({"by": "near", "clearly": False}, "beaten by near, within the spread")
+    assert beaten(adc[0], run_of("near", 0, (39, 31.25, 300))) == ({"by": "near", "clearly": None}, "beaten by near")
+    assert beaten(adc[0], adc[0] | {"config": "twin"}) == (None, "on the front")
 
 
 @pytest.mark.parametrize(
@@ -229,7 +190,7 @@ def test_fronts_say_who_beats_whom_and_whether_clearly():
 )  # fmt: skip
 def test_a_set_that_stands_apart_is_told_why(change, why):
     other = {"ground_truth_sha256": "b" * 64}
-    runs = _runs()
+    runs = set_runs()
     runs[4:] = [run | other | change for run in runs[4:]]
     if None in change.values():
         runs[2:4] = [runs[2] | other]
@@ -243,14 +204,15 @@ def test_a_set_that_stands_apart_is_told_why(change, why):
 
 
 def test_seeds_of_different_ground_truth_are_told_so():
-    runs = _runs()
+    runs = set_runs()
     runs[5]["ground_truth_sha256"] = "b" * 64
     assert {run["why_apart"] for run in stand_apart(runs)[4:]} == {"its seeds were scored on different ground truth"}
 
 
 def test_one_option_set_has_no_comparisons(tmp_path):
-    pages = [render("md", make_report(["x"], runs), {}, {}, tmp_path) for runs in (_runs(), _runs()[:2])]
-    for part in ("## Seconds to reach a test PSNR\n\nattic, compared with adc:", "## Pareto fronts of option sets"):
+    shown = {"attic": {"curves": [], "fronts": [], "views": []}}
+    pages = [render("md", make_report(["x"], runs), shown, tmp_path) for runs in (set_runs(), set_runs()[:2])]
+    for part in ("### Seconds of training to reach a test PSNR", "### Option sets that no other one beats"):
         assert [part in page for page in pages] == [True, False]
 
 
@@ -258,9 +220,9 @@ def test_seeds_that_end_by_themselves_share_a_row():
     runs = []
     for seed, points in enumerate((2, 4, 9)):
         curve = [(10 * i, 20.0 + i, 100) for i in range(1, points + 1)]
-        runs.append(_run("adc-20s", seed, *curve, open_ended=True, finished=seed < 2))
+        runs.append(run_of("adc-20s", seed, *curve, open_ended=True, finished=seed < 2))
         runs[-1]["iterations"]["5"] = runs[-1]["iterations"][str(10 * points)] | {"PSNR": 15.0}  # saved on the way
-    rows = make_report(["x"], [*_runs(), *runs])["summary"]
+    rows = make_report(["x"], [*set_runs(), *runs])["summary"]
     (row,) = (row for row in rows if row["config"] == "adc-20s")
     assert row["iterations"] == [20, 40] and row["iteration"] == 30 and row["seeds"] == [0, 1]
     assert row["PSNR"]["values"] == [22.0, 24.0]
@@ -286,7 +248,7 @@ def test_published_scenes_add_up_to_the_published_means():
 )
 def test_synthetic_scenes_compare_at_full_size_over_white_only(change):
     of_table = {"options": ["--eval", "-w"], "test_sizes": [[800, 800]], "views": {"test": 200, "train": 100}}
-    run = _run(None, None, (1, 35.0, 9), scene="lego", **of_table | change)
+    run = run_of(None, None, (1, 35.0, 9), scene="lego", **of_table | change)
     run["iterations"] = {"30000": run["iterations"]["10"]}
     found = compare([run], summarise([run]), [])
     assert bool(found) == (not change)
@@ -333,7 +295,7 @@ def test_a_page_without_marks_is_left_alone(text):
     ],
 )  # fmt: skip
 def test_options_that_all_runs_share_are_written_once(sets, text):
-    runs = [_run(name, 0, (1, 2, 3), added_options=words.split()) for name, words in sets.items()]
+    runs = [run_of(name, 0, (1, 2, 3), added_options=words.split()) for name, words in sets.items()]
     assert results_text({"summary": summarise(runs), "runs": runs}).split("\n\n", 1)[1] == text
 
 

@@ -21,7 +21,14 @@ from skimage.metrics import peak_signal_noise_ratio
 import render
 import train
 from gaussian_renderer.scored_views import mean_scores
-from splatting.evaluation.curve_recorder import CurveDrawer, CurveRecorder, curve_points, drawn, evenly_spread
+from splatting.evaluation.curve_recorder import (
+    CurveDrawer,
+    CurveRecorder,
+    curve_points,
+    drawn,
+    evenly_spread,
+    whole_points,
+)
 from splatting.evaluation.error_curve import (
     COLUMNS,
     Row,
@@ -40,11 +47,12 @@ from utils.loss_utils import ssim
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]
+VIEWS = {"test": 2, "train": 2}
 HEADER = (
     "iteration,seconds,wall_seconds,gaussians,peak_memory_mib,"
-    "test_l1,test_psnr,test_ssim,train_l1,train_psnr,train_ssim,subset\n"
+    "test_l1,test_psnr,test_ssim,train_l1,train_psnr,train_ssim,subset,estimated\n"
 )
-OLD = HEADER.replace(",subset", "")  # of files without subsets
+OLD = HEADER.replace(",subset,estimated", "")  # of files without subsets
 
 
 @pytest.fixture(autouse=True)
@@ -64,12 +72,22 @@ def _train(scene: Path, out: Path, *more: object, iterations: int) -> str:
     return (out / "point_cloud" / f"iteration_{iterations}" / "point_cloud.ply").read_bytes()
 
 
-def _recorder(folder: Path, iterations: int, always: list[int], views: dict) -> tuple[CurveRecorder, list]:
-    """A recorder of made-up scores, and a list of what it loads and scores."""
+def _recorder(
+    folder: Path,
+    iterations: int,
+    always: list[int],
+    views: dict,
+    rows: list[Row] | None = None,
+    whole: bool = False,
+    **more: bool,
+) -> tuple[CurveRecorder, list]:
+    """A recorder of made-up scores, and a list of what it loads and scores. A view that is a number has that PSNR."""
     seen = []
     return CurveRecorder(
-        str(folder), [], TrainingLog(folder, 0), iterations, always, views, lambda views: seen.append(("load", views)),
-        lambda views: seen.append(("scores", views)) or {"psnr": 20.0}, torch.device("cpu"),
+        str(folder), rows or [], TrainingLog(folder, 0), iterations, always, views,
+        lambda views: seen.append(("load", views)),
+        lambda view: seen.append(("scores", view)) or {"psnr": view if isinstance(view, float) else 20.0},
+        torch.device("cpu"), whole_test=whole, **more,
     ), seen  # fmt: skip
 
 
@@ -84,7 +102,7 @@ class TestFile:
         write_curve(path, rows)
         assert (
             path.read_text()
-            == HEADER + "3,0.3,0.3333333333333333,7,,,20.25,,,,,\n5,0.5,0.5555555555555556,,,0.125,,,,,,\n"
+            == HEADER + "3,0.3,0.3333333333333333,7,,,20.25,,,,,,\n5,0.5,0.5555555555555556,,,0.125,,,,,,,\n"
         )
         assert read_curve(path) == [_row(3, 20.25, None, gaussians=7), _row(5, None, test_l1=0.125)]
         with path.open(newline="") as file:
@@ -96,10 +114,10 @@ class TestFile:
         + [
             f"{HEADER}{lines}\n".encode()
             for lines in (
-                *("3,0.3", "x,0.3,,,,,,,,,,", "3,,,,,,,,,,,", ",0.3,,,,,,,,,,", "3,0.3,,,,,nan,,,,,"),
-                "3,0.3,,,,,,,,,,1.5",  # no whole number
+                *("3,0.3", "x,0.3,,,,,,,,,,,", "3,,,,,,,,,,,,", ",0.3,,,,,,,,,,,", "3,0.3,,,,,nan,,,,,,"),
+                "3,0.3,,,,,,,,,,1.5,",  # no whole number
                 "3,0.3,,,,,,,,,",  # a line of an older file
-                "3,0.3,,,,,,,,,,\n3,0.4,,,,,,,,,,",
+                "3,0.3,,,,,,,,,,,\n3,0.4,,,,,,,,,,,",
             )
         ],
     )
@@ -118,7 +136,7 @@ class TestFile:
         wanted = [_row(3, 20.25, gaussians=7, wall_seconds=0.4), _row(5, 21.25, gaussians=7, wall_seconds=0.6)]
         assert read_curve(path) == wanted and whole_sets(wanted) == wanted
         assert continue_curve(tmp_path, 4) == wanted[:1]
-        assert path.read_text() == HEADER + "3,0.3,0.4,7,,,20.25,,,,,\n"
+        assert path.read_text() == HEADER + "3,0.3,0.4,7,,,20.25,,,,,,\n"
 
     def test_what_a_run_goes_on_from(self, tmp_path):
         path, figure = tmp_path / "error_vs_time.csv", tmp_path / "error_vs_time.png"
@@ -148,6 +166,27 @@ class TestPoints:
         whole, training = 0.46 * 2 * views * pace(iterations), sum(pace(t) for t in range(1, iterations + 1))
         spent = sum(0.46 * 2 * pace(t) for t in points)  # of a view 0.46 iterations, as measured on a CPU
         assert whole + size * spent < max(0.05 * training, 1.05 * (whole + spent))
+
+    @pytest.mark.parametrize("views", [1, 7, 25, 30])
+    @pytest.mark.parametrize("growth", [-0.75, 0.0, 1.0, 30.0])
+    @pytest.mark.parametrize("iterations", [40, 300, 600, 2000, 30_000])
+    def test_whole_test_sets_within_a_tenth(self, views, growth, iterations):
+        """The whole sets at the end, and a view at each point between, are taken at any cost."""
+
+        def pace(t: int) -> float:
+            return 1 + growth * min(1.0, 2 * t / iterations)
+
+        points = whole_points(iterations, [-1, iterations], 2, views)
+        training = sum(pace(t) for t in range(1, iterations + 1))
+        ends = 0.46 * (2 * views * pace(iterations) + sum(map(pace, points)))
+        spent = 0.46 * sum((count - 1) * pace(t) for t, count in points.items())
+        assert ends + spent < max(0.1 * training, 1.001 * ends)
+        assert 9 <= len(points) <= 12 and min(points) > 0 and max(points) < iterations
+        if iterations >= 2000:
+            assert sorted(points.values())[-7:] == [views] * 7
+        whole = [count == views for _, count in sorted(points.items(), reverse=True)]
+        if sum(whole) > 1:  # the last ones, and the first one
+            assert whole[-1] and whole[: sum(whole) - 1] == [True] * (sum(whole) - 1)
 
     def test_points_are_evenly_spaced_in_log_time(self):
         for iterations, views, steady, count, ratio, size in (
@@ -205,9 +244,9 @@ class TestScores:
     def test_pictures_and_masks_are_loaded_before_a_scoring_is_timed(self, tmp_path):
         recorder, seen = _recorder(tmp_path, 2, [1], {"test": ["a"], "train": ["b"]})
         recorder.add(1, 1.0, 5)
-        assert seen == [("load", ["a", "b"]), ("scores", ["a"]), ("scores", ["b"])]
+        assert seen == [("load", ["a", "b"]), ("scores", "a"), ("scores", "b")]
         recorder.add(2, 2.0, 5)
-        assert seen[3:] == [("scores", ["a"]), ("scores", ["b"])]  # loaded once
+        assert seen[3:] == [("scores", "a"), ("scores", "b")]  # loaded once
         assert recorder.rows[0]["test_psnr"] == recorder.rows[1]["train_psnr"] == 20.0
 
     def test_between_a_fixed_part_of_each_set_is_scored(self, tmp_path):
@@ -216,10 +255,55 @@ class TestScores:
         for iteration in (250, 500, 1000, 2000):
             recorder.add(iteration, iteration / 10, 5)
         assert [row["subset"] for row in recorder.rows] == [1, None, 1, None]
-        scored = [views for what, views in seen if what == "scores"]
-        assert scored[0] == scored[4] and scored[1] == scored[5] == [100 + view for view in scored[0]]
-        assert [len(views) for views in scored] == [1, 1, 25, 25] * 2
+        scored = [view for what, view in seen if what == "scores"]
+        assert len(scored) == 2 * 52 and scored[:52] == scored[52:]
+        assert scored[1] == 100 + scored[0] and scored[2:52] == [*views["test"], *views["train"]]
         assert read_curve(tmp_path / "error_vs_time.csv") == recorder.rows
+
+    def test_a_part_is_turned_into_the_whole_by_what_separates_them_where_both_are_scored(self, tmp_path):
+        """Of views from 10 to 14 dB, which improve by what `gained` says; the drawn one is off by a known number."""
+        views = {"test": [10.0, 11.0, 14.0, 13.0, 12.0], "train": [20.0] * 5}
+        off = views["test"][drawn(range(5), 1)[0]] - 12.0
+        assert off
+        recorder, _ = _recorder(tmp_path, 300, [150], views)
+        for iteration, gained in ((75, 1.0), (150, 2.0), (212, 3.0), (300, 4.0)):
+            recorder._scores = lambda view, gained=gained: {"psnr": view + gained}
+            recorder.add(iteration, iteration / 10, 5)
+            if iteration == 75:
+                assert recorder.rows[0]["test_psnr"] == 13.0 + off  # nothing else is known yet
+        assert [row["subset"] for row in recorder.rows] == [1, None, 1, None]
+        assert [row["test_psnr"] for row in recorder.rows] == [13.0, 14.0, 15.0, 16.0]
+        assert [row["train_psnr"] for row in recorder.rows] == [21.0, 22.0, 23.0, 24.0]
+        assert read_curve(tmp_path / "error_vs_time.csv") == recorder.rows
+
+        assert [row["estimated"] for row in recorder.rows] == [1, None, 1, None]
+
+        # A resumed training: rows of an earlier part are estimated once.
+        for before in ([_row(75, 13.0 + off, 21.0, subset=1)], [recorder.rows[0]]):
+            again, _ = _recorder(tmp_path, 300, [], views, [dict(row) for row in before])
+            again.add(300, 30.0, 5)
+            first = again.rows[0]
+            assert (first["test_psnr"], first["subset"], first["estimated"]) == (13.0, 1, 1)
+
+    def test_for_full_eval_the_last_points_score_all_test_views(self, tmp_path):
+        views = {"test": [10.0, 14.0, 15.0], "train": [20.0] * 3}
+        recorder, _ = _recorder(tmp_path, 200, [], views, whole=True)
+        for iteration in range(1, 201):
+            if recorder.due(range(iteration, iteration + 1), 0, iteration / 10):
+                recorder.add(iteration, iteration / 10, 5)
+        rows = recorder.rows
+        assert len(rows) > 10 and [row["subset"] for row in rows[-5:]] == [None] * 5 and rows[0]["subset"] is None
+        assert {row["subset"] for row in rows} == {None, 1} and [row["test_psnr"] for row in rows] == [13.0] * len(rows)
+        assert [row["train_psnr"] for row in rows] == [None] * (len(rows) - 1) + [20.0]
+
+    def test_a_run_of_unknown_length_scores_all_test_views_where_the_seconds_so_far_allow_it(self, tmp_path):
+        recorder, _ = _recorder(
+            tmp_path, 30_000, [], {"test": [10.0, 14.0], "train": [20.0] * 2}, whole=True, steady=False
+        )
+        for seconds, spent in ((1, 0.0), (2, 0.2), (4, 0.2), (8, 0.7)):
+            recorder._spent["scoring"] = spent
+            recorder.add(15_000, seconds, 5)
+        assert [row["subset"] for row in recorder.rows] == [1, 1, None, 1]
 
     def test_views_are_drawn_by_a_seed_of_their_own_or_evenly_spread(self):
         torch.manual_seed(1)
@@ -280,7 +364,7 @@ class TestDrawer:
         return Path("Füße")
 
     def test_another_process_draws_and_imports_no_torch(self, folder):
-        drawer = CurveDrawer(folder)
+        drawer = CurveDrawer(folder, VIEWS)
         drawer.begin()
         drawer.draw()
         assert drawer.finish() is None
@@ -291,25 +375,25 @@ class TestDrawer:
 
     def test_what_goes_wrong_is_told(self, folder, monkeypatch):
         (folder / "error_vs_time.png").mkdir()
-        drawer = CurveDrawer(folder)
+        drawer = CurveDrawer(folder, VIEWS)
         drawer.draw()
         assert drawer.finish().startswith(f"UserError: cannot write {folder.resolve() / 'error_vs_time.png'} (")
 
         started, popen = [], subprocess.Popen
         monkeypatch.setattr(subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])
-        drawer = CurveDrawer(folder)
+        drawer = CurveDrawer(folder, VIEWS)
         drawer.begin()
         started[0].kill()
         drawer.draw()
         assert drawer.finish() == "the process that draws it ended with status -9"
 
     def test_nothing_is_drawn_of_a_training_that_fails(self, folder):
-        drawer = CurveDrawer(folder)
+        drawer = CurveDrawer(folder, VIEWS)
         drawer.abandon()  # none was started
         drawer.begin()
         drawer.abandon()
         files = [str((folder / f"error_vs_time.{end}").resolve()) for end in ("csv", "png")]
-        command = [sys.executable, "-m", "splatting.evaluation.figures", *files, "x"]
+        command = [sys.executable, "-m", "splatting.evaluation.figures", *files, "x", "2", "2"]
         done = subprocess.run(command, cwd=ROOT, input="", capture_output=True, text=True, check=True)
         assert (done.stdout, done.stderr) == ("", "")  # its input has ended, as when the training was killed
         assert [path.name for path in folder.iterdir()] == ["error_vs_time.csv"]

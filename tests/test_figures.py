@@ -1,5 +1,7 @@
 """Figures of error against time and of fronts: what is drawn, where, and by which marks it is told apart."""
 
+from pathlib import Path
+
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
@@ -7,7 +9,7 @@ from PIL import Image
 from splatting.evaluation.error_curve import COLUMNS
 from splatting.evaluation.figures import draw_curve, draw_curves, draw_fronts
 
-NAMES = ("seconds", "test_psnr", "test_ssim", "train_psnr", "train_ssim", "subset")
+NAMES = ("seconds", "test_psnr", "test_ssim", "train_psnr", "train_ssim", "subset", "estimated")
 
 
 @pytest.fixture
@@ -24,83 +26,98 @@ def curve(*rows: tuple) -> list[dict]:
 
 
 def runs_of(curves: dict) -> list[dict]:
-    return [{"apart": False, "config": config, "curve": rows} for config, rows in curves.items()]
+    return [{"apart": False, "config": config, "curve": rows, "views": {"test": 7}} for config, rows in curves.items()]
 
 
-def points(axes, label: str | None = None, style: str | None = None) -> list:
-    """Points of the lines with a label or a fill style."""
-    lines = [line for line in axes.lines if line.get_label() == label or line.get_fillstyle() == style]
-    return [line.get_xydata().tolist() for line in lines]
+def points(axes, label: str) -> list:
+    """Points of the lines with a label."""
+    return [line.get_xydata().tolist() for line in axes.lines if line.get_label() == label]
+
+
+def hollow(axes) -> list:
+    """Points of the marks that are not filled."""
+    return [line.get_xydata().tolist() for line in axes.lines if line.get_markerfacecolor() == "white"]
 
 
 def test_the_curve_of_a_training(tmp_path, drawn):
-    """Of whole sets the lines, the gap and the best; of subsets hollow points on lines of their own."""
+    """All points on one line for each set, the best and the end, too; estimates hollow, with their number of views.
+
+    Subsets that are not estimated are left out.
+    """
     rows = curve(
-        (0.5, 30.0, 0.5, 31.0, 0.5, 4), (1.0, 10.0, 0.75, 11.0, 0.875), (1.5, 12.0, 0.5, 13.0, 0.5, 4),
+        (0.3, 2.0, 0.5, 3.0, 0.5, 4), (0.5, 9.0, 0.5, 9.5, 0.5, 4, 1), (1.0, 10.0, 0.75, 11.0, 0.875),
+        (1.5, 12.0, 0.5, 13.0, 0.5, 3, 1),
         (2.0, 15.0, 0.75, None, 0.875), (4.0, 14.0, 0.75, 20.0, 0.875),
     )  # fmt: skip
-    draw_curve(tmp_path / "error_vs_time.png", rows, "a model")
+    draw_curve(tmp_path / "error_vs_time.png", rows, "a model", {"test": 7, "train": 6})
     with Image.open(tmp_path / "error_vs_time.png") as image:
         assert min(image.size) > 400 and len(image.convert("RGB").getcolors(10**6)) > 10
     upper, lower = drawn[0].axes
     assert upper.get_xscale() == lower.get_xscale() == lower.get_yscale() == "log"
-    assert points(upper, "test views") == [[[1, 10], [2, 15], [4, 14]]]
-    assert points(upper, "train views") == [[[1, 11], [4, 20]]]
-    assert points(upper, "test views, 4 of them") == [[[0.5, 30], [1.5, 12]]]
-    assert points(upper, "best test: 15.00 dB, iteration 4") == [[[2, 15]]]
-    assert points(upper, style="none") == [[[0.5, 30], [1.5, 12]], [[0.5, 31], [1.5, 13]]]
-    assert [y for _, y in points(lower, "train views")[0]] == [0.125] * 3
+    (test,) = points(upper, "7 test views; hollow: estimated from 3 to 4 of them")
+    assert test == [[0.5, 9], [1, 10], [1.5, 12], [2, 15], [4, 14]]
+    assert points(upper, "6 train views; hollow: estimated from 3 to 4 of them") == [
+        [[0.5, 9.5], [1, 11], [1.5, 13], [4, 20]]
+    ]
+    assert points(upper, "best of all test views: 15.00 dB, iteration 5") == [[[2, 15]]] and [2, 15] in test
+    assert hollow(upper) == [[[0.5, 9], [1.5, 12]], [[0.5, 9.5], [1.5, 13]]]
     legends = [text.get_text() for axes in (upper, lower) for text in axes.get_legend().get_texts()]
     assert "gap, 6 dB at the end" in legends and "gap, 0.125 at the end" in legends
+    draw_curve(tmp_path / "error_vs_time.png", rows[4:], "a model", {"test": 7, "train": 6})
+    assert points(drawn[1].axes[0], "7 test views") == [[[2, 15], [4, 14]]] and not hollow(drawn[1].axes[0])
 
 
 @pytest.mark.parametrize("rows", [(), ((1,),), ((1, 5.0),), ((1, 5.0, 1.0, None, 1.0),)])
 @pytest.mark.filterwarnings("error")
 def test_little_to_draw(tmp_path, rows):
-    draw_curve(tmp_path / "error_vs_time.png", curve(*rows), "")
+    draw_curve(tmp_path / "error_vs_time.png", curve(*rows), "", {"test": 1, "train": 1})
     assert (tmp_path / "error_vs_time.png").stat().st_size > 1000
 
 
-def test_the_legend_leaves_the_pareto_front_free(tmp_path, drawn):
+def test_the_figures_of_a_scene_can_be_read_at_half_their_size(tmp_path, drawn):
+    """Each panel is a file of its own; its legend covers no point, and names the views."""
     curves = {
         "base": curve((0.3, 15.0, 0.7), (2.8, 29.0, 0.945)),
-        "fast start": curve((0.3, 21.0, 0.8), (3.3, 29.5, 0.95)),
-    } | {f"set {i}": curve((0.31, 15.0, 0.7), (2.9, 28.5, 0.94)) for i in range(6)}  # fmt: skip
-    assert draw_curves(tmp_path / "curves.png", "attic", runs_of(curves))
-    fronts = [next(line for line in axes.lines if line.get_label() == "Pareto front") for axes in drawn[0].axes]
-    assert fronts[0].get_xydata().tolist() == [[0.3, 21.0], [2.8, 21.0], [2.8, 29.0], [3.3, 29.0], [3.3, 29.5]]
-    assert fronts[0].get_markevery() == 2  # corners are not marked
-    for axes, front in zip(drawn[0].axes, fronts, strict=True):
-        line = front.get_path().transformed(front.get_transform())
-        assert not line.intersects_bbox(axes.get_legend().get_window_extent(), filled=False)
+        "fast start": curve((0.3, 21.0, 0.8, None, None, 2, 1), (3.3, 29.5, 0.95)),
+    } | {f"a longer name of set {i}": curve((0.31, 15.0, 0.7), (2.9, 28.5, 0.94)) for i in range(6)}  # fmt: skip
+    files = draw_curves(tmp_path, "attic", runs_of(curves))
+    assert [file.name for file in files] == ["attic_psnr.png", "attic_ssim.png"] and all(map(Path.is_file, files))
+    for figure in drawn:
+        (axes,), (legend,) = figure.axes, figure.legends
+        assert not legend.get_window_extent().overlaps(axes.get_window_extent())
+        assert figure.bbox.contains(*legend.get_window_extent().p0) and figure.bbox.contains(
+            *legend.get_window_extent().p1
+        )
+        assert legend.get_title().get_text() == "7 test views; hollow: estimated from 2 of them"
+        inches = figure.get_figwidth()
+        letters = 358 / inches / 72 * min(text.get_fontsize() for text in legend.get_texts())
+        assert letters > 8.5  # pixels where the window is 390 wide
+    front = next(line for line in drawn[0].axes[0].lines if line.get_label() == "Pareto front")
+    assert front.get_xydata().tolist() == [[0.3, 21.0], [2.8, 21.0], [2.8, 29.0], [3.3, 29.0], [3.3, 29.5]]
+    assert front.get_markevery() == 2  # corners are not marked
+    assert draw_curves(tmp_path, "attic", runs_of({"base": []})) == []
 
 
-def test_points_of_subsets_are_hollow_and_in_no_front(tmp_path, drawn):
-    rows = curve((0.3, 35.0, 0.9, 36.0, 0.9, 2), (1.0, 36.0, 0.95, 37.0, 0.9, 2), (2.0, 20.0, 0.8, 21.0, 0.8))
-    for runs in (runs_of({None: rows}), runs_of({"a": rows, "b": rows[:2]})):
-        assert draw_curves(tmp_path / "curves.png", "attic", runs)
-        axes = drawn[-1].axes
-        assert axes[0].get_ylabel() == "PSNR of the test views (dB)"
-        hollow = points(axes[0], style="none")
-        assert [[0.3, 35.0], [1.0, 36.0]] in hollow and [[2.0, 20.0]] in points(axes[0], style="full")
-        assert ([[0.3, 36.0], [1.0, 37.0]] in hollow) == (len(runs) == 1)  # the training views
-    assert points(axes[0], "Pareto front") == [[[2.0, 20.0]]]
-    # The gap between training and test views has a panel of its own, without the difference of two subsets.
-    assert axes[2].get_ylabel() == "PSNR of the training views above the test views (dB)"
-    assert [line.get_xydata().tolist() for line in axes[2].lines] == [[[2.0, 1.0]], []]
+def test_one_option_set_has_its_training_views(tmp_path, drawn):
+    rows = curve((0.3, 35.0, 0.9, 36.0, 0.9, 2, 1), (1.0, 36.0, 0.95, 37.0, 0.9, 2, 1), (2.0, 20.0, 0.8, 21.0, 0.8))
+    draw_curves(tmp_path, "attic", runs_of({None: rows}))
+    (axes,) = drawn[0].axes
+    assert points(axes, "training views") == [[[0.3, 36.0], [1.0, 37.0], [2.0, 21.0]]] and len(hollow(axes)) == 1
+    draw_curves(tmp_path, "attic", runs_of({"a": rows, "b": rows}))
+    assert not points(drawn[2].axes[0], "training views") and len(hollow(drawn[2].axes[0])) == 2
 
 
 def test_other_programs_and_sets_that_stand_apart_are_drawn_and_in_no_front(tmp_path, drawn):
     rows = curve((1.0, 20.0, 0.6), (9.0, 25.0, 0.8))
-    runs = [*runs_of({"base": rows, "sh1": rows}), {"apart": True, "config": "best", "curve": curve((0.2, 50.0, 0.9))}]
+    best = {"apart": True, "config": "best", "curve": curve((0.2, 50.0, 0.9)), "views": {"test": 7}}
     peer = {"name": "other", "curve": curve((0.5, 40.0))}  # would be the whole front
-    assert draw_curves(tmp_path / "curves.png", "attic", runs, [peer])
-    left, right, *_ = drawn[0].axes
+    assert draw_curves(tmp_path, "attic", [*runs_of({"base": rows, "sh1": rows}), best], [peer])
+    (left,), (right,) = (figure.axes for figure in drawn)
     assert points(left, "other (another program)") == [[[0.5, 40.0]]]
     assert points(left, "best (other ground truth)") == [[[0.2, 50.0]]]
     assert points(left, "Pareto front") == [[[1.0, 20.0], [9.0, 20.0], [9.0, 25.0]]]
-    said = [axes.get_xlabel().endswith("(other programs: as they count)") for axes in (left, right)]
-    assert said == [True, False] and not points(right, "other (another program)")  # it has no SSIM
+    assert left.get_xlabel().endswith("(other programs: as they count)")
+    assert not points(right, "other (another program)")  # it has no SSIM
 
 
 def test_fronts_have_a_point_and_a_bar_for_each_set(tmp_path, drawn):
@@ -110,8 +127,8 @@ def test_fronts_have_a_point_and_a_bar_for_each_set(tmp_path, drawn):
     ends = {"adc": (31.2, 40, 300, 3), "fast": (32.2, 20, 500, 5), "small": (30.4, 50, 70, 0.7)}
     names = ("PSNR", "seconds", "gaussians", "ply_mb")
     found = {"sets": {one: dict(zip(names, map(spread, values), strict=True)) for one, values in ends.items()}}
-    assert draw_fronts(tmp_path / "fronts.png", "attic", found, ["apart", *ends])
-    seconds, gaussians, megabytes = drawn[0].axes
+    assert len(draw_fronts(tmp_path, "attic", found, ["apart", *ends])) == 3
+    seconds, gaussians, megabytes = (figure.axes[0] for figure in drawn)
     assert megabytes.get_xlabel() == "megabytes of the PLY"
     assert [bar.lines[0].get_xydata().tolist()[0] for bar in seconds.containers] == [[40, 31.2], [20, 32.2], [50, 30.4]]
     assert [bar.lines[0].get_color() for bar in seconds.containers] == ["C1", "C2", "C3"]  # as in the other figure

@@ -27,7 +27,7 @@ from splatting.evaluation import results_page, stages
 from splatting.evaluation.figures import draw_curves, draw_fronts
 from splatting.evaluation.model_folder import SCHEDULE, shorter_ends_there
 from splatting.evaluation.plan import DATASETS, Run, SceneEntry
-from splatting.evaluation.renders import GAIN, GAP, HEADER, comparisons, draw_worst_views
+from splatting.evaluation.renders import GAIN, GAP, HEADER, ComparedViews
 from splatting.evaluation.results_page import BEGIN, END
 from utils.system_utils import UserError
 
@@ -44,8 +44,8 @@ BASE_AND_SH1 = '{"base": [], "sh1": ["--sh_degree", 1]}'
 def _stand_ins(monkeypatch):
     monkeypatch.setattr(stages, "_ROOT", STAND_INS)
     monkeypatch.setattr(full_eval, "machine", lambda: MACHINE)
-    monkeypatch.setattr(report_module, "draw_curves", lambda *_: False)  # half a second each; see `figures`
-    monkeypatch.setattr(report_module, "draw_fronts", lambda path, *_: not Image.new("RGB", (9, 9)).save(path))
+    monkeypatch.setattr(report_module, "draw_curves", lambda *_: [])  # half a second each; see `figures`
+    monkeypatch.setattr(report_module, "draw_fronts", lambda *_: [])
 
 
 @pytest.fixture
@@ -118,8 +118,19 @@ def test_commands_of_a_plain_scene(figures, evaluate):
     out, scene = str(evaluate.out / "attic"), str(evaluate.scenes / "attic")
     attic, render, brick, _ = evaluate.calls()
     shared, switches = ["--eval", "--test_iterations", "-1"], ["--antialiasing", "--iterations", "40", "-r", "2"]
-    assert attic == ["train", "-s", scene, "-m", out, "--disable_viewer", "--quiet", *shared, *switches]
-    assert brick[7:] == [*shared, "-w", *switches]
+    assert attic == [
+        "train",
+        "-s",
+        scene,
+        "-m",
+        out,
+        "--disable_viewer",
+        "--quiet",
+        "--whole_curve",
+        *shared,
+        *switches,
+    ]
+    assert brick[8:] == [*shared, "-w", *switches]
     assert render == ["render", "-m", out, "-s", scene, "--iteration", "40", "--skip_train", "--eval", "--quiet",
                       "--antialiasing"]  # fmt: skip
     first = report["runs"][0]
@@ -133,9 +144,9 @@ def test_commands_of_a_plain_scene(figures, evaluate):
     }  # fmt: skip
     assert first["views"] == {"test": 2, "train": 7} and first["test_sizes"] == [[120, 80]]
     assert first["worst_views"][0] == {"PSNR": 22.0, "file": "00001.png", "picture": "photo_1.jpg"}
-    assert first["machine"] == MACHINE and report["published"] == [] and report["cheapest"] == {}
+    assert first["machine"] == MACHINE and report["published"] == [] and report["reached"] == {}
     assert (evaluate.out / "timing.txt").read_text().startswith("scenes: 0.0")
-    for name in ("attic_curves.png", "attic_worst_views.png"):
+    for name in ("attic_psnr.png", "attic_ssim.png", "attic_worst_views.png"):
         with Image.open(evaluate.out / "figures" / name) as image:
             assert image.width > 300
 
@@ -149,7 +160,7 @@ def test_data_sets_get_the_options_of_the_paper(evaluate, tmp_path):
         full_eval.main([str(word) for word in words])
     assert status.value.code == 1  # "train" is missing
     log = [json.loads(line) for root in (mip, tanks) for line in (root / "calls.txt").read_text().splitlines()]
-    trained = {Path(words[2]).name: words[10:] for words in log if words[0] == "train"}
+    trained = {Path(words[2]).name: words[11:] for words in log if words[0] == "train"}
     switches = ["-d", "depths2/", *full_eval.EXPOSURE, "--optimizer_type", "sparse_adam"]
     assert trained["garden"] == ["-i", "images_4", *switches] and trained["room"] == ["-i", "images_2", *switches]
     assert trained["truck"] == switches
@@ -423,7 +434,7 @@ def test_seeds_of_different_ground_truth(evaluate, tmp_path):
     assert row["seconds"]["mean"] == 16.0
     view = report["runs"][1]
     assert view["worst_views"][0]["file"] == "00001.png"
-    assert draw_worst_views(tmp_path / "sheet.png", view, evaluate.out)
+    ComparedViews([view], evaluate.out).draw_worst(tmp_path / "sheet.png")
     with Image.open(tmp_path / "sheet.png") as sheet:
         # Compare the middle of each image: above the label, which is masked, and in the lower half, which is not.
         masked, plain = ([sheet.getpixel((GAP + 60 + i * (120 + GAP), HEADER + y)) for i in range(3)] for y in (1, 60))
@@ -440,21 +451,20 @@ def test_seeds_and_option_sets(figures, evaluate, tmp_path, capsys, monkeypatch)
     assert (base["config"], base["seeds"], small["PSNR"]["mean"]) == ("base", [0, 2], pytest.approx(21.1))
     assert base["one_ground_truth"] and report["warnings"] == []
 
-    levels = report["cheapest"]["attic"]
-    # Seed 0 of base ends at 23.0 and seed 2 at 23.2: both reach 23.0. sh1 is twice as fast and ends at 21.0.
-    assert levels[0]["psnr"] == 23.0 and levels[0]["seconds"]["config"] == "base"
-    assert levels[-1]["psnr"] < 21.0 and levels[-1]["seconds"]["config"] == "sh1"
-    said = capsys.readouterr().out
-    assert "attic: cheapest option set for a given error" in said and "23.10 ± 0.14" in said
-    assert (evaluate.out / "figures" / "attic_sh1_worst_views.png").exists()
     found = report["reached"]["attic"]
-    assert found["default"] == "base" and found["sets"]["sh1"]["final"]["mean"] == pytest.approx(21.1)
+    # Seed 0 of base ends at 23.0 and seed 2 at 23.2: both reach 23.0. sh1 is twice as fast and ends at 21.0.
+    assert found["default"] == "base" and found["levels"][1]["psnr"] == 23.0 and found["levels"][-1]["psnr"] <= 21.0
+    counts = [[cell["reached"] for cell in found["sets"][name]][1:] for name in ("base", "sh1")]
+    assert counts == [[2] * 4, [0] * 3 + [2]]
+    assert found["sets"]["sh1"][-1]["ratio"] < 1
+    said = capsys.readouterr().out
+    assert "attic: seconds of training to reach a test PSNR" in said and "23.10 ± 0.14" in said
     assert report["fronts"]["attic"]["beaten"]["seconds"] == {"base": None, "sh1": None}
     text = evaluate.text("md")
-    for part in ("Seconds to reach a test PSNR", "Pareto fronts of option sets", "Cheapest option set"):
-        assert f"## {part}" in text
-    assert "over the seeds. Where only some" in text and "(figures/attic_fronts.png)" in text
-    assert (evaluate.out / "figures" / "attic_fronts.png").stat().st_size > 10_000
+    for part in ("Seconds of training to reach a test PSNR", "Option sets that no other one beats"):
+        assert f"### {part}" in text
+    for name in ("attic_front_seconds", "attic_psnr", "attic_worst_views"):
+        assert f"(figures/{name}.png)" in text and (evaluate.out / "figures" / f"{name}.png").is_file()
 
     page = tmp_path / "training.md"
     page.write_text(f"before\n\n{BEGIN}\nold\n{END}\n\nafter\n")
@@ -540,13 +550,15 @@ def test_damaged_files_do_not_cost_the_report(evaluate, capsys):
 
 def test_option_sets_of_another_ground_truth_stand_apart(evaluate, tmp_path):
     sets = option_sets(tmp_path, '{"base": ["--sh_degree", 1], "best": [], "flat": ["--sh_degree", 0]}')
-    assert evaluate("attic", *sets)["cheapest"]["attic"][0]["seconds"]["config"] == "best"
+    assert set(evaluate("attic", *sets)["reached"]["attic"]["sets"]) == {"base", "best", "flat"}
     model = evaluate.out / "attic" / "best"
     Image.new("RGB", (120, 80)).save(model / "test" / "ours_40" / "gt" / "00000.png")
     (model / "results.json").unlink()
     report = evaluate("attic", *sets)
     assert [run["apart"] for run in report["runs"]] == [False, True, False]
-    assert {name for row in report["cheapest"]["attic"] for name in row["seconds"]["all"]} == {"base", "flat"}
+    assert set(report["reached"]["attic"]["sets"]) == {"base", "flat"}
+    views = [re.findall(r'alt="(\w+)"', part) for part in evaluate.text("html").split("<h3>Test view")[1:]]
+    assert views == [["photo", *["render", "error"] * 2] * 2, ["photo", "render", "error"] * 2]
     assert "Left out of rankings and the Pareto front: best." in report["warnings"][0]
     first, second = evaluate.text("md").split("Scored on other ground truth", 1)
     assert " base |" in first and " best |" not in first and " best |" in second
@@ -571,7 +583,7 @@ def test_a_second_call_with_other_scenes_or_seeds_joins_the_report(evaluate):
     assert second["manifest"]["earlier_commands"] == [first["manifest"]["command"]]
     assert evaluate("attic")["runs"] == second["runs"]
     text = evaluate.text("md")  # with two tables
-    assert text.count("| attic |") == text.count("| brick |") == 2 and (evaluate.out / "timing.txt").read_text()
+    assert text.count("| attic |") == text.count("| brick |") == 3 and (evaluate.out / "timing.txt").read_text()
     evaluate("cellar", "--seeds", 1)
     report = evaluate("cellar", "--seeds", 2)
     (row,) = [row for row in report["summary"] if row["scene"] == "cellar"]
@@ -596,7 +608,7 @@ def test_peers_are_shown_and_stay_in_the_report(figures, evaluate, tmp_path):
     peer.write_text("iteration,seconds,test_psnr,gaussians\n40,2.5,31.25,1234\n")
     report = evaluate("attic", "--peer", "other", peer, "--peer", "third", peer)
     found = [(peer["scene"], peer["name"], peer["curve"][0]["test_psnr"]) for peer in report["peers"]]
-    assert found == [("attic", "other", 31.25), ("attic", "third", 31.25)] and report["cheapest"] == {}
+    assert found == [("attic", "other", 31.25), ("attic", "third", 31.25)] and report["reached"] == {}
     for kind in ("md", "html"):
         assert all(part in evaluate.text(kind) for part in ("Other programs", "31.25", "1,234"))
     peer.write_text("seconds,test_psnr\n3,32\n")
@@ -613,9 +625,9 @@ def test_names_stay_names_in_the_report(figures, evaluate, name):
     assert [evaluate.text(kind).count("<script") for kind in ("md", "html")] == [0, 1]
     assert "<script>alert" not in evaluate.text("html") and "[x](" not in text
     rows = [line for line in text.splitlines() if line.startswith("|")]
-    assert len(rows) == 6 and len({line.count("|") for line in rows[:3]}) == 1  # header, rule and row of two tables
+    assert len(rows) == 9 and len({line.count("|") for line in rows[:3]}) == 1  # header, rule and row of three tables
     assert not any(line.startswith("# a") for line in text.splitlines())
-    with Image.open(evaluate.out / "figures" / f"{name}_curves.png") as image:
+    with Image.open(evaluate.out / "figures" / f"{name}_psnr.png") as image:
         assert image.width > 300
 
 
@@ -626,7 +638,11 @@ def test_each_test_view_has_photo_render_and_error_in_the_page(evaluate, monkeyp
     assert all(part.startswith("data:image/") for part in html.split('src="')[1:])
     (page,) = re.findall(r"<h2>attic</h2>(.*)<h2>", html, re.DOTALL)
     shown = re.findall(r'<figure class="comparison">.*?</figure>', page, re.DOTALL)
-    assert len(shown) == 2 and "photo_0.jpg: 24.00 dB" in shown[0] and "photo_1.jpg: 22.00 dB" in shown[1]
+    assert (
+        len(shown) == 2 and "<details>" in page.split("</figure>")[1]
+    )  # the worst one first, the other behind a click
+    for figure, name, psnr in zip(shown, ("photo_1.jpg", "photo_0.jpg"), (22, 24), strict=True):
+        assert name in figure and f"render: {psnr}.00 dB" in figure
     for figure in shown:
         found = re.findall(r'src="data:image/jpeg;base64,([^"]+)" alt="(\w+)"', figure)
         assert [alt for _, alt in found] == ["photo", "render", "error"]
@@ -637,7 +653,7 @@ def test_each_test_view_has_photo_render_and_error_in_the_page(evaluate, monkeyp
         assert figure.count('<input type="range"') == 1
     assert "data:image" not in evaluate.text("md")
 
-    assert [view["text"][:11] for view in comparisons(attic, evaluate.out, 1)] == ["photo_0.jpg"]
+    assert [view["name"] for view in ComparedViews([attic], evaluate.out).shown(1)] == ["photo_1.jpg"]
     monkeypatch.setattr(report_module, "OF_A_REPORT", 2)  # the number of views is bounded
     evaluate("attic brick")
     assert evaluate.text("html").count('<figure class="comparison">') == 2

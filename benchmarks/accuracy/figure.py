@@ -1,6 +1,6 @@
 """Draw error against run time, from the file that `benchmarks.accuracy.oracle --json` wrote.
 
-python -m benchmarks.accuracy.figure accuracy.json docs/accuracy.png
+python -m benchmarks.accuracy.figure accuracy.json accuracy.png
 """
 
 import argparse

@@ -1,9 +1,9 @@
 """Error of every output and every gradient of the rasterizer against the float64 oracle, and against run time.
 
     python -m benchmarks.accuracy.oracle                                    # print the errors
-    python -m benchmarks.accuracy.oracle --figure docs/accuracy.png         # and draw error against run time
+    python -m benchmarks.accuracy.oracle --figure accuracy.png              # and draw error against run time
     python -m benchmarks.accuracy.oracle --json accuracy.json               # and write the numbers; a machine with
-    python -m benchmarks.accuracy.figure accuracy.json docs/accuracy.png    # matplotlib can draw them
+    python -m benchmarks.accuracy.figure accuracy.json accuracy.png         # matplotlib can draw them
 
 The error of a tensor is max |difference| / max |reference|; the median of |difference| / max |reference| stands beside
 it. Rounding alone can decide a pixel that is within 1e-4 of a cut-off (alpha 1/255, transmittance 1e-4) or that has a

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from splatting.evaluation.error_curve import Row, whole_sets
+from splatting.evaluation.error_curve import SUBSET, Row, of_whole_sets
 from splatting.evaluation.plan import DATASETS
 from splatting.files.json_files import read_json
 
@@ -26,8 +26,7 @@ COMPARED = (*SCORES, "gaussians")  # with published numbers
 DEFAULT = ("adc", "default", "defaults", "base")  # names of the set that others are compared with, the first there is
 COSTS = ("seconds", "gaussians", "ply_mb")
 DIGITS = 1e6  # of a PSNR in a curve
-STEPS = (0, 1, 2, 4, 8)  # below the highest level, times the step
-DROPS = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0)  # dB below the best; dense where the last tenths get expensive
+LOWEST = 2.0  # dB below the best final PSNR to which its levels go at least
 WIDEST_STEP = 2.0  # largest ratio of the seconds of two points to interpolate between; a wider gap tells too little
 DECIDING = {  # options of train.py that decide what test views show, and which of their pixels count
     *("--resolution", "-r", "--images", "-i", "--white_background", "-w", "--train_test_exp"),
@@ -176,91 +175,85 @@ def default_set(sets: Sets) -> str:
 
 
 def _scored(run: Run) -> list[Row]:
-    """Return the points of a run's curve that score all test views."""
-    return [row for row in whole_sets(run["curve"]) if row["test_psnr"] is not None]
+    """Return the points of a run's curve that have a PSNR of all test views, measured or estimated."""
+    return [row for row in of_whole_sets(run["curve"]) if row["test_psnr"] is not None]
 
 
 def seconds_to_reach(curve: Sequence[Row], level: float) -> float | None:
-    """Return the seconds of training until the test PSNR first reaches `level` (dB); None if it never does.
+    """Return the seconds of training until the test PSNR first reaches `level` (dB); None if that is not known.
 
-    curve: of scored rows. Between two, PSNR is taken as linear in the logarithm of the seconds. If the seconds more
-    than double between them, and for the first one, the time of the iteration that reaches `level` counts instead.
+    curve: of scored rows. Between two, PSNR is taken as linear in the logarithm of the seconds. It is not known if no
+    row reaches the level, if the first one does, or if the seconds more than double from the row before.
     """
-    index = next((i for i, row in enumerate(curve) if row["test_psnr"] >= level), None)
-    if index is None:
+    index = next((i for i, row in enumerate(curve) if row["test_psnr"] >= level), 0)
+    row, before = curve[index], curve[index - 1]
+    if not index or before["seconds"] <= 0 or row["seconds"] > WIDEST_STEP * before["seconds"]:
         return None
-    row, before = curve[index], curve[index - 1] if index else None
-    if before is None or before["seconds"] <= 0 or row["seconds"] > WIDEST_STEP * before["seconds"]:
-        return row["seconds"]
     part = (level - before["test_psnr"]) / (row["test_psnr"] - before["test_psnr"])
     return math.exp((1 - part) * math.log(before["seconds"]) + part * math.log(row["seconds"]))
 
 
 def round_levels(finals: Sequence[float]) -> list[float]:
-    """Return a few round PSNRs (dB, descending) around the final ones of several sets.
+    """Return a few PSNRs (dB, descending) for the final ones of several sets.
 
-    The first is the best final one, rounded down; the others lie below it, denser near it, down to the first that all
-    sets end above. The step is 0.1, 0.5 or 1 dB, as the final ones differ by less than 0.5, less than 5, or more.
+    The first is the best final one, rounded down to half a dB; the others lie below it, denser near it, down to the
+    first that all sets end above, and by LOWEST at least, since sets that end alike may differ on the way.
     """
-    low, high = min(finals), max(finals)
-    parts = 10 if high - low < 0.5 else 2 if high - low < 5 else 1  # of a dB
-    levels = [(math.floor(high * parts) - step) / parts for step in STEPS]
-    return levels[: sum(level > low for level in levels) + 1]
+    low, high = min(finals), math.floor(2 * max(finals)) / 2
+    drops = [0.0, 0.5]
+    while drops[-1] < LOWEST or high - drops[-1] >= low:
+        drops.append(2 * drops[-1])
+    return [high - drop for drop in drops]
 
 
 def reached(sets: Sets) -> dict[str, Any] | None:
-    """Return the table of a scene's sets; None if fewer than two have a curve to their end.
+    """Return the table of a scene's sets; None if fewer than two have a curve to their end, of two points or more.
 
-    default: the set that others are compared with. levels: `psnr`, and `of_default`: it is the mean final PSNR of that
-    set. sets: by name `final` (spread of PSNR) and `cells`, one for each level (`_cell`), with `ratio`: its mean
-    seconds as a part of the default's.
+    default: the set that others are compared with. levels: `psnr`, and `of_default`: it is the mean PSNR at the end of
+    that set. sets: by name the cells, one for each level (`_cell`), with `ratio`: its mean seconds as a part of the
+    default's.
     """
-    ends = {name: [rows[-1]["test_psnr"] if (rows := _scored(run)) else None for run in runs]
-            for name, runs in sets.items()}  # fmt: skip
-    finals = {name: spread(values) for name, values in ends.items() if None not in values}
+    curves = {name: [_scored(run) for run in runs] for name, runs in sets.items()}
+    ends = {name: [rows[-1]["test_psnr"] for rows in seeds if len(rows) > 1 and rows[-1][SUBSET] is None]
+            for name, seeds in curves.items()}  # fmt: skip
+    finals = {name: statistics.fmean(values) for name, values in ends.items() if len(values) == len(curves[name])}
     if len(finals) < 2:
         return None
     default = default_set(finals)
-    own = math.floor(finals[default]["mean"] * DIGITS) / DIGITS  # a mean of equal numbers may exceed them by a bit
-    round_ones = [level for level in round_levels([x["mean"] for x in finals.values()]) if abs(level - own) >= 0.005]
+    own = math.floor(finals[default] * DIGITS) / DIGITS  # a mean of equal numbers may exceed them by a bit
+    round_ones = [level for level in round_levels(list(finals.values())) if abs(level - own) >= 0.005]
     levels = [{"psnr": level, "of_default": level == own} for level in sorted([*round_ones, own], reverse=True)]
-    table = {
-        name: {"final": final, "cells": [_cell(sets[name], **level, is_default=name == default) for level in levels]}
-        for name, final in finals.items()
-    }
-    for entry in table.values():
-        for cell, theirs in zip(entry["cells"], table[default]["cells"], strict=True):
+    table = {name: [_cell(curves[name], **level, is_default=name == default) for level in levels] for name in finals}
+    for cells in table.values():
+        for cell, theirs in zip(cells, table[default], strict=True):
             both = cell["seconds"]["mean"], theirs["seconds"]["mean"]
-            cell["ratio"] = None if both[0] is None or not both[1] else both[0] / both[1]
+            cell["ratio"] = None if None in both or not both[1] else both[0] / both[1]
     return {"default": default, "levels": levels, "sets": table}
 
 
-def _cell(runs: Sequence[Run], psnr: float, of_default: bool, is_default: bool) -> dict[str, Any]:
-    """Return what the seeds of a set take to reach a level: spreads of seconds, Gaussians and megabytes.
+def _cell(curves: Sequence[Sequence[Row]], psnr: float, of_default: bool, is_default: bool) -> dict[str, Any]:
+    """Return what the seeds of a set take to reach a level: spreads of seconds and Gaussians.
 
-    Seeds that do not reach it have null, and so has the mean then. reached: the number of seeds that do; at_least:
-    whether seconds are a lower bound. That is so only for the default's own final PSNR: a seed of it that ends below
-    the mean counts with all its seconds, which is too few, so that no ratio flatters the others. A PLY is taken to have
-    as many bytes for each Gaussian as the run's last one.
+    Seeds that do not reach it have null, and so has the mean then. reached: the number of seeds that do; estimated:
+    whether a point that scored a part of the test views decides; at_least: whether seconds are a lower bound. That is
+    so only for the default's own end: a seed of it that ends below the mean counts with all its seconds, which is too
+    few, so that no ratio flatters the others.
     """
-    curves = [_scored(run) for run in runs]
-    rows = [next((row for row in curve if row["test_psnr"] >= psnr), None) for curve in curves]
-    at_least = of_default and is_default and None in rows
-    seconds, counts, megabytes = [], [], []
-    for run, curve, row in zip(runs, curves, rows, strict=True):
-        last = run["iterations"][str(run["final_iteration"])]
-        of_end = at_least and row is None
-        count = (curve[-1] if of_end else row or {}).get("gaussians")
-        seconds.append(curve[-1]["seconds"] if of_end else seconds_to_reach(curve, psnr))
-        counts.append(count)
-        known = count is not None and last["gaussians_saved"]
-        megabytes.append(count * last["ply_mb"] / last["gaussians_saved"] if known else None)
+    places = [next((i for i, row in enumerate(curve) if row["test_psnr"] >= psnr), None) for curve in curves]
+    at_least = of_default and is_default and None in places
+    rows = [curve[-1] if at_least and i is None else None if i is None else curve[i]
+            for curve, i in zip(curves, places, strict=True)]  # fmt: skip
+    deciding = [row for curve, i in zip(curves, places, strict=True) if i is not None
+                for row in curve[max(i - 1, 0) : i + 1]]  # fmt: skip
     return {
         "at_least": at_least,
-        "gaussians": spread(counts),
-        "mb": spread(megabytes),
-        "reached": sum(row is not None for row in rows),
-        "seconds": spread(seconds),
+        "estimated": any(row[SUBSET] is not None for row in deciding),
+        "gaussians": spread(row and row["gaussians"] for row in rows),
+        "reached": sum(i is not None for i in places),
+        "seconds": spread(
+            curve[-1]["seconds"] if at_least and i is None else seconds_to_reach(curve, psnr)
+            for curve, i in zip(curves, places, strict=True)
+        ),
     }
 
 
@@ -314,40 +307,6 @@ def _beaten_by(points: Mapping[str, Ends], name: str, cost: str) -> dict[str, An
         return None
     best = max(rivals, key=lambda other: (points[other]["PSNR"]["mean"], -points[other][cost]["mean"]))
     return {"by": best, "clearly": True if True in clear else None if None in clear else False}
-
-
-def gaussians_to_reach(curve: Sequence[Row], level: float) -> float | None:
-    """Return the least number of Gaussians of a scored iteration that reaches `level` (dB); None if none does."""
-    counts = [row["gaussians"] for row in curve if row["test_psnr"] >= level]
-    return min((count for count in counts if count is not None), default=None)
-
-
-def cheapest(sets: Sets) -> list[dict[str, Any]]:
-    """Return, for each of a few PSNRs, the set that reaches it in the fewest seconds, and that with fewest Gaussians.
-
-    With several seeds, all must reach the level, and their mean counts; std is their sample standard deviation. The
-    first level is the best that all seeds of some option set reach, rounded down to a tenth. The others are DROPS below
-    it, down to the lowest PSNR at which a curve starts.
-    """
-    curves = {name: [_scored(run) for run in runs] for name, runs in sets.items()}
-    scored = [[[row["test_psnr"] for row in curve] for curve in seeds] for seeds in curves.values()]
-    top = max((min(max(psnrs, default=-math.inf) for psnrs in seeds) for seeds in scored), default=-math.inf)
-    if not math.isfinite(top):
-        return []
-    lowest, tenths = min(psnrs[0] for seeds in scored for psnrs in seeds if psnrs), math.floor(top * 10)
-    rows = []
-    for level in ((tenths - round(10 * drop)) / 10 for drop in DROPS):
-        if level <= lowest:
-            break
-        row: dict[str, Any] = {"psnr": level}
-        for name, measure in (("seconds", seconds_to_reach), ("gaussians", gaussians_to_reach)):
-            spreads = {config: spread(measure(curve, level) for curve in seeds) for config, seeds in curves.items()}
-            costs = {config: found["mean"] for config, found in spreads.items() if found["mean"] is not None}
-            best = min(costs, key=costs.__getitem__, default=None)
-            std = spreads[best]["std"] if best else None
-            row[name] = {"all": costs, "config": best, "std": std, "value": costs.get(best)}
-        rows.append(row)
-    return rows
 
 
 def published_tables() -> list[dict[str, Any]]:

@@ -4,14 +4,16 @@ import contextlib
 import random
 import subprocess
 import sys
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import TypeVar
 
+import numpy as np
 import torch
 from tqdm import tqdm
 
-from splatting.evaluation.error_curve import COLUMNS, FIGURE, NAME, SUBSET, Row, write_curve
+from splatting.evaluation.error_curve import COLUMNS, ESTIMATED, FIGURE, NAME, SCORES, SUBSET, Row, write_curve
 from splatting.evaluation.training_log import SHORT, TrainingLog
 from splatting.evaluation.what_to_try import peak_advice
 from splatting.host.clock import running_seconds, wall_seconds
@@ -23,6 +25,7 @@ AHEAD, MANY_CORES = 2.0, 4  # seconds before the end at which drawing gets ready
 SHORTEST = 200  # iterations of a training that is scored between, too
 GRIDS = ((4, 32), (2, 12))  # points while the number of iterations doubles, and their number before the last iteration
 SHARE = 0.025  # of a training that scoring may take by its estimate; 0.05 is promised, and early points may be dearer
+WHOLE_SHARE = 0.075  # the same for --whole_curve, where 0.1 is promised
 VIEW_COST = 0.5  # of scoring a view, in iterations: it takes no gradient and no step
 _ROOT = Path(__file__).resolve().parents[2]
 View = TypeVar("View")
@@ -48,6 +51,24 @@ def curve_points(
     return frozenset(places - whole), max(1, min(views, int(budget / (sets * count))))
 
 
+def whole_points(iterations: int, whole: Iterable[int], sets: int, views: int) -> dict[int, int]:
+    """The iterations of `curve_points`' coarse grid, and how many of the `views` of the test set each scores.
+
+    As many as WHOLE_SHARE allows score all of them: the last ones, since the levels that are compared lie near the end,
+    and the first one, for the `Estimates`. The others score one view each, or if none can score all, each the same
+    number.
+    """
+    density, count = GRIDS[1]
+    whole = {t for t in whole if 0 < t < iterations} | {iterations}
+    places = {round(iterations * 2 ** (-place / density)) for place in range(1, count + 1)} - whole - {0}
+    left = WHOLE_SHARE * iterations / VIEW_COST - len(whole) * sets * views - len(places)  # beyond one view a point
+    full = min(len(places), max(0, int(left / max(views - 1, 1))))
+    size = 1 if full else max(1, min(views, int(left / max(len(places), 1)) + 1))
+    first, *others = sorted(places) or [0]
+    order = [*others[-1:], first, *others[-2::-1]]
+    return {t: views if place < full else size for place, t in enumerate(order) if t}
+
+
 def evenly_spread(views: Sequence[View], count: int) -> list[View]:
     """`count` of the views, or all if there are fewer; with two or more, the first and the last are among them."""
     count = min(count, len(views))
@@ -64,11 +85,12 @@ def drawn(views: Sequence[View], count: int) -> list[View]:
 class CurveDrawer:
     """A process that draws the curve of a folder: matplotlib takes a second, and training has other things to do.
 
-    `begin`, `draw`, `finish` in that order; `abandon` at any time.
+    `begin`, `draw`, `finish` in that order; `abandon` at any time. views: how many each set has, for the legend.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, views: Mapping[str, int]) -> None:
         self._folder = folder.resolve()
+        self._views = [str(views[name]) for name in ("test", "train")]
         self._process: subprocess.Popen | None = None
 
     def begin(self) -> None:
@@ -77,8 +99,9 @@ class CurveDrawer:
             return
         files = [str(self._folder / name) for name in (NAME, FIGURE)]
         with contextlib.suppress(OSError):  # `finish` says so
+            words = [*files, self._folder.name, *self._views]
             self._process = subprocess.Popen(
-                [sys.executable, "-X", "utf8", "-m", "splatting.evaluation.figures", *files, self._folder.name],
+                [sys.executable, "-X", "utf8", "-m", "splatting.evaluation.figures", *words],
                 cwd=_ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8",
                 **own_session(),  # Ctrl-C is for the training, which ends this process if need be
             )  # fmt: skip
@@ -111,14 +134,61 @@ class CurveDrawer:
             self._process.wait()
 
 
+class Estimates:
+    """Turns scores of a subset into those of the whole sets, in rows of a curve.
+
+    A subset's views are easier or harder than all of them. By how much is known wherever all were scored. Between two
+    such scores of the subset it is interpolated, and outside of them taken as at the nearest.
+
+    rows: those of an earlier part of the training; its subsets that are not estimated yet will be.
+    """
+
+    def __init__(self, rows: Sequence[Row], views: Mapping[str, Sequence[View]]) -> None:
+        self._sizes = {name: len(of_set) for name, of_set in views.items()}
+        self._raw: list[tuple[Row, Row]] = []  # a row of a subset, and its scores as measured
+        self._known: list[Mapping[str, Sequence[float]]] = []  # the scores of each view
+        for row in rows:
+            if row[SUBSET] is not None and not row[ESTIMATED]:
+                self.add(row, {})
+
+    def add(self, row: Row, scores: Mapping[str, Sequence[float]]) -> None:
+        """Take a scored row in. scores: by column, those of each view, in the order of the set."""
+        if row[SUBSET] is None:
+            self._known.append(scores)
+        else:
+            self._raw.append((row, {name: row[name] for name in SCORES if row[name] is not None}))
+        for old, raw in self._raw if row[SUBSET] is None else self._raw[-1:]:
+            whole = {name: self._whole(name, value, int(old[SUBSET] or 0)) for name, value in raw.items()}
+            old |= {} if None in whole.values() else whole | {ESTIMATED: 1}
+
+    def _whole(self, name: str, value: float, size: int) -> float | None:
+        """The score of all views for that of a subset of `size`; None if that is not known."""
+        count = self._sizes[name.partition("_")[0]]
+        there = drawn(range(count), size)
+        known = {}
+        for scores in self._known:
+            of_views = scores.get(name, ())
+            # Some are left out where no pixel of them counts; the PSNR of equal images is infinite.
+            if len(of_views) == count and np.isfinite(of_views).all():
+                part = fmean(of_views[i] for i in there)
+                known[part] = fmean(of_views) - part
+        if not known:
+            return None
+        parts, offsets = zip(*sorted(known.items()), strict=True)
+        return round(value + float(np.interp(value, parts, offsets)), 6)
+
+
 class CurveRecorder:
     """Scores views in the iterations of a plan, keeps the curve's file up to date, and draws it at the end.
 
     rows: those of the runs that this one resumes; `log` has their seconds. Iterations are those of the schedule, which
     are those of the run if it is `steady`. iterations: the last one; always: those that score all views, as the last
-    one does; those between score a fixed part of each set (`curve_points`, `drawn`). views: those to score, by set,
-    "test" and "train". load(views) decodes their photos; scores(views) gives their mean scores by name. If the file
-    cannot be written, one warning says so and the next point tries again: a training is worth more than its curve.
+    one does; those between score a fixed part of each set (`curve_points`, `drawn`), from which the whole is estimated
+    (`Estimates`); with whole_test, test views alone (`whole_points`), unless all fit, and of a run that is not steady a
+    view where more would take too much of the seconds so far. views: those to score, by set,
+    "test" and "train". load(views) decodes their photos; scores(view) gives the scores of one by name, none if no pixel
+    counts. If the file cannot be written, one warning says so and the next point tries again: a training is worth more
+    than its curve.
     """
 
     def __init__(
@@ -130,27 +200,33 @@ class CurveRecorder:
         always: Sequence[int],
         views: dict[str, Sequence[View]],
         load: Callable[[Sequence[View]], None],
-        scores: Callable[[Sequence[View]], dict[str, float]],
+        scores: Callable[[View], dict[str, float]],
         device: torch.device,
         steady: bool = True,
+        whole_test: bool = False,
     ) -> None:
         self.rows = rows
         self._folder = Path(model_path)
         self._log = log
         self._iterations = iterations
         self._whole = {*always, iterations}
-        most = max(map(len, views.values()))
+        self._views, most = views, max(map(len, views.values()))
         between, size = curve_points(iterations, always, len(views), most, steady)
-        self._points = self._whole | between
-        self._size = size if size < most else None
-        self._views, self._part = views, {name: drawn(of_set, size) for name, of_set in views.items()}
+        counts = {name: dict.fromkeys(between, size) for name in views}
+        if whole_test and size < most:
+            counts = {"test": whole_points(iterations, always, len(views), len(views["test"]))}
+        self._counts = counts  # of views to score, by set and iteration
+        self._clocked = whole_test and not steady  # how long it takes is not known from the iterations
+        self._points = self._whole | counts["test"].keys()
+        self._size = min((n for n in counts["test"].values() if n < len(views["test"])), default=None)
+        self._estimates = Estimates(rows, views)
         self._load = load
         self._scores = scores
         self._device = device
         self._scored = 0
         self._spent = dict.fromkeys(("scoring", "writing", "drawing", "loading"), 0.0)  # seconds
         self._warned = False
-        self._drawer = CurveDrawer(self._folder)
+        self._drawer = CurveDrawer(self._folder, {name: len(of_set) for name, of_set in views.items()})
         self._ahead = AHEAD if cores() >= MANY_CORES else 0.0
 
     def point(self, span: range) -> int | None:
@@ -180,14 +256,20 @@ class CurveRecorder:
         """
         # The peaks of log and curve, because after a rescue the curve has rows beyond the log's last record.
         peaks = [self._log.peak_memory_mib(), *(row["peak_memory_mib"] for row in self.rows[-1:])]
-        views, size = (self._part, self._size) if iteration not in self._whole else (self._views, None)
+        views = self._views
+        if iteration not in self._whole:
+            paid = not self._clocked or 0 < self._spent["scoring"] <= WHOLE_SHARE * seconds
+            views = {
+                name: drawn(views[name], counts[iteration] if paid else 1) for name, counts in self._counts.items()
+            }
+        part = len(views["test"]) < len(self._views["test"])
         row = dict.fromkeys(COLUMNS) | {
             "iteration": iteration if trained is None else trained,
             "seconds": round(self._log.seconds_before + seconds, 3),
             "wall_seconds": round(self._log.wall_seconds_before + wall_seconds(), 3),
             "gaussians": gaussians,
             "peak_memory_mib": max((peak for peak in peaks if peak is not None), default=None),
-            SUBSET: size,
+            SUBSET: len(views["test"]) if part else None,
         }
         if not self._scored:  # photos that training mostly needs soon: no part of the cost
             self._timed("loading", lambda: self._load([view for of_set in self._views.values() for view in of_set]))
@@ -204,8 +286,13 @@ class CurveRecorder:
         self._spent[part] += running_seconds() - start
 
     def _score(self, row: Row, views: dict[str, Sequence[View]]) -> None:
+        scores: dict[str, list[float]] = {}
         for name, of_set in views.items():
-            row |= {f"{name}_{score}": round(value, 6) for score, value in self._scores(of_set).items()}
+            for view in of_set:
+                for score, value in self._scores(view).items():
+                    scores.setdefault(f"{name}_{score}", []).append(value)
+        row |= {name: round(fmean(values), 6) for name, values in scores.items()}
+        self._estimates.add(row, scores)
 
     def _write(self) -> None:
         try:
@@ -240,7 +327,7 @@ class CurveRecorder:
         share = f"{100 * scoring / seconds:.1f} % of the training"
         if self._iterations <= SHORT:
             return f"Curve of {len(self.rows)} points, scored in {scoring:.2f} s ({share})"
-        between = "" if self._size is None else f", {self._size} of each set between --test_iterations"
+        between = "" if self._size is None else f", at least {self._size} of a set between --test_iterations"
         return (
             f"Scored {sum(map(len, self._views.values()))} views at {self._scored} iterations{between}, "
             f"in {scoring:.2f} s ({share}), wrote {NAME} in {writing:.3f} s ({100 * writing / seconds:.2f} %), "

@@ -15,11 +15,12 @@ from utils.system_utils import UserError, atomic_write
 NAME = "error_vs_time.csv"
 FIGURE = "error_vs_time.png"
 SUBSET = "subset"
-COUNTS = ("iteration", "gaussians", SUBSET)
+ESTIMATED = "estimated"
+COUNTS = ("iteration", "gaussians", SUBSET, ESTIMATED)
 SCORES = tuple(f"{views}_{score}" for views in ("test", "train") for score in ("l1", "psnr", "ssim"))
 COSTS = ("iteration", "seconds", "wall_seconds", "gaussians", "peak_memory_mib")
-COLUMNS = (*COSTS, *SCORES, SUBSET)
-_HEADERS = (list(COLUMNS), list(COLUMNS[:-1]))  # older files have no subsets
+COLUMNS = (*COSTS, *SCORES, SUBSET, ESTIMATED)
+_HEADERS = [list(COLUMNS[:end]) for end in (None, -1, -2)]  # older files have no estimates, or no subsets
 PEER_COLUMNS = (*COSTS, *SCORES[:3], "test_lpips", *SCORES[3:])
 PEER_REQUIRED = ("seconds", "test_psnr")
 
@@ -32,7 +33,8 @@ def read_curve(path: str | os.PathLike) -> list[Row]:
     seconds: of training, without evaluation and saving, over all resumed parts. wall_seconds: since the start of the
     process, with those of earlier parts. peak_memory_mib: the most of all parts so far, of the GPU if it trains.
     `<views>_l1`, `<views>_psnr` (dB), `<views>_ssim`: gaussian_renderer/scored_views.py. subset: number of views of
-    each set that were scored, the same ones in all such rows; None: all. UserError if the file is missing or damaged.
+    each set that were scored; None: all. estimated: 1 where the scores are estimates of those of whole sets; None in a
+    row of a subset: they are those of the subset. UserError if the file is missing or damaged.
     """
     try:
         header, *lines = _lines(path)
@@ -110,6 +112,11 @@ def continue_curve(
 def whole_sets(rows: Iterable[Row]) -> list[Row]:
     """The rows that score whole sets. Only these compare with scores of other places, and with each other's best."""
     return [row for row in rows if row.get(SUBSET) is None]
+
+
+def of_whole_sets(rows: Iterable[Row]) -> list[Row]:
+    """The rows that score whole sets or estimate them."""
+    return [row for row in rows if row.get(SUBSET) is None or row.get(ESTIMATED)]
 
 
 def best_test(rows: Iterable[Row]) -> Row | None:

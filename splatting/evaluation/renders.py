@@ -24,6 +24,7 @@ TIMES = "render_times.json"  # beside the folders of images: the time of each vi
 GAIN = 5  # amplification of the difference
 GAP = 6  # pixels between images of a sheet
 HEADER = 26  # height of a sheet's titles in pixels
+WORST = 3  # views of a sheet
 WIDEST = 480  # largest width, in pixels, of an image in a report
 _QUALITY = 85
 
@@ -118,28 +119,34 @@ def error_image(truth: Image.Image, render: Image.Image) -> Image.Image:
 
 
 def contact_sheet(views: Sequence[tuple[str, Image.Image, Image.Image]], widest: int | None = None) -> Image.Image:
-    """Draw a row for each view (label, ground truth, render), under a row of titles. Images may differ in size.
+    """Draw a row for each view (label, ground truth, render), with the error. widest: as for `sheet`."""
+    rows = [[(label, truth), ("", render), ("", error_image(truth, render))] for label, truth, render in views]
+    return sheet(("ground truth", "render", f"error x {GAIN}"), rows, widest)
 
-    widest: shrink wider images to this width in pixels, after computing the error.
+
+def sheet(
+    titles: Sequence[str], rows: Sequence[Sequence[tuple[str, Image.Image]]], widest: int | None = None
+) -> Image.Image:
+    """Draw rows of labelled images, which may differ in size, under a row of titles.
+
+    widest: shrink wider images to this width in pixels.
     """
-    cells = [
-        (label, [_shrunk(image, widest) for image in (truth, render, error_image(truth, render))])
-        for label, truth, render in views
-    ]
-    cell_width = max(images[0].width for _, images in cells)
-    cell_height = max(images[0].height for _, images in cells)
-    size = (3 * (cell_width + GAP) + GAP, HEADER + len(views) * (cell_height + GAP))
-    sheet = Image.new("RGB", size, "white")
-    draw = ImageDraw.Draw(sheet)
+    cells = [[(label, _shrunk(image, widest)) for label, image in row] for row in rows]
+    cell_width = max(image.width for row in cells for _, image in row)
+    cell_height = max(image.height for row in cells for _, image in row)
+    size = (len(titles) * (cell_width + GAP) + GAP, HEADER + len(cells) * (cell_height + GAP))
+    drawn = Image.new("RGB", size, "white")
+    draw = ImageDraw.Draw(drawn)
     font = ImageFont.load_default(size=15)
-    for column, title in enumerate(("ground truth", "render", f"error x {GAIN}")):
-        draw.text((GAP + column * (cell_width + GAP), 4), title, fill="black", font=font)
-    for row, (label, images) in enumerate(cells):
-        y = HEADER + row * (cell_height + GAP)
-        for column, image in enumerate(images):
-            sheet.paste(image, (GAP + column * (cell_width + GAP), y))
-        draw.text((GAP + 6, y + 4), printable(label), fill="white", font=font, stroke_width=2, stroke_fill="black")
-    return sheet
+    for column, title in enumerate(titles):
+        draw.text((GAP + column * (cell_width + GAP), 4), printable(title), fill="black", font=font)
+    for place, row in enumerate(cells):
+        y = HEADER + place * (cell_height + GAP)
+        for column, (label, image) in enumerate(row):
+            x = GAP + column * (cell_width + GAP)
+            drawn.paste(image, (x, y))
+            draw.text((x + 6, y + 4), printable(label), fill="white", font=font, stroke_width=2, stroke_fill="black")
+    return drawn
 
 
 def _shrunk(image: Image.Image, widest: int | None) -> Image.Image:
@@ -150,38 +157,52 @@ def _shrunk(image: Image.Image, widest: int | None) -> Image.Image:
     return image.resize((widest, max(round(image.height * widest / image.width), 1)))
 
 
-def draw_worst_views(path: Path, run: dict[str, Any], output: Path) -> bool:
-    """Draw a run's worst test views on a sheet; return False if it has none.
+class ComparedViews:
+    """The test views that several runs scored, those of the lowest PSNR first: photos, renders and their errors.
 
-    Pixels that do not count are white in the images and black in the error.
+    runs: of one scene with the same ground truth, of each option set one; all are finished. Pixels that do not count
+    are white in the images and black in the error. UserError for damaged scores or images.
     """
-    if not run["worst_views"]:
-        return False
-    rows = [(f"{view['picture']}: {view['PSNR']:.2f} dB", *_pair(run, output, view["file"]))
-            for view in run["worst_views"]]  # fmt: skip
-    with atomic_write(path) as temporary:
-        contact_sheet(rows, WIDEST).save(temporary)
-    return True
 
+    def __init__(self, runs: Sequence[dict[str, Any]], output: Path) -> None:
+        self.names = [run["config"] or "render" for run in runs]
+        self._runs, self._output = runs, output
+        self._scores = [load_scores(output / run["model"], f"ours_{run['final_iteration']}")[1]["PSNR"] for run in runs]
+        scored = [name for name in self._scores[0] if None not in [scores.get(name) for scores in self._scores]]
+        self.files = sorted(scored, key=lambda name: (statistics.fmean(own[name] for own in self._scores), name))
+        self._photo_name = photo_namer(output / runs[0]["model"])
 
-def comparisons(run: dict[str, Any], output: Path, most: int) -> list[dict[str, Any]]:
-    """Return at most `most` scored test views of a run's last scored iteration, evenly spread.
+    def _images(self, file: str) -> tuple[Image.Image, list[Image.Image]]:
+        pairs = [_pair(run, self._output, file) for run in self._runs]
+        return pairs[0][0], [render for _, render in pairs]
 
-    Each has its `photo`, `render` and `error` as JPEGs, and a `text`. Pixels are as in `draw_worst_views`. UserError
-    for a damaged image.
-    """
-    model = output / run["model"]
-    scores = load_scores(model, f"ours_{run['final_iteration']}")[1]["PSNR"]
-    names = sorted(name for name, value in scores.items() if value is not None)
-    photo_name = photo_namer(model)
-    views = []
-    for index in np.unique(np.linspace(0, len(names) - 1, most if names else 0).round().astype(int)):
-        name = names[index]
-        photo, render = _pair(run, output, name)
-        text = f"{photo_name(name)}: {scores[name]:.2f} dB; photo and render, and their error x {GAIN}"
-        images = {"photo": photo, "render": render, "error": error_image(photo, render)}
-        views.append({**{side: _jpeg(image) for side, image in images.items()}, "text": text})
-    return views
+    def shown(self, most: int) -> list[dict[str, Any]]:
+        """At most `most` views: the worst, and others evenly spread to the best.
+
+        Each has the `name` of its photo, `photo` as a JPEG, and `sets`: of each run `text`, `render` and `error`.
+        """
+        places = np.unique(np.linspace(0, len(self.files) - 1, min(most, len(self.files))).round().astype(int))
+        return [self._view(self.files[place]) for place in places]
+
+    def _view(self, file: str) -> dict[str, Any]:
+        photo, renders = self._images(file)
+        texts = [f"{name}: {own[file]:.2f} dB" for name, own in zip(self.names, self._scores, strict=True)]
+        sets = [{"text": text, "render": _jpeg(render), "error": _jpeg(error_image(photo, render))}
+                for text, render in zip(texts, renders, strict=True)]  # fmt: skip
+        return {"name": self._photo_name(file), "photo": _jpeg(photo), "sets": sets}
+
+    def draw_worst(self, path: Path) -> None:
+        """Draw the worst views on a sheet; with one run, with their errors."""
+        rows = []
+        for file in self.files[:WORST]:
+            photo, renders = self._images(file)
+            labels = [f"{own[file]:.2f} dB" for own in self._scores]
+            rows.append([(self._photo_name(file), photo), *zip(labels, renders, strict=True)])
+            if len(renders) == 1:
+                rows[-1].append(("", error_image(photo, renders[0])))
+        titles = ("photo", *self.names, f"error x {GAIN}")[: len(rows[0])]
+        with atomic_write(path) as temporary:
+            sheet(titles, rows, WIDEST).save(temporary)
 
 
 def _pair(run: dict[str, Any], output: Path, name: str) -> list[Image.Image]:

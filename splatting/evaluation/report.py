@@ -20,7 +20,7 @@ from splatting.evaluation import comparison, tables
 from splatting.evaluation.comparison import Sets
 from splatting.evaluation.figures import draw_curves, draw_fronts
 from splatting.evaluation.machine import one_line
-from splatting.evaluation.renders import comparisons, draw_worst_views
+from splatting.evaluation.renders import GAIN, ComparedViews
 from splatting.files.json_files import write_json
 from splatting.files.listing import markdown_table
 from utils.system_utils import UserError, atomic_write
@@ -36,7 +36,7 @@ _MEANT = re.compile(r"[\\`*\[\]<>&]")  # characters that begin or end Markdown's
 _ENTITIES = {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
 
 Run = dict[str, Any]
-Pictures = Mapping[str, Sequence[Mapping[str, Any]]]  # by scene: figures (path, text), views (`renders.comparisons`)
+Pictures = Mapping[str, Mapping[str, Any]]  # by scene: paths of `curves` and `fronts`; `views`, by `_views`
 
 
 def make_report(
@@ -54,7 +54,6 @@ def make_report(
     rows = comparison.summarise(runs)
     means = comparison.dataset_means(rows)
     return {
-        "cheapest": _of_scenes(runs, comparison.cheapest),
         "dataset_means": means,
         "fronts": _of_scenes(runs, comparison.fronts),
         "manifest": {
@@ -115,17 +114,16 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
     runs = comparison.grouped(report["runs"], "scene")
     shown = len({(run["scene"], run["config"]) for run in report["runs"]})
     each = max(1, min(OF_A_RUN, OF_A_REPORT // max(1, shown)))
-    pictures, of_fronts = {}, {}
+    pictures, folder = {}, output / "figures"
     for scene, members in runs.items():
         peers = [peer for peer in report["peers"] if peer["scene"] == scene]
-        text = f"{scene}: error of the test views against seconds of training"
-        pictures[scene] = _figure(output / "figures" / f"{scene}_curves.png", text, draw_curves, scene, members, peers)
-        pictures[scene] += _views(output, scene, members, each)
-    for scene, found in report["fronts"].items():
-        names = list(dict.fromkeys(run["config"] for run in runs[scene]))
-        text = f"{scene}: PSNR of each option set at its end, against seconds, Gaussians and megabytes"
-        of_fronts[scene] = _figure(output / "figures" / f"{scene}_fronts.png", text, draw_fronts, scene, found, names)
-    texts = {f"report.{kind}": render(kind, report, pictures, of_fronts, output) for kind in ("md", "html")}
+        names, found = list(dict.fromkeys(run["config"] for run in members)), report["fronts"].get(scene)
+        pictures[scene] = {
+            "curves": _figures(draw_curves, folder, scene, members, peers),
+            "fronts": _figures(draw_fronts, folder, scene, found, names) if found else [],
+            "views": _views(output, scene, members, each),
+        }
+    texts = {f"report.{kind}": render(kind, report, pictures, output) for kind in ("md", "html")}
     texts["timing.txt"] = _timing(report["runs"])
     write_json(output / "report.json", report)
     for name, text in texts.items():
@@ -134,31 +132,36 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
             temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
-def _figure(path: Path, text: str, draw: Callable[..., bool], *content: Any) -> list[dict[str, Any]]:
-    """Draw a figure; return it as a picture, none if there is nothing to draw."""
+def _figures(draw: Callable[..., list[Path]], *content: Any) -> list[Path]:
+    """Draw figures; return their files, none if there is nothing to draw."""
     try:
-        return [{"path": path, "text": text}] if draw(path, *content) else []
+        return draw(*content)
     except ImportError as error:
-        print(f"warning: no figure {path.name}: matplotlib cannot be imported ({error})", file=sys.stderr)
+        print(f"warning: no figures: matplotlib cannot be imported ({error})", file=sys.stderr)
         return []
 
 
 def _views(output: Path, scene: str, runs: Sequence[Run], each: int) -> list[dict[str, Any]]:
-    """Show views of each option set's first run that succeeded: the worst on a sheet, and up to `each` to compare."""
-    pictures: list[dict[str, Any]] = []
-    seen = set()
+    """Show views of each option set's first run that succeeded, side by side where the ground truth is the same.
+
+    Of each ground truth: `sheet`, the file with the worst views; `shown`, up to `each` views; `several` option sets.
+    """
+    first: dict[str | None, Run] = {}
     for run in runs:
-        if run["failure"] or run["config"] in seen:
-            continue
-        path = output / "figures" / f"{scene}{'_' + run['config'] if run['config'] else ''}_worst_views.png"
+        if not run["failure"] and run["worst_views"]:
+            first.setdefault(run["config"], run)
+    groups = []
+    for alike in comparison.grouped(first.values(), "ground_truth_sha256").values():
+        name = f"{scene}_{alike[0]['config']}" if groups else scene
+        path = output / "figures" / f"{name}_worst_views.png"
         try:
-            if draw_worst_views(path, run, output):
-                text = f"{run_title(run)}: the test views with the lowest PSNR"
-                pictures += [{"path": path, "text": text}, *comparisons(run, output, each)]
-                seen.add(run["config"])
+            views = ComparedViews(alike, output)
+            views.draw_worst(path)
+            groups.append({"sheet": path, "shown": views.shown(each), "several": len(alike) > 1})
         except UserError as error:
-            print(f"warning: no pictures of the test views of {run_title(run)}: {error}", file=sys.stderr)
-    return pictures
+            titles = "; ".join(map(run_title, alike))
+            print(f"warning: no pictures of the test views of {titles}: {error}", file=sys.stderr)
+    return groups
 
 
 def _timing(runs: Sequence[Run]) -> str:
@@ -174,14 +177,11 @@ def run_title(run: Mapping[str, Any]) -> str:
     return ", ".join(part for part in (run["scene"], run["config"], seed) if part)
 
 
-def render(kind: str, report: Mapping[str, Any], figures: Pictures, of_fronts: Pictures, folder: Path) -> str:
-    """Render report.jinja as a page of a kind, "md" or "html".
-
-    figures: those of each scene and its comparisons; of_fronts: of its fronts. folder: of the page, for links.
-    """
+def render(kind: str, report: Mapping[str, Any], pictures: Pictures, folder: Path) -> str:
+    """Render report.jinja as a page of a kind, "md" or "html". folder: of the page, for links."""
     scenes = comparison.grouped(report["runs"], "scene")
     text = environment(kind, folder).get_template("report.jinja").render(
-        facts=_facts(report), figures=figures, form=f"page.{kind}.jinja", fronts=of_fronts, report=report,
+        facts=_facts(report), form=f"page.{kind}.jinja", gain=GAIN, pictures=pictures, report=report,
         published=comparison.published_tables(), scenes=scenes, tables=tables, title=TITLE,
     )  # fmt: skip
     return (re.sub(r"\n{2,}", "\n\n", text) if kind == "md" else text).strip() + "\n"
@@ -209,21 +209,32 @@ def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
     def known(name: str, key: str = "mean") -> bool:
         return any(row[name][key] is not None for row in rows)
 
-    def seeds(part: str, name: str) -> bool:
-        return any(one[name]["std"] is not None for found in report[part].values() for one in found["sets"].values())
-
     return {
         "cpu_known": known("cpu_seconds"),
-        "fronts_of_seeds": seeds("fronts", "PSNR"),
+        "estimated": {
+            scene
+            for scene, found in report["reached"].items()
+            if any(cell["estimated"] for cells in found["sets"].values() for cell in cells)
+        },
         "left_out": any(row["gaussians"]["mean"] != row["gaussians_saved"]["mean"] for row in rows),
         "machines": sorted({one_line(run["machine"]) for run in runs if run["machine"]}),
         "open_ended": any(row["open_ended"] for row in rows),
-        "reached_by_seeds": seeds("reached", "final"),
+        "said": [run for run in runs if run["lines"]],
         "several_seeds": known("PSNR", "std"),
         "timed": known("seconds"),
         "unfinished": [run for run in runs if not run["finished"] and not run["failure"]],
+        "trainings": _trainings(runs),
         "without_lpips": bool(rows) and not known("LPIPS"),
     }
+
+
+def _trainings(runs: Sequence[Run]) -> str:
+    """What the report is of, in a line."""
+    parts = [f"{len(runs)} training{'s' if len(runs) > 1 else ''}"]
+    for key, name in (("scene", "scenes"), ("config", "option sets"), ("seed", "seeds")):
+        if (count := len({run[key] for run in runs})) > 1:
+            parts.append(f"{count} {name}")
+    return ", ".join(parts)
 
 
 def _data_uri(path: Path) -> str:

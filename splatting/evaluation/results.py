@@ -14,7 +14,7 @@ from splatting.evaluation.comparison import SCORES
 from splatting.evaluation.error_curve import NAME as CURVE
 from splatting.evaluation.error_curve import Row, read_curve
 from splatting.evaluation.plan import Record, Run, SceneEntry, is_model
-from splatting.evaluation.renders import TIMES, image_size, photo_namer, view_names
+from splatting.evaluation.renders import TIMES, WORST, image_size, photo_namer, view_names
 from splatting.evaluation.stages import Failure, page_file
 from splatting.evaluation.what_to_try import peak
 from splatting.files.json_files import read_json
@@ -22,7 +22,6 @@ from utils.system_utils import UserError
 
 REPORT = "report.json"
 MB = 1e6  # bytes
-WORST = 3  # number of views with the lowest PSNR to show of each run
 
 
 def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:

@@ -55,7 +55,9 @@ def train(run: Run, machine: dict[str, Any]) -> None:
     there = _checkpoints(run)
     before = record.stage("train_interrupted") or {}
     before = before if before.get("checkpoint") in there else {}
-    command = _script("train.py", "-s", str(source), "-m", str(run.model), "--disable_viewer", "--quiet")
+    command = _script(
+        "train.py", "-s", str(source), "-m", str(run.model), "--disable_viewer", "--quiet", "--whole_curve"
+    )
     command += [*run.options, *(("--start_checkpoint", str(run.model / before["checkpoint"])) if before else ())]
     _say("training" + _from_where(before, record))
     done = run_child(command)

@@ -19,6 +19,10 @@ _LAST_OF_PEER = {  # heading, and digits, of a column of a peer's curve
 }
 
 
+MAIN = (*SCORES, "seconds", "gaussians", "ply_mb")  # what a report shows first
+REST = tuple(name for name in QUANTITIES if name not in MAIN)
+
+
 class Table(NamedTuple):
     """A table of texts. title: what is said above it; empty: nothing."""
 
@@ -47,25 +51,30 @@ def _iteration(row: Mapping[str, Any]) -> str:
     return f"{several[0]:,} to {several[-1]:,}" if len(several) > 1 else number(row["iteration"], 0)
 
 
-def result_tables(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
-    """Tables of report.json's `summary`: rows that can be compared, and those that stand apart."""
+def result_tables(rows: Sequence[Mapping[str, Any]], names: Sequence[str] = tuple(QUANTITIES)) -> list[Table]:
+    """Tables of report.json's `summary`: rows that can be compared, and those that stand apart.
+
+    names: the QUANTITIES to show.
+    """
     apart = [row for row in rows if row.get("apart")]  # reports of older versions lack it
     comparable = [row for row in rows if not row.get("apart")]
     why = {f"{row['scene']}, {row['config'] or '-'}: {row.get('why_apart') or 'not known'}": None for row in apart}
     title = f"Scored on other ground truth, so not to be compared with other rows. {'. '.join(why)}."
-    return [_results(part, said) for part, said in ((comparable, ""), (apart, title)) if part]
+    return [_results(part, names, said) for part, said in ((comparable, ""), (apart, title)) if part]
 
 
-def _results(rows: Sequence[Mapping[str, Any]], title: str) -> Table:
-    """A table without columns of times, sizes and memory that are empty."""
+def _results(rows: Sequence[Mapping[str, Any]], names: Sequence[str], title: str) -> Table:
+    """A table without columns that are empty, but for PSNR and SSIM."""
     columns = {"scene": lambda row: row["scene"]}
     if any(row["config"] for row in rows):
         columns["options"] = lambda row: row["config"] or "-"
     columns["iteration"] = _iteration
-    columns["seeds"] = lambda row: " ".join(map(str, row["seeds"])) if row["seeds"] != [None] else "-"
-    for name, (head, digits) in QUANTITIES.items():
-        if name in SCORES or any(row[name]["mean"] is not None for row in rows if name in row):
+    for name in names:
+        head, digits = QUANTITIES[name]
+        if name in SCORES[:2] or any(row[name]["mean"] is not None for row in rows if name in row):
             columns[head] = lambda row, name=name, digits=digits: spread_cell(row[name], digits)
+    if any(row["seeds"] != [None] for row in rows):
+        columns["seeds"] = lambda row: " ".join("-" if seed is None else str(seed) for seed in row["seeds"])
     return table(columns, rows, title)
 
 
@@ -124,62 +133,40 @@ def _beside(values: Mapping[str, float] | None, digits: int) -> str:
 
 def reached_table(found: Mapping[str, Any]) -> Table:
     """Table of a scene's `reached`: a row for each option set, a column for each level, highest first."""
-    columns = {"options": lambda one: one[0], "final PSNR (dB)": lambda one: spread_cell(one[1]["final"], 2)}
+    default = found["default"]
+    columns = {"options": lambda one: one[0]}
     for index, level in enumerate(found["levels"]):
-        own = f" (final PSNR of {found['default']})" if level["of_default"] else ""
-        head = f"{level['psnr']:.{2 if own else 1}f} dB{own}"
-        columns[head] = lambda one, i=index: _cell(one[1]["cells"][i], found["default"], one[0] == found["default"])
+        head = f"{default}'s end" if level["of_default"] else f"{level['psnr']:.1f} dB"
+        columns[head] = lambda one, i=index: _cell(one[1][i], one[0] == default)
     return table(columns, list(found["sets"].items()))
 
 
-def _cell(cell: Mapping[str, Any], default: str, is_default: bool) -> str:
-    """Format a cell of `reached`; that of another set is compared with the default's."""
+def _cell(cell: Mapping[str, Any], is_default: bool) -> str:
+    """Format a cell of `reached`; that of another set has its part of the default's seconds, too."""
+    seconds, known = cell["seconds"], [x for x in cell["seconds"]["values"] if x is not None]
     if not cell["reached"] and not cell["at_least"]:
         return "not reached"
-    known = {key: [x for x in cell[key]["values"] if x is not None] for key in ("seconds", "gaussians", "mb")}
-    means = {key: statistics.fmean(values) if values else None for key, values in known.items()}
-    size = f" ({number(means['gaussians'], 0)}; {number(means['mb'], 1)} MB)"
-    digits = 2 if means["seconds"] < 10 else 1
-    if cell["seconds"]["mean"] is None:
-        seeds = f"{cell['reached']} of {len(cell['seconds']['values'])} seeds"
-        return f"{seeds}: {number(means['seconds'], digits)} s{size}"
-    part = "" if is_default or cell["ratio"] is None else f", {cell['ratio']:.2f} of {default}'s"
-    return f"{'≥ ' if cell['at_least'] else ''}{spread_cell(cell['seconds'], digits)} s{size}{part}"
+    if not known:
+        return "not known"
+    digits, about = 2 if known[0] < 10 else 1, "\u2265 " if cell["at_least"] else "~ " if cell["estimated"] else ""
+    if seconds["mean"] is None:
+        return f"{about}{number(statistics.fmean(known), digits)} s, {len(known)} of {len(seconds['values'])} seeds"
+    part = "" if is_default or cell["ratio"] is None else f" ({100 * cell['ratio']:.0f} %)"
+    return f"{about}{spread_cell(seconds, digits)} s{part}"
 
 
 def front_table(found: Mapping[str, Any]) -> Table:
-    """Table of a scene's `fronts`: a row for each option set, with each cost and whether the set is on its front."""
-    header, rows = ["options", "PSNR (dB)"], []
-    for cost in COSTS:
-        header += [QUANTITIES[cost][0], "on the front?"]
-    for name, point in found["sets"].items():
-        row = [name, spread_cell(point["PSNR"], 2)]
-        for cost in COSTS:
-            row += [spread_cell(point[cost], QUANTITIES[cost][1]), _on_front(found["beaten"][cost][name])]
-        rows.append(row)
-    return Table(header, rows)
+    """Table of a scene's `fronts`: for each option set and cost, whether the set is on the front."""
+    columns = {"options": lambda name: name} | {
+        QUANTITIES[cost][0]: lambda name, cost=cost: _on_front(found["beaten"][cost][name]) for cost in COSTS
+    }
+    return table(columns, list(found["sets"]))
 
 
 def _on_front(beaten: Mapping[str, Any] | None) -> str:
     if beaten is None:
-        return "yes"
-    return f"no: {beaten['by']}" + (", within the spread" if beaten["clearly"] is False else "")
-
-
-def cheapest_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Table of a scene's `cheapest`."""
-
-    def cost(row: Mapping[str, Any], name: str, digits: int) -> str:
-        return spread_cell({**row[name], "mean": row[name]["value"]}, digits)
-
-    columns = {
-        "test PSNR (dB)": lambda row: f"{row['psnr']:.1f}",
-        "first there": lambda row: row["seconds"]["config"] or "-",
-        "seconds": lambda row: cost(row, "seconds", 1),
-        "smallest": lambda row: row["gaussians"]["config"] or "-",
-        "Gaussians": lambda row: cost(row, "gaussians", 0),
-    }
-    return table(columns, rows)
+        return "on the front"
+    return f"beaten by {beaten['by']}" + (", within the spread" if beaten["clearly"] is False else "")
 
 
 def runs_table(runs: Sequence[Mapping[str, Any]]) -> Table:

@@ -1,4 +1,4 @@
-"""One-file HTML of a model, and the report's sliders, in a real browser, opened from disk."""
+"""One-file HTML of a model in a real browser, opened from disk."""
 
 import dataclasses
 import io
@@ -16,7 +16,6 @@ from PIL import Image
 from gaussian_renderer import render
 from splatting.camera_paths.generated import Ellipse
 from splatting.camera_paths.poses import poses_of
-from splatting.evaluation.report import environment
 from splatting.exports.html import write_html
 from splatting.exports.in_scene import model_of
 
@@ -134,54 +133,3 @@ def test_a_damaged_page_says_so(browser, page, tmp_path):
     tab.goto((tmp_path / "page.html").as_uri())
     tab.get_by_text("The model cannot be shown").wait_for(timeout=1000 * SECONDS)
     tab.close()
-
-
-def flat(*colour: int) -> bytes:
-    buffer = io.BytesIO()
-    Image.new("RGB", (120, 80), colour).save(buffer, "JPEG")
-    return buffer.getvalue()
-
-
-@pytest.fixture
-def report(tmp_path) -> Path:
-    view = {"photo": flat(200, 0, 0), "render": flat(0, 0, 200), "error": flat(0, 200, 0), "text": "a view"}
-    parts = (
-        '{% import "page.html.jinja" as page %}{{ page.begin("Report") }}{{ page.pictures([view]) }}{{ page.end() }}'
-    )
-    page = environment("html", tmp_path).from_string(parts).render(view=view)
-    (tmp_path / "report.html").write_text(page)
-    return tmp_path / "report.html"
-
-
-def shares(tab: "Page") -> list[float]:
-    """Parts of the window, in pixels, that show photo, render and error."""
-    shown = picture(tab)
-    return [float((shown[..., channel] > 150)[shown.min(axis=2) < 50].sum()) for channel in range(3)]
-
-
-def test_the_reports_slider_moves_between_photo_and_render(tab, report):
-    tab.goto(report.as_uri())
-    slider = tab.locator("input[type=range]")
-    photo, error, render = shares(tab)
-    assert photo == pytest.approx(render, abs=400) and error == pytest.approx(photo + render, abs=600)
-    box = slider.bounding_box()
-    tab.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    tab.mouse.down()
-    tab.mouse.move(box["x"] + 0.9 * box["width"], box["y"] + box["height"] / 2)
-    tab.mouse.up()
-    photo, _, render = shares(tab)
-    assert photo / (photo + render) == pytest.approx(0.9, abs=0.07)
-    slider.press("Home")
-    assert shares(tab)[0] < 400
-
-
-def test_without_script_and_on_paper_the_pictures_lie_side_by_side(browser, tab, report):
-    context = browser.new_context(java_script_enabled=False, viewport={"width": SIZE[0], "height": SIZE[1]})
-    plain = context.new_page()
-    plain.goto(report.as_uri())
-    tab.goto(report.as_uri())
-    tab.emulate_media(media="print")
-    for page in (plain, tab):
-        parts = shares(page)
-        assert min(parts) > 3000 and max(parts) < 1.2 * min(parts)
-    context.close()

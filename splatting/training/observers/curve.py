@@ -31,9 +31,10 @@ class Curve(Observer):
             run.launch.test_iterations,
             {"test": test, "train": evenly_spread(trained, len(test))},
             lambda cameras: self._load(cameras, views),
-            lambda cameras: views.scores(cameras, run.gaussians),
+            lambda camera: views.scores([camera], run.gaussians),
             run.device,
             not isinstance(run.schedule, DecidedSchedule),
+            run.launch.whole_curve,
         )
         self._due = False
         self._seconds = 0.0
