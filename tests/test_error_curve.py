@@ -189,13 +189,14 @@ class TestPoints:
             assert whole[-1] and whole[: sum(whole) - 1] == [True] * (sum(whole) - 1)
 
     def test_points_are_evenly_spaced_in_log_time(self):
-        for iterations, views, steady, count, ratio, size in (
-            (30_000, 1, True, 32, 2**0.25, 1),
-            (30_000, 1, False, 12, 2**0.5, 1),  # a time budget may leave too few iterations for more
-            (30_000, 25, True, 12, 2**0.5, 25),
-            (12_000, 200, True, 12, 2**0.5, 8),
+        for iterations, views, taken, count, ratio, size in (
+            (30_000, 1, None, 32, 2**0.25, 1),
+            (30_000, 1, 30_000, 12, 2**0.5, 1),  # a time budget may leave too few iterations for more
+            (30_000, 25, None, 12, 2**0.5, 25),
+            (12_000, 200, None, 12, 2**0.5, 8),
+            (12_000, 200, 30_000, 12, 2**0.5, 45),
         ):
-            points, found = curve_points(iterations, [-1, 40_000], 2, views, steady)
+            points, found = curve_points(iterations, [-1, 40_000], 2, views, taken)
             assert (len(points), found) == (count, size)
             np.testing.assert_allclose(np.divide(sorted(points)[1:], sorted(points)[:-1]), ratio, rtol=1 / 117)
 
@@ -296,14 +297,20 @@ class TestScores:
         assert {row["subset"] for row in rows} == {None, 1} and [row["test_psnr"] for row in rows] == [13.0] * len(rows)
         assert [row["train_psnr"] for row in rows] == [None] * (len(rows) - 1) + [20.0]
 
-    def test_a_run_of_unknown_length_scores_all_test_views_where_the_seconds_so_far_allow_it(self, tmp_path):
-        recorder, _ = _recorder(
-            tmp_path, 30_000, [], {"test": [10.0, 14.0], "train": [20.0] * 2}, whole=True, steady=False
-        )
-        for seconds, spent in ((1, 0.0), (2, 0.2), (4, 0.2), (8, 0.7)):
-            recorder._spent["scoring"] = spent
-            recorder.add(15_000, seconds, 5)
-        assert [row["subset"] for row in recorder.rows] == [1, 1, None, 1]
+    @pytest.mark.parametrize("whole", [False, True])
+    @pytest.mark.parametrize("taken", [60, 130, 400, 2000, 20_000])
+    def test_by_the_clock_points_fit_the_iterations_that_there_will_be(self, tmp_path, taken, whole):
+        """12 points in at most 5 % of the training, or 10 % with whole sets, from 120 iterations on."""
+        views = {"test": [10.0 + n for n in range(6)], "train": [20.0] * 6}
+        recorder, seen = _recorder(tmp_path, 30_000, [], views, whole=whole, steady=False)
+        for step in range(1, taken + 1):
+            span = range(30_000 * (step - 1) // taken + 1, 30_000 * step // taken + 1)
+            known = step > 1 + taken // 100  # as the speed is
+            if recorder.due(span, 0, step / 10, taken if known else None):
+                recorder.add(recorder.point(span), step / 10, 5, step)
+        between = sum(kind == "scores" for kind, _ in seen) - 12
+        assert 0.5 * between <= (0.1 if whole else 0.05) * taken or taken < 120
+        assert len(recorder.rows) >= (12 if taken >= 400 else 10 if taken == 130 or whole else 1)
 
     def test_views_are_drawn_by_a_seed_of_their_own_or_evenly_spread(self):
         torch.manual_seed(1)

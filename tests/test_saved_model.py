@@ -1,4 +1,4 @@
-"""What a model folder has: the newest of its PLYs and checkpoints is loaded, and opened once."""
+"""Models of a folder: the newest of its PLYs and checkpoints is loaded, and opened once."""
 
 import argparse
 import shutil

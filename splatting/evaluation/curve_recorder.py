@@ -25,6 +25,7 @@ AHEAD, MANY_CORES = 2.0, 4  # seconds before the end at which drawing gets ready
 SHORTEST = 200  # iterations of a training that is scored between, too
 GRIDS = ((4, 32), (2, 12))  # points while the number of iterations doubles, and their number before the last iteration
 SHARE = 0.025  # of a training that scoring may take by its estimate; 0.05 is promised, and early points may be dearer
+MOST_SHARE = 0.05  # the same where one view of each set at each point takes more than SHARE
 WHOLE_SHARE = 0.075  # the same for --whole_curve, where 0.1 is promised
 VIEW_COST = 0.5  # of scoring a view, in iterations: it takes no gradient and no step
 _ROOT = Path(__file__).resolve().parents[2]
@@ -32,36 +33,40 @@ View = TypeVar("View")
 
 
 def curve_points(
-    iterations: int, whole: Iterable[int], sets: int, views: int, steady: bool = True
+    iterations: int, whole: Iterable[int], sets: int, views: int, taken: float | None = None
 ) -> tuple[frozenset[int], int]:
     """The iterations that a curve scores between those of `whole`, which score all views; and how many views of a set.
 
     The points are evenly spaced in the logarithm of the iteration, and follow from the options alone, so that the same
     command scores the same on every machine. They score as many views as fit SHARE of the training, at least one, on
-    the coarse grid; all views on the fine one where that fits, too. sets: of `views` each. steady: whether each
-    iteration of the schedule is one of the training; if not, the fine grid could take too long.
+    the coarse grid; all views on the fine one where that fits, too. sets: of `views` each. taken: the iterations of a
+    run whose schedule has `iterations`, None: the same. Then there is the coarse grid alone.
     """
-    if iterations < SHORTEST:
+    (fine, many), coarse = GRIDS
+    if iterations < SHORTEST or (taken is not None and coarse[1] * VIEW_COST > MOST_SHARE * taken):
         return frozenset(), 1
     whole = {t for t in whole if 0 < t < iterations} | {iterations}
-    budget = SHARE * iterations / VIEW_COST - len(whole) * sets * views
-    (fine, many), coarse = GRIDS
-    density, count = (fine, many) if steady and budget >= sets * views * many else coarse
+    budget = SHARE * (iterations if taken is None else taken) / VIEW_COST - len(whole) * sets * views
+    density, count = (fine, many) if taken is None and budget >= sets * views * many else coarse
     places = {round(iterations * 2 ** (-place / density)) for place in range(1, count + 1)}
     return frozenset(places - whole), max(1, min(views, int(budget / (sets * count))))
 
 
-def whole_points(iterations: int, whole: Iterable[int], sets: int, views: int) -> dict[int, int]:
+def whole_points(
+    iterations: int, whole: Iterable[int], sets: int, views: int, taken: float | None = None
+) -> dict[int, int]:
     """The iterations of `curve_points`' coarse grid, and how many of the `views` of the test set each scores.
 
     As many as WHOLE_SHARE allows score all of them: the last ones, since the levels that are compared lie near the end,
     and the first one, for the `Estimates`. The others score one view each, or if none can score all, each the same
-    number.
+    number. taken: as in `curve_points`.
     """
     density, count = GRIDS[1]
     whole = {t for t in whole if 0 < t < iterations} | {iterations}
     places = {round(iterations * 2 ** (-place / density)) for place in range(1, count + 1)} - whole - {0}
-    left = WHOLE_SHARE * iterations / VIEW_COST - len(whole) * sets * views - len(places)  # beyond one view a point
+    left = (
+        WHOLE_SHARE * (iterations if taken is None else taken) / VIEW_COST - len(whole) * sets * views - len(places)
+    )  # beyond one view a point
     full = min(len(places), max(0, int(left / max(views - 1, 1))))
     size = 1 if full else max(1, min(views, int(left / max(len(places), 1)) + 1))
     first, *others = sorted(places) or [0]
@@ -184,9 +189,9 @@ class CurveRecorder:
     rows: those of the runs that this one resumes; `log` has their seconds. Iterations are those of the schedule, which
     are those of the run if it is `steady`. iterations: the last one; always: those that score all views, as the last
     one does; those between score a fixed part of each set (`curve_points`, `drawn`), from which the whole is estimated
-    (`Estimates`); with whole_test, test views alone (`whole_points`), unless all fit, and of a run that is not steady a
-    view where more would take too much of the seconds so far. views: those to score, by set,
-    "test" and "train". load(views) decodes their photos; scores(view) gives the scores of one by name, none if no pixel
+    (`Estimates`); with whole_test, test views alone (`whole_points`), unless all fit. A run that is not steady has no
+    points between until it is known how many iterations it takes. views: those to score, by set, "test" and "train".
+    load(views) decodes their photos; scores(view) gives the scores of one by name, none if no pixel
     counts. If the file cannot be written, one warning says so and the next point tries again: a training is worth more
     than its curve.
     """
@@ -210,15 +215,11 @@ class CurveRecorder:
         self._log = log
         self._iterations = iterations
         self._whole = {*always, iterations}
-        self._views, most = views, max(map(len, views.values()))
-        between, size = curve_points(iterations, always, len(views), most, steady)
-        counts = {name: dict.fromkeys(between, size) for name in views}
-        if whole_test and size < most:
-            counts = {"test": whole_points(iterations, always, len(views), len(views["test"]))}
-        self._counts = counts  # of views to score, by set and iteration
-        self._clocked = whole_test and not steady  # how long it takes is not known from the iterations
-        self._points = self._whole | counts["test"].keys()
-        self._size = min((n for n in counts["test"].values() if n < len(views["test"])), default=None)
+        self._views, self._steady, self._whole_test = views, steady, whole_test
+        self._counts: dict[str, dict[int, int]] | None = None  # of views to score, by set and iteration
+        self._points, self._size = {*self._whole}, None
+        if steady:
+            self._plan(iterations)
         self._estimates = Estimates(rows, views)
         self._load = load
         self._scores = scores
@@ -229,17 +230,33 @@ class CurveRecorder:
         self._drawer = CurveDrawer(self._folder, {name: len(of_set) for name, of_set in views.items()})
         self._ahead = AHEAD if cores() >= MANY_CORES else 0.0
 
+    def _plan(self, taken: float) -> None:
+        """Choose points, and how many views they score, for a run that takes so many iterations."""
+        views, most = self._views, max(map(len, self._views.values()))
+        given = self._iterations, self._whole, len(views)
+        between, size = curve_points(*given, most, taken if not self._steady else None)
+        self._counts = {name: dict.fromkeys(between, size) for name in views}
+        if self._whole_test and size < most:
+            self._counts = {"test": whole_points(*given, len(views["test"]), taken)}
+        elif len(views) * len(between) * VIEW_COST > MOST_SHARE * taken:
+            self._counts = {"test": dict.fromkeys(between, size)}
+        self._points = self._whole | self._counts["test"].keys()
+        self._size = min((n for n in self._counts["test"].values() if n < len(views["test"])), default=None)
+
     def point(self, span: range) -> int | None:
         """The iteration to score of those that a step stands for; None: none of them."""
         return max(self._points.intersection(span), default=None)
 
-    def due(self, span: range, first: int, seconds: float) -> bool:
+    def due(self, span: range, first: int, seconds: float, taken: float | None = None) -> bool:
         """Whether to `add` a point in the step of a span; if so, it waits for the GPU.
 
-        seconds: of training since iteration `first`. Shortly before the end it gets ready to draw.
+        seconds: of training since iteration `first`. taken: the number of iterations of a run that is not steady, as
+        far as it is known. Shortly before the end it gets ready to draw.
         """
         if not span:
             return False
+        if self._counts is None and taken is not None:
+            self._plan(taken)
         left, done = self._iterations - span[-1], span[-1] - first
         if writes_files() and seconds * left <= self._ahead * done:
             self._drawer.begin()
@@ -258,10 +275,7 @@ class CurveRecorder:
         peaks = [self._log.peak_memory_mib(), *(row["peak_memory_mib"] for row in self.rows[-1:])]
         views = self._views
         if iteration not in self._whole:
-            paid = not self._clocked or 0 < self._spent["scoring"] <= WHOLE_SHARE * seconds
-            views = {
-                name: drawn(views[name], counts[iteration] if paid else 1) for name, counts in self._counts.items()
-            }
+            views = {name: drawn(views[name], counts[iteration]) for name, counts in self._counts.items()}
         part = len(views["test"]) < len(self._views["test"])
         row = dict.fromkeys(COLUMNS) | {
             "iteration": iteration if trained is None else trained,

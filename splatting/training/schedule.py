@@ -50,8 +50,13 @@ class Schedule:
         self.length = length
         self.ends: int | None = length
 
+    @property
+    def expected(self) -> float | None:
+        """The number of iterations of the run, as far as it can be told; None: not yet."""
+        return self.ends
+
     def reach(self, iteration: int, seconds: float) -> None:
-        """Decide how to go on, before an iteration that begins after `seconds` of training. Call it for each."""
+        """Decide the part of the next iterations, before one that begins after `seconds` of training. Call for each."""
 
     def schedule_step(self, iteration: int) -> int:
         """How far the schedule is in an iteration that was reached, 0 to `length`."""
@@ -230,6 +235,11 @@ class TimeBudget(DecidedSchedule):
         self._measured = 0  # blocks of this run
         self._first = self.blocks[-1].last if self.blocks else 0
         self._told = False
+        self._expected: float | None = None
+
+    @property
+    def expected(self) -> float | None:
+        return self._expected if self.ends is None else float(self.ends)
 
     def reach(self, iteration: int, seconds: float) -> None:
         if not self.blocks or iteration > self.blocks[-1].last:
@@ -268,6 +278,7 @@ class TimeBudget(DecidedSchedule):
         before = self.blocks[-1].last if self.blocks else 0
         done = self.progress(before)
         iterations = self._iterations(seconds, 1.0 - done)
+        self._expected = before + iterations if self._speeds else None
         count, final = self._count(iterations)
         if final:
             step = (1.0 - done) / count

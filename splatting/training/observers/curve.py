@@ -46,7 +46,7 @@ class Curve(Observer):
 
     def due(self, step: Iteration) -> bool:
         first = self._run.schedule.schedule_step(self._run.first_iteration)
-        self._due = self._recorder.due(step.span, first, self._run.clock.seconds)
+        self._due = self._recorder.due(step.span, first, self._run.clock.seconds, self._run.schedule.expected)
         return self._due
 
     def measured(self, step: Iteration, losses: Losses) -> None:
