@@ -19,15 +19,18 @@ from utils.system_utils import UserError, saved_iterations
 _CHECKPOINT = re.compile(r"chkpnt(\d+)\.pth")
 
 
-def find_save(model_path: str | os.PathLike, iteration: int) -> tuple[int, Path]:
-    """The iteration, -1: the newest one, and its PLY, or its checkpoint where it has none.
-
-    UserError if the folder has no save of it.
-    """
-    folder = Path(model_path)
+def saves_in(folder: Path) -> dict[int, Path]:
+    """Saved iterations of a model folder: their PLY, or their checkpoint where there is none."""
     matches = [(_CHECKPOINT.fullmatch(path.name), path) for path in sorted(folder.glob("chkpnt*.pth"))]
     saves = {int(match[1]): path for match, path in matches if match}
-    saves |= {n: path for n in saved_iterations(folder / "point_cloud") if (path := saved_ply(folder, n)).is_file()}
+    plys = ((n, saved_ply(folder, n)) for n in saved_iterations(folder / "point_cloud"))
+    return saves | {n: path for n, path in plys if path.is_file()}
+
+
+def find_save(model_path: str | os.PathLike, iteration: int) -> tuple[int, Path]:
+    """The iteration, -1: the newest one, and its PLY or checkpoint. UserError if the folder has no save of it."""
+    folder = Path(model_path)
+    saves = saves_in(folder)
     if not saves:
         raise UserError(f"no saved model in {folder}; train it first, or name its folder by -m")
     if iteration != -1 and iteration not in saves:

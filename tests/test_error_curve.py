@@ -39,7 +39,7 @@ from splatting.evaluation.error_curve import (
     write_curve,
 )
 from splatting.evaluation.training_log import TrainingLog
-from splatting.evaluation.what_to_try import peak_advice, schedules_follow_length
+from splatting.evaluation.what_to_try import peak_advice
 from splatting.host import clock, memory
 from splatting.training import objective
 from splatting.training.observers.report import Report
@@ -326,30 +326,17 @@ class TestPeak:
     ROWS = (_row(500, 18.0, 18.5), _row(2000, 20.3, 23.0), _row(4000, 20.1, 26.0), _row(7000, 19.6, 29.0))
 
     def test_a_peak_before_the_end_is_named(self):
-        line = peak_advice(list(self.ROWS), {7000}, 30_000)
-        assert line == (
-            "Test views were best at iteration 2000: PSNR 20.30 dB, 0.70 dB above the end (train views 23.00 there, "
-            "29.00 at the end); --iterations 2000 ends with that model, --save_iterations 2000 also saves it; "
-            "--position_lr_max_steps 2000 as well is a different training: its learning rate of positions falls by "
-            "then instead of by 30000"
-        )
-        assert "that model is saved, use it with render.py --iteration 2000" in peak_advice(
-            list(self.ROWS), {2000}, 2000
-        )
-
-    def test_no_advice_that_a_schedule_of_the_length_makes_untrue(self):
-        assert not schedules_follow_length(depths=False, train_test_exp=False)
-        line = peak_advice(list(self.ROWS), {7000}, 30_000, follows_length=True)
-        assert "ends with that model" not in line
-        assert "; --save_iterations 2000 saves that model during the training; --iterations 2000 --position_lr" in line
-        assert "--iterations" not in peak_advice(list(self.ROWS), {7000}, None)
+        best = "Best test PSNR 20.30 dB at iteration 2000 (0.70 above the end)"
+        assert peak_advice(list(self.ROWS), {7000}) == f"{best}. Keep it: --save_iterations 2000"
+        assert peak_advice(list(self.ROWS), {2000}) == f"{best}. It is saved: render.py --iteration 2000"
+        assert peak_advice(list(self.ROWS), {7000}, steady=False) == best
 
     def test_no_clear_peak_and_subsets_get_no_advice(self):
         rows = [_row(500, 18.0), _row(1000, 30.0, subset=2), *self.ROWS[1:], _row(7001, 10.0, subset=2)]
-        assert peak_advice(rows, {7000}, 30_000) == peak_advice(list(self.ROWS), {7000}, 30_000)
+        assert peak_advice(rows, {7000}) == peak_advice(list(self.ROWS), {7000})
         assert best_test(rows)["iteration"] == 2000 and best_test([_row(1000, 30.0, subset=2)]) is None
         for rows in (list(self.ROWS[:2]), [_row(5, 20.09), _row(7, 20.0)], [_row(5, 20.0), _row(7, None)]):
-            assert peak_advice(rows, (), 30_000) is None
+            assert peak_advice(rows, ()) is None
 
     def test_the_advice_gives_the_model_that_was_scored(self, colmap_scene, tmp_path):
         options = "--densify_from_iter 5 --densification_interval 10 --densify_grad_threshold 1e-5 --no_curve"
@@ -427,7 +414,7 @@ class TestTraining:
                    "--opacity_reset_interval", 45, "--random_background", "--images_to_load", 3]  # fmt: skip
         with_curve = _train(colmap_scene, tmp_path / "with", *options, "--test_iterations", 9, 30, iterations=80)
         said = capfd.readouterr().out
-        line = re.search(r"^Curve of (\d+) points, scored in [\d.]+ s \([\d.]+ % of the training\)", said, re.MULTILINE)
+        line = re.search(r"^Test views scored (\d+) times, [\d.]+ s: .*/with/error_vs_time.png", said, re.MULTILINE)
         assert int(line[1]) == len(_iterations(tmp_path / "with"))
         without = _train(colmap_scene, tmp_path / "without", *options, "--no_curve", iterations=80)
         assert with_curve == without
@@ -445,13 +432,6 @@ class TestTraining:
         rows = read_curve(tmp_path / "error_vs_time.csv")
         assert len(rows) >= least and {row["subset"] for row in rows} <= {1, None}
         assert [row["iteration"] for row in whole_sets(rows)] == whole
-
-    @pytest.mark.parametrize("strategy", ["adc", "mcmc", "budget"])
-    def test_the_advice_knows_whose_rates_follow_the_length(self, colmap_scene, tmp_path, monkeypatch, strategy):
-        given, finish = [], CurveRecorder.finish
-        monkeypatch.setattr(CurveRecorder, "finish", lambda *words: (given.append(words[-1]), finish(*words)))
-        _train(colmap_scene, tmp_path / "out", "--strategy", strategy, "--max_num_splats", 400, iterations=20)
-        assert given == [strategy == "budget"]
 
     def test_a_row_tells_of_the_model_saved_at_its_iteration(self, colmap_scene, tmp_path, monkeypatch):
         out, measured = tmp_path / "out", Report.measured

@@ -66,22 +66,24 @@ def test_iterations_that_stay_are_warned_of(colmap_scene, tmp_path, capfd):
     _train(colmap_scene, out, "--save_iterations", 1, 3, iterations=5)
     # 30000, a default of --save_iterations, is not reached, so it is not overwritten.
     (out / "point_cloud" / "iteration_30000").mkdir()
+    (out / "point_cloud" / "iteration_30000" / "point_cloud.ply").touch()
     capfd.readouterr()
     _train(colmap_scene, out, "--save_iterations", 1, 30000, "--checkpoint_iterations", 3, iterations=4)
     (warning,) = _warnings(capfd.readouterr().err)
-    assert "point_cloud keeps iteration 3, 5, 30000 of an earlier training, and render.py takes the highest" in warning
+    assert "keeps iteration 3, 5, 30000 of an earlier training, and other commands take the highest" in warning
     # Files that a resumed run saved before do not belong to another training.
     _train(colmap_scene, out, "--start_checkpoint", out / "chkpnt3.pth", iterations=6)
     (warning,) = _warnings(capfd.readouterr().err)
     assert "keeps iteration 4, 5, 30000 of" in warning
 
 
-@pytest.mark.parametrize("trained", ["chkpnt5.pth", "point_cloud/iteration_5"])
+@pytest.mark.parametrize("trained", ["chkpnt5.pth", "point_cloud/iteration_5/point_cloud.ply"])
 def test_what_a_folder_must_hold_to_be_refused(tmp_path, trained):
     """Write a trained model and a cfg_args that names another scene."""
     write_cfg_args(tmp_path, argparse.Namespace(**MODEL_OPTIONS))
     check_folder(str(tmp_path), "/other", [5], None, 0)
-    (tmp_path / trained).mkdir(parents=True)
+    (tmp_path / trained).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / trained).touch()
     with pytest.raises(UserError, match="holds a model of another scene, /scene"):
         check_folder(str(tmp_path), "/other", [5], None, 0)
     check_folder(str(tmp_path), "/scene/../scene/", [5], None, 0)
@@ -202,4 +204,4 @@ def test_points_to_start_from_are_not_counted_when_a_checkpoint_has_others(colma
     assert "Number of points at initialisation :  300" in capfd.readouterr().out
     _train(colmap_scene, out, "--start_checkpoint", out / "chkpnt2.pth", "--init_type", "random", iterations=3)
     said = capfd.readouterr().out
-    assert "Number of points" not in said and "with 300 Gaussians" in said
+    assert "Number of points" not in said and "at iteration 2" in said

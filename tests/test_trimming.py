@@ -29,7 +29,7 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.readers.point_cloud import write_point_cloud
 from splatting.diagnosis.model import check_model
-from splatting.training.left_out import LeftOut, lines
+from splatting.training.left_out import LeftOut, lines, saved_line
 from utils.system_utils import UserError
 
 ITERATIONS = 12
@@ -337,12 +337,11 @@ def _left_out(**changes: object) -> LeftOut:
     return LeftOut(**values | changes)
 
 
-def test_the_three_lines():
+def test_the_lines_of_a_report():
     said = lines(_left_out())
     assert said == [
-        "Left out 50 of 1000 Gaussians (5.0 %, 0.01 MB of the PLY) that no training view and no view between two of "
-        "them depends on, found in 1.2 s (99 views); "
-        "test views change by at most 0.012 (values 0 to 1), PSNR 30.000 to 29.900 dB",
+        "Of 1,000 Gaussians, 50 invisible ones were left out (5.0 %, 0.01 MB of the PLY); 99 views were searched in "
+        "1.2 s; test views change by at most 0.012 (values 0 to 1), PSNR 30.000 to 29.900 dB",
         "Left out no SH bands; cutting them would move colours by at most 0.3 above degree 0, 0.2 above degree 1, "
         "0.1 above degree 2 (--prune_sh)",
         "Colours of the training photos are kept as bytes and at training size: 3.0 MB, 45.0 MB less than as float32 "
@@ -355,39 +354,40 @@ def test_the_three_lines():
     assert cut[0].endswith("; test views change by at most 0 (values 0 to 1)")
     zero = lines(_left_out(sh_degree=1, cut_bounds=[0.3, 0.0, 0.0, 0.0]))
     assert zero[1] == "Left out the SH bands above degree 1 (0.14 MB of the PLY): they are zero throughout"
-    assert lines(_left_out(keep_unseen=True, unseen=0, test_change={}))[0].startswith("Left out no Gaussians (--keep")
+    kept = lines(_left_out(keep_unseen=True, unseen=0, test_change={}))[0]
+    assert kept == "No Gaussian was left out (--keep_unseen)"
     assert "none above degree 0" in lines(_left_out(max_sh_degree=0, sh_degree=0, cut_bounds=[0.0]))[1]
     few = lines(_left_out(search=FEW, unseen=20, faint=20, test_change={}))[0]
-    assert few == (
-        "Left out 20 of 1000 Gaussians (2.0 %, 0.00 MB of the PLY), of an opacity that no pixel shows; "
-        "fewer than 1 % are unseen besides, looked for in 1.2 s (99 views)"
-    )
+    assert few.endswith("; 99 views were searched in 1.2 s, with fewer than 1 % unseen besides")
     long = lines(_left_out(search=TOO_LONG, unseen=0, test_change={}))[0]
-    assert long == (
-        "Left out no Gaussians; no others were looked for: that takes 99 views, more than the training's iterations / "
-        "15"
+    assert long.endswith("; only opacities were compared: a search takes 99 views, more than a 15th of the iterations")
+
+
+def test_the_line_that_training_prints():
+    plain = {"unseen": 0, "ply_bytes_saved": 0, "test_change": {}}
+    assert saved_line(_left_out(**plain), Path("OUT/iteration_7")) == (
+        "Saved 1,000 Gaussians to OUT/iteration_7 (0.25 MB)"
+    )
+    bands = saved_line(_left_out(**plain | {"sh_degree": 0, "ply_bytes_saved": 183_400}), Path("OUT"))
+    assert bands == "Saved 1,000 Gaussians to OUT (0.06 MB; SH bands above degree 0 left out)"
+    faint = saved_line(_left_out(**plain | {"unseen": 50, "faint": 50}), Path("OUT"))
+    assert faint.endswith(". Left out 50 invisible Gaussians (opacity below 1/255)")
+    assert saved_line(_left_out(), Path("OUT")).endswith(
+        "Left out 50 invisible Gaussians (no view depends on them); test views change by at most 0.012 (values 0 to 1),"
+        " PSNR 30.000 to 29.900 dB"
     )
 
 
-def test_the_short_line():
-    short = {"iterations": 600, "sh_degree": 0, "ply_bytes_saved": 183_400, "test_change": {}}
-    assert lines(_left_out(**short)) == [
-        "Saved 950 of 1000 Gaussians, SH degree 0: 0.06 MB instead of 0.25",
-    ]
-    nothing = {"iterations": 600, "unseen": 0, "ply_bytes_saved": 0, "test_change": {}}
-    assert lines(_left_out(**nothing)) == ["Saved 1000 of 1000 Gaussians, SH degree 3"]
-    assert lines(_left_out(iterations=600))[0].endswith("; test views change by at most 0.012 (values 0 to 1), "
-                                                        "PSNR 30.000 to 29.900 dB")  # fmt: skip
-
-
-def test_training_says_them(colmap_scene, tmp_path, capfd, monkeypatch):
-    for short in (2000, 0):
-        monkeypatch.setattr("splatting.training.left_out.SHORT", short)
-        train.main(["-s", str(colmap_scene), "-m", str(tmp_path), "-r", "24", "--iterations", "2"])
-        said = re.sub(r" \[\d\d/\d\d \d\d:\d\d:\d\d\]$", "", capfd.readouterr().out, flags=re.MULTILINE).splitlines()
-        expected = lines(LeftOut(**json.loads((tmp_path / "model.json").read_text())["left_out"]))
-        assert len(expected) == (1 if short else 3)
-        assert said[-1 - len(expected) :] == [*expected, "Training complete."]
-        assert json.loads((tmp_path / "train_log.json").read_text())[-1]["lines"] == expected
-    # There are 17 photos of 96 x 64, trained at 24 x 16.
-    assert "size: 0.0 MB, 1.2 MB less" in expected[2]
+def test_a_training_ends_with_at_most_six_lines(colmap_scene, tmp_path, capfd):
+    train.main(["-s", str(colmap_scene), "-m", str(tmp_path), "-r", "24", "--iterations", "210", "--eval"])
+    said = re.sub(r" \[\d\d/\d\d \d\d:\d\d:\d\d\]$", "", capfd.readouterr().out, flags=re.MULTILINE).splitlines()
+    end = said[next(n for n, line in enumerate(said) if line.startswith("210 iterations in ")) :]
+    left_out = LeftOut(**json.loads((tmp_path / "model.json").read_text())["left_out"])
+    assert saved_line(left_out, tmp_path / "point_cloud" / "iteration_210") in end
+    assert re.fullmatch(r"Test views scored \d+ times, [\d.]+ s: .*error_vs_time.png", end[1])
+    assert re.fullmatch(r"Test PSNR [\d.]+ dB. Look at the model: python view.py -m \S+", end[-2])
+    assert len(end) <= 7 and end[-1] == "Training complete."
+    kept = json.loads((tmp_path / "train_log.json").read_text())[-1]["lines"]
+    assert set(lines(left_out)) < set(kept)
+    # There are 17 photos of 96 x 64, 14 of them trained at 24 x 16.
+    assert "size: 0.0 MB, 1.0 MB less" in lines(left_out)[2]

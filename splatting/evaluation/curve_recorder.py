@@ -14,7 +14,7 @@ import torch
 from tqdm import tqdm
 
 from splatting.evaluation.error_curve import COLUMNS, ESTIMATED, FIGURE, NAME, SCORES, SUBSET, Row, write_curve
-from splatting.evaluation.training_log import SHORT, TrainingLog
+from splatting.evaluation.training_log import TrainingLog
 from splatting.evaluation.what_to_try import peak_advice
 from splatting.host.clock import running_seconds, wall_seconds
 from splatting.host.interrupt import own_session
@@ -316,37 +316,25 @@ class CurveRecorder:
                 tqdm.write(f"warning: {error}; training continues without its curve", file=sys.stderr)
             self._warned = True
 
-    def finish(
-        self, seconds: float, saved: Container[int], position_lr_max_steps: int | None, follows_length: bool
-    ) -> None:
-        """Wait for the figure, print the curve's cost beside `seconds` of training in this run, and give `peak_advice`.
+    def finish(self, seconds: float, saved: Container[int], steady: bool) -> None:
+        """Wait for the figure, say where it is, and give `peak_advice`.
 
-        The log's last record gets the costs: `curve_scoring_seconds`, `curve_writing_seconds` (of the file),
-        `curve_drawing_seconds` (of waiting), and `curve_loading_seconds` (of photos, before the first scoring).
+        seconds: of training in this run. The log's last record gets the costs: `curve_scoring_seconds`,
+        `curve_writing_seconds` (of the file), `curve_drawing_seconds` (of waiting), and `curve_loading_seconds` (of
+        photos, before the first scoring).
         """
         if writes_files():
             self._timed("drawing", self._draw)
         costs = {f"curve_{part}_seconds": round(taken, 4) for part, taken in self._spent.items()}
         self._log.add(self.rows[-1]["iteration"], seconds, **costs)
-        self._log.tell(self._costs(seconds))
-        if advice := peak_advice(self.rows, saved, position_lr_max_steps, follows_length):
-            self._log.tell(advice)
+        often = "once" if self._scored == 1 else f"{self._scored} times"
+        self._log.tell(f"Test views scored {often}, {self._spent['scoring']:.1f} s: {self._folder / FIGURE}")
+        if advice := peak_advice(self.rows, saved, steady):
+            self._log.advise(advice)
 
     def _draw(self) -> None:
         if failure := self._drawer.finish():
             print(f"warning: no {FIGURE}: {failure}", file=sys.stderr)
-
-    def _costs(self, seconds: float) -> str:
-        scoring, writing, drawing, _ = self._spent.values()
-        share = f"{100 * scoring / seconds:.1f} % of the training"
-        if self._iterations <= SHORT:
-            return f"Curve of {len(self.rows)} points, scored in {scoring:.2f} s ({share})"
-        between = "" if self._size is None else f", at least {self._size} of a set between --test_iterations"
-        return (
-            f"Scored {sum(map(len, self._views.values()))} views at {self._scored} iterations{between}, "
-            f"in {scoring:.2f} s ({share}), wrote {NAME} in {writing:.3f} s ({100 * writing / seconds:.2f} %), "
-            f"drew it in {drawing:.1f} s"
-        )
 
     def abandon(self) -> None:
         """Draw nothing: the training did not reach its end."""

@@ -80,6 +80,7 @@ class TrainingLog:
         source = self._path if before is None else Path(before) / NAME
         self.first_iteration = first_iteration
         self.records: list[dict] = []
+        self._advised = False
         if first_iteration > 0 and source.is_file():
             self.records = [r for r in _read(source) if r["iteration"] <= first_iteration]
         last = self.records[-1] if self.records else {"seconds": 0.0}
@@ -127,9 +128,20 @@ class TrainingLog:
             write_json(self._path, self.records)
 
     def tell(self, *lines: str) -> None:
-        """Print lines about the finished training, and keep them as `lines` of the last record, for reports."""
+        """Print lines about the finished training, and `keep` them."""
         print(*lines, sep="\n")
-        if self.records:
+        self.keep(*lines)
+
+    def advise(self, *lines: str) -> None:
+        """`keep` what to try next; the first line of a training is printed, too."""
+        if lines and not self._advised:
+            self._advised = True
+            print(lines[0])
+        self.keep(*lines)
+
+    def keep(self, *lines: str) -> None:
+        """Add to `lines` of the last record, which reports show."""
+        if self.records and lines:
             self.records[-1].setdefault("lines", []).extend(lines)
             write_json(self._path, self.records)
 

@@ -134,34 +134,17 @@ def peak(rows: Sequence[Row]) -> tuple[Row, float] | None:
     return None if lost < CLEAR else (best, lost)
 
 
-def peak_advice(
-    rows: Sequence[Row], saved: Container[int], position_lr_max_steps: int | None, follows_length: bool = False
-) -> str | None:
+def peak_advice(rows: Sequence[Row], saved: Container[int], steady: bool = True) -> str | None:
     """A line that names the iteration with the best test views; None unless they were clearly worse in the last row.
 
-    saved: iterations whose PLY this training has written. follows_length: `schedules_follow_length`.
-    position_lr_max_steps: None for a run whose pace is not steady, of which no other length ends with that model.
-
-    A PLY is written before its iteration's step, so a saved one is the model that was scored; its exposures are those
-    of the last save. A training of fewer --iterations ends with the same model, unless a schedule follows its length.
+    saved: iterations whose PLY this training has written, before the iteration's step, so that it is the model that was
+    scored. steady: whether another training has the same iterations, which one by the clock has not.
     """
     if (found := peak(rows)) is None:
         return None
     best, lost = found
-    at, steps, end = best["iteration"], position_lr_max_steps, whole_sets(rows)[-1]
-    line = f"Test views were best at iteration {at}: PSNR {best['test_psnr']:.2f} dB, {lost:.2f} dB above the end"
-    if None not in (best["train_psnr"], end["train_psnr"]):
-        line += f" (train views {best['train_psnr']:.2f} there, {end['train_psnr']:.2f} at the end)"
+    at = best["iteration"]
+    line = f"Best test PSNR {best['test_psnr']:.2f} dB at iteration {at} ({lost:.2f} above the end)"
     if at in saved:
-        line += f"; that model is saved, use it with render.py --iteration {at}"
-    elif steps is None:
-        return line
-    elif follows_length:
-        line += f"; --save_iterations {at} saves that model during the training"
-    else:
-        line += f"; --iterations {at} ends with that model, --save_iterations {at} also saves it"
-    if steps is not None and at < steps:
-        option = f"--position_lr_max_steps {at}"
-        line += f"; --iterations {at} {option} " if follows_length else f"; {option} as well "
-        line += f"is a different training: its learning rate of positions falls by then instead of by {steps}"
-    return line
+        return f"{line}. It is saved: render.py --iteration {at}"
+    return f"{line}. Keep it: --save_iterations {at}" if steady else line

@@ -13,13 +13,14 @@ from arguments import OPTIONS, read_model_json, read_stored_options
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.readers.info import APART, NEAREST, SceneInfo, camera_centers, standing_apart
+from scene.saved_model import saves_in
 from splatting.evaluation import training_log
 from splatting.evaluation.error_curve import Row, continue_curve
 from splatting.evaluation.training_log import TrainingLog
 from splatting.files.listing import some
 from splatting.training.density import DensityControl
 from splatting.training.schedule import DecidedSchedule, Schedule
-from utils.system_utils import UserError, saved_iterations
+from utils.system_utils import UserError
 
 _SAMPLE = 16  # cameras whose depths are checked
 _FEWEST_BEYOND = 0.01  # share of the points in front of them that must lie beyond the nearest depth
@@ -129,27 +130,32 @@ VIEWS = "views_per_iteration"  # entry of model.json, where it is not 1
 
 
 def check_folder(
-    model_path: str, source_path: str, saving_iterations: Sequence[int], checkpoint: str | None, first_iteration: int
+    model_path: str,
+    source_path: str,
+    saving_iterations: Sequence[int],
+    checkpoint: str | None,
+    first_iteration: int,
+    checkpoint_iterations: Sequence[int] = (),
 ) -> None:
     """Refuse a folder with a model of another scene (UserError): training would mix both.
 
     Warn of iterations that an earlier training of this scene has saved and this one does not overwrite.
     """
     folder = Path(model_path)
-    saved = saved_iterations(folder / "point_cloud")
-    if not lies_in(checkpoint, folder) and (saved or any(folder.glob("chkpnt*.pth"))):
+    saved = saves_in(folder)
+    if not lies_in(checkpoint, folder) and saved:
         trained_on = _options_of(folder).get("source_path")
         if trained_on and not _same_place(trained_on, source_path):
             raise UserError(
                 f"{model_path} holds a model of another scene, {trained_on}; name another folder with -m, or remove "
                 "that one"
             )
-    stay = [iteration for iteration in saved if iteration > first_iteration and iteration not in saving_iterations]
+    new = {".ply": saving_iterations, ".pth": (*saving_iterations, *checkpoint_iterations)}
+    stay = [n for n, path in saved.items() if n > first_iteration and n not in new[path.suffix]]
     if stay:
         print(
-            f"warning: {folder / 'point_cloud'} keeps iteration {', '.join(map(str, stay))} of an earlier training, "
-            "and render.py takes the highest unless --iteration is given; remove the old ones, or name another folder "
-            "with -m",
+            f"warning: {folder} keeps iteration {', '.join(map(str, sorted(stay)))} of an earlier training, and other "
+            "commands take the highest unless --iteration is given; remove the old ones, or name another folder by -m",
             file=sys.stderr,
         )
 

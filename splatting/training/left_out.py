@@ -4,11 +4,11 @@ import argparse
 import dataclasses
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from arguments import add_to_model_json, write_cfg_args
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import FEW, ITERATIONS_PER_VIEW, TOO_LONG, WORTH, change_on_views, trim
-from splatting.evaluation.training_log import SHORT
 from splatting.training.run import Run
 
 MB = 1e6
@@ -36,35 +36,34 @@ class LeftOut:
     test_change: dict[str, float] = field(default_factory=dict)  # `trimming.change_on_views`; {} without test views
 
 
-def lines(left_out: LeftOut) -> list[str]:
-    """One short line after a short training, else one each about Gaussians, SH bands and photos."""
-    if left_out.iterations <= SHORT:
-        return [_short(left_out)]
-    return [_gaussians(left_out) + _change(left_out.test_change), _bands(left_out), _pictures(left_out)]
+def saved_line(it: LeftOut, folder: Path) -> str:
+    """What was saved, where, and what the file lacks, as training says it."""
+    size = f"{(it.ply_bytes - it.ply_bytes_saved) / MB:.2f} MB"
+    if it.sh_degree < it.max_sh_degree:
+        size += f"; SH bands above degree {it.sh_degree} left out"
+    line = f"Saved {it.gaussians - it.unseen:,} Gaussians to {folder} ({size})"
+    if not it.unseen:
+        return line
+    why = "(opacity below 1/255)" if it.unseen == it.faint else "(no view depends on them)"
+    return f"{line}. Left out {it.unseen:,} invisible Gaussians {why}{_change(it.test_change)}"
 
 
-def _short(it: LeftOut) -> str:
-    line = f"Saved {it.gaussians - it.unseen} of {it.gaussians} Gaussians, SH degree {it.sh_degree}"
-    if it.ply_bytes_saved:
-        line += f": {(it.ply_bytes - it.ply_bytes_saved) / MB:.2f} MB instead of {it.ply_bytes / MB:.2f}"
-    return line + _change(it.test_change)
+def lines(it: LeftOut) -> list[str]:
+    """Lines about Gaussians, SH bands and photos, for reports."""
+    return [_gaussians(it), _bands(it), _pictures(it)]
 
 
 def _gaussians(it: LeftOut) -> str:
     if it.keep_unseen:
-        return f"Left out no Gaussians (--keep_unseen): {it.gaussians} are saved"
+        return "No Gaussian was left out (--keep_unseen)"
+    found = f"Of {it.gaussians:,} Gaussians, {it.unseen:,} invisible ones were left out{_share(it, it.unseen)}"
+    searched = f"{it.views} views were searched in {it.seconds:.1f} s"
     how = {
-        TOO_LONG: f"no others were looked for: that takes {it.views} views, more than the training's iterations / "
-        f"{ITERATIONS_PER_VIEW}",
-        FEW: f"fewer than {100 * WORTH:.0f} % are unseen besides, looked for in {it.seconds:.1f} s ({it.views} views)",
+        TOO_LONG: f"only opacities were compared: a search takes {it.views} views, more than a {ITERATIONS_PER_VIEW}th "
+        "of the iterations",
+        FEW: f"{searched}, with fewer than {100 * WORTH:.0f} % unseen besides",
     }
-    if it.search in how:
-        left = f"{it.faint} of {it.gaussians} Gaussians{_share(it, it.faint)}, of an opacity that no pixel shows"
-        return f"Left out {left if it.faint else 'no Gaussians'}; {how[it.search]}"
-    return (
-        f"Left out {it.unseen} of {it.gaussians} Gaussians{_share(it, it.unseen)} that no training view and no view "
-        f"between two of them depends on, found in {it.seconds:.1f} s ({it.views} views)"
-    )
+    return f"{found}; {how.get(it.search, searched)}{_change(it.test_change)}"
 
 
 def _share(it: LeftOut, count: int) -> str:

@@ -27,6 +27,9 @@ GROWTH = 20  # photo scenes grow 10- to 100-fold in 7,000 iterations (docs/resul
 _REMEDY = "--images_to_load, or lower --resolution (-r) or --sh_degree"
 
 
+LITTLE = 0.1  # of what is free, of which nobody has to know
+
+
 def announce_memory(
     scene: Scene, gaussians: GaussianModel, max_splats: int, absolute: bool = False, size: int = 1
 ) -> None:
@@ -42,7 +45,7 @@ def announce_memory(
     why = "--max_num_splats" if max_splats else f"scenes often grow {GROWTH}-fold"
     per_rank = [-(-count // size) for count in (now, later)]
     at_start, at_end = (training_bytes(gaussians, count, pixels, absolute) for count in per_rank)
-    training = f"training {gib(at_start)} with {now:,} Gaussians, {gib(at_end)} with {later:,} ({why})"
+    training = f"{later:,} Gaussians ({why}) {gib(at_end)}"
     each = f" for each of {size} processes" if size > 1 else ""
     pictures = images.planned_bytes
     photos = f"photos {gib(pictures)}"
@@ -52,11 +55,11 @@ def announce_memory(
         _announce_host(images, spilled_bytes(gaussians, per_rank[1]), f"{later:,} Gaussians", each)
     together = images.keep_on.type == device.type and (images.keep_on.index or 0) == (device.index or 0)
     if not together:
-        room = _announce(images.keep_on, photos + each, pictures)
+        room = _announce(images.keep_on, photos + each, pictures, pictures)
         if room < 0:
             _warn(images.keep_on, "all photos", "set --images_to_load, or lower --resolution (-r)")
         pictures = 0
-    room = _announce(device, (f"{photos}, {training}" if together else training) + each, pictures)
+    room = _announce(device, (f"{photos}, {training}" if together else training) + each, pictures, pictures + at_end)
     for count, own, needed, first in (
         (now, per_rank[0], at_start, "set "),
         (later, per_rank[1], at_end, "set a lower --max_num_splats, or "),
@@ -72,21 +75,23 @@ def _announce_host(images: ImageStore, needed: int, what: str, each: str) -> Non
     """Print what --spill keeps in the host's memory, besides photos there; warn if it does not fit."""
     host = torch.device("cpu")
     pictures = images.planned_bytes if images.keep_on == host else 0
-    room = _announce(host, f"--spill {gib(needed)} with {what}{each}", pictures)
+    room = _announce(host, f"--spill {gib(needed)} with {what}{each}", pictures, pictures + needed)
     if room < needed:
         _warn(host, what, f"set a lower --max_num_splats, or {_REMEDY}")
 
 
-def _announce(device: torch.device, content: str, pictures: int) -> float:
-    """Print one device's line. Return the bytes that are free besides the photos, infinity if that is not known.
+def _announce(device: torch.device, content: str, pictures: int, needed: int) -> float:
+    """Print what one device needs, unless it is little of what is free.
+
+    Return the bytes that are free besides the photos, infinity if that is not known.
 
     The processes of a host have equal parts of what its CPU has free.
     """
     free, sharing = free_memory(device), local_size() if device.type == "cpu" else 1
     if free is not None:
         free //= sharing
-    known = ("?" if free is None else gib(free)) + " free" + (" for each" if sharing > 1 else "")
-    print(f"Memory of the {_name(device)}, estimated: {content}; {known}")
+    if free is None or needed > LITTLE * free:
+        print(f"{_name(device)} memory: about {gib(needed)} of {'?' if free is None else gib(free)}: {content}")
     return math.inf if free is None else free - pictures
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import copy
+import math
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
@@ -33,6 +34,15 @@ from splatting.training.schedule import DecidedSchedule
 from splatting.training.strategies import AUTO, USUAL, density_control, end_in_time, of_clock
 from utils.general_utils import get_expon_lr_func
 from utils.system_utils import compute_device
+
+
+def bias_correction(step: int, beta1: float = 0.9, beta2: float = 0.999) -> float:
+    """Factor of a step of Adam whose averages began at zero (Kingma and Ba 2015, Section 2), from 1/6 up to 1.
+
+    Sparse Adam leaves it out, as the reference's. Steps that are long already would then be six times as long.
+    """
+    return math.sqrt(1 - beta2**step) / (1 - beta1**step)
+
 
 SH_INTERVAL = 1000  # iterations between raises of the active SH degree
 
@@ -132,8 +142,9 @@ class Run:
         """Compare this run with those before it, in its folder and beside its checkpoint."""
         dataset, start = self.dataset, self.start
         # A target may come before any of the iterations that are planned.
-        saves = [] if self.opt.target_psnr else self.schedule.known(self.launch.save_iterations)
-        checks.check_folder(dataset.model_path, dataset.source_path, saves, start, self.first_iteration)
+        planned = self.launch.save_iterations, self.launch.checkpoint_iterations
+        saves = [[] if self.opt.target_psnr else self.schedule.known(one) for one in planned]
+        checks.check_folder(dataset.model_path, dataset.source_path, saves[0], start, self.first_iteration, saves[1])
         if start:
             checks.check_views(start, self.schedule.views)
             checks.report_changes(start, self.options)
@@ -223,7 +234,8 @@ class Run:
         """Set the learning rates of a step, which may be one that is repeated."""
         self.gaussians.update_learning_rate(self.schedule.schedule_step(step.iteration))
         if (factor := self.schedule.rate_factor(step.iteration)) is not None:
-            self.gaussians.scale_rates(factor)
+            sparse = self.opt.optimizer_type == "sparse_adam" and self.schedule.views == 1
+            self.gaussians.scale_rates(factor * (bias_correction(step.iteration) if sparse else 1.0))
 
     def _decode_ahead(self, iteration: int) -> None:
         ahead = self.scene.images.ahead

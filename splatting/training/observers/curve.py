@@ -6,12 +6,11 @@ from pathlib import Path
 from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
 from splatting.evaluation.curve_recorder import CurveRecorder, evenly_spread
-from splatting.evaluation.what_to_try import schedules_follow_length
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
 from splatting.training.run import Run
-from splatting.training.schedule import DecidedSchedule, SettlingSchedule
+from splatting.training.schedule import DecidedSchedule
 from utils.system_utils import saved_iterations
 
 
@@ -62,15 +61,5 @@ class Curve(Observer):
             return
         run = self._run
         there = saved_iterations(Path(run.scene.model_path) / "point_cloud")
-        saved, lr_max_steps = (
-            {*run.schedule.known(run.launch.save_iterations)} & {*there},
-            run.opt.position_lr_max_steps,
-        )
-        follows_length = schedules_follow_length(
-            bool(run.dataset.depths),
-            run.dataset.train_test_exp,
-            run.schedule.sizes,
-            isinstance(run.schedule, SettlingSchedule),
-        )
-        lr_max_steps = None if isinstance(run.schedule, DecidedSchedule) else run.opt.position_lr_max_steps
-        self._recorder.finish(self._seconds, saved, lr_max_steps, follows_length)
+        saved = {*run.schedule.known(run.launch.save_iterations)} & {*there}
+        self._recorder.finish(self._seconds, saved, not isinstance(run.schedule, DecidedSchedule))

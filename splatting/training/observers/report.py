@@ -59,9 +59,9 @@ class ProgressBar(Observer):
 
     def ended(self, error: Error) -> None:
         self._bar.close()
-        if error is None:
+        if error is None and not self._run.opt.time_budget:  # else ScheduleFile says so
             count = self._done - self._run.first_iteration
-            print(f"Trained {count} iterations in {self._run.clock.seconds:.1f} s, without tests and saving")
+            print(f"{count:,} iterations in {self._run.clock.seconds:.1f} s")
 
 
 LOG_INTERVAL = 10  # iterations between TensorBoard's losses: reading one waits for the GPU
@@ -119,8 +119,27 @@ class Report(Observer):
             budget = default_budget(self._run.scene.getTrainCameras())
             options |= {CAP: opt.max_num_splats} if opt.max_num_splats else {BUDGET: budget}
         log.note(**options)
-        if sentences := what_to_try(self._run.rows, log.records):
-            log.tell(*sentences)
+        log.advise(*what_to_try(self._run.rows, log.records))
+
+
+class Summary(Observer):
+    """Says at the end what the model is worth, and how to look at it."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._psnr: float | None = None
+
+    def measured(self, step: Iteration, losses: Losses) -> None:
+        rows = self._run.rows
+        if step.last and rows and rows[-1]["iteration"] == step.iteration:
+            self._psnr = rows[-1]["test_psnr"]
+
+    def ended(self, error: Error) -> None:
+        if error is not None:
+            return
+        run = self._run
+        scored = "" if self._psnr is None else f"Test PSNR {self._psnr:.2f} dB. "
+        print(f"{scored}Look at the model: python view.py -m {run.scene.model_path}")
 
 
 def training_report(

@@ -7,9 +7,10 @@ from tqdm import tqdm
 
 from arguments import add_to_model_json
 from scene.gaussians.checkpoint import save_checkpoint
+from scene.saved_iterations import saved_ply
 from splatting.host.clock import wall_seconds
 from splatting.training.iteration import Iteration
-from splatting.training.left_out import LeftOut, lines, save_last
+from splatting.training.left_out import LeftOut, lines, save_last, saved_line
 from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
 from splatting.training.observers.divergence import DivergenceWatch
@@ -28,6 +29,7 @@ class Saves(Observer):
         self._run = run
         self._test_in_memory = test_in_memory
         self._left_out: LeftOut | None = None
+        self._iteration = 0
 
     def due(self, step: Iteration) -> bool:
         return step.takes(self._run.launch.save_iterations)
@@ -42,13 +44,16 @@ class Saves(Observer):
             tqdm.write(f"[ITER {step.iteration}] Saving Gaussians", file=sys.stdout)
             if step.last:
                 self._left_out = save_last(run, self._test_in_memory, step.iteration)
+                self._iteration = step.iteration
                 step.record["gaussians_left_out"] = self._left_out.unseen
             else:
                 run.scene.save(step.iteration)
 
     def ended(self, error: Error) -> None:
         if error is None and self._left_out is not None:
-            self._run.log.tell(*lines(self._left_out))
+            run, folder = self._run, saved_ply(self._run.scene.model_path, self._iteration).parent
+            run.log.tell(saved_line(self._left_out, folder))
+            run.log.keep(*lines(self._left_out))
 
 
 class Checkpoints(Observer):
@@ -112,8 +117,6 @@ class ScheduleFile(Observer):
             return
         save_schedule(run, self._step)
         if error is None and run.opt.time_budget:
-            run.log.tell(
-                f"Trained {self._seconds:.2f} s in {self._step.iteration} iterations for --time_budget "
-                f"{run.opt.time_budget:g}; the whole process, with reading, scoring and saving, took "
-                f"{run.log.wall_seconds_before + wall_seconds():.1f} s"
-            )
+            whole = run.log.wall_seconds_before + wall_seconds()
+            within = f"{self._seconds:.1f} s (budget {run.opt.time_budget:g} s), {whole:.1f} s in all"
+            run.log.tell(f"{self._step.iteration:,} iterations in {within}")

@@ -8,7 +8,7 @@ from splatting.training.observer import Observer
 from splatting.training.observers.curve import Curve
 from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.observers.guards import MaskWatch, MemoryGuard
-from splatting.training.observers.report import ProgressBar, Records, Report, Target
+from splatting.training.observers.report import ProgressBar, Records, Report, Summary, Target
 from splatting.training.observers.saves import Checkpoints, Saves, ScheduleFile
 from splatting.training.observers.viewers import NetworkViewer, PageObserver
 from splatting.training.run import Run
@@ -34,5 +34,6 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
         MemoryGuard(run),  # from `measured` to `stepped` the model changes; otherwise it is whole
         checkpoints,  # writes the whole state after the step
         *([ScheduleFile(run)] if isinstance(run.schedule, DecidedSchedule) else []),
+        Summary(run),  # after all that say something
         *([PageObserver(run, checkpoints)] if run.launch.viewer is not None else []),  # last: may let the training wait
     ]
