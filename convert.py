@@ -17,6 +17,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from arguments import OptionParser
 from splatting.sfm.colmap import LENS_MODELS, Program, Pycolmap, Settings
 from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder
 from splatting.sfm.programs import refuse_while_working
@@ -92,9 +93,7 @@ def _video(layout: Layout, record: StageRecord, args: argparse.Namespace) -> Sta
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(
-        description="Convert the photos in SCENE/input, or a video, to a scene for train.py."
-    )
+    parser = OptionParser(description="Convert the photos in SCENE/input, or a video, to a scene for train.py.")
     add = parser.add_argument
     add("-s", "--source_path", required=True, metavar="SCENE",
         help="scene folder; its sub-folder input has the photos; --video makes a missing one")  # fmt: skip

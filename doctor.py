@@ -8,11 +8,11 @@ Exit status: 0 no problems, 1 problems, 2 the checks could not run.
 if __name__ == "__main__":
     import splatting.host.early  # noqa: F401  (before the other imports, which take a second)
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from arguments import OptionParser
 from splatting.diagnosis import Line, environment
 
 
@@ -58,7 +58,7 @@ def _show(title: str, lines: list[Line]) -> int:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = OptionParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
     add("-s", "--source_path", default=None, metavar="SCENE",
         help="scene folder to check; with -m the model is compared with it (default: none)")  # fmt: skip

@@ -15,13 +15,14 @@ if __name__ == "__main__":
 
 import os
 import sys
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 
+from arguments import OptionParser
 from splatting.evaluation import plan, stages
 from splatting.evaluation.configs import check_options, read_configs, shipped
 from splatting.evaluation.error_curve import peers_of
@@ -47,8 +48,8 @@ _SHORT_FOR = {  # flags: words for train.py that they stand for, and help
 }
 
 
-def _parser() -> ArgumentParser:
-    parser = ArgumentParser(
+def _parser() -> OptionParser:
+    parser = OptionParser(
         description=__doc__.splitlines()[0],
         epilog="Options after -- go to train.py. A training counts as finished if it used the same scene folder and "
         "the same options of train.py, with any version of the code; a changed dataset is not detected. Exit status: 1 "

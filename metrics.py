@@ -12,7 +12,6 @@ if __name__ == "__main__":
     import splatting.host.early  # noqa: F401  (before the other imports, which take a second)
 
 import math
-from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ import torch
 from fused_ssim import fused_ssim
 from tqdm import tqdm
 
-from arguments import read_cfg_args
+from arguments import OptionParser, read_cfg_args
 from splatting.files.image_files import UNREADABLE, open_render
 from splatting.files.json_files import read_json, write_json
 from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, PerceptualDistance
@@ -228,13 +227,22 @@ def evaluate(
     """Score model folders, print the means and write the files of scores, as the command does.
 
     lpips_net: "vgg", "alex" or "both". lpips_weights: state dicts of torchvision's vgg16 or alexnet, instead of torch's
-    cache and a download. UserError if a folder cannot be scored.
+    cache and a download. UserError if a folder cannot be scored, after the others were.
     """
-    found = {model: find_pairs(model) for model in map(Path, model_paths)}
+    found, failed = {}, []
+    for model in map(Path, model_paths):
+        try:
+            found[model] = find_pairs(model)
+        except UserError as error:
+            failed.append(str(error))
+    if not found:
+        raise UserError("; ".join(failed))
     sides = [side for methods in found.values() for pairs in methods.values() for pair in pairs for side in pair.size]
     metrics = make_metrics(lpips_net, [Path(file) for file in lpips_weights], min(sides))
     for model, methods in found.items():
         _score_model(model, methods, metrics)
+    if failed:
+        raise UserError("; ".join(failed))
 
 
 def keep_lpips(model: Path, method: str, scores: Scores) -> list[str]:
@@ -288,7 +296,7 @@ def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str,
 
 
 def main() -> None:
-    parser = ArgumentParser(description="Score rendered test views: PSNR, SSIM, LPIPS.")
+    parser = OptionParser(description="Score rendered test views: PSNR, SSIM, LPIPS.")
     add = parser.add_argument
     add("-m", "--model_paths", type=Path, nargs="+", required=True,
         help="model folders to score (default: none, must be given)")  # fmt: skip

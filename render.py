@@ -28,7 +28,7 @@ import torch
 from PIL import Image
 from tqdm import tqdm
 
-from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
+from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, read_cfg_args, warn_of_background
 from gaussian_renderer.blending import PLANES, view_planes
 from gaussian_renderer.memory_errors import memory_errors_explained
 from gaussian_renderer.scored_views import ScoredViews
@@ -163,6 +163,8 @@ def _loaded(
     options = copy.copy(dataset)
     options.images_to_load = 1  # each photo is used once
     scene = load_file(options, ply, pipeline) if ply else load_saved(options, iteration, sh_degree)
+    if not ply and getattr(dataset, "other_scene", ""):
+        scene.loaded_iter = f"{scene.loaded_iter}_{dataset.other_scene}"
     if len(scene.gaussians) == 0:
         raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
     return scene, torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
@@ -181,11 +183,19 @@ def main() -> None:
     for name, plane in PLANES.items():
         help_text = f"also write {plane.what}, 16-bit PNGs (default: off)"
         parser.add_argument(f"--{name}", action="store_true", help=help_text)
+    other = "render views of another scene than the model's, into folders with its name (default: refuse)"
+    parser.add_argument("--allow_other_scene", action="store_true", help=other)
     add_path_options(parser)
     parser.add_argument("--quiet", action="store_true", help="print nothing to stdout (default: off)")
     args = get_combined_args(parser)
     options, pipeline = model_params.extract(args), pipeline_params.extract(args)
+    options.other_scene = args.other_scene
     safe_state(args.quiet)
+    if args.other_scene and not (args.allow_other_scene or args.ply):
+        trained = read_cfg_args(args.model_path)["source_path"]
+        raise UserError(
+            f"{args.model_path} is a model of another scene, {trained}; leave -s out, or give --allow_other_scene"
+        )
     warn_of_background(options)
     request = path_request(args)
     if request:

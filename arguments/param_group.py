@@ -1,10 +1,11 @@
 """Options as records, from which parser, defaults, checks and help are made."""
 
 import argparse
+import difflib
 import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NoReturn
 
 from utils.system_utils import UserError
 
@@ -65,6 +66,8 @@ class Option:
         return f"{self._shown()}; {self.origin}"
 
     def _metavar(self) -> str | None:
+        if choices := getattr(self.check, "choices", ()):
+            return f"{{{','.join(choices)}}}"
         return {int: "N", float: "X", str: "TEXT"}.get(type(self.default))
 
     def verify(self, value: Value) -> None:
@@ -79,7 +82,26 @@ class Option:
 
 
 class OptionParser(argparse.ArgumentParser):
-    """A parser in which options that we added never make an abbreviation of a reference option ambiguous."""
+    """A parser in which options that we added never make an abbreviation of a reference option ambiguous.
+
+    An error is one line, without the usage of all options, and names the option that a mistyped one may stand for.
+    """
+
+    def parse_args(self, *words: Any, **more: Any) -> argparse.Namespace:
+        args, unknown = self.parse_known_args(*words, **more)
+        if unknown:
+            self.error(self._unknown(unknown))
+        return args
+
+    def _unknown(self, words: list[str]) -> str:
+        word = next((word for word in words if word.startswith("-")), words[0])
+        if not word.startswith("-"):
+            return f"{word} belongs to no option"
+        near = difflib.get_close_matches(word.partition("=")[0], self._option_string_actions, 1)
+        return f"there is no option {word}" + (f"; did you mean {near[0]}?" if near else "")
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"error: {message} ({self.prog} -h lists all options)\n")
 
     def _get_option_tuples(self, option_string: str) -> list[Any]:
         matches = super()._get_option_tuples(option_string)
@@ -180,5 +202,10 @@ def within(low: float, high: float) -> Callable[[float], str | None]:
 
 
 def one_of(*choices: str) -> Callable[[str], str | None]:
-    """Make a check for `Option`: value is one of `choices`."""
-    return lambda value: None if value in choices else " or ".join(choices)
+    """Make a check for `Option`: value is one of `choices`, which its help shows."""
+
+    def check(value: str) -> str | None:
+        return None if value in choices else " or ".join(choices)
+
+    check.choices = choices
+    return check

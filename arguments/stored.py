@@ -116,8 +116,8 @@ def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | Non
 
     Typed options win; flags can only be switched on. The parser's model options must default to None
     (`ModelParams(parser, sentinel=True)`). `typed_sh_degree` is the degree that was typed, or None, since a saved PLY
-    may have another degree than cfg_args. With --ply, the folder may be a new one. UserError without -m or without a
-    readable cfg_args.
+    may have another degree than cfg_args; `other_scene` the name of the scene if -s names another one than the model's,
+    else empty. With --ply, the folder may be a new one. UserError without -m or without a readable cfg_args.
     """
     args = parser.parse_args(argv)
     if not getattr(args, "model_path", None):
@@ -125,7 +125,16 @@ def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | Non
     typed = {name: value for name, value in vars(args).items() if value is not None and value is not False}
     is_new = getattr(args, "ply", None) and not (Path(args.model_path) / CFG_ARGS).is_file()
     stored = {} if is_new else read_stored_options(args.model_path)
-    return argparse.Namespace(**vars(args) | stored | typed, typed_sh_degree=typed.get("sh_degree"))
+    other = _other_scene(stored.get("source_path", ""), typed.get("source_path", ""))
+    known = {"typed_sh_degree": typed.get("sh_degree"), "other_scene": other}
+    return argparse.Namespace(**vars(args) | stored | typed | known)
+
+
+def _other_scene(trained: str, named: str) -> str:
+    """The name of a scene that is not the one trained on; empty if it is, or if that one was moved away."""
+    if not named or not os.path.isdir(trained) or os.path.realpath(trained) == os.path.realpath(named):
+        return ""
+    return os.path.basename(os.path.realpath(named))
 
 
 def warn_of_background(options: argparse.Namespace) -> None:

@@ -8,8 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from arguments import OPTIONS, read_model_json, read_stored_options
+from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.readers.info import APART, NEAREST, SceneInfo, camera_centers, standing_apart
@@ -24,6 +26,30 @@ from utils.system_utils import UserError
 
 _SAMPLE = 16  # cameras whose depths are checked
 _FEWEST_BEYOND = 0.01  # share of the points in front of them that must lie beyond the nearest depth
+SMALL = 32  # pixels; a smaller side has few more than SSIM's window
+
+
+def hint_of_images(views: Sequence[Camera], info: SceneInfo, white_background: bool) -> None:
+    """Warn of images that are too small to learn from, and of transparent ones that are to be black behind."""
+    width, height = min((view.image_width, view.image_height) for view in views)
+    if min(width, height) < SMALL:
+        print(
+            f"warning: images of {width}x{height} pixels are too small to learn from; give a larger --resolution",
+            file=sys.stderr,
+        )
+    path = info.train_cameras[0].image_path
+    if info.is_nerf_synthetic and not white_background and path is not None and _has_alpha(path):
+        print(
+            "warning: the images are transparent, and train before black; -w trains before white, as published results "
+            "of such scenes do",
+            file=sys.stderr,
+        )
+
+
+def _has_alpha(path: Path) -> bool:
+    with contextlib.suppress(OSError), Image.open(path) as image:
+        return image.mode in ("RGBA", "LA")
+    return False
 
 
 def check_scene(info: SceneInfo) -> None:

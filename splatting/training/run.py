@@ -93,6 +93,7 @@ class Run:
         init_ply = None if self.start else getattr(dataset, "init_ply", None)
         self.scene, first = scene_with(init_ply, dataset, self.gaussians, sharing=sharing)
         checks.check_scene(self.scene.info)
+        checks.hint_of_images(self.scene.getTrainCameras(), self.scene.info, dataset.white_background)
         checks.check_target(opt.target_psnr, len(self.scene.getTestCameras()))
         agree_on_scene(self.scene, self.start)  # before an image is shared
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed, views, self.group.rank if views > 1 else 0)
