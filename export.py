@@ -30,7 +30,16 @@ from scene.saved_model import find_save, load_saved, read_model
 from scene.scene import Scene
 from splatting.exports.formats import FORMATS, READABLE, Format, format_of, read_splats
 from splatting.exports.in_scene import splats_of
-from splatting.exports.splats import Splats, drawable, opacities, selected, tidy, with_sh_degree, within_box
+from splatting.exports.splats import (
+    Splats,
+    drawable,
+    opacities,
+    selected,
+    tidy,
+    used_sh_degree,
+    with_sh_degree,
+    within_box,
+)
 from splatting.files.json_files import OFFSET, read_model_json
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, compute_device, run_cli
@@ -101,7 +110,7 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     make_path = _path_maker(args.path, entry)
     entry.check(args.to)
     splats, scene = load(args, options, needs_views=bool(args.max_splats) or entry.of_scene)
-    degree = splats.sh_degree if args.typed_sh_degree is None else min(args.typed_sh_degree, splats.sh_degree)
+    degree = used_sh_degree(splats) if args.typed_sh_degree is None else min(args.typed_sh_degree, splats.sh_degree)
     keep = choose(splats, args.crop, args.min_opacity)
     if scene is not None and args.max_splats:
         keep = thin_out(scene, keep, degree, args.max_splats, pipe, options)
@@ -140,7 +149,7 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
     add(
         "--ply", metavar="FILE", help=f"write this model, of any tool, instead of one of -m: {READABLE} (default: none)"
     )
-    add("--sh_degree", type=int, choices=range(4), metavar="D", help="leave SH bands above D out (default: keep all)")
+    add("--sh_degree", type=int, choices=range(4), metavar="D", help="leave SH bands above D out (default: zero bands)")
     add("--crop", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
         help="keep the Gaussians with a centre in this box, in the frame of the model (default: keep all)")  # fmt: skip
     add("--min_opacity", type=float, default=0.0, help="leave fainter Gaussians out, 0 to 1 (default: 0)")

@@ -177,7 +177,7 @@ class OptimizationParams(OptionTable):
             help="also save the Gaussians that nobody sees. Without this the last save leaves out those that no "
                  "training view and no view between neighbouring ones depends on: training views at their training "
                  "size stay the same, views from elsewhere may change"),
-        Option("prune_sh", 0.0, origin="ours", check=_tolerance,
+        Option("prune_sh", -1.0, origin="ours", check=_tolerance,
             help="in the last save, drop the highest SH bands that change no colour (0 to 1) by more than this; 0: "
                  "drop bands that are zero throughout, -1: drop none. The sh_degree in cfg_args follows"),
         Option("seed", 0, origin="ours, and the reference's fixed seed", check=within(0, 2**63 - 1), stored=MODEL_JSON,

@@ -186,11 +186,15 @@ def _given(args: argparse.Namespace, **names: str) -> dict[str, Any]:
 
 
 def _refuse_dataset_folder(args: argparse.Namespace) -> None:
-    """UserError when the model would be written into the dataset, which must not change."""
+    """UserError when `write_inputs` would overwrite a file of the dataset.
+
+    It writes both names, so a folder that has only one of them has a file of someone else.
+    """
     if not args.source_path or not args.model_path:
         return
     source, model = Path(args.source_path).resolve(), Path(args.model_path).resolve()
-    if model.is_relative_to(source):
+    found = [name for name in ("input.ply", "cameras.json") if (model / name).exists()]
+    if model == source and len(found) == 1:
         raise UserError(
-            f"the output folder {args.model_path} lies in the scene folder {source}; name another folder with -m"
+            f"a model in {args.model_path} would overwrite the scene's {found[0]}; name another folder with -m"
         )

@@ -42,7 +42,7 @@ OPTIMISATION = {
 OURS = {
     "init_pcd_path": "", "init_ply": "", "init_type": "sfm", "masks": "", "invert_masks": False,
     "mask_meaning": "auto", "images_to_load": 0, "spill": False, "max_num_splats": 0, "keep_unseen": False,
-    "prune_sh": 0.0, "seed": 0, "strategy": "auto", "absgrad": False, "absgrad_threshold": 8e-4, "split": "sample",
+    "prune_sh": -1.0, "seed": 0, "strategy": "auto", "absgrad": False, "absgrad_threshold": 8e-4, "split": "sample",
     "growth_power": 1.0, "score_views": 10, "score_error": "l1", "score_join": "sum", "score_power": 1.0,
     "opacity_decay": 0.98, "prune_opacity": 0.005, "mcmc_until_iter": 25000, "mcmc_growth": 0.05,
     "mcmc_min_opacity": 0.005, "mcmc_parts": 51, "mcmc_noise": 500000.0, "mcmc_gate_steepness": 100.0,

@@ -183,7 +183,6 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_given(source_path=f"SCENE/{SPARSE}/cameras.bin"), r"cameras\.bin is a file; give -s .*, SCENE$"),
         (_given(source_path="SCENE/images"), "images is not a scene: .*found Right, left; give -s SCENE, which is a"),
         (_given(source_path=f"SCENE/{SPARSE}"), "0 is not a scene: .*found cameras.bin.*; give -s SCENE, which is a"),
-        (_given(model_path="SCENE/output"), "the output folder SCENE/output lies in the scene folder"),
         (_given(images="images_4"), "there is no folder SCENE/images_4,.*-i$"),
         (_given(init_pcd_path="SCENE/dense.ply"), "no point cloud SCENE/dense.ply"),
         (_emptied, "SCENE is not a scene: .*found nothing"),

@@ -261,13 +261,23 @@ def test_real_scenes(shared_dir, tmp_path, name, views, held, points, extent):
         assert camera.target(torch.zeros(3)).shape == (3, camera.image_height, camera.image_width)
 
 
-@pytest.mark.parametrize("place", [".", "out", "images/deep/out", "../colmap_scene/out"])
-def test_nothing_is_written_into_the_dataset(colmap_scene, place):
+@pytest.mark.parametrize("place", [".", "output"])
+def test_a_model_may_lie_in_its_dataset(colmap_scene, place):
     before = folder_state(colmap_scene)
-    with pytest.raises(UserError, match="lies in the scene folder .*; name another folder with -m"):
+    for _ in range(2):
         Scene(options_of(colmap_scene, colmap_scene / place), FakeGaussians())
+    after = folder_state(colmap_scene)
+    assert before.items() <= after.items() and (colmap_scene / place / "cameras.json").exists()
+
+
+@pytest.mark.parametrize("name", ["input.ply", "cameras.json"])
+def test_no_file_of_the_dataset_is_overwritten(colmap_scene, name):
+    (colmap_scene / name).write_text("theirs")
+    before = folder_state(colmap_scene)
+    with pytest.raises(UserError, match=f"would overwrite the scene's {name}; name another folder with -m"):
+        Scene(options_of(colmap_scene, colmap_scene), FakeGaussians())
     assert folder_state(colmap_scene) == before
-    Scene(options_of(colmap_scene, colmap_scene.parent / "colmap_scene_out"), FakeGaussians())
+    Scene(options_of(colmap_scene, colmap_scene / "output"), FakeGaussians())
 
 
 def test_a_model_kept_in_the_dataset_can_be_used_without_the_cloud(colmap_scene):

@@ -107,6 +107,27 @@ def test_clones_and_splits_at_once_give_the_bytes_of_one_after_the_other(screen)
             assert torch.equal(average, moments(theirs)[name][key]), (name, key)
 
 
+def test_a_client_that_takes_norms_of_its_gradients_clones_the_same():
+    """The reference's own line: over gradients (N,) its norm would be one number for all."""
+
+    class Client(GaussianModel):
+        def densify_and_clone(self, grads: torch.Tensor, *others: float) -> None:
+            super().densify_and_clone(torch.norm(grads, dim=-1), *others)
+
+        def densify_and_split(self, grads: torch.Tensor, *others: float, **how: int) -> None:
+            shapes.append(tuple(grads.shape))
+            super().densify_and_split(grads, *others, **how)
+
+    models, shapes = [], []
+    for kind in (GaussianModel, Client):
+        gaussians = _toy([LIMIT / 2] * 3 + [LIMIT * 3] * 3, [1.0, 0.0, 0.0] * 2)
+        gaussians.__class__ = kind
+        _densify(gaussians, seed=3)
+        models.append(parameters(gaussians))
+    assert shapes == [(6, 1)]
+    assert all(torch.equal(value, models[1][name]) for name, value in models[0].items())
+
+
 def test_children_along_the_longest_axis_are_told_from_clones():
     """Clones stay copies; both children take the place of their parent, by the rule of scene/gaussians/long_axis.py."""
     results = []

@@ -37,6 +37,7 @@ from splatting.exports.splats import (
     opacities,
     selected,
     tidy,
+    used_sh_degree,
     with_sh_degree,
     within_box,
 )
@@ -273,6 +274,13 @@ def test_models_and_splats_are_the_same_gaussians():
         np.exp(splats_of(gaussians).log_scales), gaussians.get_scaling.detach().numpy(), rtol=1e-5
     )
     assert model_of(splats(4, 1), 3).active_sh_degree == 1 and model_of(splats(4, 3), 1).max_sh_degree == 1
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_bands_of_zeros_are_not_used(degree):
+    some = splats(5, 3)
+    some.sh[:, (degree + 1) ** 2 :] = 0
+    assert used_sh_degree(some) == degree
 
 
 def test_selection():

@@ -89,6 +89,17 @@ def test_foreign_files_load(tmp_path, kind):
     _assert_equal(gaussians, _loaded(tmp_path / "foreign.ply"))
 
 
+def test_a_model_of_two_scales_has_as_many_columns_as_values(tmp_path):
+    gaussians = model(5)
+    gaussians._scaling = torch.nn.Parameter(gaussians._scaling.detach()[:, :2].contiguous())
+    gaussians.save_ply(tmp_path / "flat.ply")
+    data = PlyData.read(tmp_path / "flat.ply", mmap=False)["vertex"].data
+    assert list(data.dtype.names) == gaussians.construct_list_of_attributes() and len(data.dtype.names) == 61
+    for i in range(2):
+        assert np.array_equal(data[f"scale_{i}"], gaussians._scaling.detach()[:, i])
+    assert np.array_equal(data["rot_3"], gaussians._rotation.detach()[:, 3])
+
+
 def test_an_empty_model_round_trips(tmp_path):
     GaussianModel(1).save_ply(tmp_path / "none.ply")
     assert len(_loaded(tmp_path / "none.ply", 1)) == 0

@@ -1,6 +1,8 @@
 """The public interface (CONTRACT.md 6.1): arguments, results, exceptions and their messages."""
 
 import inspect
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -45,6 +47,34 @@ def call(splats, camera, **changes):
         "rotations": splats["rotations"],
     }
     return GaussianRasterizer(raster_settings=camera)(**(arguments | changes))
+
+
+@pytest.mark.parametrize(
+    "name, shape",
+    [("opacities", (1, 3, 1)), ("opacities", (3,)), ("bg", (1, 3)), ("bg", (3, 1)), ("viewmatrix", (1, 4, 4)),
+     ("colors_precomp", (3, 1, 3)), ("shs", (3, 25, 3)), ("image_height", float)],
+)  # fmt: skip
+def test_shapes_that_the_reference_takes_give_the_same_image(name, shape):
+    splats, camera = scene()
+    changes = {"shs": torch.nn.functional.pad(torch.cat([splats["sh_dc"], splats["sh_rest"]], 1), (0, 0, 0, 9))[:, :16]}
+    if name == "colors_precomp":
+        changes = {"shs": None, name: torch.rand(3, 3)}
+    expected = call(splats, camera, **changes)
+    if shape is float:
+        camera = camera._replace(image_height=float(camera.image_height))
+    elif name in camera._fields:
+        camera = camera._replace(**{name: getattr(camera, name).reshape(shape)})
+    elif name == "shs":
+        changes[name] = torch.nn.functional.pad(changes[name], (0, 0, 0, 25 - changes[name].shape[1]), value=7.0)
+    else:
+        changes[name] = (splats | changes)[name].reshape(shape)
+    for got, wanted in zip(call(splats, camera, **changes), expected, strict=True):
+        assert torch.equal(got, wanted)
+
+
+def test_the_compiled_modules_stand_in_is_an_attribute():
+    code = "import diff_gaussian_rasterization as d; d._C.rasterize_gaussians"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
 def test_settings_are_the_references_tuple():

@@ -80,8 +80,9 @@ def densify_and_prune(
     if _grows_by_own_steps(gaussians):
         split = _clone_and_split(gaussians, gradient, max_grad, extent, **how)
     else:
-        gaussians.densify_and_clone(gradient, max_grad, extent)
-        gaussians.densify_and_split(gradient, max_grad, extent, **how)
+        column = gradient.unsqueeze(1)  # (N, 1) as in the reference, since overriding code takes norms of its rows
+        gaussians.densify_and_clone(column, max_grad, extent)
+        gaussians.densify_and_split(column, max_grad, extent, **how)
     remove = rules.is_useless(gaussians.opacity_logits(), min_opacity)
     if split is not None:
         remove[: len(split)] |= split

@@ -196,7 +196,7 @@ class GaussianParameters:
 
     def construct_list_of_attributes(self) -> list[str]:
         """Names of the properties of the PLY, in its order."""
-        return column_names(self._degree_of_tensors())
+        return column_names(self._degree_of_tensors(), self._scaling.shape[1])
 
     def _degree_of_tensors(self) -> int:
         """SH degree of the tensors. It is below max_sh_degree once bands were cut. UserError for a part of a band."""

@@ -36,7 +36,7 @@ def write_ply(
     header = ["ply", "format binary_little_endian 1.0"]
     header += [f"comment {comment}" for comment in (*offset_comments(world_offset), *comments)]
     header += [f"element vertex {shards.total(count)}"]
-    header += [f"property float {name}" for name in column_names(sh_degree)]
+    header += [f"property float {name}" for name in column_names(sh_degree, rows["scaling"].shape[1])]
     pieces = shards.pieces(count, lambda part: _table(rows, sh_degree, part))
     if not writes_files():
         return deque(pieces, maxlen=0).clear()
@@ -55,10 +55,11 @@ def _table(rows: Rows, sh_degree: int, part: slice) -> Tensor:
     return torch.cat(columns, dim=1).float()
 
 
-def column_names(sh_degree: int) -> list[str]:
-    """The properties of a Gaussian, in the order of the file."""
+def column_names(sh_degree: int, scales: int = 3) -> list[str]:
+    """The properties of a Gaussian, in the order of the file. scales: 2 for the flat ones of clients' own models."""
     parts = [attribute.columns for attribute in attributes(sh_degree).values()]
-    return [name for columns in (parts[0], _NORMALS, *parts[1:]) for name in columns]
+    names = [name for columns in (parts[0], _NORMALS, *parts[1:]) for name in columns]
+    return [name for name in names if not name.startswith("scale_") or int(name.removeprefix("scale_")) < scales]
 
 
 def row_bytes(sh_degree: int) -> int:

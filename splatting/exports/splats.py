@@ -57,6 +57,12 @@ def with_sh_degree(splats: Splats, degree: int) -> Splats:
     return replace(splats, sh=np.ascontiguousarray(splats.sh[:, : (degree + 1) ** 2]))
 
 
+def used_sh_degree(splats: Splats) -> int:
+    """The lowest degree above which every SH coefficient is zero."""
+    bands = np.flatnonzero(splats.sh.any(axis=(0, 2)))
+    return int(bands[-1] ** 0.5) if len(bands) else 0
+
+
 def drawable(splats: Splats) -> np.ndarray:
     """(N,) bool: the splats that the rasterizer draws. Infinite logits are opacities 0 and 1, all else is finite."""
     tables = splats.means, splats.log_scales, splats.rotations, splats.sh.reshape(len(splats), 3 * splats.sh.shape[1])

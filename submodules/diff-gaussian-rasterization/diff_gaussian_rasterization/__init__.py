@@ -4,6 +4,8 @@
 """
 
 import diff_gaussian_rasterization.backend  # noqa: F401  (first, because it says whether torch is missing)
+
+import diff_gaussian_rasterization._C  # noqa: F401  isort: skip  (clients take it as an attribute)
 from diff_gaussian_rasterization.gaussians import Gaussians
 from diff_gaussian_rasterization.ops import Rasterized, decisive, has_cuda_kernels, rasterize
 from diff_gaussian_rasterization.rasterizer import GaussianRasterizer, cpu_deep_copy_tuple, rasterize_gaussians
