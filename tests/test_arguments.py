@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import train
 from arguments import (
     OPTIONS,
     GroupParams,
@@ -407,3 +408,25 @@ def test_abbreviations_of_the_reference_mean_the_same_in_spite_of_our_options(ca
     assert _meaning(parser, "--max") == "max_num_splats"
     assert _meaning(parser, "--images_") == "images_to_load"
     assert _meaning(parser, "--s") is None
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--densify_untill_iter=5"], "there is no option --densify_untill_iter=5; did you mean --densify_until_iter"),
+        (["--xyzzy=3"], "there is no option --xyzzy=3 ("),
+        (["stray"], "stray belongs to no option"),
+        (["--iterations", "many"], "argument --iterations: invalid int value: 'many'"),
+    ],
+)
+def test_a_mistyped_option_gets_one_line(capsys, words, said):
+    with pytest.raises(SystemExit) as ended:
+        train.parse(["-s", "x", *words])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert ended.value.code == 2 and line.startswith(f"error: {said}") and line.endswith(" -h lists all options)")
+
+
+def test_choices_are_shown_as_choices(capsys):
+    with pytest.raises(SystemExit):
+        train.parse(["-h"])
+    assert "--strategy {auto,adc,mcmc,budget}" in capsys.readouterr().out

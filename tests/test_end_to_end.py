@@ -125,12 +125,13 @@ def test_skipped_views_are_not_even_opened(trained, tmp_path):
     model.mkdir()
     for name in ("cfg_args", "point_cloud"):
         (model / name).symlink_to(trained.model / name)
-    said = run("render.py", "-m", model, "-s", scene, "--skip_train")
+    said = run("render.py", "-m", model, "-s", scene, "--skip_train", "--allow_other_scene")
     assert said.count("median") == 1
-    assert names(model / "test" / f"ours_{ITERATIONS}" / "renders") == [f"{k:05d}.png" for k in range(5)]
+    copied = model / "test" / f"ours_{ITERATIONS}_scene" / "renders"
+    assert names(copied) == [f"{k:05d}.png" for k in range(5)]
     assert not (model / "train").exists()
-    again = [folder / "test" / f"ours_{ITERATIONS}" / "renders" / "00000.png" for folder in (model, trained.model)]
-    assert again[0].read_bytes() == again[1].read_bytes()
+    again = trained.model / "test" / f"ours_{ITERATIONS}" / "renders" / "00000.png"
+    assert (copied / "00000.png").read_bytes() == again.read_bytes()
 
 
 @pytest.mark.parametrize(

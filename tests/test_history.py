@@ -23,7 +23,7 @@ MODEL_OPTIONS = {
 
 
 def _train(scene: Path, out: Path, *more: object, iterations: int) -> bytes:
-    words = ["-s", scene, "-m", out, "-r", 24, "--iterations", iterations, "--test_iterations", -1, *more]
+    words = ["-s", scene, "-m", out, "-r", 48, "--iterations", iterations, "--test_iterations", -1, *more]
     words.append("--disable_viewer")  # its port may be in use, which is a warning
     train.main(list(map(str, words)))
     return (out / "point_cloud" / f"iteration_{iterations}" / "point_cloud.ply").read_bytes()
@@ -168,13 +168,13 @@ def test_changed_options_are_told_in_one_line(colmap_scene, tmp_path, capfd):
     options = ["--start_checkpoint", out / "chkpnt2.pth", "--seed", 3]
     _train(colmap_scene, tmp_path / "same", *options, iterations=3)
     assert _warnings(capfd.readouterr().err) == []
-    changed = ["-r", 32, "-w", "--eval", "--antialiasing", "--optimizer_type", "sparse_adam", "--mask_meaning",
+    changed = ["-r", 72, "-w", "--eval", "--antialiasing", "--optimizer_type", "sparse_adam", "--mask_meaning",
                "transparent", "--seed", 4]  # fmt: skip
     _train(colmap_scene, tmp_path / "changed", *options, *changed, iterations=3)
     (warning,) = _warnings(capfd.readouterr().err)
     assert warning == (
-        f"warning: {out} was trained with --resolution 24 no --white_background no --eval --mask_meaning auto "
-        "no --antialiasing --optimizer_type default --seed 3, this run has --resolution 32 --white_background --eval "
+        f"warning: {out} was trained with --resolution 48 no --white_background no --eval --mask_meaning auto "
+        "no --antialiasing --optimizer_type default --seed 3, this run has --resolution 72 --white_background --eval "
         "--mask_meaning transparent --antialiasing --optimizer_type sparse_adam --seed 4"
     )
     # In the same folder cfg_args is overwritten, so the message must come before.

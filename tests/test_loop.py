@@ -11,10 +11,10 @@ import torch
 
 import train
 from splatting.evaluation.training_log import TrainingLog
-from splatting.training import strategies
 from splatting.training.density import DensityControl
 from splatting.training.observer import Announcer, Observer
 from splatting.training.observers.standard import standard_observers
+from splatting.training.strategies import adc
 from splatting.training.strategies.adc import AdaptiveDensityControl
 
 ITERATIONS = 24
@@ -136,7 +136,7 @@ def test_another_strategy_is_another_object(colmap_scene, tmp_path, monkeypatch)
             assert self._gaussians.get_xyz.grad is None
             calls.append(("after_step", step.iteration))
 
-    monkeypatch.setattr(strategies, "AdaptiveDensityControl", Strategy)
+    monkeypatch.setattr(adc, "AdaptiveDensityControl", Strategy)
     told = []
     _train(colmap_scene, tmp_path, monkeypatch, lambda *_: [Recorder(told)])
     steps = range(1, ITERATIONS + 1)

@@ -145,6 +145,14 @@ def test_earlier_scores_that_nobody_can_use_do_not_matter(model, run, content):
     assert status == 0 and "kept" not in out
 
 
+def test_a_model_without_renders_is_named_and_the_others_are_scored(tmp_path, run):
+    good, unrendered = make_model(tmp_path / "good"), tmp_path / "unrendered"
+    unrendered.mkdir()
+    status, out, err = run("-m", unrendered, good)
+    assert status == 2 and f"{good} ours_30 (2 views): SSIM" in out and files_of(good)[0]["ours_30"]["PSNR"] > 0
+    assert "no rendered test views in" in err and "unrendered" in err
+
+
 def test_images_of_two_folders_as_tensors(model):
     folder = model / "test" / "ours_30"
     Image.fromarray(picture(9)).convert("RGBA").save(folder / "gt" / "00001.png")

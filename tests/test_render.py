@@ -199,6 +199,20 @@ def test_a_model_trained_on_black_is_not_rendered_on_white_without_a_word(
     assert warned == (words == ["-w"] and not white) and bool(said) == warned
 
 
+def test_another_scene_is_rendered_only_where_that_is_said(folder, run, colmap_scene, tmp_path):
+    other = Path(shutil.copytree(colmap_scene, tmp_path / "other"))
+    with pytest.raises(
+        UserError, match=rf"is a model of another scene, {colmap_scene}; leave -s out, or give --allow_"
+    ):
+        run("-s", str(other), "--skip_train")
+    assert not (folder / "test").exists()
+    run("-s", str(other), "--skip_train", "--allow_other_scene")
+    assert [path.name for path in (folder / "test").iterdir()] == ["ours_7_other"]
+    shutil.move(colmap_scene, tmp_path / "moved")  # is no other scene
+    run("-s", str(tmp_path / "moved"), "--skip_train")
+    assert (folder / "test" / "ours_7").is_dir()
+
+
 def test_help_says_what_happens_without_an_option(monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["render.py", "-h"])
     with pytest.raises(SystemExit):

@@ -71,6 +71,16 @@ def _paint(scene: Path, value: int) -> None:
         Image.new("RGB", (96, 64), (value,) * 3).save(path)
 
 
+def test_images_that_teach_little_are_named(colmap_scene, blender_scene, tmp_path, capfd):
+    _train(colmap_scene, tmp_path / "a", "-r", 24)
+    assert "warning: images of 24x16 pixels are too small to learn from" in capfd.readouterr().err
+    said = []
+    for words in ((), ("-w",)):
+        _train(blender_scene, tmp_path / "b", "-r", 1, *words)
+        said.append("the images are transparent, and train before black; -w trains" in capfd.readouterr().err)
+    assert said == [True, False]
+
+
 def test_one_picture(tmp_path):
     make_colmap_scene(tmp_path / "scene", views=1)
     _train(tmp_path / "scene", tmp_path / "out")

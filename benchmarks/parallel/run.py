@@ -37,6 +37,7 @@ class WorkloadRun(Run):
         here = self.group = ranks()
         views = here.size if parallel == "views" else 1
         words = ["-s", ".", "--iterations", str(steps * views), "--densify_from_iter", "10000", *_STILL * still]
+        words += ["--strategy", "adc"]
         words += ["--parallel", parallel, *["--spill"] * spill]
         self.launch, self.dataset, self.opt, self.pipe = train.parse(words)
         self.lost = self.first_iteration = 0

@@ -82,7 +82,8 @@ def check_options(words: Sequence[str], where: str, parse: Parse | None) -> None
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
             parse(words)
     except SystemExit as error:  # raised by argparse; without a message for -h
-        reason = said.getvalue().strip().rpartition("error: ")[2] or f"{' '.join(words)} trains nothing"
+        line = said.getvalue().strip().rpartition("error: ")[2]  # and where to find all options, which follows
+        reason = line.rpartition(" (")[0] or f"{' '.join(words)} trains nothing"
         raise UserError(f"{where}: {reason}; train.py -h lists the options") from error
     except UserError as error:
         raise UserError(f"{where}: {error}") from error

@@ -15,6 +15,7 @@ from gaussian_renderer.scored_views import ScoredViews
 from scene import Scene
 from scene.cameras import Camera
 from splatting.evaluation.what_to_try import BUDGET, CAP, PLANNED, STRATEGY, what_to_try
+from splatting.host.clock import wall_seconds
 from splatting.training.density import default_budget
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses, LossWatch
@@ -59,9 +60,15 @@ class ProgressBar(Observer):
 
     def ended(self, error: Error) -> None:
         self._bar.close()
-        if error is None and not self._run.opt.time_budget:  # else ScheduleFile says so
-            count = self._done - self._run.first_iteration
-            print(f"{count:,} iterations in {self._run.clock.seconds:.1f} s")
+        if error is not None:
+            return
+        run, seconds = self._run, self._run.clock.seconds
+        count = f"{self._done - run.first_iteration:,} iterations in"
+        if not run.opt.time_budget:
+            print(f"{count} {seconds:.1f} s")
+            return
+        seconds, whole = run.log.seconds_before + seconds, run.log.wall_seconds_before + wall_seconds()
+        run.log.tell(f"{count} {seconds:.1f} s (budget {run.opt.time_budget:g} s), {whole:.1f} s in all")
 
 
 LOG_INTERVAL = 10  # iterations between TensorBoard's losses: reading one waits for the GPU

@@ -8,7 +8,6 @@ from tqdm import tqdm
 from arguments import add_to_model_json
 from scene.gaussians.checkpoint import save_checkpoint
 from scene.saved_iterations import saved_ply
-from splatting.host.clock import wall_seconds
 from splatting.training.iteration import Iteration
 from splatting.training.left_out import LeftOut, lines, save_last, saved_line
 from splatting.training.objective import Losses
@@ -104,19 +103,12 @@ class ScheduleFile(Observer):
     def __init__(self, run: Run) -> None:
         self._run = run
         self._step: Iteration | None = None
-        self._seconds = 0.0
 
     def stepped(self, step: Iteration) -> None:
         self._step = step
-        if step.last:
-            self._seconds = self._run.log.seconds_before + self._run.clock.seconds
 
     def ended(self, error: Error) -> None:
         run = self._run
         if self._step is None:
             return
         save_schedule(run, self._step)
-        if error is None and run.opt.time_budget:
-            whole = run.log.wall_seconds_before + wall_seconds()
-            within = f"{self._seconds:.1f} s (budget {run.opt.time_budget:g} s), {whole:.1f} s in all"
-            run.log.tell(f"{self._step.iteration:,} iterations in {within}")

@@ -30,10 +30,10 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
         Report(run, writer, report),
         Saves(run, test_in_memory),  # before the model changes
         Records(run),  # after all that add to the iteration's record
+        Summary(run),  # after all that say something at the end
         *([NetworkViewer(run)] if network_gui.listener else []),  # after all that write: it may make training wait
         MemoryGuard(run),  # from `measured` to `stepped` the model changes; otherwise it is whole
         checkpoints,  # writes the whole state after the step
         *([ScheduleFile(run)] if isinstance(run.schedule, DecidedSchedule) else []),
-        Summary(run),  # after all that say something
         *([PageObserver(run, checkpoints)] if run.launch.viewer is not None else []),  # last: may let the training wait
     ]
