@@ -8,12 +8,14 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
 from scene.readers.info import APART, standing_apart
 from splatting.diagnosis import Line, from_error
 from splatting.files.json_files import read_json
 from splatting.files.listing import some
+from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 
 # Learning rates and size limits are fractions of the extent, but depths below 0.2 are culled and float32 is used.
@@ -27,6 +29,9 @@ OPENING = (10.0, 150.0)  # degrees; outside, the focal length is doubtful
 FEWEST_IN_VIEW = 10  # points of the cloud in a photo
 _SAMPLE = 5000  # most points tested against the views
 _WIDE = 1600
+_COMPARED, _SMALL = 16, 200  # photos whose colours are compared, and their size in pixels
+_GREY = 0.02  # spread of colours, below which they tell nothing
+_OTHER = 0.9  # error of another photo's colours, as a part of the own one's
 
 
 def check_dataset(source: str, images: str) -> list[Line]:
@@ -37,7 +42,8 @@ def check_dataset(source: str, images: str) -> list[Line]:
             info = read_scene(source, images, hold_out=False)
     except UserError as error:
         return [*_warnings(said.getvalue()), from_error(error)]
-    checks = check_views(info.train_cameras), check_extent(info), check_lenses(info.train_cameras), check_cloud(info)
+    views = info.train_cameras
+    checks = check_views(views), check_extent(info), check_lenses(views), check_cloud(info), check_colors(info)
     return [*_warnings(said.getvalue()), *chain(*checks, _check_registered(Path(source) / "convert_report.json"))]
 
 
@@ -118,13 +124,52 @@ def points_in_views(cameras: list[CameraInfo], points: np.ndarray) -> np.ndarray
     """Whether points (N,3) lie in front of each camera and inside its photo: (cameras, N) bool."""
     seen = np.zeros((len(cameras), len(points)), dtype=bool)
     for row, camera in zip(seen, cameras, strict=True):
-        local = points @ camera.R + camera.T
-        front = local[:, 2] > 0
-        depth = np.where(front, local[:, 2], 1.0)
-        x = camera.fx * local[:, 0] / depth + camera.cx
-        y = camera.fy * local[:, 1] / depth + camera.cy
-        row[:] = front & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        row[:] = _projected(camera, points)[2]
     return seen
+
+
+def _projected(camera: CameraInfo, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixel coordinates x, y of points (N, 3), and whether they are in front of the camera and inside its photo."""
+    local = points @ camera.R + camera.T
+    front = local[:, 2] > 0
+    depth = np.where(front, local[:, 2], 1.0)
+    x = camera.fx * local[:, 0] / depth + camera.cx
+    y = camera.fy * local[:, 1] / depth + camera.cy
+    return x, y, front & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+
+
+def check_colors(info: SceneInfo) -> Iterator[Line]:
+    """Colours of the points beside those of the photos where they are seen: photos may have each other's names."""
+    step = max(1, len(info.point_cloud.points) // _SAMPLE)
+    cloud = BasicPointCloud(*(values[::step] for values in info.point_cloud))
+    if len(cloud.points) < FEWEST_IN_VIEW or cloud.colors.std(axis=0).max() < _GREY:
+        return
+    cameras = info.train_cameras[:: max(1, len(info.train_cameras) // _COMPARED)][:_COMPARED]
+    photos = [_pixels(camera) for camera in cameras]
+    names = [one.image_name for place, one in enumerate(cameras) if _is_another(one, place, photos, cloud)]
+    if len(cameras) >= 3 and len(names) > len(cameras) / 2:
+        text = f"the points have the colours of other photos than those they are seen in ({some(names)})"
+        yield Line(text, "the photos have each other's names: restore those that the cameras were reconstructed with")
+
+
+def _pixels(camera: CameraInfo) -> np.ndarray:
+    """A photo, small, (H, W, 3) in [0, 1]."""
+    with Image.open(camera.image_path) as image:
+        image.draft("RGB", (_SMALL, _SMALL))
+        image = image.convert("RGB")
+        image.thumbnail((_SMALL, _SMALL))
+        return np.asarray(image) / 255
+
+
+def _is_another(camera: CameraInfo, place: int, photos: list[np.ndarray], cloud: BasicPointCloud) -> bool:
+    """Whether another photo has clearly more of the colours of the points that a camera sees than its own, `place`."""
+    x, y, inside = _projected(camera, cloud.points)
+    errors = []
+    for photo in photos:
+        rows = (y[inside] / camera.height * photo.shape[0]).astype(int)
+        columns = (x[inside] / camera.width * photo.shape[1]).astype(int)
+        errors.append(np.abs(photo[rows, columns] - cloud.colors[inside]).mean() if inside.any() else 0.0)
+    return min(errors) < _OTHER * errors[place]
 
 
 def _check_registered(path: Path) -> Iterator[Line]:

@@ -18,6 +18,8 @@ from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
 from splatting.diagnosis import Line, from_error
+from splatting.diagnosis.changes import FITS as BAD_PSNR
+from splatting.diagnosis.changes import LOST, NEAR, recorded_psnr, what_changed
 from splatting.diagnosis.dataset import check_dataset
 from splatting.evaluation.error_curve import NAME as CURVE
 from splatting.evaluation.error_curve import read_curve
@@ -38,7 +40,6 @@ BINS = (0.0, 0.01, 0.05, 0.2, 0.5, 0.9, 1.0)
 HUGE = 1.0  # extents: one standard deviation of a splat as large as the whole scene
 HUGE_SHARE = 0.01
 BLACK = 0.02  # mean of an image in [0, 1]
-BAD_PSNR = 18.0  # dB on training views; models that converge reach 22 and more
 FEW_ITERATIONS = 3000
 RESET_INTERVAL = 3000  # the default of --opacity_reset_interval
 NEAREST = 0.2  # depth below which nothing is drawn
@@ -67,8 +68,10 @@ def check_model(model_path: str, iteration: int, source: str | None = None, imag
     lines = [Line(f"{name}, {len(gaussians)} Gaussians of SH degree {gaussians.max_sh_degree}")]
     if wrong := [*_not_finite(gaussians)] or [*_wrong_sizes(gaussians, extent)]:
         return [*lines, *wrong]
-    shapes = [_opacities(gaussians), _sizes(gaussians, extent)]
-    return [*lines, *shapes, _renders(scene, options, stored), *check_training(Path(model_path))]
+    shapes, (renders, changed) = [_opacities(gaussians), _sizes(gaussians, extent)], _renders(scene, options, stored)
+    if changed:  # which explains all else, and the training has no say in it
+        return [*lines, *(line for line in shapes if not line.finding), renders]
+    return [*lines, *shapes, renders, *check_training(Path(model_path))]
 
 
 def check_training(model: Path) -> list[Line]:
@@ -149,23 +152,31 @@ def _sizes(gaussians: GaussianModel, extent: float) -> Line:
     return Line(text, "remove far points from the start cloud, and check the poses")
 
 
-def _renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) -> Line:
-    """Line about a few training views, rendered small: close to their photos, or else the likeliest reason."""
+def _renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) -> tuple[Line, bool]:
+    """Line about a few training views, rendered small: close to their photos, or else the likeliest reason.
+
+    And whether that is a change since the training.
+    """
     views = _looked_at(scene)
     means = _means(views, scene, options)
     if means is None:
-        return Line("no pixel of the inspected training views counts", "check --masks and --invert_masks")
+        return Line("no pixel of the inspected training views counts", "check --masks and --invert_masks"), False
     black = means.render < BLACK
     if black and means.photo < BLACK:
-        return Line("the photos themselves are black", "inspect them; if they are transparent, train with -w")
-    if not black and means.psnr >= BAD_PSNR:
-        return Line(f"{len(views)} training views rendered {_WIDTH} pixels wide: PSNR {means.psnr:.1f} dB")
+        return Line("the photos themselves are black", "inspect them; if they are transparent, train with -w"), False
+    then = recorded_psnr(Path(scene.model_path), scene.loaded_iter)
+    good = not black and means.psnr >= max(BAD_PSNR, (then or 0.0) - LOST)
+    changed = None
+    if not good or (then is not None and means.psnr < then - NEAR):
+        changed = what_changed(scene, views, _scored(scene, options), means.psnr, then)
+    if good and changed is None:
+        return Line(f"{len(views)} training views rendered {_WIDTH} pixels wide: PSNR {means.psnr:.1f} dB"), False
     text = "renders of the training views are black"
     text = text if black else f"training views have a PSNR of only {means.psnr:.1f} dB"
-    wrong = next(_wrong_values(scene.gaussians, scene.cameras_extent), None)
-    wrong = wrong or _other_background(scene, options, stored, means.psnr)
+    wrong = _other_background(scene, options, stored, means.psnr)
+    wrong = wrong or changed or next(_wrong_values(scene.gaussians, scene.cameras_extent), None)
     wrong = wrong or (_why_black(scene, views, means) if black else Line("", _why_bad(scene, stored)))
-    return wrong._replace(text=f"{text}: {wrong.text}" if wrong.text else text)
+    return wrong._replace(text=f"{text}: {wrong.text}" if wrong.text else text), wrong is changed
 
 
 class Means(NamedTuple):
@@ -201,19 +212,27 @@ def _other_background(scene: Scene, options: argparse.Namespace, stored: dict[st
     return Line(f"over {name} it is {means.psnr:.1f} dB", remedy + ("" if white else ", and render without -w"))
 
 
-def _measure(camera: Camera, scene: Scene, options: argparse.Namespace) -> tuple[float, ...] | None:
-    """Return the `Means` of one view; None if no pixel of it counts."""
-    gaussians = scene.gaussians
+def _pipe(scene: Scene) -> argparse.Namespace:
     pipe = PipelineParams(argparse.ArgumentParser()).extract(argparse.Namespace())
     pipe.antialiasing = read_model_json(scene.model_path).get("antialiasing", False)
+    return pipe
+
+
+def _scored(scene: Scene, options: argparse.Namespace) -> ScoredViews:
     background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
-    views = ScoredViews(pipe, background, options.train_test_exp)
+    return ScoredViews(_pipe(scene), background, options.train_test_exp)
+
+
+def _measure(camera: Camera, scene: Scene, options: argparse.Namespace) -> tuple[float, ...] | None:
+    """Return the `Means` of one view; None if no pixel of it counts."""
+    gaussians, pipe, views = scene.gaussians, _pipe(scene), _scored(scene, options)
     with torch.no_grad():
         image, target, mask = views.compared(camera, gaussians)
         if mask is not None and not mask.any():
             return None
         image, target = (pixels_that_count(x, mask) for x in (image, as_float(target)))
-        black, white = torch.zeros_like(gaussians.get_xyz), torch.ones_like(background)
+        black = torch.zeros_like(gaussians.get_xyz)
+        white = black.new_ones(3)
         silhouette = render(camera, gaussians, pipe, white, override_color=black, want_depth=False)
     ratio = min(float(psnr(image, target).mean()), 99.0)
     drawn = float((silhouette["radii"] > 0).float().mean())

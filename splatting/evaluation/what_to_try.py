@@ -9,6 +9,7 @@ from splatting.evaluation.error_curve import Row, best_test, whole_sets
 # Entries of the log's last record: options of the training.
 CAP, PLANNED, STRATEGY = "max_num_splats", "iterations_planned", "strategy"
 BUDGET = "default_budget"  # Gaussians that --strategy budget takes for the scene where no number is given
+FITTED = 18.0  # dB of training views; below, nothing is called overfitting
 CLEAR = 0.1  # dB between two points; those of a settled training differed by up to 0.07
 MANY = 2  # times as many are more than the scene needs (docs/guide/strategies.md: better with a fifth)
 FULL = 0.99  # of the cap: a densification that removes some Gaussians ends a little below it
@@ -58,6 +59,8 @@ def _overfitting(scored: Sequence[Row], strategy: str) -> str | None:
     best = best_test(scored)
     if best is None or None in (best["train_psnr"], scored[-1]["train_psnr"]):
         return None
+    if scored[-1]["train_psnr"] < FITTED:
+        return None  # what does not fit the training views cannot overfit
     lost = best["test_psnr"] - scored[-1]["test_psnr"]
     gained = scored[-1]["train_psnr"] - best["train_psnr"]
     if min(lost, gained) < CLEAR:

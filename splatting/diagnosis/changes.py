@@ -1,0 +1,180 @@
+"""Changes of a model or its photos since the training: each that is usual is undone, and tried on the views."""
+
+from collections.abc import Callable, Iterator
+from itertools import permutations, product
+from pathlib import Path
+from statistics import median
+from typing import NamedTuple
+
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from gaussian_renderer.scored_views import ScoredViews
+from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
+from scene.gaussians.attributes import Rows
+from scene.readers.point_cloud import read_point_cloud
+from scene.scene import Scene
+from splatting.diagnosis import Line
+from splatting.evaluation.error_curve import NAME as CURVE
+from splatting.evaluation.error_curve import read_curve
+from splatting.evaluation.training_log import NAME as LOG
+from splatting.evaluation.training_log import read_log
+from utils.general_utils import build_rotation
+from utils.image_utils import as_float, pixels_that_count, psnr
+from utils.system_utils import UserError
+
+FITS = 18.0  # dB of training views; models that converge reach 22 and more
+CLEARLY = 3.0  # dB that undoing a change has to gain, unless it comes to what was recorded
+NEAR = 1.5  # dB between the record and a score of small renders
+LOST = 6.0  # dB below the record, from which on something has changed
+_SCALES = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
+_COMPARED = 12  # views that may have each other's photos
+
+
+class Change(NamedTuple):
+    """A change, how to repair it, and what undoes it in raw rows."""
+
+    text: str
+    remedy: str
+    undo: Callable[[Rows], Rows]
+
+
+def recorded_psnr(model: Path, iteration: int) -> float | None:
+    """PSNR of training views that training recorded at an iteration, in its curve or log; None if in neither."""
+    try:
+        rows = read_curve(model / CURVE) if (model / CURVE).is_file() else []
+        rows = [*rows, *read_log(model / LOG)]
+    except UserError:
+        return None
+    found = (row.get("train_psnr") for row in rows if row["iteration"] == iteration)
+    return next((score for score in found if score is not None), None)
+
+
+def what_changed(scene: Scene, views: list[Camera], scored: ScoredViews, now: float, then: float | None) -> Line | None:
+    """The change that explains why views have the PSNR `now`; None if none of the usual ones does.
+
+    then: their PSNR in training, None if it is not known.
+    """
+    tried = {change: _score(views, _with(scene.gaussians, change.undo), scored) for change in _changes(scene)}
+    change, best = max(tried.items(), key=lambda pair: pair[1])
+    explains = best >= (FITS if then is None else then - LOST) and best >= now + CLEARLY
+    if explains or (then is not None and best >= max(then - NEAR, now + 1)):
+        return Line(f"{change.text}: without that it is {best:.1f} dB", change.remedy)
+    if swapped := _others_photos(scene, scored):
+        return swapped
+    if then is None or now > then - LOST:
+        return None
+    remedy = "restore the model and the photos of that training (its scene is in cfg_args), or train again"
+    return Line(f"it was {then:.1f} dB in training, so the model or the photos are not those of then", remedy)
+
+
+def _with(gaussians: GaussianModel, undo: Callable[[Rows], Rows]) -> GaussianModel:
+    changed = gaussians.part(slice(None), gaussians.max_sh_degree)
+    changed.set_rows(undo(dict(changed.rows())))
+    return changed
+
+
+@torch.no_grad()
+def _score(views: list[Camera], gaussians: GaussianModel, scored: ScoredViews) -> float:
+    """Mean PSNR of views."""
+    values = []
+    for view in views:
+        image, target, mask = scored.compared(view, gaussians)
+        if mask is None or mask.any():
+            values.append(min(float(psnr(*(pixels_that_count(x, mask) for x in (image, as_float(target)))).mean()), 99))
+    return sum(values) / max(len(values), 1)
+
+
+def _changes(scene: Scene) -> Iterator[Change]:
+    rows, folder = scene.gaussians.rows(), scene.model_path
+    yield Change(
+        "red and blue are swapped", "the program that wrote the PLY takes colours as BGR; swap f_dc and f_rest back",
+        lambda rows: rows | {name: rows[name].flip(-1) for name in ("f_dc", "f_rest")},
+    )  # fmt: skip
+    yield Change(
+        "the quaternions begin with x", "write them as w x y z",
+        lambda rows: rows | {"rotation": rows["rotation"].roll(1, dims=1)},
+    )  # fmt: skip
+    if bool(((rows["opacity"] >= 0) & (rows["opacity"] <= 1)).all()):
+        yield Change(
+            "the opacities are not logits", "write logits, as train.py does",
+            lambda rows: rows | {"opacity": rows["opacity"].clamp(1e-6, 1 - 1e-6).logit()},
+        )  # fmt: skip
+    if bool((rows["scaling"] > 0).all()):
+        yield Change(
+            "the scales are no logarithms", "write natural logarithms, as train.py does",
+            lambda rows: rows | {"scaling": rows["scaling"].log()},
+        )  # fmt: skip
+    yield from map(_scaled, _factors(rows["xyz"], Path(folder)))
+    yield from map(_placed, _factors(rows["xyz"], Path(folder)))
+    yield from map(_turned, _axes())
+
+
+def _factors(means: Tensor, folder: Path) -> list[float]:
+    """Factors by which a model may have been scaled: powers of ten, and that to the points it began with."""
+    try:
+        start = torch.from_numpy(read_point_cloud(folder / "input.ply").points).to(means)
+    except UserError:
+        return list(_SCALES)
+    spreads = [float((x - x.median(dim=0).values).norm(dim=1).median()) for x in (means, start)]
+    return [*_SCALES, spreads[0] / spreads[1]] if min(spreads) > 0 else list(_SCALES)
+
+
+def _scaled(factor: float) -> Change:
+    shift = torch.tensor(factor).log()
+    return Change(
+        f"the model was scaled by {factor:.3g}", f"scale it by {1 / factor:.3g}, or the scene as the model was",
+        lambda rows: rows | {"xyz": rows["xyz"] / factor, "scaling": rows["scaling"] - shift.to(rows["scaling"])},
+    )  # fmt: skip
+
+
+def _placed(factor: float) -> Change:
+    return Change(
+        f"the positions were scaled by {factor:.3g}, but not the sizes", f"scale the positions by {1 / factor:.3g}",
+        lambda rows: rows | {"xyz": rows["xyz"] / factor},
+    )  # fmt: skip
+
+
+def _axes() -> Iterator[Tensor]:
+    """The matrices (3, 3) that permute and flip axes, but the identity."""
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        if order != (0, 1, 2) or -1.0 in signs:
+            yield torch.diag(torch.tensor(signs))[list(order)]
+
+
+def _turned(back: Tensor) -> Change:
+    """back: the matrix that undoes the change. View dependence is not turned with it."""
+    names = ["xyz"[int(row.abs().argmax())] for row in back.T]  # of what became x, y, z
+    signs = ["-" if float(row.sum()) < 0 else "" for row in back.T]
+    axes = ", ".join(f"{sign}{name}" for sign, name in zip(signs, names, strict=True))
+
+    def undo(rows: Rows) -> Rows:
+        turn = back.to(rows["xyz"])
+        turned = turn @ build_rotation(rows["rotation"])
+        turned = turned * torch.tensor([1.0, 1.0, float(turn.det())]).to(turned)  # a mirrored axis is the same ellipse
+        x, y, z, w = Rotation.from_matrix(turned.cpu().double().numpy()).as_quat().T
+        quaternions = torch.stack([torch.from_numpy(part) for part in (w, x, y, z)], dim=1).to(rows["rotation"])
+        return rows | {"xyz": rows["xyz"] @ turn.T, "rotation": quaternions}
+
+    return Change(f"the axes were changed: x, y, z are {axes}", "use the axes of the cameras (COLMAP's)", undo)
+
+
+@torch.no_grad()
+def _others_photos(scene: Scene, scored: ScoredViews) -> Line | None:
+    """Line if most views look like the photo of another view."""
+    views = [view for view in scene.getTrainCameras() if view.columns is None]
+    views = [view for view in views if view.image_height == views[0].image_height][:_COMPARED]
+    if len(views) < 3:
+        return None
+    images = [scored.image(view, scene.gaussians) for view in views]
+    photos = [as_float(scored.target(view)) for view in views]
+    table = [[float(psnr(image, photo).mean()) for photo in photos] for image in images]
+    gains = [max(row) - row[index] for index, row in enumerate(table)]
+    if median(gains) < CLEARLY:
+        return None
+    view, row = next((view, row) for view, row, gain in zip(views, table, gains, strict=True) if gain >= CLEARLY)
+    other = views[row.index(max(row))]
+    text = f"the photos have each other's names: {view.image_name} shows what {other.image_name} should"
+    return Line(text, "restore the names that the cameras were reconstructed with")

@@ -1,0 +1,138 @@
+"""Broken models and good ones: doctor.py names what is wrong with each, and calls no good one broken."""
+
+import math
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from trainings import train_on
+
+from scene.gaussians.attributes import Rows
+from scene.gaussians.ply import write_ply
+from scene.saved_model import read_model
+from splatting.demo.make_scene import make_scene
+from splatting.diagnosis.dataset import check_dataset
+from splatting.diagnosis.model import check_model
+
+N = 400
+SWAP = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, 1, 0]])
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("doctor") / "scene"
+    make_scene(folder, 24, 120, 90, 1500, seed=1)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(scene: Path) -> Path:
+    """A model whose Gaussians are long, so that their rotations matter."""
+    out = scene.parent / "model"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stdout", sys.stdout)  # which the command silences
+        train_on(scene, out, "--eval", "--iterations", N, "--disable_viewer", "--quiet", "--test_iterations", -1,
+                 "--checkpoint_iterations", N)  # fmt: skip
+    return out
+
+
+@pytest.fixture
+def folder(trained: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(trained, tmp_path / "model"))
+
+
+def _ply(folder: Path) -> Path:
+    return folder / f"point_cloud/iteration_{N}/point_cloud.ply"
+
+
+def _edit(folder: Path, change: Callable[[Rows], Rows]) -> None:
+    gaussians = read_model(_ply(folder))
+    rows = change({name: values.clone() for name, values in gaussians.rows().items()})
+    write_ply(_ply(folder), rows, gaussians.max_sh_degree)
+
+
+def _problems(folder: Path, scene: Path | None = None) -> list[str]:
+    lines = check_model(str(folder), -1, scene and str(scene))
+    return [f"{line.text} -> {line.remedy}" for line in lines if line.finding and "only 24 photos" not in line.text]
+
+
+def _times(positions: float, sizes: float) -> Callable[[Rows], Rows]:
+    return lambda rows: rows | {"xyz": positions * rows["xyz"], "scaling": rows["scaling"] + math.log(sizes)}
+
+
+BROKEN = {
+    "times 10": (_times(10, 10), "the model was scaled by 10: without that it is"),
+    "a tenth": (_times(0.1, 0.1), "the model was scaled by 0.1: without"),
+    "times 1.5": (_times(1.5, 1.5), "the model was scaled by 1."),
+    "positions times 100": (_times(100, 1), "the positions were scaled by 100, but not the sizes"),
+    "y and z": (lambda rows: rows | {"xyz": rows["xyz"] @ SWAP}, "the axes were changed: x, y, z are x, z, y"),
+    "a mirror": (
+        lambda rows: rows | {"xyz": rows["xyz"] * torch.tensor([-1.0, 1, 1])},
+        "the axes were changed: x, y, z are -x, y, z",
+    ),
+    "red and blue": (
+        lambda rows: rows | {name: rows[name].flip(-1) for name in ("f_dc", "f_rest")},
+        "red and blue are swapped",
+    ),
+    "opacities": (lambda rows: rows | {"opacity": rows["opacity"].sigmoid()}, "the opacities are not logits"),
+    "scales": (lambda rows: rows | {"scaling": rows["scaling"].exp()}, "the scales are no logarithms"),
+    "moved": (lambda rows: rows | {"xyz": rows["xyz"] + 3}, "the model or the photos are not those of then"),
+    "faded": (lambda rows: rows | {"opacity": rows["opacity"].clamp(max=-4.0)}, "are not those of then"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_what_happened_to_a_model_is_named(folder, name):
+    change, words = BROKEN[name]
+    _edit(folder, change)
+    (problem,) = _problems(folder)
+    assert words in problem
+    assert "train longer" not in problem and "opacity_lr" not in problem
+
+
+def test_photos_with_each_others_names_are_found_before_and_after_a_training(folder, scene, tmp_path):
+    other = Path(shutil.copytree(scene, tmp_path / "scene"))
+    photos = sorted((other / "images").iterdir())
+    contents = [photo.read_bytes() for photo in photos]
+    for photo, content in zip(photos, contents[5:] + contents[:5], strict=True):
+        photo.write_bytes(content)
+    (problem,) = _problems(folder, other)
+    assert "the photos have each other's names: view_" in problem
+    found = [line for line in check_dataset(str(other), "images") if line.finding]
+    assert any("the points have the colours of other photos" in line.text for line in found)
+    assert not any("colours of other" in line.text for line in check_dataset(str(scene), "images"))
+
+
+def test_photos_of_another_scene(folder, scene, tmp_path):
+    other = Path(shutil.copytree(scene, tmp_path / "scene"))
+    rng = np.random.default_rng(0)
+    for photo in (other / "images").iterdir():
+        Image.fromarray(rng.integers(0, 255, (90, 120, 3), dtype=np.uint8)).save(photo)
+    (problem,) = _problems(folder, other)
+    assert "the model or the photos are not those of then -> restore the model and the photos" in problem
+
+
+GOOD = {
+    "as it is": lambda rows: rows,
+    "other signs of quaternions": lambda rows: rows | {"rotation": -rows["rotation"]},
+    "longer quaternions": lambda rows: rows | {"rotation": 7 * rows["rotation"]},
+    "another order": lambda rows: {name: values.flip(0) for name, values in rows.items()},
+}
+
+
+@pytest.mark.parametrize("change", GOOD.values(), ids=GOOD.keys())
+def test_good_models(folder, change):
+    _edit(folder, change)
+    assert _problems(folder) == []
+
+
+def test_a_good_model_without_a_ply_or_a_curve(folder):
+    shutil.rmtree(folder / "point_cloud")  # the checkpoint is left
+    assert _problems(folder) == []
+    (folder / "error_vs_time.csv").unlink()
+    assert _problems(folder) == []
