@@ -72,7 +72,7 @@ def load_saved(options: argparse.Namespace, iteration: int, sh_degree: int | Non
     iteration, path = find_save(options.model_path, iteration)
     gaussians = read_model(path, sh_degree)
     scene = Scene(options, gaussians, load_iteration=iteration, shuffle=False, start=False)
-    print(f"Loaded the model of iteration {iteration}" + (f" from {path}" if path.suffix == ".pth" else ""))
+    print(f"Loading trained model at iteration {iteration}" + (f" from {path}" if path.suffix == ".pth" else ""))
     if getattr(options, "train_test_exp", False):
         gaussians.load_exposures(options.model_path, scene.info.train_cameras)
     return scene
