@@ -7,6 +7,7 @@ here; each can be installed by itself too, from its folder. With GS_CUDA=1 the v
 import os
 import re
 import sys
+from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -17,15 +18,21 @@ sys.path.insert(0, str(ROOT / "submodules" / "common"))
 
 from build_extension import OLDEST_TORCH, VERSION, cuda_version, extension_options, find_nvcc  # noqa: E402
 
+NEWEST_TORCH = (2, 13)  # that was tried
 EXTENSIONS = ("diff-gaussian-rasterization", "fused-ssim", "simple-knn")
 
 
 def requirements() -> list[str]:
-    """Read requirements.txt. If torch is installed, do not pin torch and torchvision, so that it stays."""
+    """Read requirements.txt. If torch is installed, do not pin torch and torchvision, so that it stays.
+
+    A wheel made with a torch that was tried takes no newer one than those.
+    """
     lines = (ROOT / "requirements.txt").read_text(encoding="utf-8").splitlines()
     lines = [line for line in lines if line and not line.startswith("#")]
     if find_spec("torch"):
-        fitting = {"torch": "torch>={}.{}".format(*OLDEST_TORCH), "torchvision": "torchvision"}
+        tried = tuple(map(int, metadata.version("torch").split(".")[:2])) <= NEWEST_TORCH
+        newest = f",<{NEWEST_TORCH[0]}.{NEWEST_TORCH[1] + 1}" if tried else ""
+        fitting = {"torch": "torch>={}.{}".format(*OLDEST_TORCH) + newest, "torchvision": "torchvision"}
         lines = [re.sub(r"^(torch|torchvision)==.*", lambda pin: fitting[pin[1]], line) for line in lines]
     return lines
 

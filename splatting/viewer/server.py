@@ -18,6 +18,7 @@ from utils.system_utils import UserError
 if TYPE_CHECKING:
     import viser
 
+VISER = "viser==1.1.1"  # as setup.py names it
 HOST, PORT = "127.0.0.1", 8080
 _TRIED = 100  # ports, from the requested one on
 _TAKEN = errno.EADDRINUSE
@@ -80,7 +81,7 @@ def serve(address: Address, label: str) -> tuple["viser.ViserServer", str]:
         server = viser.ViserServer(address.host, port, label=label, verbose=False)
     if not auth.stands:
         stop(server)
-        raise UserError("this release of viser cannot be guarded; install the one that setup.py names: '.[viewer]'")
+        raise UserError(f"this release of viser cannot be guarded; pip install {VISER}")
     auth.control = server.gui._gui_input_handle_from_uuid.get
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     return server, _announce(address, server.get_port(), auth.token)
@@ -96,7 +97,7 @@ def _import_viser() -> ModuleType:
     try:
         import viser
     except ImportError as error:
-        raise UserError(f"the page needs a package ({error}); install it with pip install '.[viewer]'") from None
+        raise UserError(f"the page needs a package ({error}); pip install {VISER}") from None
     return viser
 
 
