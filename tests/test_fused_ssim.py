@@ -446,8 +446,11 @@ def test_messages_of_a_gpu(device: str) -> None:
     with pytest.raises(RuntimeError, match=r"kept must be \(3, 1, 20, 408\)"):
         torch.ops.fused_ssim.l1_ssim_vjp(image, image, image, torch.ones(()), torch.ones(()))
     kept = torch.ops.fused_ssim.l1_ssim(image, image, False, True)[2]
-    with pytest.raises(RuntimeError, match="gradients must be float32"):
-        torch.ops.fused_ssim.l1_ssim_vjp(image, image, kept, torch.ones(()), torch.ones(()))
+    one = torch.ones((), device=device)
+    refused = {"must be torch.float32 like img1": one.double(), "must be on cuda:0 like img1": one.cpu()}
+    for message, gradient in refused.items():
+        with pytest.raises((RuntimeError, TypeError), match=message):
+            torch.ops.fused_ssim.l1_ssim_vjp(image, image, kept, gradient, gradient)
 
 
 def test_the_paddings_have_a_name() -> None:

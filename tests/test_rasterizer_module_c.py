@@ -91,6 +91,22 @@ def test_forward_and_backward_are_those_of_the_class(colors, covariances, antial
             assert len(gradient) == 3 and not gradient.any(), name
 
 
+def test_looser_forms_of_the_camera_give_the_same_image_and_gradients():
+    inputs, camera = scene(False, False)
+    given = forward_arguments(inputs, camera)
+    loose = list(given)
+    for place, shape in {0: (1, 3), 8: (1, 4, 4), 9: (1, 4, 4), 16: (3, 1)}.items():
+        loose[place] = given[place].reshape(shape)
+    loose[12:14] = map(float, given[12:14])
+    results = []
+    for arguments in (given, loose):
+        count, color, radii, *buffers, depth = _C.rasterize_gaussians(*arguments)
+        places = (*arguments[:2], radii, *arguments[2:12], color, depth, *arguments[14:17], buffers[0], count)
+        results.append([color, *_C.rasterize_gaussians_backward(*places, *buffers[1:], *arguments[-2:])])
+    for got, wanted in zip(*results, strict=True):
+        assert torch.equal(got, wanted)
+
+
 def test_called_as_in_2023_there_is_no_inverse_depth():
     inputs, camera = scene(False, False)
     given = forward_arguments(inputs, camera)

@@ -7,14 +7,14 @@ Arguments go by place, in the order of the 2024 release. An empty tensor stands 
 import torch
 from torch import Tensor
 
-from diff_gaussian_rasterization.alternatives import chosen, given
+from diff_gaussian_rasterization.alternatives import chosen, given, shaped
 from diff_gaussian_rasterization.byte_buffers import packed, unpacked
 from diff_gaussian_rasterization.fakes import SPLAT_VALUES, TILE
 from diff_gaussian_rasterization.gaussians import Gaussians
 from diff_gaussian_rasterization.ops import gradients_of
 from diff_gaussian_rasterization.ops import mark_visible as mark
 from diff_gaussian_rasterization.optim import sparse_adam_
-from diff_gaussian_rasterization.scene import Scene, draw
+from diff_gaussian_rasterization.scene import Scene, camera_arguments, draw
 
 __all__ = ["adamUpdate", "mark_visible", "rasterize_gaussians", "rasterize_gaussians_backward"]
 
@@ -22,7 +22,7 @@ __all__ = ["adamUpdate", "mark_visible", "rasterize_gaussians", "rasterize_gauss
 @torch.no_grad()
 def mark_visible(positions: Tensor, viewmatrix: Tensor, projmatrix: Tensor) -> Tensor:
     """Marks positions (N, 3) whose z in the view (4, 4, transposed) is above 0.2: (N,) bool. projmatrix is not read."""
-    return mark(positions, viewmatrix)
+    return mark(positions, shaped(viewmatrix, 4, 4))
 
 
 @torch.no_grad()
@@ -56,9 +56,9 @@ def rasterize_gaussians(
     """
     of_2023 = debug is None
     gaussians = chosen(means3D, opacity, scales, rotations, cov3D_precomp, colors, sh)
-    options = image_height, image_width, degree, not of_2023 and bool(antialiasing), False
-    camera = viewmatrix, projmatrix, campos, (tan_fovx, tan_fovy, scale_modifier), options
-    out = draw(Scene(*gaussians, *camera), background, True)
+    place, lens = (viewmatrix, projmatrix, campos), (tan_fovx, tan_fovy, scale_modifier)
+    options = image_height, image_width, degree, not of_2023 and antialiasing, False
+    out = draw(Scene(*gaussians, *camera_arguments(*place, lens, *options)), background, True)
     buffers = (
         packed(out.splat_slots, out.splats, out.tile_counts),
         packed(out.instances),
@@ -111,8 +111,9 @@ def rasterize_gaussians_backward(
     ranges, transmittance, last = unpacked(imgBuffer, image)
     slots = instances.new_empty(int(splat_slots[-1, 0]), 0)
 
-    options = height, width, degree, bool(antialiasing), False
-    scene = Scene(*gaussians, viewmatrix, projmatrix, campos, (tan_fovx, tan_fovy, scale_modifier), options)
+    place, lens = (viewmatrix, projmatrix, campos), (tan_fovx, tan_fovy, scale_modifier)
+    scene = Scene(*gaussians, *camera_arguments(*place, lens, height, width, degree, antialiasing, False))
+    background = shaped(background, 3)
     no_layers = splats.new_empty(0)  # the backward makes its own
     kept = splats, tile_counts, instances, ranges, splat_slots, slots, last, no_layers, background, transmittance
     planes = grad_out_color, None, given(grad_out_invdepth)

@@ -14,7 +14,7 @@ def given(values: Tensor | None) -> Tensor | None:
 
 def shaped(values: Tensor | None, *shape: int) -> Tensor | None:
     """The same values in another shape where only the axes of length 1 differ, else as they are."""
-    if values is None or [n for n in values.shape if n != 1] != [n for n in shape if n != 1]:
+    if values is None or values.shape == shape or [n for n in values.shape if n != 1] != [n for n in shape if n != 1]:
         return values
     return values.reshape(shape)
 

@@ -8,6 +8,7 @@ from torch import Tensor, library
 from torch.utils._pytree import tree_flatten, tree_leaves, tree_unflatten
 
 import diff_gaussian_rasterization.fakes  # noqa: F401  (registers the fake kernels)
+from diff_gaussian_rasterization.alternatives import shaped
 from diff_gaussian_rasterization.backend import OPERATORS, has_kernels
 from diff_gaussian_rasterization.checks import check_finite, check_tensors
 from diff_gaussian_rasterization.first_order import direct_apply, first_order, function_of, is_compiled, needs_function
@@ -63,7 +64,7 @@ def rasterize(
                     check_finite(name, values)
         # torch.compile knows the operator, whose autograd is registered below.
         function = _apply if train and not is_compiled() else OPERATORS.rasterize
-        out = function(means2d, *scene, settings.bg, want_inverse_depth, train, want_absolute_gradient)
+        out = function(means2d, *scene, shaped(settings.bg, 3), want_inverse_depth, train, want_absolute_gradient)
     except (AttributeError, TypeError, RuntimeError):
         _check_types(gaussians, settings, means2d)
         raise

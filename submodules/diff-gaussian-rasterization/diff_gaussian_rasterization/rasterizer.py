@@ -83,7 +83,6 @@ def rasterize_gaussians(
     gaussians = chosen(means3D, opacities, scales, rotations, cov3Ds_precomp, colors_precomp, sh, dc)
     # Only its gradient counts, so what needs none is not looked at.
     means2d = None if means2D is None or not means2D.requires_grad else means2D.to(means3D)
-    raster_settings = _plain(raster_settings)
     with_depth = raster_settings.antialiasing is not None
     out = rasterize(
         means2d=means2d,
@@ -92,17 +91,6 @@ def rasterize_gaussians(
         **gaussians._asdict(),
     )
     return (out.color, out.radii, out.inverse_depth) if with_depth else (out.color, out.radii)
-
-
-def _plain(settings: GaussianRasterizationSettings) -> GaussianRasterizationSettings:
-    """The same settings with the shapes that `rasterize` takes, from the looser ones that the reference takes."""
-    sizes = {name: getattr(settings, name) for name in ("image_height", "image_width")}
-    return settings._replace(
-        bg=shaped(settings.bg, 3),
-        viewmatrix=shaped(settings.viewmatrix, 4, 4),
-        projmatrix=shaped(settings.projmatrix, 4, 4),
-        **{name: int(n) if isinstance(n, float) and n.is_integer() else n for name, n in sizes.items()},
-    )
 
 
 def cpu_deep_copy_tuple(input_tuple: tuple) -> tuple:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from diff_gaussian_rasterization.alternatives import shaped
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.checks import check_flag
 from diff_gaussian_rasterization.gaussians import Gaussians
@@ -82,17 +83,29 @@ def scene_arguments(gaussians: Gaussians, settings: GaussianRasterizationSetting
     for name in _FLAGS:
         if (flag := getattr(settings, name)) is not True and flag is not False and flag is not None:
             check_flag(name, flag)  # the text "no" would count as True
-    center = settings.campos  # (3,); code of 2023 also gives a row (1, 3)
-    return Scene(
-        *gaussians,
-        settings.viewmatrix,
-        settings.projmatrix,
-        center if center.dim() == 1 else center.reshape(-1),
-        (settings.tanfovx, settings.tanfovy, settings.scale_modifier),
-        (settings.image_height, settings.image_width, settings.sh_degree, bool(settings.antialiasing), raw),
-    )
+    lens = settings.tanfovx, settings.tanfovy, settings.scale_modifier
+    size = settings.image_height, settings.image_width
+    place = settings.viewmatrix, settings.projmatrix, settings.campos
+    return Scene(*gaussians, *camera_arguments(*place, lens, *size, settings.sh_degree, settings.antialiasing, raw))
+
+
+def camera_arguments(
+    view: Tensor,
+    projection: Tensor,
+    center: Tensor,
+    lens: tuple[float, ...],
+    height: float,
+    width: float,
+    degree: int,
+    antialiasing: bool | None,
+    raw: bool,
+) -> tuple:
+    """The fields of `Scene.camera`, from what the reference takes: further axes of length 1, and whole floats."""
+    size = [int(n) if isinstance(n, float) and n.is_integer() else n for n in (height, width)]
+    options = (*size, degree, bool(antialiasing), raw)
+    return shaped(view, 4, 4), shaped(projection, 4, 4), shaped(center, 3), lens, options
 
 
 def draw(scene: Scene, background: Tensor, want_inverse_depth: bool = False, train: bool = True) -> Drawing:
     """Call the operator `rasterize`. train: a backward will follow."""
-    return Drawing(*OPERATORS.rasterize(None, *scene, background, want_inverse_depth, train))
+    return Drawing(*OPERATORS.rasterize(None, *scene, shaped(background, 3), want_inverse_depth, train))
