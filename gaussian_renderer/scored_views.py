@@ -54,7 +54,7 @@ class ScoredViews:
 
     def mask(self, camera: Camera) -> Tensor | None:
         """Pixels that count, (1, H, W) bool; None if all do."""
-        mask = camera.mask
+        mask = camera.counted_pixels
         return None if mask is None else self.part(mask)
 
     def load(self, camera: Camera) -> None:

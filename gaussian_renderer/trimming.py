@@ -79,11 +79,11 @@ def search_unseen(
     seen, search.views = decisive_for_any(cameras, gaussians, pipe), len(cameras)
     walks = chain.from_iterable(views_between(cameras[i], cameras[j]) for i, j in pairs)
     for camera in tqdm(walks, desc="Looking between", total=len(FRACTIONS) * len(pairs), unit="view", leave=False):
-        if shards.marked(keep & ~seen) < WORTH * gaussians.total:
+        if shards.marked(keep & ~seen) < WORTH * gaussians.gaussian_count:
             break
         seen |= decisive_for(camera, gaussians, pipe)
         search.views += 1
-    few = shards.marked(keep & ~seen) < WORTH * gaussians.total
+    few = shards.marked(keep & ~seen) < WORTH * gaussians.gaussian_count
     search.end = FEW if few else DONE
     search.keep = keep if few else keep & seen
     return search

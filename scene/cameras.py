@@ -191,7 +191,7 @@ class Camera(nn.Module):
         return self.images.changed(source, self._size, on_device)
 
     @property
-    def is_plain(self) -> bool:
+    def has_dataset_pictures(self) -> bool:
         """Whether its pictures are those of the dataset: nothing was assigned or changed in place."""
         return not self._assigned and not self._edited
 
@@ -207,8 +207,8 @@ class Camera(nn.Module):
         self._images = store
 
     @property
-    def pictures(self) -> list[Picture]:
-        """Sources of `target`, `mask` and `invdepthmap` to decode, each with the size (width, height) it is decoded at.
+    def undecoded(self) -> list[Picture]:
+        """Sources of `target`, `counted_pixels` and `invdepthmap`, each with the size (width, height) to decode it at.
 
         Empty if they were given as pixels.
         """
@@ -244,7 +244,7 @@ class Camera(nn.Module):
         return bool(self._made) and self._made["pixels"]._version != self._made_version
 
     def ground_truth(self, background: Tensor) -> tuple[Tensor, Tensor | None]:
-        """`target` and `mask`, with one copy of the image to the device for both."""
+        """`target` and `counted_pixels`, with one copy of the image to the device for both."""
         pixels = self._pixels()
         return self._target(pixels, background), self._counting(pixels)
 
@@ -280,12 +280,12 @@ class Camera(nn.Module):
         return colors * alpha + (1 - alpha) * background[:, None, None]
 
     @property
-    def counts_all(self) -> bool:
-        """Whether `mask` is None for a reason that is known without the photo."""
+    def counts_all_pixels(self) -> bool:
+        """Whether `counted_pixels` is None for a reason that is known without the photo."""
         return self._mask is None and not self._ignore_alpha
 
     @property
-    def mask(self) -> Tensor | None:
+    def counted_pixels(self) -> Tensor | None:
         """Pixels that count in loss and scores, (1,H,W) bool; None if all count."""
         return self._counting(self._pixels() if self._ignore_alpha else None)
 
@@ -326,7 +326,7 @@ class Camera(nn.Module):
         return None if self._depth is None else self._stored(self._depth).to(self._photo_device)
 
     @property
-    def inverse_depth(self) -> Tensor | None:
+    def target_inverse_depth(self) -> Tensor | None:
         """`invdepthmap`, on `device`."""
         if "invdepthmap" in self._assigned:
             depth = self._assigned["invdepthmap"]

@@ -46,7 +46,7 @@ class FusedAdam:
     def arguments(self, observe: bool) -> tuple[Any, ...]:
         """Arguments of the operator from `averages` to `iteration`, for the next step. observe: with the statistics."""
         optimizer, stepping = self._gaussians.optimizer, list(self._stepping())
-        each = self._penalty.of_each(self._gaussians.total)
+        each = self._penalty.of_each(self._gaussians.gaussian_count)
         *guard, iteration = (optimizer.guard and optimizer.guard.arguments) or (0,)
         return (
             [one.state[name] for name in ("exp_avg", "exp_avg_sq") for one in stepping],

@@ -56,21 +56,22 @@ class GaussianModel(GaussianParameters):
     ) -> None:
         """Start from a point cloud: round Gaussians as wide as the distance to their neighbours, opacity 0.1.
 
-        spatial_lr_scale: extent of the scene in world units; scales position learning rates and size limits.
+        spatial_lr_scale: extent of the scene in world units; scales position learning rates and size limits. None: not
+        known; it must be set before training_setup.
         cam_infos: the training cameras, records with an `image_name`, each of which gets an exposure. As in the 2023
         release, the extent may stand in their place.
         """
-        if spatial_lr_scale is None:
+        if not hasattr(cam_infos, "__iter__"):
             cam_infos, spatial_lr_scale = (), cam_infos
-        rows = start_rows(pcd, spatial_lr_scale, self.max_sh_degree)
+        rows = start_rows(pcd, float(spatial_lr_scale or 0), self.max_sh_degree)
         if self.inverse_opacity_activation is not inverse_sigmoid:
             opacity = torch.full_like(rows["opacity"], INITIAL_OPACITY, device=compute_device())
             rows["opacity"] = self.inverse_opacity_activation(opacity)
-        self.spatial_lr_scale = float(spatial_lr_scale)
+        self.spatial_lr_scale = None if spatial_lr_scale is None else float(spatial_lr_scale)
         self.active_sh_degree = 0
         self.take_whole(rows)
         self.start_exposures(cam_infos)
-        print(f"Number of points at initialisation :  {self.total}")
+        print(f"Number of points at initialisation :  {self.gaussian_count}")
 
     def load_ply(self, path: str | os.PathLike, use_train_test_exp: bool = False) -> None:
         """Take all parameters from a PLY of this model's SH degree (else UserError); all SH bands become active.
@@ -194,7 +195,7 @@ class GaussianModel(GaussianParameters):
                 group["lr"] = factor * self._rates[group["name"]]
 
     @property
-    def position_rate(self) -> float:
+    def position_learning_rate(self) -> float:
         """Learning rate of the positions, as `update_learning_rate` has set it."""
         return next(group["lr"] for group in self.optimizer.param_groups if group.get("name") == "xyz")
 
@@ -229,7 +230,7 @@ class GaussianModel(GaussianParameters):
     def take_marks(self) -> list[tuple[str, list[int] | list[str], int]]:
         """Values whose step a guard held back: name of the tensor, its rows or photos, and number of all rows."""
         rows_of = self.shards.together(self.optimizer.take_marks(), self._attributes)
-        marks = [(name, rows.tolist(), self.total) for name, rows in rows_of.items()]
+        marks = [(name, rows.tolist(), self.gaussian_count) for name, rows in rows_of.items()]
         for name, rows in self.exposures.optimizer.take_marks().items():
             marks.append((name, [self.exposures.names[row] for row in rows.tolist()], len(self.exposures.names)))
         return marks
@@ -249,7 +250,7 @@ class GaussianModel(GaussianParameters):
         train.py calls it whenever it has set the degree. Code that may read or raise other bands leaves it out.
         """
         if isinstance(self.optimizer, GaussianAdam):
-            self.optimizer.set_active_columns("f_rest", 3 * self.active_bands)
+            self.optimizer.set_active_columns("f_rest", 3 * self.active_sh_bands)
 
     capture, restore = checkpoint.capture, checkpoint.restore
 

@@ -21,7 +21,7 @@ from scene.readers.info import CameraInfo, SceneInfo, exposure_names, photo_size
 from scene.readers.point_cloud import write_point_cloud
 from scene.readers.scene_folder import kind_of
 from scene.saved_iterations import find_iteration, saved_ply
-from splatting.compat.models import SceneGaussians, load_model, save_exposures
+from splatting.compat.models import SceneGaussians, call_of_either_form, load_model, save_exposures
 from splatting.compat.readers import scene_by
 from splatting.files.json_files import OFFSET, read_model_json
 from splatting.host.machine import compute_device
@@ -116,7 +116,7 @@ class Scene:
     def prefetch(self, cameras: Sequence[Camera]) -> None:
         """Start to prepare the images of the views that come next, in that order (`images.ahead` of them)."""
         ours = (camera for camera in cameras if getattr(camera, "images", None) is self.images)
-        self.images.prefetch([picture for camera in ours for picture in camera.pictures])
+        self.images.prefetch([picture for camera in ours for picture in camera.undecoded])
 
     def save(self, iteration: int, gaussians: SceneGaussians | None = None) -> None:
         """Write `point_cloud/iteration_N/point_cloud.ply`, and the exposures if they are trained.
@@ -134,7 +134,8 @@ class Scene:
 
     def create_gaussians(self) -> None:
         """Start from the dataset's points."""
-        self.gaussians.create_from_pcd(self.info.point_cloud, self.info.train_cameras, self.cameras_extent)
+        cloud, views, extent = self.info.point_cloud, self.info.train_cameras, self.cameras_extent
+        call_of_either_form(self.gaussians.create_from_pcd, (cloud, views, extent), (cloud, extent))
 
     def write_inputs(self) -> None:
         """Write the cloud and the cameras into the model folder, `input.ply` and `cameras.json`."""
@@ -176,7 +177,7 @@ class Scene:
 
     def _pictures(self, lists: dict[float, list[Camera]]) -> list[Picture]:
         cameras = [camera for cameras in lists.values() for camera in cameras]
-        return [p for camera in cameras if getattr(camera, "images", None) is self.images for p in camera.pictures]
+        return [p for camera in cameras if getattr(camera, "images", None) is self.images for p in camera.undecoded]
 
 
 def _given(args: argparse.Namespace, **names: str) -> dict[str, Any]:

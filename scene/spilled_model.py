@@ -90,7 +90,7 @@ class SpilledGaussians(GaussianModel):
         """A model of the rows (n,), ascending, for a view that sees no others; `take_gradients` wants its gradients."""
         values = {name: self.raw(name) for name in self._attributes if name != "f_rest"}
         params = {name: nn.Parameter(value.detach().index_select(0, rows)) for name, value in values.items()}
-        copies = self._fetch_stored(rows) if self.active_bands else None
+        copies = self._fetch_stored(rows) if self.active_sh_bands else None
         params["f_rest"] = nn.Parameter(copies[0]) if copies else self._rest.new_empty(len(rows), 0, 3)
         seen = GaussianModel.__new__(GaussianModel)
         vars(seen).update(vars(self))
@@ -119,7 +119,7 @@ class SpilledGaussians(GaussianModel):
     def _copied(self, rows: Tensor) -> list[Tensor]:
         """Copies (n, bands, 3) of what rows have in the host's memory; before use, the current stream has to wait."""
         with self._copies.aside(rows) as keep:
-            return [keep(stored[:, : self.active_bands].index_select(0, rows)) for stored in self._stored()]
+            return [keep(stored[:, : self.active_sh_bands].index_select(0, rows)) for stored in self._stored()]
 
     @torch.no_grad()
     def fetch_ahead(self, rows: Tensor) -> None:
@@ -171,7 +171,7 @@ class SpilledGaussians(GaussianModel):
         (group,) = (group for group in self.optimizer.param_groups if group["name"] == "f_rest")
         missed.rates.append(group["lr"])
         missed.steps.append(float(self.optimizer.state[self._rest]["step"]))
-        missed.columns = 3 * self.active_bands
+        missed.columns = 3 * self.active_sh_bands
         if missed.taken is None:
             missed.taken = torch.zeros(len(self), dtype=torch.int32, device=self._rest.device)
 

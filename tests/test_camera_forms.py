@@ -86,7 +86,7 @@ def test_both_forms_have_the_references_attributes(newer, trans, scale):
     assert (camera.trans == trans).all() and camera.scale == scale and camera.data_device == camera.device
     assert camera.fx == pytest.approx(WIDTH / 2 / math.tan(FOV_X / 2)) and (camera.cx, camera.cy) == (20, 12)
     assert camera.original_image.shape == (3, HEIGHT, WIDTH) and camera.alpha_mask.shape == (1, HEIGHT, WIDTH)
-    assert camera.alpha_mask.all() and camera.mask is None and camera.columns is None
+    assert camera.alpha_mask.all() and camera.counted_pixels is None and camera.columns is None
     assert camera.invdepthmap is None and camera.depth_mask is None and camera.depth_reliable is False
     assert isinstance(camera, torch.nn.Module) and not list(camera.parameters())
 
@@ -191,7 +191,7 @@ def test_a_pil_image_is_seen_as_its_file_is(tmp_path, kind, size):
     assert torch.equal(target, of_file.target(background))
     assert torch.equal(given.original_image, of_file.original_image)
     assert torch.equal(given.alpha_mask, of_file.alpha_mask) and (given.alpha_mask == 1).all() == (kind != "rgba")
-    assert given.pictures == [] and of_file.pictures == [(path, size)]
+    assert given.undecoded == [] and of_file.undecoded == [(path, size)]
 
 
 @pytest.mark.parametrize(
@@ -247,7 +247,7 @@ def test_a_float_image_keeps_its_values():
     clamped = image.clamp(0, 1)
     camera = _older(image)
     assert torch.equal(camera.original_image, clamped) and camera.original_image.dtype == torch.float32
-    assert torch.equal(camera.target(torch.ones(3)), clamped) and camera.pictures == []
+    assert torch.equal(camera.target(torch.ones(3)), clamped) and camera.undecoded == []
     alpha = torch.from_numpy(RNG.random((1, HEIGHT, WIDTH))).float()
     camera = _older(image, alpha)
     assert torch.equal(camera.original_image, clamped * alpha) and torch.equal(camera.alpha_mask, alpha)
@@ -351,7 +351,7 @@ def used(tmp_path: Path) -> Camera:
     Image.fromarray(RNG.integers(0, 2, (600, 800), dtype=np.uint8) * np.uint8(255)).save(tmp_path / "mask.png")
     camera = _of_file(tmp_path / "a.png", (800, 600), mask=Mask(tmp_path / "mask.png"))
     camera.images = ImageStore(0)
-    for picture in camera.pictures:
+    for picture in camera.undecoded:
         camera.images.get(*picture)
     assert camera.original_image.shape == (3, 600, 800) and camera.alpha_mask.shape == (1, 600, 800)
     return camera
@@ -360,9 +360,11 @@ def used(tmp_path: Path) -> Camera:
 def test_a_copy_shares_the_photos_and_nothing_else(used, monkeypatch):
     used.note = [1]
     twin = copy.deepcopy(used)
-    assert twin.images is used.images and twin.pictures == used.pictures and type(twin) is Camera
+    assert twin.images is used.images and twin.undecoded == used.undecoded and type(twin) is Camera
     monkeypatch.setattr("scene.images.store.decode", lambda *_: pytest.fail("decoded again"))
-    assert torch.equal(twin.original_image, used.original_image) and torch.equal(twin.mask, used.mask)
+    assert torch.equal(twin.original_image, used.original_image) and torch.equal(
+        twin.counted_pixels, used.counted_pixels
+    )
     assert twin.original_image.data_ptr() != used.original_image.data_ptr()
     before = [copy.deepcopy(getattr(used, name)) for name in ("R", "T", *MATRICES)]
     for name in ("R", "T", *MATRICES):
@@ -397,7 +399,9 @@ def test_a_pickle_leaves_the_photos_out(used):
     assert len(content) < 8192
     loaded = pickle.loads(content)
     assert loaded.images is not used.images and len(loaded.images) == 0
-    assert torch.equal(loaded.original_image, used.original_image) and torch.equal(loaded.mask, used.mask)
+    assert torch.equal(loaded.original_image, used.original_image) and torch.equal(
+        loaded.counted_pixels, used.counted_pixels
+    )
     assert torch.equal(loaded.full_proj_transform, used.full_proj_transform)
 
 
@@ -483,15 +487,15 @@ def test_images_for_other_code_lie_on_the_data_device(monkeypatch):
         camera.columns = slice(0, 5)
         assert getattr(camera, name).device.type == "cpu"
         camera.columns = None
-    assert camera.inverse_depth.device == computes
+    assert camera.target_inverse_depth.device == computes
     camera.original_image[:, 0] = 0
     assert camera.target(torch.zeros(3)).device == computes
     camera.invdepthmap = torch.zeros(1, 2, 2)
-    assert camera.inverse_depth.device == computes and camera.inverse_depth.shape == (1, 2, 2)
+    assert camera.target_inverse_depth.device == computes and camera.target_inverse_depth.shape == (1, 2, 2)
     camera.invdepthmap = None
-    assert camera.inverse_depth is None
+    assert camera.target_inverse_depth is None
     camera = _newer(data_device="cpu")
-    assert camera.alpha_mask.device.type == "cpu" and camera.inverse_depth is None
+    assert camera.alpha_mask.device.type == "cpu" and camera.target_inverse_depth is None
 
 
 def test_the_exposure_follows_a_changed_name():

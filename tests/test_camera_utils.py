@@ -67,7 +67,7 @@ def test_a_record_may_hold_its_image(record):
     image = Image.fromarray(RNG.integers(0, 256, (24, 40, 3), dtype=np.uint8))
     held = SimpleNamespace(**record._asdict() | {"image": image})
     camera = camera_utils.loadCam(_args(resolution=1), 0, held, 1.0)
-    assert camera.pictures == [] and (camera.image_width, camera.image_height) == (40, 24)
+    assert camera.undecoded == [] and (camera.image_width, camera.image_height) == (40, 24)
     np.testing.assert_array_equal(camera.target(torch.zeros(3)).permute(1, 2, 0).cpu().numpy(), np.asarray(image))
 
 

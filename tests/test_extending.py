@@ -66,7 +66,7 @@ for iteration in ("1", "600"):
     render.main()
 loaded = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(source_path=scene, model_path=whole))
 for view in Scene(loaded, gaussians, load_iteration=-1).getTrainCameras():
-    assert [source.parent.parent.name for source, _ in view.pictures] == ["images", "thermal"]
+    assert [source.parent.parent.name for source, _ in view.undecoded] == ["images", "thermal"]
 for refused in (
     lambda: gaussians.load_ply(plain + last),
     lambda: train.main(["-s", scene, "-m", resumed, "--start_checkpoint", plain + "/chkpnt300.pth", *options]),

@@ -84,7 +84,7 @@ def test_sh_degree_rises_to_the_maximum_only():
     gaussians = model(4, degree=2, active=False)
     degrees = []
     for _ in range(4):
-        degrees.append((gaussians.active_sh_degree, gaussians.active_bands))
+        degrees.append((gaussians.active_sh_degree, gaussians.active_sh_bands))
         gaussians.oneupSHdegree()
     assert degrees == [(0, 0), (1, 3), (2, 8), (2, 8)]
 

@@ -98,6 +98,13 @@ def test_a_model_of_two_scales_has_as_many_columns_as_values(tmp_path):
     for i in range(2):
         assert np.array_equal(data[f"scale_{i}"], gaussians._scaling.detach()[:, i])
     assert np.array_equal(data["rot_3"], gaussians._rotation.detach()[:, 3])
+    read = GaussianModel(3)
+    read.load_ply(tmp_path / "flat.ply")
+    assert torch.equal(read._scaling, gaussians._scaling) and torch.equal(read._rotation, gaussians._rotation)
+    with pytest.raises(UserError, match="flat Gaussians of two scales"):
+        read.raw_geometry()
+    with pytest.raises(UserError, match="flat Gaussians of two scales"):
+        read_model(tmp_path / "flat.ply")
 
 
 def test_an_empty_model_round_trips(tmp_path):

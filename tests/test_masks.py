@@ -157,20 +157,20 @@ def _views(scene: Path, **options) -> list:
 
 def test_masks_are_found_by_the_names_of_the_pictures(masked_scene, capsys):
     before = folder_state(masked_scene)
-    assert all(view.mask is None for view in _views(masked_scene))
+    assert all(view.counted_pixels is None for view in _views(masked_scene))
     capsys.readouterr()
     views = _views(masked_scene, masks="masks")
     for view in views:
-        assert view.mask.dtype == torch.bool and view.mask.shape == (1, HEIGHT, WIDTH)
-        assert view.mask[:, :, 32:].all() and not view.mask[:, :, :32].any()
+        assert view.counted_pixels.dtype == torch.bool and view.counted_pixels.shape == (1, HEIGHT, WIDTH)
+        assert view.counted_pixels[:, :, 32:].all() and not view.counted_pixels[:, :, :32].any()
         assert view.target(torch.zeros(3)).dtype == torch.uint8
     assert capsys.readouterr().err == ""
     for view in _views(masked_scene, masks=str(masked_scene / "masks"), invert_masks=True, resolution=48):
-        assert not view.mask[:, :, 14:].any() and view.mask[:, :, :14].all()
+        assert not view.counted_pixels[:, :, 14:].any() and view.counted_pixels[:, :, :14].all()
     assert folder_state(masked_scene) == before
 
     next(masked_scene.rglob("masks/left/*.png.png")).unlink()
-    (lacking,) = [view.image_name for view in _views(masked_scene, masks="masks") if view.mask is None]
+    (lacking,) = [view.image_name for view in _views(masked_scene, masks="masks") if view.counted_pixels is None]
     assert f"1 of 17 photos have no mask and count whole: {lacking}" in capsys.readouterr().err
 
 
@@ -183,7 +183,7 @@ def test_a_transparent_mask_is_alpha(masked_scene):
     Image.fromarray(pixels).save(first.image_path)
     plain = _views(masked_scene)[0].target(torch.zeros(3))
     for view in _views(masked_scene, masks="masks", mask_meaning="transparent")[:5]:
-        assert view.mask is None and view.alpha_mask.shape == (1, HEIGHT, WIDTH)
+        assert view.counted_pixels is None and view.alpha_mask.shape == (1, HEIGHT, WIDTH)
         target = view.target(torch.tensor([0.25, 0.5, 1.0]))
         assert (target[:, :, :32] == torch.tensor([0.25, 0.5, 1.0])[:, None, None]).all()
     view = _views(masked_scene, masks="masks", mask_meaning="transparent")[0]
@@ -201,14 +201,14 @@ def test_alpha_is_background_unless_it_is_to_be_ignored(colmap_scene):
     Image.fromarray(pixels).save(colmap_scene / "images" / name)
     for meaning in ("auto", "transparent"):
         view = _views(colmap_scene, mask_meaning=meaning)[0]
-        assert view.mask is None and (view.target(torch.ones(3))[:, :20] == 1).all()
+        assert view.counted_pixels is None and (view.target(torch.ones(3))[:, :20] == 1).all()
     view, other = _views(colmap_scene, mask_meaning="ignore")[:2]
-    assert view.mask[:, 21:].all() and not view.mask[:, :21].any() and other.mask is None
+    assert view.counted_pixels[:, 21:].all() and not view.counted_pixels[:, :21].any() and other.counted_pixels is None
     assert torch.equal(view.target(torch.ones(3)), torch.from_numpy(pixels[..., :3].transpose(2, 0, 1).copy()))
 
     _save(colmap_scene / "masks" / name, np.repeat(np.uint8([[0, 255]]), 48, 1).repeat(HEIGHT, 0))
     view = _views(colmap_scene, masks="masks", mask_meaning="ignore")[0]
-    assert view.mask[:, 21:, 48:].all() and view.mask.sum() == 43 * 48
+    assert view.counted_pixels[:, 21:, 48:].all() and view.counted_pixels.sum() == 43 * 48
     view = _views(colmap_scene, masks="masks", mask_meaning="transparent")[0]
     assert (view.alpha_mask[:, 21:, 48:] == 1).all() and (view.alpha_mask > 0).sum() == 44 * 48
 
@@ -315,13 +315,13 @@ def test_a_view_fetches_each_picture_once(masked_scene, meaning, monkeypatch):
         pixels[:9, :, 3] = 0
         Image.fromarray(pixels).save(path)
     view = _views(masked_scene, masks="masks", mask_meaning=meaning)[0]
-    target, mask = view.target(torch.ones(3)), view.mask
+    target, mask = view.target(torch.ones(3)), view.counted_pixels
     fetched = []
     get = view._images.get
     monkeypatch.setattr(view._images, "get", lambda *picture: fetched.append(picture) or get(*picture))
     both = view.ground_truth(torch.ones(3))
     assert torch.equal(both[0], target) and torch.equal(both[1], mask)
-    assert fetched == view.pictures and len(fetched) == 2
+    assert fetched == view.undecoded and len(fetched) == 2
 
 
 def test_masks_that_leave_nothing_do_not_train_silently(masked_scene, tmp_path, capsys):
@@ -348,16 +348,16 @@ def test_views_that_count_are_looked_at_once(capsys):
         if counting is not None:
             mask = torch.zeros(1, 100, 100, dtype=torch.bool)
             mask.view(-1)[:counting] = True
-        return SimpleNamespace(uid=uid, image_name=f"v{uid}", mask=mask, columns=columns)
+        return SimpleNamespace(uid=uid, image_name=f"v{uid}", counted_pixels=mask, columns=columns)
 
     # 9 of 10000 pixels are too few, and the first 50 of a row are not in its right half.
     views = [view(0, 9), view(1, 10), view(2, None), view(3, 50, slice(50, 100))]
     watch = MaskWatch(views)
     for one in (*views[:3], views[0]):
-        watch.add(one, one.mask)
+        watch.add(one, one.counted_pixels)
         watch.look(last=False)
     assert capsys.readouterr().err == ""
-    watch.add(views[3], views[3].mask)
+    watch.add(views[3], views[3].counted_pixels)
     watch.look(last=False)
     watch.look(last=True)
     said = capsys.readouterr().err
@@ -367,9 +367,9 @@ def test_views_that_count_are_looked_at_once(capsys):
     views = [view(uid, 0) for uid in range(150)]
     watch = MaskWatch(views)
     for one in views[:99]:
-        watch.add(one, one.mask)
+        watch.add(one, one.counted_pixels)
     watch.look(last=False)
-    watch.add(views[99], views[99].mask)
+    watch.add(views[99], views[99].counted_pixels)
     with pytest.raises(UserError, match="all 100 views"):
         watch.look(last=False)
 

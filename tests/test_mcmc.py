@@ -103,7 +103,7 @@ def test_a_few_gaussians_grow_at_least_by_one(growth, count, grown):
     counts = [count]
 
     class Few:
-        total = property(lambda _: counts[-1])
+        gaussian_count = property(lambda _: counts[-1])
 
         def grow(self, new, *_, **__) -> None:
             counts.append(counts[-1] + new)

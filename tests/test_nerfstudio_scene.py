@@ -89,7 +89,7 @@ def test_masks_of_frames(scene):
     cameras = {camera.image_name: camera for camera in read(scene).train_cameras}
     assert [n for n, camera in cameras.items() if camera.mask] == [name]
     views = Scene(options_of(scene, scene.parent / "out"), FakeGaussians()).getTrainCameras()
-    (mask,) = [view.mask for view in views if view.mask is not None]
+    (mask,) = [view.counted_pixels for view in views if view.counted_pixels is not None]
     assert mask.shape == (1, 64, 96) and mask[:, 32:].all() and not mask[:, :32].any()
     _edit(scene, lambda content: content["frames"][3].update(mask_path="masks/two.png"))
     with pytest.raises(UserError, match=r"1 of 1 masks that .*transforms.json lists are missing"):

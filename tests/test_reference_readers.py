@@ -1,5 +1,6 @@
 """Readers and records with the reference's names: both releases' forms, against our own readers and plain formulas."""
 
+import argparse
 import copy
 import dataclasses
 import json
@@ -35,7 +36,7 @@ from scene.dataset_readers import (
 )
 from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, DepthMap
 from scene.readers.info import exposure_names, photo_size
-from utils.camera_utils import camera_to_JSON
+from utils.camera_utils import camera_to_JSON, loadCam
 from utils.system_utils import UserError
 
 FIELDS = (
@@ -80,6 +81,30 @@ def test_a_view_made_of_the_references_fields():
         CameraInfo(3, np.eye(3), np.zeros(3), FovY=0.6, width=160, height=120)
     with pytest.raises(TypeError, match="needs height"):
         CameraInfo(3, np.eye(3), np.zeros(3), 0.6, 0.8, width=160)
+
+
+class _Larger(CameraInfo):
+    """A subclass as one of a named tuple is written, with fields by names that ours has, too."""
+
+    def __new__(cls, *args, label="", mask=None, cx=None, **kwargs):
+        info = super().__new__(cls, *args, **kwargs)
+        info.label, info.mask, info.cx = label, mask, cx
+        return info
+
+
+def test_a_subclass_may_make_itself_as_one_of_a_named_tuple(tmp_path):
+    Image.new("RGB", (160, 120), "teal").save(tmp_path / "a.png")
+    mask, values = np.ones((120, 160)), _values(image_path=str(tmp_path / "a.png"), depth_path="")
+    info = _Larger(**values, label="x", mask=mask, cx=np.float32(70))
+    assert info._asdict() == values and (info.label, info.cx) == ("x", 70) and info.mask is mask
+    for twin in (copy.copy(info), copy.deepcopy(info), pickle.loads(pickle.dumps(info))):
+        assert type(twin) is _Larger and (twin.label, twin.fx, twin.uid) == ("x", info.fx, 3)
+    info.group = 7
+    with pytest.raises(AttributeError, match="make another one by _replace"):
+        info.width = 5
+    args = argparse.Namespace(resolution=2, data_device="cpu", train_test_exp=False)
+    camera = loadCam(args, 0, info, 1.0)
+    assert (camera.image_width, camera.cx) == (80, 35) and camera.counted_pixels is None
 
 
 def test_a_view_made_of_2023s_fields():

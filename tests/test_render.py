@@ -41,7 +41,7 @@ def read(path) -> np.ndarray:
 
 def view(target: torch.Tensor) -> SimpleNamespace:
     size = {"image_width": target.shape[2], "image_height": target.shape[1]}
-    return SimpleNamespace(target=lambda background: target, mask=None, **size)
+    return SimpleNamespace(target=lambda background: target, counted_pixels=None, **size)
 
 
 def names(folder: Path, pattern: str = "*.png") -> list[str]:

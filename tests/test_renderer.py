@@ -72,7 +72,7 @@ def test_scores_are_computed_without_depth(camera, monkeypatch):
 
     gaussians = model(5)
     scene = argparse.Namespace(gaussians=gaussians, getTrainCameras=lambda: [camera], getTestCameras=lambda: [])
-    camera.target, camera.mask, camera.image_name = lambda _: torch.zeros(3, HEIGHT, WIDTH), None, "a"
+    camera.target, camera.counted_pixels, camera.image_name = lambda _: torch.zeros(3, HEIGHT, WIDTH), None, "a"
     for module in (scored_views, report):
         monkeypatch.setattr(module, "render", spy)
     scored_views.ScoredViews(pipeline(), BLACK, False).image(camera, gaussians)
@@ -97,7 +97,7 @@ def test_the_report_takes_the_renders_arguments_of_the_2024_release(camera, more
         return {"render": torch.zeros(3, HEIGHT, WIDTH)}
 
     scene = argparse.Namespace(gaussians=model(5), getTrainCameras=lambda: [camera], getTestCameras=lambda: [camera])
-    camera.target, camera.mask, camera.image_name = lambda _: torch.ones(3, HEIGHT, WIDTH), None, "a"
+    camera.target, camera.counted_pixels, camera.image_name = lambda _: torch.ones(3, HEIGHT, WIDTH), None, "a"
     zero = torch.zeros(())
     scores = report.training_report(
         None, 1, zero, zero, l1_loss, 0.0, [1], scene, spy, (pipeline(), BLACK, *more), True

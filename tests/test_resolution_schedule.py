@@ -96,7 +96,7 @@ def test_a_smaller_view_is_that_of_a_scene_with_smaller_photos(colmap_scene, tmp
         photo = Image.open(view.image_path).convert("RGB").resize(got._size, Image.Resampling.BOX)
         difference = got.target(black).int() - torch.from_numpy(np.asarray(photo).transpose(2, 0, 1).copy()).int()
         assert difference.abs().max() <= 1  # Pillow rounds twice
-        assert got.pictures == [] and got.mask is None and got.counts_all
+        assert got.undecoded == [] and got.counted_pixels is None and got.counts_all_pixels
         assert view._size == (96, 64) and view.target(black).shape == (3, 64, 96)
 
 
@@ -114,7 +114,7 @@ def test_masks_depth_maps_and_columns_are_smaller_too(colmap_scene, tmp_path):
     small = view.at_size((24, 16))
     counted = torch.ones(1, 16, 24, dtype=torch.bool)
     counted[:, :9, :4] = False  # row 8 touches a masked pixel
-    assert torch.equal(small.mask, counted) and not small.counts_all
+    assert torch.equal(small.counted_pixels, counted) and not small.counts_all_pixels
     assert small.columns == slice(0, 11)  # of the twelfth, a quarter does not count
     assert small.alpha_mask.shape == (1, 16, 24) and small.alpha_mask[..., 11:].sum() == 0
     right = view.at_size((96, 64))
@@ -122,7 +122,7 @@ def test_masks_depth_maps_and_columns_are_smaller_too(colmap_scene, tmp_path):
     assert view.at_size((24, 16)).columns == slice(12, 24) and right.columns == slice(0, 45)
     view = _photo(0.1, depth=InMemory(torch.arange(96.0).expand(1, 64, 96).contiguous()))
     small = view.at_size((48, 32))
-    assert small.depth_reliable and torch.equal(small.inverse_depth[0, 5], torch.arange(48) * 2 + 0.5)
+    assert small.depth_reliable and torch.equal(small.target_inverse_depth[0, 5], torch.arange(48) * 2 + 0.5)
     assert torch.equal(small.depth_mask, torch.ones(1, 32, 48))
 
 

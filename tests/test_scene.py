@@ -24,6 +24,8 @@ from scene.dataset_readers import read_scene, sceneLoadTypeCallbacks
 from scene.gaussian_model import GaussianModel
 from splatting.files.json_files import OFFSET
 from splatting.training import run
+from utils import camera_utils
+from utils.camera_utils import loadCam
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -160,6 +162,38 @@ def test_a_foreign_model_is_saved_and_loaded_with_exposures(colmap_scene, tmp_pa
         assert model.calls == [halves] and (tmp_path / str(halves) / "exposure.json").is_file() == halves
     table = json.loads((tmp_path / "True" / "exposure.json").read_text())
     assert table == {"a.png": torch.eye(3, 4).tolist()}
+
+
+class ModelOf2023(TheirModel):
+    def create_from_pcd(self, pcd, spatial_lr_scale) -> None:
+        self.start = len(pcd.points), spatial_lr_scale
+
+
+def test_functions_of_2023_get_the_arguments_that_they_take(colmap_scene, tmp_path, monkeypatch):
+    asked = []
+
+    def load(args, id, cam_info, resolution_scale):
+        asked.append(id)
+        return loadCam(args, id, cam_info, resolution_scale)
+
+    monkeypatch.setattr(camera_utils, "loadCam", load)
+    model = ModelOf2023()
+    made = Scene(_args(colmap_scene, tmp_path / "out"), model)
+    assert model.start[0] > 0 and model.start[1] == made.cameras_extent
+    assert asked == [*range(14), *range(3)]
+
+
+def test_a_reader_may_leave_the_extent_unknown(colmap_scene, tmp_path, monkeypatch):
+    read = sceneLoadTypeCallbacks["Colmap"]
+
+    def without(*args, **kwargs):
+        info = read(*args, **kwargs)
+        return info._replace(nerf_normalization={**info.nerf_normalization, "radius": None})
+
+    monkeypatch.setitem(sceneLoadTypeCallbacks, "Colmap", without)
+    model = GaussianModel(0)
+    made = Scene(_args(colmap_scene, tmp_path / "out"), model)
+    assert made.cameras_extent is None and model.spatial_lr_scale is None and len(model) > 0
 
 
 def _run(code: str, folder: Path) -> None:

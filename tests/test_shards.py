@@ -50,7 +50,7 @@ def _start(count: int, kind: type[GaussianModel] = GaussianModel, **changes: obj
 def _random(gaussians: GaussianModel, what: str, *shape: int) -> Tensor:
     """Random numbers (n, *shape) of this rank's Gaussians, the same for any number of ranks."""
     generator = torch.Generator().manual_seed(zlib.crc32(what.encode()))
-    every = torch.randn(gaussians.total, *shape, generator=generator)
+    every = torch.randn(gaussians.gaussian_count, *shape, generator=generator)
     return every[gaussians.shards.first :][: len(gaussians)]
 
 
@@ -78,8 +78,8 @@ def _adc(gaussians: GaussianModel, *further: int, **changes: object) -> None:
 
 
 def _limited(gaussians: GaussianModel) -> None:
-    _adc(gaussians, max_num_splats=gaussians.total + 7)
-    _adc(gaussians, 900, max_num_splats=gaussians.total + 5, split="long_axis", absgrad=True)
+    _adc(gaussians, max_num_splats=gaussians.gaussian_count + 7)
+    _adc(gaussians, 900, max_num_splats=gaussians.gaussian_count + 5, split="long_axis", absgrad=True)
 
 
 def _by_hand(gaussians: GaussianModel) -> None:
@@ -98,7 +98,7 @@ def _emptied(gaussians: GaussianModel) -> None:
     """All rows of the first ranks are removed, then some rows are added, then nothing is."""
     _adc(gaussians, 549, 550)
     with torch.no_grad():
-        first = gaussians.shards.items(torch.arange(len(gaussians))) < 0.8 * gaussians.total
+        first = gaussians.shards.items(torch.arange(len(gaussians))) < 0.8 * gaussians.gaussian_count
         gaussians.raw("opacity")[first] = -9.0
     _adc(gaussians, 600, 601)
     _adc(gaussians, 700, densify_grad_threshold=1e6)
@@ -118,13 +118,13 @@ def _mcmc(gaussians: GaussianModel, **changes: object) -> None:
 def _mcmc_at_one_end(gaussians: GaussianModel) -> None:
     """Only the last Gaussian lives."""
     with torch.no_grad():
-        last = gaussians.shards.items(torch.arange(len(gaussians))) == gaussians.total - 1
+        last = gaussians.shards.items(torch.arange(len(gaussians))) == gaussians.gaussian_count - 1
         gaussians.raw("opacity")[:, 0] = torch.where(last, 2.0, -5.0)
-    _mcmc(gaussians, max_num_splats=gaussians.total + 30, mcmc_min_opacity=0.01)
+    _mcmc(gaussians, max_num_splats=gaussians.gaussian_count + 30, mcmc_min_opacity=0.01)
 
 
 def _budget(gaussians: GaussianModel) -> None:
-    opt = options(strategy="budget", max_num_splats=2 * gaussians.total, opacity_decay=0.9, prune_opacity=0.05)
+    opt = options(strategy="budget", max_num_splats=2 * gaussians.gaussian_count, opacity_decay=0.9, prune_opacity=0.05)
     scene = SimpleNamespace(getTrainCameras=list)
     density = BudgetControl(
         SimpleNamespace(gaussians=gaussians, opt=opt, scene=scene, pipe=None, dataset=SimpleNamespace(train_test_exp=0))
@@ -132,11 +132,11 @@ def _budget(gaussians: GaussianModel) -> None:
     scores = "scores"
     density._scores = lambda *_: _random(gaussians, scores).double().clamp_min(0.0)
     _train(gaussians, density)
-    density.most_gaussians = gaussians.total - 10
+    density.most_gaussians = gaussians.gaussian_count - 10
     _train(gaussians, density, (14900,))
     with torch.no_grad():
         gaussians.raw("opacity")[_random(gaussians, "same") > 0] = logit(0.5)
-    density.most_gaussians = gaussians.total - 40
+    density.most_gaussians = gaussians.gaussian_count - 40
     _train(gaussians, density, (14900,))
 
 
@@ -161,7 +161,7 @@ RESUMED = ("adc", "few", "mcmc")  # from the files of one process, and trained f
 
 def _told(gaussians: GaussianModel) -> list[object]:
     """What is said of a whole model, some of whose values are then broken."""
-    told: list[object] = [cut_bounds(gaussians.raw("f_rest").detach(), gaussians.shards), gaussians.ply_bytes]
+    told: list[object] = [cut_bounds(gaussians.raw("f_rest").detach(), gaussians.shards), gaussians.size_as_ply]
     with torch.no_grad():
         some = _random(gaussians, "broken") > 1
         gaussians.raw("scaling")[some] = math.nan
@@ -196,7 +196,7 @@ def _save(gaussians: GaussianModel, folder: Path) -> tuple[int, int, int]:
     folder.mkdir(exist_ok=True, parents=True)
     save_checkpoint(folder / "chkpnt7.pth", gaussians.capture(), 7)
     gaussians.save_ply(folder / "point_cloud.ply")
-    return gaussians.shards.first, len(gaussians), gaussians.total
+    return gaussians.shards.first, len(gaussians), gaussians.gaussian_count
 
 
 def _content(folder: Path) -> list[tuple[str, bytes]]:

@@ -244,7 +244,7 @@ def test_a_distorted_scene_shows_its_points_where_they_are(tmp_path, model, cach
     scene = Scene(options_of(folder, tmp_path / "out"), FakeGaussians(), shuffle=False)
     hits = tried = 0
     for camera in scene.getTrainCameras():
-        assert camera.mask is None
+        assert camera.counted_pixels is None
         target = camera.target(torch.zeros(3)).permute(1, 2, 0).numpy()
         from_world = reconstruction.find_image_with_name(camera.image_name).cam_from_world()
         points = sorted(reconstruction.points3D.values(), key=lambda p, m=from_world: (m * p.xyz)[2])
@@ -282,4 +282,7 @@ def test_a_wide_lens_in_a_scene(tmp_path, capsys):
         assert camera.mask is not None
     assert "2 photos, the first is v" in capsys.readouterr().err
     for view in Scene(options_of(folder, tmp_path / "out"), FakeGaussians()).getTrainCameras():
-        assert view.mask.shape == (1, view.image_height, view.image_width) and 0.3 < view.mask.float().mean() < 1
+        assert (
+            view.counted_pixels.shape == (1, view.image_height, view.image_width)
+            and 0.3 < view.counted_pixels.float().mean() < 1
+        )

@@ -10,6 +10,7 @@ from scene.half_images import half
 from scene.images.sizes import training_size
 from scene.readers.info import CameraInfo, photo_size
 from splatting.compat.camera_forms import of_record
+from splatting.compat.models import call_of_either_form
 from utils.graphics_utils import camera_center, fov2focal, rigid_pose
 
 __all__ = ["Camera", "cameraList_from_camInfos", "camera_to_JSON", "loadCam"]
@@ -43,10 +44,9 @@ def cameraList_from_camInfos(
     is_test_dataset: bool = False,
 ) -> list[Camera]:
     """`loadCam` of each view; their uids count from 0."""
-    return [
-        loadCam(args, uid, info, resolution_scale, is_nerf_synthetic, is_test_dataset)
-        for uid, info in enumerate(cam_infos)
-    ]
+    of_2024 = is_nerf_synthetic, is_test_dataset
+    older = [(args, uid, info, resolution_scale) for uid, info in enumerate(cam_infos)]
+    return [call_of_either_form(loadCam, (*arguments, *of_2024), arguments) for arguments in older]
 
 
 def camera_to_JSON(id: int, camera: CameraInfo) -> dict[str, object]:

@@ -71,7 +71,7 @@ def densify_and_prune(
         getattr(gaussians, attribute.field).grad = None
     gradient = rules.mean_gradient(gaussians.xyz_gradient_accum, gaussians.denom)
     if max_splats > 0:
-        room = max_splats - gaussians.total
+        room = max_splats - gaussians.gaussian_count
         gradient = rules.limit_growth(gradient, max_grad, room, gaussians.shards)
     how = {} if seed is None else {"seed": seed, "iteration": iteration}
     if long_axis:  # said only then, as a client's own densify_and_split may not know it

@@ -52,7 +52,7 @@ def remove_useless(gaussians: GaussianParameters, min_opacity: float, most: int)
     """Remove Gaussians of an opacity below min_opacity; then those of the lowest, until there are at most `most`."""
     opacity = gaussians.opacity_logits().reshape(-1)
     remove = rules.is_useless(opacity, min_opacity)
-    over = gaussians.total - most
+    over = gaussians.gaussian_count - most
     if over > 0:
         remove[gaussians.shards.lowest(opacity, over)] = True
     gaussians.prune_points(remove)

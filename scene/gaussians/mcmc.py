@@ -66,7 +66,7 @@ def relocate(gaussians: GaussianParameters, min_opacity: float, most_parts: int,
     dead = (~live).nonzero().reshape(-1)
     counts = gaussians.shards.counts(len(dead))
     count = int(counts.sum())
-    if 0 < count < gaussians.total:
+    if 0 < count < gaussians.gaussian_count:
         draws, origins = _divide(gaussians, live, count, most_parts, seed, iteration, _RELOCATION)
         rows = gaussians.rows_at(origins)
         gaussians.table.overwrite(dead, gaussians.shards.send_draws(rows, draws, counts))
@@ -101,14 +101,14 @@ def add_noise(
 def penalise(gaussians: GaussianParameters, penalty: Penalty) -> None:
     """Add a penalty's gradients to those of the parameters, with the bits of the step that adds them itself."""
     if not gaussians.kernels_activate:
-        total = gaussians.total
+        total = gaussians.gaussian_count
         opacity, scale = gaussians.get_opacity.sum() / total, gaussians.get_scaling.sum() / (3 * total)
         return (penalty.opacity * opacity + penalty.scale * scale).backward()
     params = gaussians._opacity, gaussians._scaling
     for param in params:
         if param.grad is None:
             param.grad = torch.zeros_like(param)
-    each = penalty.of_each(gaussians.total)
+    each = penalty.of_each(gaussians.gaussian_count)
     gradients = [param.grad.contiguous() for param in params]
     penalise_(*(param.detach() for param in params), *gradients, opacity=each.opacity, scale=each.scale)
     for param, gradient in zip(params, gradients, strict=True):

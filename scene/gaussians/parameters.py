@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from scene.gaussians.attributes import Attribute, Rows, attributes
 from scene.gaussians.finite import tell_of_undrawn
-from scene.gaussians.ply import column_names, read_ply, row_bytes, write_ply
+from scene.gaussians.ply import FLAT, column_names, read_ply, row_bytes, write_ply
 from scene.gaussians.statistics import NAMES, Statistics
 from scene.gaussians.table import GaussianTable
 from splatting.distributed.ranks import Ranks
@@ -114,7 +114,7 @@ class GaussianParameters:
         return self._xyz.shape[0]
 
     @property
-    def total(self) -> int:
+    def gaussian_count(self) -> int:
         """Number of Gaussians that all ranks have."""
         return self.shards.total(len(self))
 
@@ -168,6 +168,8 @@ class GaussianParameters:
 
     def raw_geometry(self) -> dict[str, Tensor]:
         """Raw shapes by the rasterizer's names: opacities (N, 1) logit, scales (N, 3) log, rotations (N, 4) wxyz."""
+        if self._scaling.shape[1] == 2:
+            raise UserError(f"this model has {FLAT}")
         return {"opacities": self._opacity, "scales": self._scaling, "rotations": self._rotation}
 
     @property
@@ -235,13 +237,16 @@ class GaussianParameters:
         return {"opacity": self.raw_opacity(logits), "scaling": self.raw_scaling(log_scales)}
 
     @property
-    def active_bands(self) -> int:
+    def active_sh_bands(self) -> int:
         """Number of SH coefficients above band 0 that the active degree uses."""
         return (self.active_sh_degree + 1) ** 2 - 1
 
     def load_ply(self, path: str | os.PathLike) -> None:
-        """Take all parameters from a PLY of this model's SH degree (else UserError); all SH bands become active."""
-        rows = read_ply(path, self.max_sh_degree)
+        """Take all parameters from a PLY of this model's SH degree (else UserError); all SH bands become active.
+
+        Flat Gaussians of two scales are read, too; the rasterizer refuses to draw them.
+        """
+        rows = read_ply(path, self.max_sh_degree, flat=True)
         tell_of_undrawn(rows, path)
         self.take_whole(rows)
         self.active_sh_degree = self.max_sh_degree
@@ -251,9 +256,9 @@ class GaussianParameters:
         write_ply(path, raw_rows(self), self._degree_of_tensors(), self.world_offset, shards=self.shards)
 
     @property
-    def ply_bytes(self) -> int:
+    def size_as_ply(self) -> int:
         """Size of the PLY without its header."""
-        return self.total * row_bytes(self.max_sh_degree)
+        return self.gaussian_count * row_bytes(self.max_sh_degree)
 
     def part(self, keep: Tensor | slice, sh_degree: int) -> "GaussianParameters":
         """A copy of the Gaussians `keep`, (N,) bool or a slice, with the SH bands up to sh_degree; no optimiser."""

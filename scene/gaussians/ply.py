@@ -14,6 +14,7 @@ from scene.gaussians.table import WHOLE, Shards
 from splatting.files.ply_header import read_elements
 from utils.system_utils import UserError, atomic_write, writes_files
 
+FLAT = "flat Gaussians of two scales (2DGS), which this rasterizer cannot draw; give a 3DGS model"
 _NORMALS = ["nx", "ny", "nz"]  # zeros after the positions, as in the reference's files
 
 
@@ -78,8 +79,10 @@ def _degree(names: Iterable[str]) -> int | None:
 
 
 @np.errstate(over="ignore")  # doubles that float32 cannot hold become Inf
-def read_ply(path: str | os.PathLike, sh_degree: int | None) -> Rows:
+def read_ply(path: str | os.PathLike, sh_degree: int | None, flat: bool = False) -> Rows:
     """Read a Gaussian PLY of any tool: any order of properties, scalar type and encoding.
+
+    flat: take Gaussians of two scales, too, for models that draw them by other code.
 
     SH bands that the file lacks are zero: the last save of a training leaves out those that are. sh_degree: None: that
     of the file. UserError when the file is missing or unreadable, lacks properties (the message names them), or has a
@@ -91,10 +94,13 @@ def read_ply(path: str | os.PathLike, sh_degree: int | None) -> Rows:
     if sh_degree is None:
         sh_degree = 3 if degree is None else degree
     table = attributes(sh_degree if degree is None else min(degree, sh_degree))
-    wanted = table["f_rest"].columns
+    parts = {name: attribute.columns for name, attribute in table.items()}
+    wanted = parts["f_rest"]
     rest = sum(name.startswith("f_rest_") for name in present)
-    missing = [name for part, a in table.items() if part != "f_rest" for name in a.columns if name not in present]
-    if missing:
+    missing = [name for part, columns in parts.items() if part != "f_rest" for name in columns if name not in present]
+    if flat and missing == ["scale_2"]:
+        parts["scaling"] = parts["scaling"][:2]
+    elif missing:
         raise UserError(_why_no_model(path, missing, present))
     if rest != len(wanted) or not present.issuperset(wanted):
         found = "no known SH degree" if degree is None else f"SH degree {degree}"
@@ -103,9 +109,7 @@ def read_ply(path: str | os.PathLike, sh_degree: int | None) -> Rows:
             "give the --sh_degree of the file"
         )
     rows = {}
-    for (name, attribute), values in zip(
-        table.items(), _columns(vertices, [a.columns for a in table.values()]), strict=True
-    ):
+    for (name, attribute), values in zip(table.items(), _columns(vertices, list(parts.values())), strict=True):
         if len(attribute.shape) == 2:
             bands, channels = attribute.shape
             values = values.reshape(len(vertices), channels, bands).transpose(1, 2).contiguous()
@@ -117,7 +121,7 @@ def read_ply(path: str | os.PathLike, sh_degree: int | None) -> Rows:
 
 def _why_no_model(path: str | os.PathLike, missing: Sequence[str], present: Collection[str]) -> str:
     if list(missing) == ["scale_2"]:
-        return f"{path} has flat Gaussians of two scales (2DGS), which this rasterizer cannot draw; give a 3DGS model"
+        return f"{path} has {FLAT}"
     if "packed_position" in present:
         return f"{path} is a compressed PLY; unpack it with export.py --ply {path} --to FILE.ply, and give FILE.ply"
     remedy = "give a trained model"

@@ -3,8 +3,8 @@
 import math
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field, fields, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, FrozenInstanceError, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -26,9 +26,32 @@ ROUNDING = 1e-9  # distances below this part of the scene are rounding errors
 
 
 class _LikeNamedTuple:
-    """The methods of a named tuple of `_fields`, which are the reference's; further fields have names only."""
+    """The methods of a named tuple of `_fields`, which are the reference's; further fields have names only.
+
+    Fields of the tuple are not assigned to. As a named tuple, a subclass may make itself in a `__new__` of its own.
+    """
 
     _fields: ClassVar[tuple[str, ...]]
+    _fill: ClassVar[Callable[..., None] | None] = None  # of such a subclass: the __init__ that its __new__ stands for
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "__new__" in vars(cls) and cls._fill is None:
+            cls._fill, cls.__init__ = cls.__init__, lambda *_, **__: None
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> "_LikeNamedTuple":
+        made = super().__new__(cls)
+        if cls._fill is not None:
+            made._fill(*args, **kwargs)
+        return made
+
+    def __getnewargs__(self) -> tuple:
+        return tuple(self)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in self._fields and name in vars(self):
+            raise FrozenInstanceError(f"{name} is a field of a {type(self).__name__}: make another one by _replace")
+        object.__setattr__(self, name, value)
 
     def _asdict(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in self._fields}
@@ -43,7 +66,7 @@ class _LikeNamedTuple:
         return tuple(self)[index]
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class CameraInfo(_LikeNamedTuple):
     """One view. The fields up to is_test are the reference's; the others are given by name.
 
@@ -92,18 +115,18 @@ class CameraInfo(_LikeNamedTuple):
     )
 
     def __post_init__(self) -> None:
-        for name, value in zip("RT", rigid_pose(self.R, self.T, self.image_name), strict=True):
-            object.__setattr__(self, name, value)
+        values = vars(self)
+        values["R"], values["T"] = rigid_pose(self.R, self.T, self.image_name)
         for fov, focal, center, side in _AXES:
-            size, angle, length = getattr(self, side), getattr(self, fov), getattr(self, focal)
+            size, angle, length = values[side], values[fov], values[focal]
             if not size or (angle is None and length is None):
                 raise TypeError(f"a CameraInfo needs {side}, and {fov} or {focal}")
             if length is None:
-                object.__setattr__(self, focal, fov2focal(angle, size))
+                values[focal] = fov2focal(angle, size)
             elif angle is None or not math.isclose(angle, focal2fov(length, size), rel_tol=_SAME_ANGLE):
-                object.__setattr__(self, fov, focal2fov(length, size))
-            if getattr(self, center) is None:
-                object.__setattr__(self, center, size / 2)
+                values[fov] = focal2fov(length, size)
+            if values[center] is None:
+                values[center] = size / 2
 
     def _replace(self, **changes: Any) -> "CameraInfo":
         """A copy with some fields changed, and with those that follow from them.
@@ -133,7 +156,7 @@ _SAME_ANGLE = 1e-9  # relative; FovX, turned into fx and back, differs by roundi
 _AXES = (("FovX", "fx", "cx", "width"), ("FovY", "fy", "cy", "height"))
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class SceneInfo(_LikeNamedTuple):
     """A dataset: start cloud (None if not wanted), views, their size, and the cloud's PLY if it has one.
 
@@ -159,9 +182,10 @@ class SceneInfo(_LikeNamedTuple):
         return replace(self, **changes)
 
     @property
-    def extent(self) -> float:
-        """The extent E in world units."""
-        return float(self.nerf_normalization["radius"])
+    def extent(self) -> float | None:
+        """The extent E in world units; None where other code has made the record without one."""
+        radius = self.nerf_normalization["radius"]
+        return None if radius is None else float(radius)
 
 
 def split_by_order(

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from scene.half_images import half
 from scene.images.decode import picture_size, pixels_of
-from scene.images.masks import TRANSPARENT, add_alpha
+from scene.images.masks import TRANSPARENT, Mask, add_alpha
 from scene.images.store import InMemory, Size
 from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, DepthMap, depth_fit, resize
 from scene.readers.info import CameraInfo
@@ -109,9 +109,13 @@ def of_record(record: Any, size: Size, is_nerf_synthetic: bool) -> CameraInfo:
     A PIL image that it holds is resized. A file that `depth_path` names is a depth map with Blender's unit if the scene
     is_nerf_synthetic, else with COLMAP's. UserError if that file is missing.
     """
-    if not isinstance(record, CameraInfo):
+    if type(record) is not CameraInfo:
         names = {field.name for field in fields(CameraInfo)} - {"fx", "fy", "lens"}
-        record = CameraInfo(**{name: getattr(record, name) for name in names if hasattr(record, name)})
+        values = {name: getattr(record, name) for name in names if hasattr(record, name)}
+        values |= {name: float(values[name]) for name in ("cx", "cy") if values.get(name) is not None}
+        if not isinstance(values.get("mask"), Mask):
+            values["mask"] = None  # an attribute of other code by that name
+        record = CameraInfo(**values)
     if record.image is not None:
         pixels, mask = pixels_of(record.image, size), record.mask
         if mask and mask.meaning == TRANSPARENT:

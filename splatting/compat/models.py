@@ -1,10 +1,11 @@
 """The part of a model that a scene needs: of ours, or of the reference's class of that name."""
 
+import inspect
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from scene.readers.info import CameraInfo
 from utils.graphics_utils import BasicPointCloud
@@ -26,6 +27,15 @@ class SceneGaussians(Protocol):
     def load_ply(self, path: str) -> None: ...
 
     def save_ply(self, path: str) -> None: ...
+
+
+def call_of_either_form(function: Callable, newer: tuple, older: tuple) -> Any:
+    """Call a function that other code may have replaced by one of 2023, which takes fewer arguments."""
+    try:
+        inspect.signature(function).bind(*newer)
+    except TypeError:
+        return function(*older)
+    return function(*newer)
 
 
 def load_model(

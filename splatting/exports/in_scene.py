@@ -111,4 +111,4 @@ def start_from(splats: Splats, scene: Scene, gaussians: GaussianModel) -> None:
     fill_model(gaussians, splats)
     gaussians.start_exposures(scene.info.train_cameras)
     bands = "all SH bands" if splats.sh_degree <= gaussians.max_sh_degree else f"SH bands to {gaussians.max_sh_degree}"
-    print(f"Number of Gaussians at initialisation :  {gaussians.total}, with {bands}")
+    print(f"Number of Gaussians at initialisation :  {gaussians.gaussian_count}, with {bands}")

@@ -116,7 +116,7 @@ def save_last(run: Run, scored: bool, iteration: int) -> LeftOut:
     write_cfg_args(scene.model_path, argparse.Namespace(**vars(run.dataset) | {"sh_degree": final.max_sh_degree}))
     kept_pixels, file_pixels = scene.training_pixels()
     left_out = LeftOut(
-        gaussians=trained.total,
+        gaussians=trained.gaussian_count,
         unseen=search.unseen,
         faint=search.faint,
         keep_unseen=opt.keep_unseen,
@@ -126,8 +126,8 @@ def save_last(run: Run, scored: bool, iteration: int) -> LeftOut:
         max_sh_degree=trained.max_sh_degree,
         sh_degree=final.max_sh_degree,
         cut_bounds=search.cut_bounds,
-        ply_bytes=trained.ply_bytes,
-        ply_bytes_saved=trained.ply_bytes - final.ply_bytes,
+        ply_bytes=trained.size_as_ply,
+        ply_bytes_saved=trained.size_as_ply - final.size_as_ply,
         seconds=round(search.seconds, 3),
         picture_bytes=3 * kept_pixels,
         picture_bytes_in_files=3 * file_pixels,

@@ -40,7 +40,7 @@ def announce_memory(
     """
     images, device = scene.images, gaussians.get_xyz.device
     pixels = max(camera.image_width * camera.image_height for camera in scene.getTrainCameras())
-    now = gaussians.total
+    now = gaussians.gaussian_count
     later = max(max_splats, now) if max_splats else GROWTH * now
     why = "--max_num_splats" if max_splats else f"scenes often grow {GROWTH}-fold"
     per_rank = [-(-count // size) for count in (now, later)]

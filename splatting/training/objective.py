@@ -33,7 +33,7 @@ class Objective:
 
     def takes_bands(self, step: Iteration) -> bool:
         """Whether the loss of a step needs of the image no more than each rank's band and what surrounds it."""
-        return step.depth_weight == 0 and step.camera.counts_all and step.camera.columns is None
+        return step.depth_weight == 0 and step.camera.counts_all_pixels and step.camera.columns is None
 
     def __call__(self, package: dict[str, Any], step: Iteration) -> Losses:
         """package: of `render`, with `depth` where step.depth_weight is above 0.
@@ -49,7 +49,7 @@ class Objective:
         total, l1 = photometric_loss(image, target, weight, mask, camera.columns, clamp)
         depth = None
         if step.depth_weight > 0:
-            error = inverse_depth_loss(package["depth"], camera.inverse_depth, camera.columns, mask)
+            error = inverse_depth_loss(package["depth"], camera.target_inverse_depth, camera.columns, mask)
             depth = step.depth_weight * error
             total = total + depth
         return Losses(total, l1, depth, mask)

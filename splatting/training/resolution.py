@@ -67,7 +67,7 @@ class Resolution:
         return camera not in self._made
 
     def _shrinks(self, camera: Camera) -> bool:
-        if self.factor == 1 or not isinstance(camera, Camera) or not camera.is_plain:
+        if self.factor == 1 or not isinstance(camera, Camera) or not camera.has_dataset_pictures:
             return False
         return smaller(camera, self.factor) != (camera.image_width, camera.image_height)
 

@@ -53,7 +53,7 @@ class Curve(Observer):
             self._seconds = step.scored_at = self._run.clock.seconds
             point = self._recorder.point(step.span) or step.span[-1]
             with self._run.clock.paused("scoring"):
-                self._recorder.add(point, self._seconds, self._run.gaussians.total, step.iteration)
+                self._recorder.add(point, self._seconds, self._run.gaussians.gaussian_count, step.iteration)
 
     def ended(self, error: Error) -> None:
         if error is not None:

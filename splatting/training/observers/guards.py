@@ -131,7 +131,7 @@ class MemoryGuard(Observer):
             if self._changing:
                 gaussians.take_from_optimizer()
                 state = f"the model in iteration {iteration}, whose last changes may be incomplete,"
-                further = f"--max_num_splats {gaussians.total}, {further}"
+                further = f"--max_num_splats {gaussians.gaussian_count}, {further}"
             else:
                 gaussians.active_sh_degree = self._sh_degree
                 anew = "--max_num_splats or --sh_degree"  # a resumed run with as many Gaussians would end here again

@@ -54,7 +54,7 @@ class ProgressBar(Observer):
         if step.span.stop - 1 != step.iteration:  # the bar counts iterations of the schedule
             means["Iterations"] = f"{step.iteration:,}"
         # As text: tqdm would round the number to three digits.
-        self._bar.set_postfix(means, Gaussians=f"{self._run.gaussians.total:,}", refresh=False)
+        self._bar.set_postfix(means, Gaussians=f"{self._run.gaussians.gaussian_count:,}", refresh=False)
         self._bar.update(step.span.stop - 1 - self._bar.n)
         self._updated, self._done = time.monotonic(), step.iteration
 
@@ -291,7 +291,9 @@ class Records(Observer):
         run = self._run
         self._seconds = seconds = run.clock.seconds if step.scored_at is None else step.scored_at
         with run.clock.paused("saving"):
-            run.log.add(step.iteration, seconds, gaussians=run.gaussians.total, loss=run.losses.mean, **step.record)
+            run.log.add(
+                step.iteration, seconds, gaussians=run.gaussians.gaussian_count, loss=run.losses.mean, **step.record
+            )
 
     def ended(self, error: Error) -> None:
         """Note the seconds of this process: up to its first iteration, of training, of scoring and of saving."""

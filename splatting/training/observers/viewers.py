@@ -118,7 +118,7 @@ class PageObserver(Observer):
         self._numbers = now, iteration, run.clock.seconds
         took = run.clock.seconds - seconds
         speed = (iteration - before) / took if before and took > 0 else None
-        self._page.show_numbers(iteration, run.gaussians.total)
+        self._page.show_numbers(iteration, run.gaussians.gaussian_count)
         self._tab.show(speed, run.losses.mean, run.rows)
 
     def ended(self, error: Error) -> None:

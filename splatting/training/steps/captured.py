@@ -199,7 +199,7 @@ class Graphs:
     def _is_usual(self, at: Iteration) -> bool:
         """Whether the step has a photo whose pixels all count, and nothing else."""
         plain = at.depth_weight == 0 and not self._run.dataset.train_test_exp
-        return self._able and plain and at.camera.columns is None and at.camera.counts_all
+        return self._able and plain and at.camera.columns is None and at.camera.counts_all_pixels
 
     def _graph_for(self, at: Iteration) -> _Graph | None:
         """The graph for a step, made if it is worth it. The first step of a kind is not, as it may load kernels."""

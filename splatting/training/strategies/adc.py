@@ -78,7 +78,7 @@ class AdaptiveDensityControl(DensityControl):
             max_splats=self.most(iteration, self.most_gaussians),
             long_axis=self._opt.split == "long_axis",
         )
-        refuse_empty(iteration, self._gaussians.total == 0, "raise --opacity_reset_interval")
+        refuse_empty(iteration, self._gaussians.gaussian_count == 0, "raise --opacity_reset_interval")
 
 
 def of_run(run: "Run") -> AdaptiveDensityControl:

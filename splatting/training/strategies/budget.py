@@ -54,14 +54,14 @@ class BudgetControl(DensityControl):
             return
         self._gaussians.check_steps()  # before rows change, so that an error finds the rows of the step
         grows = self._grows(step.iteration)
-        aim = now = self._gaussians.total
+        aim = now = self._gaussians.gaussian_count
         if grows:
             aim = self._aim(now, step.iteration)
         remove_useless(self._gaussians, self._opt.prune_opacity, max(aim, 1))
-        refuse_empty(step.iteration, self._gaussians.total == 0, "lower --prune_opacity")
+        refuse_empty(step.iteration, self._gaussians.gaussian_count == 0, "lower --prune_opacity")
         if grows:
-            if aim > self._gaussians.total:
-                split_in_two(self._gaussians, self._chosen(step, aim - self._gaussians.total))
+            if aim > self._gaussians.gaussian_count:
+                split_in_two(self._gaussians, self._chosen(step, aim - self._gaussians.gaussian_count))
             fade(self._gaussians, self._opt.opacity_decay)
 
     def most_after(self, count: int, first: int, last: int) -> int:

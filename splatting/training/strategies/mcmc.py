@@ -66,7 +66,7 @@ class MarkovChain(DensityControl):
     def after_step(self, step: Iteration) -> None:
         """Add the noise of the random walk (the paper's update by Langevin dynamics)."""
         opt = self._opt
-        rate = self._gaussians.position_rate * opt.mcmc_noise
+        rate = self._gaussians.position_learning_rate * opt.mcmc_noise
         gate = opt.mcmc_gate_steepness, opt.mcmc_gate_opacity
         self._gaussians.add_noise(rate, *gate, seed=opt.seed, iteration=step.iteration)
 
@@ -74,12 +74,12 @@ class MarkovChain(DensityControl):
         """Move what nobody sees (the paper's relocation of dead Gaussians)."""
         least, parts, seed = self._opt.mcmc_min_opacity, self._opt.mcmc_parts, self._opt.seed
         dead = self._gaussians.relocate(least, parts, seed=seed, iteration=iteration)
-        empty = dead == self._gaussians.total
+        empty = dead == self._gaussians.gaussian_count
         refuse_empty(iteration, empty, "lower --mcmc_opacity_reg", f"with an opacity above {least} in")
 
     def _grow(self, iteration: int) -> None:
         """Grow to `_grown`."""
-        count, opt = self._gaussians.total, self._opt
+        count, opt = self._gaussians.gaussian_count, self._opt
         new = self._grown(count, iteration) - count
         if new > 0:
             self._gaussians.grow(new, opt.mcmc_parts, seed=opt.seed, iteration=iteration)
