@@ -85,19 +85,19 @@ cpp-test:
 	@$(call in_parallel,$(CXX_TEST_OBJECTS))
 	@$(call in_parallel,$(CXX_TESTS),&& TARGET)
 
-# Compiles $< of the submodule $(1); more flags follow.
-compile_test = $(CXX) $(CXX_TEST_FLAGS) -Isubmodules/$(1)/csrc -Isubmodules/common/include -Isubmodules/common/tests $<
+# Compiles for the submodule $(1); sources and more flags follow.
+compile = $(CXX) $(CXX_TEST_FLAGS) -Isubmodules/$(1)/csrc -Isubmodules/common/include -Isubmodules/common/tests
 # The submodule of build/SUBMODULE/..., and its objects.
 submodule = $(firstword $(subst /, ,$(1)))
 objects = $(filter build/$(1)/%,$(CXX_TEST_OBJECTS))
 
 build/%.o: submodules/%.cpp $$(call sources,$$(call submodule,$$*))
 	@mkdir -p $(@D)
-	$(call compile_test,$(call submodule,$*)) -c -o $@
+	$(call compile,$(call submodule,$*)) $< -c -o $@
 
 build/%: submodules/%.cpp $$(call objects,$$(call submodule,$$*)) $$(wildcard submodules/$$(dir $$*)*.h)
 	@mkdir -p $(@D)
-	$(call compile_test,$(call submodule,$*)) $(call objects,$(call submodule,$*)) -o $@
+	$(call compile,$(call submodule,$*)) $< $(call objects,$(call submodule,$*)) -o $@
 
 # CUDA kernels on the CPU: the .cu files, rewritten as C++, instead of a GPU.
 EMULATION := submodules/common/emulation
@@ -106,8 +106,10 @@ build/%/csrc/tests/test_cuda_emulated: submodules/%/csrc/tests/test_cuda_emulate
 	@mkdir -p $(@D)/emulated
 	rm -f $(@D)/emulated/*
 	$(PYTHON) $(EMULATION)/translate.py $(@D)/emulated $(wildcard submodules/$*/csrc/cuda/*.cu*)
-	$(call compile_test,$*) -Wno-unknown-pragmas -I$(@D)/emulated -Isubmodules/$*/csrc/cuda -I$(EMULATION) \
-	    $(@D)/emulated/*.cpp $(EMULATION)/emulation.cpp $(call objects,$*) -o $@
+	printf '%s\n' $< $(EMULATION)/emulation.cpp $(@D)/emulated/*.cpp | xargs -P $(CORES) -I SOURCE sh -c \
+	    '$(call compile,$*) -Wno-unknown-pragmas -I$(@D)/emulated -Isubmodules/$*/csrc/cuda -I$(EMULATION) \
+	    SOURCE -c -o $(@D)/emulated/$$(basename SOURCE).o'
+	$(CXX) $(CXX_TEST_FLAGS) $(@D)/emulated/*.o $(call objects,$*) -o $@
 
 wheels: $(VENV)/.requirements
 	.ci/wheels $(BIN)/python

@@ -159,7 +159,7 @@ def test_a_failed_write_leaves_no_file(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-PROMISES = r"is not a \S+ PLY file \(its header promises .* rows of an element, and it has \d+ bytes\)"
+ANNOUNCED = r"is not a \S+ PLY file \(\S+ (vertices|rows of \w+) announced, file ends after [\d,]+ bytes\)"
 
 
 @pytest.mark.parametrize("count", ["1" + "0" * 40, "4000000000", "+4_000_000_000", "9" * 500])
@@ -169,7 +169,7 @@ def test_a_header_that_promises_more_rows_than_the_file_has(tmp_path, kind, coun
     content = (tmp_path / "a.ply").read_bytes().replace(b"element vertex 2", f"element vertex {count}".encode())
     (tmp_path / "a.ply").write_bytes(content.replace(b"binary_little_endian", kind.encode()))
     for read in (read_model, _loaded, read_splats):
-        with pytest.raises(UserError, match=PROMISES):
+        with pytest.raises(UserError, match=ANNOUNCED):
             read(tmp_path / "a.ply")
 
 
@@ -196,7 +196,7 @@ def test_rows_are_counted_however_the_header_is_written(tmp_path, old, new):
     many = header if "junk" in new else header.replace("vertex 1", "vertex 100000000000")
     path.write_bytes((many.replace(old, new) + "0\n").encode())
     for read in (read_model, _loaded, read_splats, read_point_cloud):
-        with pytest.raises(UserError, match=PROMISES):
+        with pytest.raises(UserError, match=ANNOUNCED):
             read(path)
 
 

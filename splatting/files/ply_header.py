@@ -33,14 +33,16 @@ def read_elements(path: str | os.PathLike) -> PlyData:
     lines = header_lines(path)
     if lines[-1:] != [_END]:
         raise ValueError("there is no end_header in its first MiB")
-    size, least, rows, width = os.path.getsize(path), 0, "0", 1
+    size, least, name, rows, width = os.path.getsize(path), 0, "", "0", 1
     for words in map(str.split, lines):
         if words[:2] == ["format", "ascii"]:
             width = 2  # bytes of a value: a digit and what parts it from the next one
         elif words[:1] == ["element"]:
-            rows = words[-1]
+            name, rows = words[1], words[-1]
         elif words[:1] == ["property"]:
             least += max(int(rows), 0) * width
         if least > size + 1:  # the last line of a text may have no end
-            raise ValueError(f"its header promises {float(rows):.4g} rows of an element, and it has {size} bytes")
+            count = f"{int(rows):,}" if len(rows) < 16 else f"{float(rows):.4g}"
+            what = "vertices" if name == "vertex" else f"rows of {name}"
+            raise ValueError(f"{count} {what} announced, file ends after {size:,} bytes")
     return PlyData.read(os.fspath(path))
