@@ -2,6 +2,7 @@
 
 import copy
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -31,6 +32,20 @@ print("loaded:", *sorted(set(sys.argv[1].split(",")) & (set(sys.modules) - befor
 """
 
 
+TEAMS = """
+import os, sys, threading, time
+os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:2])
+import torch
+import gaussian_renderer
+names = [thread.name for thread in threading.enumerate()]
+torch.zeros(1 << 20).mul_(2)
+end = time.monotonic() + 20
+while len(os.listdir("/proc/self/task")) < 2 + 2 * names.count("idle OpenMP team") and time.monotonic() < end:
+    time.sleep(0.01)
+print(names.count("idle OpenMP team"), len(os.listdir("/proc/self/task")) > 3)
+"""
+
+
 def _train(scene: Path, out: Path, *more: object, iterations: int = 3) -> dict:
     """The last record of the log of a training."""
     train.main(["-s", str(scene), "-m", str(out), "-r", "24", "--iterations", str(iterations), *map(str, more)])
@@ -45,6 +60,17 @@ def _loaded(scene: Path, out: Path, *more: str) -> list[str]:
     )
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()[-1].split()[1:]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="is of GNU's OpenMP")
+@pytest.mark.parametrize(("more", "wanted"), [({}, "1 True"), ({"GOMP_SPINCOUNT": "5"}, "0 False")])
+def test_a_program_that_imports_torch_first_has_more_threads_than_cores_so_that_none_spins_for_long(more, wanted):
+    if len(os.sched_getaffinity(0)) < 2:
+        pytest.skip("has one core, on which torch's threads do not wait for each other")
+    names = {"OMP_NUM_THREADS", "GOMP_SPINCOUNT", "OMP_WAIT_POLICY"}
+    environment = {name: value for name, value in os.environ.items() if name not in names} | more
+    done = subprocess.run([sys.executable, "-c", TEAMS], cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.stdout.strip() == wanted, done.stderr
 
 
 def test_a_training_imports_nothing_that_it_does_not_use(blender_scene, tmp_path):

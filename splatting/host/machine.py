@@ -12,6 +12,7 @@ import subprocess
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import splatting.host.openmp  # noqa: F401  (for programs that imported torch before)
 from splatting.host import torchrun
 
 if TYPE_CHECKING:
