@@ -1,5 +1,6 @@
 """The loss of a render: photometric, and inverse depth where a depth map supervises. Further terms belong here."""
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -11,6 +12,10 @@ from utils.loss_utils import inverse_depth_loss, photometric_loss
 
 if TYPE_CHECKING:
     from splatting.training.run import Run
+
+
+# Of a render's package and the mask of the pixels that count, (1, H, W) bool or None.
+Term = Callable[[dict[str, Any], Tensor | None], Tensor]
 
 
 class Losses(NamedTuple):
@@ -33,7 +38,17 @@ class Objective:
 
     def takes_bands(self, step: Iteration) -> bool:
         """Whether the loss of a step needs of the image no more than each rank's band and what surrounds it."""
-        return step.depth_weight == 0 and step.camera.counts_all_pixels and step.camera.columns is None
+        return not self.terms(step) and step.camera.counts_all_pixels and step.camera.columns is None
+
+    def terms(self, step: Iteration) -> dict[str, Term]:
+        """What a step adds to the photometric loss, weights included, by name."""
+        camera, terms = step.camera, {}
+        if step.depth_weight > 0:
+            terms["depth"] = lambda package, mask: (
+                step.depth_weight
+                * inverse_depth_loss(package["depth"], camera.target_inverse_depth, camera.columns, mask)
+            )
+        return terms
 
     def __call__(self, package: dict[str, Any], step: Iteration) -> Losses:
         """package: of `render`, with `depth` where step.depth_weight is above 0.
@@ -47,12 +62,8 @@ class Objective:
             total, l1 = photometric_loss_by_bands(image, target, weight, *band, clamp)
             return Losses(total, l1, depth=None, mask=None)
         total, l1 = photometric_loss(image, target, weight, mask, camera.columns, clamp)
-        depth = None
-        if step.depth_weight > 0:
-            error = inverse_depth_loss(package["depth"], camera.target_inverse_depth, camera.columns, mask)
-            depth = step.depth_weight * error
-            total = total + depth
-        return Losses(total, l1, depth, mask)
+        further = {name: term(package, mask) for name, term in self.terms(step).items()}
+        return Losses(sum(further.values(), start=total), l1, further.get("depth"), mask)
 
 
 NEWEST = 0.4  # weight of the newest loss in the running mean, as in the reference
