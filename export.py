@@ -29,7 +29,7 @@ from gaussian_renderer.trimming import change_on_views
 from scene.saved_model import find_save, load_saved, read_model
 from scene.scene import Scene
 from splatting.exports.formats import FORMATS, READABLE, Format, format_of, read_splats
-from splatting.exports.in_scene import splats_of
+from splatting.exports.in_scene import load_file, splats_of
 from splatting.exports.splats import (
     Splats,
     drawable,
@@ -54,15 +54,18 @@ def load(args: argparse.Namespace, options: argparse.Namespace, needs_views: boo
 
     options: the model options. UserError if there is nothing to load, or views are wanted of a model without a scene.
     """
+    if needs_views:
+        if not args.model_path:
+            raise UserError(
+                f"--max_splats and pages need training views; give -m of their model beside --ply {args.ply}"
+            )
+        options.images_to_load = 1  # each image is used once or twice
+        smooth = argparse.Namespace(antialiasing=bool(args.antialiasing))
+        scene = load_file(options, args.ply, smooth) if args.ply else load_saved(options, args.iteration)
+        return splats_of(scene.gaussians, smooth.antialiasing), scene
     if args.ply:
-        if needs_views:
-            raise UserError(f"--max_splats and pages need training views, which {args.ply} has not; give a model by -m")
         splats = read_splats(args.ply)
         return replace(splats, antialiasing=splats.antialiasing or bool(args.antialiasing)), None
-    if needs_views:
-        options.images_to_load = 1  # each image is used once or twice
-        scene = load_saved(options, args.iteration)
-        return splats_of(scene.gaussians, args.antialiasing), scene
     _, path = find_save(options.model_path, args.iteration)
     gaussians = read_model(path)
     gaussians.world_offset = tuple(read_model_json(options.model_path).get(OFFSET, (0.0, 0.0, 0.0)))
@@ -81,11 +84,17 @@ def choose(splats: Splats, crop: Sequence[float] | None, min_opacity: float) -> 
 
 @torch.no_grad()
 def thin_out(
-    scene: Scene, keep: np.ndarray, sh_degree: int, count: int, pipe: argparse.Namespace, options: argparse.Namespace
+    scene: Scene,
+    keep: np.ndarray,
+    sh_degree: int,
+    count: int,
+    pipe: argparse.Namespace,
+    options: argparse.Namespace,
+    scored: bool,
 ) -> np.ndarray:
     """The mask `keep` without what matters least to the training views, with `count` Gaussians left; print the loss.
 
-    What matters is the sum of blending weights over all pixels of the training views.
+    What matters is the sum of blending weights over all pixels of the training views. scored: photos show all of it.
     """
     every, cameras = scene.gaussians, scene.getTrainCameras()
     kept = np.flatnonzero(keep)
@@ -97,9 +106,12 @@ def thin_out(
     chosen = most_important(weights, count)
     background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
     views = ScoredViews(pipe, background, options.train_test_exp)
-    change = change_on_views(before, before.part(chosen, sh_degree), cameras, views, scored=True)
-    one, other = change["psnr_before"], change["psnr_after"]
-    print(f"{len(kept)} -> {count} Gaussians: training views {one:.2f} -> {other:.2f} dB ({other - one:+.2f} dB)")
+    loss = "no score, as photos show more than the crop"
+    if scored:
+        change = change_on_views(before, before.part(chosen, sh_degree), cameras, views, scored=True)
+        one, other = change["psnr_before"], change["psnr_after"]
+        loss = f"training views {one:.2f} -> {other:.2f} dB ({other - one:+.2f} dB)"
+    print(f"{len(kept):,} -> {count:,} Gaussians: {loss}; train.py --max_num_splats {count} gives a better one")
     thinned = np.zeros_like(keep)
     thinned[kept[chosen.cpu().numpy()]] = True
     return thinned
@@ -109,20 +121,27 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     """Write the file that the command line asks for. UserError if there is nothing to load or to write."""
     make_path = _path_maker(args.path, entry)
     entry.check(args.to)
+    _refuse_to_replace_a_model(Path(args.to), args.ply)
     splats, scene = load(args, options, needs_views=bool(args.max_splats) or entry.of_scene)
     degree = used_sh_degree(splats) if args.typed_sh_degree is None else min(args.typed_sh_degree, splats.sh_degree)
     keep = choose(splats, args.crop, args.min_opacity)
     if scene is not None and args.max_splats:
-        keep = thin_out(scene, keep, degree, args.max_splats, pipe, options)
+        keep = thin_out(scene, keep, degree, args.max_splats, pipe, options, scored=args.crop is None)
     chosen = tidy(with_sh_degree(selected(splats, keep), degree))
     start = time.perf_counter()
     background = (1.0, 1.0, 1.0) if options.white_background else (0.0, 0.0, 0.0)
     entry.write(args.to, chosen, *((scene.getTrainCameras(), make_path, background) if entry.of_scene else ()))
     size, seconds = Path(args.to).stat().st_size, time.perf_counter() - start
-    what = f"{len(chosen)} of {len(splats)} Gaussians, SH degree {degree}"
+    what = f"{len(chosen):,} of {len(splats):,} Gaussians, SH degree {degree if entry.bands else 0}"
     print(
         f"Wrote {args.to}: {what}, {size / 1e6:.2f} MB ({size / max(len(chosen), 1):.0f} bytes each), {seconds:.1f} s"
     )
+
+
+def _refuse_to_replace_a_model(file: Path, source: str | None) -> None:
+    saved = file.absolute().parent.parent.name == "point_cloud" or (file.parent / "cfg_args").is_file()
+    if saved and file.exists() or (source and file.exists() and file.samefile(source)):
+        raise UserError(f"{file} is a trained model or what it began from; name another file by --to")
 
 
 def _path_maker(path: str | None, entry: Format) -> Callable[[Poses], TimedPath] | None:
@@ -147,9 +166,12 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
     add("--to", required=True, metavar="FILE", help=f"file to write; its ending is the format. {endings}")
     add("--iteration", type=int, default=-1, help="saved iteration to write (default: -1, the last)")
     add(
-        "--ply", metavar="FILE", help=f"write this model, of any tool, instead of one of -m: {READABLE} (default: none)"
+        "--ply",
+        metavar="FILE",
+        help=f"write this model, of any tool, instead of that of -m: {READABLE} (default: none)",
     )
-    add("--sh_degree", type=int, choices=range(4), metavar="D", help="leave SH bands above D out (default: zero bands)")
+    add("--sh_degree", type=int, choices=range(4), metavar="D",
+        help="leave SH bands above D out (default: those that are zero throughout)")  # fmt: skip
     add("--crop", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
         help="keep the Gaussians with a centre in this box, in the frame of the model (default: keep all)")  # fmt: skip
     add("--min_opacity", type=float, default=0.0, help="leave fainter Gaussians out, 0 to 1 (default: 0)")
@@ -165,15 +187,13 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
 def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Parse the command line; with --ply, no model folder is read. UserError for values out of range."""
     args = parser.parse_args(argv)
-    if args.ply and args.model_path:
-        raise UserError(f"--ply {args.ply} and -m {args.model_path} both name the model to write; leave one out")
     if not 0 <= args.min_opacity <= 1:
         raise UserError(f"--min_opacity must be from 0 to 1, got {args.min_opacity}")
     if args.max_splats < 0:
         raise UserError(f"--max_splats must be 0, no limit, or above, got {args.max_splats}")
     if args.crop and not all(low < high for low, high in zip(args.crop[:3], args.crop[3:], strict=True)):
         raise UserError(f"--crop takes the smaller corner first, x0 y0 z0 x1 y1 z1, got {args.crop}")
-    if not args.ply:
+    if args.model_path or not args.ply:
         return get_combined_args(parser, argv)
     args.typed_sh_degree = args.sh_degree
     return args

@@ -23,6 +23,7 @@ from fused_ssim import fused_ssim
 from tqdm import tqdm
 
 from arguments import OptionParser, read_cfg_args
+from splatting.evaluation.renders import INCOMPLETE
 from splatting.files.image_files import UNREADABLE, open_render
 from splatting.files.json_files import read_json, write_json
 from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, PerceptualDistance
@@ -78,6 +79,8 @@ def find_pairs(model: Path) -> dict[str, list[Pair]]:
 
 def _pairs_of(method: Path) -> list[Pair]:
     names = {}
+    if (method / INCOMPLETE).is_file():
+        raise UserError(f"rendering of {method} was interrupted; run render.py again")
     for side in ("renders", "gt"):
         folder = method / side
         if not folder.is_dir():

@@ -37,7 +37,7 @@ from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
 from scene.scene import Scene
 from splatting.camera_paths.render_path import add_path_options, path_request, render_path
-from splatting.evaluation.renders import TIMES, summarise_times
+from splatting.evaluation.renders import INCOMPLETE, TIMES, summarise_times
 from splatting.exports.in_scene import load_file
 from splatting.files.image_files import remove_leftovers, save_png, write_plane
 from splatting.files.json_files import write_json
@@ -60,19 +60,18 @@ def write_views(
     """
     scored = ScoredViews(pipe, background, train_test_exp)
     for side in ("renders", "gt"):
-        remove_leftovers(folder / side, len(views))
         if views:
             mkdir_p(folder / side)
+            (folder / INCOMPLETE).touch()
+        remove_leftovers(folder / side, len(views))
     remove_leftovers(folder / "masks", 0)  # some views may have none
     for plane in PLANES:
         remove_leftovers(folder / plane, len(views) if plane in planes else 0)
-    if not views:
-        return []
     seconds = []
     for view in {(view.image_width, view.image_height): view for view in views}.values():
         # The first call of a size also pays for allocations and caches.
         scored.whole(view, gaussians)
-    for index, view in enumerate(tqdm(views, desc=f"Rendering {folder.parent.name}", unit="view")):
+    for index, view in enumerate(tqdm(views, desc=f"Rendering {folder.parent.name}", unit="view", disable=not views)):
         _wait(background.device)
         start = time.perf_counter()
         image = scored.whole(view, gaussians)
@@ -87,6 +86,7 @@ def write_views(
         if (mask := scored.mask(view)) is not None:  # white where pixels count
             with atomic_write(folder / "masks" / f"{index:05d}.png") as temporary:
                 Image.fromarray(mask[0].to(torch.uint8).mul(255).cpu().numpy()).save(temporary)
+    (folder / INCOMPLETE).unlink(missing_ok=True)
     return seconds
 
 

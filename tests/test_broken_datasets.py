@@ -135,6 +135,11 @@ def _emptied(scene: Path) -> None:
     scene.mkdir()
 
 
+def _model(scene: Path) -> None:
+    _emptied(scene)
+    (scene / "cfg_args").touch()
+
+
 def _no_model(scene: Path) -> None:
     for path in (scene / SPARSE).iterdir():
         path.unlink()
@@ -186,8 +191,12 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_given(images="images_4"), "there is no folder SCENE/images_4,.*-i$"),
         (_given(init_pcd_path="SCENE/dense.ply"), "no point cloud SCENE/dense.ply"),
         (_emptied, "SCENE is not a scene: .*found nothing"),
+        (_model, "SCENE is not a scene: .*found cfg_args; it is a model that train.py wrote: give it as -m"),
         (_moved, "not a scene: .*found garden; give -s a scene in it: SCENE/garden$"),
-        (_gone("sparse"), r"looked for the folder sparse .*found images;.* run python convert.py -s SCENE first$"),
+        (
+            _gone("sparse"),
+            r"looked for the folder sparse .*found images;.* run \S*python\S* convert.py -s SCENE first$",
+        ),
         (_gone("images"), "there is no folder SCENE/images,.*-i"),
         (
             lambda scene: [path.unlink() for path in (scene / SPARSE).iterdir()] and {},

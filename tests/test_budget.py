@@ -400,6 +400,11 @@ def test_a_start_above_the_cap_shrinks_to_it(colmap_scene, tmp_path, counts):
     assert numbers[0] == 300 and numbers == sorted(numbers, reverse=True) and numbers[-1] == 100
 
 
+def test_adc_tells_of_a_start_above_the_cap(colmap_scene, tmp_path, capsys):
+    _train(colmap_scene, tmp_path / "out", "--max_num_splats", 100, "--strategy", "adc")
+    assert "the start has 300 Gaussians, more than --max_num_splats 100; adc adds none" in capsys.readouterr().err
+
+
 def test_a_scene_with_nothing_to_densify(colmap_scene, tmp_path, counts):
     """Only a corner counts, to which no Gaussian reaches: none draws an error, so none is split, and none is lost."""
     for path in (colmap_scene / "images").rglob("*.png"):
@@ -458,9 +463,8 @@ def test_a_number_out_of_reach_is_told(colmap_scene, tmp_path, capsys):
 
     window = "--densify_from_iter", 10, "--densification_interval", 20, "--max_num_splats"
     assert said(*window, 2000, "--densify_until_iter", 100) == ""
-    assert "as --densify_until_iter 300 is not before the end; lower it" in said(
-        *window, 2000, "--densify_until_iter", 300
-    )
+    told = said(*window, 2000, "--densify_until_iter", 300)
+    assert "as --densify_until_iter 300 is not before the end; give 80" in told
     # 300 Gaussians double in 20, 40, 60 and 80, but not in 100.
     told = said(*window, 10_000, "--densify_until_iter", 100)
     assert "budget gets to 4,800 of 10,000 Gaussians at the most, as they at most double each time" in told

@@ -153,7 +153,7 @@ def _wrong_files(folder) -> dict[str, str]:
     return {
         "folder": "is a folder; give the file",
         "point_cloud.ply": "is a PLY",
-        "absent": "no checkpoint",
+        "absent": "absent; give one of chkpnt5.pth",
         "text": "chkpntN.pth",
         "empty": "chkpntN.pth",
         "cut": "chkpntN.pth",
@@ -169,6 +169,7 @@ def _wrong_files(folder) -> dict[str, str]:
 
 def test_wrong_files_end_in_a_sentence_and_run_nothing(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "chkpnt5.pth").touch()
     for name, words in _wrong_files(tmp_path).items():
         with pytest.raises(UserError) as caught:
             load_checkpoint(tmp_path / name)

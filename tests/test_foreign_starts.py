@@ -19,7 +19,7 @@ from gaussian_renderer.blending import blending_weights, most_important
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.ply import read_ply
 from scene.readers.point_cloud import read_point_cloud
-from scene.saved_model import load_saved, read_model
+from scene.saved_model import find_save, load_saved, read_model
 from splatting.camera_paths.keyframes import CameraPath, Keyframe
 from splatting.exports.formats import format_of, is_point_cloud, read_splats
 from splatting.exports.in_scene import model_of, splats_of
@@ -168,12 +168,29 @@ def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
     best = part.part(most_important(blending_weights(part, scene.getTrainCameras(), args[2]), 100), 3)
     np.testing.assert_allclose(read_splats(target).means, best.get_xyz.detach().numpy())
     assert after > 0 and abs(before - after) < 20
+    for path, at in ((start, start), (None, out / "input.ply"), (None, find_save(str(out), -1)[1])):
+        before = Path(at).read_bytes()
+        words = ("--ply", path) if path else ("-m", out)
+        with pytest.raises(UserError, match="is a trained model or what it began from; name another file by --to"):
+            export.export(*_export_options(*words, "--to", at))
+        assert Path(at).read_bytes() == before
+
+
+def test_a_file_is_thinned_out_by_the_views_of_a_model(tmp_path, colmap_scene, capsys):
+    out, file = tmp_path / "out", tmp_path / "theirs.ply"
+    format_of(file).write(file, splats(300, 1))
+    _train(colmap_scene, out)
+    capsys.readouterr()
+    box = "--crop", -1, -1, -1, 1, 1, 1
+    export.export(*_export_options("-m", out, "--ply", file, "--to", tmp_path / "a.splat", "--max_splats", 50, *box))
+    said = capsys.readouterr().out
+    assert "-> 50 Gaussians: no score, as photos show more than the crop; train.py --max_num_splats 50" in said
+    assert "50 of 300 Gaussians, SH degree 0," in said  # as .splat has no bands
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("--ply a.ply -m out", "both name the model to write"),
         ("--ply a.ply --min_opacity 2", "--min_opacity must be from 0 to 1, got 2.0"),
         ("--ply a.ply --max_splats -1", "--max_splats must be 0"),
         ("--ply a.ply --crop 1 0 0 0 1 1", "--crop takes the smaller corner first"),
@@ -182,7 +199,7 @@ def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
         ("", "no model folder given"),
         ("--ply a.ply --to b.splat --path ellipse", "--path is the animation of a page; leave it out for .sp"),
         ("--ply a.ply --to b.html --path elipse", "--path must be interpolate, ellipse, spiral or a file"),
-        ("--ply a.ply --to b.html", "pages need training views, which a.ply has not"),
+        ("--ply a.ply --to b.html", "pages need training views; give -m of their model"),
         ("--ply a.ply --to b.obj", "the format of b.obj is unknown; end its name with one of .compressed.ply"),
     ],
 )

@@ -14,6 +14,7 @@ from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import metrics
+from splatting.evaluation.renders import INCOMPLETE
 from splatting.files import image_files
 from utils import lpips_utils
 from utils.system_utils import UserError, compute_device, run_cli
@@ -151,6 +152,12 @@ def test_a_model_without_renders_is_named_and_the_others_are_scored(tmp_path, ru
     status, out, err = run("-m", unrendered, good)
     assert status == 2 and f"{good} ours_30 (2 views): SSIM" in out and files_of(good)[0]["ours_30"]["PSNR"] > 0
     assert "no rendered test views in" in err and "unrendered" in err
+
+
+def test_renders_of_an_interrupted_command_are_not_scored(tmp_path, run):
+    (make_model(tmp_path / "model") / "test/ours_30" / INCOMPLETE).touch()
+    status, _, err = run("-m", tmp_path / "model")
+    assert status == 2 and "ours_30 was interrupted; run render.py again" in err
 
 
 def test_images_of_two_folders_as_tensors(model):

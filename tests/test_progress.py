@@ -10,7 +10,7 @@ from splatting.training.schedule import Schedule
 def test_the_number_of_gaussians_is_exact(capsys):
     run = SimpleNamespace(
         losses=LossWatch(), dataset=SimpleNamespace(depths=""), first_iteration=0,
-        schedule=Schedule(20), gaussians=SimpleNamespace(total=123_456), clock=SimpleNamespace(seconds=1.0),
+        schedule=Schedule(20), gaussians=SimpleNamespace(gaussian_count=123_456), clock=SimpleNamespace(seconds=1.0),
         opt=SimpleNamespace(time_budget=0.0),
     )  # fmt: skip
     bar = ProgressBar(run)

@@ -23,7 +23,7 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import attributes
 from scene.gaussians.ply import write_ply
 from scene.saved_model import load_saved
-from splatting.evaluation.renders import summarise_times
+from splatting.evaluation.renders import INCOMPLETE, summarise_times
 from splatting.files.image_files import read_plane, to_bytes, write_plane
 from utils.system_utils import UserError
 
@@ -96,7 +96,11 @@ def test_renders_and_ground_truth_side_by_side_in_the_place_of_earlier_ones(tmp_
         return render.write_views(folder, views[:count], None, Namespace(), torch.zeros(3))
 
     assert write(0) == [] and not folder.parent.exists()
+    with pytest.raises(KeyError):  # as if it was interrupted
+        render.write_views(folder, [view(plain)], None, Namespace(), torch.zeros(3))
+    assert (folder / INCOMPLETE).is_file()
     seconds = write(2)
+    assert not (folder / INCOMPLETE).exists()
     assert len(seconds) == 2 and min(seconds) > 0
     assert names(folder) == ["gt/00000.png", "gt/00001.png", "renders/00000.png", "renders/00001.png"]
     for side, index, image in (("renders", 0, first), ("renders", 1, second), ("gt", 1, composited)):

@@ -16,6 +16,7 @@ from arguments import ModelParams
 from scene.gaussians import ply
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
 from scene.saved_model import find_save, load_saved, read_model
+from splatting.host.start import typed_python
 from splatting.training import loop
 from utils.system_utils import UserError
 
@@ -85,7 +86,8 @@ def test_an_interrupted_training_can_be_looked_at(colmap_scene, tmp_path, monkey
     with pytest.raises(KeyboardInterrupt):
         train_on(colmap_scene, tmp_path, *WORDS, "--iterations", 40)
     said = capfd.readouterr().err
-    assert f"stopped at iteration 20; look at the model with view.py -m {tmp_path}, resume with" in said
+    look = f"stopped at iteration 20; look at the model: {typed_python()} view.py -m {tmp_path}; resume with"
+    assert look in said
     path = tmp_path / "point_cloud/iteration_20/point_cloud.ply"
     assert torch.equal(read_model(path).get_xyz, load_checkpoint(tmp_path / "chkpnt20.pth")[0][1])
     monkeypatch.undo()

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from waiting import LIMIT, wait_for
 
+from splatting.host.start import typed_python
+
 ROOT = Path(__file__).parents[1]
 COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor")
 needs_full = pytest.mark.skipif(not os.path.exists("/dev/full"), reason="the system has no /dev/full")
@@ -103,6 +105,23 @@ def test_train_with_a_closed_output_trains(tmp_path, colmap_scene):
     words = f'"{sys.executable}" train.py -s "{colmap_scene}" -m "{tmp_path / "model"}" --iterations 3 >&- 2>&-'
     assert subprocess.run(["sh", "-c", words], cwd=ROOT, timeout=120).returncode == 0
     assert (tmp_path / "model" / "point_cloud" / "iteration_3" / "point_cloud.ply").exists()
+
+
+def test_a_python_without_torch_is_named():
+    done = subprocess.run([sys.executable, "-S", "train.py", "-s", "x"], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr == (
+        f"error: {sys.executable} has no torch; run make install, then .venv/bin/python train.py -s x\n"
+    )
+
+
+def test_the_python_that_a_person_types(monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "bin x" / "python"))
+    assert typed_python() == f"'{tmp_path}/bin x/python'"
+    monkeypatch.chdir(tmp_path)
+    assert typed_python() == "'bin x/python'"
+    monkeypatch.setattr("shutil.which", {"python": sys.executable}.get)
+    assert typed_python() == "python"
 
 
 def test_letters_that_an_output_does_not_have(tmp_path):

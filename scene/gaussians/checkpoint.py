@@ -252,7 +252,11 @@ def _refuse_other_kinds(path: str | os.PathLike) -> None:
     if os.path.isdir(path):
         raise UserError(f"--start_checkpoint {path} is a folder; give the file chkpntN.pth in it")
     if not os.path.isfile(path):
-        raise UserError(f"no checkpoint {path}; train with --checkpoint_iterations to have one written")
+        others = sorted(file.name for file in Path(path).parent.glob("chkpnt*.pth"))
+        remedy = (
+            f"give one of {', '.join(others)}" if others else "train with --checkpoint_iterations to have one written"
+        )
+        raise UserError(f"no checkpoint {path}; {remedy}")
     with open(path, "rb") as file:
         if file.read(4) in (b"ply\n", b"ply\r"):
             raise UserError(

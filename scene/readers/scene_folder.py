@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 from splatting.files.listing import some
+from splatting.host.start import typed_python
 from utils.system_utils import UserError
 
 COLMAP, BLENDER, NERFSTUDIO = "Colmap", "Blender", "Nerfstudio"
@@ -39,6 +40,8 @@ def _kind(folder: Path) -> str | None:
 
 
 def _remedy(folder: Path) -> str:
+    if (folder / "cfg_args").is_file():
+        return "it is a model that train.py wrote: give it as -m, and its scene as -s"
     below = sorted(path for path in folder.iterdir() if path.is_dir() and _kind(path))
     if below:
         return f"give -s a scene in it: {some(list(map(str, below)))}"
@@ -48,12 +51,10 @@ def _remedy(folder: Path) -> str:
         return "the files of a COLMAP model belong in a folder sparse/0 of the scene, beside the folder images"
     inner = [path for path in (folder / "input", folder / "images", folder) if path.is_dir() and _has_pictures(path)]
     if inner and inner[0].name == "input":
-        return f"photos need camera poses: run python convert.py -s {folder} first"
+        return f"photos need camera poses: run {typed_python()} convert.py -s {folder} first"
     if inner:
-        return (
-            f"photos need camera poses: put them into a folder input of the scene and run python convert.py -s "
-            f"{folder if inner[0] != folder else folder.parent} first"
-        )
+        command = f"{typed_python()} convert.py -s {folder if inner[0] != folder else folder.parent}"
+        return f"photos need camera poses: put them into a folder input of the scene and run {command} first"
     return "give -s the folder that holds one of them"
 
 

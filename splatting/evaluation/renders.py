@@ -20,6 +20,7 @@ from utils.system_utils import UserError, atomic_write
 if TYPE_CHECKING:
     import torch
 
+INCOMPLETE = "incomplete"  # beside them, until the last image of a set is written
 TIMES = "render_times.json"  # beside the folders of images: the time of each view
 GAIN = 5  # amplification of the difference
 GAP = 6  # pixels between images of a sheet

@@ -25,13 +25,15 @@ class Format:
     """A format. ending: of its files' names; what: for people.
 
     write: writes a file of splats, whole or not at all. UserError if it cannot be written. of_scene: it also takes the
-    further arguments of `write_html`. check: raises UserError if a package or program that the file needs is missing.
+    further arguments of `write_html`. bands: it keeps SH bands. check: raises UserError if a package or program that
+    the file needs is missing.
     """
 
     ending: str
     write: Callable[..., None]
     what: str
     of_scene: bool = False
+    bands: bool = True
     check: Callable[[str | os.PathLike], Any] = lambda path: None
 
 
@@ -45,7 +47,7 @@ def _write_html(*arguments: Any) -> None:
 FORMATS = (
     Format(".compressed.ply", write_compressed_ply, "PlayCanvas, SuperSplat"),
     Format(".ply", write_plain_ply, "float32, everything kept"),
-    Format(".splat", write_splat, "antimatter15, 32 bytes a splat, no SH bands"),
+    Format(".splat", write_splat, "antimatter15, 32 bytes a splat, no SH bands", bands=False),
     Format(".spz", write_spz, "Niantic, version 4", check=find_zstandard),
     Format(".sog", write_sog, "PlayCanvas, through splat-transform", check=find_program),
     Format(".glb", write_glb, "glTF with KHR_gaussian_splatting, float32"),

@@ -9,6 +9,8 @@ import gc
 import importlib.util
 import io
 import os
+import shlex
+import shutil
 import signal
 import sys
 import threading
@@ -116,3 +118,11 @@ def _make_context() -> None:
             driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), device)
     except (OSError, AttributeError):  # no driver, or another one of that name
         pass
+
+
+def typed_python() -> str:
+    """How this Python is called from here: python where that is what runs, else its path."""
+    found, own = shutil.which("python"), Path(sys.executable)
+    if found and Path(found).absolute() == own.absolute():
+        return "python"
+    return shlex.quote(str(own.relative_to(Path.cwd()) if own.is_relative_to(Path.cwd()) else own))

@@ -138,12 +138,18 @@ def warn_of_fewer(density: DensityControl, opt: argparse.Namespace, count: int, 
     if schedule.schedule_step(first) >= density.ends > 0:
         return  # a resumed run has no say in it any more
     most = density.most_after(count, first, schedule.ends)
+    if opt.strategy == "adc" and 0 < opt.max_num_splats < count:
+        print(
+            f"warning: the start has {count:,} Gaussians, more than --max_num_splats {opt.max_num_splats}; adc adds "
+            "none, and removes only faint ones; --strategy budget gets down to it",
+            file=sys.stderr,
+        )
     if most >= aim:
         return
     if opt.strategy == "mcmc":
         why = f"--mcmc_growth {opt.mcmc_growth:g} adds too few each time; raise it, or lower --densification_interval"
     elif schedule.length < density.ends:
-        why = f"--densify_until_iter {opt.densify_until_iter} is not before the end; lower it"
+        why = f"--densify_until_iter {opt.densify_until_iter} is not before the end; give {schedule.length // 2}"
     else:
         why = "they at most double each time; lower --densification_interval, or raise --densify_until_iter"
     print(

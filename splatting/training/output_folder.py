@@ -2,14 +2,17 @@
 
 import contextlib
 import os
+import shlex
 import sys
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
+from scene.saved_model import saves_in
 from splatting.distributed.ranks import ranks
 from splatting.files.folders import locked, remove_temporary_files
 from splatting.files.listing import some
+from splatting.host.start import typed_python
 from utils.system_utils import mkdir_p
 
 _INPUTS = ("cfg_args", "model.json", "cameras.json", "input.ply")
@@ -19,6 +22,13 @@ def new_folder() -> str:
     """Name of a new folder under ./output, after OAR_JOB_ID or at random, as in the reference."""
     name = os.environ.get("OAR_JOB_ID") or str(uuid.uuid4())
     return os.path.join("./output/", ranks().shared(name)[:10])
+
+
+def view_command(model_path: str, iteration: int | None = None) -> str:
+    """The command that shows a model; iteration: None, the newest one."""
+    older = iteration is not None and max(saves_in(Path(model_path)), default=iteration) > iteration
+    which = f" --iteration {iteration}" if older else ""
+    return f"{typed_python()} view.py -m {shlex.quote(model_path)}{which}"
 
 
 @contextlib.contextmanager

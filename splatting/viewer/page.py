@@ -15,6 +15,7 @@ from splatting.exports.in_scene import splats_of
 from splatting.exports.ply import write_plain_ply
 from splatting.exports.splats import drawable, selected, tidy
 from splatting.host.interrupt import DeferredInterrupt
+from splatting.host.start import typed_python
 from splatting.viewer import server as servers
 from splatting.viewer.frames import LONGEST, Frames, inside
 from splatting.viewer.legend import Legend
@@ -174,7 +175,8 @@ class Page:
         except UserError as error:
             self._tell(client, "Not saved", str(error))
         else:
-            tqdm.write(as_utf8(f"Saved {file}; its video: render.py -m {folder} --path {file}"), file=sys.stdout)
+            video = f"{typed_python()} render.py -m {folder} --path {file}"
+            tqdm.write(as_utf8(f"Saved {file}; its video: {video}"), file=sys.stdout)
             self._tell(client, "Saved", f"{PATHS}/{file.name}; the terminal shows how to make its video")
 
     def stop(self) -> None:

@@ -20,6 +20,7 @@ from splatting.training.density import default_budget
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses, LossWatch
 from splatting.training.observer import Error, Observer
+from splatting.training.output_folder import view_command
 from splatting.training.run import Run
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.loss_utils import l1_loss
@@ -63,10 +64,10 @@ class ProgressBar(Observer):
         if error is not None:
             return
         run, seconds = self._run, self._run.clock.seconds
-        count = f"{self._done - run.first_iteration:,} iterations in"
         if not run.opt.time_budget:
-            print(f"{count} {seconds:.1f} s")
+            print(f"{self._done - run.first_iteration:,} iterations in {seconds:.1f} s")
             return
+        count = f"{self._done:,} iterations in"  # with those before a resume, as the seconds
         seconds, whole = run.log.seconds_before + seconds, run.log.wall_seconds_before + wall_seconds()
         run.log.tell(f"{count} {seconds:.1f} s (budget {run.opt.time_budget:g} s), {whole:.1f} s in all")
 
@@ -135,9 +136,10 @@ class Summary(Observer):
     def __init__(self, run: Run) -> None:
         self._run = run
         self._psnr: float | None = None
+        self._iteration = run.first_iteration
 
     def measured(self, step: Iteration, losses: Losses) -> None:
-        rows = self._run.rows
+        rows, self._iteration = self._run.rows, step.iteration
         if step.last and rows and rows[-1]["iteration"] == step.iteration:
             self._psnr = rows[-1]["test_psnr"]
 
@@ -146,7 +148,7 @@ class Summary(Observer):
             return
         run = self._run
         scored = "" if self._psnr is None else f"Test PSNR {self._psnr:.2f} dB. "
-        print(f"{scored}Look at the model: python view.py -m {run.scene.model_path}")
+        print(f"{scored}Look at the model: {view_command(run.scene.model_path, self._iteration)}")
 
 
 def training_report(

@@ -13,6 +13,7 @@ from splatting.training.left_out import LeftOut, lines, save_last, saved_line
 from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
 from splatting.training.observers.divergence import DivergenceWatch
+from splatting.training.output_folder import view_command
 from splatting.training.run import Run
 from splatting.training.schedule import DecidedSchedule
 from splatting.training.schedule_file import NAME, write_schedule
@@ -84,8 +85,10 @@ class Checkpoints(Observer):
             if step.stopping:
                 run.scene.save(step.iteration)
         if step.stopping:
-            look = f"stopped at iteration {step.iteration}; look at the model with view.py -m {run.scene.model_path}"
-            tqdm.write(f"{look}, resume with --start_checkpoint {path}", file=sys.stderr)
+            look = f"look at the model: {view_command(run.scene.model_path, step.iteration)}"
+            early = ", worse than a shorter run's at its end" if run.opt.time_budget else ""
+            said = f"stopped at iteration {step.iteration}; {look}{early}; resume with --start_checkpoint {path}"
+            tqdm.write(said, file=sys.stderr)
 
 
 def save_schedule(run: Run, step: Iteration) -> None:

@@ -18,6 +18,7 @@ from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
 from splatting.training.observers.saves import Checkpoints
+from splatting.training.output_folder import view_command
 from splatting.training.run import Run
 from splatting.viewer.page import Page, serve
 from splatting.viewer.server import Address
@@ -129,7 +130,7 @@ class PageObserver(Observer):
             if error is not None and not by_button:
                 self._page.notify("The training has stopped", "Its terminal says why, and how to resume it")
             elif run.launch.viewer_exit:
-                self._page.notify("The training is over", f"See its model by python view.py -m {run.scene.model_path}")
+                self._page.notify("The training is over", f"See its model by {view_command(run.scene.model_path)}")
             else:
                 self._stay("stopped" if by_button else "complete")
         finally:
