@@ -115,6 +115,7 @@ def test_photos_of_another_scene(folder, scene, tmp_path):
         Image.fromarray(rng.integers(0, 255, (90, 120, 3), dtype=np.uint8)).save(photo)
     (problem,) = _problems(folder, other)
     assert "the model or the photos are not those of then -> restore the model and the photos" in problem
+    assert problem.endswith(f"; or give -s {scene}, which it was trained on")
 
 
 GOOD = {

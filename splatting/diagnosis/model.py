@@ -56,6 +56,7 @@ def check_model(model_path: str, iteration: int, source: str | None = None, imag
     """
     try:
         stored = read_stored_options(model_path)
+        trained_on = stored.get("source_path")
         stored |= {"source_path": source} if source is not None else {}
         stored |= {"images": images} if images is not None else {}
         options, scene = _load(model_path, stored, iteration)
@@ -69,6 +70,8 @@ def check_model(model_path: str, iteration: int, source: str | None = None, imag
     if wrong := [*_not_finite(gaussians)] or [*_wrong_sizes(gaussians, extent)]:
         return [*lines, *wrong]
     shapes, (renders, changed) = [_opacities(gaussians), _sizes(gaussians, extent)], _renders(scene, options, stored)
+    if renders.finding and source and trained_on and Path(source).resolve() != Path(trained_on).resolve():
+        renders = renders._replace(remedy=f"{renders.remedy}; or give -s {trained_on}, which it was trained on")
     if changed:  # which explains all else, and the training has no say in it
         return [*lines, *(line for line in shapes if not line.finding), renders]
     return [*lines, *shapes, renders, *check_training(Path(model_path))]
