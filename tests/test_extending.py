@@ -32,7 +32,7 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "inside" / "extending.md"
 CODE = (
     *("arguments", "gaussian_renderer", "splatting", "scene", "utils"),
-    *("train.py", "render.py", "pyproject.toml", "version.txt"),
+    *("train.py", "render.py", "export.py", "pyproject.toml", "version.txt"),
 )
 TESTS = ("conftest.py", "gaussians.py", "synthetic.py", "test_densification.py")
 HOT, COLD, START = 0.9, 0.2, 0.5
@@ -48,7 +48,7 @@ OPTIONS = [
 # The program that runs in the copy: training, resuming, reading and writing a PLY, rendering, and two refusals.
 SCRIPT = """
 import argparse, sys
-import render, train
+import export, render, train
 from arguments import ModelParams
 from scene import Scene
 from scene.gaussian_model import GaussianModel
@@ -61,6 +61,14 @@ train.main(["-s", scene, "-m", resumed, "--start_checkpoint", whole + "/chkpnt30
 gaussians = GaussianModel(3)
 gaussians.load_ply(whole + last)
 gaussians.save_ply(whole + "/again.ply")
+sys.argv = ["export.py", "-m", whole, "--to", whole + "/theirs.ply"]  # which has the paper's attributes alone
+export.main()
+short = [*options, "--iterations", "2", "--save_iterations", "2", "--checkpoint_iterations", "2"]
+train.main(["-s", scene, "-m", whole + "/started", "--init_ply", whole + "/theirs.ply", *short])
+started = GaussianModel(3)
+started.load_ply(whole + "/started/point_cloud/iteration_2/point_cloud.ply")
+assert "temperature" not in open(whole + "/theirs.ply", "rb").read(3000).decode("latin1")
+assert abs(float(started.raw("temperature").mean()) - 0.5) < 0.02  # as in new Gaussians
 for iteration in ("1", "600"):
     sys.argv = ["render.py", "-m", whole, "--iteration", iteration, "--thermal", "--quiet"]
     render.main()

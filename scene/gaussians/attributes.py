@@ -24,13 +24,14 @@ class Attribute(NamedTuple):
 
 
 @cache
-def attributes(sh_degree: int) -> dict[str, Attribute]:
+def attributes(sh_degree: int, further: bool = True) -> dict[str, Attribute]:
     """Attributes by optimiser group, in the order of groups and PLY columns, for a maximal SH degree.
 
-    The six of the paper come first. A further attribute is one more line here. Callers share the table.
+    The six of the paper come first. A further attribute is one more line here. Callers share the table. further: False:
+    the six, which are all that files of other tools have.
     """
     bands = (sh_degree + 1) ** 2 - 1
-    return {
+    table = {
         "xyz": Attribute("_xyz", (3,), ["x", "y", "z"], lambda opt, extent: opt.position_lr_init * extent),
         "f_dc": Attribute("_features_dc", (1, 3), _numbered("f_dc", 3), lambda opt, _: opt.feature_lr),
         "f_rest": Attribute(
@@ -40,6 +41,7 @@ def attributes(sh_degree: int) -> dict[str, Attribute]:
         "scaling": Attribute("_scaling", (3,), _numbered("scale", 3), lambda opt, _: opt.scaling_lr),
         "rotation": Attribute("_rotation", (4,), _numbered("rot", 4), lambda opt, _: opt.rotation_lr),
     }
+    return table if further else {name: table[name] for name in table if name in IN_CHECKPOINT}
 
 
 # Entries 1 to 6 of a checkpoint, in the reference's order. Other attributes follow after its last entry.

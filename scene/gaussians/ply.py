@@ -9,7 +9,7 @@ import torch
 from plyfile import PlyParseError
 from torch import Tensor
 
-from scene.gaussians.attributes import Rows, attributes
+from scene.gaussians.attributes import IN_CHECKPOINT, Rows, attributes
 from scene.gaussians.table import WHOLE, Shards
 from splatting.files.ply_header import read_elements
 from utils.system_utils import UserError, atomic_write, writes_files
@@ -37,7 +37,8 @@ def write_ply(
     header = ["ply", "format binary_little_endian 1.0"]
     header += [f"comment {comment}" for comment in (*offset_comments(world_offset), *comments)]
     header += [f"element vertex {shards.total(count)}"]
-    header += [f"property float {name}" for name in column_names(sh_degree, rows["scaling"].shape[1])]
+    names = column_names(sh_degree, rows["scaling"].shape[1], _has_further(rows))
+    header += [f"property float {name}" for name in names]
     pieces = shards.pieces(count, lambda part: _table(rows, sh_degree, part))
     if not writes_files():
         return deque(pieces, maxlen=0).clear()
@@ -50,15 +51,19 @@ def write_ply(
 
 def _table(rows: Rows, sh_degree: int, part: slice) -> Tensor:
     """Some Gaussians (n, columns) as a PLY has them, float32."""
-    parts = [rows[name][part] for name in attributes(sh_degree)]
+    parts = [rows[name][part] for name in attributes(sh_degree, _has_further(rows))]
     parts.insert(1, torch.zeros_like(parts[0]))
     columns = [(values.transpose(1, 2) if values.dim() == 3 else values).flatten(1) for values in parts]
     return torch.cat(columns, dim=1).float()
 
 
-def column_names(sh_degree: int, scales: int = 3) -> list[str]:
+def _has_further(rows: Rows) -> bool:
+    return len(rows) > len(IN_CHECKPOINT)
+
+
+def column_names(sh_degree: int, scales: int = 3, further: bool = True) -> list[str]:
     """The properties of a Gaussian, in the order of the file. scales: 2 for the flat ones of clients' own models."""
-    parts = [attribute.columns for attribute in attributes(sh_degree).values()]
+    parts = [attribute.columns for attribute in attributes(sh_degree, further).values()]
     names = [name for columns in (parts[0], _NORMALS, *parts[1:]) for name in columns]
     return [name for name in names if not name.startswith("scale_") or int(name.removeprefix("scale_")) < scales]
 
@@ -79,10 +84,11 @@ def _degree(names: Iterable[str]) -> int | None:
 
 
 @np.errstate(over="ignore")  # doubles that float32 cannot hold become Inf
-def read_ply(path: str | os.PathLike, sh_degree: int | None, flat: bool = False) -> Rows:
+def read_ply(path: str | os.PathLike, sh_degree: int | None, flat: bool = False, further: bool = True) -> Rows:
     """Read a Gaussian PLY of any tool: any order of properties, scalar type and encoding.
 
-    flat: take Gaussians of two scales, too, for models that draw them by other code.
+    flat: take Gaussians of two scales, too, for models that draw them by other code. further: read attributes beyond
+    the paper's six, too.
 
     SH bands that the file lacks are zero: the last save of a training leaves out those that are. sh_degree: None: that
     of the file. UserError when the file is missing or unreadable, lacks properties (the message names them), or has a
@@ -93,7 +99,7 @@ def read_ply(path: str | os.PathLike, sh_degree: int | None, flat: bool = False)
     degree = _degree(present)
     if sh_degree is None:
         sh_degree = 3 if degree is None else degree
-    table = attributes(sh_degree if degree is None else min(degree, sh_degree))
+    table = attributes(sh_degree if degree is None else min(degree, sh_degree), further)
     parts = {name: attribute.columns for name, attribute in table.items()}
     wanted = parts["f_rest"]
     rest = sum(name.startswith("f_rest_") for name in present)

@@ -113,7 +113,7 @@ def read_plain_ply(path: str | os.PathLike) -> Splats:
 
     Doubles far from their origin, as of scene/export_world.py, become relative to one that is near them.
     """
-    columns = {name: values.numpy() for name, values in read_ply(path, None).items()}
+    columns = {name: values.numpy() for name, values in read_ply(path, None, further=False).items()}
     offset = stored_offset(path)
     if any(line.split() in (["property", "double", "x"], ["property", "float64", "x"]) for line in header_lines(path)):
         columns["xyz"], origin = _near_origin(path, columns["xyz"])
