@@ -94,8 +94,8 @@ def test_the_kernels_are_timed(monkeypatch, capsys):
 def test_tables_of_a_gpu_have_stages_memory_and_marks(monkeypatch, capsys):
     launched = [("project_kernel", 0.25), ("sort", 0.5), ("blend_kernel", 1.0), ("blend_kernel", 0.125)]
     times = dict.fromkeys(("forward", "+ backward", "step"), GpuTime(0.82, launched))
-    monkeypatch.setattr(rasterizer, "measure_on_gpu", lambda name: rasterizer.Measured(name, times, [20.0, 70.0]))
-    rasterizer.print_gpu(["S", "M"])
+    monkeypatch.setattr(rasterizer, "measure_on_gpu", lambda name, _: rasterizer.Measured(name, times, [20.0, 70.0]))
+    rasterizer.print_gpu(["S", "M"], "morton")
     said = capsys.readouterr().out
     assert ["blend", "1.125", "1.125"] in _rows(said, "blend ") and ["bin", "0.500", "0.500"] in _rows(said, "bin ")
     assert _rows(said, "S ") == [

@@ -13,6 +13,7 @@ import torch
 from gaussians import pipeline
 from PIL import Image
 from plyfile import PlyData, PlyElement
+from scipy.spatial import KDTree
 from simple_knn._C import distCUDA2
 from synthetic import FakeGaussians, make_colmap_scene
 
@@ -294,9 +295,11 @@ def test_export_in_the_scenes_own_coordinates(surveyed, tmp_path, monkeypatch):
     for name in model.dtype.names:
         distance = dict(zip("xyz", UTM, strict=True)).get(name, 0.0)
         np.testing.assert_array_equal(exported[name], model[name].astype(exported.dtype[name]) + distance)
-    wanted = [point.xyz for _, point in sorted(pycolmap.Reconstruction(scene / "sparse" / "0").points3D.items())]
+    points = np.stack([point.xyz for point in pycolmap.Reconstruction(scene / "sparse" / "0").points3D.values()])
     found = np.stack([exported[name] for name in "xyz"], axis=1)
-    np.testing.assert_allclose(found, wanted, rtol=0, atol=0.1)  # five steps of training away
+    distances, nearest = KDTree(found).query(points)
+    assert len(found) == len(points) and len(set(nearest)) > 0.9 * len(found)
+    assert distances.max() < 0.1  # five steps of training away
     monkeypatch.setattr(sys, "argv", ["export_world", str(out), str(_ply(out, 5))])
     with pytest.raises(UserError, match="is the model itself"):
         export_world.main()

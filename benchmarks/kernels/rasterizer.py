@@ -2,6 +2,7 @@
 
     python -m benchmarks.kernels.rasterizer                  # on the GPU if there is one and the build has CUDA
     python -m benchmarks.kernels.rasterizer --device cpu
+    python -m benchmarks.kernels.rasterizer --order morton   # rows as trainings keep them; default: at random
 
 Milliseconds are medians. An instance is a splat in a tile. Processed instances are those that the backward reads: in
 each tile, those up to the last one that a pixel of the tile blends. A GPU's tables also have peak memory, and stages
@@ -26,7 +27,7 @@ from benchmarks.harness.measuring import (
     peak_mib,
     print_table,
 )
-from benchmarks.workloads.splat_scenes import CPU_WORKLOADS, GPU_WORKLOADS, SplatScene, frustum
+from benchmarks.workloads.splat_scenes import CPU_WORKLOADS, GPU_WORKLOADS, ORDERS, SplatScene, frustum
 from utils.system_utils import UserError, run_cli
 
 CPU_STAGES = ("project", "bin", "blend", "blend_rows", "rows_vjp")
@@ -73,12 +74,12 @@ def measure_on_cpu(scene: SplatScene, repeats: int) -> dict[str, float]:
     return result | {"instances": len(stages.instances), "processed": stages.processed}
 
 
-def print_cpu(names: list[str], thread_counts: list[int], repeats: int) -> None:
+def print_cpu(names: list[str], order: str, thread_counts: list[int], repeats: int) -> None:
     """Print times and rates. Evaluations: processed instances x 256 pixels."""
     header = ["splats, image, sigma", "threads", "forward", "+ backward", *CPU_STAGES, "instances", "processed"]
     rows = []
     for n, width, height, sigma in (CPU_WORKLOADS[name] for name in names):
-        scene = frustum(n, width, height, sigma)
+        scene = ORDERS[order](frustum(n, width, height, sigma))
         for threads in dict.fromkeys(thread_counts):
             torch.set_num_threads(threads)
             found = measure_on_cpu(scene, repeats)
@@ -103,9 +104,9 @@ class Measured:
         return by_stage(self.times["step"].launched)
 
 
-def measure_on_gpu(name: str) -> Measured:
+def measure_on_gpu(name: str, order: str) -> Measured:
     """Measure a workload by name."""
-    calls = Calls(frustum(*GPU_WORKLOADS[name], device="cuda"))
+    calls = Calls(ORDERS[order](frustum(*GPU_WORKLOADS[name], device="cuda")))
     # Memory first: Adam's averages would not count, but the memory that they leave in the pool could.
     memory = [peak_mib(run, calls.clear) for run in (calls.forward, calls.with_backward)]
     times = {step: gpu_time(run) for step, run in calls.steps().items()}
@@ -114,9 +115,9 @@ def measure_on_gpu(name: str) -> Measured:
     return Measured(name, times, memory)
 
 
-def print_gpu(names: list[str]) -> None:
+def print_gpu(names: list[str], order: str) -> None:
     """Measure the workloads and print every table."""
-    found = [measure_on_gpu(name) for name in names]
+    found = [measure_on_gpu(name, order) for name in names]
     for workload in found:
         print(f"\nKernels of a step in order, {workload.name}")
         print_table(["stage", "kernel", "ms"], [[stage, name, f"{ms:.4f}"] for stage, name, ms in workload.kernels()])
@@ -155,6 +156,7 @@ def main() -> None:
     add = parser.add_argument
     add_device(parser)
     add("--workloads", nargs="+", help=f"CPU: of {', '.join(CPU_WORKLOADS)}; GPU: of {', '.join(GPU_WORKLOADS)}")
+    add("--order", choices=list(ORDERS), default="random", help="of the rows (default: random, as drawn)")
     add("--threads", type=int, nargs="+", default=[1, torch.get_num_threads()], help="CPU: numbers of threads to use")
     add("--repeats", type=int, default=9, help="CPU: number of timed calls (default: 9)")
     args = parser.parse_args()
@@ -163,11 +165,11 @@ def main() -> None:
     names = args.workloads or list(known)
     if unknown := [name for name in names if name not in known]:
         raise UserError(f"--workloads {unknown[0]}: on this device there are {', '.join(known)}")
-    print(describe(device))
+    print(f"{describe(device)}, rows: {args.order}")
     if device == "cuda":
-        print_gpu(names)
+        print_gpu(names, args.order)
     else:
-        print_cpu(names, args.threads, args.repeats)
+        print_cpu(names, args.order, args.threads, args.repeats)
 
 
 if __name__ == "__main__":

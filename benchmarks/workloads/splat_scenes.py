@@ -1,11 +1,13 @@
 """Seeded scenes of Gaussians and cameras for tests and benchmarks, with raw parameters as in training."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings
 from torch import Tensor
+
+from scene.gaussians.morton import morton_codes
 
 PARAMETERS = ("means", "opacities", "scales", "rotations", "sh_dc", "sh_rest")
 FOV = math.radians(60)
@@ -136,6 +138,15 @@ def frustum(
     y = (2 * draw.uniform(n) - 1) * 1.02 * (height / (2 * focal)) * z
     size = torch.log(sigma_px * z / focal) + 0.8 * draw.normal(n)
     return SplatScene({"means": torch.stack([x, y, z], -1)} | draw.appearance(size), width, height)
+
+
+def in_morton_order(scene: SplatScene) -> SplatScene:
+    """Sort the rows as trainings do."""
+    order = morton_codes(scene.parameters["means"], 1.0).argsort(stable=True)
+    return replace(scene, parameters={name: rows[order] for name, rows in scene.parameters.items()})
+
+
+ORDERS = {"random": lambda scene: scene, "morton": in_morton_order}
 
 
 def ordinary(n: int = 2000, width: int = 203, height: int = 117) -> SplatScene:

@@ -93,7 +93,7 @@ class GaussianTable:
 
     def permute(self, order: Tensor) -> None:
         """Put the rows, with the statistics, into an order (N,) int64: row i becomes what row order[i] was."""
-        self.change(lambda values: values.index_select(0, order), self.row_groups())
+        self.change(lambda values: _permuted(values, order), self.row_groups())
 
     def change(self, change: Change, groups: Iterable[Group]) -> None:
         """Change the rows of groups and of the statistics, one tensor at a time."""
@@ -172,6 +172,18 @@ def _move_up(values: Tensor, indices: Tensor) -> Tensor:
         part = indices[start : start + _CHUNK]
         values[start : start + len(part)] = values.index_select(0, part)  # later parts read rows further down
     return values[: len(indices)]
+
+
+def _permuted(values: Tensor, order: Tensor) -> Tensor:
+    """values[order]; column by column in the memory of `values` itself where there is too little for all of them."""
+    try:
+        return beside(values, values.index_select(0, order))
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        for column in values.view(len(values), -1).unbind(1):
+            column.copy_(column.index_select(0, order))
+        return values
 
 
 def trainable(values: Tensor) -> Tensor:

@@ -112,6 +112,10 @@ class Shards:
         A rank without Gaussians takes no steps, and the last rank has some if any has. Every rank must call it.
         """
 
+    def sort(self, gaussians: Any, codes: Tensor) -> None:
+        """Put all rows into the order of their codes (N,) int64; ties keep theirs. Every rank must call it."""
+        gaussians.table.permute(codes.argsort(stable=True))
+
     def kept(self, indices: Tensor) -> None:
         """Take note of the rows (n,) that were kept."""
 
@@ -178,15 +182,25 @@ class Divided(Shards):
         finally:
             self.keys = None
 
-    @torch.no_grad()
     def _divide_again(self, gaussians: Any) -> None:
-        """Move all that belongs to rows that have changed, one tensor at a time."""
+        if self.ranks.anyone(self.changed):
+            self._move(gaussians, self.keys)
+
+    def sort(self, gaussians: Any, codes: Tensor) -> None:
+        order = codes.argsort(stable=True)
+        gaussians.table.permute(order)
+        self._move(gaussians, codes[order])
+
+    @torch.no_grad()
+    def _move(self, gaussians: Any, keys: Tensor) -> None:
+        """Move all that belongs to rows to the places of their keys (n,), ascending, one tensor at a time."""
         ranks = self.ranks
-        if not ranks.anyone(self.changed):
-            return
-        counts = ranks.numbers(len(self.keys))[:, 0].tolist()
-        # The place of a key: how many keys of all ranks are below it.
-        places = sum(torch.searchsorted(part, self.keys) for part in ranks.gather(self.keys).split(counts))
+        counts = ranks.numbers(len(keys))[:, 0].tolist()
+        # The place of a key: how many keys of all ranks come before it, and of equal ones those of lower ranks.
+        places = torch.arange(len(keys), device=keys.device)
+        for rank, part in enumerate(ranks.gather(keys).split(counts)):
+            if rank != ranks.rank:
+                places = places + torch.searchsorted(part, keys, right=rank < ranks.rank)
         bounds = [bound(rank, sum(counts), ranks.size) for rank in range(ranks.size + 1)]
         moves = Redistribution(ranks, places, bounds)
         self.match(gaussians.optimizer)

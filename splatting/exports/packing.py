@@ -1,10 +1,10 @@
 """Numbers in few bits: what the compressed formats share."""
 
 import numpy as np
+import torch
 
+from scene.gaussians.morton import morton_codes
 from splatting.exports.splats import Splats, base_colors, opacities
-
-_MORTON_BITS = 21  # a coordinate
 
 
 def pack(parts: np.ndarray, *bits: int) -> np.ndarray:
@@ -40,29 +40,9 @@ def rgba_bytes(splats: Splats) -> np.ndarray:
 
 
 def morton_order(points: np.ndarray) -> np.ndarray:
-    """Indices (N,) that put points (N, 3) along a Z-order curve, so that neighbours in a file are near each other."""
-    if not len(points):
-        return np.zeros(0, dtype=np.int64)
-    points = points.astype(np.float64)
-    low, size = points.min(axis=0), np.ptp(points, axis=0)
-    cells = ((points - low) / np.where(size > 0, size, 1) * ((1 << _MORTON_BITS) - 1)).astype(np.uint64)
-    codes = np.zeros(len(points), dtype=np.uint64)
-    for axis in range(3):
-        codes |= _spread(cells[:, axis]) << np.uint64(axis)
-    return np.argsort(codes, kind="stable")
-
-
-def _spread(x: np.ndarray) -> np.ndarray:
-    """21 bits with two zeros between each and the next."""
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        x = (x | (x << np.uint64(shift))) & np.uint64(mask)
-    return x
+    """Indices (N,) that put points (N, 3) along a Morton curve, so that neighbours in a file are near each other."""
+    middle, _, scale = spread(points)
+    return morton_codes(torch.from_numpy(points.astype(np.float64) - middle), scale).argsort(stable=True).numpy()
 
 
 def spread(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:

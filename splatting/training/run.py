@@ -14,6 +14,7 @@ from torch import Tensor
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
+from scene.gaussians.morton import sort_rows
 from scene.spilled_model import SpilledGaussians
 from splatting.deterministic.counter_rng import Stream, uniform
 from splatting.distributed.consistency import agree_on_scene
@@ -135,6 +136,7 @@ class Run:
             else:
                 start_from(first, self.scene, self.gaussians)
             self.gaussians.training_setup(self.opt)
+            sort_rows(self.gaussians)
         self.gaussians.limit_columns()
         if (views := self.schedule.views) > 1:
             self.gaussians.optimizer.set_betas(0.9**views, 0.999**views)

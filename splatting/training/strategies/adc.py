@@ -11,6 +11,7 @@ from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
+from scene.gaussians.morton import sort_rows
 from splatting.training.density import DensityControl, refuse_empty
 from splatting.training.iteration import Iteration
 from splatting.training.schedule import DecidedSchedule
@@ -79,6 +80,7 @@ class AdaptiveDensityControl(DensityControl):
             long_axis=self._opt.split == "long_axis",
         )
         refuse_empty(iteration, self._gaussians.gaussian_count == 0, "raise --opacity_reset_interval")
+        sort_rows(self._gaussians)
 
 
 def of_run(run: "Run") -> AdaptiveDensityControl:

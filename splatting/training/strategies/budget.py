@@ -17,6 +17,7 @@ from torch import Tensor
 from scene.cameras import Camera
 from scene.gaussians import density_rules as rules
 from scene.gaussians.budget import count_after, fade, remove_useless, split_in_two
+from scene.gaussians.morton import sort_rows
 from splatting.deterministic.counter_rng import Stream, permutation
 from splatting.deterministic.portable_math import exp, log
 from splatting.training.density import DensityControl, default_budget, refuse_empty
@@ -63,6 +64,7 @@ class BudgetControl(DensityControl):
             if aim > self._gaussians.gaussian_count:
                 split_in_two(self._gaussians, self._chosen(step, aim - self._gaussians.gaussian_count))
             fade(self._gaussians, self._opt.opacity_decay)
+        sort_rows(self._gaussians)
 
     def most_after(self, count: int, first: int, last: int) -> int:
         for iteration in filter(self.changes, range(first, last)):  # the last iteration takes no step

@@ -14,6 +14,7 @@ from torch import Tensor
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.gaussians.mcmc import NO_PENALTY, Penalty
+from scene.gaussians.morton import sort_rows
 from splatting.training.density import DensityControl, default_budget, refuse_empty
 from splatting.training.iteration import Iteration
 from splatting.training.schedule import DecidedSchedule
@@ -66,6 +67,8 @@ class MarkovChain(DensityControl):
     def after_step(self, step: Iteration) -> None:
         """Add the noise of the random walk (the paper's update by Langevin dynamics)."""
         opt = self._opt
+        if self.changes(step.iteration):
+            sort_rows(self._gaussians)
         rate = self._gaussians.position_learning_rate * opt.mcmc_noise
         gate = opt.mcmc_gate_steepness, opt.mcmc_gate_opacity
         self._gaussians.add_noise(rate, *gate, seed=opt.seed, iteration=step.iteration)
