@@ -124,7 +124,8 @@ class OptimizationParams(OptionTable):
     title = "optimisation"
     # fmt: off
     options = (
-        Option("iterations", 30_000, "training steps, one photo each", "paper", check=within(1, 2**31 - 1)),
+        Option("iterations", 30_000, "training steps, one photo each", "paper", check=within(1, 2**31 - 1),
+               compared=False),
         Option("position_lr_init", 0.00016, origin="paper", check=at_least(0),
             help="learning rate of positions at the start, times the scene extent"),
         Option("position_lr_final", 0.0000016, origin="paper", check=at_least(0),

@@ -18,6 +18,7 @@ from utils.system_utils import UserError, atomic_write
 
 _IN_CFG_ARGS = {option.name: option.default for option in OPTIONS if option.stored == CFG_ARGS}
 _IN_MODEL_JSON = {option.name: option.default for option in OPTIONS if option.stored == MODEL_JSON}
+_OF_TRAINING = {option.name: option.default for option in OPTIONS if not option.stored and option.compared}
 _OF_MODEL = {option.name for option in ModelParams.options if option.stored == MODEL_JSON}
 
 
@@ -75,14 +76,17 @@ def write_model_json(
     """Write `model.json`, what cfg_args has no place for, with sorted keys.
 
     args: options; of those that belong here all are written that it has, but model options only where they differ from
-    their default. world_offset: world coordinates of the origin of the model's frame (scene/readers/world_offset.py);
-    zero writes no entry. more: further entries, which win.
+    their default. The entry `options` has all others that differ from theirs. world_offset: world coordinates of
+    the origin of the model's frame (scene/readers/world_offset.py); zero writes no entry. more: further entries, which
+    win.
     """
     record: dict[str, Any] = {"version": VERSION}
     for name, default in _IN_MODEL_JSON.items():
         value = getattr(args, name, None)
         if value is not None and not (name in _OF_MODEL and value == default):
             record[name] = value
+    others = {name: getattr(args, name, default) for name, default in _OF_TRAINING.items()}
+    record["options"] = {name: value for name, value in others.items() if value != _OF_TRAINING[name]}
     if any(world_offset):
         record[OFFSET] = list(world_offset)
     json_files.write_model_json(model_path, record | more)
@@ -109,6 +113,13 @@ def read_stored_options(model_path: str | os.PathLike) -> dict[str, Value]:
     if record:
         stored |= {name: _IN_MODEL_JSON[name] for name in _OF_MODEL}
     return stored | {name: record[name] for name in _IN_MODEL_JSON if name in record}
+
+
+def read_training_options(model_path: str | os.PathLike) -> dict[str, Value]:
+    """Do as `read_stored_options`, with the options of the training, where they were recorded."""
+    others = read_model_json(model_path).get("options")
+    known = _OF_TRAINING | others if isinstance(others, dict) else {}
+    return known | read_stored_options(model_path)
 
 
 def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> argparse.Namespace:

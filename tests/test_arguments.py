@@ -296,14 +296,15 @@ def test_cfg_args_is_never_executed(tmp_path, text, monkeypatch):
 
 
 def test_model_json_has_what_is_stored_there_with_sorted_keys(tmp_path):
-    write_model_json(tmp_path, _parse("--invert_masks", "--seed", "7"), antialiasing=True)
+    write_model_json(tmp_path, _parse("--invert_masks", "--seed", "7", "--lambda_dssim", "0.5"), antialiasing=True)
     record = read_model_json(tmp_path)
     assert list(record) == sorted(record) and record.pop("version")
     assert record == {
         "antialiasing": True, "invert_masks": True, "optimizer_type": "default", "resolution_schedule": "auto",
-        "seed": 7, "strategy": "auto",
+        "seed": 7, "strategy": "auto", "options": {"lambda_dssim": 0.5},
     }  # fmt: skip
     write_cfg_args(tmp_path, argparse.Namespace())
+    del record["options"]
     assert read_stored_options(tmp_path) == {**MODEL, **record, "masks": "", "mask_meaning": "auto"}
 
 

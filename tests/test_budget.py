@@ -450,7 +450,7 @@ def test_the_default_budget_follows_the_iterations_that_the_clock_allows():
         return control._aim(10_000, int(14_999 / stride))
 
     assert (aim(0, 10.0), aim(0, 2.0), aim(0, 1.0)) == (25 * 3000, 25 * 15_000, 400_000)
-    assert aim(123_456, 10.0) == 123_456  # as it was given
+    assert (aim(123_456, 10.0), aim(20_000, 10.0)) == (25 * 3000, 20_000)  # a given number has the same bound
 
 
 # What is out of reach
@@ -464,19 +464,23 @@ def test_a_number_out_of_reach_is_told(colmap_scene, tmp_path, capsys):
     window = "--densify_from_iter", 10, "--densification_interval", 20, "--max_num_splats"
     assert said(*window, 2000, "--densify_until_iter", 100) == ""
     told = said(*window, 2000, "--densify_until_iter", 300)
-    assert "as --densify_until_iter 300 is not before the end; give 80" in told
+    assert "as --densify_until_iter 300 is not before the end; give --densify_until_iter 80" in told
+    told = said("--max_num_splats", 200, "--densify_from_iter", 160)
+    assert "gets to 300 Gaussians, not to 200, as --densify_from_iter 160 is not before the end; give" in told
+    assert told.endswith("give --densify_from_iter 8 --densify_until_iter 80")
+    assert "it removes none; --strategy budget does" in said(*window, 200, strategy="mcmc")
     # 300 Gaussians double in 20, 40, 60 and 80, but not in 100.
     told = said(*window, 10_000, "--densify_until_iter", 100)
-    assert "budget gets to 4,800 of 10,000 Gaussians at the most, as they at most double each time" in told
+    assert "budget gets to 4,800 Gaussians, not to 10,000, as they at most double each time" in told
     mcmc = "--mcmc_until_iter", 100, "--mcmc_growth", 0.5
     assert said(*mcmc, *window, 1518, strategy="mcmc") == ""
     told = said(*mcmc, *window, 1519, strategy="mcmc")
-    assert "mcmc gets to 1,518 of 1,519 Gaussians at the most, as --mcmc_growth 0.5 adds too few" in told
+    assert "mcmc gets to 1,518 Gaussians, not to 1,519, as --mcmc_growth 0.5 adds too few" in told
     assert said(*mcmc, *window, 0, strategy="mcmc") == said(*window, 301, strategy="adc") == ""
 
 
 def test_what_is_told_to_be_the_most_is_reached(colmap_scene, tmp_path, capsys):
     window = "--densify_from_iter", 10, "--densification_interval", 20, "--densify_until_iter", 300
     _train(colmap_scene, tmp_path, *window, "--max_num_splats", 2000, "--prune_opacity", 0, "--growth_power", 2)
-    (most,) = re.findall("gets to (.*) of 2,000", capsys.readouterr().err)
+    (most,) = re.findall("gets to (.*) Gaussians, not to 2,000", capsys.readouterr().err)
     assert int(most.replace(",", "")) == json.loads((tmp_path / "train_log.json").read_text())[-1]["gaussians"]

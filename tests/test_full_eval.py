@@ -286,6 +286,7 @@ def test_a_signal_reaches_the_training_and_the_next_call_resumes_it(evaluate, se
     assert [run["finished"] for run in evaluate("attic brick")["runs"]] == [True, True]
     checkpoint = str(evaluate.out / "attic" / "chkpnt5.pth")
     assert evaluate.calls("train")[1][-2:] == ["--start_checkpoint", checkpoint]
+    assert not Path(checkpoint).exists() and list(evaluate.report["runs"][0]["iterations"]) == ["40"]
 
 
 def test_a_checkpoint_beyond_the_iterations_is_resumed_where_the_training_decides_its_end(evaluate, any_options):

@@ -169,13 +169,14 @@ def test_changed_options_are_told_in_one_line(colmap_scene, tmp_path, capfd):
     _train(colmap_scene, tmp_path / "same", *options, iterations=3)
     assert _warnings(capfd.readouterr().err) == []
     changed = ["-r", 72, "-w", "--eval", "--antialiasing", "--optimizer_type", "sparse_adam", "--mask_meaning",
-               "transparent", "--seed", 4]  # fmt: skip
+               "transparent", "--seed", 4, "--lambda_dssim", 0.4]  # fmt: skip
     _train(colmap_scene, tmp_path / "changed", *options, *changed, iterations=3)
     (warning,) = _warnings(capfd.readouterr().err)
     assert warning == (
         f"warning: {out} was trained with --resolution 48 no --white_background no --eval --mask_meaning auto "
-        "no --antialiasing --optimizer_type default --seed 3, this run has --resolution 72 --white_background --eval "
-        "--mask_meaning transparent --antialiasing --optimizer_type sparse_adam --seed 4"
+        "no --antialiasing --lambda_dssim 0.2 --optimizer_type default --seed 3, this run has "
+        "--resolution 72 --white_background --eval --mask_meaning transparent "
+        "--antialiasing --lambda_dssim 0.4 --optimizer_type sparse_adam --seed 4"
     )
     # In the same folder cfg_args is overwritten, so the message must come before.
     _train(colmap_scene, out, *options, "-w", iterations=3)

@@ -291,7 +291,7 @@ def test_strategies_grow_within_windows_of_the_schedule(colmap_scene, tmp_path, 
     assert len(counts) == 60
     # Every fifth iteration would be 5 times, so they are more often.
     assert [t for t in range(1, 60) if counts[t] > counts[t - 1]] == [*range(11, 40)]
-    assert strategy == "mcmc" or counts[-1] == 5000
+    assert strategy == "mcmc" or counts[-1] == 25 * 60  # as many as so few iterations can train
 
 
 def test_few_steps_have_larger_rates(colmap_scene, tmp_path, monkeypatch):

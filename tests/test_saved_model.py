@@ -1,6 +1,7 @@
 """Models of a folder: the newest of its PLYs and checkpoints is loaded, and opened once."""
 
 import argparse
+import re
 import shutil
 import signal
 from pathlib import Path
@@ -20,6 +21,7 @@ from splatting.host.start import typed_python
 from splatting.training import loop
 from utils.system_utils import UserError
 
+PAGES = Path(__file__).parents[1] / "docs" / "api"
 WORDS = ("--eval", "-r", 24, "--no_curve", "--disable_viewer", "--test_iterations", -1, "--quiet")
 
 
@@ -100,3 +102,11 @@ def test_an_interrupted_training_can_be_looked_at(colmap_scene, tmp_path, monkey
         monkeypatch.setattr("sys.argv", ["command", "-m", str(tmp_path), "--quiet", *map(str, words)])
         command.main()
     assert list((tmp_path / "test/ours_20/renders").iterdir()) and (tmp_path / "a.splat").stat().st_size > 1000
+
+
+def test_the_example_of_the_renderers_page(colmap_scene, tmp_path, monkeypatch):
+    train_on(colmap_scene, tmp_path / "OUT", *WORDS, "--iterations", 3)
+    (example,) = re.findall(r"```python\n(.*?)```", (PAGES / "renderer.md").read_text(encoding="utf-8"), re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    exec(example, names := {})
+    assert names["image"].shape == (3, 16, 24) and names["image"].max() > 0.1

@@ -122,14 +122,15 @@ def test_doctor_repeats_it(tmp_path):
         assert "cannot be read as a training log" in line.text and line.remedy == "train again to record one"
 
 
-@pytest.mark.parametrize("cap", [0, 300])
+@pytest.mark.parametrize("cap", [0, 340])
 def test_training_says_it_at_its_end(colmap_scene, tmp_path, capsys, monkeypatch, cap):
     monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
     words = ["-s", str(colmap_scene), "-m", str(tmp_path), "--eval", "--iterations", "12", "-r", "32"]
-    train.main([*words, "--disable_viewer", "--max_num_splats", str(cap)])
+    words += ["--densify_from_iter", "4", "--densification_interval", "2", "--densify_grad_threshold", "1e-7"]
+    train.main([*words, "--disable_viewer", "--test_iterations", "2", "12", "--max_num_splats", str(cap)])
     last = json.loads((tmp_path / LOG).read_text())[-1]
     assert last["iterations_planned"] == 12 and last.get("max_num_splats") == (cap or None)
     assert last.get("default_budget") == (None if cap else 100_000)
-    told = "there was no room for more Gaussians (--max_num_splats 300)"
+    told = "there was no room for more Gaussians (--max_num_splats 340)"
     assert (told in capsys.readouterr().out) == (told in " ".join(last["lines"])) == bool(cap)
     assert [told in line.text for line in check_training(Path(tmp_path))] == [True] * bool(cap)

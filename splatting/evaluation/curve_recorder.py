@@ -104,7 +104,8 @@ class CurveDrawer:
             return
         files = [str(self._folder / name) for name in (NAME, FIGURE)]
         with contextlib.suppress(OSError):  # `finish` says so
-            words = [*files, self._folder.name, *self._views]
+            title = "/".join(self._folder.parts[-3 if self._folder.name.startswith("seed_") else -1 :])
+            words = [*files, title, *self._views]
             self._process = subprocess.Popen(
                 [sys.executable, "-X", "utf8", "-m", "splatting.evaluation.figures", *words],
                 cwd=_ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8",

@@ -245,8 +245,8 @@ def check_folders(runs: Sequence[Run]) -> None:
                 )
         elif record.key != run.key:
             raise UserError(
-                f"{run.model} was trained with other options or data ({_differences(record.key, run.key)}); choose "
-                "another --output_path, or remove that folder"
+                f"{run.model} was trained with other options or data ({_differences(record.key, run.key)}); give the "
+                "option set another name, choose another --output_path, or remove that folder"
             )
 
 

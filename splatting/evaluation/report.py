@@ -51,7 +51,8 @@ def make_report(
     them; earlier_commands: those of calls that made other runs.
     """
     runs = comparison.stand_apart(runs)
-    rows = comparison.summarise(runs)
+    scenes = list(comparison.grouped(runs, "scene"))
+    rows = sorted(comparison.summarise(runs), key=lambda row: scenes.index(row["scene"]))
     means = comparison.dataset_means(rows)
     return {
         "dataset_means": means,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -65,13 +66,23 @@ def train(run: Run, machine: dict[str, Any]) -> None:
     if done.status and (left := [name for name, stamp in _checkpoints(run).items() if stamp != there.get(name)]):
         stopped = done.interrupt and done.status in (128 + signal.SIGINT, 128 + signal.SIGTERM)
         latest = max(left, key=_iteration_of)
-        record.note("train_interrupted" if stopped else "train_failed", checkpoint=latest, **spent)
+        stops = {"stops": [*before.get("stops", []), _iteration_of(latest)]} if stopped else {}
+        record.note("train_interrupted" if stopped else "train_failed", checkpoint=latest, **stops, **spent)
     _expect_success("train", command, done)
+    for stop in before.get("stops", ()):
+        _remove_stop(run, stop)
     iterations = trained_iterations(run.model)
     if (run.iterations or max(logged(run.model), default=None)) not in iterations:
         raise StageFailed(Failure("train", command, [f"train.py succeeded, but {run.model} lacks the last iteration"]))
     record.note("train", iterations=iterations, machine=machine, **spent)
     _stop_if_asked(done)
+
+
+def _remove_stop(run: Run, iteration: int) -> None:
+    """Remove what an interrupt has saved, unless that iteration was asked for, too."""
+    if str(iteration) not in run.options:
+        shutil.rmtree(ply_file(run.model, iteration).parent, ignore_errors=True)
+        (run.model / f"chkpnt{iteration}.pth").unlink(missing_ok=True)
 
 
 def _sum(before: dict[str, Any], done: Finished) -> dict[str, float | None]:

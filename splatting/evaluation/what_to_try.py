@@ -72,9 +72,9 @@ def _overfitting(scored: Sequence[Row], strategy: str) -> str | None:
 
 
 def _at_cap(rows: Sequence[Row], scored: Sequence[Row], cap: int | None) -> str | None:
-    """The number of Gaussians reached its cap before the end."""
+    """The number of Gaussians rose to its cap before the end."""
     first = next((row["iteration"] for row in rows if cap and (row["gaussians"] or 0) >= FULL * cap), None)
-    if first is None:
+    if first is None or first == rows[0]["iteration"]:
         return None
     after = [row["test_psnr"] for row in scored if row["iteration"] >= first]
     gained = f"; since then test views changed by {after[-1] - after[0]:+.2f} dB" if len(after) > 1 else ""

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from arguments import OPTIONS, read_model_json, read_stored_options
+from arguments import OPTIONS, read_model_json, read_training_options
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
@@ -126,35 +126,38 @@ def warn_of_late_reset(opt: argparse.Namespace, white_background: bool, schedule
         )
 
 
-def warn_of_fewer(density: DensityControl, opt: argparse.Namespace, count: int, first: int) -> None:
+def warn_of_another_number(density: DensityControl, opt: argparse.Namespace, count: int, first: int) -> None:
     """Warn if a strategy cannot reach its number of Gaussians in time.
 
     count: of Gaussians, now; first: the next iteration. Not known of a run with a time budget.
     """
     schedule, aim = density.schedule, density.most_gaussians
-    # The number that mcmc takes where none is given is a limit, nothing to reach.
-    if schedule.ends is None or (opt.strategy == "mcmc" and not opt.max_num_splats):
-        return
-    if schedule.schedule_step(first) >= density.ends > 0:
+    if schedule.ends is None or schedule.schedule_step(first) >= density.ends > 0:
         return  # a resumed run has no say in it any more
-    most = density.most_after(count, first, schedule.ends)
-    if opt.strategy == "adc" and 0 < opt.max_num_splats < count:
-        print(
-            f"warning: the start has {count:,} Gaussians, more than --max_num_splats {opt.max_num_splats}; adc adds "
-            "none, and removes only faint ones; --strategy budget gets down to it",
-            file=sys.stderr,
-        )
-    if most >= aim:
+    reached = density.most_after(count, first, schedule.ends)
+    too_many, too_late = 0 < opt.max_num_splats < count, opt.densify_from_iter >= schedule.length
+    if opt.strategy == "adc":
+        if too_many:
+            text = f"the start has {count:,} Gaussians, more than --max_num_splats {opt.max_num_splats}; adc adds none"
+            remedy = "" if too_late else "; --strategy budget gets down to it"
+            print(f"warning: {text}, and removes only faint ones{remedy}", file=sys.stderr)
         return
-    if opt.strategy == "mcmc":
+    # The number that mcmc takes where none is given is a limit, nothing to reach.
+    if reached == aim or ((reached > aim or opt.strategy == "mcmc") and not opt.max_num_splats):
+        return
+    if too_late:
+        window = f"--densify_from_iter {schedule.length // 20} --densify_until_iter {schedule.length // 2}"
+        why = f"--densify_from_iter {opt.densify_from_iter} is not before the end; give {window}"
+    elif opt.strategy == "mcmc":
         why = f"--mcmc_growth {opt.mcmc_growth:g} adds too few each time; raise it, or lower --densification_interval"
+        why = "it removes none; --strategy budget does" if too_many else why
     elif schedule.length < density.ends:
-        why = f"--densify_until_iter {opt.densify_until_iter} is not before the end; give {schedule.length // 2}"
+        end = f"--densify_until_iter {opt.densify_until_iter}"
+        why = f"{end} is not before the end; give --densify_until_iter {schedule.length // 2}"
     else:
         why = "they at most double each time; lower --densification_interval, or raise --densify_until_iter"
     print(
-        f"warning: --strategy {opt.strategy} gets to {most:,} of {aim:,} Gaussians at the most, as {why}",
-        file=sys.stderr,
+        f"warning: --strategy {opt.strategy} gets to {reached:,} Gaussians, not to {aim:,}, as {why}", file=sys.stderr
     )
 
 
@@ -251,7 +254,7 @@ def strategy_of(checkpoint: str) -> str:
 def _options_of(folder: Path) -> dict[str, object]:
     """Training options that a folder records; none if they cannot be read, as in a folder without a model."""
     with contextlib.suppress(UserError, OSError):
-        return read_stored_options(folder)
+        return read_training_options(folder)
     return {}
 
 

@@ -112,7 +112,7 @@ class Run:
             opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
         )
         self.density.schedule = self.schedule
-        checks.warn_of_fewer(self.density, opt, self.gaussians.gaussian_count, self.first_iteration + 1)
+        checks.warn_of_another_number(self.density, opt, self.gaussians.gaussian_count, self.first_iteration + 1)
         if capture is None and first is None:
             self.density.started()
         self.group.tell_notes()

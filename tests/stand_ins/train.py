@@ -38,11 +38,18 @@ if (args.s / "full").exists():
     sys.exit(2)
 
 
+def save(iteration: int) -> None:
+    ply = args.m / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
+    ply.parent.mkdir(parents=True, exist_ok=True)
+    ply.write_text(f"ply\nelement vertex {100 * iteration * (1 + args.sh_degree)}\nend_header\n")
+
+
 def stop(signum, frame):
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: sys.exit("two signals: no checkpoint"))
     time.sleep(0.5)
     (args.m / ("chkpnt41.pth" if args.time_budget else "chkpnt5.pth")).write_bytes(b"")
+    save(41 if args.time_budget else 5)
     sys.exit(128 + signum)
 
 
@@ -68,8 +75,6 @@ for t in (end // 4, end // 2, end):
 log = []
 for t in sorted({7000, 30000, end}):
     if t <= end:
-        ply = args.m / "point_cloud" / f"iteration_{t}" / "point_cloud.ply"
-        ply.parent.mkdir(parents=True, exist_ok=True)
-        ply.write_text(f"ply\nelement vertex {100 * t * slowness}\nend_header\n")
+        save(t)
         log.append({"iteration": t, "seconds": t * slowness / 10})
 (args.m / "train_log.json").write_text(json.dumps(log))

@@ -27,6 +27,7 @@ from splatting.training.strategies.error_scores import error_scores
 if TYPE_CHECKING:
     from splatting.training.run import Run
 
+ITERATIONS_A_SCORE = 5  # at least, of a scored view
 _SMALLEST = 1e-300
 
 
@@ -74,7 +75,7 @@ class BudgetControl(DensityControl):
 
     def _aim(self, now: int, iteration: int) -> int:
         """How many Gaussians there are to be after the densification of an iteration, `now` before it."""
-        most = self.most_gaussians if self._opt.max_num_splats else self.most(iteration, self.most_gaussians)
+        most = self.most(iteration, self.most_gaussians)
         return count_after(now, most, self._remaining(iteration), self._opt.growth_power)
 
     def _grows(self, iteration: int) -> bool:
@@ -105,7 +106,10 @@ class BudgetControl(DensityControl):
 
     def _scored_views(self, iteration: int) -> list[Camera]:
         order = permutation(self._opt.seed, Stream.SCORED_VIEWS, iteration, len(self._cameras))
-        return [self._cameras[index] for index in order[: self._opt.score_views]]
+        count = self._opt.score_views
+        if self.schedule.stride(iteration) > 1:  # few iterations, of which scores shall not take the time
+            count = min(count, max(self._interval(iteration) // ITERATIONS_A_SCORE, 1))
+        return [self._cameras[index] for index in order[:count]]
 
 
 def of_run(run: "Run") -> BudgetControl:
