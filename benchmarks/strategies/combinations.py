@@ -30,6 +30,7 @@ STRATEGIES = {
 MIXED = [  # with the second of the seconds
     *("--optimizer_type sparse_adam", "--resolution_schedule none", "--resolution_schedule spectrum", "--antialiasing"),
     *("--random_background", "--spill", "--sh_degree 0", "--plain_step", "--iterations 7000"),
+    *("--max_num_splats 15000", "--max_num_splats 100000"),
     *("--strategy adc --absgrad --split long_axis", "--strategy adc --optimizer_type sparse_adam"),
     *("--strategy adc --iterations 7000", "--strategy mcmc --optimizer_type sparse_adam"),
     "--strategy budget --score_error loss --score_join max",
