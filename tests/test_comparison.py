@@ -171,6 +171,8 @@ def test_fronts_say_who_beats_whom_and_whether_clearly():
         [run_of("near", seed, (seconds, 31.25, 300)) for seed, seconds in enumerate((36, 43.5))],
     )
     assert beaten(*adc, *near) == ({"by": "near", "clearly": False}, "beaten by near, within the spread")
+    better = [run_of("near", seed, (seconds, 35, 300)) for seed, seconds in enumerate((36, 43.5))]
+    assert beaten(*adc, *better)[0] == {"by": "near", "clearly": False}  # its seconds may be more
     assert beaten(adc[0], run_of("near", 0, (39, 31.25, 300))) == ({"by": "near", "clearly": None}, "beaten by near")
     assert beaten(adc[0], adc[0] | {"config": "twin"}) == (None, "on the front")
 

@@ -291,8 +291,9 @@ def fronts(sets: Sets) -> dict[str, Any] | None:
 def _beaten_by(points: Mapping[str, Ends], name: str, cost: str) -> dict[str, Any] | None:
     """Return the set that beats one, by the means: no worse in PSNR and cost, and better in one of them. None: none.
 
-    by: of several, the one with the highest PSNR. clearly: whether one of them is better in PSNR or cost by more than
-    the root of the sum of both squared standard deviations; null where one of these is not known, as with one seed.
+    by: of several, the one with the highest PSNR. clearly: whether one of them is better in PSNR and cost, each by more
+    than the root of the sum of both squared standard deviations, or equal; null where one of these is not known, as
+    with one seed.
     """
     rivals, clear = [], []
     for other, theirs in points.items():
@@ -302,7 +303,8 @@ def _beaten_by(points: Mapping[str, Ends], name: str, cost: str) -> dict[str, An
         rivals.append(other)
         pairs = [(theirs[key]["std"], points[name][key]["std"]) for key in ("PSNR", cost)]
         unknown = any(None in pair for pair in pairs)
-        clear.append(None if unknown else any(g > math.hypot(*pair) for g, pair in zip(gains, pairs, strict=True)))
+        sure = (gain == 0 or gain > math.hypot(*pair) for gain, pair in zip(gains, pairs, strict=True) if not unknown)
+        clear.append(None if unknown else all(sure))
     if not rivals:
         return None
     best = max(rivals, key=lambda other: (points[other]["PSNR"]["mean"], -points[other][cost]["mean"]))
