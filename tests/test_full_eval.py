@@ -208,7 +208,7 @@ def test_only_the_first_scoring_tries_a_download(evaluate):
     """The stand-in scores no LPIPS, as metrics.py without weights."""
     evaluate("attic brick")
     tried = [json.loads((evaluate.out / name / "scored.txt").read_text())[0] for name in ("attic", "brick")]
-    assert tried == [None, "0"] and "LPIPS is missing: metrics.py found no weights" in evaluate.text("md")
+    assert tried == [None, "told"] and "LPIPS is missing: metrics.py found no weights" in evaluate.text("md")
 
 
 def test_other_options_are_not_mixed_in(evaluate):

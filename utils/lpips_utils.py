@@ -28,6 +28,8 @@ _FIRST_LAYER = {"vgg": (64, 3, 3, 3), "alex": (64, 3, 11, 11)}
 MIN_SIDE = {"vgg": 16, "alex": 31}
 _DOWNLOAD_TIMEOUT = 10.0  # seconds without an answer before the network counts as absent
 
+TOLD = "told"  # GS_DOWNLOAD where an earlier command has said what to do
+
 
 class LpipsUnavailable(Exception):
     """LPIPS cannot be computed here; the text names the missing file and its place."""
@@ -141,6 +143,8 @@ def _features_from_cache(net: str) -> dict[str, torch.Tensor]:
     url = models.get_model_weights(NETS[net]).IMAGENET1K_V1.url
     cached = Path(torch.hub.get_dir()) / "checkpoints" / url.rsplit("/", 1)[1]
     if not cached.is_file() and not _download(url, cached):
+        if os.environ.get("GS_DOWNLOAD") == TOLD:
+            raise LpipsUnavailable("its weights are missing, as told above")
         raise LpipsUnavailable(
             f"its weights are missing; put {url} at {cached}, or name the file with --lpips_weights of metrics.py"
         )
@@ -150,10 +154,11 @@ def _features_from_cache(net: str) -> dict[str, torch.Tensor]:
 def _download(url: str, file: Path) -> bool:
     """Download a file whose name ends in the first digits of its SHA-256.
 
-    False if that fails, and at once if it has failed before or the environment forbids it (GS_DOWNLOAD=0).
+    False if that fails, and at once if it has failed before or the environment forbids it (GS_DOWNLOAD=0, or
+    TOLD).
     """
     global _network_failed
-    if _network_failed or os.environ.get("GS_DOWNLOAD") == "0":
+    if _network_failed or os.environ.get("GS_DOWNLOAD") in ("0", TOLD):
         return False
     before = socket.getdefaulttimeout()
     socket.setdefaulttimeout(_DOWNLOAD_TIMEOUT)

@@ -17,6 +17,7 @@ from splatting.evaluation.child import Finished, run_child
 from splatting.evaluation.model_folder import load_scores, logged, ply_file, trained_iterations
 from splatting.evaluation.plan import Record, Run
 from splatting.evaluation.renders import TIMES, ground_truth_digest, view_names
+from utils.lpips_utils import TOLD
 from utils.system_utils import UserError, mkdir_p
 
 _ROOT = Path(__file__).resolve().parents[2]
@@ -193,7 +194,7 @@ def score(run: Run, download: bool = True) -> bool:
     if None in renders.values() or not _scored(model, methods):
         record.forget("metrics")
     before = record.stage("metrics")
-    environment = {} if download else {"GS_DOWNLOAD": "0"}
+    environment = {} if download else {"GS_DOWNLOAD": TOLD}
     _once(
         record, "metrics", "scoring", _script("metrics.py", "-m", str(model)), {"renders": renders}, dict,
         lambda: {"ground_truth_sha256": ground_truth_digest(model / "test" / methods[-1])}, **environment,
