@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from gaussians import model
 from rasterizer_tools import GPU_MARKS
 from trainings import OPTIONS, differences, trained
 
@@ -12,6 +13,7 @@ import train
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from splatting.training.density import DensityControl
+from splatting.training.schedule import Block, Decided, DecidedSchedule
 from splatting.training.steps import captured, speculative
 from splatting.training.strategies.mcmc import MarkovChain
 from utils.system_utils import UserError
@@ -96,6 +98,23 @@ def test_growth_ends_at_the_limit(scene, tmp_path):
     assert counts[0] == [*grown, grown[-1]]
     assert counts[1] == [min(count, 430) for count in counts[0]] and counts[1][-1] == 430
     assert counts[2] == [start] * 6  # nothing is removed
+
+
+@pytest.mark.parametrize("stride", [1.0, 10.0])
+def test_a_start_larger_than_the_clock_can_train_loses_the_faintest(stride):
+    """25 Gaussians for each iteration; without a clock, or with enough of it, nothing is removed."""
+    gaussians = model(200)
+    with torch.no_grad():
+        gaussians._opacity[:, 0] = torch.linspace(2.0, -2.0, 200)
+    opt = argparse.Namespace(
+        mcmc_opacity_reg=0, mcmc_scale_reg=0, mcmc_until_iter=0, max_num_splats=0,
+        mcmc_min_opacity=0.005, mcmc_parts=51, seed=0,
+    )  # fmt: skip
+    control, kept = MarkovChain(gaussians, opt), gaussians._xyz.detach().clone()
+    control.schedule = DecidedSchedule(Decided(60, [Block(30, 0.0, stride / 60, 0.0)], None, 9.0))
+    control._relocate(1)
+    left = 200 if stride == 1.0 else 25 * 6
+    assert len(gaussians) == left and torch.equal(gaussians._xyz, kept[:left])
 
 
 @pytest.mark.parametrize(("growth", "count", "grown"), [(0.05, 5, 6), (0.05, 40, 42), (0.0, 5, 5), (1.0, 30, 45)])

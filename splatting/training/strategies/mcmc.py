@@ -13,6 +13,7 @@ from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
+from scene.gaussians.budget import remove_useless
 from scene.gaussians.mcmc import NO_PENALTY, Penalty
 from scene.gaussians.morton import sort_rows
 from splatting.training.density import DensityControl, default_budget, refuse_empty
@@ -74,8 +75,11 @@ class MarkovChain(DensityControl):
         self._gaussians.add_noise(rate, *gate, seed=opt.seed, iteration=step.iteration)
 
     def _relocate(self, iteration: int) -> None:
-        """Move what nobody sees (the paper's relocation of dead Gaussians)."""
+        """Move what nobody sees (the paper's relocation of dead Gaussians), or remove what the clock cannot train."""
         least, parts, seed = self._opt.mcmc_min_opacity, self._opt.mcmc_parts, self._opt.seed
+        most = self.most(iteration, 0)
+        if most and self._gaussians.gaussian_count > most:
+            remove_useless(self._gaussians, least, most)
         dead = self._gaussians.relocate(least, parts, seed=seed, iteration=iteration)
         empty = dead == self._gaussians.gaussian_count
         refuse_empty(iteration, empty, "lower --mcmc_opacity_reg", f"with an opacity above {least} in")
