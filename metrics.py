@@ -23,7 +23,8 @@ from fused_ssim import fused_ssim
 from tqdm import tqdm
 
 from arguments import OptionParser, read_cfg_args
-from splatting.evaluation.renders import INCOMPLETE
+from splatting.evaluation.model_folder import json_or_none
+from splatting.evaluation.renders import INCOMPLETE, TIMES, model_digest
 from splatting.files.image_files import UNREADABLE, open_render
 from splatting.files.json_files import read_json, write_json
 from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, PerceptualDistance
@@ -81,6 +82,10 @@ def _pairs_of(method: Path) -> list[Pair]:
     names = {}
     if (method / INCOMPLETE).is_file():
         raise UserError(f"rendering of {method} was interrupted; run render.py again")
+    times = json_or_none(method / TIMES)
+    now = model_digest(method.parent.parent, method.name.removeprefix("ours_"))
+    if isinstance(times, dict) and None not in (now, times.get("model_sha256")) and times["model_sha256"] != now:
+        raise UserError(f"{method} shows an earlier model than the one saved now; run render.py again")
     for side in ("renders", "gt"):
         folder = method / side
         if not folder.is_dir():

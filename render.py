@@ -37,7 +37,7 @@ from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
 from scene.scene import Scene
 from splatting.camera_paths.render_path import add_path_options, path_request, render_path
-from splatting.evaluation.renders import INCOMPLETE, TIMES, summarise_times
+from splatting.evaluation.renders import INCOMPLETE, TIMES, model_digest, summarise_times
 from splatting.exports.in_scene import load_file
 from splatting.files.image_files import remove_leftovers, save_png, write_plane
 from splatting.files.json_files import write_json
@@ -124,6 +124,7 @@ def render_set(
     sizes = [(view.image_width, view.image_height) for view in views]
     antialiasing = getattr(pipeline, "antialiasing", False)  # options of 2023 lack it
     times = summarise_times(seconds, sizes, len(gaussians), antialiasing, background.device)
+    times["model_sha256"] = model_digest(Path(model_path), str(iteration))
     write_json(folder / TIMES, times)
     median = f"median {times['median_ms']:.2f} ms a view ({times['fps']:.1f} frames per second)"
     print(f"{name}: {len(views)} views, {median}")

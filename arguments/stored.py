@@ -136,12 +136,12 @@ def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | Non
     typed = {name: value for name, value in vars(args).items() if value is not None and value is not False}
     is_new = getattr(args, "ply", None) and not (Path(args.model_path) / CFG_ARGS).is_file()
     stored = {} if is_new else read_stored_options(args.model_path)
-    other = _other_scene(stored.get("source_path", ""), typed.get("source_path", ""))
+    other = other_scene(stored.get("source_path", ""), typed.get("source_path", ""))
     known = {"typed_sh_degree": typed.get("sh_degree"), "other_scene": other}
     return argparse.Namespace(**vars(args) | stored | typed | known)
 
 
-def _other_scene(trained: str, named: str) -> str:
+def other_scene(trained: str, named: str) -> str:
     """The name of a scene that is not the one trained on; empty if it is, or if that one was moved away."""
     if not named or not os.path.isdir(trained) or os.path.realpath(trained) == os.path.realpath(named):
         return ""

@@ -80,17 +80,37 @@ def test_iterations_that_stay_are_warned_of(colmap_scene, tmp_path, capfd):
 @pytest.mark.parametrize("trained", ["chkpnt5.pth", "point_cloud/iteration_5/point_cloud.ply"])
 def test_what_a_folder_must_hold_to_be_refused(tmp_path, trained):
     """Write a trained model and a cfg_args that names another scene."""
-    write_cfg_args(tmp_path, argparse.Namespace(**MODEL_OPTIONS))
-    check_folder(str(tmp_path), "/other", [5], None, 0)
+
+    def check(source: Path, checkpoint: Path | None = None) -> None:
+        options = MODEL_OPTIONS | {"source_path": str(source), "model_path": str(tmp_path)}
+        check_folder(argparse.Namespace(**options), [5], checkpoint and str(checkpoint), 5 if checkpoint else 0)
+
+    scene, other = tmp_path / "scene", tmp_path / "other"
+    scene.mkdir()
+    write_cfg_args(tmp_path, argparse.Namespace(**MODEL_OPTIONS | {"source_path": str(scene)}))
+    check(other)
     (tmp_path / trained).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / trained).touch()
-    with pytest.raises(UserError, match="holds a model of another scene, /scene"):
-        check_folder(str(tmp_path), "/other", [5], None, 0)
-    check_folder(str(tmp_path), "/scene/../scene/", [5], None, 0)
-    # Resuming in the same folder with a scene that was moved is only reported (report_changes).
-    check_folder(str(tmp_path), "/other", [5], str(tmp_path / "chkpnt5.pth"), 5)
+    with pytest.raises(UserError, match=f"holds a model of another scene, {scene}"):
+        check(other)
+    check(scene / ".." / "scene")
+    # Resuming in the same folder is report_changes' to judge.
+    check(other, tmp_path / "chkpnt5.pth")
+    scene.rename(tmp_path / "moved")
+    check(tmp_path / "moved")
     (tmp_path / "cfg_args").write_text("of another program")
-    check_folder(str(tmp_path), "/other", [5], None, 0)
+    check(other)
+
+
+def test_a_longer_model_keeps_the_options_that_it_was_trained_with(colmap_scene, tmp_path):
+    out = tmp_path / "out"
+    _train(colmap_scene, out, "--eval", "--checkpoint_iterations", 2, iterations=4)
+    before = folder_state(out)
+    for start in ([], ["--start_checkpoint", out / "chkpnt2.pth"]):
+        with pytest.raises(UserError, match="keeps iteration .*4 of .* with --eval, which no --eval would not fit"):
+            _train(colmap_scene, out, *start, iterations=3)
+        assert folder_state(out) == before
+    _train(colmap_scene, out, iterations=4)  # is the one that commands take
 
 
 # From a checkpoint elsewhere
@@ -130,11 +150,11 @@ def test_a_checkpoint_alone_counts_from_zero_and_says_so(whole, colmap_scene, tm
     alone = _elsewhere(whole / "chkpnt20.pth", tmp_path)
     _train(colmap_scene, tmp_path / "new", "--eval", "--start_checkpoint", alone, iterations=40)
     said = capfd.readouterr().err
-    assert f"there is no train_log.json beside {alone}: seconds count from iteration 20, in the curve too" in said
+    assert f"{LOG} beside {alone} is missing, or has nothing up to iteration 20: seconds count from there" in said
     assert all(row["iteration"] > 20 for row in read_curve(tmp_path / "new" / CURVE))
     # The folder that the checkpoint was taken from has the log.
     _train(colmap_scene, whole, "--eval", "--start_checkpoint", alone, iterations=40)
-    assert "there is no train_log" not in capfd.readouterr().err
+    assert "train_log.json beside" not in capfd.readouterr().err
     assert read_curve(whole / CURVE)[0]["iteration"] < 20
 
 
@@ -168,14 +188,14 @@ def test_changed_options_are_told_in_one_line(colmap_scene, tmp_path, capfd):
     options = ["--start_checkpoint", out / "chkpnt2.pth", "--seed", 3]
     _train(colmap_scene, tmp_path / "same", *options, iterations=3)
     assert _warnings(capfd.readouterr().err) == []
-    changed = ["-r", 72, "-w", "--eval", "--antialiasing", "--optimizer_type", "sparse_adam", "--mask_meaning",
+    changed = ["-r", 72, "-w", "--antialiasing", "--optimizer_type", "sparse_adam", "--mask_meaning",
                "transparent", "--seed", 4, "--lambda_dssim", 0.4]  # fmt: skip
     _train(colmap_scene, tmp_path / "changed", *options, *changed, iterations=3)
     (warning,) = _warnings(capfd.readouterr().err)
     assert warning == (
-        f"warning: {out} was trained with --resolution 48 no --white_background no --eval --mask_meaning auto "
+        f"warning: {out} was trained with --resolution 48 no --white_background --mask_meaning auto "
         "no --antialiasing --lambda_dssim 0.2 --optimizer_type default --seed 3, this run has "
-        "--resolution 72 --white_background --eval --mask_meaning transparent "
+        "--resolution 72 --white_background --mask_meaning transparent "
         "--antialiasing --lambda_dssim 0.4 --optimizer_type sparse_adam --seed 4"
     )
     # In the same folder cfg_args is overwritten, so the message must come before.
@@ -183,10 +203,22 @@ def test_changed_options_are_told_in_one_line(colmap_scene, tmp_path, capfd):
     assert len(_warnings(capfd.readouterr().err)) == 1
 
 
-def test_another_scene_is_told(whole, colmap_scene, tmp_path, capfd):
+def test_photos_that_were_trained_on_are_not_held_out_by_resuming(colmap_scene, tmp_path, capfd):
+    out = tmp_path / "out"
+    _train(colmap_scene, out, "--checkpoint_iterations", 2, iterations=3)
+    with pytest.raises(UserError, match="was trained on all photos, so --eval can hold out none that it has not seen"):
+        _train(colmap_scene, tmp_path / "new", "--eval", "--start_checkpoint", out / "chkpnt2.pth", iterations=3)
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_checkpoint_of_another_scene_is_refused_and_one_of_a_moved_scene_told(whole, colmap_scene, tmp_path, capfd):
+    other = shutil.copytree(colmap_scene, tmp_path / "other")
+    start = "--eval", "--start_checkpoint", whole / "chkpnt20.pth"
+    with pytest.raises(UserError, match=f"chkpnt20.pth is of another scene, {colmap_scene}; resume it with that one"):
+        _train(other, tmp_path / "new", *start, iterations=40)
     moved = colmap_scene.rename(tmp_path / "moved_scene")
     capfd.readouterr()
-    _train(moved, whole, "--eval", "--start_checkpoint", whole / "chkpnt20.pth", iterations=40)
+    _train(moved, whole, *start, iterations=40)
     (warning,) = _warnings(capfd.readouterr().err)
     assert f"trained with --source_path {colmap_scene}, this run has --source_path {moved}" in warning
 

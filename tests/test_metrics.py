@@ -1,5 +1,6 @@
 """metrics.py: numbers against independent code, files by contract, errors. LPIPS itself: test_lpips.py."""
 
+import hashlib
 import json
 import math
 import shutil
@@ -109,6 +110,21 @@ def test_ssim_is_scikit_images_inside_and_zero_padded_at_the_border():
     _, full = structural_similarity(*padded, **options)
     assert metrics.ssim(render, truth) == pytest.approx(full[5:-5, 5:-5].mean(), abs=1e-9)
     assert metrics.ssim(picture(1, 5, 7), picture(1, 5, 7)) == pytest.approx(1, abs=1e-12)  # below the window
+
+
+def test_renders_of_an_earlier_model_are_refused(model, run):
+    ply = model / "point_cloud/iteration_30/point_cloud.ply"
+    ply.parent.mkdir(parents=True)
+    ply.write_bytes(b"now")
+    times = model / "test/ours_30/render_times.json"
+    for digest, status in (
+        (None, 0),
+        (hashlib.sha256(b"now").hexdigest(), 0),
+        (hashlib.sha256(b"then").hexdigest(), 2),
+    ):
+        times.write_text(json.dumps({"model_sha256": digest}))
+        got, _, error = run("-m", model)
+        assert got == status and ("shows an earlier model than the one saved now; run render.py" in error) == (got == 2)
 
 
 def test_files_by_contract_and_lpips_scored_before_is_kept(model, lpips, run, monkeypatch):

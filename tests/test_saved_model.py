@@ -88,8 +88,8 @@ def test_an_interrupted_training_can_be_looked_at(colmap_scene, tmp_path, monkey
     with pytest.raises(KeyboardInterrupt):
         train_on(colmap_scene, tmp_path, *WORDS, "--iterations", 40)
     said = capfd.readouterr().err
-    look = f"stopped at iteration 20; look at the model: {typed_python()} view.py -m {tmp_path}; resume with"
-    assert look in said
+    look = f"Stopped at iteration 20\nLook at the model: {typed_python()} view.py -m {tmp_path}\n"
+    assert f"{look}Resume by the same command with --start_checkpoint {tmp_path / 'chkpnt20.pth'}" in said
     path = tmp_path / "point_cloud/iteration_20/point_cloud.ply"
     assert torch.equal(read_model(path).get_xyz, load_checkpoint(tmp_path / "chkpnt20.pth")[0][1])
     monkeypatch.undo()

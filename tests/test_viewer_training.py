@@ -182,7 +182,7 @@ def test_stop_saves_a_checkpoint_that_can_be_resumed(colmap_scene, tmp_path, mon
     with pytest.raises(KeyboardInterrupt):
         _train(colmap_scene, tmp_path / "out", "--no_curve")
     assert load_checkpoint(str(tmp_path / "out/chkpnt33.pth"), "cpu")[1] == 33
-    assert "resume with --start_checkpoint" in capfd.readouterr().err
+    assert "with --start_checkpoint" in capfd.readouterr().err
     monkeypatch.undo()
     monkeypatch.setattr(sys, "stdout", sys.stdout)
     resumed = _train(colmap_scene, tmp_path / "out", "--start_checkpoint", tmp_path / "out/chkpnt33.pth", viewer=False)

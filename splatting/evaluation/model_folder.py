@@ -26,7 +26,7 @@ def json_or_none(path: Path) -> Any | None:
         return None
 
 
-def ply_file(model: Path, iteration: int) -> Path:
+def ply_file(model: Path, iteration: int | str) -> Path:
     """Return the path of a saved iteration's Gaussians."""
     return model / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
 

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from splatting.evaluation.figures import printable
-from splatting.evaluation.model_folder import json_or_none, load_scores
+from splatting.evaluation.model_folder import json_or_none, load_scores, ply_file
 from splatting.files.image_files import UNREADABLE, open_render
 from utils.system_utils import UserError, atomic_write
 
@@ -53,6 +53,18 @@ def summarise_times(
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,
     }
+
+
+def model_digest(model: Path, iteration: str) -> str | None:
+    """Return the SHA-256 of the PLY of an iteration, None if a model folder has none of it."""
+    ply = ply_file(model, iteration)
+    if not ply.is_file():
+        return None
+    digest = hashlib.sha256()
+    with open(ply, "rb") as file:
+        for part in iter(lambda: file.read(1 << 20), b""):
+            digest.update(part)
+    return digest.hexdigest()
 
 
 def image_of(file: Path) -> Image.Image:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from arguments import OPTIONS, read_model_json, read_training_options
+from arguments import OPTIONS, other_scene, read_model_json, read_training_options
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
@@ -161,38 +161,45 @@ def warn_of_another_number(density: DensityControl, opt: argparse.Namespace, cou
     )
 
 
+_OF_VIEWS = {"images", "resolution", "white_background", "eval", "train_test_exp"}  # in cfg_args, for all saves alike
 VIEWS = "views_per_iteration"  # entry of model.json, where it is not 1
 
 
 def check_folder(
-    model_path: str,
-    source_path: str,
+    now: argparse.Namespace,
     saving_iterations: Sequence[int],
     checkpoint: str | None,
     first_iteration: int,
     checkpoint_iterations: Sequence[int] = (),
 ) -> None:
-    """Refuse a folder with a model of another scene (UserError): training would mix both.
+    """Refuse a folder with a model of another scene (UserError), or with one that this training's options do not fit.
 
-    Warn of iterations that an earlier training of this scene has saved and this one does not overwrite.
+    now: all options. Warn of iterations that an earlier training has saved and this one does not overwrite. Programs
+    that read them take the folder's options, which are those of the last training.
     """
-    folder = Path(model_path)
-    saved = saves_in(folder)
-    if not lies_in(checkpoint, folder) and saved:
-        trained_on = _options_of(folder).get("source_path")
-        if trained_on and not _same_place(trained_on, source_path):
-            raise UserError(
-                f"{model_path} holds a model of another scene, {trained_on}; name another folder with -m, or remove "
-                "that one"
-            )
+    folder = Path(now.model_path)
+    saved, then = saves_in(folder), _options_of(folder)
+    trained_on = str(then.get("source_path", ""))
+    if not lies_in(checkpoint, folder) and saved and other_scene(trained_on, now.source_path):
+        raise UserError(
+            f"{folder} holds a model of another scene, {trained_on}; name another folder with -m, or remove that one"
+        )
     new = {".ply": saving_iterations, ".pth": (*saving_iterations, *checkpoint_iterations)}
     stay = [n for n, path in saved.items() if n > first_iteration and n not in new[path.suffix]]
-    if stay:
-        print(
-            f"warning: {folder} keeps iteration {', '.join(map(str, sorted(stay)))} of an earlier training, and other "
-            "commands take the highest unless --iteration is given; remove the old ones, or name another folder by -m",
-            file=sys.stderr,
+    if not stay:
+        return
+    kept = f"{folder} keeps iteration {', '.join(map(str, sorted(stay)))} of an earlier training"
+    changed = [name for name in _changed(then, now) if name in _OF_VIEWS]
+    if changed and max(stay) > max(saving_iterations, default=0):
+        before, after = (" ".join(_typed(n, of[n]) for n in changed) for of in (then, vars(now)))
+        raise UserError(
+            f"{kept} with {before}, which {after} would not fit; name another folder by -m, or remove the old one"
         )
+    print(
+        f"warning: {kept}, and other commands take the highest unless --iteration is given; remove the old ones, or "
+        "name another folder by -m",
+        file=sys.stderr,
+    )
 
 
 def lies_in(checkpoint: str | None, folder: str | os.PathLike) -> bool:
@@ -214,12 +221,23 @@ def check_views(checkpoint: str, views: int) -> None:
 def report_changes(checkpoint: str, now: argparse.Namespace) -> None:
     """Warn if the run that wrote a checkpoint had other options than this run, `now`.
 
-    now: all options. Those that the checkpoint's folder does not record are not compared.
+    now: all options. Those that the checkpoint's folder does not record are not compared. UserError for another scene,
+    and for --eval after a training on all photos.
     """
     folder = Path(checkpoint).parent
     then = _options_of(folder)
-    names = [option.name for option in OPTIONS if option.compared and option.name in then]
-    changed = [name for name in names if not _equal(name, then[name], getattr(now, name))]
+    trained_on = str(then.get("source_path", ""))
+    if other_scene(trained_on, now.source_path):
+        raise UserError(
+            f"{checkpoint} is of another scene, {trained_on}; resume it with that one, or start from its model with "
+            "--init_ply"
+        )
+    changed = _changed(then, now)
+    if "eval" in changed and now.eval:
+        raise UserError(
+            f"{checkpoint} was trained on all photos, so --eval can hold out none that it has not seen; leave --eval "
+            "out, or start a new training"
+        )
     if changed:
         before, after = (" ".join(_typed(n, of[n]) for n in changed) for of in (then, vars(now)))
         print(f"warning: {folder} was trained with {before}, this run has {after}", file=sys.stderr)
@@ -239,8 +257,8 @@ def continue_records(model_path: str, checkpoint: str | None, first_iteration: i
         log.not_before(rows[-1])
     elif checkpoint and not log.records:
         print(
-            f"there is no {training_log.NAME} beside {checkpoint}: seconds count from iteration {first_iteration}, "
-            "in the curve too",
+            f"{training_log.NAME} beside {checkpoint} is missing, or has nothing up to iteration {first_iteration}: "
+            "seconds count from there, in the curve too",
             file=sys.stderr,
         )
     return log, rows
@@ -256,6 +274,12 @@ def _options_of(folder: Path) -> dict[str, object]:
     with contextlib.suppress(UserError, OSError):
         return read_training_options(folder)
     return {}
+
+
+def _changed(then: dict[str, object], now: argparse.Namespace) -> list[str]:
+    """Names of options that differ from those of an earlier training, as far as that recorded them."""
+    names = [option.name for option in OPTIONS if option.compared and option.name in then]
+    return [name for name in names if not _equal(name, then[name], getattr(now, name))]
 
 
 def _equal(name: str, then: object, now: object) -> bool:

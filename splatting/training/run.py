@@ -143,11 +143,11 @@ class Run:
 
     def _check_records(self) -> None:
         """Compare this run with those before it, in its folder and beside its checkpoint."""
-        dataset, start = self.dataset, self.start
+        start = self.start
         # A target may come before any of the iterations that are planned.
         planned = self.launch.save_iterations, self.launch.checkpoint_iterations
         saves = [[] if self.opt.target_psnr else self.schedule.known(one) for one in planned]
-        checks.check_folder(dataset.model_path, dataset.source_path, saves[0], start, self.first_iteration, saves[1])
+        checks.check_folder(self.options, saves[0], start, self.first_iteration, saves[1])
         if start:
             checks.check_views(start, self.schedule.views)
             checks.report_changes(start, self.options)

@@ -25,6 +25,8 @@ from splatting.training.run import Run
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.loss_utils import l1_loss
 
+# Without a rate: that of the schedule is not that of iterations.
+BY_CLOCK = "{l_bar}{bar}| [{elapsed}<{remaining}{postfix}]"
 BAR_INTERVAL = 10  # iterations between updates, at least
 BAR_SECONDS = 0.2  # between updates, at least: each reads the losses, and so waits for the GPU
 
@@ -38,7 +40,8 @@ class ProgressBar(Observer):
         self._shown = {"Loss": run.losses} | ({"Depth Loss": self._depth} if run.dataset.depths else {})
         self._updated, self._done = -math.inf, run.first_iteration
         first = run.schedule.schedule_step(run.first_iteration)
-        self._bar = tqdm(initial=first, total=run.schedule.length, desc="Training progress", dynamic_ncols=True)
+        form = {"bar_format": BY_CLOCK} if run.opt.time_budget else {}
+        self._bar = tqdm(initial=first, total=run.schedule.length, desc="Training progress", dynamic_ncols=True, **form)
 
     def due(self, step: Iteration) -> bool:
         shown = step.iteration % BAR_INTERVAL == 0 and time.monotonic() - self._updated >= BAR_SECONDS

@@ -85,10 +85,10 @@ class Checkpoints(Observer):
             if step.stopping:
                 run.scene.save(step.iteration)
         if step.stopping:
-            look = f"look at the model: {view_command(run.scene.model_path, step.iteration)}"
-            early = ", worse than a shorter run's at its end" if run.opt.time_budget else ""
-            said = f"stopped at iteration {step.iteration}; {look}{early}; resume with --start_checkpoint {path}"
-            tqdm.write(said, file=sys.stderr)
+            look = f"Look at the model: {view_command(run.scene.model_path, step.iteration)}"
+            early = ", before its learning rates fell" if run.opt.time_budget else ""
+            resume = f"Resume by the same command with --start_checkpoint {path}"
+            tqdm.write(f"Stopped at iteration {step.iteration}{early}\n{look}\n{resume}", file=sys.stderr)
 
 
 def save_schedule(run: Run, step: Iteration) -> None:
