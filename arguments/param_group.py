@@ -96,7 +96,8 @@ class OptionParser(argparse.ArgumentParser):
     def _unknown(self, words: list[str]) -> str:
         word = next((word for word in words if word.startswith("-")), words[0])
         if not word.startswith("-"):
-            return f"{word} belongs to no option"
+            folder = "; name a model folder by -m" if "-m" in self._option_string_actions else ""
+            return f"{word} belongs to no option{folder}"
         near = difflib.get_close_matches(word.partition("=")[0], self._option_string_actions, 1)
         return f"there is no option {word}" + (f"; did you mean {near[0]}?" if near else "")
 

@@ -416,7 +416,7 @@ def test_abbreviations_of_the_reference_mean_the_same_in_spite_of_our_options(ca
     [
         (["--densify_untill_iter=5"], "there is no option --densify_untill_iter=5; did you mean --densify_until_iter"),
         (["--xyzzy=3"], "there is no option --xyzzy=3 ("),
-        (["stray"], "stray belongs to no option"),
+        (["stray"], "stray belongs to no option; name a model folder by -m"),
         (["--iterations", "many"], "argument --iterations: invalid int value: 'many'"),
     ],
 )

@@ -22,6 +22,7 @@ from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, rand
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 
+_FILES, _SUFFIXES = ("cameras", "images", "points3D"), ("bin", "txt")
 AGAIN = "copy all three files of the model again from where they were made"
 
 
@@ -93,6 +94,11 @@ def find_model(scene: Path) -> tuple[Path, ColmapModel]:
     inside = sorted(path for path in sparse.iterdir() if path.is_dir())
     folders = [folder for folder in dict.fromkeys([sparse / "0", sparse, *inside]) if _kinds(folder)]
     if not folders:
+        for folder in (sparse / "0", sparse, *inside):
+            missing = [name for name in _FILES if not any((folder / f"{name}.{kind}").is_file() for kind in _SUFFIXES)]
+            if len(missing) < len(_FILES):
+                no = " and no ".join(missing)
+                raise UserError(f"{folder} has no {no} as .bin or .txt; copy the whole model there")
         found = sorted(str(path.relative_to(scene)) for path in sparse.glob("**/*"))[:8]
         raise UserError(
             f"no COLMAP model in {sparse / '0'}, {sparse} or its other folders: looked for cameras, images and "
@@ -151,5 +157,4 @@ def read_model_of_kind(folder: Path, suffix: str, with_2d_points: bool = False) 
 
 def _kinds(folder: Path) -> list[str]:
     """Suffixes of the models in a folder, the binary one first."""
-    names = ("cameras", "images", "points3D")
-    return [kind for kind in ("bin", "txt") if all((folder / f"{name}.{kind}").is_file() for name in names)]
+    return [kind for kind in _SUFFIXES if all((folder / f"{name}.{kind}").is_file() for name in _FILES)]
