@@ -18,6 +18,7 @@ from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.exposure import apply_exposure
 from scene.gaussians.parameters import GaussianParameters
+from scene.sleeping import Sleeping
 from splatting.distributed.rendering.divided import (
     DividedDrawn,
     KnownBands,
@@ -110,10 +111,12 @@ class Drawn:
 
     band = None
 
-    def __init__(self, drawing: Drawing, scene: Scene, background: Tensor, want_depth: bool) -> None:
+    def __init__(
+        self, drawing: Drawing, scene: Scene, background: Tensor, want_depth: bool, awake: Tensor | None = None
+    ) -> None:
         self.image, self.depth = drawing.color, drawing.inverse_depth if want_depth else None
         self.radii, self.blend_depth = drawing.radii, drawing.last
-        self._drawing, self._scene, self._background = drawing, scene, background
+        self._drawing, self._scene, self._background, self._awake = drawing, scene, background, awake
 
     def decisive(self) -> Tensor:
         """Gaussians that the image depends on (`decisive` of diff_gaussian_rasterization): (N,) bool."""
@@ -141,7 +144,7 @@ class Drawn:
         `FusedAdam.write_now`, for a step that is captured.
         """
         source, planes = self._drawing.kept(self._background), (image_gradient, None, depth_gradient)
-        adam.apply(self._scene, source, planes, self.radii, observe, absolute and observe, now)
+        adam.apply(self._scene, source, planes, self.radii, observe, absolute and observe, now, self._awake)
 
 
 @torch.no_grad()
@@ -154,18 +157,32 @@ def draw(
     scaling: float = 1.0,
     by_bands: bool = False,
     bands: KnownBands | None = None,
+    sleeping: Sleeping | None = None,
+    now: Tensor | None = None,
 ) -> Drawn | DividedDrawn:
     """Render a view without autograd, to go back from the image by the methods of what it returns.
 
     Of a model that is divided among processes: by_bands: each needs no more of the image than the loss of its band.
-    bands: those of earlier steps, in which the camera's uid stands for the view.
+    bands: those of earlier steps, in which the camera's uid stands for the view. sleeping: of the model, whose blocks
+    wake for a step. now: as for `Drawn.step`.
     """
     gaussians, raw = model_inputs(camera, pc, pipe, scaling)
     scene = scene_arguments(gaussians, rasterizer_settings(camera, pc, pipe, background, scaling), raw)
     divided = draw_divided(pc, scene, background, want_depth, by_bands, bands, camera)
     if divided is not None:
         return divided
-    return Drawn(rasterize_scene(scene, background, want_depth), scene, background, want_depth)
+    awake = None
+    if sleeping is not None:
+        sleeping.wake(scene, now)
+        awake = sleeping.awake
+    return Drawn(rasterize_scene(scene, background, want_depth, awake=awake), scene, background, want_depth, awake)
+
+
+@torch.no_grad()
+def wake(sleeping: Sleeping, camera: Camera, pc: GaussianModel, pipe: argparse.Namespace, background: Tensor) -> None:
+    """Wake the blocks of a model that a view may show, before a step by `render`."""
+    gaussians, raw = model_inputs(camera, pc, pipe)
+    sleeping.wake(scene_arguments(gaussians, rasterizer_settings(camera, pc, pipe, background), raw))
 
 
 def decisive_for(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace) -> Tensor:

@@ -15,7 +15,7 @@ from scene.gaussians.mcmc import NO_PENALTY, Penalty
 # In the operator's order (gs::Stepped).
 _STEPPED = ("xyz", "opacity", "scaling", "rotation", "f_dc", "f_rest")
 
-NOW_WORDS = 22  # int64: what changes from step to step (gs::StepNow)
+NOW_WORDS = 23  # int64: what changes from step to step (gs::StepNow)
 
 
 class FusedAdam:
@@ -70,10 +70,17 @@ class FusedAdam:
         observe: bool,
         absolute: bool,
         now: Tensor | None,
+        awake: Tensor | None = None,
     ) -> None:
-        """Step from the gradients of a view: scene, source, planes as for `gradients_of`, radii (N,) int32 pixels."""
+        """Step from the gradients of a view: scene, source, planes as for `gradients_of`, radii (N,) int32 pixels.
+
+        awake: of scene/sleeping.py, None: all are.
+        """
+        gaussians, camera, *options = scene.lists
+        camera = camera if awake is None else (*camera, awake)
         # By place: names would cost the operator microseconds.
-        OPERATORS.apply_gradients_(*scene.lists, source, planes, [], radii, *self.arguments(observe), now, absolute)
+        arguments = source, planes, [], radii, *self.arguments(observe), now, absolute
+        OPERATORS.apply_gradients_(gaussians, camera, *options, *arguments)
 
     def write_now(self, now: Tensor, iteration: int) -> None:
         """Write what the next step stands for, (NOW_WORDS,) int64 on the CPU, and advance the step counters.

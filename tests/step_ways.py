@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from gaussian_renderer import Drawn
+from scene.sleeping import Sleeping
 from splatting.training.steps import captured
 from splatting.training.steps.captured import CapturedStep, Graphs
 from splatting.training.steps.fused import FusedStep
@@ -52,6 +53,7 @@ class Rerun:
     def capture(self, body: Callable[[], torch.Tensor]) -> tuple[Callable[[], None], torch.Tensor]:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(Drawn, "step", lambda *_: None)  # to capture a step does not take it
+            patch.setattr(Sleeping, "wake", lambda *_: None)
             result = body()
         self.records += 1
 

@@ -1,6 +1,6 @@
 """A training has the same bytes by every way to take its steps: each of trainings.OPTIONS, each way, any ranks."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from trainings import ITERATIONS, OPTIONS, differences, narrow_scene, trained
 from scene.readers.point_cloud import write_point_cloud
 from scene.spilled_model import SpilledGaussians
 from splatting.distributed.ranks import ranks
+from splatting.training import run
 from splatting.training.steps.captured import Graphs
 
 Result = dict[str, bytes | list]
@@ -30,6 +31,14 @@ WITHOUT_GRAPHS = ("exposure", "depth", "masks", "budget errors")  # whose steps 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return narrow_scene(tmp_path_factory.mktemp("bytes") / "scene")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _awake() -> Iterator[None]:
+    """No block sleeps (tests/test_sleeping.py): rows of other processes and of the host's memory do not."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "MOST_SHARE", 0.0)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -56,10 +56,12 @@ class GaussianAdam(torch.optim.Adam):
     State and state dict have torch's form (step, exp_avg, exp_avg_sq), so checkpoints of both can be exchanged.
     guard: see StepGuard. Groups that the kernel cannot step are stepped by torch, unguarded: several parameters, or
     another dtype, device, betas, eps or further option than the optimiser's. Groups may change between any two steps.
+    rows: (N,) bool, those that take the next step, None: all.
     parts: by group, what takes the next step in place of a parameter that has a gradient; its values are not read.
     """
 
     guard: StepGuard | None = None
+    rows: Tensor | None = None
     parts: Mapping[str, Part] = MappingProxyType({})
 
     def __init__(self, groups: list[dict], eps: float = 1e-15) -> None:
@@ -142,7 +144,15 @@ class GaussianAdam(torch.optim.Adam):
                 columns.append(active)
         if tensors:
             lists, guard = map(list, zip(*tensors, strict=True)), self.guard.arguments if self.guard else ()
-            adam_(*lists, rates, *self.defaults["betas"], self.defaults["eps"], columns, *guard)
+            adam_(
+                *lists,
+                rates,
+                *self.defaults["betas"],
+                self.defaults["eps"],
+                columns,
+                *(guard or (None, None, 0)),
+                self.rows,
+            )
         if others:
             self._step_by_torch(others)
         return loss

@@ -19,7 +19,7 @@ def run_training(run: Run, observers: Sequence[Observer]) -> None:
     Raises KeyboardInterrupt or Terminated, after a complete step, if a signal asked for it.
     """
     taker, together = step_taker(run), Together(run)
-    every = Announcer([together, *observers])
+    every = Announcer([together, *observers], run.look)
     # Backward runs on this thread: waking autograd's worker costs time in every iteration.
     with run.interrupt, every, torch.autograd.set_multithreading_enabled(False), _whole_steps(run, taker):
         for at in run.iterations():
@@ -30,6 +30,7 @@ def run_training(run: Run, observers: Sequence[Observer]) -> None:
             at.stopping = together.stopping  # read once: a signal may come at any moment
             if at.stopping:
                 taker.drain()
+                run.end_sleep()
             every.stepped(at)
             if at.stopping:
                 together.wait()

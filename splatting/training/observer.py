@@ -1,6 +1,7 @@
 """Observers of a training. Each overrides the hooks that it needs; the loop calls no others."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from types import TracebackType
 from typing import TypeAlias
 
@@ -37,7 +38,10 @@ class Observer:
 class Announcer:
     """Calls the hooks of observers, in the order of the list. Inside `with`, an error is told to `ended`."""
 
-    def __init__(self, observers: Sequence[Observer]) -> None:
+    def __init__(self, observers: Sequence[Observer], look: Callable[[], AbstractContextManager] = nullcontext) -> None:
+        """look: what an iteration that is due is told within."""
+        self._look = look
+
         def overridden(hook: str) -> list:
             plain = getattr(Observer, hook)
             return [getattr(one, hook) for one in observers if getattr(type(one), hook) is not plain]
@@ -53,12 +57,14 @@ class Announcer:
             notify(step)
 
     def measured(self, step: Iteration, losses: Losses) -> None:
-        for notify in self._measured:
-            notify(step, losses)
+        with self._look() if step.due else nullcontext():
+            for notify in self._measured:
+                notify(step, losses)
 
     def stepped(self, step: Iteration) -> None:
-        for notify in self._stepped:
-            notify(step)
+        with self._look() if step.due else nullcontext():
+            for notify in self._stepped:
+                notify(step)
 
     def ended(self, error: Error = None) -> None:
         for notify in self._ended:

@@ -4,6 +4,7 @@ import argparse
 import copy
 import math
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,10 @@ from torch import Tensor
 
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.gaussians.morton import sort_rows
+from scene.sleeping import MOST_SHARE, REST, Sleeping, share_seen
 from scene.spilled_model import SpilledGaussians
 from splatting.deterministic.counter_rng import Stream, uniform
 from splatting.distributed.consistency import agree_on_scene
@@ -112,6 +115,7 @@ class Run:
             opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
         )
         self.density.schedule = self.schedule
+        self.sleeping = self._may_sleep()
         checks.warn_of_another_number(self.density, opt, self.gaussians.gaussian_count, self.first_iteration + 1)
         if capture is None and first is None:
             self.density.started()
@@ -245,6 +249,45 @@ class Run:
         if (last := self.schedule.ends) is not None:
             ahead = min(ahead, last - iteration + 1)
         self.scene.prefetch(list(filter(self.resolution.needs, self.views.coming(iteration, ahead))))
+
+    def _may_sleep(self) -> Sleeping | None:
+        """What lets blocks sleep, where views see few of the scene's points, and a step concerns no other row."""
+        cloud, density = self.scene.info.point_cloud, self.density
+        dense = type(self.gaussians) is GaussianModel and type(self.gaussians.optimizer) is GaussianAdam
+        alone = not (self.group.several or self.schedule.views > 1 or density.queues or any(density.penalty))
+        in_python = self.pipe.compute_cov3D_python or self.pipe.convert_SHs_python
+        ours = type(self.objective) is Objective and vars(type(density)).get("fusable", False) and not in_python
+        if not (dense and alone and ours and cloud is not None and len(cloud.points)):
+            return None
+        points = torch.as_tensor(cloud.points, dtype=torch.float32, device=self.device)
+        return Sleeping(self.gaussians) if share_seen(points, self.scene.getTrainCameras()) < MOST_SHARE else None
+
+    def rests(self, step: Iteration) -> bool:
+        """Whether all blocks of Gaussians wake after a step."""
+        return self.sleeping is not None and (
+            step.iteration % REST == 0 or step.takes(self.launch.checkpoint_iterations)
+        )
+
+    def after_step(self, step: Iteration) -> None:
+        """What follows the optimiser's step."""
+        self.density.after_step(step)
+        if self.sleeping is None:
+            return
+        self.gaussians.optimizer.rows = None
+        if step.changes:
+            self.sleeping.reset()
+        elif self.rests(step):
+            self.sleeping.rest()
+
+    def look(self) -> AbstractContextManager:
+        """Within it, others may read the model."""
+        return nullcontext() if self.sleeping is None else self.sleeping.look()
+
+    def end_sleep(self) -> None:
+        """Let all blocks take the steps that they have missed, and sleep no more."""
+        if self.sleeping is not None:
+            self.sleeping.rest()
+        self.sleeping = None
 
     def render_options(self, step: Iteration) -> dict[str, bool]:
         """Options of `render` that make it compute what this step's loss needs, and no more."""

@@ -94,8 +94,8 @@ class CapturedStep(FusedStep):
         run, density = self._run, self._run.density
         losses = self._graphs.launch(at)
         if losses is not None:
-            with self._ahead.capacity(at) if density.queues else nullcontext():
-                density.after_step(at)
+            with self._ahead.capacity(at) if density.queues or run.rests(at) else nullcontext():
+                run.after_step(at)
             return losses
         with self._ahead.capacity(at):
             drawn, losses, gradients = self.measure(at)
@@ -181,7 +181,7 @@ class Graphs:
         run, optimizer = self._run, self._run.gaussians.optimizer
         columns = optimizer.active_columns("f_rest")
         used = run.objective, run.density, run.pipe.antialiasing, type(optimizer), optimizer.guard, columns
-        used = *used, run.resolution.factor
+        used = *used, run.resolution.factor, run.sleeping and run.sleeping.awake.data_ptr()
         baked = self._adam.places(), used
         if baked != self._baked:
             self._graphs.clear()
@@ -259,11 +259,12 @@ class Graphs:
     @torch.no_grad()
     def _body(self, iteration: int, placeholder: Any) -> Tensor:
         run = self._run
-        drawn, losses, gradients = self._fused.measure(placeholder)
+        now = self._inputs[:NOW_WORDS]
+        drawn, losses, gradients = self._fused.measure(placeholder, now)
         run.gaussians.guard_loss(iteration, losses.total)
         density = run.density
         observed = density.observes(iteration), density.absolute_gradients
-        drawn.step(self._adam, *gradients, *observed, self._inputs[:NOW_WORDS])
+        drawn.step(self._adam, *gradients, *observed, now)
         return torch.stack([losses.total, losses.l1])
 
     def _numbers_of(self, camera: Camera) -> np.ndarray:

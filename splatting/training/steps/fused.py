@@ -61,12 +61,13 @@ class FusedStep(PlainStep):
     def _knows_model(self) -> bool:
         return FusedAdam.takes(self._run.gaussians)
 
-    def measure(self, at: Iteration) -> Measured:
-        """Render: what was drawn, the losses, and their gradients of image and depth."""
+    def measure(self, at: Iteration, now: Tensor | None = None) -> Measured:
+        """Render: what was drawn, the losses, and their gradients of image and depth. now: as for `Drawn.step`."""
         run = self._run
         exposures, objective = run.dataset.train_test_exp, run.objective
         by_bands = run.group.several and not exposures and objective.takes_bands(at)
         wants = {"want_depth": at.depth_weight > 0, "by_bands": by_bands, "bands": self._bands}
+        wants |= {"sleeping": run.sleeping, "now": now}
         drawn = draw(at.camera, run.gaussians, run.pipe, at.background, **wants)
         with torch.enable_grad():
             image, depth = drawn.image.requires_grad_(), drawn.depth
@@ -90,6 +91,7 @@ class FusedStep(PlainStep):
         if self._has_further_terms:
             for param in params:
                 param.grad = None
+            self._run.end_sleep()
         return self._has_further_terms
 
     def advance(self, at: Iteration, drawn: Drawn, gradients: tuple[Tensor, Tensor | None]) -> None:
@@ -97,4 +99,4 @@ class FusedStep(PlainStep):
         run, density = self._run, self._run.density
         drawn.step(self._adam, *gradients, density.observes(at.iteration), density.absolute_gradients)
         run.gaussians.exposures.step()
-        density.after_step(at)
+        run.after_step(at)

@@ -5,7 +5,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from gaussian_renderer import render, visible_rows
+from gaussian_renderer import render, visible_rows, wake
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Announcer
@@ -76,6 +76,8 @@ class PlainStep:
     def take(self, at: Iteration, observers: Announcer) -> None:
         """Take a step; the observers are told once the gradients are there."""
         run = self._run
+        if run.sleeping:
+            self._wake(at)
         package = self._views.render(at)
         losses = run.objective(package, at)
         losses.total.backward()
@@ -86,7 +88,16 @@ class PlainStep:
         run.density.after_backward(at, package)
         if not at.last:  # as in the reference, the last iteration takes no step
             run.gaussians.step(package["radii"])
-            run.density.after_step(at)
+            run.after_step(at)
+
+    def _wake(self, at: Iteration) -> None:
+        """Wake the blocks that the step concerns: all, where rows change or nothing follows."""
+        run = self._run
+        if at.changes or at.last:
+            run.sleeping.rest()
+        else:
+            wake(run.sleeping, at.camera, run.gaussians, run.pipe, at.background)
+            run.gaussians.optimizer.rows = run.sleeping.rows()
 
     def throttle(self, at: Iteration) -> None:
         pass

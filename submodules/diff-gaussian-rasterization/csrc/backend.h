@@ -44,14 +44,17 @@ struct RowMemory {
   void mark_decisive(const Where&, const BlendInput<T>&, const int32_t* last, bool* decisive);       \
   template <class T>                                                                                 \
   void adam(const Where&, const AdamInput<T>* tensors, int64_t count, const StepGuard<T>&);          \
-  /* Adam without bias correction on the visible rows, (rows); `step` is not read. */                \
+  /* Adam on the visible rows, (rows); where `step` is 0, without bias correction. */                \
   template <class T>                                                                                 \
   void sparse_adam(const Where&, const AdamInput<T>&, const bool* visible, const StepGuard<T>&);     \
   /* Adam's steps without a gradient that rows have missed (MissedSteps), under no guard. */         \
   template <class T>                                                                                 \
   void catch_up(const Where&, const AdamInput<T>&, const MissedSteps<T>&);                           \
   template <class T>                                                                                 \
-  void penalise(const Where&, const PenaltyInput<T>&);
+  void penalise(const Where&, const PenaltyInput<T>&);                                               \
+  /* The values of the scene change. */                                                              \
+  template <class T>                                                                                 \
+  void wake(const Where&, const Scene<T>&, const SleepInput<T>&);
 
 // Compiled once: see gs/rounded.h.
 void observe(const Executor&, const ObserveInput&);

@@ -32,7 +32,13 @@ struct Scene {
   const T* center;      // 3
   double tan_x, tan_y;
   Image image;
+  const uint8_t* awake = nullptr;  // (sleep_blocks(N)) 0: no Gaussian of the block reaches the image; null: unknown
 };
+
+// Gaussians sleep and wake in blocks of so many.
+constexpr int64_t kSleepBlock = 128;
+constexpr int64_t sleep_blocks(int64_t count) { return (count + kSleepBlock - 1) / kSleepBlock; }
+constexpr int64_t kTerms = 128;  // of past steps that are kept, so that no block may miss more
 
 // What binning reads of a splat. It fits one memory sector, because binning reads splats in depth order. On a GPU
 // binning makes records that it was not given.
@@ -252,10 +258,12 @@ enum Stepped { kStepMeans, kStepOpacities, kStepScales, kStepRotations, kStepShD
 struct StepNow {
   float constants[kStepped][7];  // AdamStep in math/adam.h of each attribute
   int64_t iteration;             // of the guard
+  int64_t step;                  // its number, from 1
 };
 
 // The step that every Gaussian takes as soon as its gradients are known, so that these never reach memory. The values
 // are those of the Scene and change in place: a Gaussian's row is read before it is written, and no other reads it.
+// Blocks that sleep (Scene::awake) take no step.
 template <class T>
 struct GaussianStep {
   AdamInput<T> attributes[kStepped];  // the gradients are not read; without columns an attribute takes no step
@@ -264,6 +272,21 @@ struct GaussianStep {
   bool sparse;            // only Gaussians of observed.radii above 0 take a step, and without bias correction
   ObserveInput observed;  // the view's gradients are not read; with max_radii null nothing is observed
   Penalty<T> penalty;     // whose gradients are added, where opacities and scales take steps
+};
+
+// Which blocks wake: those that a view may show, for the step that follows, unless the guard has stopped; all, for no
+// step yet; or all without a trace, so that only the values change.
+enum Waking { kWakeSeen, kWakeAll, kWakeToLook };
+
+// The blocks of Gaussians that sleep (math/sleep.h) through a step. Blocks that wake take the steps before it that they
+// have missed. step: its attributes, guard and `now`.
+template <class T>
+struct SleepInput {
+  GaussianStep<T> step;
+  Waking waking;
+  uint8_t* awake;  // (blocks) written
+  int32_t* taken;  // (blocks) the number of the last step that a block takes part in, with kWakeSeen this one included
+  T* terms;        // (kTerms, kStepped) lr sqrt(1 - beta2^s) / (1 - beta1^s) of step s, at s modulo kTerms
 };
 
 }  // namespace gs

@@ -35,18 +35,19 @@ def adam_(
     loss: Tensor | None = None,
     stopped: Tensor | None = None,
     iteration: int = 0,
+    rows: Tensor | None = None,
 ) -> None:
     """Takes one step of Adam (Kingma and Ba 2015, algorithm 1, eps as in torch.optim.Adam) of several parameters.
 
     Each list has an entry for every parameter. values, gradients and both averages: tensors of one shape (N, ...), all
     parameters of one dtype (float32, or on the CPU float64) and device; all but gradients contiguous. steps: one
     float32 each, on the CPU, the number of steps taken before. rates: learning rates. columns: how many leading values
-    of each row take part, -1 for all.
+    of each row take part, -1 for all. rows: (N,) bool, those that step, the others keep every bit; None: all.
     Changes values, exp_avgs, exp_avg_sqs and `stopped`, and adds 1 to every entry of steps, even if the guard holds
     the step back.
     """
     lists = values, gradients, exp_avgs, exp_avg_sqs, steps
-    _adam(*lists, rates, beta1, beta2, eps, columns, None, loss, stopped, iteration)
+    _adam(*lists, rates, beta1, beta2, eps, columns, rows, loss, stopped, iteration)
 
 
 def sparse_adam_(

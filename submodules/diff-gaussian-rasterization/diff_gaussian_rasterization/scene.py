@@ -106,6 +106,13 @@ def camera_arguments(
     return shaped(view, 4, 4), shaped(projection, 4, 4), shaped(center, 3), lens, options
 
 
-def draw(scene: Scene, background: Tensor, want_inverse_depth: bool = False, train: bool = True) -> Drawing:
-    """Call the operator `rasterize`. train: a backward will follow."""
-    return Drawing(*OPERATORS.rasterize(None, *scene, shaped(background, 3), want_inverse_depth, train))
+def draw(
+    scene: Scene,
+    background: Tensor,
+    want_inverse_depth: bool = False,
+    train: bool = True,
+    awake: Tensor | None = None,
+) -> Drawing:
+    """Call the operator `rasterize`. train: a backward will follow. awake: of `wake_`, whose sleepers are left out."""
+    options = want_inverse_depth, train, False, awake
+    return Drawing(*OPERATORS.rasterize(None, *scene, shaped(background, 3), *options))

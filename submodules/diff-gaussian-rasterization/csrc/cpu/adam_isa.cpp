@@ -118,7 +118,7 @@ void adam(const Executor& executor, const AdamInput<T>* tensors, int64_t count, 
 
 template <class T>
 void sparse_adam(const Executor& executor, const AdamInput<T>& in, const bool* visible, const StepGuard<T>& guard) {
-  const AdamStep<T> step = adam_step_of(in, true);
+  const AdamStep<T> step = adam_step_of(in, in.step == 0);
   bool finite = may_step(guard);
   for_dynamic(executor, finite ? in.rows : 0, 1024, [&](int64_t begin, int64_t end) {
     const bool mine = for_runs(

@@ -119,8 +119,12 @@ void project_block(const Scene<T>& s, const Camera<T>& camera, const Projected<T
 template <class T>
 void project(const Executor& executor, const Scene<T>& s, const Projected<T>& out) {
   const Camera<T> camera = camera_of(s);
-  for_dynamic(executor, s.count, kBlock, [&](int64_t begin, int64_t end) {
-    project_block(part_of(s, begin, end - begin), camera, part_of(out, begin));
+  const int64_t block = s.awake ? kSleepBlock : kBlock;
+  for_dynamic(executor, s.count, block, [&](int64_t begin, int64_t end) {
+    if (s.awake && !s.awake[begin / block])
+      cull_all(end - begin, part_of(out, begin));
+    else
+      project_block(part_of(s, begin, end - begin), camera, part_of(out, begin));
   });
 }
 

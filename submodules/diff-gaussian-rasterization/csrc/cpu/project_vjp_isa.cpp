@@ -12,7 +12,7 @@ GS_ISA_BEGIN
 
 namespace {
 
-constexpr int64_t kBlock = 128;  // Gaussians whose gradients, some 30 KB of floats, stay in a core's cache
+constexpr int64_t kBlock = kSleepBlock;  // Gaussians whose gradients, some 30 KB of floats, stay in a core's cache
 
 template <class T>
 SceneGradient<T> part_of(const SceneGradient<T>& g, int64_t first, int rest_bands) {
@@ -171,6 +171,7 @@ void project_vjp_step(const Executor& executor, const Scene<T>& s, const int32_t
   const bool may = may_step(guard);
   bool finite = may;
   for_dynamic(executor, s.count, kBlock, [&](int64_t begin, int64_t end) {
+    if (s.awake && !s.awake[begin / kBlock]) return;
     const int64_t count = end - begin;
     BlockGradient<T> gradient;
     SceneGradient<T> wanted = gradient.pointers();

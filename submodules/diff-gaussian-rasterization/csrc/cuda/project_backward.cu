@@ -14,7 +14,8 @@ namespace cuda {
 
 namespace {
 
-constexpr int kThreads = 128;
+constexpr int kThreads = kSleepBlock;
+constexpr int kBlocks = 5;  // that an SM is to hold at once: more registers do not pay
 
 // A source of moments for project_vjp_kernel, as SlotSums is: moments that were summed before.
 struct StoredMoments {
@@ -98,10 +99,10 @@ struct Addition : StepParameters {};
 // PenalisedStep, between which nothing differs but a call; or Addition, whose code would cost these registers, and
 // whose sums may therefore differ by rounding.
 template <class Source, class Step>
-__global__ void __launch_bounds__(kThreads)
+__global__ void __launch_bounds__(kThreads, kBlocks)
     project_vjp_kernel(const int32_t* halted, Scene<float> s, Source source, SceneGradient<float> out,
                        const __grid_constant__ Step step) {
-  if (is_halted(halted)) return;
+  if (is_halted(halted) || (s.awake && !s.awake[blockIdx.x])) return;
   constexpr bool kAdds = std::is_same_v<Step, Addition>;
   constexpr int kStage = SlotSums::kStage > WarpGradients::kFloats ? SlotSums::kStage : WarpGradients::kFloats;
   static_assert(32 * RowBefore::kFloats <= kStage, "a warp has memory for the rows of its lanes");

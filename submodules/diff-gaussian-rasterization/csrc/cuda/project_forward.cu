@@ -13,7 +13,7 @@ namespace cuda {
 
 namespace {
 
-constexpr int kThreads = 128;
+constexpr int kThreads = kSleepBlock;
 
 // In front of the camera, and no farther off the image than a tenth of its size.
 __device__ bool near_view(const Camera<float>& cam, Vec3<float> view) {
@@ -23,9 +23,18 @@ __device__ bool near_view(const Camera<float>& cam, Vec3<float> view) {
          y < cam.height * view.z + spare_y;
 }
 
+// A Gaussian that sleeps.
+__device__ void leave_out(int64_t i, int64_t count, const Projected<float>& out) {
+  if (i >= count) return;
+  out.radii[i] = out.tile_counts[i] = 0;
+  out.depths[i] = INFINITY;
+  if (out.records) out.records[i] = TileRecord{};
+}
+
 __global__ void __launch_bounds__(kThreads)
     project_kernel(const int32_t* halted, Scene<float> s, Projected<float> out) {
   if (is_halted(halted)) return;
+  if (s.awake && !s.awake[blockIdx.x]) return leave_out(int64_t(blockIdx.x) * kThreads + threadIdx.x, s.count, out);
   __shared__ Camera<float> camera;
   __shared__ __align__(16) float rest[kThreads * kRest];
   if (threadIdx.x == 0) camera = camera_of(s);

@@ -2,7 +2,7 @@
 #include <cuda_runtime.h>
 
 #include "../backend.h"
-#include "../math/adam.h"
+#include "../math/step_now.h"
 #include "guarded_adam.cuh"
 #include "queue.cuh"
 
@@ -32,7 +32,7 @@ void sparse_adam<float>(const Queue& queue, const AdamInput<float>& in, const bo
                         const StepGuard<float>& guard) {
   const int64_t n = in.rows * in.columns;
   if (!n) return;
-  const AdamConstants step = baseline::make_uncorrected_adam_step<float>(in.lr, in.beta1, in.beta2, in.eps);
+  const AdamConstants step = step_constants(in.step == 0, in.lr, in.beta1, in.beta2, in.eps, in.step);
   sparse_adam_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, in, visible, step,
                                                                                  guard);
   check_launch("sparse_adam");

@@ -69,14 +69,18 @@ struct Step {
                    "a step needs scales, rotations, sh_dc and sh_rest, not cov3d or colors");
     GS_CHECK_TYPE(radii, "radii must be a tensor, got None");
     check_tensor(*radii, "radii", ScalarType::Int, scene.device(), {scene.count()});
+    GS_CHECK(!observes() || statistics.size() == 3, "give max_radii, gradient_sums and views, or none of them");
+    GS_CHECK(!observes() || scene.dtype() == ScalarType::Float, "statistics are of float32 Gaussians, got float64");
+    if (observes()) check_statistics(statistics[0], statistics[1], statistics[2], *radii);
+    check_adam(scene);
+  }
+
+  void check_adam(const SceneTensors& scene) const {
     check_steps(attributes, steps, {rates.size(), columns.size()});
     GS_CHECK(averages.size() == 2 * steps.size(), "averages must be two for each of the ", steps.size(),
              " attributes, got ", averages.size());
     GS_CHECK_VALUE(constants.size() == 5, "constants must have 5 entries, got ", constants.size());
     GS_CHECK_VALUE((constants[3] == 0 && constants[4] == 0) || scene.raw(), "penalties are of raw Gaussians");
-    GS_CHECK(!observes() || statistics.size() == 3, "give max_radii, gradient_sums and views, or none of them");
-    GS_CHECK(!observes() || scene.dtype() == ScalarType::Float, "statistics are of float32 Gaussians, got float64");
-    if (observes()) check_statistics(statistics[0], statistics[1], statistics[2], *radii);
     if (!now) return;
     check_tensor(*now, "now", ScalarType::Long, scene.device(), {gs::kStepNowWords});
     GS_CHECK_VALUE(now->is_contiguous(), "now must be contiguous");
@@ -101,6 +105,7 @@ struct Step {
     out.guard = step_guard<T>(gaussians[0], entry(guard, 0), entry(guard, 1), iteration);
     if (now) out.now = reinterpret_cast<const gs::StepNow*>(read<int64_t>(*now));
     out.penalty = {T(constants[3]), T(constants[4])};
+    if (!pixels.defined()) return out;
     out.observed = {pixels.numel(), nullptr, nullptr, nullptr, read<int32_t>(pixels), nullptr};
     if (!observes()) return out;
     out.observed.max_radii = write<float>(statistics[0]);
@@ -108,6 +113,21 @@ struct Step {
     return out;
   }
 };
+
+// gaussians: those of Input, in its order, without means2d; an empty tensor of one axis stands for none. camera: view
+// matrix, projection and centre, then which blocks are awake, unless all are.
+SceneTensors scene_of(List<Tensor> gaussians, List<Tensor> camera, List<double> lens, Sizes options) {
+  GS_CHECK_VALUE(gaussians.size() == kInputs - 1 && (camera.size() == 3 || camera.size() == 4), "give ", kInputs - 1,
+                 " tensors of the Gaussians and 3 or 4 of the camera, got ", gaussians.size(), " and ", camera.size());
+  std::array<const Tensor*, kInputs - 1> inputs;
+  for (size_t input = 0; input < inputs.size(); ++input) {
+    const Tensor& t = gaussians[input];
+    inputs[input] = t.defined() && t.dim() == 1 && t.size(0) == 0 && input > 1 ? nullptr : &t;
+  }
+  SceneTensors scene(inputs, {&camera[0], &camera[1], &camera[2]}, lens, options);
+  if (camera.size() == 4) scene.set_awake(&camera[3]);
+  return scene;
+}
 
 void run(const SceneTensors& scene, const GradientSource& source, const Tensor& /*lengths*/,
          const gs::GaussianStep<double>& step) {
@@ -133,7 +153,6 @@ void run(const SceneTensors& scene, const GradientSource& source, const Tensor& 
   if (later.lengths) gs::observe(gs::torch_executor(), later);
 }
 
-// gaussians: those of Input, in its order, without means2d; an empty tensor of one axis stands for none.
 // planes: the gradients of colour, transmittance and inverse depth, or nothing for rows.
 // With `sums`, the results of rasterize_vjp for another view or tensors like these, which share no memory: adds a
 // view's gradients to them. Those of Gaussians that were not seen stay. With `absolute`, the third column of means2d is
@@ -145,14 +164,7 @@ void run(const SceneTensors& scene, const GradientSource& source, const Tensor& 
 // and stopped.
 void apply_gradients_op(List<Tensor> gaussians, List<Tensor> camera, List<double> lens, Sizes options,
                         List<Tensor> source, List<MaybeTensor> planes, List<Tensor> sums, STEP_PARAMETERS) {
-  GS_CHECK_VALUE(gaussians.size() == kInputs - 1 && camera.size() == 3, "give ", kInputs - 1,
-                 " tensors of the Gaussians and 3 of the camera, got ", gaussians.size(), " and ", camera.size());
-  std::array<const Tensor*, kInputs - 1> inputs;
-  for (size_t input = 0; input < inputs.size(); ++input) {
-    const Tensor& t = gaussians[input];
-    inputs[input] = t.defined() && t.dim() == 1 && t.size(0) == 0 && input > 1 ? nullptr : &t;
-  }
-  const SceneTensors scene(inputs, {&camera[0], &camera[1], &camera[2]}, lens, options);
+  const SceneTensors scene = scene_of(gaussians, camera, lens, options);
   const MaybeTensor grad_color = entry(planes, 0), grad_transmittance = entry(planes, 1);
   const MaybeTensor grad_inverse_depth = entry(planes, 2);
   if (!sums.empty()) {
@@ -169,6 +181,32 @@ void apply_gradients_op(List<Tensor> gaussians, List<Tensor> camera, List<double
   if (!now) advance(steps);
 }
 
+// Before a step of Adam, decides which blocks of Gaussians sleep through it, and lets the others take the steps that
+// they have missed (math/sleep.h). sleep: awake, taken and terms of gs::SleepInput. waking: gs::Waking. The other
+// arguments are those of apply_gradients_; no counter advances.
+void wake_op(List<Tensor> gaussians, List<Tensor> camera, List<double> lens, Sizes options, List<Tensor> sleep,
+             int64_t waking, List<Tensor> averages, List<Tensor> steps, List<Tensor> guard, Sizes attributes,
+             List<double> rates, List<double> constants, Sizes columns, int64_t iteration, const MaybeTensor& now) {
+  const SceneTensors scene = scene_of(gaussians, camera, lens, options);
+  const MaybeTensor none;
+  const Step step{none,      averages, steps, {},        guard, attributes, rates,
+                  constants, columns,  false, iteration, now,   false};
+  GS_CHECK_VALUE(scene.raw() && !scene.has(kCov3d) && !scene.has(kColors), "blocks of raw Gaussians sleep");
+  GS_CHECK_VALUE(sleep.size() == 3 && waking >= gs::kWakeSeen && waking <= gs::kWakeToLook,
+                 "give awake, taken and terms, and how to wake, from 0 to 2");
+  step.check_adam(scene);
+  const int64_t blocks = gs::sleep_blocks(scene.count());
+  check_tensor(sleep[0], "awake", ScalarType::Byte, scene.device(), {blocks});
+  check_tensor(sleep[1], "taken", ScalarType::Int, scene.device(), {blocks});
+  check_tensor(sleep[2], "terms", scene.dtype(), scene.device(), {gs::kTerms, int64_t(gs::kStepped)});
+  with_scalar(scene.dtype(), [&](auto zero) {
+    using T = decltype(zero);
+    const gs::SleepInput<T> in{step.of<T>(gaussians, {}), gs::Waking(waking), write<uint8_t>(sleep[0]),
+                               write<int32_t>(sleep[1]), write<T>(sleep[2])};
+    GS_RUN(T, scene.means(), wake, scene.scene<T>(), in);
+  });
+}
+
 // Writes what the next step stands for, and advances the counters.
 void step_now_op(Tensor& now, Sizes attributes, List<Tensor> steps, List<double> rates, double beta1, double beta2,
                  double eps, bool sparse, int64_t iteration) {
@@ -180,6 +218,7 @@ void step_now_op(Tensor& now, Sizes attributes, List<Tensor> steps, List<double>
     gs::set_constants(*to, attributes[k],
                       gs::step_constants(sparse, rates[k], beta1, beta2, eps, double(*read<float>(steps[k])) + 1));
   to->iteration = iteration;
+  to->step = steps.size() ? int64_t(*read<float>(steps[0])) + 1 : 0;
   advance(steps);
 }
 
@@ -191,6 +230,10 @@ GS_OPERATORS(diff_gaussian_rasterization, m) {
       "Tensor[] camera, " CAMERA_SCHEMA ", Tensor[] source, Tensor?[] planes, Tensor(b!)[] sums, " STEP_SCHEMA
       ") -> ()",
       TORCH_BOX(&apply_gradients_op));
+  m.define("wake_(Tensor(a!)[] gaussians, Tensor[] camera, " CAMERA_SCHEMA
+           ", Tensor(b!)[] sleep, int waking, Tensor(c!)[] averages, Tensor[] steps, Tensor[] guard, int[] attributes, "
+           "float[] rates, float[] constants, int[] columns, int iteration=0, Tensor? now=None) -> ()",
+           TORCH_BOX(&wake_op));
   m.define(
       "step_now_(Tensor(a!) now, int[] attributes, Tensor(b!)[] steps, float[] rates, float beta1, float beta2, "
       "float eps, bool sparse, int iteration) -> ()",

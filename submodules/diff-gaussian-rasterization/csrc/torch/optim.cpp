@@ -51,15 +51,14 @@ void check_visible(const Tensor& visible, const Tensor& value) {
 }
 
 // Takes one step of every parameter, in one launch on a GPU. Advances each counter first, as torch does, even if
-// the guard holds the step back. visible: takes a step of sparse Adam instead, of these rows, and has no counters.
+// the guard holds the step back. visible: these rows alone step; without counters it is a step of sparse Adam.
 void adam_op(List<Tensor> values, List<Tensor> gradients, List<Tensor> exp_avg, List<Tensor> exp_avg_sq,
              List<Tensor> steps, List<double> rates, double beta1, double beta2, double eps, Sizes columns,
              const MaybeTensor& visible, const MaybeTensor& loss, const MaybeTensor& stopped, int64_t iteration) {
   const size_t n = values.size();
   for (size_t size :
-       {gradients.size(), exp_avg.size(), exp_avg_sq.size(), visible ? n : steps.size(), rates.size(), columns.size()})
+       {gradients.size(), exp_avg.size(), exp_avg_sq.size(), visible && steps.empty() ? n : steps.size(), rates.size(), columns.size()})
     GS_CHECK(size == n, "every list must have an entry for each of the ", n, " parameters, got ", size);
-  GS_CHECK_VALUE(!visible || steps.empty(), "sparse Adam has no counters");
   if (n == 0) return;
   const Tensor& first = values[0];
   std::vector<Tensor> contiguous;  // keeps the gradients' memory until the call is over
@@ -76,7 +75,7 @@ void adam_op(List<Tensor> values, List<Tensor> gradients, List<Tensor> exp_avg, 
     for (size_t i = 0; i < n; ++i) {
       gs::AdamInput<T> in = adam_input<T>(values[i], contiguous[i], exp_avg[i], exp_avg_sq[i], columns[i]);
       in.lr = rates[i], in.beta1 = beta1, in.beta2 = beta2, in.eps = eps;
-      if (!visible) in.step = double(*read<float>(steps[i])) + 1;
+      if (!steps.empty()) in.step = double(*read<float>(steps[i])) + 1;
       inputs.push_back(in);
     }
     const gs::StepGuard<T> guard = step_guard<T>(first, loss, stopped, iteration);

@@ -155,8 +155,9 @@ using Rasterized =
 
 // absolute: what the backward that autograd runs gets; the forward does not depend on it.
 Rasterized rasterize_op(const Tensor& means2d, SCENE_PARAMETERS, const Tensor& background, bool inverse_depth,
-                        bool train, bool /*absolute*/) {
-  const SceneTensors scene(SCENE_ARGUMENTS);
+                        bool train, bool /*absolute*/, const MaybeTensor& awake) {
+  SceneTensors scene(SCENE_ARGUMENTS);
+  scene.set_awake(given(awake));
   scene.checked(kMeans2d, &means2d);  // it only receives a gradient
   ProjectedTensors p = project(scene, false);
   BinnedTensors b = bin(p, scene.image(), train);
@@ -197,7 +198,7 @@ GS_OPERATORS(diff_gaussian_rasterization, m) {
       TORCH_BOX(&blend_op));
   m.define(
       "rasterize(Tensor means2d, " SCENE_SCHEMA
-      ", Tensor background, bool inverse_depth, bool train, bool absolute=False) -> (Tensor color, "
+      ", Tensor background, bool inverse_depth, bool train, bool absolute=False, Tensor? awake=None) -> (Tensor color, "
       "Tensor transmittance, Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, "
       "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last, Tensor layers)",
       TORCH_BOX(&rasterize_op));

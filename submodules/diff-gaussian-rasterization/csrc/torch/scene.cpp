@@ -78,6 +78,12 @@ SceneTensors::SceneTensors(const std::array<const Tensor*, kInputs - 1>& gaussia
   check_settings();
 }
 
+void SceneTensors::set_awake(const Tensor* awake) {
+  if (!awake) return;
+  check_tensor(*awake, "awake", ScalarType::Byte, device_, {gs::sleep_blocks(count())});
+  awake_ = packed(*awake);
+}
+
 Tensor SceneTensors::checked(Input input, const Tensor* given) const {
   const Row& row = kRows[input];
   const bool none = !given || !given->defined();

@@ -51,6 +51,9 @@ class SceneTensors {
   SceneTensors(const std::array<const Tensor*, kInputs - 1>& gaussians, const std::array<const Tensor*, 3>& camera,
                List<double> lens, Sizes options);
 
+  // Takes which blocks sleep (gs::Scene::awake), if that is given.
+  void set_awake(const Tensor* awake);
+
   // Checks the shape, dtype and device of an input. Returns it contiguous; undefined where it was not given.
   Tensor checked(Input input, const Tensor* given) const;
 
@@ -89,7 +92,8 @@ class SceneTensors {
             pointer(center_),
             tan_x_,
             tan_y_,
-            image_};
+            image_,
+            awake_.defined() ? read<uint8_t>(awake_) : nullptr};
   }
 
  private:
@@ -99,7 +103,7 @@ class SceneTensors {
   ScalarType dtype_;
   Device device_;
   InputTensors inputs_;  // means2d stays undefined
-  Tensor view_, projection_, center_;
+  Tensor view_, projection_, center_, awake_;
   double tan_x_, tan_y_, scale_modifier_;
   int sh_degree_;
   bool antialiasing_, raw_;

@@ -1,0 +1,111 @@
+"""Blocks of Gaussians that sleep: a step costs what its view may see, and Adam stays dense.
+
+A row without a gradient goes on by Adam's averages alone, and its steps have a closed form (csrc/math/sleep.h of the
+rasterizer). So a block of 128 rows that a view certainly does not show is left alone, and takes all the steps that it
+has missed when a view may show it. Rows lie along a Morton curve, so most blocks are small in space. Every REST
+iterations all blocks wake, so that what is saved then is whole.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
+import torch
+from diff_gaussian_rasterization.backend import OPERATORS
+from diff_gaussian_rasterization.scene import Scene
+from torch import Tensor
+
+from scene.cameras import Camera
+from scene.fused_adam import FusedAdam
+from scene.gaussian_model import GaussianModel
+
+BLOCK = 128  # rows
+REST = 100  # iterations
+MOST_SHARE = 0.7  # of the points, seen by a view on average; where more are, sleep saves nothing
+_TERMS = 128, 6  # of past steps, for each attribute
+_SEEN, _ALL, _LOOK = range(3)  # gs::Waking
+
+
+class Sleeping:
+    """Which blocks of a model are awake, and the steps that the others miss."""
+
+    def __init__(self, gaussians: GaussianModel) -> None:
+        self._gaussians, self._adam = gaussians, FusedAdam(gaussians)
+        self._terms = gaussians._xyz.detach().new_zeros(_TERMS)
+        self.awake = self._taken = torch.empty(0)
+        self._kept: list[Tensor] | None = None  # while somebody looks: what the parameters were
+        self.reset()
+
+    def reset(self) -> None:
+        """All blocks are awake and have missed nothing: call it once all rows have taken the same steps."""
+        rows = self._gaussians._xyz
+        blocks = -(-len(rows) // BLOCK)
+        taken = int(self._gaussians.optimizer.state_of(rows)["step"])
+        if len(self.awake) != blocks:
+            self.awake = torch.ones(blocks, dtype=torch.uint8, device=rows.device)
+            self._taken = torch.zeros(blocks, dtype=torch.int32, device=rows.device)
+        self.awake.fill_(1)
+        self._taken.fill_(taken)
+        self._is_whole = True
+
+    def wake(self, scene: Scene, now: Tensor | None = None) -> None:
+        """Before a step: wake the blocks that the scene's camera may show. now: of FusedAdam.write_now."""
+        self._wake(scene, _SEEN, now)
+        self._is_whole = False
+
+    def rest(self) -> None:
+        """Let all blocks take the steps that they have missed. The next step may leave them asleep."""
+        if self._kept is not None:
+            self._restore()
+        self._wake(self._anywhere(), _ALL)
+        self._is_whole = True
+
+    def rows(self) -> Tensor:
+        """The rows that are awake, (N,) bool."""
+        return self.awake.bool().repeat_interleave(BLOCK)[: len(self._gaussians._xyz)]
+
+    @contextmanager
+    def look(self) -> Iterator[None]:
+        """Within it, all parameters are what they would be had no block slept; then they are as before, to the bit."""
+        if self._is_whole:
+            yield
+            return
+        self._kept = [values.detach().clone() for values in self._values()]
+        self._wake(self._anywhere(), _LOOK)
+        try:
+            yield
+        finally:
+            if self._kept is not None:
+                self._restore()
+
+    def _restore(self) -> None:
+        for values, kept in zip(self._values(), self._kept, strict=True):
+            values.detach().copy_(kept)
+        self._kept = None
+
+    def _values(self) -> list[Tensor]:
+        return [self._gaussians.raw(name) for name in ("xyz", "opacity", "scaling", "rotation", "f_dc", "f_rest")]
+
+    def _anywhere(self) -> Scene:
+        """The Gaussians with a camera, of which nothing matters."""
+        means, opacities, scales, rotations, sh_dc, sh_rest = (values.detach() for values in self._values())
+        matrix, center = torch.eye(4, device=means.device), means.new_zeros(3)
+        shapes = means, opacities, scales, rotations, None, None
+        return Scene(*shapes, sh_dc, sh_rest, matrix, matrix, center, (1.0, 1.0, 1.0), (16, 16, 0, False, True))
+
+    def _wake(self, scene: Scene, waking: int, now: Tensor | None = None) -> None:
+        averages, steps, _, guard, attributes, rates, constants, columns, _, iteration = self._adam.arguments(False)
+        sleep = [self.awake, self._taken, self._terms]
+        step = averages, steps, guard, attributes, rates, constants, columns, iteration, now
+        OPERATORS.wake_(*scene.lists, sleep, waking, *step)
+
+
+def share_seen(points: Tensor, cameras: Sequence[Camera]) -> float:
+    """The share of points (N, 3) that a camera sees, on the mean of up to 32 cameras."""
+    views = cameras[:: -(-len(cameras) // 32)]
+    ones = torch.cat((points, torch.ones_like(points[:, :1])), 1)
+    shares = []
+    for view in views:
+        x, y, _, w = (ones @ view.full_proj_transform.to(points)).unbind(1)
+        shares.append(float(((w > 0) & (x.abs() < w) & (y.abs() < w)).float().mean()))
+    return sum(shares) / len(shares)

@@ -1,0 +1,90 @@
+// Wakes blocks of Gaussians.
+#include <algorithm>
+#include <cstring>
+#include <numeric>
+#include <type_traits>
+
+#include "../backend.h"
+#include "../math/adam.h"
+#include "../math/sleep.h"
+#include "adam_rows.h"
+#include "scene_lanes.h"
+
+GS_ISA_BEGIN
+
+namespace {
+
+// Whether a view may show one of the Gaussians.
+template <class T>
+bool may_be_seen(const Scene<T>& s, const Watch<T>& watch) {
+  using S = Simd<T>;
+  int32_t rows[kSleepBlock];
+  std::iota(rows, rows + s.count, 0);
+  for (int64_t first = 0; first < s.count; first += S::kLanes) {
+    bool seen = false;
+    for_packs<T>(rows + first, std::min<int64_t>(S::kLanes, s.count - first), [&](const Pack<T>& pack) {
+      typename S::Vec scales[3];
+      read_rows(s.scales, 3, s.count, 3, pack, scales);
+      const typename S::Vec largest = larger(larger(scales[0], scales[1]), scales[2]) + watch.log_scale;
+      const typename S::Mask unseen =
+          surely_unseen(watch, read_means(s, pack), typename S::Vec(s.scale_modifier * exponential(largest)));
+      seen = S::bits(~unseen) & ((1u << pack.count) - 1);
+    });
+    if (seen) return true;
+  }
+  return false;
+}
+
+template <class T>
+void take_missed_of_block(const AdamInput<T>& to, const MissedSum<T>& missed, int64_t first, int64_t rows, bool keep) {
+  for (int64_t r = first; r < first + rows; ++r)
+    for (int64_t at = r * to.row; at < r * to.row + to.columns; ++at) {
+      T mean = to.mean[at], square = to.square[at];
+      take_missed(missed, to.value[at], mean, square);
+      if (keep) to.mean[at] = mean, to.square[at] = square;
+    }
+}
+
+template <class T>
+AdamStep<T> step_of(const GaussianStep<T>& in, int attribute) {
+  AdamStep<T> step = adam_step_of(in.attributes[attribute], false);
+  if constexpr (std::is_same_v<T, float>)
+    if (in.now) std::memcpy(&step, in.now->constants[attribute], sizeof step);
+  return step;
+}
+
+}  // namespace
+
+template <class T>
+void wake(const Executor& executor, const Scene<T>& s, const SleepInput<T>& in) {
+  const GaussianStep<T>& step = in.step;
+  if (in.waking == kWakeSeen && step.guard.stopped && *step.guard.stopped) return;
+  const int64_t number = step.now ? step.now->step : int64_t(step.attributes[kStepMeans].step);
+  const Camera<T> camera = camera_of(s);
+  const bool keep = in.waking != kWakeToLook;
+  for (int a = 0; a < kStepped; ++a)
+    if (step.attributes[a].columns && keep) {
+      const AdamStep<T> constants = step_of(step, a);
+      in.terms[number % kTerms * kStepped + a] = constants.rate / constants.root_correction;
+    }
+  for_dynamic(executor, s.count, kSleepBlock, [&](int64_t begin, int64_t end) {
+    const int64_t block = begin / kSleepBlock, taken = in.taken[block], missed = number - 1 - taken;
+    MissedSum<T> sums[kStepped] = {};
+    for (int a = 0; a < kStepped && missed > 0; ++a)
+      if (step.attributes[a].columns) sums[a] = missed_sum(in.terms, a, step.attributes[a], taken, missed);
+    const bool wakes = in.waking != kWakeSeen || missed < 0 ||
+                       may_be_seen(part_of(s, begin, end - begin),
+                                   Watch<T>(camera, sums[kStepMeans].reach(), sums[kStepScales].reach()));
+    for (int a = 0; a < kStepped && wakes && missed > 0; ++a)
+      take_missed_of_block(step.attributes[a], sums[a], begin, end - begin, keep);
+    if (!keep) return;
+    in.awake[block] = wakes;
+    if (wakes) in.taken[block] = int32_t(number - (in.waking == kWakeAll));
+  });
+}
+
+#define GS_INSTANTIATE(T) template void wake<T>(const Executor&, const Scene<T>&, const SleepInput<T>&);
+GS_INSTANTIATE(float)
+GS_INSTANTIATE(double)
+
+GS_ISA_END

@@ -1,0 +1,89 @@
+#pragma once
+// Blocks of Gaussians that sleep through steps whose views cannot show them, and what these steps come to.
+//
+// A value without a gradient goes on by its averages alone. With m and v after step t, step t + j moves it by
+//   -lr c m_j / sqrt(v_j),  m_j = beta1^j m,  v_j = beta2^j v,  c = sqrt(1 - beta2^(t + j)) / (1 - beta1^(t + j)),
+// as long as sqrt(v_j) is far above epsilon. That is -lr c rho^j m / sqrt(v), rho = beta1 / sqrt(beta2). So k such
+// steps are one: the value moves by -A m / sqrt(v), A = sum of lr c rho^j over j from 1 to k, and the averages are
+// multiplied by beta1^k and beta2^k. Epsilon is taken as of step t. Against k steps one by one this differs by
+// rounding.
+//
+// |m| / sqrt(v) is at most (1 - beta1) / sqrt((1 - beta2) (1 - beta1^2 / beta2)), by Cauchy and Schwarz over the
+// gradients that m and v are sums of: 7.27 for the usual decays. So A bounds how far a sleeping value can have moved.
+#include "../data.h"
+#include "exponential.h"
+#include "projection.h"
+
+GS_ISA_BEGIN
+
+// The steps that one attribute of a block has missed.
+template <class T>
+struct MissedSum {
+  T sum;           // A
+  T keep1, keep2;  // beta1^k, beta2^k
+  T eps;           // epsilon sqrt(1 - beta2^t)
+  T most;          // the bound of |m| / sqrt(v), which averages from elsewhere may pass
+
+  GS_HD T reach() const { return sum * most; }
+};
+
+// taken: the steps that the block has taken, behind which it has missed `count`, at most kTerms - 1.
+template <class T>
+GS_HD MissedSum<T> missed_sum(const T* terms, int attribute, const AdamInput<T>& in, int64_t taken, int64_t count) {
+  const double rho = in.beta1 / std::sqrt(in.beta2);
+  double sum = 0, keep1 = 1, keep2 = 1;
+  for (int64_t j = count; j > 0; --j) {
+    sum = (sum + double(terms[(taken + j) % kTerms * kStepped + attribute])) * rho;
+    keep1 *= in.beta1, keep2 *= in.beta2;
+  }
+  const double most = (1 - in.beta1) / std::sqrt((1 - in.beta2) * (1 - in.beta1 * rho / std::sqrt(in.beta2)));
+  const double corrected = std::sqrt(1 - std::pow(in.beta2, double(taken > 0 ? taken : 1)));
+  return {T(sum), T(keep1), T(keep2), T(in.eps * corrected), T(most)};
+}
+
+template <class T>
+GS_HD void take_missed(const MissedSum<T>& missed, T& value, T& mean, T& square) {
+  const T ratio = mean / (std::sqrt(square) + missed.eps);
+  value = multiply_add(-missed.sum, clamp(ratio, -missed.most, missed.most), value);
+  mean *= missed.keep1, square *= missed.keep2;
+}
+
+// What tests a block: how far the means and the logarithms of scales may have moved, and the camera.
+template <class T>
+struct Watch {
+  Camera<T> cam;
+  T x, y, z;         // the farthest that a mean may have moved in the view
+  T wide_x, wide_y;  // px: the deviation on the image of a ball of scale 1 at depth 1 is at most this
+  T log_scale;
+
+  GS_HD Watch(const Camera<T>& camera, T mean_reach, T scale_reach) : cam(camera), log_scale(scale_reach) {
+    const T ball = mean_reach * T(1.7321);  // over the diagonal
+    const T depth = length(cam.row_z);
+    x = ball * length(cam.row_x), y = ball * length(cam.row_y), z = ball * depth;
+    const T ray_x = larger(magnitude(cam.ray_min_x), magnitude(cam.ray_max_x));
+    const T ray_y = larger(magnitude(cam.ray_min_y), magnitude(cam.ray_max_y));
+    wide_x = cam.focal_x * (length(cam.row_x) + ray_x * depth);
+    wide_y = cam.focal_y * (length(cam.row_y) + ray_y * depth);
+  }
+};
+
+// Whether a Gaussian certainly has no tile and no radius, wherever within `watch` it has moved. See surely_outside.
+template <class T, class V>
+GS_HD Truth<V> surely_unseen(const Watch<T>& watch, Vec3<V> mean, V largest_scale) {
+  const Camera<T>& cam = watch.cam;
+  const Vec3<V> view = to_view(cam, mean);
+  const V nearest = view.z - watch.z, per_depth = 1 / nearest;
+  const V ray_x = view.x / view.z, ray_y = view.y / view.z;
+  const V x = cam.mean_focal_x * ray_x + cam.axis_x, y = cam.mean_focal_y * ray_y + cam.axis_y;
+  const V moved_x = magnitude(cam.mean_focal_x) * (watch.x + magnitude(ray_x) * watch.z) * per_depth;
+  const V moved_y = magnitude(cam.mean_focal_y) * (watch.y + magnitude(ray_y) * watch.z) * per_depth;
+  const V away_x = larger<V>(-x, x - T(cam.width + kTile)) - moved_x;
+  const V away_y = larger<V>(-y, y - T(cam.height + kTile)) - moved_y;
+  const V deviations = (larger<V>(away_x, away_y) - 3) / T(3.5);
+  const V scale = largest_scale * per_depth;
+  const V variance = scale * scale * (watch.wide_x * watch.wide_x + watch.wide_y * watch.wide_y);
+  const V farthest = view.z + watch.z;
+  return (!in_front(farthest)) | (in_front(nearest) & (deviations > 1) & (variance + 1 < deviations * deviations));
+}
+
+GS_ISA_END

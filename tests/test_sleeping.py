@@ -1,0 +1,253 @@
+"""Blocks of Gaussians that sleep: what they miss, that no view shows them, and trainings in which they do."""
+
+import math
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from diff_gaussian_rasterization.backend import OPERATORS
+from diff_gaussian_rasterization.optim import adam_
+from diff_gaussian_rasterization.scene import Scene
+from rasterizer_tools import BOTH_AND_GPU, GPU_MARKS
+from step_ways import WAYS, take_as  # noqa: F401  (a fixture)
+from trainings import ITERATIONS, OPTIONS, differences, narrow_scene, trained
+
+from scene import sleeping
+from scene.readers.point_cloud import write_point_cloud
+from scene.saved_model import read_model
+from scene.sleeping import BLOCK, Sleeping
+from splatting.training import run as runs
+
+BETAS, EPS = (0.9, 0.999), 1e-15
+MOST_RATIO = 0.1 / math.sqrt(0.001 * (1 - 0.81 / 0.999))  # of |m| / sqrt(v) (csrc/math/sleep.h)
+NAMES = ("default", "white", "masks", "exposure", "depth", "absgrad", "budget", "degree 0")
+
+
+class Blocks:
+    """Raw Gaussians with Adam's state, whose blocks may sleep."""
+
+    def __init__(self, values: list[torch.Tensor], step: int = 0) -> None:
+        self.values = values  # in the order of gs::Stepped
+        means = values[0]
+        count = -(-len(means) // BLOCK)
+        self.averages = [torch.zeros_like(value) for value in values * 2]
+        self.steps = [torch.tensor(float(step)) for _ in values]
+        self.awake = torch.ones(count, dtype=torch.uint8, device=means.device)
+        self.taken = torch.full((count,), step, dtype=torch.int32, device=means.device)
+        self.terms = torch.zeros(128, 6, dtype=means.dtype, device=means.device)
+
+    def scene(self, camera: tuple) -> Scene:
+        means, opacities, scales, rotations, sh_dc, sh_rest = self.values
+        return Scene(means, opacities, scales, rotations, None, None, sh_dc, sh_rest, *camera)
+
+    def wake(self, camera: tuple, waking: int, rate: float) -> None:
+        sleep, constants = [self.awake, self.taken, self.terms], [*BETAS, EPS, 0.0, 0.0]
+        six = range(6)
+        lists = self.averages, self.steps, [], [*six], [rate for _ in six], constants, [-1 for _ in six]
+        OPERATORS.wake_(*self.scene(camera).lists, sleep, waking, *lists)
+
+    def step(self, gradients: list[torch.Tensor], rate: float) -> None:
+        adam_(
+            self.values, gradients, self.averages[:6], self.averages[6:], self.steps, [rate] * 6, *BETAS, EPS, [-1] * 6
+        )
+
+
+def _rows(count: int, generator: torch.Generator, place: dict) -> list[torch.Tensor]:
+    shapes = (3,), (1,), (3,), (4,), (1, 3), (15, 3)
+    return [torch.randn(count, *shape, generator=generator, dtype=torch.float64).to(**place) for shape in shapes]
+
+
+def _camera(view: torch.Tensor, place: dict, width: int = 96, height: int = 64) -> tuple:
+    """A camera whose matrix world to view is (4, 4); the fields of Scene behind the Gaussians."""
+    near, tan_x, tan_y = 0.01, 0.7, 0.7 * height / width
+    full = torch.zeros(4, 4, dtype=torch.float64)
+    full[0, 0], full[1, 1], full[3, 2], full[2, 2], full[2, 3] = 1 / tan_x, 1 / tan_y, 1.0, 1.0, -near
+    center = torch.linalg.inv(view)[:3, 3]
+    matrices = view.T, (full @ view).T, center
+    return *(m.contiguous().to(**place) for m in matrices), (tan_x, tan_y, 1.0), (height, width, 3, False, True)
+
+
+def _away(place: dict) -> tuple:
+    view = torch.eye(4, dtype=torch.float64)
+    view[2, 3] = -1e4  # all lie behind it
+    return _camera(view, place)
+
+
+@BOTH_AND_GPU
+@pytest.mark.parametrize("missed", [1, 7, 99])
+def test_missed_steps_are_those_without_a_gradient(device, dtype, missed):
+    place, generator = {"device": device, "dtype": dtype}, torch.Generator().manual_seed(missed)
+    slept = Blocks(_rows(300, generator, place))
+    for _ in range(5):
+        slept.step(_rows(300, generator, place), 0.01)
+    slept.taken.fill_(5)
+    dense = Blocks([value.clone() for value in slept.values])
+    dense.averages, dense.steps = [x.clone() for x in slept.averages], [x.clone() for x in slept.steps]
+    before = [value.clone() for value in slept.values]
+    for number in range(missed):
+        rate = 0.01 * (1 + 0.5 * math.sin(number))  # as a schedule's, or that of a clock
+        slept.wake(_away(place), sleeping._SEEN, rate)
+        for step in slept.steps:
+            step += 1
+        dense.step([torch.zeros_like(value) for value in dense.values], rate)
+    assert not slept.awake.any() and (slept.taken == 5).all()
+    assert all(map(torch.equal, slept.values, before))
+    slept.wake(_away(place), sleeping._LOOK, 0.01)
+    looked = [value.clone() for value in slept.values]
+    for value, kept in zip(slept.values, before, strict=True):
+        value.copy_(kept)
+    slept.wake(_away(place), sleeping._ALL, 0.01)
+    assert all(map(torch.equal, slept.values, looked)) and (slept.taken == 5 + missed).all()
+    most = 1e-12 if dtype == torch.float64 else 2e-6
+    for value, other, old in zip(slept.values, dense.values, before, strict=True):
+        assert (value - other).abs().max() <= most * (1 + (other - old).abs().max())
+    for one, other in zip(slept.averages, dense.averages, strict=True):
+        torch.testing.assert_close(one, other, rtol=10 * most, atol=0)
+
+
+def _clusters(rng: np.random.Generator, place: dict, blocks: int = 24) -> Blocks:
+    """A block a cluster, in a room of 10 units: balls, needles and giants, with averages at their limit."""
+    count = blocks * BLOCK - int(rng.integers(BLOCK))
+    values = _rows(count, torch.Generator().manual_seed(int(rng.integers(2**31))), place)
+    centers = np.repeat(rng.uniform(-10, 10, (blocks, 3)), BLOCK, 0)[:count]
+    spread = np.repeat(10 ** rng.uniform(-3, 0.3, (blocks, 1)), BLOCK, 0)[:count]
+    values[0].copy_(torch.tensor(centers + spread * rng.normal(size=(count, 3))))
+    needles = np.where(rng.random((count, 3)) < 0.03, rng.uniform(0, 2.5, (count, 3)), 0)
+    values[2].copy_(torch.tensor(rng.uniform(-6, -1, (count, 1)) + needles))
+    out = Blocks(values, step=500)
+    for value, mean, square in zip(values, out.averages[:6], out.averages[6:], strict=True):
+        square.fill_(1e-6)
+        mean.copy_(torch.tensor(rng.choice([-1, 1], value.shape)) * MOST_RATIO * 1e-3)
+    return out
+
+
+def _looking(rng: np.random.Generator, at: np.ndarray, place: dict) -> tuple:
+    """A camera near a point, or far from it, that looks anywhere."""
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    turn *= np.sign(np.linalg.det(turn))
+    view = np.eye(4)
+    view[:3, :3], view[:3, 3] = turn, -turn @ (at + rng.normal(size=3) * 10 ** rng.uniform(-2, 1))
+    return _camera(torch.tensor(view), place)
+
+
+@BOTH_AND_GPU
+def test_no_view_shows_a_block_that_sleeps(device, dtype):
+    place, rng = {"device": device, "dtype": dtype}, np.random.default_rng(7)
+    asleep = woken = 0
+    for _ in range(60):
+        blocks = _clusters(rng, place)
+        missed, rate = int(rng.integers(1, 100)), 10 ** rng.uniform(-5, -2)
+        blocks.terms.fill_(rate)
+        for step in blocks.steps:
+            step += missed
+        camera = _looking(rng, blocks.values[0][int(rng.integers(len(blocks.values[0])))].cpu().numpy(), place)
+        whole = Blocks([value.clone() for value in blocks.values])
+        whole.averages, whole.steps, whole.taken = blocks.averages, blocks.steps, blocks.taken
+        whole.terms = blocks.terms
+        whole.wake(camera, sleeping._LOOK, rate)
+        blocks.wake(camera, sleeping._SEEN, rate)
+        rows = blocks.awake.bool().repeat_interleave(BLOCK)[: len(blocks.values[0])]
+        for scene in (whole.scene(camera), blocks.scene(camera)):
+            *_, tiles, radii = OPERATORS.project(*scene)
+            assert not (tiles[~rows].any() or radii[~rows].any())
+        drawn = [
+            OPERATORS.rasterize(None, *scene, torch.zeros(3, **place), True, True, False, awake)
+            for scene, awake in ((whole.scene(camera), None), (blocks.scene(camera), blocks.awake))
+        ]
+        assert all(torch.equal(one, other) for one, other in zip(*(d[:4] for d in drawn), strict=True))
+        asleep, woken = asleep + int((~rows).sum()), woken + int(rows.sum())
+    assert min(asleep, woken) > 0.1 * (asleep + woken)
+
+
+# Trainings
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of a room of clusters, of which a view sees a part."""
+    folder = narrow_scene(tmp_path_factory.mktemp("sleeping") / "scene")
+    rng = np.random.default_rng(0)
+    centers = np.repeat(rng.uniform(-8, 8, (30, 3)), 200, 0)
+    points = np.concatenate((0.5 * rng.normal(size=(1000, 3)), centers + 0.1 * rng.normal(size=centers.shape)))
+    write_point_cloud(folder / "points.ply", points, rng.integers(0, 255, points.shape))
+    return folder
+
+
+def _trained(scene: Path, out: Path, *options: object) -> dict:
+    return trained(scene, out, "--init_pcd_path", scene / "points.ply", *options)
+
+
+@pytest.fixture(autouse=True)
+def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The share of blocks that are awake, step by step. All rest every 20 iterations."""
+    found, wake = [], Sleeping.wake
+
+    def noted(self: Sleeping, *arguments: object) -> None:
+        wake(self, *arguments)
+        found.append(float(self.awake.float().mean()))
+
+    monkeypatch.setattr(runs, "REST", 20)
+    monkeypatch.setattr(runs, "MOST_SHARE", 2.0)
+    monkeypatch.setattr(Sleeping, "wake", noted)
+    return found
+
+
+@pytest.fixture(scope="module")
+def plain(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict]:
+    """Trains by plain steps with the options of a name, once."""
+    folder = tmp_path_factory.mktemp("plain")
+    return cache(lambda name: _trained(scene, folder / name, "--plain_step", *OPTIONS[name]))
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("way", WAYS)
+def test_fast_steps(scene, tmp_path, take_as, plain, shares, way, name):  # noqa: F811
+    expected = plain(name)
+    shares.clear()
+    take_as(way)
+    assert not differences(_trained(scene, tmp_path, *OPTIONS[name]), expected)
+    assert min(shares) < 0.9
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
+def test_steps_of_a_gpu(scene, tmp_path, name, _):
+    expected = _trained(scene, tmp_path / "plain", "--plain_step", *OPTIONS[name])
+    assert not differences(_trained(scene, tmp_path / "captured", *OPTIONS[name]), expected)
+
+
+@pytest.mark.parametrize("way", [(), ("--plain_step",)])
+def test_scores_and_saves_between_change_nothing(scene, tmp_path, plain, way):
+    looks = "--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44
+    assert not differences(_trained(scene, tmp_path, *way, *looks), plain("default"))
+    _trained(scene, tmp_path / "plain", "--plain_step", "--save_iterations", 9, 44)
+    for iteration in (9, 44):
+        ply = f"point_cloud/iteration_{iteration}/point_cloud.ply"
+        assert (tmp_path / ply).read_bytes() == (tmp_path / "plain" / ply).read_bytes()
+
+
+@pytest.mark.parametrize("iteration", [40, 33])  # where all blocks rest anyway, and where they do for the checkpoint
+def test_resumed(scene, tmp_path, iteration):
+    whole = _trained(scene, tmp_path / "a", "--checkpoint_iterations", iteration, ITERATIONS)
+    start = "--start_checkpoint", tmp_path / "a" / f"chkpnt{iteration}.pth"
+    assert not differences(_trained(scene, tmp_path / "b", *start), whole)
+
+
+def test_where_views_see_most_points_no_block_sleeps(scene, tmp_path, monkeypatch, shares):
+    monkeypatch.setattr(runs, "MOST_SHARE", 0.0)
+    _trained(scene, tmp_path)
+    assert not shares
+
+
+def test_a_model_that_is_saved_between_is_as_if_no_block_had_slept(scene, tmp_path, monkeypatch):
+    """Up to rounding, which a training magnifies: in few steps, from the same points."""
+    words = "--save_iterations", 9
+    _trained(scene, tmp_path / "asleep", *words)
+    monkeypatch.setattr(runs, "MOST_SHARE", 0.0)
+    _trained(scene, tmp_path / "awake", *words)
+    one, other = (read_model(tmp_path / out / "point_cloud/iteration_9/point_cloud.ply") for out in ("asleep", "awake"))
+    torch.testing.assert_close(one.get_xyz, other.get_xyz, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(one.get_opacity, other.get_opacity, rtol=1e-4, atol=1e-4)
