@@ -158,7 +158,7 @@ def named(case: Case, state: State, iteration: int) -> dict:
 def step_recorded(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> None:
     """Take the same step by numbers that the device's memory holds; those of the call are wrong."""
     _, _, steps, rates, *constants, _ = case.lists(state)
-    host = torch.zeros(22, dtype=torch.int64)
+    host = torch.zeros(23, dtype=torch.int64)
     scene, kept, planes, radii = rendered(state, camera, case, iteration)
     ops.step_now_(host, case.attributes, steps, rates, *constants, case.sparse, iteration)
     wrong = {"steps": [t + 5 for t in steps], "rates": [2.0 * rate for rate in rates], "iteration": 77}

@@ -175,7 +175,7 @@ WRONG = {
         (RuntimeError, "step counter must be one float32 on the CPU", {"steps": lambda t: [t[0].int(), t[1]]}),
     ],
     "adam_ of visible rows": [
-        (ValueError, "sparse Adam has no counters", {"steps": [torch.tensor(1.0)]}),
+        (RuntimeError, "for each of the 1 parameters, got 2", {"steps": [torch.tensor(1.0), torch.tensor(1.0)]}),
         (RuntimeError, OF_VISIBLE, {"visible": torch.ones(4, dtype=torch.bool)}),
         (RuntimeError, OF_VISIBLE, {"visible": torch.ones(3)}),
         (RuntimeError, OF_VISIBLE, {"visible": torch.ones(3, 1, dtype=torch.bool)}),
@@ -219,6 +219,13 @@ WRONG = {
         *((ValueError, f"got {count} of splat 0", _unseen(count)) for count in (1, -1)),
         (ValueError, "or splats, tile_counts, rows and counts, got 3 tensors", {"source": lambda t: t[:3]}),
     ],
+    "wake_": [
+        (ValueError, "blocks of raw Gaussians sleep", {"options": lambda t: [*t[:4], False]}),
+        (ValueError, "give awake, taken and terms, and how to wake, from 0 to 2", {"waking": 3}),
+        (ValueError, r"awake must be \(1,\)", {"sleep": _changed(0, lambda t: t.repeat(2))}),
+        (TypeError, "taken must be torch.int32", {"sleep": _changed(1, Tensor.long)}),
+        (ValueError, r"terms must be \(128, 6\)", {"sleep": _changed(2, lambda t: t[1:])}),
+    ],
     "apply_gradients_ to sums": [
         (ValueError, "sums must have 9 tensors, got 8", {"sums": lambda t: t[:8]}),
         (ValueError, r"the sum of means must be \(3, 3\)", {"sums": _changed(1, lambda t: t[1:])}),
@@ -246,11 +253,11 @@ WRONG = {
         (TypeError, "radii must be", {"radii": torch.ones(3)}),
         (ValueError, "radii must be", {"radii": _integers(1, 1)}),
         (ValueError, "tile_counts must be", {"source": _changed(1, _integers(1, 1))}),
-        (ValueError, "now must be contiguous", {"now": torch.zeros(44, dtype=torch.int64)[::2]}),
+        (ValueError, "now must be contiguous", {"now": torch.zeros(46, dtype=torch.int64)[::2]}),
         (ValueError, "now must be", {"now": torch.zeros(21, dtype=torch.int64)}),
         (ValueError, "penalties are of raw", {"options": [7, 18, 3, 0, 0], "constants": [0.9, 0.99, 1e-8, 0, 0.1]}),
         (ValueError, "not cov3d or colors", {"gaussians": lambda t: [*t[:5], torch.rand(3, 3), t[5], t[5]]}),
-        (ValueError, "give 8 tensors of the Gaussians and 3 of the camera", {"camera": lambda t: t[:2]}),
+        (ValueError, "give 8 tensors of the Gaussians and 3 or 4 of the camera", {"camera": lambda t: t[:2]}),
     ],
     "project": [
         (ValueError, "lens must have 3 entries, and options 5, got 2 and 5", {"lens": [0.5, 0.5]}),

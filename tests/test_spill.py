@@ -11,11 +11,17 @@ from trainings import OPTIONS, differences, narrow_scene, trained
 from scene import spilled_model
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
-from splatting.training import memory_estimate, objective
+from splatting.training import memory_estimate, objective, run
 from splatting.training.memory_estimate import spilled_bytes, training_bytes
 from utils.system_utils import UserError
 
 BETAS, EPS = (0.9, 0.999), 1e-15
+
+
+@pytest.fixture(autouse=True)
+def _awake(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No block sleeps beside the spilled model, which knows no sleep."""
+    monkeypatch.setattr(run, "MOST_SHARE", 0.0)
 
 
 @pytest.fixture(scope="module")

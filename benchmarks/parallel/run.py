@@ -8,6 +8,8 @@ import torch
 import train
 from benchmarks.parallel.workload import Workload
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.morton import sort_rows
+from scene.sleeping import Sleeping
 from scene.spilled_model import SpilledGaussians
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch
@@ -30,10 +32,13 @@ class WorkloadRun(Run):
     """A run whose scene is a workload. Gaussians are observed, and none is added or removed.
 
     steps: how many it takes; in the last one the optimisers rest. still: with learning rates of 0, which have the
-    arithmetic of a step but leave the scene as it is, so that every step does the same work. spill: as the option.
+    arithmetic of a step but leave the scene as it is, so that every step does the same work. sleep: let blocks sleep,
+    with rows in order. spill: as the option.
     """
 
-    def __init__(self, workload: Workload, parallel: str, steps: int, still: bool, spill: bool = False) -> None:
+    def __init__(
+        self, workload: Workload, parallel: str, steps: int, still: bool, sleep: bool = False, spill: bool = False
+    ) -> None:
         here = self.group = ranks()
         views = here.size if parallel == "views" else 1
         words = ["-s", ".", "--iterations", str(steps * views), "--densify_from_iter", "10000", *_STILL * still]
@@ -55,6 +60,9 @@ class WorkloadRun(Run):
         self.objective = Objective(self)
         self.density = density_control(self)
         self.density.schedule = self.schedule
+        if sleep:
+            sort_rows(self.gaussians)
+            self.sleeping = Sleeping(self.gaussians)
         self._depth_weight = get_expon_lr_func(0.0, 0.0)
 
     def begin(self) -> None:

@@ -95,8 +95,8 @@ def measure(case: dict[str, Any]) -> dict[str, Any]:
         torch.cuda.set_per_process_memory_fraction(min(case["cap"] * 2**30 / total, 1.0))
     workload = replace(ALL[case["workload"]].changed(case["gaussians"], case["size"]), crop=case["crop"])
     steps = case["warm_up"] + _BLOCK * case["blocks"] + 1
-    spill = case["model"] == "spill"
-    run = WorkloadRun(workload, case["parallel"], steps, still=not case["learn"], spill=spill)
+    model = {name: case["model"] == name for name in ("sleep", "spill")}
+    run = WorkloadRun(workload, case["parallel"], steps, still=not case["learn"], **model)
     if device.type == "cuda":
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
@@ -192,7 +192,8 @@ def options() -> argparse.ArgumentParser:
     add("--gaussians", type=int, nargs="+", default=[None], help="in place of the workload's")
     add("--size", type=int, nargs=2, metavar=("WIDTH", "HEIGHT"), help="of the image, in place of the workload's")
     add("--crop", type=int, default=1, help="see the middle of so many parts across and down (default: 1)")
-    add("--model", nargs="+", choices=["gpu", "spill"], default=["gpu"], help="where it lies (default: gpu)")
+    add("--model", nargs="+", choices=["gpu", "sleep", "spill"], default=["gpu"],
+        help="where it lies, and whether blocks sleep (default: gpu)")  # fmt: skip
     add("--cap", type=float, default=0.0, help="GiB of a GPU that a process may take (default: all)")
     add("--learn", action="store_true", help="train, and show digests of the parameters")
     add("--warm_up", type=int, default=24, help="steps (default: 24)")

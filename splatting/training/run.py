@@ -63,6 +63,7 @@ class Run:
     """
 
     first_done: float | None = None
+    sleeping: Sleeping | None = None
 
     def __init__(
         self, dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, launch: argparse.Namespace

@@ -60,6 +60,7 @@ def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict
         "apply_gradients_": (ops.apply_gradients_, [*in_lists, state, planes, [], *step]),
         "apply_gradients_ of rows": (ops.apply_gradients_, [*in_lists, source, [], [], *step]),
         "apply_gradients_ to sums": (ops.apply_gradients_, [*in_lists, source, [], sums, None, [], [], [], []]),
+        "wake_": (ops.wake_, _wake(in_lists, step)),
         "decisive": (ops.decisive, [splats, instances, ranges, last]),
         "adam_": (ops.adam_, adam),
         "adam_ of visible rows": (ops.adam_, [*sparse, *guard]),
@@ -105,10 +106,19 @@ def _step(raw: dict[str, Tensor], guard: list) -> list:
     return [*lists, False, iteration]
 
 
+def _wake(lists: list, step: list) -> list:
+    """The arguments of `wake_`. lists, step: of `apply_gradients_`."""
+    gaussians, camera, lens, options = lists
+    blocks = torch.zeros(-(-len(gaussians[0]) // 128), dtype=torch.int32, device=gaussians[0].device)
+    sleep = [blocks.to(torch.uint8), blocks, gaussians[0].new_zeros(128, 6)]
+    _, averages, counters, _, *others = step
+    return [gaussians, camera, lens, [*options[:4], True], sleep, 0, averages, counters, *others[:5], others[6]]
+
+
 def _step_now() -> list:
     """The arguments of `step_now_`."""
     counters = [torch.tensor(float(place)) for place in range(6)]
-    return [torch.zeros(22, dtype=torch.int64), list(range(6)), counters, [0.1] * 6, 0.9, 0.99, 1e-8, False, 7]
+    return [torch.zeros(23, dtype=torch.int64), list(range(6)), counters, [0.1] * 6, 0.9, 0.99, 1e-8, False, 7]
 
 
 def outcomes() -> Iterator[tuple[str, str, str]]:

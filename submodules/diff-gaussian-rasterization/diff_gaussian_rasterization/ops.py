@@ -137,7 +137,7 @@ def _setup_context(ctx, inputs, output):
 
 def _keep(ctx, inputs, output):
     """Keep what the backward needs of the operator's inputs and output."""
-    _, *tensors, lens, options, background, inverse_depth, train, absolute = inputs
+    _, *tensors, lens, options, background, inverse_depth, train, absolute = inputs[:18]
     ctx.set_materialize_grads(False)
     ctx.numbers, ctx.inverse_depth, ctx.train, ctx.absolute = (lens, options), inverse_depth, train, absolute
     ctx.save_for_backward(*tensors, *Drawing.kept(output, background))
