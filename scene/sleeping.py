@@ -6,6 +6,7 @@ has missed when a view may show it. Rows lie along a Morton curve, so most block
 iterations all blocks wake, so that what is saved then is whole.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -22,7 +23,8 @@ from scene.gaussian_model import GaussianModel
 BLOCK = 128  # rows
 REST = 100  # iterations
 MOST_SHARE = 0.7  # of the points, seen by a view on average; where more are, sleep saves nothing
-_TERMS = 128, 6  # of past steps, for each attribute
+_TERMS = 128, 8  # of past steps, for each attribute, and powers (gs::SleepInput)
+_POWERS = 6
 _SEEN, _ALL, _LOOK = range(3)  # gs::Waking
 
 
@@ -31,7 +33,9 @@ class Sleeping:
 
     def __init__(self, gaussians: GaussianModel) -> None:
         self._gaussians, self._adam = gaussians, FusedAdam(gaussians)
+        beta1, beta2 = gaussians.optimizer.defaults["betas"]
         self._terms = gaussians._xyz.detach().new_zeros(_TERMS)
+        self._terms[:, _POWERS] = (beta1 / math.sqrt(beta2)) ** torch.arange(_TERMS[0], dtype=torch.float64)
         self.awake = self._taken = torch.empty(0)
         self._kept: list[Tensor] | None = None  # while somebody looks: what the parameters were
         self.reset()

@@ -224,7 +224,7 @@ WRONG = {
         (ValueError, "give awake, taken and terms, and how to wake, from 0 to 2", {"waking": 3}),
         (ValueError, r"awake must be \(1,\)", {"sleep": _changed(0, lambda t: t.repeat(2))}),
         (TypeError, "taken must be torch.int32", {"sleep": _changed(1, Tensor.long)}),
-        (ValueError, r"terms must be \(128, 6\)", {"sleep": _changed(2, lambda t: t[1:])}),
+        (ValueError, r"terms must be \(128, 8\)", {"sleep": _changed(2, lambda t: t[1:])}),
     ],
     "apply_gradients_ to sums": [
         (ValueError, "sums must have 9 tensors, got 8", {"sums": lambda t: t[:8]}),

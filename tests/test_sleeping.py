@@ -37,7 +37,8 @@ class Blocks:
         self.steps = [torch.tensor(float(step)) for _ in values]
         self.awake = torch.ones(count, dtype=torch.uint8, device=means.device)
         self.taken = torch.full((count,), step, dtype=torch.int32, device=means.device)
-        self.terms = torch.zeros(128, 6, dtype=means.dtype, device=means.device)
+        self.terms = torch.zeros(128, 8, dtype=means.dtype, device=means.device)
+        self.terms[:, 6] = (BETAS[0] / math.sqrt(BETAS[1])) ** torch.arange(128, dtype=torch.float64)
 
     def scene(self, camera: tuple) -> Scene:
         means, opacities, scales, rotations, sh_dc, sh_rest = self.values
@@ -140,7 +141,7 @@ def test_no_view_shows_a_block_that_sleeps(device, dtype):
     for _ in range(60):
         blocks = _clusters(rng, place)
         missed, rate = int(rng.integers(1, 100)), 10 ** rng.uniform(-5, -2)
-        blocks.terms.fill_(rate)
+        blocks.terms[:, :6] = rate
         for step in blocks.steps:
             step += missed
         camera = _looking(rng, blocks.values[0][int(rng.integers(len(blocks.values[0])))].cpu().numpy(), place)

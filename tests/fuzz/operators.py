@@ -110,7 +110,7 @@ def _wake(lists: list, step: list) -> list:
     """The arguments of `wake_`. lists, step: of `apply_gradients_`."""
     gaussians, camera, lens, options = lists
     blocks = torch.zeros(-(-len(gaussians[0]) // 128), dtype=torch.int32, device=gaussians[0].device)
-    sleep = [blocks.to(torch.uint8), blocks, gaussians[0].new_zeros(128, 6)]
+    sleep = [blocks.to(torch.uint8), blocks, gaussians[0].new_zeros(128, 8)]
     _, averages, counters, _, *others = step
     return [gaussians, camera, lens, [*options[:4], True], sleep, 0, averages, counters, *others[:5], others[6]]
 

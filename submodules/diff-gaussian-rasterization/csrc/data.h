@@ -39,6 +39,7 @@ struct Scene {
 constexpr int64_t kSleepBlock = 128;
 constexpr int64_t sleep_blocks(int64_t count) { return (count + kSleepBlock - 1) / kSleepBlock; }
 constexpr int64_t kTerms = 128;  // of past steps that are kept, so that no block may miss more
+constexpr int kTermColumns = 8, kPowers = 6;
 
 // What binning reads of a splat. It fits one memory sector, because binning reads splats in depth order. On a GPU
 // binning makes records that it was not given.
@@ -286,7 +287,9 @@ struct SleepInput {
   Waking waking;
   uint8_t* awake;  // (blocks) written
   int32_t* taken;  // (blocks) the number of the last step that a block takes part in, with kWakeSeen this one included
-  T* terms;        // (kTerms, kStepped) lr sqrt(1 - beta2^s) / (1 - beta1^s) of step s, at s modulo kTerms
+  // (kTerms, kTermColumns), at 16 bytes: of each attribute lr sqrt(1 - beta2^s) / (1 - beta1^s) of step s, in row s
+  // modulo kTerms; and in row j of column kPowers (beta1 / sqrt(beta2))^j, which is given.
+  T* terms;
 };
 
 }  // namespace gs

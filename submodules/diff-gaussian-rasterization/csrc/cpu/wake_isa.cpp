@@ -45,6 +45,15 @@ void take_missed_of_block(const AdamInput<T>& to, const MissedSum<T>& missed, in
     }
 }
 
+// MissedSum::sum.
+template <class T>
+T sum_of(const T* terms, int attribute, int64_t taken, int64_t missed) {
+  T sum = 0;
+  for (int64_t j = 1; j <= missed; ++j)
+    sum += terms[(taken + j) % kTerms * kTermColumns + attribute] * terms[j * kTermColumns + kPowers];
+  return sum;
+}
+
 template <class T>
 AdamStep<T> step_of(const GaussianStep<T>& in, int attribute) {
   AdamStep<T> step = adam_step_of(in.attributes[attribute], false);
@@ -65,16 +74,18 @@ void wake(const Executor& executor, const Scene<T>& s, const SleepInput<T>& in) 
   for (int a = 0; a < kStepped; ++a)
     if (step.attributes[a].columns && keep) {
       const AdamStep<T> constants = step_of(step, a);
-      in.terms[number % kTerms * kStepped + a] = constants.rate / constants.root_correction;
+      in.terms[number % kTerms * kTermColumns + a] = constants.rate / constants.root_correction;
     }
   for_dynamic(executor, s.count, kSleepBlock, [&](int64_t begin, int64_t end) {
     const int64_t block = begin / kSleepBlock, taken = in.taken[block], missed = number - 1 - taken;
     MissedSum<T> sums[kStepped] = {};
     for (int a = 0; a < kStepped && missed > 0; ++a)
-      if (step.attributes[a].columns) sums[a] = missed_sum(in.terms, a, step.attributes[a], taken, missed);
-    const bool wakes = in.waking != kWakeSeen || missed < 0 ||
-                       may_be_seen(part_of(s, begin, end - begin),
-                                   Watch<T>(camera, sums[kStepMeans].reach(), sums[kStepScales].reach()));
+      if (step.attributes[a].columns)
+        sums[a] = missed_sum(step.attributes[a], sum_of(in.terms, a, taken, missed), taken, missed);
+    const bool wakes =
+        in.waking != kWakeSeen || missed < 0 ||
+        may_be_seen(part_of(s, begin, end - begin), Watch<T>(camera, sums[kStepMeans].sum * sums[kStepMeans].most,
+                                                             sums[kStepScales].sum * sums[kStepScales].most));
     for (int a = 0; a < kStepped && wakes && missed > 0; ++a)
       take_missed_of_block(step.attributes[a], sums[a], begin, end - begin, keep);
     if (!keep) return;

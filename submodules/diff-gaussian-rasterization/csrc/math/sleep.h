@@ -23,22 +23,19 @@ struct MissedSum {
   T keep1, keep2;  // beta1^k, beta2^k
   T eps;           // epsilon sqrt(1 - beta2^t)
   T most;          // the bound of |m| / sqrt(v), which averages from elsewhere may pass
-
-  GS_HD T reach() const { return sum * most; }
 };
+
+template <class T>
+GS_HD T most_ratio(const AdamInput<T>& in) {
+  return T((1 - in.beta1) / std::sqrt((1 - in.beta2) * (1 - in.beta1 * in.beta1 / in.beta2)));
+}
 
 // taken: the steps that the block has taken, behind which it has missed `count`, at most kTerms - 1.
 template <class T>
-GS_HD MissedSum<T> missed_sum(const T* terms, int attribute, const AdamInput<T>& in, int64_t taken, int64_t count) {
-  const double rho = in.beta1 / std::sqrt(in.beta2);
-  double sum = 0, keep1 = 1, keep2 = 1;
-  for (int64_t j = count; j > 0; --j) {
-    sum = (sum + double(terms[(taken + j) % kTerms * kStepped + attribute])) * rho;
-    keep1 *= in.beta1, keep2 *= in.beta2;
-  }
-  const double most = (1 - in.beta1) / std::sqrt((1 - in.beta2) * (1 - in.beta1 * rho / std::sqrt(in.beta2)));
+GS_HD MissedSum<T> missed_sum(const AdamInput<T>& in, T sum, int64_t taken, int64_t count) {
   const double corrected = std::sqrt(1 - std::pow(in.beta2, double(taken > 0 ? taken : 1)));
-  return {T(sum), T(keep1), T(keep2), T(in.eps * corrected), T(most)};
+  return {sum, T(std::pow(in.beta1, double(count))), T(std::pow(in.beta2, double(count))), T(in.eps * corrected),
+          most_ratio(in)};
 }
 
 template <class T>

@@ -99,7 +99,10 @@ void step_plainly(const Where& where, Stepping& s, const StepCase& how, const Re
   const auto visible = std::make_unique<bool[]>(s.values.count);
   for (int64_t i = 0; i < s.values.count; ++i) visible[i] = r.radii[i] > 0;
   if (!how.sparse) return adam(where, inputs, 6, s.guard(how, iteration));
-  for (const gs::AdamInput<float>& in : inputs) sparse_adam(where, in, visible.get(), s.guard(how, iteration));
+  for (gs::AdamInput<float>& in : inputs) {
+    in.step = 0;  // without bias correction
+    sparse_adam(where, in, visible.get(), s.guard(how, iteration));
+  }
 }
 
 inline gs::GaussianStep<float> gaussian_step(Stepping& s, const StepCase& how, const Rendered& r, int64_t iteration) {

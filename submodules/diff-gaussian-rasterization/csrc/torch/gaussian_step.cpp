@@ -198,7 +198,7 @@ void wake_op(List<Tensor> gaussians, List<Tensor> camera, List<double> lens, Siz
   const int64_t blocks = gs::sleep_blocks(scene.count());
   check_tensor(sleep[0], "awake", ScalarType::Byte, scene.device(), {blocks});
   check_tensor(sleep[1], "taken", ScalarType::Int, scene.device(), {blocks});
-  check_tensor(sleep[2], "terms", scene.dtype(), scene.device(), {gs::kTerms, int64_t(gs::kStepped)});
+  check_tensor(sleep[2], "terms", scene.dtype(), scene.device(), {gs::kTerms, int64_t(gs::kTermColumns)});
   with_scalar(scene.dtype(), [&](auto zero) {
     using T = decltype(zero);
     const gs::SleepInput<T> in{step.of<T>(gaussians, {}), gs::Waking(waking), write<uint8_t>(sleep[0]),

@@ -56,8 +56,8 @@ void adam_op(List<Tensor> values, List<Tensor> gradients, List<Tensor> exp_avg, 
              List<Tensor> steps, List<double> rates, double beta1, double beta2, double eps, Sizes columns,
              const MaybeTensor& visible, const MaybeTensor& loss, const MaybeTensor& stopped, int64_t iteration) {
   const size_t n = values.size();
-  for (size_t size :
-       {gradients.size(), exp_avg.size(), exp_avg_sq.size(), visible && steps.empty() ? n : steps.size(), rates.size(), columns.size()})
+  for (size_t size : {gradients.size(), exp_avg.size(), exp_avg_sq.size(), visible && steps.empty() ? n : steps.size(),
+                      rates.size(), columns.size()})
     GS_CHECK(size == n, "every list must have an entry for each of the ", n, " parameters, got ", size);
   if (n == 0) return;
   const Tensor& first = values[0];
