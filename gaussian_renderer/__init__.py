@@ -168,13 +168,13 @@ def draw(
     """
     gaussians, raw = model_inputs(camera, pc, pipe, scaling)
     scene = scene_arguments(gaussians, rasterizer_settings(camera, pc, pipe, background, scaling), raw)
-    divided = draw_divided(pc, scene, background, want_depth, by_bands, bands, camera)
-    if divided is not None:
-        return divided
     awake = None
     if sleeping is not None:
         sleeping.wake(scene, now)
         awake = sleeping.awake
+    divided = draw_divided(pc, scene, background, want_depth, by_bands, bands, camera, awake)
+    if divided is not None:
+        return divided
     return Drawn(rasterize_scene(scene, background, want_depth, awake=awake), scene, background, want_depth, awake)
 
 

@@ -19,8 +19,8 @@ from torch import Tensor
 from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
+from splatting.distributed.rows import BLOCK
 
-BLOCK = 128  # rows
 REST = 100  # iterations
 MOST_SHARE = 0.7  # of the points, seen by a view on average; where more are, sleep saves nothing
 _TERMS = 128, 8  # of past steps, for each attribute, and powers (gs::SleepInput)

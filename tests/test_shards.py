@@ -142,18 +142,18 @@ def _budget(gaussians: GaussianModel) -> None:
 
 Scenario = tuple[int, type[GaussianModel], Callable[[GaussianModel], None], dict[str, object]]
 SCENARIOS: dict[str, Scenario] = {
-    "adc": (150, GaussianModel, _adc, {}),
-    "sparse": (80, GaussianModel, _adc, {"optimizer_type": "sparse_adam"}),
-    "limited": (150, GaussianModel, _limited, {}),
+    "adc": (900, GaussianModel, _adc, {}),
+    "sparse": (480, GaussianModel, _adc, {"optimizer_type": "sparse_adam"}),
+    "limited": (900, GaussianModel, _limited, {}),
     "few": (2, GaussianModel, _adc, {}),
     "one": (1, GaussianModel, _adc, {}),
-    "by hand": (90, GaussianModel, _by_hand, {}),
-    "client": (70, Client, _adc, {}),
-    "emptied": (60, GaussianModel, _emptied, {}),
-    "mcmc": (120, GaussianModel, _mcmc, {}),
+    "by hand": (540, GaussianModel, _by_hand, {}),
+    "client": (420, Client, _adc, {}),
+    "emptied": (360, GaussianModel, _emptied, {}),
+    "mcmc": (720, GaussianModel, _mcmc, {}),
     "mcmc, few": (2, GaussianModel, _mcmc, {}),
     "mcmc, one end": (20, GaussianModel, _mcmc_at_one_end, {}),
-    "budget": (130, GaussianModel, _budget, {}),
+    "budget": (780, GaussianModel, _budget, {}),
     "budget, few": (2, GaussianModel, _budget, {}),
 }
 RESUMED = ("adc", "few", "mcmc")  # from the files of one process, and trained further
@@ -218,7 +218,7 @@ def test_ranks_together_write_the_files_of_one_process(alone, tmp_path, size):
     every, others = zip(*in_ranks(size, _run, tmp_path, folder), strict=True)
     assert others == (told,) * size
     for name, (_, _, total) in shapes.items():
-        bounds = [rank * total // size for rank in range(size + 1)]
+        bounds = [min(-(-total // 128) * rank // size * 128, total) for rank in range(size + 1)]
         assert [rank[name] for rank in every] == [(a, b - a, total) for a, b in pairwise(bounds)], name
     for there in sorted(folder.iterdir()):
         found, wanted = _content(tmp_path / there.name), _content(there)

@@ -11,6 +11,7 @@ import torch
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.optim import adam_
 from diff_gaussian_rasterization.scene import Scene
+from processes import in_ranks
 from rasterizer_tools import BOTH_AND_GPU, GPU_MARKS
 from step_ways import WAYS, take_as  # noqa: F401  (a fixture)
 from trainings import ITERATIONS, OPTIONS, differences, narrow_scene, trained
@@ -19,6 +20,7 @@ from scene import sleeping
 from scene.readers.point_cloud import write_point_cloud
 from scene.saved_model import read_model
 from scene.sleeping import BLOCK, Sleeping
+from splatting.distributed.ranks import ranks
 from splatting.training import run as runs
 
 BETAS, EPS = (0.9, 0.999), 1e-15
@@ -183,16 +185,20 @@ def _trained(scene: Path, out: Path, *options: object) -> dict:
 
 @pytest.fixture(autouse=True)
 def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The share of blocks that are awake, step by step. All rest every 20 iterations."""
+    return _sleeps(monkeypatch)
+
+
+def _sleeps(patch: pytest.MonkeyPatch) -> list[float]:
+    """Let blocks sleep. The share that is awake, step by step; all rest every 20 iterations."""
     found, wake = [], Sleeping.wake
 
     def noted(self: Sleeping, *arguments: object) -> None:
         wake(self, *arguments)
         found.append(float(self.awake.float().mean()))
 
-    monkeypatch.setattr(runs, "REST", 20)
-    monkeypatch.setattr(runs, "MOST_SHARE", 2.0)
-    monkeypatch.setattr(Sleeping, "wake", noted)
+    patch.setattr(runs, "REST", 20)
+    patch.setattr(runs, "MOST_SHARE", 2.0)
+    patch.setattr(Sleeping, "wake", noted)
     return found
 
 
@@ -218,6 +224,30 @@ def test_fast_steps(scene, tmp_path, take_as, plain, shares, way, name):  # noqa
 def test_steps_of_a_gpu(scene, tmp_path, name, _):
     expected = _trained(scene, tmp_path / "plain", "--plain_step", *OPTIONS[name])
     assert not differences(_trained(scene, tmp_path / "captured", *OPTIONS[name]), expected)
+
+
+def _in_rank(scene: Path, folder: Path, kinds: list[tuple[str, ...]]) -> tuple[list[dict], float]:
+    """Results of trainings in the same processes, those of the first rank, and the smallest share awake."""
+    results: list[dict] = []
+    with pytest.MonkeyPatch.context() as patch:
+        found = _sleeps(patch)
+        for number, (name, *more) in enumerate(kinds):
+            out = folder / str(number)
+            try:
+                results.append(_trained(scene, out, *OPTIONS[name], *more))
+            except FileNotFoundError:  # only the first rank writes
+                if ranks().first:
+                    raise
+    return results, min(found)
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_ranks(scene, tmp_path, plain, size):
+    kinds = [("default",), ("white", "--plain_step"), ("exposure",), ("absgrad",), ("budget",)][: 5 if size == 2 else 2]
+    for results, share in in_ranks(size, _in_rank, scene, tmp_path, kinds):
+        assert share < 0.9
+        for (name, *_), result in zip(kinds, results, strict=False):
+            assert not differences(result, plain(name)), name
 
 
 @pytest.mark.parametrize("way", [(), ("--plain_step",)])

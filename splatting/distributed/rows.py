@@ -14,6 +14,7 @@ from splatting.distributed.ranks import ALONE, Ranks
 from splatting.distributed.selection import largest, lowest, weighted_choice
 from splatting.host.machine import compute_device
 
+BLOCK = 128  # rows that one rank has together, as they sleep together (scene/sleeping.py)
 _PART, _RANK = 43, 32  # bits of a key below the number of a part, and below the rank or piece in it
 
 
@@ -246,8 +247,8 @@ WHOLE = Shards()
 
 
 def bound(rank: int, total: int, size: int) -> int:
-    """The first of all rows that a rank has, once they are divided evenly."""
-    return rank * total // size
+    """The first of all rows that a rank has, once they are divided evenly by blocks."""
+    return min(rank * -(-total // BLOCK) // size * BLOCK, total)
 
 
 def changes_rows(method: Callable[..., Any]) -> Callable[..., Any]:

@@ -255,7 +255,7 @@ class Run:
         """What lets blocks sleep, where views see few of the scene's points, and a step concerns no other row."""
         cloud, density = self.scene.info.point_cloud, self.density
         dense = type(self.gaussians) is GaussianModel and type(self.gaussians.optimizer) is GaussianAdam
-        alone = not (self.group.several or self.schedule.views > 1 or density.queues or any(density.penalty))
+        alone = not (self.schedule.views > 1 or density.queues or any(density.penalty))
         in_python = self.pipe.compute_cov3D_python or self.pipe.convert_SHs_python
         ours = type(self.objective) is Objective and vars(type(density)).get("fusable", False) and not in_python
         if not (dense and alone and ours and cloud is not None and len(cloud.points)):

@@ -54,13 +54,15 @@ def draw_view(
     want_depth: bool,
     train: bool,
     find: Callable[..., Bands] | None = None,
+    awake: Tensor | None = None,
 ) -> View:
     """Render the rank's band of a view with the Gaussians of all ranks, with the bits of one process.
 
-    scene: the rasterizer's arguments with the rank's own Gaussians. find: takes the place of `find_bands`.
+    scene: the rasterizer's arguments with the rank's own Gaussians. find: takes the place of `find_bands`. awake: of
+    the rank's own blocks (scene/sleeping.py), None: all are.
     """
     height, width = scene.size
-    own, depths, rects, tile_counts, radii = OPERATORS.project(*scene)
+    own, depths, rects, tile_counts, radii = OPERATORS.project(*scene, awake)
     bands = (find or find_bands)(ranks, rects, tile_counts, height, width)
     (splats, depths, rects, counts), sent = send_splats(ranks, bands, (own, depths, rects, tile_counts))
     instances, ranges, *slots = OPERATORS.bin(splats, depths, rects, counts, height, width, train)

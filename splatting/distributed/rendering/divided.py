@@ -45,15 +45,16 @@ def draw_divided(
     by_bands: bool,
     bands: KnownBands | None,
     camera: Camera | MiniCam,
+    awake: Tensor | None = None,
 ) -> "DividedDrawn | None":
     """`draw` of the renderer for a divided model, of which each rank gives its own part; None for a whole one."""
     if not (ranks := ranks_of(model)).several:
         return None
     find = bands and partial(bands.find, camera.uid)
-    view = draw_view(ranks, scene, background, want_depth, train=True, find=find)
+    view = draw_view(ranks, scene, background, want_depth, train=True, find=find, awake=awake)
     if bands:
         bands.drawn(camera.uid, view.last)
-    return DividedDrawn(surroundings(view) if by_bands else whole_image(view), scene, want_depth, by_bands)
+    return DividedDrawn(surroundings(view) if by_bands else whole_image(view), scene, want_depth, by_bands, awake)
 
 
 class DividedDrawn:
@@ -62,10 +63,10 @@ class DividedDrawn:
     The image's gradient needs no more rows than the image has.
     """
 
-    def __init__(self, view: View, scene: Scene, want_depth: bool, by_bands: bool) -> None:
+    def __init__(self, view: View, scene: Scene, want_depth: bool, by_bands: bool, awake: Tensor | None) -> None:
         self.image, self.depth, self.radii = view.color, view.inverse_depth if want_depth else None, view.radii
         self.band = view.band if by_bands else None
-        self._view, self._scene = view, scene
+        self._view, self._scene, self._awake = view, scene, awake
 
     def decisive(self) -> Tensor:
         return decisive_in(self._view)
@@ -84,7 +85,7 @@ class DividedDrawn:
     ) -> None:
         absolute &= observe
         source = self._source((image_gradient, None, depth_gradient), absolute)
-        adam.apply(self._scene, source, (), self.radii, observe, absolute, now)
+        adam.apply(self._scene, source, (), self.radii, observe, absolute, now, self._awake)
 
     def _source(self, planes: tuple[Tensor | None, ...], absolute: bool) -> tuple[Tensor, ...]:
         view = self._view

@@ -120,8 +120,10 @@ BlendedTensors blend(const Tensor& splats, const Tensor& instances, const Tensor
 using Tensors5 = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
 using Tensors4 = std::tuple<Tensor, Tensor, Tensor, Tensor>;
 
-Tensors5 project_op(SCENE_PARAMETERS) {
-  const ProjectedTensors p = project(SceneTensors(SCENE_ARGUMENTS), true);
+Tensors5 project_op(SCENE_PARAMETERS, const MaybeTensor& awake) {
+  SceneTensors scene(SCENE_ARGUMENTS);
+  scene.set_awake(given(awake));
+  const ProjectedTensors p = project(scene, true);
   return {p.splats, p.depths, p.rects, p.tile_counts, p.radii};
 }
 
@@ -185,7 +187,7 @@ Tensor decisive_op(const Tensor& splats, const Tensor& instances, const Tensor& 
 
 GS_OPERATORS(diff_gaussian_rasterization, m) {
   m.define("project(" SCENE_SCHEMA
-           ") -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, Tensor radii)",
+           ", Tensor? awake=None) -> (Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, Tensor radii)",
            TORCH_BOX(&project_op));
   m.define(
       "bin(Tensor splats, Tensor depths, Tensor rects, Tensor tile_counts, int height, int width, bool train) -> "
