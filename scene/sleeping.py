@@ -9,6 +9,7 @@ iterations all blocks wake, so that what is saved then is whole.
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
@@ -20,12 +21,15 @@ from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from splatting.distributed.rows import BLOCK
+from utils.system_utils import UserError
 
 REST = 100  # iterations
 MOST_SHARE = 0.7  # of the points, seen by a view on average; where more are, sleep saves nothing
 _TERMS = 128, 8  # of past steps, for each attribute, and powers (gs::SleepInput)
 _POWERS = 6
-_SEEN, _ALL, _LOOK = range(3)  # gs::Waking
+_NAMES = "xyz", "opacity", "scaling", "rotation", "f_dc", "f_rest"  # in the order of gs::Stepped
+
+State = dict[str, Any]  # awake, taken and terms, and of the rows that sleep all that a step changes
 
 
 class Sleeping:
@@ -37,7 +41,7 @@ class Sleeping:
         self._terms = gaussians._xyz.detach().new_zeros(_TERMS)
         self._terms[:, _POWERS] = (beta1 / math.sqrt(beta2)) ** torch.arange(_TERMS[0], dtype=torch.float64)
         self.awake = self._taken = torch.empty(0)
-        self._kept: list[Tensor] | None = None  # while somebody looks: what the parameters were
+        self._asleep: State | None = None  # while somebody looks: what all was before
         self.reset()
 
     def reset(self) -> None:
@@ -54,14 +58,15 @@ class Sleeping:
 
     def wake(self, scene: Scene, now: Tensor | None = None) -> None:
         """Before a step: wake the blocks that the scene's camera may show. now: of FusedAdam.write_now."""
-        self._wake(scene, _SEEN, now)
+        self._wake(scene, False, now)
         self._is_whole = False
 
     def rest(self) -> None:
         """Let all blocks take the steps that they have missed. The next step may leave them asleep."""
-        if self._kept is not None:
-            self._restore()
-        self._wake(self._anywhere(), _ALL)
+        if self._asleep is not None:
+            self._put_back(self._asleep)
+            self._asleep = None
+        self._wake(self._anywhere(), True)
         self._is_whole = True
 
     def rows(self) -> Tensor:
@@ -70,38 +75,78 @@ class Sleeping:
 
     @contextmanager
     def look(self) -> Iterator[None]:
-        """Within it, all parameters are what they would be had no block slept; then they are as before, to the bit."""
+        """Within it, the model is what it would be had no block slept; then it is as before, to the bit."""
         if self._is_whole:
             yield
             return
-        self._kept = [values.detach().clone() for values in self._values()]
-        self._wake(self._anywhere(), _LOOK)
+        rows = self._sleepers()
+        states = {"awake": self.awake, "taken": self._taken, "terms": self._terms}
+        self._asleep = {name: values.clone() for name, values in states.items()}
+        self._asleep["rows"] = [values[rows] for values in self._moved()]
+        self._wake(self._anywhere(), True)
         try:
             yield
         finally:
-            if self._kept is not None:
-                self._restore()
+            if self._asleep is not None:
+                self._put_back(self._asleep)
+                self._asleep = None
 
-    def _restore(self) -> None:
-        for values, kept in zip(self._values(), self._kept, strict=True):
-            values.detach().copy_(kept)
-        self._kept = None
+    def captured(self) -> State | None:
+        """Within `look`, what a checkpoint of the model lacks; None: nothing. Every rank must call it."""
+        if self._asleep is None:
+            return None
+        whole = self._gaussians.shards.whole
+        changed = {name: whole(self._asleep[name]) for name in ("awake", "taken")}
+        return self._asleep | changed | {"rows": [whole(values) for values in self._asleep["rows"]]}
+
+    def restore(self, captured: State) -> None:
+        """Let the blocks sleep again that slept when a checkpoint was written. UserError if it does not fit."""
+        shards, count = self._gaussians.shards, len(self._gaussians)
+        first = shards.first // BLOCK
+        try:
+            asleep = (captured["awake"] == 0).repeat_interleave(BLOCK)
+            before = int(asleep[: shards.first].sum())
+            own = int(asleep[shards.first : shards.first + count].sum())
+            blocks = slice(first, first + len(self.awake))
+            self._put_back(
+                {"awake": captured["awake"][blocks], "taken": captured["taken"][blocks], "terms": captured["terms"]}
+                | {"rows": [values[before : before + own] for values in captured["rows"]]}
+            )
+        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+            raise UserError(f"the rows of the checkpoint that slept do not fit ({error}); give another one") from error
+
+    def _put_back(self, state: State) -> None:
+        self.awake.copy_(state["awake"])
+        self._taken.copy_(state["taken"])
+        self._terms.copy_(state["terms"])
+        rows = self._sleepers()
+        for values, kept in zip(self._moved(), state["rows"], strict=True):
+            values.index_copy_(0, rows, kept.to(values.device))
+        self._is_whole = False
+
+    def _sleepers(self) -> Tensor:
+        return (~self.rows()).nonzero().reshape(-1)
 
     def _values(self) -> list[Tensor]:
-        return [self._gaussians.raw(name) for name in ("xyz", "opacity", "scaling", "rotation", "f_dc", "f_rest")]
+        return [self._gaussians.raw(name).detach() for name in _NAMES]
+
+    def _moved(self) -> list[Tensor]:
+        """All that a step changes."""
+        states = [self._gaussians.optimizer.state_of(self._gaussians.raw(name)) for name in _NAMES]
+        return [*self._values(), *(state[name] for state in states for name in ("exp_avg", "exp_avg_sq"))]
 
     def _anywhere(self) -> Scene:
         """The Gaussians with a camera, of which nothing matters."""
-        means, opacities, scales, rotations, sh_dc, sh_rest = (values.detach() for values in self._values())
+        means, opacities, scales, rotations, sh_dc, sh_rest = self._values()
         matrix, center = torch.eye(4, device=means.device), means.new_zeros(3)
         shapes = means, opacities, scales, rotations, None, None
         return Scene(*shapes, sh_dc, sh_rest, matrix, matrix, center, (1.0, 1.0, 1.0), (16, 16, 0, False, True))
 
-    def _wake(self, scene: Scene, waking: int, now: Tensor | None = None) -> None:
+    def _wake(self, scene: Scene, every: bool, now: Tensor | None = None) -> None:
         averages, steps, _, guard, attributes, rates, constants, columns, _, iteration = self._adam.arguments(False)
         sleep = [self.awake, self._taken, self._terms]
         step = averages, steps, guard, attributes, rates, constants, columns, iteration, now
-        OPERATORS.wake_(*scene.lists, sleep, waking, *step)
+        OPERATORS.wake_(*scene.lists, sleep, every, *step)
 
 
 def share_seen(points: Tensor, cameras: Sequence[Camera]) -> float:

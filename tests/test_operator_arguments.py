@@ -221,7 +221,7 @@ WRONG = {
     ],
     "wake_": [
         (ValueError, "blocks of raw Gaussians sleep", {"options": lambda t: [*t[:4], False]}),
-        (ValueError, "give awake, taken and terms, and how to wake, from 0 to 2", {"waking": 3}),
+        (ValueError, "give awake, taken and terms", {"sleep": lambda t: t[:2]}),
         (ValueError, r"awake must be \(1,\)", {"sleep": _changed(0, lambda t: t.repeat(2))}),
         (TypeError, "taken must be torch.int32", {"sleep": _changed(1, Tensor.long)}),
         (ValueError, r"terms must be \(128, 8\)", {"sleep": _changed(2, lambda t: t[1:])}),

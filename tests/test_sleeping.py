@@ -1,6 +1,8 @@
 """Blocks of Gaussians that sleep: what they miss, that no view shows them, and trainings in which they do."""
 
 import math
+import os
+import signal
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -16,12 +18,14 @@ from rasterizer_tools import BOTH_AND_GPU, GPU_MARKS
 from step_ways import WAYS, take_as  # noqa: F401  (a fixture)
 from trainings import ITERATIONS, OPTIONS, differences, narrow_scene, trained
 
-from scene import sleeping
+from scene.gaussians.checkpoint import ASLEEP, further, load_checkpoint, save_checkpoint
 from scene.readers.point_cloud import write_point_cloud
 from scene.saved_model import read_model
 from scene.sleeping import BLOCK, Sleeping
 from splatting.distributed.ranks import ranks
 from splatting.training import run as runs
+from splatting.training.steps import fused
+from utils.system_utils import UserError
 
 BETAS, EPS = (0.9, 0.999), 1e-15
 MOST_RATIO = 0.1 / math.sqrt(0.001 * (1 - 0.81 / 0.999))  # of |m| / sqrt(v) (csrc/math/sleep.h)
@@ -46,11 +50,11 @@ class Blocks:
         means, opacities, scales, rotations, sh_dc, sh_rest = self.values
         return Scene(means, opacities, scales, rotations, None, None, sh_dc, sh_rest, *camera)
 
-    def wake(self, camera: tuple, waking: int, rate: float) -> None:
+    def wake(self, camera: tuple, every: bool, rate: float) -> None:
         sleep, constants = [self.awake, self.taken, self.terms], [*BETAS, EPS, 0.0, 0.0]
         six = range(6)
         lists = self.averages, self.steps, [], [*six], [rate for _ in six], constants, [-1 for _ in six]
-        OPERATORS.wake_(*self.scene(camera).lists, sleep, waking, *lists)
+        OPERATORS.wake_(*self.scene(camera).lists, sleep, every, *lists)
 
     def step(self, gradients: list[torch.Tensor], rate: float) -> None:
         adam_(
@@ -92,18 +96,14 @@ def test_missed_steps_are_those_without_a_gradient(device, dtype, missed):
     before = [value.clone() for value in slept.values]
     for number in range(missed):
         rate = 0.01 * (1 + 0.5 * math.sin(number))  # as a schedule's, or that of a clock
-        slept.wake(_away(place), sleeping._SEEN, rate)
+        slept.wake(_away(place), False, rate)
         for step in slept.steps:
             step += 1
         dense.step([torch.zeros_like(value) for value in dense.values], rate)
     assert not slept.awake.any() and (slept.taken == 5).all()
     assert all(map(torch.equal, slept.values, before))
-    slept.wake(_away(place), sleeping._LOOK, 0.01)
-    looked = [value.clone() for value in slept.values]
-    for value, kept in zip(slept.values, before, strict=True):
-        value.copy_(kept)
-    slept.wake(_away(place), sleeping._ALL, 0.01)
-    assert all(map(torch.equal, slept.values, looked)) and (slept.taken == 5 + missed).all()
+    slept.wake(_away(place), True, 0.01)
+    assert (slept.taken == 5 + missed).all()
     most = 1e-12 if dtype == torch.float64 else 2e-6
     for value, other, old in zip(slept.values, dense.values, before, strict=True):
         assert (value - other).abs().max() <= most * (1 + (other - old).abs().max())
@@ -148,10 +148,10 @@ def test_no_view_shows_a_block_that_sleeps(device, dtype):
             step += missed
         camera = _looking(rng, blocks.values[0][int(rng.integers(len(blocks.values[0])))].cpu().numpy(), place)
         whole = Blocks([value.clone() for value in blocks.values])
-        whole.averages, whole.steps, whole.taken = blocks.averages, blocks.steps, blocks.taken
-        whole.terms = blocks.terms
-        whole.wake(camera, sleeping._LOOK, rate)
-        blocks.wake(camera, sleeping._SEEN, rate)
+        whole.averages, whole.steps = [x.clone() for x in blocks.averages], blocks.steps
+        whole.taken, whole.terms = blocks.taken.clone(), blocks.terms.clone()
+        whole.wake(camera, True, rate)
+        blocks.wake(camera, False, rate)
         rows = blocks.awake.bool().repeat_interleave(BLOCK)[: len(blocks.values[0])]
         for scene in (whole.scene(camera), blocks.scene(camera)):
             *_, tiles, radii = OPERATORS.project(*scene)
@@ -238,16 +238,22 @@ def _in_rank(scene: Path, folder: Path, kinds: list[tuple[str, ...]]) -> tuple[l
             except FileNotFoundError:  # only the first rank writes
                 if ranks().first:
                     raise
-    return results, min(found)
+        return results if ranks().first else [], min(found)
 
 
 @pytest.mark.parametrize("size", [2, 3])
 def test_ranks(scene, tmp_path, plain, size):
-    kinds = [("default",), ("white", "--plain_step"), ("exposure",), ("absgrad",), ("budget",)][: 5 if size == 2 else 2]
-    for results, share in in_ranks(size, _in_rank, scene, tmp_path, kinds):
-        assert share < 0.9
-        for (name, *_), result in zip(kinds, results, strict=False):
-            assert not differences(result, plain(name)), name
+    kinds: list[tuple] = [("default", "--checkpoint_iterations", 33, ITERATIONS), ("white", "--plain_step")]
+    if size == 2:
+        _trained(scene, tmp_path / "alone", "--checkpoint_iterations", 33, ITERATIONS)
+        kinds += [("exposure",), ("absgrad",), ("budget",)]
+        kinds += [("default", "--start_checkpoint", tmp_path / "alone/chkpnt33.pth")]
+    found = in_ranks(size, _in_rank, scene, tmp_path, kinds)
+    assert all(share < 0.9 for _, share in found)
+    for (name, *_), result in zip(kinds, found[0][0], strict=True):
+        assert not differences(result, plain(name)), name
+    start = "--start_checkpoint", tmp_path / "0/chkpnt33.pth"
+    assert not differences(_trained(scene, tmp_path / "resumed", *start), plain("default"))
 
 
 @pytest.mark.parametrize("way", [(), ("--plain_step",)])
@@ -260,11 +266,37 @@ def test_scores_and_saves_between_change_nothing(scene, tmp_path, plain, way):
         assert (tmp_path / ply).read_bytes() == (tmp_path / "plain" / ply).read_bytes()
 
 
-@pytest.mark.parametrize("iteration", [40, 33])  # where all blocks rest anyway, and where they do for the checkpoint
-def test_resumed(scene, tmp_path, iteration):
-    whole = _trained(scene, tmp_path / "a", "--checkpoint_iterations", iteration, ITERATIONS)
-    start = "--start_checkpoint", tmp_path / "a" / f"chkpnt{iteration}.pth"
-    assert not differences(_trained(scene, tmp_path / "b", *start), whole)
+@pytest.mark.parametrize("iteration", [40, 33])  # where all blocks rest, and where some sleep
+def test_resumed(scene, tmp_path, plain, iteration):
+    checkpoint = tmp_path / "a" / f"chkpnt{iteration}.pth"
+    planned = "--checkpoint_iterations", iteration, ITERATIONS
+    assert not differences(_trained(scene, tmp_path / "a", *planned), plain("default"))
+    assert not differences(_trained(scene, tmp_path / "b", "--start_checkpoint", checkpoint), plain("default"))
+    capture, _ = load_checkpoint(checkpoint)
+    asleep = further(capture, ASLEEP)
+    assert (asleep is None) == (iteration == 40)
+    if asleep:
+        asleep["rows"].pop()
+        save_checkpoint(tmp_path / "bad.pth", capture, iteration)
+        with pytest.raises(UserError, match="that slept do not fit"):
+            _trained(scene, tmp_path / "c", "--start_checkpoint", tmp_path / "bad.pth")
+
+
+def test_interrupted(scene, tmp_path, plain, monkeypatch):
+    draw, calls = fused.draw, []
+
+    def interrupted(*args: object, **named: object) -> object:
+        calls.append(1)
+        if len(calls) == 37:
+            os.kill(os.getpid(), signal.SIGINT)
+        return draw(*args, **named)
+
+    monkeypatch.setattr(fused, "draw", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        _trained(scene, tmp_path / "cut")
+    (checkpoint,) = (tmp_path / "cut").glob("chkpnt*.pth")
+    assert further(load_checkpoint(checkpoint)[0], ASLEEP)
+    assert not differences(_trained(scene, tmp_path / "whole", "--start_checkpoint", checkpoint), plain("default"))
 
 
 def test_where_views_see_most_points_no_block_sleeps(scene, tmp_path, monkeypatch, shares):
@@ -275,10 +307,15 @@ def test_where_views_see_most_points_no_block_sleeps(scene, tmp_path, monkeypatc
 
 def test_a_model_that_is_saved_between_is_as_if_no_block_had_slept(scene, tmp_path, monkeypatch):
     """Up to rounding, which a training magnifies: in few steps, from the same points."""
-    words = "--save_iterations", 9
+    words = "--save_iterations", 9, "--checkpoint_iterations", 9, ITERATIONS
     _trained(scene, tmp_path / "asleep", *words)
     monkeypatch.setattr(runs, "MOST_SHARE", 0.0)
     _trained(scene, tmp_path / "awake", *words)
     one, other = (read_model(tmp_path / out / "point_cloud/iteration_9/point_cloud.ply") for out in ("asleep", "awake"))
     torch.testing.assert_close(one.get_xyz, other.get_xyz, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(one.get_opacity, other.get_opacity, rtol=1e-4, atol=1e-4)
+    one, other = (load_checkpoint(tmp_path / out / "chkpnt9.pth")[0] for out in ("asleep", "awake"))
+    assert further(one, ASLEEP) and not further(other, ASLEEP)
+    torch.testing.assert_close(one[1], other[1], rtol=1e-5, atol=1e-5)
+    averages, dense = (capture[10]["state"][0]["exp_avg"] for capture in (one, other))
+    assert (averages - dense).abs().max() < 1e-3 * dense.abs().max()

@@ -22,8 +22,9 @@ from splatting.host.machine import VERSION
 from utils.system_utils import UserError, atomic_write, writes_files
 
 _LARGEST = 1e15  # extent; learning rates are multiples of it
+_OPTIMIZER = 10  # which entry its state dict is
 _ENTRIES = 12  # the reference's; the values of further attributes may follow
-EXPOSURES, WRITTEN_BY = "exposures", "version"  # keys in the optimiser's state dict
+EXPOSURES, WRITTEN_BY, ASLEEP = "exposures", "version", "asleep"  # keys in the optimiser's state dict
 
 
 class State(NamedTuple):
@@ -124,6 +125,17 @@ def pack(state: State) -> tuple:
         state.spatial_lr_scale,
         *(values for name, values in state.rows.items() if name not in IN_CHECKPOINT),
     )
+
+
+def with_further(entries: tuple, key: str, values: dict[str, Any]) -> tuple:
+    """The entries with one more key in the optimiser's state dict."""
+    return (*entries[:_OPTIMIZER], entries[_OPTIMIZER] | {key: values}, *entries[_OPTIMIZER + 1 :])
+
+
+def further(entries: Sequence[Any], key: str) -> Any:
+    """What stands there, or None."""
+    optimizer = entries[_OPTIMIZER]
+    return optimizer.get(key) if isinstance(optimizer, dict) else None
 
 
 def unpack(entries: Sequence[Any], table: dict[str, Attribute], max_sh_degree: int) -> State:

@@ -30,7 +30,6 @@ def run_training(run: Run, observers: Sequence[Observer]) -> None:
             at.stopping = together.stopping  # read once: a signal may come at any moment
             if at.stopping:
                 taker.drain()
-                run.end_sleep()
             every.stepped(at)
             if at.stopping:
                 together.wait()

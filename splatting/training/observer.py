@@ -62,7 +62,7 @@ class Announcer:
                 notify(step, losses)
 
     def stepped(self, step: Iteration) -> None:
-        with self._look() if step.due else nullcontext():
+        with self._look() if step.due or step.stopping else nullcontext():
             for notify in self._stepped:
                 notify(step)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
-from scene.gaussians.checkpoint import load_checkpoint
+from scene.gaussians.checkpoint import ASLEEP, further, load_checkpoint, with_further
 from scene.gaussians.morton import sort_rows
 from scene.sleeping import MOST_SHARE, REST, Sleeping, share_seen
 from scene.spilled_model import SpilledGaussians
@@ -117,6 +117,8 @@ class Run:
         )
         self.density.schedule = self.schedule
         self.sleeping = self._may_sleep()
+        if self.sleeping and capture and (asleep := further(capture, ASLEEP)):
+            self.sleeping.restore(asleep)
         checks.warn_of_another_number(self.density, opt, self.gaussians.gaussian_count, self.first_iteration + 1)
         if capture is None and first is None:
             self.density.started()
@@ -265,9 +267,7 @@ class Run:
 
     def rests(self, step: Iteration) -> bool:
         """Whether all blocks of Gaussians wake after a step."""
-        return self.sleeping is not None and (
-            step.iteration % REST == 0 or step.takes(self.launch.checkpoint_iterations)
-        )
+        return self.sleeping is not None and step.iteration % REST == 0
 
     def after_step(self, step: Iteration) -> None:
         """What follows the optimiser's step."""
@@ -283,6 +283,12 @@ class Run:
     def look(self) -> AbstractContextManager:
         """Within it, others may read the model."""
         return nullcontext() if self.sleeping is None else self.sleeping.look()
+
+    def captured(self) -> tuple:
+        """The state of the model for a checkpoint, from which a training resumes. Every rank must call it."""
+        state = self.gaussians.capture()
+        asleep = self.sleeping and self.sleeping.captured()
+        return with_further(state, ASLEEP, asleep) if asleep else state
 
     def end_sleep(self) -> None:
         """Let all blocks take the steps that they have missed, and sleep no more."""

@@ -112,7 +112,7 @@ def _wake(lists: list, step: list) -> list:
     blocks = torch.zeros(-(-len(gaussians[0]) // 128), dtype=torch.int32, device=gaussians[0].device)
     sleep = [blocks.to(torch.uint8), blocks, gaussians[0].new_zeros(128, 8)]
     _, averages, counters, _, *others = step
-    return [gaussians, camera, lens, [*options[:4], True], sleep, 0, averages, counters, *others[:5], others[6]]
+    return [gaussians, camera, lens, [*options[:4], True], sleep, False, averages, counters, *others[:5], others[6]]
 
 
 def _step_now() -> list:

@@ -135,6 +135,7 @@ class MemoryGuard(Observer):
             else:
                 gaussians.active_sh_degree = self._sh_degree
                 anew = "--max_num_splats or --sh_degree"  # a resumed run with as many Gaussians would end here again
+            self._run.end_sleep()
             gaussians.check_finite(iteration)
             gaussians.check_steps()
             path = self._folder / f"chkpnt{iteration}.pth"

@@ -275,18 +275,14 @@ struct GaussianStep {
   Penalty<T> penalty;     // whose gradients are added, where opacities and scales take steps
 };
 
-// Which blocks wake: those that a view may show, for the step that follows, unless the guard has stopped; all, for no
-// step yet; or all without a trace, so that only the values change.
-enum Waking { kWakeSeen, kWakeAll, kWakeToLook };
-
 // The blocks of Gaussians that sleep (math/sleep.h) through a step. Blocks that wake take the steps before it that they
 // have missed. step: its attributes, guard and `now`.
 template <class T>
 struct SleepInput {
   GaussianStep<T> step;
-  Waking waking;
+  bool all;        // all blocks wake, for no step yet; or those that a view may show, unless the guard has stopped
   uint8_t* awake;  // (blocks) written
-  int32_t* taken;  // (blocks) the number of the last step that a block takes part in, with kWakeSeen this one included
+  int32_t* taken;  // (blocks) the number of the last step that a block takes part in: this one, unless all wake
   // (kTerms, kTermColumns), at 16 bytes: of each attribute lr sqrt(1 - beta2^s) / (1 - beta1^s) of step s, in row s
   // modulo kTerms; and in row j of column kPowers (beta1 / sqrt(beta2))^j, which is given.
   T* terms;

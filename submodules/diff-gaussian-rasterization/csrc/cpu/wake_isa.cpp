@@ -36,13 +36,10 @@ bool may_be_seen(const Scene<T>& s, const Watch<T>& watch) {
 }
 
 template <class T>
-void take_missed_of_block(const AdamInput<T>& to, const MissedSum<T>& missed, int64_t first, int64_t rows, bool keep) {
+void take_missed_of_block(const AdamInput<T>& to, const MissedSum<T>& missed, int64_t first, int64_t rows) {
   for (int64_t r = first; r < first + rows; ++r)
-    for (int64_t at = r * to.row; at < r * to.row + to.columns; ++at) {
-      T mean = to.mean[at], square = to.square[at];
-      take_missed(missed, to.value[at], mean, square);
-      if (keep) to.mean[at] = mean, to.square[at] = square;
-    }
+    for (int64_t at = r * to.row; at < r * to.row + to.columns; ++at)
+      take_missed(missed, to.value[at], to.mean[at], to.square[at]);
 }
 
 // MissedSum::sum.
@@ -67,12 +64,11 @@ AdamStep<T> step_of(const GaussianStep<T>& in, int attribute) {
 template <class T>
 void wake(const Executor& executor, const Scene<T>& s, const SleepInput<T>& in) {
   const GaussianStep<T>& step = in.step;
-  if (in.waking == kWakeSeen && step.guard.stopped && *step.guard.stopped) return;
+  if (!in.all && step.guard.stopped && *step.guard.stopped) return;
   const int64_t number = step.now ? step.now->step : int64_t(step.attributes[kStepMeans].step);
   const Camera<T> camera = camera_of(s);
-  const bool keep = in.waking != kWakeToLook;
   for (int a = 0; a < kStepped; ++a)
-    if (step.attributes[a].columns && keep) {
+    if (step.attributes[a].columns) {
       const AdamStep<T> constants = step_of(step, a);
       in.terms[number % kTerms * kTermColumns + a] = constants.rate / constants.root_correction;
     }
@@ -83,14 +79,13 @@ void wake(const Executor& executor, const Scene<T>& s, const SleepInput<T>& in) 
       if (step.attributes[a].columns)
         sums[a] = missed_sum(step.attributes[a], sum_of(in.terms, a, taken, missed), taken, missed);
     const bool wakes =
-        in.waking != kWakeSeen || missed < 0 ||
+        in.all || missed < 0 ||
         may_be_seen(part_of(s, begin, end - begin), Watch<T>(camera, sums[kStepMeans].sum * sums[kStepMeans].most,
                                                              sums[kStepScales].sum * sums[kStepScales].most));
     for (int a = 0; a < kStepped && wakes && missed > 0; ++a)
-      take_missed_of_block(step.attributes[a], sums[a], begin, end - begin, keep);
-    if (!keep) return;
+      take_missed_of_block(step.attributes[a], sums[a], begin, end - begin);
     in.awake[block] = wakes;
-    if (wakes) in.taken[block] = int32_t(number - (in.waking == kWakeAll));
+    if (wakes) in.taken[block] = int32_t(number - in.all);
   });
 }
 

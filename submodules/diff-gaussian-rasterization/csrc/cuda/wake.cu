@@ -46,7 +46,7 @@ __device__ bool is_aligned(const float* p) { return reinterpret_cast<uintptr_t>(
 
 // Whole blocks go 16 bytes a thread, and several loads are under way before the first store.
 __device__ void take_missed_of_whole_block(float* values, float* means, float* squares, int count,
-                                           const MissedSum<float>& missed, bool keep) {
+                                           const MissedSum<float>& missed) {
   constexpr int kAhead = 3;
   float4 *value = reinterpret_cast<float4*>(values), *mean = reinterpret_cast<float4*>(means),
          *square = reinterpret_cast<float4*>(squares);
@@ -63,23 +63,22 @@ __device__ void take_missed_of_whole_block(float* values, float* means, float* s
       take_missed(missed, v[j].x, m[j].x, s[j].x), take_missed(missed, v[j].y, m[j].y, s[j].y);
       take_missed(missed, v[j].z, m[j].z, s[j].z), take_missed(missed, v[j].w, m[j].w, s[j].w);
       __stcs(value + at, v[j]);
-      if (keep) __stcs(mean + at, m[j]), __stcs(square + at, s[j]);
+      __stcs(mean + at, m[j]), __stcs(square + at, s[j]);
     }
   }
 }
 
 __device__ void take_missed_of_block(const AdamInput<float>& to, const MissedSum<float>& missed, int64_t first,
-                                     int rows, bool keep) {
+                                     int rows) {
   float *value = to.value + first * to.row, *mean = to.mean + first * to.row, *square = to.square + first * to.row;
   const int row = int(to.row), columns = int(to.columns);
   if (columns == row && rows == kThreads && is_aligned(value) && is_aligned(mean) && is_aligned(square))
-    return take_missed_of_whole_block(value, mean, square, kThreads / 4 * row, missed, keep);
+    return take_missed_of_whole_block(value, mean, square, kThreads / 4 * row, missed);
   for (int k = threadIdx.x; k < rows * columns; k += kThreads) {
     const int at = k / columns * row + k % columns;
     float v = value[at], m = mean[at], s = square[at];
     take_missed(missed, v, m, s);
-    value[at] = v;
-    if (keep) mean[at] = m, square[at] = s;
+    value[at] = v, mean[at] = m, square[at] = s;
   }
 }
 
@@ -96,12 +95,12 @@ __device__ void write_terms(const SleepInput<float>& in, int64_t number) {
 
 __global__ void __launch_bounds__(kThreads)
     wake_kernel(const int32_t* halted, Scene<float> s, const __grid_constant__ SleepInput<float> in) {
-  if (is_halted(halted) || (in.waking == kWakeSeen && in.step.guard.stopped && *in.step.guard.stopped)) return;
+  if (is_halted(halted) || (!in.all && in.step.guard.stopped && *in.step.guard.stopped)) return;
   const int64_t number = in.step.now ? in.step.now->step : int64_t(in.step.attributes[kStepMeans].step);
   __shared__ Camera<float> camera;
   __shared__ PartialSums sums;
   __shared__ MissedSum<float> steps[kStepped];
-  if (blockIdx.x == 0 && threadIdx.x < kStepped && in.waking != kWakeToLook) write_terms(in, number);
+  if (blockIdx.x == 0 && threadIdx.x < kStepped) write_terms(in, number);
   if (threadIdx.x == 32) camera = camera_of(s);
   for (int64_t block = blockIdx.x; block * kThreads < s.count; block += gridDim.x) {
     const int64_t taken = in.taken[block], first = block * kThreads, i = first + threadIdx.x;
@@ -112,7 +111,7 @@ __global__ void __launch_bounds__(kThreads)
     __syncthreads();  // nobody reads the last block's sums any more
     if (missed > 0) sums.add(in.terms, taken, missed);
     __syncthreads();
-    bool wakes = in.waking != kWakeSeen || missed < 0;
+    bool wakes = in.all || missed < 0;
     if (!wakes) {
       const float most = missed > 0 ? most_ratio(in.step.attributes[kStepMeans]) : 0;
       const Watch<float> watch(camera, missed > 0 ? most * sums.total(kStepMeans) : 0,
@@ -127,12 +126,11 @@ __global__ void __launch_bounds__(kThreads)
       __syncthreads();
       const int rows = int(s.count - first < kThreads ? s.count - first : kThreads);
       for (int a = 0; a < kStepped; ++a)
-        if (in.step.attributes[a].columns)
-          take_missed_of_block(in.step.attributes[a], steps[a], first, rows, in.waking != kWakeToLook);
+        if (in.step.attributes[a].columns) take_missed_of_block(in.step.attributes[a], steps[a], first, rows);
     }
-    if (threadIdx.x || in.waking == kWakeToLook) continue;
+    if (threadIdx.x) continue;
     in.awake[block] = wakes;
-    if (wakes) in.taken[block] = int32_t(number - (in.waking == kWakeAll));
+    if (wakes) in.taken[block] = int32_t(number - in.all);
   }
 }
 

@@ -182,18 +182,17 @@ void apply_gradients_op(List<Tensor> gaussians, List<Tensor> camera, List<double
 }
 
 // Before a step of Adam, decides which blocks of Gaussians sleep through it, and lets the others take the steps that
-// they have missed (math/sleep.h). sleep: awake, taken and terms of gs::SleepInput. waking: gs::Waking. The other
+// they have missed (math/sleep.h). sleep: awake, taken and terms of gs::SleepInput, as is all. The other
 // arguments are those of apply_gradients_; no counter advances.
 void wake_op(List<Tensor> gaussians, List<Tensor> camera, List<double> lens, Sizes options, List<Tensor> sleep,
-             int64_t waking, List<Tensor> averages, List<Tensor> steps, List<Tensor> guard, Sizes attributes,
+             bool all, List<Tensor> averages, List<Tensor> steps, List<Tensor> guard, Sizes attributes,
              List<double> rates, List<double> constants, Sizes columns, int64_t iteration, const MaybeTensor& now) {
   const SceneTensors scene = scene_of(gaussians, camera, lens, options);
   const MaybeTensor none;
   const Step step{none,      averages, steps, {},        guard, attributes, rates,
                   constants, columns,  false, iteration, now,   false};
   GS_CHECK_VALUE(scene.raw() && !scene.has(kCov3d) && !scene.has(kColors), "blocks of raw Gaussians sleep");
-  GS_CHECK_VALUE(sleep.size() == 3 && waking >= gs::kWakeSeen && waking <= gs::kWakeToLook,
-                 "give awake, taken and terms, and how to wake, from 0 to 2");
+  GS_CHECK_VALUE(sleep.size() == 3, "give awake, taken and terms");
   step.check_adam(scene);
   const int64_t blocks = gs::sleep_blocks(scene.count());
   check_tensor(sleep[0], "awake", ScalarType::Byte, scene.device(), {blocks});
@@ -201,8 +200,8 @@ void wake_op(List<Tensor> gaussians, List<Tensor> camera, List<double> lens, Siz
   check_tensor(sleep[2], "terms", scene.dtype(), scene.device(), {gs::kTerms, int64_t(gs::kTermColumns)});
   with_scalar(scene.dtype(), [&](auto zero) {
     using T = decltype(zero);
-    const gs::SleepInput<T> in{step.of<T>(gaussians, {}), gs::Waking(waking), write<uint8_t>(sleep[0]),
-                               write<int32_t>(sleep[1]), write<T>(sleep[2])};
+    const gs::SleepInput<T> in{step.of<T>(gaussians, {}), all, write<uint8_t>(sleep[0]), write<int32_t>(sleep[1]),
+                               write<T>(sleep[2])};
     GS_RUN(T, scene.means(), wake, scene.scene<T>(), in);
   });
 }
@@ -231,7 +230,7 @@ GS_OPERATORS(diff_gaussian_rasterization, m) {
       ") -> ()",
       TORCH_BOX(&apply_gradients_op));
   m.define("wake_(Tensor(a!)[] gaussians, Tensor[] camera, " CAMERA_SCHEMA
-           ", Tensor(b!)[] sleep, int waking, Tensor(c!)[] averages, Tensor[] steps, Tensor[] guard, int[] attributes, "
+           ", Tensor(b!)[] sleep, bool all, Tensor(c!)[] averages, Tensor[] steps, Tensor[] guard, int[] attributes, "
            "float[] rates, float[] constants, int[] columns, int iteration=0, Tensor? now=None) -> ()",
            TORCH_BOX(&wake_op));
   m.define(
