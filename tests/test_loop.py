@@ -89,7 +89,7 @@ def test_observers_are_told_in_the_order_of_the_list_and_of_the_error(colmap_sce
 def test_a_hook_that_is_not_overridden_costs_nothing(monkeypatch):
     for hook in ("due", "begins", "measured", "stepped", "ended"):
         monkeypatch.setattr(Observer, hook, lambda *_: pytest.fail("called"))
-    step = SimpleNamespace(changes=False, due=True)
+    step = SimpleNamespace(changes=False, due=True, stopping=None)
     with Announcer([Observer()]) as tell:
         tell.begins(step)
         tell.measured(step, None)

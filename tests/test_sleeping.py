@@ -111,6 +111,24 @@ def test_missed_steps_are_those_without_a_gradient(device, dtype, missed):
         torch.testing.assert_close(one, other, rtol=10 * most, atol=0)
 
 
+@BOTH_AND_GPU
+@pytest.mark.parametrize("mean", [math.nan, math.inf])
+def test_a_value_whose_missed_steps_are_not_finite_stays(device, dtype, mean):
+    place = {"device": device, "dtype": dtype}
+    slept = Blocks(_rows(300, torch.Generator().manual_seed(0), place))
+    before = [value.clone() for value in slept.values]
+    slept.averages[0][7] = mean
+    slept.averages[7].fill_(1.0)
+    slept.terms[:, 1] = math.inf  # as of a rate that has overflown
+    slept.averages[1].fill_(1.0)
+    for step in slept.steps:
+        step += 5
+    slept.wake(_away(place), True, 0.01)
+    assert all(map(torch.equal, slept.values[:2], before[:2]))
+    assert slept.averages[0][7].isnan().all() and slept.averages[1].isnan().all()  # as an ordinary step marks them
+    assert not slept.averages[0][:7].isnan().any()
+
+
 def _clusters(rng: np.random.Generator, place: dict, blocks: int = 24) -> Blocks:
     """A block a cluster, in a room of 10 units: balls, needles and giants, with averages at their limit."""
     count = blocks * BLOCK - int(rng.integers(BLOCK))

@@ -1,6 +1,7 @@
 """A training has the same bytes by every way to take its steps: each of trainings.OPTIONS, each way, any ranks."""
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
@@ -33,11 +34,17 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return narrow_scene(tmp_path_factory.mktemp("bytes") / "scene")
 
 
-@pytest.fixture(scope="module", autouse=True)
+@contextmanager
 def _awake() -> Iterator[None]:
-    """No block sleeps (tests/test_sleeping.py): rows of other processes and of the host's memory do not."""
+    """No block sleeps (tests/test_sleeping.py), as rows of the host's memory do not."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "MOST_SHARE", 0.0)
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _awake_here() -> Iterator[None]:
+    with _awake():
         yield
 
 
@@ -119,13 +126,14 @@ def test_scores_and_saves_between_change_nothing(scene, tmp_path, plain, way):
 def _all(scene: Path, folder: Path, kinds: list[tuple[str, tuple[str, ...]]]) -> list[Result]:
     """All trainings in the same processes; results of the first rank."""
     results = []
-    for name, more in kinds:
-        out = folder / "_".join([name, *more])
-        try:
-            results.append(trained(scene, out, *OPTIONS[name], *more))
-        except FileNotFoundError:
-            if ranks().first:
-                raise
+    with _awake():
+        for name, more in kinds:
+            out = folder / "_".join([name, *more])
+            try:
+                results.append(trained(scene, out, *OPTIONS[name], *more))
+            except FileNotFoundError:
+                if ranks().first:
+                    raise
     return results
 
 

@@ -135,11 +135,11 @@ class MemoryGuard(Observer):
             else:
                 gaussians.active_sh_degree = self._sh_degree
                 anew = "--max_num_splats or --sh_degree"  # a resumed run with as many Gaussians would end here again
-            self._run.end_sleep()
-            gaussians.check_finite(iteration)
-            gaussians.check_steps()
             path = self._folder / f"chkpnt{iteration}.pth"
-            save_checkpoint(path, gaussians.capture(), iteration)
+            with self._run.look():
+                gaussians.check_finite(iteration)
+                gaussians.check_steps()
+                save_checkpoint(path, self._run.captured(), iteration)
         except (UserError, MemoryError, RuntimeError) as error:
             return f"and the model could not be saved ({error}); resume an earlier checkpoint"
         return (

@@ -38,11 +38,15 @@ GS_HD MissedSum<T> missed_sum(const AdamInput<T>& in, T sum, int64_t taken, int6
           most_ratio(in)};
 }
 
+// Where the result would not be finite, the value stays, as in adam_if_finite.
 template <class T>
 GS_HD void take_missed(const MissedSum<T>& missed, T& value, T& mean, T& square) {
   const T ratio = mean / (std::sqrt(square) + missed.eps);
-  value = multiply_add(-missed.sum, clamp(ratio, -missed.most, missed.most), value);
-  mean *= missed.keep1, square *= missed.keep2;
+  const T moved = multiply_add(-missed.sum, clamp(ratio, -missed.most, missed.most), value);
+  const bool finite = is_finite(moved) & is_finite(mean);
+  value = finite ? moved : value;
+  mean = finite ? mean * missed.keep1 : T(NAN);
+  square *= missed.keep2;
 }
 
 // What tests a block: how far the means and the logarithms of scales may have moved, and the camera.
