@@ -739,6 +739,47 @@ void test_gaussian_step() {
     }
 }
 
+// Blocks wake on the GPU as on the CPU, where some lie behind the camera, one has missed nothing, and one is repeated.
+void test_wake() {
+  for (const bool all : {false, true})
+    for (const gs::emulation::Order order : gs::emulation::kOrders) {
+      gs::emulation::order = order;
+      constexpr int64_t count = 5 * gs::kSleepBlock - 28;
+      Stepping start{Parameters<float>(count)};
+      for (int64_t i = 0; i < count; ++i) {
+        start.values.means[3 * i + 2] = i / gs::kSleepBlock % 2 ? -3.0f : 3.0f;
+        for (int k = 0; k < 3; ++k) start.values.scales[3 * i + k] = -5;
+      }
+      alignas(16) float terms[2][gs::kTerms * gs::kTermColumns];
+      for (int64_t k = 0; k < gs::kTerms * gs::kTermColumns; ++k) terms[0][k] = terms[1][k] = float(k % 7) * 1e-4f;
+      Stepping got[2] = {start, start};
+      uint8_t awake[2][5] = {};
+      int32_t taken[2][5] = {{2, 1, 100, 101, 9}, {2, 1, 100, 101, 9}};
+      gs::emulation::Memory memory;
+      for (const int on_gpu : {0, 1}) {
+        gs::SleepInput<float> in{{}, all, awake[on_gpu], taken[on_gpu], terms[on_gpu]};
+        got[on_gpu].inputs({}, nullptr, in.step.attributes);
+        for (gs::AdamInput<float>& to : in.step.attributes) to.step = 101;
+        const gs::Scene<float> scene = scene_of(got[on_gpu].values, {40, 24}, false);
+        if (on_gpu)
+          gs::cuda::wake(memory.queue(), scene, in);
+        else
+          gs::GS_ISA::wake(gs::serial_executor(), scene, in);
+      }
+      const uint8_t wakes[2][5] = {{1, 0, 1, 1, 1}, {1, 1, 1, 1, 1}};
+      for (int block = 0; block < 5; ++block) {
+        CHECK(awake[0][block] == wakes[all][block] && awake[1][block] == wakes[all][block]);
+        CHECK(taken[0][block] == taken[1][block] && taken[0][block] == (wakes[all][block] ? 101 - all : 1));
+      }
+      for (int a = 0; a < gs::kStepped; ++a) {
+        check_near(*got[1].values.all()[a], *got[0].values.all()[a], 1e-6);
+        check_near(got[1].mean[a], got[0].mean[a], 1e-6), check_near(got[1].square[a], got[0].square[a], 1e-6);
+        CHECK(*got[1].values.all()[a] != *start.values.all()[a]);
+      }
+      CHECK(std::equal(std::begin(terms[0]), std::end(terms[0]), std::begin(terms[1])));
+    }
+}
+
 // Covariances and colours that are given, whose scene has no scales, rotations and coefficients to read.
 void test_given_covariances_and_colors() {
   Parameters<float> p(50);
@@ -819,6 +860,7 @@ int main() {
   return gs::run_shared("CUDA kernels, emulated", before,
                         {test_rows,
                          test_gaussian_step,
+                         test_wake,
                          test_lists,
                          test_lists_without_records,
                          test_ahead,
