@@ -40,7 +40,8 @@ class Sleeping:
         beta1, beta2 = gaussians.optimizer.defaults["betas"]
         self._terms = gaussians._xyz.detach().new_zeros(_TERMS)
         self._terms[:, _POWERS] = (beta1 / math.sqrt(beta2)) ** torch.arange(_TERMS[0], dtype=torch.float64)
-        self.awake = self._taken = torch.empty(0)
+        self.awake = self._terms.new_empty(0, dtype=torch.uint8)
+        self._taken = self._terms.new_empty(0, dtype=torch.int32)
         self._asleep: State | None = None  # while somebody looks: what all was before
         self.reset()
 
@@ -59,14 +60,20 @@ class Sleeping:
     def wake(self, scene: Scene, now: Tensor | None = None) -> None:
         """Before a step: wake the blocks that the scene's camera may show. now: of FusedAdam.write_now."""
         self._wake(scene, False, now)
+
+    def stepped(self) -> None:
+        """A step was taken, or taken back: from now on, the blocks that sleep are behind."""
         self._is_whole = False
 
-    def rest(self) -> None:
-        """Let all blocks take the steps that they have missed. The next step may leave them asleep."""
+    def rest(self, guarded: bool = True) -> None:
+        """Let all blocks take the steps that they have missed. The next step may leave them asleep.
+
+        guarded: unless the optimiser's guard has stopped its steps.
+        """
         if self._asleep is not None:
             self._put_back(self._asleep)
             self._asleep = None
-        self._wake(self._anywhere(), True)
+        self._wake(self._anywhere(), True, guarded=guarded)
         self._is_whole = True
 
     def rows(self) -> Tensor:
@@ -79,10 +86,8 @@ class Sleeping:
         if self._is_whole:
             yield
             return
-        rows = self._sleepers()
         states = {"awake": self.awake, "taken": self._taken, "terms": self._terms}
-        self._asleep = {name: values.clone() for name, values in states.items()}
-        self._asleep["rows"] = [values[rows] for values in self._moved()]
+        self._asleep = {name: values.clone() for name, values in states.items()} | {"rows": self._copied()}
         self._wake(self._anywhere(), True)
         try:
             yield
@@ -108,8 +113,12 @@ class Sleeping:
             before = int(asleep[: shards.first].sum())
             own = int(asleep[shards.first : shards.first + count].sum())
             blocks = slice(first, first + len(self.awake))
+            taken = captured["taken"][blocks]
+            behind = self._taken.cpu() - taken.cpu()
+            if not ((behind >= 0) & (behind < _TERMS[0])).all():
+                raise ValueError("blocks have missed more steps than are known")
             self._put_back(
-                {"awake": captured["awake"][blocks], "taken": captured["taken"][blocks], "terms": captured["terms"]}
+                {"awake": captured["awake"][blocks], "taken": taken, "terms": captured["terms"].view(_TERMS)}
                 | {"rows": [values[before : before + own] for values in captured["rows"]]}
             )
         except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
@@ -123,6 +132,14 @@ class Sleeping:
         for values, kept in zip(self._moved(), state["rows"], strict=True):
             values.index_copy_(0, rows, kept.to(values.device))
         self._is_whole = False
+
+    def _copied(self) -> list[Tensor]:
+        """What a step changes of the rows that sleep; on the host where the device has no memory left."""
+        rows, moved = self._sleepers(), self._moved()
+        try:
+            return [values[rows] for values in moved]
+        except torch.OutOfMemoryError:
+            return [values.cpu()[rows.cpu()] for values in moved]
 
     def _sleepers(self) -> Tensor:
         return (~self.rows()).nonzero().reshape(-1)
@@ -142,10 +159,10 @@ class Sleeping:
         shapes = means, opacities, scales, rotations, None, None
         return Scene(*shapes, sh_dc, sh_rest, matrix, matrix, center, (1.0, 1.0, 1.0), (16, 16, 0, False, True))
 
-    def _wake(self, scene: Scene, every: bool, now: Tensor | None = None) -> None:
+    def _wake(self, scene: Scene, every: bool, now: Tensor | None = None, guarded: bool = True) -> None:
         averages, steps, _, guard, attributes, rates, constants, columns, _, iteration = self._adam.arguments(False)
         sleep = [self.awake, self._taken, self._terms]
-        step = averages, steps, guard, attributes, rates, constants, columns, iteration, now
+        step = averages, steps, guard if guarded else [], attributes, rates, constants, columns, iteration, now
         OPERATORS.wake_(*scene.lists, sleep, every, *step)
 
 

@@ -18,13 +18,18 @@ from rasterizer_tools import BOTH_AND_GPU, GPU_MARKS
 from step_ways import WAYS, take_as  # noqa: F401  (a fixture)
 from trainings import ITERATIONS, OPTIONS, differences, narrow_scene, trained
 
+import train
+from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import ASLEEP, further, load_checkpoint, save_checkpoint
 from scene.readers.point_cloud import write_point_cloud
 from scene.saved_model import read_model
 from scene.sleeping import BLOCK, Sleeping
 from splatting.distributed.ranks import ranks
 from splatting.training import run as runs
-from splatting.training.steps import fused
+from splatting.training.iteration import Iteration
+from splatting.training.objective import Objective
+from splatting.training.observers.report import ProgressBar
+from splatting.training.steps import captured, fused
 from utils.system_utils import UserError
 
 BETAS, EPS = (0.9, 0.999), 1e-15
@@ -207,14 +212,14 @@ def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 def _sleeps(patch: pytest.MonkeyPatch) -> list[float]:
-    """Let blocks sleep. The share that is awake, step by step; all rest every 20 iterations."""
+    """Let blocks sleep. The share that is awake, step by step; all rest every 7 iterations."""
     found, wake = [], Sleeping.wake
 
     def noted(self: Sleeping, *arguments: object) -> None:
         wake(self, *arguments)
         found.append(float(self.awake.float().mean()))
 
-    patch.setattr(runs, "REST", 20)
+    patch.setattr(runs, "REST", 7)  # also between changes of rows
     patch.setattr(runs, "MOST_SHARE", 2.0)
     patch.setattr(Sleeping, "wake", noted)
     return found
@@ -274,6 +279,13 @@ def test_ranks(scene, tmp_path, plain, size):
     assert not differences(_trained(scene, tmp_path / "resumed", *start), plain("default"))
 
 
+def test_a_rank_without_rows(scene, tmp_path):
+    few = tmp_path / "few.ply"
+    write_point_cloud(few, 0.7 * np.random.default_rng(0).normal(size=(100, 3)), np.full((100, 3), 128))
+    (result,), _ = in_ranks(2, _in_rank, scene, tmp_path, [("default", "--init_pcd_path", few)])[0]
+    assert not differences(result, _trained(scene, tmp_path / "alone", "--init_pcd_path", few))
+
+
 @pytest.mark.parametrize("way", [(), ("--plain_step",)])
 def test_scores_and_saves_between_change_nothing(scene, tmp_path, plain, way):
     looks = "--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44
@@ -284,7 +296,7 @@ def test_scores_and_saves_between_change_nothing(scene, tmp_path, plain, way):
         assert (tmp_path / ply).read_bytes() == (tmp_path / "plain" / ply).read_bytes()
 
 
-@pytest.mark.parametrize("iteration", [40, 33])  # where all blocks rest, and where some sleep
+@pytest.mark.parametrize("iteration", [42, 33])  # where all blocks rest, and where some sleep
 def test_resumed(scene, tmp_path, plain, iteration):
     checkpoint = tmp_path / "a" / f"chkpnt{iteration}.pth"
     planned = "--checkpoint_iterations", iteration, ITERATIONS
@@ -292,12 +304,23 @@ def test_resumed(scene, tmp_path, plain, iteration):
     assert not differences(_trained(scene, tmp_path / "b", "--start_checkpoint", checkpoint), plain("default"))
     capture, _ = load_checkpoint(checkpoint)
     asleep = further(capture, ASLEEP)
-    assert (asleep is None) == (iteration == 40)
-    if asleep:
+    assert (asleep is None) == (iteration == 42)
+
+
+@pytest.mark.parametrize("what", ["rows", "taken", "terms"])
+def test_damaged_sleep_is_refused(scene, tmp_path, what):
+    _trained(scene, tmp_path / "a", "--checkpoint_iterations", 33, ITERATIONS)
+    capture, iteration = load_checkpoint(tmp_path / "a/chkpnt33.pth")
+    asleep = further(capture, ASLEEP)
+    if what == "rows":
         asleep["rows"].pop()
-        save_checkpoint(tmp_path / "bad.pth", capture, iteration)
-        with pytest.raises(UserError, match="that slept do not fit"):
-            _trained(scene, tmp_path / "c", "--start_checkpoint", tmp_path / "bad.pth")
+    elif what == "taken":
+        asleep["taken"] -= 2**30
+    else:
+        asleep["terms"] = asleep["terms"][:5]
+    save_checkpoint(tmp_path / "bad.pth", capture, iteration)
+    with pytest.raises(UserError, match="that slept do not fit"):
+        _trained(scene, tmp_path / "b", "--start_checkpoint", tmp_path / "bad.pth")
 
 
 def test_interrupted(scene, tmp_path, plain, monkeypatch):
@@ -315,6 +338,84 @@ def test_interrupted(scene, tmp_path, plain, monkeypatch):
     (checkpoint,) = (tmp_path / "cut").glob("chkpnt*.pth")
     assert further(load_checkpoint(checkpoint)[0], ASLEEP)
     assert not differences(_trained(scene, tmp_path / "whole", "--start_checkpoint", checkpoint), plain("default"))
+
+
+def test_captured_steps_that_are_stopped_resume_to_the_same_bytes(scene, tmp_path, plain, take_as, monkeypatch):  # noqa: F811
+    """Some iterations after all blocks have rested, no Python of theirs has run."""
+    take_as("captured")
+    launch = captured.Graphs.launch
+
+    def interrupted(self: captured.Graphs, at: Iteration) -> object:
+        if at.iteration == 37:
+            os.kill(os.getpid(), signal.SIGINT)
+        return launch(self, at)
+
+    monkeypatch.setattr(captured.Graphs, "launch", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        _trained(scene, tmp_path / "cut")
+    monkeypatch.setattr(captured.Graphs, "launch", launch)
+    start = "--start_checkpoint", tmp_path / "cut/chkpnt37.pth"
+    assert further(load_checkpoint(start[1])[0], ASLEEP)
+    assert not differences(_trained(scene, tmp_path / "whole", *start), plain("default"))
+
+
+@pytest.mark.parametrize("way", [(), ("--plain_step",)])
+def test_the_last_good_model_has_the_missed_steps_up_to_there(scene, tmp_path, monkeypatch, way):
+    words = *way, "--densification_interval", 1000
+    _trained(scene, tmp_path / "good", *words, "--checkpoint_iterations", 31, ITERATIONS)
+    call = Objective.__call__
+
+    def broken(self: Objective, package: dict, at: Iteration) -> object:
+        losses = call(self, package, at)
+        return losses._replace(total=losses.total * math.nan) if at.iteration == 32 else losses
+
+    monkeypatch.setattr(Objective, "__call__", broken)
+    monkeypatch.setattr(ProgressBar, "due", lambda self, step: step.last)  # so that others rest before it is found
+    with pytest.raises(UserError, match="the last good model, after iteration 31"):
+        _trained(scene, tmp_path / "bad", *words)
+    good, bad = (load_checkpoint(tmp_path / name / "chkpnt31.pth")[0] for name in ("good", "bad"))
+    assert all(torch.equal(one, other) for one, other in zip(good[1:7], bad[1:7], strict=True))
+
+
+@pytest.mark.parametrize("way", [(), ("--plain_step",)])
+def test_a_term_that_somebody_adds_to_the_loss_reaches_all_rows(scene, tmp_path, monkeypatch, way):
+    made, call, began = [], Objective.__init__, Objective.__call__
+    monkeypatch.setattr(Objective, "__init__", lambda self, run: (made.append(run), call(self, run))[1])
+
+    def more(self: Objective, package: dict, at: Iteration) -> object:
+        losses = began(self, package, at)
+        return losses._replace(total=losses.total + made[-1].gaussians.get_opacity.mean())
+
+    monkeypatch.setattr(Objective, "__call__", more)
+    asleep = _trained(scene, tmp_path / "asleep", *way)
+    monkeypatch.setattr(runs, "MOST_SHARE", 0.0)
+    assert not differences(asleep, _trained(scene, tmp_path / "awake", *way))
+
+
+def test_a_replaced_report_may_change_the_model(scene, tmp_path, monkeypatch, shares):
+    monkeypatch.setattr(train, "training_report", lambda *_: {})
+    _trained(scene, tmp_path)
+    assert not shares
+
+
+def test_a_model_with_activations_of_its_own_does_not_sleep(scene, tmp_path, monkeypatch, shares):
+    begin = GaussianModel.__init__
+
+    def own(self: GaussianModel, *arguments: object) -> None:
+        begin(self, *arguments)
+        self.scaling_activation = lambda values: torch.exp(values)
+
+    monkeypatch.setattr(GaussianModel, "__init__", own)
+    _trained(scene, tmp_path)
+    assert not shares
+
+
+def test_the_progress_bar_does_not_wake_blocks(scene, tmp_path, monkeypatch):
+    looks, look = [], Sleeping.look
+    monkeypatch.setattr(Sleeping, "look", lambda self: (looks.append(1), look(self))[1])
+    monkeypatch.setattr(ProgressBar, "due", lambda self, step: True)
+    _trained(scene, tmp_path)
+    assert len(looks) < 4
 
 
 def test_where_views_see_most_points_no_block_sleeps(scene, tmp_path, monkeypatch, shares):

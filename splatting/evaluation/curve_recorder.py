@@ -27,6 +27,7 @@ GRIDS = ((4, 32), (2, 12))  # points while the number of iterations doubles, and
 SHARE = 0.025  # of a training that scoring may take by its estimate; 0.05 is promised, and early points may be dearer
 MOST_SHARE = 0.05  # the same where one view of each set at each point takes more than SHARE
 WHOLE_SHARE = 0.075  # the same for --whole_curve, where 0.1 is promised
+REPLANNED = 1.5  # times as many iterations as were expected, or more, get points of their own
 VIEW_COST = 0.5  # of scoring a view, in iterations: it takes no gradient and no step
 _ROOT = Path(__file__).resolve().parents[2]
 View = TypeVar("View")
@@ -217,7 +218,8 @@ class CurveRecorder:
         self._iterations = iterations
         self._whole = {*always, iterations}
         self._views, self._steady, self._whole_test = views, steady, whole_test
-        self._counts: dict[str, dict[int, int]] | None = None  # of views to score, by set and iteration
+        self._counts: dict[str, dict[int, int]] = {}  # of views to score, by set and iteration
+        self._planned = 0.0  # for so many iterations
         self._points, self._size = {*self._whole}, None
         if steady:
             self._plan(iterations)
@@ -233,6 +235,7 @@ class CurveRecorder:
 
     def _plan(self, taken: float) -> None:
         """Choose points, and how many views they score, for a run that takes so many iterations."""
+        self._planned = taken
         views, most = self._views, max(map(len, self._views.values()))
         given = self._iterations, self._whole, len(views)
         between, size = curve_points(*given, most, taken if not self._steady else None)
@@ -256,7 +259,7 @@ class CurveRecorder:
         """
         if not span:
             return False
-        if self._counts is None and taken is not None:
+        if not self._steady and taken is not None and taken > REPLANNED * self._planned:
             self._plan(taken)
         left, done = self._iterations - span[-1], span[-1] - first
         if writes_files() and seconds * left <= self._ahead * done:

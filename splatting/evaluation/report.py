@@ -27,6 +27,7 @@ from utils.system_utils import UserError, atomic_write
 
 TITLE = "3D Gaussian Splatting: evaluation"
 SHORTEST = 10.0  # seconds of a process whose share of the processors says something
+_WARNING = "warning: "  # before what a training said at its start
 EVEN = 0.8  # share of the best that trainings get on a machine of their own
 OF_A_RUN, OF_A_REPORT = 24, 96  # test views at most in the HTML file, at about 0.1 MB each
 RESIZE_FILTER = "Pillow, bicubic, antialiased where it shrinks; 8-bit pictures"
@@ -104,6 +105,8 @@ def _warnings(runs: Sequence[Run], rows: Sequence[dict[str, Any]]) -> list[str]:
         values = {str(run["machine"].get(name)) for run in runs if run["machine"]}
         if len(values) > 1:
             lines.append(f"Trained with different {name}: {', '.join(sorted(values))}.")
+    said = ((run, line) for run in runs for line in run["lines"] or () if line.startswith(_WARNING))
+    lines += dict.fromkeys(f"{run['scene']} {run['config'] or ''}: {line.removeprefix(_WARNING)}" for run, line in said)
     for row in rows:
         if row["failed_seeds"]:
             lines.append(f"{row['scene']} {row['config'] or ''}: means without failed seeds {row['failed_seeds']}.")

@@ -109,45 +109,53 @@ def check_exposures(gaussians: GaussianModel, train_test_exp: bool, checkpoint: 
         print(f"{checkpoint} has no exposures: all photos start without a correction")
 
 
-def warn_of_late_reset(opt: argparse.Namespace, white_background: bool, schedule: Schedule) -> None:
-    """Warn if adaptive density control resets opacities so late that the model cannot recover.
+def late_reset(opt: argparse.Namespace, white_background: bool, schedule: Schedule) -> str | None:
+    """What to say if adaptive density control resets opacities so late that the model cannot recover.
 
     A run with a time budget leaves such resets out.
     """
     if opt.strategy != "adc" or isinstance(schedule, DecidedSchedule):
-        return
+        return None
     last = range(max(1, schedule.ends - rules.RECOVERY + 1), schedule.ends)
     resets = [rules.actions(t, opt, white_background, schedule.span(t), schedule.stride(t)).reset_opacity for t in last]
     due = [t for t, is_reset in zip(last, resets, strict=True) if is_reset]
-    if due:
-        print(
-            f"warning: opacities are reset in iteration {due[-1]}, and {schedule.ends - due[-1]} iterations are "
-            "too few to recover from that; change --iterations or --opacity_reset_interval"
-        )
+    if not due:
+        return None
+    cause = "--opacity_reset_interval"
+    if white_background and schedule.schedule_step(due[-1]) % opt.opacity_reset_interval:
+        cause = "--densify_from_iter, where a white background has one"
+    return (
+        f"opacities are reset in iteration {due[-1]}, and {schedule.ends - due[-1]} iterations are too few to recover "
+        f"from that; change --iterations or {cause}"
+    )
 
 
-def warn_of_another_number(density: DensityControl, opt: argparse.Namespace, count: int, first: int) -> None:
-    """Warn if a strategy cannot reach its number of Gaussians in time.
+def another_number(density: DensityControl, opt: argparse.Namespace, count: int, first: int) -> str | None:
+    """What to say if a strategy cannot reach its number of Gaussians in time.
 
     count: of Gaussians, now; first: the next iteration. Not known of a run with a time budget.
     """
     schedule, aim = density.schedule, density.most_gaussians
-    if schedule.ends is None or schedule.schedule_step(first) >= density.ends > 0:
-        return  # a resumed run has no say in it any more
+    if opt.schedule or schedule.ends is None or schedule.schedule_step(first) >= density.ends > 0:
+        return None  # what is repeated or resumed has no say in it any more
     reached = density.most_after(count, first, schedule.ends)
     too_many, too_late = 0 < opt.max_num_splats < count, opt.densify_from_iter >= schedule.length
     if opt.strategy == "adc":
         if too_many:
-            text = f"the start has {count:,} Gaussians, more than --max_num_splats {opt.max_num_splats}; adc adds none"
             remedy = "" if too_late else "; --strategy budget gets down to it"
-            print(f"warning: {text}, and removes only faint ones{remedy}", file=sys.stderr)
-        return
+            return f"{_start_of(count, opt)}; adc adds none, and removes only faint ones{remedy}"
+        return None
     # The number that mcmc takes where none is given is a limit, nothing to reach.
     if reached == aim or ((reached > aim or opt.strategy == "mcmc") and not opt.max_num_splats):
-        return
+        return None
     if too_late:
-        window = f"--densify_from_iter {schedule.length // 20} --densify_until_iter {schedule.length // 2}"
+        done = schedule.schedule_step(first) - 1
+        window = f"--densify_from_iter {done + (schedule.length - done) // 20}"
+        if opt.strategy != "mcmc":
+            window += f" --densify_until_iter {done + (schedule.length - done) // 2}"
         why = f"--densify_from_iter {opt.densify_from_iter} is not before the end; give {window}"
+        if too_many and opt.strategy == "budget":
+            return f"{_start_of(count, opt)}; only faint ones are removed, as {why}"
     elif opt.strategy == "mcmc":
         why = f"--mcmc_growth {opt.mcmc_growth:g} adds too few each time; raise it, or lower --densification_interval"
         why = "it removes none; --strategy budget does" if too_many else why
@@ -156,9 +164,11 @@ def warn_of_another_number(density: DensityControl, opt: argparse.Namespace, cou
         why = f"{end} is not before the end; give --densify_until_iter {schedule.length // 2}"
     else:
         why = "they at most double each time; lower --densification_interval, or raise --densify_until_iter"
-    print(
-        f"warning: --strategy {opt.strategy} gets to {reached:,} Gaussians, not to {aim:,}, as {why}", file=sys.stderr
-    )
+    return f"--strategy {opt.strategy} gets to {reached:,} Gaussians, not to {aim:,}, as {why}"
+
+
+def _start_of(count: int, opt: argparse.Namespace) -> str:
+    return f"the start has {count:,} Gaussians, more than --max_num_splats {opt.max_num_splats}"
 
 
 _OF_VIEWS = {"images", "resolution", "white_background", "eval", "train_test_exp"}  # in cfg_args, for all saves alike

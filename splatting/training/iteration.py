@@ -25,6 +25,7 @@ class Iteration:
     changes: bool  # rows of the Gaussians, the SH degree or the size of views change in this iteration
     started: float  # seconds of training before it
     due: bool = False  # the model is read, written or changed, so every loss so far must be checked first
+    read: bool = False  # an observer reads the model
     record: dict[str, float] | None = None  # what train_log.json gets of this iteration; None: no record
     scored_at: float | None = None  # seconds of training when the curve scored it, for all records of the same score
     stopping: type[KeyboardInterrupt] | None = None  # raised once the step is complete

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from types import TracebackType
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
@@ -12,7 +12,12 @@ Error: TypeAlias = BaseException | None
 
 
 class Observer:
-    """Base of all observers. A hook that a class does not override costs nothing."""
+    """Base of all observers. A hook that a class does not override costs nothing.
+
+    reads_model: whether it reads the model where it is due. Blocks that sleep are brought up to date for that.
+    """
+
+    reads_model: ClassVar[bool] = True
 
     def due(self, step: Iteration) -> bool:
         """Whether this iteration reads the model or a loss, or writes something. Asked once, when it begins.
@@ -39,30 +44,33 @@ class Announcer:
     """Calls the hooks of observers, in the order of the list. Inside `with`, an error is told to `ended`."""
 
     def __init__(self, observers: Sequence[Observer], look: Callable[[], AbstractContextManager] = nullcontext) -> None:
-        """look: what an iteration that is due is told within."""
+        """look: within it, observers are told of an iteration in which they read the model."""
         self._look = look
 
         def overridden(hook: str) -> list:
             plain = getattr(Observer, hook)
             return [getattr(one, hook) for one in observers if getattr(type(one), hook) is not plain]
 
-        self._due, self._begins, self._measured, self._stepped, self._ended = map(
-            overridden, ("due", "begins", "measured", "stepped", "ended")
+        self._begins, self._measured, self._stepped, self._ended = map(
+            overridden, ("begins", "measured", "stepped", "ended")
         )
+        self._due = [(due, due.__self__.reads_model) for due in overridden("due")]
 
     def begins(self, step: Iteration) -> None:
         # A list, so that each observer is asked in every iteration, whatever the others answer.
-        step.due = any([step.changes, *[due(step) for due in self._due]])
+        due = [(due(step), reads) for due, reads in self._due]
+        step.due = step.changes or any(is_due for is_due, _ in due)
+        step.read = any(is_due and reads for is_due, reads in due)
         for notify in self._begins:
             notify(step)
 
     def measured(self, step: Iteration, losses: Losses) -> None:
-        with self._look() if step.due else nullcontext():
+        with self._look() if step.read else nullcontext():
             for notify in self._measured:
                 notify(step, losses)
 
     def stepped(self, step: Iteration) -> None:
-        with self._look() if step.due or step.stopping else nullcontext():
+        with self._look() if step.read or step.stopping else nullcontext():
             for notify in self._stepped:
                 notify(step)
 

@@ -3,6 +3,7 @@
 import argparse
 import copy
 import math
+import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
 from itertools import count
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 
 from scene.cameras import Camera
+from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.checkpoint import ASLEEP, further, load_checkpoint, with_further
@@ -90,7 +92,8 @@ class Run:
         self.schedule = schedule_file.schedule_of(opt, self.start, self.first_iteration, views, self.group.shared)
         if isinstance(self.schedule, DecidedSchedule):
             end_in_time(opt)
-        checks.warn_of_late_reset(opt, dataset.white_background, self.schedule)
+        self.warnings: list[str] = []
+        self._warn(checks.late_reset(opt, dataset.white_background, self.schedule))
         kind = SpilledGaussians if opt.spill else GaussianModel
         self.gaussians = kind(dataset.sh_degree, opt.optimizer_type)
         self.gaussians.divide(self.group)
@@ -119,10 +122,16 @@ class Run:
         self.sleeping = self._may_sleep()
         if self.sleeping and capture and (asleep := further(capture, ASLEEP)):
             self.sleeping.restore(asleep)
-        checks.warn_of_another_number(self.density, opt, self.gaussians.gaussian_count, self.first_iteration + 1)
+        self._warn(checks.another_number(self.density, opt, self.gaussians.gaussian_count, self.first_iteration + 1))
         if capture is None and first is None:
             self.density.started()
         self.group.tell_notes()
+
+    def _warn(self, text: str | None) -> None:
+        """Print what a check says, and keep it for the log."""
+        if text is not None:
+            self.warnings.append(f"warning: {text}")
+            print(self.warnings[-1], file=sys.stderr)
 
     def _strategy_by_the_clock(self) -> str:
         if self.opt.schedule:
@@ -253,14 +262,21 @@ class Run:
             ahead = min(ahead, last - iteration + 1)
         self.scene.prefetch(list(filter(self.resolution.needs, self.views.coming(iteration, ahead))))
 
+    @property
+    def is_standard(self) -> bool:
+        """Whether loss and density control need gradients of the image alone, and the kernels compute all the rest.
+
+        What an objective or a strategy says of itself is not inherited; subclasses opt in.
+        """
+        own = type(self.objective) is Objective and vars(type(self.density)).get("fusable", False)
+        return own and not (self.pipe.compute_cov3D_python or self.pipe.convert_SHs_python)
+
     def _may_sleep(self) -> Sleeping | None:
         """What lets blocks sleep, where views see few of the scene's points, and a step concerns no other row."""
         cloud, density = self.scene.info.point_cloud, self.density
-        dense = type(self.gaussians) is GaussianModel and type(self.gaussians.optimizer) is GaussianAdam
+        dense = type(self.gaussians.optimizer) is GaussianAdam and FusedAdam.takes(self.gaussians)
         alone = not (self.schedule.views > 1 or density.queues or any(density.penalty))
-        in_python = self.pipe.compute_cov3D_python or self.pipe.convert_SHs_python
-        ours = type(self.objective) is Objective and vars(type(density)).get("fusable", False) and not in_python
-        if not (dense and alone and ours and cloud is not None and len(cloud.points)):
+        if not (dense and alone and self.is_standard and cloud is not None and len(cloud.points)):
             return None
         points = torch.as_tensor(cloud.points, dtype=torch.float32, device=self.device)
         return Sleeping(self.gaussians) if share_seen(points, self.scene.getTrainCameras()) < MOST_SHARE else None
@@ -279,6 +295,8 @@ class Run:
             self.sleeping.reset()
         elif self.rests(step):
             self.sleeping.rest()
+        else:
+            self.sleeping.stepped()
 
     def look(self) -> AbstractContextManager:
         """Within it, others may read the model."""
@@ -290,10 +308,10 @@ class Run:
         asleep = self.sleeping and self.sleeping.captured()
         return with_further(state, ASLEEP, asleep) if asleep else state
 
-    def end_sleep(self) -> None:
-        """Let all blocks take the steps that they have missed, and sleep no more."""
+    def end_sleep(self, guarded: bool = True) -> None:
+        """Let all blocks take the steps that they have missed, and sleep no more. guarded: of `Sleeping.rest`."""
         if self.sleeping is not None:
-            self.sleeping.rest()
+            self.sleeping.rest(guarded)
         self.sleeping = None
 
     def render_options(self, step: Iteration) -> dict[str, bool]:

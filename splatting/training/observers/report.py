@@ -34,6 +34,8 @@ BAR_SECONDS = 0.2  # between updates, at least: each reads the losses, and so wa
 class ProgressBar(Observer):
     """Shows running means. At the end of a training it says how long that took."""
 
+    reads_model = False
+
     def __init__(self, run: Run) -> None:
         self._run = run
         self._depth = LossWatch()
@@ -130,6 +132,7 @@ class Report(Observer):
             budget = default_budget(self._run.scene.getTrainCameras())
             options |= {CAP: opt.max_num_splats} if opt.max_num_splats else {BUDGET: budget}
         log.note(**options)
+        log.keep(*self._run.warnings)
         log.advise(*what_to_try(self._run.rows, log.records))
 
 

@@ -8,7 +8,7 @@ from splatting.training.observer import Observer
 from splatting.training.observers.curve import Curve
 from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.observers.guards import MaskWatch, MemoryGuard
-from splatting.training.observers.report import ProgressBar, Records, Report, Summary, Target
+from splatting.training.observers.report import ProgressBar, Records, Report, Summary, Target, training_report
 from splatting.training.observers.saves import Checkpoints, Saves, ScheduleFile
 from splatting.training.observers.viewers import NetworkViewer, PageObserver
 from splatting.training.run import Run
@@ -19,6 +19,8 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
     """The observers of every training. writer: TensorBoard's, or None. report: `training_report`."""
     with_curve = not run.launch.no_curve and bool(run.scene.getTestCameras())
     test_in_memory = with_curve or run.opt.iterations in run.launch.test_iterations
+    if report is not training_report:
+        run.end_sleep()  # it may read or change the model in every iteration
     watch = DivergenceWatch(run)
     checkpoints = Checkpoints(run, watch)
     return [

@@ -119,6 +119,8 @@ class CapturedStep(FusedStep):
     def rewind(self, steps: int) -> None:
         """Take back what the host has counted for steps that will be replayed."""
         self._run.gaussians.rewind(steps)
+        if self._run.sleeping:
+            self._run.sleeping.stepped()  # a rest may be among the steps
         self._graphs.clear()
 
 

@@ -6,7 +6,7 @@ from torch import Tensor
 from gaussian_renderer import Drawn, KnownBands, draw, exposed
 from scene.fused_adam import FusedAdam
 from splatting.training.iteration import Iteration
-from splatting.training.objective import Losses, Objective
+from splatting.training.objective import Losses
 from splatting.training.observer import Announcer
 from splatting.training.run import Run
 from splatting.training.steps.plain import PlainStep
@@ -29,13 +29,8 @@ class FusedStep(PlainStep):
 
     @staticmethod
     def suits(run: Run) -> bool:
-        """Whether nobody else needs gradients. Own objectives and density controls may, and options that ask autograd.
-
-        What an objective or a strategy says of itself is not inherited; subclasses opt in.
-        """
-        own = type(run.objective) is Objective and vars(type(run.density)).get("fusable", False)
-        by_autograd = run.launch.plain_step or run.pipe.compute_cov3D_python or run.pipe.convert_SHs_python
-        return own and not (by_autograd or torch.is_anomaly_enabled())
+        """Whether nobody else needs gradients. Foreign objectives and density controls may, and some options do."""
+        return run.is_standard and not (run.launch.plain_step or torch.is_anomaly_enabled())
 
     def take(self, at: Iteration, observers: Announcer) -> None:
         """Take a step; the observers are told once the loss is known."""
@@ -89,9 +84,7 @@ class FusedStep(PlainStep):
         params = [gaussians.raw(name) for name in gaussians._attributes]
         self._has_further_terms = any([param.grad is not None for param in params])
         if self._has_further_terms:
-            for param in params:
-                param.grad = None
-            self._run.end_sleep()
+            self._end_sleep()
         return self._has_further_terms
 
     def advance(self, at: Iteration, drawn: Drawn, gradients: tuple[Tensor, Tensor | None]) -> None:

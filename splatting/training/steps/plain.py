@@ -81,6 +81,9 @@ class PlainStep:
         package = self._views.render(at)
         losses = run.objective(package, at)
         losses.total.backward()
+        if self._reaches_sleepers():
+            self._end_sleep()
+            return self.take(at, observers)
         package, losses = self._views.collect(package, losses)
         if any(run.density.penalty):
             run.gaussians.penalise(run.density.penalty.times(run.schedule.views))
@@ -98,6 +101,23 @@ class PlainStep:
         else:
             wake(run.sleeping, at.camera, run.gaussians, run.pipe, at.background)
             run.gaussians.optimizer.rows = run.sleeping.rows()
+
+    def _reaches_sleepers(self) -> bool:
+        """Whether the loss depends on a row that sleeps: somebody has added a term to it."""
+        rows = self._run.sleeping and self._run.gaussians.optimizer.rows
+        if rows is None:
+            return False
+        gaussians, asleep = self._run.gaussians, ~rows
+        gradients = [gaussians.raw(name).grad for name in gaussians._attributes]
+        return any(bool(gradient[asleep].any()) for gradient in gradients if gradient is not None)
+
+    def _end_sleep(self) -> None:
+        """Let all blocks wake for good, and drop the gradients of a step that will be taken again."""
+        gaussians = self._run.gaussians
+        gaussians.optimizer.zero_grad(set_to_none=True)
+        gaussians.exposures.optimizer.zero_grad(set_to_none=True)
+        gaussians.optimizer.rows = None
+        self._run.end_sleep()
 
     def throttle(self, at: Iteration) -> None:
         pass

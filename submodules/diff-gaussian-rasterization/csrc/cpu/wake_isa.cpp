@@ -64,7 +64,7 @@ AdamStep<T> step_of(const GaussianStep<T>& in, int attribute) {
 template <class T>
 void wake(const Executor& executor, const Scene<T>& s, const SleepInput<T>& in) {
   const GaussianStep<T>& step = in.step;
-  if (!in.all && step.guard.stopped && *step.guard.stopped) return;
+  if (step.guard.stopped && *step.guard.stopped) return;
   const int64_t number = step.now ? step.now->step : int64_t(step.attributes[kStepMeans].step);
   const Camera<T> camera = camera_of(s);
   for (int a = 0; a < kStepped; ++a)

@@ -95,7 +95,7 @@ __device__ void write_terms(const SleepInput<float>& in, int64_t number) {
 
 __global__ void __launch_bounds__(kThreads)
     wake_kernel(const int32_t* halted, Scene<float> s, const __grid_constant__ SleepInput<float> in) {
-  if (is_halted(halted) || (!in.all && in.step.guard.stopped && *in.step.guard.stopped)) return;
+  if (is_halted(halted) || (in.step.guard.stopped && *in.step.guard.stopped)) return;
   const int64_t number = in.step.now ? in.step.now->step : int64_t(in.step.attributes[kStepMeans].step);
   __shared__ Camera<float> camera;
   __shared__ PartialSums sums;
