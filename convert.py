@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from arguments import OptionParser
-from splatting.host.start import typed_python
+from splatting.host.start import typed_command
 from splatting.sfm.colmap import LENS_MODELS, Program, Pycolmap, Settings
 from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder
 from splatting.sfm.programs import refuse_while_working
@@ -68,7 +68,7 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     print(summary(report))
     for line in report["advice"]:
         print(f"warning: {line}", file=sys.stderr)
-    print(f"train it with: {typed_python()} train.py -s {shlex.quote(str(layout.scene))}")
+    print(f"train it with: {typed_command('train.py')} -s {shlex.quote(str(layout.scene))}")
 
 
 def _masks(given: str | None) -> Path | None:

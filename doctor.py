@@ -37,6 +37,10 @@ def diagnose(source: str | None, images: str | None, model: str | None, iteratio
 
     for option, folder in (("-s", source), ("-m", model)):
         if folder is not None and not (folder and Path(folder).is_dir()):
+            if option == "-m" and source is not None and not Path(folder).exists():
+                print(f"no model in {folder} yet: it is not checked")
+                model = None
+                continue
             raise UserError(f"no folder {folder or repr(folder)}; pass an existing folder as {option}")
     if source is not None:
         from splatting.diagnosis.dataset import check_dataset

@@ -132,7 +132,11 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     background = (1.0, 1.0, 1.0) if options.white_background else (0.0, 0.0, 0.0)
     entry.write(args.to, chosen, *((scene.getTrainCameras(), make_path, background) if entry.of_scene else ()))
     size, seconds = Path(args.to).stat().st_size, time.perf_counter() - start
-    what = f"{len(chosen):,} of {len(splats):,} Gaussians, SH degree {degree if entry.bands else 0}"
+    kept = degree if entry.bands else 0
+    unused = (
+        " (no others are used)" if entry.bands and degree < splats.sh_degree and args.typed_sh_degree is None else ""
+    )
+    what = f"{len(chosen):,} of {len(splats):,} Gaussians, SH degree {kept}{unused}"
     print(
         f"Wrote {args.to}: {what}, {size / 1e6:.2f} MB ({size / max(len(chosen), 1):.0f} bytes each), {seconds:.1f} s"
     )

@@ -94,6 +94,11 @@ def _scenes(args: Namespace) -> list[SceneEntry]:
         scenes = plan.finished_scenes(args.output_path)
     if not scenes:
         raise UserError("no scenes given; pass data sets as -m360, -tat, -db, or folders as --scenes")
+    if not args.skip_training and args.scenes:
+        from scene.readers.scene_folder import kind_of  # here, as scores alone need no extensions
+
+        for folder in args.scenes:
+            kind_of(folder)
     plan.check_names(scenes)
     return scenes
 

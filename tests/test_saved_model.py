@@ -17,7 +17,7 @@ from arguments import ModelParams
 from scene.gaussians import ply
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
 from scene.saved_model import find_save, load_saved, read_model
-from splatting.host.start import typed_python
+from splatting.host.start import typed_command
 from splatting.training import loop
 from utils.system_utils import UserError
 
@@ -88,7 +88,7 @@ def test_an_interrupted_training_can_be_looked_at(colmap_scene, tmp_path, monkey
     with pytest.raises(KeyboardInterrupt):
         train_on(colmap_scene, tmp_path, *WORDS, "--iterations", 40)
     said = capfd.readouterr().err
-    look = f"Stopped at iteration 20\nLook at the model: {typed_python()} view.py -m {tmp_path}\n"
+    look = f"Stopped at iteration 20\nLook at the model: {typed_command('view.py')} -m {tmp_path}\n"
     assert f"{look}Resume by the same command with --start_checkpoint {tmp_path / 'chkpnt20.pth'}" in said
     path = tmp_path / "point_cloud/iteration_20/point_cloud.ply"
     assert torch.equal(read_model(path).get_xyz, load_checkpoint(tmp_path / "chkpnt20.pth")[0][1])

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from waiting import LIMIT, wait_for
 
-from splatting.host.start import typed_python
+from splatting.host.start import typed_command
 
 ROOT = Path(__file__).parents[1]
 COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor")
@@ -115,13 +115,16 @@ def test_a_python_without_torch_is_named():
     )
 
 
-def test_the_python_that_a_person_types(monkeypatch, tmp_path):
+def test_the_command_that_a_person_types(monkeypatch, tmp_path):
+    monkeypatch.chdir(ROOT)
     monkeypatch.setattr(sys, "executable", str(tmp_path / "bin x" / "python"))
-    assert typed_python() == f"'{tmp_path}/bin x/python'"
+    assert typed_command("view.py") == f"'{tmp_path}/bin x/python' view.py"
     monkeypatch.chdir(tmp_path)
-    assert typed_python() == "'bin x/python'"
+    assert typed_command("view.py") == f"'bin x/python' {ROOT}/view.py"
     monkeypatch.setattr("shutil.which", {"python": sys.executable}.get)
-    assert typed_python() == "python"
+    assert typed_command("view.py") == f"python {ROOT}/view.py"
+    monkeypatch.chdir("/")
+    assert typed_command("view.py") == f"python {ROOT}/view.py"
 
 
 def test_letters_that_an_output_does_not_have(tmp_path):

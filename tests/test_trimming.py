@@ -342,8 +342,8 @@ def test_the_lines_of_a_report():
     assert said == [
         "Of 1,000 Gaussians, 50 invisible ones were left out (5.0 %, 0.01 MB of the PLY); 99 views were searched in "
         "1.2 s; test views change by at most 0.012 (values 0 to 1), PSNR 30.000 to 29.900 dB",
-        "Left out no SH bands; cutting them would move colours by at most 0.3 above degree 0, 0.2 above degree 1, "
-        "0.1 above degree 2 (--prune_sh)",
+        "All SH bands were kept. To cut them (--prune_sh) would move colours, from 0 to 1, by up to 0.3 above degree 0, "
+        "0.2 above degree 1, 0.1 above degree 2",
         "Colours of the training photos are kept as bytes and at training size: 3.0 MB, 45.0 MB less than as float32 "
         "at the size of the files",
     ]

@@ -1,6 +1,7 @@
 """Checkpoints, files chkpntN.pth of (state of the model, N): tensors and plain values."""
 
 import argparse
+import math
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -171,8 +172,8 @@ def _check_rows(rows: Rows, table: dict[str, Attribute], max_sh_degree: int) -> 
         found = tuple(values.shape[1:])
         if name == "f_rest" and found[1:] == shape[1:] and found != shape:
             raise UserError(
-                f"the checkpoint has {found[0]} SH coefficients above band 0, but --sh_degree {max_sh_degree} needs "
-                f"{shape[0]}; give the --sh_degree it was trained with"
+                f"the checkpoint does not have the SH coefficients of --sh_degree {max_sh_degree}; give "
+                f"--sh_degree {math.isqrt(found[0] + 1) - 1}, with which it was trained"
             )
         if found != shape or values.dtype != torch.float32:
             raise UserError(

@@ -49,6 +49,11 @@ class FileIndex:
         )
         return next(alike, None)
 
+    def description(self) -> str:
+        """After a miss: what the folder has, in brackets."""
+        there = sorted(str(path.relative_to(self._folder)) for paths in self._folded_paths.values() for path in paths)
+        return f" (the folder has {some(there)})" if there else " (the folder is empty)"
+
 
 def _folded(name: str) -> str:
     name = unicodedata.normalize("NFC", os.path.normpath(name.replace("\\", "/"))).casefold()
@@ -80,7 +85,9 @@ def find_images(
         if other:
             instead = f" ({other.relative_to(folder)} is there instead)"
         else:
-            instead = " (it is there, but a link to nothing or no file)" if os.path.lexists(folder / missing[0]) else ""
+            instead = index.description()
+            if os.path.lexists(folder / missing[0]):
+                instead = " (it is there, but a link to nothing or no file)"
         raise UserError(
             f"{len(missing)} of {len(paths)} {kind} that {listed_by} lists are missing: "
             f"{some([str(folder / name) for name in missing])}{instead}; {remedy}"

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 from splatting.files.listing import some
-from splatting.host.start import typed_python
+from splatting.host.start import typed_command
 from utils.system_utils import UserError
 
 COLMAP, BLENDER, NERFSTUDIO = "Colmap", "Blender", "Nerfstudio"
@@ -51,10 +51,10 @@ def _remedy(folder: Path) -> str:
         return "the files of a COLMAP model belong in a folder sparse/0 of the scene, beside the folder images"
     inner = [path for path in (folder / "input", folder / "images", folder) if path.is_dir() and _has_pictures(path)]
     if inner and inner[0].name == "input":
-        return f"photos need camera poses: run {typed_python()} convert.py -s {folder} first"
+        return f"photos need camera poses: run {typed_command('convert.py')} -s {folder} first"
     if inner:
-        command = f"{typed_python()} convert.py -s {folder if inner[0] != folder else folder.parent}"
-        return f"photos need camera poses: put them into a folder input of the scene and run {command} first"
+        command = f"{typed_command('convert.py')} -s {folder}"
+        return f"photos need camera poses: put them into a folder {folder / 'input'} and run {command} first"
     return "give -s the folder that holds one of them"
 
 

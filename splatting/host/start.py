@@ -22,6 +22,7 @@ from splatting.host.interrupt import raise_on_signals
 _TRIM, _SEPARATE = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of mallopt
 _KEPT = 256 << 20  # bytes that may lie free
 _LARGE = 32 << 20  # bytes of an allocation that is given back as soon as it is freed; glibc allows no more
+_ROOT = Path(__file__).resolve().parents[2]
 _DRIVER = "libcuda.so.1"
 _waiting = False  # whether the collector is
 
@@ -51,6 +52,8 @@ def imported() -> None:
         gc.freeze()
         gc.enable()
         _waiting = False
+    if "numpy" in sys.modules:
+        import numpy.random  # noqa: F401  (or numpy would import it later, and might swallow a signal)
     if threading.current_thread() is threading.main_thread():
         if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
             signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -120,9 +123,13 @@ def _make_context() -> None:
         pass
 
 
-def typed_python() -> str:
-    """How this Python is called from here: python where that is what runs, else its path."""
+def typed_command(script: str) -> str:
+    """How a command of this program is called from here: its Python (python where that is what runs), and its path."""
     found, own = shutil.which("python"), Path(sys.executable)
-    if found and Path(found).absolute() == own.absolute():
-        return "python"
-    return shlex.quote(str(own.relative_to(Path.cwd()) if own.is_relative_to(Path.cwd()) else own))
+    python = "python" if found and Path(found).absolute() == own.absolute() else _typed(own)
+    return f"{python} {_typed(_ROOT / script)}"
+
+
+def _typed(path: Path) -> str:
+    here = Path.cwd()
+    return shlex.quote(str(path.relative_to(here) if here in path.parents and here != here.parent else path))

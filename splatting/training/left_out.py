@@ -88,9 +88,9 @@ def _bands(it: LeftOut) -> str:
         moved = f"colours move by at most {bound:.2g} (values 0 to 1)" if bound else "they are zero throughout"
         return f"Left out the SH bands above degree {it.sh_degree} ({saved:.2f} MB of the PLY): {moved}"
     if it.max_sh_degree == 0:
-        return "Left out no SH bands: there are none above degree 0"
+        return "The model has no SH bands above degree 0"
     moved = ", ".join(f"{bound:.2g} above degree {degree}" for degree, bound in enumerate(it.cut_bounds[:-1]))
-    return f"Left out no SH bands; cutting them would move colours by at most {moved} (--prune_sh)"
+    return f"All SH bands were kept. To cut them (--prune_sh) would move colours, from 0 to 1, by up to {moved}"
 
 
 def _pictures(it: LeftOut) -> str:

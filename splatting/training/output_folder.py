@@ -12,7 +12,7 @@ from scene.saved_model import saves_in
 from splatting.distributed.ranks import ranks
 from splatting.files.folders import locked, remove_temporary_files
 from splatting.files.listing import some
-from splatting.host.start import typed_python
+from splatting.host.start import typed_command
 from utils.system_utils import mkdir_p
 
 _INPUTS = ("cfg_args", "model.json", "cameras.json", "input.ply")
@@ -28,7 +28,7 @@ def view_command(model_path: str, iteration: int | None = None) -> str:
     """The command that shows a model; iteration: None, the newest one."""
     older = iteration is not None and max(saves_in(Path(model_path)), default=iteration) > iteration
     which = f" --iteration {iteration}" if older else ""
-    return f"{typed_python()} view.py -m {shlex.quote(model_path)}{which}"
+    return f"{typed_command('view.py')} -m {shlex.quote(model_path)}{which}"
 
 
 @contextlib.contextmanager

@@ -15,7 +15,7 @@ from splatting.exports.in_scene import splats_of
 from splatting.exports.ply import write_plain_ply
 from splatting.exports.splats import drawable, selected, tidy
 from splatting.host.interrupt import DeferredInterrupt
-from splatting.host.start import typed_python
+from splatting.host.start import typed_command
 from splatting.viewer import server as servers
 from splatting.viewer.frames import LONGEST, Frames, inside
 from splatting.viewer.legend import Legend
@@ -175,7 +175,7 @@ class Page:
         except UserError as error:
             self._tell(client, "Not saved", str(error))
         else:
-            video = f"{typed_python()} render.py -m {folder} --path {file}"
+            video = f"{typed_command('render.py')} -m {folder} --path {file}"
             tqdm.write(as_utf8(f"Saved {file}; its video: {video}"), file=sys.stdout)
             self._tell(client, "Saved", f"{PATHS}/{file.name}; the terminal shows how to make its video")
 

@@ -70,11 +70,17 @@ class ProgressBar(Observer):
             return
         run, seconds = self._run, self._run.clock.seconds
         if not run.opt.time_budget:
-            print(f"{self._done - run.first_iteration:,} iterations in {seconds:.1f} s")
+            before = f", {run.log.seconds_before + seconds:.1f} s with those before" if run.first_iteration else ""
+            print(f"{_iterations(self._done - run.first_iteration)} in {seconds:.1f} s{before}")
             return
-        count = f"{self._done:,} iterations in"  # with those before a resume, as the seconds
+        # With those before a resume, as the budget.
         seconds, whole = run.log.seconds_before + seconds, run.log.wall_seconds_before + wall_seconds()
-        run.log.tell(f"{count} {seconds:.1f} s (budget {run.opt.time_budget:g} s), {whole:.1f} s in all")
+        budget = f"budget {run.opt.time_budget:g} s, {whole:.1f} s with start, scores and saves"
+        run.log.tell(f"{_iterations(self._done)} in {seconds:.1f} s ({budget})")
+
+
+def _iterations(count: int) -> str:
+    return f"{count:,} iteration{'s' if count != 1 else ''}"
 
 
 LOG_INTERVAL = 10  # iterations between TensorBoard's losses: reading one waits for the GPU
