@@ -219,21 +219,6 @@ def test_bands_follow_what_an_earlier_visit_has_processed():
         assert borders == ([0, 20, 40, 60] if visit < 8 else [0, 5, 6, 60])
 
 
-def test_ranks_weigh_by_their_splats_whether_they_take_a_sample_or_not(monkeypatch):
-    generator = torch.Generator().manual_seed(6)
-    rects = []
-    for count, first in ((20_000, 0), (3_999, 60), (0, 0)):
-        top = first + torch.randint(37, (count,), generator=generator)
-        rects.append(torch.stack((torch.zeros_like(top), top, 1 + top % 3, top + 1 + top % 4), 1).int())
-    monkeypatch.setattr(bands, "_TILE_COST", 8)
-    found = []
-    for sample in (1 << 16, 4_000):
-        monkeypatch.setattr(bands, "_SAMPLE", sample)
-        ranks = _Others(rects, height=1600)
-        found.append(find_bands(ranks, rects[0], torch.ones(20_000), 1600, 40).borders)
-    assert all(abs(one - other) <= 1 for one, other in zip(*found, strict=True)) and found[0][2] < 40
-
-
 def test_bands_of_a_view_are_kept_for_some_visits():
     rects = torch.tensor([[0, 0, 1, 1]] * 9, dtype=torch.int32)
     ranks, known, counts = _Others([rects, rects, rects]), KnownBands(), torch.ones(9, dtype=torch.int32)
