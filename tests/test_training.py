@@ -293,8 +293,9 @@ def test_training_is_called_as_the_references(colmap_scene, tmp_path):
 
 
 def test_a_late_reset_is_announced(colmap_scene, tmp_path, capfd):
-    _train(colmap_scene, tmp_path, "--opacity_reset_interval", 3, iterations=5)
-    assert "opacities are reset in iteration 3, and 2 iterations" in capfd.readouterr().out
+    """Also where --quiet silences the standard output."""
+    _train(colmap_scene, tmp_path, "--opacity_reset_interval", 3, "--quiet", iterations=5)
+    assert "warning: opacities are reset in iteration 3, and 2 iterations" in capfd.readouterr().err
 
 
 def test_seconds_leave_evaluation_and_saving_out(colmap_scene, tmp_path, monkeypatch):

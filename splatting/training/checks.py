@@ -29,20 +29,20 @@ _FEWEST_BEYOND = 0.01  # share of the points in front of them that must lie beyo
 SMALL = 32  # pixels; a smaller side has few more than SSIM's window
 
 
+def _warn(text: str) -> None:
+    print(f"warning: {text}", file=sys.stderr)
+
+
 def hint_of_images(views: Sequence[Camera], info: SceneInfo, white_background: bool) -> None:
     """Warn of images that are too small to learn from, and of transparent ones that are to be black behind."""
     width, height = min((view.image_width, view.image_height) for view in views)
     if min(width, height) < SMALL:
-        print(
-            f"warning: images of {width}x{height} pixels are too small to learn from; give a larger --resolution",
-            file=sys.stderr,
-        )
+        _warn(f"images of {width}x{height} pixels are too small to learn from; give a larger --resolution")
     path = info.train_cameras[0].image_path
     if info.is_nerf_synthetic and not white_background and path is not None and _has_alpha(path):
-        print(
-            "warning: the images are transparent, and train before black; -w trains before white, as published results "
-            "of such scenes do",
-            file=sys.stderr,
+        _warn(
+            "the images are transparent, and train before black; -w trains before white, as published results "
+            "of such scenes do"
         )
 
 
@@ -120,8 +120,8 @@ def warn_of_late_reset(opt: argparse.Namespace, white_background: bool, schedule
     resets = [rules.actions(t, opt, white_background, schedule.span(t), schedule.stride(t)).reset_opacity for t in last]
     due = [t for t, is_reset in zip(last, resets, strict=True) if is_reset]
     if due:
-        print(
-            f"warning: opacities are reset in iteration {due[-1]}, and {schedule.ends - due[-1]} iterations are "
+        _warn(
+            f"opacities are reset in iteration {due[-1]}, and {schedule.ends - due[-1]} iterations are "
             "too few to recover from that; change --iterations or --opacity_reset_interval"
         )
 
@@ -140,7 +140,7 @@ def warn_of_another_number(density: DensityControl, opt: argparse.Namespace, cou
         if too_many:
             text = f"the start has {count:,} Gaussians, more than --max_num_splats {opt.max_num_splats}; adc adds none"
             remedy = "" if too_late else "; --strategy budget gets down to it"
-            print(f"warning: {text}, and removes only faint ones{remedy}", file=sys.stderr)
+            _warn(f"{text}, and removes only faint ones{remedy}")
         return
     # The number that mcmc takes where none is given is a limit, nothing to reach.
     if reached == aim or ((reached > aim or opt.strategy == "mcmc") and not opt.max_num_splats):
@@ -156,9 +156,7 @@ def warn_of_another_number(density: DensityControl, opt: argparse.Namespace, cou
         why = f"{end} is not before the end; give --densify_until_iter {schedule.length // 2}"
     else:
         why = "they at most double each time; lower --densification_interval, or raise --densify_until_iter"
-    print(
-        f"warning: --strategy {opt.strategy} gets to {reached:,} Gaussians, not to {aim:,}, as {why}", file=sys.stderr
-    )
+    _warn(f"--strategy {opt.strategy} gets to {reached:,} Gaussians, not to {aim:,}, as {why}")
 
 
 _OF_VIEWS = {"images", "resolution", "white_background", "eval", "train_test_exp"}  # in cfg_args, for all saves alike
@@ -195,10 +193,9 @@ def check_folder(
         raise UserError(
             f"{kept} with {before}, which {after} would not fit; name another folder by -m, or remove the old one"
         )
-    print(
-        f"warning: {kept}, and other commands take the highest unless --iteration is given; remove the old ones, or "
-        "name another folder by -m",
-        file=sys.stderr,
+    _warn(
+        f"{kept}, and other commands take the highest unless --iteration is given; remove the old ones, or "
+        "name another folder by -m"
     )
 
 
@@ -240,7 +237,7 @@ def report_changes(checkpoint: str, now: argparse.Namespace) -> None:
         )
     if changed:
         before, after = (" ".join(_typed(n, of[n]) for n in changed) for of in (then, vars(now)))
-        print(f"warning: {folder} was trained with {before}, this run has {after}", file=sys.stderr)
+        _warn(f"{folder} was trained with {before}, this run has {after}")
 
 
 def continue_records(model_path: str, checkpoint: str | None, first_iteration: int) -> tuple[TrainingLog, list[Row]]:
