@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 OPTIONS = ("--iterations", "12", "--checkpoint_iterations", "5", "--save_iterations", "6", "-r", "2")
@@ -28,6 +28,11 @@ def command(logs: Path, size: int, fault: str, *options: str, restarts: int = 0)
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc_per_node={size}"]
     torchrun += [f"--max-restarts={restarts}", f"--log-dir={logs}", "--redirects=3"]
     return [*torchrun, str(ROOT / "tests" / "faulty_train.py"), *fault.split(), *options]
+
+
+def words(scene: Path, out: Path, *options: str) -> list[str]:
+    """Options of a short training."""
+    return ["-s", str(scene), "-m", str(out), *OPTIONS, *options]
 
 
 def environment(**more: str) -> dict[str, str]:
@@ -54,3 +59,8 @@ def launch(logs: Path, fault: str, *options: str, size: int = 2, restarts: int =
     line = command(logs, size, fault, *options, restarts=restarts)
     done = subprocess.run(line, cwd=logs.parent, env=environment(**more), capture_output=True, timeout=120)
     return outputs(logs, size, done.returncode)
+
+
+def launch_fault(scene: Path, folder: Path, fault: str, **more: Any) -> Launched:
+    """Train into folder/out with a fault."""
+    return launch(folder / "logs", fault, *words(scene, folder / "out", "--no_curve", "--plain_step"), **more)

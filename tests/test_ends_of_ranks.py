@@ -1,5 +1,6 @@
 """Parts of a launch on several ranks that need no second process."""
 
+import argparse
 import io
 import os
 import subprocess
@@ -7,11 +8,16 @@ import sys
 from pathlib import Path
 
 import pytest
+from trainings import narrow_scene
 
 import train
+from arguments import ModelParams
+from scene import Scene
+from scene.gaussian_model import GaussianModel
 from splatting.distributed import quiet
 from splatting.distributed.alike import refuse_differences
 from splatting.distributed.board import here, is_gone
+from splatting.distributed.consistency import agree_on_scene
 from splatting.distributed.ending import DONE, FAULT, HANG, LOST, SIGNAL, End, verdict
 from splatting.distributed.ranks import Ranks, using
 from splatting.host import machine, torchrun
@@ -95,6 +101,25 @@ def test_differences_name_what_and_whose():
     with pytest.raises(UserError) as refused:
         refuse_differences([{"a": "1"}, {"a": "1"}, {"a": "2", "b": "3"}], "do so")
     assert str(refused.value) == "rank 2 differs from rank 0 in a (2, not 1), b (3, not nothing); do so"
+
+
+def test_ranks_of_which_one_lacks_the_masks_are_refused(tmp_path):
+    source, facts = narrow_scene(tmp_path / "scene"), []
+
+    class Pair(_Second):
+        def everyone(self, value: dict) -> list[dict]:
+            facts.append(value)
+            return facts[-2:]
+
+    def scene(masks: str) -> Scene:
+        given = argparse.Namespace(source_path=str(source), model_path=str(tmp_path), masks=masks)
+        return Scene(ModelParams(argparse.ArgumentParser()).extract(given), GaussianModel(0))
+
+    with_masks, without = scene("masks"), scene("")
+    with using(Pair()):
+        agree_on_scene(with_masks, None)
+        with pytest.raises(UserError, match="rank 1 differs from rank 0 in the training views; give all"):
+            agree_on_scene(without, None)
 
 
 def test_lines_are_told_once_with_the_ranks_that_say_them(monkeypatch):

@@ -28,6 +28,7 @@ class _Writer:
 
     def __init__(self, folder: str, flush_secs: int) -> None:
         self.scalars: dict[str, dict[int, float]] = {}
+        self.shown: list[tuple[str, int]] = []  # images and histograms
         _Writer.last = self
 
     def add_scalar(self, tag: str, value: float, step: int) -> None:
@@ -35,9 +36,12 @@ class _Writer:
             raise OSError(28, "No space left on device")
         self.scalars.setdefault(tag, {})[step] = value
 
-    def add_histogram(self, *_: object) -> None: ...
+    def add_histogram(self, tag: str, values: torch.Tensor, step: int) -> None:
+        self.shown.append((tag, step))
 
-    def add_image(self, tag: str, image: torch.Tensor, global_step: int) -> None: ...
+    def add_image(self, tag: str, image: torch.Tensor, global_step: int) -> None:
+        assert image.shape[0] == 3 and image.is_floating_point()
+        self.shown.append((tag, global_step))
 
     def close(self) -> None:
         self.scalars["closed"] = {}
@@ -50,6 +54,19 @@ def writer(monkeypatch: pytest.MonkeyPatch) -> type[_Writer]:
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", module)
     monkeypatch.setattr(sys, "stdout", sys.stdout)
     return _Writer
+
+
+def test_tags_are_the_references(colmap_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "LOG_INTERVAL", 2)
+    _train(colmap_scene, tmp_path, "--iterations", "3", "--test_iterations", "2", "3")
+    scalars, shown = _Writer.last.scalars, _Writer.last.shown
+    every = {tag: list(values) for tag, values in scalars.items()}
+    losses = dict.fromkeys(("train_loss_patches/l1_loss", "train_loss_patches/total_loss", "iter_time"), [2])
+    scores = [f"{name}/loss_viewpoint - {score}" for name in ("test", "train") for score in ("l1_loss", "psnr")]
+    assert every == losses | dict.fromkeys((*scores, "total_points"), [2, 3]) | {"closed": []}
+    assert [step for tag, step in shown if tag == "scene/opacity_histogram"] == [2, 3]
+    assert sum(tag.startswith("test_view_") and tag.endswith("/render") for tag, step in shown if step == 3) == 3
+    assert {step for tag, step in shown if tag.endswith("/ground_truth")} == {2}
 
 
 def test_without_tensorboard_a_sentence_says_so(colmap_scene, tmp_path, monkeypatch, capsys):

@@ -1,47 +1,16 @@
-"""Exchange between ranks, against its plain formulation: the same bits."""
+"""Operators of the exchange between ranks, against their plain formulation (tests/test_over_ranks.py: all of it)."""
 
 import pytest
 import torch
-from diff_gaussian_rasterization.fakes import ABSOLUTE_VALUES, MOMENT_VALUES, SPLAT_VALUES
+from diff_gaussian_rasterization.fakes import ABSOLUTE_VALUES, MOMENT_VALUES
 from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, moved_by_a_word, ops
 from torch import Tensor
 
 from splatting.distributed.ranks import Ranks
-from splatting.distributed.rendering import exchange
 from splatting.distributed.rendering.exchange import Sent, return_rows
 from splatting.host.read_later import read_later
 
-Splats = tuple[Tensor, ...]  # splats, depths, rects, tile_counts
 LARGE = 20_000  # more than a thread of the CPU takes at once, and no multiple of anything
-
-
-def some_splats(count: int, device: str, dtype: torch.dtype) -> Splats:
-    """Any bits, so that NaNs of all kinds are among the values."""
-    generator = torch.Generator().manual_seed(count)
-
-    def words(*shape: int) -> Tensor:
-        return torch.randint(-(2**31), 2**31, shape, generator=generator, dtype=torch.int64).to(torch.int32)
-
-    wide = dtype.itemsize // 4
-    splats, depths = words(count, SPLAT_VALUES * wide).view(dtype), words(count, wide).view(dtype).view(count)
-    return tuple(t.to(device) for t in (splats, depths, words(count, 4), words(count)))
-
-
-def same_bits(one: Tensor, other: Tensor) -> bool:
-    return one.dtype == other.dtype and torch.equal(
-        one.reshape(-1).view(torch.int32), other.reshape(-1).view(torch.int32)
-    )
-
-
-@BOTH_AND_GPU
-@pytest.mark.parametrize("chosen", [0, 1, 7, LARGE])
-def test_splats_are_packed_and_unpacked(chosen, device, dtype):
-    splats = some_splats(LARGE // 2, device, dtype)
-    gaussians = torch.randint(LARGE // 2, (chosen,), generator=torch.Generator().manual_seed(1)).to(device)
-    packed = exchange._packed([splats, splats], gaussians, [chosen // 3, chosen - chosen // 3])
-    assert packed.shape == (chosen, 11 * dtype.itemsize // 4 + 5) and packed.dtype == torch.int32
-    for values, whole in zip(exchange._unpacked(packed, splats), splats, strict=True):
-        assert values.shape == (chosen, *whole.shape[1:]) and same_bits(values, whole.index_select(0, gaussians))
 
 
 def reach_of(kind: str, device: str) -> tuple[Tensor, Tensor, Tensor]:
@@ -108,21 +77,6 @@ RUNS = pytest.mark.parametrize("kind", ["none", "one", "no rows", "hardly any", 
 @BOTH_AND_GPU
 @VALUES
 @RUNS
-def test_runs_move(kind, values, device, dtype):
-    counts, rows = some_runs(kind, values, device, dtype)
-    shuffled = torch.randperm(len(counts), generator=torch.Generator().manual_seed(3)).to(device)
-    # As ranks get them: in order in each of three parts, which lie in each other.
-    merged = torch.cat([torch.arange(len(counts), device=device)[rank::3] for rank in range(3)])
-    for places in (shuffled, merged, merged.sort().values):
-        moved = exchange.move_runs(rows, counts, places.int())
-        order, runs = places.argsort(), rows.split(counts.tolist())
-        assert torch.equal(moved, torch.cat([rows[:0], *(runs[run] for run in order.tolist())]))
-    assert torch.equal(moved, rows)
-
-
-@BOTH_AND_GPU
-@VALUES
-@RUNS
 def test_runs_are_added_up(kind, values, device, dtype):
     counts, rows = some_runs(kind, values, device, dtype)
     run = torch.arange(len(counts), device=device)
@@ -140,16 +94,6 @@ def test_runs_are_added_up(kind, values, device, dtype):
     assert torch.equal(again[~whole], found[:-3][kept == 1])
     wide = torch.cat((rows, rows), 1)[:, values:]
     assert torch.equal(ops.sum_runs(wide, counts, kept, int(kept.sum())), again)
-
-
-@CPU_AND_GPU
-def test_parts_are_added_up(device):
-    counts = torch.randint(9, (LARGE,), generator=torch.Generator().manual_seed(4), dtype=torch.int32).to(device)
-    counts[0] = 2**31 - 1
-    sizes = [5, 0, 1, LARGE - 7, 1]
-    found = exchange._sums_of_parts(counts, sizes)
-    assert found.dtype == torch.int64 and found.tolist() == [int(part.sum()) for part in counts.split(sizes)]
-    assert exchange._sums_of_parts(counts[:0], [0, 0]).tolist() == [0, 0]
 
 
 class _Both(Ranks):

@@ -10,7 +10,7 @@ import pytest
 from synthetic import folder_state
 
 import train
-from arguments import read_model_json, read_stored_options, write_cfg_args, write_model_json
+from arguments import read_model_json, write_cfg_args
 from splatting.evaluation.error_curve import COLUMNS, read_curve, write_curve
 from splatting.training.checks import check_folder, continue_records
 from utils.system_utils import UserError
@@ -221,14 +221,6 @@ def test_a_checkpoint_of_another_scene_is_refused_and_one_of_a_moved_scene_told(
     _train(moved, whole, *start, iterations=40)
     (warning,) = _warnings(capfd.readouterr().err)
     assert f"trained with --source_path {colmap_scene}, this run has --source_path {moved}" in warning
-
-
-def test_what_a_folder_does_not_tell_is_not_missed(tmp_path):
-    write_cfg_args(tmp_path, argparse.Namespace(**MODEL_OPTIONS))
-    assert read_stored_options(tmp_path) == MODEL_OPTIONS  # a model of the reference, which writes no model.json
-    write_model_json(tmp_path, argparse.Namespace(masks="m"), antialiasing=True, seed=2)
-    told = {"masks": "m", "invert_masks": False, "mask_meaning": "auto", "antialiasing": True, "seed": 2}
-    assert read_stored_options(tmp_path) == MODEL_OPTIONS | told
 
 
 def test_points_to_start_from_are_not_counted_when_a_checkpoint_has_others(colmap_scene, tmp_path, capfd):

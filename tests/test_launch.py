@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from launching import OPTIONS, ROOT, Launched, command, environment, launch, outputs
+from launching import ROOT, Launched, command, environment, launch, launch_fault, outputs, words
 from waiting import wait_for
 
 import train
@@ -25,15 +25,7 @@ def _files(folder: Path) -> list[str]:
 
 
 def _train(scene: Path, out: Path, *options: str) -> None:
-    train.main(_words(scene, out, *options, "--disable_viewer", "--quiet"))
-
-
-def _words(scene: Path, out: Path, *options: str) -> list[str]:
-    return ["-s", str(scene), "-m", str(out), *OPTIONS, *options]
-
-
-def _fault(scene: Path, folder: Path, fault: str, **more) -> Launched:
-    return launch(folder / "logs", fault, *_words(scene, folder / "out", "--no_curve", "--plain_step"), **more)
+    train.main(words(scene, out, *options, "--disable_viewer", "--quiet"))
 
 
 def _assert_interrupted(done: Launched) -> None:
@@ -44,7 +36,7 @@ def _assert_interrupted(done: Launched) -> None:
 
 def test_several_ranks_write_the_files_of_one_and_speak_with_one_voice(colmap_scene, tmp_path):
     _train(colmap_scene, tmp_path / "one", "--eval")
-    done = launch(tmp_path / "logs", "warning 1 0", *_words(colmap_scene, tmp_path / "out", "--eval"))
+    done = launch(tmp_path / "logs", "warning 1 0", *words(colmap_scene, tmp_path / "out", "--eval"))
     assert done.status == 0
     one, out = tmp_path / "one", tmp_path / "out"
     assert _files(one) == _files(out)
@@ -88,7 +80,7 @@ STANDS = "the last checkpoint stands: resume with --start_checkpoint {out}/chkpn
 )
 def test_a_fault_of_one_rank_ends_all_with_one_sentence(colmap_scene, tmp_path, fault, said):
     began = time.monotonic()
-    done = _fault(colmap_scene, tmp_path, fault, size=3 if fault == "kill 0 7" else 2)
+    done = launch_fault(colmap_scene, tmp_path, fault, size=3 if fault == "kill 0 7" else 2)
     assert time.monotonic() - began < 90  # 30 seconds on a machine that does nothing else
     assert done.status != 0
     (line,) = done.errors
@@ -102,7 +94,7 @@ def test_a_fault_of_one_rank_ends_all_with_one_sentence(colmap_scene, tmp_path, 
 
 def test_no_rank_goes_on_after_one_has_stopped(colmap_scene, tmp_path):
     """Rank 0 has no fault of its own: what it saves is the model after the iteration in which the other stopped."""
-    done = _fault(colmap_scene, tmp_path, "overflow 1 7")
+    done = launch_fault(colmap_scene, tmp_path, "overflow 1 7")
     (line,) = done.errors
     assert line.startswith("error: xyz of 1 of 300 (131) had no finite step in iteration 7 (view "), line
     assert sorted(path.name for path in (tmp_path / "out").glob("chkpnt*")) == ["chkpnt5.pth", "chkpnt7.pth"]
@@ -114,7 +106,7 @@ def test_no_rank_goes_on_after_one_has_stopped(colmap_scene, tmp_path):
 
 
 def test_a_signal_to_one_rank_stops_all_after_one_iteration(colmap_scene, tmp_path):
-    done = _fault(colmap_scene, tmp_path, "interrupt 1 7")
+    done = launch_fault(colmap_scene, tmp_path, "interrupt 1 7")
     _assert_interrupted(done)
     assert [path.name for path in sorted((tmp_path / "out").glob("chkpnt*.pth"))] == ["chkpnt5.pth", "chkpnt8.pth"]
     records = json.loads((tmp_path / "out" / "train_log.json").read_text())
@@ -124,8 +116,8 @@ def test_a_signal_to_one_rank_stops_all_after_one_iteration(colmap_scene, tmp_pa
 @pytest.mark.parametrize("stopped", [False, True], ids=["", "after all ranks were stopped"])
 def test_a_signal_to_torchrun_saves_one_checkpoint(colmap_scene, tmp_path, stopped):
     """Ranks that were all stopped, as on a laptop that sleeps, go on, although one of them continues first."""
-    words = _words(colmap_scene, tmp_path / "out", "--no_curve", "--iterations", "100000")
-    line = command(tmp_path / "logs", 2, "none 0 0", *words)
+    given = words(colmap_scene, tmp_path / "out", "--no_curve", "--iterations", "100000")
+    line = command(tmp_path / "logs", 2, "none 0 0", *given)
     with subprocess.Popen(line, cwd=tmp_path, env=environment(), stdout=-3, stderr=-3) as process:
         try:
             wait_for(lambda: (tmp_path / "out" / "chkpnt5.pth").exists())
@@ -162,7 +154,7 @@ def test_a_restarted_training_goes_on_from_its_newest_checkpoint(colmap_scene, t
     (tmp_path / "out" / "chkpnt9.pth").write_text("of an earlier training")
     old = time.time() - 86400
     os.utime(tmp_path / "out" / "chkpnt9.pth", (old, old))
-    done = _fault(colmap_scene, tmp_path, "kill 1 7", restarts=1)
+    done = launch_fault(colmap_scene, tmp_path, "kill 1 7", restarts=1)
     assert done.status == 0
     assert f"Restarted by torchrun: resuming {tmp_path / 'out' / 'chkpnt5.pth'}" in done.stdout[0]
     _train(colmap_scene, tmp_path / "one", "--no_curve")
@@ -185,15 +177,15 @@ def test_ranks_with_other_options_or_other_code_are_refused(colmap_scene, tmp_pa
     shutil.copy(ROOT / "train.py", other)
     with (other / "splatting" / "training" / "density.py").open("a") as file:
         file.write("# changed\n")
-    done = _fault(colmap_scene, tmp_path, fault, OTHER_CODE=str(other))
+    done = launch_fault(colmap_scene, tmp_path, fault, OTHER_CODE=str(other))
     assert done.status != 0 and done.errors == [f"error: rank 1 differs from rank 0 in {differs}"]
     assert not (tmp_path / "out").exists()
 
 
 def test_ranks_keep_the_pace_of_the_first(colmap_scene, tmp_path):
     paced = ("--iterations", "3000", "--eval", "--time_budget", "2", "--target_psnr", "90", "--test_iterations", "-1")
-    words = ["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "-r", "2", *paced]
-    done = launch(tmp_path / "logs", "none 0 0", *words)
+    given = ["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "-r", "2", *paced]
+    done = launch(tmp_path / "logs", "none 0 0", *given)
     assert done.status == 0 and done.errors == []
     schedule = json.loads((tmp_path / "out" / "schedule.json").read_text())
     records = json.loads((tmp_path / "out" / "train_log.json").read_text())

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from diff_gaussian_rasterization.backend import OPERATORS
 from fused_ssim import BAND_ROWS, REACH, fused_photometric_loss, photometric_loss_by_bands
 from processes import in_ranks
 from rasterizer_tools import BOTH_AND_GPU, GPU_MARKS
@@ -169,15 +168,6 @@ def test_bands_have_about_equal_loads(rows, monkeypatch):
     rects[0] = rects[0][tile_counts > 0]
     found = find_bands(_Others(rects), reaching, tile_counts, 97, 40)
     assert found.borders[0] == 0 and found.borders[-1] == tile_rows(97) == 7 and sorted(found.borders) == found.borders
-    reach = reaching, tile_counts.int(), found.limits
-    sizes = OPERATORS.list_records(*reach, 0)[0][:-1].sum(1).tolist()
-    _, reached, _ = OPERATORS.list_records(*reach, sum(sizes))
-    for (first, end), of_band in zip(pairwise(found.borders), reached.split(sizes), strict=True):
-        assert of_band.tolist() == [
-            splat
-            for splat, (_, top, _, bottom) in enumerate(reaching.tolist())
-            if tile_counts[splat] > 0 and top < end and bottom > first and first < end
-        ]
     rows_of_tiles = torch.zeros(7)
     for left, top, right, bottom in torch.cat(rects).tolist():
         rows_of_tiles[top:bottom] += right - left
@@ -217,21 +207,6 @@ def test_bands_follow_what_an_earlier_visit_has_processed():
         borders = known.find("a", ranks, rects, counts, 953, 40).borders
         known.drawn("a", last)
         assert borders == ([0, 20, 40, 60] if visit < 8 else [0, 5, 6, 60])
-
-
-def test_ranks_weigh_by_their_splats_whether_they_take_a_sample_or_not(monkeypatch):
-    generator = torch.Generator().manual_seed(6)
-    rects = []
-    for count, first in ((20_000, 0), (3_999, 60), (0, 0)):
-        top = first + torch.randint(37, (count,), generator=generator)
-        rects.append(torch.stack((torch.zeros_like(top), top, 1 + top % 3, top + 1 + top % 4), 1).int())
-    monkeypatch.setattr(bands, "_TILE_COST", 8)
-    found = []
-    for sample in (1 << 16, 4_000):
-        monkeypatch.setattr(bands, "_SAMPLE", sample)
-        ranks = _Others(rects, height=1600)
-        found.append(find_bands(ranks, rects[0], torch.ones(20_000), 1600, 40).borders)
-    assert all(abs(one - other) <= 1 for one, other in zip(*found, strict=True)) and found[0][2] < 40
 
 
 def test_bands_of_a_view_are_kept_for_some_visits():

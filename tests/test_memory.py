@@ -1,16 +1,12 @@
 """Too little memory: the warning beforehand, the files saved when memory runs out, and the message."""
 
 import re
-import signal
-import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 import torch
 from gaussians import model, options
-from PIL import Image
 
 import render
 import train
@@ -134,9 +130,7 @@ def _failing(function, call: int, error: Exception):
     ids=["cpu", "gpu", "instances"],
 )
 def test_the_state_before_is_saved_and_goes_on_to_the_same_end(colmap_scene, tmp_path, monkeypatch, error, said):
-    monkeypatch.setattr(
-        "splatting.training.run.SH_INTERVAL", 5
-    )  # so that the failing iteration is one that raises the degree
+    monkeypatch.setattr("splatting.training.run.SH_INTERVAL", 5)  # the failing iteration raises the degree
     with monkeypatch.context() as patch:
         patch.setattr(plain, "render", _failing(plain.render, 2, error))  # densification, and the raise of the degree
         with pytest.raises(UserError, match="training ran out of memory in iteration 5") as caught:
@@ -221,8 +215,6 @@ def test_every_command_ends_in_a_sentence(capsys):
         run_cli(full)
     assert ended.value.code == 2
     assert re.fullmatch(r"error: ran out of memory \(.* asked for, .*\n", capsys.readouterr().err)
-    with pytest.raises(RuntimeError, match="shapes"):
-        run_cli(lambda: (_ for _ in ()).throw(RuntimeError("shapes differ")))
 
 
 # The estimate
@@ -232,7 +224,7 @@ def test_the_estimate_and_its_warnings(colmap_scene, tmp_path, monkeypatch, capf
     free = 1 << 24
     monkeypatch.setattr(memory_estimate, "free_memory", lambda _: free)
     at_start = 300 * (16 * 59 + memory_estimate.PER_GAUSSIAN) + 24 * 16 * memory_estimate.PER_PIXEL
-    pictures = 17 * 4 * 24 * 16
+    pictures, many = 17 * 4 * 24 * 16, ("--max_num_splats", 2_000_000_000)
 
     def said(*more: object) -> tuple[str, str]:
         _train(colmap_scene, tmp_path, *more)
@@ -242,21 +234,17 @@ def test_the_estimate_and_its_warnings(colmap_scene, tmp_path, monkeypatch, capf
 
     line, warning = said()
     assert "of 0.02 GiB: photos 0.00 GiB, 6,000 Gaussians (scenes often grow 20-fold) 0.01 GiB" in line and not warning
-    absolute = said("--absgrad", "--max_num_splats", 2_000_000_000)[0]  # 25 bytes more of each
-    assert f"2,000,000,000 Gaussians (--max_num_splats) {gib(2e9 * 1095)}" in absolute
-    assert "--images_to_load" not in line and "--images_to_load" not in said("--images_to_load", 17)[0]
+    assert f"2,000,000,000 Gaussians (--max_num_splats) {gib(2e9 * 1095)}" in said("--absgrad", *many)[0]
     assert "photos 0.00 GiB (--images_to_load keeps 5 of 17 decoded images), " in said("--images_to_load", 5)[0]
-    line, warning = said("--max_num_splats", 2_000_000_000)
-    assert f"2,000,000,000 Gaussians (--max_num_splats) {gib(2e9 * 1070)}" in line
+    line, warning = said(*many)
+    assert f"2,000,000,000 Gaussians (--max_num_splats) {gib(2e9 * 1070)}" in line  # 25 bytes less of each
     assert "too small for 2,000,000,000 Gaussians; set a lower --max_num_splats" in warning
     free = pictures + at_start
     assert "6,000 Gaussians" in said()[1] and not said("--max_num_splats", 300)[1]
     with monkeypatch.context() as patch:
         patch.setattr(memory_estimate, "local_size", lambda: 2)  # processes that share what is free
         line, warning = said("--max_num_splats", 300)
-    assert f"of {gib(free // 2)}" in line and "for 300 Gaussians" in warning
-    free -= 1
-    assert "for 300 Gaussians; set --images_to_load" in said()[1]
+    assert f"of {gib(free // 2)}" in line and "for 300 Gaussians; set --images_to_load" in warning
     free = 1 << 40
     assert said() == ("", "")  # nobody has to know
 
@@ -292,34 +280,11 @@ def test_render_decodes_only_what_it_renders(colmap_scene, tmp_path, monkeypatch
     assert len(decoded) == len(set(decoded)) == 3
 
 
-def test_threads_end_with_an_interrupted_run(colmap_scene, tmp_path):
-    for path in (colmap_scene / "images").rglob("*.png"):
-        Image.open(path).resize((1200, 800)).save(path)
-    command = [
-        sys.executable, "train.py", "-s", colmap_scene, "-m", tmp_path / "out", "--iterations", 100000, "-r", 24,
-        "--test_iterations", -1, "--images_to_load", 4, "--checkpoint_iterations", 3,
-    ]  # fmt: skip
-    with subprocess.Popen(list(map(str, command)), cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as run:
-        deadline = time.monotonic() + 120
-        while not (tmp_path / "out" / "chkpnt3.pth").exists() and run.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.01)
-        run.send_signal(signal.SIGINT)
-        _, error = run.communicate(timeout=60)
-    assert run.returncode == 130 and b"Traceback" not in error, error.decode()
-
-
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU")
 def test_a_full_gpu_saves_the_model(colmap_scene, tmp_path, monkeypatch):
-    draw, calls = fused.draw, []
-
-    def greedy(*args: object, **kwargs: object) -> dict:
-        calls.append(1)
-        if len(calls) == 3:
-            torch.empty(1 << 50, dtype=torch.uint8, device="cuda")
-        return draw(*args, **kwargs)
-
-    monkeypatch.setattr(fused, "draw", greedy)
+    error = _raised(lambda: torch.empty(1 << 50, dtype=torch.uint8, device="cuda"))
+    monkeypatch.setattr(fused, "draw", _failing(fused.draw, 3, error))
     monkeypatch.setattr(Graphs, "launch", lambda *_: None)  # a captured step calls nothing
     with pytest.raises(UserError, match="GiB asked for, .* GiB free on the GPU.*chkpnt3.pth"):
         _train(colmap_scene, tmp_path)

@@ -1,6 +1,5 @@
 """Training by the clock: it ends when its seconds are over, goes through the whole schedule, and can be repeated."""
 
-import argparse
 import json
 import math
 import random
@@ -10,19 +9,20 @@ from pathlib import Path
 
 import pytest
 import torch
+from gaussians import options
 from trainings import train_on
 
-import train
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.gaussians.checkpoint import load_checkpoint
 from splatting.evaluation.training_log import Stopwatch
 from splatting.training import loop
-from splatting.training.observer import Announcer
+from splatting.training.iteration import Iteration
 from splatting.training.observers import report
 from splatting.training.observers.report import ProgressBar
 from splatting.training.observers.saves import ScheduleFile
 from splatting.training.resolution import Resolution
+from splatting.training.run import Run
 from splatting.training.schedule import Block, Decided, DecidedSchedule, Schedule, SettlingSchedule, TimeBudget
 from splatting.training.schedule_file import read_schedule, write_schedule
 from splatting.training.strategies import of_clock
@@ -105,18 +105,16 @@ def test_it_ends_within_three_percent_and_goes_through_the_whole_schedule(name, 
     assert len(schedule.blocks) < 420
 
 
-def test_progress_follows_the_seconds_that_are_left():
-    """Half of the schedule is done in half of the seconds, also where iterations become dearer or start slowly."""
-    for name in ("constant", "growth", "a slow start"):
-        schedule, halfway = _fresh(30_000, 20.0), []
-        seconds = 0.0
-        for iteration in range(1, 100_000):
-            schedule.reach(iteration, seconds)
-            if schedule.schedule_step(iteration) >= 15_000:
-                halfway.append(seconds)
-                break
-            seconds += COSTS[name](iteration, schedule.schedule_step(iteration))
-        assert halfway[0] == pytest.approx(10.0, abs=0.7), name
+@pytest.mark.parametrize("name", ["constant", "growth", "a slow start"])
+def test_half_of_the_schedule_is_done_in_half_of_the_seconds(name):
+    schedule, begun = _fresh(30_000, 20.0), []
+
+    def cost(iteration: int, step: int) -> float:
+        begun.append((step, (begun[-1][1] + COSTS[name](iteration - 1, begun[-1][0])) if begun else 0.0))
+        return COSTS[name](iteration, step)
+
+    _run(schedule, cost)
+    assert next(seconds for step, seconds in begun if step >= 15_000) == pytest.approx(10.0, abs=0.7)
 
 
 @pytest.mark.parametrize(
@@ -139,16 +137,6 @@ def test_an_iteration_that_takes_longer_than_the_budget_is_followed_by_the_last(
     assert _run(_fresh(1, 1.0), lambda t, n: 5.0)[0] == 2
     assert _run(_fresh(1, 1.0), lambda t, n: 0.1)[0] == 10
     assert capsys.readouterr().err.count("\n") == 1
-
-
-def test_a_schedule_replays_every_iteration(tmp_path):
-    schedule = _fresh(30_000, 5.0)
-    last, _ = _run(schedule, _noisy)
-    write_schedule(tmp_path / "schedule.json", schedule.recorded(last, True))
-    again = DecidedSchedule(read_schedule(tmp_path / "schedule.json"))
-    assert again.ends == last and again.is_last(last) and not again.is_last(last - 1)
-    for t in range(1, last + 1):
-        assert (again.span(t), again.stride(t)) == (schedule.span(t), schedule.stride(t))
 
 
 def test_a_resumed_run_goes_on_from_its_place_with_the_seconds_that_are_left(tmp_path):
@@ -230,103 +218,84 @@ def test_a_broken_schedule_is_refused(tmp_path, content, reason):
     assert str(path) in str(error.value) and "name the schedule.json of a run with --time_budget" in str(error.value)
 
 
-def _options(**changed: object) -> argparse.Namespace:
-    known = {"densify_from_iter": 500, "densify_until_iter": 15_000, "densification_interval": 100}
-    return argparse.Namespace(**known | {"opacity_reset_interval": 3000} | changed)
+def _evenly(length: int, count: int) -> Decided:
+    """A schedule that so many iterations go through in equal parts."""
+    return Decided(length, [Block(count, 0.0, 1 / count, 0.0)], count, 9.0, levels=())
+
+
+def _actions(stride: int, white: bool = False, **changed: int) -> dict[int, rules.Actions]:
+    """What adaptive density control does in each iteration of a run that takes so many steps of 30,000 at a time."""
+    schedule = DecidedSchedule(_evenly(30_000, 30_000 // stride))
+    place = ((t, options(**changed), white, schedule.span(t), schedule.stride(t)) for t in range(1, schedule.ends + 1))
+    return {one[0]: rules.actions(*one) for one in place}
 
 
 def test_windows_and_resets_are_of_the_schedule_and_densifications_of_the_run():
-    schedule = DecidedSchedule(Decided(30_000, [Block(15_000, 0.0, 1 / 15_000, 0.0)], 15_000, 0.0))  # two at a time
-    todo = {t: rules.actions(t, _options(), False, schedule.span(t), schedule.stride(t)) for t in range(1, 15_001)}
+    todo = _actions(2)
     assert [t for t in todo if todo[t].densify] == list(range(300, 7500, 100))
     assert [t for t in todo if todo[t].reset_opacity] == [1500, 3000, 4500, 6000]
     assert min(t for t in todo if todo[t].limit_size) == 1501
     assert max(t for t in todo if todo[t].observe) == 7499
-    white = {t: rules.actions(t, _options(densify_from_iter=501), True, schedule.span(t), 2.0) for t in range(1, 1000)}
-    assert [t for t in white if white[t].reset_opacity] == [251]
+    white = _actions(2, white=True, densify_from_iter=501)
+    assert [t for t in white if white[t].reset_opacity] == [251, 1500, 3000, 4500, 6000]
 
 
-def test_a_run_of_few_steps_still_densifies_twenty_times():
-    def densifications(stride: int, **changed: int) -> list[int]:
-        todo = ((t, range(stride * (t - 1) + 1, stride * t + 1)) for t in range(1, 30_000 // stride + 1))
-        opt = _options(**changed)
-        return [t for t, span in todo if rules.actions(t, opt, False, span, stride).densify]
-
-    assert len(densifications(1)) == 144 and len(densifications(5)) == 28
-    few = densifications(30)
-    assert few == list(range(24, 500, 24)) and len(few) == 20
-    assert len(densifications(30, densify_from_iter=14_900)) == 3  # each of its iterations
+@pytest.mark.parametrize(
+    ("stride", "changed", "count"),
+    [(1, {}, 144), (5, {}, 28), (30, {}, 20), (30, {"densify_from_iter": 14_900}, 3)],  # the last: all that there are
+)
+def test_a_run_of_few_steps_still_densifies_twenty_times(stride, changed, count):
+    assert sum(todo.densify for todo in _actions(stride, **changed).values()) == count
 
 
-def test_a_short_run_does_without_resets_that_it_would_not_recover_from():
-    def resets(stride: int, **changed: int) -> int:
-        count = 30_000 // stride
-        schedule = DecidedSchedule(Decided(30_000, [Block(count, 0.0, 1 / count, 0.0)], count, 0.0))
-        return sum(
-            rules.actions(t, _options(**changed), True, schedule.span(t), schedule.stride(t)).reset_opacity
-            for t in range(1, count + 1)
-        )
+@pytest.mark.parametrize(
+    ("stride", "changed", "count"),
+    [(3, {}, 5), (4, {}, 0), (4, {"opacity_reset_interval": 5000}, 3)]
+    + [(1, {"opacity_reset_interval": 200}, 75)],  # as the user wants it
+)
+def test_a_short_run_does_without_resets_that_it_would_not_recover_from(stride, changed, count):
+    assert sum(todo.reset_opacity for todo in _actions(stride, white=True, **changed).values()) == count
 
-    assert resets(3) == 5 and resets(4) == 0
-    assert resets(1, opacity_reset_interval=200) == 75  # as the user wants it
-    assert resets(4, opacity_reset_interval=5000) == 3
+
+def _noted(monkeypatch: pytest.MonkeyPatch, look: Callable[[Run, Iteration], object]) -> list:
+    """What there is when each iteration begins, before it sets rates and SH degree."""
+    found = []
+    monkeypatch.setattr(ProgressBar, "begins", lambda self, step: found.append(look(self._run, step)))
+    return found
 
 
 @pytest.mark.parametrize("strategy", ["mcmc", "budget"])
 def test_strategies_grow_within_windows_of_the_schedule(colmap_scene, tmp_path, monkeypatch, strategy):
-    two_at_a_time = Decided(120, [Block(60, 0.0, 1 / 60, 0.0)], 60, 9.0, levels=())
-    write_schedule(tmp_path / "two.json", two_at_a_time)
-    counts, begins = [], ProgressBar.begins
-
-    def note(self, step) -> None:
-        counts.append(len(self._run.gaussians))
-        begins(self, step)
-
-    monkeypatch.setattr(ProgressBar, "begins", note)
-    words = ["-s", colmap_scene, "-m", tmp_path / "out", "-r", 24, "--no_curve", "--test_iterations", -1,
-             "--schedule", tmp_path / "two.json", "--iterations", 120, "--strategy", strategy,
-             "--densification_interval", 5, "--densify_from_iter", 20, "--densify_until_iter", 80,
-             "--mcmc_until_iter", 80, "--max_num_splats", 5000, "--mcmc_growth", 0.02]  # fmt: skip
-    train.main([*map(str, words)])
+    write_schedule(tmp_path / "two.json", _evenly(120, 60))
+    counts = _noted(monkeypatch, lambda run, _: len(run.gaussians))
+    window = "--densify_from_iter", 20, "--densify_until_iter", 80, "--mcmc_until_iter", 80
+    words = "--iterations", 120, "--strategy", strategy, "--max_num_splats", 5000, "--mcmc_growth", 0.02
+    _train(colmap_scene, tmp_path / "out", "--schedule", tmp_path / "two.json", *words, *window)
     assert len(counts) == 60
     # Every fifth iteration would be 5 times, so they are more often.
     assert [t for t in range(1, 60) if counts[t] > counts[t - 1]] == [*range(11, 40)]
     assert strategy == "mcmc" or counts[-1] == 25 * 60  # as many as so few iterations can train
 
 
-def test_few_steps_have_larger_rates(colmap_scene, tmp_path, monkeypatch):
-    path = tmp_path / "few.json"
-    write_schedule(path, Decided(120, [Block(60, 0.0, 1 / 60, 0.0)], 60, 9.0, levels=()))
-    rates = _rates(monkeypatch, colmap_scene, tmp_path / "out", "--schedule", path, "--iterations", 120)
-    assert len(rates) == 60
-    before, later = rates[0], rates[30]  # those of an iteration are set after it is told
-    assert [later[n] / before[n] for n in ("f_dc", "opacity", "scaling", "rotation")] == pytest.approx([8.0] * 4)
-    assert later["xyz"] < 1.01 * before["xyz"]
+RATES = [
+    (("--strategy", "adc"), 1.0), (("--strategy", "mcmc"), 1.0), (("--strategy", "budget"), 8.0),
+    (("--strategy", "adc", "--schedule", "few.json"), 8.0),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(("strategy", "factor"), [("adc", 1.0), ("mcmc", 1.0), ("budget", 8.0)])
-def test_the_budget_has_larger_rates_in_few_iterations_without_a_clock_too(
-    colmap_scene, tmp_path, monkeypatch, strategy, factor
+@pytest.mark.parametrize(("words", "factor"), RATES)
+def test_few_iterations_have_larger_rates_with_the_budget_or_a_clock(
+    colmap_scene, tmp_path, monkeypatch, words, factor
 ):
-    words = "--strategy", strategy, "--max_num_splats", 500, "--iterations", 20
-    rates = _rates(monkeypatch, colmap_scene, tmp_path / "out", *words)
-    assert rates[10]["opacity"] / rates[0]["opacity"] == pytest.approx(factor)
-    assert rates[10]["xyz"] < 1.01 * rates[0]["xyz"]
-    assert (rates[-1]["opacity"] < 0.3 * rates[10]["opacity"]) == (strategy == "budget")
-
-
-def _rates(monkeypatch: pytest.MonkeyPatch, scene: Path, out: Path, *words: object) -> list[dict[str, float]]:
-    """Learning rates of a training before each iteration sets its own."""
-    rates, begins = [], ProgressBar.begins
-
-    def note(self, step) -> None:
-        rates.append({group["name"]: group["lr"] for group in self._run.gaussians.optimizer.param_groups})
-        begins(self, step)
-
-    monkeypatch.setattr(ProgressBar, "begins", note)
-    every = "-s", scene, "-m", out, "-r", 24, "--no_curve", "--test_iterations", -1, "--plain_step", *words
-    train.main([*map(str, every)])
-    return rates
+    rates = _noted(monkeypatch, lambda run, _: {one["name"]: one["lr"] for one in run.gaussians.optimizer.param_groups})
+    monkeypatch.chdir(tmp_path)
+    write_schedule(Path("few.json"), _evenly(20, 20))
+    _train(colmap_scene, tmp_path / "out", *words, "--max_num_splats", 500, "--iterations", 20, "--plain_step")
+    first, later = rates[0], rates[10]
+    names = "f_dc", "opacity", "scaling", "rotation"
+    assert [later[name] / first[name] for name in names] == pytest.approx([factor] * 4)
+    assert later["xyz"] < 1.01 * first["xyz"]
+    assert (rates[-1]["opacity"] < 0.3 * later["opacity"]) == (factor > 1)
 
 
 @pytest.mark.parametrize("length", [30_000, 7000])
@@ -336,7 +305,7 @@ def _rates(monkeypatch: pytest.MonkeyPatch, scene: Path, out: Path, *words: obje
 )
 def test_rates_fall_to_a_tenth_at_the_end(length, steps, factor):
     """Whatever --iterations counts: the rates of a run follow the number of its own."""
-    schedule = DecidedSchedule(Decided(length, [Block(steps, 0.0, 1 / steps, 0.0)], steps, 9.0, levels=()))
+    schedule = DecidedSchedule(_evenly(length, steps))
     percents = range(steps // 100, steps + 1, steps // 100)
     factors = [schedule.rate_factor(iteration) for iteration in percents]
     held = int(0.7 * len(factors))
@@ -376,6 +345,10 @@ def _train(scene: Path, out: Path, *more: object) -> dict[int, bytes]:
     return train_on(scene, out, "--disable_viewer", *OPTIONS, *more)
 
 
+def _stored(out: Path, name: str) -> str:
+    return json.loads((out / "model.json").read_text())[name]
+
+
 def _last_record(out: Path) -> dict:
     return json.loads((out / "train_log.json").read_text())[-1]
 
@@ -411,7 +384,7 @@ def test_a_short_training_by_the_clock_begins_with_smaller_views_and_replays(col
         return _train(colmap_scene, tmp_path / name, "-r", 1, "--iterations", 1200, *more)
 
     def told(name: str) -> str:
-        return json.loads((tmp_path / name / "model.json").read_text())["resolution_schedule"]
+        return _stored(tmp_path / name, "resolution_schedule")
 
     _timed(monkeypatch, lambda t: 0.04)
     short = trained("short", "--time_budget", 4)
@@ -462,19 +435,10 @@ def test_a_repeated_schedule_names_its_own_resolution_schedule(colmap_scene, tmp
     write_schedule(tmp_path / "schedule.json", schedule)
     words = "--iterations", 100, "--schedule", tmp_path / "schedule.json"
     _train(colmap_scene, tmp_path / "out", *words, "--checkpoint_iterations", 50)
-    assert json.loads((tmp_path / "out" / "model.json").read_text())["resolution_schedule"] == "pyramid"
+    assert _stored(tmp_path / "out", "resolution_schedule") == "pyramid"
     start = "--start_checkpoint", tmp_path / "out" / "chkpnt10.pth"
     _train(colmap_scene, tmp_path / "out", *words, *start, "--resolution_schedule", "pyramid")
     assert "was trained with" not in capsys.readouterr().err
-
-
-def test_a_target_needs_test_views(colmap_scene, tmp_path):
-    words = ["-s", colmap_scene, "-m", tmp_path / "out", "--iterations", 5, "--target_psnr", 20, "--disable_viewer"]
-    with pytest.raises(
-        UserError, match="^--target_psnr needs held-out views to score, and there are none; give --eval"
-    ):
-        train.main(list(map(str, words)))
-    assert not (tmp_path / "out").exists()
 
 
 def test_what_contradicts_itself_is_refused(colmap_scene, tmp_path):
@@ -536,31 +500,21 @@ def test_a_slow_start_does_not_end_a_short_run():
 
 def test_a_decided_run_goes_through_rates_degrees_and_windows(colmap_scene, tmp_path, monkeypatch):
     """40 iterations stand for 4000: the first tenth of the run for the first 400."""
-    path, rates, seen = tmp_path / "schedule.json", [], []
-    blocks = [Block(20, 0.0, 0.02, 0.0), Block(40, 0.4, 0.03, 0.0)]
-    write_schedule(path, Decided(4000, blocks, 40, 0.0, levels=()))
-    update, begin = GaussianModel.update_learning_rate, GaussianModel.densify_and_prune
 
-    def rate(self, iteration: int) -> float:
-        rates.append(update(self, iteration))
-        seen.append((iteration, self.active_sh_degree))
-        return rates[-1]
+    def look(run: Run, step: Iteration) -> tuple[float, int, bool]:
+        return run.gaussians.position_learning_rate, run.gaussians.active_sh_degree, step.changes
 
-    def densify(self, *args, **options):
-        grown.append(options["iteration"])
-        return begin(self, *args, **options)
-
-    grown, steps, begins = [], [], Announcer.begins
-    monkeypatch.setattr(GaussianModel, "update_learning_rate", rate)
-    monkeypatch.setattr(GaussianModel, "densify_and_prune", densify)
-    monkeypatch.setattr(Announcer, "begins", lambda self, step: steps.append(step) or begins(self, step))
-    options = "--position_lr_max_steps", 4000, "--densify_from_iter", 400, "--densify_until_iter", 2000
-    _train(colmap_scene, tmp_path / "out", "--schedule", path, "--iterations", 4000, *options)
-    assert [iteration for iteration, _ in seen] == [*range(80, 1601, 80), *range(1720, 4001, 120)]
-    assert rates[-1] == pytest.approx(rates[0] / 100 * 100 ** (80 / 4000), rel=1e-6)
-    assert grown == [*range(6, 24)]  # all in the window, as every fifth would be too few
-    assert [step.iteration for step in steps if step.changes] == [*range(6, 25), 32, 40]
-    assert [t for t in range(1, 40) if seen[t][1] > seen[t - 1][1]] == [13, 24, 32]  # after 1000, 2000 and 3000
+    path, steps = tmp_path / "schedule.json", [*range(80, 1601, 80), *range(1720, 4001, 120)]
+    write_schedule(path, Decided(4000, [Block(20, 0.0, 0.02, 0.0), Block(40, 0.4, 0.03, 0.0)], 40, 0.0, levels=()))
+    found = _noted(monkeypatch, look)
+    words = "--position_lr_max_steps", 4000, "--densify_from_iter", 400, "--densify_until_iter", 2000
+    _train(colmap_scene, tmp_path / "out", "--schedule", path, "--iterations", 4000, *words)
+    rates, degrees, changes = zip(*found, strict=True)
+    expected = [0.01 ** ((step - steps[0]) / 4000) for step in steps[:-1]]
+    assert [rate / rates[1] for rate in rates[1:]] == pytest.approx(expected, rel=1e-6)
+    # All in the window, as every fifth would be too few; and where the SH degree is raised.
+    assert [t for t, change in enumerate(changes, 1) if change] == [*range(6, 25), 32, 40]
+    assert [t for t in range(1, 40) if degrees[t] > degrees[t - 1]] == [13, 24, 32]  # after 1000, 2000 and 3000
 
 
 def test_a_checkpoint_comes_with_its_schedule_and_the_last_one_is_the_end(colmap_scene, tmp_path, monkeypatch):
@@ -637,27 +591,23 @@ def test_a_reset_too_late_to_recover_from_is_left_out(colmap_scene, tmp_path, mo
     assert len(done) == 2 * resets
 
 
-def _stored_strategy(out: Path) -> str:
-    return json.loads((out / "model.json").read_text())["strategy"]
-
-
 def test_a_time_budget_takes_the_strategy_that_is_best_in_it(colmap_scene, tmp_path, monkeypatch, capsys):
     _timed(monkeypatch, lambda t: 0.1)
     words = "--time_budget", 6, "--checkpoint_iterations", 1800
     first = _train(colmap_scene, tmp_path / "a", *words)
     out = capsys.readouterr().out
     assert out.count("--time_budget takes --strategy budget, which is best here; name another one to compare") == 1
-    assert _stored_strategy(tmp_path / "a") == read_schedule(tmp_path / "a" / "schedule.json").strategy == "budget"
+    assert _stored(tmp_path / "a", "strategy") == read_schedule(tmp_path / "a" / "schedule.json").strategy == "budget"
     repeated = _train(colmap_scene, tmp_path / "b", "--schedule", tmp_path / "a" / "schedule.json")
     assert list(repeated.values()) == [first[max(first)]]
     (checkpoint,) = (tmp_path / "a").glob("chkpnt*.pth")
     _train(colmap_scene, tmp_path / "c", *words, "--start_checkpoint", checkpoint)
-    assert _stored_strategy(tmp_path / "b") == _stored_strategy(tmp_path / "c") == "budget"
+    assert _stored(tmp_path / "b", "strategy") == _stored(tmp_path / "c", "strategy") == "budget"
     _train(colmap_scene, tmp_path / "d", "--iterations", 20)
     _train(colmap_scene, tmp_path / "e", "--iterations", 20, "--strategy", "mcmc", "--checkpoint_iterations", 10)
     start = "--start_checkpoint", tmp_path / "e" / "chkpnt10.pth"
     _train(colmap_scene, tmp_path / "f", "--iterations", 30, *start)
-    assert (_stored_strategy(tmp_path / "d"), _stored_strategy(tmp_path / "f")) == ("adc", "mcmc")
+    assert [_stored(tmp_path / name, "strategy") for name in "df"] == ["adc", "mcmc"]
 
 
 @pytest.mark.parametrize(

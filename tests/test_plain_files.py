@@ -26,12 +26,10 @@ from utils.lpips_utils import _load_state
 from utils.system_utils import UserError
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
-IN_A_FOLDER = {
-    "cfg_args": read_cfg_args,
-    "exposure.json": read_pretrained,
-    "transforms.json": lambda folder: read_scene(folder, "images", False),
-}
 TEXTS = {
+    "cfg_args": lambda path: read_cfg_args(path.parent),
+    "exposure.json": lambda path: read_pretrained(path.parent),
+    "transforms.json": lambda path: read_scene(path.parent, "images", False),
     "a camera path": read_camera_path,
     "--path": lambda path: path_maker(str(path)),
     "option sets": lambda path: read_configs(path, None),
@@ -76,23 +74,17 @@ def _endless(path: Path, kind: str) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device"])
-@pytest.mark.parametrize("what", [*FILES, *IN_A_FOLDER])
+@pytest.mark.parametrize("what", FILES)
 def test_what_is_no_file_is_refused_at_once(tmp_path, what, kind):
     with _soon(), pytest.raises(UserError) as refused:
-        if what in FILES:
-            FILES[what](_endless(tmp_path / "given", kind))
-        else:
-            IN_A_FOLDER[what](_endless(tmp_path / what, kind).parent)
+        FILES[what](_endless(tmp_path / what, kind))
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("what", [*TEXTS, "cfg_args", "exposure.json", "transforms.json"])
+@pytest.mark.parametrize("what", TEXTS)
 def test_a_text_of_any_size_is_not_read(tmp_path, what):
     with _soon(), pytest.raises(UserError) as refused:
-        if what in TEXTS:
-            TEXTS[what](_endless(tmp_path / "given", "large"))
-        else:
-            IN_A_FOLDER[what](_endless(tmp_path / what, "large").parent)
+        TEXTS[what](_endless(tmp_path / what, "large"))
     assert "more than 256 MiB" in str(refused.value) or what == "cfg_args"
 
 

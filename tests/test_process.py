@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -163,41 +164,28 @@ def test_views_that_are_scored_are_decoded_side_by_side(colmap_scene, tmp_path, 
     assert all(decoded[name].startswith("decode") for name in tested), decoded  # every 8th photo
 
 
-class _Driver:
-    """A stand-in for libcuda."""
-
-    def __init__(self, initialised: int = 0) -> None:
-        self.calls: list[str] = []
-        self._initialised = initialised
-
-    def cuInit(self, flags: int) -> int:
-        self.calls.append("init")
-        return self._initialised
-
-    def cuDeviceGet(self, device: object, number: int) -> int:
-        self.calls.append(f"device {number}")
-        return 0
-
-    def cuDevicePrimaryCtxRetain(self, context: object, device: object) -> int:
-        self.calls.append("context")
-        return 0
-
-
 @pytest.mark.parametrize(
-    ("driver", "calls"), [(_Driver(), ["init", "device 0", "context"]), (_Driver(100), ["init"]), (None, [])]
+    ("initialised", "expected"), [(0, ["init", "device 0", "context"]), (100, ["init"]), (None, [])]
 )
-def test_the_gpus_context_is_made_in_a_thread(monkeypatch, driver, calls):
-    def load(name: str) -> _Driver:
+def test_the_gpus_context_is_made_in_a_thread(monkeypatch, initialised, expected):
+    """initialised: the driver's answer; None: there is no driver."""
+    calls = []
+
+    def load(name: str) -> SimpleNamespace:
         assert name == "libcuda.so.1" and threading.current_thread().name == "cuda start"
-        if driver is None:
+        if initialised is None:
             raise OSError("no such library")
-        return driver
+        return SimpleNamespace(
+            cuInit=lambda flags: calls.append("init") or initialised,
+            cuDeviceGet=lambda device, number: calls.append(f"device {number}") or 0,
+            cuDevicePrimaryCtxRetain=lambda context, device: calls.append("context") or 0,
+        )
 
     monkeypatch.setattr(start.ctypes, "CDLL", load)
     monkeypatch.setattr(start, "_computes_on_a_gpu", lambda: True)
     thread = start.begin_cuda()
     thread.join()
-    assert driver is None or driver.calls == calls
+    assert calls == expected
     assert not thread.daemon  # the driver must not be left in the middle of it
 
 

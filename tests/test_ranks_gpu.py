@@ -1,13 +1,12 @@
 """Trainings by two ranks with a GPU each, by NCCL: the bytes of one GPU, and one end for all after a fault."""
 
-import hashlib
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from launching import OPTIONS, Launched, launch
+from launching import launch, launch_fault
+from trainings import whole_result
 
 pytestmark = [
     pytest.mark.gpu,
@@ -21,48 +20,17 @@ LONG = (
 )
 
 
-def _train(scene: Path, folder: Path, size: int, *options: str) -> dict[str, Any]:
-    """Train, and return what models and checkpoints hold by their paths."""
+def _train(scene: Path, folder: Path, size: int, *options: str) -> list[object]:
+    """Train; what a checkpoint holds, and the last model."""
     out = folder / f"{size}"
     done = launch(folder / f"logs{size}", "none 0 0", "-s", str(scene), "-m", str(out), *LONG, *options, size=size)
     assert done.status == 0, done.stderr
-    paths = [path for path in sorted(out.rglob("*.p*")) if path.suffix in (".ply", ".pth")]
-    return {str(path.relative_to(out)): _content(path) for path in paths}
-
-
-def _content(path: Path) -> Any:
-    """Digest of a PLY's bytes; of a checkpoint, whose tensors one GPU tags as its own, digests of each tensor's."""
-    if path.suffix == ".ply":
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    return _digests(torch.load(path, map_location="cpu", weights_only=True))
-
-
-def _digests(part: Any) -> Any:
-    """The same structure, with kind, shape and digest in place of each tensor."""
-    if isinstance(part, dict):
-        return {key: _digests(value) for key, value in part.items()}
-    if isinstance(part, tuple | list):
-        return [type(part).__name__, *map(_digests, part)]
-    if torch.is_tensor(part):
-        values = hashlib.sha256(part.detach().numpy().tobytes()).hexdigest()
-        return type(part).__name__, part.dtype, part.requires_grad, tuple(part.shape), values
-    return type(part).__name__, part
+    return [whole_result(out, 150), (out / "point_cloud/iteration_300/point_cloud.ply").read_bytes()]
 
 
 @pytest.mark.parametrize("options", [(), ("--strategy", "mcmc", "--max_num_splats", "400", "--train_test_exp")])
 def test_two_gpus_write_the_bytes_of_one(colmap_scene, tmp_path, options):
-    one = _train(colmap_scene, tmp_path, 1, *options)
-    assert len(one) >= 4
-    assert _train(colmap_scene, tmp_path, 2, *options) == one
-
-
-def _fault(scene: Path, folder: Path, fault: str) -> Launched:
-    options = ("-s", str(scene), "-m", str(folder / "out"), *OPTIONS, "--no_curve", "--plain_step")
-    began = time.monotonic()
-    done = launch(folder / "logs", fault, *options)
-    assert time.monotonic() - began < 60  # half of it to start
-    assert done.status != 0
-    return done
+    assert _train(colmap_scene, tmp_path, 1, *options) == _train(colmap_scene, tmp_path, 2, *options)
 
 
 @pytest.mark.parametrize(
@@ -76,7 +44,10 @@ def _fault(scene: Path, folder: Path, fault: str) -> Launched:
     ids=lambda value: value.split()[0] if value[:5] != "error" else "",
 )
 def test_a_fault_of_one_rank_ends_both_with_one_sentence(colmap_scene, tmp_path, fault, said):
-    done = _fault(colmap_scene, tmp_path, fault)
+    began = time.monotonic()
+    done = launch_fault(colmap_scene, tmp_path, fault)
+    assert time.monotonic() - began < 60  # half of it to start
+    assert done.status != 0
     (line,) = done.errors
     assert line.startswith(said), line
     names = {path.name for path in (tmp_path / "out").glob("chkpnt*.pth")}
@@ -84,6 +55,6 @@ def test_a_fault_of_one_rank_ends_both_with_one_sentence(colmap_scene, tmp_path,
 
 
 def test_a_signal_to_one_rank_stops_both_with_a_checkpoint(colmap_scene, tmp_path):
-    done = _fault(colmap_scene, tmp_path, "interrupt 1 7")
-    assert done.errors == [] and "".join(done.stderr).count("interrupted") == 1
+    done = launch_fault(colmap_scene, tmp_path, "interrupt 1 7")
+    assert done.status != 0 and done.errors == [] and "".join(done.stderr).count("interrupted") == 1
     assert {path.name for path in (tmp_path / "out").glob("chkpnt*.pth")} == {"chkpnt5.pth", "chkpnt8.pth"}

@@ -6,7 +6,7 @@ import pytest
 import torch
 from diff_gaussian_rasterization.optim import adam_, catch_up_
 from gaussians import model
-from trainings import OPTIONS, differences, narrow_scene, trained
+from trainings import OPTIONS, differences, leaves, narrow_scene, trained
 
 from scene import spilled_model
 from scene.gaussian_model import GaussianModel
@@ -90,12 +90,6 @@ def _stopped(scene: Path, out: Path, *options: object) -> tuple[str, list[object
     return said, [iteration, *capture[:7], capture[10]["state"], capture[11]]
 
 
-def _equal(a: object, b: object) -> bool:
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(_equal(a[key], b[key]) for key in a)
-    return torch.equal(a, b) if torch.is_tensor(a) else a == b
-
-
 @pytest.mark.parametrize("kind", ["default", "sparse"])
 @pytest.mark.parametrize("what", ["loss", "f_rest", "xyz"])
 def test_a_guard_leaves_the_same_model_and_marks(scene, tmp_path, monkeypatch, what, kind):
@@ -125,7 +119,7 @@ def test_a_guard_leaves_the_same_model_and_marks(scene, tmp_path, monkeypatch, w
             results.append(_stopped(scene, tmp_path / name, *OPTIONS[kind], *further))
     (said, usual), (told, spilled) = results
     assert said == told and ("became nan" if what == "loss" else f"{what} of 1 of") in said
-    assert all(map(_equal, spilled, usual))
+    assert leaves(spilled) == leaves(usual)
 
 
 def test_the_estimate_leaves_out_what_lies_in_the_hosts_memory():

@@ -34,7 +34,6 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_host_that_runs_ahead_without_capacity_gives_the_same_bytes(scene, tmp_path, monkeypatch, options, _):
     """Capacity for one instance at first, and never for more than the last visit needed: many steps overflow."""
     plain = trained(scene, tmp_path / "plain", "--plain_step", *options)
-    assert trained(scene, tmp_path / "ahead", *options) == plain
     overflows, replay = [], speculative.Speculation._replay
     monkeypatch.setattr(speculative.Speculation, "_replay", lambda *x: (overflows.append(1), replay(*x)))
     monkeypatch.setattr(speculative, "_with_spare", lambda count: count)

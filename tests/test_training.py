@@ -13,18 +13,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from plyfile import PlyData
+from waiting import wait_for
 
 import train
 from arguments import read_stored_options
-from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.readers.point_cloud import write_point_cloud
+from scene.saved_model import read_model
 from splatting.evaluation.training_log import Stopwatch, TrainingLog
 from splatting.training import run as training_run
 from splatting.training.iteration import ViewOrder
-from splatting.training.observers import report
 from splatting.training.steps import fused
 from utils.system_utils import UserError
 
@@ -35,12 +36,6 @@ SMALL = ["-r", "24", "--test_iterations", "-1"]
 def _train(scene: Path, out: Path, *more: object, iterations: int) -> Path:
     train.main(["-s", str(scene), "-m", str(out), "--iterations", str(iterations), *SMALL, *map(str, more)])
     return out / "point_cloud" / f"iteration_{iterations}" / "point_cloud.ply"
-
-
-def _raw(ply: Path, degree: int = 3) -> GaussianModel:
-    gaussians = GaussianModel(degree)
-    gaussians.load_ply(ply)
-    return gaussians
 
 
 def _steps(checkpoint: Path) -> list[float]:
@@ -65,17 +60,14 @@ def test_order_of_a_step(colmap_scene, tmp_path):
     assert steps[10] == [9, 9, 9, 8, 9, 9]  # 10 reset the opacities
     assert steps[11] == [10, 10, 10, 9, 10, 10] and steps[12] == steps[11]  # no step in the last
     for t in (3, 7, 11, 12):
-        saved = _raw(tmp_path / f"point_cloud/iteration_{t}/point_cloud.ply")
+        saved = read_model(tmp_path / f"point_cloud/iteration_{t}/point_cloud.ply")
         assert torch.equal(saved._xyz, load_checkpoint(tmp_path / f"chkpnt{t - 1}.pth")[0][1])
-    first = _raw(tmp_path / "point_cloud/iteration_1/point_cloud.ply")._xyz
-    assert torch.equal(first.detach().unique(dim=0), _cloud(tmp_path).unique(dim=0))
+    first = read_model(tmp_path / "point_cloud/iteration_1/point_cloud.ply")._xyz
+    vertex = PlyData.read(tmp_path / "input.ply")["vertex"]
+    points = torch.from_numpy(np.stack([vertex[axis] for axis in "xyz"], axis=1))
+    assert torch.equal(first.detach().unique(dim=0), points.unique(dim=0))
     before, after = (load_checkpoint(tmp_path / f"chkpnt{t}.pth")[0][1] for t in (7, 8))
     assert len(after) > len(before)
-
-
-def _cloud(out: Path) -> torch.Tensor:
-    vertex = PlyData.read(out / "input.ply")["vertex"]
-    return torch.from_numpy(np.stack([vertex[axis] for axis in "xyz"], axis=1))
 
 
 def test_every_view_once_an_epoch():
@@ -132,7 +124,7 @@ def test_sh_degree_rises_every_interval_up_to_its_maximum(blender_scene, tmp_pat
         "--start_checkpoint", tmp_path / "out/chkpnt3.pth", iterations=4,
     )  # fmt: skip
     assert promised[5:] == columns[1:3]
-    assert _raw(ply, degree)._xyz.isfinite().all()
+    assert read_model(ply)._xyz.isfinite().all()
 
 
 def test_interrupt_saves_a_checkpoint_that_goes_on_to_the_same_end(colmap_scene, tmp_path, monkeypatch):
@@ -164,13 +156,14 @@ def test_interrupt_saves_a_checkpoint_that_goes_on_to_the_same_end(colmap_scene,
     ("sent", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -signal.SIGKILL)]
 )
 def test_a_killed_run_leaves_whole_files(colmap_scene, tmp_path, sent, status):
+    """While its threads decode photos."""
+    for path in (colmap_scene / "images").rglob("*.png"):
+        Image.open(path).resize((1200, 800)).save(path)
     every = list(map(str, range(1, 3000)))
     command = [sys.executable, "train.py", "-s", colmap_scene, "-m", tmp_path / "out", "--iterations", "100000", *SMALL,
-               "--save_iterations", *every, "--checkpoint_iterations", *every]  # fmt: skip
+               "--images_to_load", 4, "--save_iterations", *every, "--checkpoint_iterations", *every]  # fmt: skip
     with subprocess.Popen(list(map(str, command)), cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as run:
-        deadline = time.monotonic() + 120
-        while not (tmp_path / "out" / "chkpnt20.pth").exists() and run.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.01)
+        wait_for(lambda: (tmp_path / "out" / "chkpnt20.pth").exists() or run.poll() is not None, 120)
         run.send_signal(sent)
         _, error = run.communicate(timeout=60)
     assert run.returncode == status, error.decode()
@@ -180,7 +173,7 @@ def test_a_killed_run_leaves_whole_files(colmap_scene, tmp_path, sent, status):
     plys = list((tmp_path / "out" / "point_cloud").glob("iteration_*/point_cloud.ply"))
     assert len(plys) >= 20
     for ply in plys:
-        assert len(_raw(ply)) == 300
+        assert len(read_model(ply)) == 300
     for checkpoint in (tmp_path / "out").glob("chkpnt*.pth"):
         load_checkpoint(checkpoint)
 
@@ -188,7 +181,8 @@ def test_a_killed_run_leaves_whole_files(colmap_scene, tmp_path, sent, status):
 def test_refusals_before_anything_is_written(colmap_scene, tmp_path):
     out = tmp_path / "out"
     ply = _train(colmap_scene, tmp_path / "other", "--checkpoint_iterations", 2, iterations=2)
-    checkpoint = tmp_path / "other" / "chkpnt2.pth"
+    checkpoint, empty = tmp_path / "other" / "chkpnt2.pth", tmp_path / "empty.ply"
+    write_point_cloud(empty, np.zeros((0, 3)), np.zeros((0, 3)))
     cases = {
         "is a PLY": ["--start_checkpoint", ply],
         "is a folder": ["--start_checkpoint", tmp_path / "other"],
@@ -200,18 +194,13 @@ def test_refusals_before_anything_is_written(colmap_scene, tmp_path):
         "-r) 100000 is too wide": ["-r", 100_000],
         "--iterations": ["--iterations", -1],
         "absent": ["-s", tmp_path / "absent"],
+        "sh_degree": ["--start_checkpoint", checkpoint, "--sh_degree", 1],
+        "no points": ["--init_pcd_path", empty],
+        "--target_psnr needs held-out views to score, and there are none; give --eval": ["--target_psnr", 20],
+        "--resolution_schedule must be auto or none or pyramid or spectrum": ["--resolution_schedule", "fine"],
     }
     for words, options in cases.items():
         with pytest.raises(UserError, match=re.escape(words)):
-            _train(colmap_scene, out, *options, iterations=5)
-        assert not out.exists(), words
-    empty = tmp_path / "empty.ply"
-    write_point_cloud(empty, np.zeros((0, 3)), np.zeros((0, 3)))
-    for words, options in {
-        "sh_degree": ["--start_checkpoint", checkpoint, "--sh_degree", 1],
-        "no points": ["--init_pcd_path", empty],
-    }.items():
-        with pytest.raises(UserError, match=words):
             _train(colmap_scene, out, *options, iterations=5)
         assert not out.exists(), words
 
@@ -244,33 +233,19 @@ def test_a_damaged_log_is_no_reason_to_stop(tmp_path, capsys, content):
     assert again.records[-1]["seconds"] == 3.5
 
 
-def test_a_stopwatch_pauses_also_when_something_fails(monkeypatch):
-    now = [100.0]
-    monkeypatch.setattr("splatting.evaluation.training_log.running_seconds", lambda: now[0])
-    clock = Stopwatch()
-    now[0] += 2
-    with pytest.raises(ZeroDivisionError), clock.paused("saving"):
-        now[0] += 30
-        _ = 1 / 0
-    now[0] += 3
-    for purpose in ("saving", "scoring"):
-        with clock.paused(purpose):
-            now[0] += 4
-    assert clock.seconds == 5 and clock.spent == {"saving": 34, "scoring": 4}
-
-
 def test_a_stopwatch_stands_still_in_a_pause_and_counts_one_in_another_once(monkeypatch):
     now = [100.0]
     monkeypatch.setattr("splatting.evaluation.training_log.running_seconds", lambda: now[0])
     clock = Stopwatch()
     now[0] += 2
-    with clock.paused("viewing"):
+    with pytest.raises(ZeroDivisionError), clock.paused("viewing"):
         now[0] += 600
         assert clock.seconds == 2
         with clock.paused("saving"):
             now[0] += 4
             assert clock.seconds == 2
         now[0] += 10
+        _ = 1 / 0
     now[0] += 3
     assert clock.seconds == 5 and clock.spent == {"viewing": 610, "saving": 4}
 
@@ -288,10 +263,11 @@ def test_the_output_folder_is_made_for_other_code_too(tmp_path, monkeypatch, opt
     """With the options of either release, or with all of them in one record."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("OAR_JOB_ID", "a_long_job_id")
-    monkeypatch.setattr(train, "SummaryWriter", _Writer)
+    writer = object()
+    monkeypatch.setattr(train, "SummaryWriter", lambda folder: writer)
     args = argparse.Namespace(sh_degree=3, source_path="/s", model_path="", images="images", resolution=-1,
                               white_background=True, data_device="cuda", eval=True, **options)  # fmt: skip
-    assert train.prepare_output_and_logger(args) is _Writer.last
+    assert train.prepare_output_and_logger(args) is writer
     assert args.model_path == "./output/a_long_job"
     stored = read_stored_options(args.model_path)
     assert stored["white_background"] and stored["source_path"] == "/s" and stored["train_test_exp"] is False
@@ -317,50 +293,9 @@ def test_training_is_called_as_the_references(colmap_scene, tmp_path):
 
 
 def test_a_late_reset_is_announced(colmap_scene, tmp_path, capfd):
-    _train(colmap_scene, tmp_path, "--opacity_reset_interval", 3, iterations=5)
-    assert "opacities are reset in iteration 3, and 2 iterations" in capfd.readouterr().out
-
-
-class _Writer:
-    """A stand-in for TensorBoard's writer, which is optional."""
-
-    def __init__(self, folder: str) -> None:
-        self.tags: list[tuple[str, int]] = []
-        _Writer.last = self
-
-    def add_scalar(self, tag: str, value: float, step: int) -> None:
-        assert isinstance(value, float | int)
-        self.tags.append((tag, step))
-
-    def add_image(self, tag: str, image: torch.Tensor, global_step: int) -> None:
-        assert image.shape[0] == 3 and image.is_floating_point()
-        self.tags.append((tag, global_step))
-
-    def add_histogram(self, tag: str, values: torch.Tensor, step: int) -> None:
-        self.tags.append((tag, step))
-
-    def close(self) -> None:
-        self.tags.append(("closed", 0))
-
-
-def test_tensorboard_gets_the_references_tags(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(train, "SummaryWriter", _Writer)
-    monkeypatch.setattr(report, "LOG_INTERVAL", 2)
-    _train(colmap_scene, tmp_path, "--eval", "--test_iterations", "2", "3", iterations=3)
-    tags = _Writer.last.tags
-    for tag in ("train_loss_patches/l1_loss", "train_loss_patches/total_loss", "iter_time"):
-        assert [step for name, step in tags if name == tag] == [2]
-    for tag in (
-        "test/loss_viewpoint - l1_loss",
-        "train/loss_viewpoint - psnr",
-        "scene/opacity_histogram",
-        "total_points",
-    ):
-        assert [step for name, step in tags if name == tag] == [2, 3]
-    renders = [name for name, step in tags if name.startswith("test_view_") and name.endswith("/render") and step == 3]
-    truths = [step for name, step in tags if name.endswith("/ground_truth")]
-    assert len(renders) == 3 and set(truths) == {2}
-    assert tags[-1] == ("closed", 0)
+    """Also where --quiet silences the standard output."""
+    _train(colmap_scene, tmp_path, "--opacity_reset_interval", 3, "--quiet", iterations=5)
+    assert "warning: opacities are reset in iteration 3, and 2 iterations" in capfd.readouterr().err
 
 
 def test_seconds_leave_evaluation_and_saving_out(colmap_scene, tmp_path, monkeypatch):

@@ -52,10 +52,10 @@ def _code() -> dict[str, str]:
 
 
 def _digest(cameras: Sequence[Camera]) -> str:
-    """Digest of names, sizes, matrices, and kinds of pictures."""
+    """Digest of names, sizes, matrices, and kinds of image files (photo, mask, depth map)."""
     digest = hashlib.sha256()
     for camera in cameras:
-        kinds = [getattr(source, "suffix", type(source).__name__) for source, _ in getattr(camera, "pictures", ())]
+        kinds = [getattr(source, "suffix", type(source).__name__) for source, _ in getattr(camera, "undecoded", ())]
         digest.update(f"{camera.image_name} {camera.image_width} {camera.image_height} {kinds}\n".encode())
         digest.update(camera.full_proj_transform.cpu().numpy().tobytes())
     return digest.hexdigest()

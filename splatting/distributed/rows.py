@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from splatting.deterministic.counter_rng import Stream
-from splatting.distributed.gathering import in_order, whole
 from splatting.distributed.ranks import ALONE, Ranks
 from splatting.distributed.selection import largest, lowest, weighted_choice
 from splatting.host.machine import compute_device
 
+PIECE = 1 << 16  # rows that are sent at a time
 BLOCK = 128  # rows that one rank has together, as they sleep together (scene/sleeping.py)
 _PART, _RANK = 43, 32  # bits of a key below the number of a part, and below the rank or piece in it
 
@@ -48,7 +48,7 @@ class Shards:
 
         count: of this rank's rows; part: gives some of them (n, ...).
         """
-        return in_order(self.ranks, count, part)
+        return _in_order(self.ranks, count, part)
 
     def items(self, indices: Tensor) -> Tensor:
         """Indices (n,) among all rows, of those of this rank."""
@@ -156,7 +156,7 @@ class Divided(Shards):
         return values[first:stop].clone()  # so that the rest can be freed
 
     def whole(self, values: Tensor) -> Tensor:
-        return whole(values, self.ranks)
+        return _whole(values, self.ranks)
 
     def items(self, indices: Tensor) -> Tensor:
         return indices + self.first
@@ -297,3 +297,27 @@ class Redistribution:
 
 def _steps(state: dict[str, Any]) -> int:
     return int(state.get("step", 0))
+
+
+def _in_order(ranks: Ranks, count: int, part: Callable[[slice], Tensor]) -> Iterator[Tensor]:
+    """Pieces of all ranks' rows, on the rank that writes; other ranks get none, yet must go through all.
+
+    count: of this rank's rows; part: gives some of them (n, ...).
+    """
+    for holder, rows in enumerate(ranks.numbers(count)[:, 0].tolist()):
+        for start in range(0, rows, PIECE):
+            piece = part(slice(start, start + PIECE) if holder == ranks.rank else slice(0, 0))
+            received = ranks.exchange([piece, *[piece[:0]] * (ranks.size - 1)])
+            if ranks.first:
+                yield received[holder]
+
+
+def _whole(values: Tensor, ranks: Ranks) -> Tensor:
+    """All ranks' rows (N, ...), on the CPU of the rank that writes; none elsewhere. Every rank must call it."""
+    total = ranks.before(len(values))[1]
+    every = torch.empty(total if ranks.first else 0, *values.shape[1:], dtype=values.dtype)
+    filled = 0
+    for piece in _in_order(ranks, len(values), values.detach().__getitem__):
+        every[filled : filled + len(piece)] = piece
+        filled += len(piece)
+    return every

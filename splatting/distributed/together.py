@@ -20,7 +20,7 @@ from splatting.distributed.watch import Watch
 from splatting.distributed.watched import TIMEOUT, RankLost, WatchedRanks
 from splatting.host import interrupt, torchrun
 from splatting.host.errors import UserError, first_line
-from splatting.host.machine import compute_device, cores
+from splatting.host.machine import compute_device, cores, device_name, instruction_set
 
 _SIGNALS = (130, 143)  # exit statuses
 
@@ -101,7 +101,8 @@ def _join_and_run(main: Callable[[], object], board: Board, watch: Watch, ending
 def _joined(board: Board) -> Iterator[WatchedRanks]:
     """Make the process group: NCCL on GPUs, one a rank, and gloo on CPUs."""
     device = _own_device()
-    refuse_differences(_everyone(board, _machine(device)), "start all ranks with the same installation")
+    board.post("machine", _machine(device))
+    refuse_differences(board.everyone("machine"), "start all ranks with the same installation")
     options = {"device_id": device} if device.type == "cuda" else {}
     backend = "nccl" if device.type == "cuda" else "gloo"
     # NCCL's own watchdog would abort this process as soon as another is gone, before anybody has said which.
@@ -115,11 +116,6 @@ def _joined(board: Board) -> Iterator[WatchedRanks]:
         **options,
     )
     yield WatchedRanks()
-
-
-def _everyone(board: Board, facts: dict[str, str]) -> list[dict[str, str]]:
-    board.post("machine", facts)
-    return board.everyone("machine")
 
 
 def _own_device() -> torch.device:
@@ -137,7 +133,5 @@ def _own_device() -> torch.device:
 
 
 def _machine(device: torch.device) -> dict[str, str]:
-    from splatting.host.machine import device_name, instruction_set
-
     facts = {"torch": torch.__version__, "the backend": device.type, "the instruction set": instruction_set()}
     return facts | ({"the GPU": device_name(device)} if device.type == "cuda" else {})

@@ -1,7 +1,7 @@
 """Ranks whose collective calls are watched, so that one that fails or never returns ends in a sentence."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 from functools import wraps
@@ -9,16 +9,14 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
-from torch import Tensor
 
 from splatting.distributed import quiet
-from splatting.distributed.ranks import Value
 from splatting.distributed.several import SeveralRanks
 from splatting.host.clock import running_seconds
 from splatting.host.memory import is_out_of_memory
 
 # Of a collective call. It has to be longer than any work of one rank that the others wait for, as rank 0 writing tens
-# of gigabytes to a slow disk. A rank that is gone or hangs is noticed by others means and within seconds (watch.py).
+# of gigabytes to a slow disk. A rank that is gone or hangs is noticed by other means and within seconds (watch.py).
 TIMEOUT = timedelta(minutes=30)
 # Of gloo's errors for a rank that cannot be reached, and of torch's for a store.
 _WORDS = ("closed by peer", "reset by peer", "broken pipe", "timed out", "timeout", "connect", "read error", "socket")
@@ -118,36 +116,11 @@ class WatchedRanks(SeveralRanks):
         else:
             dist.destroy_process_group(numbers)
 
-    @_watched
-    def numbers(self, *values: int) -> Tensor:
-        return super().numbers(*values)
-
-    @_watched
-    def shared(self, value: Value, holder: int = 0) -> Value:
-        return super().shared(value, holder)
-
-    @_watched
-    def handed(
-        self, holder: int, values: Tensor | None, shape: Sequence[int], dtype: torch.dtype, device: torch.device
-    ) -> Tensor:
-        return super().handed(holder, values, shape, dtype, device)
-
-    @_watched
-    def everyone(self, value: Value) -> list[Value]:
-        return super().everyone(value)
-
-    @_watched
-    def agree(self, numbers: Tensor, meanwhile: Callable[[], None] = lambda: None) -> list[list[int]]:
-        return super().agree(numbers, meanwhile)
-
-    @_watched
-    def table(self, values: Tensor) -> Tensor:
-        return super().table(values)
-
-    @_watched
-    def added(self, values: Tensor) -> Tensor:
-        return super().added(values)
-
-    @_watched
-    def send(self, rows: Tensor, sizes: Sequence[int], counts: Sequence[int] | None = None) -> tuple[Tensor, list[int]]:
-        return super().send(rows, sizes, counts)
+    numbers = _watched(SeveralRanks.numbers)
+    shared = _watched(SeveralRanks.shared)
+    handed = _watched(SeveralRanks.handed)
+    everyone = _watched(SeveralRanks.everyone)
+    agree = _watched(SeveralRanks.agree)
+    table = _watched(SeveralRanks.table)
+    added = _watched(SeveralRanks.added)
+    send = _watched(SeveralRanks.send)

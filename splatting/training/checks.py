@@ -29,20 +29,20 @@ _FEWEST_BEYOND = 0.01  # share of the points in front of them that must lie beyo
 SMALL = 32  # pixels; a smaller side has few more than SSIM's window
 
 
+def _warn(text: str) -> None:
+    print(f"warning: {text}", file=sys.stderr)
+
+
 def hint_of_images(views: Sequence[Camera], info: SceneInfo, white_background: bool) -> None:
     """Warn of images that are too small to learn from, and of transparent ones that are to be black behind."""
     width, height = min((view.image_width, view.image_height) for view in views)
     if min(width, height) < SMALL:
-        print(
-            f"warning: images of {width}x{height} pixels are too small to learn from; give a larger --resolution",
-            file=sys.stderr,
-        )
+        _warn(f"images of {width}x{height} pixels are too small to learn from; give a larger --resolution")
     path = info.train_cameras[0].image_path
     if info.is_nerf_synthetic and not white_background and path is not None and _has_alpha(path):
-        print(
-            "warning: the images are transparent, and train before black; -w trains before white, as published results "
-            "of such scenes do",
-            file=sys.stderr,
+        _warn(
+            "the images are transparent, and train before black; -w trains before white, as published results "
+            "of such scenes do"
         )
 
 
@@ -205,10 +205,9 @@ def check_folder(
         raise UserError(
             f"{kept} with {before}, which {after} would not fit; name another folder by -m, or remove the old one"
         )
-    print(
-        f"warning: {kept}, and other commands take the highest unless --iteration is given; remove the old ones, or "
-        "name another folder by -m",
-        file=sys.stderr,
+    _warn(
+        f"{kept}, and other commands take the highest unless --iteration is given; remove the old ones, or "
+        "name another folder by -m"
     )
 
 
@@ -250,7 +249,7 @@ def report_changes(checkpoint: str, now: argparse.Namespace) -> None:
         )
     if changed:
         before, after = (" ".join(_typed(n, of[n]) for n in changed) for of in (then, vars(now)))
-        print(f"warning: {folder} was trained with {before}, this run has {after}", file=sys.stderr)
+        _warn(f"{folder} was trained with {before}, this run has {after}")
 
 
 def continue_records(model_path: str, checkpoint: str | None, first_iteration: int) -> tuple[TrainingLog, list[Row]]:

@@ -12,7 +12,7 @@ from utils.system_utils import UserError
 
 @dataclass(slots=True)
 class Iteration:
-    """One iteration, counted from 1. Run.steps makes it; only the fields `due` to `stopping` and its end change later.
+    """One iteration, counted from 1. Run.iterations makes it; later change only `due` to `stopping`, and its end.
 
     An observer that is asked before those that save may end the training with this iteration (`end`), in `measured`.
     """
@@ -24,16 +24,12 @@ class Iteration:
     depth_weight: float  # of the depth loss, 0 if the view has no reliable depth map
     changes: bool  # rows of the Gaussians, the SH degree or the size of views change in this iteration
     started: float  # seconds of training before it
+    span: range  # steps of the schedule that it stands for (training/schedule.py)
     due: bool = False  # the model is read, written or changed, so every loss so far must be checked first
     read: bool = False  # an observer reads the model
     record: dict[str, float] | None = None  # what train_log.json gets of this iteration; None: no record
     scored_at: float | None = None  # seconds of training when the curve scored it, for all records of the same score
     stopping: type[KeyboardInterrupt] | None = None  # raised once the step is complete
-    span: range = None  # steps of the schedule that it stands for (training/schedule.py), itself by default
-
-    def __post_init__(self) -> None:
-        if self.span is None:
-            self.span = range(self.iteration, self.iteration + 1)
 
     def takes(self, planned: Collection[int]) -> bool:
         """Whether what is planned for an iteration of the schedule is to be done in it."""

@@ -10,7 +10,7 @@ from splatting.distributed.rendering.views import rasterize_views
 
 
 class ViewOfEach:
-    """Renders the rank's own view with the Gaussians of all ranks; `Views` of splatting/training/steps/plain.py.
+    """Renders the rank's own view with the Gaussians of all ranks; `OneView` of training/steps/plain.py.
 
     A step follows the sum of the gradients of the batch's views, and counts each view in the statistics. Adam's steps
     do not depend on a gradient's scale, so the sum does what the mean would. run: of the training.

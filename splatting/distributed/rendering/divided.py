@@ -11,6 +11,7 @@ from torch import Tensor
 
 from scene.cameras import Camera, MiniCam
 from scene.fused_adam import FusedAdam
+from splatting.distributed.ranks import ALONE, Ranks
 from splatting.distributed.rendering.band import (
     View,
     decisive_in,
@@ -20,7 +21,6 @@ from splatting.distributed.rendering.band import (
     whole_image,
 )
 from splatting.distributed.rendering.bands import KnownBands as KnownBands
-from splatting.distributed.rendering.models import ranks_of
 from splatting.distributed.rendering.rasterize import rasterize_over
 
 _ONLY_COLORS = [name == "colors" for name in GRADIENTS]
@@ -32,9 +32,14 @@ def gradient_of_colors(scene: Scene, source: Sequence[Tensor], planes: Sequence[
     return gradients_of(given, source, planes, _ONLY_COLORS)[_ONLY_COLORS.index(True)]
 
 
+def _ranks_of(model: Any) -> Ranks:
+    """The ranks among which a model's Gaussians are divided; `ALONE` for a whole model, of any class."""
+    return getattr(getattr(model, "shards", None), "ranks", ALONE)
+
+
 def rasterizer_of(model: Any) -> Callable[..., Rasterized]:
     """`rasterize`, or that of the ranks among which a model is divided."""
-    return partial(rasterize_over, ranks) if (ranks := ranks_of(model)).several else rasterize
+    return partial(rasterize_over, ranks) if (ranks := _ranks_of(model)).several else rasterize
 
 
 def draw_divided(
@@ -48,7 +53,7 @@ def draw_divided(
     awake: Tensor | None = None,
 ) -> "DividedDrawn | None":
     """`draw` of the renderer for a divided model, of which each rank gives its own part; None for a whole one."""
-    if not (ranks := ranks_of(model)).several:
+    if not (ranks := _ranks_of(model)).several:
         return None
     find = bands and partial(bands.find, camera.uid)
     view = draw_view(ranks, scene, background, want_depth, train=True, find=find, awake=awake)

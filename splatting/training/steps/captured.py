@@ -108,7 +108,7 @@ class CapturedStep(FusedStep):
     # What speculation asks for, of steps that overflowed
 
     def replay(self, at: Iteration, first: Losses) -> None:
-        """Queue a step once more; the losses that the observers hold get its values."""
+        """Queue a step once more, with the same values, which go into the losses that observers hold (`first`)."""
         self._run.set_rates(at)
         losses = self._queue(at)
         with torch.no_grad():
@@ -117,7 +117,7 @@ class CapturedStep(FusedStep):
                     old.detach().copy_(new)
 
     def rewind(self, steps: int) -> None:
-        """Take back what the host has counted for steps that will be replayed."""
+        """Take back what the host has counted for steps that will be replayed, or that an error has ended."""
         self._run.gaussians.rewind(steps)
         if self._run.sleeping:
             self._run.sleeping.stepped()  # a rest may be among the steps

@@ -1,7 +1,5 @@
 """The plain step: autograd, with every gradient of every parameter there for whoever wants it."""
 
-from typing import Protocol
-
 import torch
 from torch import Tensor
 
@@ -14,27 +12,19 @@ from splatting.training.run import Run
 Package = dict[str, Tensor | None]
 
 
-class Views(Protocol):
-    """What an iteration renders, by the model that there is."""
-
-    def render(self, at: Iteration) -> Package:
-        """The result of `render`, with what the loss needs."""
-
-    def collect(self, package: Package, losses: Losses) -> tuple[Package, Losses]:
-        """Called after backward: give the model its gradients; the package of all its rows, and the losses to show."""
-
-
 class OneView:
-    """The iteration's view of the whole model."""
+    """Renders the iteration's view, of the whole model; other models have a class of their own with these methods."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
 
     def render(self, at: Iteration) -> Package:
+        """The result of `render`, with what the loss needs."""
         run = self._run
         return render(at.camera, run.gaussians, run.pipe, at.background, **run.render_options(at))
 
     def collect(self, package: Package, losses: Losses) -> tuple[Package, Losses]:
+        """Called after backward: give the model its gradients; the package of all its rows, and the losses to show."""
         return package, losses
 
 
@@ -69,7 +59,7 @@ class PlainStep:
     returns their number. A plain step leaves nothing pending.
     """
 
-    def __init__(self, run: Run, views: Views | None = None) -> None:
+    def __init__(self, run: Run, views: OneView | None = None) -> None:
         self._run = run
         self._views = OneView(run) if views is None else views
 

@@ -19,13 +19,16 @@ from collections import deque
 from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import torch
 from diff_gaussian_rasterization.backend import OPERATORS
 
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
+
+if TYPE_CHECKING:
+    from splatting.training.steps.captured import CapturedStep
 
 AHEAD = 8  # steps; enough to hide a pause of the host, and few to replay
 _REPORTS = 2 * AHEAD
@@ -37,19 +40,6 @@ _NAP = 1e-4  # seconds; steps of less than this are queued in numbers anyway
 Capacity = tuple[int, int, int]  # of instances, slots and gradient rows (gs::Room)
 
 
-class Steps(Protocol):
-    """What queues the steps of a speculation."""
-
-    def measure(self, at: Iteration) -> object:
-        """Render the iteration's view so that the host waits."""
-
-    def replay(self, at: Iteration, first: Losses) -> None:
-        """Queue a step once more, with the same values. first: its losses, which the observers hold."""
-
-    def rewind(self, steps: int) -> None:
-        """Take back what the host has counted for steps that will be replayed, or that an error has ended."""
-
-
 @dataclass
 class _Pending:
     at: Iteration
@@ -58,9 +48,9 @@ class _Pending:
 
 
 class Speculation:
-    """The steps that a GPU has yet to do. first: the capacity of the first step."""
+    """The steps that a GPU has yet to do. first: the capacity of the first step. steps: queues and replays them."""
 
-    def __init__(self, device: torch.device, first: Capacity, steps: Steps) -> None:
+    def __init__(self, device: torch.device, first: Capacity, steps: "CapturedStep") -> None:
         self._words = torch.zeros(5, dtype=torch.int64, device=device)
         self._reports = torch.zeros(_REPORTS, 5, dtype=torch.int64, pin_memory=True)
         self._numbers = list(self._reports.numpy())  # the same memory

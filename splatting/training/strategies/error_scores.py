@@ -15,8 +15,6 @@ from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from utils.loss_utils import C1, C2, SIGMA, WINDOW
 
-ERRORS = ("l1", "squared", "loss")
-
 
 def error_map(
     kind: str,
