@@ -198,9 +198,12 @@ def test_a_set_that_stands_apart_is_told_why(change, why):
 
 
 def test_seeds_of_different_ground_truth_are_told_so():
-    runs = set_runs()
+    runs, why = set_runs(), "its seeds were scored on different ground truth"
     runs[5]["ground_truth_sha256"] = "b" * 64
-    assert {run["why_apart"] for run in stand_apart(runs)[4:]} == {"its seeds were scored on different ground truth"}
+    assert {run["why_apart"] for run in stand_apart(runs)[4:]} == {why}
+    other = runs[2] | {"ground_truth_sha256": "b" * 64}  # both ground truths have two runs, so that all stand apart
+    reasons = [run["why_apart"] for run in stand_apart([runs[4], runs[4] | {"seed": 2}, runs[5], other])]
+    assert reasons == [why] * 3 + ["the pixels of its test views differ, or which of them count"]
 
 
 def test_one_option_set_has_no_comparisons(tmp_path):
