@@ -1,4 +1,4 @@
-"""Readers of a model folder: number of Gaussians, log, scores."""
+"""Readers of a model folder: number of Gaussians, curve, log, scores."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from arguments.stored import read_model_json, read_stored_options
+from splatting.evaluation.error_curve import NAME as CURVE
+from splatting.evaluation.error_curve import Row, read_curve
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
 from splatting.evaluation.what_to_try import schedules_follow_length
@@ -80,6 +82,11 @@ def load_scores(model: Path, method: str) -> tuple[dict[str, float | None], dict
     except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:
         raise UserError(f"{model} has no scores of {method}; run render.py and metrics.py -m {model} first") from error
     return results, per_view
+
+
+def curve_of(model: Path) -> list[Row]:
+    """Read the points of the training's curve; none if it has none. UserError if the file is damaged."""
+    return read_curve(model / CURVE) if (model / CURVE).is_file() else []
 
 
 def training_seconds(model: Path, iteration: int) -> float | None:
