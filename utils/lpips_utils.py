@@ -80,27 +80,6 @@ def load_network(net: str, weights: list[Path], device: torch.device) -> nn.Modu
     return model.to(device).eval().requires_grad_(False)
 
 
-class PerceptualDistance:
-    """LPIPS with one backbone, `vgg` or `alex`. Arguments and errors are those of `load_network`."""
-
-    def __init__(self, net: str, weights: list[Path], device: torch.device) -> None:
-        self._model = load_network(net, weights, device)
-
-    @torch.no_grad()
-    def __call__(
-        self, image: torch.Tensor, other: torch.Tensor, *, unit_range: bool, mask: torch.Tensor | None = None
-    ) -> float:
-        """Distance of two images (3, H, W), float32 in [0, 1].
-
-        The network's normalisation expects [-1, 1]. unit_range: True passes [0, 1] nevertheless, as for the published
-        3DGS numbers; False maps to [-1, 1] first, as the package documents. mask: (H, W) bool, the pixels over which
-        the map of distances is averaged; without a mask the layers' means are added, as published.
-        """
-        self._model.spatial = mask is not None
-        distance = self._model(image[None], other[None], normalize=not unit_range)
-        return float(distance if mask is None else distance[0, 0][mask].mean())
-
-
 def _pick(state: dict[str, torch.Tensor], name: str, like: torch.Tensor, net: str) -> torch.Tensor:
     value = state.get(f"features.{name}")
     if not isinstance(value, torch.Tensor) or value.shape != like.shape:
