@@ -85,7 +85,7 @@ def _pick(state: dict[str, torch.Tensor], name: str, like: torch.Tensor, net: st
     if not isinstance(value, torch.Tensor) or value.shape != like.shape:
         found = "nothing" if value is None else str(tuple(getattr(value, "shape", ())))
         raise UserError(
-            f"the LPIPS weights for {net} have {found} as features.{name}, wanted {tuple(like.shape)}; "
+            f"the LPIPS weights for {net} have {found} as features.{name}, expected {tuple(like.shape)}; "
             f"give --lpips_weights the state dict of torchvision's {NETS[net]}"
         )
     return value
@@ -112,7 +112,7 @@ def _load_state(file: Path) -> dict[str, torch.Tensor]:
             f"{file} is not a state dict of torchvision: {error}; give --lpips_weights one that torch has written"
         ) from error
     if not isinstance(state, dict):
-        raise UserError(f"{file} holds a {type(state).__name__}, wanted a state dict in torchvision's format")
+        raise UserError(f"{file} holds a {type(state).__name__}, expected a state dict in torchvision's format")
     return state
 
 

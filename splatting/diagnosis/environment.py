@@ -102,9 +102,9 @@ def _check_extension(name: str) -> Line:
     installed = _version(name) or _version(WHOLE)
     if installed is None:
         return Line(f"{extension} is not installed", again)
-    wanted = (ROOT / "version.txt").read_text(encoding="utf-8").strip()
-    if installed.partition("+")[0] != wanted:
-        return Line(f"{extension} is version {installed}, but this code is {wanted}", again)
+    expected = (ROOT / "version.txt").read_text(encoding="utf-8").strip()
+    if installed.partition("+")[0] != expected:
+        return Line(f"{extension} is version {installed}, but this code is {expected}", again)
     try:
         folder = Path(importlib.import_module(package).__file__).parent
     except ImportError as error:

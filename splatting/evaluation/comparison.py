@@ -349,11 +349,11 @@ def compare(
     return compared
 
 
-def _meets(run: dict[str, Any], wanted: dict[str, Any]) -> bool:
+def _meets(run: dict[str, Any], required: dict[str, Any]) -> bool:
     return (
-        run["test_sizes"] == wanted.get("test_sizes", run["test_sizes"])
-        and run["views"]["test"] == wanted.get("test_views", run["views"]["test"])
-        and set(wanted.get("options", ())) <= set(run["options"] or ())
+        run["test_sizes"] == required.get("test_sizes", run["test_sizes"])
+        and run["views"]["test"] == required.get("test_views", run["views"]["test"])
+        and set(required.get("options", ())) <= set(run["options"] or ())
     )
 
 
