@@ -39,9 +39,9 @@ _FARTHEST = 4 * _RADIUS  # from where a view has the whole ring in front of it
 _HALVINGS = 40  # of the bisection
 
 
-def ring_of_clusters(n: int, width: int, height: int, seed: int = 0, device: torch.device | str = "cpu") -> SplatScene:
+def ring_of_clusters(n: int, width: int, height: int, device: str) -> SplatScene:
     """Draw Gaussians in clusters that stand in a ring around the origin, in the plane of x and z; rows at random."""
-    numbers = Draw(seed, device)
+    numbers = Draw(0, device)
     cluster = (_CLUSTERS * numbers.uniform(n)).long().clamp_max(_CLUSTERS - 1)
     angles = 2 * math.pi * (torch.arange(_CLUSTERS, device=device) + numbers.uniform(_CLUSTERS)) / _CLUSTERS
     centers = torch.stack([_RADIUS * angles.sin(), 4 * numbers.uniform(_CLUSTERS) - 2, _RADIUS * angles.cos()], -1)
@@ -89,7 +89,7 @@ class Ring:
     """The scene in training, with learning rates of 0, so that every step meets the same Gaussians."""
 
     def __init__(self, n: int, width: int, height: int, device: str) -> None:
-        self._scene = in_morton_order(ring_of_clusters(n, width, height, device=device))
+        self._scene = in_morton_order(ring_of_clusters(n, width, height, device))
         _, _, opt, self._pipe = train.parse(["-s", "."])
         self._gaussians = GaussianModel(3)
         self._gaussians.set_rows(model_rows(self._scene.parameters))

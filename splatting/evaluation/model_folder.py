@@ -12,7 +12,6 @@ from splatting.evaluation.error_curve import NAME as CURVE
 from splatting.evaluation.error_curve import Row, read_curve
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
-from splatting.evaluation.what_to_try import schedules_follow_length
 from splatting.files.json_files import read_json
 from splatting.files.plain_files import plain
 from utils.system_utils import UserError, saved_iterations
@@ -66,9 +65,9 @@ def shorter_ends_there(model: Path) -> bool:
         options = read_stored_options(model)
     except UserError:
         return False
-    return not schedules_follow_length(
-        bool(options.get("depths")), bool(options.get("train_test_exp")), options.get("resolution_schedule", "none")
-    )
+    # These schedules follow --iterations: the depth loss's weight, the exposures' learning rate, the views' sizes.
+    pyramid = options.get("resolution_schedule", "none") != "none"
+    return not (options.get("depths") or options.get("train_test_exp") or pyramid)
 
 
 def load_scores(model: Path, method: str) -> tuple[dict[str, float | None], dict[str, dict[str, float | None]]]:

@@ -131,10 +131,10 @@ def error_image(truth: Image.Image, render: Image.Image) -> Image.Image:
     return Image.fromarray(np.minimum(difference * GAIN, 255).astype(np.uint8))
 
 
-def contact_sheet(views: Sequence[tuple[str, Image.Image, Image.Image]], widest: int | None = None) -> Image.Image:
-    """Draw a row for each view (label, ground truth, render), with the error. widest: as for `sheet`."""
+def contact_sheet(views: Sequence[tuple[str, Image.Image, Image.Image]]) -> Image.Image:
+    """Draw a row for each view (label, ground truth, render), with the error."""
     rows = [[(label, truth), ("", render), ("", error_image(truth, render))] for label, truth, render in views]
-    return sheet(("ground truth", "render", f"error x {GAIN}"), rows, widest)
+    return sheet(("ground truth", "render", f"error x {GAIN}"), rows)
 
 
 def sheet(
