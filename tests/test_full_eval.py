@@ -251,24 +251,23 @@ def _interrupt(evaluate: Evaluation, *given: str, sent: signal.Signals = signal.
     assert process.returncode == status, said
 
 
-@pytest.mark.parametrize(("sent", "status"), [(signal.SIGINT, 130), (signal.SIGHUP, 143)])
-def test_a_signal_reaches_the_training_and_the_next_call_resumes_it(evaluate, sent, status):
-    _interrupt(evaluate, "attic brick", sent=sent, status=status)
+@pytest.mark.parametrize(
+    ("sent", "status", "more", "at", "end"),
+    [
+        (signal.SIGINT, 130, (), 5, 40),
+        (signal.SIGHUP, 143, (), 5, 40),
+        (signal.SIGINT, 130, ("--", "--time_budget", "20"), 41, 43),  # beyond --iterations, as the training decides
+    ],
+)
+def test_a_signal_reaches_the_training_and_the_next_call_resumes_it(evaluate, sent, status, more, at, end):
+    _interrupt(evaluate, "attic brick", *more, sent=sent, status=status)
     runs = evaluate.report["runs"]
     assert [run["finished"] for run in runs] == [False, False] and not runs[0]["failure"]
     assert "Not finished: attic; brick." in evaluate.text("md") and "Nothing was scored." in evaluate.text("md")
-    assert [run["finished"] for run in evaluate("attic brick")["runs"]] == [True, True]
-    checkpoint = str(evaluate.out / "attic" / "chkpnt5.pth")
+    assert [run["finished"] for run in evaluate("attic brick", *more)["runs"]] == [True, True]
+    checkpoint = str(evaluate.out / "attic" / f"chkpnt{at}.pth")
     assert evaluate.calls("train")[1][-2:] == ["--start_checkpoint", checkpoint]
-    assert not Path(checkpoint).exists() and list(evaluate.report["runs"][0]["iterations"]) == ["40"]
-
-
-def test_a_checkpoint_beyond_the_iterations_is_resumed_where_the_training_decides_its_end(evaluate):
-    given = ("attic", "--", "--time_budget", "20")
-    _interrupt(evaluate, *given)
-    assert evaluate(*given)["runs"][0]["final_iteration"] == 43
-    checkpoint = str(evaluate.out / "attic" / "chkpnt41.pth")
-    assert evaluate.calls("train")[-1][-2:] == ["--start_checkpoint", checkpoint]
+    assert not Path(checkpoint).exists() and list(evaluate.report["runs"][0]["iterations"]) == [str(end)]
 
 
 def test_a_checkpoint_of_a_failure_is_not_resumed_but_that_of_an_interrupt_is(evaluate, capsys):
