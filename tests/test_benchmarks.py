@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import sys
 from collections import Counter
 from functools import partial
@@ -24,6 +25,14 @@ from benchmarks.scenes import step_profile, training
 from benchmarks.strategies.figure import draw
 from benchmarks.strategies.tables import at, joined
 from utils.system_utils import UserError
+
+
+def test_no_command_imports_the_benchmarks():
+    """They measure the project, which must run without them; of its rooms, test_house.py says so."""
+    commands = Path(__file__).parents[1].glob("*.py")
+    assert not [
+        path for path in commands if re.search(r"^\s*(from|import) benchmarks\b", path.read_text(), re.MULTILINE)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -81,6 +90,9 @@ def test_the_kernels_are_timed(monkeypatch, capsys):
     rasterizer.main()
     (row,) = _rows(capsys.readouterr().out, "0 k, 40x27")
     assert all(float(cell) >= 0 for cell in row[2:9])
+    monkeypatch.setattr(sys, "argv", words.replace(" S ", " M+ ").split())
+    with pytest.raises(UserError, match="M\\+: on this device there are S, M, L, wide"):
+        rasterizer.main()
 
 
 def test_tables_of_a_gpu_have_stages_memory_and_marks(monkeypatch, capsys):

@@ -441,6 +441,19 @@ class TestTraining:
             assert read_curve(out / "error_vs_time.csv")[-1]["peak_memory_mib"] == max(of_log, of_row)
         assert json.loads((out / "train_log.json").read_text())[-1]["peak_memory_mib"] < own + 5e4
 
+    def test_an_interrupted_training_keeps_its_points_and_draws_nothing(self, colmap_scene, tmp_path, monkeypatch):
+        plain, steps = objective.photometric_loss, iter(range(1, 20))
+
+        def interrupted(*args: object) -> tuple:
+            if next(steps) == 8:
+                raise KeyboardInterrupt
+            return plain(*args)
+
+        monkeypatch.setattr(objective, "photometric_loss", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            _train(colmap_scene, tmp_path, "--test_iterations", 6, 8, iterations=20)
+        assert _iterations(tmp_path) == [6] and not (tmp_path / "error_vs_time.png").exists()
+
     @pytest.mark.parametrize("options", [["--eval", "--no_curve"], []], ids=["no curve", "no test views"])
     def test_no_curve_leaves_none_of_an_earlier_training(self, colmap_scene, tmp_path, options):
         for name in ("error_vs_time.csv", "error_vs_time.png"):
