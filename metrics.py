@@ -24,10 +24,9 @@ from tqdm import tqdm
 
 from arguments import OptionParser, read_cfg_args
 from splatting.evaluation.model_folder import json_or_none
-from splatting.evaluation.renders import INCOMPLETE, TIMES, model_digest
-from splatting.files.image_files import UNREADABLE, open_render
+from splatting.evaluation.renders import INCOMPLETE, TIMES, image_of, image_size, mask_of, model_digest
 from splatting.files.json_files import read_json, write_json
-from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, PerceptualDistance
+from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, load_network
 from utils.system_utils import UserError, compute_device, run_cli
 
 CONVENTIONS = {
@@ -51,13 +50,13 @@ Scores = dict[str, dict[str, float | None]]
 
 @dataclass(frozen=True)
 class Pair:
-    """Files of a render, its ground truth and the mask of pixels that count (None: all), with one size in pixels."""
+    """Files of a render and its ground truth, with one size in pixels. masked: whether a mask tells what counts."""
 
     name: str
     render: Path
     truth: Path
     size: tuple[int, int]
-    mask: Path | None = None
+    masked: bool
 
 
 def find_pairs(model: Path) -> dict[str, list[Pair]]:
@@ -99,31 +98,13 @@ def _pairs_of(method: Path) -> list[Pair]:
     pairs = []
     for name in sorted(names["gt"]):
         render, truth = method / "renders" / name, method / "gt" / name
-        sizes = _size(render), _size(truth)
-        if sizes[0] != sizes[1]:
-            raise UserError(f"{render} has {sizes[0]} pixels, but its ground truth {sizes[1]}; run render.py again")
         mask = method / "masks" / name
-        if mask.is_file() and _size(mask) != sizes[0]:
-            raise UserError(f"{mask} has {_size(mask)} pixels, but its render {sizes[0]}; run render.py again")
-        pairs.append(Pair(name, render, truth, sizes[0], mask if mask.is_file() else None))
+        size = image_size(render)
+        for file in (truth, mask):
+            if file.exists() and (other := image_size(file)) != size:
+                raise UserError(f"{render} has {size} pixels, but {file} {other}; run render.py again")
+        pairs.append(Pair(name, render, truth, size, mask.is_file()))
     return pairs
-
-
-def _size(file: Path) -> tuple[int, int]:
-    try:
-        with open_render(file) as image:
-            return image.size
-    except UNREADABLE as error:
-        raise UserError(f"{file} is not a readable image; run render.py again") from error
-
-
-def _read(file: Path) -> np.ndarray:
-    """Read the first three channels of an image, (H, W, 3) uint8."""
-    try:
-        with open_render(file) as image:
-            return np.asarray(image.convert("RGB"))
-    except UNREADABLE as error:
-        raise UserError(f"{file} is damaged ({error}); run render.py again") from error
 
 
 def trained_with_eval(model: Path) -> bool | None:
@@ -154,13 +135,21 @@ def ssim(render: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) 
     return similarity if mask is None else 1 - (1 - similarity) * mask.size / int(mask.sum())
 
 
-def _lpips_metric(distance: PerceptualDistance, unit_range: bool, device: torch.device) -> Metric:
+def _lpips_metric(network: torch.nn.Module, unit_range: bool, device: torch.device) -> Metric:
+    """Return LPIPS by a network of `load_network`, whose normalisation expects [-1, 1].
+
+    unit_range: True passes [0, 1] nevertheless, as for the published 3DGS numbers; False maps to [-1, 1] first, as the
+    package documents.
+    """
+
+    @torch.no_grad()
     def metric(render: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
         if mask is not None:
             render = np.where(mask[..., None], render, truth)
-        images = [torch.from_numpy(image.transpose(2, 0, 1).copy()).to(device) / 255 for image in (render, truth)]
-        counts = None if mask is None else torch.from_numpy(mask).to(device)
-        return distance(*images, unit_range=unit_range, mask=counts)
+        images = [torch.from_numpy(image.transpose(2, 0, 1)[None].copy()).to(device) / 255 for image in (render, truth)]
+        network.spatial = mask is not None  # without a mask the layers' means are added, as published
+        distance = network(*images, normalize=not unit_range)
+        return float(distance if mask is None else distance[0, 0][torch.from_numpy(mask).to(device)].mean())
 
     return metric
 
@@ -182,14 +171,14 @@ def make_metrics(lpips_net: str, weights: list[Path], smallest_side: int) -> dic
         try:
             if smallest_side < MIN_SIDE[net]:
                 raise LpipsUnavailable(f"it needs images with sides of at least {MIN_SIDE[net]} pixels")
-            distance = PerceptualDistance(net, weights, device)
+            network = load_network(net, weights, device)
         except LpipsUnavailable as reason:
             print(f"{', '.join(mine)} are null unless scored before: {reason}")
             continue
         except ImportError as error:
             print(f"{', '.join(mine)} are null unless scored before: {error}; run pip install -r requirements.txt")
             continue
-        metrics.update({key: _lpips_metric(distance, key == "LPIPS", device) for key in mine})
+        metrics.update({key: _lpips_metric(network, key == "LPIPS", device) for key in mine})
     return metrics
 
 
@@ -200,8 +189,8 @@ def score(pairs: list[Pair], metrics: dict[str, Metric], title: str) -> Scores:
     """
     scores: Scores = {key: {} for key in metrics}
     for pair in tqdm(pairs, desc=title, unit="view"):
-        render, truth = _read(pair.render), _read(pair.truth)
-        mask = None if pair.mask is None else _read(pair.mask)[..., 0] > 0
+        render, truth = (np.asarray(image_of(file)) for file in (pair.render, pair.truth))
+        mask = mask_of(pair.truth.parents[1], pair.name)
         if mask is not None and not mask.any():
             continue
         for key, metric in metrics.items():
@@ -223,7 +212,7 @@ def readImages(renders_dir: str | Path, gt_dir: str | Path) -> tuple[list[torch.
     names = sorted(file.name for file in Path(renders_dir).iterdir() if not file.name.startswith("."))
 
     def read(folder: str | Path) -> list[torch.Tensor]:
-        pixels = [torch.from_numpy(_read(Path(folder) / name).copy()) for name in names]
+        pixels = [torch.from_numpy(np.array(image_of(Path(folder) / name))) for name in names]
         return [image.to(compute_device()).permute(2, 0, 1)[None].contiguous() / 255 for image in pixels]
 
     return read(renders_dir), read(gt_dir), names
@@ -295,7 +284,7 @@ def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str,
         "trained_with_eval": held_out,
         "views": {name: len(pairs) for name, pairs in methods.items()},
     }
-    masked = {name: sum(pair.mask is not None for pair in pairs) for name, pairs in methods.items()}
+    masked = {name: sum(pair.masked for pair in pairs) for name, pairs in methods.items()}
     if any(masked.values()):
         info |= {"masked": {key: MASKED[key.split("_")[0]] for key in metrics}, "masked_views": masked}
     write_json(model / "results.json", results, sort_keys=False)

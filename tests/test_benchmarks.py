@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import sys
 from collections import Counter
 from functools import partial
@@ -26,6 +27,14 @@ from benchmarks.strategies.tables import at, joined
 from utils.system_utils import UserError
 
 
+def test_no_command_imports_the_benchmarks():
+    """They measure the project, which must run without them; of its rooms, test_house.py says so."""
+    commands = Path(__file__).parents[1].glob("*.py")
+    assert not [
+        path for path in commands if re.search(r"^\s*(from|import) benchmarks\b", path.read_text(), re.MULTILINE)
+    ]
+
+
 @pytest.mark.parametrize(
     ("name", "short"),
     [
@@ -47,14 +56,9 @@ def test_kernels_belong_to_the_stage_that_began():
 
 def _calls(iterations: int, options: list[str], out: Path) -> Counter[str]:
     """Calls of a training by name: operators, and steps of autograd as "node"."""
-    stdout = sys.stdout
-    try:
-        with profile(activities=[ProfilerActivity.CPU]) as profiled:
-            train.main(
-                ["-m", str(out), "--iterations", str(iterations), "--test_iterations", "-1", "--quiet", *options]
-            )
-    finally:
-        sys.stdout = stdout  # training silences it
+    words = ["-m", str(out), "--iterations", str(iterations), "--test_iterations", "-1", "--quiet", *options]
+    with profile(activities=[ProfilerActivity.CPU]) as profiled:
+        train.main(words)
     node = "autograd::engine::evaluate_function"
     names = ("node" if event.name.startswith(node) else event.name for event in profiled.events())
     ours = ("aten::", "diff_gaussian_rasterization::", "fused_ssim::", "node")
@@ -81,12 +85,12 @@ def _rows(said: str, first: str) -> list[list[str]]:
 
 def test_the_kernels_are_timed(monkeypatch, capsys):
     monkeypatch.setitem(rasterizer.CPU_WORKLOADS, "S", (300, 40, 27, 2.4))
-    words = ["rasterizer", "--device", "cpu", "--workloads", "S", "--threads", "1", "--repeats", "1"]
-    monkeypatch.setattr(sys, "argv", words)
+    words = "rasterizer --device cpu --workloads S --threads 1 --repeats 1"
+    monkeypatch.setattr(sys, "argv", words.split())
     rasterizer.main()
     (row,) = _rows(capsys.readouterr().out, "0 k, 40x27")
     assert all(float(cell) >= 0 for cell in row[2:9])
-    monkeypatch.setattr(sys, "argv", [*words[:3], "--workloads", "M+"])
+    monkeypatch.setattr(sys, "argv", words.replace(" S ", " M+ ").split())
     with pytest.raises(UserError, match="M\\+: on this device there are S, M, L, wide"):
         rasterizer.main()
 
@@ -108,20 +112,17 @@ def test_tables_of_a_gpu_have_stages_memory_and_marks(monkeypatch, capsys):
 
 def test_two_builds_take_turns(monkeypatch, capsys):
     folder = str(Path(diff_gaussian_rasterization.__file__).parents[1])
-    words = ["builds", folder, folder, "--device", "cpu", "--workloads", "S", "--starts", "1", "--rounds", "1"]
-    monkeypatch.setattr(sys, "argv", words)
+    words = "--device cpu --workloads S --starts 1 --rounds 1"
+    monkeypatch.setattr(sys, "argv", ["builds", folder, folder, *words.split()])
     builds.main()
     rows = _rows(capsys.readouterr().out, "S ")
     assert [row[1] for row in rows] == list(builds.STEPS)
-    assert all(0.2 < float(row[4]) < 5 and float(row[2]) > 0.05 for row in rows)
+    assert all(float(cell) > 0 for row in rows for cell in row[2:])
 
 
 def test_the_profile_of_a_step_adds_up_kernels_by_name():
-    kernels = {
-        "void gs::cuda::(anonymous namespace)::blend_kernel<true>(int const*, gs::BlendInput<float>)": 3.0,
-        "void gs::cuda::(anonymous namespace)::blend_kernel<false>(int const*, gs::BlendInput<float>)": 2.0,
-        "Memcpy HtoD (Pinned -> Device)": 4.0,
-    }
+    kernels = {"void gs::blend_kernel<true>(int)": 3.0, "void gs::blend_kernel<false>(int)": 2.0}
+    kernels["Memcpy HtoD (Pinned -> Device)"] = 4.0
     run = {"kernels": kernels, "counts": dict.fromkeys(kernels, 1.5)}
     assert step_profile.by_name(run)["blend_kernel"] == (5.0, 3.0)
     assert step_profile.kernels_of(run) == 5.0  # a copy from the host runs beside the kernels
@@ -136,13 +137,10 @@ def test_runs_of_a_seed_are_compared(capsys):
     assert _rows(said, "mean")[1][1:3] == ["2", "1.0 (0.0)"]
 
 
-SMALL = {"gaussians": 1000, "size": (64, 40)}
-
-
 @pytest.mark.parametrize("name", ["XL", "city"])
 def test_ranks_draw_together_what_one_process_draws(name, monkeypatch):
     monkeypatch.setattr(workload, "_PIECE", 300)
-    scene = workload.ALL[name].changed(**SMALL)
+    scene = workload.ALL[name].changed(1000, (64, 40))
     whole = scene.rows(0, 1, torch.device("cpu"))
     parts = [scene.rows(rank, 3, torch.device("cpu")) for rank in range(3)]
     for attribute, values in whole.items():
@@ -150,15 +148,14 @@ def test_ranks_draw_together_what_one_process_draws(name, monkeypatch):
 
 
 def test_steps_of_ranks_and_of_a_spilled_model_stand_beside_those_of_one_process(monkeypatch, capsys):
-    words = ["--size", "64", "40", "--rounds", "1", "--warm_up", "2", "--blocks", "2"]
-    words += ["--workload", "city", "--gaussians", "1000", "--crop", "2"]
-    monkeypatch.setattr(sys, "argv", ["steps", "--ranks", "1", "2", "--parallel", "views", *words])
+    words = "--size 64 40 --rounds 1 --warm_up 2 --blocks 2 --workload city --gaussians 1000 --crop 2"
+    monkeypatch.setattr(sys, "argv", ["steps", "--ranks", "1", "2", "--parallel", "views", *words.split()])
     steps.main()
     rows = _rows(capsys.readouterr().out, "city")
     assert [row[1:4] for row in rows] == [["1", "", "gpu"], ["2", "views", "gpu"]]
     assert rows[0][7] == "1.00" and float(rows[1][7]) > 0
     monkeypatch.setattr(steps, "launch", lambda case, limit: steps.measure(case))  # no process of its own
-    monkeypatch.setattr(sys, "argv", ["steps", "--model", "gpu", "spill", "--learn", *words])
+    monkeypatch.setattr(sys, "argv", ["steps", "--model", "gpu", "spill", "--learn", *words.split()])
     steps.main()
     rows = _rows(capsys.readouterr().out, "city")
     assert rows[0][-1] == rows[1][-1] != ""
@@ -195,7 +192,6 @@ def test_runs_agree_with_the_oracle_and_are_reported_and_drawn(monkeypatch, caps
     for kernel, ratio in ((CPU_DOUBLE, "0.00"), (CPU_FLOAT, "1.00")):
         oracle.print_ratios(runs | {(case, CUDA_FLOAT): runs[case, kernel] for case in oracle.CASES})
         assert f"where either error exceeds 1e-06: {ratio} (at most 3 allowed)" in capsys.readouterr().out
-    pytest.importorskip("matplotlib")
     measured = {"machines": ["a machine"], "timed sizes": oracle.TIMED_SIZES}
     figure.draw(measured | {"records": [r | {"milliseconds": 70.0} for r in records]}, tmp_path / "accuracy.png")
     with Image.open(tmp_path / "accuracy.png") as image:
@@ -229,22 +225,17 @@ def test_files_of_trainings_are_joined():
 
 def test_a_figure_of_whatever_trainings_there_are(tmp_path, monkeypatch):
     drawn = []
-    monkeypatch.setattr(
-        "matplotlib.figure.Figure.savefig", lambda figure, path, **_: drawn.append(figure) or path.touch()
-    )
+    save = lambda figure, path, **_: drawn.append(figure) or path.touch()  # noqa: E731
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", save)
     many = {f"set{number}": {"0": _run((1, 20), (5, 20 + number))} for number in range(11)}
     clock = {"5s": {"0": _run((5, 30)), "1": _run((5, 31))}, "9s": {"0": None}}
-    files = [
-        _file(many | clock, **dict.fromkeys(clock, ["--strategy", "mcmc", "--time_budget", "5"])),
-        _file({"set0": {"0": _run((2, 18))}, "set1": {"0": _run((2, 18), whole=False)}}, "b"),
-        _file({"set0": {"0": None}}, "nothing"),
-        _file({"set0": {"0": _run((1, 10), (2, 11)), "1": _run((4, 10), (5, 11))}}, "c"),  # at no time both
-    ]
+    budget = ["--strategy", "mcmc", "--time_budget", "5"]
+    files = [_file(many | clock, **dict.fromkeys(clock, budget)), _file({"set0": {"0": None}}, "nothing")]
+    files.append(_file({"set0": {"0": _run((1, 10), (2, 11)), "1": _run((4, 10), (5, 11))}}, "c"))  # at no time both
+    files.append(_file({"set0": {"0": _run((2, 18))}, "set1": {"0": _run((2, 18), whole=False)}}, "d"))
     draw(joined(files), tmp_path / "figure.png", ["set10"])
     panels = drawn[0].axes
-    assert [panel.get_title() for panel in panels] == ["a", "b", "c", ""]
+    assert [panel.get_title() for panel in panels] == ["a", "c", "d", ""]
     assert panels[0].get_legend_handles_labels()[1] == [*(f"set{number}" for number in range(10)), "mcmc by the clock"]
-    assert (tmp_path / "figure.png").exists()
     with pytest.raises(UserError, match="no training is left"):
         draw(joined([_file({"adc": {"0": _run((1, 20))}})]), tmp_path / "none.png", ["adc"])
-    assert not (tmp_path / "none.png").exists()

@@ -1,6 +1,5 @@
 """Runs beside each other: spread, levels and fronts of option sets, published tables, and the tables of them."""
 
-import ast
 import json
 import statistics
 from pathlib import Path
@@ -11,7 +10,6 @@ from hypothesis import strategies as st
 from report_runs import curve, run_of, set_runs
 
 import train
-from splatting.evaluation import configs
 from splatting.evaluation.comparison import (
     comparable_sets,
     compare,
@@ -31,7 +29,6 @@ from splatting.evaluation.plan import DATASETS
 from splatting.evaluation.report import make_report, render
 from splatting.evaluation.results_page import BEGIN, END, replace_results, results_text
 from splatting.evaluation.tables import front_table, reached_table, result_tables
-from splatting.evaluation.what_to_try import peak
 from splatting.files.listing import markdown_table
 from utils.system_utils import UserError
 
@@ -60,15 +57,6 @@ def test_seconds_to_reach_between_points():
     assert seconds_to_reach(rows, 24.5) == pytest.approx((200 * 300) ** 0.5)  # halfway in the logarithm
 
 
-def test_subsets_are_no_peak():
-    part = [row | {"subset": 2} for row in curve((1, 35, 10), (2, 36, 10))]
-    whole = curve((3, 20, 10), (4, 20.05, 10))
-    late = [part[0] | {"test_psnr": 1.0}]
-    assert peak(part + whole + late) is peak(part + whole[::-1]) is peak(part) is None  # 0.05 dB is not clear
-    best, lost = peak([*part, *whole, whole[0] | {"iteration": 80, "test_psnr": 19.0}])
-    assert best["iteration"] == 20 and lost == pytest.approx(1.05)
-
-
 def test_a_failed_seed_is_left_out_and_named():
     runs = [run_of(None, seed, (1, 1.0 + seed, 9), failure=[None, {"stage": "train"}][seed == 1]) for seed in range(3)]
     (row,) = summarise(runs)
@@ -80,7 +68,6 @@ def test_a_failed_seed_is_left_out_and_named():
     ("finals", "levels"),
     [
         ([30.43, 30.11], [30.0, 29.5, 29.0, 28.0]),
-        ([30.43, 27.1], [30.0, 29.5, 29.0, 28.0, 26.0]),
         ([30.43, 20.0], [30.0, 29.5, 29.0, 28.0, 26.0, 22.0, 14.0]),
         ([30.5, 26.5], [30.5, 30.0, 29.5, 28.5, 26.5, 22.5]),
     ],
@@ -166,13 +153,10 @@ def test_fronts_say_who_beats_whom_and_whether_clearly():
         found = fronts(comparable_sets(runs, "attic"))
         return found["beaten"]["seconds"]["adc"], front_table(found).rows[0][1]
 
-    adc, near = (
-        set_runs()[:2],
-        [run_of("near", seed, (seconds, 31.25, 300)) for seed, seconds in enumerate((36, 43.5))],
-    )
-    assert beaten(*adc, *near) == ({"by": "near", "clearly": False}, "beaten by near, within the spread")
-    better = [run_of("near", seed, (seconds, 35, 300)) for seed, seconds in enumerate((36, 43.5))]
-    assert beaten(*adc, *better)[0] == {"by": "near", "clearly": False}  # its seconds may be more
+    adc = set_runs()[:2]
+    for psnr in (31.25, 35):  # its seconds may be more
+        near = [run_of("near", seed, (seconds, psnr, 300)) for seed, seconds in enumerate((36, 43.5))]
+        assert beaten(*adc, *near) == ({"by": "near", "clearly": False}, "beaten by near, within the spread")
     assert beaten(adc[0], run_of("near", 0, (39, 31.25, 300))) == ({"by": "near", "clearly": None}, "beaten by near")
     assert beaten(adc[0], adc[0] | {"config": "twin"}) == (None, "on the front")
 
@@ -182,8 +166,6 @@ def test_fronts_say_who_beats_whom_and_whether_clearly():
     [
         ({"test_sizes": [[48, 32]], "options": ["-r", "2", "--sh_degree", "1"]},
          "its test views have 48x32 pixels, the others' 96x64; -r 2 instead of the defaults"),
-        ({"test_sizes": [[48, 64]], "options": ["--sh_degree", "1", "--train_test_exp"]},
-         "its test views have 48x64 pixels, the others' 96x64; --train_test_exp instead of the defaults"),
         ({"options": ["--masks", "foreground"]},
          "the pixels of its test views differ, or which of them count; --masks foreground instead of the defaults"),
         ({"views": {"test": 3, "train": 6}}, "it has 3 test views, the others 2"),
@@ -206,16 +188,18 @@ def test_a_set_that_stands_apart_is_told_why(change, why):
 
 
 def test_seeds_of_different_ground_truth_are_told_so():
-    runs = set_runs()
+    runs, why = set_runs(), "its seeds were scored on different ground truth"
     runs[5]["ground_truth_sha256"] = "b" * 64
-    assert {run["why_apart"] for run in stand_apart(runs)[4:]} == {"its seeds were scored on different ground truth"}
+    assert {run["why_apart"] for run in stand_apart(runs)[4:]} == {why}
+    other = runs[2] | {"ground_truth_sha256": "b" * 64}  # both ground truths have two runs, so that all stand apart
+    reasons = [run["why_apart"] for run in stand_apart([runs[4], runs[4] | {"seed": 2}, runs[5], other])]
+    assert reasons == [why] * 3 + ["the pixels of its test views differ, or which of them count"]
 
 
 def test_one_option_set_has_no_comparisons(tmp_path):
     shown = {"attic": {"curves": [], "fronts": [], "views": []}}
-    pages = [render("md", make_report(["x"], runs), shown, tmp_path) for runs in (set_runs(), set_runs()[:2])]
-    for part in ("### Seconds of training to reach a test PSNR", "### Option sets that no other one beats"):
-        assert [part in page for page in pages] == [True, False]
+    page = render("md", make_report(["x"], set_runs()[:2]), shown, tmp_path)
+    assert "### Seconds of training to reach a test PSNR" not in page and "### Option sets that no" not in page
 
 
 def test_seeds_that_end_by_themselves_share_a_row():
@@ -265,19 +249,6 @@ def test_markdown_keeps_columns_apart():
     assert [markdown_table(*table).splitlines(), markdown_table(*table, right=False).splitlines()] == [right, left]
 
 
-def test_nothing_imports_the_benchmarks():
-    """The benchmarks measure the project, which must run without them."""
-    outside = ("benchmarks", "tests", "build", "output")
-    folders = [path for path in ROOT.iterdir() if path.name not in outside and not path.name.startswith(".")]
-    ours = [file for path in folders for file in ([path] if path.suffix == ".py" else path.glob("**/*.py"))]
-    assert len(ours) > 100
-    for path in ours:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            assert not [name for name in names if name.split(".")[0] == "benchmarks"], path
-
-
 @pytest.mark.parametrize("text", ["", BEGIN, f"{END}\n{BEGIN}", f"{BEGIN}{BEGIN}{END}"])
 def test_a_page_without_marks_is_left_alone(text):
     with pytest.raises(UserError, match="one line <!-- results: begin"):
@@ -288,12 +259,11 @@ def test_a_page_without_marks_is_left_alone(text):
     ("sets", "text"),
     [
         ({None: "--iterations 40"}, "Options of every run: `--iterations 40`."),
-        ({"base": "--iterations 40", "long": "--iterations 50"},
-         "Each option set adds:\n\n- base: `--iterations 40`\n- long: `--iterations 50`"),
         ({"base": "--test_iterations -1 -w", "sh1": "--test_iterations -1 -w --sh_degree 1"},
          "Options of every run: `--test_iterations -1 -w`.\n\nEach option set adds:\n\n- base: nothing\n"
          "- sh1: `--sh_degree 1`"),
-        ({"base": "", "sh1": "--sh_degree 1"}, "Each option set adds:\n\n- base: nothing\n- sh1: `--sh_degree 1`"),
+        ({"base": "--iterations 40", "long": "--iterations 50"},
+         "Each option set adds:\n\n- base: `--iterations 40`\n- long: `--iterations 50`"),
     ],
 )  # fmt: skip
 def test_options_that_all_runs_share_are_written_once(sets, text):
@@ -307,8 +277,7 @@ def test_shipped_sets_are_options_of_training(tmp_path, monkeypatch):
     described = {name for line in guide if line.startswith("| `") for name in line.split("|")[1].split("`")[1::2]}
     for name in shipped():
         sets = read_configs(Path(name), train.parse)
-        assert read_configs(configs.SHIPPED / f"{name}.json", train.parse) == sets and len(sets) > 1
-        assert set(sets) <= described, "many_scenes.md does not tell what these are for"
+        assert len(sets) > 1 and set(sets) <= described, "many_scenes.md does not tell what these are for"
     assert default_set(read_configs(Path("strategies"), None)) == "adc" == default_set({"defaults": [], "adc": []})
     assert default_set({"fast": [], "defaults": []}) == "defaults" and default_set({"x": [], "y": []}) == "x"
     assert read_configs(Path("strategies"), None)["adc"] == ()

@@ -49,15 +49,15 @@ def exit_status(*argv: str) -> int:
     return 0
 
 
-def test_exit_statuses(healthy, colmap_scene, tmp_path, capsys):
+def test_exit_statuses(healthy, colmap_scene, capsys):
     assert exit_status() == 0
     assert capsys.readouterr().out.endswith("no problems found: ready\n")
     assert exit_status("-s", str(colmap_scene)) == 1
     out = capsys.readouterr().out
     assert "PROBLEM only 17 photos -> " in out and "PROBLEM only 300 points" in out and out.endswith("2 problems\n")
-    for option, folder in ((option, folder) for option in ("-s", "-m") for folder in (tmp_path / "nowhere", "''")):
-        with pytest.raises(UserError, match=f"no folder .*{folder}; pass an existing folder as {option}"):
-            doctor.main([option, str(folder).strip("'")])
+    for option, folder in (("-s", "nowhere"), ("-m", "")):
+        with pytest.raises(UserError, match=f"no folder .*{folder}.*; pass an existing folder as {option}"):
+            doctor.main([option, folder])
 
 
 def test_missing_packages_end_it(monkeypatch, colmap_scene, capsys):
@@ -85,7 +85,7 @@ def test_extensions_that_do_not_fit(monkeypatch, tmp_path):
 
     def check(version: str = "0.1.0") -> str:
         (tmp_path / "version.txt").write_text(f"{version}\n")
-        return str(environment._check_extension("simple-knn", "simple_knn"))
+        return str(environment._check_extension("simple-knn"))
 
     monkeypatch.setattr(environment, "ROOT", tmp_path)
     monkeypatch.setattr(environment, "_version", versions.get)
@@ -101,9 +101,8 @@ def test_the_rasterizer_is_tried(monkeypatch):
     line = environment._check_rasterizer(torch)
     assert not line.finding and "agrees with its float64 oracle" in line.text
     right = diff_gaussian_rasterization.rasterize
-    monkeypatch.setattr(
-        diff_gaussian_rasterization, "rasterize", lambda **k: (r := right(**k))._replace(color=r.color + 1e-4)
-    )
+    wrong = lambda **k: (drawn := right(**k))._replace(color=drawn.color + 1e-4)  # noqa: E731
+    monkeypatch.setattr(diff_gaussian_rasterization, "rasterize", wrong)
     line = environment._check_rasterizer(torch)
     assert line.finding and "1.0e-04 off the oracle" in line.text
 
@@ -157,14 +156,12 @@ def test_points_and_cameras_that_do_not_meet(info):
     many = np.random.default_rng(0).normal(scale=0.2, size=(2000, 3)).astype(np.float32)
     assert problems(check_cloud(_with_cloud(info, many))) == []
     half_turn = np.diag([-1.0, 1.0, -1.0])
-    for turned, said in (
-        (99, "100% of the points are in no photo -> poses and points do not belong together"),
-        (1, f"1 cameras have hardly any point in view ({info.train_cameras[0].image_name})"),
-    ):
-        around = _with_cameras(
-            info, lambda i, c, n=turned: {"R": c.R @ half_turn, "T": half_turn @ c.T} if i < n else {}
-        )
-        assert said in problems(check_cloud(_with_cloud(around, many)))[0]
+    turned = lambda camera: {"R": camera.R @ half_turn, "T": half_turn @ camera.T}  # noqa: E731
+    away = _with_cloud(_with_cameras(info, lambda _, camera: turned(camera)), many)
+    assert "100% of the points are in no photo -> poses and points do not belong" in problems(check_cloud(away))[0]
+    one = _with_cloud(_with_cameras(info, lambda i, camera: {} if i else turned(camera)), many)
+    name = info.train_cameras[0].image_name
+    assert f"1 cameras have hardly any point in view ({name})" in problems(check_cloud(one))[0]
     far = many.copy()
     far[::20] = 1e5
     assert "5.0% of the points are more than 100 extents away" in problems(check_cloud(_with_cloud(info, far)))[0]
@@ -188,9 +185,7 @@ def test_what_convert_noted(colmap_scene):
     said = problems(check_dataset(str(colmap_scene), "images"))
     assert "PROBLEM only 17 of 30 photos were placed by convert.py -> take more photos between them" in said
     path.write_text("{")
-    assert any(
-        "convert_report.json is damaged" in text for text in problems(check_dataset(str(colmap_scene), "images"))
-    )
+    assert "convert_report.json is damaged" in str(problems(check_dataset(str(colmap_scene), "images")))
 
 
 @pytest.fixture
@@ -198,7 +193,7 @@ def model(colmap_scene, tmp_path):
     """A function that writes a model of the synthetic scene with changed Gaussians and returns the folder."""
 
     def write(
-        change=lambda gaussians: None, iteration: int = 7, source: Path = colmap_scene, cloud: Path = colmap_scene
+        change=lambda _: None, iteration: int = 7, source: Path = colmap_scene, cloud: Path = colmap_scene
     ) -> str:
         folder = tmp_path / "model"
         given = argparse.Namespace(source_path=str(source), model_path=str(folder))

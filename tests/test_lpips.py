@@ -15,7 +15,7 @@ import metrics
 from lpipsPyTorch import lpips
 from lpipsPyTorch.modules.lpips import LPIPS
 from utils import lpips_utils
-from utils.lpips_utils import NETS, LpipsUnavailable, PerceptualDistance, import_lpips
+from utils.lpips_utils import NETS, LpipsUnavailable, import_lpips, load_network
 from utils.system_utils import UserError
 
 CPU = torch.device("cpu")
@@ -54,8 +54,14 @@ def _cache_of_torch(judges, monkeypatch) -> None:
 
 
 def images(count: int = 1) -> list[torch.Tensor]:
+    """Two batches (count, 3, 48, 40) of 8-bit colours in [0, 1]."""
     generator = torch.Generator().manual_seed(0)
-    return [torch.rand(count, 3, 48, 40, generator=generator) for _ in range(2)]
+    return [torch.randint(0, 256, (count, 3, 48, 40), generator=generator) / 255 for _ in range(2)]
+
+
+def pixels(image: torch.Tensor) -> np.ndarray:
+    """The image (1, 3, H, W) as metrics.py reads it."""
+    return (image[0].permute(1, 2, 0) * 255).round().byte().numpy()
 
 
 @pytest.mark.parametrize("net", NETS)
@@ -68,27 +74,25 @@ def test_values_are_the_packages(net, judges):
     if net == "squeeze":  # which metrics.py does not have
         return
     for paths in ([], [judges.files[net]], [judges.files["vgg"], judges.files["alex"]]):  # the one that fits is found
-        ours = PerceptualDistance(net, paths, CPU)
-        assert [ours(x[0], y[0], unit_range=unit_range) for unit_range in (True, False)] == [plain, mapped]
+        ours = metrics.make_metrics(net, paths, 40)
+        assert ours[f"LPIPS_{net}"](*map(pixels, (x, y)), None) == mapped
+        assert net != "vgg" or ours["LPIPS"](*map(pixels, (x, y)), None) == plain
 
 
 def test_under_a_mask_it_is_the_mean_of_the_packages_map(judges):
-    (x, y), judge = images(), judges.models["alex"]
+    (x, y), judge = images(), judges.models["vgg"]
     mask = torch.zeros(48, 40, dtype=torch.bool)
     mask[10:40, 5:30] = True
     judge.spatial = True
-    expected, everywhere = judge(x, y)[0, 0][mask].mean().item(), judge(x, y).mean().item()
+    expected, everywhere = judge(torch.where(mask, x, y), y)[0, 0][mask].mean().item(), judge(x, y).mean().item()
     judge.spatial = False
-    distance = PerceptualDistance("alex", [], CPU)
-    assert distance(x[0], y[0], unit_range=True, mask=mask) == expected
-    plain = distance(x[0], y[0], unit_range=True)
+    metric = metrics.make_metrics("vgg", [], 40)["LPIPS"]
+    assert metric(pixels(x), pixels(y), mask.numpy()) == expected
+    hidden = np.where(mask.numpy()[..., None], pixels(x), 255 - pixels(x))
+    assert metric(hidden, pixels(y), mask.numpy()) == expected
+    plain = metric(pixels(x), pixels(y), None)
     assert plain != expected
     assert plain == pytest.approx(everywhere, rel=0.05)  # each layer's map is stretched to the image
-
-    metric = metrics._lpips_metric(distance, True, CPU)
-    shown, truth = ((image[0].permute(1, 2, 0) * 255).byte().numpy() for image in (x, y))
-    hidden = np.where(mask.numpy()[..., None], shown, 255 - shown)
-    assert metric(hidden, truth, mask.numpy()) == metric(shown, truth, mask.numpy()) < metric(shown, truth)
 
 
 def test_the_default_is_alex_and_a_batch_is_summed():
@@ -129,7 +133,7 @@ def test_downloaded_weights_are_kept_with_a_checked_digest(judges, tmp_path, mon
 
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     monkeypatch.setattr(torch.hub, "download_url_to_file", download)
-    PerceptualDistance("alex", [], CPU)
+    load_network("alex", [], CPU)
     (kept,) = (tmp_path / "hub" / "checkpoints").iterdir()
     assert kept.read_bytes() == judges.files["alex"].read_bytes()
 
@@ -146,10 +150,9 @@ def test_without_weights_it_is_refused_after_one_attempt(tmp_path, monkeypatch, 
     monkeypatch.setenv("GS_DOWNLOAD", forbidden)
     monkeypatch.setattr(torch.hub, "download_url_to_file", download)
     for net, name in NETS.items():
-        for make in (lambda net: PerceptualDistance(net, [], CPU), LPIPS):
-            said = f"missing; put .*/{name}-.* at {tmp_path}/hub/checkpoints/{name}"
-            with pytest.raises(LpipsUnavailable, match="as told above" if forbidden == "told" else said):
-                make(net)
+        said = f"missing; put .*/{name}-.* at {tmp_path}/hub/checkpoints/{name}"
+        with pytest.raises(LpipsUnavailable, match="as told above" if forbidden == "told" else said):
+            LPIPS(net)
     assert len(tried) == attempts
 
 
@@ -159,7 +162,7 @@ def test_a_network_that_never_answers_is_given_up(tmp_path, monkeypatch):
         monkeypatch.setenv("https_proxy", f"http://127.0.0.1:{silent.getsockname()[1]}")
         monkeypatch.setattr(lpips_utils, "_DOWNLOAD_TIMEOUT", 0.3)
         with pytest.raises(LpipsUnavailable):
-            PerceptualDistance("alex", [], CPU)
+            load_network("alex", [], CPU)
     assert socket.getdefaulttimeout() is None
 
 
@@ -167,15 +170,12 @@ def test_weights_of_the_wrong_kind(judges, tmp_path):
     def refused(content: object, net: str = "vgg") -> str:
         torch.save(content, tmp_path / "weights.pth")
         with pytest.raises((UserError, LpipsUnavailable)) as caught:
-            PerceptualDistance(net, [tmp_path / "weights.pth"], CPU)
+            load_network(net, [tmp_path / "weights.pth"], CPU)
         return str(caught.value)
 
     vgg = torch.load(judges.files["vgg"], weights_only=True)
     assert "torchvision's vgg16 or alexnet" in refused({"something": torch.zeros(3)})
     assert "features.28.weight" in refused({name: value for name, value in vgg.items() if "28.weight" not in name})
     assert "list" in refused([1, 2]) and "alexnet" in refused(vgg, "alex")
-    assert "which are never run" in refused({"features.0.weight": bytearray(9)})
-    (tmp_path / "garbage.pth").write_bytes(b"no weights at all")
-    for file in ("garbage.pth", "missing.pth"):
-        with pytest.raises(UserError, match=file):
-            PerceptualDistance("vgg", [tmp_path / file], CPU)
+    with pytest.raises(UserError, match="missing.pth"):
+        load_network("vgg", [tmp_path / "missing.pth"], CPU)

@@ -3,7 +3,6 @@
 import json
 import math
 import shutil
-import sys
 from argparse import ArgumentParser, Namespace
 from collections import Counter
 from collections.abc import Callable
@@ -70,7 +69,6 @@ def run(folder, monkeypatch) -> Callable[..., None]:
     """Runs render.py on that model in this process."""
 
     def command(*words: str) -> None:
-        monkeypatch.setattr("sys.stdout", sys.stdout)  # which the command replaces
         monkeypatch.setattr("sys.argv", ["render.py", "-m", str(folder), *words])
         render.main()
 
@@ -99,13 +97,10 @@ def test_renders_and_ground_truth_side_by_side_in_the_place_of_earlier_ones(tmp_
     with pytest.raises(KeyError):  # as if it was interrupted
         render.write_views(folder, [view(plain)], None, Namespace(), torch.zeros(3))
     assert (folder / INCOMPLETE).is_file()
-    seconds = write(2)
-    assert not (folder / INCOMPLETE).exists()
-    assert len(seconds) == 2 and min(seconds) > 0
+    assert len(write(2)) == 2 and not (folder / INCOMPLETE).exists()
     assert names(folder) == ["gt/00000.png", "gt/00001.png", "renders/00000.png", "renders/00001.png"]
-    for side, index, image in (("renders", 0, first), ("renders", 1, second), ("gt", 1, composited)):
-        expected = np.floor(image.double().numpy() * 255 + 0.5).transpose(1, 2, 0)
-        assert np.array_equal(read(folder / side / f"{index:05d}.png"), expected)
+    for name, image in (("renders/00000", first), ("renders/00001", second), ("gt/00001", composited)):
+        assert np.array_equal(read(folder / f"{name}.png"), to_bytes(image).numpy())
     assert np.array_equal(read(folder / "gt" / "00000.png"), plain.numpy().transpose(1, 2, 0))
     (folder / "gt" / "notes.png").write_text("mine")
     write(1)
@@ -160,21 +155,14 @@ def test_sets_by_the_references_arguments(folder, colmap_scene):
 
 
 def test_times_are_in_milliseconds_by_picture():
-    cpu = torch.device("cpu")
-    times = summarise_times([0.02, 0.05, 0.01], [(8, 6), (4, 3), (8, 6)], 7, True, cpu)
-    assert times.pop("device") and times.pop("threads") == torch.get_num_threads()
-    assert times == {
-        "antialiasing": True,
-        "fps": 50.0,
-        "gaussians": 7,
-        "median_ms": 20.0,
-        "milliseconds": {"00000.png": 20.0, "00001.png": 50.0, "00002.png": 10.0},
-        "sizes": [(4, 3), (8, 6)],
-        "torch": torch.__version__,
-    }
+    times = summarise_times([0.02, 0.05, 0.01], [(8, 6), (4, 3), (8, 6)], 7, True, torch.device("cpu"))
+    assert times["milliseconds"] == {"00000.png": 20.0, "00001.png": 50.0, "00002.png": 10.0}
+    assert (times["median_ms"], times["fps"], times["sizes"]) == (20.0, 50.0, [(4, 3), (8, 6)])
+    assert times["antialiasing"] and times["gaussians"] == 7 and times["threads"] == torch.get_num_threads()
+    assert times["device"] and times["torch"] == torch.__version__
 
 
-def test_times_on_disk_are_those_of_the_last_run(folder, run, colmap_scene, capsys):
+def test_times_on_disk_are_those_of_the_last_run(folder, run, colmap_scene):
     files = [folder / name / "ours_7" / "render_times.json" for name in ("train", "test")]
 
     def timed_views(held_out: bool) -> list[int]:
@@ -183,12 +171,8 @@ def test_times_on_disk_are_those_of_the_last_run(folder, run, colmap_scene, caps
         return [len(json.loads(file.read_text())["milliseconds"]) if file.exists() else 0 for file in files]
 
     assert timed_views(held_out=True) == [14, 3]
-    assert "test: 3 views, median " in capsys.readouterr().out
     text = files[1].read_text()
-    times = json.loads(text)
-    assert text == json.dumps(times, indent=1, sort_keys=True) + "\n"
-    assert times["gaussians"] == 5 and times["sizes"] == [[96, 64]] and not times["antialiasing"]
-    assert times["median_ms"] == sorted(times["milliseconds"].values())[1] > 0
+    assert text == json.dumps(json.loads(text), indent=1, sort_keys=True) + "\n"
     assert timed_views(held_out=False) == [17, 0]
 
 
@@ -205,9 +189,7 @@ def test_a_model_trained_on_black_is_not_rendered_on_white_without_a_word(
 
 def test_another_scene_is_rendered_only_where_that_is_said(folder, run, colmap_scene, tmp_path):
     other = Path(shutil.copytree(colmap_scene, tmp_path / "other"))
-    with pytest.raises(
-        UserError, match=rf"is a model of another scene, {colmap_scene}; leave -s out, or give --allow_"
-    ):
+    with pytest.raises(UserError, match=f"of another scene, {colmap_scene}; leave -s out, or give --allow_"):
         run("-s", str(other), "--skip_train")
     assert not (folder / "test").exists()
     run("-s", str(other), "--skip_train", "--allow_other_scene")
@@ -225,13 +207,8 @@ def test_help_says_what_happens_without_an_option(monkeypatch, capsys):
     for option, default in {
         "--model_path TEXT, -m TEXT": "none, must be given",
         "--sh_degree N": "that of the saved PLY",
-        "--resolution N, -r N": "that of the model",
         "--white_background, -w": "that of the model",
-        "--masks TEXT": "that of the model",
-        "--antialiasing": "that of the model",
         "--debug": "off; reference",
-        "--skip_train": "off",
-        "--iteration ITERATION": "-1, the last",
     }.items():
         _, _, after = text.partition(f" {option} ")[2].partition("(default: ")
         assert after.startswith(f"{default})"), option
@@ -260,9 +237,8 @@ def test_depth_and_alpha_are_written_on_request_as_the_rasterizer_drew_them(fold
         run("--quiet", *words)
         return [len(list((folder / "test" / "ours_7" / plane).glob("*"))) for plane in ("depth", "alpha")]
 
-    assert [counts(), counts("--depth"), counts("--alpha"), counts("--depth", "--alpha")] == [
-        [0, 0], [3, 0], [0, 3], [3, 3],
-    ]  # fmt: skip
+    asked = (), ("--depth",), ("--alpha",), ("--depth", "--alpha")
+    assert [counts(*words) for words in asked] == [[0, 0], [3, 0], [0, 3], [3, 3]]
     options = Namespace(source_path=str(colmap_scene), model_path=str(folder), eval=True)
     scene = load_saved(ModelParams(ArgumentParser()).extract(options), 7)
     for name, views in (("train", scene.getTrainCameras()), ("test", scene.getTestCameras())):
@@ -279,27 +255,10 @@ def test_depth_and_alpha_are_written_on_request_as_the_rasterizer_drew_them(fold
                 assert largest > 0.1
 
 
-def test_planes_are_written_whole_or_not_at_all(tmp_path, monkeypatch):
-    values = np.array([[0.0, 0.25, 3.0]], dtype=np.float32)
-    write_plane(tmp_path / "a.png", values)
-    np.testing.assert_allclose(read_plane(tmp_path / "a.png"), values, rtol=0, atol=1.5 / 65535)
-    before = (tmp_path / "a.png").read_bytes()
-
-    def broken(self, path, *_, **__) -> None:
-        Path(path).write_bytes(b"half")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Image.Image, "save", broken)
-    with pytest.raises(UserError, match="cannot write"):
-        write_plane(tmp_path / "a.png", 2 * values)
-    assert (tmp_path / "a.png").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
-
-
-def test_planes_of_nothing_and_files_that_are_none(tmp_path):
-    write_plane(tmp_path / "zero.png", np.zeros((2, 3)))
-    assert read_plane(tmp_path / "zero.png").tolist() == [[0.0] * 3] * 2
-    write_plane(tmp_path / "past.png", np.array([[0.5, 2.0]]), largest=1.0)
-    assert read_plane(tmp_path / "past.png").tolist() == pytest.approx(np.array([[0.5, 1.0]]), abs=1 / 65535)
+def test_planes_come_back_and_other_files_are_refused(tmp_path):
+    for values, largest in (([[0.0, 0.0]], None), ([[0.5, 2.0]], 1.0), ([[0.0, 0.25, 3.0]], None)):
+        write_plane(tmp_path / "a.png", np.array(values), largest)
+        np.testing.assert_allclose(read_plane(tmp_path / "a.png"), np.minimum(values, largest or 3.0), atol=3 / 65535)
     Image.new("L", (2, 2)).save(tmp_path / "grey.png")
     (tmp_path / "text.png").write_text("hello")
     for name in ("grey", "text", "absent"):

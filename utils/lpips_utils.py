@@ -80,33 +80,12 @@ def load_network(net: str, weights: list[Path], device: torch.device) -> nn.Modu
     return model.to(device).eval().requires_grad_(False)
 
 
-class PerceptualDistance:
-    """LPIPS with one backbone, `vgg` or `alex`. Arguments and errors are those of `load_network`."""
-
-    def __init__(self, net: str, weights: list[Path], device: torch.device) -> None:
-        self._model = load_network(net, weights, device)
-
-    @torch.no_grad()
-    def __call__(
-        self, image: torch.Tensor, other: torch.Tensor, *, unit_range: bool, mask: torch.Tensor | None = None
-    ) -> float:
-        """Distance of two images (3, H, W), float32 in [0, 1].
-
-        The network's normalisation expects [-1, 1]. unit_range: True passes [0, 1] nevertheless, as for the published
-        3DGS numbers; False maps to [-1, 1] first, as the package documents. mask: (H, W) bool, the pixels over which
-        the map of distances is averaged; without a mask the layers' means are added, as published.
-        """
-        self._model.spatial = mask is not None
-        distance = self._model(image[None], other[None], normalize=not unit_range)
-        return float(distance if mask is None else distance[0, 0][mask].mean())
-
-
 def _pick(state: dict[str, torch.Tensor], name: str, like: torch.Tensor, net: str) -> torch.Tensor:
     value = state.get(f"features.{name}")
     if not isinstance(value, torch.Tensor) or value.shape != like.shape:
         found = "nothing" if value is None else str(tuple(getattr(value, "shape", ())))
         raise UserError(
-            f"the LPIPS weights for {net} have {found} as features.{name}, wanted {tuple(like.shape)}; "
+            f"the LPIPS weights for {net} have {found} as features.{name}, expected {tuple(like.shape)}; "
             f"give --lpips_weights the state dict of torchvision's {NETS[net]}"
         )
     return value
@@ -133,7 +112,7 @@ def _load_state(file: Path) -> dict[str, torch.Tensor]:
             f"{file} is not a state dict of torchvision: {error}; give --lpips_weights one that torch has written"
         ) from error
     if not isinstance(state, dict):
-        raise UserError(f"{file} holds a {type(state).__name__}, wanted a state dict in torchvision's format")
+        raise UserError(f"{file} holds a {type(state).__name__}, expected a state dict in torchvision's format")
     return state
 
 

@@ -7,7 +7,6 @@ import argparse
 import json
 from pathlib import Path
 
-from benchmarks.harness.measuring import require_matplotlib
 from utils.system_utils import atomic_write, run_cli
 
 COLORS = {"CPU float32": "tab:blue", "CPU float64": "tab:green", "CUDA float32": "tab:red"}
@@ -25,7 +24,6 @@ MARKERS = {
 
 def draw(measured: dict, path: Path) -> None:
     """Draw a panel per scene and antialiasing setting; each kernel is a column of marks at its run time."""
-    require_matplotlib()
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
     from matplotlib.ticker import LogFormatter

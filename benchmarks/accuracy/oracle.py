@@ -25,7 +25,7 @@ from tqdm import tqdm
 from benchmarks.accuracy.figure import draw
 from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT, ORACLE, Backend, kernels, run
 from benchmarks.harness.calls import Calls
-from benchmarks.harness.measuring import cpu_milliseconds, describe, gpu_milliseconds, print_table, require_matplotlib
+from benchmarks.harness.measuring import cpu_milliseconds, describe, gpu_milliseconds, print_table
 from benchmarks.workloads.splat_scenes import KINDS
 from benchmarks.workloads.stability_cases import Problem, all_stiff
 from splatting.files.json_files import write_json
@@ -139,8 +139,6 @@ def main() -> None:
     parser.add_argument("--figure", type=Path, help="also time the kernels, and draw error against time to this file")
     parser.add_argument("--json", type=Path, help="also time the kernels, and write every measurement to this file")
     args = parser.parse_args()
-    if args.figure:
-        require_matplotlib()
     machines = list(dict.fromkeys(describe(kernel.device) for kernel in kernels()))
     print("\n".join(machines))
     records, runs = measure(times=bool(args.figure or args.json))

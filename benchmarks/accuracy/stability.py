@@ -19,7 +19,6 @@ same float32 values.
 
 import argparse
 import math
-import time
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -28,7 +27,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks.accuracy.runs import CPU_DOUBLE, CUDA_FLOAT, ORACLE, TEXTBOOK, Backend, kernels, run
-from benchmarks.harness.measuring import describe, print_table
+from benchmarks.harness.measuring import cpu_milliseconds, describe, print_table
 from benchmarks.workloads.stability_cases import CASES, PLAIN, Case, Problem
 from utils.system_utils import run_cli
 
@@ -96,13 +95,8 @@ class Judged:
         return Result(bool(finite), by_plane, by_name)
 
     def milliseconds(self, backend: Backend) -> float:
-        """Time forward and backward, least of three. A case has few splats, so this is mostly the call's overhead."""
-        times = []
-        for _ in range(3):
-            start = time.perf_counter()
-            run(self.problem, backend, keep=self.keep)
-            times.append(1e3 * (time.perf_counter() - start))
-        return min(times)
+        """Time forward and backward. A case has few splats, so this is mostly the call's overhead."""
+        return cpu_milliseconds(lambda: run(self.problem, backend, keep=self.keep), repeats=3)
 
 
 def beyond(case: Case, backend: Backend, judged: Judged, result: Result) -> list[str]:

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, TEXTBOOK
 from benchmarks.accuracy.stability import ROUNDING, Judged, Result
-from benchmarks.harness.measuring import describe, require_matplotlib
+from benchmarks.harness.measuring import describe
 from benchmarks.workloads.stability_cases import PLAIN, Case, Problem, at_depths, needles, needles_of
 from utils.system_utils import atomic_write, run_cli
 
@@ -74,7 +74,6 @@ def measure(sweep: Sweep) -> list[dict]:
 
 def draw(path: Path, measured: dict[str, list[dict]], title: str) -> None:
     """Draw a column for each sweep, and a row each for the errors of image and gradients and for milliseconds."""
-    require_matplotlib()
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(14, 11), layout="constrained")
@@ -103,7 +102,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("figure", type=Path, help="image file to write")
     args = parser.parse_args()
-    require_matplotlib()
     machine = describe()
     print(machine)
     measured = {sweep.name: measure(sweep) for sweep in SWEEPS}

@@ -1,7 +1,6 @@
 """Head and form of tables, and run time and memory of a call on the CPU and on a GPU."""
 
 import argparse
-import importlib.util
 import platform
 import re
 import statistics
@@ -43,12 +42,6 @@ def chosen_device(args: argparse.Namespace) -> str:
     if args.device == "cuda" and found != "cuda":
         raise UserError("--device cuda needs a visible GPU and the rasterizer built with CUDA (GS_CUDA=1)")
     return args.device or found
-
-
-def require_matplotlib() -> None:
-    """Raise UserError if matplotlib is missing."""
-    if importlib.util.find_spec("matplotlib") is None:
-        raise UserError("drawing needs matplotlib: pip install matplotlib, or draw on another machine")
 
 
 WARM_UPS, REPEATS = 20, 50  # on a GPU

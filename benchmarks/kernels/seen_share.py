@@ -11,15 +11,16 @@ sides, one after the other; figures are means over them, in the better of two ro
 import argparse
 import math
 import time
-from types import SimpleNamespace
 
 import torch
+from diff_gaussian_rasterization import GaussianRasterizationSettings
+from torch import Tensor
 
 import train
 from benchmarks.harness.measuring import add_device, chosen_device, describe, launches, print_table
-from benchmarks.workloads.ring_of_clusters import ring_of_clusters, view_of_share
-from benchmarks.workloads.splat_scenes import in_morton_order
+from benchmarks.workloads.splat_scenes import FOV, Draw, SplatScene, in_morton_order, model_rows, on_device, settings
 from gaussian_renderer import draw
+from scene.cameras import ZFAR, ZNEAR, MiniCam
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.sleeping import REST, Sleeping
@@ -30,18 +31,68 @@ SIZES = {"cuda": (2_000_000, 1600, 1060), "cpu": (50_000, 400, 265)}  # Gaussian
 SHARES = [0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0]
 _TURN = math.pi * (3 - math.sqrt(5))  # from view to view: they never meet, however many there are
 _ROUNDS = 2
-_NAMES = {"xyz": "means", "f_dc": "sh_dc", "f_rest": "sh_rest", "opacity": "opacities", "scaling": "scales",
-          "rotation": "rotations"}  # fmt: skip
+# The scene: a ring of clusters, and cameras that see a requested share of it.
+_RADIUS = 10.0
+_CLUSTERS = 60
+_SIGMA_PX = 1.4  # median size from the ring's middle
+_FARTHEST = 4 * _RADIUS  # from where a view has the whole ring in front of it
+_HALVINGS = 40  # of the bisection
+
+
+def ring_of_clusters(n: int, width: int, height: int, device: str) -> SplatScene:
+    """Draw Gaussians in clusters that stand in a ring around the origin, in the plane of x and z; rows at random."""
+    numbers = Draw(0, device)
+    cluster = (_CLUSTERS * numbers.uniform(n)).long().clamp_max(_CLUSTERS - 1)
+    angles = 2 * math.pi * (torch.arange(_CLUSTERS, device=device) + numbers.uniform(_CLUSTERS)) / _CLUSTERS
+    centers = torch.stack([_RADIUS * angles.sin(), 4 * numbers.uniform(_CLUSTERS) - 2, _RADIUS * angles.cos()], -1)
+    size = math.log(_SIGMA_PX * _RADIUS / (width / (2 * math.tan(FOV / 2)))) + 0.8 * numbers.normal(n)
+    return SplatScene(
+        {"means": centers[cluster] + 0.5 * numbers.normal(n, 3)} | numbers.appearance(size), width, height
+    )
+
+
+def view_of_share(scene: SplatScene, share: float, turn: float) -> GaussianRasterizationSettings:
+    """Return a camera that looks away from the ring's axis, `turn` radians from +z, and sees a share of the means.
+
+    A camera that moves backwards along its axis sees more and more, from a few Gaussians behind the ring on its far
+    side to all of them.
+    """
+    means = scene.parameters["means"][:: max(1, len(scene.parameters["means"]) // 100_000)].double()
+    nearest, farthest = -1.2 * _RADIUS, _FARTHEST
+    for _ in range(_HALVINGS):
+        back = (nearest + farthest) / 2
+        seen = _share_of(means, scene, _view(turn, back))
+        nearest, farthest = (back, farthest) if seen < share else (nearest, back)
+    camera = settings(scene.width, scene.height, torch.float32, view=_view(turn, farthest))
+    return on_device(camera, scene.parameters["means"].device)
+
+
+def _view(turn: float, back: float) -> Tensor:
+    """World to view, of a camera that stands `back` behind the origin."""
+    view = torch.eye(4, dtype=torch.float64)
+    sine, cosine = math.sin(turn), math.cos(turn)
+    view[0, 0], view[0, 2], view[2, 0], view[2, 2] = cosine, -sine, sine, cosine
+    view[2, 3] = back
+    return view
+
+
+def _share_of(means: Tensor, scene: SplatScene, view: Tensor) -> float:
+    """The share of the means that lie on the image."""
+    view = view.to(means.device)
+    x, y, z = (means @ view[:3, :3].T + view[:3, 3]).T
+    wide = math.tan(FOV / 2)
+    high = wide * scene.height / scene.width
+    return float(((z > 0.2) & (x.abs() < wide * z) & (y.abs() < high * z)).double().mean())
 
 
 class Ring:
     """The scene in training, with learning rates of 0, so that every step meets the same Gaussians."""
 
     def __init__(self, n: int, width: int, height: int, device: str) -> None:
-        self._scene = in_morton_order(ring_of_clusters(n, width, height, device=device))
+        self._scene = in_morton_order(ring_of_clusters(n, width, height, device))
         _, _, opt, self._pipe = train.parse(["-s", "."])
         self._gaussians = GaussianModel(3)
-        self._gaussians.set_rows({name: self._scene.parameters[ours] for name, ours in _NAMES.items()})
+        self._gaussians.set_rows(model_rows(self._scene.parameters))
         self._gaussians.active_sh_degree, self._gaussians.spatial_lr_scale = 3, 1.0
         self._gaussians.start_exposures(())
         self._gaussians.training_setup(opt)
@@ -51,11 +102,11 @@ class Ring:
         self._target = torch.rand(3, height, width, generator=torch.Generator().manual_seed(1)).to(device)
         self._background = torch.zeros(3, device=device)
 
-    def views(self, share: float, count: int) -> list[SimpleNamespace]:
+    def views(self, share: float, count: int) -> list[MiniCam]:
         """Return views from all sides that see a share of the Gaussians."""
         return [_camera(view_of_share(self._scene, share, turn * _TURN)) for turn in range(count)]
 
-    def step(self, camera: SimpleNamespace, sleeping: Sleeping | None) -> None:
+    def step(self, camera: MiniCam, sleeping: Sleeping | None) -> None:
         """Take the step of a view."""
         drawn = draw(camera, self._gaussians, self._pipe, self._background, sleeping=sleeping)
         image = drawn.image.requires_grad_()
@@ -63,14 +114,14 @@ class Ring:
         drawn.step(self._adam, image.grad, None, True)
         self.radii = drawn.radii
 
-    def run(self, views: list[SimpleNamespace], sleeps: bool) -> None:
+    def run(self, views: list[MiniCam], sleeps: bool) -> None:
         """Take the steps of all views, and let all blocks rest as trainings do."""
         for taken, view in enumerate(views, 1):
             self.step(view, self._sleeping if sleeps else None)
             if sleeps and taken % REST == 0:
                 self._sleeping.rest()
 
-    def milliseconds(self, views: list[SimpleNamespace], sleeps: bool) -> float:
+    def milliseconds(self, views: list[MiniCam], sleeps: bool) -> float:
         """Return the milliseconds of a step: on a GPU those of its kernels."""
         self._sleeping.reset()
         self.run(views, sleeps)  # warms up
@@ -80,7 +131,7 @@ class Ring:
         self.run(views, sleeps)
         return 1e3 * (time.perf_counter() - start) / len(views)
 
-    def shares(self, views: list[SimpleNamespace]) -> tuple[float, float]:
+    def shares(self, views: list[MiniCam]) -> tuple[float, float]:
         """Return the mean share of the Gaussians that a view sees, and of those that are awake."""
         seen, awake = [], []
         self._sleeping.reset()
@@ -91,16 +142,10 @@ class Ring:
         return sum(seen) / len(seen), sum(awake) / len(awake)
 
 
-def _camera(settings: object) -> SimpleNamespace:
-    return SimpleNamespace(
-        image_height=settings.image_height,
-        image_width=settings.image_width,
-        FoVx=2 * math.atan(settings.tanfovx),
-        FoVy=2 * math.atan(settings.tanfovy),
-        world_view_transform=settings.viewmatrix,
-        full_proj_transform=settings.projmatrix,
-        camera_center=settings.campos,
-    )
+def _camera(settings: GaussianRasterizationSettings) -> MiniCam:
+    angles = (2 * math.atan(tangent) for tangent in (settings.tanfovy, settings.tanfovx))
+    matrices = settings.viewmatrix, settings.projmatrix
+    return MiniCam(settings.image_width, settings.image_height, *angles, ZNEAR, ZFAR, *matrices)
 
 
 def measure(device: str, size: tuple[int, int, int], views: int) -> list[list[str]]:

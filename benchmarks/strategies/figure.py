@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.harness.measuring import require_matplotlib
 from benchmarks.strategies.tables import BUDGET, DEFAULT, at, joined
 from utils.system_utils import UserError, atomic_write, run_cli
 
@@ -25,7 +24,6 @@ _COLORS = {"adc": "tab:blue", "budget": "black", "mcmc": "tab:red"}  # of time b
 
 def draw(found: dict, path: Path, left_out: Sequence[str] = ()) -> None:
     """Draw the records of `benchmarks.strategies.tables.joined`. left_out: names of sets."""
-    require_matplotlib()
     from matplotlib import colormaps
     from matplotlib.figure import Figure
 

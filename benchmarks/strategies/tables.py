@@ -12,6 +12,8 @@ import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from splatting.files.listing import markdown_table
 from utils.system_utils import UserError, run_cli
 
@@ -114,16 +116,8 @@ def at(curve: Sequence[dict], seconds: float) -> float:
 
     Only points that score all test views count. Before the first one it is minus infinity.
     """
-    rows = [row for row in curve if row["whole"]]
-    before = [row for row in rows if row["seconds"] <= seconds]
-    after = [row for row in rows if row["seconds"] > seconds]
-    if not before:
-        return -math.inf
-    if not after:
-        return before[-1]["test_psnr"]
-    one, two = before[-1], after[0]
-    part = (seconds - one["seconds"]) / (two["seconds"] - one["seconds"])
-    return one["test_psnr"] + part * (two["test_psnr"] - one["test_psnr"])
+    points = [(row["seconds"], row["test_psnr"]) for row in curve if row["whole"]]
+    return float(np.interp(seconds, *zip(*points, strict=True), left=-math.inf)) if points else -math.inf
 
 
 def joined(files: Sequence[dict]) -> dict:

@@ -24,11 +24,10 @@ from queue import Queue
 from tqdm import tqdm
 
 from benchmarks.harness.measuring import describe
-from benchmarks.strategies.tables import print_tables
+from benchmarks.strategies.tables import DEFAULT, print_tables
 from utils.system_utils import UserError, atomic_write, compute_device, run_cli
 
 ROOT = Path(__file__).resolve().parents[2]
-DEFAULT = "adc"
 _PART = re.compile(r"([0-9.]+)% of (gaussians|seconds)")
 _KEPT = ["iteration", "seconds", "gaussians", "test_psnr", "train_psnr", "test_ssim"]
 

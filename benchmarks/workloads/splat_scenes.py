@@ -10,6 +10,7 @@ from torch import Tensor
 from scene.gaussians.morton import morton_codes
 
 PARAMETERS = ("means", "opacities", "scales", "rotations", "sh_dc", "sh_rest")
+_COLUMNS = ("xyz", "opacity", "scaling", "rotation", "f_dc", "f_rest")  # of a model, in the same order
 FOV = math.radians(60)
 # Arguments of `frustum`: splats, width, height, median pixel sigma.
 GPU_WORKLOADS = {
@@ -25,6 +26,11 @@ CPU_WORKLOADS = {
     "L": (300_000, 800, 800, 1.7),
     "wide": (5_000, 400, 400, 8.0),
 }
+
+
+def model_rows(parameters: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Return parameters by the names of a model's columns."""
+    return {column: parameters[name] for column, name in zip(_COLUMNS, PARAMETERS, strict=True)}
 
 
 @dataclass

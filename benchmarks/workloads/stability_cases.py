@@ -141,7 +141,7 @@ def axes(n: int, *sigma: float) -> Tensor:
     return torch.tensor(sigma, dtype=torch.float64).expand(n, 3)
 
 
-# ---- bounds that many cases share ----
+# ---- bounds ----
 
 PLAIN = Bound(5e-6, 1e-5, "sums of some 50 terms, each rounded a few times; the case itself adds no error")
 STEEP = Bound(
@@ -152,6 +152,13 @@ LONGEST = Bound(1e-2, 6e-2, "as above, a hundred times longer; parts thinner tha
 GIVEN = Bound(
     2e-2, 4e-2, "float32 covariances hold no needle: rounding moves short axes by 0.06 px^2; negative ones count as 0"
 )
+ELSEWHERE = Bound(
+    5e-6, 1e-5, "differences of coordinates are exact while the camera is not turned; one rounding is the image"
+)
+STACKED = Bound(5e-6, 5e-6, "some 2,300 blends, each rounding T once; back to front nothing is subtracted")
+LARGE = Bound(6e-5, 1e-4, "pixel coordinates of 16,384 have steps of 1e-3")
+TELE = Bound(1e-1, 2e-1, "a focal length of 4e6 px: one rounding of a rotation or a mean is 0.3 px")
+OBLIQUE = Bound(1e-5, 3e-5, "rays of 100 to the axis: a rounding of z counts a hundredfold")
 NOTHING = Bound(1e-7, 0, "the background, rounded to float32")
 ABSENT = Bound(5e-6, 0, "as if the Gaussian were not there")
 
@@ -328,15 +335,7 @@ PLACE = [
     Case("place", "at the near plane", at_depths(0.19999, *NEAR, 0.20001, 0.201, 0.25), PLAIN),
     Case("place", "behind, on and around the camera", in_the_dark, ABSENT),
     Case("place", "1e7 units away", at_depths(1e5, 1e6, 1e7), PLAIN),
-    Case(
-        "place",
-        "1e6 units from the origin",
-        far_from_the_origin,
-        Bound(
-            5e-6, 1e-5, "differences of coordinates are exact while the camera is not turned; one rounding is the image"
-        ),
-        double=1e-8,
-    ),
+    Case("place", "1e6 units from the origin", far_from_the_origin, ELSEWHERE, double=1e-8),
     Case("place", "at the limit of the Jacobian's ray", at_the_clamp, PLAIN),
     Case("place", "3 to 1,000 half images aside", at_rays(3, 1e3, (1, 4), 0.5), PLAIN),
     Case("place", "beside and above the camera", at_rays(20, 200, (0.2001, 0.22), 0.5), PLAIN),
@@ -396,12 +395,7 @@ OPACITY = [
     Case("opacity", "infinite logits", with_logits(torch.tensor([math.inf, -math.inf, math.inf, -math.inf])), PLAIN),
     Case("opacity", "alpha 0.99 within ulps", at_alpha(0.99), PLAIN),
     Case("opacity", "alpha 1/255 within ulps", at_alpha(1 / 255), PLAIN),
-    Case(
-        "opacity",
-        "50,000 splats on one pixel",
-        one_pixel_stack,
-        Bound(5e-6, 5e-6, "some 2,300 blends, each rounding T once; back to front nothing is subtracted"),
-    ),
+    Case("opacity", "50,000 splats on one pixel", one_pixel_stack, STACKED),
     Case("opacity", "transmittance down to the stop", many_opaque, PLAIN),
     Case("opacity", "depth ties", lambda g: tied(g, False), PLAIN, cut=0.0),
     Case("opacity", "equal splats", lambda g: tied(g, True), PLAIN, cut=0.0),
@@ -460,28 +454,14 @@ def seen_by(n: int, cam: GaussianRasterizationSettings, sigma: float = 3.0) -> C
 NARROW, WIDE = math.radians(1e-3), math.radians(179)
 CAMERA = [
     Case("camera", "one pixel", seen_by(40, camera(1, 1)), PLAIN),
-    Case(
-        "camera",
-        "16,384 x 5 px",
-        seen_by(20, camera(16384, 5), sigma=20),
-        Bound(6e-5, 1e-4, "pixel coordinates of 16,384 have steps of 1e-3"),
-    ),
+    Case("camera", "16,384 x 5 px", seen_by(20, camera(16384, 5), sigma=20), LARGE),
     Case("camera", "17 x 31 px", seen_by(60, camera(17, 31)), PLAIN),
     Case("camera", "field of view 0.001 degrees", seen_by(60, camera(fov=NARROW)), PLAIN),
     Case(
-        "camera",
-        "field of view 0.001 degrees, turned",
-        seen_by(60, camera(fov=NARROW, view=TURNED)),
-        Bound(1e-1, 2e-1, "a focal length of 4e6 px: one rounding of a rotation or a mean is 0.3 px"),
-        double=1e-9,
+        "camera", "field of view 0.001 degrees, turned", seen_by(60, camera(fov=NARROW, view=TURNED)), TELE, double=1e-9
     ),
     Case("camera", "field of view 179 degrees", seen_by(60, camera(fov=WIDE)), PLAIN),
-    Case(
-        "camera",
-        "field of view 179 degrees, turned",
-        seen_by(60, camera(fov=WIDE, view=TURNED)),
-        Bound(1e-5, 3e-5, "rays of 100 to the axis: a rounding of z counts a hundredfold"),
-    ),
+    Case("camera", "field of view 179 degrees, turned", seen_by(60, camera(fov=WIDE, view=TURNED)), OBLIQUE),
     Case("camera", "principal point outside", seen_by(60, camera(principal=(3.0, -2.0))), PLAIN),
     Case("camera", "focal lengths 100 : 1", seen_by(60, camera(tan_ratio=100)), PLAIN),
     Case("camera", "focal lengths 1 : 100", seen_by(60, camera(tan_ratio=0.01)), PLAIN),

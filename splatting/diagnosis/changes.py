@@ -17,8 +17,7 @@ from scene.gaussians.attributes import Rows
 from scene.readers.point_cloud import read_point_cloud
 from scene.scene import Scene
 from splatting.diagnosis import Line
-from splatting.evaluation.error_curve import NAME as CURVE
-from splatting.evaluation.error_curve import read_curve
+from splatting.evaluation.model_folder import curve_of
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
 from utils.general_utils import build_rotation
@@ -45,8 +44,7 @@ class Change(NamedTuple):
 def recorded_psnr(model: Path, iteration: int) -> float | None:
     """PSNR of training views that training recorded at an iteration, in its curve or log; None if in neither."""
     try:
-        rows = read_curve(model / CURVE) if (model / CURVE).is_file() else []
-        rows = [*rows, *read_log(model / LOG)]
+        rows = [*curve_of(model), *read_log(model / LOG)]
     except UserError:
         return None
     found = (row.get("train_psnr") for row in rows if row["iteration"] == iteration)

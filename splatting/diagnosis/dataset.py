@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
-from scene.readers.info import APART, standing_apart
+from scene.readers.info import APART, camera_centers, standing_apart
 from splatting.diagnosis import Line, from_error
 from splatting.files.json_files import read_json
 from splatting.files.listing import some
@@ -61,7 +61,7 @@ def check_views(cameras: list[CameraInfo]) -> Iterator[Line]:
 
 def check_extent(info: SceneInfo) -> Iterator[Line]:
     """Scale of the scene, and cameras far away from the others."""
-    centers = _centers(info)
+    centers = camera_centers(info.train_cameras)
     low, high = EXTENT
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
     if len(centers) > 1 and spread < 1e-3 * info.extent:
@@ -77,10 +77,6 @@ def check_extent(info: SceneInfo) -> Iterator[Line]:
     if far:
         text = f"{len(far)} cameras are more than {APART:g} times as far out as usual ({some(far)})"
         yield Line(text, "remove them from the model, as their poses are likely wrong; the extent leaves them out")
-
-
-def _centers(info: SceneInfo) -> np.ndarray:
-    return np.array([camera.center for camera in info.train_cameras])
 
 
 def check_lenses(cameras: list[CameraInfo]) -> Iterator[Line]:
@@ -104,11 +100,12 @@ def check_cloud(info: SceneInfo) -> Iterator[Line]:
         yield Line(text)
     if not len(points):
         return
-    far = np.linalg.norm(points - _centers(info).mean(axis=0), axis=1) > FAR_POINT * info.extent
+    far = np.linalg.norm(points - camera_centers(info.train_cameras).mean(axis=0), axis=1) > FAR_POINT * info.extent
     if far.mean() > FAR_SHARE:
         text = f"{far.mean():.1%} of the points are more than {FAR_POINT:g} extents away"
         yield Line(text, "remove them from the cloud (COLMAP: filter by reprojection error and angle)")
-    seen = points_in_views(info.train_cameras, points[:: max(1, len(points) // _SAMPLE)])
+    sample = points[:: max(1, len(points) // _SAMPLE)]
+    seen = np.array([_projected(camera, sample)[2] for camera in info.train_cameras])
     unseen = float((~seen.any(axis=0)).mean())
     counts = seen.sum(axis=1) * len(points) / seen.shape[1]
     away = [c.image_name for c, n in zip(info.train_cameras, counts, strict=True) if n < FEWEST_IN_VIEW]
@@ -118,14 +115,6 @@ def check_cloud(info: SceneInfo) -> Iterator[Line]:
     elif away:
         text = f"{len(away)} cameras have hardly any point in view ({some(away)})"
         yield Line(text, "remove them from the model: they face away from the scene, or their poses are wrong")
-
-
-def points_in_views(cameras: list[CameraInfo], points: np.ndarray) -> np.ndarray:
-    """Whether points (N,3) lie in front of each camera and inside its photo: (cameras, N) bool."""
-    seen = np.zeros((len(cameras), len(points)), dtype=bool)
-    for row, camera in zip(seen, cameras, strict=True):
-        row[:] = _projected(camera, points)[2]
-    return seen
 
 
 def _projected(camera: CameraInfo, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

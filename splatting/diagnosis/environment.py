@@ -16,11 +16,7 @@ from pathlib import Path
 from splatting.diagnosis import Line
 
 ROOT = Path(__file__).resolve().parents[2]
-EXTENSIONS = {  # folder and distribution: package
-    "diff-gaussian-rasterization": "diff_gaussian_rasterization",
-    "fused-ssim": "fused_ssim",
-    "simple-knn": "simple_knn",
-}
+EXTENSIONS = ("diff-gaussian-rasterization", "fused-ssim", "simple-knn")  # folders and distributions of packages
 WHOLE = "gaussian-splatting"  # the distribution of all three
 _INSTALL = "pip install -r requirements.txt"
 # Largest difference of the rasterizer in float32 from its oracle on one splat: rounding of some dozen operations.
@@ -40,7 +36,7 @@ def check_build() -> list[Line]:
     """torch and its CUDA, the extensions and their versions; torch must be installed."""
     import torch
 
-    lines = [_check_gpu(torch), *(_check_extension(name, package) for name, package in EXTENSIONS.items())]
+    lines = [_check_gpu(torch), *map(_check_extension, EXTENSIONS)]
     return [*lines, _check_rasterizer(torch)] if extensions_load() else lines
 
 
@@ -48,11 +44,15 @@ def extensions_load() -> bool:
     """Whether all three extensions can be imported, and are those of this code."""
     try:
         importlib.import_module("splatting.host.extensions")
-        for package in EXTENSIONS.values():
-            importlib.import_module(package)
+        for name in EXTENSIONS:
+            importlib.import_module(_package(name))
     except ImportError:
         return False
     return True
+
+
+def _package(extension: str) -> str:
+    return extension.replace("-", "_")
 
 
 def _required() -> list[str]:
@@ -96,14 +96,15 @@ def _nvidia_gpu() -> str:
     return done.stdout.split("(UUID")[0].strip() if done.returncode == 0 else ""
 
 
-def _check_extension(name: str, package: str) -> Line:
+def _check_extension(name: str) -> Line:
+    package = _package(name)
     extension, again = f"the extension {name}", f"run `pip install ./submodules/{name}`"
     installed = _version(name) or _version(WHOLE)
     if installed is None:
         return Line(f"{extension} is not installed", again)
-    wanted = (ROOT / "version.txt").read_text(encoding="utf-8").strip()
-    if installed.partition("+")[0] != wanted:
-        return Line(f"{extension} is version {installed}, but this code is {wanted}", again)
+    expected = (ROOT / "version.txt").read_text(encoding="utf-8").strip()
+    if installed.partition("+")[0] != expected:
+        return Line(f"{extension} is version {installed}, but this code is {expected}", again)
     try:
         folder = Path(importlib.import_module(package).__file__).parent
     except ImportError as error:

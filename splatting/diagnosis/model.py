@@ -21,8 +21,7 @@ from splatting.diagnosis import Line, from_error
 from splatting.diagnosis.changes import FITS as BAD_PSNR
 from splatting.diagnosis.changes import LOST, NEAR, recorded_psnr, what_changed
 from splatting.diagnosis.dataset import check_dataset
-from splatting.evaluation.error_curve import NAME as CURVE
-from splatting.evaluation.error_curve import read_curve
+from splatting.evaluation.model_folder import curve_of
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
 from splatting.evaluation.what_to_try import what_to_try
@@ -80,11 +79,10 @@ def check_model(model_path: str, iteration: int, source: str | None = None, imag
 def check_training(model: Path) -> list[Line]:
     """Notes on what the log and the curve of the training suggest to try; none where it has written none."""
     try:
-        rows = read_curve(model / CURVE) if (model / CURVE).is_file() else []
-        records = read_log(model / LOG)
+        said = what_to_try(curve_of(model), read_log(model / LOG))
     except UserError as error:
         return [from_error(error)]
-    return [Line(sentence, note=True) for sentence in what_to_try(rows, records)]
+    return [Line(sentence, note=True) for sentence in said]
 
 
 def _load(model_path: str, stored: dict[str, Any], iteration: int) -> tuple[argparse.Namespace, Scene]:

@@ -128,24 +128,29 @@ def stand_apart(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """
     scenes, sets, marked = grouped(runs, "scene"), grouped(runs, "scene", "config"), []
     for run in runs:
-        known = Counter(filter(None, (other["ground_truth_sha256"] for other in scenes[run["scene"]])))
+        there = scenes[run["scene"]]
+        known = Counter(filter(None, (other["ground_truth_sha256"] for other in there)))
+        counts = max(known, key=known.__getitem__, default=None)
         seeds = {other["ground_truth_sha256"] for other in sets[run["scene"], run["config"]]}
-        marked.append({**run, "apart": len(known) > 1 and seeds != {max(known, key=known.__getitem__)}})
-    return [{**run, "why_apart": _why(run, marked) if run["apart"] else None} for run in marked]
+        apart = len(known) > 1 and seeds != {counts}
+        like = next(other for other in there if other["ground_truth_sha256"] == counts)
+        marked.append({**run, "apart": apart, "why_apart": _why(run, seeds, like) if apart else None})
+    return marked
 
 
-def _why(run: Run, runs: Sequence[Run]) -> str:
-    """Return in what a run's test views differ from those of the comparable runs of its scene, as far as is known."""
+def _why(run: Run, seeds: set[str | None], like: Run) -> str:
+    """Return in what a run's test views differ from those of the ground truth that counts, as far as is known.
+
+    seeds: ground truths of the run's option set. like: a run with the ground truth that counts.
+    """
     if run["ground_truth_sha256"] is None:
         return "its ground truth is not known"
-    members = [other for other in runs if other["scene"] == run["scene"]]
-    if len({other["ground_truth_sha256"] for other in members if other["config"] == run["config"]}) > 1:
+    if len(seeds) > 1:
         return "its seeds were scored on different ground truth"
-    pair = run, next(other for other in members if not other["apart"])
     (size, other_size), (count, other_count), (words, other_words) = (
-        (" ".join(f"{w}x{h}" for w, h in one["test_sizes"]) for one in pair),
-        (one["views"]["test"] for one in pair),
-        (" ".join(filter(_decides, with_values(one["options"] or ()))) or "the defaults" for one in pair),
+        (" ".join(f"{w}x{h}" for w, h in one["test_sizes"]) for one in (run, like)),
+        (one["views"]["test"] for one in (run, like)),
+        (" ".join(filter(_decides, with_values(one["options"] or ()))) or "the defaults" for one in (run, like)),
     )
     reasons = [f"its test views have {size} pixels, the others' {other_size}"] if size != other_size else []
     reasons += [f"it has {count} test views, the others {other_count}"] if count != other_count else []
@@ -344,11 +349,11 @@ def compare(
     return compared
 
 
-def _meets(run: dict[str, Any], wanted: dict[str, Any]) -> bool:
+def _meets(run: dict[str, Any], required: dict[str, Any]) -> bool:
     return (
-        run["test_sizes"] == wanted.get("test_sizes", run["test_sizes"])
-        and run["views"]["test"] == wanted.get("test_views", run["views"]["test"])
-        and set(wanted.get("options", ())) <= set(run["options"] or ())
+        run["test_sizes"] == required.get("test_sizes", run["test_sizes"])
+        and run["views"]["test"] == required.get("test_views", run["views"]["test"])
+        and set(required.get("options", ())) <= set(run["options"] or ())
     )
 
 

@@ -1,4 +1,4 @@
-"""Readers of a model folder: number of Gaussians, log, scores."""
+"""Readers of a model folder: number of Gaussians, curve, log, scores."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from arguments.stored import read_model_json, read_stored_options
+from splatting.evaluation.error_curve import NAME as CURVE
+from splatting.evaluation.error_curve import Row, read_curve
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
-from splatting.evaluation.what_to_try import schedules_follow_length
 from splatting.files.json_files import read_json
 from splatting.files.plain_files import plain
 from utils.system_utils import UserError, saved_iterations
@@ -64,9 +65,9 @@ def shorter_ends_there(model: Path) -> bool:
         options = read_stored_options(model)
     except UserError:
         return False
-    return not schedules_follow_length(
-        bool(options.get("depths")), bool(options.get("train_test_exp")), options.get("resolution_schedule", "none")
-    )
+    # These schedules follow --iterations: the depth loss's weight, the exposures' learning rate, the views' sizes.
+    pyramid = options.get("resolution_schedule", "none") != "none"
+    return not (options.get("depths") or options.get("train_test_exp") or pyramid)
 
 
 def load_scores(model: Path, method: str) -> tuple[dict[str, float | None], dict[str, dict[str, float | None]]]:
@@ -80,6 +81,11 @@ def load_scores(model: Path, method: str) -> tuple[dict[str, float | None], dict
     except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:
         raise UserError(f"{model} has no scores of {method}; run render.py and metrics.py -m {model} first") from error
     return results, per_view
+
+
+def curve_of(model: Path) -> list[Row]:
+    """Read the points of the training's curve; none if it has none. UserError if the file is damaged."""
+    return read_curve(model / CURVE) if (model / CURVE).is_file() else []
 
 
 def training_seconds(model: Path, iteration: int) -> float | None:

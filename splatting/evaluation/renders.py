@@ -82,7 +82,7 @@ def _opened(file: Path, read: Callable[[Image.Image], Any]) -> Any:
         with open_render(file) as image:
             return read(image)
     except UNREADABLE as error:
-        raise UserError(f"{file} is missing or damaged; run render.py and metrics.py again") from error
+        raise UserError(f"{file} is missing or damaged ({error}); run render.py again") from error
 
 
 def view_names(folder: Path) -> list[str]:
@@ -90,8 +90,8 @@ def view_names(folder: Path) -> list[str]:
     return sorted(file.name for file in folder.glob("*.png") if not file.name.startswith("."))
 
 
-def _mask(method: Path, name: str) -> np.ndarray | None:
-    """Read which pixels of a view count for metrics.py, (H, W) bool; None: all. method: the folder `ours_N`."""
+def mask_of(method: Path, name: str) -> np.ndarray | None:
+    """Read which pixels of a view count, (H, W) bool; None: all. method: the folder `ours_N`."""
     file = method / "masks" / name
     return np.asarray(image_of(file))[..., 0] > 0 if file.is_file() else None
 
@@ -106,7 +106,7 @@ def ground_truth_digest(method: Path) -> str:
         image = image_of(method / "gt" / name)
         digest.update(f"{image.width}x{image.height}".encode())
         digest.update(np.asarray(image).tobytes())
-        if (mask := _mask(method, name)) is not None:
+        if (mask := mask_of(method, name)) is not None:
             digest.update(b"mask")
             digest.update(mask.tobytes())
     return digest.hexdigest()
@@ -131,10 +131,10 @@ def error_image(truth: Image.Image, render: Image.Image) -> Image.Image:
     return Image.fromarray(np.minimum(difference * GAIN, 255).astype(np.uint8))
 
 
-def contact_sheet(views: Sequence[tuple[str, Image.Image, Image.Image]], widest: int | None = None) -> Image.Image:
-    """Draw a row for each view (label, ground truth, render), with the error. widest: as for `sheet`."""
+def contact_sheet(views: Sequence[tuple[str, Image.Image, Image.Image]]) -> Image.Image:
+    """Draw a row for each view (label, ground truth, render), with the error."""
     rows = [[(label, truth), ("", render), ("", error_image(truth, render))] for label, truth, render in views]
-    return sheet(("ground truth", "render", f"error x {GAIN}"), rows, widest)
+    return sheet(("ground truth", "render", f"error x {GAIN}"), rows)
 
 
 def sheet(
@@ -205,7 +205,9 @@ class ComparedViews:
         return {"name": self._photo_name(file), "photo": _jpeg(photo), "sets": sets}
 
     def draw_worst(self, path: Path) -> None:
-        """Draw the worst views on a sheet; with one run, with their errors."""
+        """Draw the worst views on a sheet; with one run, with their errors. UserError if there is none."""
+        if not self.files:
+            raise UserError("no view has a PSNR of each option set")
         rows = []
         for file in self.files[:WORST]:
             photo, renders = self._images(file)
@@ -221,7 +223,7 @@ class ComparedViews:
 def _pair(run: dict[str, Any], output: Path, name: str) -> list[Image.Image]:
     """Read ground truth and render of a view, RGB, white where pixels do not count."""
     method = output / run["model"] / "test" / f"ours_{run['final_iteration']}"
-    pair, mask = [image_of(method / side / name) for side in ("gt", "renders")], _mask(method, name)
+    pair, mask = [image_of(method / side / name) for side in ("gt", "renders")], mask_of(method, name)
     if mask is None:
         return pair
     return [Image.fromarray(np.where(mask[..., None], np.asarray(image), np.uint8(255))) for image in pair]

@@ -11,8 +11,7 @@ from typing import Any
 from scene.readers.info import HOLD
 from splatting.evaluation import model_folder as folder_of
 from splatting.evaluation.comparison import SCORES
-from splatting.evaluation.error_curve import NAME as CURVE
-from splatting.evaluation.error_curve import Row, read_curve
+from splatting.evaluation.error_curve import Row
 from splatting.evaluation.plan import Record, Run, SceneEntry, is_model
 from splatting.evaluation.renders import TIMES, WORST, image_size, photo_namer, view_names
 from splatting.evaluation.stages import Failure, page_file
@@ -80,10 +79,8 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
 
 
 def _curve(model: Path) -> list[Row]:
-    if not (model / CURVE).is_file():
-        return []
     try:
-        return read_curve(model / CURVE)
+        return folder_of.curve_of(model)
     except UserError as error:
         print(f"warning: {error}", file=sys.stderr)
         return []

@@ -44,7 +44,7 @@ def train(run: Run, machine: dict[str, Any]) -> None:
     """Train, unless the training is finished. Resume only from a checkpoint that an interrupt left.
 
     A checkpoint of a training that failed may hold half a densification, and would fail again with the same options, so
-    training then starts from the beginning. `runs.check_folders` has made sure that nothing in the model folder was
+    training then starts from the beginning. `plan.check_folders` has made sure that nothing in the model folder was
     made with other options.
     """
     if (source := run.scene.source) is None or not source.is_dir():
@@ -133,15 +133,15 @@ def _source(run: Run) -> tuple[str, ...]:
 
 
 def _once(
-    record: Record, name: str, say: str, command: list[str], wanted: dict[str, Any],
+    record: Record, name: str, say: str, command: list[str], requested: dict[str, Any],
     found: Callable[[], dict[str, Any] | None], also: Callable[[], dict[str, Any]] = dict, **environment: str,
 ) -> None:  # fmt: skip
-    """Run a command, unless its stage is noted as done with what is wanted and what is found.
+    """Run a command, unless its stage is noted as done with what is requested and what is found.
 
     found: tells of the stage's files, None where they are missing; also: what is noted besides.
     """
     noted, there = record.stage(name), found()
-    if noted and there is not None and {key: noted.get(key) for key in wanted | there} == wanted | there:
+    if noted and there is not None and {key: noted.get(key) for key in requested | there} == requested | there:
         return
     _say(say)
     done, stage = run_child(command, **environment), name.partition("_")[0]
@@ -149,7 +149,7 @@ def _once(
     there = found()
     if there is None:
         raise StageFailed(Failure(stage, command, ["the scene has no test views, so there is nothing to score"]))
-    record.note(name, **wanted, **there, **also(), wall_seconds=round(done.wall_seconds, 3))
+    record.note(name, **requested, **there, **also(), wall_seconds=round(done.wall_seconds, 3))
     _stop_if_asked(done)
 
 
@@ -161,9 +161,11 @@ def render(run: Run, options: Sequence[str]) -> None:
     for iteration in _saved(run, "render"):
         command = _script("render.py", "-m", str(run.model), *_source(run), "--iteration", str(iteration))
         command += ["--skip_train", "--eval", "--quiet", *options]
-        wanted = {"model": _stamp(ply_file(run.model, iteration)), "options": list(options)}
+        requested = {"model": _stamp(ply_file(run.model, iteration)), "options": list(options)}
         say = f"rendering iteration {iteration}"
-        _once(Record(run.model), f"render_{iteration}", say, command, wanted, partial(_rendered, run.model, iteration))
+        _once(
+            Record(run.model), f"render_{iteration}", say, command, requested, partial(_rendered, run.model, iteration)
+        )
 
 
 def _stamp(file: Path) -> list[int]:
@@ -218,9 +220,9 @@ def page(run: Run, output: Path, options: Sequence[str]) -> None:
     mkdir_p(file.parent)
     command = _script("export.py", "-m", str(run.model), *_source(run), "--iteration", str(last))
     command += ["--to", str(file), *options]
-    wanted = {"model": _stamp(ply_file(run.model, last)), "options": list(options)}
+    requested = {"model": _stamp(ply_file(run.model, last)), "options": list(options)}
     say = "writing the model as a page"
-    _once(Record(run.model), "html", say, command, wanted, lambda: {} if file.is_file() else None)
+    _once(Record(run.model), "html", say, command, requested, lambda: {} if file.is_file() else None)
 
 
 def _scored(model: Path, methods: Sequence[str]) -> bool:

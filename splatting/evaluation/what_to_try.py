@@ -117,16 +117,6 @@ def _late(rows: Sequence[Row], scored: Sequence[Row]) -> str | None:
     return _LATE.format(last=last, all=end["seconds"], change=change, slower=slower, at=middle["iteration"])
 
 
-def schedules_follow_length(
-    depths: bool, train_test_exp: bool, resolution_schedule: str = "none", rates: bool = False
-) -> bool:
-    """Whether a schedule follows --iterations: depth loss's weight, exposures' learning rate, or views' sizes.
-
-    rates: whether the other learning rates do.
-    """
-    return depths or train_test_exp or resolution_schedule != "none" or rates
-
-
 def peak(rows: Sequence[Row]) -> tuple[Row, float] | None:
     """The whole-set row with the best test views, and how much PSNR was lost since; None if that is not CLEAR."""
     rows = whole_sets(rows)
