@@ -58,6 +58,24 @@ class Served:
         servers.stop(self.server)
 
 
+def _set(client: Client, handle: object, value: object) -> None:
+    client.send("GuiUpdateMessage", uuid=handle._impl.uuid, updates={"value": value})
+
+
+def _button(page: Page, label: str) -> object:
+    return next(h for h in page.server.gui._gui_input_handle_from_uuid.values() if getattr(h, "label", "") == label)
+
+
+@contextlib.contextmanager
+def _restored(page: Page):
+    """The page, whose controls get their values back."""
+    controls = page.server.gui._gui_input_handle_from_uuid.values()
+    before = [(handle, handle.value) for handle in controls if not handle._impl.is_button]
+    yield
+    for handle, value in before:
+        handle.value = value
+
+
 @pytest.fixture(scope="module")
 def local():
     with Served() as served:
@@ -85,11 +103,9 @@ def test_the_page_is_served_and_may_ask_nobody_else(local):
 @pytest.mark.parametrize(
     "path",
     [
-        "/../../etc/passwd", "/..%2f..%2f..%2f..%2f..%2f..%2fetc/passwd", "/%2e%2e/%2e%2e/%2e%2e/%2e%2e/etc/passwd",
-        "//etc/passwd", "/%2fetc%2fpasswd", "/..\\..\\etc\\passwd", "/%2e%2e%5c%2e%2e%5cetc%5cpasswd",
-        "/....//....//etc/passwd", "/%252e%252e/etc/passwd", "/./.././../etc/passwd", "/etc/passwd%00", "/\x00",
-        "http://127.0.0.1/../../etc/passwd", "/index.html/../../../_viser.py", "/assets/../../../_viser.py",
-        "/index.html%00.png", "/?../../etc/passwd=1",
+        "/../../etc/passwd", "/..%2f..%2f..%2fetc/passwd", "/%2e%2e/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd",
+        "/..\\..\\etc\\passwd", "/%252e%252e/etc/passwd", "/etc/passwd%00", "http://127.0.0.1/../../etc/passwd",
+        "/assets/../../../_viser.py",
     ],
 )  # fmt: skip
 def test_no_request_reads_a_file_but_the_page(local, path):
@@ -259,34 +275,22 @@ def test_what_is_no_message_is_not_heard_and_what_only_shows_something_takes_no_
     assert not is_accepted(message, lambda uuid: SimpleNamespace(value="a", disabled=True))
 
 
-def _attack(client: Client, uuid: str) -> None:
-    """All that once made viser's controls raise in the thread that trains, and a wish for a tunnel to the outside."""
-    for update in ({"update_cb": [5]}, {"sync_cb": 5}, {"gui_api": 5}, {"removed": True}, {"uuid": 5}):
-        client.send("GuiUpdateMessage", uuid=uuid, updates=update)
-    client.send(
-        "FileTransferStartUpload",
-        source_component_uuid=uuid, transfer_uuid="t", filename="f", mime_type="m", part_count=1, size_bytes=3,
-    )  # fmt: skip
-    client.send("FileTransferPart", source_component_uuid=uuid, transfer_uuid="t", part_index=0, content=b"abc")
-    client.send("ShareUrlRequest")
-
-
 def test_no_message_takes_a_control_from_the_program_or_opens_a_tunnel(local, monkeypatch, capfd):
     opened = []
     monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *_: opened.append(1))
-    heard = local.server.gui.add_checkbox("heard", False)
-    shown, field = local.server.gui.add_text("Iteration", "0", disabled=True), local.server.gui.add_number("n", 1.0)
+    heard, shown = local.server.gui.add_checkbox("heard", False), local.server.gui.add_text("n", "0", disabled=True)
     with Client(local.url) as client:
         client.look()
-        for handle in (shown, field):
-            _attack(client, handle._impl.uuid)
+        for update in ({"update_cb": [5]}, {"sync_cb": 5}, {"gui_api": 5}, {"removed": True}, {"uuid": 5}):
+            client.send("GuiUpdateMessage", uuid=shown._impl.uuid, updates=update)
+        client.send("ShareUrlRequest")
         client._socket.send("text")
         client._socket.send(b"\xff")
         client.look((0.0, 0.0))
-        client.send("GuiUpdateMessage", uuid=heard._impl.uuid, updates={"value": True})
+        _set(client, heard, True)
         wait_for(lambda: heard.value)
-    shown.value, field.value = "17", 2.0
-    assert (shown.value, field.value) == ("17", 2.0) and not opened
+    shown.value = "17"
+    assert shown.value == "17" and not opened
     said = capfd.readouterr()
     assert "Traceback" not in said.err and "warn" not in said.err.lower()
 
@@ -300,31 +304,15 @@ def test_a_long_message_ends_its_connection(local):
                 one.recv(LIMIT)
 
 
-def test_many_connections_leave_the_process_its_files(local, monkeypatch):
-    """Each takes a file descriptor, also one that asks for nothing; a training without one cannot save."""
-    monkeypatch.setattr(auth, "MOST", 4)
-    taken = [socket.create_connection(("127.0.0.1", local.port), LIMIT) for _ in range(12)]
-    wait_for(lambda: len(select.select(taken, [], [], 0)[0]) >= 8)  # nothing but an end can have come
-    ended = select.select(taken, [], [], 0)[0]
-    for one in taken:
-        if one not in ended:
-            one.sendall(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{local.port}\r\n\r\n".encode())
-    answers = [one.recv(12) for one in taken if one not in ended]
-    assert 1 <= answers.count(b"HTTP/1.1 200") == len(answers) <= 4  # one of an earlier test may still be there
-    for one in taken:
-        one.close()
-    wait_for(lambda: get(local.port)[0] == 200)
-
-
-def test_who_asks_for_nothing_does_not_keep_others_out(local, monkeypatch):
-    """The oldest goes that has said nothing, then the oldest that waits for an answer; an open page stays."""
+def test_many_connections_leave_the_process_its_files_and_others_their_answers(local, monkeypatch):
+    """Each takes a file descriptor, and a training without one cannot save. An open page stays."""
     monkeypatch.setattr(auth, "MOST", 4)
     with Client(local.url) as page:
         page.look()
-        silent = [socket.create_connection(("127.0.0.1", local.port), LIMIT) for _ in range(10)]
+        silent = [socket.create_connection(("127.0.0.1", local.port), LIMIT) for _ in range(12)]
+        wait_for(lambda: len(select.select(silent, [], [], 0)[0]) >= 9)  # nothing but an end can have come
         for _ in range(5):
             assert get(local.port)[0] == 200
-        wait_for(lambda: len(select.select(silent, [], [], 0)[0]) >= 7)
         page.look((0.0, 0.0, -5.0))
         wait_for(lambda: [c for c in local.server.get_clients().values() if c.camera.position[2] == -5.0])
         for one in silent:
@@ -373,9 +361,7 @@ def _opening(port: int) -> bytes:
 
 
 def test_a_browser_that_answers_nothing_does_not_hold_the_end(monkeypatch):
-    monkeypatch.setitem(
-        serve_websockets.__init__.__kwdefaults__, "close_timeout", 3600
-    )  # which is not to be waited for
+    monkeypatch.setitem(serve_websockets.__init__.__kwdefaults__, "close_timeout", 3600)  # not to be waited for
     own = Served()
     with socket.create_connection(("127.0.0.1", own.port), LIMIT) as one:
         one.sendall(_opening(own.port))
@@ -420,20 +406,11 @@ def test_pictures_follow_the_camera_of_each_browser(page, monkeypatch):
     wait_for(lambda: not page.watchers.any)
 
 
-def test_hostile_messages_neither_stop_the_page_nor_make_large_pictures(page):
-    with Client(page.url) as client:
-        client.look(size=(10**6, 10**6))
-        assert max(_answered(page, client).shape) <= 1600
-        for wrong in ({"position": [float("nan")] * 3}, {"fov": 0.0}, {"wxyz": [0.0] * 4}):
-            client.look(**wrong)
-        client.look((0.0, 0.0, -5.0), size=(64, 64))
-        assert _answered(page, client).shape[0] in (32, 128)
-    page.view.scaling.value = float("nan")
-    page.view.background.value = (999, -5, 0)
-    page.view.mode.value = "no such mode"
-    settings = page.settings()
-    assert settings.scaling == 1.0 and settings.background == (1.0, 0.0, 0.0)
-    page.view.scaling.value, page.view.mode.value, page.view.background.value = 1.0, "Colour", (0, 0, 0)
+def test_settings_out_of_range_count_as_the_nearest(page):
+    with _restored(page):
+        page.view.scaling.value, page.view.background.value = float("nan"), (999, -5, 0)
+        settings = page.settings()
+        assert settings.scaling == 1.0 and settings.background == (1.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -451,7 +428,7 @@ def test_a_browser_of_any_window_and_place_goes_to_a_camera(page, capfd, wrong):
     with Client(page.url) as client:
         client.look(**wrong)
         wait_for(page.server.get_clients)
-        client.send("GuiUpdateMessage", uuid=page.images.camera._impl.uuid, updates={"value": name})
+        _set(client, page.images.camera, name)
         camera = page.images._cameras.by_name[name]
         place = camera_center(camera.R, camera.T)
         heard = {}
@@ -464,17 +441,17 @@ def test_a_browser_of_any_window_and_place_goes_to_a_camera(page, capfd, wrong):
 
 
 def test_a_crop_box_that_many_drag_is_drawn_once(page, capfd):
-    crop, corner = page.view.crop._impl.uuid, page.view.corners[0]._impl.uuid
+    crop, corner = page.view.crop, page.view.corners[0]
     with Client(page.url) as one, Client(page.url) as other:
         for client in (one, other):
             client.look()
         for step in range(200):
-            one.send("GuiUpdateMessage", uuid=crop, updates={"value": step % 2 == 0})
-            other.send("GuiUpdateMessage", uuid=corner, updates={"value": [-float(step + 1), -1.0, -1.0]})
-        wait_for(lambda: page.view.corners[0].value[0] == -200.0 and not page.view.crop.value)
-        one.send("GuiUpdateMessage", uuid=crop, updates={"value": True})
+            _set(one, crop, step % 2 == 0)
+            _set(other, corner, [-float(step + 1), -1.0, -1.0])
+        wait_for(lambda: corner.value[0] == -200.0 and not crop.value)
+        _set(one, crop, True)
         wait_for(lambda: page.view._box is not None)
-        one.send("GuiUpdateMessage", uuid=crop, updates={"value": False})
+        _set(one, crop, False)
         wait_for(lambda: page.view._box is None)
     assert "/crop box" not in page.server.scene._handle_from_node_name
     assert "rror" not in capfd.readouterr().err
@@ -539,24 +516,6 @@ def test_one_line_says_where_the_page_is_and_another_warns_of_a_network(host, ad
     assert said.err.count("\n") == (4 if "token" in address else 2)
 
 
-def _set(client: Client, handle: object, value: object) -> None:
-    client.send("GuiUpdateMessage", uuid=handle._impl.uuid, updates={"value": value})
-
-
-def _button(page: Page, label: str) -> object:
-    return next(h for h in page.server.gui._gui_input_handle_from_uuid.values() if getattr(h, "label", "") == label)
-
-
-@contextlib.contextmanager
-def _restored(page: Page):
-    """The page, whose controls get their values back."""
-    controls = page.server.gui._gui_input_handle_from_uuid.values()
-    before = [(handle, handle.value) for handle in controls if not handle._impl.is_button]
-    yield
-    for handle, value in before:
-        handle.value = value
-
-
 def test_each_browser_reads_the_scale_of_its_own_frame(page):
     def until(words: str, different: int) -> None:
         def holds() -> bool:
@@ -578,11 +537,11 @@ def test_each_browser_reads_the_scale_of_its_own_frame(page):
     wait_for(lambda: not page._legends)
 
 
-def test_a_crop_is_written_into_the_models_folder_and_nowhere_else(page, tmp_path, capfd):
+def test_a_crop_is_written_into_the_models_folder_and_nowhere_else(page, capfd):
     view, folder = page.view, page.view.crop_file.folder
     with Client(page.url) as client, _restored(page):
         client.look()
-        for name in ("../../outside", str(tmp_path / "outside"), "", "a/b", "mine"):
+        for name in ("../../outside", "mine"):  # test_viewer.py has more names
             _set(client, view.crop_file.field, name)
             _set(client, view.corners[0], [-0.5, -0.5, -0.5])
             _set(client, view.corners[1], [0.5, 0.5, 0.5])
@@ -595,9 +554,9 @@ def test_a_crop_is_written_into_the_models_folder_and_nowhere_else(page, tmp_pat
             assert heard["title"] == ("Exported" if name == "mine" else "Not exported")
             assert 0 < heard["auto_close_seconds"] < 60  # so that messages do not pile up
     assert folder.parent.name == "a\udcff" and [file.name for file in folder.iterdir()] == ["mine.ply"]
-    assert not list(folder.parent.parent.rglob("outside*")) and not list(tmp_path.iterdir())
+    assert not list(folder.parent.parent.rglob("outside*"))
     said = capfd.readouterr()
-    assert said.err.count("warning: the crop is not exported") == 4 and "of 200 Gaussians to" in said.out
+    assert said.err.count("warning: the crop is not exported") == 1 and "of 200 Gaussians to" in said.out
 
 
 def test_reset_gives_the_view_its_first_values(page):
