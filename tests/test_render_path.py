@@ -57,7 +57,6 @@ def run(out: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
     """Runs render.py in this process; returns the folder of the videos."""
 
     def command(*words: object) -> Path:
-        monkeypatch.setattr("sys.stdout", sys.stdout)  # which the command replaces
         monkeypatch.setattr("sys.argv", ["render.py", "-m", str(out), *map(str, words)])
         render.main()
         return out / "videos" / "ours_7"
@@ -209,15 +208,11 @@ def test_memory_does_not_grow_with_the_length(run, monkeypatch):
     [
         ("--fps 5", "^--fps is for a path; leave it out, or pass --path, too$"),
         ("--path ellipse --depth", "^--depth is for the train and test views; leave it out, or --path$"),
-        ("--path ellipse --fps 0", "^--fps must be 1 to 240, got 0$"),
         ("--path ellipse --fps 241", "^--fps must be 1 to 240, got 241$"),
         ("--path ellipse --size 401 300", "odd side.* use --size 400 300$"),
         ("--path ellipse --size 0 4", "^--size must be two even numbers of 2 to 16384 pixels, got 0 4$"),
-        ("--path ellipse --size 4 16386", "^--size must be two even numbers"),
-        ("--path ellipse --seconds 0", "^--seconds must be 0.1 to 3600, got 0$"),
         ("--path ellipse --seconds nan", "^--seconds must be 0.1 to 3600, got nan$"),
         ("--path elipse", "^--path must be interpolate, ellipse, spiral or a file of keyframes; there is no file"),
-        ("--path=", "^--path must be .*there is no file $"),
         ("--path " + "x" * 5000, "^--path must be .*there is no file xxx"),
         ("--path spiral", "^--path spiral needs training cameras that face one way"),
         ("--path broken.json", "broken.json is not JSON"),
