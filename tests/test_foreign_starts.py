@@ -112,9 +112,6 @@ def test_a_start_relative_to_a_world_offset_is_moved_back(tmp_path, colmap_scene
     started = _train(colmap_scene, tmp_path / "out", "--init_ply", path)
     means = _by_place(splats_of(started)).means
     np.testing.assert_allclose(means, _by_place(start).means + [1.0, -2.0, 3.0], rtol=0, atol=1e-6)
-    written(tmp_path, ".ply", replace(start, world_offset=(1e300, 0.0, 0.0)))
-    with pytest.raises(UserError, match=r"model.ply lies 1e\+300 from the origin of its world"):
-        _train(colmap_scene, tmp_path / "out", "--init_ply", path)
 
 
 def test_an_exported_model_keeps_its_world_offset(tmp_path, colmap_scene):
@@ -207,7 +204,6 @@ def test_a_file_is_thinned_out_by_the_views_of_a_model(tmp_path, colmap_scene, c
         ("--ply a.ply --to b.splat --path ellipse", "--path is the animation of a page; leave it out for .sp"),
         ("--ply a.ply --to b.html --path elipse", "--path must be interpolate, ellipse, spiral or a file"),
         ("--ply a.ply --to b.html", "pages need training views; give -m of their model"),
-        ("--ply a.ply --to b.obj", "the format of b.obj is unknown; end its name with one of .compressed.ply"),
     ],
 )
 def test_export_refuses(words, said):

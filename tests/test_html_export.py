@@ -259,12 +259,6 @@ def test_a_lone_camera_turns_about_the_model(tmp_path):
     assert math.dist(camera["position"], camera["target"]) == pytest.approx(distance)
 
 
-def test_a_path_is_made_of_the_training_cameras(tmp_path):
-    write_html(tmp_path / "scene.html", balls(each=2), cameras(), Ellipse, (1.0, 1.0, 1.0))
-    content = _settings(tmp_path / "scene.html")
-    assert content["background"]["color"] == [1.0, 1.0, 1.0] and content["startMode"] == "animTrack"
-
-
 @pytest.mark.parametrize(
     ("views", "said"),
     [

@@ -62,6 +62,14 @@ def test_depth_unless_it_is_not_wanted(camera):
     assert depth.max().item() == pytest.approx(0.5 / 3.0, rel=0.01)  # opacity / distance, at the nearest pixel centre
 
 
+def _report(camera, draw, *more: object, halves: bool = False) -> dict[str, float]:
+    """Scores of a training report whose views are this camera's, five of training and one of test."""
+    camera.target, camera.counted_pixels, camera.image_name = lambda _: torch.ones(3, HEIGHT, WIDTH), None, "a"
+    scene = argparse.Namespace(gaussians=model(5), getTrainCameras=lambda: [camera], getTestCameras=lambda: [camera])
+    zero, arguments = torch.zeros(()), (pipeline(), BLACK, *more)
+    return report.training_report(None, 1, zero, zero, l1_loss, 0.0, [1], scene, draw, arguments, halves)
+
+
 def test_scores_are_computed_without_depth(camera, monkeypatch):
     """Neither the scores nor the training report computes an inverse depth, which nothing reads."""
     asked = []
@@ -70,19 +78,13 @@ def test_scores_are_computed_without_depth(camera, monkeypatch):
         asked.append(options["want_depth"])
         return render(*args, **options)
 
-    gaussians = model(5)
-    scene = argparse.Namespace(gaussians=gaussians, getTrainCameras=lambda: [camera], getTestCameras=lambda: [])
-    camera.target, camera.counted_pixels, camera.image_name = lambda _: torch.zeros(3, HEIGHT, WIDTH), None, "a"
     for module in (scored_views, report):
         monkeypatch.setattr(module, "render", spy)
-    scored_views.ScoredViews(pipeline(), BLACK, False).image(camera, gaussians)
-    zero = torch.zeros(())
-    report.training_report(None, 1, zero, zero, l1_loss, 0.0, [1], scene, spy, (pipeline(), BLACK))
-    assert asked == [False] * 6
+    scored_views.ScoredViews(pipeline(), BLACK, False).image(camera, model(5))
+    _report(camera, spy)
+    assert asked == [False] * 7
     # Somebody else's renderer is given the reference's arguments alone.
-    report.training_report(
-        None, 1, zero, zero, l1_loss, 0.0, [1], scene, lambda *four: render(*four), (pipeline(), BLACK)
-    )
+    _report(camera, lambda *four: render(*four))
 
 
 @pytest.mark.parametrize("more", [(), (1.0, False, None), (1.0, False, None, True)])
@@ -90,19 +92,11 @@ def test_the_report_takes_the_renders_arguments_of_the_2024_release(camera, more
     """Whose sixth says that exposures are used, as train_test_exp does."""
     asked = []
 
-    def spy(
-        camera, gaussians, pipe, background, scale=1.0, separate_sh=False, color=None, use_trained_exp=False
-    ) -> dict:
+    def spy(camera, gaussians, pipe, color, scale=1.0, separate_sh=False, override=None, use_trained_exp=False):
         asked.append(use_trained_exp)
         return {"render": torch.zeros(3, HEIGHT, WIDTH)}
 
-    scene = argparse.Namespace(gaussians=model(5), getTrainCameras=lambda: [camera], getTestCameras=lambda: [camera])
-    camera.target, camera.counted_pixels, camera.image_name = lambda _: torch.ones(3, HEIGHT, WIDTH), None, "a"
-    zero = torch.zeros(())
-    scores = report.training_report(
-        None, 1, zero, zero, l1_loss, 0.0, [1], scene, spy, (pipeline(), BLACK, *more), True
-    )
-    assert asked == [True] * 6 and scores["test_l1"] == 1.0
+    assert _report(camera, spy, *more, halves=True)["test_l1"] == 1.0 and asked == [True] * 6
 
 
 def test_screen_points_are_zeros_with_a_gradient_of_their_own_in_every_render(camera):

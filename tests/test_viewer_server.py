@@ -389,7 +389,7 @@ def _answered(page: Page, client: Client):
     return client.picture()
 
 
-def test_pictures_follow_the_camera_of_each_browser(page, monkeypatch):
+def test_each_browser_gets_pictures_of_its_own_camera(page, monkeypatch):
     monkeypatch.setattr(watchers, "STILL_AFTER", 3600.0)  # seconds, so that no machine is too slow to see a movement
     with Client(page.url) as one, Client(page.url) as other:
         one.look(size=(120, 80))
@@ -398,11 +398,7 @@ def test_pictures_follow_the_camera_of_each_browser(page, monkeypatch):
         other.look((0.5, 0.0, -4.0), size=(60, 60))
         assert _answered(page, other).shape == (120, 120, 3)
         one.look((1.5, 0.0, -4.0), size=(120, 80))
-        coarse = _answered(page, one)
-        assert coarse.shape == (40, 60, 3)
-        monkeypatch.setattr(watchers, "STILL_AFTER", 0.0)
-        sharp = _answered(page, one)
-        assert sharp.shape == (160, 240, 3) and abs(sharp.astype(int) - first).mean() > 3
+        assert _answered(page, one).shape == (40, 60, 3)  # coarse while it moves
     wait_for(lambda: not page.watchers.any)
 
 
