@@ -36,16 +36,6 @@ PLAIN = Settings()
 BLACK = torch.zeros(3)
 
 
-class Clock:
-    """A clock that stands still until it is moved."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
 @pytest.fixture
 def gaussians():
     return model(200)
@@ -209,8 +199,8 @@ def test_an_image_is_shown_only_where_it_was_taken_and_drawn_once(gaussians, sce
 @pytest.mark.parametrize("share", [STILL, MOVING])
 @pytest.mark.parametrize("cost", [0.001, 0.05, 2.0])
 def test_frames_take_no_more_than_their_share_of_the_time(share, cost):
-    clock, spent, count = Clock(), 0.0, 0
-    budget, step = Budget(clock), 0.004
+    clock, spent, count = SimpleNamespace(now=100.0), 0.0, 0
+    budget, step = Budget(lambda: clock.now), 0.004
     end = clock.now + 60
     while clock.now < end:
         clock.now += step
@@ -225,7 +215,8 @@ def test_frames_take_no_more_than_their_share_of_the_time(share, cost):
 
 
 def test_a_browser_that_moves_gets_coarse_frames_and_then_a_sharp_one():
-    watchers = Watchers(clock := Clock())
+    clock = SimpleNamespace(now=100.0)
+    watchers = Watchers(lambda: clock.now)
     assert not watchers.any and watchers.next() is None
     watchers.moved(7, FRONT)
     first = watchers.next()
@@ -246,7 +237,8 @@ def test_a_browser_that_moves_gets_coarse_frames_and_then_a_sharp_one():
 
 
 def test_a_model_that_changes_is_shown_to_all_who_look_and_nobody_waits_for_it():
-    watchers = Watchers(clock := Clock())
+    clock = SimpleNamespace(now=100.0)
+    watchers = Watchers(lambda: clock.now)
     for client in (1, 2):
         watchers.moved(client, FRONT)
         watchers.drew(watchers.next(5), 5)
@@ -358,8 +350,8 @@ def test_keyframes_are_listed_gone_to_and_deleted_anywhere(recorded, monkeypatch
         ("1: at 0 s", ("1: at 0 s", "2: at 2 s"), [3, 4]),  # a path begins at 0
         ("no such", ("1: at 0 s", "2: at 2 s"), [3, 4]),
         ("2: at 2 s", ("1: at 0 s",), [3]),
-        ("1: at 0 s", (path_tab._NONE,), []),
-        (path_tab._NONE, (path_tab._NONE,), []),
+        ("1: at 0 s", ("none yet",), []),
+        ("none yet", ("none yet",), []),
     ):
         recorded.chosen.value = chosen
         recorded.delete()

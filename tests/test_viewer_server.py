@@ -158,10 +158,9 @@ def test_other_addresses_need_the_token(public, capfd):
         Client(url, "http://127.0.0.1:1", headers={"Cookie": cookie.split(";")[0]})
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "127.3.2.1", "::1", "localhost"])
-def test_only_other_addresses_than_loopback_have_a_token(host):
-    assert Auth(host).token is None
-    assert all(Auth(other).token for other in ("0.0.0.0", "::", "", "192.168.0.1", f"{host}.evil.example"))
+def test_only_other_addresses_than_loopback_have_a_token():
+    assert not any(Auth(host).token for host in ("127.0.0.1", "127.3.2.1", "::1", "localhost"))
+    assert all(Auth(host).token for host in ("0.0.0.0", "::", "", "192.168.0.1", "127.0.0.1.evil.example"))
 
 
 def test_a_taken_port_is_passed_over_and_told(capfd):
@@ -245,23 +244,17 @@ def test_what_a_browser_sends_is_heard(message):
     "message",
     [
         *[CAMERA | wrong for wrong in (
-            {"position": [0.0, 0.0]}, {"position": "abc"}, {"position": [[1], [2], [3]]}, {"wxyz": [1.0, 0.0, 0.0]},
-            {"position": [math.nan] * 3}, {"position": [1e300, 0, 0]}, {"fov": math.inf}, {"fov": None},
-            {"image_width": math.inf}, {"image_width": "x"}, {"up_direction": [1]}, {"more": 1},
-            {"up_direction": [0, 0, 0]}, {"up_direction": [0, 1e-200, 0]},
+            {"position": [0.0, 0.0]}, {"position": "abc"}, {"position": [math.nan] * 3}, {"position": [1e300, 0, 0]},
+            {"fov": None}, {"image_width": math.inf}, {"more": 1}, {"up_direction": [0, 1e-200, 0]},
         )],
         CLICK | {"name": 5}, CLICK | {"ray_origin": []},
         *[_update(uuid, value) for uuid, value in (
-            ("text", 1), ("text", ["a"]), ("number", "1"), ("number", math.nan), ("number", math.inf), ("number", True),
-            ("whole", [1]), ("switch", 1), ("switch", "yes"), ("vector", []), ("vector", [1, 2]), ("vector", [1] * 4),
-            ("vector", "123"), ("vector", [1, 2, math.nan]), ("vector", 1), ("none", 1), (5, 1), ("number", 1e300),
-            ("whole", 1e300), ("whole", 2**53 + 1), ("whole", -(2**63)), ("vector", [1e300, 0, 0]),
-            ("nested", [[1, 2], [1e300, 4]]), ("nested", [1, 2]),
+            ("text", 1), ("number", "1"), ("number", math.nan), ("number", True), ("number", 1e300), ("whole", [1]),
+            ("whole", 2**53 + 1), ("switch", 1), ("vector", []), ("vector", [1] * 4), ("vector", "123"), ("vector", 1),
+            ("vector", [1, 2, math.nan]), ("none", 1), (5, 1), ("nested", [[1, 2], [1e300, 4]]), ("nested", [1, 2]),
         )],
         _update("number", 1, removed=True), _update("number", 1) | {"updates": {"update_cb": [5]}},
-        _update("number", 1) | {"updates": 5}, {"type": "ShareUrlRequest"}, {"type": 5}, {"type": "Message"}, {}, [], 5,
-        {"type": "FileTransferStartUpload", "source_component_uuid": "number", "transfer_uuid": "t", "filename": "f",
-         "mime_type": "m", "part_count": 1, "size_bytes": 3},
+        {"type": "ShareUrlRequest"}, {"type": 5}, {"type": "FileTransferStartUpload"}, {}, [], 5,
     ],
 )  # fmt: skip
 def test_nothing_else_is_heard(message):
@@ -411,12 +404,8 @@ def test_settings_out_of_range_count_as_the_nearest(page):
 
 @pytest.mark.parametrize(
     "wrong",
-    [
-        *({"size": size} for size in ((0, 64), (96, 0), (0, 0), (-5, 1e18))),
-        {"position": (0.0, 0.0, 0.0)},  # which is what it looks at
-        {"position": (1e18, 0.0, 0.0)},
-    ],
-    ids=str,
+    [{"size": (0, 0)}, {"size": (-5, 1e18)}, {"position": (0.0, 0.0, 0.0)}, {"position": (1e18, 0.0, 0.0)}],
+    ids=["no window", "an endless window", "at what it looks at", "far away"],
 )
 def test_a_browser_of_any_window_and_place_goes_to_a_camera(page, capfd, wrong):
     name = next(iter(page.images._cameras.by_name))
