@@ -54,27 +54,12 @@ def _in_torch(means: Tensor, log_scales: Tensor, rotations: Tensor, items: Tenso
 @pytest.mark.parametrize("count", [0, 1, 1023, 40_000])
 def test_the_bits_are_those_of_torch(count, device):
     parents = _parents(count)
-    for where in (WHERE, WHERE | {"seed": 2**63 + 5, "stream": 0, "iteration": 2**32 - 1, "draw": 0}):
+    for where in (WHERE, {"seed": 2**63 + 5, "stream": 0, "iteration": 2**32 - 1, "draw": 0}):
         wanted = _in_torch(*parents, **where)
         got = split_positions(*(t.to(device) for t in parents), **where)
         assert got.shape == (count, 3) and torch.equal(got.cpu(), wanted)
-
-
-def test_unturned_and_round_the_offsets_are_the_normal_numbers():
-    items = torch.arange(5000)
-    zero, rotations = torch.zeros(5000, 3), torch.tensor([1.0, 0, 0, 0]).expand(5000, 4)
-    wanted = _normal(3, Stream.SPLIT, 600, items, 1)[:, :3].float()
-    assert torch.equal(split_positions(zero, zero, rotations, items, **WHERE), wanted)
-
-
-def test_every_argument_matters():
-    means, _, rotations, items = _parents(50)
-    parents = means, torch.zeros(50, 3), rotations, items
-    base = split_positions(*parents, **WHERE)
-    for name in WHERE:
-        assert not (base == split_positions(*parents, **WHERE | {name: WHERE[name] + 1})).all(dim=1).any(), name
-    assert torch.equal(base, split_positions(*parents, **WHERE | {"seed": 3 + 2**64}))
-    assert not torch.equal(base, split_positions(*parents, **WHERE | {"seed": 3 + 2**32}))
+        again = split_positions(*(t.to(device) for t in parents), **where | {"seed": where["seed"] + 2**64})
+        assert torch.equal(again, got)
 
 
 @CPU_AND_GPU
