@@ -1,6 +1,5 @@
 """render.py --path: the video, its frames, its memory, and every refusal."""
 
-import argparse
 import json
 import os
 import shutil
@@ -17,6 +16,7 @@ import pytest
 import torch
 from gaussians import model, pipeline
 from PIL import Image
+from synthetic import options_of
 from waiting import LIMIT, wait_for
 
 from gaussian_renderer import render as draw
@@ -154,8 +154,7 @@ def test_the_background_is_the_models_and_exposures_are_not_applied(run, out, tm
 def test_the_lens_of_a_photo_is_ignored(run, out, _colmap_master):
     """The scene's photos have principal points off centre. A path through a camera shows it centred."""
     folder = run("--path", "interpolate", "--seconds", "0.5", "--fps", "4", "--frames")
-    given = argparse.Namespace(model_path=str(out), source_path=str(_colmap_master), eval=True)
-    scene = render.load_saved(render.ModelParams(argparse.ArgumentParser()).extract(given), 7)
+    scene = render.load_saved(options_of(_colmap_master, out, eval=True), 7)
     first = scene.getTrainCameras()[0]
     assert abs(first.cx - first.image_width / 2) > 1
     pose = poses_of([first])

@@ -1,6 +1,5 @@
 """The viewer's server: who may connect and send what, what a request can reach, and the page over a websocket."""
 
-import argparse
 import contextlib
 import http.client
 import math
@@ -18,7 +17,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from gaussians import model, pipeline
-from synthetic import make_colmap_scene
+from synthetic import options_of
 
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
 
@@ -29,7 +28,6 @@ from websockets.asyncio.server import serve as serve_websockets  # noqa: E402
 from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
 
-from arguments import ModelParams  # noqa: E402
 from scene import Scene  # noqa: E402
 from splatting.viewer import auth, watchers  # noqa: E402
 from splatting.viewer import server as servers  # noqa: E402
@@ -364,16 +362,21 @@ def test_a_browser_that_answers_nothing_does_not_hold_the_end(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory):
+def _page(_colmap_master, tmp_path_factory):
     """A page whose model and first photo have names that are not UTF-8."""
-    folder = tmp_path_factory.mktemp("page")
-    make_colmap_scene(folder / "scene")
-    given = argparse.Namespace(source_path=str(folder / "scene"), model_path=str(folder / "a\udcff"), eval=True)
-    scene = Scene(ModelParams(argparse.ArgumentParser()).extract(given), model(200), shuffle=False, start=False)
+    options = options_of(_colmap_master, tmp_path_factory.mktemp("page") / "a\udcff", eval=True)
+    scene = Scene(options, model(200), shuffle=False, start=False)
     scene.getTrainCameras()[0].image_name = "b\udcff.png"
     shown = Page(ANY, scene, pipeline(), False, False)
     yield shown
     shown.stop()
+
+
+@pytest.fixture
+def page(_page):
+    """The page, which the browsers of a test leave before the next one begins."""
+    yield _page
+    wait_for(lambda: not _page.watchers.any)
 
 
 def _answered(page: Page, client: Client):
@@ -392,14 +395,13 @@ def test_each_browser_gets_pictures_of_its_own_camera(page, monkeypatch):
         assert _answered(page, other).shape == (120, 120, 3)
         one.look((1.5, 0.0, -4.0), size=(120, 80))
         assert _answered(page, one).shape == (40, 60, 3)  # coarse while it moves
-    wait_for(lambda: not page.watchers.any)
 
 
 def test_settings_out_of_range_count_as_the_nearest(page):
     with _restored(page):
-        page.view.scaling.value, page.view.background.value = float("nan"), (999, -5, 0)
+        page.view.scaling.value, page.view.background.value = 1e9, (999, -5, 0)
         settings = page.settings()
-        assert settings.scaling == 1.0 and settings.background == (1.0, 0.0, 0.0)
+        assert settings.scaling == 2.0 and settings.background == (1.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -421,7 +423,6 @@ def test_a_browser_of_any_window_and_place_goes_to_a_camera(page, capfd, wrong):
             heard |= {message["type"]: message for message in client.messages() if not message.get("initial")}
         assert heard["SetCameraPositionMessage"]["position"] == pytest.approx(place)
         assert 0 < heard["SetCameraFovMessage"]["fov"] < math.pi
-    wait_for(lambda: not page.watchers.any)
     assert "Traceback" not in capfd.readouterr().err
 
 

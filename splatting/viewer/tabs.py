@@ -112,11 +112,10 @@ class ViewTab:
 
     def read(self) -> Settings:
         """What the controls say. Numbers out of range count as the nearest that is in it."""
-        scaling = self.scaling.value if math.isfinite(self.scaling.value) else 1.0
         box = tuple(corner.value for corner in self.corners) if self.crop.value else None
         return Settings(
             mode=self.mode.value,
-            scaling=min(max(scaling, 0.0), _MOST_SCALING),
+            scaling=min(max(self.scaling.value, 0.0), _MOST_SCALING),
             sh_degree=max(self.degree.value, 0),
             background=tuple(min(max(x / 255, 0.0), 1.0) for x in self.background.value),
             crop=box,
