@@ -164,6 +164,13 @@ def test_left_of_the_slider_is_the_scenes_image_and_right_of_it_the_render(gauss
     assert (inner[:, 23:25] == 255).all()  # the slider's line
 
 
+def test_a_slim_window_gets_no_more_pixels_than_others(gaussians, scene_cameras, monkeypatch):
+    monkeypatch.setattr("splatting.viewer.frames.LONGEST", 100)
+    name, camera = next(iter(scene_cameras.by_name.items()))
+    shown = drawn(gaussians, at(camera, 40, 400), scene_cameras, camera=name, comparison=views.SLIDER)
+    assert shown.shape == (100, 10, 3)
+
+
 def test_side_by_side_are_image_render_and_error(gaussians, scene_cameras):
     name, camera = next(iter(scene_cameras.by_name.items()))
     shown = drawn(gaussians, at(camera), scene_cameras, camera=name, comparison=views.BESIDE).astype(int)
