@@ -48,9 +48,9 @@ def _foreign_ply(path: Path, count: int, kind: str) -> Path:
 
 @pytest.mark.parametrize("kind", ["float", "double", "text"])
 def test_plys_of_any_form_are_read(tmp_path, kind):
-    read, wanted = read_splats(_foreign_ply(tmp_path / "a.ply", 20, kind)), splats(20, 1)
+    read, expected = read_splats(_foreign_ply(tmp_path / "a.ply", 20, kind)), splats(20, 1)
     for name in ("means", "log_scales", "rotations", "opacity_logits", "sh"):
-        np.testing.assert_allclose(getattr(read, name), getattr(wanted, name), rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(getattr(read, name), getattr(expected, name), rtol=1e-6, atol=1e-6)
 
 
 def test_what_is_no_3dgs_model_is_refused_by_name(tmp_path):
@@ -156,8 +156,8 @@ def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
     box = ["--crop", -1, -1, -1, 1, 1, 1]
     export.export(*_export_options("-m", out, "--to", target, *box, "--min_opacity", 0.3, "--sh_degree", 1))
     read, every = read_splats(target), read_splats(find_save(str(out), -1)[1])
-    wanted = (np.abs(every.means) <= 1).all(axis=1) & (1 / (1 + np.exp(-every.opacity_logits)) >= 0.3)
-    np.testing.assert_allclose(read.means, every.means[wanted], atol=1e-6)
+    expected = (np.abs(every.means) <= 1).all(axis=1) & (1 / (1 + np.exp(-every.opacity_logits)) >= 0.3)
+    np.testing.assert_allclose(read.means, every.means[expected], atol=1e-6)
     assert read.sh_degree == 1 and 10 < len(read) < 200
     assert re.search(rf"Wrote .*few.ply: {len(read)} of 300 Gaussians, SH degree 1, 0.0\d MB", capsys.readouterr().out)
     args = _export_options("-m", out, "--to", target, "--max_splats", 100, "--min_opacity", 0.3)

@@ -126,7 +126,7 @@ class Watched(Observer):
         full = view @ near.projection_matrix
         return MiniCam(width, height, near.FoVy, near.FoVx, near.znear, near.zfar, view, full)
 
-    def wanted(self, camera: MiniCam, scaling: float = 1.0) -> bytes:
+    def expected(self, camera: MiniCam, scaling: float = 1.0) -> bytes:
         """What `render` shows of the model now."""
         with torch.no_grad():
             drawn = render(camera, self.run.gaussians, self.run.pipe, self.run.background, scaling)
@@ -138,7 +138,7 @@ class Watched(Observer):
         switches = {"shs_python": int(self.run.pipe.convert_SHs_python)} | changes
         frame, path = viewer.ask(request(camera, **switches))
         assert path == str(self.run.dataset.source_path)
-        assert frame.tobytes() == self.wanted(camera, changes.get("scaling_modifier", 1.0))
+        assert frame.tobytes() == self.expected(camera, changes.get("scaling_modifier", 1.0))
         return frame.tobytes()
 
 

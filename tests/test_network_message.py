@@ -135,6 +135,6 @@ def test_the_switches_count_for_the_frame_alone():
         frame = frame_bytes(parse(request(CAMERA, shs_python=shs, rot_scale_python=1)), gaussians, pipe, white)
         with torch.no_grad():
             options = pipeline(convert_SHs_python=bool(shs), compute_cov3D_python=True, antialiasing=True)
-            wanted = as_bytes(render(camera, gaussians, options, white)["render"])
-        assert bytes(frame) == wanted.tobytes() and wanted.std() > 10
+            expected = as_bytes(render(camera, gaussians, options, white)["render"])
+        assert bytes(frame) == expected.tobytes() and expected.std() > 10
     assert vars(pipe) == before

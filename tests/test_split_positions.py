@@ -55,9 +55,9 @@ def _in_torch(means: Tensor, log_scales: Tensor, rotations: Tensor, items: Tenso
 def test_the_bits_are_those_of_torch(count, device):
     parents = _parents(count)
     for where in (WHERE, {"seed": 2**63 + 5, "stream": 0, "iteration": 2**32 - 1, "draw": 0}):
-        wanted = _in_torch(*parents, **where)
+        expected = _in_torch(*parents, **where)
         got = split_positions(*(t.to(device) for t in parents), **where)
-        assert got.shape == (count, 3) and torch.equal(got.cpu(), wanted)
+        assert got.shape == (count, 3) and torch.equal(got.cpu(), expected)
         again = split_positions(*(t.to(device) for t in parents), **where | {"seed": where["seed"] + 2**64})
         assert torch.equal(again, got)
 
@@ -65,9 +65,9 @@ def test_the_bits_are_those_of_torch(count, device):
 @CPU_AND_GPU
 def test_broken_parents_harm_nobody_else(device):
     parents = [t.to(device) for t in _parents(6)]
-    wanted = split_positions(*parents, **WHERE)
+    expected = split_positions(*parents, **WHERE)
     parents[0][1, 2], parents[1][2, 0], parents[2][3, 1] = math.nan, math.nan, math.nan
     parents[1][4] = torch.tensor([math.inf, -math.inf, 0.0], device=device)
     got = split_positions(*parents, **WHERE)
-    assert torch.equal(got[[0, 5]], wanted[[0, 5]]) and torch.equal(got[1, :2], wanted[1, :2])
+    assert torch.equal(got[[0, 5]], expected[[0, 5]]) and torch.equal(got[1, :2], expected[1, :2])
     assert got[1, 2].isnan() and got[2].isnan().any() and got[3].isnan().all() and not got[4].isnan().any()

@@ -134,10 +134,10 @@ class Page:
         if fault != self._faults.get(client):
             self._faults[client] = fault
             tqdm.write(f"warning: the viewer could not draw a frame ({fault})", file=sys.stderr)
-            self._tell(self.server.get_clients().get(client), "No picture", fault, color="red")
+            self._notify(self.server.get_clients().get(client), "No picture", fault, color="red")
 
     @staticmethod
-    def _tell(client: "viser.ClientHandle | None", title: str, body: str, **look: Any) -> None:
+    def _notify(client: "viser.ClientHandle | None", title: str, body: str, **look: Any) -> None:
         """Show a message to a browser, unless it has left."""
         if client is not None:
             client.add_notification(title, as_utf8(body), auto_close_seconds=_READ, **look)
@@ -150,7 +150,7 @@ class Page:
         """Show a notification to all, and wait until it has probably been sent."""
         clients = self.server.get_clients().values()
         for client in clients:
-            self._tell(client, title, body)
+            self._notify(client, title, body)
             client.flush()
         if clients:
             time.sleep(_SENT)
@@ -173,11 +173,11 @@ class Page:
         try:
             file = self.path.save()
         except UserError as error:
-            self._tell(client, "Not saved", str(error))
+            self._notify(client, "Not saved", str(error))
         else:
             video = f"{typed_python()} render.py -m {folder} --path {file}"
             tqdm.write(as_utf8(f"Saved {file}; its video: {video}"), file=sys.stdout)
-            self._tell(client, "Saved", f"{PATHS}/{file.name}; the terminal shows how to make its video")
+            self._notify(client, "Saved", f"{PATHS}/{file.name}; the terminal shows how to make its video")
 
     def stop(self) -> None:
         """Stop to listen."""
