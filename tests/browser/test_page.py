@@ -169,13 +169,6 @@ def test_the_slider_shows_the_photo(tab, training):
     field.fill("0")
     field.press("Enter")
     _until(lambda: error() > 30, "the render's opacity is not shown")
-    tab.get_by_role("tab", name="View").click()
-    tab.get_by_role("combobox", name="Show").click()
-    tab.get_by_role("option", name="Error").click()
-    tab.get_by_text("Difference of photo and render").wait_for()
-    tab.mouse.move(300, 400)
-    tab.mouse.wheel(0, 300)
-    tab.get_by_text("No photo was taken from here").wait_for()
 
 
 def test_a_click_on_a_drawn_camera_leads_there(tab, training):
