@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -17,7 +16,6 @@ import torch
 from gaussians import model, pipeline
 from PIL import Image
 from synthetic import options_of
-from waiting import LIMIT, wait_for
 
 from gaussian_renderer import render as draw
 from gaussian_renderer.free_view import free_view
@@ -29,7 +27,6 @@ from utils.system_utils import UserError
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="no imageio-ffmpeg: pip install '.[video]'")
 render = pytest.importorskip("render", reason="the extensions are not built: make test")
-ROOT = Path(__file__).resolve().parents[1]
 PATH = CameraPath(tuple(Keyframe(at, (0.2 * at, 0.0, -3.0), (1.0, 0.0, 0.0, 0.0), 45.0 + at) for at in (0.0, 0.4, 1.0)))
 
 
@@ -303,20 +300,6 @@ def test_an_interrupted_video_leaves_nothing(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         write_video(tmp_path / "a.mp4", frames(), 64, 48, 30)
     assert started[0].returncode is not None and list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("sent", ["SIGTERM", "SIGHUP"])
-def test_a_command_that_is_told_to_end_leaves_no_file(out, sent):
-    words = ["--path", "ellipse", "--seconds", "3600", "--quiet"]
-    with subprocess.Popen([sys.executable, "render.py", "-m", str(out), *words], cwd=ROOT, stderr=-1) as process:
-        try:
-            wait_for(lambda: written(out / "videos"))
-            process.send_signal(getattr(signal, sent))
-            said = process.communicate(timeout=LIMIT)[1].decode()
-        finally:
-            process.kill()
-    assert process.returncode == 143 and said.endswith("terminated\n") and "Traceback" not in said
-    assert written(out / "videos") == []
 
 
 def test_names_that_ffmpeg_would_take_for_something_else(tmp_path, monkeypatch):
