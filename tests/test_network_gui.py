@@ -117,28 +117,19 @@ class Watched(Observer):
         finally:
             viewer.leave()
 
-    def camera(self, number: int, width: int = 48, height: int = 32) -> MiniCam:
-        """A view beside that of a photo."""
-        views = self.run.scene.getTrainCameras()
-        near = views[number % len(views)]
-        view = near.world_view_transform.clone()
-        view[3, :3] += 0.003 * number * torch.tensor([1.0, -2.0, 0.5], device=view.device)
-        full = view @ near.projection_matrix
-        return MiniCam(width, height, near.FoVy, near.FoVx, near.znear, near.zfar, view, full)
-
-    def expected(self, camera: MiniCam, scaling: float = 1.0) -> bytes:
-        """What `render` shows of the model now."""
-        with torch.no_grad():
-            drawn = render(camera, self.run.gaussians, self.run.pipe, self.run.background, scaling)
-        return as_bytes(drawn["render"]).tobytes()
+    def camera(self, number: int) -> MiniCam:
+        """One of many views of the model."""
+        return free_view(48, 32, 0.8, (0.02 * number, 0.0, -3.0), (1.0, 0.0, 0.0, 0.0), self.run.background.device)
 
     def check(self, viewer: Viewer, number: int, **changes: object) -> bytes:
-        """Ask for a frame, training being paused; it must be the model's."""
-        camera = self.camera(number)
-        switches = {"shs_python": int(self.run.pipe.convert_SHs_python)} | changes
+        """Ask for a frame, training being paused; it must be what `render` shows of the model now."""
+        run, camera = self.run, self.camera(number)
+        switches = {"shs_python": int(run.pipe.convert_SHs_python)} | changes
         frame, path = viewer.ask(request(camera, **switches))
-        assert path == str(self.run.dataset.source_path)
-        assert frame.tobytes() == self.expected(camera, changes.get("scaling_modifier", 1.0))
+        with torch.no_grad():
+            scaling = changes.get("scaling_modifier", 1.0)
+            drawn = render(camera, run.gaussians, run.pipe, run.background, scaling)["render"]
+        assert path == str(run.dataset.source_path) and frame.tobytes() == as_bytes(drawn).tobytes()
         return frame.tobytes()
 
 
