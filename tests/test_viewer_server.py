@@ -398,8 +398,10 @@ def test_each_browser_gets_pictures_of_its_own_camera(page, monkeypatch):
 def test_settings_out_of_range_count_as_the_nearest(page):
     with _restored(page):
         page.view.scaling.value, page.view.background.value = 1e9, (999, -5, 0)
+        page.view.degree.value = 1.7  # as no page sends it; the rasterizer takes whole ones alone
         settings = page.settings()
         assert settings.scaling == 2.0 and settings.background == (1.0, 0.0, 0.0)
+        assert type(settings.sh_degree) is int and settings.sh_degree == 1
 
 
 @pytest.mark.parametrize(

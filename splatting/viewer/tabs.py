@@ -116,7 +116,7 @@ class ViewTab:
         return Settings(
             mode=self.mode.value,
             scaling=min(max(self.scaling.value, 0.0), _MOST_SCALING),
-            sh_degree=max(self.degree.value, 0),
+            sh_degree=max(int(self.degree.value), 0),
             background=tuple(min(max(x / 255, 0.0), 1.0) for x in self.background.value),
             crop=box,
         )
