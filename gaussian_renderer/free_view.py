@@ -106,9 +106,8 @@ def _between(first: Camera, second: Camera, fraction: float) -> MiniCam:
 
     turn = Slerp([0, 1], Rotation.from_matrix([first.R, second.R]))(fraction).as_matrix()
     center = mixed(*(camera_center(camera.R, camera.T) for camera in (first, second)))
-    width, height = (
-        math.ceil(WIDER * max(getattr(first, side), getattr(second, side))) for side in ("image_width", "image_height")
-    )
+    width = math.ceil(WIDER * max(first.image_width, second.image_width))
+    height = math.ceil(WIDER * max(first.image_height, second.image_height))
     fovx, fovy = focal2fov(mixed(first.fx, second.fx), width), focal2fov(mixed(first.fy, second.fy), height)
     # Offsets of the principal point from the image's centre stay what they are in pixels.
     shift_x = mixed(first.cx - first.image_width / 2, second.cx - second.image_width / 2)

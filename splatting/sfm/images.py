@@ -214,10 +214,8 @@ def extract_frames(video: Path, folder: Path, count: int) -> None:
 def sharpness(frame: np.ndarray) -> float:
     """Return the mean squared difference of neighbouring green values along both axes of a frame (H, W, 3) uint8."""
     rows, columns = frame[::_STEP, :, 1].astype(np.int16), frame[:, ::_STEP, 1].astype(np.int16)
-    return sum(
-        float(np.mean(np.square(np.diff(lines, axis=axis), dtype=np.float64)))
-        for axis, lines in ((1, rows), (0, columns))
-    )
+    changes = np.diff(rows, axis=1), np.diff(columns, axis=0)
+    return sum(float(np.square(change, dtype=np.float64).mean()) for change in changes)
 
 
 def _frames(decoder: Any, video: Path) -> Iterator[np.ndarray]:
