@@ -214,11 +214,9 @@ def test_export_refuses(words, said):
 @pytest.mark.parametrize("name", ["interpolate", "tour.json"])
 def test_a_page_plays_the_camera_path(tmp_path, colmap_scene, name):
     _train(colmap_scene, tmp_path / "out")
-    keys = (
-        Keyframe(0.0, (0.0, 0.0, -3.0), (1.0, 0.0, 0.0, 0.0), 40.0),
-        Keyframe(7.0, (1.0, 0.0, -3.0), (1.0, 0, 0, 0), 50.0),
-    )
-    CameraPath(keys).write(tmp_path / "tour.json")
+    first = Keyframe(0.0, (0.0, 0.0, -3.0), (1.0, 0.0, 0.0, 0.0), 40.0)
+    last = replace(first, seconds=7.0, position=(1.0, 0.0, -3.0), fov=50.0)
+    CameraPath((first, last)).write(tmp_path / "tour.json")
     path = str(tmp_path / name) if name.endswith("json") else name
     export.export(*_export_options("-m", tmp_path / "out", "--to", tmp_path / "page.HTML", "--path", path))
     text = re.search(r'id="page">(.*?)</script>', (tmp_path / "page.HTML").read_text(encoding="utf-8"))[1]

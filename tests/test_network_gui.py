@@ -283,12 +283,10 @@ def test_no_message_takes_longer_than_its_limit_though_bytes_keep_coming(monkeyp
     ours, theirs = socket.socketpair()
     with ours, theirs:
         theirs.sendall(packed(valid()))
-        for act in (
-            lambda: network_transfer.receive_message(ours),
-            lambda: network_transfer.send_message(ours, b"1", b""),
-        ):
-            with pytest.raises(network_transfer.ViewerLost, match="took more than 0 s"):
-                act()
+        with pytest.raises(network_transfer.ViewerLost, match="took more than 0 s"):
+            network_transfer.receive_message(ours)
+        with pytest.raises(network_transfer.ViewerLost, match="took more than 0 s"):
+            network_transfer.send_message(ours, b"1", b"")
 
 
 def test_a_viewer_whose_messages_come_in_pieces_is_served():

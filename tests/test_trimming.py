@@ -323,10 +323,7 @@ LEFT_OUT = LeftOut(
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        (
-            {},
-            "50 invisible ones were left out (5.0 %, 0.01 MB of the PLY); 99 views were searched in 1.2 s; test",
-        ),
+        ({}, "50 invisible ones were left out (5.0 %, 0.01 MB of the PLY); 99 views were searched in 1.2 s"),
         ({}, "by at most 0.012 (values 0 to 1), PSNR 30.000 to 29.900 dB"),
         ({}, "cutting them would move colours by at most 0.3 above degree 0, 0.2 above degree 1, 0.1 above degree 2 ("),
         ({}, "at training size: 3.0 MB, 45.0 MB less"),
