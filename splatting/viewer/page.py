@@ -1,4 +1,4 @@
-"""The page: its server, its tabs and the browsers that watch; and the page of a saved model."""
+"""The page: its server, its tabs and the browsers that watch."""
 
 import argparse
 import sys
@@ -193,15 +193,6 @@ def write_crop(path: Path, gaussians: GaussianModel, box: tuple[Vector, Vector],
         raise UserError("the crop box has no Gaussians; move its corners")
     write_plain_ply(path, splats)
     return len(splats)
-
-
-def serve_saved(address: Address, scene: Scene, pipe: argparse.Namespace, white: bool, with_exposures: bool) -> None:
-    """Serve the page until a signal comes, and raise that. white, with_exposures: as for `Page`."""
-    page = Page(address, scene, pipe, white, with_exposures)
-    try:
-        raise serve(page)
-    finally:
-        page.stop()
 
 
 def serve(page: Page) -> type[KeyboardInterrupt] | None:
