@@ -169,6 +169,8 @@ def test_the_slider_shows_the_photo(tab, training):
     field.fill("0")
     field.press("Enter")
     _until(lambda: error() > 30, "the render's opacity is not shown")
+    tab.get_by_role("tab", name="View").click()
+    tab.get_by_role("button", name="Reset").click()  # of what other tests of this training see
 
 
 def test_a_click_on_a_drawn_camera_leads_there(tab, training):
