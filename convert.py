@@ -19,20 +19,11 @@ from pathlib import Path
 
 from arguments import OptionParser
 from splatting.host.start import typed_command
+from splatting.sfm import stages
 from splatting.sfm.colmap import LENS_MODELS, Program, Pycolmap, Settings
 from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder
 from splatting.sfm.programs import refuse_while_working
 from splatting.sfm.report import summary
-from splatting.sfm.stages import (
-    Stage,
-    StageRecord,
-    image_stage,
-    model_state,
-    reconstruction_stages,
-    resize_stage,
-    undistortion_stage,
-    video_stage,
-)
 from utils.system_utils import UserError, run_cli
 
 
@@ -41,27 +32,27 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     masks = _masks(args.mask_path)
     names = [] if args.video else find_images(layout)
     refuse_while_working(layout.log)
-    record = StageRecord(layout.stages)
+    record = stages.StageRecord(layout.stages)
     refuse_foreign_results(layout, record.begun("undistortion"), record.begun("photos"), args.skip_matching)
     kept = []
     if args.video:
         kept = record.run([_video(layout, record, args)])
         names = find_images(layout)
     if args.skip_matching:
-        stages = []
+        planned = []
         program = "--skip_matching: the model that was in distorted/sparse"
-        made_from = [names, model_state(layout)]
+        made_from = [names, stages.model_state(layout)]
     else:
         program = args.colmap_executable
         backend = Program(program, layout, settings) if program else Pycolmap(layout, settings)
         program, made_from = backend.identity, None
-        stages = [image_stage(layout, names, masks)]
-        stages += reconstruction_stages(backend, masks is not None)
+        planned = [stages.image_stage(layout, names, masks)]
+        planned += stages.reconstruction_stages(backend, masks is not None)
     made = {"camera": settings.camera, "mapper": settings.mapper, "matcher": settings.matcher, "program": program}
-    stages.append(undistortion_stage(layout, settings, made_from, **made))
+    planned.append(stages.undistortion_stage(layout, settings, made_from, **made))
     if args.resize:
-        stages.append(resize_stage(layout))
-    kept += record.run(stages)
+        planned.append(stages.resize_stage(layout))
+    kept += record.run(planned)
     if kept:
         print(f"done before: {', '.join(kept)} (to start from the beginning, remove {layout.work})")
     report = json.loads(layout.report.read_text(encoding="utf-8"))
@@ -80,7 +71,7 @@ def _masks(given: str | None) -> Path | None:
     return Path(given)
 
 
-def _video(layout: Layout, record: StageRecord, args: argparse.Namespace) -> Stage:
+def _video(layout: Layout, record: stages.StageRecord, args: argparse.Namespace) -> stages.Stage:
     video = Path(args.video)
     if not video.is_file():
         raise UserError(f"no video {video}; pass an existing file as --video")
@@ -89,7 +80,7 @@ def _video(layout: Layout, record: StageRecord, args: argparse.Namespace) -> Sta
             f"{layout.input} already has files, and the frames would be mixed with them; omit --video, or convert the "
             "video in another folder"
         )
-    return video_stage(layout, video, args.video_frames)
+    return stages.video_stage(layout, video, args.video_frames)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

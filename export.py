@@ -30,16 +30,7 @@ from scene.saved_model import find_save, load_saved, read_model
 from scene.scene import Scene
 from splatting.exports.formats import FORMATS, READABLE, Format, format_of, read_splats
 from splatting.exports.in_scene import load_file, splats_of
-from splatting.exports.splats import (
-    Splats,
-    drawable,
-    opacities,
-    selected,
-    tidy,
-    used_sh_degree,
-    with_sh_degree,
-    within_box,
-)
+from splatting.exports.splats import Splats, choose, selected, tidy, used_sh_degree, with_sh_degree
 from splatting.files.json_files import OFFSET, read_model_json
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, compute_device, run_cli
@@ -70,16 +61,6 @@ def load(args: argparse.Namespace, options: argparse.Namespace, needs_views: boo
     gaussians = read_model(path)
     gaussians.world_offset = tuple(read_model_json(options.model_path).get(OFFSET, (0.0, 0.0, 0.0)))
     return splats_of(gaussians, args.antialiasing), None
-
-
-def choose(splats: Splats, crop: Sequence[float] | None, min_opacity: float) -> np.ndarray:
-    """(N,) bool: the splats that are drawn, lie in the box, and have at least this opacity. UserError if none do."""
-    keep = drawable(splats) & (opacities(splats) >= min_opacity)
-    if crop is not None:
-        keep &= within_box(splats, crop)
-    if len(splats) and not keep.any():
-        raise UserError("no Gaussian is left; give a larger --crop or a smaller --min_opacity")
-    return keep
 
 
 @torch.no_grad()
@@ -133,9 +114,8 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     entry.write(args.to, chosen, *((scene.getTrainCameras(), make_path, background) if entry.of_scene else ()))
     size, seconds = Path(args.to).stat().st_size, time.perf_counter() - start
     kept = degree if entry.bands else 0
-    unused = (
-        " (no others are used)" if entry.bands and degree < splats.sh_degree and args.typed_sh_degree is None else ""
-    )
+    spare = args.typed_sh_degree is None and entry.bands and degree < splats.sh_degree
+    unused = " (higher bands are zero)" if spare else ""
     what = f"{len(chosen):,} of {len(splats):,} Gaussians, SH degree {kept}{unused}"
     print(
         f"Wrote {args.to}: {what}, {size / 1e6:.2f} MB ({size / max(len(chosen), 1):.0f} bytes each), {seconds:.1f} s"

@@ -12,7 +12,7 @@ import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
 from scene.saved_model import load_saved
-from splatting.viewer.page import serve_saved
+from splatting.viewer.page import Page, serve
 from splatting.viewer.server import PORT, add_host_option, checked_address
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, run_cli
@@ -34,7 +34,11 @@ def main() -> None:
     scene = load_saved(options, args.iteration, args.typed_sh_degree)
     if len(scene.gaussians) == 0:
         raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
-    serve_saved(place, scene, pipeline, options.white_background, options.train_test_exp)
+    page = Page(place, scene, pipeline, options.white_background, options.train_test_exp)
+    try:
+        raise serve(page)
+    finally:
+        page.stop()
 
 
 if __name__ == "__main__":

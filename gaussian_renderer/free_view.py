@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from scene.cameras import ZFAR, ZNEAR, Camera, MiniCam
-from utils.graphics_utils import focal2fov, projection, world_to_camera
+from utils.graphics_utils import camera_center, focal2fov, projection, world_to_camera
 
 NEAREST = 3  # neighbours of each camera; in a sequence and in a ring its two sides are among them
 FRACTIONS = (0.2, 0.4, 0.6, 0.8)  # of the way from a camera to its neighbour
@@ -77,7 +77,7 @@ def neighbours(cameras: Sequence[Camera], nearest: int = NEAREST) -> list[tuple[
 
 def _distances(cameras: Sequence[Camera]) -> np.ndarray:
     """(N, N) distances of `neighbours`."""
-    centers = np.array([_center(camera) for camera in cameras])
+    centers = np.array([camera_center(camera.R, camera.T) for camera in cameras])
     turns = np.array([camera.R for camera in cameras]).reshape(-1, 9)
     far = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     turned = np.arccos(np.clip((turns @ turns.T - 1) / 2, -1, 1))  # the trace of Ra^T Rb is 1 + 2 cos(angle)
@@ -105,17 +105,12 @@ def _between(first: Camera, second: Camera, fraction: float) -> MiniCam:
         return (1 - fraction) * one + fraction * other
 
     turn = Slerp([0, 1], Rotation.from_matrix([first.R, second.R]))(fraction).as_matrix()
-    center = mixed(_center(first), _center(second))
-    width, height = (
-        math.ceil(WIDER * max(getattr(first, side), getattr(second, side))) for side in ("image_width", "image_height")
-    )
+    center = mixed(*(camera_center(camera.R, camera.T) for camera in (first, second)))
+    width = math.ceil(WIDER * max(first.image_width, second.image_width))
+    height = math.ceil(WIDER * max(first.image_height, second.image_height))
     fovx, fovy = focal2fov(mixed(first.fx, second.fx), width), focal2fov(mixed(first.fy, second.fy), height)
     # Offsets of the principal point from the image's centre stay what they are in pixels.
     shift_x = mixed(first.cx - first.image_width / 2, second.cx - second.image_width / 2)
     shift_y = mixed(first.cy - first.image_height / 2, second.cy - second.image_height / 2)
     project = projection(ZNEAR, ZFAR, fovx, fovy, 2 * shift_x / width, 2 * shift_y / height)
     return _view(width, height, fovy, fovx, turn, center, project, first.device)
-
-
-def _center(camera: Camera) -> np.ndarray:
-    return -camera.R @ camera.T

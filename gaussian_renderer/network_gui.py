@@ -16,14 +16,7 @@ from typing import Any
 from tqdm import tqdm
 
 from gaussian_renderer.network_message import BadMessage, Request, decode, parse
-from gaussian_renderer.network_transfer import (
-    ViewerLeft,
-    ViewerLost,
-    readable,
-    receive_message,
-    send_message,
-    set_up,
-)
+from gaussian_renderer.network_transfer import ViewerLeft, ViewerLost, readable, receive_message, send_message, set_up
 from scene.cameras import MiniCam
 from splatting.host.machine import compute_device
 from utils.system_utils import UserError

@@ -141,32 +141,23 @@ def _two(**changes: object) -> dict:
 
 BROKEN = {
     "": "is not JSON",
-    "{": "is not JSON",
     "\xff": "is not JSON",
     "[" * 100_000: r"is not JSON \(nested too deep\)",
     "[1]": "needs a list called keyframes",
-    '{"keyframes": {}}': "needs a list called keyframes",
-    '{"keyframes": []}': "has 0 keyframes; a camera path needs at least 2",
-    json.dumps({"keyframes": [KEY]}): "has 1 keyframes",
+    json.dumps({"keyframes": [KEY]}): "has 1 keyframes; a camera path needs at least 2",
     json.dumps({"keyframes": [KEY, 5]}): "keyframe 2 must be an object",
     json.dumps(_two(seconds=0)): "keyframe 2 is at 0.0 s, not after keyframe 1",
     json.dumps({"keyframes": [{**KEY, "seconds": 1}, {**KEY, "seconds": 2}]}): "keyframe 1 must be at 0 seconds",
     json.dumps(_two() | {"easing": "fast"}): "easing must be linear or smooth, got 'fast'",
-    json.dumps(_two() | {"easing": []}): "easing must be linear or smooth",
     json.dumps(_two(fov=0)): "keyframe 2: fov must be 0.001 to 179.9 degrees, got 0",
-    json.dumps(_two(fov=180)): "fov must be",
     json.dumps(_two(fov=[50])): r"fov must be a number, got \[50\]",
     json.dumps(_two(fov=True)): "fov must be a number, got True",
     json.dumps(_two(fov=math.nan)): "fov must be a number, got nan",
-    json.dumps(_two(seconds="1")): "seconds must be a number, got '1'",
     json.dumps(_two(seconds=10**400)): "seconds must be a number, got 1000",
     json.dumps(_two(position=[0, 0])): "position must be 3 numbers",
-    json.dumps(_two(position=[0, 0, math.inf])): "position must be 3 numbers",
     json.dumps(_two(position=[0, 0, 2e12])): r"position must be at most 1e\+12 from the origin",
     json.dumps(_two(position=None)): "position must be 3 numbers, got None",
     json.dumps(_two(wxyz=[0, 0, 0, 0])): "wxyz must be a unit quaternion",
-    json.dumps(_two(wxyz=[1, 0, 0])): "wxyz must be 4 numbers",
-    json.dumps({"keyframes": [{"seconds": 0}]}): "keyframe 1: fov must be a number, got None",
 }
 
 

@@ -48,9 +48,9 @@ def _foreign_ply(path: Path, count: int, kind: str) -> Path:
 
 @pytest.mark.parametrize("kind", ["float", "double", "text"])
 def test_plys_of_any_form_are_read(tmp_path, kind):
-    read, wanted = read_splats(_foreign_ply(tmp_path / "a.ply", 20, kind)), splats(20, 1)
+    read, expected = read_splats(_foreign_ply(tmp_path / "a.ply", 20, kind)), splats(20, 1)
     for name in ("means", "log_scales", "rotations", "opacity_logits", "sh"):
-        np.testing.assert_allclose(getattr(read, name), getattr(wanted, name), rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(getattr(read, name), getattr(expected, name), rtol=1e-6, atol=1e-6)
 
 
 def test_what_is_no_3dgs_model_is_refused_by_name(tmp_path):
@@ -112,9 +112,6 @@ def test_a_start_relative_to_a_world_offset_is_moved_back(tmp_path, colmap_scene
     started = _train(colmap_scene, tmp_path / "out", "--init_ply", path)
     means = _by_place(splats_of(started)).means
     np.testing.assert_allclose(means, _by_place(start).means + [1.0, -2.0, 3.0], rtol=0, atol=1e-6)
-    written(tmp_path, ".ply", replace(start, world_offset=(1e300, 0.0, 0.0)))
-    with pytest.raises(UserError, match=r"model.ply lies 1e\+300 from the origin of its world"):
-        _train(colmap_scene, tmp_path / "out", "--init_ply", path)
 
 
 def test_an_exported_model_keeps_its_world_offset(tmp_path, colmap_scene):
@@ -159,8 +156,8 @@ def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
     box = ["--crop", -1, -1, -1, 1, 1, 1]
     export.export(*_export_options("-m", out, "--to", target, *box, "--min_opacity", 0.3, "--sh_degree", 1))
     read, every = read_splats(target), read_splats(find_save(str(out), -1)[1])
-    wanted = (np.abs(every.means) <= 1).all(axis=1) & (1 / (1 + np.exp(-every.opacity_logits)) >= 0.3)
-    np.testing.assert_allclose(read.means, every.means[wanted], atol=1e-6)
+    expected = (np.abs(every.means) <= 1).all(axis=1) & (1 / (1 + np.exp(-every.opacity_logits)) >= 0.3)
+    np.testing.assert_allclose(read.means, every.means[expected], atol=1e-6)
     assert read.sh_degree == 1 and 10 < len(read) < 200
     assert re.search(rf"Wrote .*few.ply: {len(read)} of 300 Gaussians, SH degree 1, 0.0\d MB", capsys.readouterr().out)
     args = _export_options("-m", out, "--to", target, "--max_splats", 100, "--min_opacity", 0.3)
@@ -207,7 +204,6 @@ def test_a_file_is_thinned_out_by_the_views_of_a_model(tmp_path, colmap_scene, c
         ("--ply a.ply --to b.splat --path ellipse", "--path is the animation of a page; leave it out for .sp"),
         ("--ply a.ply --to b.html --path elipse", "--path must be interpolate, ellipse, spiral or a file"),
         ("--ply a.ply --to b.html", "pages need training views; give -m of their model"),
-        ("--ply a.ply --to b.obj", "the format of b.obj is unknown; end its name with one of .compressed.ply"),
     ],
 )
 def test_export_refuses(words, said):
@@ -218,11 +214,9 @@ def test_export_refuses(words, said):
 @pytest.mark.parametrize("name", ["interpolate", "tour.json"])
 def test_a_page_plays_the_camera_path(tmp_path, colmap_scene, name):
     _train(colmap_scene, tmp_path / "out")
-    keys = (
-        Keyframe(0.0, (0.0, 0.0, -3.0), (1.0, 0.0, 0.0, 0.0), 40.0),
-        Keyframe(7.0, (1.0, 0.0, -3.0), (1.0, 0, 0, 0), 50.0),
-    )
-    CameraPath(keys).write(tmp_path / "tour.json")
+    first = Keyframe(0.0, (0.0, 0.0, -3.0), (1.0, 0.0, 0.0, 0.0), 40.0)
+    last = replace(first, seconds=7.0, position=(1.0, 0.0, -3.0), fov=50.0)
+    CameraPath((first, last)).write(tmp_path / "tour.json")
     path = str(tmp_path / name) if name.endswith("json") else name
     export.export(*_export_options("-m", tmp_path / "out", "--to", tmp_path / "page.HTML", "--path", path))
     text = re.search(r'id="page">(.*?)</script>', (tmp_path / "page.HTML").read_text(encoding="utf-8"))[1]

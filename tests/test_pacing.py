@@ -360,9 +360,8 @@ def test_a_budgeted_training_replays_and_resumes_to_the_byte(colmap_scene, tmp_p
     saved = _train(colmap_scene, clocked, *every, "--time_budget", 20)
     record = _last_record(clocked)
     assert record["seconds"] == pytest.approx(20.0, rel=0.03) and len(saved) == 2 and record["iteration"] == max(saved)
-    assert re.match(
-        r"\d+ iterations in (19|20)\.\d s \(budget 20 s, [\d.]+ s with start, scores and saves\)", record["lines"][0]
-    )
+    said = r"\d+ iterations in (19|20)\.\d s \(budget 20 s, [\d.]+ s with start, scores and saves\)"
+    assert re.match(said, record["lines"][0])
     (checkpoint,) = clocked.glob("chkpnt*.pth")
     monkeypatch.undo()  # the clock of this machine has no say below
     assert _train(colmap_scene, replayed, *every, "--schedule", clocked / "schedule.json") == saved

@@ -15,7 +15,7 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.exposure import Exposures
 from splatting.training.observers import report
 from utils.graphics_utils import getProjectionMatrix
-from utils.loss_utils import inverse_depth_loss, l1_loss
+from utils.loss_utils import l1_loss
 from utils.system_utils import UserError
 
 WIDTH, HEIGHT = 41, 27
@@ -57,9 +57,17 @@ def test_depth_unless_it_is_not_wanted(camera):
         gaussians._scaling.fill_(math.log(0.5))
         gaussians._opacity.fill_(0.0)
     depth = render(camera, gaussians, pipeline(), BLACK)["depth"]
+    assert depth.requires_grad  # test_rasterizer_gradients.py has its derivative
     assert render(camera, gaussians, pipeline(), BLACK, want_depth=False)["depth"] is None
-    assert depth.shape == (1, HEIGHT, WIDTH)
     assert depth.max().item() == pytest.approx(0.5 / 3.0, rel=0.01)  # opacity / distance, at the nearest pixel centre
+
+
+def _report(camera, draw, *more: object, halves: bool = False) -> dict[str, float]:
+    """Scores of a training report whose views are this camera's, five of training and one of test."""
+    camera.target, camera.counted_pixels, camera.image_name = lambda _: torch.ones(3, HEIGHT, WIDTH), None, "a"
+    scene = argparse.Namespace(gaussians=model(5), getTrainCameras=lambda: [camera], getTestCameras=lambda: [camera])
+    zero, arguments = torch.zeros(()), (pipeline(), BLACK, *more)
+    return report.training_report(None, 1, zero, zero, l1_loss, 0.0, [1], scene, draw, arguments, halves)
 
 
 def test_scores_are_computed_without_depth(camera, monkeypatch):
@@ -70,19 +78,13 @@ def test_scores_are_computed_without_depth(camera, monkeypatch):
         asked.append(options["want_depth"])
         return render(*args, **options)
 
-    gaussians = model(5)
-    scene = argparse.Namespace(gaussians=gaussians, getTrainCameras=lambda: [camera], getTestCameras=lambda: [])
-    camera.target, camera.counted_pixels, camera.image_name = lambda _: torch.zeros(3, HEIGHT, WIDTH), None, "a"
     for module in (scored_views, report):
         monkeypatch.setattr(module, "render", spy)
-    scored_views.ScoredViews(pipeline(), BLACK, False).image(camera, gaussians)
-    zero = torch.zeros(())
-    report.training_report(None, 1, zero, zero, l1_loss, 0.0, [1], scene, spy, (pipeline(), BLACK))
-    assert asked == [False] * 6
+    scored_views.ScoredViews(pipeline(), BLACK, False).image(camera, model(5))
+    _report(camera, spy)
+    assert asked == [False] * 7
     # Somebody else's renderer is given the reference's arguments alone.
-    report.training_report(
-        None, 1, zero, zero, l1_loss, 0.0, [1], scene, lambda *four: render(*four), (pipeline(), BLACK)
-    )
+    _report(camera, lambda *four: render(*four))
 
 
 @pytest.mark.parametrize("more", [(), (1.0, False, None), (1.0, False, None, True)])
@@ -90,26 +92,19 @@ def test_the_report_takes_the_renders_arguments_of_the_2024_release(camera, more
     """Whose sixth says that exposures are used, as train_test_exp does."""
     asked = []
 
-    def spy(
-        camera, gaussians, pipe, background, scale=1.0, separate_sh=False, color=None, use_trained_exp=False
-    ) -> dict:
+    def spy(camera, gaussians, pipe, color, scale=1.0, separate_sh=False, override=None, use_trained_exp=False):
         asked.append(use_trained_exp)
         return {"render": torch.zeros(3, HEIGHT, WIDTH)}
 
-    scene = argparse.Namespace(gaussians=model(5), getTrainCameras=lambda: [camera], getTestCameras=lambda: [camera])
-    camera.target, camera.counted_pixels, camera.image_name = lambda _: torch.ones(3, HEIGHT, WIDTH), None, "a"
-    zero = torch.zeros(())
-    scores = report.training_report(
-        None, 1, zero, zero, l1_loss, 0.0, [1], scene, spy, (pipeline(), BLACK, *more), True
-    )
-    assert asked == [True] * 6 and scores["test_l1"] == 1.0
+    assert _report(camera, spy, *more, halves=True)["test_l1"] == 1.0 and asked == [True] * 6
 
 
 def test_screen_points_are_zeros_with_a_gradient_of_their_own_in_every_render(camera):
     gaussian_renderer._zero.cache_clear()
     gaussians = model(20)
     with torch.inference_mode():  # rendering an image first must not prevent training
-        assert not render(camera, gaussians, pipeline(), BLACK)["viewspace_points"].requires_grad
+        package = render(camera, gaussians, pipeline(), BLACK)
+        assert not package["viewspace_points"].requires_grad and not package["render"].requires_grad
     gradients = []
     for weight in (1.0, 2.0):
         package = render(camera, gaussians, pipeline(), BLACK)
@@ -196,13 +191,6 @@ def test_inactive_bands_are_not_read(camera):
     assert gaussians._features_rest.grad[:, :3].any() and not gaussians._features_rest.grad[:, 3:].any()
 
 
-def test_without_gradients(camera):
-    gaussians = model(20)
-    with torch.no_grad():
-        package = render(camera, gaussians, pipeline(), BLACK)
-    assert not package["render"].requires_grad and not package["viewspace_points"].requires_grad
-
-
 def test_an_empty_model_shows_the_background(camera):
     background = torch.tensor([0.1, 0.5, 0.9])
     image = render(camera, GaussianModel(3), pipeline(), background)["render"]
@@ -241,28 +229,3 @@ def test_a_view_without_a_picture_has_no_exposure_and_an_unknown_one_is_named(ca
     camera.exposure_name = "somewhere.png"
     with pytest.raises(UserError, match="no trained exposure of somewhere.png"):
         render(camera, gaussians, pipeline(), BLACK, use_trained_exp=True)
-
-
-def test_the_inverse_depth_is_differentiated(camera):
-    """The depth loss's gradient by central differences, for the opacity and the distance of a Gaussian in front."""
-    gaussians = model(1)
-    with torch.no_grad():
-        gaussians._xyz.zero_()
-        gaussians._scaling.fill_(math.log(0.5))
-        gaussians._opacity.fill_(0.5)
-    target = torch.full((1, HEIGHT, WIDTH), 0.1)
-
-    def loss() -> torch.Tensor:
-        return inverse_depth_loss(render(camera, gaussians, pipeline(), BLACK, want_depth=True)["depth"], target)
-
-    loss().backward()
-    for param, index in ((gaussians._opacity, (0, 0)), (gaussians._xyz, (0, 2))):
-        step, values = 1e-2, []
-        for sign in (1, -1):
-            with torch.no_grad():
-                param[index] += sign * step
-                values.append(loss().item())
-                param[index] -= sign * step
-        slope = (values[0] - values[1]) / (2 * step)
-        # The bound allows for float32 values of 0.1, and for pixels that cross the target or alpha's cut-off at 1/255.
-        assert slope != 0 and param.grad[index].item() == pytest.approx(slope, rel=0.03)

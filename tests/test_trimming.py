@@ -5,6 +5,7 @@ import json
 import math
 import re
 import sys
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from types import SimpleNamespace
@@ -83,6 +84,11 @@ def runs(_colmap_master, tmp_path_factory) -> SimpleNamespace:
     return SimpleNamespace(**{name: folder / name for name in ("trimmed", "whole", "cut", "halves")})
 
 
+@pytest.fixture(scope="module")
+def cameras(runs) -> list[Camera]:
+    return _load(runs.whole)[0].getTrainCameras()
+
+
 def _walked(scene: Scene) -> list:
     """Views between neighbouring training cameras."""
     cameras = scene.getTrainCameras()
@@ -98,17 +104,10 @@ def test_only_rows_that_neither_training_views_nor_those_between_depend_on_are_m
     assert len(_ply(runs.whole)) == 600
 
 
-def test_a_walk_between_neighbours_sees_the_whole_model(runs):
+def test_training_views_and_a_walk_between_neighbours_are_the_same_to_the_bit(runs):
     scene, whole = _load(runs.whole)
     trimmed = _load(runs.trimmed)[1]
-    for camera in _walked(scene)[::5]:
-        assert torch.equal(_image(camera, whole), _image(camera, trimmed))
-
-
-def test_training_views_are_the_same_to_the_bit(runs):
-    scene, whole = _load(runs.whole)
-    trimmed = _load(runs.trimmed)[1]
-    for camera in scene.getTrainCameras():
+    for camera in scene.getTrainCameras() + _walked(scene)[::5]:
         assert torch.equal(_image(camera, whole), _image(camera, trimmed))
 
 
@@ -194,8 +193,8 @@ def test_test_views_that_train_in_half_stay_the_same_in_whole(runs):
     assert (runs.halves / "exposure.json").exists()
 
 
-def test_colours_move_by_no_more_than_asked(runs):
-    cameras = _load(runs.whole)[0].getTrainCameras()[:3]
+def test_colours_move_by_no_more_than_asked(cameras):
+    cameras = cameras[:3]
     gaussians = model(200, seed=4)
     with torch.no_grad():
         gaussians._features_rest *= 0.02
@@ -213,17 +212,15 @@ def test_colours_move_by_no_more_than_asked(runs):
     assert all(torch.equal(values, before[name]) for name, values in parameters(gaussians).items())
 
 
-def test_a_model_that_no_view_sees_is_kept(runs):
-    cameras = _load(runs.whole)[0].getTrainCameras()
+def test_a_model_that_no_view_sees_is_kept(cameras):
     gaussians = model(5)
     with torch.no_grad():
         gaussians._opacity.fill_(-50.0)
     assert trim(gaussians, cameras, pipeline(), False, -1.0, iterations=10**6)[0] is gaussians
 
 
-def test_faint_gaussians_go_without_a_look(runs, monkeypatch):
+def test_faint_gaussians_go_without_a_look(runs, cameras, monkeypatch):
     """No pixel takes an alpha below 1/255, so opacities below it are in no image from anywhere."""
-    cameras = _load(runs.whole)[0].getTrainCameras()
     gaussians = model(200, seed=4)
     with torch.no_grad():
         gaussians._opacity[:50] = FAINT - 1e-3
@@ -238,8 +235,7 @@ def test_faint_gaussians_go_without_a_look(runs, monkeypatch):
         assert decisive_for(camera, gaussians, pipeline())[50:60].any()
 
 
-def test_few_unseen_ones_are_kept_without_looking_further(runs):
-    cameras = _load(runs.whole)[0].getTrainCameras()
+def test_few_unseen_ones_are_kept_without_looking_further(cameras):
     gaussians = model(200, seed=4)
     with torch.no_grad():
         # Just below what a pixel takes, and just above what counts as faint.
@@ -253,8 +249,7 @@ def test_few_unseen_ones_are_kept_without_looking_further(runs):
     assert search.end == DONE and search.unseen == 2 and search.faint == 0
 
 
-def test_many_cameras_have_fewer_neighbours(runs):
-    cameras = _load(runs.whole)[0].getTrainCameras()
+def test_many_cameras_have_fewer_neighbours(cameras):
     pairs, views = walk(cameras, 10**6)
     assert pairs == neighbours(cameras, NEAREST) and views == len(cameras) + 4 * len(pairs)
     fewer, views = walk(cameras, views - 1)
@@ -311,71 +306,48 @@ def test_a_view_between_is_interpolated():
         assert (clip[1] / clip[3]).item() * view.image_height / 2 == pytest.approx(-1 + fraction, abs=1e-3)
 
 
-def test_a_turn_takes_the_shorter_way():
-    for angle in (1e-9, 3.0, math.pi - 1e-6):
-        turns = Rotation.from_rotvec([[0, 0, 0.1], [0, 0, 0.1 + angle]])
-        first, second = _standing(np.zeros((2, 3)), turns)
-        for fraction, view in zip(FRACTIONS, views_between(first, second), strict=True):
-            wanted = Rotation.from_rotvec([0, 0, 0.1 + fraction * angle]).as_matrix()
-            np.testing.assert_allclose(view.world_view_transform[:3, :3], wanted, atol=1e-6)
-
-
 @pytest.mark.parametrize("value", ["-0.5", "nan"])
 def test_no_such_tolerance(value, tmp_path):
     with pytest.raises(UserError, match="prune_sh must be"):
         train.main(["-s", str(tmp_path), "-m", str(tmp_path / "out"), f"--prune_sh={value}"])
 
 
-def _left_out(**changes: object) -> LeftOut:
-    values = {
-        "gaussians": 1000, "unseen": 50, "faint": 0, "keep_unseen": False, "search": DONE, "views": 99,
-        "iterations": 7000, "max_sh_degree": 3, "sh_degree": 3, "cut_bounds": [0.3, 0.2, 0.1, 0.0],
-        "ply_bytes": 248_000, "ply_bytes_saved": 12_400, "seconds": 1.25,
-        "picture_bytes": 3_000_000, "picture_bytes_in_files": 12_000_000,
-        "test_change": {"largest": 0.0123, "psnr_before": 30.0, "psnr_after": 29.9},
-    }  # fmt: skip
-    return LeftOut(**values | changes)
+LEFT_OUT = LeftOut(
+    gaussians=1000, unseen=50, faint=0, keep_unseen=False, search=DONE, views=99, iterations=7000, max_sh_degree=3,
+    sh_degree=3, cut_bounds=[0.3, 0.2, 0.1, 0.0], ply_bytes=248_000, ply_bytes_saved=12_400, seconds=1.25,
+    picture_bytes=3_000_000, picture_bytes_in_files=12_000_000,
+    test_change={"largest": 0.0123, "psnr_before": 30.0, "psnr_after": 29.9},
+)  # fmt: skip
 
 
-def test_the_lines_of_a_report():
-    said = lines(_left_out())
-    assert said == [
-        "Of 1,000 Gaussians, 50 invisible ones were left out (5.0 %, 0.01 MB of the PLY); 99 views were searched in "
-        "1.2 s; test views change by at most 0.012 (values 0 to 1), PSNR 30.000 to 29.900 dB",
-        "All SH bands were kept. To cut them (--prune_sh) would move colours, from 0 to 1, by up to 0.3 above degree 0, "
-        "0.2 above degree 1, 0.1 above degree 2",
-        "Colours of the training photos are kept as bytes and at training size: 3.0 MB, 45.0 MB less than as float32 "
-        "at the size of the files",
-    ]
-    # 950 Gaussians lose 12 coefficients of 3 channels, 4 bytes each.
-    cut = lines(_left_out(sh_degree=1, test_change={"largest": 0.0}))
-    moved = "colours move by at most 0.2 (values 0 to 1)"
-    assert cut[1] == f"Left out the SH bands above degree 1 (0.14 MB of the PLY): {moved}"
-    assert cut[0].endswith("; test views change by at most 0 (values 0 to 1)")
-    zero = lines(_left_out(sh_degree=1, cut_bounds=[0.3, 0.0, 0.0, 0.0]))
-    assert zero[1] == "Left out the SH bands above degree 1 (0.14 MB of the PLY): they are zero throughout"
-    kept = lines(_left_out(keep_unseen=True, unseen=0, test_change={}))[0]
-    assert kept == "No Gaussian was left out (--keep_unseen)"
-    assert "none above degree 0" in lines(_left_out(max_sh_degree=0, sh_degree=0, cut_bounds=[0.0]))[1]
-    few = lines(_left_out(search=FEW, unseen=20, faint=20, test_change={}))[0]
-    assert few.endswith("; 99 views were searched in 1.2 s, with fewer than 1 % unseen besides")
-    long = lines(_left_out(search=TOO_LONG, unseen=0, test_change={}))[0]
-    assert long.endswith("; only opacities were compared: a search takes 99 views, more than a 15th of the iterations")
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, "50 invisible ones were left out (5.0 %, 0.01 MB of the PLY); 99 views were searched in 1.2 s"),
+        ({}, "by at most 0.012 (values 0 to 1), PSNR 30.000 to 29.900 dB"),
+        ({}, "would move colours, from 0 to 1, by up to 0.3 above degree 0, 0.2 above degree 1, 0.1 above degree 2"),
+        ({}, "at training size: 3.0 MB, 45.0 MB less"),
+        # 950 Gaussians lose 12 coefficients of 3 channels, 4 bytes each.
+        ({"sh_degree": 1}, "the SH bands above degree 1 (0.14 MB of the PLY): colours move by at most 0.2 (values"),
+        ({"sh_degree": 1, "cut_bounds": [0.3, 0.0, 0.0, 0.0]}, "(0.14 MB of the PLY): they are zero throughout"),
+        ({"max_sh_degree": 0, "sh_degree": 0, "cut_bounds": [0.0]}, "no SH bands above degree 0"),
+        ({"keep_unseen": True, "unseen": 0, "test_change": {}}, "No Gaussian was left out (--keep_unseen)\n"),
+        ({"search": FEW, "unseen": 20, "faint": 20}, "searched in 1.2 s, with fewer than 1 % unseen besides"),
+        ({"search": TOO_LONG, "unseen": 0}, "a search takes 99 views, more than a 15th of the iterations"),
+    ],
+)
+def test_the_lines_of_a_report(changes, said):
+    assert said in "\n".join(lines(replace(LEFT_OUT, **changes)))
 
 
 def test_the_line_that_training_prints():
-    plain = {"unseen": 0, "ply_bytes_saved": 0, "test_change": {}}
-    assert saved_line(_left_out(**plain), Path("OUT/iteration_7")) == (
-        "Saved 1,000 Gaussians to OUT/iteration_7 (0.25 MB)"
-    )
-    bands = saved_line(_left_out(**plain | {"sh_degree": 0, "ply_bytes_saved": 183_400}), Path("OUT"))
-    assert bands == "Saved 1,000 Gaussians to OUT (0.06 MB; SH bands above degree 0 left out)"
-    faint = saved_line(_left_out(**plain | {"unseen": 50, "faint": 50}), Path("OUT"))
-    assert faint.endswith(". Left out 50 invisible Gaussians (opacity below 1/255)")
-    assert saved_line(_left_out(), Path("OUT")).endswith(
-        "Left out 50 invisible Gaussians (no view depends on them); test views change by at most 0.012 (values 0 to 1),"
-        " PSNR 30.000 to 29.900 dB"
-    )
+    plain = replace(LEFT_OUT, unseen=0, ply_bytes_saved=0, test_change={})
+    assert saved_line(plain, Path("OUT/iteration_7")) == "Saved 1,000 Gaussians to OUT/iteration_7 (0.25 MB)"
+    bands = replace(plain, sh_degree=0, ply_bytes_saved=183_400)
+    assert saved_line(bands, Path("OUT")).endswith("(0.06 MB; SH bands above degree 0 left out)")
+    faint = replace(plain, unseen=50, faint=50)
+    assert saved_line(faint, Path("OUT")).endswith(". Left out 50 invisible Gaussians (opacity below 1/255)")
+    assert "(no view depends on them); test views change by at most 0.012" in saved_line(LEFT_OUT, Path("OUT"))
 
 
 def test_a_training_ends_with_at_most_six_lines(colmap_scene, tmp_path, capfd):

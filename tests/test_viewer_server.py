@@ -1,6 +1,5 @@
 """The viewer's server: who may connect and send what, what a request can reach, and the page over a websocket."""
 
-import argparse
 import contextlib
 import http.client
 import math
@@ -18,7 +17,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from gaussians import model, pipeline
-from synthetic import make_colmap_scene
+from synthetic import options_of
 
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
 
@@ -29,7 +28,6 @@ from websockets.asyncio.server import serve as serve_websockets  # noqa: E402
 from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
 
-from arguments import ModelParams  # noqa: E402
 from scene import Scene  # noqa: E402
 from splatting.viewer import auth, watchers  # noqa: E402
 from splatting.viewer import server as servers  # noqa: E402
@@ -56,6 +54,24 @@ class Served:
 
     def __exit__(self, *_: object) -> None:
         servers.stop(self.server)
+
+
+def _set(client: Client, handle: object, value: object) -> None:
+    client.send("GuiUpdateMessage", uuid=handle._impl.uuid, updates={"value": value})
+
+
+def _button(page: Page, label: str) -> object:
+    return next(h for h in page.server.gui._gui_input_handle_from_uuid.values() if getattr(h, "label", "") == label)
+
+
+@contextlib.contextmanager
+def _restored(page: Page):
+    """The page, whose controls get their values back."""
+    controls = page.server.gui._gui_input_handle_from_uuid.values()
+    before = [(handle, handle.value) for handle in controls if not handle._impl.is_button]
+    yield
+    for handle, value in before:
+        handle.value = value
 
 
 @pytest.fixture(scope="module")
@@ -85,11 +101,9 @@ def test_the_page_is_served_and_may_ask_nobody_else(local):
 @pytest.mark.parametrize(
     "path",
     [
-        "/../../etc/passwd", "/..%2f..%2f..%2f..%2f..%2f..%2fetc/passwd", "/%2e%2e/%2e%2e/%2e%2e/%2e%2e/etc/passwd",
-        "//etc/passwd", "/%2fetc%2fpasswd", "/..\\..\\etc\\passwd", "/%2e%2e%5c%2e%2e%5cetc%5cpasswd",
-        "/....//....//etc/passwd", "/%252e%252e/etc/passwd", "/./.././../etc/passwd", "/etc/passwd%00", "/\x00",
-        "http://127.0.0.1/../../etc/passwd", "/index.html/../../../_viser.py", "/assets/../../../_viser.py",
-        "/index.html%00.png", "/?../../etc/passwd=1",
+        "/../../etc/passwd", "/..%2f..%2f..%2fetc/passwd", "/%2e%2e/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd",
+        "/..\\..\\etc\\passwd", "/%252e%252e/etc/passwd", "/etc/passwd%00", "http://127.0.0.1/../../etc/passwd",
+        "/assets/../../../_viser.py",
     ],
 )  # fmt: skip
 def test_no_request_reads_a_file_but_the_page(local, path):
@@ -142,10 +156,9 @@ def test_other_addresses_need_the_token(public, capfd):
         Client(url, "http://127.0.0.1:1", headers={"Cookie": cookie.split(";")[0]})
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "127.3.2.1", "::1", "localhost"])
-def test_only_other_addresses_than_loopback_have_a_token(host):
-    assert Auth(host).token is None
-    assert all(Auth(other).token for other in ("0.0.0.0", "::", "", "192.168.0.1", f"{host}.evil.example"))
+def test_only_other_addresses_than_loopback_have_a_token():
+    assert not any(Auth(host).token for host in ("127.0.0.1", "127.3.2.1", "::1", "localhost"))
+    assert all(Auth(host).token for host in ("0.0.0.0", "::", "", "192.168.0.1", "127.0.0.1.evil.example"))
 
 
 def test_a_taken_port_is_passed_over_and_told(capfd):
@@ -166,9 +179,7 @@ def test_a_taken_port_is_passed_over_and_told(capfd):
     [
         ("no.such.host.invalid", 8080, "cannot listen at no.such.host.invalid"),
         ("198.51.100.7", 8080, "cannot listen at 198.51.100.7"),
-        ("a" * 80, 8080, "cannot listen"),
         ("127.0.0.1", 70000, "between 0 .any. and 65535, got 70000"),
-        ("127.0.0.1", -1, "between 0"),
     ],
 )
 def test_an_address_that_cannot_be_listened_at_is_refused_at_once(host, port, reason):
@@ -229,23 +240,17 @@ def test_what_a_browser_sends_is_heard(message):
     "message",
     [
         *[CAMERA | wrong for wrong in (
-            {"position": [0.0, 0.0]}, {"position": "abc"}, {"position": [[1], [2], [3]]}, {"wxyz": [1.0, 0.0, 0.0]},
-            {"position": [math.nan] * 3}, {"position": [1e300, 0, 0]}, {"fov": math.inf}, {"fov": None},
-            {"image_width": math.inf}, {"image_width": "x"}, {"up_direction": [1]}, {"more": 1},
-            {"up_direction": [0, 0, 0]}, {"up_direction": [0, 1e-200, 0]},
+            {"position": [0.0, 0.0]}, {"position": "abc"}, {"position": [math.nan] * 3}, {"position": [1e300, 0, 0]},
+            {"fov": None}, {"image_width": math.inf}, {"more": 1}, {"up_direction": [0, 1e-200, 0]},
         )],
         CLICK | {"name": 5}, CLICK | {"ray_origin": []},
         *[_update(uuid, value) for uuid, value in (
-            ("text", 1), ("text", ["a"]), ("number", "1"), ("number", math.nan), ("number", math.inf), ("number", True),
-            ("whole", [1]), ("switch", 1), ("switch", "yes"), ("vector", []), ("vector", [1, 2]), ("vector", [1] * 4),
-            ("vector", "123"), ("vector", [1, 2, math.nan]), ("vector", 1), ("none", 1), (5, 1), ("number", 1e300),
-            ("whole", 1e300), ("whole", 2**53 + 1), ("whole", -(2**63)), ("vector", [1e300, 0, 0]),
-            ("nested", [[1, 2], [1e300, 4]]), ("nested", [1, 2]),
+            ("text", 1), ("number", "1"), ("number", math.nan), ("number", True), ("number", 1e300), ("whole", [1]),
+            ("whole", 2**53 + 1), ("switch", 1), ("vector", []), ("vector", [1] * 4), ("vector", "123"), ("vector", 1),
+            ("vector", [1, 2, math.nan]), ("none", 1), (5, 1), ("nested", [[1, 2], [1e300, 4]]), ("nested", [1, 2]),
         )],
         _update("number", 1, removed=True), _update("number", 1) | {"updates": {"update_cb": [5]}},
-        _update("number", 1) | {"updates": 5}, {"type": "ShareUrlRequest"}, {"type": 5}, {"type": "Message"}, {}, [], 5,
-        {"type": "FileTransferStartUpload", "source_component_uuid": "number", "transfer_uuid": "t", "filename": "f",
-         "mime_type": "m", "part_count": 1, "size_bytes": 3},
+        {"type": "ShareUrlRequest"}, {"type": 5}, {"type": "FileTransferStartUpload"}, {}, [], 5,
     ],
 )  # fmt: skip
 def test_nothing_else_is_heard(message):
@@ -259,34 +264,22 @@ def test_what_is_no_message_is_not_heard_and_what_only_shows_something_takes_no_
     assert not is_accepted(message, lambda uuid: SimpleNamespace(value="a", disabled=True))
 
 
-def _attack(client: Client, uuid: str) -> None:
-    """All that once made viser's controls raise in the thread that trains, and a wish for a tunnel to the outside."""
-    for update in ({"update_cb": [5]}, {"sync_cb": 5}, {"gui_api": 5}, {"removed": True}, {"uuid": 5}):
-        client.send("GuiUpdateMessage", uuid=uuid, updates=update)
-    client.send(
-        "FileTransferStartUpload",
-        source_component_uuid=uuid, transfer_uuid="t", filename="f", mime_type="m", part_count=1, size_bytes=3,
-    )  # fmt: skip
-    client.send("FileTransferPart", source_component_uuid=uuid, transfer_uuid="t", part_index=0, content=b"abc")
-    client.send("ShareUrlRequest")
-
-
 def test_no_message_takes_a_control_from_the_program_or_opens_a_tunnel(local, monkeypatch, capfd):
     opened = []
     monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *_: opened.append(1))
-    heard = local.server.gui.add_checkbox("heard", False)
-    shown, field = local.server.gui.add_text("Iteration", "0", disabled=True), local.server.gui.add_number("n", 1.0)
+    heard, shown = local.server.gui.add_checkbox("heard", False), local.server.gui.add_text("n", "0", disabled=True)
     with Client(local.url) as client:
         client.look()
-        for handle in (shown, field):
-            _attack(client, handle._impl.uuid)
+        for update in ({"update_cb": [5]}, {"sync_cb": 5}, {"gui_api": 5}, {"removed": True}, {"uuid": 5}):
+            client.send("GuiUpdateMessage", uuid=shown._impl.uuid, updates=update)
+        client.send("ShareUrlRequest")
         client._socket.send("text")
         client._socket.send(b"\xff")
         client.look((0.0, 0.0))
-        client.send("GuiUpdateMessage", uuid=heard._impl.uuid, updates={"value": True})
+        _set(client, heard, True)
         wait_for(lambda: heard.value)
-    shown.value, field.value = "17", 2.0
-    assert (shown.value, field.value) == ("17", 2.0) and not opened
+    shown.value = "17"
+    assert shown.value == "17" and not opened
     said = capfd.readouterr()
     assert "Traceback" not in said.err and "warn" not in said.err.lower()
 
@@ -300,31 +293,15 @@ def test_a_long_message_ends_its_connection(local):
                 one.recv(LIMIT)
 
 
-def test_many_connections_leave_the_process_its_files(local, monkeypatch):
-    """Each takes a file descriptor, also one that asks for nothing; a training without one cannot save."""
-    monkeypatch.setattr(auth, "MOST", 4)
-    taken = [socket.create_connection(("127.0.0.1", local.port), LIMIT) for _ in range(12)]
-    wait_for(lambda: len(select.select(taken, [], [], 0)[0]) >= 8)  # nothing but an end can have come
-    ended = select.select(taken, [], [], 0)[0]
-    for one in taken:
-        if one not in ended:
-            one.sendall(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{local.port}\r\n\r\n".encode())
-    answers = [one.recv(12) for one in taken if one not in ended]
-    assert 1 <= answers.count(b"HTTP/1.1 200") == len(answers) <= 4  # one of an earlier test may still be there
-    for one in taken:
-        one.close()
-    wait_for(lambda: get(local.port)[0] == 200)
-
-
-def test_who_asks_for_nothing_does_not_keep_others_out(local, monkeypatch):
-    """The oldest goes that has said nothing, then the oldest that waits for an answer; an open page stays."""
+def test_many_connections_leave_the_process_its_files_and_others_their_answers(local, monkeypatch):
+    """Each takes a file descriptor, and a training without one cannot save. An open page stays."""
     monkeypatch.setattr(auth, "MOST", 4)
     with Client(local.url) as page:
         page.look()
-        silent = [socket.create_connection(("127.0.0.1", local.port), LIMIT) for _ in range(10)]
+        silent = [socket.create_connection(("127.0.0.1", local.port), LIMIT) for _ in range(12)]
+        wait_for(lambda: len(select.select(silent, [], [], 0)[0]) >= 9)  # nothing but an end can have come
         for _ in range(5):
             assert get(local.port)[0] == 200
-        wait_for(lambda: len(select.select(silent, [], [], 0)[0]) >= 7)
         page.look((0.0, 0.0, -5.0))
         wait_for(lambda: [c for c in local.server.get_clients().values() if c.camera.position[2] == -5.0])
         for one in silent:
@@ -373,9 +350,7 @@ def _opening(port: int) -> bytes:
 
 
 def test_a_browser_that_answers_nothing_does_not_hold_the_end(monkeypatch):
-    monkeypatch.setitem(
-        serve_websockets.__init__.__kwdefaults__, "close_timeout", 3600
-    )  # which is not to be waited for
+    monkeypatch.setitem(serve_websockets.__init__.__kwdefaults__, "close_timeout", 3600)  # not to be waited for
     own = Served()
     with socket.create_connection(("127.0.0.1", own.port), LIMIT) as one:
         one.sendall(_opening(own.port))
@@ -385,16 +360,21 @@ def test_a_browser_that_answers_nothing_does_not_hold_the_end(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory):
+def _page(_colmap_master, tmp_path_factory):
     """A page whose model and first photo have names that are not UTF-8."""
-    folder = tmp_path_factory.mktemp("page")
-    make_colmap_scene(folder / "scene")
-    given = argparse.Namespace(source_path=str(folder / "scene"), model_path=str(folder / "a\udcff"), eval=True)
-    scene = Scene(ModelParams(argparse.ArgumentParser()).extract(given), model(200), shuffle=False, start=False)
+    options = options_of(_colmap_master, tmp_path_factory.mktemp("page") / "a\udcff", eval=True)
+    scene = Scene(options, model(200), shuffle=False, start=False)
     scene.getTrainCameras()[0].image_name = "b\udcff.png"
     shown = Page(ANY, scene, pipeline(), False, False)
     yield shown
     shown.stop()
+
+
+@pytest.fixture
+def page(_page):
+    """The page, which the browsers of a test leave before the next one begins."""
+    yield _page
+    wait_for(lambda: not _page.watchers.any)
 
 
 def _answered(page: Page, client: Client):
@@ -403,7 +383,7 @@ def _answered(page: Page, client: Client):
     return client.picture()
 
 
-def test_pictures_follow_the_camera_of_each_browser(page, monkeypatch):
+def test_each_browser_gets_pictures_of_its_own_camera(page, monkeypatch):
     monkeypatch.setattr(watchers, "STILL_AFTER", 3600.0)  # seconds, so that no machine is too slow to see a movement
     with Client(page.url) as one, Client(page.url) as other:
         one.look(size=(120, 80))
@@ -412,38 +392,22 @@ def test_pictures_follow_the_camera_of_each_browser(page, monkeypatch):
         other.look((0.5, 0.0, -4.0), size=(60, 60))
         assert _answered(page, other).shape == (120, 120, 3)
         one.look((1.5, 0.0, -4.0), size=(120, 80))
-        coarse = _answered(page, one)
-        assert coarse.shape == (40, 60, 3)
-        monkeypatch.setattr(watchers, "STILL_AFTER", 0.0)
-        sharp = _answered(page, one)
-        assert sharp.shape == (160, 240, 3) and abs(sharp.astype(int) - first).mean() > 3
-    wait_for(lambda: not page.watchers.any)
+        assert _answered(page, one).shape == (40, 60, 3)  # coarse while it moves
 
 
-def test_hostile_messages_neither_stop_the_page_nor_make_large_pictures(page):
-    with Client(page.url) as client:
-        client.look(size=(10**6, 10**6))
-        assert max(_answered(page, client).shape) <= 1600
-        for wrong in ({"position": [float("nan")] * 3}, {"fov": 0.0}, {"wxyz": [0.0] * 4}):
-            client.look(**wrong)
-        client.look((0.0, 0.0, -5.0), size=(64, 64))
-        assert _answered(page, client).shape[0] in (32, 128)
-    page.view.scaling.value = float("nan")
-    page.view.background.value = (999, -5, 0)
-    page.view.mode.value = "no such mode"
-    settings = page.settings()
-    assert settings.scaling == 1.0 and settings.background == (1.0, 0.0, 0.0)
-    page.view.scaling.value, page.view.mode.value, page.view.background.value = 1.0, "Colour", (0, 0, 0)
+def test_settings_out_of_range_count_as_the_nearest(page):
+    with _restored(page):
+        page.view.scaling.value, page.view.background.value = 1e9, (999, -5, 0)
+        page.view.degree.value = 1.7  # as no page sends it; the rasterizer takes whole ones alone
+        settings = page.settings()
+        assert settings.scaling == 2.0 and settings.background == (1.0, 0.0, 0.0)
+        assert type(settings.sh_degree) is int and settings.sh_degree == 1
 
 
 @pytest.mark.parametrize(
     "wrong",
-    [
-        *({"size": size} for size in ((0, 64), (96, 0), (0, 0), (-5, 1e18))),
-        {"position": (0.0, 0.0, 0.0)},  # which is what it looks at
-        {"position": (1e18, 0.0, 0.0)},
-    ],
-    ids=str,
+    [{"size": (0, 0)}, {"size": (-5, 1e18)}, {"position": (0.0, 0.0, 0.0)}, {"position": (1e18, 0.0, 0.0)}],
+    ids=["no window", "an endless window", "at what it looks at", "far away"],
 )
 def test_a_browser_of_any_window_and_place_goes_to_a_camera(page, capfd, wrong):
     name = next(iter(page.images._cameras.by_name))
@@ -451,7 +415,7 @@ def test_a_browser_of_any_window_and_place_goes_to_a_camera(page, capfd, wrong):
     with Client(page.url) as client:
         client.look(**wrong)
         wait_for(page.server.get_clients)
-        client.send("GuiUpdateMessage", uuid=page.images.camera._impl.uuid, updates={"value": name})
+        _set(client, page.images.camera, name)
         camera = page.images._cameras.by_name[name]
         place = camera_center(camera.R, camera.T)
         heard = {}
@@ -459,22 +423,21 @@ def test_a_browser_of_any_window_and_place_goes_to_a_camera(page, capfd, wrong):
             heard |= {message["type"]: message for message in client.messages() if not message.get("initial")}
         assert heard["SetCameraPositionMessage"]["position"] == pytest.approx(place)
         assert 0 < heard["SetCameraFovMessage"]["fov"] < math.pi
-    wait_for(lambda: not page.watchers.any)
     assert "Traceback" not in capfd.readouterr().err
 
 
 def test_a_crop_box_that_many_drag_is_drawn_once(page, capfd):
-    crop, corner = page.view.crop._impl.uuid, page.view.corners[0]._impl.uuid
+    crop, corner = page.view.crop, page.view.corners[0]
     with Client(page.url) as one, Client(page.url) as other:
         for client in (one, other):
             client.look()
         for step in range(200):
-            one.send("GuiUpdateMessage", uuid=crop, updates={"value": step % 2 == 0})
-            other.send("GuiUpdateMessage", uuid=corner, updates={"value": [-float(step + 1), -1.0, -1.0]})
-        wait_for(lambda: page.view.corners[0].value[0] == -200.0 and not page.view.crop.value)
-        one.send("GuiUpdateMessage", uuid=crop, updates={"value": True})
+            _set(one, crop, step % 2 == 0)
+            _set(other, corner, [-float(step + 1), -1.0, -1.0])
+        wait_for(lambda: corner.value[0] == -200.0 and not crop.value)
+        _set(one, crop, True)
         wait_for(lambda: page.view._box is not None)
-        one.send("GuiUpdateMessage", uuid=crop, updates={"value": False})
+        _set(one, crop, False)
         wait_for(lambda: page.view._box is None)
     assert "/crop box" not in page.server.scene._handle_from_node_name
     assert "rror" not in capfd.readouterr().err
@@ -539,24 +502,6 @@ def test_one_line_says_where_the_page_is_and_another_warns_of_a_network(host, ad
     assert said.err.count("\n") == (4 if "token" in address else 2)
 
 
-def _set(client: Client, handle: object, value: object) -> None:
-    client.send("GuiUpdateMessage", uuid=handle._impl.uuid, updates={"value": value})
-
-
-def _button(page: Page, label: str) -> object:
-    return next(h for h in page.server.gui._gui_input_handle_from_uuid.values() if getattr(h, "label", "") == label)
-
-
-@contextlib.contextmanager
-def _restored(page: Page):
-    """The page, whose controls get their values back."""
-    controls = page.server.gui._gui_input_handle_from_uuid.values()
-    before = [(handle, handle.value) for handle in controls if not handle._impl.is_button]
-    yield
-    for handle, value in before:
-        handle.value = value
-
-
 def test_each_browser_reads_the_scale_of_its_own_frame(page):
     def until(words: str, different: int) -> None:
         def holds() -> bool:
@@ -578,11 +523,11 @@ def test_each_browser_reads_the_scale_of_its_own_frame(page):
     wait_for(lambda: not page._legends)
 
 
-def test_a_crop_is_written_into_the_models_folder_and_nowhere_else(page, tmp_path, capfd):
+def test_a_crop_is_written_into_the_models_folder_and_nowhere_else(page, capfd):
     view, folder = page.view, page.view.crop_file.folder
     with Client(page.url) as client, _restored(page):
         client.look()
-        for name in ("../../outside", str(tmp_path / "outside"), "", "a/b", "mine"):
+        for name in ("../../outside", "mine"):  # test_viewer.py has more names
             _set(client, view.crop_file.field, name)
             _set(client, view.corners[0], [-0.5, -0.5, -0.5])
             _set(client, view.corners[1], [0.5, 0.5, 0.5])
@@ -595,9 +540,9 @@ def test_a_crop_is_written_into_the_models_folder_and_nowhere_else(page, tmp_pat
             assert heard["title"] == ("Exported" if name == "mine" else "Not exported")
             assert 0 < heard["auto_close_seconds"] < 60  # so that messages do not pile up
     assert folder.parent.name == "a\udcff" and [file.name for file in folder.iterdir()] == ["mine.ply"]
-    assert not list(folder.parent.parent.rglob("outside*")) and not list(tmp_path.iterdir())
+    assert not list(folder.parent.parent.rglob("outside*"))
     said = capfd.readouterr()
-    assert said.err.count("warning: the crop is not exported") == 4 and "of 200 Gaussians to" in said.out
+    assert said.err.count("warning: the crop is not exported") == 1 and "of 200 Gaussians to" in said.out
 
 
 def test_reset_gives_the_view_its_first_values(page):

@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -27,11 +26,6 @@ from splatting.viewer.page import serve  # noqa: E402
 from utils.system_utils import UserError  # noqa: E402
 
 ITERATIONS = 120
-
-
-@pytest.fixture(autouse=True)
-def _stdout(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
 
 
 class Watched:
@@ -151,42 +145,21 @@ def test_nothing_is_drawn_while_nobody_looks(colmap_scene, tmp_path, monkeypatch
     assert "viewing_seconds" not in json.loads((tmp_path / "out/train_log.json").read_text())[-1]
 
 
-def test_a_paused_training_waits_takes_single_steps_and_shows_how_it_goes(colmap_scene, tmp_path, monkeypatch):
+def test_the_page_shows_how_the_training_goes(colmap_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(observed, "_NUMBERS_EVERY", 0.0)
-    reached, seen = [], []
-
-    def drive(watched: Watched) -> None:
-        step, resume = watched.requests.step, watched.requests.resume
-
-        def reach() -> None:
-            reached.append(int(watched.page.iteration.value))
-
-        watched.pause(_after(0.3, reach, step), _after(0.3, reach, step), _after(0.3, reach, resume))
+    seen = []
 
     def note(watched: Watched) -> None:
         tab = watched.observer._tab
         seen.append((int(watched.page.iteration.value), float(tab.speed.value), len(tab.curve.data[0])))
 
-    watched = Watched(monkeypatch, {2: Watched.connect, 30: drive, 33: note, 34: note, 60: note, 115: note})
+    watched = Watched(monkeypatch, {2: Watched.connect, 33: note, 34: note, 60: note, 115: note})
     _train(colmap_scene, tmp_path / "out", "--test_iterations", *range(10, 120, 10))
-    assert reached == watched.paused == [30, 31, 32]
     iterations, speeds, points = zip(*seen, strict=True)
     assert iterations == (32, 33, 59, 114) and min(speeds) > 0 and 1 < points[2] < points[3]
     tab = watched.observer._tab
     seconds, psnr = tab.curve.data
     assert (seconds[1:] >= seconds[:-1]).all() and tab.curve.visible and 5 < psnr.mean() < 60 and float(tab.loss.value)
-
-
-def test_stop_saves_a_checkpoint_that_can_be_resumed(colmap_scene, tmp_path, monkeypatch, capfd):
-    Watched(monkeypatch, {33: lambda w: w.requests.stop()})
-    with pytest.raises(KeyboardInterrupt):
-        _train(colmap_scene, tmp_path / "out", "--no_curve")
-    assert load_checkpoint(str(tmp_path / "out/chkpnt33.pth"), "cpu")[1] == 33
-    assert "with --start_checkpoint" in capfd.readouterr().err
-    monkeypatch.undo()
-    monkeypatch.setattr(sys, "stdout", sys.stdout)
-    resumed = _train(colmap_scene, tmp_path / "out", "--start_checkpoint", tmp_path / "out/chkpnt33.pth", viewer=False)
-    assert resumed.read_bytes() == _train(colmap_scene, tmp_path / "alone", viewer=False).read_bytes()
 
 
 @pytest.mark.parametrize("end", ["stop", "signal"])
@@ -239,21 +212,21 @@ class _Staying(Watched):
             client.look((0.0, 0.0, -3.0))
             return client.picture()
 
-    def closes(self) -> None:
-        """Press the button."""
+    def look_and_close(self) -> np.ndarray:
+        """The picture; then press the button."""
+        picture = self.picture()
         tab = self.observer._tab
         assert tab.close.visible and not tab.pause.visible and not tab.note.visible
         with Client(self.page.url) as client:
             client.look()
             client.send("GuiUpdateMessage", uuid=tab.close._impl.uuid, updates={"value": True})
             wait_for(lambda: self.requests.stopped)
+        return picture
 
 
 def test_the_page_stays_after_its_training_and_shows_the_saved_model(colmap_scene, tmp_path, monkeypatch, capfd):
     def visit(watched: _Staying) -> tuple:
-        shown, picture = watched.page._gaussians, watched.picture()
-        watched.closes()
-        return shown, picture, watched.page.count.value
+        return watched.page._gaussians, watched.look_and_close(), watched.page.count.value
 
     watched = _Staying(monkeypatch, {5: lambda w: w.requests.pause() or w.requests.resume()}, visit)
     # The last iteration is one of densification, after the model is saved.
@@ -266,17 +239,15 @@ def test_the_page_stays_after_its_training_and_shows_the_saved_model(colmap_scen
     assert f"The page stays open at {watched.page.url}" in said and "--viewer_exit" in said
 
 
-def test_a_training_that_the_page_stops_can_be_looked_at(colmap_scene, tmp_path, monkeypatch):
-    def visit(watched: _Staying) -> np.ndarray:
-        picture = watched.picture()
-        watched.closes()
-        return picture
-
-    watched = _Staying(monkeypatch, {33: lambda w: w.requests.stop()}, visit)
+def test_a_training_that_the_page_stops_can_be_looked_at_and_resumed(colmap_scene, tmp_path, monkeypatch, capfd):
+    watched = _Staying(monkeypatch, {33: lambda w: w.requests.stop()}, _Staying.look_and_close)
     with pytest.raises(KeyboardInterrupt):
         _train(colmap_scene, tmp_path / "out", "--no_curve", stays=True)
     assert watched.seen[0].std() > 5 and watched.page.iteration.value == "33"
-    assert (tmp_path / "out/chkpnt33.pth").exists()
+    assert load_checkpoint(str(tmp_path / "out/chkpnt33.pth"), "cpu")[1] == 33
+    assert "with --start_checkpoint" in capfd.readouterr().err
+    resumed = _train(colmap_scene, tmp_path / "out", "--start_checkpoint", tmp_path / "out/chkpnt33.pth", viewer=False)
+    assert resumed.read_bytes() == _train(colmap_scene, tmp_path / "alone", viewer=False).read_bytes()
 
 
 def test_a_signal_ends_the_page_of_a_training_that_is_over(colmap_scene, tmp_path, monkeypatch):

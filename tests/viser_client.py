@@ -50,9 +50,8 @@ class Client:
         """The messages of the next packet. TimeoutError without one."""
         packet = self._socket.recv(timeout)
         length = int.from_bytes(packet[8:_HEAD], "little")
-        return msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(packet[_HEAD : _HEAD + length]))[
-            "messages"
-        ]
+        unpacked = zstandard.ZstdDecompressor().decompress(packet[_HEAD : _HEAD + length])
+        return msgspec.msgpack.decode(unpacked)["messages"]
 
     def until(self, kind: str, timeout: float = _PATIENCE) -> dict[str, Any]:
         """The next message of a kind."""

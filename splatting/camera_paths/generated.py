@@ -47,7 +47,8 @@ class Interpolated:
         rows = np.column_stack([keys.positions, _same_side(keys.quaternions), keys.fov])
         self._radius = turning_radius(keys)
         knots = np.concatenate([[0.0], np.cumsum(np.sqrt(self._steps(rows)))])
-        self._curve = CubicHermiteSpline(knots, rows, _tangents(knots, rows))
+        # Tangents of the parabola through a row and its neighbours; at the ends, of the line.
+        self._curve = CubicHermiteSpline(knots, rows, np.gradient(rows, knots, axis=0))
         samples = np.unique(np.linspace(knots[:-1], knots[1:], _SEGMENT_SAMPLES + 1))
         way = np.concatenate([[0.0], np.cumsum(self._steps(self._rows(samples)))])
         grows = np.concatenate([[True], np.diff(way) > _STEP * way[-1]])
@@ -229,15 +230,6 @@ def _same_side(quaternions: np.ndarray) -> np.ndarray:
     """The quaternions, negated where the one before is nearer to that."""
     flips = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     return quaternions * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
-
-
-def _tangents(knots: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Derivatives at the knots: those of the parabola through a row and its neighbours; at the ends, of the line."""
-    spans = np.diff(knots)[:, None]
-    slopes = np.diff(rows, axis=0) / spans
-    before, after = spans[:-1], spans[1:]
-    inner = (slopes[:-1] * after + slopes[1:] * before) / (before + after)
-    return np.concatenate([slopes[:1], inner, slopes[-1:]])
 
 
 def plane_normal(poses: Poses) -> np.ndarray:

@@ -133,21 +133,18 @@ class Box:
     half: tuple[float, float, float]
     turn: float
 
-    def _to_local(self, v: np.ndarray) -> np.ndarray:
-        c, s = np.float32(np.cos(self.turn)), np.float32(np.sin(self.turn))
+    def _turned(self, v: np.ndarray, sign: int = 1) -> np.ndarray:
+        """Vectors (3, R) in the box's own frame; with the sign -1 back to the world's."""
+        c, s = np.float32(np.cos(self.turn)), np.float32(sign * np.sin(self.turn))
         return np.stack([c * v[0] - s * v[2], v[1], s * v[0] + c * v[2]])
-
-    def _to_world(self, v: np.ndarray) -> np.ndarray:
-        c, s = np.float32(np.cos(self.turn)), np.float32(np.sin(self.turn))
-        return np.stack([c * v[0] + s * v[2], v[1], -s * v[0] + c * v[2]])
 
     def local(self, points: np.ndarray) -> np.ndarray:
         """Return points (3, R) in the box's own frame, in units of its half sizes: the surface is at max |.| = 1."""
-        return self._to_local(points - _column(*self.center)) / _column(*self.half)
+        return self._turned(points - _column(*self.center)) / _column(*self.half)
 
     def intersect(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        o = self._to_local(origin - _column(*self.center))
-        d = self._to_local(direction)
+        o = self._turned(origin - _column(*self.center))
+        d = self._turned(direction)
         half = _column(*self.half)
         with np.errstate(divide="ignore", invalid="ignore"):
             middle, reach = -o / d, np.abs(half / d)
@@ -162,7 +159,7 @@ class Box:
         index = np.arange(q.shape[1])
         n = np.zeros_like(q)
         n[face, index] = np.sign(q[face, index])
-        return self._to_world(n)
+        return self._turned(n, -1)
 
 
 Shape = Ground | Sphere | Torus | Box

@@ -77,13 +77,8 @@ def write_html(
         "name": _NAME,
         "settings": settings(poses, names, turn, camera_path, background, distance),
     }
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    options = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    environment = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), **options)
     content = environment.get_template("page.html.jinja").render(
         background=", ".join(f"{255 * value:.0f}" for value in background),
         css=(FOLDER / "viewer.css").read_text(encoding="utf-8"),

@@ -198,9 +198,8 @@ def _in_chunks(splats: Splats) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _table(name: str, columns: list[str], values: np.ndarray, kind: str) -> PlyElement:
-    return PlyElement.describe(
-        unstructured_to_structured(values, np.dtype([(column, kind) for column in columns])), name
-    )
+    form = np.dtype([(column, kind) for column in columns])
+    return PlyElement.describe(unstructured_to_structured(values, form), name)
 
 
 def read_compressed_ply(path: str | os.PathLike) -> Splats:

@@ -186,10 +186,9 @@ def _write_stage(usd: ModuleType, layer: str, splats: Splats) -> None:
     for name, value in values.items():
         field.GetPrim().GetAttribute(name).Set(value)
     # The kernel reaches three standard deviations; bounds let programs frame and cull the splats.
-    reach = 3 * np.exp(splats.log_scales.max(axis=1, keepdims=True)) if len(splats) else splats.means
-    bounds = (
-        [(splats.means - reach).min(axis=0), (splats.means + reach).max(axis=0)] if len(splats) else np.zeros((2, 3))
-    )
-    extent = field.GetPrim().GetAttribute("extent")
-    extent.Set(vt.Vec3fArray.FromNumpy(np.asarray(bounds, np.float32)))
+    bounds = np.zeros((2, 3), np.float32)
+    if len(splats):
+        reach = 3 * np.exp(splats.log_scales.max(axis=1, keepdims=True))
+        bounds[:] = (splats.means - reach).min(axis=0), (splats.means + reach).max(axis=0)
+    field.GetPrim().GetAttribute("extent").Set(vt.Vec3fArray.FromNumpy(bounds))
     stage.GetRootLayer().Save()

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from utils.sh_utils import C0
+from utils.system_utils import UserError
 
 _LARGEST = 80.0  # of a logarithm of a scale; exp(89) is infinite in float32
 # Sign of each SH coefficient under y -> -y, z -> -z: each basis function is a polynomial of x y z, in the order of
@@ -74,6 +75,16 @@ def within_box(splats: Splats, box: Sequence[float]) -> np.ndarray:
     """(N,) bool: the splats whose centre lies in a box x0 y0 z0 x1 y1 z1 of the means' frame."""
     low, high = np.asarray(box[:3]), np.asarray(box[3:])
     return ((splats.means >= low) & (splats.means <= high)).all(axis=1)
+
+
+def choose(splats: Splats, crop: Sequence[float] | None, min_opacity: float) -> np.ndarray:
+    """(N,) bool: the splats that are drawn, lie in the box, and have at least this opacity. UserError if none do."""
+    keep = drawable(splats) & (opacities(splats) >= min_opacity)
+    if crop is not None:
+        keep &= within_box(splats, crop)
+    if len(splats) and not keep.any():
+        raise UserError("no Gaussian is left; give a larger --crop or a smaller --min_opacity")
+    return keep
 
 
 def tidy(splats: Splats) -> Splats:

@@ -169,9 +169,8 @@ def _read_zstd(content: bytes, path: str | os.PathLike) -> Splats:
 def _read_gzip(content: bytes) -> Splats:
     stream = gzip.GzipFile(fileobj=io.BytesIO(content))
     header = _header(stream.read(_HEADER.size), (2, 3), len(content))
-    parts = [
-        stream.read(width * header.count) for width in _widths(header)
-    ]  # no more than that, however much is packed
+    # No more than that, however much is packed.
+    parts = [stream.read(width * header.count) for width in _widths(header)]
     stream.read(1)  # at the end it checks the sum
     return _splats(parts, header)
 

@@ -3,7 +3,6 @@
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageOps
 from tqdm import tqdm
+from tqdm.contrib.concurrent import thread_map
 
 from scene.images.decode import picture_size
 from splatting.files.image_files import UNREADABLE, open_image
@@ -175,13 +175,8 @@ def _in_threads(work: Callable[[str], None], names: Sequence[str], title: str) -
             return error
         return None
 
-    with ThreadPoolExecutor(threads()) as pool:
-        try:
-            attempts = tqdm(pool.map(attempt, names), total=len(names), desc=title, dynamic_ncols=True)
-            faults = [fault for fault in attempts if fault]
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    attempts = thread_map(attempt, names, max_workers=threads(), desc=title, dynamic_ncols=True)
+    faults = [fault for fault in attempts if fault]
     if len(faults) == 1:
         raise faults[0]
     if faults:
@@ -219,10 +214,8 @@ def extract_frames(video: Path, folder: Path, count: int) -> None:
 def sharpness(frame: np.ndarray) -> float:
     """Return the mean squared difference of neighbouring green values along both axes of a frame (H, W, 3) uint8."""
     rows, columns = frame[::_STEP, :, 1].astype(np.int16), frame[:, ::_STEP, 1].astype(np.int16)
-    return sum(
-        float(np.mean(np.square(np.diff(lines, axis=axis), dtype=np.float64)))
-        for axis, lines in ((1, rows), (0, columns))
-    )
+    changes = np.diff(rows, axis=1), np.diff(columns, axis=0)
+    return sum(float(np.square(change, dtype=np.float64).mean()) for change in changes)
 
 
 def _frames(decoder: Any, video: Path) -> Iterator[np.ndarray]:

@@ -75,12 +75,7 @@ def survey(job: dict[str, Any]) -> None:
                 "track_length": model.compute_mean_track_length(),
                 "error": model.compute_mean_reprojection_error(),
                 "cameras": [
-                    {
-                        "id": i,
-                        "model": c.model_name,
-                        "size": [c.width, c.height],
-                        "params": [float(p) for p in c.params],
-                    }
+                    {"id": i, "model": c.model_name, "size": [c.width, c.height], "params": c.params.tolist()}
                     for i, c in sorted(model.cameras.items())
                 ],
             }

@@ -117,12 +117,13 @@ def _composed(settings: Settings, target: Tensor, image: Tensor) -> Tensor:
 
 def _fitted(image: Tensor, pose: Pose) -> Tensor:
     """The image in the middle of a canvas of the window's aspect, not larger than LONGEST."""
-    shrink = max(image.shape[1:]) / LONGEST
+    aspect = pose.width / pose.height
+    shrink = max(canvas(image.shape[2], image.shape[1], aspect)) / LONGEST
     if shrink > 1:
         size = [max(1, round(side / shrink)) for side in image.shape[1:]]
         image = torch.nn.functional.interpolate(image[None], size, mode="area")[0]
     height, width = image.shape[1:]
-    wide, high = canvas(width, height, pose.width / pose.height)
+    wide, high = canvas(width, height, aspect)
     fitted = image.new_full((3, high, wide), _BORDER)
     top, left = (high - height) // 2, (wide - width) // 2
     fitted[:, top : top + height, left : left + width] = image

@@ -1,4 +1,4 @@
-"""The page: its server, its tabs and the browsers that watch; and the page of a saved model."""
+"""The page: its server, its tabs and the browsers that watch."""
 
 import argparse
 import sys
@@ -134,10 +134,10 @@ class Page:
         if fault != self._faults.get(client):
             self._faults[client] = fault
             tqdm.write(f"warning: the viewer could not draw a frame ({fault})", file=sys.stderr)
-            self._tell(self.server.get_clients().get(client), "No picture", fault, color="red")
+            self._notify(self.server.get_clients().get(client), "No picture", fault, color="red")
 
     @staticmethod
-    def _tell(client: "viser.ClientHandle | None", title: str, body: str, **look: Any) -> None:
+    def _notify(client: "viser.ClientHandle | None", title: str, body: str, **look: Any) -> None:
         """Show a message to a browser, unless it has left."""
         if client is not None:
             client.add_notification(title, as_utf8(body), auto_close_seconds=_READ, **look)
@@ -150,7 +150,7 @@ class Page:
         """Show a notification to all, and wait until it has probably been sent."""
         clients = self.server.get_clients().values()
         for client in clients:
-            self._tell(client, title, body)
+            self._notify(client, title, body)
             client.flush()
         if clients:
             time.sleep(_SENT)
@@ -173,11 +173,11 @@ class Page:
         try:
             file = self.path.save()
         except UserError as error:
-            self._tell(client, "Not saved", str(error))
+            self._notify(client, "Not saved", str(error))
         else:
             video = f"{typed_command('render.py')} -m {folder} --path {file}"
             tqdm.write(as_utf8(f"Saved {file}; its video: {video}"), file=sys.stdout)
-            self._tell(client, "Saved", f"{PATHS}/{file.name}; the terminal shows how to make its video")
+            self._notify(client, "Saved", f"{PATHS}/{file.name}; the terminal shows how to make its video")
 
     def stop(self) -> None:
         """Stop to listen."""
@@ -193,15 +193,6 @@ def write_crop(path: Path, gaussians: GaussianModel, box: tuple[Vector, Vector],
         raise UserError("the crop box has no Gaussians; move its corners")
     write_plain_ply(path, splats)
     return len(splats)
-
-
-def serve_saved(address: Address, scene: Scene, pipe: argparse.Namespace, white: bool, with_exposures: bool) -> None:
-    """Serve the page until a signal comes, and raise that. white, with_exposures: as for `Page`."""
-    page = Page(address, scene, pipe, white, with_exposures)
-    try:
-        raise serve(page)
-    finally:
-        page.stop()
 
 
 def serve(page: Page) -> type[KeyboardInterrupt] | None:

@@ -47,8 +47,8 @@ class PathTab:
         pose = pose_of(client.camera)
         if pose is None or len(self.keyframes) == _MOST:
             return
-        wait = self.seconds.value if math.isfinite(self.seconds.value) else 0.1
-        seconds = self.keyframes[-1].seconds + min(max(wait, 0.1), _LONGEST_WAIT) if self.keyframes else 0.0
+        wait = min(max(self.seconds.value, 0.1), _LONGEST_WAIT)
+        seconds = self.keyframes[-1].seconds + wait if self.keyframes else 0.0
         self.keyframes.append(Keyframe(round(seconds, 3), pose.position, pose.wxyz, math.degrees(pose.fov)))
         self._list(len(self.keyframes) - 1)
 

@@ -11,18 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from splatting.viewer import views
 from splatting.viewer.frusta import Frusta
-from splatting.viewer.views import (
-    ALONE,
-    COMPARISONS,
-    MODES,
-    SLIDER,
-    SceneCameras,
-    Settings,
-    Vector,
-    fov_of_canvas,
-    window_of,
-)
+from splatting.viewer.views import SceneCameras, Settings, Vector
 from utils.graphics_utils import camera_center
 from utils.system_utils import UserError
 
@@ -78,7 +69,7 @@ class ViewTab:
         background: Vector,
     ) -> None:
         gui, self._scene = server.gui, server.scene
-        self.mode = gui.add_dropdown("Show", MODES)
+        self.mode = gui.add_dropdown("Show", views.MODES)
         self.scaling = gui.add_slider("Scaling modifier", 0.01, _MOST_SCALING, 0.01, 1.0)
         self.degree = gui.add_slider("SH degree", 0, max(sh_degree, 1), 1, sh_degree, disabled=sh_degree == 0)
         self.background = gui.add_rgb("Background", tuple(round(255 * x) for x in background))
@@ -121,12 +112,11 @@ class ViewTab:
 
     def read(self) -> Settings:
         """What the controls say. Numbers out of range count as the nearest that is in it."""
-        scaling = self.scaling.value if math.isfinite(self.scaling.value) else 1.0
         box = tuple(corner.value for corner in self.corners) if self.crop.value else None
         return Settings(
             mode=self.mode.value,
-            scaling=min(max(scaling, 0.0), _MOST_SCALING),
-            sh_degree=max(self.degree.value, 0),
+            scaling=min(max(self.scaling.value, 0.0), _MOST_SCALING),
+            sh_degree=max(int(self.degree.value), 0),
             background=tuple(min(max(x / 255, 0.0), 1.0) for x in self.background.value),
             crop=box,
         )
@@ -151,9 +141,8 @@ class ImagesTab:
         self.frusta = Frusta(cameras, self._choose)
         self.camera = gui.add_dropdown("Camera", tuple(cameras.by_name), hint="the view jumps there")
         again = gui.add_button("Go to the camera")
-        self.comparison = gui.add_dropdown(
-            "Compare", COMPARISONS, hint="shown while the view is that of the chosen camera"
-        )
+        hint = "shown while the view is that of the chosen camera"
+        self.comparison = gui.add_dropdown("Compare", views.COMPARISONS, hint=hint)
         self.slider = gui.add_slider("Slider", 0.0, 1.0, 0.005, 0.5, hint="0: render, 1: photo", visible=False)
         shown = gui.add_checkbox("Draw cameras", False, hint="a click on one jumps there; those near the view fade")
         self._begin()
@@ -178,16 +167,16 @@ class ImagesTab:
             initial.fov = camera.FoVy
 
     def _compare(self, client: "viser.ClientHandle | None") -> None:
-        self.slider.visible = self.comparison.value == SLIDER
-        if self.comparison.value != ALONE:
+        self.slider.visible = self.comparison.value == views.SLIDER
+        if self.comparison.value != views.ALONE:
             self.go(client)
 
     def go(self, client: "viser.ClientHandle | None") -> None:
         """Move a browser's camera to the chosen one."""
         camera = self._cameras.by_name.get(self.camera.value)
         if client is not None and camera is not None:
-            width, height = window_of(client.camera)
-            place, fov = camera_center(camera.R, camera.T), fov_of_canvas(camera, width / height)
+            width, height = views.window_of(client.camera)
+            place, fov = camera_center(camera.R, camera.T), views.fov_of_canvas(camera, width / height)
             self._cameras.move(client, place, np.asarray(camera.R), fov)
 
     def _choose(self, event: Any, name: str) -> None:

