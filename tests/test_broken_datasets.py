@@ -222,7 +222,7 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_word("images.txt", (8, "77")), r"SCENE/sparse/0/images\.txt has the camera 77"),
         (_word("points3D.txt", (2, "nan")), r"line 4 of SCENE/sparse/0/points3D\.txt .*nan"),
         (_gone(PHOTO), "1 of 9 photos .*are missing: SCENE/images/left/v02.png"),
-        (_seven_gone, "7 of 9 photos that .* lists are missing: .*Right/V03.png, .* and 2 more; .*-i"),
+        (_seven_gone, r"7 of 9 photos that .* lists are missing: .*Right/V03.png, .* and 2 more \(the folder has .*-i"),
         (_converted, r"9 of 9 photos .*Right/V03.png.*\(Right/V03.jpg is there instead\)"),
         (_linked_to_nothing, r"1 of 9 photos .* missing: SCENE/images/left/v02.png \(it is there, but"),
         (_cut(PHOTO, 40), "cannot read SCENE/images/left/v02.png .*truncated"),

@@ -439,21 +439,28 @@ def test_the_default_budget_follows_the_iterations_that_the_clock_allows():
 def test_a_number_out_of_reach_is_told(colmap_scene, tmp_path, capsys):
     def said(*more: object, strategy: str = "budget") -> str:
         _train(colmap_scene, tmp_path / "out", "--strategy", strategy, *more)
-        return "".join(line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: --strategy"))
+        return "".join(
+            line for line in capsys.readouterr().err.splitlines() if re.match("warning: (--str|the sta)", line)
+        )
 
     window = "--densify_from_iter", 10, "--densification_interval", 20, "--max_num_splats"
     assert said(*window, 2000, "--densify_until_iter", 100) == ""
     told = said(*window, 2000, "--densify_until_iter", 300)
     assert "as --densify_until_iter 300 is not before the end; give --densify_until_iter 80" in told
-    told = said("--max_num_splats", 200, "--densify_from_iter", 160)
-    assert "gets to 300 Gaussians, not to 200, as --densify_from_iter 160 is not before the end; give" in told
-    assert told.endswith("give --densify_from_iter 8 --densify_until_iter 80")
+    told = said("--max_num_splats", 200, "--densify_from_iter", 160, "--checkpoint_iterations", 80)
+    assert "300 Gaussians, more than --max_num_splats 200; only faint ones are removed, as --densify_from_iter" in told
+    assert told.endswith("160 is not before the end; give --densify_from_iter 8 --densify_until_iter 80")
+    late = "--max_num_splats", 500, "--densify_from_iter", 160, "--start_checkpoint", tmp_path / "half.pth"
+    (tmp_path / "out" / "chkpnt80.pth").rename(tmp_path / "half.pth")
+    assert said(*late).endswith("give --densify_from_iter 84 --densify_until_iter 120")
     assert "it removes none; --strategy budget does" in said(*window, 200, strategy="mcmc")
     # 300 Gaussians double in 20, 40, 60 and 80, but not in 100.
     told = said(*window, 10_000, "--densify_until_iter", 100)
     assert "budget gets to 4,800 Gaussians, not to 10,000, as they at most double each time" in told
     mcmc = "--mcmc_until_iter", 100, "--mcmc_growth", 0.5
     assert said(*mcmc, *window, 1518, strategy="mcmc") == ""
+    # 300 grow in 20 to 140; what they become in 160, the last iteration, is not saved.
+    assert "gets to 5,122 Gaussians" in said("--mcmc_growth", 0.5, *window, 9999, strategy="mcmc")
     told = said(*mcmc, *window, 1519, strategy="mcmc")
     assert "mcmc gets to 1,518 Gaussians, not to 1,519, as --mcmc_growth 0.5 adds too few" in told
     assert said(*mcmc, *window, 0, strategy="mcmc") == said(*window, 301, strategy="adc") == ""

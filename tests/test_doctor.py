@@ -58,6 +58,8 @@ def test_exit_statuses(healthy, colmap_scene, capsys):
     for option, folder in (("-s", "nowhere"), ("-m", "")):
         with pytest.raises(UserError, match=f"no folder .*{folder}.*; pass an existing folder as {option}"):
             doctor.main([option, folder])
+    assert exit_status("-s", str(colmap_scene), "-m", "nowhere") == 1
+    assert "no model in nowhere yet" in capsys.readouterr().out
 
 
 def test_missing_packages_end_it(monkeypatch, colmap_scene, capsys):

@@ -291,6 +291,14 @@ class TestScores:
         assert 0.5 * between <= (0.1 if whole else 0.05) * taken or taken < 120
         assert len(recorder.rows) >= (12 if taken >= 400 else 10 if taken == 130 or whole else 1)
 
+    def test_points_are_planned_again_where_the_first_iterations_were_slow(self, tmp_path):
+        recorder, _ = _recorder(tmp_path, 30_000, [], {"test": [10.0] * 6, "train": [20.0] * 6}, steady=False)
+        for step in range(1, 401):
+            span = range(30_000 * (step - 1) // 400 + 1, 30_000 * step // 400 + 1)
+            if recorder.due(span, 0, step / 10, 30.0 if step < 6 else 400.0):
+                recorder.add(recorder.point(span), step / 10, 5, step)
+        assert len(recorder.rows) >= 12
+
     def test_views_are_drawn_by_a_seed_of_their_own_or_evenly_spread(self):
         torch.manual_seed(1)
         views = list("abcdefghijklmnop")

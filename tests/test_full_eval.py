@@ -447,6 +447,7 @@ def test_seeds_and_option_sets(figures, evaluate, tmp_path, capsys, monkeypatch)
         ("--skip_training --skip_rendering", "no scenes given"),
         ("--scenes SCENES/attic SCENES/attic", "two scenes are named attic"),
         ("--scenes nowhere", "no such scene folder: nowhere"),
+        ("--scenes SCENES", "scenes is not a scene"),
         ("--scenes SCENES/attic --iterations 0", "--iterations must be at least 1"),
         ("--scenes SCENES/attic --seeds 1 1", "--seeds must be distinct"),
         ("--scenes SCENES/attic --seeds 1 -- --seed 2", "--seed is given twice"),
