@@ -77,11 +77,11 @@ STRATEGY_OPTIONS: tuple[Option, ...] = (
         help="seconds of training that the run takes, without scoring and saving, to 3 %; 0: no budget. It goes "
              "through the whole schedule of --iterations in them, in fewer or more iterations, with learning rates "
              "that follow their number, and writes schedule.json"),
-    Option("resolution_schedule", "auto", origin="ours", check=one_of("auto", "none", "pyramid", "spectrum"),
+    Option("resolution_schedule", "auto", origin="ours", check=one_of("auto", "none", "pyramid"),
         stored=MODEL_JSON,
         help="smaller views at first, so that the first iterations take less time. pyramid: a quarter of the size up "
-             "to 10 % of the schedule, half of it up to 25 %; spectrum: sizes by how fine the photos' detail is; "
-             "auto: pyramid where --time_budget leaves no more than an iteration for 6 of the schedule, else none"),
+             "to 10 % of the schedule, half of it up to 25 %; auto: pyramid where --time_budget leaves no more than an "
+             "iteration for 6 of the schedule, else none"),
     Option("target_psnr", 0.0, origin="ours", check=at_least(0),
         help="stop, and save, once the mean PSNR (dB) of the test views (--eval) is at least this; 0: no target. They "
              "are scored every 100 iterations, or every 20 times their number if that is more"),

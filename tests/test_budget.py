@@ -466,6 +466,11 @@ def test_a_number_out_of_reach_is_told(colmap_scene, tmp_path, capsys):
     assert said(*mcmc, *window, 0, strategy="mcmc") == said(*window, 301, strategy="adc") == ""
 
 
+def test_options_of_another_strategy_are_named(colmap_scene, tmp_path, capsys):
+    _train(colmap_scene, tmp_path, "--strategy", "mcmc", "--absgrad", "--growth_power", 2, "--mcmc_noise", 5)
+    assert "warning: --strategy mcmc has no use for --absgrad, --growth_power\n" in capsys.readouterr().err
+
+
 def test_what_is_told_to_be_the_most_is_reached(colmap_scene, tmp_path, capsys):
     window = "--densify_from_iter", 10, "--densification_interval", 20, "--densify_until_iter", 300
     _train(colmap_scene, tmp_path, *window, "--max_num_splats", 2000, "--prune_opacity", 0, "--growth_power", 2)

@@ -27,7 +27,7 @@ TRAININGS = {
     "masks": ("--masks", "masks", "-d", "depths", "--eval"),
     "alpha": ("--masks", "masks", "--mask_meaning", "transparent", "--random_background"),
     "limit": ("--masks", "masks", "-d", "depths", "--images_to_load", 4),
-    "smaller": ("--masks", "masks", "-d", "depths", "--resolution_schedule", "spectrum"),
+    "smaller": ("--masks", "masks", "-d", "depths", "--resolution_schedule", "pyramid"),
     "smaller, limit": ("--resolution_schedule", "pyramid", "--images_to_load", 3),
     "exposures": ("--train_test_exp", "--eval"),
     "views": ("--parallel", "views", "--masks", "masks", "--eval"),

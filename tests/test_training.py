@@ -197,7 +197,7 @@ def test_refusals_before_anything_is_written(colmap_scene, tmp_path):
         "sh_degree": ["--start_checkpoint", checkpoint, "--sh_degree", 1],
         "no points": ["--init_pcd_path", empty],
         "--target_psnr needs held-out views to score, and there are none; give --eval": ["--target_psnr", 20],
-        "--resolution_schedule must be auto or none or pyramid or spectrum": ["--resolution_schedule", "fine"],
+        "--resolution_schedule must be auto or none or pyramid": ["--resolution_schedule", "fine"],
     }
     for words, options in cases.items():
         with pytest.raises(UserError, match=re.escape(words)):

@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 
 from arguments import OPTIONS, other_scene, read_model_json, read_training_options
+from arguments.strategies import STRATEGY_OPTIONS
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
@@ -107,6 +108,14 @@ def check_exposures(gaussians: GaussianModel, train_test_exp: bool, checkpoint: 
         raise UserError(f"{checkpoint} was trained with --train_test_exp; give that option")
     if train_test_exp and not gaussians.exposures.trained:
         print(f"{checkpoint} has no exposures: all photos start without a correction")
+
+
+def without_effect(opt: argparse.Namespace) -> str | None:
+    """What to say of options that belong to another strategy; their help begins with its name."""
+    other = {"adc", "mcmc", "budget"} - {opt.strategy}
+    given = [f"--{o.name}" for o in STRATEGY_OPTIONS
+             if o.help.partition(":")[0] in other and getattr(opt, o.name) != o.default]  # fmt: skip
+    return f"--strategy {opt.strategy} has no use for {some(given)}" if given else None
 
 
 def late_reset(opt: argparse.Namespace, white_background: bool, schedule: Schedule) -> str | None:

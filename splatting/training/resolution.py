@@ -1,24 +1,15 @@
-"""Coarse to fine: views that are smaller at first, by how far the schedule is (--resolution_schedule).
-
-The levels of "spectrum" follow the photos' frequencies (the idea of Chen et al. 2025, DashGaussian).
-"""
+"""Coarse to fine: views that are smaller at first, by how far the schedule is (--resolution_schedule)."""
 
 import argparse
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
 
 import torch
-from torch import Tensor
 
 from scene.cameras import Camera
 from scene.images.store import GPU_SHARE, ImageStore
 from splatting.host.memory import free_memory
 from splatting.training.schedule import PYRAMID, DecidedSchedule, Levels, Schedule
 
-FACTORS = (4.0, 3.0, 2.0, 1.5, 1.0)  # few, because a CUDA graph is captured for each size
-UNTIL = 0.5  # part of the schedule by which views have their full size at the latest
-_SAMPLE = 8  # photos that are looked at
-_DECIMALS = 3  # of a part, so that the last bits of a Fourier transform decide nothing
 LEAST = 32  # pixels of the shorter side; a picture is not made smaller than that
 
 
@@ -87,60 +78,14 @@ def smaller(camera: Camera, factor: float) -> tuple[int, int]:
     return tuple(max(1, round(side / factor)) for side in sides)
 
 
-def spectrum_levels(cameras: Sequence[Camera]) -> Levels:
-    """Levels for the training views: each factor lasts until the schedule has done the part of detail that it keeps.
-
-    The detail of a photo is the sum of the amplitudes of its frequencies, and a photo that is smaller by a factor keeps
-    those below 1 / (2 factor) cycles per pixel in both directions. So a quarter of the size trains for longer where
-    photos are smooth. The parts are means over some photos, and the schedule is its first half (UNTIL). The rule is
-    our own.
-    """
-    views = [camera for camera in cameras if isinstance(camera, Camera)]
-    views = views[:: max(1, len(views) // _SAMPLE)][:_SAMPLE]
-    kept = [_detail(camera) for camera in views]
-    if not kept:
-        return ()
-    means = [round(part, _DECIMALS) for part in torch.stack(kept).mean(dim=0).tolist()]
-    levels = [(0.0, FACTORS[0])]
-    for factor, part in zip(FACTORS[1:], means, strict=False):
-        if UNTIL * part > levels[-1][0]:
-            levels.append((UNTIL * part, factor))
-        else:  # the factor before has no time
-            levels[-1] = (levels[-1][0], factor)
-    return tuple(levels)
+# "auto" is none of them, unless --time_budget chooses the pyramid.
+LEVELS: dict[str, Levels] = {"none": (), "pyramid": PYRAMID}
 
 
-def _detail(camera: Camera) -> Tensor:
-    """Part of the detail of a view's photo that each of FACTORS keeps, (5,) float64; all ones if it has none."""
-    pixels = camera.target(torch.zeros(3, device=camera.device))
-    if camera.columns is not None:
-        pixels = pixels[..., camera.columns]
-    grey = pixels.cpu().double().mean(dim=0)
-    amplitude = torch.fft.rfft2(grey - grey.mean()).abs()
-    rows, columns = torch.fft.fftfreq(grey.shape[0]).abs(), torch.fft.rfftfreq(grey.shape[1])
-    fineness = torch.maximum(rows[:, None], columns[None, :])
-    # The real transform leaves out half of the frequencies, whose amplitudes are the same.
-    amplitude = amplitude * torch.where((columns > 0) & (columns < 0.5), 2.0, 1.0)
-    total = amplitude.sum()
-    if total < 1e-9:
-        return torch.ones(len(FACTORS), dtype=torch.float64)
-    return torch.stack([amplitude[fineness <= 0.5 / factor].sum() for factor in FACTORS]) / total
-
-
-# What gives the levels of each --resolution_schedule. "auto" is none of them, unless --time_budget chooses the pyramid.
-LEVELS: dict[str, Callable[[Sequence[Camera]], Levels]] = {
-    "none": lambda _: (),
-    "pyramid": lambda _: PYRAMID,
-    "spectrum": spectrum_levels,
-}
-
-
-def resolution_of(
-    opt: argparse.Namespace, schedule: Schedule, cameras: Sequence[Camera], images: ImageStore
-) -> Resolution:
-    """The sizes of the training views `cameras` by the options, or by the schedule that a run repeats or resumes."""
+def resolution_of(opt: argparse.Namespace, schedule: Schedule, images: ImageStore) -> Resolution:
+    """The sizes of the training views by the options, or by the schedule that a run repeats or resumes."""
     if not isinstance(schedule, DecidedSchedule):
         schedule.sizes = "none" if opt.resolution_schedule == "auto" else opt.resolution_schedule
     if not schedule.levels:
-        schedule.levels = LEVELS.get(schedule.sizes, LEVELS["none"])(cameras)
+        schedule.levels = LEVELS.get(schedule.sizes, ())
     return Resolution(schedule, images)

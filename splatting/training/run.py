@@ -105,7 +105,7 @@ class Run:
         checks.check_target(opt.target_psnr, len(self.scene.getTestCameras()))
         agree_on_scene(self.scene, self.start)  # before an image is shared
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed, views, self.group.rank if views > 1 else 0)
-        self.resolution = resolution_of(opt, self.schedule, self.scene.getTrainCameras(), self.scene.images)
+        self.resolution = resolution_of(opt, self.schedule, self.scene.images)
         self._decode_ahead(self.first_iteration + 1)
         self._begin_model(capture, first)
         self._check_records()
@@ -122,6 +122,7 @@ class Run:
         self.sleeping = self._may_sleep()
         if self.sleeping and capture and (asleep := further(capture, ASLEEP)):
             self.sleeping.restore(asleep)
+        self._warn(checks.without_effect(opt))
         self._warn(checks.another_number(self.density, opt, self.gaussians.gaussian_count, self.first_iteration + 1))
         if capture is None and first is None:
             self.density.started()
