@@ -74,10 +74,8 @@ def psnr_of(folder: Path) -> float:
 def world(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """A scene with central principal point and depth maps, and the model that train.py made of it, rendered."""
     folder = tmp_path_factory.mktemp("clients")
-    scene, model, text = folder / "scene", folder / "model", folder / "text"
+    scene, model = folder / "scene", folder / "model"
     model_of_colmap = make_colmap_scene(scene, params=(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
-    text.mkdir()
-    model_of_colmap.write_text(str(text))
     scales = {}
     for image in model_of_colmap.images.values():
         name = os.path.splitext(image.name)[0]
@@ -91,7 +89,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     command("render.py", "-m", model, cwd=ROOT)
     ply = model / "point_cloud" / f"iteration_{ITERATIONS}" / "point_cloud.ply"
     psnr = psnr_of(model / "test" / f"ours_{ITERATIONS}")
-    return SimpleNamespace(scene=scene, model=model, text=text, ply=ply, count=ply_count(ply), psnr=psnr)
+    return SimpleNamespace(scene=scene, model=model, ply=ply, count=ply_count(ply), psnr=psnr)
 
 
 @pytest.fixture
@@ -223,15 +221,6 @@ def test_the_loop_of_2023_with_its_own_option_classes(world, client, tmp_path):
     assert len(resumed["losses"]) == 200 and abs(resumed["psnr"] - result["psnr"]) < 1.0
 
 
-def test_sparse_trainer(client):
-    result = client("sparse_trainer")
-    assert result["is_optimizer"] and {"step", "exp_avg", "exp_avg_sq"} <= set(result["state"])
-    assert result["apart"] == 0 and result["depth"] == [1, HEIGHT, WIDTH]
-    assert result["unseen_moved"] == 0 and result["seen_moved"] > 0.03
-    assert result["seen_wrong"] < 1e-5
-    assert fell(result["losses"])
-
-
 def test_distiller(world, client):
     result = client("distiller")
     assert result["first"] == ITERATIONS and fell(result["losses"], 0.95)
@@ -252,23 +241,6 @@ def test_pruner(world, client, tmp_path):
     command("train.py", "-s", world.scene, "-m", tmp_path / "more", "--eval", "--iterations", 345, "--keep_unseen",
             "--start_checkpoint", pruned / "chkpnt340.pth", cwd=ROOT)  # fmt: skip
     assert ply_count(tmp_path / "more" / "point_cloud" / "iteration_345" / "point_cloud.ply") == third
-
-
-def test_densifier(client):
-    result = client("densifier")
-    network = result.pop("network")
-    assert network["network_moved"] > 0 and fell(network["losses"])
-    for name, kind in result.items():
-        counts = kind["counts"]
-        grown = [before + clones + splits for before, (clones, splits) in zip(counts, kind["changes"], strict=False)]
-        assert counts[1:] == grown and counts[0] == 300 and counts[-1] > 450, name
-        assert kind["same"] and kind["softened"] == pytest.approx(0.5, abs=1e-3) and kind["reset"] <= 0.0101, name
-        assert kind["moments"][:2] == [[counts[-1], 3]] * 2 and kind["moments"][2] == 38, name
-        assert kind["rest_moved"] > 0 and fell(kind["losses"][:24]), name
-    for name in ("labelled", "own_adam_labelled"):
-        rows, different = result[name]["labels"]
-        assert rows == [result[name]["counts"][-1], 4] and 200 < different <= 300
-        assert result[name]["label_trained"] > 0.01
 
 
 @pytest.mark.parametrize("release", ["2023", "2024"])
@@ -312,33 +284,6 @@ def test_segmentation(world, client):
     assert result["label_image"] == [3, HEIGHT, WIDTH]
 
 
-def test_foreign_model(client):
-    result = client("foreign_model")
-    assert result["foreign"] < 1e-4 and result["foreign_rasterized"] < 1e-4 and fell(result["foreign_losses"])
-    assert result["soft_scale"] == pytest.approx([0.03, 0.03], rel=1e-3)
-    assert max(result["soft"], result["soft_covariance"], result["soft_trained"]) < 1e-4
-    assert result["soft_counts"][1] > 310 and fell(result["soft_losses"])
-    assert result["soft_split"][0] == pytest.approx(0.03 / 1.6, rel=0.2) and result["soft_split"][1] < 0.2
-
-
-def test_colmap_reader_client(world, client):
-    result = client("colmap_reader_client", world.text)
-    assert result["counts"] == [VIEWS, 1, 300, 3, 300, 3, 300]
-    assert result["text_names"] and result["text_ids"] and result["text_colors"] == 0
-    near = ("text_images", "text_points2d", "text_cameras", "text_points", "text_errors", "method", "roundtrip")
-    assert {name: result[name] for name in near if result[name] > 1e-9} == {}
-    keypoints, ids, seen = result["sightings"]
-    assert keypoints == ids >= seen > 0
-    assert result["infos"] < 1e-6 and result["same_names"] and result["same_paths"]
-    assert result["radius"][0] == pytest.approx(result["radius"][1], rel=1e-5) and result["translate"] == [3]
-    assert result["synthetic"] is False and result["split"] == [14, 3, 14, 3]
-    assert result["exposed"] == [VIEWS, 3] and result["is_test"] == [3, True]
-    assert result["cloud"] == [300, 3, 300, 3] and result["fetched"][0] < 1e-5 and result["fetched"][1] == 0
-    assert result["gaussians"] == [300, pytest.approx(result["radius"][0], rel=1e-6)] and result["created"] < 1e-5
-    keys = ["id", "img_name", "width", "height", "position", "rotation", "fy", "fx"]
-    assert result["json"] == [*keys, 3, WIDTH, pytest.approx(0, abs=1e-6)]
-
-
 # Cameras and renderers
 
 
@@ -373,16 +318,6 @@ def test_camera_paths(world, client, tmp_path):
     assert result["full_alpha"] == [pytest.approx(0.4, abs=1e-6), 0]
     assert result["full_depth"] == [[1, 10, 20], pytest.approx(1.25), True]
     assert result["wild_depth"] == [False, 0]
-
-
-def test_replaced_load_cam(world, client):
-    result = client("replaced_load_cam")
-    assert fell(result["losses"]) and len(result["loaded"]) == 2 * VIEWS and len(set(result["loaded"])) == VIEWS
-    assert result["test"] == 2 * HELD_OUT and not any(result["synthetic"]) and result["depth_paths"] == [""]
-    assert result["sizes"] == [[[WIDTH // 2, HEIGHT // 2]], [[WIDTH // 4, HEIGHT // 4]]]
-    names = sorted(result["loaded"])[::2]
-    assert [entry[:2] for entry in result["listed"]] == [[k, names[8 * k]] for k in range(HELD_OUT)]
-    assert {tuple(shape) for *_, shape in result["listed"]} == {(3, HEIGHT // 2, WIDTH // 2)}
 
 
 def test_run_wrapper(client, tmp_path):
