@@ -118,7 +118,7 @@ def _turned(change):
     return lambda scene: _edit(scene, edit)
 
 
-@pytest.mark.parametrize("scale", [2.0, 0.5, 1e-4, [4.0, 0.25, 1.0, 8.0], 5.0, 0.1])
+@pytest.mark.parametrize("scale", [2.0, 1e-4, [4.0, 0.25, 1.0, 8.0]])
 def test_a_scale_of_poses_is_divided_out(blender_scene, tmp_path, scale):
     plain = Scene(options_of(blender_scene, tmp_path / "plain"), FakeGaussians(), shuffle=False)
     factors = np.broadcast_to(scale, 4)

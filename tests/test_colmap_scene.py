@@ -13,7 +13,7 @@ import pycolmap
 import pytest
 import torch
 from PIL import Image
-from synthetic import CENTER, FOCAL, FakeGaussians, as_text, folder_state, options_of, read
+from synthetic import CENTER, FOCAL, FakeGaussians, folder_state, options_of, read
 
 from scene import Scene
 from scene.dataset_readers import scene_extent
@@ -27,15 +27,8 @@ from utils.system_utils import UserError
 def _assert_same(a, b) -> None:
     assert len(a.train_cameras) == len(b.train_cameras) > 0
     for one, other in zip(a.train_cameras, b.train_cameras, strict=True):
-        assert (one.image_name, one.uid, one.width, one.height) == (
-            other.image_name,
-            other.uid,
-            other.width,
-            other.height,
-        )
-        assert (one.fx, one.fy, one.cx, one.cy) == (other.fx, other.fy, other.cx, other.cy)
-        np.testing.assert_array_equal(one.R, other.R)
-        np.testing.assert_array_equal(one.T, other.T)
+        for name in ("image_name", "uid", "width", "height", "fx", "fy", "cx", "cy", "R", "T"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     np.testing.assert_array_equal(a.point_cloud.points, b.point_cloud.points)
     np.testing.assert_array_equal(a.point_cloud.colors, b.point_cloud.colors)
 
@@ -67,20 +60,6 @@ def test_the_three_classic_files_and_sparse_itself_suffice(colmap_scene):
         shutil.move(sparse / "0" / name, sparse / name)
     shutil.rmtree(sparse / "0")
     _assert_same(read(colmap_scene), whole)
-
-
-def test_empty_second_lines_in_text(colmap_scene):
-    whole = read(colmap_scene)
-    as_text(colmap_scene)
-    sparse = colmap_scene / "sparse" / "0"
-    lines = [line for line in (sparse / "images.txt").read_text().splitlines() if not line.startswith("#")]
-    lines[1::2] = [""] * len(lines[1::2])
-    (sparse / "images.txt").write_text("\n".join(lines) + "\n")
-    (sparse / "points3D.txt").write_text("")
-    info = read(colmap_scene, want_cloud=False)
-    assert [c.image_name for c in info.train_cameras] == [c.image_name for c in whole.train_cameras]
-    with pytest.raises(UserError, match="has no points; start from random points with --init_type random"):
-        read(colmap_scene)
 
 
 def test_broken_binary_falls_back_to_text(colmap_scene):
@@ -118,6 +97,7 @@ def test_a_fresh_scene_writes_its_side_files_and_leaves_the_dataset_alone(colmap
     assert (len(scene.getTrainCameras()), len(scene.getTestCameras())) == (14, 3)
     for camera in scene.getTrainCameras():
         camera.target(torch.zeros(3))
+        assert camera.images is scene.images
     assert scene.loaded_iter is None and scene.cameras_extent == gaussians.extent
     scene.save(7)
     assert folder_state(colmap_scene) == before
@@ -217,9 +197,6 @@ def test_another_aspect_ratio_is_reported(colmap_scene, capsys):
     assert said.startswith("1 of 17 photos") and f"left/{picture.name} (96 x 66, camera 96 x 64)" in said
 
 
-# In a process that imports our module first: two zlibs must not clash.
-
-
 @pytest.mark.parametrize(("name", "what"), [("images.bin", "photo"), ("points3D.bin", "point")])
 @pytest.mark.parametrize("bit", [33, 40, 63])
 def test_a_count_beyond_the_file_is_refused(colmap_scene, name, what, bit):
@@ -287,11 +264,7 @@ def test_a_model_kept_in_the_dataset_can_be_used_without_the_cloud(colmap_scene)
     options = options_of(colmap_scene, colmap_scene / "out", init_pcd_path="absent.ply")
     scene = Scene(options, FakeGaussians(), load_iteration=-1)
     assert scene.gaussians.loaded == str(ply)
-    assert scene.cameras_extent == pytest.approx(scene_extent(_read_cameras(colmap_scene)))
-
-
-def _read_cameras(scene: Path):
-    return read(scene, want_cloud=False).train_cameras
+    assert scene.cameras_extent == pytest.approx(scene_extent(read(colmap_scene, want_cloud=False).train_cameras))
 
 
 @pytest.mark.parametrize(

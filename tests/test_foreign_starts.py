@@ -32,25 +32,17 @@ def _foreign_ply(path: Path, count: int, kind: str) -> Path:
     format_of("a.ply").write(path, splats(count, 1))
     data = PlyData.read(path, mmap=False)["vertex"].data
     names = [name for name in data.dtype.names if name not in ("nx", "ny", "nz")]
-    names = list(np.random.default_rng(0).permutation(names))
     if kind == "2DGS":
         names.remove("scale_2")
     if kind == "points":
         names = ["x", "y", "z"]
-    form = [(name, "f8" if kind == "double" else "f4") for name in names]
+    form = [(name, "f4") for name in names]
     more = [("red", "u1"), ("green", "u1"), ("blue", "u1")] if kind == "points" else [("segment", "i4")]
     foreign = np.zeros(count, dtype=[*more, *form])
     for name in names:
         foreign[name] = data[name]
-    PlyData([PlyElement.describe(foreign, "vertex")], text=kind == "text").write(str(path))
+    PlyData([PlyElement.describe(foreign, "vertex")], text=False).write(str(path))
     return path
-
-
-@pytest.mark.parametrize("kind", ["float", "double", "text"])
-def test_plys_of_any_form_are_read(tmp_path, kind):
-    read, expected = read_splats(_foreign_ply(tmp_path / "a.ply", 20, kind)), splats(20, 1)
-    for name in ("means", "log_scales", "rotations", "opacity_logits", "sh"):
-        np.testing.assert_allclose(getattr(read, name), getattr(expected, name), rtol=1e-6, atol=1e-6)
 
 
 def test_what_is_no_3dgs_model_is_refused_by_name(tmp_path):

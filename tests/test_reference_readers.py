@@ -235,6 +235,7 @@ def _same(view: CameraInfo, other: CameraInfo) -> None:
 
 def test_a_colmap_scene_in_the_form_of_2024(colmap_scene, cache_folder):
     before = _files(colmap_scene)
+    assert sceneLoadTypeCallbacks["Colmap"] is readColmapSceneInfo
     info = readColmapSceneInfo(str(colmap_scene), None, "", True, False)
     ours = read_scene(colmap_scene, "images", True)
     assert [c.image_name for c in info.train_cameras] == [c.image_name for c in ours.train_cameras]
@@ -366,6 +367,7 @@ def test_views_of_a_lens_that_distorts_are_undistorted(tmp_path, cache_folder):
 
 def test_a_blender_scene_in_both_forms(blender_scene, cache_folder):
     before = _files(blender_scene)
+    assert sceneLoadTypeCallbacks["Blender"] is readNerfSyntheticInfo
     info = readNerfSyntheticInfo(str(blender_scene), True, "", True)
     ours = read_scene(blender_scene, "", True)
     for view, other in zip(info.train_cameras + info.test_cameras, ours.train_cameras + ours.test_cameras, strict=True):
@@ -424,13 +426,3 @@ def test_a_nerfstudio_scene_like_a_blender_scene(blender_scene, tmp_path):
     info = readNerfstudioInfo(str(blender_scene), False, "", True)
     assert (len(info.train_cameras), len(info.test_cameras), info.is_nerf_synthetic) == (3, 1, False)
     assert info.ply_path == str(blender_scene / "points.ply") and type(info.train_cameras[0].image_path) is str
-
-
-# Callbacks
-
-
-def test_callbacks_are_the_readers_and_can_be_called(colmap_scene, blender_scene):
-    assert sceneLoadTypeCallbacks["Colmap"] is readColmapSceneInfo
-    assert sceneLoadTypeCallbacks["Blender"] is readNerfSyntheticInfo
-    assert len(sceneLoadTypeCallbacks["Colmap"](str(colmap_scene), "images", "", True, False).test_cameras) == 3
-    assert len(sceneLoadTypeCallbacks["Blender"](str(blender_scene), False, "", True).test_cameras) == 2
