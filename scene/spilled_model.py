@@ -1,6 +1,7 @@
 """The trained model with a part of it in the host's memory (`--spill`)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
@@ -10,10 +11,43 @@ from torch import Tensor, nn
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import Part, SparseGaussianAdam
-from scene.gaussians.side_stream import SideStream
 from scene.gaussians.table import GaussianTable, in_host_memory
 
 _MOST_MISSED = 1000  # steps, after which all rows catch up, so that the list of steps stays short
+
+
+class _SideStream:
+    """Runs copies between a GPU and its host beside the current stream of a GPU; on the CPU at once."""
+
+    def __init__(self) -> None:
+        self._stream: torch.cuda.Stream | None = None
+
+    @contextmanager
+    def aside(self, *used: Tensor) -> Iterator[Callable[[Tensor], Tensor]]:
+        """Queue what is done here behind the work so far, and let the current stream go on.
+
+        used: tensors that it reads. Yields what a new tensor goes through that the current stream shall use.
+        """
+        if not used[0].is_cuda:
+            yield lambda made: made
+            return
+        here = torch.cuda.current_stream(used[0].device)
+        self._stream = self._stream or torch.cuda.Stream(used[0].device)
+        self._stream.wait_stream(here)
+        for tensor in used:
+            tensor.record_stream(self._stream)
+
+        def keep(made: Tensor) -> Tensor:
+            made.record_stream(here)
+            return made
+
+        with torch.cuda.stream(self._stream):
+            yield keep
+
+    def join(self) -> None:
+        """Let the current stream wait for all that was queued here."""
+        if self._stream is not None:
+            torch.cuda.current_stream(self._stream.device).wait_stream(self._stream)
 
 
 class _Missed:
@@ -48,10 +82,9 @@ class SpilledGaussians(GaussianModel):
     """
 
     def __init__(self, sh_degree: int, optimizer_type: str = "default") -> None:
-        self._missed, self._seen, self._copies = _Missed(), None, SideStream()
-        self._near: list[
-            tuple[Tensor, Sequence[Tensor]]
-        ] = []  # rows and their copies, as they are in the host's memory
+        self._missed, self._seen, self._copies = _Missed(), None, _SideStream()
+        # Rows and their copies, as they are in the host's memory.
+        self._near: list[tuple[Tensor, Sequence[Tensor]]] = []
         super().__init__(sh_degree, optimizer_type)
 
     @property

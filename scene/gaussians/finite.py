@@ -5,7 +5,7 @@ import sys
 import torch
 
 from scene.gaussians.attributes import Rows
-from scene.gaussians.table import WHOLE, Shards
+from splatting.distributed.rows import WHOLE, Shards
 from utils.system_utils import UserError
 
 _PART = 1 << 16  # rows checked at a time, as there may be little memory left
