@@ -303,23 +303,6 @@ def test_physics_loop(world, client):
     assert first == 0 and second > 1e-3 and third > 1e-3
 
 
-def test_camera_paths(world, client, tmp_path):
-    result = client("camera_paths")
-    assert result["matrix"] == "float32" and result["projection"] == "torch.float32"
-    assert result["trans"] == [0, 0, 0] and result["scale"] == 1
-    assert result["pickled"] < 200_000  # one view, not the whole dataset: 17 photos of 18 kB
-    assert result["at_next"] < 1e-3 and result["first_kept"] > 0 and result["scaled"] < 1e-4
-    assert near_render(world, tmp_path / "out" / "frames" / "00000.png", 0, "train")
-    assert len(list((tmp_path / "out" / "frames").iterdir())) == 4
-    assert result["made"] < 1e-3 and result["made_fields"] == [7, 1, "virtual", 0] and result["made_mask"] == 1
-    assert result["made_depth"] == [True, False]
-    assert result["full_image"] == [[3, 10, 20], pytest.approx([1, 0.2, 0], abs=1 / 255)]
-    # The left half of a training photo of a test view counts; the right half does not.
-    assert result["full_alpha"] == [pytest.approx(0.4, abs=1e-6), 0]
-    assert result["full_depth"] == [[1, 10, 20], pytest.approx(1.25), True]
-    assert result["wild_depth"] == [False, 0]
-
-
 def test_run_wrapper(client, tmp_path):
     result = client("run_wrapper", free_port())
     assert result["train"] == result["render"] == VIEWS and result["status"] == 0
