@@ -156,8 +156,6 @@ KINDS = {
     "rgb": lambda: _photo(),
     "rgba": lambda: _photo(4),
     "opaque": lambda: _photo().convert("RGBA"),
-    "grey": lambda: _photo().convert("L"),
-    "palette": lambda: _photo().convert("P"),
     "16-bit": lambda: Image.fromarray(RNG.integers(0, 65536, (HEIGHT, WIDTH), dtype=np.uint16)),
 }
 
