@@ -257,7 +257,7 @@ def test_options_of_the_2023_release_are_enough():
     assert keyword.spatial_lr_scale == 1.5
 
 
-@pytest.mark.parametrize("change", ["slice", "transpose", "plain", "load"])
+@pytest.mark.parametrize("change", ["slice", "transpose", "plain", "cut", "load"])
 def test_tensors_assigned_from_outside_train(change, tmp_path):
     gaussians = model(20)
     if change == "slice":
@@ -268,6 +268,10 @@ def test_tensors_assigned_from_outside_train(change, tmp_path):
     elif change == "plain":
         gaussians._scaling = gaussians.scaling_inverse_activation(gaussians.get_scaling * 0.5)
         gaussians._opacity = gaussians._opacity.detach() * 0.9
+    elif change == "cut":
+        gaussians = model(40)
+        for field in GROUPS.values():
+            setattr(gaussians, field, nn.Parameter(getattr(gaussians, field).detach()[::2]))
     else:
         gaussians.save_ply(tmp_path / "a.ply")
         gaussians = GaussianModel(3)

@@ -243,36 +243,7 @@ def test_pruner(world, client, tmp_path):
     assert ply_count(tmp_path / "more" / "point_cloud" / "iteration_345" / "point_cloud.ply") == third
 
 
-@pytest.mark.parametrize("release", ["2023", "2024"])
-def test_files_go_both_ways_between_a_plain_model_and_ours(world, client, tmp_path, release):
-    result = client("reference_model", release)
-    assert result["entries"] == [[12, ITERATIONS, True]] * 2
-    assert fell(result["losses"]) and result["count"] == world.count
-    assert len(set(result["steps"].values())) <= 2  # opacities may have missed a step
-    assert result["read"] == result["restored"] == 0
-    out = tmp_path / "out"
-    assert (out / "ours.ply").read_bytes() == (out / "theirs.ply").read_bytes()
-    command("train.py", "-s", world.scene, "-m", tmp_path / "resumed", "--eval", "--iterations", 325, "--keep_unseen",
-            "--start_checkpoint", out / "chkpnt320.pth", cwd=ROOT)  # fmt: skip
-    ply = tmp_path / "resumed" / "point_cloud" / "iteration_325" / "point_cloud.ply"
-    resumed, before = PlyData.read(ply)["vertex"], PlyData.read(out / "theirs.ply")["vertex"]
-    assert len(resumed) == world.count and 0 < np.abs(resumed["f_dc_0"] - before["f_dc_0"]).max() < 0.1
-
-
 # Models and files
-
-
-def test_model_editor(world, client, tmp_path):
-    result = client("model_editor")
-    assert result["count"] == world.count
-    assert result["green_left"] < 1e-6 and result["red_seen"] > 0.5
-    assert ply_count(tmp_path / "out" / "red" / "point_cloud.ply") == world.count
-    kept = result["kept"]
-    assert 0 < kept <= world.count // 2 and result["radii"] == [kept] and result["sizes"] == [kept, kept]
-    assert result["small_bands"] == [kept, 4, 3] and result["small_xyz"] == 0 and result["small_difference"] < 1e-6
-    for name in ("tuned_scene", "tuned_lone", "tuned_small"):
-        before, after = result[name]
-        assert after < before, name
 
 
 def test_segmentation(world, client):
