@@ -76,9 +76,9 @@ class SpilledGaussians(GaussianModel):
     """A GaussianModel whose SH bands above 0, with their averages, lie in the host's memory; on the CPU the same one.
 
     A step concerns copies of the rows that a view sees: `fetch` makes them, `take_gradients` takes their gradients, and
-    `step` writes them back. `fetch_ahead` copies beside a step what the next one will want. Other rows take their steps
-    of Adam later, each with its own rate and correction: when a view sees them, or before anybody reads the bands of
-    all Gaussians or their averages through this class.
+    `step` writes them back. `fetch_ahead` copies rows of the next step beside the present one. Unseen rows replay the
+    steps of Adam that they skipped, each with its own rate and correction: when a view sees them, or before anybody
+    reads the bands of all Gaussians or their averages through this class.
     """
 
     def __init__(self, sh_degree: int, optimizer_type: str = "default") -> None:
@@ -156,7 +156,7 @@ class SpilledGaussians(GaussianModel):
 
     @torch.no_grad()
     def fetch_ahead(self, rows: Tensor) -> None:
-        """Begin to copy the rows (n,) of the next `fetch`, but those of the last one, which are about to change."""
+        """Begin to copy the rows (n,) of the next `fetch`, except rows that this step updates."""
         if self._seen.copies and len(self._stored()) == 3:
             fresh = torch.ones(len(self), dtype=torch.bool, device=rows.device)
             fresh[self._seen.rows] = False
@@ -167,15 +167,14 @@ class SpilledGaussians(GaussianModel):
     def take_gradients(self) -> Tensor:
         """Take the gradients of the last `fetch`, zeros for other rows; none are made for the bands above 0.
 
-        These get a stand-in that tells whether their rows still have a gradient. Returns the rows.
+        These get a stand-in that tells whether their rows still have a gradient. A parameter that got no gradient has
+        none here, and the optimiser passes it over. Returns the rows.
         """
         rows, seen, copies = self._seen
         for name in self._attributes:
             if name != "f_rest":
                 param, gradient = self.raw(name), seen.raw(name).grad
-                param.grad = torch.zeros_like(param)
-                if gradient is not None:
-                    param.grad.index_copy_(0, rows, gradient)
+                param.grad = None if gradient is None else torch.zeros_like(param).index_copy_(0, rows, gradient)
         if copies:
             self._rest.grad = copies[0].new_zeros(()).expand_as(self._rest)
         return rows

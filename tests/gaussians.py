@@ -3,6 +3,7 @@
 import argparse
 
 import numpy as np
+import pytest
 import torch
 
 from arguments import OptimizationParams, PipelineParams
@@ -13,6 +14,8 @@ from utils.graphics_utils import BasicPointCloud
 GROUPS = {group: attribute.field for group, attribute in attributes(0).items()}
 STANDARD = tuple(attributes(0, further=False))  # the groups of the paper
 FURTHER = tuple(group for group in GROUPS if group not in STANDARD)
+needs_fused_step = pytest.mark.skipif(bool(FURTHER), reason="a model with further attributes takes plain steps")
+needs_59_values = pytest.mark.skipif(bool(FURTHER), reason="the numbers of bytes are of the paper's attributes")
 
 
 def options(**changes: object) -> argparse.Namespace:

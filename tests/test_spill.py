@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 from diff_gaussian_rasterization.optim import adam_, catch_up_
-from gaussians import model
+from gaussians import model, needs_59_values
 from trainings import OPTIONS, differences, leaves, narrow_scene, trained
 
 from scene import spilled_model
@@ -122,6 +122,7 @@ def test_a_guard_leaves_the_same_model_and_marks(scene, tmp_path, monkeypatch, w
     assert leaves(spilled) == leaves(usual)
 
 
+@needs_59_values
 def test_the_estimate_leaves_out_what_lies_in_the_hosts_memory():
     gaussians = model(50)
     usual, spilled = (training_bytes(gaussians, 1000, 0, spill=spill) for spill in (None, True))
