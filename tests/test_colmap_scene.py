@@ -40,10 +40,8 @@ def test_values_are_the_models(colmap_scene):
     assert names == sorted((image.name for image in reconstruction.images.values()), key=os.fsencode)
     assert names[0].startswith("Right/V") and names[-1].startswith("left/v")
     for camera in info.train_cameras:
-        image = reconstruction.find_image_with_name(camera.image_name)
-        pose = image.cam_from_world().matrix()
-        np.testing.assert_array_equal(camera.R.T, pose[:, :3])
-        np.testing.assert_array_equal(camera.T, pose[:, 3])
+        pose = reconstruction.find_image_with_name(camera.image_name).cam_from_world().matrix()
+        np.testing.assert_array_equal(np.column_stack([camera.R.T, camera.T]), pose)
         assert (camera.fx, camera.fy, camera.cx, camera.cy) == (FOCAL, FOCAL, *CENTER)
         assert camera.image_path == colmap_scene / "images" / camera.image_name
     points = [reconstruction.points3D[number] for number in sorted(reconstruction.points3D)]
