@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 from diff_gaussian_rasterization.optim import adam_, catch_up_
-from gaussians import model, needs_59_values
+from gaussians import cloud, model, needs_59_values, options
 from trainings import OPTIONS, differences, leaves, narrow_scene, trained
 
 from scene import spilled_model
@@ -78,6 +78,17 @@ def test_a_long_list_of_missed_steps_is_cut(scene, tmp_path, monkeypatch, most):
     usual = trained(scene, tmp_path / "usual")
     monkeypatch.setattr(spilled_model, "_MOST_MISSED", most)
     assert differences(trained(scene, tmp_path / "spilled", "--spill"), usual) == []
+
+
+def test_a_parameter_without_a_gradient_takes_no_step():
+    gaussians = spilled_model.SpilledGaussians(1)
+    gaussians.create_from_pcd(cloud(20), [], 1.0)
+    gaussians.training_setup(options())
+    gaussians.fetch(torch.arange(5)).get_xyz.sum().backward()
+    gaussians.take_gradients()
+    assert gaussians._xyz.grad.any(dim=1).sum() == 5
+    gaussians.step(torch.ones(20, dtype=torch.int32))
+    assert list(gaussians.optimizer.state) == [gaussians._xyz]
 
 
 def _stopped(scene: Path, out: Path, *options: object) -> tuple[str, list[object]]:
