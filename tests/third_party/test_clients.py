@@ -17,7 +17,7 @@ import pytest
 import torch
 from PIL import Image
 from plyfile import PlyData
-from synthetic import FOCAL, HEIGHT, WIDTH, make_blender_scene, make_colmap_scene
+from synthetic import FOCAL, HEIGHT, WIDTH, make_colmap_scene
 
 pytest.importorskip("diff_gaussian_rasterization", reason="the extensions are not built: make test")
 
@@ -340,9 +340,3 @@ def test_metrics_client(world, client, torch_home):
         assert result["results"][name] == pytest.approx(result["scores"][name], abs=tolerance), name
         assert result["per_view"][name] == pytest.approx(result["own"][name], abs=tolerance), name
     assert result["results"]["PSNR"] == pytest.approx(world.psnr, abs=0.01) and result["results"]["LPIPS"] > 0.01
-
-
-def test_single_calls(client, tmp_path):
-    make_blender_scene(tmp_path / "blender")
-    result = client("single_calls", tmp_path / "blender")
-    assert {name: outcome for name, outcome in result.items() if outcome != "ok"} == {}
