@@ -14,8 +14,9 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from scene.gaussians.ply import read_vertices
+from scene.saved_iterations import find_iteration, saved_ply
 from splatting.files.json_files import OFFSET, read_model_json
-from utils.system_utils import UserError, atomic_write, run_cli, searchForMaxIteration
+from utils.system_utils import UserError, atomic_write, run_cli
 
 _AXES = ("x", "y", "z")
 
@@ -40,9 +41,8 @@ def main() -> None:
     parser.add_argument("out", type=Path, help="PLY to write")
     parser.add_argument("--iteration", type=int, default=-1, help="saved iteration (default: -1, the highest)")
     args = parser.parse_args()
-    folder = args.model / "point_cloud"
-    iteration = searchForMaxIteration(folder) if args.iteration == -1 else args.iteration
-    ply = folder / f"iteration_{iteration}" / "point_cloud.ply"
+    iteration = find_iteration(args.model, args.iteration)
+    ply = saved_ply(args.model, iteration)
     if args.out.resolve() == ply.resolve():
         raise UserError(f"{args.out} is the model itself; name another file")
     offset = np.array(read_model_json(args.model).get(OFFSET, [0, 0, 0]), dtype=np.float64)

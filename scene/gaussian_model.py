@@ -164,12 +164,11 @@ class GaussianModel(GaussianParameters):
         self._take({name: trainable(getattr(self, a.field)) for name, a in self._attributes.items()})
         self._zero_statistics()
         self._rates = {n: a.rate(training_args, self.spatial_lr_scale) for n, a in self._attributes.items()}
-        self.optimizer = _OPTIMIZERS[self.optimizer_type](
-            [
-                {"params": [getattr(self, a.field)], "lr": self._rates[name], "name": name}
-                for name, a in self._attributes.items()
-            ]
-        )
+        groups = [
+            {"params": [getattr(self, a.field)], "lr": self._rates[name], "name": name}
+            for name, a in self._attributes.items()
+        ]
+        self.optimizer = _OPTIMIZERS[self.optimizer_type](groups)
         self.xyz_scheduler_args = get_expon_lr_func(
             lr_init=training_args.position_lr_init * self.spatial_lr_scale,
             lr_final=training_args.position_lr_final * self.spatial_lr_scale,

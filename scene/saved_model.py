@@ -10,7 +10,7 @@ from pathlib import Path
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint, unpack
-from scene.gaussians.finite import tell_of_undrawn
+from scene.gaussians.finite import warn_of_undrawn
 from scene.gaussians.ply import read_ply
 from scene.saved_iterations import saved_ply
 from scene.scene import Scene
@@ -53,7 +53,7 @@ def read_model(path: Path, sh_degree: int | None = None) -> GaussianModel:
     else:
         rows = read_ply(path, sh_degree)
         gaussians = GaussianModel(_degree(rows["f_rest"].shape[1]))
-    tell_of_undrawn(rows, path)
+    warn_of_undrawn(rows, path)
     gaussians.take_whole(rows)
     gaussians.active_sh_degree = gaussians.max_sh_degree
     return gaussians

@@ -4,7 +4,8 @@ import argparse
 import json
 import random
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,7 @@ class Scene:
         self.images = ImageStore(getattr(args, "images_to_load", None) or 0, place, device, sharing)
         self.train_cameras = {scale: self._cameras(args, scale, shuffle, False) for scale in resolution_scales}
         self.test_cameras = {scale: self._cameras(args, scale, shuffle, True) for scale in resolution_scales}
-        self.images.plan(self._pictures(self.train_cameras), self._pictures(self.test_cameras))
+        self.images.plan(*(self._pictures(chain(*of.values())) for of in (self.train_cameras, self.test_cameras)))
 
         gaussians.world_offset = tuple(self.info.offset.tolist())
         if not start:
@@ -115,8 +116,7 @@ class Scene:
 
     def prefetch(self, cameras: Sequence[Camera]) -> None:
         """Start to prepare the images of the views that come next, in that order (`images.ahead` of them)."""
-        ours = (camera for camera in cameras if getattr(camera, "images", None) is self.images)
-        self.images.prefetch([picture for camera in ours for picture in camera.undecoded])
+        self.images.prefetch(self._pictures(cameras))
 
     def save(self, iteration: int, gaussians: SceneGaussians | None = None) -> None:
         """Write `point_cloud/iteration_N/point_cloud.ply`, and the exposures if they are trained.
@@ -175,8 +175,8 @@ class Scene:
             if view.image_path in tested:
                 camera.columns = half(camera.image_width, in_test_list)
 
-    def _pictures(self, lists: dict[float, list[Camera]]) -> list[Picture]:
-        cameras = [camera for cameras in lists.values() for camera in cameras]
+    def _pictures(self, cameras: Iterable[Camera]) -> list[Picture]:
+        """Those of our cameras; cameras of other classes have none."""
         return [p for camera in cameras if getattr(camera, "images", None) is self.images for p in camera.undecoded]
 
 

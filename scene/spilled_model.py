@@ -1,6 +1,7 @@
 """The trained model with a part of it in the host's memory (`--spill`)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
@@ -10,10 +11,43 @@ from torch import Tensor, nn
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import Part, SparseGaussianAdam
-from scene.gaussians.side_stream import SideStream
 from scene.gaussians.table import GaussianTable, in_host_memory
 
 _MOST_MISSED = 1000  # steps, after which all rows catch up, so that the list of steps stays short
+
+
+class _SideStream:
+    """Runs copies between a GPU and its host beside the current stream of a GPU; on the CPU at once."""
+
+    def __init__(self) -> None:
+        self._stream: torch.cuda.Stream | None = None
+
+    @contextmanager
+    def aside(self, *used: Tensor) -> Iterator[Callable[[Tensor], Tensor]]:
+        """Queue what is done here behind the work so far, and let the current stream go on.
+
+        used: tensors that it reads. Yields what a new tensor goes through that the current stream shall use.
+        """
+        if not used[0].is_cuda:
+            yield lambda made: made
+            return
+        here = torch.cuda.current_stream(used[0].device)
+        self._stream = self._stream or torch.cuda.Stream(used[0].device)
+        self._stream.wait_stream(here)
+        for tensor in used:
+            tensor.record_stream(self._stream)
+
+        def keep(made: Tensor) -> Tensor:
+            made.record_stream(here)
+            return made
+
+        with torch.cuda.stream(self._stream):
+            yield keep
+
+    def join(self) -> None:
+        """Let the current stream wait for all that was queued here."""
+        if self._stream is not None:
+            torch.cuda.current_stream(self._stream.device).wait_stream(self._stream)
 
 
 class _Missed:
@@ -42,16 +76,15 @@ class SpilledGaussians(GaussianModel):
     """A GaussianModel whose SH bands above 0, with their averages, lie in the host's memory; on the CPU the same one.
 
     A step concerns copies of the rows that a view sees: `fetch` makes them, `take_gradients` takes their gradients, and
-    `step` writes them back. `fetch_ahead` copies beside a step what the next one will want. Other rows take their steps
-    of Adam later, each with its own rate and correction: when a view sees them, or before anybody reads the bands of
-    all Gaussians or their averages through this class.
+    `step` writes them back. `fetch_ahead` copies rows of the next step beside the present one. Unseen rows replay the
+    steps of Adam that they skipped, each with its own rate and correction: when a view sees them, or before anybody
+    reads the bands of all Gaussians or their averages through this class.
     """
 
     def __init__(self, sh_degree: int, optimizer_type: str = "default") -> None:
-        self._missed, self._seen, self._copies = _Missed(), None, SideStream()
-        self._near: list[
-            tuple[Tensor, Sequence[Tensor]]
-        ] = []  # rows and their copies, as they are in the host's memory
+        self._missed, self._seen, self._copies = _Missed(), None, _SideStream()
+        # Rows and their copies, as they are in the host's memory.
+        self._near: list[tuple[Tensor, Sequence[Tensor]]] = []
         super().__init__(sh_degree, optimizer_type)
 
     @property
@@ -123,7 +156,7 @@ class SpilledGaussians(GaussianModel):
 
     @torch.no_grad()
     def fetch_ahead(self, rows: Tensor) -> None:
-        """Begin to copy the rows (n,) of the next `fetch`, but those of the last one, which are about to change."""
+        """Begin to copy the rows (n,) of the next `fetch`, except rows that this step updates."""
         if self._seen.copies and len(self._stored()) == 3:
             fresh = torch.ones(len(self), dtype=torch.bool, device=rows.device)
             fresh[self._seen.rows] = False
@@ -134,15 +167,14 @@ class SpilledGaussians(GaussianModel):
     def take_gradients(self) -> Tensor:
         """Take the gradients of the last `fetch`, zeros for other rows; none are made for the bands above 0.
 
-        These get a stand-in that tells whether their rows still have a gradient. Returns the rows.
+        These get a stand-in that tells whether their rows still have a gradient. A parameter that got no gradient has
+        none here, and the optimiser passes it over. Returns the rows.
         """
         rows, seen, copies = self._seen
         for name in self._attributes:
             if name != "f_rest":
                 param, gradient = self.raw(name), seen.raw(name).grad
-                param.grad = torch.zeros_like(param)
-                if gradient is not None:
-                    param.grad.index_copy_(0, rows, gradient)
+                param.grad = None if gradient is None else torch.zeros_like(param).index_copy_(0, rows, gradient)
         if copies:
             self._rest.grad = copies[0].new_zeros(()).expand_as(self._rest)
         return rows

@@ -3,6 +3,7 @@
 import argparse
 
 import numpy as np
+import pytest
 import torch
 
 from arguments import OptimizationParams, PipelineParams
@@ -11,6 +12,10 @@ from scene.gaussians.attributes import attributes
 from utils.graphics_utils import BasicPointCloud
 
 GROUPS = {group: attribute.field for group, attribute in attributes(0).items()}
+STANDARD = tuple(attributes(0, further=False))  # the groups of the paper
+FURTHER = tuple(group for group in GROUPS if group not in STANDARD)
+needs_fused_step = pytest.mark.skipif(bool(FURTHER), reason="a model with further attributes takes plain steps")
+needs_59_values = pytest.mark.skipif(bool(FURTHER), reason="the numbers of bytes are of the paper's attributes")
 
 
 def options(**changes: object) -> argparse.Namespace:
@@ -44,6 +49,12 @@ def model(
     gaussians.active_sh_degree = degree if active else 0
     gaussians.training_setup(options(**changes))
     return gaussians
+
+
+def append(gaussians: GaussianModel, count: int, *radii: torch.Tensor) -> None:
+    """Append copies of the first Gaussians, which may have radii (count,), as density control does."""
+    rows = {group: values[:count] for group, values in parameters(gaussians).items()}
+    gaussians.densification_postfix(*(rows.pop(group) for group in STANDARD), *radii, **rows)
 
 
 def take_steps(gaussians: GaussianModel, steps: int, seed: int = 0) -> None:

@@ -118,7 +118,7 @@ def _turned(change):
     return lambda scene: _edit(scene, edit)
 
 
-@pytest.mark.parametrize("scale", [2.0, 0.5, 1e-4, [4.0, 0.25, 1.0, 8.0], 5.0, 0.1])
+@pytest.mark.parametrize("scale", [2.0, 1e-4, [4.0, 0.25, 1.0, 8.0]])
 def test_a_scale_of_poses_is_divided_out(blender_scene, tmp_path, scale):
     plain = Scene(options_of(blender_scene, tmp_path / "plain"), FakeGaussians(), shuffle=False)
     factors = np.broadcast_to(scale, 4)
@@ -154,10 +154,3 @@ def test_real_scene(shared_dir, tmp_path):
     assert (len(scene.getTrainCameras()), len(scene.getTestCameras())) == (100, 25)
     target = scene.getTestCameras()[0].target(torch.ones(3))
     assert target.shape == (3, 200, 200) and target.max() == 1 and target.mean() > 0.5
-
-
-def test_a_loaded_model_needs_no_cloud(blender_scene, tmp_path):
-    FakeGaussians().save_ply(str(tmp_path / "out" / "point_cloud" / "iteration_7" / "point_cloud.ply"))
-    (blender_scene / "points3d.ply").write_text("no PLY")
-    scene = Scene(options_of(blender_scene, tmp_path / "out"), FakeGaussians(), load_iteration=7)
-    assert len(scene.getTrainCameras()) == 6

@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import os
 import re
 import shutil
 from collections.abc import Callable
@@ -113,17 +112,6 @@ def _pose(row: int, values: list[float]) -> Change:
     return _frame(transform_matrix=matrix.tolist())
 
 
-def _turned(factors: list[float]) -> Change:
-    """The first pose with its axes in the world multiplied by factors."""
-
-    def edit(content: dict) -> None:
-        pose = np.array(content["frames"][0]["transform_matrix"])
-        pose[:3, :3] *= np.array(factors)[:, None]
-        content["frames"][0]["transform_matrix"] = pose.tolist()
-
-    return _json(edit)
-
-
 def _moved(scene: Path) -> None:
     (scene / "garden").mkdir()
     for name in ("images", "sparse"):
@@ -164,11 +152,6 @@ def _converted(scene: Path) -> None:
         path.unlink()
 
 
-def _linked_to_nothing(scene: Path) -> None:
-    (scene / PHOTO).unlink()
-    os.symlink(scene / "gone.png", scene / PHOTO)
-
-
 def _one_photo(scene: Path) -> dict[str, bool]:
     shutil.rmtree(scene)
     make_colmap_scene(scene, views=1)
@@ -187,8 +170,6 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_given(source_path="SCENE/garden"), "no scene folder SCENE/garden"),
         (_given(source_path=f"SCENE/{SPARSE}/cameras.bin"), r"cameras\.bin is a file; give -s .*, SCENE$"),
         (_given(source_path="SCENE/images"), "images is not a scene: .*found Right, left; give -s SCENE, which is a"),
-        (_given(source_path=f"SCENE/{SPARSE}"), "0 is not a scene: .*found cameras.bin.*; give -s SCENE, which is a"),
-        (_given(images="images_4"), "there is no folder SCENE/images_4,.*-i$"),
         (_given(init_pcd_path="SCENE/dense.ply"), "no point cloud SCENE/dense.ply"),
         (_emptied, "SCENE is not a scene: .*found nothing"),
         (_model, "SCENE is not a scene: .*found cfg_args; it is a model that train.py wrote: give it as -m"),
@@ -198,15 +179,9 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
             r"looked for the folder sparse .*found images;.* run \S*python\S* convert.py -s SCENE first$",
         ),
         (_gone("images"), "there is no folder SCENE/images,.*-i"),
-        (
-            lambda scene: [path.unlink() for path in (scene / SPARSE).iterdir()] and {},
-            "no COLMAP model.*found sparse/0;",
-        ),
+        (_no_model, "no COLMAP model.*found sparse/0;"),
         (_gone(f"{SPARSE}/images.bin"), "^SCENE/sparse/0 has no images as .bin or .txt; copy the"),
-        (_gone(f"{SPARSE}/points3D.bin"), "^SCENE/sparse/0 has no points3D as .bin or .txt; copy the"),
         (_cut(f"{SPARSE}/cameras.bin", 5), "0/cameras.bin ends within camera 1 of 1, or is no such file; copy the"),
-        (_cut(f"{SPARSE}/images.bin", 1000), "SCENE/sparse/0/images.bin ends within photo 9 of 9"),
-        (_cut(f"{SPARSE}/points3D.bin", 1000), "SCENE/sparse/0/points3D.bin ends within point 292 of 300"),
         (_written(f"{SPARSE}/cameras.bin", b""), "^SCENE/sparse/0/cameras.bin is empty; copy the file again from"),
         (_written(f"{SPARSE}/images.bin", "<!DOCTYPE html><html>404</html>"), "0/images.bin is a web page"),
         (_no_views, "COLMAP model in SCENE/sparse/0 has no registered photo"),
@@ -214,29 +189,20 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_word("cameras.txt", (1, "PINHOLE2")), r"line 4 of .*0/cameras\.txt .*no camera model PINHOLE2"),
         (_word("cameras.txt", (1, "EQUIRECTANGULAR"), (6, ""), (7, "")), "V03.png has the camera model EQUIREC"),
         (_word("cameras.txt", (4, "0")), "camera of Right/V03.png has no usable size or focal length"),
-        (_word("cameras.txt", (6, "nan")), "camera of Right/V03.png has no usable size or focal length, .*nan"),
         (_word("images.txt", (5, "nan")), "pose of .*png is not finite"),
-        (_word("images.txt", (1, "nan")), "pose of .*png is not finite"),
         (_word("images.txt", (5, "1e30")), "more than 1e[+]12 from the origin"),
-        (_word("images.txt", (6, "1e300")), "more than 1e[+]12 from the origin"),
         (_word("images.txt", (8, "77")), r"SCENE/sparse/0/images\.txt has the camera 77"),
         (_word("points3D.txt", (2, "nan")), r"line 4 of SCENE/sparse/0/points3D\.txt .*nan"),
         (_gone(PHOTO), "1 of 9 photos .*are missing: SCENE/images/left/v02.png"),
         (_seven_gone, r"7 of 9 photos that .* lists are missing: .*Right/V03.png, .* and 2 more \(the folder has .*-i"),
         (_converted, r"9 of 9 photos .*Right/V03.png.*\(Right/V03.jpg is there instead\)"),
-        (_linked_to_nothing, r"1 of 9 photos .* missing: SCENE/images/left/v02.png \(it is there, but"),
         (_cut(PHOTO, 40), "cannot read SCENE/images/left/v02.png .*truncated"),
         (_written(PHOTO, b""), "SCENE/images/left/v02.png is empty"),
         (_written(PHOTO, "version https://git-lfs.github.com/spec/v1\noid sha256:4\n"), "left/v02.png .*git lfs pull"),
-        (
-            lambda scene: Image.new("F", (96, 64), 0.5).save(scene / PHOTO, "TIFF"),
-            "cannot read .*v02.png .*floating-point",
-        ),
+        (_floats, "cannot read .*v02.png .*floating-point"),
         (_one_photo, "SCENE has too few photos for --eval"),
         (_own(XYZ, "0 0 0"), "points3D.ply has no red, green, blue"),
-        (_own(f"{XYZ}, {RGB}", "0 0"), "points3D.ply is not a readable PLY file"),
         (_own(f"{XYZ}, {RGB.replace('uchar', 'float')}", "0 0 0 255 128 0"), "colours in .*points3D.ply are neither"),
-        (_mine("float x, float y", "1 2"), "has no z, red"),
         (_mine("float x", "", element="face 0"), "has no x, y, z, red, green, blue"),
         (
             _mine(f"{XYZ}, {RGB}", "0 0 0 1 1 1\n0 nan 0 1 1 1", "vertex 2"),
@@ -253,26 +219,18 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_written("transforms_train.json", "[" * 100_000), "transforms_train.json is not a camera file"),
         (_json(lambda content: content.pop("camera_angle_x")), "has neither camera_angle_x nor fl_x"),
         (_with(camera_angle_x=40.0), "camera_angle_x in .*between 0 and pi, got 40.0; .*radians"),
-        (_with(camera_angle_x=float("nan")), "camera_angle_x in .*got nan"),
         (_with(camera_angle_x=10**400), "OverflowError"),
         (_with(cx=1e30), "principal point far outside"),
-        (_with(w=1e9), "camera of r_0 has no usable size"),
         (_no_frames, "SCENE/transforms_train.json lists no frames"),
         (_frame(file_path="a" * 5000), "1 of 4 photos"),
-        (_frame(file_path="a\0b\ud800"), "1 of 4 photos"),
         (_lacking("file_path"), r"^frame 2 of SCENE/transforms_train\.json has no file_path"),
         (_lacking("transform_matrix"), r"frame 2 \(./train/r_1\) of .*has no transform_matrix"),
         (_frame(transform_matrix=[[1, 2], [3, 4]]), r"^frame 1 \(./train/r_0\) of .* must be 4x4 .*got shape"),
         (_frame(transform_matrix=[[0] * 4] * 4), r"^frame 1 \(./train/r_0\) of SCENE/.*Singular matrix"),
-        (_frame(transform_matrix=[[1e400] * 4] * 4), "finite"),
         (_pose(3, [1, 2, 3, 4]), "the last row of transform_matrix must be 0 0 0 1"),
-        (_pose(0, [1e30, 0, 0, 0]), "pose of r_0 has no rotation, but a matrix that stretches"),
         (_pose(0, [1, 0, 0, 1e30]), "camera of r_0 is more than 1e[+]12 from the origin"),
         (_pose(1, [0, 9, 0, 0]), "pose of r_0 has no rotation, but a matrix that stretches by 0.1111 to 1;"),
-        (_pose(1, [0.01, 1, 0, 0]), "pose of r_0 has no rotation, but a matrix that stretches by 0.995 to 1.005;"),
         (_pose(1, [0, -1, 0, 0]), "pose of r_0 is mirrored"),
-        (_turned([1, 1, -2]), "has no rotation"),
-        (_turned([3, 3, -3]), "pose of r_0 is mirrored"),
     ],
     "nerfstudio": [
         (_with(camera_model="EQUIRECTANGULAR"), "camera_model EQUIRECTANGULAR in .*cannot be used, only PINHOLE"),
@@ -280,7 +238,6 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_with(fl_x="wide"), "is not a camera file .*could not convert"),
         (_with(fl_x=[1]), "is not a camera file .*TypeError"),
         (_with(fl_x=0), "camera of images/.* has no usable size or focal length"),
-        (_with(fl_x=1e400), "no usable size or focal length"),
         (_with(w=0), "no usable size or focal length"),
         (_with(frames=[]), "lists no frames"),
         (_json(lambda content: content.pop("frames")), "is not a camera file .*KeyError: 'frames'"),
@@ -289,16 +246,15 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
     ],
 }
 # In units of the photo's size these are damaged files, not lenses.
-for _model in ("PINHOLE", "OPENCV"):
-    for _params in (
-        *((FOCAL, FOCAL, 45.0, 1e300), (FOCAL, FOCAL, -1e300, 34.5), (FOCAL, FOCAL, 1e39, 34.5)),
-        *((FOCAL, FOCAL, 1e20, 34.5), (1e300, FOCAL, 45.0, 34.5), (1e-300, FOCAL, 45.0, 34.5)),
-        (FOCAL, 5e-324, 45.0, 34.5),
+for name, further in (("PINHOLE", ""), ("OPENCV", " 0.1 0 0 0")):
+    for params in (
+        (FOCAL, FOCAL, 45, 1e300),
+        (FOCAL, FOCAL, -1e20, 34),
+        (1e300, FOCAL, 45, 34),
+        (FOCAL, 5e-324, 45, 34),
     ):
-        _line = f"{' '.join(map(repr, _params))}{' 0.1 0 0 0' if _model == 'OPENCV' else ''}"
-        _said = "camera of Right/V03.png has no usable size or focal length, or a principal"
-        _places = (1, _model), (4, _line), (5, ""), (6, ""), (7, "")
-        FAULTS["colmap"].append((_word("cameras.txt", *_places), _said))
+        places = (1, name), (4, " ".join(map(repr, params)) + further), (5, ""), (6, ""), (7, "")
+        FAULTS["colmap"].append((_word("cameras.txt", *places), "camera of Right/V03.png has no usable size or focal"))
 
 
 @pytest.fixture(scope="module")

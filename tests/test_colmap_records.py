@@ -12,7 +12,6 @@ import numpy as np
 import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic import make_colmap_scene
 
 from scene import colmap_loader
 from scene.colmap_loader import (
@@ -33,7 +32,6 @@ from scene.colmap_loader import (
     read_points3D_text,
     rotmat2qvec,
 )
-from scene.dataset_readers import readColmapCameras
 from scene.images import lens
 from scene.readers.colmap import ColmapModel, read_model
 from utils.system_utils import UserError
@@ -167,39 +165,6 @@ def test_real_models_are_those_of_pycolmap(shared_dir, tmp_path, name, kind):
     wanted = pycolmap.Reconstruction(str(shared_dir / "scenes" / name / "sparse" / "0"))
     (wanted.write_binary if kind == "bin" else wanted.write_text)(str(tmp_path))
     _assert_equal(read_model(tmp_path), wanted)
-
-
-@pytest.mark.parametrize("suffix", ["bin", "txt"])
-def test_quaternions_of_any_length_are_normalised(tmp_path, suffix):
-    reconstruction = make_colmap_scene(tmp_path, views=3)
-    sparse = tmp_path / "sparse" / "0"
-    reconstruction.write_text(str(sparse))
-    lengths = {image.name: 0.3 * number for number, image in reconstruction.images.items()}
-    for name in ("cameras", "images", "points3D"):
-        (sparse / f"{name}.{'txt' if suffix == 'bin' else 'bin'}").unlink()
-    if suffix == "txt":
-        lines = (sparse / "images.txt").read_text().splitlines()
-        for place, line in enumerate(lines):
-            words = line.split()
-            if words[-1] in lengths:
-                turn = [repr(float(word) * lengths[words[-1]]) for word in words[1:5]]
-                lines[place] = " ".join([words[0], *turn, *words[5:]])
-        (sparse / "images.txt").write_text("\n".join(lines) + "\n")
-    else:
-        content = bytearray((sparse / "images.bin").read_bytes())
-        for name, length in lengths.items():
-            at = content.index(name.encode()) - 60  # before the translation and the camera's id
-            content[at : at + 32] = struct.pack(
-                "<4d", *(length * value for value in struct.unpack_from("<4d", content, at))
-            )
-        (sparse / "images.bin").write_bytes(content)
-    wanted = {image.name: image.cam_from_world().matrix() for image in reconstruction.images.values()}
-    extrinsics = READERS["images"][suffix == "txt"](sparse / f"images.{suffix}")
-    intrinsics = READERS["cameras"][suffix == "txt"](sparse / f"cameras.{suffix}")
-    infos = readColmapCameras(extrinsics, intrinsics, None, str(tmp_path / "images"), "", [])
-    published = {info.image_name: np.column_stack([info.R.T, info.T]) for info in infos}
-    for name, pose in wanted.items():
-        np.testing.assert_allclose(published[name], pose, atol=1e-14)
 
 
 def test_without_pycolmap_what_needs_it_is_said(monkeypatch):

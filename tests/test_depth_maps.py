@@ -278,9 +278,7 @@ def test_training_follows_the_maps_or_leaves_them_alone(scene, tmp_path, monkeyp
     off = _train(scene, tmp_path / "off", "-d", "depths", "--depth_l1_weight_init", 0, "--depth_l1_weight_final", 0)
     assert off == plain
     weight = ("--depth_l1_weight_init", 20, "--depth_l1_weight_final", 20)  # the photos alone would give another depth
-    supervised = _train(scene, tmp_path / "on", "-d", "depths", *weight, "--images_to_load", 2)
-    assert supervised != plain
-    assert supervised == _train(scene, tmp_path / "unlimited", "-d", "depths", *weight)
+    assert _train(scene, tmp_path / "on", "-d", "depths", *weight) != plain
     error = {name: _depth_error(scene, tmp_path / name) for name in ("plain", "on")}
     assert error["on"] < 0.8 * error["plain"], error
 

@@ -23,7 +23,6 @@ from gaussian_renderer import render
 from gaussian_renderer.blending import blending_weights, most_important
 from gaussian_renderer.free_view import free_view, rotation_matrix
 from scene.export_world import export_world
-from scene.gaussian_model import GaussianModel
 from splatting.exports import scene_formats
 from splatting.exports.formats import FORMATS, format_of, read_splats
 from splatting.exports.html import turned
@@ -445,5 +444,3 @@ def test_numbers_that_float32_cannot_hold_are_read_without_warnings(tmp_path, co
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert len(read_splats(path)) == 300
-        if not packed:
-            GaussianModel(0).load_ply(path)

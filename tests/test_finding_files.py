@@ -5,14 +5,11 @@ import shutil
 import unicodedata
 from pathlib import Path
 
-import numpy as np
 import pycolmap
 import pytest
-import torch
 from PIL import EpsImagePlugin, Image
-from synthetic import HEIGHT, WIDTH, FakeGaussians, folder_state, make_colmap_scene, options_of, read
+from synthetic import HEIGHT, WIDTH, make_colmap_scene, read
 
-from scene import Scene
 from utils.system_utils import UserError
 
 
@@ -48,13 +45,6 @@ def test_names_with_spaces_and_letters_of_all_sorts(colmap_scene, text):
     _rename(colmap_scene, dict(zip(olds, names, strict=False)), text)
     found = [camera.image_name for camera in read(colmap_scene).train_cameras]
     assert set(names) < set(found) and len(found) == 17
-
-
-def test_names_that_are_not_utf8(colmap_scene):
-    path = colmap_scene / "sparse" / "0" / "images.bin"
-    path.write_bytes(path.read_bytes().replace(b"left/v02", b"left/\xe902"))
-    with pytest.raises(UserError, match=r"the name of photo [0-9]+ in .*images.bin is not UTF-8; rename it"):
-        read(colmap_scene)
 
 
 def test_names_that_match_but_for_case_accents_or_slashes(colmap_scene, capsys):
@@ -128,44 +118,6 @@ def test_several_cameras_and_sizes(tmp_path):
     assert (cameras[1].width, cameras[1].file_size) == (WIDTH, (WIDTH, HEIGHT))
     assert cameras[7].fx == 55 and cameras[7].file_size == (cameras[7].width, cameras[7].height)
     assert cameras[7].width < 55
-
-
-def _kinds(image: Image.Image) -> dict[str, tuple[Image.Image, dict]]:
-    exif = Image.Exif()
-    exif[0x0112] = 6  # orientation: turn by a quarter
-    grey = image.convert("L")
-    sixteen = Image.fromarray(np.asarray(grey).astype(np.uint16) * 257)
-    return {
-        "EXIF": (image, {"format": "JPEG", "quality": 100, "subsampling": 0, "exif": exif}),
-        "grey": (grey, {"format": "PNG"}),
-        "16 bit": (sixteen, {"format": "PNG"}),
-        "palette": (image.quantize(256), {"format": "PNG"}),
-        "CMYK": (image.convert("CMYK"), {"format": "TIFF"}),
-    }
-
-
-@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV"])
-@pytest.mark.parametrize("kind", ["EXIF", "grey", "16 bit", "palette", "CMYK"])
-def test_pictures_of_any_kind(tmp_path, kind, model):
-    params = (110.0, 110.0, 45.0, 34.5) + ((-0.1, 0, 0, 0) if model == "OPENCV" else ())
-    folder = tmp_path / "scene"
-    make_colmap_scene(folder, model=model, params=params, views=1)
-    (path,) = (folder / "images").rglob("*.png")
-    options = options_of(folder, tmp_path / "out")
-    (camera,) = Scene(options, FakeGaussians()).getTrainCameras()
-    plain = camera.target(torch.zeros(3)).float()
-    with Image.open(path) as image:
-        picture, how = _kinds(image.convert("RGB"))[kind]
-    picture.save(path, **how)
-    before = folder_state(folder)
-    (camera,) = Scene(options, FakeGaussians()).getTrainCameras()
-    target = camera.target(torch.zeros(3)).float()
-    assert target.shape == plain.shape
-    if kind in ("grey", "16 bit"):
-        plain = (plain * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0).expand(3, -1, -1)  # ITU-R 601
-    # A palette of 256 colours and JPEG lose some levels; a turned photo would be off by 30 or more.
-    assert (target - plain).abs().mean() < (6 if kind == "palette" else 1)
-    assert folder_state(folder) == before
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to(path), lambda path: path.symlink_to("gone")])

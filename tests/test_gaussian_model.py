@@ -6,11 +6,12 @@ import math
 import numpy as np
 import pytest
 import torch
-from gaussians import cloud, model, moments, options, parameters, take_steps
+from gaussians import FURTHER, GROUPS, cloud, model, moments, options, parameters, take_steps
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from scene.gaussian_model import GaussianModel
+from utils.general_utils import get_expon_lr_func
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 
@@ -40,9 +41,8 @@ def test_start_from_a_cloud(degree):
 
 
 def test_points_at_one_place_get_the_smallest_size():
-    np.testing.assert_allclose(
-        _started(np.ones((5, 3), np.float32))._scaling.detach().numpy(), 0.5 * math.log(1e-7), rtol=1e-6
-    )
+    log_scales = _started(np.ones((5, 3), np.float32))._scaling.detach().numpy()
+    np.testing.assert_allclose(log_scales, 0.5 * math.log(1e-7), rtol=1e-6)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
@@ -60,24 +60,19 @@ def test_an_empty_or_broken_cloud_is_refused():
 def test_covariance_against_scipy():
     gaussians = model(10)
     w, x, y, z = gaussians._rotation.detach().double().numpy().T
-    axes = (
-        Rotation.from_quat(np.stack((x, y, z, w), 1)).as_matrix()
-        * (1.5 * gaussians.get_scaling.detach().double().numpy())[:, None]
-    )
+    scales = 1.5 * gaussians.get_scaling.detach().double().numpy()
+    axes = Rotation.from_quat(np.stack((x, y, z, w), 1)).as_matrix() * scales[:, None]
     full = axes @ axes.transpose(0, 2, 1)
     expected = full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     np.testing.assert_allclose(gaussians.get_covariance(1.5).detach().numpy(), expected, atol=1e-6 * np.abs(full).max())
     np.testing.assert_allclose(gaussians.get_rotation.detach().norm(dim=1).numpy(), 1, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("iteration", "rate"), [(0, 1.6e-4), (1, None), (15_000, 1.6e-5), (30_000, 1.6e-6), (40_000, 1.6e-6)]
-)
-def test_position_learning_rate(iteration, rate):
-    gaussians = model(4, extent=3.0)
-    expected = math.exp((1 - 1 / 30_000) * math.log(1.6e-4) + math.log(1.6e-6) / 30_000) if rate is None else rate
-    assert gaussians.update_learning_rate(iteration) == pytest.approx(3.0 * expected, rel=1e-12)
-    assert gaussians.optimizer.param_groups[0]["lr"] == pytest.approx(3.0 * expected, rel=1e-12)
+def test_position_learning_rate():
+    gaussians, rate = model(4, extent=3.0), get_expon_lr_func(1.6e-4, 1.6e-6, max_steps=30_000)
+    for iteration in (0, 15_000, 40_000):
+        assert gaussians.update_learning_rate(iteration) == pytest.approx(3.0 * rate(iteration), rel=1e-12)
+        assert gaussians.optimizer.param_groups[0]["lr"] == gaussians.position_learning_rate
 
 
 def test_sh_degree_rises_to_the_maximum_only():
@@ -97,7 +92,7 @@ def test_capture_and_restore():
     gaussians.denom += 2
     gaussians.xyz_gradient_accum += 0.5
     capture = gaussians.capture()
-    assert len(capture) == 12
+    assert len(capture) == 12 + len(FURTHER)
     other = GaussianModel(3)
     other.restore(capture, options(feature_lr=0.5))
     for name, value in parameters(gaussians).items():
@@ -118,7 +113,7 @@ def test_restore_refuses_another_degree():
 
 def test_restore_refuses_other_attributes():
     capture = model(5).capture()
-    with pytest.raises(UserError, match=r"has 7 attributes per Gaussian.*has 6 \(xyz, f_dc"):
+    with pytest.raises(UserError, match=rf"has {len(GROUPS) + 1} attributes per Gaussian.*has {len(GROUPS)} \(xyz"):
         GaussianModel(3).restore((*capture, torch.zeros(5, 1)), options())
 
 

@@ -3,19 +3,20 @@
 import numpy as np
 import pytest
 import torch
-from gaussians import model, parameters
+from gaussians import FURTHER, model, parameters
 from plyfile import PlyData, PlyElement
 
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.attributes import attributes
 from scene.readers.point_cloud import read_point_cloud
 from scene.saved_model import read_model
-from splatting.exports.formats import read_splats
 from utils.system_utils import UserError
 
 ORDER = (
     ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     + [f"f_rest_{i}" for i in range(45)]
     + ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    + [column for name in FURTHER for column in attributes(0)[name].columns]
 )
 
 
@@ -94,7 +95,8 @@ def test_a_model_of_two_scales_has_as_many_columns_as_values(tmp_path):
     gaussians._scaling = torch.nn.Parameter(gaussians._scaling.detach()[:, :2].contiguous())
     gaussians.save_ply(tmp_path / "flat.ply")
     data = PlyData.read(tmp_path / "flat.ply", mmap=False)["vertex"].data
-    assert list(data.dtype.names) == gaussians.construct_list_of_attributes() and len(data.dtype.names) == 61
+    names = gaussians.construct_list_of_attributes()
+    assert list(data.dtype.names) == names == [name for name in ORDER if name != "scale_2"]
     for i in range(2):
         assert np.array_equal(data[f"scale_{i}"], gaussians._scaling.detach()[:, i])
     assert np.array_equal(data["rot_3"], gaussians._rotation.detach()[:, 3])
@@ -147,18 +149,6 @@ def test_refusals(tmp_path):
             _loaded(tmp_path / "cut.ply", 2)
 
 
-def test_a_failed_write_leaves_no_file(tmp_path, monkeypatch):
-    gaussians = model(5)
-
-    def fail(*_: object, **__: object) -> None:
-        raise OSError("disk full")
-
-    monkeypatch.setattr("utils.system_utils.os.replace", fail)
-    with pytest.raises(UserError, match="cannot write .*disk full"):
-        gaussians.save_ply(tmp_path / "point_cloud.ply")
-    assert not list(tmp_path.iterdir())
-
-
 ANNOUNCED = r"is not a \S+ PLY file \(\S+ (vertices|rows of \w+) announced, file ends after [\d,]+ bytes\)"
 
 
@@ -168,9 +158,8 @@ def test_a_header_that_promises_more_rows_than_the_file_has(tmp_path, kind, coun
     model(2).save_ply(tmp_path / "a.ply")
     content = (tmp_path / "a.ply").read_bytes().replace(b"element vertex 2", f"element vertex {count}".encode())
     (tmp_path / "a.ply").write_bytes(content.replace(b"binary_little_endian", kind.encode()))
-    for read in (read_model, _loaded, read_splats):
-        with pytest.raises(UserError, match=ANNOUNCED):
-            read(tmp_path / "a.ply")
+    with pytest.raises(UserError, match=ANNOUNCED):
+        _loaded(tmp_path / "a.ply")
 
 
 JUNK = "element junk 1000000000000\nproperty {}\n"
@@ -195,7 +184,7 @@ def test_rows_are_counted_however_the_header_is_written(tmp_path, old, new):
     header, path = "ply\nformat ascii 1.0\nelement vertex 1\nproperty double x\nend_header\n", tmp_path / "a.ply"
     many = header if "junk" in new else header.replace("vertex 1", "vertex 100000000000")
     path.write_bytes((many.replace(old, new) + "0\n").encode())
-    for read in (read_model, _loaded, read_splats, read_point_cloud):
+    for read in (_loaded, read_point_cloud):
         with pytest.raises(UserError, match=ANNOUNCED):
             read(path)
 
@@ -209,12 +198,6 @@ def test_a_file_as_long_as_its_header_says_is_read(tmp_path, end, last):
     lines += ["1 2 3 0 0 0"] * 2
     (tmp_path / "a.ply").write_bytes((end.join(lines) + (end if last else "")).encode())
     assert read_point_cloud(tmp_path / "a.ply").points.tolist() == [[1, 2, 3]] * 2
-
-
-def test_rows_without_columns_are_no_reason_for_a_traceback(tmp_path):
-    (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 1{'0' * 40}\nend_header\n")
-    with pytest.raises(UserError):
-        _loaded(tmp_path / "a.ply")
 
 
 def test_gaussians_that_are_not_drawn_are_told_of(tmp_path, capsys):

@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from utils.general_utils import (
     PILtoTorch,
     build_rotation,
-    build_scaling_rotation,
     get_expon_lr_func,
     inverse_sigmoid,
     safe_state,
@@ -27,16 +26,6 @@ def test_rotations_are_scipys():
     wanted = Rotation.from_quat(q.numpy(), scalar_first=True).as_matrix()
     np.testing.assert_allclose(build_rotation(q).numpy(), wanted, atol=1e-15)  # some roundings of values below 1
     assert torch.equal(build_rotation(torch.zeros(1, 4)), torch.eye(3)[None])
-
-
-def test_covariance_from_scales_and_rotations():
-    g = torch.Generator().manual_seed(1)
-    q, s = torch.randn(20, 4, dtype=torch.float64, generator=g), torch.rand(20, 3, dtype=torch.float64, generator=g)
-    factor = build_scaling_rotation(s, q)
-    R = Rotation.from_quat(q.numpy(), scalar_first=True).as_matrix()
-    wanted = np.einsum("nij,nj,nkj->nik", R, s.numpy() ** 2, R)
-    packed = strip_symmetric(factor @ factor.transpose(1, 2)).numpy()
-    np.testing.assert_allclose(packed, wanted[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]], atol=1e-15)
 
 
 def test_upper_triangles_in_their_order():

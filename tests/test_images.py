@@ -146,13 +146,6 @@ def test_exif_orientation_is_ignored(tmp_path):
     assert torch.equal(decode(tmp_path / "a.png", (20, 10)), _chw(image))
 
 
-def test_floating_point_pixels_are_refused_before_they_are_decoded(tmp_path):
-    Image.new("F", (4, 3), 0.5).save(tmp_path / "f.tiff")
-    for read in (picture_size, lambda path: decode(path, (4, 3))):
-        with pytest.raises(UserError, match="f.tiff .floating-point pixels; save it with 8 or 16 bits"):
-            read(tmp_path / "f.tiff")
-
-
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
 @pytest.mark.parametrize("kept", [0.0, 0.3, 0.9])
 def test_a_truncated_picture_is_found_before_it_is_needed(tmp_path, suffix, kept):

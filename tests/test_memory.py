@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from gaussians import model, options
+from gaussians import model, needs_59_values, needs_fused_step, options
 
 import render
 import train
@@ -120,6 +120,7 @@ def _failing(function, call: int, error: Exception):
     return fails
 
 
+@needs_fused_step
 @pytest.mark.parametrize(
     ("error", "said"),
     [
@@ -183,6 +184,7 @@ def test_a_densification_cut_short_is_saved_whole(colmap_scene, tmp_path, monkey
     _train(colmap_scene, tmp_path, "--start_checkpoint", tmp_path / "chkpnt3.pth")
 
 
+@needs_fused_step
 def test_nothing_trained_saves_nothing(colmap_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(fused, "draw", _failing(fused.draw, 1, ON_A_GPU))
     with pytest.raises(UserError, match="in iteration 1 .*nothing was trained yet"):
@@ -190,6 +192,7 @@ def test_nothing_trained_saves_nothing(colmap_scene, tmp_path, monkeypatch):
     assert not list(tmp_path.glob("*.pth"))
 
 
+@needs_fused_step
 def test_other_errors_pass(colmap_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(fused, "draw", _failing(fused.draw, 3, RuntimeError("shapes differ")))
     with pytest.raises(RuntimeError, match="shapes differ"):
@@ -220,6 +223,7 @@ def test_every_command_ends_in_a_sentence(capsys):
 # The estimate
 
 
+@needs_59_values
 def test_the_estimate_and_its_warnings(colmap_scene, tmp_path, monkeypatch, capfd):
     free = 1 << 24
     monkeypatch.setattr(memory_estimate, "free_memory", lambda _: free)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from gaussians import GROUPS, model, options, parameters
+from gaussians import GROUPS, append, model, options, parameters
 from torch import Tensor, nn
 from torch.optim.optimizer import register_optimizer_step_post_hook
 
@@ -15,6 +15,7 @@ from scene.gaussians.adam import GaussianAdam, SparseGaussianAdam
 EXTENT = 20.0  # Gaussians of 0.2 and less are cloned, larger ones split, and those of more than 2 removed
 ADAM = {"lr": 0.0, "eps": 1e-15}
 OPTIMIZERS = {
+    "ours": GaussianAdam,
     "adam": lambda groups: torch.optim.Adam(groups, **ADAM),
     "amsgrad": lambda groups: torch.optim.Adam(groups, amsgrad=True, **ADAM),
     "rmsprop": lambda groups: torch.optim.RMSprop(groups, momentum=0.5, centered=True),
@@ -93,8 +94,7 @@ def test_appended_rows_start_with_averages_of_zero(name):
     gaussians = _with(OPTIMIZERS[name])
     _step(gaussians, 0, torch.arange(30))
     before = {group["name"]: dict(gaussians.optimizer.state[group["params"][0]]) for group in _groups(gaussians)}
-    new = {group: values[:4] for group, values in parameters(gaussians).items()}
-    gaussians.densification_postfix(*new.values())
+    append(gaussians, 4)
     assert len(gaussians) == 34 and all(group["params"][0] is getattr(gaussians, GROUPS[group["name"]])
                                         for group in gaussians.optimizer.param_groups)  # fmt: skip
     for group in gaussians.optimizer.param_groups:
@@ -227,7 +227,7 @@ def test_a_further_group_with_a_row_per_gaussian_is_pruned_along():
     assert torch.equal(now, before[:5]) and gaussians.optimizer.state[now]["exp_avg"].shape == (5, 2)
     rows = {name: values[:2] for name, values in parameters(gaussians).items()}
     with pytest.raises(ValueError, match="no rows are given for feature, which has a row for every Gaussian"):
-        gaussians.densification_postfix(*rows.values())
+        append(gaussians, 2)
     assert len(gaussians) == 5 == len(gaussians.optimizer.param_groups[0]["params"][0])
     params = gaussians.cat_tensors_to_optimizer(rows | {"feature": torch.zeros(2, 2)})
     assert set(params) == {*GROUPS, "feature"} and params["feature"].shape == (7, 2)
@@ -236,16 +236,16 @@ def test_a_further_group_with_a_row_per_gaussian_is_pruned_along():
 
 
 def test_a_subclass_manages_its_rows_by_the_references_names():
-    """Overrides written for the reference: 6 arguments, tensors by group name, `valid` masks."""
+    """Overrides written for the reference: its arguments, tensors by group name, `valid` masks."""
 
     class Client(GaussianModel):
         calls = 0
 
-        def densification_postfix(self, xyz, dc, rest, opacities, scaling, rotation):
+        def densification_postfix(self, xyz, dc, rest, opacities, scaling, rotation, **others):
             Client.calls += 1
             rows = {"xyz": xyz, "f_dc": dc, "f_rest": rest, "opacity": opacities, "scaling": scaling,
                     "rotation": rotation}  # fmt: skip
-            self._adopt(self.cat_tensors_to_optimizer(rows))
+            self._adopt(self.cat_tensors_to_optimizer(rows | others))
             count = self.get_xyz.shape[0]
             self.xyz_gradient_accum, self.denom = torch.zeros((count, 1)), torch.zeros((count, 1))
             self.max_radii2D = torch.zeros(count)
@@ -275,7 +275,7 @@ def test_attributes_that_are_not_optimised_keep_their_rows_in_step():
     rotation = gaussians._rotation.detach().clone()
     gaussians.prune_points(torch.arange(30) < 10)
     assert torch.equal(gaussians._rotation, rotation[10:])
-    gaussians.densification_postfix(*(values[:3] for values in parameters(gaussians).values()))
+    append(gaussians, 3)
     assert torch.equal(gaussians._rotation, torch.cat((rotation[10:], rotation[10:13])))
 
 
@@ -289,7 +289,7 @@ def test_rows_change_before_training_is_set_up():
     gaussians.prune_points(torch.arange(30) < 10)
     gaussians.reset_opacity()
     assert torch.equal(gaussians._xyz, before["xyz"][10:]) and gaussians.get_opacity.max() <= 0.01 + 1e-6
-    gaussians.densification_postfix(*(values[:3] for values in parameters(gaussians).values()))
+    append(gaussians, 3)
     assert torch.equal(gaussians._xyz, before["xyz"][[*range(10, 30), 10, 11, 12]])
     gaussians.xyz_gradient_accum, gaussians.denom = torch.ones(23, 1), torch.ones(23, 1)
     gaussians.densify_and_prune(0.5, 0.0, EXTENT, None)
@@ -351,15 +351,6 @@ def test_a_copy_of_a_model_trains_on_as_the_model_does():
                 getattr(each, GROUPS[name]).grad = gradient
             each.optimizer.step()
     assert all(torch.equal(values, parameters(other)[name]) for name, values in parameters(gaussians).items())
-
-
-def test_a_loss_on_inactive_bands_reaches_them():
-    """No band above 0 is rendered at degree 0, but a client's own loss may read the coefficients."""
-    gaussians = model(20, active=False)
-    gaussians._features_rest.grad = torch.ones_like(gaussians._features_rest)
-    before = gaussians._features_rest.detach().clone()
-    gaussians.optimizer.step()
-    assert (gaussians._features_rest < before).all()
 
 
 def test_groups_that_change_after_a_step_follow_torch():

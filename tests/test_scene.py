@@ -72,7 +72,7 @@ def test_replaced_training_views_train(colmap_scene, tmp_path):
     assert {views[t].uid for t in range(1, 10)} == {0, 1, 2} and made.training_pixels()[0] == 3 * 24 * 16
 
 
-def test_a_readers_replacement_gets_the_references_arguments(colmap_scene, tmp_path, monkeypatch):
+def test_a_readers_replacement_gets_the_references_arguments(colmap_scene, blender_scene, tmp_path, monkeypatch):
     calls = []
     known = read_scene(colmap_scene, "images", True)
 
@@ -87,16 +87,11 @@ def test_a_readers_replacement_gets_the_references_arguments(colmap_scene, tmp_p
     assert calls == [(str(colmap_scene), "photos", "d", True, True)]
     assert (len(made.getTrainCameras()), len(made.getTestCameras())) == (14, 1)
     assert made.cameras_extent == known.extent
+    monkeypatch.setitem(sceneLoadTypeCallbacks, "Blender", theirs)
+    Scene(_args(blender_scene, tmp_path / "out", OF_2023, white_background=True), FakeGaussians(), start=False)
+    assert calls[1:] == [(str(blender_scene), True, "", True)]
     monkeypatch.undo()
     assert len(Scene(_args(colmap_scene, tmp_path / "out"), FakeGaussians(), start=False).getTestCameras()) == 3
-
-
-def test_a_replaced_reader_of_blender_scenes(blender_scene, tmp_path, monkeypatch):
-    calls = []
-    known = read_scene(blender_scene, "images", True)
-    monkeypatch.setitem(sceneLoadTypeCallbacks, "Blender", lambda *given: calls.append(given) or known)
-    made = Scene(_args(blender_scene, tmp_path / "out", OF_2023, white_background=True), FakeGaussians(), start=False)
-    assert calls == [(str(blender_scene), True, "", True)] and made.info is known
 
 
 class TheirInfo2023(NamedTuple):

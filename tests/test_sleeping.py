@@ -13,6 +13,7 @@ import torch
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.optim import adam_
 from diff_gaussian_rasterization.scene import Scene
+from gaussians import needs_fused_step
 from processes import in_ranks
 from rasterizer_tools import BOTH_AND_GPU, GPU_MARKS
 from step_ways import WAYS, take_as  # noqa: F401  (a fixture)
@@ -323,6 +324,7 @@ def test_damaged_sleep_is_refused(scene, tmp_path, what):
         _trained(scene, tmp_path / "b", "--start_checkpoint", tmp_path / "bad.pth")
 
 
+@needs_fused_step
 def test_interrupted(scene, tmp_path, plain, monkeypatch):
     draw, calls = fused.draw, []
 

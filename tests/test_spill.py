@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 from diff_gaussian_rasterization.optim import adam_, catch_up_
-from gaussians import model
+from gaussians import cloud, model, needs_59_values, options
 from trainings import OPTIONS, differences, leaves, narrow_scene, trained
 
 from scene import spilled_model
@@ -80,6 +80,17 @@ def test_a_long_list_of_missed_steps_is_cut(scene, tmp_path, monkeypatch, most):
     assert differences(trained(scene, tmp_path / "spilled", "--spill"), usual) == []
 
 
+def test_a_parameter_without_a_gradient_takes_no_step():
+    gaussians = spilled_model.SpilledGaussians(1)
+    gaussians.create_from_pcd(cloud(20), [], 1.0)
+    gaussians.training_setup(options())
+    gaussians.fetch(torch.arange(5)).get_xyz.sum().backward()
+    gaussians.take_gradients()
+    assert gaussians._xyz.grad.any(dim=1).sum() == 5
+    gaussians.step(torch.ones(20, dtype=torch.int32))
+    assert list(gaussians.optimizer.state) == [gaussians._xyz]
+
+
 def _stopped(scene: Path, out: Path, *options: object) -> tuple[str, list[object]]:
     """What a run says that stops, and the state that it leaves, but for its statistics and learning rates."""
     with pytest.raises(UserError) as error:
@@ -122,6 +133,7 @@ def test_a_guard_leaves_the_same_model_and_marks(scene, tmp_path, monkeypatch, w
     assert leaves(spilled) == leaves(usual)
 
 
+@needs_59_values
 def test_the_estimate_leaves_out_what_lies_in_the_hosts_memory():
     gaussians = model(50)
     usual, spilled = (training_bytes(gaussians, 1000, 0, spill=spill) for spill in (None, True))

@@ -33,6 +33,8 @@ def test_text(tmp_path, text):
     cloud = read_point_cloud(tmp_path / "a.xyz")
     np.testing.assert_array_equal(cloud.points, np.float32(POINTS))
     np.testing.assert_allclose(cloud.colors, BYTES / 255, atol=1e-7)
+    write_point_cloud(tmp_path / "ply.xyz", POINTS, BYTES)  # the content tells the kind
+    np.testing.assert_array_equal(read_point_cloud(tmp_path / "ply.xyz").points, cloud.points)
     assert cloud.points.dtype == np.float64 and cloud.colors.dtype == cloud.normals.dtype == np.float32
 
 
@@ -52,11 +54,6 @@ def test_points_without_colours_are_grey(tmp_path):
         cloud = read_point_cloud(tmp_path / name)
         np.testing.assert_array_equal(cloud.points, np.float32(POINTS))
         assert (cloud.colors == np.float32(127 / 255)).all()
-
-
-def test_the_content_tells_the_kind(tmp_path):
-    write_point_cloud(tmp_path / "cloud.txt", POINTS, BYTES)
-    np.testing.assert_array_equal(read_point_cloud(tmp_path / "cloud.txt").points, np.float32(POINTS))
 
 
 @pytest.mark.parametrize(

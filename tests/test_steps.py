@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from gaussians import needs_fused_step
 from rasterizer_tools import GPU_MARKS
 from step_ways import Rerun, fused_iterations, take_as  # noqa: F401  (a fixture)
 from trainings import ITERATIONS, OPTIONS, differences, narrow_scene, trained
@@ -20,6 +21,7 @@ from splatting.training.steps.fused import FusedStep
 from splatting.training.steps.plain import PlainStep
 from utils.system_utils import UserError
 
+pytestmark = needs_fused_step
 GPU = [pytest.param(None, marks=GPU_MARKS)]
 GROWING = ("--opacity_reset_interval", 1000)  # lists get longer to the end, as no reset makes their splats small
 

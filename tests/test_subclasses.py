@@ -107,15 +107,6 @@ def test_start_and_reset_go_through_the_inverse_activation():
     torch.testing.assert_close(gaussians._opacity.detach(), inverse(torch.full((5, 1), 0.01)))
 
 
-def test_children_of_a_split_go_through_the_inverse_activation():
-    plain, other = model(30), model(30)
-    other.scaling_inverse_activation = lambda x: torch.log(x) - 5
-    for gaussians in (plain, other):
-        gaussians.densify_and_split(torch.ones(30), 0.5, 0.0, seed=1)
-    assert len(plain) == len(other) == 60
-    torch.testing.assert_close(other._scaling, plain._scaling - 5)
-
-
 # Masks
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from gaussians import needs_fused_step
 from PIL import Image
 from plyfile import PlyData
 from waiting import wait_for
@@ -127,6 +128,7 @@ def test_sh_degree_rises_every_interval_up_to_its_maximum(blender_scene, tmp_pat
     assert read_model(ply)._xyz.isfinite().all()
 
 
+@needs_fused_step
 def test_interrupt_saves_a_checkpoint_that_goes_on_to_the_same_end(colmap_scene, tmp_path, monkeypatch):
     whole = _train(colmap_scene, tmp_path / "whole", iterations=9)
     plain, calls = fused.draw, []

@@ -12,7 +12,7 @@ import pytest
 import torch
 from lenses import DISTORTED, DISTORTIONS, colmap_camera, make_lens
 from PIL import Image
-from synthetic import FakeGaussians, folder_state, make_colmap_scene, options_of, read
+from synthetic import BROWN, FakeGaussians, folder_state, make_colmap_scene, options_of, read
 
 from scene import Scene
 from scene.images.decode import picture_size
@@ -155,13 +155,6 @@ def test_a_cache_that_cannot_be_written_is_named(tmp_path, monkeypatch):
         undistort([_view(_photo(tmp_path / "a.png"), _lens("OPENCV"))])
 
 
-def test_a_broken_picture_is_named(tmp_path):
-    path = _photo(tmp_path / "a.png")
-    path.write_bytes(path.read_bytes()[:-4000])
-    with pytest.raises(UserError, match="cannot read .*a.png"):
-        _view(path, _lens("OPENCV"))
-
-
 def test_pictures_smaller_than_their_lens(tmp_path):
     whole = undistortion(_lens("OPENCV_FISHEYE"), WIDTH, HEIGHT).pinhole
     # Sizes are whole pixels.
@@ -231,15 +224,9 @@ def test_alpha_is_undistorted_or_ignored(tmp_path):
     assert kept.mask is None and ((counts == 255) <= (alpha == 255)).all() and (counts == 255).any()
 
 
-@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "SIMPLE_RADIAL"])
-def test_a_distorted_scene_shows_its_points_where_they_are(tmp_path, model, cache_folder):
-    params = {
-        "OPENCV": (110.0, 110.0, 45.0, 34.5, -0.2, 0.03, 0.004, -0.003),
-        "OPENCV_FISHEYE": (80.0, 80.0, 45.0, 34.5, 0.05, -0.01, 0.003, -0.001),
-        "SIMPLE_RADIAL": (110.0, 45.0, 34.5, -0.2),
-    }[model]
+def test_a_distorted_scene_shows_its_points_where_they_are(tmp_path):
     folder = tmp_path / "scene"
-    reconstruction = make_colmap_scene(folder, model=model, params=params, views=5)
+    reconstruction = make_colmap_scene(folder, model="OPENCV", params=BROWN, views=5)
     before = folder_state(folder)
     scene = Scene(options_of(folder, tmp_path / "out"), FakeGaussians(), shuffle=False)
     hits = tried = 0
@@ -282,7 +269,5 @@ def test_a_wide_lens_in_a_scene(tmp_path, capsys):
         assert camera.mask is not None
     assert "2 photos, the first is v" in capsys.readouterr().err
     for view in Scene(options_of(folder, tmp_path / "out"), FakeGaussians()).getTrainCameras():
-        assert (
-            view.counted_pixels.shape == (1, view.image_height, view.image_width)
-            and 0.3 < view.counted_pixels.float().mean() < 1
-        )
+        assert view.counted_pixels.shape == (1, view.image_height, view.image_width)
+        assert 0.3 < view.counted_pixels.float().mean() < 1

@@ -11,7 +11,7 @@ from scene.gaussians.attributes import Rows
 from scene.gaussians.long_axis import long_axis_children
 from scene.gaussians.parameters import GaussianParameters
 from scene.gaussians.statistics import NAMES
-from scene.gaussians.table import changes_rows
+from splatting.distributed.rows import changes_rows
 
 _STANDARD = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")  # the order of densification_postfix
 

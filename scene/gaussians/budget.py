@@ -6,8 +6,8 @@ from torch import Tensor
 from scene.gaussians import density_rules as rules
 from scene.gaussians.long_axis import long_axis_children
 from scene.gaussians.parameters import GaussianParameters
-from scene.gaussians.table import changes_rows
 from splatting.deterministic.portable_math import exp, log
+from splatting.distributed.rows import changes_rows
 
 
 def count_after(now: int, budget: int, remaining: int, power: float) -> int:

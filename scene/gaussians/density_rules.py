@@ -12,8 +12,8 @@ import torch
 from diff_gaussian_rasterization.density import split_positions
 from torch import Tensor
 
-from scene.gaussians.table import WHOLE, Shards
 from splatting.deterministic.counter_rng import Stream
+from splatting.distributed.rows import WHOLE, Shards
 
 SHRINK = 0.8  # N children of a split have 1 / (0.8 N) of the parent's scale: 1 / 1.6 for two (paper, section 5.2)
 PRUNE_EXTENT = 0.1  # a Gaussian wider than this part of the scene's extent is removed, once sizes are limited

@@ -5,7 +5,7 @@ import sys
 import torch
 
 from scene.gaussians.attributes import Rows
-from scene.gaussians.table import WHOLE, Shards
+from splatting.distributed.rows import WHOLE, Shards
 from utils.system_utils import UserError
 
 _PART = 1 << 16  # rows checked at a time, as there may be little memory left
@@ -26,21 +26,13 @@ def check_finite(rows: Rows, where: str, remedy: str, shards: Shards = WHOLE) ->
             )
 
 
-def tell_of_undrawn(rows: Rows, source: object) -> None:
-    """Say how many Gaussians of a file the rasterizer leaves out, because a value is not finite.
+def warn_of_undrawn(rows: Rows, source: object) -> None:
+    """Warn of the Gaussians of a file that the rasterizer leaves out, because a value is not finite.
 
     Infinite logits are drawn: programs that set the opacities 0 and 1 write them.
     """
-    drawn = torch.stack(
-        [
-            (~values.isnan() if name == "opacity" else values.isfinite()).flatten(1).all(dim=1)
-            for name, values in rows.items()
-        ]
-    ).all(dim=0)
-    if not drawn.all():
-        undrawn = len(drawn) - int(drawn.sum())
-        print(
-            f"warning: {undrawn} of {len(drawn)} Gaussians in {source} have values that are not finite, and are not "
-            "drawn",
-            file=sys.stderr,
-        )
+    usable = [~values.isnan() if name == "opacity" else values.isfinite() for name, values in rows.items()]
+    drawn = torch.stack([values.flatten(1).all(dim=1) for values in usable]).all(dim=0)
+    if undrawn := int((~drawn).sum()):
+        fault = "have values that are not finite, and are not drawn"
+        print(f"warning: {undrawn} of {len(drawn)} Gaussians in {source} {fault}", file=sys.stderr)

@@ -16,9 +16,9 @@ from torch import Tensor
 from scene.gaussians.adc import append_rows
 from scene.gaussians.density_rules import logit
 from scene.gaussians.parameters import GaussianParameters
-from scene.gaussians.table import WHOLE, Shards, changes_rows
 from splatting.deterministic.counter_rng import Stream, random_bits
 from splatting.deterministic.portable_math import exp, log
+from splatting.distributed.rows import WHOLE, Shards, changes_rows
 
 MOST_PARTS = 51  # of one Gaussian (paper): itself and 50 copies
 _UNITS = 2**24  # of opacity 1, where Gaussians are drawn in proportion to it
@@ -47,10 +47,8 @@ NO_PENALTY = Penalty()
 def start_as(gaussians: GaussianParameters, opacity: float, scale: float) -> None:
     """Give all Gaussians an opacity, and multiply their scales; call it before the first step."""
     with torch.no_grad():
-        logits, log_scales = (
-            torch.full_like(gaussians._opacity, logit(opacity)),
-            gaussians.log_scales() + math.log(scale),
-        )
+        logits = torch.full_like(gaussians._opacity, logit(opacity))
+        log_scales = gaussians.log_scales() + math.log(scale)
         for name, values in gaussians.raw_shapes(logits, log_scales).items():
             gaussians.raw(name).copy_(values)
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from scene.gaussians.attributes import Attribute, Rows, attributes
-from scene.gaussians.finite import tell_of_undrawn
+from scene.gaussians.finite import warn_of_undrawn
 from scene.gaussians.ply import FLAT, column_names, read_ply, row_bytes, write_ply
 from scene.gaussians.statistics import NAMES, Statistics
 from scene.gaussians.table import GaussianTable
@@ -247,7 +247,7 @@ class GaussianParameters:
         Flat Gaussians of two scales are read, too; the rasterizer refuses to draw them.
         """
         rows = read_ply(path, self.max_sh_degree, flat=True)
-        tell_of_undrawn(rows, path)
+        warn_of_undrawn(rows, path)
         self.take_whole(rows)
         self.active_sh_degree = self.max_sh_degree
 

@@ -10,7 +10,7 @@ from plyfile import PlyParseError
 from torch import Tensor
 
 from scene.gaussians.attributes import IN_CHECKPOINT, Rows, attributes
-from scene.gaussians.table import WHOLE, Shards
+from splatting.distributed.rows import WHOLE, Shards
 from splatting.files.ply_header import read_elements
 from utils.system_utils import UserError, atomic_write, writes_files
 

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from scene.gaussians.table import WHOLE, Shards
+from splatting.distributed.rows import WHOLE, Shards
 
 
 def cut_bounds(f_rest: Tensor, shards: Shards = WHOLE) -> list[float]:

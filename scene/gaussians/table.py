@@ -10,9 +10,6 @@ from torch import Tensor, nn
 
 from scene.gaussians.attributes import Rows
 from scene.gaussians.statistics import NAMES
-from splatting.distributed.rows import WHOLE as WHOLE
-from splatting.distributed.rows import Shards as Shards
-from splatting.distributed.rows import changes_rows as changes_rows
 from splatting.host.memory import is_out_of_memory
 
 _CHUNK = 1 << 16  # rows moved at a time when memory is too short for all of them

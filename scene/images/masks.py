@@ -78,19 +78,15 @@ class Mask:
         if self.inverted:
             grey = 255 - grey
         if self.meaning == TRANSPARENT:
-            return _resized(grey, size, Image.Resampling.BICUBIC)
+            image = Image.fromarray(np.ascontiguousarray(grey))
+            image = image if image.size == size else image.resize(size, Image.Resampling.BICUBIC)
+            return torch.from_numpy(np.array(image))[None]
         kept = Image.fromarray(np.where(grey >= 128, 255, 0).astype(np.uint8))
         if size[0] > kept.width:
             kept = kept.filter(_REACH).resize(size, Image.Resampling.BOX)
         elif size != kept.size:
             kept = kept.resize(size, Image.Resampling.BOX).filter(_REACH)
         return torch.from_numpy(np.where(np.asarray(kept) == 255, np.uint8(255), np.uint8(0)))[None]
-
-
-def _resized(grey: np.ndarray, size: tuple[int, int], resampling: Image.Resampling) -> Tensor:
-    image = Image.fromarray(np.ascontiguousarray(grey))
-    image = image if image.size == size else image.resize(size, resampling)
-    return torch.from_numpy(np.array(image))[None]
 
 
 @dataclass(frozen=True)

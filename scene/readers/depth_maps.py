@@ -40,8 +40,7 @@ class DepthMap:
 
     def decode(self, size: tuple[int, int]) -> Tensor:
         """Inverse depth (1, H, W) float32 at a size (width, height). UserError for a file that cannot be read."""
-        values = np.maximum(resize(read_values(self.path) / self.unit, size), 0.0)
-        return torch.from_numpy((values * self.scale + self.offset).astype(np.float32))[None]
+        return fitted(read_values(self.path) / self.unit, size, self.scale, self.offset)
 
 
 class DepthFit(NamedTuple):
@@ -130,6 +129,12 @@ def _is_16_bit_color(path: Path) -> bool:
     with open(path, "rb") as file:
         header = file.read(26)
     return header.startswith(b"\x89PNG") and len(header) == 26 and header[24] == 16 and header[25] in (2, 6)
+
+
+def fitted(values: np.ndarray, size: tuple[int, int], scale: float, offset: float) -> Tensor:
+    """Inverse depth (1, H, W) float32 at a size (width, height) of a map's values (h, w); those below 0 count as 0."""
+    values = np.maximum(resize(values, size), 0.0) * scale + offset
+    return torch.from_numpy(values.astype(np.float32))[None]
 
 
 def resize(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -109,11 +109,6 @@ class CameraInfo(_LikeNamedTuple):
     depth: Decodable | InMemory | None = None
     image: Any = None
 
-    _fields: ClassVar[tuple[str, ...]] = (
-        *("uid", "R", "T", "FovY", "FovX", "depth_params", "image_path", "image_name", "depth_path"),
-        *("width", "height", "is_test"),
-    )
-
     def __post_init__(self) -> None:
         values = vars(self)
         values["R"], values["T"] = rigid_pose(self.R, self.T, self.image_name)
@@ -171,11 +166,8 @@ class SceneInfo(_LikeNamedTuple):
     nerf_normalization: Mapping[str, Any]
     ply_path: str | Path | None
     is_nerf_synthetic: bool = False
+    _: KW_ONLY
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
-
-    _fields: ClassVar[tuple[str, ...]] = (
-        *("point_cloud", "train_cameras", "test_cameras", "nerf_normalization", "ply_path", "is_nerf_synthetic"),
-    )
 
     def _replace(self, **changes: Any) -> "SceneInfo":
         """A copy with some fields changed."""
@@ -186,6 +178,10 @@ class SceneInfo(_LikeNamedTuple):
         """The extent E in world units; None where other code has made the record without one."""
         radius = self.nerf_normalization["radius"]
         return None if radius is None else float(radius)
+
+
+for record in (CameraInfo, SceneInfo):
+    record._fields = tuple(item.name for item in fields(record) if not item.kw_only)
 
 
 def split_by_order(

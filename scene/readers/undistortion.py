@@ -7,7 +7,6 @@ edited photo is undistorted again, and a copied or moved scene is not.
 import hashlib
 import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
@@ -15,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
-from tqdm import tqdm
+from tqdm.contrib.concurrent import thread_map
 
 from scene.images.decode import decode, picture_size
 from scene.images.lens import Undistortion, import_pycolmap, shown_pixels, undistortion
@@ -79,13 +78,7 @@ def _say_which_are_cut(photos: Sequence[CameraInfo]) -> None:
 
 def _in_threads(work: Callable[[Job], Result], jobs: Sequence[Job], title: str) -> list[Result]:
     # pycolmap, Pillow and hashlib release Python's lock while they work.
-    with ThreadPoolExecutor(threads()) as pool:
-        futures = [pool.submit(work, job) for job in jobs]
-        try:
-            return [future.result() for future in tqdm(futures, desc=title, unit="photo", leave=False)]
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    return thread_map(work, jobs, max_workers=threads(), desc=title, unit="photo", leave=False)
 
 
 def _key(photo: CameraInfo, version: str) -> str:

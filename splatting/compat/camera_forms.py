@@ -15,7 +15,7 @@ from scene.half_images import half
 from scene.images.decode import picture_size, pixels_of
 from scene.images.masks import TRANSPARENT, Mask, add_alpha
 from scene.images.store import InMemory, Size
-from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, DepthMap, depth_fit, resize
+from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, DepthMap, depth_fit, fitted
 from scene.readers.info import CameraInfo
 from utils.general_utils import check_flags
 
@@ -62,8 +62,7 @@ def _of_2024(
     depth: InMemory | None = None
     if invdepthmap is not None:
         fit, values = depth_fit(depth_params), np.asarray(invdepthmap, dtype=np.float64)
-        values = np.maximum(resize(values[..., 0] if values.ndim > 2 else values, size), 0.0)
-        depth = InMemory(torch.from_numpy((values * fit.scale + fit.offset).astype(np.float32))[None])
+        depth = InMemory(fitted(values[..., 0] if values.ndim > 2 else values, size, fit.scale, fit.offset))
     info = CameraInfo(
         *(colmap_id, R, T, FoVy, FoVx, depth_params, "", image_name, "", *size),
         image=InMemory(pixels_of(image, size)),

@@ -11,6 +11,8 @@ from synthetic import make_blender_scene, make_colmap_scene
 import train
 from fuzz.damage import changed, damaged, damaged_text
 from scene.dataset_readers import read_scene
+from scene.readers.colmap import read_model_of_kind
+from scene.readers.depth_scale import sightings
 from scene.readers.info import SceneInfo
 from scene.readers.point_cloud import read_point_cloud, write_point_cloud
 from utils.graphics_utils import getProjectionMatrix
@@ -48,6 +50,10 @@ class Colmap:
             path.write_text(damaged_text(rng, whole.decode()))
         try:
             _read_and_train(rng, scene)
+            model = read_model_of_kind(path.parent, suffix, with_2d_points=True)
+            for image in model.images:
+                pixels, depths = sightings(image, model.points, "the model")
+                assert len(pixels) == len(depths), "a photo's points and their depths differ in number"
         finally:
             path.write_bytes(whole)
 
