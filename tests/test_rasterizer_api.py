@@ -348,22 +348,16 @@ def test_signatures_list_every_input(function):
 def test_other_types_than_tensors_are_named(as_other, grad):
     splats, camera = scene()
     kind = "numpy.ndarray" if as_other is torch.Tensor.numpy else "list"
-    with torch.set_grad_enabled(grad):
-        for name, values in splats.items():
-            wrong = splats | {name: as_other(values)}
-            with pytest.raises(TypeError, match=f"^{name} must be a tensor, got {kind}: convert"):
-                render(wrong, camera, torch.zeros(3, 3), raw=False)
-            with pytest.raises(TypeError, match=f"^{name} must be a tensor, got {kind}"):
-                rest = {k: v for k, v in wrong.items() if k not in ("means", "opacities")}
-                decisive(wrong["means"], wrong["opacities"], camera, **rest)
-        for name in ("viewmatrix", "bg"):
-            with pytest.raises(TypeError, match=f"^{name} must be a tensor, got {kind}"):
-                render(splats, camera._replace(**{name: as_other(getattr(camera, name))}), raw=False)
-        for name, key in (("means3D", "means"), ("scales", "scales"), ("means2D", "means"), ("opacities", "opacities")):
-            with pytest.raises(TypeError, match=f"^{name} must be a tensor, got {kind}"):
-                call(splats, camera, **{name: as_other(splats[key])})
-        with pytest.raises(TypeError, match=f"^sh must be a tensor, got {kind}"):
-            call(splats, camera, shs=as_other(torch.zeros(3, 16, 3)))
+    calls = [(name, lambda n, v: render(splats | {n: v}, camera, torch.zeros(3, 3), raw=False)) for name in splats]
+    calls += [(n, lambda n, v: render(splats, camera._replace(**{n: v}), raw=False)) for n in ("viewmatrix", "bg")]
+    calls += [(name, lambda n, v: call(splats, camera, **{n: v})) for name in ("means3D", "means2D", "opacities")]
+    calls += [("sh", lambda _, v: call(splats, camera, shs=v))]
+    for name, function in calls:
+        refused = pytest.raises(TypeError, match=f"^{name} must be a tensor, got {kind}")
+        with torch.set_grad_enabled(grad), refused:
+            function(name, as_other(torch.zeros(3, 3)))
+    with pytest.raises(TypeError, match=f"^means must be a tensor, got {kind}: convert"):
+        decisive(as_other(splats["means"]), splats["opacities"], camera)
 
 
 def test_one_gradient_alone_is_that_among_all():

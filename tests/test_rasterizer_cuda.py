@@ -3,7 +3,7 @@
 import pytest
 import torch
 from diff_gaussian_rasterization.optim import adam_, observe_, sparse_adam_
-from rasterizer_tools import GPU_MARKS, gradients, loss_of, scene_arguments
+from rasterizer_tools import GPU_MARKS, error, gradients, loss_of, scene_arguments
 
 from benchmarks.workloads.splat_scenes import KINDS, SplatScene, frustum
 
@@ -16,10 +16,6 @@ def run(scene: SplatScene, device: str, dtype: torch.dtype = torch.float32, keep
     """All planes, the radii and all gradients of a weighted sum of the planes; keep: the pixels that count."""
     parameters = {name: t.float().to(dtype) for name, t in scene.parameters.items()}
     return gradients(parameters, scene.settings(dtype, **changes), device, lambda out: loss_of(out, keep))
-
-
-def largest_error(got: torch.Tensor, wanted: torch.Tensor) -> float:
-    return float((got.double() - wanted.double()).abs().max() / wanted.double().abs().max().clamp_min(1e-300))
 
 
 MIRRORED_AND_SHEARED = torch.eye(4, dtype=torch.float64)
@@ -48,7 +44,7 @@ def test_errors_are_those_of_cpu_float(kind, changes):
             assert (gpu[name] - double[name]).abs().max() <= 1 or kind == "huge and tiny"
             continue
         mask = keep if name in PLANES else 1
-        errors = [largest_error(x[name] * mask, double[name] * mask) for x in (gpu, cpu)]
+        errors = [error(x[name] * mask, double[name] * mask).largest for x in (gpu, cpu)]
         print(f"{kind:15} {name:15} cuda {errors[0]:.1e} cpu {errors[1]:.1e}")
         # The issue's bound, with a floor of a few units in the last place.
         if not errors[0] <= 3 * errors[1] + 1e-6:

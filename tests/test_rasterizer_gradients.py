@@ -73,21 +73,6 @@ def test_the_clamped_ray_has_its_exact_derivative(side, axis, antialiasing):
     _check(parameters, camera)
 
 
-def test_the_gradient_of_means2d_is_that_of_the_mean_in_ndc():
-    """Moving the principal point by h moves a splat by h W/2 pixels and changes nothing else of it."""
-    parameters, size = few(1)
-    weights = torch.randn(3, 7, 18, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-
-    def loss(x, y, means2d=None):
-        return (weights * render(parameters, settings(**size, principal=(x, y)), means2d).color).sum()
-
-    means2d = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
-    loss(0.0, 0.0, means2d).backward()
-    h = 1e-5
-    differences = [(loss(h, 0) - loss(-h, 0)) / (2 * h), (loss(0, h) - loss(0, -h)) / (2 * h), 0.0]
-    torch.testing.assert_close(means2d.grad[0], torch.tensor(differences, dtype=torch.float64), rtol=1e-7, atol=1e-8)
-
-
 def test_each_plane_gives_its_gradient_alone():
     """A backward from one result must not depend on whether the others are used or requested."""
     parameters, size = few()
