@@ -49,18 +49,6 @@ def test_sizes_and_strides(device: str) -> None:
             assert torch.equal(composite(same.to(device), BACKGROUND.to(device)).cpu(), wanted)
 
 
-def test_number_of_threads_changes_no_bit() -> None:
-    before, results = torch.get_num_threads(), []
-    picture = every_pair()
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            results.append(composite(picture, BACKGROUND))
-    finally:
-        torch.set_num_threads(before)
-    assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
-
-
 @pytest.mark.parametrize("device", ["cpu", GPU])
 def test_opcheck(device: str) -> None:
     picture = every_pair()[:, :3, :5].to(device)
