@@ -21,6 +21,7 @@ CHECK_PYTHON := import sys; sys.exit(sys.version_info < (3, 10) and "Python 3.10
 EXTENSIONS := simple-knn fused-ssim diff-gaussian-rasterization
 CXX_TESTS := $(patsubst submodules/%.cpp,build/%,$(wildcard submodules/*/csrc/tests/*.cpp))
 CXX_TEST_OBJECTS := $(patsubst submodules/%.cpp,build/%.o,$(wildcard submodules/*/csrc/cpu/*.cpp))
+CXX_PLATFORM_TESTS := $(patsubst submodules/%.cpp,build/%.o,$(wildcard submodules/*/csrc/tests/platforms/*.cpp))
 CORES := $(shell nproc 2> /dev/null || getconf _NPROCESSORS_ONLN)
 CXX_TEST_FLAGS := -std=c++17 -O1 -g1 -Wall -Wextra -Werror -fsanitize=address,undefined -fno-sanitize-recover=all -pthread
 
@@ -82,7 +83,7 @@ format: $(VENV)/.requirements
 # A process a core builds an object or a test; a test that is built is run at once. The longest take minutes.
 in_parallel = printf '%s\n' $(1) | xargs -P $(CORES) -I TARGET sh -c '$(MAKE) --no-print-directory TARGET $(2)'
 cpp-test:
-	@$(call in_parallel,$(CXX_TEST_OBJECTS))
+	@$(call in_parallel,$(CXX_TEST_OBJECTS) $(CXX_PLATFORM_TESTS))
 	@$(call in_parallel,$(CXX_TESTS),&& TARGET)
 
 # Compiles for the submodule $(1); sources and more flags follow.

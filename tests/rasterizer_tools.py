@@ -20,7 +20,6 @@ from torch import Tensor
 
 from benchmarks.workloads.splat_scenes import on_device, settings
 
-BUILT = has_cuda_kernels()
 GPU_MARKS = (
     pytest.mark.gpu,
     pytest.mark.skipif(

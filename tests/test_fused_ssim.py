@@ -6,8 +6,6 @@ import pytest
 import torch
 from fused_ssim import allowed_padding, fused_l1_ssim, fused_photometric_loss, fused_ssim
 from fused_ssim.reference import l1_ssim, ssim_map
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, GPU_MARKS, moved_by_a_word
 from skimage.metrics import structural_similarity
 from torch import Tensor
@@ -52,7 +50,8 @@ def image_pair(name: str, shape: tuple[int, ...] = (3, 40, 47), dtype: torch.dty
 
 
 PAIRS = ["noise", "unrelated", "nearly equal", "bright sky", "flat", "black and flat", "salt on white", "overexposed"]
-SHAPES = [(1, 1, 1), (2, 3, 7, 5), (3, 2, 70), (70, 3), (11, 11), (1, 12, 1030)]
+# Tiles of the CPU are 32 rows by 2 KB.
+SHAPES = [(1, 1, 1), (2, 3, 7, 5), (3, 2, 70), (65, 3), (11, 11), (1, 12, 1030), (33, 257), (31, 255)]
 CASES = [(name, (3, 40, 47)) for name in PAIRS] + [("unrelated", shape) for shape in SHAPES]
 
 
@@ -115,41 +114,6 @@ def test_agrees_with_the_cpu(shape: tuple[int, ...], as_bytes: bool, device: str
         assert (results[2] - wanted[2]).abs().max() <= 40 * EPS[torch.float32] * wanted[2].abs().max()
 
 
-@on_a_gpu
-@pytest.mark.parametrize("name", PAIRS)
-def test_both_gradients_add_up_as_on_the_cpu(name: str, device: str) -> None:
-    img1, img2 = image_pair(name, (3, 70, 131), torch.float32)
-    gradients = []
-    for place in (device, "cpu"):
-        x = img1.to(place).requires_grad_()
-        l1, ssim = fused_l1_ssim(x, img2.to(place))
-        gradients.append(torch.autograd.grad(0.8 * l1 - 0.2 * ssim, x)[0].cpu())
-    largest = gradients[1].abs().max() * max(1, img1.abs().max())
-    assert (gradients[0] - gradients[1]).abs().max() <= 40 * EPS[torch.float32] * largest
-
-
-def test_bright_images_keep_their_precision() -> None:
-    """The textbook's E[x²] - mu² in float32 is a thousand times worse, which is the reason for csrc/math/ssim.h."""
-    img1, img2 = image_pair("bright sky", dtype=torch.float32)
-    wanted = with_gradient(l1_ssim, img1.double(), img2.double(), "same")[2]
-    ours = with_gradient(fused_l1_ssim, img1, img2, "same")[2]
-
-    def textbook(img1: Tensor, img2: Tensor, padding: str) -> tuple[Tensor, Tensor]:
-        taps = torch.exp(-(torch.arange(-5.0, 6) ** 2) / 4.5)
-        window = (torch.outer(taps, taps) / taps.sum() ** 2)[None, None]
-        x, y = img1[:, None], img2[:, None]
-        mean = [torch.nn.functional.conv2d(z, window, padding=5) for z in (x, y, x * x, y * y, x * y)]
-        top = (2 * mean[0] * mean[1] + 0.0001) * (2 * (mean[4] - mean[0] * mean[1]) + 0.0009)
-        variances = mean[2] - mean[0] ** 2 + mean[3] - mean[1] ** 2
-        return img1.sum(), (top / ((mean[0] ** 2 + mean[1] ** 2 + 0.0001) * (variances + 0.0009))).mean()
-
-    def error(gradient: Tensor) -> float:
-        return float((gradient - wanted).abs().max() / wanted.abs().max())
-
-    assert error(ours) < 1e-6
-    assert error(with_gradient(textbook, img1, img2, "same")[2]) > 100 * error(ours)
-
-
 @pytest.mark.parametrize("name", ["noise", "unrelated", "salt on white"])
 def test_agrees_with_scikit_image(name: str) -> None:
     img1, img2 = image_pair(name)
@@ -169,13 +133,6 @@ def test_agrees_with_scikit_image(name: str) -> None:
     assert abs(float(fused_ssim(img1, img2, padding="valid")) - wanted) < tolerance
     difference = (ssim_map(img1, img2) - torch.from_numpy(full))[:, 5:-5, 5:-5].abs().max()
     assert difference < tolerance  # scikit-image also checks the oracle
-
-
-@both_paddings
-def test_gradcheck(padding: str) -> None:
-    img1, img2 = image_pair("unrelated", (12, 13))
-    assert (img1 - img2).abs().min() > 1e-5  # away from the kink of |x|
-    torch.autograd.gradcheck(lambda x: fused_l1_ssim(x, img2, padding), img1.requires_grad_())
 
 
 @CPU_AND_GPU
@@ -243,35 +200,6 @@ def test_photometric_loss_is_its_parts(weight: float, as_bytes: bool, device: st
         wanted = loss_and_gradient(fused_photometric_loss, *on_cpu, weight, clamp)
         assert abs(fused[0].cpu() - wanted[0]) <= 10 * EPS[dtype]
         assert (fused[2].cpu() - wanted[2]).abs().max() <= 40 * EPS[dtype] * wanted[2].abs().max()
-
-
-def test_photometric_loss_agrees_with_reference() -> None:
-    image, target = out_of_range(torch.float32)
-    got = loss_and_gradient(fused_photometric_loss, image, target, 0.2)
-
-    def exact(image: Tensor, target: Tensor, weight: float) -> tuple[Tensor, Tensor]:
-        l1, ssim = l1_ssim(image.clamp(0, 1), target)
-        return (1 - weight) * l1 + weight * (1 - ssim), l1
-
-    wanted = loss_and_gradient(exact, image.double(), target.double(), 0.2)
-    # Tolerances of test_agrees_with_reference, and a few roundings of the sum.
-    assert abs(got[0] - wanted[0]) <= 12 * EPS[torch.float32]
-    assert (got[2] - wanted[2]).abs().max() <= 40 * EPS[torch.float32] * wanted[2].abs().max()
-
-
-def test_torch_func_differentiates_the_photometric_loss() -> None:
-    image, target = image_pair("noise")
-    inside = image.clone().requires_grad_()
-    fused_photometric_loss(inside, target, 0.2)[0].backward()
-    assert torch.equal(torch.func.grad(lambda x: fused_photometric_loss(x, target, 0.2)[0])(image), inside.grad)
-
-
-def test_photometric_loss_gradcheck() -> None:
-    image, target = image_pair("unrelated", (12, 13))
-    image = 1.4 * image - 0.2
-    for kink in (image, image - 1, image - target):
-        assert kink.abs().min() > 1e-5
-    torch.autograd.gradcheck(lambda x: fused_photometric_loss(x, target, 0.2)[0], image.requires_grad_())
 
 
 def test_photometric_loss_keeps_nothing_it_does_not_need() -> None:
@@ -367,20 +295,6 @@ def test_does_not_wait_for_the_gpu(device: str) -> None:
             torch.cuda.set_sync_debug_mode("default")
 
 
-@settings(max_examples=30, deadline=None)
-@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**31), st.sampled_from([0.0, 1e-3, 1.0]))
-def test_properties(height: int, width: int, seed: int, contrast: float) -> None:
-    """SSIM is symmetric in the images, at most 1, and unchanged by mirroring and by another order of planes."""
-    random = torch.Generator().manual_seed(seed)
-    img1, img2 = (1 - contrast * torch.rand((3, height, width), generator=random) for _ in range(2))
-    ssim = fused_ssim(img1, img2)
-    assert -1 <= ssim <= 1
-    # Variances of img1 and the difference, instead of img2 and the difference, have other roundings of some eps each.
-    assert abs(ssim - fused_ssim(img2, img1)) <= 8 * EPS[torch.float32]
-    assert abs(ssim - fused_ssim(img1.flip(1, 2), img2.flip(1, 2))) <= 8 * EPS[torch.float32]
-    assert abs(ssim - fused_ssim(img1[[2, 0, 1]], img2[[2, 0, 1]])) <= EPS[torch.float32]
-
-
 @CPU_AND_GPU
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_a_pixel_that_is_not_finite_shows(value: float, device: str) -> None:
@@ -441,16 +355,12 @@ def test_messages_of_a_gpu(device: str) -> None:
     with pytest.raises(ValueError, match="same device, got img1 on cuda:0 and img2 on cpu"):
         fused_ssim(image, image.cpu())
     # The operator itself checks inputs that bypass the Python function.
-    with pytest.raises(RuntimeError, match="img1 must be float32 on a GPU"):
-        torch.ops.fused_ssim.l1_ssim(image.double(), image.double(), False, False)
-    with pytest.raises(RuntimeError, match=r"kept must be \(3, 1, 20, 408\)"):
-        torch.ops.fused_ssim.l1_ssim_vjp(image, image, image, torch.ones(()), torch.ones(()))
     kept = torch.ops.fused_ssim.l1_ssim(image, image, False, True)[2]
     one = torch.ones((), device=device)
-    refused = {"must be torch.float32 like img1": one.double(), "must be on cuda:0 like img1": one.cpu()}
-    for message, gradient in refused.items():
+    refused = {r"kept must be \(3, 1, 20, 408\)": (image, one), "must be on cuda:0 like img1": (kept, one.cpu())}
+    for message, (maps, gradient) in refused.items():
         with pytest.raises((RuntimeError, TypeError), match=message):
-            torch.ops.fused_ssim.l1_ssim_vjp(image, image, kept, gradient, gradient)
+            torch.ops.fused_ssim.l1_ssim_vjp(image, image, maps, gradient, gradient)
 
 
 def test_the_paddings_have_a_name() -> None:

@@ -1,13 +1,9 @@
 """The spherical harmonics, of the oracle and of the kernels, against SciPy's."""
 
 import numpy as np
-import pytest
 import torch
 from diff_gaussian_rasterization.reference.colour import sh_basis
-from rasterizer_tools import ops, scene_arguments
 from scipy.special import sph_harm_y
-
-from benchmarks.workloads.splat_scenes import settings
 
 
 def real_harmonics(directions: np.ndarray) -> np.ndarray:
@@ -33,25 +29,3 @@ def directions(n: int) -> np.ndarray:
 def test_the_oracles_basis():
     d = np.concatenate([directions(50), -directions(50)])
     np.testing.assert_allclose(sh_basis(torch.tensor(3.7 * d)).numpy(), real_harmonics(d), rtol=0, atol=1e-13)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_the_kernels_colours(degree):
-    n = 50
-    d = directions(n)
-    generator = torch.Generator().manual_seed(0)
-    coefficients = 0.05 * torch.randn(n, 16, 3, generator=generator, dtype=torch.float64)
-    parameters = {
-        "means": torch.tensor(2.5 * d),
-        "opacities": torch.ones(n, 1, dtype=torch.float64),
-        "scales": torch.full((n, 3), 3.0, dtype=torch.float64),  # large enough to be on the image
-        "rotations": torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).repeat(n, 1),
-        "sh_dc": coefficients[:, :1],
-        "sh_rest": coefficients[:, 1:],
-    }
-    camera = settings(32, 32, sh_degree=degree)
-    splats, _, _, counts, _ = ops.project(*scene_arguments(parameters, camera, raw=False))
-    assert (counts > 0).all()
-    bands = (degree + 1) ** 2
-    wanted = 0.5 + np.einsum("nk,nkc->nc", real_harmonics(d)[:, :bands], coefficients[:, :bands].numpy())
-    np.testing.assert_allclose(splats[:, 6:9].numpy(), wanted.clip(min=0), rtol=0, atol=1e-13)

@@ -4,6 +4,7 @@ import pytest
 import torch
 from diff_gaussian_rasterization import _C, GaussianRasterizer, optim
 from rasterizer_tools import CPU_AND_GPU, activated, few, leaves
+from torch import Tensor
 
 from benchmarks.workloads.splat_scenes import on_device, settings
 
@@ -59,6 +60,12 @@ def forward_arguments(inputs, camera) -> tuple:
     )
 
 
+def backward(given: tuple, count: int, radii: Tensor, buffers: list, *gradients: Tensor) -> tuple:
+    """The gradients of a forward with these arguments and results; `gradients` are those of the planes."""
+    places = *given[:2], radii, *given[2:12], *gradients, *given[14:17], buffers[0], count, *buffers[1:], *given[-2:]
+    return _C.rasterize_gaussians_backward(*places)
+
+
 @CPU_AND_GPU
 @pytest.mark.parametrize("antialiasing", [False, True])
 @pytest.mark.parametrize(("colors", "covariances"), [(False, False), (True, True), (False, True)])
@@ -76,13 +83,7 @@ def test_forward_and_backward_are_those_of_the_class(colors, covariances, antial
         assert torch.equal(got, image) and not got.requires_grad
     assert all(buffer.dtype == torch.uint8 and buffer.dim() == 1 for buffer in buffers)
 
-    background, means, colors_precomp, opacities, scales, rotations, modifier, covariance, *camera_places = given
-    view, projection, tan_x, tan_y, _, _, sh, degree, center, _, smooth, debug = camera_places
-    got = _C.rasterize_gaussians_backward(
-        *(background, means, radii, colors_precomp, opacities, scales, rotations, modifier, covariance),
-        *(view, projection, tan_x, tan_y, *gradients, sh, degree, center),
-        *(buffers[0], count, buffers[1], buffers[2], smooth, debug),
-    )
+    got = backward(given, count, radii, buffers, *gradients)
     names = "means2D", "colors_precomp", "opacities", "means3D", "cov3D_precomp", "shs", "scales", "rotations"
     for name, gradient in zip(names, got, strict=True):
         if name in inputs:
@@ -101,8 +102,7 @@ def test_looser_forms_of_the_camera_give_the_same_image_and_gradients():
     results = []
     for arguments in (given, loose):
         count, color, radii, *buffers, depth = _C.rasterize_gaussians(*arguments)
-        places = (*arguments[:2], radii, *arguments[2:12], color, depth, *arguments[14:17], buffers[0], count)
-        results.append([color, *_C.rasterize_gaussians_backward(*places, *buffers[1:], *arguments[-2:])])
+        results.append([color, *backward(arguments, count, radii, buffers, color, depth)])
     for got, wanted in zip(*results, strict=True):
         assert torch.equal(got, wanted)
 
@@ -121,21 +121,18 @@ def test_without_gaussians_both_ways():
     given = forward_arguments({name: values[:0] for name, values in inputs.items()}, camera)
     count, color, radii, *buffers, _ = _C.rasterize_gaussians(*given)
     assert count == 0 and torch.equal(color, camera.bg[:, None, None].expand_as(color)) and radii.shape == (0,)
-    backward = (*given[:2], radii, *given[2:12], color, EMPTY, given[14], *given[15:17], buffers[0], count)
-    gradients = _C.rasterize_gaussians_backward(*backward, *buffers[1:], *given[-2:])
-    assert all(len(gradient) == 0 for gradient in gradients)
+    assert all(len(gradient) == 0 for gradient in backward(given, count, radii, buffers, color, EMPTY))
 
 
 def test_buffers_of_another_rendering_are_refused():
     inputs, camera = scene(False, False)
     given = forward_arguments(inputs, camera)
     count, color, radii, *buffers, depth = _C.rasterize_gaussians(*given)
-    backward = [*given[:2], radii, *given[2:12], color, depth, given[14], *given[15:17], buffers[0], count]
     for place in range(3):
         wrong = list(buffers)
         wrong[place] = wrong[place][:-4]
         with pytest.raises(ValueError, match="the buffer must be the one of this rendering"):
-            _C.rasterize_gaussians_backward(*backward[:-2], wrong[0], count, *wrong[1:], *given[-2:])
+            backward(given, count, radii, wrong, color, depth)
 
 
 def test_mark_visible_takes_both_matrices():

@@ -1,47 +1,12 @@
-"""The operators: the single steps against the whole, their names and sizes, and what is too large for them."""
+"""The operators: their names and sizes, and what is too large for them."""
 
 import pytest
 import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings, fakes
-from diff_gaussian_rasterization.ops import gradients_of
+from diff_gaussian_rasterization import fakes
 from diff_gaussian_rasterization.scene import GRADIENTS, Scene, draw
-from rasterizer_tools import BOTH_AND_GPU, few, leaves, ops, render, scene_arguments, together
+from rasterizer_tools import few, ops, render, scene_arguments
 
-from benchmarks.workloads.splat_scenes import on_device, settings
-
-
-def _few(device: str, dtype: torch.dtype = torch.float32) -> tuple[dict, GaussianRasterizationSettings]:
-    """A few splats and their camera."""
-    raw, size = few(dtype=dtype)
-    return {name: t.to(device) for name, t in raw.items()}, on_device(settings(**size), device)
-
-
-@BOTH_AND_GPU
-def test_the_steps_one_by_one_are_the_whole(device, dtype):
-    """rasterize is project, bin and blend; its backward is blend_rows, and the sums of these by projection."""
-    raw, camera = _few(device, dtype)
-    raw = together(raw, raw)
-    scene = scene_arguments(raw, camera)
-    splats, depths, rects, counts, radii = ops.project(*scene)
-    instances, ranges, *slots = ops.bin(splats, depths, rects, counts, 7, 18, True)
-    color, left, inverse_depth, last, layers = ops.blend(splats, instances, ranges, camera.bg, 7, 18, True, True)
-    inputs = leaves(raw)
-    out = render(inputs, camera)
-    for got, whole in zip((color, left, inverse_depth, radii), (out[0], out[3], out[2], out[1]), strict=True):
-        assert torch.equal(got, whole)
-    weights = torch.linspace(-1, 1, color.numel()).reshape(color.shape).to(color)
-    (weights * out.color).sum().backward()
-    kept = splats, counts, instances, ranges, *slots, last, layers, camera.bg, left
-    rows = splats, counts, *ops.blend_rows(kept, weights, None, None)
-    needed = [name in raw for name in GRADIENTS]
-    found = dict(zip(GRADIENTS, gradients_of(scene, rows, (), needed), strict=True))
-    assert [name for name, gradient in found.items() if gradient is not None] == list(raw)
-    for name, values in inputs.items():
-        if device == "cpu":
-            assert torch.equal(values.grad, found[name]), name
-        else:  # two kernels of one template, which the compiler may fuse differently
-            wanted = found[name]
-            torch.testing.assert_close(values.grad, wanted, rtol=1e-5, atol=1e-6 * wanted.abs().max().item())
+from benchmarks.workloads.splat_scenes import settings
 
 
 def test_the_scene_is_the_operators_first_inputs():
@@ -52,7 +17,8 @@ def test_the_scene_is_the_operators_first_inputs():
 
 
 def test_the_fake_kernels_have_the_sizes_of_the_real_ones():
-    raw, camera = _few("cpu")
+    raw, size = few(dtype=torch.float32)
+    camera = settings(**size)
     arguments = scene_arguments(raw, camera)
     splats, depths, rects, counts, _ = ops.project(*arguments)
     assert splats.shape[1] == fakes.SPLAT_VALUES

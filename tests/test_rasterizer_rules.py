@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 from diff_gaussian_rasterization.ops import mark_visible
-from rasterizer_tools import DTYPES_AND_GPU, activated, few, one_splat, ops, pick, render, scene_arguments, together
+from rasterizer_tools import DTYPES_AND_GPU, one_splat, render, together
 
-from benchmarks.workloads.splat_scenes import ordinary, settings
+from benchmarks.workloads.splat_scenes import settings
 
 BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 MIDDLE = (..., 8, 8)  # of 17 x 17: the optical axis goes exactly through this pixel's centre
@@ -76,16 +76,6 @@ def test_alpha_is_capped_at_0_99_and_the_gradient_passes(dtype):
     # d colour / d opacity = colour - background, as if alpha were the uncapped 0.995.
     assert splat["opacities"].grad.item() == pytest.approx(1.0 - 0.25, rel=1e-5 if dtype == torch.float32 else 1e-12)
     assert splat["colors"].grad[0, 0].item() == pytest.approx(0.99, rel=1e-6)
-
-
-@DTYPES_AND_GPU
-def test_a_saturated_splat_in_front_leaves_the_rest_a_hundredth(dtype):
-    splats = leaf(together(one_splat(z=1, opacity=1.0, dtype=dtype), one_splat(z=2, opacity=0.5, dtype=dtype)))
-    out = render(splats, camera(dtype), raw=False)
-    out.color[0, 8, 8].backward()
-    behind = 0.5 * 1.0 + 0.5 * 0.2  # the splat's colour over the background
-    assert splats["opacities"].grad[0].item() == pytest.approx(1.0 - behind, rel=1e-4)
-    assert splats["opacities"].grad[1].item() == pytest.approx(0.01 * (1.0 - 0.2), rel=1e-4)
 
 
 @DTYPES_AND_GPU
@@ -159,62 +149,3 @@ def test_equal_depths_keep_the_order_of_their_index():
     for first, second, wanted in [(red, green, [0.8, 0.16, 0]), (green, red, [0.16, 0.8, 0])]:
         got = render(together(first, second), black, raw=False).color[MIDDLE]
         torch.testing.assert_close(got, torch.tensor(wanted, dtype=torch.float64), rtol=1e-12, atol=0)
-    # With many splats at one depth among others, bin's list in each tile is sorted by (depth, index).
-    scene = ordinary(600, 75, 53)
-    parameters = {name: t.float() for name, t in scene.parameters.items()}
-    parameters["means"][::3, 2] = 4.0
-    arguments = scene_arguments(parameters, settings(75, 53, torch.float32))
-    splats, depths, rects, counts, _ = ops.project(*arguments)
-    instances, ranges, _, _ = ops.bin(splats, depths, rects, counts, 53, 75, False)
-    ties = 0
-    for begin, end in zip(ranges[:-1].tolist(), ranges[1:].tolist(), strict=True):
-        tile = instances[begin:end].tolist()
-        keys = [(depths[i].item(), i) for i in tile]
-        assert keys == sorted(keys)
-        ties += sum(a[0] == b[0] for a, b in zip(keys, keys[1:], strict=False))
-    assert ties > 50
-
-
-@DTYPES_AND_GPU
-def test_inverse_depth_is_the_sum_of_weights_over_z_without_background(dtype):
-    alphas, zs = [0.3, 0.6, 0.5], [1.0, 2.5, 7.0]
-    splats = together(*(one_splat(z=z, opacity=a, dtype=dtype) for z, a in zip(zs, alphas, strict=True)))
-    out = render(splats, camera(dtype), raw=False)
-    left, wanted = 1.0, 0.0
-    for z, alpha in zip(zs, alphas, strict=True):
-        wanted += left * alpha / z
-        left *= 1 - alpha
-    eps = 8 * torch.finfo(dtype).eps
-    assert out.inverse_depth[MIDDLE].item() == pytest.approx(wanted, rel=eps)
-    assert out.transmittance[MIDDLE].item() == pytest.approx(left, rel=eps)
-    corner = render(one_splat(scale=1e-3, dtype=dtype), camera(dtype), raw=False)
-    assert corner.inverse_depth[0, 0, 0] == 0 and corner.transmittance[0, 0, 0] == 1
-
-
-@DTYPES_AND_GPU
-def test_the_background_shows_through_and_its_gradient_path_is_in_the_splats(dtype):
-    """The background is behind the last splat: d colour / d alpha = colour - background."""
-    for background in ([0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.2, 0.7, 0.4]):
-        splat = leaf(one_splat(opacity=0.6, dtype=dtype))
-        bg = torch.tensor(background, dtype=dtype)
-        out = render(splat, camera(dtype, bg=bg), raw=False)
-        wanted = 0.6 * splat["colors"][0] + 0.4 * bg
-        torch.testing.assert_close(out.color[MIDDLE], wanted, rtol=1e-6, atol=1e-7)
-        weights = torch.tensor([1.0, -2.0, 0.5], dtype=dtype)
-        (weights * out.color[MIDDLE]).sum().backward()
-        slope = (weights * (splat["colors"][0].detach() - bg)).sum().item()
-        assert splat["opacities"].grad.item() == pytest.approx(slope, rel=1e-5)
-
-
-def test_the_antialiasing_factor_dims_and_nothing_else_changes():
-    splats = activated(few(3)[0])
-    size = few(3)[1]
-    plain, dimmed = (render(splats, settings(**size, antialiasing=on), raw=False) for on in (False, True))
-    assert torch.equal(plain.radii, dimmed.radii)
-    for i in range(3):
-        alone = pick(splats, slice(i, i + 1))
-        a, b = (1 - render(alone, settings(**size, antialiasing=on), raw=False).transmittance for on in (False, True))
-        ratio = b / a
-        assert ratio.max() < 1
-        # All pixels of a splat have one factor: sqrt(det / det dilated) does not depend on the pixel.
-        assert (ratio.max() - ratio.min()).item() < 1e-12

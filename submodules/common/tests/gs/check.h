@@ -2,13 +2,8 @@
 // The macros of the C++ tests: a failure reports file, line and both values; the test continues and exits with 1.
 #include <cmath>
 #include <iostream>
-#include <limits>
 
 namespace gs {
-
-// Whether long double is wider than double, so that it can tell a double's error. On macOS, and by MSVC's rules, it is
-// not; tests that need it are then left out.
-constexpr bool kLongDoubleIsWider = std::numeric_limits<long double>::digits > std::numeric_limits<double>::digits;
 
 inline int& failures() {
   static int count = 0;

@@ -1,7 +1,6 @@
 #pragma once
-// Hand-made lists of splats for a row of tiles, blended by a backend, and by the rule itself in double.
+// Hand-made lists of splats for a row of tiles, blended by a backend.
 #include <algorithm>
-#include <cmath>
 #include <random>
 #include <vector>
 
@@ -40,8 +39,6 @@ struct LongLists {
 struct Blending {
   std::vector<float> color, transmittance, depth, moments, absolute;
   std::vector<int32_t> last;
-  std::vector<double> exact_color, exact_transmittance, exact_depth;  // of blend_exactly alone
-  std::vector<bool> decided;                                          // whether rounding cannot move the end
 };
 
 // depth, last: whether these outputs are asked for; without depth the backward gives lengths of absolute gradients.
@@ -74,32 +71,5 @@ Blending blend_lists(const Where& where, const LongLists& lists, bool depth, boo
             gs::BlendGradient<float>{lists.count(), total, lists.count(), slots.data(), out.transmittance.data(),
                                      out.last.data(), g, depth ? g + 3 * pixels : nullptr, g + 4 * pixels,
                                      out.moments.data(), to, nullptr, depth ? nullptr : out.absolute.data()});
-  return out;
-}
-
-// The rule, a pixel at a time.
-inline Blending blend_exactly(const LongLists& lists) {
-  const int width = lists.image.width, height = lists.image.height;
-  const size_t pixels = size_t(width) * height;
-  Blending out;
-  out.exact_color.resize(3 * pixels), out.exact_transmittance.resize(pixels), out.exact_depth.resize(pixels);
-  out.last.resize(pixels), out.decided.resize(pixels, true);
-  for (size_t pixel = 0; pixel < pixels; ++pixel) {
-    const int x = int(pixel) % width, y = int(pixel) / width, tile = x / kTile;
-    double left = 1, sum[4] = {0, 0, 0, 0};
-    for (int64_t k = lists.ranges[tile]; k < lists.ranges[tile + 1]; ++k) {
-      const float* s = &lists.splats[kSplatValues * lists.instances[k]];
-      const double u = s[2] * (double(x) - s[0]) + s[3] * (double(y) - s[1]), v = s[4] * (double(y) - s[1]);
-      const double power = s[5] - u * u - v * v, alpha = std::min(0.99, std::exp2(power));
-      if (std::abs(power + std::log2(255.0)) < 2e-5) out.decided[pixel] = false;
-      if (alpha < 1 / 255.0) continue;
-      if (std::abs(left * (1 - alpha) - 1e-4) < 1e-8) out.decided[pixel] = false;
-      if (left * (1 - alpha) < 1e-4) break;
-      for (int c = 0; c < 4; ++c) sum[c] += left * alpha * s[6 + c];
-      left *= 1 - alpha, out.last[pixel] = int32_t(k - lists.ranges[tile]) + 1;
-    }
-    for (int c = 0; c < 3; ++c) out.exact_color[c * pixels + pixel] = sum[c] + left * float(0.1f * float(c + 1));
-    out.exact_transmittance[pixel] = left, out.exact_depth[pixel] = sum[3];
-  }
   return out;
 }

@@ -1,5 +1,5 @@
 #pragma once
-// Gradient rows of a rendering, of the whole image at once or of bands of tile rows one after the other.
+// Gradient rows of a rendering.
 #include <algorithm>
 #include <vector>
 
@@ -30,55 +30,6 @@ KeptRows keep_rows(const Where& where, const gs::BlendInput<float>& in, const gs
   return out;
 }
 
-// A band's own forward and rows: tile rows `top` to `bottom` keep their lists, the others' are empty. The planes of r
-// must be those of the whole image.
-template <class Where>
-KeptRows rows_of_band(const Where& where, const Rendered& r, int top, int bottom, bool absolute) {
-  using gs::cuda::blend, gs::GS_ISA::blend;
-  const gs::Image image = r.scene.image;
-  const int across = (image.width + 15) / 16;
-  std::vector<int64_t> ranges = r.ranges;
-  for (int64_t& begin : ranges) begin = std::clamp(begin, r.ranges[top * across], r.ranges[bottom * across]);
-  const size_t pixels = size_t(image.width) * image.height;
-  std::vector<float> color(3 * pixels), transmittance(pixels), depth(pixels);
-  std::vector<int32_t> last(pixels);
-  std::vector<float> layers = memory_for_layers<float>(where, image, r.input.instance_count);
-  gs::BlendInput<float> in = r.input;
-  in.ranges = ranges.data();
-  const bool made = r.backward.layers;
-  blend(where, in,
-        gs::Blended<float>{color.data(), transmittance.data(), depth.data(), last.data(),
-                           made ? layers.data() : nullptr});
-  for (size_t pixel = size_t(16 * top) * image.width; pixel < pixels && pixel < size_t(16 * bottom) * image.width;
-       ++pixel) {
-    for (int c = 0; c < 3; ++c) CHECK(color[c * pixels + pixel] == r.color[c * pixels + pixel]);
-    CHECK(transmittance[pixel] == r.transmittance[pixel] && depth[pixel] == r.inverse_depth[pixel]);
-    CHECK(last[pixel] == r.last[pixel]);
-  }
-  gs::BlendGradient<float> g = r.backward;
-  g.transmittance = transmittance.data(), g.last = last.data(), g.layers = made ? layers.data() : nullptr;
-  return keep_rows(where, in, g, absolute);
-}
-
-// The rows of all bands of `high` tile rows, those of a splat in the order of the bands.
-template <class Where>
-KeptRows rows_by_bands(const Where& where, const Rendered& r, int high, bool absolute) {
-  const int down = (r.scene.image.height + 15) / 16;
-  std::vector<KeptRows> bands;
-  for (int top = 0; top < down; top += high)
-    bands.push_back(rows_of_band(where, r, top, std::min(top + high, down), absolute));
-  KeptRows out{{}, std::vector<int32_t>(r.scene.count, 0), bands[0].values};
-  std::vector<size_t> taken(bands.size(), 0);
-  for (int64_t i = 0; i < r.scene.count; ++i)
-    for (size_t b = 0; b < bands.size(); ++b) {
-      const auto from = bands[b].rows.begin() + taken[b];
-      const size_t values = size_t(bands[b].counts[i]) * out.values;
-      out.rows.insert(out.rows.end(), from, from + values);
-      out.counts[i] += bands[b].counts[i], taken[b] += values;
-    }
-  return out;
-}
-
 // In place of the rows of each splat, their sum.
 template <class Where>
 KeptRows summed(const Where& where, const KeptRows& in) {
@@ -101,8 +52,7 @@ inline std::vector<Parameters<float>> scenes_for_rows() {
   return scenes;
 }
 
-// Checks the rows of bands against those of the whole image, and `gradients_of` them and of their sums against those of
-// the lists.
+// Checks `gradients_of` rows and of their sums against those of the lists.
 // gradients_of(r, rows or null for the lists, lengths of absolute gradients or null): means, ..., sh_rest.
 template <class Where, class GradientsOf>
 void check_rows(const Where& where, const gs::Scene<float>& scene, bool depth, bool layers,
@@ -112,10 +62,6 @@ void check_rows(const Where& where, const gs::Scene<float>& scene, bool depth, b
   if (!layers) r->backward.layers = nullptr;
   for (const bool absolute : {false, true}) {
     const KeptRows whole = keep_rows(where, r->input, r->backward, absolute);
-    for (const int high : {1, 2}) {
-      const KeptRows bands = rows_by_bands(where, *r, high, absolute);
-      CHECK(bands.rows == whole.rows && bands.counts == whole.counts);
-    }
     std::vector<float> lengths[2];
     for (std::vector<float>& of : lengths) of.assign(absolute ? scene.count : 0, -77.0f);
     const auto to = [&](int which) { return absolute ? lengths[which].data() : nullptr; };

@@ -1,14 +1,13 @@
-// The small functions: exp2, activations, lanes, quaternions, covariances.
+// The small functions: exp2, activations, sums of lanes.
 #include <limits>
 #include <random>
 #include <vector>
 
-#include "cpu/row_lanes.h"
 #include "gs/check.h"
 #include "gs/lane_sums.h"
-#include "math/covariance.h"
+#include "gs/simd.h"
+#include "math/activation.h"
 #include "math/exp2.h"
-#include "math/sh.h"
 
 using namespace gs::GS_ISA;
 
@@ -118,98 +117,12 @@ void test_exponential() {
   CHECK(std::isnan(log_one_plus(nan)) && std::isnan(log_one_plus(V{} + nan)[0]));
 }
 
-// Rows become vectors and rows again, whole packs and the last, from rows that do not follow each other. The tensors
-// have no room behind their last row, and the sanitizers watch.
-template <class T>
-void test_row_lanes() {
-  constexpr int kLanes = Simd<T>::kLanes;
-  for (const int columns : {1, 3, 4, 9, 10, 24, 45})
-    for (const int stride : {columns, columns + 7})
-      for (const int count : {1, kLanes, kLanes + 3}) {
-        std::vector<int32_t> rows;
-        for (int i = 0; i < count; ++i) rows.push_back(2 * i);
-        const int64_t n = 2 * count - 1;
-        std::vector<T> from((n - 1) * stride + columns), to(from.size(), T(-1)), wanted = to;
-        for (size_t i = 0; i < from.size(); ++i) from[i] = T(i);
-        for (const int32_t row : rows)
-          for (int k = 0; k < columns; ++k) wanted[row * stride + k] = from[row * stride + k];
-        for_packs<T>(rows.data(), count, [&](const Pack<T>& pack) {
-          typename Simd<T>::Vec values[45];
-          read_rows(from.data(), stride, n, columns, pack, values);
-          for (int k = 0; k < columns; ++k)
-            for (int i = 0; i < pack.count; ++i) CHECK(values[k][i] == from[pack.row[i] * stride + k]);
-          write_rows(values, stride, columns, pack, to.data());
-        });
-        CHECK(to == wanted);
-      }
-}
-
-template <class T>
-void test_degenerate_quaternions() {
-  T norm;
-  // Zero, and quaternions so short that a gradient divided by their length would overflow.
-  for (T size : {T(0), std::numeric_limits<T>::denorm_min(), std::numeric_limits<T>::min()}) {
-    const Quat<T> none = normalise(Quat<T>{0, size, -size, 0}, norm);
-    CHECK(none.w == 1 && none.x == 0 && none.y == 0 && none.z == 0 && norm == 0);
-    const Quat<T> still = normalise_vjp(none, norm, Vec3<T>{1, 2, 3});
-    CHECK(still.w == 0 && still.x == 0 && still.y == 0 && still.z == 0);
-  }
-  // Their squares leave the range of the type.
-  for (double size : {1e-20, 1e-25, 1e20, 1e30}) {
-    const Quat<T> q = normalise(Quat<T>{T(size), T(-size), T(size), T(size)}, norm);
-    CHECK_NEAR(q.w, 0.5, 1e-6);
-    CHECK_NEAR(q.x, -0.5, 1e-6);
-    CHECK_NEAR(norm / T(size), 2, 1e-6);
-  }
-}
-
-void test_covariance_axes() {
-  for (int trial = 0; trial < 20; ++trial) {
-    double m[3][3], full[3][3] = {};
-    for (auto& row : m)
-      for (double& value : row) value = normal();
-    for (int i = 0; i < 3; ++i)
-      for (int j = 0; j < 3; ++j)
-        for (int k = 0; k < 3; ++k) full[i][j] += m[i][k] * m[j][k];
-    const double packed[6] = {full[0][0], full[0][1], full[0][2], full[1][1], full[1][2], full[2][2]};
-    const Axes<double> axes = axes_of_covariance(packed);
-    double back[3][3] = {};
-    for (int k = 0; k < 3; ++k) {
-      const double a[3] = {axes.direction[k].x, axes.direction[k].y, axes.direction[k].z};
-      for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) back[i][j] += axes.scale[k] * axes.scale[k] * a[i] * a[j];
-    }
-    for (int i = 0; i < 3; ++i)
-      for (int j = 0; j < 3; ++j) CHECK_NEAR(back[i][j], full[i][j], 1e-13 * (1 + std::abs(full[i][j])));
-  }
-  // Flat covariances: pivots of zero, or a little below by rounding.
-  const float flat[6] = {0, 0, 0, 1, 1, 1}, negative[6] = {1, 1, 1, 1, 1, 0.9999999f};
-  for (const float* c : {flat, negative})
-    for (const Vec3<float>& d : axes_of_covariance(c).direction) CHECK(finite(d));
-}
-
-// The direction of no vector, of a tiny and of a huge one.
-void test_direction() {
-  Vec3<float> none;
-  CHECK(sh_direction(Vec3<float>{0, 0, 0}, none) == 0);
-  CHECK(none.x == 0 && none.y == 0 && none.z == 0);
-  const Vec3<float> nothing = sh_direction_vjp(none, 0.0f, Vec3<float>{1, 2, 3});
-  CHECK(nothing.x == 0 && nothing.y == 0 && nothing.z == 0);
-  CHECK_NEAR(sh_direction(Vec3<float>{3e-30f, 0, 4e-30f}, none) * 1e30, 5, 1e-5);
-  CHECK_NEAR(none.x, 0.6, 1e-6);
-  CHECK_NEAR(sh_direction(Vec3<float>{3e30f, 0, 4e30f}, none) * 1e-30, 5, 1e-5);
-}
-
 }  // namespace
 
 int main() {
   test_exp2();
   test_lane_sums<float>(), test_lane_sums<double>();
   test_exponential<float>(), test_exponential<double>();
-  test_row_lanes<float>(), test_row_lanes<double>();
   test_sigmoid<float>(), test_sigmoid<double>();
-  test_degenerate_quaternions<float>(), test_degenerate_quaternions<double>();
-  test_covariance_axes();
-  test_direction();
   return gs::finish_tests("rasterizer functions");
 }

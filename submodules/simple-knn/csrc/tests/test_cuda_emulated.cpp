@@ -1,10 +1,8 @@
 // The CUDA kernels on the CPU (submodules/common/emulation), under the sanitizers, against the CPU backend: the same
 // bits in any order of the threads.
-#include <limits>
-#include <random>
-#include <vector>
-
 #include "backend.h"
+#include "box_tree.h"
+#include "clouds.h"
 #include "emulated_queue.h"
 #include "gs/check.h"
 
@@ -26,18 +24,22 @@ void check_cloud(const std::vector<T>& points) {
 
 template <class T>
 void check_clouds() {
-  std::mt19937 random(3);
-  std::normal_distribution<double> normal;
-  for (int64_t n : {0, 1, 2, 3, 8, 9, 100, 700}) {
-    std::vector<T> points(3 * n);
-    for (T& x : points) x = T(normal(random));
+  for (const int n : kSizes) for_clouds<T>(n, check_cloud<T>);
+  for_clouds<T>(100, [](std::vector<T> points) {
+    points[4] = std::numeric_limits<T>::infinity(), points[16] = std::numeric_limits<T>::quiet_NaN();
     check_cloud(points);
-    for (T& x : points) x = T(int(x));  // many duplicates
+    for (T& x : points) x = std::numeric_limits<T>::max() * std::tanh(x);  // distances overflow
     check_cloud(points);
-    if (n < 9) continue;
-    points[4] = std::numeric_limits<T>::infinity();
-    points[16] = std::numeric_limits<T>::quiet_NaN();
-    check_cloud(points);
+  });
+}
+
+// Nodes and points of a level that is too large to build here.
+void check_largest_level() {
+  const int64_t n = (int64_t(1) << 31) - 1;
+  const int level = gs::leaf_level(n);
+  for (const int64_t node : {int64_t(0), int64_t(1), int64_t(12345), (int64_t(1) << level) - 1}) {
+    CHECK(gs::node_of(n, level, gs::first_point(n, level, node)) == node);
+    CHECK(gs::node_of(n, level, gs::first_point(n, level, node + 1) - 1) == node);
   }
 }
 
@@ -45,5 +47,6 @@ void check_clouds() {
 
 int main() {
   check_clouds<float>(), check_clouds<double>();
+  check_largest_level();
   return gs::finish_tests("CUDA nearest neighbours, emulated");
 }

@@ -1,9 +1,8 @@
-// The kd-tree against all pairs, on clouds that are hard for a tree.
+// The kd-tree against all pairs.
 #include <algorithm>
-#include <random>
-#include <vector>
 
 #include "backend.h"
+#include "clouds.h"
 #include "gs/check.h"
 #include "gs/check_threads.h"
 
@@ -40,50 +39,9 @@ void check_cloud(const std::vector<T>& points) {
   }
 }
 
-template <class T>
-void check_clouds() {
-  std::mt19937 random(1);
-  std::normal_distribution<T> normal;
-  // Sizes around those where leaves and levels change.
-  for (int n : {0, 1, 2, 3, 4, 5, 7, 8, 9, 15, 16, 17, 18, 33, 64, 65, 500}) {
-    std::vector<T> points(3 * n);
-    for (T& x : points) x = normal(random);
-    check_cloud(points);
-    for (T& x : points) x = std::round(x);  // many duplicates and ties
-    check_cloud(points);
-    for (int i = 0; i < n; ++i) points[3 * i + 1] = points[3 * i + 2] = 0;  // collinear
-    check_cloud(points);
-    check_cloud(std::vector<T>(3 * n, T(0.1)));
-    for (T& x : points) x = std::exp(8 * normal(random));  // far outliers
-    check_cloud(points);
-  }
-}
-
-template <class T>
-void check_extremes() {
-  const T infinity = std::numeric_limits<T>::infinity(), nan = std::numeric_limits<T>::quiet_NaN();
-  const T largest = std::numeric_limits<T>::max();
-  const std::vector<T> points = {0, 0, 0, nan, 0, 0, 0, 1, 0, 0, 0, -infinity, 0, 0, 3};
-  std::vector<T> out(5);
-  gs::mean_distance2_cpu(points.data(), 5, out.data(), gs::serial_executor());
-  CHECK_NEAR(out[0], 5, 0);
-  CHECK(out[1] == 0 && out[3] == 0);
-  CHECK_NEAR(out[2], 5.5, 0);
-  CHECK_NEAR(out[4], 9.5, 0);
-
-  std::vector<T> far(3 * 20);  // every squared distance overflows
-  for (int i = 0; i < 20; ++i) far[3 * i] = (i - 10) * (largest / 16);
-  out.assign(20, 0);
-  gs::mean_distance2_cpu(far.data(), 20, out.data(), gs::serial_executor());
-  for (T value : out) CHECK(value == largest);
-}
-
 }  // namespace
 
 int main() {
-  check_clouds<float>();
-  check_clouds<double>();
-  check_extremes<float>();
-  check_extremes<double>();
+  for (const int n : kSizes) for_clouds<float>(n, check_cloud<float>), for_clouds<double>(n, check_cloud<double>);
   return gs::finish_tests("mean_distance2");
 }

@@ -46,11 +46,14 @@ void add_random_positions(gs::Results& results) {
   Parameters<float> p = same_scene<float>(500);
   std::vector<int64_t> items(p.count);
   std::iota(items.begin(), items.end(), 0);
-  std::vector<float> children(p.means.size());
-  gs::split_positions(gs::serial_executor(), {p.count, p.means.data(), p.scales.data(), p.rotations.data(),
-                                              items.data(), 7, 1, 100, 2, children.data()});
-  gs::add_noise(gs::serial_executor(), {p.count, p.means.data(), p.scales.data(), p.rotations.data(),
-                                        p.opacities.data(), 0.1, 100, 0.005, 7, 100, 2, nullptr});
+  std::vector<float> children = p.means;
+  gs::Displacement split{p.count, children.data(), p.scales.data(), p.rotations.data()};
+  split.items = items.data(), split.seed = 7, split.draw = 1, split.iteration = 100, split.stream = 2;
+  gs::displace(gs::serial_executor(), split);
+  gs::Displacement noise{p.count, p.means.data(), p.scales.data(), p.rotations.data(), p.opacities.data()};
+  noise.size = 0.1, noise.steepness = 100, noise.threshold = 0.005;
+  noise.seed = 7, noise.iteration = 100, noise.stream = 2;
+  gs::displace(gs::serial_executor(), noise);
   results.add("positions of children", children), results.add("positions with noise", p.means);
 }
 
