@@ -1,7 +1,7 @@
 """The loss of a render: photometric, and inverse depth where a depth map supervises. Further terms belong here."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import torch
 from fused_ssim import photometric_loss_by_bands
@@ -30,8 +30,11 @@ class Losses(NamedTuple):
 class Objective:
     """`(1 - lambda_dssim) L1 + lambda_dssim (1 - SSIM)` (Kerbl et al. 2023, Eq. 7), and the weighted depth loss.
 
-    Strategies say whether renders are compared clamped to [0, 1] (DensityControl.clamps).
+    Strategies say whether renders are compared clamped to [0, 1] (DensityControl.clamps). fusable: as that of
+    DensityControl.
     """
+
+    fusable: ClassVar[bool] = True
 
     def __init__(self, run: "Run") -> None:
         self._run = run

@@ -269,7 +269,7 @@ class Run:
 
         What an objective or a strategy says of itself is not inherited; subclasses opt in.
         """
-        own = type(self.objective) is Objective and vars(type(self.density)).get("fusable", False)
+        own = all(vars(type(one)).get("fusable", False) for one in (self.objective, self.density))
         return own and not (self.pipe.compute_cov3D_python or self.pipe.convert_SHs_python)
 
     def _may_sleep(self) -> Sleeping | None:
