@@ -114,8 +114,8 @@ class Sleeping:
             own = int(asleep[shards.first : shards.first + count].sum())
             blocks = slice(first, first + len(self.awake))
             taken = captured["taken"][blocks]
-            behind = self._taken.cpu() - taken.cpu()
-            if not ((behind >= 0) & (behind < _TERMS[0])).all():
+            behind = self._taken.cpu() - taken.cpu()  # -1: woken for a step that memory did not suffice for
+            if not ((behind >= -1) & (behind < _TERMS[0])).all():
                 raise ValueError("blocks have missed more steps than are known")
             self._put_back(
                 {"awake": captured["awake"][blocks], "taken": taken, "terms": captured["terms"].view(_TERMS)}

@@ -439,11 +439,8 @@ def test_the_default_budget_follows_the_iterations_that_the_clock_allows():
 def test_a_number_out_of_reach_is_told(colmap_scene, tmp_path, capsys):
     def said(*more: object, strategy: str = "budget") -> str:
         _train(colmap_scene, tmp_path / "out", "--strategy", strategy, *more)
-        return "".join(
-            line
-            for line in capsys.readouterr().err.splitlines()
-            if re.match("warning: (--strategy .* gets|the start)", line)
-        )
+        lines = capsys.readouterr().err.splitlines()
+        return "".join(line for line in lines if re.match("warning: (--strategy .* gets|the start)", line))
 
     window = "--densify_from_iter", 10, "--densification_interval", 20, "--max_num_splats"
     assert said(*window, 2000, "--densify_until_iter", 100) == ""

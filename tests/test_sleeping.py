@@ -308,6 +308,17 @@ def test_resumed(scene, tmp_path, plain, iteration):
     assert (asleep is None) == (iteration == 42)
 
 
+def test_a_checkpoint_from_within_a_step_resumes(scene, tmp_path, plain):
+    """As where memory has run out: the blocks that the step concerns are awake for it already."""
+    _trained(scene, tmp_path / "a", "--checkpoint_iterations", 33, ITERATIONS)
+    capture, iteration = load_checkpoint(tmp_path / "a/chkpnt33.pth")
+    asleep = further(capture, ASLEEP)
+    asleep["taken"] += asleep["awake"].int()
+    save_checkpoint(tmp_path / "within.pth", capture, iteration)
+    start = "--start_checkpoint", tmp_path / "within.pth"
+    assert not differences(_trained(scene, tmp_path / "b", *start), plain("default"))
+
+
 @pytest.mark.parametrize("what", ["rows", "taken", "terms"])
 def test_damaged_sleep_is_refused(scene, tmp_path, what):
     _trained(scene, tmp_path / "a", "--checkpoint_iterations", 33, ITERATIONS)

@@ -191,10 +191,10 @@ def test_lists_that_are_too_long_for_any_capacity_end_the_run_with_the_reason(sc
     """The step is rendered by a host that waits, whose operator says so. 10 stands for 2^31."""
     replay, measure, halted = speculative.Speculation._replay, FusedStep.measure, []
 
-    def refusing(self, at):
+    def refusing(self, at, *now):
         if halted:
             raise RuntimeError("more than 10 instances")
-        return measure(self, at)
+        return measure(self, at, *now)
 
     monkeypatch.setattr(speculative.Speculation, "_replay", lambda *x: (halted.append(1), replay(*x)))
     monkeypatch.setattr(FusedStep, "measure", refusing)
