@@ -31,7 +31,7 @@ from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.report import make_report, write_report
 from splatting.evaluation.results import read_earlier, read_run
 from splatting.evaluation.stages import Failure, StageFailed
-from splatting.evaluation.tables import MAIN, Table, reached_table, result_tables
+from splatting.evaluation.tables import MAIN, Table, reached_legend, reached_table, result_tables
 from splatting.files.folders import locked
 from splatting.files.listing import markdown_table
 from utils.system_utils import UserError, mkdir_p, run_cli
@@ -176,6 +176,7 @@ def _report(
         print(f"\n{table.title}\n{_text(table)}" if table.title else _text(table))
     for scene, found in report["reached"].items():
         print(f"\n{scene}: seconds of training to reach a test PSNR\n{_text(reached_table(found))}")
+        print(reached_legend(found))
     print(f"\nreport: {output / 'report.html'}")
     return scored
 

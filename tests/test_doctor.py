@@ -311,13 +311,16 @@ def test_a_scene_too_small_to_be_drawn(model, colmap_scene):
     assert "most Gaussians are nearer than 0.2 and never drawn -> scale cameras and points" in line
 
 
-def test_models_that_have_not_converged(model):
+def test_models_that_have_not_converged(model, monkeypatch):
     lines = check_model(model(), -1)
     assert lines[0].text == "iteration 7, 300 Gaussians of SH degree 3"
     assert "opacities: 0-0.01 0%, 0.01-0.05 0%, 0.05-0.2 100%" in lines[1].text
     assert any("PSNR of only" in text and "train longer, 3000 iterations" in text for text in problems(lines))
     assert "shortly after opacities were reset" in str(problems(check_model(model(iteration=6100), 6100)))
-    assert "the dataset has problems (only 17 photos)" in str(problems(check_model(model(iteration=20000), -1)))
+    late = model(iteration=20000)
+    assert "the model does not fit these photos" in str(problems(check_model(late, -1)))  # one colour would fit better
+    monkeypatch.setattr(splatting.diagnosis.model, "BEGUN", 30_000)
+    assert "the dataset has problems (only 17 photos)" in str(problems(check_model(late, -1)))
 
 
 @pytest.mark.parametrize("halves", [False, True])

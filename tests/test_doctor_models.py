@@ -1,5 +1,6 @@
 """Broken models and good ones: doctor.py names what is wrong with each, and calls no good one broken."""
 
+import json
 import math
 import shutil
 import sys
@@ -12,6 +13,7 @@ import torch
 from PIL import Image
 from trainings import train_on
 
+import splatting.diagnosis.model
 from scene.gaussians.attributes import Rows
 from scene.gaussians.ply import write_ply
 from scene.saved_model import read_model
@@ -101,7 +103,12 @@ def test_photos_with_each_others_names_are_found_before_and_after_a_training(fol
     contents = [photo.read_bytes() for photo in photos]
     for photo, content in zip(photos, contents[5:] + contents[:5], strict=True):
         photo.write_bytes(content)
-    (problem,) = _problems(folder, other)
+    assert _problems(folder, other) == [
+        f"the model fits the scene that it was trained on, but not {other} -> give -s {scene}"
+    ]
+    options = folder / "cfg_args"
+    options.write_text(options.read_text().replace(str(scene), str(other)))  # as if they changed after the training
+    (problem,) = _problems(folder)
     assert "the photos have each other's names: view_" in problem
     found = [line for line in check_dataset(str(other), "images") if line.finding]
     assert any("the points have the colours of other photos" in line.text for line in found)
@@ -114,8 +121,29 @@ def test_photos_of_another_scene(folder, scene, tmp_path):
     for photo in (other / "images").iterdir():
         Image.fromarray(rng.integers(0, 255, (90, 120, 3), dtype=np.uint8)).save(photo)
     (problem,) = _problems(folder, other)
-    assert "the model or the photos are not those of then -> restore the model and the photos" in problem
-    assert problem.endswith(f"; or give -s {scene}, which it was trained on")
+    assert problem.endswith(f"but not {other} -> give -s {scene}")
+
+
+@pytest.mark.parametrize("log", [True, False], ids=["log", "no log"])
+def test_colours_that_nothing_explains(folder, log):
+    """What was recorded tells that something has changed; without that, one colour would be nearer to the photos."""
+    for name in () if log else ("train_log.json", "error_vs_time.csv"):
+        (folder / name).unlink()
+    _edit(folder, lambda rows: rows | {"f_dc": -rows["f_dc"], "f_rest": -rows["f_rest"]})
+    (problem,) = _problems(folder)
+    assert ("are not those of then" if log else "dB -> check the model's colours, the poses") in problem
+    assert "train longer" not in problem
+
+
+def test_opacities_that_were_reset_too_late(folder, monkeypatch):
+    log = folder / "train_log.json"
+    records = json.loads(log.read_text())
+    said = "warning: opacities are reset in iteration 300, and 100 are too few to recover from that; change it"
+    records[-1]["lines"] = [said, *records[-1].get("lines", [])]
+    log.write_text(json.dumps(records))
+    assert _problems(folder) == []  # they did recover
+    monkeypatch.setattr(splatting.diagnosis.model, "UNRECOVERED", 1.0)
+    assert _problems(folder) == [said.removeprefix("warning: ").replace("; ", " -> ")]
 
 
 GOOD = {

@@ -400,7 +400,7 @@ class TestTraining:
         options = ["--densify_from_iter", 10, "--densification_interval", 20, "--densify_grad_threshold", 1e-5,
                    "--opacity_reset_interval", 45, "--random_background", "--images_to_load", 3]  # fmt: skip
         with_curve = _train(colmap_scene, tmp_path / "with", *options, "--test_iterations", 9, 30, iterations=80)
-        scored = re.search(r"\nTest views scored (\d+) times, [\d.]+ s: .*error_vs_time.png", capfd.readouterr().out)
+        scored = re.search(r"\nTest PSNR measured (\d+) times, [\d.]+ s: .*error_vs_time.png", capfd.readouterr().out)
         assert int(scored[1]) == len(_iterations(tmp_path / "with"))
         without = _train(colmap_scene, tmp_path / "without", *options, "--no_curve", iterations=80)
         assert with_curve == without

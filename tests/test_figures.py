@@ -55,7 +55,7 @@ def test_the_curve_of_a_training(tmp_path, drawn):
     assert test == [[0.5, 9], [1, 10], [1.5, 12], [2, 15], [4, 14]]
     (train,) = points(upper, "6 train views; hollow: estimated from 3 to 4 of them")
     assert train == [[0.5, 9.5], [1, 11], [1.5, 13], [4, 20]]
-    assert points(upper, "best of all test views: 15.00 dB, iteration 5") == [[[2, 15]]] and [2, 15] in test
+    assert points(upper, "highest mean over all test views: 15.00 dB, iteration 5") == [[[2, 15]]] and [2, 15] in test
     assert hollow(upper) == [[[0.5, 9], [1.5, 12]], [[0.5, 9.5], [1.5, 13]]]
     legends = [text.get_text() for axes in (upper, lower) for text in axes.get_legend().get_texts()]
     assert "gap, 6 dB at the end" in legends and "gap, 0.125 at the end" in legends
@@ -82,7 +82,8 @@ def test_the_figures_of_a_scene_can_be_read_at_half_their_size(tmp_path, drawn):
         (axes,), (legend,) = figure.axes, figure.legends
         assert not legend.get_window_extent().overlaps(axes.get_window_extent())
         assert all(figure.bbox.contains(*corner) for corner in legend.get_window_extent().get_points())
-        assert legend.get_title().get_text() == "7 test views; hollow: estimated from 2 of them"
+        said = legend.get_title().get_text()
+        assert said == "7 test views; hollow: estimated from 2 of them\nPareto front of all points"
         inches = figure.get_figwidth()
         letters = 358 / inches / 72 * min(text.get_fontsize() for text in legend.get_texts())
         assert letters > 8.5  # pixels where the window is 390 wide
@@ -97,6 +98,9 @@ def test_one_option_set_has_its_training_views(tmp_path, drawn):
     draw_curves(tmp_path, "attic", runs_of({None: rows}))
     draw_curves(tmp_path, "attic", runs_of({"a": rows, "b": rows}))
     one, two = drawn[0].axes[0], drawn[2].axes[0]
+    twice = runs_of({"a": rows, "b": rows}) + runs_of({"a": rows})
+    draw_curves(tmp_path, "attic", twice)
+    assert drawn[4].legends[0].get_title().get_text().endswith("\na line for each seed; Pareto front of all points")
     assert points(one, "training views") == [[[0.3, 36.0], [1.0, 37.0], [2.0, 21.0]]] and len(hollow(one)) == 1
     assert not points(two, "training views") and len(hollow(two)) == 2
 
@@ -123,6 +127,10 @@ def test_fronts_have_a_point_and_a_bar_for_each_set(tmp_path, drawn):
     found = {"sets": {one: dict(zip(names, map(spread, values), strict=True)) for one, values in ends.items()}}
     assert len(draw_fronts(tmp_path, "attic", found, ["apart", *ends])) == 3
     seconds, gaussians, megabytes = (figure.axes[0] for figure in drawn)
+    for point in found["sets"].values():
+        point["gaussians"] = spread(1000)
+    files = draw_fronts(tmp_path, "attic", found, list(ends))  # which points of one number would hide
+    assert [file.stem for file in files] == ["attic_front_seconds", "attic_front_ply_mb"]
     assert megabytes.get_xlabel() == "megabytes of the PLY"
     assert [bar.lines[0].get_xydata().tolist()[0] for bar in seconds.containers] == [[40, 31.2], [20, 32.2], [50, 30.4]]
     assert [bar.lines[0].get_color() for bar in seconds.containers] == ["C1", "C2", "C3"]  # as in the other figure

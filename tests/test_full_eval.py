@@ -424,7 +424,7 @@ def test_seeds_and_option_sets(figures, evaluate, tmp_path, capsys, monkeypatch)
     }
     said, text = capsys.readouterr().out, evaluate.text("md")
     assert "attic: seconds of training to reach a test PSNR" in said and "23.10 ± 0.14" in said
-    for part in ("Seconds of training to reach a test PSNR", "Option sets that no other one beats"):
+    for part in ("Seconds of training to reach a test PSNR", "Pareto front"):
         assert f"### {part}" in text
     for name in ("attic_front_seconds", "attic_psnr", "attic_worst_views"):
         assert f"(figures/{name}.png)" in text and (evaluate.out / "figures" / f"{name}.png").is_file()

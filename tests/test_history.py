@@ -203,6 +203,14 @@ def test_changed_options_are_told_in_one_line(colmap_scene, tmp_path, capfd):
     assert len(_warnings(capfd.readouterr().err)) == 1
 
 
+def test_a_resumed_curve_of_other_views_is_told(whole, colmap_scene, tmp_path, capfd):
+    start = "--eval", "--start_checkpoint", whole / "chkpnt20.pth"
+    for words, told in (("-r", 72), True), (("--lambda_dssim", 0.4), False):
+        _train(colmap_scene, tmp_path / "new", *start, *words, iterations=21)
+        (warning,) = _warnings(capfd.readouterr().err)
+        assert warning.endswith("; the earlier points of its curve are of those other views") == told
+
+
 def test_photos_that_were_trained_on_are_not_held_out_by_resuming(colmap_scene, tmp_path, capfd):
     out = tmp_path / "out"
     _train(colmap_scene, out, "--checkpoint_iterations", 2, iterations=3)

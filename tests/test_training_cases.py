@@ -73,7 +73,7 @@ def test_images_that_teach_little_are_named(colmap_scene, blender_scene, tmp_pat
     assert "warning: images of 24x16 pixels are too small to learn from" in capfd.readouterr().err
     for words, hinted in ((), True), (("-w",), False):
         _train(blender_scene, tmp_path / "b", "-r", 1, *words, iterations=1)
-        assert ("images are transparent, and train before black; -w trains" in capfd.readouterr().err) == hinted
+        assert ("transparent parts of the images count as black; with -w they" in capfd.readouterr().err) == hinted
 
 
 def test_one_picture(tmp_path):

@@ -21,7 +21,7 @@ from splatting.diagnosis import Line, from_error
 from splatting.diagnosis.changes import FITS as BAD_PSNR
 from splatting.diagnosis.changes import LOST, NEAR, recorded_psnr, what_changed
 from splatting.diagnosis.dataset import check_dataset
-from splatting.evaluation.model_folder import curve_of
+from splatting.evaluation.model_folder import closing_lines, curve_of
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
 from splatting.evaluation.what_to_try import what_to_try
@@ -40,12 +40,14 @@ HUGE = 1.0  # extents: one standard deviation of a splat as large as the whole s
 HUGE_SHARE = 0.01
 BLACK = 0.02  # mean of an image in [0, 1]
 FEW_ITERATIONS = 3000
+BEGUN = 200  # iterations, from which on a model is better than one colour
 RESET_INTERVAL = 3000  # the default of --opacity_reset_interval
 NEAREST = 0.2  # depth below which nothing is drawn
 FEW_GAUSSIANS = 2000
 _CLEARLY = 3.0  # dB
 _VIEWS = 4
 _WIDTH = 200
+_RESET_SAID = "warning: opacities are reset"  # as training/checks.py says it
 
 
 def check_model(model_path: str, iteration: int, source: str | None = None, images: str | None = None) -> list[Line]:
@@ -54,9 +56,8 @@ def check_model(model_path: str, iteration: int, source: str | None = None, imag
     source, images: scene folder and its folder of photos, None: those that the model was trained on.
     """
     try:
-        stored = read_stored_options(model_path)
-        trained_on = stored.get("source_path")
-        stored |= {"source_path": source} if source is not None else {}
+        own = read_stored_options(model_path)
+        stored = own | ({"source_path": source} if source is not None else {})
         stored |= {"images": images} if images is not None else {}
         options, scene = _load(model_path, stored, iteration)
     except UserError as error:
@@ -69,11 +70,23 @@ def check_model(model_path: str, iteration: int, source: str | None = None, imag
     if wrong := [*_not_finite(gaussians)] or [*_wrong_sizes(gaussians, extent)]:
         return [*lines, *wrong]
     shapes, (renders, changed) = [_opacities(gaussians), _sizes(gaussians, extent)], _renders(scene, options, stored)
-    if renders.finding and source and trained_on and Path(source).resolve() != Path(trained_on).resolve():
-        renders = renders._replace(remedy=f"{renders.remedy}; or give -s {trained_on}, which it was trained on")
+    if renders.finding and stored != own and _fits(model_path, own, scene.loaded_iter):
+        renders = Line(f"the model fits the scene that it was trained on, but not {stored['source_path']}",
+                       f"give -s {own['source_path']}")  # fmt: skip
+        changed = True
     if changed:  # which explains all else, and the training has no say in it
         return [*lines, *(line for line in shapes if not line.finding), renders]
-    return [*lines, *shapes, renders, *check_training(Path(model_path))]
+    reset = [] if renders.finding else _late_reset(scene)
+    return [*lines, *shapes, renders, *reset, *check_training(Path(model_path))]
+
+
+def _fits(model_path: str, stored: dict[str, Any], iteration: int) -> bool:
+    """Whether the model renders the views of the scene that it was trained on well."""
+    try:
+        options, scene = _load(model_path, stored, iteration)
+    except UserError:
+        return False
+    return not _renders(scene, options, stored)[0].finding
 
 
 def check_training(model: Path) -> list[Line]:
@@ -136,6 +149,13 @@ def _wrong_values(gaussians: GaussianModel, extent: float) -> Iterator[Line]:
         yield Line(text, remedy)
 
 
+def _late_reset(scene: Scene) -> Iterator[Line]:
+    """What training said at its start of a reset, if the opacities have not recovered from it."""
+    faint = float(scene.gaussians.get_opacity.detach().median()) < UNRECOVERED
+    said = closing_lines(Path(scene.model_path)) if faint else []
+    yield from (from_error(UserError(line.partition(": ")[2])) for line in said if line.startswith(_RESET_SAID))
+
+
 def _opacities(gaussians: GaussianModel) -> Line:
     opacity = gaussians.get_opacity.detach().flatten().cpu().numpy()
     parts = zip(BINS, BINS[1:], np.histogram(opacity, bins=BINS)[0] / len(opacity), strict=False)
@@ -176,18 +196,23 @@ def _renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) 
     text = text if black else f"training views have a PSNR of only {means.psnr:.1f} dB"
     wrong = _other_background(scene, options, stored, means.psnr)
     wrong = wrong or changed or next(_wrong_values(scene.gaussians, scene.cameras_extent), None)
-    wrong = wrong or (_why_black(scene, views, means) if black else Line("", _why_bad(scene, stored)))
+    wrong = wrong or next(_late_reset(scene), None)
+    wrong = wrong or (_why_black(scene, views, means) if black else Line("", _why_bad(scene, stored, means)))
     return wrong._replace(text=f"{text}: {wrong.text}" if wrong.text else text), wrong is changed
 
 
 class Means(NamedTuple):
-    """Means over views: render, photo and PSNR (dB) of scored pixels; shares of covered pixels and drawn Gaussians."""
+    """Means over views: render, photo and PSNR (dB) of scored pixels; shares of covered pixels and drawn Gaussians.
+
+    plain: the PSNR of an image that has the photo's mean colour everywhere.
+    """
 
     render: float
     photo: float
     coverage: float
     drawn: float
     psnr: float
+    plain: float
 
 
 def _looked_at(scene: Scene) -> list[Camera]:
@@ -235,9 +260,10 @@ def _measure(camera: Camera, scene: Scene, options: argparse.Namespace) -> tuple
         black = torch.zeros_like(gaussians.get_xyz)
         white = black.new_ones(3)
         silhouette = render(camera, gaussians, pipe, white, override_color=black, want_depth=False)
-    ratio = min(float(psnr(image, target).mean()), 99.0)
+    mean = target.flatten(1).mean(dim=1).view(-1, *[1] * (target.dim() - 1))
+    ratios = (min(float(psnr(x, target).mean()), 99.0) for x in (image, mean.expand_as(target)))
     drawn = float((silhouette["radii"] > 0).float().mean())
-    return float(image.mean()), float(target.mean()), 1 - float(silhouette["render"].mean()), drawn, ratio
+    return float(image.mean()), float(target.mean()), 1 - float(silhouette["render"].mean()), drawn, *ratios
 
 
 def _why_black(scene: Scene, cameras: list[Camera], means: Means) -> Line:
@@ -260,13 +286,18 @@ def _depths(camera: Camera, points: torch.Tensor) -> torch.Tensor:
     return points @ camera.world_view_transform[:3, 2] + camera.world_view_transform[3, 2]
 
 
-def _why_bad(scene: Scene, stored: dict[str, Any]) -> str:
+def _why_bad(scene: Scene, stored: dict[str, Any], means: Means) -> str:
     iteration = scene.loaded_iter
     faint = float(scene.gaussians.get_opacity.detach().median()) < UNRECOVERED
     if faint and RESET_INTERVAL <= iteration < 15_000 and iteration % RESET_INTERVAL < 500:
         return "this iteration is shortly after opacities were reset; check a later one"
     if (sizes := _sizes(scene.gaussians, scene.cameras_extent)).finding:
         return sizes.remedy
+    if means.psnr < means.plain and iteration >= BEGUN:
+        return (
+            "check the model's colours, the poses, the background and the scene (-s): the model does not fit these "
+            f"photos, as an image of a photo's mean colour has {means.plain:.1f} dB"
+        )
     if iteration < FEW_ITERATIONS:
         return f"train longer, {FEW_ITERATIONS} iterations at least"
     dataset = check_dataset(stored.get("source_path", ""), stored.get("images", "images"))

@@ -27,6 +27,8 @@ DEFAULT = ("adc", "default", "defaults", "base")  # names of the set that others
 COSTS = ("seconds", "gaussians", "ply_mb")
 DIGITS = 1e6  # of a PSNR in a curve
 LOWEST = 2.0  # dB below the best final PSNR to which its levels go at least
+SHORTEST = 10.0  # seconds of a process whose share of the processors says something
+EVEN = 0.8  # share of the best that trainings get on a machine of their own
 WIDEST_STEP = 2.0  # largest ratio of the seconds of two points to interpolate between; a wider gap tells too little
 DECIDING = {  # options of train.py that decide what test views show, and which of their pixels count
     *("--resolution", "-r", "--images", "-i", "--white_background", "-w", "--train_test_exp"),
@@ -240,26 +242,32 @@ def _cell(curves: Sequence[Sequence[Row]], psnr: float, of_default: bool, is_def
     """Return what the seeds of a set take to reach a level: spreads of seconds and Gaussians.
 
     Seeds that do not reach it have null, and so has the mean then. reached: the number of seeds that do; estimated:
-    whether a point that scored a part of the test views decides; at_least: whether seconds are a lower bound. That is
-    so only for the default's own end: a seed of it that ends below the mean counts with all its seconds, which is too
-    few, so that no ratio flatters the others.
+    whether a point that scored a part of the test views decides; at_end: whether the seconds are all those of each
+    seed. That is so only for the default's own end, unless each seed was as good before.
     """
     places = [next((i for i, row in enumerate(curve) if row["test_psnr"] >= psnr), None) for curve in curves]
-    at_least = of_default and is_default and None in places
-    rows = [curve[-1] if at_least and i is None else None if i is None else curve[i]
-            for curve, i in zip(curves, places, strict=True)]  # fmt: skip
+    lasts = [i in (None, len(curve) - 1) for curve, i in zip(curves, places, strict=True)]
+    at_end = of_default and is_default and any(lasts)
+    if at_end:
+        rows = [curve[-1] for curve in curves]
+    else:
+        rows = [None if i is None else curve[i] for curve, i in zip(curves, places, strict=True)]
     deciding = [row for curve, i in zip(curves, places, strict=True) if i is not None
                 for row in curve[max(i - 1, 0) : i + 1]]  # fmt: skip
     return {
-        "at_least": at_least,
-        "estimated": any(row[SUBSET] is not None for row in deciding),
+        "at_end": at_end,
+        "estimated": not at_end and any(row[SUBSET] is not None for row in deciding),
         "gaussians": spread(row and row["gaussians"] for row in rows),
         "reached": sum(i is not None for i in places),
-        "seconds": spread(
-            curve[-1]["seconds"] if at_least and i is None else seconds_to_reach(curve, psnr)
-            for curve, i in zip(curves, places, strict=True)
-        ),
+        "seconds": spread(curve[-1]["seconds"] if at_end else seconds_to_reach(curve, psnr) for curve in curves),
     }
+
+
+def uneven_shares(runs: Iterable[Run]) -> tuple[float, float] | None:
+    """Return the least and the most of a processor that trainings got, if they differ too much to compare seconds."""
+    shares = [run["cpu_seconds"] / run["wall_seconds"] for run in runs
+              if run["cpu_seconds"] is not None and (run["wall_seconds"] or 0) >= SHORTEST]  # fmt: skip
+    return (min(shares), max(shares)) if shares and min(shares) <= EVEN * max(shares) else None
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
@@ -275,13 +283,14 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def fronts(sets: Sets) -> dict[str, Any] | None:
-    """Return where each set ended, and which sets no other one beats; None if fewer than two sets have scores.
+    """Return where each set ended, and which sets are on the Pareto front; None if fewer than two sets have scores.
 
     sets: by name the spreads over the seeds of PSNR (dB, of metrics.py), seconds of training, Gaussians trained and
-    ply_mb, at the last iteration. beaten: for each cost and set, None if it is on the front, else `by` and `clearly` of
-    `_beaten_by`.
+    ply_mb, at the last iteration. beaten: for each cost and set, None if it is on the Pareto front, else `by` and
+    `clearly` of `_beaten_by`. By seconds nothing is clear where the trainings got unequal shares of the processors.
     """
     points: dict[str, Ends] = {}
+    uneven = uneven_shares([run for runs in sets.values() for run in runs])
     for name, runs in sets.items():
         ends = [run["iterations"][str(run["final_iteration"])] for run in runs]
         point = {key: spread(end[key] for end in ends) for key in ("PSNR", *COSTS)}
@@ -290,6 +299,8 @@ def fronts(sets: Sets) -> dict[str, Any] | None:
     if len(points) < 2:
         return None
     beaten = {cost: {name: _beaten_by(points, name, cost) for name in points} for cost in COSTS}
+    for by in filter(None, beaten["seconds"].values()) if uneven else ():
+        by["clearly"] = False
     return {"beaten": beaten, "sets": points}
 
 

@@ -332,7 +332,11 @@ class CurveRecorder:
         costs = {f"curve_{part}_seconds": round(taken, 4) for part, taken in self._spent.items()}
         self._log.add(self.rows[-1]["iteration"], seconds, **costs)
         often = "once" if self._scored == 1 else f"{self._scored} times"
-        self._log.tell(f"Test views scored {often}, {self._spent['scoring']:.1f} s: {self._folder / FIGURE}")
+        sizes = sorted(row[SUBSET] for row in self.rows[-self._scored :] if row[SUBSET] is not None)
+        if sizes:
+            some = f"{sizes[0]}" if sizes[0] == sizes[-1] else f"{sizes[0]} to {sizes[-1]}"
+            often += f" ({len(sizes)} of them on {some} of {len(self._views['test'])} views)"
+        self._log.tell(f"Test PSNR measured {often}, {self._spent['scoring']:.1f} s: {self._folder / FIGURE}")
         if advice := peak_advice(self.rows, saved, steady):
             self._log.advise(advice)
 

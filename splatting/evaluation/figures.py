@@ -30,10 +30,11 @@ MARKERS = "osD"  # with ten colours they tell thirty sets apart
 PEER_MARKERS = "xs^vDP*"
 LABELS = {
     "seconds": "seconds of training",
-    "gaussians": "Gaussians, as trained",
+    "gaussians": "Gaussians trained",
     "ply_mb": "megabytes of the PLY",
 }
 PANEL, DPI, FONT = (5.6, 4.2), 140, 12  # of a report's figure: inches, and letters to be read at half the size, too
+DIFFER = 1.02  # times the lowest mean of a cost; where none has more, their points hide each other
 LEGEND = 72  # letters in a line of a legend
 
 Value = Callable[[Row, str], float | None]
@@ -139,7 +140,7 @@ def draw_curve(path: str | os.PathLike, rows: list[Row], title: str, views: Mapp
         label = f"gap, {abs(ends[1][-1] - ends[0][-1]):.3g}{unit} at the end" if len(both) > 1 else None
         axes.fill_between([row["seconds"] for row in both], *ends, color="gray", alpha=0.2, linewidth=0, label=label)
     if best := best_test(rows):
-        label = f"best of all test views: {best['test_psnr']:.2f} dB, iteration {best['iteration']:,}"
+        label = f"highest mean over all test views: {best['test_psnr']:.2f} dB, iteration {best['iteration']:,}"
         _draw(
             upper, [(best["seconds"], best["test_psnr"])], label, marker="*", color="black", markersize=12, linestyle=""
         )
@@ -163,8 +164,9 @@ def _panel(path: Path, title: str, log: bool, labels: tuple[str, str], draw: Cal
         _label(axes, *labels, log=log)
         handles, names = axes.get_legend_handles_labels()
         columns = max(1, min(4, LEGEND // (6 + max(map(len, names), default=0))))
-        figure.legend(handles, names, title=said, loc="outside lower center", ncols=columns, fontsize=FONT - 2,
-                      title_fontsize=FONT - 2, frameon=False)  # fmt: skip
+        legend = figure.legend(handles, names, title=said, loc="outside lower center", ncols=columns, fontsize=FONT - 2,
+                               title_fontsize=FONT - 2, frameon=False)  # fmt: skip
+        legend.get_title().set_multialignment("center")
         _save(figure, path, DPI)
     return path
 
@@ -174,14 +176,16 @@ def draw_curves(
 ) -> list[Path]:
     """Draw a scene's test PSNR and 1 - SSIM against seconds of training; return the files, none if no run has a curve.
 
-    Each option set has a colour and each seed a line. With several option sets, the Pareto front of all points is
-    marked, without runs that stand apart. With one, the training views are drawn too, dashed. peers:
+    Each option set has a colour and each seed a line, which the legend says. With several option sets, the Pareto front
+    of all points is marked, without runs that stand apart. With one, the training views are drawn too, dashed. peers:
     curves of other programs, in grey; they are no part of the front.
     """
     runs = [run for run in runs if any(row["test_psnr"] is not None for row in of_whole_sets(run["curve"]))]
     several = len({run["config"] for run in runs}) > 1
     counts = {run["views"]["test"] for run in runs}
     said = _views_text(counts.pop() if len(counts) == 1 else None, [row for run in runs for row in run["curve"]])
+    more = ["a line for each seed"] * (len(runs) > len({run["config"] for run in runs}))
+    said = "\n".join([said, "; ".join([*more, "Pareto front of all points"])] if several else [said, *more])
 
     def draw(axes: Axes, value: Value, sign: int) -> str:
         ours = _draw_runs(axes, runs, value, several)
@@ -247,7 +251,7 @@ def draw_front(axes: Axes, points: Sequence[Point], sign: int) -> None:
 
 
 def draw_fronts(folder: Path, scene: str, found: Mapping[str, Any], names: Sequence[str]) -> list[Path]:
-    """Draw PSNR against each cost, where each option set ended; return the files.
+    """Draw PSNR against each cost that sets differ in, where each option set ended; return the files.
 
     found: the scene's `fronts` in report.json. names: all option sets of the scene, which colours follow, so that they
     are those of the curves. A point is the mean over the seeds, a bar the standard deviation; the front goes
@@ -267,6 +271,7 @@ def draw_fronts(folder: Path, scene: str, found: Mapping[str, Any], names: Seque
     return [
         _panel(folder / f"{scene}_front_{cost}.png", scene, False, (LABELS[cost], y), partial(draw, cost=cost))
         for cost in COSTS
+        if max(means := [point[cost]["mean"] for point in found["sets"].values()]) > DIFFER * min(means)
     ]
 
 

@@ -26,9 +26,7 @@ from splatting.files.listing import markdown_table
 from utils.system_utils import UserError, atomic_write
 
 TITLE = "3D Gaussian Splatting: evaluation"
-SHORTEST = 10.0  # seconds of a process whose share of the processors says something
 _WARNING = "warning: "  # before what a training said at its start
-EVEN = 0.8  # share of the best that trainings get on a machine of their own
 OF_A_RUN, OF_A_REPORT = 24, 96  # test views at most in the HTML file, at about 0.1 MB each
 RESIZE_FILTER = "Pillow, bicubic, antialiased where it shrinks; 8-bit pictures"
 _PHOTOGRAPHIC = 1 << 18  # bytes of a PNG above which a JPEG replaces it
@@ -93,12 +91,10 @@ def _warnings(runs: Sequence[Run], rows: Sequence[dict[str, Any]]) -> list[str]:
                 "scores and curves cannot be compared. Left out of rankings and the Pareto front: "
                 f"{', '.join(apart)}."
             )
-        shares = [run["cpu_seconds"] / run["wall_seconds"] for run in members
-                  if run["cpu_seconds"] is not None and (run["wall_seconds"] or 0) >= SHORTEST]  # fmt: skip
-        if shares and min(shares) <= EVEN * max(shares):
+        if shares := comparison.uneven_shares(members):
             lines.append(
-                f"{scene}: the trainings got {min(shares):.2f} to {max(shares):.2f} CPU seconds a second. Where they "
-                "got less, other programs used the machine, or the option set leaves processors idle; compare CPU "
+                f"{scene}: the trainings got {100 * shares[0]:.0f} to {100 * shares[1]:.0f} % of a processor. Where "
+                "they got less, other programs used the machine, or the option set leaves processors idle; compare CPU "
                 "seconds, too."
             )
     for name in ("commit", "cpu", "gpu", "instruction_set", "threads"):
@@ -215,11 +211,6 @@ def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
 
     return {
         "cpu_known": known("cpu_seconds"),
-        "estimated": {
-            scene
-            for scene, found in report["reached"].items()
-            if any(cell["estimated"] for cells in found["sets"].values() for cell in cells)
-        },
         "left_out": any(row["gaussians"]["mean"] != row["gaussians_saved"]["mean"] for row in rows),
         "machines": sorted({one_line(run["machine"]) for run in runs if run["machine"]}),
         "open_ended": any(row["open_ended"] for row in rows),

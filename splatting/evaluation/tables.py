@@ -10,7 +10,7 @@ from splatting.evaluation.comparison import COMPARED, COSTS, SCORES
 
 QUANTITIES = {  # heading and digits
     **{"PSNR": ("PSNR (dB)", 2), "SSIM": ("SSIM", 4), "LPIPS": ("LPIPS", 4), "seconds": ("training (s)", 1)},
-    **{"process_seconds": ("process (s)", 1), "cpu_seconds": ("CPU (s)", 1), "gaussians": ("Gaussians", 0)},
+    **{"process_seconds": ("process (s)", 1), "cpu_seconds": ("CPU (s)", 1), "gaussians": ("Gaussians trained", 0)},
     **{"ply_mb": ("PLY (MB)", 1), "peak_memory_mib": ("peak memory (MiB)", 0), "render_ms": ("render (ms)", 2)},
 }
 _LAST_OF_PEER = {  # heading, and digits, of a column of a peer's curve
@@ -144,19 +144,30 @@ def reached_table(found: Mapping[str, Any]) -> Table:
 def _cell(cell: Mapping[str, Any], is_default: bool) -> str:
     """Format a cell of `reached`; that of another set has its part of the default's seconds, too."""
     seconds, known = cell["seconds"], [x for x in cell["seconds"]["values"] if x is not None]
-    if not cell["reached"] and not cell["at_least"]:
+    if not cell["reached"] and not cell["at_end"]:
         return "not reached"
     if not known:
         return "not known"
-    digits, about = 2 if known[0] < 10 else 1, "\u2265 " if cell["at_least"] else "~ " if cell["estimated"] else ""
+    digits, about = 2 if known[0] < 10 else 1, "~ " if cell["estimated"] else ""
     if seconds["mean"] is None:
         return f"{about}{number(statistics.fmean(known), digits)} s, {len(known)} of {len(seconds['values'])} seeds"
     part = "" if is_default or cell["ratio"] is None else f" ({100 * cell['ratio']:.0f} %)"
     return f"{about}{spread_cell(seconds, digits)} s{part}"
 
 
+def reached_legend(found: Mapping[str, Any]) -> str:
+    """What is said below `reached_table`, in a line."""
+    texts = [cell for row in reached_table(found).rows for cell in row[1:]]
+    parts = {
+        " %)": f"In brackets: the part of {found['default']}'s seconds.",
+        "~": "~: rests on an estimate from a part of the test views.",
+        " seeds": "1 of 2 seeds: the mean of those that got there.",
+    }
+    return " ".join(text for mark, text in parts.items() if any(mark in cell for cell in texts))
+
+
 def front_table(found: Mapping[str, Any]) -> Table:
-    """Table of a scene's `fronts`: for each option set and cost, whether the set is on the front."""
+    """Table of a scene's `fronts`: for each option set and cost, whether the set is on the Pareto front."""
     columns = {"options": lambda name: name} | {
         QUANTITIES[cost][0]: lambda name, cost=cost: _on_front(found["beaten"][cost][name]) for cost in COSTS
     }
@@ -165,8 +176,8 @@ def front_table(found: Mapping[str, Any]) -> Table:
 
 def _on_front(beaten: Mapping[str, Any] | None) -> str:
     if beaten is None:
-        return "on the front"
-    return f"beaten by {beaten['by']}" + (", within the spread" if beaten["clearly"] is False else "")
+        return "on the Pareto front"
+    return f"perhaps beaten by {beaten['by']}" if beaten["clearly"] is False else f"beaten by {beaten['by']}"
 
 
 def runs_table(runs: Sequence[Mapping[str, Any]]) -> Table:

@@ -18,6 +18,7 @@ from scene.gaussians import density_rules as rules
 from scene.readers.info import APART, NEAREST, SceneInfo, camera_centers, standing_apart
 from scene.saved_model import saves_in
 from splatting.evaluation import training_log
+from splatting.evaluation.error_curve import NAME as CURVE
 from splatting.evaluation.error_curve import Row, continue_curve
 from splatting.evaluation.training_log import TrainingLog
 from splatting.files.listing import some
@@ -42,8 +43,8 @@ def hint_of_images(views: Sequence[Camera], info: SceneInfo, white_background: b
     path = info.train_cameras[0].image_path
     if info.is_nerf_synthetic and not white_background and path is not None and _has_alpha(path):
         _warn(
-            "the images are transparent, and train before black; -w trains before white, as published results "
-            "of such scenes do"
+            "transparent parts of the images count as black; with -w they count as white, as in published results of "
+            "such scenes"
         )
 
 
@@ -258,7 +259,9 @@ def report_changes(checkpoint: str, now: argparse.Namespace) -> None:
         )
     if changed:
         before, after = (" ".join(_typed(n, of[n]) for n in changed) for of in (then, vars(now)))
-        _warn(f"{folder} was trained with {before}, this run has {after}")
+        mixed = _OF_VIEWS.intersection(changed) and (folder / CURVE).exists()
+        of_curve = "; the earlier points of its curve are of those other views" if mixed else ""
+        _warn(f"{folder} was trained with {before}, this run has {after}{of_curve}")
 
 
 def continue_records(model_path: str, checkpoint: str | None, first_iteration: int) -> tuple[TrainingLog, list[Row]]:

@@ -159,7 +159,7 @@ class Summary(Observer):
         if error is not None:
             return
         run = self._run
-        scored = "" if self._psnr is None else f"Test PSNR {self._psnr:.2f} dB. "
+        scored = "" if self._psnr is None else f"Test PSNR {self._psnr:.2f} dB (as metrics.py). "
         print(f"{scored}Look at the model: {view_command(run.scene.model_path, self._iteration)}")
 
 
