@@ -22,6 +22,7 @@ import train  # noqa: E402
 from scene.gaussians.checkpoint import load_checkpoint  # noqa: E402
 from scene.saved_model import read_model  # noqa: E402
 from splatting.training.observers import viewers as observed  # noqa: E402
+from splatting.viewer import training_tab  # noqa: E402
 from splatting.viewer.page import serve  # noqa: E402
 from utils.system_utils import UserError  # noqa: E402
 
@@ -289,6 +290,13 @@ def test_neither_a_checkpoint_nor_a_frame_that_fails_ends_a_training(colmap_scen
     assert [title for title, _ in told] == ["Not saved", "Saved", "The training is over"]
     said = capfd.readouterr().err
     assert "warning: cannot write" in said and said.count("no memory for a frame") == 1
+
+
+def test_points_of_some_test_views_are_called_so():
+    rows = [{"subset": 4, "estimated": None}, {"subset": 4, "estimated": 1}, {"subset": None, "estimated": None}]
+    scored, estimated = "2 of 4 points are scores of some test views.", "1 of 4 points are estimates from scores of"
+    text = training_tab._of_some_views([rows[0], *rows])
+    assert text.startswith(f"{scored} {estimated}") and training_tab._of_some_views(rows[2:]) == ""
 
 
 def test_a_wrong_address_is_refused_before_a_file_is_written(colmap_scene, tmp_path):
