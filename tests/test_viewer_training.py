@@ -96,7 +96,7 @@ class Watched:
 def _train(scene: Path, out: Path, *options: object, viewer: bool = True, stays: bool = False) -> Path:
     words = ["-s", scene, "-m", out, "-r", 24, "--iterations", ITERATIONS, "--eval", "--densify_from_iter", 20,
              "--densification_interval", 20, "--densify_grad_threshold", 1e-6, *options]  # fmt: skip
-    train.main([*map(str, words), *(["--viewer", "0"] if viewer else []), *(["--viewer_exit"] * (not stays))])
+    train.main([*map(str, words), *(["--viewer", "0", *(["--viewer_exit"] * (not stays))] if viewer else [])])
     return out / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply"
 
 
@@ -297,6 +297,11 @@ def test_points_of_some_test_views_are_called_so():
     scored, estimated = "2 of 4 points are scores of some test views.", "1 of 4 points are estimates from scores of"
     text = training_tab._of_some_views([rows[0], *rows])
     assert text.startswith(f"{scored} {estimated}") and training_tab._of_some_views(rows[2:]) == ""
+
+
+def test_viewer_exit_without_a_page_is_refused():
+    with pytest.raises(UserError, match="--viewer_exit closes the page of --viewer"):
+        train.parse(["-s", "scene", "--viewer_exit"])
 
 
 def test_a_wrong_address_is_refused_before_a_file_is_written(colmap_scene, tmp_path):
