@@ -32,6 +32,7 @@ def _raise(error: BaseException):
     [
         (UserError("fix it like this"), 2, "error: fix it like this\n"),
         (KeyboardInterrupt(), 130, "interrupted\n"),
+        (KeyboardInterrupt("stopped from the page"), 130, "stopped from the page\n"),
         (Terminated(), 143, "terminated\n"),
     ],
 )
