@@ -145,13 +145,14 @@ class ImagesTab:
         self.comparison = gui.add_dropdown("Compare", views.COMPARISONS, hint=hint)
         self.slider = gui.add_slider("Slider", 0.0, 1.0, 0.005, 0.5, hint="0: render, 1: photo", visible=False)
         shown = gui.add_checkbox("Draw cameras", False, hint="a click on one jumps there; those near the view fade")
+        colours = gui.add_markdown("Training views are blue, test views orange.", visible=False)
         self._begin()
         # In turn, so that the view does not get its place from one camera and its direction from the next.
         self.camera.on_update(serialized(lambda event: (self._begin(), self.go(event.client))))
         again.on_click(serialized(lambda event: self.go(event.client)))
         self.comparison.on_update(serialized(lambda event: (self._compare(event.client), changed(False))))
         self.slider.on_update(lambda _: changed(True))
-        shown.on_update(serialized(lambda _: self.frusta.show(shown.value)))
+        shown.on_update(serialized(lambda _: (self.frusta.show(shown.value), setattr(colours, "visible", shown.value))))
 
     def read(self, settings: Settings) -> Settings:
         """The settings, with what these controls say."""
