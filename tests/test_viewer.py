@@ -21,7 +21,7 @@ from splatting.camera_paths.keyframes import read_camera_path
 from splatting.exports.formats import read_splats
 from splatting.viewer import frusta, legend, path_tab, views
 from splatting.viewer.frames import LONGEST, Frame, Frames, inside, shown_part
-from splatting.viewer.page import write_crop
+from splatting.viewer.page import used_degree, write_crop
 from splatting.viewer.path_tab import PathTab
 from splatting.viewer.tabs import FileName, first_box
 from splatting.viewer.views import Pose, SceneCameras, Settings, canvas, fov_of_canvas, pose_of
@@ -150,6 +150,12 @@ def test_the_sh_degree_of_a_frame_is_not_that_of_the_model(gaussians):
     plain = drawn(gaussians, sh_degree=0)
     gaussians.active_sh_degree = 0
     np.testing.assert_array_equal(plain, rendered(gaussians))
+
+
+def test_bands_without_a_coefficient_are_not_offered(gaussians):
+    for degree, bands in ((3, 15), (2, 7), (1, 3), (0, 0)):
+        gaussians._features_rest.data[:, bands:] = 0
+        assert used_degree(gaussians) == degree
 
 
 @pytest.mark.parametrize("size", [(300, 100), (96, 64), (60, 200)])
@@ -379,6 +385,17 @@ def test_no_name_leads_out_of_the_folder(server, tmp_path, name):
         file.path()
     (tmp_path / "crop1.ply").touch()
     assert FileName(server, tmp_path, "crop", ".ply").path() == tmp_path / "crop2.ply"
+
+
+def test_the_next_file_gets_the_next_name_and_a_typed_name_stays(server, tmp_path):
+    file = FileName(server, tmp_path, "crop", ".ply")
+    file.path().touch()
+    assert file.replaced() == " (replaced)"
+    file.suggest()
+    assert file.path().name == "crop2.ply" and not file.replaced() and file.names() == ("crop1",)
+    file.field.value = "crop1"
+    file.suggest()
+    assert file.field.value == "crop1"
 
 
 def test_a_crop_is_written_as_any_program_reads_it(gaussians, tmp_path):

@@ -276,7 +276,7 @@ def test_neither_a_checkpoint_nor_a_frame_that_fails_ends_a_training(colmap_scen
     told = []
 
     def save(watched: Watched) -> None:
-        watched.page.notify = lambda title, body: told.append((title, body))
+        watched.page.notify = lambda title, body, color=None: told.append((title, color))
         watched.requests.save()
 
     def broken(*_: object) -> None:
@@ -288,7 +288,7 @@ def test_neither_a_checkpoint_nor_a_frame_that_fails_ends_a_training(colmap_scen
     expected = _train(colmap_scene, tmp_path / "alone", "--no_curve", viewer=False).read_bytes()
     assert _train(colmap_scene, tmp_path / "out", "--no_curve").read_bytes() == expected
     assert (tmp_path / "out/chkpnt20.pth").is_file() and watched.frames
-    assert [title for title, _ in told] == ["Not saved", "Saved", "The training is over"]
+    assert told == [("Not saved", "red"), ("Saved", None), ("The training is over", None)]
     said = capfd.readouterr().err
     assert "warning: cannot write" in said and said.count("no memory for a frame") == 1
 

@@ -61,11 +61,12 @@ class Page:
         self.iteration = gui.add_text("Iteration", str(scene.loaded_iter or 0), disabled=True)
         self.count = gui.add_text("Gaussians", f"{len(gaussians):,}", disabled=True)
         self.tabs = gui.add_tab_group()
-        positions, degree = gaussians.get_xyz, gaussians.max_sh_degree
+        # A training adds bands until its end; of a saved model those beyond its last one that is used are all zero.
+        degree = gaussians.max_sh_degree if scene.loaded_iter is None else used_degree(gaussians)
         with self.tabs.add_tab("View"):
             background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
             calls = self.watchers.changed, self.requests.crop
-            self.view = ViewTab(self.server, *calls, folder / CROPS, positions, degree, background)
+            self.view = ViewTab(self.server, *calls, folder / CROPS, gaussians.get_xyz, degree, background)
         with self.tabs.add_tab("Photos"):
             self.images = ImagesTab(self.server, self.watchers.changed, self._cameras)
         with self.tabs.add_tab("Path"):
@@ -146,28 +147,29 @@ class Page:
         """Show the iteration and the number of Gaussians."""
         self.iteration.value, self.count.value = f"{iteration:,}", f"{gaussians:,}"
 
-    def notify(self, title: str, body: str) -> None:
+    def notify(self, title: str, body: str, **look: Any) -> None:
         """Show a notification to all, and wait until it has probably been sent."""
         clients = self.server.get_clients().values()
         for client in clients:
-            self._notify(client, title, body)
+            self._notify(client, title, body, **look)
             client.flush()
         if clients:
             time.sleep(_SENT)
 
     def export_crop(self) -> None:
         """Write the Gaussians in the crop box into the model's folder. Called by the thread that changes the model."""
-        box = tuple(corner.value for corner in self.view.corners)
+        name = self.view.crop_file
         try:
-            file = self.view.crop_file.path()
-            count = write_crop(file, self._gaussians, box, self._antialiasing)
+            file, replaced = name.path(), name.replaced()
+            count = write_crop(file, self._gaussians, self.view.corners(), self._antialiasing)
         except Exception as error:  # as for a frame; a full disk
             tqdm.write(f"warning: the crop is not exported ({first_line(error)})", file=sys.stderr)
-            self.notify("Not exported", first_line(error))
+            self.notify("Not exported", first_line(error), color="red")
         else:
             what = f"{count:,} of {len(self._gaussians):,} Gaussians"
-            tqdm.write(as_utf8(f"Exported {what} to {file}"), file=sys.stdout)
-            self.notify("Exported", f"{what}: {CROPS}/{file.name}")
+            tqdm.write(as_utf8(f"Exported {what} to {file}{replaced}"), file=sys.stdout)
+            self.notify("Exported", f"{what}: {CROPS}/{file.name}{replaced}")
+            name.suggest()
 
     def _save_path(self, client: "viser.ClientHandle | None", folder: Path) -> None:
         try:
@@ -182,6 +184,12 @@ class Page:
     def stop(self) -> None:
         """Stop to listen."""
         servers.stop(self.server)
+
+
+def used_degree(gaussians: GaussianModel) -> int:
+    """The highest SH degree of which a coefficient is not zero."""
+    used = gaussians.get_features_rest.detach().any(0).any(1).nonzero()
+    return int((int(used.max()) + 1) ** 0.5) if len(used) else 0
 
 
 def write_crop(path: Path, gaussians: GaussianModel, box: tuple[Vector, Vector], antialiasing: bool) -> int:

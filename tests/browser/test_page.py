@@ -135,10 +135,9 @@ def test_every_kind_of_control_is_heard(tab, training):
     assert [keyframe["seconds"] for keyframe in json.loads(path.read_text())["keyframes"]] == [0, 3]
     tab.get_by_role("tab", name="View").click()
     tab.get_by_role("checkbox", name="Crop box").click()
-    _type(tab, "Corner 1", "900")
+    _type(tab, "x from, to", "900")
     _type(tab, "Background", "rgb(250, 0, 0)")
-    # Now the box is far away, and what is outside of it is not drawn.
-    _type(tab, "Corner 2", "901")
+    # Now the box is beside the Gaussians, and what is outside of it is not drawn.
     red = np.array([250, 0, 0])
     _until(lambda: abs(np.median(_picture(tab)[150:], (0, 1)) - red).max() < 5, "the crop box was not heard")
     tab.get_by_role("button", name="Reset").click()

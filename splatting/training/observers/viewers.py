@@ -108,7 +108,7 @@ class PageObserver(Observer):
             if not isinstance(error.__cause__, OSError):  # such as a loss that is not finite
                 raise
             tqdm.write(f"warning: {error}", file=sys.stderr)
-            self._page.notify("Not saved", str(error))
+            self._page.notify("Not saved", str(error), color="red")
         else:
             self._page.notify("Saved", f"chkpnt{step.iteration}.pth")
 
