@@ -1,5 +1,6 @@
 """The viewer's frames, and when they are drawn: no server, no browser."""
 
+import asyncio
 import contextlib
 import math
 from dataclasses import replace
@@ -318,19 +319,19 @@ class Gui:
 
 @pytest.fixture
 def server() -> SimpleNamespace:
-    return SimpleNamespace(gui=Gui())
+    return SimpleNamespace(gui=Gui(), get_clients=lambda: {7: "a browser"})
 
 
 @pytest.fixture
 def recorded(server, tmp_path, scene_cameras) -> PathTab:
-    tab = PathTab(server, tmp_path / "paths", scene_cameras)
+    tab = PathTab(server, tmp_path / "paths", scene_cameras, lambda client, error: None)
     tab.easing.value = "smooth"
     return tab
 
 
 def _client(**changes: object) -> SimpleNamespace:
     camera = {"position": [1, 2, 3], "wxyz": [0, 1, 0, 0], "fov": 1.0, "image_width": 4, "image_height": 3}
-    return SimpleNamespace(camera=SimpleNamespace(**camera | changes), atomic=contextlib.nullcontext)
+    return SimpleNamespace(camera=SimpleNamespace(**camera | changes), atomic=contextlib.nullcontext, client_id=7)
 
 
 def test_a_recorded_path_is_read_by_what_renders_it(recorded, tmp_path):
@@ -346,9 +347,19 @@ def test_a_recorded_path_is_read_by_what_renders_it(recorded, tmp_path):
     assert [frame.position for frame in path.keyframes] == [(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)]
     assert math.isclose(path.keyframes[0].fov, math.degrees(1.0)) and path.keyframes[0].wxyz == (0.0, 1.0, 0.0, 0.0)
     assert [file.name for file in tmp_path.rglob("*.json")] == ["fly_1-a.json"]
+    (tmp_path / "paths/a b.json").touch()  # a name that the page does not take
+    recorded.list_files()
+    recorded.keyframes, recorded.easing.value, recorded.file.field.value = [], "linear", "other"
+    recorded.files.value = recorded.files.options[0]  # as viser does by itself
+    recorded.open(client := _client())
+    assert tuple(recorded.keyframes) == path.keyframes and recorded.easing.value == "smooth"
+    assert recorded.files.options == ("fly_1-a",) == (recorded.file.field.value,) and client.camera.position[0] == 1
 
 
 def test_keyframes_are_listed_gone_to_and_deleted_anywhere(recorded, monkeypatch):
+    for call in (recorded.go, recorded.delete, recorded.open):
+        with pytest.raises(UserError, match="no keyframe is chosen|no such path"):
+            call(_client())
     for x in (1.0, 2.0, 3.0, 4.0):
         recorded.add(_client(position=[x, 0, 0]))
     assert recorded.chosen.options == ("1: at 0 s", "2: at 2 s", "3: at 4 s", "4: at 6 s")
@@ -360,20 +371,47 @@ def test_keyframes_are_listed_gone_to_and_deleted_anywhere(recorded, monkeypatch
     for chosen, options, places in (
         ("2: at 2 s", ("1: at 0 s", "2: at 4 s", "3: at 6 s"), [1, 3, 4]),
         ("1: at 0 s", ("1: at 0 s", "2: at 2 s"), [3, 4]),  # a path begins at 0
-        ("no such", ("1: at 0 s", "2: at 2 s"), [3, 4]),
         ("2: at 2 s", ("1: at 0 s",), [3]),
         ("1: at 0 s", ("none yet",), []),
-        ("none yet", ("none yet",), []),
     ):
         recorded.chosen.value = chosen
-        recorded.delete()
-        assert recorded.chosen.options == options and recorded.chosen.value in (*options, "no such")
+        recorded.delete(client := _client())
+        assert recorded.chosen.options == options and recorded.chosen.value in options
         assert [key.position[0] for key in recorded.keyframes] == places
-    recorded.go(_client())
+        there = places[options.index(recorded.chosen.value)] if places else 1  # where it was
+        assert client.camera.position[0] == there, "the picture is not that of the chosen keyframe"
     monkeypatch.setattr(path_tab, "_MOST", 3)
-    for _ in range(5):
+    for _ in range(3):
+        recorded.add(_client())
+    with pytest.raises(UserError, match="at most 3 keyframes"):
         recorded.add(_client())
     assert len(recorded.keyframes) == 3
+
+
+def test_a_path_is_played_in_its_time_and_stopped(recorded, monkeypatch):
+    clock = SimpleNamespace(now=5.0)
+    monkeypatch.setattr(path_tab, "time", SimpleNamespace(perf_counter=lambda: clock.now))
+    monkeypatch.setattr(path_tab, "_BETWEEN", 0.0)
+    for x in (1.0, 3.0):
+        recorded.add(_client(position=[x, 0, 0]))
+    recorded.easing.value = "linear"
+
+    async def play(stopped_after: int) -> list[float]:
+        recorded.turn(client := _client())
+        places = []
+        while recorded.play.label == "Stop":
+            await asyncio.sleep(0)  # a step of the path
+            places.append(float(client.camera.position[0]))
+            clock.now += 0.5
+            if len(places) == stopped_after:
+                recorded.turn(client)
+        return places
+
+    assert sorted({*asyncio.run(play(stopped_after=99))}) == [1.0, 1.5, 2.0, 2.5, 3.0]
+    assert max(asyncio.run(play(stopped_after=3))) < 3.0 and recorded.play.label == "Play"
+    recorded.keyframes.pop()
+    with pytest.raises(UserError, match="at least 2 keyframes"):
+        asyncio.run(play(99))
 
 
 @pytest.mark.parametrize("name", ["", "..", "../a", "a/b", "a\\b", "/etc/x", "a.json", "a\0b", "ä", "a\n", "x" * 65])

@@ -595,3 +595,17 @@ def test_cameras_near_a_browser_are_not_drawn_and_a_click_on_another_leads_there
         wait_for(lambda: page.images.camera.value == list(cameras)[2])
         page.images.camera.value = next(iter(cameras))
     wait_for(lambda: not frusta._drawn)
+
+
+def test_a_path_is_saved_with_the_command_of_its_video_and_what_fails_is_red(page, capfd):
+    with Client(page.url) as client, _restored(page):
+        client.look(size=(121, 80))
+        _set(client, page.path.saved, True)
+        told = client.until("NotificationShowMessage")["props"]
+        assert told["color"] == "red" and "at least 2 keyframes" in told["body"]
+        for number in (1, 2):
+            _set(client, _button(page, "Add this view"), True)
+            wait_for(lambda number=number: len(page.path.keyframes) == number)
+        _set(client, page.path.saved, True)
+        assert client.until("NotificationShowMessage")["props"]["title"] == "Saved"
+    assert capfd.readouterr().out.strip().endswith("camera_paths/path1.json' --size 120 80")

@@ -1,6 +1,7 @@
 """The page: its server, its tabs and the browsers that watch."""
 
 import argparse
+import shlex
 import sys
 import time
 from pathlib import Path
@@ -23,7 +24,7 @@ from splatting.viewer.path_tab import PathTab
 from splatting.viewer.server import Address
 from splatting.viewer.tabs import ImagesTab, ViewTab, serialized
 from splatting.viewer.training_tab import Requests
-from splatting.viewer.views import SceneCameras, Settings, Vector, as_utf8, pose_of
+from splatting.viewer.views import SceneCameras, Settings, Vector, as_utf8, pose_of, window_of
 from splatting.viewer.watchers import Watchers, Wish
 from utils.system_utils import UserError, first_line
 
@@ -70,8 +71,8 @@ class Page:
         with self.tabs.add_tab("Photos"):
             self.images = ImagesTab(self.server, self.watchers.changed, self._cameras)
         with self.tabs.add_tab("Path"):
-            self.path = PathTab(self.server, folder / PATHS, self._cameras)
-        self.path.saved.on_click(serialized(lambda event: self._save_path(event.client, folder)))
+            self.path = PathTab(self.server, folder / PATHS, self._cameras, self._refuse)
+        self.path.saved.on_click(serialized(lambda event: self._save_path(event.client, folder), self._refuse))
         self.server.scene.set_up_direction(tuple(self._cameras.up.tolist()))
         self.server.initial_camera.near = 1e-3 * self._cameras.size
         self.server.initial_camera.far = 1e3 * self._cameras.size
@@ -86,6 +87,7 @@ class Page:
                 self.watchers.moved(client.client_id, pose)
                 self.images.frusta.moved(client)
 
+        self.path.list_files()
         self._legends[client.client_id] = client.gui.add_html("", order=self.count.order + 0.5, visible=False)
         self.images.frusta.came(client)
         await moved(client.camera)
@@ -125,6 +127,9 @@ class Page:
             image = image.repeat(2, axis=0).repeat(2, axis=1)  # JPEG halves the resolution of colours
         quality = _COARSE_QUALITY if coarse else _FULL_QUALITY
         client.scene.set_background_image(image, "jpeg", jpeg_quality=quality)
+
+    def _refuse(self, client: "viser.ClientHandle", error: UserError) -> None:
+        self._notify(client, "Not done", str(error), color="red")
 
     def _explain(self, client: int, legend: Legend) -> None:
         shown, text = self._legends.get(client), legend.html()
@@ -171,18 +176,16 @@ class Page:
             self.notify("Exported", f"{what}: {CROPS}/{file.name}{replaced}")
             name.suggest()
 
-    def _save_path(self, client: "viser.ClientHandle | None", folder: Path) -> None:
-        try:
-            file = self.path.save()
-        except UserError as error:
-            self._notify(client, "Not saved", str(error))
-        else:
-            video = f"{typed_command('render.py')} -m {folder} --path {file}"
-            tqdm.write(as_utf8(f"Saved {file}; its video: {video}"), file=sys.stdout)
-            self._notify(client, "Saved", f"{PATHS}/{file.name}; the terminal shows how to make its video")
+    def _save_path(self, client: "viser.ClientHandle", folder: Path) -> None:
+        replaced, file = self.path.file.replaced(), self.path.save()
+        size = (max(2, side - side % 2) for side in window_of(client.camera))
+        words = shlex.join(map(str, ("-m", folder, "--path", file, "--size", *size)))
+        tqdm.write(as_utf8(f"Saved {file}{replaced}; its video: {typed_command('render.py')} {words}"), file=sys.stdout)
+        self._notify(client, "Saved", f"{PATHS}/{file.name}{replaced}; the terminal shows how to make its video")
 
     def stop(self) -> None:
         """Stop to listen."""
+        self.path.stop()
         servers.stop(self.server)
 
 

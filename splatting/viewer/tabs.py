@@ -25,11 +25,22 @@ _OUTLIERS = 0.02  # quantile of the positions at which the crop box begins
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
-def serialized(call: Callable[[Any], object]) -> Callable[[Any], Any]:
-    """A coroutine for a call, because viser runs those one after the other, and plain functions in many threads."""
+Tell = Callable[["viser.ClientHandle", UserError], None]
+
+
+def serialized(call: Callable[[Any], object], tell: Tell | None = None) -> Callable[[Any], Any]:
+    """A coroutine for a call, because viser runs those one after the other, and plain functions in many threads.
+
+    tell: called with the browser and a UserError of the call.
+    """
 
     async def called(event: Any) -> None:
-        call(event)
+        try:
+            call(event)
+        except UserError as error:
+            if tell is None:
+                raise
+            tell(event.client, error)
 
     return called
 

@@ -121,7 +121,7 @@ def test_every_kind_of_control_is_heard(tab, training):
     address, scene = training
     _open(tab, address)
     tab.get_by_role("tab", name="Path").click()
-    _type(tab, "Seconds to next keyframe", "3")
+    _type(tab, "Seconds from previous keyframe", "3")
     _type(tab, "Name", "typed")
     keyframes = tab.get_by_role("combobox", name="Keyframes")
     for listed in ("1: at 0 s", "2: at 3 s"):
@@ -133,6 +133,9 @@ def test_every_kind_of_control_is_heard(tab, training):
     path = scene.parent / "out/camera_paths/typed.json"
     _until(path.is_file, "the path was not saved")
     assert [keyframe["seconds"] for keyframe in json.loads(path.read_text())["keyframes"]] == [0, 3]
+    tab.get_by_role("button", name="Play").click()
+    tab.get_by_role("button", name="Stop", exact=True).wait_for()
+    tab.get_by_role("button", name="Play").wait_for(timeout=1000 * SECONDS)
     tab.get_by_role("tab", name="View").click()
     tab.get_by_role("checkbox", name="Crop box").click()
     _type(tab, "x from, to", "900")
