@@ -22,13 +22,21 @@ from utils.system_utils import (
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def test_run_cli_says_one_line_and_exits(capsys):
-    def fails() -> None:
-        raise UserError("fix it like this")
+def _raise(error: BaseException) -> None:
+    raise error
 
+
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [
+        (UserError("fix it like this"), 2, "error: fix it like this\n"),
+        (KeyboardInterrupt("stopped from the page"), 130, "stopped from the page\n"),
+    ],
+)
+def test_run_cli_says_one_line_and_exits(error, status, said, capsys):
     with pytest.raises(SystemExit) as exit_info:
-        run_cli(fails)
-    assert exit_info.value.code == 2 and capsys.readouterr() == ("", "error: fix it like this\n")
+        run_cli(lambda: _raise(error))
+    assert exit_info.value.code == status and capsys.readouterr() == ("", said)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """The viewer's frames, and when they are drawn: no server, no browser."""
 
+import asyncio
 import contextlib
 import math
 from dataclasses import replace
@@ -21,7 +22,7 @@ from splatting.camera_paths.keyframes import read_camera_path
 from splatting.exports.formats import read_splats
 from splatting.viewer import frusta, legend, path_tab, views
 from splatting.viewer.frames import LONGEST, Frame, Frames, inside, shown_part
-from splatting.viewer.page import write_crop
+from splatting.viewer.page import used_degree, write_crop
 from splatting.viewer.path_tab import PathTab
 from splatting.viewer.tabs import FileName, first_box
 from splatting.viewer.views import Pose, SceneCameras, Settings, canvas, fov_of_canvas, pose_of
@@ -124,7 +125,8 @@ def test_a_frame_that_lacks_its_photo_says_so(gaussians, scene_cameras):
     ):
         there = frame(gaussians, at(camera), scene_cameras, camera=name, **settings).legend
         away = frame(gaussians, FRONT, scene_cameras, camera=name, **settings).legend
-        assert not there.warning and "No photo was taken from here" in away.html()
+        assert not there.warning and "No photo was taken from here" in away.html() and not away.sides
+        assert ("Photo left of the line" in there.html()) == ("comparison" in settings)
         assert away.numbers == () or settings["mode"] == views.DEPTH
     assert frame(gaussians, at(camera), scene_cameras, camera=name, mode=views.ERROR).legend.numbers[-1] == 51
     assert not frame(gaussians, FRONT, scene_cameras, camera=name).legend.html()
@@ -149,6 +151,12 @@ def test_the_sh_degree_of_a_frame_is_not_that_of_the_model(gaussians):
     plain = drawn(gaussians, sh_degree=0)
     gaussians.active_sh_degree = 0
     np.testing.assert_array_equal(plain, rendered(gaussians))
+
+
+def test_bands_without_a_coefficient_are_not_offered(gaussians):
+    for degree, bands in ((3, 15), (2, 7), (1, 3), (0, 0)):
+        gaussians._features_rest.data[:, bands:] = 0
+        assert used_degree(gaussians) == degree
 
 
 @pytest.mark.parametrize("size", [(300, 100), (96, 64), (60, 200)])
@@ -177,6 +185,9 @@ def test_side_by_side_are_image_render_and_error(gaussians, scene_cameras):
     top, left = (shown.shape[0] - 64) // 2, (shown.shape[1] - 3 * 96) // 2
     target, image, error = np.split(shown[top : top + 64, left : left + 3 * 96], 3, axis=1)
     assert abs(error - np.minimum(abs(target - image) * 5, 255)).max() <= 4  # rounded before the difference
+    for mode, sides in ((views.COLOUR, "photo, render, error"), (views.DEPTH, "photo, render")):
+        words = frame(gaussians, at(camera), scene_cameras, camera=name, comparison=views.BESIDE, mode=mode).legend
+        assert f"left: {sides}</div>" in words.html()
     alone = drawn(gaussians, at(camera), scene_cameras, camera=name, mode=views.ERROR).astype(int)
     assert abs(alone[:64, (alone.shape[1] - 96) // 2 :][:, :96] - error).max() <= 1
 
@@ -308,19 +319,19 @@ class Gui:
 
 @pytest.fixture
 def server() -> SimpleNamespace:
-    return SimpleNamespace(gui=Gui())
+    return SimpleNamespace(gui=Gui(), get_clients=lambda: {7: "a browser"})
 
 
 @pytest.fixture
 def recorded(server, tmp_path, scene_cameras) -> PathTab:
-    tab = PathTab(server, tmp_path / "paths", scene_cameras)
+    tab = PathTab(server, tmp_path / "paths", scene_cameras, lambda client, error: None)
     tab.easing.value = "smooth"
     return tab
 
 
 def _client(**changes: object) -> SimpleNamespace:
     camera = {"position": [1, 2, 3], "wxyz": [0, 1, 0, 0], "fov": 1.0, "image_width": 4, "image_height": 3}
-    return SimpleNamespace(camera=SimpleNamespace(**camera | changes), atomic=contextlib.nullcontext)
+    return SimpleNamespace(camera=SimpleNamespace(**camera | changes), atomic=contextlib.nullcontext, client_id=7)
 
 
 def test_a_recorded_path_is_read_by_what_renders_it(recorded, tmp_path):
@@ -336,9 +347,19 @@ def test_a_recorded_path_is_read_by_what_renders_it(recorded, tmp_path):
     assert [frame.position for frame in path.keyframes] == [(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)]
     assert math.isclose(path.keyframes[0].fov, math.degrees(1.0)) and path.keyframes[0].wxyz == (0.0, 1.0, 0.0, 0.0)
     assert [file.name for file in tmp_path.rglob("*.json")] == ["fly_1-a.json"]
+    (tmp_path / "paths/a b.json").touch()  # a name that the page does not take
+    recorded.list_files()
+    recorded.keyframes, recorded.easing.value, recorded.file.field.value = [], "linear", "other"
+    recorded.files.value = recorded.files.options[0]  # as viser does by itself
+    recorded.open(client := _client())
+    assert tuple(recorded.keyframes) == path.keyframes and recorded.easing.value == "smooth"
+    assert recorded.files.options == ("fly_1-a",) == (recorded.file.field.value,) and client.camera.position[0] == 1
 
 
 def test_keyframes_are_listed_gone_to_and_deleted_anywhere(recorded, monkeypatch):
+    for call in (recorded.go, recorded.delete, recorded.open):
+        with pytest.raises(UserError, match="no keyframe is chosen|no such path"):
+            call(_client())
     for x in (1.0, 2.0, 3.0, 4.0):
         recorded.add(_client(position=[x, 0, 0]))
     assert recorded.chosen.options == ("1: at 0 s", "2: at 2 s", "3: at 4 s", "4: at 6 s")
@@ -350,20 +371,47 @@ def test_keyframes_are_listed_gone_to_and_deleted_anywhere(recorded, monkeypatch
     for chosen, options, places in (
         ("2: at 2 s", ("1: at 0 s", "2: at 4 s", "3: at 6 s"), [1, 3, 4]),
         ("1: at 0 s", ("1: at 0 s", "2: at 2 s"), [3, 4]),  # a path begins at 0
-        ("no such", ("1: at 0 s", "2: at 2 s"), [3, 4]),
         ("2: at 2 s", ("1: at 0 s",), [3]),
         ("1: at 0 s", ("none yet",), []),
-        ("none yet", ("none yet",), []),
     ):
         recorded.chosen.value = chosen
-        recorded.delete()
-        assert recorded.chosen.options == options and recorded.chosen.value in (*options, "no such")
+        recorded.delete(client := _client())
+        assert recorded.chosen.options == options and recorded.chosen.value in options
         assert [key.position[0] for key in recorded.keyframes] == places
-    recorded.go(_client())
+        there = places[options.index(recorded.chosen.value)] if places else 1  # where it was
+        assert client.camera.position[0] == there, "the picture is not that of the chosen keyframe"
     monkeypatch.setattr(path_tab, "_MOST", 3)
-    for _ in range(5):
+    for _ in range(3):
+        recorded.add(_client())
+    with pytest.raises(UserError, match="at most 3 keyframes"):
         recorded.add(_client())
     assert len(recorded.keyframes) == 3
+
+
+def test_a_path_is_played_in_its_time_and_stopped(recorded, monkeypatch):
+    clock = SimpleNamespace(now=5.0)
+    monkeypatch.setattr(path_tab, "time", SimpleNamespace(perf_counter=lambda: clock.now))
+    monkeypatch.setattr(path_tab, "_BETWEEN", 0.0)
+    for x in (1.0, 3.0):
+        recorded.add(_client(position=[x, 0, 0]))
+    recorded.easing.value = "linear"
+
+    async def play(stopped_after: int) -> list[float]:
+        recorded.turn(client := _client())
+        places = []
+        while recorded.play.label == "Stop":
+            await asyncio.sleep(0)  # a step of the path
+            places.append(float(client.camera.position[0]))
+            clock.now += 0.5
+            if len(places) == stopped_after:
+                recorded.turn(client)
+        return places
+
+    assert sorted({*asyncio.run(play(stopped_after=99))}) == [1.0, 1.5, 2.0, 2.5, 3.0]
+    assert max(asyncio.run(play(stopped_after=3))) < 3.0 and recorded.play.label == "Play"
+    recorded.keyframes.pop()
+    with pytest.raises(UserError, match="at least 2 keyframes"):
+        asyncio.run(play(99))
 
 
 @pytest.mark.parametrize("name", ["", "..", "../a", "a/b", "a\\b", "/etc/x", "a.json", "a\0b", "ä", "a\n", "x" * 65])
@@ -375,6 +423,17 @@ def test_no_name_leads_out_of_the_folder(server, tmp_path, name):
         file.path()
     (tmp_path / "crop1.ply").touch()
     assert FileName(server, tmp_path, "crop", ".ply").path() == tmp_path / "crop2.ply"
+
+
+def test_the_next_file_gets_the_next_name_and_a_typed_name_stays(server, tmp_path):
+    file = FileName(server, tmp_path, "crop", ".ply")
+    file.path().touch()
+    assert file.replaced() == " (replaced)"
+    file.suggest()
+    assert file.path().name == "crop2.ply" and not file.replaced() and file.names() == ("crop1",)
+    file.field.value = "crop1"
+    file.suggest()
+    assert file.field.value == "crop1"
 
 
 def test_a_crop_is_written_as_any_program_reads_it(gaussians, tmp_path):

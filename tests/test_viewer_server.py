@@ -427,18 +427,18 @@ def test_a_browser_of_any_window_and_place_goes_to_a_camera(page, capfd, wrong):
 
 
 def test_a_crop_box_that_many_drag_is_drawn_once(page, capfd):
-    crop, corner = page.view.crop, page.view.corners[0]
+    crop, ends = page.view.crop, page.view.box[0]
     with Client(page.url) as one, Client(page.url) as other:
         for client in (one, other):
             client.look()
         for step in range(200):
             _set(one, crop, step % 2 == 0)
-            _set(other, corner, [-float(step + 1), -1.0, -1.0])
-        wait_for(lambda: corner.value[0] == -200.0 and not crop.value)
+            _set(other, ends, [-float(step + 1), -1.0])
+        wait_for(lambda: ends.value[0] == -200.0 and not crop.value)
         _set(one, crop, True)
-        wait_for(lambda: page.view._box is not None)
+        wait_for(lambda: page.view._edges is not None)
         _set(one, crop, False)
-        wait_for(lambda: page.view._box is None)
+        wait_for(lambda: page.view._edges is None)
     assert "/crop box" not in page.server.scene._handle_from_node_name
     assert "rror" not in capfd.readouterr().err
 
@@ -527,10 +527,10 @@ def test_a_crop_is_written_into_the_models_folder_and_nowhere_else(page, capfd):
     view, folder = page.view, page.view.crop_file.folder
     with Client(page.url) as client, _restored(page):
         client.look()
-        for name in ("../../outside", "mine"):  # test_viewer.py has more names
+        for name, replaced in (("../../outside", False), ("mine", False), ("mine", True)):  # test_viewer.py has more
             _set(client, view.crop_file.field, name)
-            _set(client, view.corners[0], [-0.5, -0.5, -0.5])
-            _set(client, view.corners[1], [0.5, 0.5, 0.5])
+            for ends in view.box:
+                _set(client, ends, [-0.5, 0.5])
             _set(client, _button(page, "Export the crop"), True)
             wait_for(lambda: page.requests.any)
             assert view.crop_file.field.value == name
@@ -538,6 +538,7 @@ def test_a_crop_is_written_into_the_models_folder_and_nowhere_else(page, capfd):
             assert not page.requests.any
             heard = client.until("NotificationShowMessage")["props"]
             assert heard["title"] == ("Exported" if name == "mine" else "Not exported")
+            assert heard["color"] == (None if name == "mine" else "red") and heard["body"].endswith(")") == replaced
             assert 0 < heard["auto_close_seconds"] < 60  # so that messages do not pile up
     assert folder.parent.name == "a\udcff" and [file.name for file in folder.iterdir()] == ["mine.ply"]
     assert not list(folder.parent.parent.rglob("outside*"))
@@ -548,13 +549,13 @@ def test_a_crop_is_written_into_the_models_folder_and_nowhere_else(page, capfd):
 def test_reset_gives_the_view_its_first_values(page):
     view, first = page.view, Settings(sh_degree=3)
     view.mode.value, view.scaling.value, view.background.value = "Depth", 0.3, (9, 9, 9)
-    view.crop.value, view.corners[0].value = True, (7.0, 7.0, 7.0)
+    view.crop.value, view.box[0].value = True, (7.0, 7.0)
     wait_for(lambda: view.crop_file.field.visible)
     with Client(page.url) as client:
         client.look()
         _set(client, _button(page, "Reset"), True)
         wait_for(lambda: view.read() == first and not view.crop_file.field.visible)
-    assert tuple(corner.value for corner in view.corners) == first_box(page._gaussians.get_xyz)
+    assert view.corners() == first_box(page._gaussians.get_xyz)
 
 
 def test_browsers_begin_at_the_chosen_camera_and_render_alone_leads_nowhere(page):
@@ -594,3 +595,17 @@ def test_cameras_near_a_browser_are_not_drawn_and_a_click_on_another_leads_there
         wait_for(lambda: page.images.camera.value == list(cameras)[2])
         page.images.camera.value = next(iter(cameras))
     wait_for(lambda: not frusta._drawn)
+
+
+def test_a_path_is_saved_with_the_command_of_its_video_and_what_fails_is_red(page, capfd):
+    with Client(page.url) as client, _restored(page):
+        client.look(size=(121, 80))
+        _set(client, page.path.saved, True)
+        told = client.until("NotificationShowMessage")["props"]
+        assert told["color"] == "red" and "at least 2 keyframes" in told["body"]
+        for number in (1, 2):
+            _set(client, _button(page, "Add this view"), True)
+            wait_for(lambda number=number: len(page.path.keyframes) == number)
+        _set(client, page.path.saved, True)
+        assert client.until("NotificationShowMessage")["props"]["title"] == "Saved"
+    assert capfd.readouterr().out.strip().endswith("camera_paths/path1.json' --size 120 80")

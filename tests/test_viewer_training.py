@@ -22,6 +22,7 @@ import train  # noqa: E402
 from scene.gaussians.checkpoint import load_checkpoint  # noqa: E402
 from scene.saved_model import read_model  # noqa: E402
 from splatting.training.observers import viewers as observed  # noqa: E402
+from splatting.viewer import training_tab  # noqa: E402
 from splatting.viewer.page import serve  # noqa: E402
 from utils.system_utils import UserError  # noqa: E402
 
@@ -95,7 +96,7 @@ class Watched:
 def _train(scene: Path, out: Path, *options: object, viewer: bool = True, stays: bool = False) -> Path:
     words = ["-s", scene, "-m", out, "-r", 24, "--iterations", ITERATIONS, "--eval", "--densify_from_iter", 20,
              "--densification_interval", 20, "--densify_grad_threshold", 1e-6, *options]  # fmt: skip
-    train.main([*map(str, words), *(["--viewer", "0"] if viewer else []), *(["--viewer_exit"] * (not stays))])
+    train.main([*map(str, words), *(["--viewer", "0", *(["--viewer_exit"] * (not stays))] if viewer else [])])
     return out / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply"
 
 
@@ -241,9 +242,10 @@ def test_the_page_stays_after_its_training_and_shows_the_saved_model(colmap_scen
 
 def test_a_training_that_the_page_stops_can_be_looked_at_and_resumed(colmap_scene, tmp_path, monkeypatch, capfd):
     watched = _Staying(monkeypatch, {33: lambda w: w.requests.stop()}, _Staying.look_and_close)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt, match="stopped from the page"):
         _train(colmap_scene, tmp_path / "out", "--no_curve", stays=True)
     assert watched.seen[0].std() > 5 and watched.page.iteration.value == "33"
+    assert f"saved as {tmp_path / 'out/chkpnt33.pth'}" in watched.observer._tab.state.content
     assert load_checkpoint(str(tmp_path / "out/chkpnt33.pth"), "cpu")[1] == 33
     assert "with --start_checkpoint" in capfd.readouterr().err
     resumed = _train(colmap_scene, tmp_path / "out", "--start_checkpoint", tmp_path / "out/chkpnt33.pth", viewer=False)
@@ -274,7 +276,7 @@ def test_neither_a_checkpoint_nor_a_frame_that_fails_ends_a_training(colmap_scen
     told = []
 
     def save(watched: Watched) -> None:
-        watched.page.notify = lambda title, body: told.append((title, body))
+        watched.page.notify = lambda title, body, color=None: told.append((title, color))
         watched.requests.save()
 
     def broken(*_: object) -> None:
@@ -286,9 +288,21 @@ def test_neither_a_checkpoint_nor_a_frame_that_fails_ends_a_training(colmap_scen
     expected = _train(colmap_scene, tmp_path / "alone", "--no_curve", viewer=False).read_bytes()
     assert _train(colmap_scene, tmp_path / "out", "--no_curve").read_bytes() == expected
     assert (tmp_path / "out/chkpnt20.pth").is_file() and watched.frames
-    assert [title for title, _ in told] == ["Not saved", "Saved", "The training is over"]
+    assert told == [("Not saved", "red"), ("Saved", None), ("The training is over", None)]
     said = capfd.readouterr().err
     assert "warning: cannot write" in said and said.count("no memory for a frame") == 1
+
+
+def test_points_of_some_test_views_are_called_so():
+    rows = [{"subset": 4, "estimated": None}, {"subset": 4, "estimated": 1}, {"subset": None, "estimated": None}]
+    scored, estimated = "2 of 4 points are scores of some test views.", "1 of 4 points are estimates from scores of"
+    text = training_tab._of_some_views([rows[0], *rows])
+    assert text.startswith(f"{scored} {estimated}") and training_tab._of_some_views(rows[2:]) == ""
+
+
+def test_viewer_exit_without_a_page_is_refused():
+    with pytest.raises(UserError, match="--viewer_exit closes the page of --viewer"):
+        train.parse(["-s", "scene", "--viewer_exit"])
 
 
 def test_a_wrong_address_is_refused_before_a_file_is_written(colmap_scene, tmp_path):

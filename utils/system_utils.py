@@ -108,8 +108,8 @@ def _outcome(main: Callable[[], object]) -> tuple[int, str]:
         return 2, f"{reason}; lower --resolution (-r), or free memory that other programs use"
     except Terminated:
         return 143, "terminated"
-    except KeyboardInterrupt:
-        return 130, "interrupted"
+    except KeyboardInterrupt as error:
+        return 130, str(error) or "interrupted"
     return 0, ""
 
 

@@ -29,7 +29,7 @@ class Iteration:
     read: bool = False  # an observer reads the model
     record: dict[str, float] | None = None  # what train_log.json gets of this iteration; None: no record
     scored_at: float | None = None  # seconds of training when the curve scored it, for all records of the same score
-    stopping: type[KeyboardInterrupt] | None = None  # raised once the step is complete
+    stopping: type[KeyboardInterrupt] | KeyboardInterrupt | None = None  # raised once the step is complete
 
     def takes(self, planned: Collection[int]) -> bool:
         """Whether what is planned for an iteration of the schedule is to be done in it."""

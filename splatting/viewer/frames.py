@@ -67,7 +67,8 @@ class Frames:
             target = as_float(camera.target(self._background(settings)))
             self._compared = key, (target, *self._image(settings, camera, target))
         target, image, words = self._compared[1]
-        return Frame(to_bytes(_fitted(_composed(settings, target, image), pose)).numpy(), words)
+        shown = to_bytes(_fitted(_composed(settings, target, image), pose)).numpy()
+        return Frame(shown, words._replace(sides=_sides(settings)))
 
     def compared(self, settings: Settings, pose: Pose) -> Camera | None:
         """The scene's camera whose target this frame shows, None: no target."""
@@ -97,6 +98,13 @@ class Frames:
 
 def _needs_photo(settings: Settings) -> bool:
     return settings.comparison != views.ALONE or settings.mode == views.ERROR
+
+
+def _sides(settings: Settings) -> str:
+    """Which of the images of `_composed` is where."""
+    error = ", error" if settings.mode == views.COLOUR else ""
+    sides = {views.SLIDER: "Photo left of the line, render right", views.BESIDE: f"From the left: photo, render{error}"}
+    return sides.get(settings.comparison, "")
 
 
 def _composed(settings: Settings, target: Tensor, image: Tensor) -> Tensor:

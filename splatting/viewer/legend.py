@@ -17,17 +17,18 @@ _TICKS = (0.0, 0.25, 0.5, 0.75, 1.0)  # places on a scale that get a number
 class Legend(NamedTuple):
     """title: what the colours mean. numbers: along the scale, from its dark to its bright end. stops: its colours.
 
-    warning: what the frame lacks.
+    warning: what the frame lacks. sides: which image is where.
     """
 
     title: str = ""
     numbers: tuple[float, ...] = ()
     stops: tuple[tuple[float, float, float], ...] = _STOPS
     warning: str = ""
+    sides: str = ""
 
     def html(self) -> str:
         """What the page shows; empty if there is nothing to say."""
-        parts = [text for text in (self.warning, self.title) if text]
+        parts = [text for text in (self.warning, self.sides, self.title) if text]
         if self.numbers:
             colours = ", ".join(f"rgb({', '.join(f'{100 * x:g}%' for x in stop)})" for stop in self.stops)
             parts.append(f'<div style="height:0.8em;background:linear-gradient(to right, {colours})"></div>')
@@ -79,5 +80,5 @@ def error_image(target: Tensor, render: Tensor) -> Tensor:
 
 
 ERROR_SCALE = Legend(
-    "Difference of photo and render, of 255", tuple(255 / ERROR_GAIN * tick for tick in _TICKS), _GREYS
+    "Difference of photo and render in each colour, of 255", tuple(255 / ERROR_GAIN * tick for tick in _TICKS), _GREYS
 )

@@ -1,6 +1,7 @@
 """The page: its server, its tabs and the browsers that watch."""
 
 import argparse
+import shlex
 import sys
 import time
 from pathlib import Path
@@ -23,7 +24,7 @@ from splatting.viewer.path_tab import PathTab
 from splatting.viewer.server import Address
 from splatting.viewer.tabs import ImagesTab, ViewTab, serialized
 from splatting.viewer.training_tab import Requests
-from splatting.viewer.views import SceneCameras, Settings, Vector, as_utf8, pose_of
+from splatting.viewer.views import SceneCameras, Settings, Vector, as_utf8, pose_of, window_of
 from splatting.viewer.watchers import Watchers, Wish
 from utils.system_utils import UserError, first_line
 
@@ -61,16 +62,17 @@ class Page:
         self.iteration = gui.add_text("Iteration", str(scene.loaded_iter or 0), disabled=True)
         self.count = gui.add_text("Gaussians", f"{len(gaussians):,}", disabled=True)
         self.tabs = gui.add_tab_group()
-        positions, degree = gaussians.get_xyz, gaussians.max_sh_degree
+        # A training adds bands until its end; of a saved model those beyond its last one that is used are all zero.
+        degree = gaussians.max_sh_degree if scene.loaded_iter is None else used_degree(gaussians)
         with self.tabs.add_tab("View"):
             background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
             calls = self.watchers.changed, self.requests.crop
-            self.view = ViewTab(self.server, *calls, folder / CROPS, positions, degree, background)
+            self.view = ViewTab(self.server, *calls, folder / CROPS, gaussians.get_xyz, degree, background)
         with self.tabs.add_tab("Photos"):
             self.images = ImagesTab(self.server, self.watchers.changed, self._cameras)
         with self.tabs.add_tab("Path"):
-            self.path = PathTab(self.server, folder / PATHS, self._cameras)
-        self.path.saved.on_click(serialized(lambda event: self._save_path(event.client, folder)))
+            self.path = PathTab(self.server, folder / PATHS, self._cameras, self._refuse)
+        self.path.saved.on_click(serialized(lambda event: self._save_path(event.client, folder), self._refuse))
         self.server.scene.set_up_direction(tuple(self._cameras.up.tolist()))
         self.server.initial_camera.near = 1e-3 * self._cameras.size
         self.server.initial_camera.far = 1e3 * self._cameras.size
@@ -85,6 +87,7 @@ class Page:
                 self.watchers.moved(client.client_id, pose)
                 self.images.frusta.moved(client)
 
+        self.path.list_files()
         self._legends[client.client_id] = client.gui.add_html("", order=self.count.order + 0.5, visible=False)
         self.images.frusta.came(client)
         await moved(client.camera)
@@ -125,6 +128,9 @@ class Page:
         quality = _COARSE_QUALITY if coarse else _FULL_QUALITY
         client.scene.set_background_image(image, "jpeg", jpeg_quality=quality)
 
+    def _refuse(self, client: "viser.ClientHandle", error: UserError) -> None:
+        self._notify(client, "Not done", str(error), color="red")
+
     def _explain(self, client: int, legend: Legend) -> None:
         shown, text = self._legends.get(client), legend.html()
         if shown is not None and shown.content != text:
@@ -146,42 +152,47 @@ class Page:
         """Show the iteration and the number of Gaussians."""
         self.iteration.value, self.count.value = f"{iteration:,}", f"{gaussians:,}"
 
-    def notify(self, title: str, body: str) -> None:
+    def notify(self, title: str, body: str, **look: Any) -> None:
         """Show a notification to all, and wait until it has probably been sent."""
         clients = self.server.get_clients().values()
         for client in clients:
-            self._notify(client, title, body)
+            self._notify(client, title, body, **look)
             client.flush()
         if clients:
             time.sleep(_SENT)
 
     def export_crop(self) -> None:
         """Write the Gaussians in the crop box into the model's folder. Called by the thread that changes the model."""
-        box = tuple(corner.value for corner in self.view.corners)
+        name = self.view.crop_file
         try:
-            file = self.view.crop_file.path()
-            count = write_crop(file, self._gaussians, box, self._antialiasing)
+            file, replaced = name.path(), name.replaced()
+            count = write_crop(file, self._gaussians, self.view.corners(), self._antialiasing)
         except Exception as error:  # as for a frame; a full disk
             tqdm.write(f"warning: the crop is not exported ({first_line(error)})", file=sys.stderr)
-            self.notify("Not exported", first_line(error))
+            self.notify("Not exported", first_line(error), color="red")
         else:
             what = f"{count:,} of {len(self._gaussians):,} Gaussians"
-            tqdm.write(as_utf8(f"Exported {what} to {file}"), file=sys.stdout)
-            self.notify("Exported", f"{what}: {CROPS}/{file.name}")
+            tqdm.write(as_utf8(f"Exported {what} to {file}{replaced}"), file=sys.stdout)
+            self.notify("Exported", f"{what}: {CROPS}/{file.name}{replaced}")
+            name.suggest()
 
-    def _save_path(self, client: "viser.ClientHandle | None", folder: Path) -> None:
-        try:
-            file = self.path.save()
-        except UserError as error:
-            self._notify(client, "Not saved", str(error))
-        else:
-            video = f"{typed_command('render.py')} -m {folder} --path {file}"
-            tqdm.write(as_utf8(f"Saved {file}; its video: {video}"), file=sys.stdout)
-            self._notify(client, "Saved", f"{PATHS}/{file.name}; the terminal shows how to make its video")
+    def _save_path(self, client: "viser.ClientHandle", folder: Path) -> None:
+        replaced, file = self.path.file.replaced(), self.path.save()
+        size = (max(2, side - side % 2) for side in window_of(client.camera))
+        words = shlex.join(map(str, ("-m", folder, "--path", file, "--size", *size)))
+        tqdm.write(as_utf8(f"Saved {file}{replaced}; its video: {typed_command('render.py')} {words}"), file=sys.stdout)
+        self._notify(client, "Saved", f"{PATHS}/{file.name}{replaced}; the terminal shows how to make its video")
 
     def stop(self) -> None:
         """Stop to listen."""
+        self.path.stop()
         servers.stop(self.server)
+
+
+def used_degree(gaussians: GaussianModel) -> int:
+    """The highest SH degree of which a coefficient is not zero."""
+    used = gaussians.get_features_rest.detach().any(0).any(1).nonzero()
+    return int((int(used.max()) + 1) ** 0.5) if len(used) else 0
 
 
 def write_crop(path: Path, gaussians: GaussianModel, box: tuple[Vector, Vector], antialiasing: bool) -> int:

@@ -84,6 +84,7 @@ def serve(address: Address, label: str) -> tuple["viser.ViserServer", str]:
         raise UserError(f"this release of viser cannot be guarded; pip install {VISER}")
     auth.control = server.gui._gui_input_handle_from_uuid.get
     server.gui.configure_theme(show_logo=False, show_share_button=False)
+    server.gui.main_panel.dock_right()  # beside the picture, of which it would cover a third
     return server, _announce(address, server.get_port(), auth.token)
 
 

@@ -25,11 +25,22 @@ _OUTLIERS = 0.02  # quantile of the positions at which the crop box begins
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
-def serialized(call: Callable[[Any], object]) -> Callable[[Any], Any]:
-    """A coroutine for a call, because viser runs those one after the other, and plain functions in many threads."""
+Tell = Callable[["viser.ClientHandle", UserError], None]
+
+
+def serialized(call: Callable[[Any], object], tell: Tell | None = None) -> Callable[[Any], Any]:
+    """A coroutine for a call, because viser runs those one after the other, and plain functions in many threads.
+
+    tell: called with the browser and a UserError of the call.
+    """
 
     async def called(event: Any) -> None:
-        call(event)
+        try:
+            call(event)
+        except UserError as error:
+            if tell is None:
+                raise
+            tell(event.client, error)
 
     return called
 
@@ -38,17 +49,34 @@ class FileName:
     """A field with the name of a file. Whatever a browser sends, the file lies in the folder and has the ending."""
 
     def __init__(self, server: "viser.ViserServer", folder: Path, first: str, ending: str) -> None:
-        self.folder, self._ending = folder, ending
+        self.folder, self._first, self._ending = folder, first, ending
+        self._suggested = self._free()
+        self.field = server.gui.add_text("Name", self._suggested, hint="letters, digits, - and _")
+
+    def _free(self) -> str:
         number = 1
-        while (folder / f"{first}{number}{ending}").exists():
+        while (self.folder / f"{self._first}{number}{self._ending}").exists():
             number += 1
-        self.field = server.gui.add_text("Name", f"{first}{number}", hint="letters, digits, - and _")
+        return f"{self._first}{number}"
+
+    def suggest(self) -> None:
+        """Put the next free name in the place of the one that was suggested before, but not of one that was typed."""
+        if self.field.value == self._suggested:
+            self.field.value = self._suggested = self._free()
 
     def path(self) -> Path:
         """The file. UserError for a name that is none."""
         if not _NAME.fullmatch(self.field.value):
             raise UserError("a name has 1 to 64 letters, digits, - and _; choose another one")
         return self.folder / f"{self.field.value}{self._ending}"
+
+    def replaced(self) -> str:
+        """What there is to say of a file that is written now, if there is one already."""
+        return " (replaced)" if self.path().exists() else ""
+
+    def names(self) -> tuple[str, ...]:
+        """Names of the files that are there."""
+        return tuple(sorted(file.stem for file in self.folder.glob(f"*{self._ending}") if _NAME.fullmatch(file.stem)))
 
 
 class ViewTab:
@@ -71,24 +99,24 @@ class ViewTab:
         gui, self._scene = server.gui, server.scene
         self.mode = gui.add_dropdown("Show", views.MODES)
         self.scaling = gui.add_slider("Scaling modifier", 0.01, _MOST_SCALING, 0.01, 1.0)
-        self.degree = gui.add_slider("SH degree", 0, max(sh_degree, 1), 1, sh_degree, disabled=sh_degree == 0)
+        self.degree = gui.add_slider("SH degree", 0, max(sh_degree, 1), 1, sh_degree, visible=sh_degree > 0)
         self.background = gui.add_rgb("Background", tuple(round(255 * x) for x in background))
         self.crop = gui.add_checkbox("Crop box", False, hint="Gaussians outside are not drawn; the model stays whole")
         low, high = first_box(positions)
         longest = max(b - a for a, b in zip(low, high, strict=True))
         step = 10.0 ** math.floor(math.log10(max(longest, 1e-6) / 100))
-        self.corners = [gui.add_vector3(f"Corner {n}", at, step=step) for n, at in ((1, low), (2, high))]
+        self.box = [gui.add_vector2(f"{x} from, to", at, step=step) for x, *at in zip("xyz", low, high, strict=True)]
         self.crop_file = FileName(server, folder, "crop", ".ply")
         written = gui.add_button("Export the crop", hint="writes its Gaussians, whatever else is set here")
         reset = gui.add_button("Reset", color="gray", hint="everything in this tab")
-        self._of_crop = *self.corners, self.crop_file.field, written
-        self._box = None
+        self._of_crop = *self.box, self.crop_file.field, written
+        self._edges = None
         self._show_box()
-        shown = self.mode, self.scaling, self.degree, self.background, self.crop, *self.corners
+        shown = self.mode, self.scaling, self.degree, self.background, self.crop, *self.box
         self._first = [(handle, handle.value) for handle in shown]
         for handle in (self.mode, self.scaling, self.degree, self.background):
             handle.on_update(lambda _: changed())
-        for handle in (self.crop, *self.corners):
+        for handle in (self.crop, *self.box):
             handle.on_update(serialized(lambda _: (self._show_box(), changed())))
         written.on_click(lambda _: export())
         reset.on_click(serialized(lambda _: self._reset()))
@@ -99,20 +127,24 @@ class ViewTab:
 
     def _show_box(self) -> None:
         """Draw the edges of the crop box into the scene, and show the controls that it needs."""
-        if self._box is not None:
-            self._box.remove()
-            self._box = None
+        if self._edges is not None:
+            self._edges.remove()
+            self._edges = None
         for handle in self._of_crop:
             if handle.visible != self.crop.value:
                 handle.visible = self.crop.value
         if self.crop.value:
-            one, other = (torch.tensor(corner.value) for corner in self.corners)
+            one, other = torch.tensor(self.corners())
             size, middle = (other - one).abs().tolist(), ((one + other) / 2).tolist()
-            self._box = self._scene.add_box("/crop box", (255, 160, 40), size, wireframe=True, position=middle)
+            self._edges = self._scene.add_box("/crop box", (255, 160, 40), size, wireframe=True, position=middle)
+
+    def corners(self) -> tuple[Vector, Vector]:
+        """Opposite corners of the crop box."""
+        return tuple(zip(*(ends.value for ends in self.box), strict=True))
 
     def read(self) -> Settings:
         """What the controls say. Numbers out of range count as the nearest that is in it."""
-        box = tuple(corner.value for corner in self.corners) if self.crop.value else None
+        box = self.corners() if self.crop.value else None
         return Settings(
             mode=self.mode.value,
             scaling=min(max(self.scaling.value, 0.0), _MOST_SCALING),
@@ -145,13 +177,14 @@ class ImagesTab:
         self.comparison = gui.add_dropdown("Compare", views.COMPARISONS, hint=hint)
         self.slider = gui.add_slider("Slider", 0.0, 1.0, 0.005, 0.5, hint="0: render, 1: photo", visible=False)
         shown = gui.add_checkbox("Draw cameras", False, hint="a click on one jumps there; those near the view fade")
+        colours = gui.add_markdown("Training views are blue, test views orange.", visible=False)
         self._begin()
         # In turn, so that the view does not get its place from one camera and its direction from the next.
         self.camera.on_update(serialized(lambda event: (self._begin(), self.go(event.client))))
         again.on_click(serialized(lambda event: self.go(event.client)))
         self.comparison.on_update(serialized(lambda event: (self._compare(event.client), changed(False))))
         self.slider.on_update(lambda _: changed(True))
-        shown.on_update(serialized(lambda _: self.frusta.show(shown.value)))
+        shown.on_update(serialized(lambda _: (self.frusta.show(shown.value), setattr(colours, "visible", shown.value))))
 
     def read(self, settings: Settings) -> Settings:
         """The settings, with what these controls say."""

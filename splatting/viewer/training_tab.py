@@ -82,6 +82,13 @@ class Requests:
         self._set(paused=False, stopped=False, _steps=0, _checkpoints=0)
 
 
+def _of_some_views(rows: Sequence[dict[str, float | None]]) -> str:
+    """What to say of points that not all test views were scored for."""
+    estimated = [row.get("estimated") for row in rows if row.get("subset") is not None]
+    counts = (estimated.count(None), "scores"), (len(estimated) - estimated.count(None), "estimates from scores")
+    return " ".join(f"{n} of {len(rows)} points are {what} of some test views." for n, what in counts if n)
+
+
 class TrainingTab:
     """Buttons that make requests; iterations a second, loss, and the error against time."""
 
@@ -129,11 +136,12 @@ class TrainingTab:
             points = [point for point in points if all(map(math.isfinite, point))]
             if len(points) > 1:
                 self.curve.data = tuple(np.array(values, dtype=np.float64) for values in zip(*points, strict=True))
-                self.curve.visible, self.note.visible = True, False
+                self.note.content = text = _of_some_views(rows)
+                self.curve.visible, self.note.visible = True, bool(text)
 
     def end(self, text: str) -> None:
         """Show that the training is over. text: what came of it."""
         for button in self._buttons:
             button.visible = False
-        self.note.visible = False
+        self.note.visible = self.note.visible and self.curve.visible
         self.state.content, self.state.visible, self.close.visible = text, True, True

@@ -19,7 +19,8 @@ from synthetic import make_colmap_scene
 pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
 pytestmark = pytest.mark.browser
 ROOT = Path(__file__).resolve().parents[2]
-WINDOW = 900, 600
+PICTURE = 900, 600
+WINDOW = PICTURE[0] + 324, PICTURE[1]  # with the controls beside the picture
 SECONDS = 60  # until something must have happened
 
 
@@ -63,7 +64,7 @@ def _until(holds: Callable[[], bool], what: str) -> None:
 
 
 def _picture(tab) -> np.ndarray:
-    """What the tab shows left of the controls, (600, 525, 3)."""
+    """The left part of the picture that the tab shows, (600, 525, 3)."""
     shot = tab.screenshot(clip={"x": 0, "y": 0, "width": 525, "height": 600})
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(float)
 
@@ -120,7 +121,7 @@ def test_every_kind_of_control_is_heard(tab, training):
     address, scene = training
     _open(tab, address)
     tab.get_by_role("tab", name="Path").click()
-    _type(tab, "Seconds to next keyframe", "3")
+    _type(tab, "Seconds from previous keyframe", "3")
     _type(tab, "Name", "typed")
     keyframes = tab.get_by_role("combobox", name="Keyframes")
     for listed in ("1: at 0 s", "2: at 3 s"):
@@ -132,12 +133,14 @@ def test_every_kind_of_control_is_heard(tab, training):
     path = scene.parent / "out/camera_paths/typed.json"
     _until(path.is_file, "the path was not saved")
     assert [keyframe["seconds"] for keyframe in json.loads(path.read_text())["keyframes"]] == [0, 3]
+    tab.get_by_role("button", name="Play").click()
+    tab.get_by_role("button", name="Stop", exact=True).wait_for()
+    tab.get_by_role("button", name="Play").wait_for(timeout=1000 * SECONDS)
     tab.get_by_role("tab", name="View").click()
     tab.get_by_role("checkbox", name="Crop box").click()
-    _type(tab, "Corner 1", "900")
+    _type(tab, "x from, to", "900")
     _type(tab, "Background", "rgb(250, 0, 0)")
-    # Now the box is far away, and what is outside of it is not drawn.
-    _type(tab, "Corner 2", "901")
+    # Now the box is beside the Gaussians, and what is outside of it is not drawn.
     red = np.array([250, 0, 0])
     _until(lambda: abs(np.median(_picture(tab)[150:], (0, 1)) - red).max() < 5, "the crop box was not heard")
     tab.get_by_role("button", name="Reset").click()
@@ -153,12 +156,12 @@ def test_the_slider_shows_the_photo(tab, training):
     name = tab.get_by_role("combobox", name="Camera").input_value().split(": ")[1]
     tab.get_by_role("combobox", name="Compare").click()
     tab.get_by_role("option", name="Slider").click()
-    # The photo, 96 x 64, fills the window, which has its aspect.
+    # The photo, 96 x 64, fills the place of the picture, which has its aspect.
     photo = np.asarray(Image.open(next(scene.rglob(f"{Path(name).stem}.*"))).convert("RGB")).astype(float)
 
     def error() -> float:
         shown = Image.fromarray(_picture(tab).astype(np.uint8))
-        columns = shown.width * 96 // 900
+        columns = shown.width * 96 // PICTURE[0]
         small = np.asarray(shown.resize((columns, 64), Image.Resampling.BOX)).astype(float)
         return abs(small - photo[:, :columns])[2:-2, 2:-2].mean()
 
@@ -185,7 +188,7 @@ def test_a_click_on_a_drawn_camera_leads_there(tab, training):
     tab.get_by_role("tab", name="Photos").click()
     chosen = tab.get_by_role("combobox", name="Camera")
     tab.get_by_role("checkbox", name="Draw cameras").click()
-    middle = WINDOW[0] / 2, WINDOW[1] / 2
+    middle = PICTURE[0] / 2, PICTURE[1] / 2
     tab.mouse.move(*middle)
     time.sleep(1.0)
     tab.mouse.click(*middle, delay=50)

@@ -23,6 +23,7 @@ from splatting.training.run import Run
 from splatting.viewer.page import Page, serve
 from splatting.viewer.server import Address
 from splatting.viewer.training_tab import TrainingTab
+from splatting.viewer.views import as_utf8
 from splatting.viewer.watchers import MOVING, STILL, Budget, Wish
 from utils.system_utils import UserError, first_line
 
@@ -84,7 +85,7 @@ class PageObserver(Observer):
             self._show_numbers(step.iteration)
         while True:
             if requests.stopped or run.interrupt.requested:
-                step.stopping = run.interrupt.requested or KeyboardInterrupt
+                step.stopping = run.interrupt.requested or KeyboardInterrupt("stopped from the page")
                 self._checkpoints.save(step)
                 return
             if requests.take_checkpoint():
@@ -107,7 +108,7 @@ class PageObserver(Observer):
             if not isinstance(error.__cause__, OSError):  # such as a loss that is not finite
                 raise
             tqdm.write(f"warning: {error}", file=sys.stderr)
-            self._page.notify("Not saved", str(error))
+            self._page.notify("Not saved", str(error), color="red")
         else:
             self._page.notify("Saved", f"chkpnt{step.iteration}.pth")
 
@@ -132,7 +133,8 @@ class PageObserver(Observer):
             elif run.launch.viewer_exit:
                 self._page.notify("The training is over", f"See its model by {view_command(run.scene.model_path)}")
             else:
-                self._stay("stopped" if by_button else "complete")
+                saved = as_utf8(f"{run.scene.model_path}/chkpnt{self._step.iteration}.pth")
+                self._stay(f"stopped and saved as {saved}" if by_button else "complete")
         finally:
             self._page.stop()
 
@@ -144,7 +146,7 @@ class PageObserver(Observer):
             self._show_saved(step.iteration)  # the last step has changed the model after that
         self._requests.reset()
         self._tab.end(f"The training is {how}. This page stays until it is closed here, or by Ctrl-C in its terminal.")
-        self._page.notify(f"The training is {how}", "The page stays open")
+        self._page.notify("The training is over", f"It is {how}; the page stays open")
         sys.stdout.flush()  # which may be a pipe
         line = f"The page stays open at {self._page.url} until it is closed there, or Ctrl-C (--viewer_exit closes it)"
         tqdm.write(line, file=sys.stderr)
