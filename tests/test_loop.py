@@ -168,22 +168,6 @@ def test_a_signal_while_the_curve_is_drawn_ends_the_program_at_once(colmap_scene
     assert (tmp_path / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply").is_file()
 
 
-def test_an_iteration_that_is_scored_and_saved_gets_one_record(colmap_scene, tmp_path, monkeypatch):
-    added = []
-    add = TrainingLog.add
-
-    def noted(log: TrainingLog, iteration: int, seconds: float, **values: float) -> None:
-        added.append((iteration, sorted(values)))
-        add(log, iteration, seconds, **values)
-
-    monkeypatch.setattr(TrainingLog, "add", noted)
-    options = ["--eval", "--no_curve", "--test_iterations", 5, "--save_iterations", 5, 9]
-    _train(colmap_scene, tmp_path, monkeypatch, standard_observers, *options)
-    scores = ["gaussians", "loss", "test_l1", "test_psnr", "train_l1", "train_psnr"]
-    last = ["gaussians", "gaussians_left_out", "loss"]
-    assert added == [(5, scores), (9, ["gaussians", "loss"]), (ITERATIONS, last)]
-
-
 def test_a_checkpoint_of_the_last_iteration_does_not_turn_seconds_back(tmp_path):
     log = TrainingLog(tmp_path, 0)
     log.add(7, 2.0, loss=0.5)
