@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import time
 from argparse import Namespace
 from types import SimpleNamespace
 
@@ -176,8 +177,9 @@ def test_a_checkpoint_of_the_last_iteration_does_not_turn_seconds_back(tmp_path)
 
 
 def test_what_replaces_training_report_is_called(colmap_scene, tmp_path, monkeypatch):
-    """Programs that import train.py as a module put their own in its place."""
-    reported = []
+    """Programs that import train.py as a module put their own in its place. Its seconds are none of training."""
+    reported, clock = [], time.perf_counter
+    monkeypatch.setattr("splatting.evaluation.training_log.running_seconds", lambda: clock() + 1000 * len(reported))
 
     def report(writer, iteration: int, *_: object) -> dict[str, float]:
         reported.append(iteration)
@@ -188,3 +190,4 @@ def test_what_replaces_training_report_is_called(colmap_scene, tmp_path, monkeyp
     assert reported == list(range(1, ITERATIONS + 1))
     records = json.loads((tmp_path / "train_log.json").read_text())
     assert [record["iteration"] for record in records if "test_psnr" in record] == [4]
+    assert records[-1]["seconds"] < 500

@@ -5,7 +5,6 @@ import json
 import re
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -248,21 +247,6 @@ def test_a_late_reset_is_announced(colmap_scene, tmp_path, capfd):
     """Also where --quiet silences the standard output."""
     _train(colmap_scene, tmp_path, "--opacity_reset_interval", 3, "--quiet", iterations=5)
     assert "warning: opacities are reset in iteration 3, and 2 iterations" in capfd.readouterr().err
-
-
-def test_seconds_leave_evaluation_and_saving_out(colmap_scene, tmp_path, monkeypatch):
-    later, clock = [0.0], time.perf_counter  # seconds that a clock of this test's own is ahead
-    monkeypatch.setattr("splatting.evaluation.training_log.running_seconds", lambda: clock() + later[0])
-
-    def slow(*_: object) -> dict[str, float]:
-        later[0] += 1000
-        return {"test_psnr": 1.0}
-
-    monkeypatch.setattr(train, "training_report", slow)
-    _train(colmap_scene, tmp_path, iterations=4)
-    log = json.loads((tmp_path / "train_log.json").read_text())
-    assert len(log) > 1 and log[-1]["seconds"] < 500
-    assert later[0] == 4000  # four evaluations
 
 
 def test_minus_one_saves_the_last_iteration_only(colmap_scene, tmp_path):
