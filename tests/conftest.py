@@ -4,7 +4,7 @@ import os
 import shutil
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
@@ -81,6 +81,14 @@ def colmap_scene(_colmap_master: Path, tmp_path: Path) -> Path:
 def blender_scene(_blender_master: Path, tmp_path: Path) -> Path:
     """A Blender scene of 4 training and 2 test frames, 40x30 RGBA; a copy that tests may change."""
     return Path(shutil.copytree(_blender_master, tmp_path / "blender_scene"))
+
+
+@pytest.fixture
+def threads() -> Iterator[Callable[[int], None]]:
+    """A function that sets torch's number of threads for this test."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
 
 
 @pytest.fixture

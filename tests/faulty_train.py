@@ -24,7 +24,7 @@ import splatting.distributed.watch
 import train
 from splatting.training.iteration import Iteration
 from splatting.training.run import Run
-from utils.system_utils import UserError, run_cli
+from utils.system_utils import run_cli
 
 splatting.distributed.watch.PATIENCE = 3.0
 prepare = Run.prepare
@@ -69,7 +69,6 @@ _FAULTS = {
     "interrupt": lambda run: os.kill(os.getpid(), signal.SIGINT),
     "memory": _raise(MemoryError()),
     "bug": _raise(ValueError("no such thing")),
-    "user": _raise(UserError("this cannot be; do something else")),
     "hang": _hang,
     "overflow": _overflow,
 }

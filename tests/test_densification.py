@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from gaussians import GROUPS, model, moments, options, parameters, take_steps
+from gaussians import model, moments, options, parameters, take_steps
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -69,20 +69,33 @@ def test_clones_and_children_inherit_from_their_own_parent():
         assert torch.equal(value, expected), name
 
 
+class Replacing(GaussianModel):
+    """A client that replaces a step, and so gets its own call."""
+
+    def densify_and_clone(self, grads: torch.Tensor, *others: float) -> None:
+        before = len(self)
+        super().densify_and_clone(grads, *others)
+        self.cloned = len(self) - before
+
+
+class TakingNorms(Replacing):
+    """The reference's own line: over gradients (N,) its norm would be one number for all."""
+
+    def densify_and_clone(self, grads: torch.Tensor, *others: float) -> None:
+        super().densify_and_clone(torch.norm(grads, dim=-1), *others)
+
+    def densify_and_split(self, grads: torch.Tensor, *others: float, **how: int) -> None:
+        assert grads.shape == (300, 1)
+        super().densify_and_split(grads, *others, **how)
+
+
+@pytest.mark.parametrize("client", [Replacing, TakingNorms])
 @pytest.mark.parametrize(("screen", "long_axis"), [(None, False), (20, False), (20, True)])
-def test_clones_and_splits_at_once_give_the_bytes_of_one_after_the_other(screen, long_axis):
-    """A client that replaces a step gets its own call; all the rest is as without."""
-
-    class Client(GaussianModel):
-        def densify_and_clone(self, *args: object) -> None:
-            before = len(self)
-            super().densify_and_clone(*args)
-            cloned.append(len(self) - before)
-
-    generator, cloned, models = torch.Generator().manual_seed(7), [], []
+def test_clones_and_splits_at_once_give_the_bytes_of_one_after_the_other(screen, long_axis, client):
+    generator, models = torch.Generator().manual_seed(7), []
     scales = (LIMIT * 20 ** (2 * torch.rand(300, generator=generator) - 1)).tolist()  # up to twice what is pruned
     gradients = (2 * THRESHOLD * torch.rand(300, generator=generator)).tolist()
-    for kind in (GaussianModel, Client):
+    for kind in (GaussianModel, client):
         gaussians = _toy(scales, gradients)
         gaussians.__class__ = kind
         with torch.no_grad():
@@ -90,32 +103,11 @@ def test_clones_and_splits_at_once_give_the_bytes_of_one_after_the_other(screen,
         _densify(gaussians, screen=screen, seed=3, iteration=700, long_axis=long_axis)
         models.append(gaussians)
     ours, theirs = models
-    assert cloned[0] > 20 and len(ours) == len(theirs) != 300
+    assert theirs.cloned > 20 and len(ours) == len(theirs) != 300
     for name, value in parameters(ours).items():
         assert torch.equal(value, parameters(theirs)[name]), name
         for key, average in moments(ours)[name].items():
             assert torch.equal(average, moments(theirs)[name][key]), (name, key)
-
-
-def test_a_client_that_takes_norms_of_its_gradients_clones_the_same():
-    """The reference's own line: over gradients (N,) its norm would be one number for all."""
-
-    class Client(GaussianModel):
-        def densify_and_clone(self, grads: torch.Tensor, *others: float) -> None:
-            super().densify_and_clone(torch.norm(grads, dim=-1), *others)
-
-        def densify_and_split(self, grads: torch.Tensor, *others: float, **how: int) -> None:
-            shapes.append(tuple(grads.shape))
-            super().densify_and_split(grads, *others, **how)
-
-    models, shapes = [], []
-    for kind in (GaussianModel, Client):
-        gaussians = _toy([LIMIT / 2] * 3 + [LIMIT * 3] * 3, [1.0, 0.0, 0.0] * 2)
-        gaussians.__class__ = kind
-        _densify(gaussians, seed=3)
-        models.append(parameters(gaussians))
-    assert shapes == [(6, 1)]
-    assert all(torch.equal(value, models[1][name]) for name, value in models[0].items())
 
 
 def test_a_split_along_the_longest_axis_has_two_children():
@@ -139,33 +131,14 @@ def test_children_along_the_longest_axis_are_told_from_clones():
         assert torch.equal(results[0][name], value) and torch.equal(results[1][name], value), name
 
 
-def test_optimiser_does_nothing_in_a_densification_iteration():
-    gaussians = _toy([LIMIT] * 3, [0.0] * 3)
-    for name in GROUPS.values():
-        getattr(gaussians, name).grad = torch.ones_like(getattr(gaussians, name))
-    before = parameters(gaussians)
-    _densify(gaussians)
-    gaussians.optimizer.step()
-    for name, value in parameters(gaussians).items():
-        assert torch.equal(value, before[name])
-        assert moments(gaussians)[name]["step"] == 2
-
-
-def test_reset_freezes_opacity_alone():
+def test_reset_lowers_opacities_to_a_hundredth():
     gaussians = _toy([LIMIT] * 3, [0.0] * 3)
     with torch.no_grad():
         gaussians._opacity[0] = -6.0
-    for name in GROUPS.values():
-        getattr(gaussians, name).grad = torch.ones_like(getattr(gaussians, name))
-    before = parameters(gaussians)
     gaussians.reset_opacity()
-    assert not moments(gaussians)["opacity"]["exp_avg"].any()
-    gaussians.optimizer.step()
     low = torch.tensor(rules.logit(0.01), dtype=torch.float32).item()
     assert gaussians._opacity.reshape(-1).tolist() == [-6.0, low, low]
     assert gaussians.get_opacity[1:].detach().numpy() == pytest.approx(0.01)
-    for name, value in parameters(gaussians).items():
-        assert name == "opacity" or not torch.equal(value, before[name])
 
 
 def test_pruning():
@@ -261,20 +234,6 @@ def test_a_view_in_one_pass_is_its_two_parts():
     assert torch.equal(fused.xyz_gradient_accum.reshape(-1), torch.from_numpy(exact))
     # torch's square root is sometimes off by a unit in the last place.
     torch.testing.assert_close(fused.xyz_gradient_accum, plain.xyz_gradient_accum, rtol=2 * 2**-23, atol=0)
-
-
-def test_any_number_of_threads_observes_the_same():
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            gaussians = model(40_000, degree=0)
-            for points, radii in _views(gaussians, 2, seed=1):
-                gaussians.observe(points, radii)
-            results.append(gaussians.xyz_gradient_accum)
-    finally:
-        torch.set_num_threads(before)
-    assert all(torch.equal(results[0], other) for other in results[1:])
 
 
 def test_the_cap_takes_the_largest_gradients_ties_by_index():

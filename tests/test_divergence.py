@@ -7,12 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 from diff_gaussian_rasterization.optim import adam_, sparse_adam_
-from gaussians import model, parameters
 from trainings import leaves
 
 import train
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.adam import StepGuard
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.saved_model import read_model
 from splatting.training import objective
@@ -92,70 +90,7 @@ def test_there_is_no_step_under_a_loss_that_is_not_finite(step, loss):
     assert stopped == 7 and all(torch.equal(a, b) for a, b in zip(state, before, strict=True))
 
 
-def test_guards_that_do_not_fit_are_named(step):
-    state, gradient = _state(torch.float32, rows=4)
-    stopped = torch.zeros(1, dtype=torch.int64)
-    loss = torch.tensor(0.5)
-    for said, guard in {
-        "needs the loss, one torch.float32 on cpu": (loss.double(), stopped, 1),
-        "needs the loss": (None, stopped, 1),
-        "stopped must be one int64 on cpu, got": (loss, torch.zeros(1), 1),
-        "count from 1, got 0": (loss, stopped, 0),
-    }.items():
-        with pytest.raises(RuntimeError, match=said):
-            step(state, gradient, *guard)
-
-
-def test_float32_steps_are_doubles_from_1e_minus_30_to_1e10():
-    """Squares below 1e-38 vanish in float32, but there eps of 1e-15 outweighs their roots anyway."""
-    size = 10 ** torch.linspace(-30, 10, 41, dtype=torch.float64)[:, None]
-    generator = torch.Generator().manual_seed(0)
-    theirs = torch.nn.Parameter(torch.zeros(41, 3, dtype=torch.float64))
-    optimizer = torch.optim.Adam([theirs], lr=RATE, betas=BETAS, eps=EPS)
-    ours, stopped = [torch.zeros(41, 3) for _ in range(3)], torch.zeros(1, dtype=torch.int64)
-    counter = torch.zeros(())
-    for iteration in range(1, 51):
-        gradient = (torch.randn(41, 3, generator=generator, dtype=torch.float64) * size).float()
-        theirs.grad = gradient.double()
-        optimizer.step()
-        lists = [[t] for t in (ours[0], gradient, *ours[1:], counter)]
-        adam_(*lists, [RATE], *BETAS, EPS, [-1], torch.tensor(0.5), stopped, iteration)
-    assert stopped == 0 and theirs.abs().max() > 5 * RATE
-    # Fifty steps of at most 0.01, each exact to some units of float32. The bound is on steps, so that 1e-30 counts too.
-    unit = torch.finfo(torch.float32).eps
-    assert ((ours[0] - theirs.detach()).abs() <= 50 * 8 * unit * RATE).all()
-    tiny = size[:, 0] < 1e-16  # steps of 1e-17 and less, which need another bound
-    ratio = ours[0].double()[tiny] / theirs.detach()[tiny]
-    assert ((ratio - 1).abs() < 1e-4).all()
-
-
 # The model
-
-
-def test_marks_are_taken_and_counters_go_back():
-    gaussians = model(6)
-    guard = StepGuard("cpu")
-    gaussians.guard_steps(guard)
-    for iteration in range(1, 5):
-        for values in gaussians.rows().values():
-            values.grad = None
-        for name, attribute in gaussians._attributes.items():
-            param = getattr(gaussians, attribute.field)
-            param.grad = torch.full_like(param, 0.1)
-            if iteration == 2 and name in ("scaling", "f_dc"):
-                param.grad[4] = NAN
-                param.grad[1] = INF
-        guard.watch(iteration, torch.tensor(0.5))
-        gaussians.step(torch.ones(6, dtype=torch.int32))
-        if iteration == 2:
-            good = {name: values.clone() for name, values in parameters(gaussians).items()}
-    assert guard.stopped_in() == 2
-    assert gaussians.take_marks() == [("f_dc", [1, 4], 6), ("scaling", [1, 4], 6)]
-    gaussians.rewind(2)
-    assert all(torch.equal(values, good[name]) for name, values in parameters(gaussians).items())
-    assert all(state["step"] == 2 for state in gaussians.optimizer.state.values())
-    assert not any(t.isnan().any() for state in gaussians.optimizer.state.values() for t in state.values())
-    assert gaussians.take_marks() == []
 
 
 # The training

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from synthetic import folder_state
+from test_arguments import MODEL
 
 import train
 from arguments import read_model_json, write_cfg_args
@@ -16,10 +17,6 @@ from splatting.training.checks import check_folder, continue_records
 from utils.system_utils import UserError
 
 CURVE, LOG = "error_vs_time.csv", "train_log.json"
-MODEL_OPTIONS = {
-    "sh_degree": 3, "source_path": "/scene", "model_path": "out", "images": "images", "depths": "", "resolution": -1,
-    "white_background": False, "train_test_exp": False, "data_device": "cuda", "eval": False,
-}  # fmt: skip
 
 
 def _train(scene: Path, out: Path, *more: object, iterations: int) -> bytes:
@@ -82,12 +79,12 @@ def test_what_a_folder_must_hold_to_be_refused(tmp_path, trained):
     """Write a trained model and a cfg_args that names another scene."""
 
     def check(source: Path, checkpoint: Path | None = None) -> None:
-        options = MODEL_OPTIONS | {"source_path": str(source), "model_path": str(tmp_path)}
+        options = MODEL | {"source_path": str(source), "model_path": str(tmp_path)}
         check_folder(argparse.Namespace(**options), [5], checkpoint and str(checkpoint), 5 if checkpoint else 0)
 
     scene, other = tmp_path / "scene", tmp_path / "other"
     scene.mkdir()
-    write_cfg_args(tmp_path, argparse.Namespace(**MODEL_OPTIONS | {"source_path": str(scene)}))
+    write_cfg_args(tmp_path, argparse.Namespace(**MODEL | {"source_path": str(scene)}))
     check(other)
     (tmp_path / trained).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / trained).touch()
@@ -229,12 +226,3 @@ def test_a_checkpoint_of_another_scene_is_refused_and_one_of_a_moved_scene_told(
     _train(moved, whole, *start, iterations=40)
     (warning,) = _warnings(capfd.readouterr().err)
     assert f"trained with --source_path {colmap_scene}, this run has --source_path {moved}" in warning
-
-
-def test_points_to_start_from_are_not_counted_when_a_checkpoint_has_others(colmap_scene, tmp_path, capfd):
-    out = tmp_path / "out"
-    _train(colmap_scene, out, "--checkpoint_iterations", 2, iterations=3)
-    assert "Number of points at initialisation :  300" in capfd.readouterr().out
-    _train(colmap_scene, out, "--start_checkpoint", out / "chkpnt2.pth", "--init_type", "random", iterations=3)
-    said = capfd.readouterr().out
-    assert "Number of points" not in said and "at iteration 2" in said

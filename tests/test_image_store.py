@@ -12,7 +12,6 @@ import torch
 from PIL import Image
 from waiting import wait_for
 
-import train
 from scene.images.decode import decode
 from scene.images.store import ImageStore
 from utils.system_utils import UserError
@@ -184,25 +183,6 @@ def test_bytes_are_those_of_the_largest_that_are_kept(tmp_path):
     sizes = [(10, 10), (30, 20), (5, 5)]
     store.plan([(tmp_path / f"{number}.JPG", size) for number, size in enumerate(sizes)])
     assert store.planned_bytes == 3 * (600 + 100)
-
-
-OPTIONS = [
-    "-r", "24", "--test_iterations", "20", "--eval", "--densify_from_iter", "10", "--densification_interval", "20",
-    "--densify_grad_threshold", "5e-5", "--iterations", "60",
-]  # fmt: skip
-
-
-def test_what_is_kept_and_decoded_ahead_changes_no_bit(colmap_scene, tmp_path, monkeypatch):
-    plys = []
-    for name, options, ahead in (("all", [], True), ("plain", [], False), ("1", [1], True), ("2", [2], True),
-                                 ("5", [5], True)):  # fmt: skip
-        with monkeypatch.context() as patch:
-            if not ahead:
-                patch.setattr(ImageStore, "prefetch", lambda *_: None)
-            limit = ["--images_to_load", *map(str, options)] if options else []
-            train.main(["-s", str(colmap_scene), "-m", str(tmp_path / name), *OPTIONS, *limit])
-        plys.append((tmp_path / name / "point_cloud" / "iteration_60" / "point_cloud.ply").read_bytes())
-    assert len(set(plys)) == 1
 
 
 def test_a_gpu_keeps_what_fits_its_share(files, monkeypatch):

@@ -1,7 +1,6 @@
 """The photometric loss by bands of an image: the bits of the whole image, from what a rank has of it."""
 
 from collections.abc import Callable
-from itertools import pairwise
 from types import SimpleNamespace
 
 import pytest
@@ -20,7 +19,6 @@ from splatting.distributed.rendering.bands import (
     find_bands,
     row_processed,
     row_widths,
-    tile_rows,
 )
 
 # Height, width, and the rows of tiles where bands begin and the last one ends.
@@ -94,12 +92,6 @@ def test_a_band_begins_and_ends_between_tiles(rows):
         photometric_loss_by_bands(*image_pair(40, 20, torch.float32, True), 0.2, rows, torch.clone)
 
 
-def test_a_band_takes_the_images_that_the_loss_takes():
-    image, photo = image_pair(40, 20, torch.float32, True)
-    with pytest.raises(ValueError, match="must have the same shape"):
-        photometric_loss_by_bands(image, photo[:, 1:], 0.2, (0, 16), torch.clone)
-
-
 OF_FOUR = [
     (70, [0, 1, 1, 3, 5]),
     (33, [0, 0, 0, 2, 3]),
@@ -145,34 +137,11 @@ class _Others(Ranks):
 
     def __init__(self, rects: list[Tensor], height: int = 97) -> None:
         self._rects, self._height = rects, height
-        self.told = 0
 
     def table(self, values: Tensor) -> Tensor:
-        self.told += 1
         others = [row_widths(rects, torch.ones(len(rects)), self._height) for rects in self._rects[1:]]
         widths = torch.stack((values[0], *others))
         return torch.stack((widths, values[1] * torch.tensor([[1], [0], [0]])), 1)
-
-
-@pytest.mark.parametrize("rows", [1, 3, 7])
-def test_bands_have_about_equal_loads(rows, monkeypatch):
-    monkeypatch.setattr(bands, "_TILE_COST", 8)
-    generator = torch.Generator().manual_seed(rows)
-    rects = []
-    for count in (50, 0, 9):
-        top = torch.randint(7, (count,), generator=generator)
-        bottom = (top + torch.randint(1, rows + 1, (count,), generator=generator)).clamp(max=7)
-        rects.append(torch.stack((torch.zeros_like(top), top, 1 + top % 3, bottom), 1).int())
-    tile_counts = torch.arange(50) % 5  # the first rectangle and every fifth one after it do not count
-    reaching = rects[0]
-    rects[0] = rects[0][tile_counts > 0]
-    found = find_bands(_Others(rects), reaching, tile_counts, 97, 40)
-    assert found.borders[0] == 0 and found.borders[-1] == tile_rows(97) == 7 and sorted(found.borders) == found.borders
-    rows_of_tiles = torch.zeros(7)
-    for left, top, right, bottom in torch.cat(rects).tolist():
-        rows_of_tiles[top:bottom] += right - left
-    loads = [rows_of_tiles[first:end].sum() for first, end in pairwise(found.borders)]
-    assert max(loads) < 0.75 * sum(loads)
 
 
 def test_of_many_splats_a_sample_gives_the_bands(monkeypatch):
@@ -207,13 +176,3 @@ def test_bands_follow_what_an_earlier_visit_has_processed():
         borders = known.find("a", ranks, rects, counts, 953, 40).borders
         known.drawn("a", last)
         assert borders == ([0, 20, 40, 60] if visit < 8 else [0, 5, 6, 60])
-
-
-def test_bands_of_a_view_are_kept_for_some_visits():
-    rects = torch.tensor([[0, 0, 1, 1]] * 9, dtype=torch.int32)
-    ranks, known, counts = _Others([rects, rects, rects]), KnownBands(), torch.ones(9, dtype=torch.int32)
-    found = [known.find("a", ranks, rects, counts, 97, 40) for _ in range(8)]
-    assert ranks.told == 1 and all(one is found[0] for one in found)
-    assert known.find("b", ranks, rects, counts, 97, 40) is not found[0] and ranks.told == 2
-    assert known.find("a", ranks, rects, counts, 100, 40) is not found[0] and ranks.told == 3
-    assert known.find("a", ranks, rects, counts, 97, 40) is not found[0] and ranks.told == 4

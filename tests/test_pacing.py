@@ -10,13 +10,11 @@ from pathlib import Path
 import pytest
 import torch
 from gaussians import options
-from trainings import train_on
+from trainings import before_steps, train_on
 
-from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.gaussians.checkpoint import load_checkpoint
 from splatting.evaluation.training_log import Stopwatch
-from splatting.training import loop
 from splatting.training.iteration import Iteration
 from splatting.training.observers import report
 from splatting.training.observers.report import ProgressBar
@@ -55,7 +53,7 @@ def _noisy(iteration: int, step: int) -> float:
 COSTS = {
     "constant": lambda t, n: 0.01,
     "noisy": _noisy,
-    "a slow start": lambda t, n: 0.8 if t == 1 else 0.005,
+    "a slow start": lambda t, n: 3.0 if t == 1 else 0.005,
     "growth": lambda t, n: 0.002 * (1 + 20 * min(1.0, n / 15_000)),
     "sudden growth": lambda t, n: 0.002 if n < 20_000 else 0.03,
     "faster than the schedule": lambda t, n: 0.0001,
@@ -164,13 +162,6 @@ def test_the_end_of_a_repeated_schedule_is_known():
     assert repeated.known([50, 100]) == [20] and repeated.known([50]) == [] == _fresh(100, 9.0).known([50, 100])
 
 
-def test_the_steady_schedule_changes_nothing():
-    schedule = Schedule(7)
-    assert [list(schedule.span(t)) for t in range(1, 8)] == [[t] for t in range(1, 8)]
-    assert [t for t in range(1, 9) if schedule.is_last(t)] == [7] and schedule.is_over(7) and not schedule.is_over(6)
-    assert schedule.known([3, 7, 8]) == [3, 7]
-
-
 GOOD = {
     "blocks": [
         {"last": 2, "seconds": 0.0, "start": 0.0, "step": 0.1}, {"last": 10, "seconds": 1.0, "start": 0.2, "step": 0.1}
@@ -195,14 +186,11 @@ def _with_block(index: int, **values: object) -> dict:
         (GOOD | {"iterations": 0}, "0 is no whole number from 1 on"),
         (GOOD | {"iterations": True}, "True is no whole number"),
         (GOOD | {"blocks": []}, "its blocks do not follow each other"),
-        (GOOD | {"blocks": 3}, "is no schedule of a run"),
         (GOOD | {"blocks": [3]}, "is no schedule of a run"),
         (_with_block(1, last=2), "its blocks do not follow each other"),
-        (_with_block(1, last=9.0), "9.0 is no whole number"),
         (_with_block(1, start=-0.1), "-0.1 is no number from 0 on"),
         (_with_block(0, start=0.3), "its progress does not ascend"),
         (_with_block(1, step=0.2), "its progress goes beyond its end"),
-        (_with_block(1, step="x"), "'x' is no number"),
         (GOOD | {"ended": 9}, "its last block does not end with its last iteration"),
         (json.dumps(GOOD).replace("5.0", "NaN"), "nan is no number"),
         (GOOD | {"time_budget": 10**400}, "is no schedule of a run"),
@@ -225,9 +213,9 @@ def _evenly(length: int, count: int) -> Decided:
 
 def _actions(stride: int, white: bool = False, **changed: int) -> dict[int, rules.Actions]:
     """What adaptive density control does in each iteration of a run that takes so many steps of 30,000 at a time."""
-    schedule = DecidedSchedule(_evenly(30_000, 30_000 // stride))
-    place = ((t, options(**changed), white, schedule.span(t), schedule.stride(t)) for t in range(1, schedule.ends + 1))
-    return {one[0]: rules.actions(*one) for one in place}
+    schedule, opt = DecidedSchedule(_evenly(30_000, 30_000 // stride)), options(**changed)
+    every = range(1, schedule.ends + 1)
+    return {t: rules.actions(t, opt, white, schedule.span(t), schedule.stride(t)) for t in every}
 
 
 def test_windows_and_resets_are_of_the_schedule_and_densifications_of_the_run():
@@ -264,17 +252,17 @@ def _noted(monkeypatch: pytest.MonkeyPatch, look: Callable[[Run, Iteration], obj
     return found
 
 
-@pytest.mark.parametrize("strategy", ["mcmc", "budget"])
-def test_strategies_grow_within_windows_of_the_schedule(colmap_scene, tmp_path, monkeypatch, strategy):
+def test_strategies_grow_within_windows_of_the_schedule(colmap_scene, tmp_path, monkeypatch):
     write_schedule(tmp_path / "two.json", _evenly(120, 60))
     counts = _noted(monkeypatch, lambda run, _: len(run.gaussians))
-    window = "--densify_from_iter", 20, "--densify_until_iter", 80, "--mcmc_until_iter", 80
-    words = "--iterations", 120, "--strategy", strategy, "--max_num_splats", 5000, "--mcmc_growth", 0.02
-    _train(colmap_scene, tmp_path / "out", "--schedule", tmp_path / "two.json", *words, *window)
-    assert len(counts) == 60
+    words = "--iterations", 120, "--max_num_splats", 5000, "--densify_from_iter", 20, "--densify_until_iter", 80
+    for strategy in (("mcmc", "--mcmc_growth", 0.02, "--mcmc_until_iter", 80), ("budget",)):
+        out = tmp_path / strategy[0]
+        _train(colmap_scene, out, "--schedule", tmp_path / "two.json", *words, "--strategy", *strategy)
     # Every fifth iteration would be 5 times, so they are more often.
-    assert [t for t in range(1, 60) if counts[t] > counts[t - 1]] == [*range(11, 40)]
-    assert strategy == "mcmc" or counts[-1] == 25 * 60  # as many as so few iterations can train
+    grown = [t for t in range(1, 120) if counts[t] > counts[t - 1]]
+    assert grown == [*range(11, 40), *range(71, 100)] and len(counts) == 120
+    assert counts[-1] == 25 * 60  # as many as so few iterations can train
 
 
 RATES = [
@@ -318,27 +306,19 @@ def test_rates_fall_to_a_tenth_at_the_end(length, steps, factor):
 
 def _timed(monkeypatch: pytest.MonkeyPatch, cost: Callable[[int], float]) -> None:
     """Let an iteration take cost(iteration) seconds of training by a clock of its own."""
-    now, chosen = [0.0], loop.step_taker
+    now = [0.0]
 
     class Watch(Stopwatch):
+        def __init__(self, *given: object) -> None:
+            super().__init__(*given)
+            now[0] = 0.0
+
         @property
         def seconds(self) -> float:
             return now[0]
 
-    def taker(run):
-        now[0] = 0.0
-        taken = chosen(run)
-        take = taken.take
-
-        def timed(step, tell) -> None:
-            now[0] += cost(step.iteration)
-            take(step, tell)
-
-        taken.take = timed
-        return taken
-
     monkeypatch.setattr("splatting.training.run.Stopwatch", Watch)
-    monkeypatch.setattr(loop, "step_taker", taker)
+    before_steps(monkeypatch, lambda step: now.append(now.pop() + cost(step.iteration)))
 
 
 def _train(scene: Path, out: Path, *more: object) -> dict[int, bytes]:
@@ -378,20 +358,24 @@ def test_a_budgeted_training_replays_and_resumes_to_the_byte(colmap_scene, tmp_p
     assert "Training complete" in capsys.readouterr().out
 
 
-def test_a_short_training_by_the_clock_begins_with_smaller_views_and_replays(colmap_scene, tmp_path, monkeypatch):
+def test_a_short_training_by_the_clock_begins_with_smaller_views_and_replays(
+    colmap_scene, tmp_path, monkeypatch, capsys
+):
     def trained(name: str, *more: object) -> dict[int, bytes]:
         return _train(colmap_scene, tmp_path / name, "-r", 1, "--iterations", 1200, *more)
 
-    def told(name: str) -> str:
-        return _stored(tmp_path / name, "resolution_schedule")
-
     _timed(monkeypatch, lambda t: 0.04)
-    short = trained("short", "--time_budget", 4)
+    short = trained("short", "--time_budget", 4, "--checkpoint_iterations", 600)
     whole = trained("whole", "--time_budget", 4, "--resolution_schedule", "none")
-    assert (told("short"), told("whole")) == ("pyramid", "none")
     assert short.keys() == whole.keys() and short != whole  # by a clock that sizes do not move
     monkeypatch.undo()
-    assert trained("again", "--schedule", tmp_path / "short" / "schedule.json") == short and told("again") == "pyramid"
+    repeats = "--schedule", tmp_path / "short" / "schedule.json"
+    assert trained("again", *repeats) == short
+    names = [_stored(tmp_path / name, "resolution_schedule") for name in ("short", "whole", "again")]
+    assert names == ["pyramid", "none", "pyramid"]
+    (checkpoint,) = (tmp_path / "short").glob("chkpnt*.pth")
+    trained("resumed", *repeats, "--resolution_schedule", "pyramid", "--start_checkpoint", checkpoint)
+    assert "--resolution_schedule" not in capsys.readouterr().err  # as that is its name
 
 
 def test_training_stops_at_the_target_with_the_model_that_was_scored(colmap_scene, tmp_path, monkeypatch, capsys):
@@ -410,34 +394,13 @@ def test_training_stops_at_the_target_with_the_model_that_was_scored(colmap_scen
     early = _train(colmap_scene, stopped, *more, "--target_psnr", wanted)
     assert max(early) == end and early == {t: ply for t, ply in saved.items() if t <= end}
     assert f"{end} iterations in " in capsys.readouterr().out
+    _train(colmap_scene, whole, *more, "--target_psnr", wanted)
+    assert "of an earlier training, and other commands take the highest" in capsys.readouterr().err
     # With a time budget, whichever comes first; the schedule then says where the run ended.
     _timed(monkeypatch, lambda t: 0.1)
-    early = _train(colmap_scene, again, "--time_budget", 20, "--target_psnr", wanted, "--plain_step")
-    ended = json.loads((again / "schedule.json").read_text())["ended"]
+    early = _train(colmap_scene, again, "--time_budget", 20, "--target_psnr", wanted)
+    ended = read_schedule(again / "schedule.json").ended
     assert ended == max(early) < 200 and ended % 10 == 0
-    monkeypatch.undo()
-    replayed = _train(colmap_scene, tmp_path / "replayed", "--schedule", again / "schedule.json")
-    assert replayed == {t: ply for t, ply in early.items() if t == ended}
-
-
-def test_a_target_may_leave_an_earlier_models_last_iteration(colmap_scene, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(report, "EVERY", 5)
-    monkeypatch.setattr(report, "PER_VIEW", 1)
-    _train(colmap_scene, tmp_path, "--iterations", 20)
-    assert "of an earlier training" not in capsys.readouterr().err
-    assert set(_train(colmap_scene, tmp_path, "--iterations", 20, "--target_psnr", 1)) == {5, 20}
-    assert "keeps iteration 20 of an earlier training, and other commands take the highest" in capsys.readouterr().err
-
-
-def test_a_repeated_schedule_names_its_own_resolution_schedule(colmap_scene, tmp_path, capsys):
-    schedule = Decided(100, [Block(20, 0.0, 0.05, 0.0)], 20, 5.0, "pyramid", ((0.0, 4.0), (0.5, 1.0)))
-    write_schedule(tmp_path / "schedule.json", schedule)
-    words = "--iterations", 100, "--schedule", tmp_path / "schedule.json"
-    _train(colmap_scene, tmp_path / "out", *words, "--checkpoint_iterations", 50)
-    assert _stored(tmp_path / "out", "resolution_schedule") == "pyramid"
-    start = "--start_checkpoint", tmp_path / "out" / "chkpnt10.pth"
-    _train(colmap_scene, tmp_path / "out", *words, *start, "--resolution_schedule", "pyramid")
-    assert "was trained with" not in capsys.readouterr().err
 
 
 def test_what_contradicts_itself_is_refused(colmap_scene, tmp_path):
@@ -460,7 +423,7 @@ def test_what_contradicts_itself_is_refused(colmap_scene, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_checkpoint_finds_its_place_or_is_refused(colmap_scene, tmp_path, monkeypatch, capsys):
+def test_a_checkpoint_finds_its_place_or_is_refused(colmap_scene, tmp_path, monkeypatch):
     steady, clocked = tmp_path / "steady", tmp_path / "clocked"
     _timed(monkeypatch, lambda t: 0.0)  # a busy machine's seconds would be missing below
     _train(colmap_scene, steady, "--iterations", 60, "--checkpoint_iterations", 30)
@@ -471,9 +434,6 @@ def test_a_checkpoint_finds_its_place_or_is_refused(colmap_scene, tmp_path, monk
     assert first["last"] == 30 and first["step"] == 1 / 60  # half of the schedule is done
     assert max(saved) in (79, 80, 81)
     (checkpoint,) = clocked.glob("chkpnt*.pth")
-    capsys.readouterr()
-    _train(colmap_scene, tmp_path / "on", "--iterations", 120, "--start_checkpoint", checkpoint)
-    assert "is of a run with --time_budget, and this one has none" in capsys.readouterr().err
     for reason, more in (
         ("and without one --iterations 60 leaves nothing to do; resume it with --time_budget", ("--iterations", 60)),
         ("of a schedule of 60 iterations, not 61", ("--iterations", 61, "--time_budget", 9)),
@@ -485,16 +445,6 @@ def test_a_checkpoint_finds_its_place_or_is_refused(colmap_scene, tmp_path, monk
     (steady / "schedule.json").write_text("{")
     with pytest.raises(UserError, match="is no schedule .*; restore it for .*chkpnt30.pth, or move it elsewhere"):
         _train(colmap_scene, tmp_path / "out", "--iterations", 60, *start, "--time_budget", 9)
-    (steady / "schedule.json").write_text(json.dumps(GOOD | {"iterations": 60}))
-    with pytest.raises(UserError, match="ends before iteration 30 of .*chkpnt30.pth, so it is of another run"):
-        _train(colmap_scene, tmp_path / "out", "--iterations", 60, *start, "--time_budget", 9)
-    _train(colmap_scene, steady, "--iterations", 5)
-    assert not (steady / "schedule.json").exists()  # it was of another training
-
-
-def test_a_slow_start_does_not_end_a_short_run():
-    last, seconds = _run(_fresh(30_000, 1.0), lambda t, n: 0.6 if t == 1 else 0.001)
-    assert seconds == pytest.approx(1.0, rel=0.03) and last > 300
 
 
 def test_a_decided_run_goes_through_rates_degrees_and_windows(colmap_scene, tmp_path, monkeypatch):
@@ -549,7 +499,7 @@ def test_a_steady_run_leaves_the_schedule_of_a_folder_where_it_goes_on(colmap_sc
     assert before.ended == max(whole) > on
     more = "--iterations", on + 20, "--checkpoint_iterations", on + 10, "--start_checkpoint"
     _train(colmap_scene, out, *more, late)
-    assert "this one has none" in capsys.readouterr().err
+    assert "is of a run with --time_budget, and this one has none" in capsys.readouterr().err
     left = read_schedule(path)
     assert left == DecidedSchedule(before).up_to(on) and (left.ended, left.blocks[-1].last) == (None, on)
     with pytest.raises(UserError, match="is of a run that did not end"):
@@ -566,28 +516,12 @@ def test_a_steady_run_leaves_the_schedule_of_a_folder_where_it_goes_on(colmap_sc
 
 
 def test_a_steady_run_from_elsewhere_removes_the_schedule_of_its_folder(colmap_scene, tmp_path):
-    _train(colmap_scene, tmp_path / "a", "--iterations", 20, "--checkpoint_iterations", 10)
-    (tmp_path / "b").mkdir()
-    (tmp_path / "b" / "schedule.json").write_text(json.dumps(GOOD))
-    start = "--start_checkpoint", tmp_path / "a" / "chkpnt10.pth"
-    _train(colmap_scene, tmp_path / "b", "--iterations", 20, *start)
-    assert not (tmp_path / "b" / "schedule.json").exists()
-
-
-@pytest.mark.parametrize(("seconds", "reset", "resets"), [(20, 3000, 0), (20, 1000, 2), (300, 3000, 1)])
-def test_a_reset_too_late_to_recover_from_is_left_out(colmap_scene, tmp_path, monkeypatch, seconds, reset, resets):
-    """Of 3600 iterations of the schedule, 600 are left after 3000: some 33 or 500 of the run, and 50 are needed."""
-    monkeypatch.setattr(rules, "RECOVERY", 50)
-    _timed(monkeypatch, lambda t: 0.1)
-    done, reset_opacity = [], GaussianModel.reset_opacity
-    monkeypatch.setattr(GaussianModel, "reset_opacity", lambda self: (done.append(1), reset_opacity(self)))
-    words = "--opacity_reset_interval", reset, "--densify_until_iter", reset + 500, "--iterations", 3600
-    if reset == 1000:
-        words = (*words[:3], 3500, *words[4:])
-    _train(colmap_scene, tmp_path / "a", *words, "--time_budget", seconds, "--strategy", "adc")
-    assert len(done) == resets
-    _train(colmap_scene, tmp_path / "b", *words, "--schedule", tmp_path / "a" / "schedule.json")
-    assert len(done) == 2 * resets
+    """From the start, or from the checkpoint of another folder."""
+    for name, start in (("a", ()), ("b", ("--start_checkpoint", tmp_path / "a" / "chkpnt10.pth"))):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "schedule.json").write_text(json.dumps(GOOD))
+        _train(colmap_scene, tmp_path / name, "--iterations", 20, "--checkpoint_iterations", 10, *start)
+        assert not (tmp_path / name / "schedule.json").exists()
 
 
 def test_a_time_budget_takes_the_strategy_that_is_best_in_it(colmap_scene, tmp_path, monkeypatch, capsys):
@@ -624,6 +558,6 @@ def test_no_strategy_grows_beyond_what_the_clock_can_train(colmap_scene, tmp_pat
     words = "--strategy", strategy, "--densify_grad_threshold", 1e-7, "--mcmc_growth", 0.1, "--max_num_splats", 0
     by_clock = _train(colmap_scene, tmp_path / "a", *words, "--time_budget", 6)
     without = _train(colmap_scene, tmp_path / "b", *words, "--iterations", 60, "--densification_interval", 2,
-                     "--densify_from_iter", 2)  # fmt: skip
+                     "--densify_from_iter", 2, "--max_num_splats", 3000)  # fmt: skip
     counts = [int(re.search(rb"element vertex (\d+)", plies[max(plies)])[1]) for plies in (by_clock, without)]
     assert 300 < counts[0] <= 25 * 75 < counts[1]

@@ -75,16 +75,11 @@ def test_a_program_that_imports_torch_first_has_more_threads_than_cores_so_that_
 
 
 def test_a_training_imports_nothing_that_it_does_not_use(blender_scene, tmp_path):
-    """A checkpoint takes the optimiser's state."""
-    out = tmp_path / "out"
-    assert _loaded(blender_scene, out, "--eval", "--no_curve", "--checkpoint_iterations", "6") == []
-    resumed = ["--start_checkpoint", str(out / "chkpnt6.pth"), "--optimizer_type", "sparse_adam"]
-    assert _loaded(blender_scene, out, "--eval", "--no_curve", *resumed) == []
-
-
-def test_a_training_leaves_drawing_its_curve_to_another_process(colmap_scene, tmp_path):
-    assert _loaded(colmap_scene, tmp_path, "--eval") == []
+    """A checkpoint takes the optimiser's state. Another process draws the curve."""
+    assert _loaded(blender_scene, tmp_path, "--eval", "--checkpoint_iterations", "6") == []
     assert (tmp_path / "error_vs_time.png").is_file()
+    resumed = ["--start_checkpoint", str(tmp_path / "chkpnt6.pth"), "--optimizer_type", "sparse_adam"]
+    assert _loaded(blender_scene, tmp_path, "--eval", "--no_curve", *resumed) == []
 
 
 def _decorated(name: str) -> bool:

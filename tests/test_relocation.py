@@ -9,6 +9,7 @@ from gaussians import GROUPS, model, take_steps
 from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.budget import fade, remove_useless, split_in_two
 from scene.gaussians.mcmc import MOST_PARTS, divided, draw, opacity_units
 
 LOGITS = torch.tensor([-5.2, -2.0, 0.0, 1.5, 4.0, 9.0, 15.0])
@@ -17,29 +18,14 @@ DRAW = WHERE | {"draw": 1}
 RULE = 0.005, MOST_PARTS
 
 
-def _paper(before: float, parts: int) -> tuple[float, float]:
-    """Opacity and factor of the scales, by the paper's double sum."""
-    opacity = 1 - (1 - before) ** (1 / parts)
-    total = 0.0
-    for i in range(1, parts + 1):
-        total += sum(math.comb(i - 1, k) * (-1) ** k * opacity ** (k + 1) / math.sqrt(k + 1) for k in range(i))
-    return opacity, before / total
+@pytest.mark.parametrize("parts", [1, 2, 5, 17, MOST_PARTS])
+def test_coinciding_parts_keep_the_image(parts):
+    """Parts that are blended one after another: as opaque in the middle, and as much hidden along a line.
 
-
-@pytest.mark.parametrize("parts", [1, 2, 3, 17, MOST_PARTS])
-def test_parts_are_the_papers(parts):
+    The paper's double sum is the one pair of opacity and scale that does both.
+    """
     logits, larger = divided(LOGITS, torch.full((len(LOGITS),), parts))
     assert logits.dtype == larger.dtype == torch.float64
-    for logit, part, log_factor in zip(LOGITS.double().tolist(), logits.tolist(), larger.tolist(), strict=True):
-        opacity, factor = _paper(1 / (1 + math.exp(-logit)), parts)
-        assert 1 / (1 + math.exp(-part)) == pytest.approx(opacity, rel=1e-9)
-        assert math.exp(log_factor) == pytest.approx(factor, rel=1e-6)
-
-
-@pytest.mark.parametrize("parts", [2, 5, MOST_PARTS])
-def test_coinciding_parts_keep_the_image(parts):
-    """Parts that are blended one after another: as opaque in the middle, and as much hidden along a line."""
-    logits, larger = divided(LOGITS, torch.full((len(LOGITS),), parts))
     line = np.linspace(-12, 12, 20_001)
     for logit, part, log_factor in zip(LOGITS.double().tolist(), logits.tolist(), larger.tolist(), strict=True):
         one = np.exp(-0.5 * line**2) / (1 + math.exp(-logit))
@@ -56,16 +42,11 @@ def test_an_opacity_of_one_can_be_divided():
     assert logits.isfinite().all() and larger.isfinite().all() and (larger < 0).all()
 
 
-def test_draws_are_in_proportion_and_the_same_for_any_number_of_threads():
-    units = torch.tensor([0, 1, 5, 0, 2, 0]) * 2**30
-    before = torch.get_num_threads()
-    try:
-        drawn = []
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            drawn.append(draw(units, 80_000, **DRAW)[1])
-    finally:
-        torch.set_num_threads(before)
+def test_draws_are_in_proportion_and_the_same_for_any_number_of_threads(threads):
+    units, drawn = torch.tensor([0, 1, 5, 0, 2, 0]) * 2**30, []
+    for count in (1, 3):
+        threads(count)
+        drawn.append(draw(units, 80_000, **DRAW)[1])
     assert torch.equal(*drawn)
     share = drawn[0].bincount(minlength=6) / 80_000
     assert (share[units == 0] == 0).all()
@@ -103,26 +84,30 @@ def _averages(gaussians: GaussianModel) -> list[Tensor]:
     return [s[key].reshape(len(gaussians), -1).clone() for s in state for key in ("exp_avg", "exp_avg_sq")]
 
 
+def _assert_parts(gaussians: GaussianModel, live: int, before: dict[str, Tensor], averages: list[Tensor]) -> None:
+    """The first `live` Gaussians of `before` stayed, some of them as parts; all others are further parts of those."""
+    after = _values(gaussians)
+    (origins,) = (after["xyz"][live:, None] == before["xyz"][None, :live]).all(dim=2).nonzero()[:, 1:].T
+    assert len(origins) == len(gaussians) - live  # each lies where a live one is
+    copies = origins.bincount(minlength=live)
+    alone = (copies == 0).nonzero()[:, 0]
+    for name in GROUPS:
+        assert torch.equal(after[name][live:], after[name][origins])
+        stayed = alone if name in ("opacity", "scaling") else slice(live)
+        assert torch.equal(after[name][stayed], before[name][stayed])
+    logits, larger = divided(before["opacity"][:live, 0], copies + 1)
+    torch.testing.assert_close(after["opacity"][:live, 0], logits.float())
+    torch.testing.assert_close(after["scaling"][:live], before["scaling"][:live] + larger[:, None].float())
+    for old, new in zip(averages, _averages(gaussians), strict=True):
+        assert torch.equal(new[alone], old[alone]) and new[alone].any()
+        assert not new[origins].any() and not new[live:].any()
+
+
 def test_dead_gaussians_become_parts_of_live_ones():
     gaussians = _trained()
     before, averages = _values(gaussians), _averages(gaussians)
     assert gaussians.relocate(*RULE, **WHERE) == 12
-    after = _values(gaussians)
-    (origins,) = (after["xyz"][28:, None] == before["xyz"][None, :28]).all(dim=2).nonzero()[:, 1:].T
-    assert len(origins) == 12  # each lies where a live one is
-    copies = origins.bincount(minlength=28)
-    changed = copies > 0
-    for name in GROUPS:
-        assert torch.equal(after[name][28:], after[name][origins])
-        assert torch.equal(after[name][:28][~changed], before[name][:28][~changed])
-        if name not in ("opacity", "scaling"):
-            assert torch.equal(after[name][:28], before[name][:28])
-    logits, larger = divided(before["opacity"][:28, 0], copies + 1)
-    torch.testing.assert_close(after["opacity"][:28, 0], logits.float())
-    torch.testing.assert_close(after["scaling"][:28], before["scaling"][:28] + larger[:, None].float())
-    untouched = torch.cat((~changed, torch.zeros(12, dtype=torch.bool)))
-    for old, new in zip(averages, _averages(gaussians), strict=True):
-        assert torch.equal(new[untouched], old[untouched]) and new[untouched].any() and not new[~untouched].any()
+    _assert_parts(gaussians, 28, before, averages)
     assert all(getattr(gaussians, field).grad is None for field in GROUPS.values())
 
 
@@ -158,20 +143,11 @@ def test_growth_appends_parts():
     before, averages = _values(gaussians), _averages(gaussians)
     gaussians.grow(7, MOST_PARTS, **WHERE)
     assert len(gaussians) == 47
-    after = _values(gaussians)
-    origins = (after["xyz"][40:, None] == before["xyz"][None]).all(dim=2).nonzero()[:, 1]
-    assert len(origins) == 7
-    logits, larger = divided(before["opacity"][:, 0], origins.bincount(minlength=40) + 1)
-    torch.testing.assert_close(after["opacity"][:40, 0], logits.float())
-    torch.testing.assert_close(after["scaling"][:40], before["scaling"] + larger[:, None].float())
-    assert all(torch.equal(after[name][40:], after[name][origins]) for name in GROUPS)
-    for old, new in zip(averages, _averages(gaussians), strict=True):
-        assert not new[40:].any() and not new[origins].any()
-        rest = [row for row in range(40) if row not in origins]
-        assert torch.equal(new[rest], old[rest])
+    _assert_parts(gaussians, 40, before, averages)
 
 
 def test_other_activations_are_followed():
+    """By the rules of both strategies."""
     plain, own = _trained(), _trained()
     with torch.no_grad():
         own._opacity.sigmoid_()
@@ -180,7 +156,15 @@ def test_other_activations_are_followed():
     own.scaling_inverse_activation = torch.abs
     for gaussians in (plain, own):
         gaussians.relocate(*RULE, **WHERE)
+        split_in_two(gaussians, torch.tensor([1, 4]))
+    least = float(plain.get_opacity.detach().sort(dim=0).values[2:4].mean())
+    for gaussians in (plain, own):
+        remove_useless(gaussians, least, 99)
+        fade(gaussians, 0.9)
+    assert len(own) == len(plain) < 42
+    for name in ("get_opacity", "get_scaling", "get_xyz"):
+        torch.testing.assert_close(getattr(own, name), getattr(plain, name))
+    for gaussians in (plain, own):
         gaussians.start_as(0.5, 0.1)
+        torch.testing.assert_close(gaussians.get_opacity, torch.full_like(own._opacity, 0.5))
     torch.testing.assert_close(own.get_scaling, plain.get_scaling)
-    torch.testing.assert_close(own.get_opacity, torch.full_like(own._opacity, 0.5))
-    torch.testing.assert_close(plain.get_opacity, torch.full_like(own._opacity, 0.5))

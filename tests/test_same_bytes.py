@@ -4,7 +4,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -30,14 +30,6 @@ from splatting.host.machine import instruction_set
 ROOT = Path(__file__).resolve().parents[1]
 Results = list[Tensor]
 RATE, BETAS, EPS_OF_ADAM = 0.01, (0.9, 0.999), 1e-15
-
-
-@pytest.fixture
-def threads() -> Iterator[Callable[[int], None]]:
-    """A function that sets torch's number of threads for this test."""
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)
 
 
 # What is repeated. There are enough splats for several parts in sorts and sums, and enough tiles for threads to take

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from gaussians import model, parameters
-from trainings import train_on
+from trainings import before_steps, train_on
 
 import export
 import render
@@ -17,8 +17,8 @@ from arguments import ModelParams
 from scene.gaussians import ply
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
 from scene.saved_model import find_save, load_saved, read_model
+from splatting.evaluation.training_log import read_log
 from splatting.host.start import typed_command
-from splatting.training import loop
 from utils.system_utils import UserError
 
 PAGES = Path(__file__).parents[1] / "docs" / "api"
@@ -70,32 +70,24 @@ def test_a_ply_is_opened_once_to_be_rendered(colmap_scene, tmp_path, monkeypatch
 
 
 def test_an_interrupted_training_can_be_looked_at(colmap_scene, tmp_path, monkeypatch, capfd):
-    taker = loop.step_taker
-
-    def interrupting(run):
-        taken = taker(run)
-        take = taken.take
-
-        def at(step, tell) -> None:
-            take(step, tell)
-            if step.iteration == 20:
-                signal.raise_signal(signal.SIGINT)
-
-        taken.take = at
-        return taken
-
-    monkeypatch.setattr(loop, "step_taker", interrupting)
+    before_steps(monkeypatch, lambda step: step.iteration == 20 and signal.raise_signal(signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
         train_on(colmap_scene, tmp_path, *WORDS, "--iterations", 40)
+    monkeypatch.undo()
     said = capfd.readouterr().err
     look = f"Stopped at iteration 20\nLook at the model: {typed_command('view.py')} -m {tmp_path}\n"
     assert f"{look}Resume by the same command with --start_checkpoint {tmp_path / 'chkpnt20.pth'}" in said
     path = tmp_path / "point_cloud/iteration_20/point_cloud.ply"
     assert torch.equal(read_model(path).get_xyz, load_checkpoint(tmp_path / "chkpnt20.pth")[0][1])
-    monkeypatch.undo()
     start = "--start_checkpoint", tmp_path / "chkpnt20.pth"
-    train_on(colmap_scene, tmp_path / "resumed", *WORDS[:-1], "--iterations", 21, *start)
-    assert f"Resuming {tmp_path / 'resumed'} at iteration 20" in capfd.readouterr().out
+    resumed = train_on(colmap_scene, tmp_path / "resumed", *WORDS[:-1], "--iterations", 40, *start)
+    told = capfd.readouterr().out
+    assert f"Resuming {tmp_path / 'resumed'} at iteration 20" in told and "Number of points" not in told
+    assert resumed == train_on(colmap_scene, tmp_path / "whole", *WORDS, "--iterations", 40)
+    (whole,), (cut, end) = (read_log(tmp_path / name / "train_log.json") for name in ("whole", "resumed"))
+    assert (cut["iteration"], end["iteration"]) == (20, 40) and end["seconds"] > cut["seconds"] > 0
+    # The running mean of the loss goes on where it was.
+    assert (end["loss"], end["gaussians"]) == (whole["loss"], whole["gaussians"])
 
     shutil.rmtree(tmp_path / "point_cloud")  # as after a crash: a checkpoint alone
     for command, words in ((render, ("--skip_train",)), (export, ("--to", tmp_path / "a.splat"))):

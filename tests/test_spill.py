@@ -31,7 +31,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 @pytest.mark.parametrize("columns", [-1, 0, 9, 24])
-def test_missed_steps_are_steps_without_a_gradient(dtype, columns):
+def test_missed_steps_are_steps_without_a_gradient(threads, dtype, columns):
     count, past = 130, 90
     generator = torch.Generator().manual_seed(0)
     state = [torch.randn(count, 15, 3, generator=generator, dtype=dtype) for _ in range(3)]
@@ -50,14 +50,10 @@ def test_missed_steps_are_steps_without_a_gradient(dtype, columns):
         for whole, values in zip(wanted, part, strict=True):
             whole[rows] = values
     assert (state[0] == wanted[0]).all() == (columns == 0)
-    before = torch.get_num_threads()
-    for threads in (1, 3):
+    for threads_now in (1, 3):
         found = [t.clone() for t in state]
-        try:
-            torch.set_num_threads(threads)
-            catch_up_(*found, taken, rates, numbers, *BETAS, EPS, columns)
-        finally:
-            torch.set_num_threads(before)
+        threads(threads_now)
+        catch_up_(*found, taken, rates, numbers, *BETAS, EPS, columns)
         assert all(torch.equal(a, b) for a, b in zip(found, wanted, strict=True))
 
 

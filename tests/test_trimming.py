@@ -306,12 +306,6 @@ def test_a_view_between_is_interpolated():
         assert (clip[1] / clip[3]).item() * view.image_height / 2 == pytest.approx(-1 + fraction, abs=1e-3)
 
 
-@pytest.mark.parametrize("value", ["-0.5", "nan"])
-def test_no_such_tolerance(value, tmp_path):
-    with pytest.raises(UserError, match="prune_sh must be"):
-        train.main(["-s", str(tmp_path), "-m", str(tmp_path / "out"), f"--prune_sh={value}"])
-
-
 LEFT_OUT = LeftOut(
     gaussians=1000, unseen=50, faint=0, keep_unseen=False, search=DONE, views=99, iterations=7000, max_sh_degree=3,
     sh_degree=3, cut_bounds=[0.3, 0.2, 0.1, 0.0], ply_bytes=248_000, ply_bytes_saved=12_400, seconds=1.25,
@@ -324,13 +318,10 @@ LEFT_OUT = LeftOut(
     ("changes", "said"),
     [
         ({}, "50 invisible ones were left out (5.0 %, 0.01 MB of the PLY); 99 views were searched in 1.2 s"),
-        ({}, "by at most 0.012 (values 0 to 1), PSNR 30.000 to 29.900 dB"),
-        ({}, "would move colours, from 0 to 1, by up to 0.3 above degree 0, 0.2 above degree 1, 0.1 above degree 2"),
         ({}, "at training size: 3.0 MB, 45.0 MB less"),
         # 950 Gaussians lose 12 coefficients of 3 channels, 4 bytes each.
         ({"sh_degree": 1}, "the SH bands above degree 1 (0.14 MB of the PLY): colours move by at most 0.2 (values"),
         ({"sh_degree": 1, "cut_bounds": [0.3, 0.0, 0.0, 0.0]}, "(0.14 MB of the PLY): they are zero throughout"),
-        ({"max_sh_degree": 0, "sh_degree": 0, "cut_bounds": [0.0]}, "no SH bands above degree 0"),
         ({"keep_unseen": True, "unseen": 0, "test_change": {}}, "No Gaussian was left out (--keep_unseen)\n"),
         ({"search": FEW, "unseen": 20, "faint": 20}, "searched in 1.2 s, with fewer than 1 % unseen besides"),
         ({"search": TOO_LONG, "unseen": 0}, "a search takes 99 views, more than a 15th of the iterations"),
@@ -341,12 +332,10 @@ def test_the_lines_of_a_report(changes, said):
 
 
 def test_the_line_that_training_prints():
-    plain = replace(LEFT_OUT, unseen=0, ply_bytes_saved=0, test_change={})
-    assert saved_line(plain, Path("OUT/iteration_7")) == "Saved 1,000 Gaussians to OUT/iteration_7 (0.25 MB)"
-    bands = replace(plain, sh_degree=0, ply_bytes_saved=183_400)
-    assert saved_line(bands, Path("OUT")).endswith("(0.06 MB; SH bands above degree 0 left out)")
-    faint = replace(plain, unseen=50, faint=50)
-    assert saved_line(faint, Path("OUT")).endswith(". Left out 50 invisible Gaussians (opacity below 1/255)")
+    bands = replace(LEFT_OUT, unseen=0, sh_degree=0, ply_bytes_saved=183_400, test_change={})
+    assert saved_line(bands, Path("O")) == "Saved 1,000 Gaussians to O (0.06 MB; SH bands above degree 0 left out)"
+    faint = replace(bands, unseen=50, faint=50)
+    assert saved_line(faint, Path("O")).endswith(". Left out 50 invisible Gaussians (opacity below 1/255)")
     assert "(no view depends on them); test views change by at most 0.012" in saved_line(LEFT_OUT, Path("OUT"))
 
 
@@ -363,7 +352,4 @@ def test_a_training_ends_with_at_most_six_lines(colmap_scene, tmp_path, capfd):
         r"Test PSNR [\d.]+ dB \(as metrics.py\). Look at the model: \S*python\S* view.py -m \S+", end[-2]
     )
     assert len(end) <= 7 and end[-1] == "Training complete."
-    kept = json.loads((tmp_path / "train_log.json").read_text())[-1]["lines"]
-    assert set(lines(left_out)) < set(kept)
-    # There are 17 photos of 96 x 64, 14 of them trained at 24 x 16.
-    assert "size: 0.0 MB, 1.0 MB less" in lines(left_out)[2]
+    assert set(lines(left_out)) < set(json.loads((tmp_path / "train_log.json").read_text())[-1]["lines"])

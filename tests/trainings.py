@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,9 @@ from PIL import Image
 from synthetic import FOCAL, make_colmap_scene
 
 import train
-from splatting.training import run
+from splatting.training import loop, run
+from splatting.training.iteration import Iteration
+from splatting.training.steps.plain import PlainStep
 
 ITERATIONS = 60
 MCMC = ("--strategy", "mcmc", "--mcmc_noise", 5e4, "--mcmc_gate_opacity", 0.5, "--mcmc_min_opacity", 0.45)
@@ -67,6 +70,19 @@ def trained(scene: Path, out: Path, *options: object) -> dict[str, bytes | list]
         patch.setattr(run, "SH_INTERVAL", 12)  # between the iterations that change rows
         train_on(scene, out, *words, "--no_curve", "--quiet", "--disable_viewer", *options)
     return whole_result(out, ITERATIONS)
+
+
+def before_steps(monkeypatch: pytest.MonkeyPatch, act: Callable[[Iteration], None]) -> None:
+    """Let act(step) be called before each step of a training is taken."""
+    chosen = loop.step_taker
+
+    def taker(of: run.Run) -> PlainStep:
+        taken = chosen(of)
+        take = taken.take
+        taken.take = lambda step, tell: (act(step), take(step, tell))
+        return taken
+
+    monkeypatch.setattr(loop, "step_taker", taker)
 
 
 def leaves(value: object) -> list:
