@@ -10,7 +10,7 @@ import torch
 from tqdm import tqdm
 
 from arguments import ModelParams, OptimizationParams, PipelineParams
-from gaussian_renderer import network_gui, render
+from gaussian_renderer import render
 from scene import GaussianModel, Scene
 from utils.general_utils import get_expon_lr_func, safe_state
 from utils.image_utils import psnr
@@ -25,36 +25,6 @@ try:
 except ImportError:
     SparseGaussianAdam = None
 SPARSE_ADAM_AVAILABLE = SparseGaussianAdam is not None
-
-
-def serve_viewer(gaussians, pipe, background, dataset, iteration, iterations):
-    """Answer a connected viewer until it wants training to go on; returns how many images were sent."""
-    sent = 0
-    if network_gui.conn is None:
-        network_gui.try_connect()
-    while network_gui.conn is not None:
-        try:
-            image_bytes = None
-            camera, train, pipe.convert_SHs_python, pipe.compute_cov3D_python, keep_alive, scale = network_gui.receive()
-            if camera is not None:
-                image = render(
-                    camera,
-                    gaussians,
-                    pipe,
-                    background,
-                    scaling_modifier=scale,
-                    use_trained_exp=dataset.train_test_exp,
-                    separate_sh=SPARSE_ADAM_AVAILABLE,
-                )["render"]
-                pixels = (torch.clamp(image, min=0, max=1.0) * 255).byte().permute(1, 2, 0).contiguous()
-                image_bytes = memoryview(pixels.cpu().numpy())
-                sent += 1
-            network_gui.send(image_bytes, dataset.source_path)
-            if train and (iteration < iterations or not keep_alive):
-                break
-        except Exception:
-            network_gui.conn = None
-    return sent
 
 
 @torch.no_grad()
@@ -84,10 +54,9 @@ def training(dataset, opt, pipe, args):
     started, ended = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
     use_sparse_adam = opt.optimizer_type == "sparse_adam" and SPARSE_ADAM_AVAILABLE
     depth_weight = get_expon_lr_func(opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations)
-    stack, losses, depth_losses, sent, seconds = None, [], [], 0, 0.0
+    stack, losses, depth_losses, seconds = None, [], [], 0.0
 
     for iteration in tqdm(range(first + 1, opt.iterations + 1)):
-        sent += serve_viewer(gaussians, pipe, background, dataset, iteration, opt.iterations)
         started.record()
         gaussians.update_learning_rate(iteration)
         if iteration % 1000 == 0:
@@ -152,7 +121,6 @@ def training(dataset, opt, pipe, args):
         "depth_losses": depth_losses,
         "psnr": evaluate(scene.getTestCameras(), gaussians, pipe, background, dataset),
         "count": gaussians.get_xyz.shape[0],
-        "sent": sent,
         "exposures": list(exposures.shape),
         "exposure_moved": (exposures - torch.eye(3, 4, device="cuda")).abs().max().item(),
         "seconds": seconds,
@@ -162,24 +130,15 @@ def training(dataset, opt, pipe, args):
 if __name__ == "__main__":
     parser = ArgumentParser(description="Training script parameters")
     lp, op, pp = ModelParams(parser), OptimizationParams(parser), PipelineParams(parser)
-    parser.add_argument("--ip", type=str, default="127.0.0.1")
-    parser.add_argument("--port", type=int, default=6009)
     parser.add_argument("--debug_from", type=int, default=-1)
-    parser.add_argument("--detect_anomaly", action="store_true", default=False)
     parser.add_argument("--save_iterations", nargs="+", type=int, default=[7_000, 30_000])
-    parser.add_argument("--quiet", action="store_true")
-    parser.add_argument("--disable_viewer", action="store_true", default=False)
     parser.add_argument("--checkpoint_iterations", nargs="+", type=int, default=[])
     parser.add_argument("--start_checkpoint", type=str, default=None)
     out = sys.argv[3]
     args = parser.parse_args(["-s", sys.argv[1], "-m", out, *sys.argv[4:]])
     args.save_iterations.append(args.iterations)
     os.makedirs(out, exist_ok=True)
-    safe_state(args.quiet)
-    if not args.disable_viewer:
-        network_gui.init(args.ip, args.port)
-    torch.autograd.set_detect_anomaly(args.detect_anomaly)
+    safe_state(False)
     result = training(lp.extract(args), op.extract(args), pp.extract(args), args)
     with open(os.path.join(out, "result.json"), "w") as file:
         json.dump(result, file)
-    print("\nTraining complete.")
