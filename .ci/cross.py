@@ -27,7 +27,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / "build" / "cross"
-EXTENSIONS = ("simple-knn", "fused-ssim", "diff-gaussian-rasterization")
+EXTENSIONS = sorted(path.parent.name for path in ROOT.glob("submodules/*/setup.py"))
 ZIG = "ziglang==0.17.1"
 # Flags of submodules/common/build_extension.py that matter to results, and its instruction sets.
 FLAGS = ("-std=c++17", "-O3", "-Wall", "-Wextra", "-Werror", "-fno-math-errno", "-fno-trapping-math", "-pthread")

@@ -192,6 +192,12 @@ def test_the_whole_stays_within_its_size():
     assert all(found[what] <= most for what, most in MOST.items()), found
 
 
+def test_module_docstrings_begin_with_a_noun_or_a_verb():
+    """A clause without a head neither names the subject of its module nor says what it does."""
+    clause = re.compile(r"(What|Which|How|Where|Whether)\b")
+    assert [path for path in _python() if clause.match(ast.get_docstring(_tree(path)) or "")] == []
+
+
 def test_functions_are_short_in_python():
     long = {
         f"{_module(path)}.{node.name}": length
