@@ -67,17 +67,10 @@ class Transforms:
         write_point_cloud(blender / "points3d.ply", np.eye(3), np.zeros((3, 3), np.uint8))
         shutil.copytree(blender, nerfstudio)
         content = json.loads((nerfstudio / "transforms_train.json").read_text())
-        content |= {
-            "ply_file_path": "points3d.ply",
-            "w": 40,
-            "h": 30,
-            "fl_x": 50.0,
-            "k1": 0.0,
-            "camera_model": "OPENCV",
-        }
-        content |= {"cx": 20.0, "cy": 15.0, "test_filenames": ["./train/r_0.png"]}
-        for name in ("transforms_train.json", "transforms_test.json"):
-            (nerfstudio / name).unlink()
+        content |= {"ply_file_path": "points3d.ply", "camera_model": "OPENCV", "test_filenames": ["./train/r_0.png"]}
+        content |= {"w": 40, "h": 30, "fl_x": 50.0, "k1": 0.0, "cx": 20.0, "cy": 15.0}
+        for path in nerfstudio.glob("transforms_*.json"):
+            path.unlink()
         (nerfstudio / "transforms.json").write_text(json.dumps(content))
         self._files = [blender / "transforms_train.json", nerfstudio / "transforms.json"]
 
