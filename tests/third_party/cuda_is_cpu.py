@@ -6,7 +6,6 @@ Without a GPU, "cuda" means the CPU in the script's process. With a GPU, the scr
 import os
 import runpy
 import sys
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -33,29 +32,12 @@ class CudaIsCpu(TorchFunctionMode):
         return func(*map(_mapped, args), **kwargs)
 
 
-class _Event:
-    """torch.cuda.Event on the clock of the CPU."""
-
-    def __init__(self, enable_timing: bool = False) -> None:
-        self._seconds = 0.0
-
-    def record(self) -> None:
-        self._seconds = time.perf_counter()
-
-    def synchronize(self) -> None:
-        pass
-
-    def elapsed_time(self, end: "_Event") -> float:
-        return 1000 * (end._seconds - self._seconds)
-
-
 def main() -> None:
     """Run the script of the command line as Python itself would."""
     del sys.argv[0]
     sys.path[0] = os.path.dirname(os.path.abspath(sys.argv[0]))
     if not torch.cuda.is_available():
         CudaIsCpu().__enter__()
-        torch.cuda.Event = _Event
     runpy.run_path(sys.argv[0], run_name="__main__")
 
 

@@ -7,6 +7,7 @@ from argparse import ArgumentParser
 from random import randint
 
 import torch
+from fused_ssim import fused_ssim
 from tqdm import tqdm
 
 from arguments import ModelParams, OptimizationParams, PipelineParams
@@ -14,24 +15,14 @@ from gaussian_renderer import render
 from scene import GaussianModel, Scene
 from utils.general_utils import get_expon_lr_func, safe_state
 from utils.image_utils import psnr
-from utils.loss_utils import l1_loss, ssim
-
-try:
-    from fused_ssim import fused_ssim
-except ImportError:
-    fused_ssim = None
-try:
-    from diff_gaussian_rasterization import SparseGaussianAdam
-except ImportError:
-    SparseGaussianAdam = None
-SPARSE_ADAM_AVAILABLE = SparseGaussianAdam is not None
+from utils.loss_utils import l1_loss
 
 
 @torch.no_grad()
 def evaluate(cameras, gaussians, pipe, background, dataset):
     scores = []
     for camera in cameras:
-        image = render(camera, gaussians, pipe, background, 1.0, SPARSE_ADAM_AVAILABLE, None, dataset.train_test_exp)
+        image = render(camera, gaussians, pipe, background, 1.0, True, None, dataset.train_test_exp)
         image = torch.clamp(image["render"], 0.0, 1.0)
         target = torch.clamp(camera.original_image.to("cuda"), 0.0, 1.0)
         if dataset.train_test_exp:
@@ -41,8 +32,6 @@ def evaluate(cameras, gaussians, pipe, background, dataset):
 
 
 def training(dataset, opt, pipe, args):
-    if not SPARSE_ADAM_AVAILABLE and opt.optimizer_type == "sparse_adam":
-        sys.exit("Trying to use sparse adam but it is not installed")
     first = 0
     gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
     scene = Scene(dataset, gaussians)
@@ -51,25 +40,18 @@ def training(dataset, opt, pipe, args):
         (model_params, first) = torch.load(args.start_checkpoint)
         gaussians.restore(model_params, opt)
     background = torch.tensor([1, 1, 1] if dataset.white_background else [0, 0, 0], dtype=torch.float32, device="cuda")
-    started, ended = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-    use_sparse_adam = opt.optimizer_type == "sparse_adam" and SPARSE_ADAM_AVAILABLE
     depth_weight = get_expon_lr_func(opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations)
-    stack, losses, depth_losses, seconds = None, [], [], 0.0
+    stack, losses, depth_losses = None, [], []
 
     for iteration in tqdm(range(first + 1, opt.iterations + 1)):
-        started.record()
         gaussians.update_learning_rate(iteration)
         if iteration % 1000 == 0:
             gaussians.oneupSHdegree()
         if not stack:
             stack = scene.getTrainCameras().copy()
         camera = stack.pop(randint(0, len(stack) - 1))
-        if (iteration - 1) == args.debug_from:
-            pipe.debug = True
         bg = torch.rand((3), device="cuda") if opt.random_background else background
-        package = render(
-            camera, gaussians, pipe, bg, use_trained_exp=dataset.train_test_exp, separate_sh=SPARSE_ADAM_AVAILABLE
-        )
+        package = render(camera, gaussians, pipe, bg, use_trained_exp=dataset.train_test_exp, separate_sh=True)
         image, points = package["render"], package["viewspace_points"]
         visible, radii = package["visibility_filter"], package["radii"]
         if camera.alpha_mask is not None:
@@ -77,7 +59,7 @@ def training(dataset, opt, pipe, args):
             image *= alpha_mask
         target = camera.original_image.cuda()
         l1 = l1_loss(image, target)
-        similarity = fused_ssim(image.unsqueeze(0), target.unsqueeze(0)) if fused_ssim else ssim(image, target)
+        similarity = fused_ssim(image.unsqueeze(0), target.unsqueeze(0))
         loss = (1.0 - opt.lambda_dssim) * l1 + opt.lambda_dssim * (1.0 - similarity)
         if depth_weight(iteration) > 0 and camera.depth_reliable:
             depth, wanted, counted = package["depth"], camera.invdepthmap.cuda(), camera.depth_mask.cuda()
@@ -85,12 +67,9 @@ def training(dataset, opt, pipe, args):
             loss += depth_weight(iteration) * depth_loss
             depth_losses.append(depth_loss.item())
         loss.backward()
-        ended.record()
 
         with torch.no_grad():
             losses.append(l1.item())
-            ended.synchronize()
-            seconds += started.elapsed_time(ended) / 1000
             if iteration in args.save_iterations:
                 scene.save(iteration)
             if iteration < opt.densify_until_iter:
@@ -107,7 +86,7 @@ def training(dataset, opt, pipe, args):
             if iteration < opt.iterations:
                 gaussians.exposure_optimizer.step()
                 gaussians.exposure_optimizer.zero_grad(set_to_none=True)
-                if use_sparse_adam:
+                if opt.optimizer_type == "sparse_adam":
                     gaussians.optimizer.step(radii > 0, radii.shape[0])
                 else:
                     gaussians.optimizer.step()
@@ -123,14 +102,12 @@ def training(dataset, opt, pipe, args):
         "count": gaussians.get_xyz.shape[0],
         "exposures": list(exposures.shape),
         "exposure_moved": (exposures - torch.eye(3, 4, device="cuda")).abs().max().item(),
-        "seconds": seconds,
     }
 
 
 if __name__ == "__main__":
     parser = ArgumentParser(description="Training script parameters")
     lp, op, pp = ModelParams(parser), OptimizationParams(parser), PipelineParams(parser)
-    parser.add_argument("--debug_from", type=int, default=-1)
     parser.add_argument("--save_iterations", nargs="+", type=int, default=[7_000, 30_000])
     parser.add_argument("--checkpoint_iterations", nargs="+", type=int, default=[])
     parser.add_argument("--start_checkpoint", type=str, default=None)
