@@ -1,6 +1,5 @@
 """A small demo scene: trained, rendered, scored and reported by the commands that users type."""
 
-import hashlib
 import json
 import os
 import re
@@ -12,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from PIL import Image
+from synthetic import folder_state
 
 from splatting.demo.make_scene import make_scene
 
@@ -32,18 +32,13 @@ def run(*command: object) -> str:
     return done.stdout
 
 
-def digest(folder: Path) -> dict[str, str]:
-    files = (file for file in folder.rglob("*") if file.is_file())
-    return {str(file.relative_to(folder)): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
-
-
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> SimpleNamespace:
     """A scene, the model trained on it, and the output of train.py and render.py."""
     folder = tmp_path_factory.mktemp("end_to_end")
     scene, model = folder / "scene", folder / "model"
     make_scene(scene, VIEWS, 120, 90, 3000, seed=0)
-    before = digest(scene)
+    before = folder_state(scene)
     training = run("train.py", "-s", scene, "-m", model, "--eval", "--iterations", ITERATIONS,
                    "--densify_from_iter", 100, "--test_iterations", 1, ITERATIONS)  # fmt: skip
     rendering = run("render.py", "-m", model)
@@ -55,7 +50,7 @@ def test_training_leaves_the_files_of_the_contract_and_the_dataset_alone(trained
     expected = {"cfg_args", "cameras.json", "input.ply", f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply"}
     assert expected <= files
     assert not [name for name in files if ".tmp" in name]
-    assert digest(trained.scene) == trained.before
+    assert folder_state(trained.scene) == trained.before
 
 
 def test_renders_are_numbered_and_stand_beside_their_ground_truth(trained):

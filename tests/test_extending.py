@@ -11,7 +11,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -85,16 +85,6 @@ for refused in (
 """
 
 
-class Runs(NamedTuple):
-    """Model folders and other results that the tests check."""
-
-    plain: Path  # trained by the plain code
-    whole: Path  # trained by the extended code
-    resumed: Path  # the same training, resumed at iteration 300
-    truth: list[np.ndarray]  # thermal photos (H, W) uint8 by sorted name
-    said: str
-
-
 def _extend(folder: Path) -> None:
     """Copy the code into `folder` and apply the page's diffs there."""
     folder.mkdir()
@@ -129,7 +119,11 @@ def _paint(scene: Path, model: Path) -> list[np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def runs(_colmap_master: Path, tmp_path_factory: pytest.TempPathFactory) -> Runs:
+def runs(_colmap_master: Path, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """Folders of models: of the plain code, of the extended one, and of the latter resumed at iteration 300.
+
+    With the thermal photos (H, W) by sorted name, and what the extended program said.
+    """
     folder = tmp_path_factory.mktemp("extending")
     scene, plain, code = (folder / name for name in ("scene", "plain", "code"))
     whole, resumed = folder / "whole", folder / "resumed"
@@ -143,10 +137,10 @@ def runs(_colmap_master: Path, tmp_path_factory: pytest.TempPathFactory) -> Runs
     command = [sys.executable, "-c", SCRIPT, *map(str, (scene, plain, whole, resumed)), *options]
     done = subprocess.run(command, cwd=code, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
-    return Runs(plain, whole, resumed, truth, done.stderr)
+    return SimpleNamespace(plain=plain, whole=whole, resumed=resumed, truth=truth, said=done.stderr)
 
 
-def _image_error(runs: Runs, iteration: int) -> float:
+def _image_error(runs: SimpleNamespace, iteration: int) -> float:
     """Mean absolute difference of the rendered temperatures from the truth."""
     errors = []
     for index, truth in enumerate(runs.truth):

@@ -18,7 +18,6 @@ from splatting.diagnosis.environment import EXTENSIONS
 from splatting.host.machine import VERSION as WRITTEN
 
 ROOT = Path(__file__).resolve().parents[1]
-WRITTEN_IN = (".py", ".toml", ".yml", ".sh")
 NOTES = ROOT / ".ci" / "release_notes.py"
 
 
@@ -36,13 +35,12 @@ def test_the_version_is_one():
 
 def test_no_other_file_writes_it_by_hand():
     """A number beside the word: a second place would be forgotten at the next release."""
-    apart = ("tests", "build", "output", "eval")
-    folders = [path for path in ROOT.iterdir() if path.is_dir() and path.name not in apart and path.name[0] != "."]
-    places = [path for folder in (ROOT / ".ci", *folders) for path in folder.rglob("*") if path.suffix in WRITTEN_IN]
-    places += [path for path in ROOT.iterdir() if path.suffix in WRITTEN_IN]
-    assert len(places) > 100
-    written = re.compile(rf"^\s*version\s*=\s*[\"']{re.escape(WRITTEN)}[\"']", re.MULTILINE | re.IGNORECASE)
-    assert [path for path in places if written.search(path.read_text(encoding="utf-8"))] == []
+    written = rf"^\s*version\s*=\s*[\"']{re.escape(WRITTEN)}[\"']"
+    search = ["git", "grep", "-liE", written, "--", "*.py", "*.toml", "*.yml", "*.sh", ":!tests"]
+    done = subprocess.run(search, cwd=ROOT, capture_output=True, text=True)
+    if done.returncode > 1:
+        pytest.skip("not a clone")
+    assert done.stdout == ""
 
 
 def test_a_model_folder_has_it(tmp_path):

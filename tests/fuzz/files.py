@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-from synthetic import make_blender_scene, make_colmap_scene
+from synthetic import as_text, make_blender_scene, make_colmap_scene
 
 import train
 from fuzz.damage import changed, damaged, damaged_text
@@ -24,17 +24,11 @@ class Colmap:
     """One file of a COLMAP model is damaged, binary or text; what can still be read must be usable."""
 
     def __init__(self, folder: Path) -> None:
-        import pycolmap
-
         self._scenes = {}
         for suffix in ("bin", "txt"):
             scene = self._scenes[suffix] = folder / f"colmap_{suffix}"
             make_colmap_scene(scene, views=9)
-        sparse = self._scenes["txt"] / "sparse" / "0"
-        model = pycolmap.Reconstruction(str(sparse))
-        for path in sparse.iterdir():
-            path.unlink()
-        model.write_text(str(sparse))
+        as_text(self._scenes["txt"])
 
     def run(self, rng: random.Random) -> None:
         suffix = rng.choice(("bin", "bin", "txt"))
