@@ -27,18 +27,12 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / "build" / "cross"
-EXTENSIONS = ("simple-knn", "fused-ssim", "diff-gaussian-rasterization")
+EXTENSIONS = sorted(path.parent.name for path in ROOT.glob("submodules/*/setup.py"))
 ZIG = "ziglang==0.17.1"
 # Flags of submodules/common/build_extension.py that matter to results, and its instruction sets.
 FLAGS = ("-std=c++17", "-O3", "-Wall", "-Wextra", "-Werror", "-fno-math-errno", "-fno-trapping-math", "-pthread")
 ROUNDED = "-ffp-contract=off"
 ARM64 = {"baseline": ("-DGS_PLAIN", ROUNDED), "neon": ()}
-PACKAGES = {  # of Debian, by command
-    "aarch64-linux-gnu-g++": "g++-aarch64-linux-gnu",
-    "qemu-aarch64": "qemu-user",
-    "x86_64-w64-mingw32-g++-posix": "g++-mingw-w64-x86-64-posix",
-    "wine64": "wine64",
-}
 
 
 @dataclass(frozen=True)
@@ -93,7 +87,7 @@ def in_parallel(commands: Iterator[list[str]]) -> None:
 
 
 def command_of(tool: tuple[str, ...]) -> list[str]:
-    """The command line of a compiler or emulator; ends with the package to install if it is missing."""
+    """The command line of a compiler or emulator; ends if it is missing."""
     name, *rest = tool
     if name == "zig":
         python = OUT / "zig" / "bin" / "python"
@@ -104,7 +98,7 @@ def command_of(tool: tuple[str, ...]) -> list[str]:
     # Debian keeps wine64 outside of PATH.
     path = shutil.which(name, path=os.pathsep.join([os.environ["PATH"], "/usr/lib/wine"]))
     if path is None:
-        sys.exit(f"there is no {name}: install it (on Debian and Ubuntu the package {PACKAGES.get(name, name)})")
+        sys.exit(f"there is no {name}: install it (on Debian and Ubuntu by .ci/install_emulators)")
     return [path, *rest]
 
 

@@ -13,26 +13,21 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 VENV = ROOT / ".venv"
-EXTENSIONS = ("simple-knn", "fused-ssim", "diff-gaussian-rasterization")
-
-
-def commands(python: Path, options: list[str]) -> list[list[str]]:
-    """Return the command lines in their order: requirements, the three extensions, the tests."""
-    install = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-    lines = [[*install, "-r", "requirements-dev.txt"]]
-    lines += [[*install, "--no-deps", "--no-build-isolation", f"./submodules/{name}"] for name in EXTENSIONS]
-    lines.append([str(python), "-m", "pytest", "-m", "not browser", "--numprocesses", "auto", *options])
-    return lines
+EXTENSIONS = sorted(path.parent.name for path in ROOT.glob("submodules/*/setup.py"))
 
 
 def main() -> int:
-    """Run them; return the exit status of the first that fails, or 0."""
+    """Return the exit status of the first command that fails, or 0."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], epilog="other options go to pytest")
     options = parser.parse_known_args()[1]
     python = VENV / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
     if not python.exists():
         venv.create(VENV, with_pip=True)
-    for command in commands(python, options):
+    install = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    commands = [[*install, "-r", "requirements-dev.txt"]]
+    commands += [[*install, "--no-deps", "--no-build-isolation", f"./submodules/{name}"] for name in EXTENSIONS]
+    commands.append([python, "-m", "pytest", "-m", "not browser", "--numprocesses", "auto", *options])
+    for command in commands:
         print("+", *command, flush=True)
         if status := subprocess.run(command, cwd=ROOT).returncode:
             return status

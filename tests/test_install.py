@@ -6,6 +6,7 @@ import importlib.util
 import os
 import platform
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -18,6 +19,7 @@ import torch
 
 ROOT = Path(__file__).resolve().parent.parent
 COMMON = ROOT / "submodules" / "common"
+PACKAGES = ("diff_gaussian_rasterization", "fused_ssim", "simple_knn")
 
 
 def load(name: str) -> ModuleType:
@@ -48,18 +50,14 @@ def fake_nvcc(folder: Path, release: str = "13.0") -> Path:
     return nvcc
 
 
-@pytest.mark.parametrize(
-    ("installed", "words"),
-    [
-        (None, "torch is not installed: run `pip install -r requirements.txt` first$"),
-        (SimpleNamespace(__version__="2.9.1+cpu"), r"torch 2.9.1\+cpu is too old: 2.10 or newer is needed$"),
-    ],
-    ids=["missing", "old"],
-)
-def test_torch_that_does_not_serve(installed, words, builder, monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch", installed)
-    with pytest.raises(SystemExit, match=f"^error: {words}"):
-        builder.import_torch()
+def test_torch_that_does_not_serve(builder, monkeypatch):
+    for installed, words in {
+        None: "torch is not installed: run `pip install -r requirements.txt` first$",
+        "2.9.1+cpu": r"torch 2.9.1\+cpu is too old: 2.10 or newer is needed$",
+    }.items():
+        monkeypatch.setitem(sys.modules, "torch", installed and SimpleNamespace(__version__=installed))
+        with pytest.raises(SystemExit, match=f"^error: {words}"):
+            builder.import_torch()
 
 
 def test_missing_compiler(builder, monkeypatch, tmp_path):
@@ -114,7 +112,7 @@ def test_root_from_nvcc_behind_a_wrapper(builder, tmp_path):
     assert builder.toolkit_root(str(wrapper)) == (tmp_path / "cuda").resolve()
 
 
-@pytest.mark.parametrize(("release", "seeded"), [("12.8", False), ("12.9", True), ("13.0", True)])
+@pytest.mark.parametrize(("release", "seeded"), [("12.8", False), ("12.9", True)])
 def test_only_an_nvcc_that_knows_seeds_gets_one(release, seeded, builder, tmp_path):
     nvcc, csrc = str(fake_nvcc(tmp_path, release)), ROOT / "submodules" / "simple-knn" / "csrc"
     plan = builder.compilations(torch, ["c++"], nvcc, csrc, tmp_path)
@@ -219,30 +217,32 @@ def test_compile_error_ends_without_traceback(tmp_path: Path) -> None:
     assert not (tmp_path / "toy" / "_backend.so").exists()
 
 
-def copy_modules(package: Path, to: Path) -> None:
+def copy_modules(package: str, folder: Path) -> None:
     """Copy an extension's modules, and those that all share, as its build does."""
-    shutil.copytree(package, to, ignore=shutil.ignore_patterns("*.so", "__pycache__"))
+    source = ROOT / "submodules" / package.replace("_", "-") / package
+    shutil.copytree(source, folder / package, ignore=shutil.ignore_patterns("*.so", "__pycache__"))
     for shared in (COMMON / "package").glob("*.py"):
-        shutil.copy(shared, to)
+        shutil.copy(shared, folder / package)
 
 
-@pytest.mark.parametrize("package", ["diff_gaussian_rasterization", "fused_ssim", "simple_knn"])
+def last_line(statement: str, folder: Path) -> str:
+    """The error in which a statement ends in the repository if modules of a folder are found first."""
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])}
+    command = [sys.executable, "-B", "-c", statement]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=env)
+    assert done.returncode == 1
+    return done.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
 def test_an_extension_without_torch_says_what_to_do(package: str, tmp_path: Path) -> None:
-    folder = ROOT / "submodules" / package.replace("_", "-")
-    copy_modules(folder / package, tmp_path / package)
-    env = os.environ | {"PYTHONPATH": str(tmp_path)}
-
-    def last_line(torch_py: str) -> str:
-        (tmp_path / "torch.py").write_text(torch_py)
-        command = [sys.executable, "-B", "-c", f"import {package}"]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=env)
-        assert done.returncode == 1
-        return done.stderr.splitlines()[-1]
-
-    remedy = f"install it, then run `pip install ./submodules/{folder.name}` in the repository"
-    missing = "raise ModuleNotFoundError(\"No module named 'torch'\", name='torch')"
-    assert last_line(missing) == f"ImportError: {package} needs torch: {remedy}"
-    assert last_line("import part_of_torch") == "ModuleNotFoundError: No module named 'part_of_torch'"
+    copy_modules(package, tmp_path)
+    remedy = f"install it, then run `pip install ./submodules/{package.replace('_', '-')}` in the repository"
+    torch_py = tmp_path / "torch.py"
+    torch_py.write_text("raise ModuleNotFoundError(\"No module named 'torch'\", name='torch')")
+    assert last_line(f"import {package}", tmp_path) == f"ImportError: {package} needs torch: {remedy}"
+    torch_py.write_text("import part_of_torch")
+    assert last_line(f"import {package}", tmp_path) == "ModuleNotFoundError: No module named 'part_of_torch'"
 
 
 @pytest.mark.parametrize(
@@ -254,16 +254,11 @@ def test_an_extension_without_torch_says_what_to_do(package: str, tmp_path: Path
     ],
 )
 def test_an_older_extension_ends_in_the_remedy(statement: str, package: str, lacking: str, tmp_path: Path) -> None:
-    name = package.replace("_", "-")
-    older = tmp_path / package
-    copy_modules(ROOT / "submodules" / name / package, older)
-    (older / lacking).unlink()
-    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
-    command = [sys.executable, "-c", statement]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=env)
-    assert done.returncode == 1 and done.stderr.splitlines()[-1] == (
+    copy_modules(package, tmp_path)
+    (tmp_path / package / lacking).unlink()
+    assert last_line(statement, tmp_path) == (
         f"ImportError: the installed {package} does not fit this checkout (it has no {lacking}): "
-        f"run `pip install ./submodules/{name}` in the repository"
+        f"run `pip install ./submodules/{package.replace('_', '-')}` in the repository"
     )
 
 
@@ -283,15 +278,15 @@ def test_requirements_are_pinned() -> None:
             assert "==" in line or line.startswith(("#", "-r ")), f"{name}: {line}"
 
 
-def repository(folder: Path, kernel: str) -> None:
+def copy_repository(folder: Path) -> None:
     """Copy what the repository's own build needs, with tiny extensions, and other packages, which must stay out."""
     for name in ("setup.py", "pyproject.toml", "requirements.txt", "version.txt"):
         shutil.copy(ROOT / name, folder)
     shutil.copytree(COMMON, folder / "submodules" / "common")
-    for package in ("diff_gaussian_rasterization", "fused_ssim", "simple_knn"):
+    for package in PACKAGES:
         extension = folder / "submodules" / package.replace("_", "-")
         extension.mkdir()
-        write_extension(extension, kernel)
+        write_extension(extension, "")
         (extension / "toy").rename(extension / package)
     for package in ("utils", "scene"):  # setuptools would find these by itself
         (folder / package).mkdir()
@@ -300,12 +295,11 @@ def repository(folder: Path, kernel: str) -> None:
 
 
 def test_the_root_wheel_has_the_extensions_alone(tmp_path: Path) -> None:
-    repository(tmp_path, "")
+    copy_repository(tmp_path)
     name, names, requires = wheel_of(tmp_path)
     assert name.startswith("gaussian_splatting-") and "-cp310-abi3-" in name
-    packages = ("diff_gaussian_rasterization", "fused_ssim", "simple_knn")
     files = ["__init__.py", "_backend.so", *(path.name for path in (COMMON / "package").glob("*.py"))]
-    parts = {f"{package}/{file}" for package in packages for file in files}
+    parts = {f"{package}/{file}" for package in PACKAGES for file in files}
     assert {name for name in names if ".dist-info/" not in name} == parts
     # The installed torch stays.
     assert "torch<2.14,>=2.10" in requires and "torchvision" in requires
@@ -313,19 +307,20 @@ def test_the_root_wheel_has_the_extensions_alone(tmp_path: Path) -> None:
 
 
 def test_the_sdist_has_all_that_is_tracked() -> None:
-    """But for what only a checkout needs."""
     tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
     if tracked.returncode:
         pytest.skip("not a checkout of git")
     manifest = (ROOT / "MANIFEST.in").read_text()
     grafted = re.findall(r"^graft (\S+)$", manifest, re.MULTILINE)
-    included = re.findall(r"^include (.+)$", manifest, re.MULTILINE)
-    patterns = [pattern for line in included for pattern in line.split()]
+    included = [*re.search(r"^include (.+)$", manifest, re.MULTILINE)[1].split(), "MANIFEST.in", "pyproject.toml"]
     for name in tracked.stdout.splitlines():
-        folder = name.partition("/")[0]
-        if "/" in name:
-            assert folder in grafted, f"MANIFEST.in does not graft {folder}"
-        else:
-            known = any(fnmatch.fnmatch(name, pattern) for pattern in patterns)
-            implied = "setup.py", "pyproject.toml", "MANIFEST.in", ".gitignore", ".gitattributes"
-            assert known or name in implied, name
+        folder, _, inner = name.partition("/")
+        taken = folder in grafted if inner else any(fnmatch.fnmatch(name, pattern) for pattern in included)
+        assert taken or name in (".gitignore", ".gitattributes"), name
+
+
+def test_other_platforms_take_the_flags_of_the_builder(builder: ModuleType) -> None:
+    cross = runpy.run_path(str(ROOT / ".ci" / "cross.py"))
+    assert {isa: list(flags) for isa, flags in cross["ARM64"].items()} == builder.ARM64_ISAS
+    unneeded = {"-fPIC", "-fvisibility=hidden", "-fvisibility-inlines-hidden"}
+    assert set(cross["FLAGS"]) - {"-Werror", "-pthread"} == set(builder.CXX_FLAGS) - unneeded

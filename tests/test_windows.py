@@ -11,6 +11,7 @@ import subprocess
 import sys
 import types
 from pathlib import Path
+from unittest.mock import DEFAULT, Mock
 
 import pytest
 from test_house import ROOMS
@@ -34,23 +35,10 @@ def in_use() -> PermissionError:
     return error
 
 
-def refusing(times: int, error: OSError, real=os.replace):
-    """A stand-in for os.replace that fails so many times."""
-    left = [times]
-
-    def replace(source, target):
-        left[0] -= 1
-        if left[0] >= 0:
-            raise error
-        real(source, target)
-
-    return replace
-
-
 def test_a_file_that_another_program_has_open_for_a_moment_is_replaced(tmp_path, monkeypatch):
     target = tmp_path / "model.json"
     target.write_text("old")
-    monkeypatch.setattr(os, "replace", refusing(2, in_use()))
+    monkeypatch.setattr(os, "replace", Mock(side_effect=[in_use(), in_use(), DEFAULT], wraps=os.replace))
     with atomic_write(target) as path:
         path.write_text("new")
     assert target.read_text() == "new" and len(list(tmp_path.iterdir())) == 1
@@ -58,12 +46,12 @@ def test_a_file_that_another_program_has_open_for_a_moment_is_replaced(tmp_path,
 
 @pytest.mark.parametrize("error", [in_use(), PermissionError(errno.EACCES, "denied")], ids=["in use", "denied"])
 def test_a_file_that_stays_open_is_an_error_and_another_error_is_one_at_once(tmp_path, monkeypatch, error):
-    tries = []
+    replace = Mock(side_effect=error)
     monkeypatch.setattr(system_utils, "_PATIENCE", 0.1)
-    monkeypatch.setattr(os, "replace", lambda *paths: (tries.append(paths), refusing(1, error)(*paths)))
+    monkeypatch.setattr(os, "replace", replace)
     with pytest.raises(UserError, match="cannot write .*model.json"), atomic_write(tmp_path / "model.json") as path:
         path.write_text("new")
-    assert (len(tries) > 1) == hasattr(error, "winerror") and not list(tmp_path.iterdir())
+    assert (replace.call_count > 1) == hasattr(error, "winerror") and not list(tmp_path.iterdir())
 
 
 def locking(descriptor: int, mode: int, size: int) -> None:
@@ -123,11 +111,9 @@ def test_paths_on_two_drives(monkeypatch, tmp_path):
 def test_photos_that_a_model_of_windows_names(tmp_path):
     """Backslashes, and another letter case."""
     (tmp_path / "left").mkdir()
-    for name in ("left/IMG_1.JPG", "left/IMG_2.JPG"):
-        (tmp_path / name).touch()
-    names = [r"left\IMG_1.JPG", r"LEFT\img_2.jpg"]
-    found = find_images(tmp_path, names, "images.bin", "copy them")
-    assert [path.name for path in found] == ["IMG_1.JPG", "IMG_2.JPG"]
+    (tmp_path / "left/IMG_1.JPG").touch()
+    for name in (r"left\IMG_1.JPG", r"LEFT\img_1.jpg"):
+        assert find_images(tmp_path, [name], "images.bin", "copy them") == [tmp_path / "left/IMG_1.JPG"]
 
 
 def test_a_port_that_is_taken_stays_taken(monkeypatch):
@@ -143,18 +129,21 @@ def test_text_files_are_opened_as_utf_8():
     files = [path for room in ROOMS for path in (ROOT / room).rglob("*.py") if room != "benchmarks"]
     unnamed = []
     for path in (*files, *ROOT.glob("*.py")):
+        on_linux = {"host", "distributed"} & set(path.relative_to(ROOT).parts)
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if not isinstance(node, ast.Call) or any(word.arg in ("encoding", None) for word in node.keywords):
-                continue
-            name = getattr(node.func, "attr", None) or getattr(node.func, "id", None)
-            text = name in ("read_text", "write_text") or (
-                isinstance(node.func, ast.Name) and name == "open" and not _is_binary(node)
-            )
-            if text and not {"host", "distributed"} & set(path.relative_to(ROOT).parts):
+            if isinstance(node, ast.Call) and _is_text(node) and not on_linux:
                 unnamed.append(f"{path.relative_to(ROOT)}:{node.lineno}")
     assert unnamed == []
 
 
-def _is_binary(call: ast.Call) -> bool:
-    modes = [*call.args[1:2], *(word.value for word in call.keywords if word.arg == "mode")]
-    return any(isinstance(mode, ast.Constant) and "b" in mode.value for mode in modes)
+def _is_text(call: ast.Call) -> bool:
+    """Whether a call opens a file as text and names no encoding."""
+    words = {word.arg: word.value for word in call.keywords}
+    if {"encoding", None} & words.keys():
+        return False
+    if isinstance(call.func, ast.Attribute):
+        return call.func.attr in ("read_text", "write_text")
+    if not isinstance(call.func, ast.Name) or call.func.id != "open":
+        return False
+    modes = [*call.args[1:2], words.get("mode")]
+    return not any(isinstance(mode, ast.Constant) and "b" in mode.value for mode in modes)

@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-from synthetic import make_blender_scene, make_colmap_scene
+from synthetic import as_text, make_blender_scene, make_colmap_scene
 
 import train
 from fuzz.damage import changed, damaged, damaged_text
@@ -24,17 +24,11 @@ class Colmap:
     """One file of a COLMAP model is damaged, binary or text; what can still be read must be usable."""
 
     def __init__(self, folder: Path) -> None:
-        import pycolmap
-
         self._scenes = {}
         for suffix in ("bin", "txt"):
             scene = self._scenes[suffix] = folder / f"colmap_{suffix}"
             make_colmap_scene(scene, views=9)
-        sparse = self._scenes["txt"] / "sparse" / "0"
-        model = pycolmap.Reconstruction(str(sparse))
-        for path in sparse.iterdir():
-            path.unlink()
-        model.write_text(str(sparse))
+        as_text(self._scenes["txt"])
 
     def run(self, rng: random.Random) -> None:
         suffix = rng.choice(("bin", "bin", "txt"))
@@ -67,17 +61,10 @@ class Transforms:
         write_point_cloud(blender / "points3d.ply", np.eye(3), np.zeros((3, 3), np.uint8))
         shutil.copytree(blender, nerfstudio)
         content = json.loads((nerfstudio / "transforms_train.json").read_text())
-        content |= {
-            "ply_file_path": "points3d.ply",
-            "w": 40,
-            "h": 30,
-            "fl_x": 50.0,
-            "k1": 0.0,
-            "camera_model": "OPENCV",
-        }
-        content |= {"cx": 20.0, "cy": 15.0, "test_filenames": ["./train/r_0.png"]}
-        for name in ("transforms_train.json", "transforms_test.json"):
-            (nerfstudio / name).unlink()
+        content |= {"ply_file_path": "points3d.ply", "camera_model": "OPENCV", "test_filenames": ["./train/r_0.png"]}
+        content |= {"w": 40, "h": 30, "fl_x": 50.0, "k1": 0.0, "cx": 20.0, "cy": 15.0}
+        for path in nerfstudio.glob("transforms_*.json"):
+            path.unlink()
         (nerfstudio / "transforms.json").write_text(json.dumps(content))
         self._files = [blender / "transforms_train.json", nerfstudio / "transforms.json"]
 

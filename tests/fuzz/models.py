@@ -6,8 +6,10 @@ from pathlib import Path
 
 import torch
 from gaussians import model, options, take_steps
+from rasterizer_tools import render
 from small_splats import empty_spz, splats
 
+from benchmarks.workloads.splat_scenes import settings
 from fuzz.damage import changed, damaged, damaged_text
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
@@ -85,16 +87,11 @@ class Checkpoint:
         gaussians = GaussianModel(1)
         gaussians.restore(capture, options())
         take_steps(gaussians, 1)
-        assert all(rows.isfinite().all() for rows in gaussians.rows().values()), (
-            "a step made values that are not finite"
-        )
+        finite = all(rows.isfinite().all() for rows in gaussians.rows().values())
+        assert finite, "a step made values that are not finite"
 
 
 def _render(gaussians: GaussianModel) -> None:
-    from rasterizer_tools import render
-
-    from benchmarks.workloads.splat_scenes import settings
-
     if len(gaussians) > 1000:
         return
     parameters = {

@@ -8,9 +8,9 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from types import TracebackType
 
 ROOT = Path(__file__).resolve().parents[2]
+WORKER = ("-m", "fuzz.worker")
 START, CASE = 120, 40  # seconds until the child is ready, and most for a case; the machine may be busy
 
 
@@ -25,9 +25,7 @@ class Sandbox:
     def __enter__(self) -> "Sandbox":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._end()
 
     def run(self, kind: str, number: int) -> str | None:
@@ -43,7 +41,8 @@ class Sandbox:
             status = self._child.wait()
             log = Path(self._folder.name, "log").read_text(errors="replace")[-2000:]
             self._end()
-            return f"hangs for more than {CASE} s" if answer is None else f"ended with {_status(status)}\n{log}"
+            said = signal.Signals(-status).name if status < 0 else f"status {status}"
+            return f"hangs for more than {CASE} s" if answer is None else f"ended with {said}\n{log}"
         finding, more, seconds = json.loads(answer)
         self.worst[kind] = tuple(map(max, self.worst.get(kind, (0, 0.0)), (more, seconds)))
         return finding
@@ -56,9 +55,10 @@ class Sandbox:
             "OMP_NUM_THREADS": "1",
             "GS_CACHE": str(folder / "cache"),
         }
-        command = [sys.executable, "-m", "fuzz.worker", str(self._seed), str(folder)]
-        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-        self._child = subprocess.Popen(command, cwd=ROOT, env=environment, **pipes)
+        command = [sys.executable, *WORKER, str(self._seed), str(folder)]
+        with open(folder / "log", "ab") as log:
+            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": log}
+            self._child = subprocess.Popen(command, cwd=ROOT, env=environment, **pipes)
         if not self._answer(START):
             raise RuntimeError(f"the worker did not start: {(folder / 'log').read_text(errors='replace')[-2000:]}")
 
@@ -73,7 +73,3 @@ class Sandbox:
             self._child.communicate()
             self._child = None
             self._folder.cleanup()
-
-
-def _status(status: int) -> str:
-    return signal.Signals(-status).name if status < 0 else f"status {status}"

@@ -6,6 +6,7 @@ python -m fuzz.worker SEED FOLDER
 import json
 import math
 import os
+import pkgutil
 import random
 import resource
 import sys
@@ -17,7 +18,7 @@ import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
 
 import train
-from fuzz.kinds import KINDS
+from fuzz import KINDS
 from utils.system_utils import UserError
 
 MOST = 2 << 30  # bytes that a case may add to the memory in use
@@ -28,27 +29,23 @@ def main() -> None:
     """Answer every line of stdin with a line of JSON: a finding or null, the bytes added, the processor's seconds."""
     seed, folder = sys.argv[1], Path(sys.argv[2])
     answers = os.fdopen(os.dup(1), "w")
-    log = os.open(folder / "log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-    os.dup2(log, 1)
-    os.dup2(log, 2)
+    os.dup2(2, 1)  # what is said goes to the log
     train.SummaryWriter = lambda folder: None  # its threads would pile up
     torch.set_num_threads(1)
-    kinds = {name: make(_made(folder / name)) for name, make in KINDS.items()}
+    kinds = {}
+    for kind, place in KINDS.items():
+        (folder / kind).mkdir()
+        kinds[kind] = pkgutil.resolve_name(f"fuzz.{place}")(folder / kind)
     size = _memory("VmSize") + ROOM
     resource.setrlimit(resource.RLIMIT_AS, (size, size))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     print("ready", file=answers, flush=True)
     for line in sys.stdin:
         kind, number = line.split()
-        os.truncate(log, 0)
+        os.truncate(2, 0)
         answer = _run(kinds[kind], random.Random(f"{seed} {kind} {number}"))
         sys.stdout.flush()
         print(json.dumps(answer), file=answers, flush=True)
-
-
-def _made(folder: Path) -> Path:
-    folder.mkdir()
-    return folder
 
 
 def _run(kind: object, rng: random.Random) -> tuple[str | None, int, float]:

@@ -6,9 +6,7 @@ Without a GPU, "cuda" means the CPU in the script's process. With a GPU, the scr
 import os
 import runpy
 import sys
-import time
 from collections.abc import Callable
-from functools import wraps
 from typing import Any
 
 import torch
@@ -34,49 +32,12 @@ class CudaIsCpu(TorchFunctionMode):
         return func(*map(_mapped, args), **kwargs)
 
 
-class _Event:
-    """torch.cuda.Event on the clock of the CPU."""
-
-    def __init__(self, enable_timing: bool = False) -> None:
-        self._seconds = 0.0
-
-    def record(self) -> None:
-        self._seconds = time.perf_counter()
-
-    def synchronize(self) -> None:
-        pass
-
-    def elapsed_time(self, end: "_Event") -> float:
-        return 1000 * (end._seconds - self._seconds)
-
-
-def _with_mapped_arguments(function: Callable) -> Callable:
-    @wraps(function)
-    def call(*args: Any, **kwargs: Any) -> Any:
-        return function(*map(_mapped, args), **{name: _mapped(value) for name, value in kwargs.items()})
-
-    return call
-
-
-def install() -> None:
-    """Let "cuda" mean the CPU from now on, in this thread."""
-    CudaIsCpu().__enter__()
-    torch.nn.Module.cuda = lambda module, device=None: module
-    for owner, name in ((torch.nn.Module, "to"), (torch, "load")):
-        setattr(owner, name, _with_mapped_arguments(getattr(owner, name)))
-    torch.cuda.Event = _Event
-    for name in ("synchronize", "empty_cache", "set_device", "reset_peak_memory_stats"):
-        setattr(torch.cuda, name, lambda *args, **kwargs: None)
-    for name in ("max_memory_allocated", "memory_allocated"):
-        setattr(torch.cuda, name, lambda *args, **kwargs: 0)
-
-
 def main() -> None:
     """Run the script of the command line as Python itself would."""
     del sys.argv[0]
     sys.path[0] = os.path.dirname(os.path.abspath(sys.argv[0]))
     if not torch.cuda.is_available():
-        install()
+        CudaIsCpu().__enter__()
     runpy.run_path(sys.argv[0], run_name="__main__")
 
 

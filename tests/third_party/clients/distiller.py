@@ -49,7 +49,6 @@ background = torch.zeros(3, device="cuda")
 losses = []
 for step in range(STEPS):
     camera = copy.deepcopy(scene.getTrainCameras()[step % 4])
-    camera.FoVx *= 1.0
     image = render(camera, student, pipe, background)["render"]
     with torch.no_grad():
         wanted = render(camera, teacher, pipe, background)["render"].detach()
@@ -59,9 +58,10 @@ for step in range(STEPS):
     student.optimizer.zero_grad(set_to_none=True)
     scheduler.step()
     losses.append(loss.item())
-student.save_ply(os.path.join(out, "student", "point_cloud", "iteration_1", "point_cloud.ply"))
+ply = os.path.join(out, "student", "point_cloud", "iteration_1", "point_cloud.ply")
+student.save_ply(ply)
 again = GaussianModel(DEGREE)
-again.load_ply(os.path.join(out, "student", "point_cloud", "iteration_1", "point_cloud.ply"))
+again.load_ply(ply)
 result = {
     "first": first,
     "losses": losses,
@@ -71,6 +71,5 @@ result = {
     "count": teacher.get_xyz.shape[0],
     "saved": (again.get_features - student.get_features).abs().max().item(),
 }
-torch.save((student.capture(), STEPS), os.path.join(out, "student", "chkpnt_student.pth"))
 with open(os.path.join(out, "result.json"), "w") as file:
     json.dump(result, file)

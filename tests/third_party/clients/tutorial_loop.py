@@ -7,61 +7,22 @@ from argparse import ArgumentParser
 from random import randint
 
 import torch
+from fused_ssim import fused_ssim
 from tqdm import tqdm
 
 from arguments import ModelParams, OptimizationParams, PipelineParams
-from gaussian_renderer import network_gui, render
+from gaussian_renderer import render
 from scene import GaussianModel, Scene
 from utils.general_utils import get_expon_lr_func, safe_state
 from utils.image_utils import psnr
-from utils.loss_utils import l1_loss, ssim
-
-try:
-    from fused_ssim import fused_ssim
-except ImportError:
-    fused_ssim = None
-try:
-    from diff_gaussian_rasterization import SparseGaussianAdam
-except ImportError:
-    SparseGaussianAdam = None
-SPARSE_ADAM_AVAILABLE = SparseGaussianAdam is not None
-
-
-def serve_viewer(gaussians, pipe, background, dataset, iteration, iterations):
-    """Answer a connected viewer until it wants training to go on; returns how many images were sent."""
-    sent = 0
-    if network_gui.conn is None:
-        network_gui.try_connect()
-    while network_gui.conn is not None:
-        try:
-            image_bytes = None
-            camera, train, pipe.convert_SHs_python, pipe.compute_cov3D_python, keep_alive, scale = network_gui.receive()
-            if camera is not None:
-                image = render(
-                    camera,
-                    gaussians,
-                    pipe,
-                    background,
-                    scaling_modifier=scale,
-                    use_trained_exp=dataset.train_test_exp,
-                    separate_sh=SPARSE_ADAM_AVAILABLE,
-                )["render"]
-                pixels = (torch.clamp(image, min=0, max=1.0) * 255).byte().permute(1, 2, 0).contiguous()
-                image_bytes = memoryview(pixels.cpu().numpy())
-                sent += 1
-            network_gui.send(image_bytes, dataset.source_path)
-            if train and (iteration < iterations or not keep_alive):
-                break
-        except Exception:
-            network_gui.conn = None
-    return sent
+from utils.loss_utils import l1_loss
 
 
 @torch.no_grad()
 def evaluate(cameras, gaussians, pipe, background, dataset):
     scores = []
     for camera in cameras:
-        image = render(camera, gaussians, pipe, background, 1.0, SPARSE_ADAM_AVAILABLE, None, dataset.train_test_exp)
+        image = render(camera, gaussians, pipe, background, 1.0, True, None, dataset.train_test_exp)
         image = torch.clamp(image["render"], 0.0, 1.0)
         target = torch.clamp(camera.original_image.to("cuda"), 0.0, 1.0)
         if dataset.train_test_exp:
@@ -71,8 +32,6 @@ def evaluate(cameras, gaussians, pipe, background, dataset):
 
 
 def training(dataset, opt, pipe, args):
-    if not SPARSE_ADAM_AVAILABLE and opt.optimizer_type == "sparse_adam":
-        sys.exit("Trying to use sparse adam but it is not installed")
     first = 0
     gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
     scene = Scene(dataset, gaussians)
@@ -81,26 +40,18 @@ def training(dataset, opt, pipe, args):
         (model_params, first) = torch.load(args.start_checkpoint)
         gaussians.restore(model_params, opt)
     background = torch.tensor([1, 1, 1] if dataset.white_background else [0, 0, 0], dtype=torch.float32, device="cuda")
-    started, ended = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-    use_sparse_adam = opt.optimizer_type == "sparse_adam" and SPARSE_ADAM_AVAILABLE
     depth_weight = get_expon_lr_func(opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations)
-    stack, losses, depth_losses, sent, seconds = None, [], [], 0, 0.0
+    stack, losses, depth_losses = None, [], []
 
     for iteration in tqdm(range(first + 1, opt.iterations + 1)):
-        sent += serve_viewer(gaussians, pipe, background, dataset, iteration, opt.iterations)
-        started.record()
         gaussians.update_learning_rate(iteration)
         if iteration % 1000 == 0:
             gaussians.oneupSHdegree()
         if not stack:
             stack = scene.getTrainCameras().copy()
         camera = stack.pop(randint(0, len(stack) - 1))
-        if (iteration - 1) == args.debug_from:
-            pipe.debug = True
         bg = torch.rand((3), device="cuda") if opt.random_background else background
-        package = render(
-            camera, gaussians, pipe, bg, use_trained_exp=dataset.train_test_exp, separate_sh=SPARSE_ADAM_AVAILABLE
-        )
+        package = render(camera, gaussians, pipe, bg, use_trained_exp=dataset.train_test_exp, separate_sh=True)
         image, points = package["render"], package["viewspace_points"]
         visible, radii = package["visibility_filter"], package["radii"]
         if camera.alpha_mask is not None:
@@ -108,7 +59,7 @@ def training(dataset, opt, pipe, args):
             image *= alpha_mask
         target = camera.original_image.cuda()
         l1 = l1_loss(image, target)
-        similarity = fused_ssim(image.unsqueeze(0), target.unsqueeze(0)) if fused_ssim else ssim(image, target)
+        similarity = fused_ssim(image.unsqueeze(0), target.unsqueeze(0))
         loss = (1.0 - opt.lambda_dssim) * l1 + opt.lambda_dssim * (1.0 - similarity)
         if depth_weight(iteration) > 0 and camera.depth_reliable:
             depth, wanted, counted = package["depth"], camera.invdepthmap.cuda(), camera.depth_mask.cuda()
@@ -116,12 +67,9 @@ def training(dataset, opt, pipe, args):
             loss += depth_weight(iteration) * depth_loss
             depth_losses.append(depth_loss.item())
         loss.backward()
-        ended.record()
 
         with torch.no_grad():
             losses.append(l1.item())
-            ended.synchronize()
-            seconds += started.elapsed_time(ended) / 1000
             if iteration in args.save_iterations:
                 scene.save(iteration)
             if iteration < opt.densify_until_iter:
@@ -138,7 +86,7 @@ def training(dataset, opt, pipe, args):
             if iteration < opt.iterations:
                 gaussians.exposure_optimizer.step()
                 gaussians.exposure_optimizer.zero_grad(set_to_none=True)
-                if use_sparse_adam:
+                if opt.optimizer_type == "sparse_adam":
                     gaussians.optimizer.step(radii > 0, radii.shape[0])
                 else:
                     gaussians.optimizer.step()
@@ -152,34 +100,22 @@ def training(dataset, opt, pipe, args):
         "depth_losses": depth_losses,
         "psnr": evaluate(scene.getTestCameras(), gaussians, pipe, background, dataset),
         "count": gaussians.get_xyz.shape[0],
-        "sent": sent,
         "exposures": list(exposures.shape),
         "exposure_moved": (exposures - torch.eye(3, 4, device="cuda")).abs().max().item(),
-        "seconds": seconds,
     }
 
 
 if __name__ == "__main__":
     parser = ArgumentParser(description="Training script parameters")
     lp, op, pp = ModelParams(parser), OptimizationParams(parser), PipelineParams(parser)
-    parser.add_argument("--ip", type=str, default="127.0.0.1")
-    parser.add_argument("--port", type=int, default=6009)
-    parser.add_argument("--debug_from", type=int, default=-1)
-    parser.add_argument("--detect_anomaly", action="store_true", default=False)
     parser.add_argument("--save_iterations", nargs="+", type=int, default=[7_000, 30_000])
-    parser.add_argument("--quiet", action="store_true")
-    parser.add_argument("--disable_viewer", action="store_true", default=False)
     parser.add_argument("--checkpoint_iterations", nargs="+", type=int, default=[])
     parser.add_argument("--start_checkpoint", type=str, default=None)
     out = sys.argv[3]
     args = parser.parse_args(["-s", sys.argv[1], "-m", out, *sys.argv[4:]])
     args.save_iterations.append(args.iterations)
     os.makedirs(out, exist_ok=True)
-    safe_state(args.quiet)
-    if not args.disable_viewer:
-        network_gui.init(args.ip, args.port)
-    torch.autograd.set_detect_anomaly(args.detect_anomaly)
+    safe_state(False)
     result = training(lp.extract(args), op.extract(args), pp.extract(args), args)
     with open(os.path.join(out, "result.json"), "w") as file:
         json.dump(result, file)
-    print("\nTraining complete.")

@@ -66,17 +66,13 @@ class OptimizationOptions(ParamGroup):
         super().__init__(parser, "Optimization Parameters")
 
 
-def training(dataset, opt, pipe, args):
+def training(dataset, opt, pipe):
     gaussians = GaussianModel(dataset.sh_degree)
     scene = Scene(dataset, gaussians)
     gaussians.training_setup(opt)
-    first = 0
-    if args.start_checkpoint:
-        (model_params, first) = torch.load(args.start_checkpoint)
-        gaussians.restore(model_params, opt)
     background = torch.tensor([0, 0, 0], dtype=torch.float32, device="cuda")
     stack, losses = None, []
-    for iteration in range(first + 1, opt.iterations + 1):
+    for iteration in range(1, opt.iterations + 1):
         if network_gui.conn is None:
             network_gui.try_connect()
         gaussians.update_learning_rate(iteration)
@@ -102,8 +98,6 @@ def training(dataset, opt, pipe, args):
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none=True)
-            if iteration in args.checkpoint_iterations:
-                torch.save((gaussians.capture(), iteration), scene.model_path + "/chkpnt" + str(iteration) + ".pth")
     scene.save(opt.iterations)
     with torch.no_grad():
         scores = [
@@ -117,13 +111,11 @@ if __name__ == "__main__":
     parser = ArgumentParser()
     lp, op, pp = ModelOptions(parser), OptimizationOptions(parser), PipelineOptions(parser)
     parser.add_argument("--port", type=int, default=6009)
-    parser.add_argument("--checkpoint_iterations", nargs="+", type=int, default=[])
-    parser.add_argument("--start_checkpoint", type=str, default=None)
     out = sys.argv[3]
     args = parser.parse_args(["-s", sys.argv[1], "-m", out, *sys.argv[4:]])
     os.makedirs(out, exist_ok=True)
     safe_state(False)
     network_gui.init("127.0.0.1", args.port)
-    result = training(lp.extract(args), op.extract(args), pp.extract(args), args)
+    result = training(lp.extract(args), op.extract(args), pp.extract(args))
     with open(os.path.join(out, "result.json"), "w") as file:
         json.dump(result, file)

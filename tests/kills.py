@@ -1,4 +1,12 @@
-"""Trials of killed trainings. Processes are forked from this one, which has everything imported."""
+"""Kill trainings at random and at aimed moments, resume them, and compare the end with a training that was let be.
+
+python -m tests.kills N [SEED]
+
+Kills are SIGKILL: after a random time, and before, in or after the n-th write of a file. A trial kills one to three
+times, each time resuming from the newest checkpoint. At its end the PLYs, the tensors of the checkpoints and the names
+of all files must be those of the training that was let be, with no temporary file or lock left over. Trainings are
+forked from this process, which has everything imported.
+"""
 
 import argparse
 import hashlib
@@ -10,6 +18,7 @@ import sys
 import tempfile
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,11 +27,14 @@ import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import matplotlib.pyplot  # noqa: F401  (here: otherwise every child would start a process that imports it)
 import numpy as np
 import torch
-from synthetic import make_blender_scene
 
 import train
 import utils.system_utils
 from scene.readers.point_cloud import write_point_cloud
+
+sys.path.insert(0, str(Path(__file__).parent))
+from synthetic import make_blender_scene  # noqa: E402
+from trainings import leaves  # noqa: E402
 
 OPTIONS = (
     *("--iterations", "60", "--eval", "--quiet", "--test_iterations", "30", "60", "--save_iterations", "20", "40"),
@@ -39,34 +51,28 @@ def main() -> int:
     parser.add_argument("seed", type=int, nargs="?", default=0)
     args = parser.parse_args()
     rng, begin = random.Random(args.seed), time.monotonic()
-    counts = {"random": 0, "before": 0, "in": 0, "after": 0}
-    trials, wrong = 0, 0
+    counts, trials, wrong = Counter(), 0, 0
     with tempfile.TemporaryDirectory(prefix="kills") as folder:
         scene, out = Path(folder, "scene"), Path(folder, "out")
         make_blender_scene(scene)
         points = np.random.default_rng(0).normal(size=(300, 3))  # a scene without points would start with 100,000
         write_point_cloud(scene / "points3d.ply", points, np.full((300, 3), 127, np.uint8))
-        wanted, seconds, writes = _undisturbed(scene, Path(folder, "undisturbed"))
-        while sum(counts.values()) < args.kills:
+        expected, seconds, writes = _undisturbed(scene, Path(folder, "undisturbed"))
+        while counts.total() < args.kills:
             shutil.rmtree(out, ignore_errors=True)
             done = _trial(rng, scene, out, seconds, writes)
+            counts.update(name.split()[0] for name in done)
             trials += 1
-            for name in done:
-                counts[name.split()[0]] += 1
-            if differences := _differences(wanted, _state(out)):
+            if differences := expected ^ _state(out):
                 wrong += 1
-                print(f"WRONG after {', '.join(done)}: {', '.join(differences)}", flush=True)
-            if trials % 20 == 0:
-                print(f"{sum(counts.values())} kills, {wrong} of {trials} trials wrong", flush=True)
+                print(f"WRONG after {', '.join(done)}: {sorted(differences)}", flush=True)
     by_moment = ", ".join(f"{count} {name}" for name, count in counts.items())
-    print(
-        f"{sum(counts.values())} kills ({by_moment} a write) in {trials} trials, {time.monotonic() - begin:.0f} s: "
-        f"{wrong} ended differently"
-    )
+    print(f"{counts.total()} kills ({by_moment} a write) in {trials} trials, {time.monotonic() - begin:.0f} s: "
+          f"{wrong} ended differently")  # fmt: skip
     return 1 if wrong else 0
 
 
-def _undisturbed(scene: Path, out: Path) -> tuple[dict[str, str], float, int]:
+def _undisturbed(scene: Path, out: Path) -> tuple[set[tuple[str, str]], float, int]:
     """State of the training that is let be, its seconds, and the number of its writes."""
     _wait(_start(scene, out, lambda: None), out)  # the first one warms caches up
     shutil.rmtree(out)
@@ -108,15 +114,10 @@ def _start(scene: Path, out: Path, prepare: Callable[[], Any]) -> int:
     status = 1
     try:
         prepare()
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, 1)
-        errors = os.open(out.parent / "errors", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-        os.dup2(errors, 2)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        os.dup2(os.open(out.parent / "errors", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
         words = ["-s", str(scene), "-m", str(out), *OPTIONS]
-        newest = _newest(out)
-        if newest >= 60:  # killed after its last checkpoint
-            newest = 50
-        if newest:
+        if newest := min(_newest(out), 50):  # the last one leaves nothing to train
             words += ["--start_checkpoint", str(out / f"chkpnt{newest}.pth")]
         train.SummaryWriter = lambda folder: None
         torch.set_num_threads(1)
@@ -167,33 +168,18 @@ def _killer(moment: str, number: int) -> Callable[[str, int, Path], None]:
     return act
 
 
-def _state(out: Path) -> dict[str, str]:
-    """A digest of each file that training determines, and the names of the others."""
-    state = {}
-    for path in sorted(out.rglob("*")):
-        name = str(path.relative_to(out))
+def _state(out: Path) -> set[tuple[str, str]]:
+    """The names of all files, each with a digest of what training determines in it."""
+    state = set()
+    for path in filter(Path.is_file, out.rglob("*")):
+        content = b""
         if path.suffix == ".ply" or path.name in ("cameras.json", "exposure.json"):
-            state[name] = hashlib.sha256(path.read_bytes()).hexdigest()
-        elif path.suffix == ".pth" and ".tmp" not in name:
-            state[name] = _digest(torch.load(path, weights_only=True))
-        elif path.is_file():
-            state[name] = "there"
+            content = path.read_bytes()
+        elif path.suffix == ".pth" and ".tmp" not in path.name:
+            content = repr(leaves(torch.load(path, weights_only=True))).encode()
+        state.add((str(path.relative_to(out)), hashlib.sha256(content).hexdigest()))
     return state
 
 
-def _digest(content: Any) -> str:
-    if torch.is_tensor(content):
-        return hashlib.sha256(content.detach().contiguous().numpy().tobytes()).hexdigest()
-    if isinstance(content, dict):
-        return str([(key, _digest(content[key])) for key in sorted(content, key=str)])
-    if isinstance(content, list | tuple):
-        return str([_digest(part) for part in content])
-    return repr(content)
-
-
-def _differences(wanted: dict[str, str], found: dict[str, str]) -> list[str]:
-    return (
-        [f"{name} is missing" for name in wanted if name not in found]
-        + [f"{name} is left over" for name in found if name not in wanted]
-        + [f"{name} differs" for name in wanted if name in found and wanted[name] != found[name]]
-    )
+if __name__ == "__main__":
+    sys.exit(main())
