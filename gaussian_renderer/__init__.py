@@ -19,7 +19,7 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.exposure import apply_exposure
 from scene.gaussians.parameters import GaussianParameters
 from scene.sleeping import Sleeping
-from splatting.distributed.rendering.divided import (
+from splatting.distributed.rendering.sharded import (
     DividedDrawn,
     KnownBands,
     draw_divided,

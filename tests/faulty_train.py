@@ -20,23 +20,23 @@ from collections.abc import Callable
 
 import torch
 
-import splatting.distributed.watch
+import splatting.distributed.watchdog
 import train
 from splatting.training.iteration import Iteration
 from splatting.training.run import Run
 from utils.system_utils import run_cli
 
-splatting.distributed.watch.PATIENCE = 3.0
+splatting.distributed.watchdog.PATIENCE = 3.0
 prepare = Run.prepare
-beat = splatting.distributed.watch.Watch.beat
+beat = splatting.distributed.watchdog.Watch.beat
 
 
-def _long_beat(watch: splatting.distributed.watch.Watch) -> None:
+def _long_beat(watch: splatting.distributed.watchdog.Watch) -> None:
     """As with a slow store. A process that ends while its watch asks the store aborts."""
     beat(watch)
     until = time.monotonic() + 0.5
     while watch.is_alive() and time.monotonic() < until:
-        watch._board.read("here")
+        watch._store.read("here")
 
 
 def _raise(error: Exception) -> Callable[[Run], None]:
@@ -89,6 +89,6 @@ def _main() -> None:
 
 
 Run.prepare = _prepare
-splatting.distributed.watch.Watch.beat = _long_beat
+splatting.distributed.watchdog.Watch.beat = _long_beat
 if __name__ == "__main__":
     run_cli(_main, several=True)

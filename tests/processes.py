@@ -10,8 +10,8 @@ import torch.distributed as dist
 import torch.multiprocessing as mp
 from torch.multiprocessing.spawn import start_processes
 
+from splatting.distributed.process_group import SeveralRanks
 from splatting.distributed.ranks import using
-from splatting.distributed.several import SeveralRanks
 
 
 def in_ranks(size: int, function: Callable[..., Any], *args: Any) -> list[Any]:
@@ -23,7 +23,7 @@ def in_ranks(size: int, function: Callable[..., Any], *args: Any) -> list[Any]:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     # One process imports torch and the code; the others are its forks.
-    mp.get_context("forkserver").set_forkserver_preload(["train", "splatting.distributed.several"])
+    mp.get_context("forkserver").set_forkserver_preload(["train", "splatting.distributed.process_group"])
     with mp.get_context("forkserver").Manager() as manager:
         results = manager.dict()
         start_processes(_run, (size, port, function, args, results), nprocs=size, start_method="forkserver")

@@ -14,12 +14,12 @@ import train
 from arguments import ModelParams
 from scene import Scene
 from scene.gaussian_model import GaussianModel
-from splatting.distributed import quiet
-from splatting.distributed.alike import refuse_differences
-from splatting.distributed.board import here, is_gone
+from splatting.distributed import rank_logging
 from splatting.distributed.consistency import agree_on_scene
-from splatting.distributed.ending import DONE, FAULT, HANG, LOST, SIGNAL, End, verdict
+from splatting.distributed.key_value_store import here, is_gone
 from splatting.distributed.ranks import Ranks, using
+from splatting.distributed.replicated import refuse_differences
+from splatting.distributed.shutdown import DONE, FAULT, HANG, LOST, SIGNAL, End, verdict
 from splatting.host import machine, torchrun
 from splatting.training.restart import newest_checkpoint, what_stands
 from utils.system_utils import UserError, atomic_write, run_cli
@@ -122,12 +122,12 @@ def test_ranks_of_which_one_lacks_the_masks_are_refused(tmp_path):
 
 def test_lines_are_told_once_with_the_ranks_that_say_them(monkeypatch):
     said = io.StringIO()
-    first = quiet.Noted(said, printed=True)
+    first = rank_logging.Noted(said, printed=True)
     first.write("\r 50%|##   |\rwarning: of all\n")
-    monkeypatch.setattr(quiet, "_noted", first)
+    monkeypatch.setattr(rank_logging, "_noted", first)
     others = ["warning: of all", "warning: of two"]
     for _ in range(2):
-        quiet.tell({1: others, 2: [*others, "warning: of one"]})
+        rank_logging.tell({1: others, 2: [*others, "warning: of one"]})
     told = said.getvalue().splitlines()[-2:]
     assert told == ["ranks 1, 2: warning: of two", "rank 2: warning: of one"]
     assert said.getvalue().count("of two") == 1
@@ -169,7 +169,8 @@ def test_a_training_of_one_process_loads_nothing_of_several(colmap_scene, tmp_pa
     done = subprocess.run([sys.executable, "-c", code, *options], cwd=ROOT, capture_output=True, text=True, check=True)
     loaded = done.stderr.splitlines()[-1].split()
     assert loaded[0] == "loaded" and "splatting.distributed.ranks" in loaded
-    assert not {f"splatting.distributed.{name}" for name in ("several", "together", "watch", "watched", "board")} & {
-        *loaded
-    }
+    assert not {
+        f"splatting.distributed.{name}"
+        for name in ("process_group", "launcher", "watchdog", "watched_ranks", "key_value_store")
+    } & {*loaded}
     assert train.parse(options)[0].parallel == "tiles"

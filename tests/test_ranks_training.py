@@ -8,20 +8,20 @@ import torch
 from processes import in_ranks
 
 import train
-from splatting.distributed import several
+from splatting.distributed import process_group
 from splatting.training.steps.fused import FusedStep
 
-COLLECTIVES = ("all_gather", several.ALL_GATHER, "all_gather_object", "all_reduce", "all_to_all_single", "barrier",
-               "broadcast", "broadcast_object_list")  # fmt: skip
+COLLECTIVES = ("all_gather", process_group.ALL_GATHER, "all_gather_object", "all_reduce", "all_to_all_single",
+               "barrier", "broadcast", "broadcast_object_list")  # fmt: skip
 # What a step costs that changes no rows. Each call waits for the slowest rank: add none without need.
 STEP = {
-    several.ALL_GATHER: 1,  # numbers of splats that each rank sends, with signals and flags
+    process_group.ALL_GATHER: 1,  # numbers of splats that each rank sends, with signals and flags
     "all_reduce": 1,  # sums of the loss
     "all_to_all_single": 4,  # splats, rows around a band; numbers of gradient rows of each splat, the rows
     "broadcast": 1,  # the photo
 }
 # the image in place of the rows around a band
-WHOLE_STEP = {several.ALL_GATHER: 1, "all_to_all_single": 4, "broadcast": 1}
+WHOLE_STEP = {process_group.ALL_GATHER: 1, "all_to_all_single": 4, "broadcast": 1}
 FIRST = "broadcast_object_list"  # once for each photo: its shape
 
 
@@ -32,13 +32,13 @@ def _train(scene: str, out: str, options: list[str]) -> list[dict[str, int]]:
     measure, advance = FusedStep.measure, FusedStep.advance
 
     def counting(name: str) -> None:
-        call = getattr(several.dist, name)
+        call = getattr(process_group.dist, name)
 
         def counted_call(*args: object, **kwargs: object) -> object:
             calls[name] += 1
             return call(*args, **kwargs)
 
-        setattr(several.dist, name, counted_call)
+        setattr(process_group.dist, name, counted_call)
 
     def measured(self: FusedStep, step: object) -> tuple:
         calls.clear()
@@ -53,7 +53,7 @@ def _train(scene: str, out: str, options: list[str]) -> list[dict[str, int]]:
         patch.setattr(FusedStep, "measure", measured)
         patch.setattr(FusedStep, "advance", advanced)
         for name in COLLECTIVES:
-            patch.setattr(several.dist, name, getattr(several.dist, name))  # so that it is undone
+            patch.setattr(process_group.dist, name, getattr(process_group.dist, name))  # so that it is undone
             counting(name)
         words = ["-s", scene, "-m", out, "--iterations", "30", "--no_curve", "--disable_viewer", "--quiet"]
         density = ["--densify_from_iter", "5", "--densification_interval", "10", "--densify_grad_threshold", "5e-5"]
@@ -71,6 +71,6 @@ def _train(scene: str, out: str, options: list[str]) -> list[dict[str, int]]:
 def test_a_step_takes_few_collective_calls(colmap_scene, tmp_path, size, options, cost):
     for calls in in_ranks(size, _train, str(colmap_scene), str(tmp_path / "model"), options):
         assert 10 < sum(each.pop(FIRST, 0) for each in calls) <= 20
-        found_bands = cost | {several.ALL_GATHER: 2}
+        found_bands = cost | {process_group.ALL_GATHER: 2}
         assert 10 < sum(each == found_bands for each in calls) <= 20  # at a view's first visit
         assert len(calls) > 20 and all(each in (cost, found_bands) for each in calls), calls

@@ -38,7 +38,7 @@ _PATIENCE = 2.0  # seconds for it to close the file
 def run_cli(main: Callable[[], object], several: bool = False) -> None:
     """Run a command line: a UserError prints its sentence and exits 2; a bug keeps its traceback.
 
-    several: whether processes of torchrun can run it together (distributed/together.py); others refuse to.
+    several: whether processes of torchrun can run it together (distributed/launcher.py); others refuse to.
 
     Signals exit as in shells: Ctrl-C 130, SIGTERM 143, and 141 if the reader of the output is gone (`| head`). An
     output that cannot be written (disk full) exits 2, and one that is closed does not matter.
@@ -90,7 +90,7 @@ def _status_of_several(main: Callable[[], object], several: bool) -> int:
         if torchrun.rank() == 0:
             print(f"error: {Path(sys.argv[0]).name} runs in one process; start it without torchrun", file=sys.stderr)
         return 2
-    from splatting.distributed.together import run_together  # it loads torch.distributed
+    from splatting.distributed.launcher import run_together  # it loads torch.distributed
 
     return run_together(main, _outcome)
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from scene.cameras import Camera
 from scene.scene import Scene
-from splatting.distributed.alike import refuse_differences
 from splatting.distributed.ranks import ranks
+from splatting.distributed.replicated import refuse_differences
 from splatting.training.restart import what_stands
 
 _ROOT = Path(__file__).resolve().parents[2]

@@ -17,7 +17,7 @@ Value = TypeVar("Value")
 
 
 class Ranks:
-    """One process by itself; the base of several (distributed/several.py), whose calls are collective.
+    """One process by itself; the base of several (distributed/process_group.py), whose calls are collective.
 
     Every rank has to make the same collective calls in the same order. rank: of this process, from 0; size: how many
     there are. Rank 0 writes the files and prints.
@@ -132,7 +132,7 @@ class Ranks:
         return nullcontext()
 
     def tell_notes(self) -> None:
-        """Print what only other ranks have said so far, with their names (splatting/distributed/quiet.py)."""
+        """Print what only other ranks have said so far, with their names (splatting/distributed/rank_logging.py)."""
 
 
 ALONE = Ranks()

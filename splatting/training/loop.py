@@ -7,9 +7,9 @@ import torch
 
 from splatting.training.observer import Announcer, Observer
 from splatting.training.run import Run
+from splatting.training.step_agreement import StepAgreement
 from splatting.training.steps import step_taker
 from splatting.training.steps.plain import PlainStep
-from splatting.training.together import Together
 
 
 def run_training(run: Run, observers: Sequence[Observer]) -> None:
@@ -18,7 +18,7 @@ def run_training(run: Run, observers: Sequence[Observer]) -> None:
     Whatever else happens is an observer's business, in the order of the list (training/observers/standard.py).
     Raises KeyboardInterrupt or Terminated, after a complete step, if a signal asked for it.
     """
-    taker, together = step_taker(run), Together(run)
+    taker, together = step_taker(run), StepAgreement(run)
     every = Announcer([together, *observers], run.look)
     # Backward runs on this thread: waking autograd's worker costs time in every iteration.
     with run.interrupt, every, torch.autograd.set_multithreading_enabled(False), _whole_steps(run, taker):

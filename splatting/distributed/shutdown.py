@@ -5,9 +5,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 
-from splatting.distributed import quiet
-from splatting.distributed.board import Board, is_gone
-from splatting.distributed.quiet import names
+from splatting.distributed import rank_logging
+from splatting.distributed.key_value_store import KeyValueStore, is_gone
+from splatting.distributed.rank_logging import names
 from splatting.host.clock import running_seconds
 
 DONE, FAULT, HANG, SIGNAL, LOST = "done", "fault", "hang", "signal", "lost"
@@ -56,8 +56,8 @@ def verdict(ends: Mapping[int, End], gone: Sequence[int], size: int) -> tuple[in
 class Ending:
     """This rank's end, which its main thread or its watch begins, whichever is first."""
 
-    def __init__(self, board: Board) -> None:
-        self._board = board
+    def __init__(self, store: KeyValueStore) -> None:
+        self._store = store
         self._begun = threading.Lock()
         self.stands: Callable[[], str] = lambda: "start it again"
 
@@ -65,42 +65,42 @@ class Ending:
         """Whether the caller is the first to end this rank."""
         return self._begun.acquire(blocking=False)
 
-    def finish(self, end: End, board: Board | None = None) -> tuple[int, bool]:
+    def finish(self, end: End, store: KeyValueStore | None = None) -> tuple[int, bool]:
         """Tell the others, and see how they end. Returns the exit status, and whether it is this rank that spoke.
 
-        board: that of the calling thread.
+        store: that of the calling thread.
         """
-        board = board or self._board
-        end.notes = quiet.take()
+        store = store or self._store
+        end.notes = rank_logging.take()
         try:
-            board.post("end", asdict(end))
-            ends, gone = self._others(board, end)
-            speaker, line, status, lost = verdict(ends, gone, board.size)
-            speaks = speaker == board.rank and status != 0 and board.claim("told")
-            tells = speaks if status else board.rank == 0
+            store.post("end", asdict(end))
+            ends, gone = self._others(store, end)
+            speaker, line, status, lost = verdict(ends, gone, store.size)
+            speaks = speaker == store.rank and status != 0 and store.claim("told")
+            tells = speaks if status else store.rank == 0
         except RuntimeError:  # the store is gone, with torchrun
             ends, line, status, lost = {}, end.line or "error: torchrun has ended", end.status or 1, True
-            speaks = tells = board.rank == 0
+            speaks = tells = store.rank == 0
         if tells:
-            quiet.tell({rank: one.notes for rank, one in ends.items() if rank != board.rank})
+            rank_logging.tell({rank: one.notes for rank, one in ends.items() if rank != store.rank})
         if speaks and line:
             # A progress bar may have been left in its line.
-            quiet.speak(f"\n{line}; {self.stands()}" if lost else line)
+            rank_logging.speak(f"\n{line}; {self.stands()}" if lost else line)
         return status, speaks
 
-    def _others(self, board: Board, end: End) -> tuple[dict[int, End], list[int]]:
+    def _others(self, store: KeyValueStore, end: End) -> tuple[dict[int, End], list[int]]:
         """The ends of all ranks that have ended, and those that are gone."""
-        before, started = board.read("beat"), running_seconds()
-        people = board.read("here")
+        before, started = store.read("beat"), running_seconds()
+        people = store.read("here")
         while True:
-            ends = {rank: End(**one) for rank, one in board.read("end").items()}
+            ends = {rank: End(**one) for rank, one in store.read("end").items()}
             waited = running_seconds() - started
-            missing = [rank for rank in range(board.size) if rank not in ends]
+            missing = [rank for rank in range(store.size) if rank not in ends]
             gone = [rank for rank in missing if rank in people and is_gone(people[rank])]
             if waited > _SILENT:
-                beats = board.read("beat")
+                beats = store.read("beat")
                 gone = [rank for rank in missing if rank in gone or beats.get(rank) == before.get(rank)]
-            settled = len(gone) == len(missing) or end.kind == DONE and board.rank > 0
+            settled = len(gone) == len(missing) or end.kind == DONE and store.rank > 0
             if settled or waited > _WAIT:
                 return ends, [] if end.kind == DONE else gone
             time.sleep(0.05)

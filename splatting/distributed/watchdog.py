@@ -4,10 +4,10 @@ import os
 import sys
 import threading
 
-from splatting.distributed.board import Board, is_gone
-from splatting.distributed.ending import DONE, HANG, LOST, NO_WORD, End, Ending
-from splatting.distributed.quiet import names
-from splatting.distributed.watched import WatchedRanks
+from splatting.distributed.key_value_store import KeyValueStore, is_gone
+from splatting.distributed.rank_logging import names
+from splatting.distributed.shutdown import DONE, HANG, LOST, NO_WORD, End, Ending
+from splatting.distributed.watched_ranks import WatchedRanks
 from splatting.host.clock import running_seconds
 
 _BEAT = 0.5  # seconds between two beats
@@ -25,7 +25,7 @@ class Watch(threading.Thread):
 
     def __init__(self, rank: int, size: int, ending: Ending) -> None:
         super().__init__(name="watch over ranks", daemon=True)
-        self._board, self._ending = Board(rank, size), ending
+        self._store, self._ending = KeyValueStore(rank, size), ending
         self._over = threading.Event()
         self.ranks: WatchedRanks | None = None
         self._number = 0
@@ -37,7 +37,7 @@ class Watch(threading.Thread):
         """Leave a note of what this rank does."""
         ranks = self.ranks
         self._number += 1
-        self._board.post("beat", [self._number, ranks.calls if ranks else 0, bool(ranks and ranks.expected)])
+        self._store.post("beat", [self._number, ranks.calls if ranks else 0, bool(ranks and ranks.expected)])
 
     def run(self) -> None:
         """Look until `leave`."""
@@ -61,15 +61,15 @@ class Watch(threading.Thread):
     def _look(self, took: float) -> End | None:
         """How this rank has to end, if the main thread does not see to it. took: seconds that the store has taken."""
         # Seconds in which this process ran: one that was stopped, as all ranks may have been, has waited for nobody.
-        now, beats = running_seconds(), self._board.read("beat")
+        now, beats = running_seconds(), self._store.read("beat")
         for rank, (number, _, _) in beats.items():
             if self._seen.get(rank, (0, 0.0))[0] != number or took > _SILENT / 2:  # no rank could leave a note
                 self._seen[rank] = number, now
-        ends = self._board.read("end")
-        people = self._board.read("here")
+        ends = self._store.read("end")
+        people = self._store.read("here")
         gone = [
             rank
-            for rank in range(self._board.size)
+            for rank in range(self._store.size)
             if rank not in ends
             and (rank in people and is_gone(people[rank]) or rank in beats and now - self._seen[rank][1] > _SILENT)
         ]
@@ -97,7 +97,7 @@ class Watch(threading.Thread):
     def _end(self, end: End) -> None:
         if not self._ending.begin():
             return
-        status, _ = self._ending.finish(end, self._board)
+        status, _ = self._ending.finish(end, self._store)
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         os._exit(status)

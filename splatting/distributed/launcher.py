@@ -11,13 +11,13 @@ from typing import NoReturn
 import torch
 import torch.distributed as dist
 
-from splatting.distributed import quiet
-from splatting.distributed.alike import refuse_differences
-from splatting.distributed.board import Board, here
-from splatting.distributed.ending import DONE, FAULT, LOST, NO_WORD, SIGNAL, End, Ending
+from splatting.distributed import rank_logging
+from splatting.distributed.key_value_store import KeyValueStore, here
 from splatting.distributed.ranks import using
-from splatting.distributed.watch import Watch
-from splatting.distributed.watched import TIMEOUT, RankLost, WatchedRanks
+from splatting.distributed.replicated import refuse_differences
+from splatting.distributed.shutdown import DONE, FAULT, LOST, NO_WORD, SIGNAL, End, Ending
+from splatting.distributed.watchdog import Watch
+from splatting.distributed.watched_ranks import TIMEOUT, RankLost, WatchedRanks
 from splatting.host import interrupt, torchrun
 from splatting.host.errors import UserError, first_line
 from splatting.host.machine import compute_device, cores, device_name, instruction_set
@@ -32,19 +32,19 @@ def run_together(main: Callable[[], object], outcome: Callable[[Callable[[], obj
     is raised again on the rank that tells of it.
     """
     rank, size = torchrun.rank(), torchrun.size()
-    quiet.hush(rank == 0)
+    rank_logging.hush(rank == 0)
     try:
-        board = Board(rank, size)
+        store = KeyValueStore(rank, size)
     except UserError as error:
-        quiet.speak(f"error: rank {rank}: {error}")
+        rank_logging.speak(f"error: rank {rank}: {error}")
         return 2
-    ending = Ending(board)
+    ending = Ending(store)
     watch = Watch(rank, size, ending)
-    board.post("here", here())
+    store.post("here", here())
     watch.start()
     end = error = None
     try:
-        end, error = _ended(lambda: outcome(lambda: _join_and_run(main, board, watch, ending)))
+        end, error = _ended(lambda: outcome(lambda: _join_and_run(main, store, watch, ending)))
         interrupt.ignore()
     except KeyboardInterrupt:  # torchrun ends the others when one has ended, also where that was being told
         interrupt.ignore()
@@ -56,7 +56,7 @@ def run_together(main: Callable[[], object], outcome: Callable[[Callable[[], obj
     status, spoke = ending.finish(end)
     at_once = not watch.leave() or status and watch.ranks and watch.ranks.by_gpu
     if error is not None and spoke:
-        quiet.unhush()
+        rank_logging.unhush()
         if not at_once:
             raise error
         traceback.print_exception(error)
@@ -90,28 +90,28 @@ def _end_of(status: int, line: str) -> End:
     return End(kind, status, line)
 
 
-def _join_and_run(main: Callable[[], object], board: Board, watch: Watch, ending: Ending) -> None:
-    with _joined(board) as ranks, using(ranks):
+def _join_and_run(main: Callable[[], object], store: KeyValueStore, watch: Watch, ending: Ending) -> None:
+    with _joined(store) as ranks, using(ranks):
         watch.ranks = ranks
         ending.stands = lambda: ranks.stands()
         main()
 
 
 @contextmanager
-def _joined(board: Board) -> Iterator[WatchedRanks]:
+def _joined(store: KeyValueStore) -> Iterator[WatchedRanks]:
     """Make the process group: NCCL on GPUs, one a rank, and gloo on CPUs."""
     device = _own_device()
-    board.post("machine", _machine(device))
-    refuse_differences(board.everyone("machine"), "start all ranks with the same installation")
+    store.post("machine", _machine(device))
+    refuse_differences(store.everyone("machine"), "start all ranks with the same installation")
     options = {"device_id": device} if device.type == "cuda" else {}
     backend = "nccl" if device.type == "cuda" else "gloo"
     # NCCL's own watchdog would abort this process as soon as another is gone, before anybody has said which.
     os.environ.setdefault("TORCH_NCCL_ASYNC_ERROR_HANDLING", "0")
     dist.init_process_group(
         backend,
-        store=dist.PrefixStore("group", board.store),
-        rank=board.rank,
-        world_size=board.size,
+        store=dist.PrefixStore("group", store.raw),
+        rank=store.rank,
+        world_size=store.size,
         timeout=TIMEOUT,
         **options,
     )

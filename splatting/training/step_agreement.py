@@ -10,7 +10,7 @@ _SIGNALS = (None, KeyboardInterrupt, Terminated)
 _WARM = 2  # iterations of a run after which a step takes as long as the others
 
 
-class Together(Observer):
+class StepAgreement(Observer):
     """Shares whether an iteration is due, which signal asks to stop, and where the guard has stopped the optimisers.
 
     These go with the numbers that they exchange to render the iteration's view (`agree`), and are known when its

@@ -1,4 +1,4 @@
-"""A board where ranks leave notes for each other, in torchrun's store, which outlives each of them."""
+"""Notes of ranks for each other, in torchrun's key-value store, which outlives each of them."""
 
 import json
 import os
@@ -18,7 +18,7 @@ _WAIT = timedelta(minutes=10)  # for the store itself, as long as torchrun start
 _LOOK = 0.05  # seconds
 
 
-class Board:
+class KeyValueStore:
     """A connection to the store. Each thread needs its own: a call that waits holds it."""
 
     def __init__(self, rank: int, size: int) -> None:
@@ -30,16 +30,16 @@ class Board:
             place = f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
             raise UserError(f"no store of torchrun at {place} ({first_line(error)}); start all ranks anew") from error
         # The store outlives a restart of all ranks, and the notes of those before it are not for these.
-        self.store = dist.PrefixStore(f"board/{torchrun.restarts()}", store)
+        self.raw = dist.PrefixStore(f"notes/{torchrun.restarts()}", store)
 
     def post(self, name: str, value: Any) -> None:
         """Leave a note for all, in place of this rank's last one of that name."""
-        self.store.set(f"{name}/{self.rank}", json.dumps(value))
+        self.raw.set(f"{name}/{self.rank}", json.dumps(value))
 
     def read(self, name: str) -> dict[int, Any]:
         """Everyone's notes of a name that are there, by rank."""
         keys = {rank: f"{name}/{rank}" for rank in range(self.size)}
-        return {rank: json.loads(self.store.get(key)) for rank, key in keys.items() if self.store.check([key])}
+        return {rank: json.loads(self.raw.get(key)) for rank, key in keys.items() if self.raw.check([key])}
 
     def everyone(self, name: str) -> list[Any]:
         """The notes of all ranks, once all are there."""
@@ -49,7 +49,7 @@ class Board:
 
     def claim(self, name: str) -> bool:
         """Whether this rank is the first to ask for a name."""
-        return self.store.add(name, 1) == 1
+        return self.raw.add(name, 1) == 1
 
 
 def here() -> list:

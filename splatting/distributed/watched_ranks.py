@@ -10,8 +10,8 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-from splatting.distributed import quiet
-from splatting.distributed.several import SeveralRanks
+from splatting.distributed import rank_logging
+from splatting.distributed.process_group import SeveralRanks
 from splatting.host.clock import running_seconds
 from splatting.host.memory import is_out_of_memory
 
@@ -82,9 +82,9 @@ class WatchedRanks(SeveralRanks):
         return self.prompt and not self._at_work
 
     def tell_notes(self) -> None:
-        said = self.everyone(quiet.take())
+        said = self.everyone(rank_logging.take())
         if self.first:
-            quiet.tell(dict(enumerate(said)))
+            rank_logging.tell(dict(enumerate(said)))
 
     @property
     def waiting_since(self) -> float | None:
