@@ -176,7 +176,8 @@ def _report(
         print(f"\n{table.title}\n{_text(table)}" if table.title else _text(table))
     for scene, found in report["reached"].items():
         print(f"\n{scene}: seconds of training to reach a test PSNR\n{_text(reached_table(found))}")
-        print(reached_legend(found))
+        if legend := reached_legend(found):
+            print(legend)
     print(f"\nreport: {output / 'report.html'}")
     return scored
 

@@ -92,6 +92,19 @@ def test_vendored_files_are_those_of_the_record():
         assert f"{record['package']} {record['version']}, MIT" in files[name][:100].decode()
 
 
+def test_vendor_writes_nothing_that_differs_from_the_record(tmp_path, monkeypatch):
+    (tmp_path / "LICENSE").write_text("other")
+    replaced = {"ROOT": tmp_path, "FOLDER": tmp_path / "viewer", "_output": lambda *_: b"code"}
+    replaced |= {"_installed": lambda *_: (tmp_path, Path("esbuild"))}
+    for name, value in replaced.items():
+        monkeypatch.setattr(vendor, name, value)
+    monkeypatch.setattr("shutil.which", lambda _: "npm")
+    digest = hashlib.sha256(b"other").hexdigest()
+    with pytest.raises(UserError, match=f'the files differ from those of .*"LICENSE": "{digest}"'):
+        vendor.main([])
+    assert not (tmp_path / "viewer").exists()
+
+
 def test_the_viewer_names_no_other_addresses():
     code = gzip.decompress((vendor.FOLDER / vendor.VIEWER).read_bytes()).decode()
     code += (vendor.FOLDER / "viewer.css").read_text()

@@ -1,5 +1,6 @@
 """The remote viewer of a training: a client written from the protocol watches, pauses, misbehaves; nothing changes."""
 
+import contextlib
 import os
 import re
 import signal
@@ -287,6 +288,25 @@ def test_no_message_takes_longer_than_its_limit_though_bytes_keep_coming(monkeyp
             network_transfer.receive_message(ours)
         with pytest.raises(network_transfer.ViewerLost, match="took more than 0 s"):
             network_transfer.send_message(ours, b"1", b"")
+
+
+def test_bytes_that_keep_coming_do_not_renew_the_limit(monkeypatch):
+    monkeypatch.setattr(network_transfer, "LONGEST", 0.2)
+    ours, theirs = socket.socketpair()
+
+    def dribble() -> None:
+        with contextlib.suppress(OSError):
+            for byte in packed(valid()):
+                theirs.sendall(bytes([byte]))
+                time.sleep(0.02)
+
+    with ours, theirs:
+        thread = threading.Thread(target=dribble)
+        thread.start()
+        with pytest.raises(network_transfer.ViewerLost, match="took more than 0.2 s"):
+            network_transfer.receive_message(ours)
+        theirs.close()
+        thread.join()
 
 
 def test_a_viewer_whose_messages_come_in_pieces_is_served():

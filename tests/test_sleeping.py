@@ -390,7 +390,7 @@ def test_the_last_good_model_has_the_missed_steps_up_to_there(scene, tmp_path, m
     assert all(torch.equal(one, other) for one, other in zip(good[1:7], bad[1:7], strict=True))
 
 
-@pytest.mark.parametrize("way", [(), ("--plain_step",)])
+@pytest.mark.parametrize("way", [(), ("--plain_step",), ("--plain_step", *OPTIONS["exposure"])])
 def test_a_term_that_somebody_adds_to_the_loss_reaches_all_rows(scene, tmp_path, monkeypatch, way):
     made, call, began = [], Objective.__init__, Objective.__call__
     monkeypatch.setattr(Objective, "__init__", lambda self, run: (made.append(run), call(self, run))[1])

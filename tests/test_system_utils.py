@@ -37,6 +37,8 @@ def test_run_cli_says_one_line_and_exits(error, status, said, capsys):
     with pytest.raises(SystemExit) as exit_info:
         run_cli(lambda: _raise(error))
     assert exit_info.value.code == status and capsys.readouterr() == ("", said)
+    with pytest.raises(ZeroDivisionError):  # a bug keeps its traceback
+        run_cli(lambda: 1 / 0)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """Checkpoints, files chkpntN.pth of (state of the model, N): tensors and plain values."""
 
 import argparse
-import math
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -171,9 +170,10 @@ def _check_rows(rows: Rows, table: dict[str, Attribute], max_sh_degree: int) -> 
         shape = table[name].shape
         found = tuple(values.shape[1:])
         if name == "f_rest" and found[1:] == shape[1:] and found != shape:
+            degree = next((d for d in range(4) if (d + 1) ** 2 - 1 == found[0]), None)
+            remedy = "a checkpoint of this model" if degree is None else f"--sh_degree {degree}, that of its training"
             raise UserError(
-                f"the checkpoint does not have the SH coefficients of --sh_degree {max_sh_degree}; give "
-                f"--sh_degree {math.isqrt(found[0] + 1) - 1}, with which it was trained"
+                f"the checkpoint does not have the SH coefficients of --sh_degree {max_sh_degree}; give {remedy}"
             )
         if found != shape or values.dtype != torch.float32:
             raise UserError(

@@ -1,6 +1,7 @@
 """Kinds of dataset folders, and hints at the right folder for a user who gave another one."""
 
 import os
+import shlex
 from pathlib import Path
 
 from splatting.files.listing import some
@@ -51,9 +52,9 @@ def _remedy(folder: Path) -> str:
         return "the files of a COLMAP model belong in a folder sparse/0 of the scene, beside the folder images"
     inner = [path for path in (folder / "input", folder / "images", folder) if path.is_dir() and _has_pictures(path)]
     if inner and inner[0].name == "input":
-        return f"photos need camera poses: run {typed_command('convert.py')} -s {folder} first"
+        return f"photos need camera poses: run {typed_command('convert.py')} -s {shlex.quote(str(folder))} first"
     if inner:
-        command = f"{typed_command('convert.py')} -s {folder}"
+        command = f"{typed_command('convert.py')} -s {shlex.quote(str(folder))}"
         return f"photos need camera poses: put them into a folder {folder / 'input'} and run {command} first"
     return "give -s the folder that holds one of them"
 

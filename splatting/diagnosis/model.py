@@ -47,7 +47,7 @@ FEW_GAUSSIANS = 2000
 _CLEARLY = 3.0  # dB
 _VIEWS = 4
 _WIDTH = 200
-_RESET_SAID = "warning: opacities are reset"  # as training/checks.py says it
+_RESET_SAID = "warning: opacities are reset"  # the beginning of what training/checks.py:late_reset says
 
 
 def check_model(model_path: str, iteration: int, source: str | None = None, images: str | None = None) -> list[Line]:
@@ -71,8 +71,10 @@ def check_model(model_path: str, iteration: int, source: str | None = None, imag
         return [*lines, *wrong]
     shapes, (renders, changed) = [_opacities(gaussians), _sizes(gaussians, extent)], _renders(scene, options, stored)
     if renders.finding and stored != own and _fits(model_path, own, scene.loaded_iter):
-        renders = Line(f"the model fits the scene that it was trained on, but not {stored['source_path']}",
-                       f"give -s {own['source_path']}")  # fmt: skip
+        other_scene = stored["source_path"] != own["source_path"]
+        what, name, option = ("scene", "source_path", "-s") if other_scene else ("photos", "images", "-i")
+        said = f"the model fits the {what} that it was trained on, but not {stored[name]}"
+        renders = Line(said, f"give {option} {own[name]}")
         changed = True
     if changed:  # which explains all else, and the training has no say in it
         return [*lines, *(line for line in shapes if not line.finding), renders]

@@ -102,11 +102,15 @@ def _warnings(runs: Sequence[Run], rows: Sequence[dict[str, Any]]) -> list[str]:
         if len(values) > 1:
             lines.append(f"Trained with different {name}: {', '.join(sorted(values))}.")
     said = ((run, line) for run in runs for line in run["lines"] or () if line.startswith(_WARNING))
-    lines += dict.fromkeys(f"{run['scene']} {run['config'] or ''}: {line.removeprefix(_WARNING)}" for run, line in said)
+    lines += dict.fromkeys(f"{_set_of(run)}: {line.removeprefix(_WARNING)}" for run, line in said)
     for row in rows:
         if row["failed_seeds"]:
-            lines.append(f"{row['scene']} {row['config'] or ''}: means without failed seeds {row['failed_seeds']}.")
+            lines.append(f"{_set_of(row)}: means without failed seeds {row['failed_seeds']}.")
     return lines
+
+
+def _set_of(row: Mapping[str, Any]) -> str:
+    return " ".join(filter(None, (row["scene"], row["config"])))
 
 
 def write_report(report: Mapping[str, Any], output: Path) -> None:
@@ -214,7 +218,9 @@ def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
         "left_out": any(row["gaussians"]["mean"] != row["gaussians_saved"]["mean"] for row in rows),
         "machines": sorted({one_line(run["machine"]) for run in runs if run["machine"]}),
         "open_ended": any(row["open_ended"] for row in rows),
-        "said": [run for run in runs if run["lines"]],
+        "said": [
+            (run, said) for run in runs if (said := [x for x in run["lines"] or () if not x.startswith(_WARNING)])
+        ],
         "several_seeds": known("PSNR", "std"),
         "timed": known("seconds"),
         "unfinished": [run for run in runs if not run["finished"] and not run["failure"]],

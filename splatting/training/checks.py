@@ -119,14 +119,14 @@ def without_effect(opt: argparse.Namespace) -> str | None:
     return f"--strategy {opt.strategy} has no use for {some(given)}" if given else None
 
 
-def late_reset(opt: argparse.Namespace, white_background: bool, schedule: Schedule) -> str | None:
+def late_reset(opt: argparse.Namespace, white_background: bool, schedule: Schedule, done: int) -> str | None:
     """What to say if adaptive density control resets opacities so late that the model cannot recover.
 
-    A run with a time budget leaves such resets out.
+    done: iterations before this run, which may have been the reset. A run with a time budget leaves such resets out.
     """
     if opt.strategy != "adc" or isinstance(schedule, DecidedSchedule):
         return None
-    last = range(max(1, schedule.ends - rules.RECOVERY + 1), schedule.ends)
+    last = range(max(done, schedule.ends - rules.RECOVERY) + 1, schedule.ends)
     resets = [rules.actions(t, opt, white_background, schedule.span(t), schedule.stride(t)).reset_opacity for t in last]
     due = [t for t, is_reset in zip(last, resets, strict=True) if is_reset]
     if not due:
@@ -158,11 +158,12 @@ def another_number(density: DensityControl, opt: argparse.Namespace, count: int,
     # The number that mcmc takes where none is given is a limit, nothing to reach.
     if reached == aim or ((reached > aim or opt.strategy == "mcmc") and not opt.max_num_splats):
         return None
+    done = schedule.schedule_step(first) - 1
+    until = f"--densify_until_iter {done + (schedule.length - done) // 2}"
     if too_late:
-        done = schedule.schedule_step(first) - 1
         window = f"--densify_from_iter {done + (schedule.length - done) // 20}"
         if opt.strategy != "mcmc":
-            window += f" --densify_until_iter {done + (schedule.length - done) // 2}"
+            window += f" {until}"
         why = f"--densify_from_iter {opt.densify_from_iter} is not before the end; give {window}"
         if too_many and opt.strategy == "budget":
             return f"{_start_of(count, opt)}; only faint ones are removed, as {why}"
@@ -170,8 +171,7 @@ def another_number(density: DensityControl, opt: argparse.Namespace, count: int,
         why = f"--mcmc_growth {opt.mcmc_growth:g} adds too few each time; raise it, or lower --densification_interval"
         why = "it removes none; --strategy budget does" if too_many else why
     elif schedule.length < density.ends:
-        end = f"--densify_until_iter {opt.densify_until_iter}"
-        why = f"{end} is not before the end; give --densify_until_iter {schedule.length // 2}"
+        why = f"--densify_until_iter {opt.densify_until_iter} is not before the end; give {until}"
     else:
         why = "they at most double each time; lower --densification_interval, or raise --densify_until_iter"
     return f"--strategy {opt.strategy} gets to {reached:,} Gaussians, not to {aim:,}, as {why}"

@@ -90,7 +90,7 @@ def _bands(it: LeftOut) -> str:
     if it.max_sh_degree == 0:
         return "The model has no SH bands above degree 0"
     moved = ", ".join(f"{bound:.2g} above degree {degree}" for degree, bound in enumerate(it.cut_bounds[:-1]))
-    return f"All SH bands were kept. To cut them (--prune_sh) would move colours, from 0 to 1, by up to {moved}"
+    return f"All SH bands were kept. Cutting them (--prune_sh) moves colours (values 0 to 1) by at most {moved}"
 
 
 def _pictures(it: LeftOut) -> str:

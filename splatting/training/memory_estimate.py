@@ -1,4 +1,4 @@
-"""Estimate of the memory that a training needs, printed before it starts."""
+"""Estimate of the memory that a training needs, printed before it starts if that is much of what is free."""
 
 import math
 import sys

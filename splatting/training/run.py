@@ -93,7 +93,7 @@ class Run:
         if isinstance(self.schedule, DecidedSchedule):
             end_in_time(opt)
         self.warnings: list[str] = []
-        self._warn(checks.late_reset(opt, dataset.white_background, self.schedule))
+        self._warn(checks.late_reset(opt, dataset.white_background, self.schedule, self.first_iteration))
         kind = SpilledGaussians if opt.spill else GaussianModel
         self.gaussians = kind(dataset.sh_degree, opt.optimizer_type)
         self.gaussians.divide(self.group)
