@@ -16,7 +16,7 @@ from splatting.host.clock import running_seconds
 from splatting.host.memory import is_out_of_memory
 
 # Of a collective call. It has to be longer than any work of one rank that the others wait for, as rank 0 writing tens
-# of gigabytes to a slow disk. A rank that is gone or hangs is noticed by other means and within seconds (watch.py).
+# of gigabytes to a slow disk. A rank that is gone or hangs is noticed by other means and within seconds (watchdog.py).
 TIMEOUT = timedelta(minutes=30)
 # Of gloo's errors for a rank that cannot be reached, and of torch's for a store.
 _WORDS = ("closed by peer", "reset by peer", "broken pipe", "timed out", "timeout", "connect", "read error", "socket")

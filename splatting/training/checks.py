@@ -111,12 +111,12 @@ def check_exposures(gaussians: GaussianModel, train_test_exp: bool, checkpoint: 
         print(f"{checkpoint} has no exposures: all photos start without a correction")
 
 
-def without_effect(opt: argparse.Namespace) -> str | None:
-    """What to say of options that belong to another strategy; their help begins with its name."""
-    other = {"adc", "mcmc", "budget"} - {opt.strategy}
+def without_effect(opt: argparse.Namespace, strategy: str) -> str | None:
+    """What to say of given options that belong to another strategy; their help begins with its name."""
+    other = {"adc", "mcmc", "budget"} - {strategy}
     given = [f"--{o.name}" for o in STRATEGY_OPTIONS
              if o.help.partition(":")[0] in other and getattr(opt, o.name) != o.default]  # fmt: skip
-    return f"--strategy {opt.strategy} has no use for {some(given)}" if given else None
+    return f"--strategy {strategy} has no use for {some(given)}" if given else None
 
 
 def late_reset(opt: argparse.Namespace, white_background: bool, schedule: Schedule, done: int) -> str | None:

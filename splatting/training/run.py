@@ -74,7 +74,7 @@ class Run:
 
         launch: the options of splatting/training/launch.py.
         """
-        opt = copy.copy(opt)  # of which the strategy is decided here
+        given, opt = opt, copy.copy(opt)  # of which the strategy, and windows by the clock, are decided here
         self.dataset, self.opt, self.pipe, self.launch = dataset, opt, pipe, launch
         self.group = ranks()
         checks.check_page(launch.viewer, self.group.several)
@@ -122,7 +122,7 @@ class Run:
         self.sleeping = self._may_sleep()
         if self.sleeping and capture and (asleep := further(capture, ASLEEP)):
             self.sleeping.restore(asleep)
-        self._warn(checks.without_effect(opt))
+        self._warn(checks.without_effect(given, opt.strategy))
         self._warn(checks.another_number(self.density, opt, self.gaussians.gaussian_count, self.first_iteration + 1))
         if capture is None and first is None:
             self.density.started()
