@@ -170,8 +170,7 @@ def draw(
     scene = scene_arguments(gaussians, rasterizer_settings(camera, pc, pipe, background, scaling), raw)
     awake = None
     if sleeping is not None:
-        sleeping.wake(scene, now)
-        awake = sleeping.awake
+        awake = sleeping.wake(scene, now)
     divided = draw_divided(pc, scene, background, want_depth, by_bands, bands, camera, awake)
     if divided is not None:
         return divided

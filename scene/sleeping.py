@@ -6,7 +6,6 @@ has missed when a view may show it. Rows lie along a Morton curve, so most block
 iterations all blocks wake, so that what is saved then is whole.
 """
 
-import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -25,8 +24,7 @@ from utils.system_utils import UserError
 
 REST = 100  # iterations
 MOST_SHARE = 0.7  # of the points, seen by a view on average; where more are, sleep saves nothing
-_TERMS = 128, 8  # of past steps, for each attribute, and powers (gs::SleepInput)
-_POWERS = 6
+_TERMS = 128, 8  # of past steps, for each attribute (gs::SleepInput)
 _NAMES = "xyz", "opacity", "scaling", "rotation", "f_dc", "f_rest"  # in the order of gs::Stepped
 
 State = dict[str, Any]  # awake, taken and terms, and of the rows that sleep all that a step changes
@@ -37,9 +35,7 @@ class Sleeping:
 
     def __init__(self, gaussians: GaussianModel) -> None:
         self._gaussians, self._adam = gaussians, FusedAdam(gaussians)
-        beta1, beta2 = gaussians.optimizer.defaults["betas"]
         self._terms = gaussians._xyz.detach().new_zeros(_TERMS)
-        self._terms[:, _POWERS] = (beta1 / math.sqrt(beta2)) ** torch.arange(_TERMS[0], dtype=torch.float64)
         self.awake = self._terms.new_empty(0, dtype=torch.uint8)
         self._taken = self._terms.new_empty(0, dtype=torch.int32)
         self._asleep: State | None = None  # while somebody looks: what all was before
@@ -57,9 +53,14 @@ class Sleeping:
         self._taken.fill_(taken)
         self._is_whole = True
 
-    def wake(self, scene: Scene, now: Tensor | None = None) -> None:
-        """Before a step: wake the blocks that the scene's camera may show. now: of FusedAdam.write_now."""
-        self._wake(scene, False, now)
+    def wake(self, scene: Scene, now: Tensor | None = None) -> Tensor:
+        """Before a step: wake the blocks that the scene's camera may show. now: of FusedAdam.write_now.
+
+        Returns which are awake, as the rasterizer takes it: on a GPU their list, from which it draws at the cost of
+        these alone; else, and of a rank's rows, a flag for each.
+        """
+        blocks = self._wake(scene, False, now)
+        return self.awake if blocks is None or self._gaussians.shards.ranks.several else blocks
 
     def stepped(self) -> None:
         """A step was taken, or taken back: from now on, the blocks that sleep are behind."""
@@ -159,11 +160,11 @@ class Sleeping:
         shapes = means, opacities, scales, rotations, None, None
         return Scene(*shapes, sh_dc, sh_rest, matrix, matrix, center, (1.0, 1.0, 1.0), (16, 16, 0, False, True))
 
-    def _wake(self, scene: Scene, every: bool, now: Tensor | None = None, guarded: bool = True) -> None:
+    def _wake(self, scene: Scene, every: bool, now: Tensor | None = None, guarded: bool = True) -> Tensor | None:
         averages, steps, _, guard, attributes, rates, constants, columns, _, iteration = self._adam.arguments(False)
         sleep = [self.awake, self._taken, self._terms]
         step = averages, steps, guard if guarded else [], attributes, rates, constants, columns, iteration, now
-        OPERATORS.wake_(*scene.lists, sleep, every, *step)
+        return OPERATORS.wake_(*scene.lists, sleep, every, *step)
 
 
 def share_seen(points: Tensor, cameras: Sequence[Camera]) -> float:

@@ -53,7 +53,7 @@ class Rerun:
     def capture(self, body: Callable[[], torch.Tensor]) -> tuple[Callable[[], None], torch.Tensor]:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(Drawn, "step", lambda *_: None)  # to capture a step does not take it
-            patch.setattr(Sleeping, "wake", lambda *_: None)
+            patch.setattr(Sleeping, "wake", lambda self, *_: self.awake)
             result = body()
         self.records += 1
 

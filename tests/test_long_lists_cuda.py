@@ -60,7 +60,7 @@ class View:
         planes = torch.randn(4, height, width, generator=torch.Generator().manual_seed(3)).to(device)
         self.color, self.depth = planes[:3], planes[3:]
         out = self.forward(True)
-        self.room = [len(out[6]), len(out[9]), len(out[6])]  # of instances, slots and gradient rows, at most
+        self.room = [len(out[6]), len(out[9]), len(out[6]), 0]  # of instances, slots and gradient rows, at most
 
     def forward(self, inverse_depth: bool) -> Drawing:
         return draw(self.scene, self.camera.bg, inverse_depth)
@@ -115,7 +115,7 @@ def beside_other_work() -> None:
     view = View(60_000, 300, 200)
     wanted, product = view.both(), torch.randn(2048, 2048, device="cuda")
     streams = [torch.cuda.Stream() for _ in range(4)]
-    words = [torch.zeros(5, dtype=torch.int64, device="cuda") for _ in streams]
+    words = [torch.zeros(6, dtype=torch.int64, device="cuda") for _ in streams]
     torch.cuda.synchronize()
     results = []
     for _ in range(25):
@@ -131,7 +131,7 @@ def beside_other_work() -> None:
 def any_room() -> None:
     """More room changes no bit. With less, the step halts, and the next one that has enough is as if nothing was."""
     view = View(30_000, 90, 75)
-    wanted, words = view.both(), torch.zeros(5, dtype=torch.int64, device="cuda")
+    wanted, words = view.both(), torch.zeros(6, dtype=torch.int64, device="cuda")
     for step, more in enumerate((0, 1, 255, 256, 100_000, 3_000_000), 1):
         got = view.ahead(words, [room + more for room in view.room])
         assert words[0] == 0 and same_bits(got, wanted), more
@@ -140,7 +140,7 @@ def any_room() -> None:
             less[place] -= 1
             view.ahead(words, less)
             view.ahead(words, view.room)
-            assert words[0] == step + 1 and words[4] == step
+            assert words[0] == step + 1 and words[5] == step
             words[0] = 0
 
 

@@ -93,7 +93,7 @@ def test_other_ranks_are_errors(outcomes):
 
 
 # Operators without a kernel for shapes alone: nobody compiles them.
-UNCOMPILED = {"run_ahead_", "in_host_memory", "photometric_band", "photometric_of_sums"}
+UNCOMPILED = {"wake_", "run_ahead_", "in_host_memory", "photometric_band", "photometric_of_sums"}
 NOT_ON_GPU = {"step_now_", "catch_up_", "penalise_"}
 TRAINED = {  # inputs that have a gradient
     "rasterize": ("means2d", "means", "opacities", "scales", "rotations", "sh_dc", "sh_rest"),

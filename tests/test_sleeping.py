@@ -50,7 +50,6 @@ class Blocks:
         self.awake = torch.ones(count, dtype=torch.uint8, device=means.device)
         self.taken = torch.full((count,), step, dtype=torch.int32, device=means.device)
         self.terms = torch.zeros(128, 8, dtype=means.dtype, device=means.device)
-        self.terms[:, 6] = (BETAS[0] / math.sqrt(BETAS[1])) ** torch.arange(128, dtype=torch.float64)
 
     def scene(self, camera: tuple) -> Scene:
         means, opacities, scales, rotations, sh_dc, sh_rest = self.values
@@ -216,9 +215,10 @@ def _sleeps(patch: pytest.MonkeyPatch) -> list[float]:
     """Let blocks sleep. The share that is awake, step by step; all rest every 7 iterations."""
     found, wake = [], Sleeping.wake
 
-    def noted(self: Sleeping, *arguments: object) -> None:
-        wake(self, *arguments)
+    def noted(self: Sleeping, *arguments: object) -> torch.Tensor:
+        awake = wake(self, *arguments)
         found.append(float(self.awake.float().mean()))
+        return awake
 
     patch.setattr(runs, "REST", 7)  # also between changes of rows
     patch.setattr(runs, "MOST_SHARE", 2.0)

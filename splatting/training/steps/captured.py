@@ -21,6 +21,7 @@ from torch import Tensor
 
 from scene.cameras import Camera
 from scene.fused_adam import NOW_WORDS, FusedAdam
+from splatting.distributed.rows import BLOCK
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Announcer
@@ -49,7 +50,8 @@ class CapturedStep(FusedStep):
         super().__init__(run)
         count = len(run.gaussians)
         lists = max(_INSTANCES * count, _LEAST)
-        self._ahead = Speculation(run.device, (lists, max(_SLOTS * count, _LEAST), lists), self)
+        blocks = -(-count // BLOCK)
+        self._ahead = Speculation(run.device, (lists, max(_SLOTS * count, _LEAST), lists, blocks), self)
         self._graphs = Graphs(run, self, self._adam, self._ahead.capacity)
 
     def take(self, at: Iteration, observers: Announcer) -> None:

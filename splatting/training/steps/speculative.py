@@ -34,10 +34,11 @@ AHEAD = 8  # steps; enough to hide a pause of the host, and few to replay
 _REPORTS = 2 * AHEAD
 _SPARE = 1.25  # times what a view needed before: Gaussians move and multiply until its next visit
 _LEAST = 1024
+_LEAST_BLOCKS = 16
 _MOST = 2**31 - 1
 _NAP = 1e-4  # seconds; steps of less than this are queued in numbers anyway
 
-Capacity = tuple[int, int, int]  # of instances, slots and gradient rows (gs::Room)
+Capacity = tuple[int, int, int, int]  # of instances, slots, gradient rows and blocks that are awake (gs::Room)
 
 
 @dataclass
@@ -51,8 +52,8 @@ class Speculation:
     """The steps that a GPU has yet to do. first: the capacity of the first step. steps: queues and replays them."""
 
     def __init__(self, device: torch.device, first: Capacity, steps: "CapturedStep") -> None:
-        self._words = torch.zeros(5, dtype=torch.int64, device=device)
-        self._reports = torch.zeros(_REPORTS, 5, dtype=torch.int64, pin_memory=True)
+        self._words = torch.zeros(6, dtype=torch.int64, device=device)
+        self._reports = torch.zeros(_REPORTS, 6, dtype=torch.int64, pin_memory=True)
         self._numbers = list(self._reports.numpy())  # the same memory
         self._stream = torch.cuda.current_stream(device)
         self._first, self._steps = first, steps
@@ -70,7 +71,7 @@ class Speculation:
         self._collect(0)
         self._stream.synchronize()
         self._words[0] = 0  # what was queued in vain may have overflowed
-        self._done = int(self._words[4])
+        self._done = int(self._words[5])
 
     def throttle(self) -> None:
         """Wait until another step can be queued."""
@@ -83,7 +84,7 @@ class Speculation:
     def abort(self) -> int:
         """Drop the steps that overflowed, after an error. Returns their number; they changed nothing."""
         self._stream.synchronize()
-        while self._pending and (report := self._report()) and not report[3]:
+        while self._pending and (report := self._report()) and not report[4]:
             self._finish(report)
         lost = len(self._pending)
         self._steps.rewind(sum(pending.counted for pending in self._pending))
@@ -103,19 +104,22 @@ class Speculation:
         """What a view needed before, and some spare; a new view gets that of the largest."""
         if not self._needed:
             return self._first
-        needed = self._needed.get(view) or tuple(map(max, zip(*self._needed.values(), strict=True)))
-        instances, slots, rows = map(_with_spare, needed)
-        return min(instances, _MOST), slots, min(rows, _MOST)
+        *lists, blocks = self._needed_by(view)
+        instances, slots, rows = map(_with_spare, lists)
+        return min(instances, _MOST), slots, min(rows, _MOST), _with_spare(blocks, _LEAST_BLOCKS)
+
+    def _needed_by(self, view: Hashable | None) -> Capacity:
+        return self._needed.get(view) or tuple(map(max, zip(*self._needed.values(), strict=True)))
 
     def _report(self) -> list[int] | None:
-        """Of the first pending step: instances, slots, rows, halted; None until the GPU has written them."""
+        """Of the first pending step: what it needs, then halted; None until the GPU has written them."""
         number = self._done + 1
         numbers = self._numbers[number % _REPORTS]
-        return numbers[:4].tolist() if numbers[4] == number else None
+        return numbers[:5].tolist() if numbers[5] == number else None
 
     def _finish(self, report: list[int]) -> None:
         """Strike the first pending step off."""
-        self._needed[_view(self._pending.popleft().at)] = tuple(report[:3])
+        self._needed[_view(self._pending.popleft().at)] = tuple(report[:4])
         self._done += 1
 
     def _collect(self, most: int) -> None:
@@ -126,7 +130,7 @@ class Speculation:
                 if len(self._pending) <= most:
                     return
                 time.sleep(_NAP)
-            elif report[3]:
+            elif report[4]:
                 self._replay(report)
             else:
                 self._finish(report)
@@ -136,23 +140,26 @@ class Speculation:
         self.overflows += 1
         self._stream.synchronize()
         self._words[0] = 0
-        self._numbers[(self._done + 1) % _REPORTS][4] = 0  # the halted step's report will come once more
+        self._numbers[(self._done + 1) % _REPORTS][5] = 0  # the halted step's report will come once more
         self._steps.rewind(len(self._pending))
         for pending in self._pending:
             pending.counted = False
-        instances, slots, rows, _ = report
+        instances, slots, rows, blocks, _ = report
         if instances > _MOST:
             self._steps.measure(self._pending[0].at)  # raises an error: its lists are too long for any capacity
+        view = _view(self._pending[0].at)
+        if not instances:  # it overflowed with blocks, and counted nothing else
+            instances, slots, rows, _ = self._needed_by(view)
         # A step that overflowed with instances did not count its rows, of which there are no more.
-        self._needed[_view(self._pending[0].at)] = instances, slots, rows or instances
+        self._needed[view] = instances, slots, rows or instances, blocks
         for pending in self._pending:
             self._steps.replay(pending.at, pending.losses)
             pending.counted = True
 
 
-def _with_spare(count: int) -> int:
+def _with_spare(count: int, least: int = _LEAST) -> int:
     """A little more, in few different sizes, so that torch's allocator finds them again."""
-    requested = max(int(_SPARE * count), _LEAST)
+    requested = max(int(_SPARE * count), least)
     unit = 1 << max(requested.bit_length() - 4, 0)
     return -(-requested // unit) * unit
 

@@ -3,6 +3,8 @@
 // splat in a tile). All arrays are row-major and contiguous unless a stride is given; T is float or double.
 #include <cstdint>
 
+#include "gs/hd.h"
+
 namespace gs {
 
 struct Image {
@@ -32,14 +34,23 @@ struct Scene {
   const T* center;      // 3
   double tan_x, tan_y;
   Image image;
-  const uint8_t* awake = nullptr;  // (sleep_blocks(N)) 0: no Gaussian of the block reaches the image; null: unknown
+  const uint8_t* awake = nullptr;   // (sleep_blocks(N)) 0: no Gaussian of the block reaches the image; null: unknown
+  const int32_t* blocks = nullptr;  // (listed) on a GPU: the blocks that are awake, ascending, then -1; or null
+  int64_t listed = 0;
+
+  // Rows of what is made of the Gaussians: a row for each, or for those of the listed blocks alone.
+  GS_HD int64_t rows() const;
 };
 
 // Gaussians sleep and wake in blocks of so many.
 constexpr int64_t kSleepBlock = 128;
-constexpr int64_t sleep_blocks(int64_t count) { return (count + kSleepBlock - 1) / kSleepBlock; }
-constexpr int64_t kTerms = 128;  // of past steps that are kept, so that no block may miss more
-constexpr int kTermColumns = 8, kPowers = 6;
+GS_HD constexpr int64_t sleep_blocks(int64_t count) { return (count + kSleepBlock - 1) / kSleepBlock; }
+template <class T>
+GS_HD int64_t Scene<T>::rows() const {
+  return blocks ? listed * kSleepBlock : count;
+}
+constexpr int64_t kTerms = 128;  // of past steps that are kept, a power of 2; no block may miss as many
+constexpr int kTermColumns = 8;
 
 // What binning reads of a splat. It fits one memory sector, because binning reads splats in depth order. On a GPU
 // binning makes records that it was not given.
@@ -81,9 +92,10 @@ struct alignas(16) SplatSlots {
   int32_t wide;     // the rectangle's width
 };
 
-// What lists may hold, or what they need: instances, slots, and gradient rows (a processed instance has one).
+// What lists may hold, or what they need: instances, slots, gradient rows (a processed instance has one), and blocks
+// of Gaussians that are awake.
 struct Room {
-  int64_t instances, slots, rows;
+  int64_t instances, slots, rows, blocks;
 };
 
 // How far a host may run ahead of a GPU: it gives room for lists whose lengths it does not know. If one is too long,
@@ -93,7 +105,7 @@ struct Ahead {
   Room* needed;     // on the device: of the last step that was not halted before
   int64_t* done;    // on the device: the number of steps that were done
   Room room;
-  int64_t* reports;  // (report_count, 5) page-locked: of a step, instances, slots, rows, halted, its number; or null
+  int64_t* reports;  // (report_count, 6) page-locked: of a step its needs, halted, and its number; or null
   int report_count;  // step n, counted from 1, writes report n % report_count
 };
 
@@ -189,6 +201,7 @@ struct ObserveInput {
   const int32_t* radii;                      // (N) of this view
   const float* gradients;                    // (N, 3) of the means on the screen; the third value is not read
   const float* lengths = nullptr;            // (N) what stands for the gradients' lengths; or null
+  const int32_t* blocks = nullptr;  // radii, gradients and lengths are of these blocks (Scene::blocks); or null
 };
 
 // Gaussians that move at random (math/displace.h): by noise, or to the children of split ones.
@@ -283,9 +296,11 @@ struct SleepInput {
   bool all;        // all blocks wake, for no step yet; or those that a view may show, unless the guard has stopped
   uint8_t* awake;  // (blocks) written
   int32_t* taken;  // (blocks) the number of the last step that a block takes part in: this one, unless all wake
-  // (kTerms, kTermColumns), at 16 bytes: of each attribute lr sqrt(1 - beta2^s) / (1 - beta1^s) of step s, in row s
-  // modulo kTerms; and in row j of column kPowers (beta1 / sqrt(beta2))^j, which is given.
+  // (kTerms, kTermColumns): of each attribute lr sqrt(1 - beta2^s) / (1 - beta1^s) of step s, in row s modulo kTerms.
   T* terms;
+  int32_t* blocks = nullptr;  // (room) written on a GPU unless all wake: those that are awake (Scene::blocks)
+  int64_t room = 0;
+  const Ahead* ahead = nullptr;  // judges whether there is room for them
 };
 
 }  // namespace gs

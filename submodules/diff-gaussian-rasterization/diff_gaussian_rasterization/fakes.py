@@ -110,6 +110,5 @@ def _(rows, counts, kept, room):
 @_fake("observe_")
 @_fake("penalise_")
 @_fake("step_now_")
-@_fake("wake_")
 def _(*_args, **_keywords):
     return None

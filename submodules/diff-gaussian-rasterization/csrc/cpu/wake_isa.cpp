@@ -42,15 +42,6 @@ void take_missed_of_block(const AdamInput<T>& to, const MissedSum<T>& missed, in
       take_missed(missed, to.value[at], to.mean[at], to.square[at]);
 }
 
-// MissedSum::sum.
-template <class T>
-T sum_of(const T* terms, int attribute, int64_t taken, int64_t missed) {
-  T sum = 0;
-  for (int64_t j = 1; j <= missed; ++j)
-    sum += terms[(taken + j) % kTerms * kTermColumns + attribute] * terms[j * kTermColumns + kPowers];
-  return sum;
-}
-
 template <class T>
 AdamStep<T> step_of(const GaussianStep<T>& in, int attribute) {
   AdamStep<T> step = adam_step_of(in.attributes[attribute], false);
@@ -67,23 +58,22 @@ void wake(const Executor& executor, const Scene<T>& s, const SleepInput<T>& in) 
   if (step.guard.stopped && *step.guard.stopped) return;
   const int64_t number = step.now ? step.now->step : int64_t(step.attributes[kStepMeans].step);
   const Camera<T> camera = camera_of(s);
+  MissedSums<T> sums = {};
+  for (int64_t k = 0; k < kTerms; ++k) sums.set_decays(step.attributes[kStepMeans], number, k);
   for (int a = 0; a < kStepped; ++a)
     if (step.attributes[a].columns) {
       const AdamStep<T> constants = step_of(step, a);
       in.terms[number % kTerms * kTermColumns + a] = constants.rate / constants.root_correction;
+      sums.add_up(step.attributes[a], in.terms, a, number);
     }
   for_dynamic(executor, s.count, kSleepBlock, [&](int64_t begin, int64_t end) {
-    const int64_t block = begin / kSleepBlock, taken = in.taken[block], missed = number - 1 - taken;
-    MissedSum<T> sums[kStepped] = {};
-    for (int a = 0; a < kStepped && missed > 0; ++a)
-      if (step.attributes[a].columns)
-        sums[a] = missed_sum(step.attributes[a], sum_of(in.terms, a, taken, missed), taken, missed);
+    const int64_t block = begin / kSleepBlock, missed = missed_before(number, in.taken[block]);
+    const auto reach = [&](int a) { return missed > 0 ? sums.reach(a, missed) : T(0); };
     const bool wakes =
         in.all || missed < 0 ||
-        may_be_seen(part_of(s, begin, end - begin), Watch<T>(camera, sums[kStepMeans].sum * sums[kStepMeans].most,
-                                                             sums[kStepScales].sum * sums[kStepScales].most));
+        may_be_seen(part_of(s, begin, end - begin), Watch<T>(camera, reach(kStepMeans), reach(kStepScales)));
     for (int a = 0; a < kStepped && wakes && missed > 0; ++a)
-      take_missed_of_block(step.attributes[a], sums[a], begin, end - begin);
+      take_missed_of_block(step.attributes[a], sums.of(a, missed), begin, end - begin);
     in.awake[block] = wakes;
     if (wakes) in.taken[block] = int32_t(number - in.all);
   });

@@ -6,10 +6,17 @@
 namespace gs {
 namespace cuda {
 
-// Notes the lengths of the lists, and halts if there is less room.
+// Notes the number of blocks that are awake, and halts if there is less room for them. It is the first to judge.
+__device__ inline void judge_blocks(const Ahead& ahead, int64_t blocks) {
+  if (is_halted(ahead.halted)) return;
+  *ahead.needed = {0, 0, 0, blocks};
+  if (blocks > ahead.room.blocks) *ahead.halted = int32_t(*ahead.done + 1);
+}
+
+// Does the same for the lengths of the lists.
 __device__ inline void judge_lists(const Ahead& ahead, int64_t instances, int64_t slots) {
   if (is_halted(ahead.halted)) return;
-  *ahead.needed = {instances, slots, 0};
+  *ahead.needed = {instances, slots, 0, ahead.needed->blocks};
   if (instances > ahead.room.instances || slots > ahead.room.slots) *ahead.halted = int32_t(*ahead.done + 1);
 }
 
@@ -26,10 +33,10 @@ __device__ inline void judge_rows(const Ahead& ahead, int64_t rows) {
       *ahead.done = step;
   }
   if (!ahead.reports) return;
-  volatile int64_t* to = ahead.reports + 5 * (step % ahead.report_count);
-  to[0] = needed.instances, to[1] = needed.slots, to[2] = needed.rows, to[3] = *ahead.halted;
+  volatile int64_t* to = ahead.reports + 6 * (step % ahead.report_count);
+  to[0] = needed.instances, to[1] = needed.slots, to[2] = needed.rows, to[3] = needed.blocks, to[4] = *ahead.halted;
   __threadfence_system();
-  to[4] = step;
+  to[5] = step;
 }
 
 }  // namespace cuda

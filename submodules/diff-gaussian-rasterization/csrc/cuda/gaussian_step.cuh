@@ -113,10 +113,10 @@ struct WarpGradients {
   __device__ float* opacities() const { return memory + 32 * 13; }
 };
 
-// Adds the view to the statistics of Gaussian i, whose gradient on the screen this is.
-__device__ inline void observe_one(const ObserveInput& in, int64_t i, const float* gradient) {
+// Adds the view to the statistics of Gaussian i, whose gradient on the screen this is. at: the row of its radius.
+__device__ inline void observe_one(const ObserveInput& in, int64_t i, int64_t at, const float* gradient) {
   Observed o{in.max_radii[i], in.gradient_sums[i], in.views[i]};
-  gs::observe(in.radii[i], gradient[0], gradient[1], o);
+  gs::observe(in.radii[at], gradient[0], gradient[1], o);
   in.max_radii[i] = o.max_radius, in.gradient_sums[i] = o.gradient_sum, in.views[i] = o.views;
 }
 

@@ -3,6 +3,7 @@
 
 #include "../backend.h"
 #include "../math/observe.h"
+#include "awake.cuh"
 #include "queue.cuh"
 
 namespace gs {
@@ -14,13 +15,14 @@ constexpr int kThreads = 256;
 
 __global__ void __launch_bounds__(kThreads) observe_kernel(const int32_t* halted, ObserveInput in) {
   if (is_halted(halted)) return;
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i >= in.count) return;
+  const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (at >= in.count || (in.blocks && !in.radii[at])) return;
+  const int64_t i = gaussian_at(in.blocks, at);
   Observed o{in.max_radii[i], in.gradient_sums[i], in.views[i]};
   if (in.lengths)
-    gs::observe(in.radii[i], in.lengths[i], o);
+    gs::observe(in.radii[at], in.lengths[at], o);
   else
-    gs::observe(in.radii[i], in.gradients[3 * i], in.gradients[3 * i + 1], o);
+    gs::observe(in.radii[at], in.gradients[3 * at], in.gradients[3 * at + 1], o);
   in.max_radii[i] = o.max_radius, in.gradient_sums[i] = o.gradient_sum, in.views[i] = o.views;
 }
 

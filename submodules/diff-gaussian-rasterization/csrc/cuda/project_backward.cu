@@ -5,6 +5,7 @@
 
 #include "../backend.h"
 #include "../math/scene_row.h"
+#include "awake.cuh"
 #include "gaussian_step.cuh"
 #include "gradient_rows.cuh"
 #include "sh_rows.cuh"
@@ -102,7 +103,9 @@ template <class Source, class Step>
 __global__ void __launch_bounds__(kThreads, kBlocks)
     project_vjp_kernel(const int32_t* halted, Scene<float> s, Source source, SceneGradient<float> out,
                        const __grid_constant__ Step step) {
-  if (is_halted(halted) || (s.awake && !s.awake[blockIdx.x])) return;
+  if (is_halted(halted)) return;
+  const int64_t block = awake_block(s, blockIdx.x);
+  if (block < 0) return;
   constexpr bool kAdds = std::is_same_v<Step, Addition>;
   constexpr int kStage = SlotSums::kStage > WarpGradients::kFloats ? SlotSums::kStage : WarpGradients::kFloats;
   static_assert(32 * RowBefore::kFloats <= kStage, "a warp has memory for the rows of its lanes");
@@ -111,8 +114,9 @@ __global__ void __launch_bounds__(kThreads, kBlocks)
   __shared__ __align__(16) float stage[kThreads / 32 * kStage];
   if (threadIdx.x == 0) camera = camera_of(s);
   __syncthreads();
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x, first = i - (threadIdx.x & 31);
-  const bool seen = i < s.count && source.seen(i);
+  const int64_t i = block * kThreads + threadIdx.x, first = i - (threadIdx.x & 31);
+  const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x;  // in what the forward has made
+  const bool seen = i < s.count && source.seen(at);
   float* row = rest + threadIdx.x * kRest;
   float* warp_rows = rest + (threadIdx.x & ~31) * kRest;
   float* warp_stage = stage + threadIdx.x / 32 * kStage;
@@ -120,7 +124,7 @@ __global__ void __launch_bounds__(kThreads, kBlocks)
     fetch_rows(s.sh_rest, first, s.count, s.rest_stride, 3 * (sh_count(s.sh_degree) - 1), __ballot_sync(kWarp, seen), 0,
                warp_rows);
   float m[kGradientValues];
-  source.read(i, seen, m, warp_stage);
+  source.read(at, seen, m, warp_stage);
   wait_for_rows();
   RowGradient g = {};
   const SceneGradient<float> mine = g.pointers(out, i);
@@ -136,7 +140,7 @@ __global__ void __launch_bounds__(kThreads, kBlocks)
   }
   if (first >= s.count) return;
   if (step.wanted) {
-    if (step.observed.max_radii && i < s.count) observe_one(step.observed, i, g.means2d);
+    if (step.observed.max_radii && i < s.count) observe_one(step.observed, i, at, g.means2d);
     const WarpGradients gradients{warp_stage};
     write_gradient(g, gradients);
     if (i < s.count) penalise_one(step, i, gradients);
@@ -155,8 +159,8 @@ __global__ void __launch_bounds__(kThreads, kBlocks)
 template <class Source, class Step>
 void launch_project_vjp(const Queue& queue, const Scene<float>& s, const Source& source,
                         const SceneGradient<float>& out, const Step& step) {
-  project_vjp_kernel<<<blocks_for(s.count, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, s, source, out,
-                                                                                       step);
+  project_vjp_kernel<<<blocks_for(s.rows(), kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, s, source, out,
+                                                                                        step);
   check_launch("project_vjp");
 }
 
@@ -181,31 +185,31 @@ void launch_step(const Queue& queue, const Scene<float>& s, const SlotSums& sour
 template <>
 void project_vjp<float>(const Queue& queue, const Scene<float>& s, const int32_t* tile_counts, const float* moments,
                         const SceneGradient<float>& out) {
-  if (s.count) launch_project_vjp(queue, s, StoredMoments{moments, tile_counts}, out, StepParameters{});
+  if (s.rows()) launch_project_vjp(queue, s, StoredMoments{moments, tile_counts}, out, StepParameters{});
 }
 
 void rasterize_vjp(const Queue& queue, const Scene<float>& s, const BlendInput<float>& in,
                    const BlendGradient<float>& g, const GradientMemory& memory) {
-  if (!s.count) return;
+  if (!s.rows()) return;
   const SlotSums source{fill_rows(queue, in, g), g.slots};
   launch_gradients(queue, s, source, memory.take(memory.context));
 }
 
 void rasterize_vjp_step(const Queue& queue, const Scene<float>& s, const BlendInput<float>& in,
                         const BlendGradient<float>& g, const GaussianStep<float>& step) {
-  if (s.count) launch_step(queue, s, {fill_rows(queue, in, g), g.slots}, step);
+  if (s.rows()) launch_step(queue, s, {fill_rows(queue, in, g), g.slots}, step);
 }
 
 void rows_vjp(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, const RowSums<float>& to,
               const GradientMemory& memory) {
-  if (!s.count) return;
+  if (!s.rows()) return;
   const SlotSums source = sums_of(queue, in, to);
   launch_gradients(queue, s, source, memory.take(memory.context));
 }
 
 void rows_vjp_step(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, const RowSums<float>& to,
                    const GaussianStep<float>& step) {
-  if (s.count) launch_step(queue, s, sums_of(queue, in, to), step);
+  if (s.rows()) launch_step(queue, s, sums_of(queue, in, to), step);
 }
 
 }  // namespace cuda

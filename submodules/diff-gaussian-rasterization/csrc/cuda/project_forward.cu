@@ -3,6 +3,7 @@
 
 #include "../backend.h"
 #include "../math/scene_row.h"
+#include "awake.cuh"
 #include "sh_rows.cuh"
 #include "splat_row.cuh"
 #include "tile_record.cuh"
@@ -23,23 +24,24 @@ __device__ bool near_view(const Camera<float>& cam, Vec3<float> view) {
          y < cam.height * view.z + spare_y;
 }
 
-// A Gaussian that sleeps.
-__device__ void leave_out(int64_t i, int64_t count, const Projected<float>& out) {
-  if (i >= count) return;
-  out.radii[i] = out.tile_counts[i] = 0;
-  out.depths[i] = INFINITY;
-  if (out.records) out.records[i] = TileRecord{};
+// A Gaussian that sleeps, or none.
+__device__ void leave_out(int64_t row, int64_t rows, const Projected<float>& out) {
+  if (row >= rows) return;
+  out.radii[row] = out.tile_counts[row] = 0;
+  out.depths[row] = INFINITY;
+  if (out.records) out.records[row] = TileRecord{};
 }
 
 __global__ void __launch_bounds__(kThreads)
     project_kernel(const int32_t* halted, Scene<float> s, Projected<float> out) {
   if (is_halted(halted)) return;
-  if (s.awake && !s.awake[blockIdx.x]) return leave_out(int64_t(blockIdx.x) * kThreads + threadIdx.x, s.count, out);
+  const int64_t row = int64_t(blockIdx.x) * kThreads + threadIdx.x, block = awake_block(s, blockIdx.x);
+  if (block < 0) return leave_out(row, s.rows(), out);
   __shared__ Camera<float> camera;
   __shared__ __align__(16) float rest[kThreads * kRest];
   if (threadIdx.x == 0) camera = camera_of(s);
   __syncthreads();
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int64_t i = block * kThreads + threadIdx.x;
   Splat<float> splat = {};
   float depth = INFINITY;
   int radius = 0;
@@ -60,23 +62,23 @@ __global__ void __launch_bounds__(kThreads)
   int32_t count = warp_count_tiles(splat, rect, s.image, mask);
   wait_for_rows();
   if (count && !project_color(s, camera, SceneRow<float>{s, i}, rest + threadIdx.x * kRest, splat)) count = 0;
-  if (i >= s.count) return;
-  out.radii[i] = radius;
-  out.tile_counts[i] = count;
-  out.depths[i] = count ? depth : INFINITY;
+  if (row >= s.rows()) return;
+  out.radii[row] = radius;
+  out.tile_counts[row] = count;
+  out.depths[row] = count ? depth : INFINITY;
   // A shape with tiles may still have a colour that is not finite: then `count` is 0.
-  if (out.records) out.records[i] = tile_record(rect, count, mask);
+  if (out.records) out.records[row] = tile_record(rect, count, mask);
   if (!count) return;
-  if (out.rects) reinterpret_cast<int4*>(out.rects)[i] = make_int4(rect.x0, rect.y0, rect.x1, rect.y1);
-  store_splat(out.splats, i, splat);
+  if (out.rects) reinterpret_cast<int4*>(out.rects)[row] = make_int4(rect.x0, rect.y0, rect.x1, rect.y1);
+  store_splat(out.splats, row, splat);
 }
 
 }  // namespace
 
 template <>
 void project<float>(const Queue& queue, const Scene<float>& s, const Projected<float>& out) {
-  if (!s.count) return;
-  project_kernel<<<blocks_for(s.count, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, s, out);
+  if (!s.rows()) return;
+  project_kernel<<<blocks_for(s.rows(), kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, s, out);
   check_launch("project");
 }
 

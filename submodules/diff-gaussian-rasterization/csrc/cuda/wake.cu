@@ -1,11 +1,15 @@
-// Wakes blocks of Gaussians. A block of threads takes one after the other.
+// Wakes blocks of Gaussians. A block of threads takes one of them.
 #include <cuda_runtime.h>
+#include <thrust/iterator/counting_iterator.h>
+#include <thrust/iterator/transform_iterator.h>
 
 #include <algorithm>
+#include <cub/cub.cuh>
 
 #include "../backend.h"
 #include "../math/scene_row.h"
 #include "../math/sleep.h"
+#include "ahead.cuh"
 #include "guarded_adam.cuh"
 #include "queue.cuh"
 
@@ -17,29 +21,13 @@ using namespace baseline;
 namespace {
 
 constexpr int kThreads = kSleepBlock;
-constexpr int64_t kMostBlocks = 2048;  // of threads; each makes the camera once
+static_assert(kThreads == kTerms, "a thread makes the decays of a number of missed steps");
 
-// The sums of a warp each, of every attribute's terms (MissedSum::sum).
-struct PartialSums {
-  float of_warp[kThreads / 32][kTermColumns];
-
-  __device__ void add(const float* terms, int64_t taken, int64_t missed) {
-    const int64_t j = threadIdx.x + 1;
-    const bool counts = j <= missed;
-    const float4* row = reinterpret_cast<const float4*>(terms + (taken + (counts ? j : 0)) % kTerms * kTermColumns);
-    const float4 low = row[0], high = row[1];
-    const float power = counts ? terms[j * kTermColumns + kPowers] : 0;
-    float v[kStepped] = {low.x * power, low.y * power, low.z * power, low.w * power, high.x * power, high.y * power};
-    for (int a = 0; a < kStepped; ++a) {
-      for (int step = 16; step; step /= 2) v[a] += __shfl_xor_sync(kWarp, v[a], step);
-      if ((threadIdx.x & 31) == 0) of_warp[threadIdx.x / 32][a] = v[a];
-    }
-  }
-  __device__ float total(int attribute) const {
-    float sum = 0;
-    for (const auto& of : of_warp) sum += of[attribute];
-    return sum;
-  }
+// What all blocks share.
+struct Waking {
+  Camera<float> camera;
+  MissedSums<float> missed;
+  int64_t number;  // of the step
 };
 
 __device__ bool is_aligned(const float* p) { return reinterpret_cast<uintptr_t>(p) % 16 == 0; }
@@ -82,56 +70,125 @@ __device__ void take_missed_of_block(const AdamInput<float>& to, const MissedSum
   }
 }
 
+__device__ bool has_stopped(const SleepInput<float>& in) { return in.step.guard.stopped && *in.step.guard.stopped; }
+
 // Notes what the step that follows would be for a row without a gradient.
-__device__ void write_terms(const SleepInput<float>& in, int64_t number) {
-  const int a = threadIdx.x;
-  const AdamInput<float>& to = in.step.attributes[a];
-  if (!to.columns) return;
-  const float* c = in.step.now ? in.step.now->constants[a] : nullptr;
+__device__ void write_terms(const SleepInput<float>& in, int attribute, int64_t number) {
+  const AdamInput<float>& to = in.step.attributes[attribute];
+  const float* c = in.step.now ? in.step.now->constants[attribute] : nullptr;
   const AdamConstants step = c ? AdamConstants{c[0], c[1], c[2], c[3], c[4], c[5], c[6]}
                                : make_adam_step<float>(to.lr, to.beta1, to.beta2, to.eps, to.step);
-  in.terms[number % kTerms * kTermColumns + a] = step.rate / step.root_correction;
+  in.terms[number % kTerms * kTermColumns + attribute] = step.rate / step.root_correction;
 }
 
 __global__ void __launch_bounds__(kThreads)
-    wake_kernel(const int32_t* halted, Scene<float> s, const __grid_constant__ SleepInput<float> in) {
-  if (is_halted(halted) || (in.step.guard.stopped && *in.step.guard.stopped)) return;
+    prepare_kernel(const int32_t* halted, Scene<float> s, const __grid_constant__ SleepInput<float> in, Waking* out) {
+  if (is_halted(halted)) return;
+  __shared__ float terms[kTerms * kTermColumns];  // each is read once, one after the other
+  for (int k = threadIdx.x; k < kTerms * kTermColumns; k += kThreads) terms[k] = in.terms[k];
+  __syncthreads();
+  const int a = threadIdx.x;
   const int64_t number = in.step.now ? in.step.now->step : int64_t(in.step.attributes[kStepMeans].step);
-  __shared__ Camera<float> camera;
-  __shared__ PartialSums sums;
-  __shared__ MissedSum<float> steps[kStepped];
-  if (blockIdx.x == 0 && threadIdx.x < kStepped) write_terms(in, number);
-  if (threadIdx.x == 32) camera = camera_of(s);
-  for (int64_t block = blockIdx.x; block * kThreads < s.count; block += gridDim.x) {
-    const int64_t taken = in.taken[block], first = block * kThreads, i = first + threadIdx.x;
-    const int64_t missed = number - 1 - taken;  // below 0 where this step is repeated
-    bool seen = i < s.count;
-    const Vec3<float> mean = seen ? load3(s.means + 3 * i) : Vec3<float>{};
-    const Vec3<float> scales = seen ? load3(s.scales + 3 * i) : Vec3<float>{};
-    __syncthreads();  // nobody reads the last block's sums any more
-    if (missed > 0) sums.add(in.terms, taken, missed);
-    __syncthreads();
-    bool wakes = in.all || missed < 0;
-    if (!wakes) {
-      const float most = missed > 0 ? most_ratio(in.step.attributes[kStepMeans]) : 0;
-      const Watch<float> watch(camera, missed > 0 ? most * sums.total(kStepMeans) : 0,
-                               missed > 0 ? most * sums.total(kStepScales) : 0);
-      const float largest = larger(larger(scales.x, scales.y), scales.z) + watch.log_scale;
-      seen = seen && !surely_unseen(watch, mean, s.scale_modifier * exponential(largest));
-      wakes = __syncthreads_or(seen);
-    }
-    if (wakes && missed > 0) {
-      if (threadIdx.x < kStepped)
-        steps[threadIdx.x] = missed_sum(in.step.attributes[threadIdx.x], sums.total(threadIdx.x), taken, missed);
-      __syncthreads();
-      const int rows = int(s.count - first < kThreads ? s.count - first : kThreads);
-      for (int a = 0; a < kStepped; ++a)
-        if (in.step.attributes[a].columns) take_missed_of_block(in.step.attributes[a], steps[a], first, rows);
-    }
-    if (threadIdx.x) continue;
-    in.awake[block] = wakes;
-    if (wakes) in.taken[block] = int32_t(number - in.all);
+  out->missed.set_decays(in.step.attributes[kStepMeans], number, threadIdx.x);
+  if (a < kStepped && in.step.attributes[a].columns) {
+    if (!has_stopped(in)) write_terms(in, a, number);
+    out->missed.add_up(in.step.attributes[a], terms, a, number);
   }
+  if (threadIdx.x == 64) out->number = number;
+  if (threadIdx.x == 96) out->camera = camera_of(s);
+}
+
+// Tests which blocks a view may show.
+__global__ void __launch_bounds__(kThreads)
+    test_kernel(const int32_t* halted, Scene<float> s, const __grid_constant__ SleepInput<float> in,
+                const Waking* waking, uint8_t* seen) {
+  if (is_halted(halted)) return;
+  const int64_t block = blockIdx.x, i = block * kThreads + threadIdx.x;
+  // Read at once, before it is known whether they are needed.
+  bool mine = i < s.count;
+  const Vec3<float> mean = mine ? load3(s.means + 3 * i) : Vec3<float>{};
+  const Vec3<float> scales = mine ? load3(s.scales + 3 * i) : Vec3<float>{};
+  const int64_t missed = missed_before(waking->number, in.taken[block]);
+  if (mine && missed >= 0) {
+    const MissedSums<float>& sums = waking->missed;
+    const Watch<float> watch(waking->camera, missed ? sums.reach(kStepMeans, missed) : 0,
+                             missed ? sums.reach(kStepScales, missed) : 0);
+    const float largest = larger(larger(scales.x, scales.y), scales.z) + watch.log_scale;
+    mine = !surely_unseen(watch, mean, s.scale_modifier * exponential(largest));
+  }
+  const bool wakes = __syncthreads_or(mine);
+  if (threadIdx.x == 0) seen[block] = wakes;
+}
+
+// Lets blocks take the steps that they have missed: a block of threads each of those that are listed, or of all. The
+// blocks between them sleep.
+__global__ void __launch_bounds__(kThreads)
+    take_missed_kernel(const int32_t* halted, int64_t count, const __grid_constant__ SleepInput<float> in,
+                       const Waking* waking) {
+  if (is_halted(halted) || has_stopped(in)) return;
+  const int64_t place = blockIdx.x, blocks = sleep_blocks(count), block = in.all ? place : in.blocks[place];
+  if (!in.all) {
+    const int64_t before = place ? in.blocks[place - 1] : -1;
+    if (place && before < 0) return;
+    const auto sleep = [&](int64_t first, int64_t end) {
+      for (int64_t b = first + threadIdx.x; b < end; b += kThreads) in.awake[b] = 0;
+    };
+    sleep(before + 1, block < 0 ? blocks : block);
+    if (block < 0) return;
+    if (place == in.room - 1) sleep(block + 1, blocks);
+  }
+  const int64_t missed = missed_before(waking->number, in.taken[block]), first = block * kThreads;
+  const int rows = int(count - first < kThreads ? count - first : kThreads);
+  for (int a = 0; a < kStepped && missed > 0; ++a)
+    if (in.step.attributes[a].columns)
+      take_missed_of_block(in.step.attributes[a], waking->missed.of(a, missed), first, rows);
+  __syncthreads();  // all have read `taken`
+  if (threadIdx.x == 0) in.awake[block] = 1, in.taken[block] = int32_t(waking->number - in.all);
+}
+
+struct IsAwake {
+  const uint8_t* awake;
+  int64_t blocks;
+  __host__ __device__ int32_t operator()(int64_t block) const {
+#ifdef __CUDA_ARCH__
+    if (block < blocks) return awake[block] != 0;
+#endif
+    return 0;
+  }
+};
+
+// Takes the number of blocks before one that are awake. Behind the last one stands the number of all.
+struct ListedAt {
+  IsAwake is_awake;
+  Ahead ahead;
+  int32_t* list;
+  int64_t room, block;
+  __host__ __device__ void operator=(int32_t before) const {
+#ifdef __CUDA_ARCH__
+    if (block == is_awake.blocks && ahead.halted) judge_blocks(ahead, before);
+    if (is_awake(block) && before < room) list[before] = int32_t(block);
+#endif
+  }
+};
+
+struct Listed {
+  ListedAt at;
+  __host__ __device__ ListedAt operator()(int64_t block) const {
+    return {at.is_awake, at.ahead, at.list, at.room, block};
+  }
+};
+
+// Lists the blocks that have a flag, as far as there is room.
+void list_seen(const Queue& queue, const uint8_t* seen, int64_t blocks, const SleepInput<float>& in) {
+  GS_CUDA_CHECK(cudaMemsetAsync(in.blocks, -1, in.room * sizeof *in.blocks, stream_of(queue)));
+  const IsAwake is_awake{seen, blocks};
+  const thrust::counting_iterator<int64_t> every(0);
+  const auto flags = thrust::make_transform_iterator(every, is_awake);
+  const auto places =
+      thrust::make_transform_iterator(every, Listed{{is_awake, in.ahead ? *in.ahead : Ahead{}, in.blocks, in.room, 0}});
+  with_memory(queue, [&](void* memory, size_t& bytes) {
+    return cub::DeviceScan::ExclusiveSum(memory, bytes, flags, places, blocks + 1, stream_of(queue));
+  });
 }
 
 }  // namespace
@@ -139,9 +196,19 @@ __global__ void __launch_bounds__(kThreads)
 template <>
 void wake<float>(const Queue& queue, const Scene<float>& s, const SleepInput<float>& in) {
   if (!s.count) return;
-  const unsigned blocks = unsigned(std::min(sleep_blocks(s.count), kMostBlocks));
-  wake_kernel<<<blocks, kThreads, 0, stream_of(queue)>>>(queue.halted, s, in);
-  check_launch("wake");
+  const cudaStream_t stream = stream_of(queue);
+  const int64_t blocks = sleep_blocks(s.count);
+  Waking* waking = queue.array<Waking>(1);
+  prepare_kernel<<<1, kThreads, 0, stream>>>(queue.halted, s, in, waking);
+  check_launch("prepare");
+  if (!in.all) {
+    uint8_t* seen = queue.array<uint8_t>(blocks);
+    test_kernel<<<unsigned(blocks), kThreads, 0, stream>>>(queue.halted, s, in, waking, seen);
+    check_launch("test");
+    list_seen(queue, seen, blocks, in);
+  }
+  take_missed_kernel<<<unsigned(in.all ? blocks : in.room), kThreads, 0, stream>>>(queue.halted, s.count, in, waking);
+  check_launch("take_missed");
 }
 
 }  // namespace cuda

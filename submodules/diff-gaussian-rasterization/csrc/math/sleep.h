@@ -25,17 +25,41 @@ struct MissedSum {
   T most;          // the bound of |m| / sqrt(v), which averages from elsewhere may pass
 };
 
+// The same of all attributes, by the number of missed steps.
 template <class T>
-GS_HD T most_ratio(const AdamInput<T>& in) {
-  return T((1 - in.beta1) / std::sqrt((1 - in.beta2) * (1 - in.beta1 * in.beta1 / in.beta2)));
-}
+struct MissedSums {
+  T sum[kStepped][kTerms];
+  T keep1[kTerms], keep2[kTerms], eps[kTerms], most;
 
-// taken: the steps that the block has taken, behind which it has missed `count`, at most kTerms - 1.
-template <class T>
-GS_HD MissedSum<T> missed_sum(const AdamInput<T>& in, T sum, int64_t taken, int64_t count) {
-  const double corrected = std::sqrt(1 - std::pow(in.beta2, double(taken > 0 ? taken : 1)));
-  return {sum, T(std::pow(in.beta1, double(count))), T(std::pow(in.beta2, double(count))), T(in.eps * corrected),
-          most_ratio(in)};
+  GS_HD MissedSum<T> of(int attribute, int64_t missed) const {
+    return {sum[attribute][missed], keep1[missed], keep2[missed], eps[missed], most};
+  }
+  // The farthest that a value of the attribute can have moved.
+  GS_HD T reach(int attribute, int64_t missed) const { return most * sum[attribute][missed]; }
+
+  // Fills an attribute's sums before step `number`. The sum of k + 1 steps is that of the last k, which is one decay
+  // older, and one step more.
+  GS_HD void add_up(const AdamInput<T>& in, const T* terms, int attribute, int64_t number) {
+    const double decay = in.beta1 / std::sqrt(in.beta2);
+    double total = 0;
+    for (int64_t k = 0; k < kTerms; ++k) {
+      sum[attribute][k] = T(total);
+      total = decay * (total + terms[((number - 1 - k) & (kTerms - 1)) * kTermColumns + attribute]);
+    }
+  }
+  GS_HD void set_decays(const AdamInput<T>& in, int64_t number, int64_t missed) {
+    const int64_t taken = number - 1 - missed;
+    keep1[missed] = T(std::pow(in.beta1, double(missed)));
+    keep2[missed] = T(std::pow(in.beta2, double(missed)));
+    eps[missed] = T(in.eps * std::sqrt(1 - std::pow(in.beta2, double(taken > 0 ? taken : 1))));
+    most = T((1 - in.beta1) / std::sqrt((1 - in.beta2) * (1 - in.beta1 * in.beta1 / in.beta2)));
+  }
+};
+
+// The steps that a block has missed before step `number`; below 0 where that step is repeated.
+GS_HD int64_t missed_before(int64_t number, int64_t taken) {
+  const int64_t missed = number - 1 - taken;
+  return missed < kTerms ? missed : kTerms - 1;
 }
 
 // Where the result would not be finite, the value stays, as in adam_if_finite.

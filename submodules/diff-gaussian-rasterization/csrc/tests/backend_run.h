@@ -108,7 +108,7 @@ std::unique_ptr<RenderedOf<T>> bin_scene(const Where& where, const gs::Scene<T>&
   auto out = std::make_unique<RenderedOf<T>>();
   RenderedOf<T>& r = *out;
   const gs::Image image = scene.image;
-  const size_t n = scene.count;
+  const size_t n = scene.rows();
   r.scene = scene;
   r.splats.resize(kSplatValues * n), r.depths.resize(n), r.tile_counts.resize(n), r.radii.resize(n);
   r.rects.assign(4 * n, 0x7fffffff), r.records.resize(n);  // undefined values must not be used
@@ -123,7 +123,7 @@ std::unique_ptr<RenderedOf<T>> bin_scene(const Where& where, const gs::Scene<T>&
     to.instances.resize(count), to.slot_count = slots;
     return gs::Binned{to.instances.data(), to.ranges.data()};
   };
-  bin(where, scene.count, projected, image,
+  bin(where, scene.rows(), projected, image,
       gs::BinMemory{take, &r, asked.slots ? r.slots.data() : nullptr, asked.ahead});
   return out;
 }
@@ -149,9 +149,9 @@ std::unique_ptr<RenderedOf<T>> render(const Where& where, const gs::Scene<T>& sc
   T* const layers = r.layers.empty() ? nullptr : r.layers.data();
   blend(where, r.input,
         gs::Blended<T>{r.color.data(), r.transmittance.data(), r.inverse_depth.data(), r.last.data(), layers});
-  r.gradient.assign(3 * pixels, T(1)), r.moments.resize(kGradientValues * scene.count);
+  r.gradient.assign(3 * pixels, T(1)), r.moments.resize(kGradientValues * scene.rows());
   const T* const g = r.gradient.data();
-  r.backward = {scene.count,      room,   r.slot_count, r.slots.data(), r.transmittance.data(), r.last.data(), g, g, g,
+  r.backward = {scene.rows(),     room,   r.slot_count, r.slots.data(), r.transmittance.data(), r.last.data(), g, g, g,
                 r.moments.data(), layers, asked.ahead};
   return out;
 }

@@ -101,7 +101,7 @@ void check_ahead(Parameters<float>& p, gs::Image image, bool absolute, bool reco
   const Result<float> wanted = run_emulated(p, image, false, true, gs::emulation::Order::forward, absolute);
   constexpr int kReports = 4;
   int32_t halted = 0;
-  int64_t done = 0, reports[5 * kReports], *report = nullptr;
+  int64_t done = 0, reports[6 * kReports], *report = nullptr;
   gs::Room needed{};
   const auto go = [&](gs::Room room) {
     gs::emulation::order = gs::emulation::Order::shuffled;
@@ -109,21 +109,21 @@ void check_ahead(Parameters<float>& p, gs::Image image, bool absolute, bool reco
     gs::Queue queue = memory.queue();
     queue.halted = &halted;
     const gs::Ahead ahead{&halted, &needed, &done, room, reports, kReports};
-    report = reports + 5 * ((done + 1) % kReports);
-    std::fill_n(report, 5, -1);
+    report = reports + 6 * ((done + 1) % kReports);
+    std::fill_n(report, 6, -1);
     return run(queue, p, image, false, records, &ahead, absolute);
   };
   constexpr int64_t plenty = 20000;
-  go({plenty, plenty, plenty});
+  go({plenty, plenty, plenty, 0});
   const gs::Room exact = needed;
   CHECK(exact.instances == wanted.instances && exact.slots >= exact.instances && exact.rows <= exact.instances);
   CHECK(exact.rows > 0);
   for (const int64_t more : {0, 1, 1000, 20000}) {
-    const Result<float> got = go({exact.instances + more, exact.slots + more, exact.rows + more});
+    const Result<float> got = go({exact.instances + more, exact.slots + more, exact.rows + more, 0});
     CHECK(got.color == wanted.color && got.gradient == wanted.gradient && got.instances == wanted.instances);
     CHECK(got.absolute == wanted.absolute);
     CHECK(halted == 0 && report[0] == exact.instances && report[1] == exact.slots && report[2] == exact.rows);
-    CHECK(report[3] == 0 && report[4] == done);
+    CHECK(report[4] == 0 && report[5] == done);
   }
   const std::vector<float> untouched(wanted.gradient.size(), -77.0f), no_lengths(wanted.absolute.size(), -77.0f);
   for (int64_t gs::Room::* const lacking : {&gs::Room::instances, &gs::Room::slots, &gs::Room::rows})
@@ -131,12 +131,12 @@ void check_ahead(Parameters<float>& p, gs::Image image, bool absolute, bool reco
       gs::Room room = exact;
       room.*lacking = of;
       CHECK(go(room).gradient == untouched);
-      CHECK(halted == done + 1 && report[3] == done + 1 && report[4] == done + 1);
+      CHECK(halted == done + 1 && report[4] == done + 1 && report[5] == done + 1);
       CHECK(report[0] == exact.instances && report[1] == exact.slots &&
             report[2] == (lacking == &gs::Room::rows ? exact.rows : 0));
-      const Result<float> later = go({plenty, plenty, plenty});
+      const Result<float> later = go({plenty, plenty, plenty, 0});
       CHECK(later.gradient == untouched && later.absolute == no_lengths);
-      CHECK(halted == done + 1 && report[3] == done + 1 && report[4] == done + 1);
+      CHECK(halted == done + 1 && report[4] == done + 1 && report[5] == done + 1);
       halted = 0;
     }
 }
@@ -579,44 +579,91 @@ void test_gaussian_step() {
 }
 
 // Blocks wake on the GPU as on the CPU, where some lie behind the camera, one has missed nothing, and one is repeated.
+// They are listed. Without room for them nothing changes.
 void test_wake() {
-  for (const bool all : {false, true})
-    for (const gs::emulation::Order order : gs::emulation::kOrders) {
-      gs::emulation::order = order;
-      constexpr int64_t count = 5 * gs::kSleepBlock - 28;
-      Stepping start{Parameters<float>(count)};
-      for (int64_t i = 0; i < count; ++i) {
-        start.values.means[3 * i + 2] = i / gs::kSleepBlock % 2 ? -3.0f : 3.0f;
-        for (int k = 0; k < 3; ++k) start.values.scales[3 * i + k] = -5;
+  for (const int64_t room : {5, 4, 3})
+    for (const bool all : {false, true})
+      for (const gs::emulation::Order order : gs::emulation::kOrders) {
+        gs::emulation::order = order;
+        constexpr int64_t count = 5 * gs::kSleepBlock - 28;
+        Stepping start{Parameters<float>(count)};
+        for (int64_t i = 0; i < count; ++i) {
+          start.values.means[3 * i + 2] = i / gs::kSleepBlock % 2 ? -3.0f : 3.0f;
+          for (int k = 0; k < 3; ++k) start.values.scales[3 * i + k] = -5;
+        }
+        float terms[2][gs::kTerms * gs::kTermColumns];
+        for (int64_t k = 0; k < gs::kTerms * gs::kTermColumns; ++k) terms[0][k] = terms[1][k] = float(k % 7) * 1e-4f;
+        Stepping got[2] = {start, start};
+        uint8_t awake[2][5] = {{7, 7, 7, 7, 7}, {7, 7, 7, 7, 7}};
+        int32_t taken[2][5] = {{2, 1, 100, 101, 9}, {2, 1, 100, 101, 9}}, blocks[5], halted = 0;
+        int64_t done = 6;
+        gs::Room needed{1, 1, 1, 1};
+        const gs::Ahead ahead{&halted, &needed, &done, {0, 0, 0, room}, nullptr, 1};
+        for (const int on_gpu : {0, 1}) {
+          gs::SleepInput<float> in{{}, all, awake[on_gpu], taken[on_gpu], terms[on_gpu], blocks, room, &ahead};
+          got[on_gpu].inputs({}, nullptr, in.step.attributes);
+          for (gs::AdamInput<float>& to : in.step.attributes) to.step = 101;
+          const gs::Scene<float> scene = scene_of(got[on_gpu].values, {40, 24}, false);
+          gs::emulation::Memory memory;
+          gs::Queue queue = memory.queue();
+          queue.halted = &halted;
+          if (on_gpu)
+            gs::cuda::wake(queue, scene, in);
+          else
+            gs::GS_ISA::wake(gs::serial_executor(), scene, in);
+        }
+        CHECK(halted == (!all && room == 3 ? 7 : 0) && (all || (needed.blocks == 4 && needed.instances == 0)));
+        if (halted) {
+          CHECK(got[1].bytes() == start.bytes() && awake[1][1] == 7 && taken[1][0] == 2);
+          continue;
+        }
+        const int32_t listed[5] = {0, 2, 3, 4, -1};
+        CHECK(all || std::equal(blocks, blocks + room, listed));
+        const uint8_t wakes[2][5] = {{1, 0, 1, 1, 1}, {1, 1, 1, 1, 1}};
+        for (int block = 0; block < 5; ++block) {
+          CHECK(awake[0][block] == wakes[all][block] && awake[1][block] == wakes[all][block]);
+          CHECK(taken[0][block] == taken[1][block] && taken[0][block] == (wakes[all][block] ? 101 - all : 1));
+        }
+        for (int a = 0; a < gs::kStepped; ++a) {
+          check_near(*got[1].values.all()[a], *got[0].values.all()[a], 1e-6);
+          check_near(got[1].mean[a], got[0].mean[a], 1e-6), check_near(got[1].square[a], got[0].square[a], 1e-6);
+          CHECK(*got[1].values.all()[a] != *start.values.all()[a]);
+        }
+        CHECK(std::equal(std::begin(terms[0]), std::end(terms[0]), std::begin(terms[1])));
       }
-      alignas(16) float terms[2][gs::kTerms * gs::kTermColumns];
-      for (int64_t k = 0; k < gs::kTerms * gs::kTermColumns; ++k) terms[0][k] = terms[1][k] = float(k % 7) * 1e-4f;
-      Stepping got[2] = {start, start};
-      uint8_t awake[2][5] = {};
-      int32_t taken[2][5] = {{2, 1, 100, 101, 9}, {2, 1, 100, 101, 9}};
+}
+
+// Blocks that are listed take the step, with the bits of blocks that have flags.
+void test_listed_blocks() {
+  constexpr int64_t count = 5 * gs::kSleepBlock - 28, most = 4;
+  const uint8_t awake[5] = {1, 0, 1, 0, 1};
+  for (const gs::emulation::Order order : gs::emulation::kOrders) {
+    gs::emulation::order = order;
+    Stepping flagged{Parameters<float>(count)};
+    std::fill(flagged.statistics.begin(), flagged.statistics.end(), 0.0f);
+    Stepping listed = flagged, start = flagged;
+    const auto step = [&](Stepping& s, const int32_t* blocks) {
       gs::emulation::Memory memory;
-      for (const int on_gpu : {0, 1}) {
-        gs::SleepInput<float> in{{}, all, awake[on_gpu], taken[on_gpu], terms[on_gpu]};
-        got[on_gpu].inputs({}, nullptr, in.step.attributes);
-        for (gs::AdamInput<float>& to : in.step.attributes) to.step = 101;
-        const gs::Scene<float> scene = scene_of(got[on_gpu].values, {40, 24}, false);
-        if (on_gpu)
-          gs::cuda::wake(memory.queue(), scene, in);
-        else
-          gs::GS_ISA::wake(gs::serial_executor(), scene, in);
-      }
-      const uint8_t wakes[2][5] = {{1, 0, 1, 1, 1}, {1, 1, 1, 1, 1}};
-      for (int block = 0; block < 5; ++block) {
-        CHECK(awake[0][block] == wakes[all][block] && awake[1][block] == wakes[all][block]);
-        CHECK(taken[0][block] == taken[1][block] && taken[0][block] == (wakes[all][block] ? 101 - all : 1));
-      }
-      for (int a = 0; a < gs::kStepped; ++a) {
-        check_near(*got[1].values.all()[a], *got[0].values.all()[a], 1e-6);
-        check_near(got[1].mean[a], got[0].mean[a], 1e-6), check_near(got[1].square[a], got[0].square[a], 1e-6);
-        CHECK(*got[1].values.all()[a] != *start.values.all()[a]);
-      }
-      CHECK(std::equal(std::begin(terms[0]), std::end(terms[0]), std::begin(terms[1])));
-    }
+      const gs::Queue queue = memory.queue();
+      gs::Scene<float> scene = scene_of(s.values, {40, 24}, false);
+      blocks ? (scene.blocks = blocks, scene.listed = most) : (scene.awake = awake, 0);
+      const auto r = render_with(queue, scene, 1);
+      gs::GaussianStep<float> in = gaussian_step(s, {}, *r, 1);
+      in.observed.blocks = blocks;
+      gs::cuda::rasterize_vjp_step(queue, r->scene, r->input, r->backward, in);
+      std::vector<float> lengths(r->radii.size(), 0.5f);
+      in.observed.count = int64_t(lengths.size()), in.observed.lengths = lengths.data();
+      if (blocks) gs::cuda::observe(queue, in.observed);  // twice, to see where lengths go
+      return std::make_pair(r->color, r->instances.size());
+    };
+    const int32_t blocks[most] = {0, 2, 4, -1};
+    const auto image = step(flagged, nullptr);
+    CHECK(step(listed, blocks) == image && image.second > 0);
+    for (int64_t i = 0; i < count; ++i)
+      CHECK(listed.statistics[2 * count + i] == 2 * flagged.statistics[2 * count + i]);
+    listed.statistics = flagged.statistics;
+    CHECK(listed.bytes() == flagged.bytes() && listed.bytes() != start.bytes());
+  }
 }
 
 // Covariances and colours that are given, whose scene has no scales, rotations and coefficients to read.
@@ -685,6 +732,7 @@ int main() {
                         {test_rows,
                          test_gaussian_step,
                          test_wake,
+                         test_listed_blocks,
                          test_lists,
                          test_lists_without_records,
                          test_ahead,

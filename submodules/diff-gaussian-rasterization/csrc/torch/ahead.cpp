@@ -23,19 +23,19 @@ void run_ahead_op(const MaybeTensor& words, Sizes room, const MaybeTensor& repor
   current.reset();
   if (!words) return;
   GS_CHECK_VALUE(words->is_cuda(), "words must be on a GPU, got ", words->device());
-  check_tensor(*words, "words", ScalarType::Long, words->device(), {5});
-  GS_CHECK_VALUE(room.size() == 3, "room must be of instances, slots and rows, got ", room.size(), " numbers");
+  check_tensor(*words, "words", ScalarType::Long, words->device(), {6});
+  GS_CHECK_VALUE(room.size() == 4, "room must be of instances, slots, rows and blocks, got ", room.size(), " numbers");
   const int64_t most = std::numeric_limits<int32_t>::max();
-  GS_CHECK_VALUE(room[0] >= 0 && room[0] <= most && room[1] >= 0 && room[2] >= 0 && room[2] <= most,
+  GS_CHECK_VALUE(room[0] >= 0 && room[0] <= most && room[1] >= 0 && room[2] >= 0 && room[2] <= most && room[3] >= 0,
                  "room must be from 0 to 2^31 - 1, got ", room);
   const int64_t count = reports && reports->dim() == 2 ? reports->size(0) : 0;
-  if (reports) check_tensor(*reports, "reports", ScalarType::Long, DeviceType::CPU, {count, 5});
+  if (reports) check_tensor(*reports, "reports", ScalarType::Long, DeviceType::CPU, {count, 6});
   GS_CHECK_VALUE(!reports || (0 < count && count <= most), "reports need a row");
   GS_CHECK_VALUE(words->is_contiguous() && (!reports || (reports->is_contiguous() && page_locked(*reports))),
                  "words and reports must be contiguous, and the reports in page-locked memory");
   int64_t* first = write<int64_t>(*words);
-  current = gs::Ahead{reinterpret_cast<int32_t*>(first), reinterpret_cast<gs::Room*>(first + 1),       first + 4,
-                      {room[0], room[1], room[2]},       reports ? write<int64_t>(*reports) : nullptr, int(count)};
+  current = gs::Ahead{reinterpret_cast<int32_t*>(first),    reinterpret_cast<gs::Room*>(first + 1),       first + 5,
+                      {room[0], room[1], room[2], room[3]}, reports ? write<int64_t>(*reports) : nullptr, int(count)};
 }
 
 }  // namespace

@@ -97,9 +97,9 @@ GradientSource::GradientSource(const SceneTensors& scene, SOURCE_PARAMETERS, boo
   const bool rows = source.size() == 4 && !grad_color;
   GS_CHECK_VALUE(rows || source.size() == kKept, "the source must be what a forward has kept, ", int(kKept),
                  " tensors, or splats, tile_counts, rows and counts, got ", source.size(), " tensors");
-  check_tensor(source[kSplats], "splats", scene.dtype(), scene.device(), {scene.count(), kSplatValues});
+  check_tensor(source[kSplats], "splats", scene.dtype(), scene.device(), {scene.rows(), kSplatValues});
   if (!rows) blend_.emplace(SOURCE_ARGUMENTS);
-  check_counts(source[kTileCounts], scene.count(), scene.device());
+  check_counts(source[kTileCounts], scene.rows(), scene.device());
   tile_counts_ = packed(source[kTileCounts]);
   if (rows) take_rows(scene, source, absolute, lengths);
 }
@@ -108,7 +108,7 @@ void GradientSource::take_rows(const SceneTensors& scene, List<Tensor> source, b
   Tensor rows = source[2];
   const Tensor& counts = source[3];
   check_tensor(rows, "rows", scene.dtype(), scene.device(), {-1, row_values(absolute)});
-  check_tensor(counts, "counts", ScalarType::Int, scene.device(), {scene.count()});
+  check_tensor(counts, "counts", ScalarType::Int, scene.device(), {scene.rows()});
   GS_CHECK(rows.size(0) <= std::numeric_limits<int32_t>::max(), rows.size(0), " rows are more than 2^31 - 1");
   GS_CHECK(rows.is_cpu() || scene.dtype() == ScalarType::Float, kFloatAlone);
   splats_ = aligned(source[kSplats], 2), counts_ = packed(counts);
@@ -157,7 +157,9 @@ void GradientSource::step(const gs::Queue& queue, const gs::Scene<float>& scene,
 }
 #endif
 
-Tensor absolute_like(const Tensor& means, bool wanted) { return wanted ? empty({means.size(0)}, means) : Tensor(); }
+Tensor absolute_like(const SceneTensors& scene, bool wanted) {
+  return wanted ? empty({scene.rows()}, scene.means()) : Tensor();
+}
 
 namespace {
 
@@ -190,7 +192,7 @@ Gradients vjp_into(const SceneTensors& scene, const GradientSource& source, cons
 
 Gradients vjp(const SceneTensors& scene, const GradientSource& source, bool lengths,
               const std::function<SceneGradients()>& make) {
-  const Tensor absolute = absolute_like(scene.means(), lengths);
+  const Tensor absolute = absolute_like(scene, lengths);
   Gradients all = vjp_into(scene, source, absolute, make);
   if (lengths) {
     Tensor column = torch::stable::select(std::get<kMeans2d>(all), 1, 2);

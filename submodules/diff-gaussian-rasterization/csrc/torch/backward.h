@@ -122,7 +122,7 @@ class GradientSource {
 };
 
 // Memory for the lengths of absolute gradients; undefined if they are not wanted.
-Tensor absolute_like(const Tensor& means, bool wanted);
+Tensor absolute_like(const SceneTensors& scene, bool wanted);
 
 // The gradients of a scene in what `make` allocates. lengths: whether the third value of a row of means2d becomes the
 // length of its absolute gradient, instead of 0.

@@ -68,10 +68,11 @@ struct Step {
     GS_CHECK_VALUE(!scene.has(kCov3d) && !scene.has(kColors),
                    "a step needs scales, rotations, sh_dc and sh_rest, not cov3d or colors");
     GS_CHECK_TYPE(radii, "radii must be a tensor, got None");
-    check_tensor(*radii, "radii", ScalarType::Int, scene.device(), {scene.count()});
+    check_tensor(*radii, "radii", ScalarType::Int, scene.device(), {scene.rows()});
+    GS_CHECK(!sparse || !scene.blocks().defined(), "no block sleeps through a sparse step");
     GS_CHECK(!observes() || statistics.size() == 3, "give max_radii, gradient_sums and views, or none of them");
     GS_CHECK(!observes() || scene.dtype() == ScalarType::Float, "statistics are of float32 Gaussians, got float64");
-    if (observes()) check_statistics(statistics[0], statistics[1], statistics[2], *radii);
+    if (observes()) check_statistics(statistics[0], statistics[1], statistics[2], *radii, scene.count());
     check_adam(scene);
   }
 
@@ -87,9 +88,9 @@ struct Step {
     GS_CHECK(scene.dtype() == ScalarType::Float, "now is of float32 Gaussians, got float64");
   }
 
-  // What a backend takes. pixels: the radii, contiguous.
+  // What a backend takes. pixels: the radii, contiguous; those of `blocks`, if that is defined.
   template <class T>
-  gs::GaussianStep<T> of(List<Tensor> gaussians, const Tensor& pixels) const {
+  gs::GaussianStep<T> of(List<Tensor> gaussians, const Tensor& pixels, const Tensor& blocks = {}) const {
     constexpr int kPlaces[gs::kStepped] = {0, 1, 2, 3, 6, 7};  // of gs::Stepped, among the Gaussians' tensors
     gs::GaussianStep<T> out{};
     out.sparse = sparse;
@@ -108,6 +109,7 @@ struct Step {
     if (!pixels.defined()) return out;
     out.observed = {pixels.numel(), nullptr, nullptr, nullptr, read<int32_t>(pixels), nullptr};
     if (!observes()) return out;
+    if (blocks.defined()) out.observed.blocks = read<int32_t>(blocks);
     out.observed.max_radii = write<float>(statistics[0]);
     out.observed.gradient_sums = write<float>(statistics[1]), out.observed.views = write<float>(statistics[2]);
     return out;
@@ -115,7 +117,7 @@ struct Step {
 };
 
 // gaussians: those of Input, in its order, without means2d; an empty tensor of one axis stands for none. camera: view
-// matrix, projection and centre, then which blocks are awake, unless all are.
+// matrix, projection and centre, then which blocks are awake (SceneTensors::set_awake), unless all are.
 SceneTensors scene_of(List<Tensor> gaussians, List<Tensor> camera, List<double> lens, Sizes options) {
   GS_CHECK_VALUE(gaussians.size() == kInputs - 1 && (camera.size() == 3 || camera.size() == 4), "give ", kInputs - 1,
                  " tensors of the Gaussians and 3 or 4 of the camera, got ", gaussians.size(), " and ", camera.size());
@@ -175,18 +177,22 @@ void apply_gradients_op(List<Tensor> gaussians, List<Tensor> camera, List<double
   }
   const Step step{STEP_ARGUMENTS};
   step.check(scene);
-  const Tensor pixels = packed(*radii), lengths = absolute_like(scene.means(), absolute && step.observes());
+  const Tensor pixels = packed(*radii), lengths = absolute_like(scene, absolute && step.observes());
   const GradientSource from(scene, SOURCE_ARGUMENTS, absolute, lengths.defined());
-  with_scalar(scene.dtype(), [&](auto zero) { run(scene, from, lengths, step.of<decltype(zero)>(gaussians, pixels)); });
+  with_scalar(scene.dtype(), [&](auto zero) {
+    run(scene, from, lengths, step.of<decltype(zero)>(gaussians, pixels, scene.blocks()));
+  });
   if (!now) advance(steps);
 }
 
 // Before a step of Adam, decides which blocks of Gaussians sleep through it, and lets the others take the steps that
 // they have missed (math/sleep.h). sleep: awake, taken and terms of gs::SleepInput, as is all. The other
-// arguments are those of apply_gradients_; no counter advances.
-void wake_op(List<Tensor> gaussians, List<Tensor> camera, List<double> lens, Sizes options, List<Tensor> sleep,
-             bool all, List<Tensor> averages, List<Tensor> steps, List<Tensor> guard, Sizes attributes,
-             List<double> rates, List<double> constants, Sizes columns, int64_t iteration, const MaybeTensor& now) {
+// arguments are those of apply_gradients_; no counter advances. Returns on a GPU, unless all wake, the blocks that are
+// awake (gs::Scene::blocks), with room for all of them, or for those that a host that runs ahead expects.
+MaybeTensor wake_op(List<Tensor> gaussians, List<Tensor> camera, List<double> lens, Sizes options, List<Tensor> sleep,
+                    bool all, List<Tensor> averages, List<Tensor> steps, List<Tensor> guard, Sizes attributes,
+                    List<double> rates, List<double> constants, Sizes columns, int64_t iteration,
+                    const MaybeTensor& now) {
   const SceneTensors scene = scene_of(gaussians, camera, lens, options);
   const MaybeTensor none;
   const Step step{none,      averages, steps, {},        guard, attributes, rates,
@@ -198,12 +204,18 @@ void wake_op(List<Tensor> gaussians, List<Tensor> camera, List<double> lens, Siz
   check_tensor(sleep[0], "awake", ScalarType::Byte, scene.device(), {blocks});
   check_tensor(sleep[1], "taken", ScalarType::Int, scene.device(), {blocks});
   check_tensor(sleep[2], "terms", scene.dtype(), scene.device(), {gs::kTerms, int64_t(gs::kTermColumns)});
+  MaybeTensor listed;
+  if (!all && scene.device().is_cuda())
+    listed = empty<int32_t>({ahead() ? std::min(ahead()->room.blocks, blocks) : blocks}, sleep[0]);
   with_scalar(scene.dtype(), [&](auto zero) {
     using T = decltype(zero);
-    const gs::SleepInput<T> in{step.of<T>(gaussians, {}), all, write<uint8_t>(sleep[0]), write<int32_t>(sleep[1]),
-                               write<T>(sleep[2])};
+    const gs::SleepInput<T> in{step.of<T>(gaussians, {}),    all,
+                               write<uint8_t>(sleep[0]),     write<int32_t>(sleep[1]),
+                               write<T>(sleep[2]),           listed ? write<int32_t>(*listed) : nullptr,
+                               listed ? listed->size(0) : 0, ahead()};
     GS_RUN(T, scene.means(), wake, scene.scene<T>(), in);
   });
+  return listed;
 }
 
 // Writes what the next step stands for, and advances the counters.
@@ -231,7 +243,7 @@ GS_OPERATORS(diff_gaussian_rasterization, m) {
       TORCH_BOX(&apply_gradients_op));
   m.define("wake_(Tensor(a!)[] gaussians, Tensor[] camera, " CAMERA_SCHEMA
            ", Tensor(b!)[] sleep, bool all, Tensor(c!)[] averages, Tensor[] steps, Tensor[] guard, int[] attributes, "
-           "float[] rates, float[] constants, int[] columns, int iteration=0, Tensor? now=None) -> ()",
+           "float[] rates, float[] constants, int[] columns, int iteration=0, Tensor? now=None) -> Tensor?",
            TORCH_BOX(&wake_op));
   m.define(
       "step_now_(Tensor(a!) now, int[] attributes, Tensor(b!)[] steps, float[] rates, float beta1, float beta2, "

@@ -27,15 +27,15 @@ void check_counter(const Tensor& step) {
            "a step counter must be one float32 on the CPU, got ", in_words(step));
 }
 
-void check_statistics(const Tensor& max_radii, const Tensor& gradient_sums, const Tensor& views, const Tensor& radii) {
+void check_statistics(const Tensor& max_radii, const Tensor& gradient_sums, const Tensor& views, const Tensor& radii,
+                      int64_t count) {
   for (const auto& [name, t] :
        {std::pair("max_radii", &max_radii), std::pair("gradient_sums", &gradient_sums), std::pair("views", &views)})
     check_given(*t, name);
   check_given(radii, "radii");
-  const int64_t n = radii.numel();
   for (const Tensor* t : {&max_radii, &gradient_sums, &views}) {
-    GS_CHECK(t->numel() == n && has_dtype(*t, ScalarType::Float) && t->device() == radii.device(),
-             "statistics must be ", n, " float32 on ", radii.device(), ", got ", in_words(*t));
+    GS_CHECK(t->numel() == count && has_dtype(*t, ScalarType::Float) && t->device() == radii.device(),
+             "statistics must be ", count, " float32 on ", radii.device(), ", got ", in_words(*t));
     GS_CHECK(t->is_contiguous(), "statistics must be contiguous");
   }
   GS_CHECK(has_dtype(radii, ScalarType::Int), "radii must be int32, got ", radii.scalar_type());
@@ -91,9 +91,10 @@ void adam_op(List<Tensor> values, List<Tensor> gradients, List<Tensor> exp_avg, 
 }
 
 void observe_op(Tensor& max_radii, Tensor& gradient_sums, Tensor& views, const Tensor& radii, const Tensor& gradient) {
-  check_statistics(max_radii, gradient_sums, views, radii);
-  check_given(gradient, "gradient");
+  check_given(radii, "radii");
   const int64_t n = radii.numel();
+  check_statistics(max_radii, gradient_sums, views, radii, n);
+  check_given(gradient, "gradient");
   const bool lengths = gradient.dim() == 1;
   GS_CHECK((lengths || (gradient.dim() == 2 && gradient.size(1) == 3)) && gradient.size(0) == n &&
                has_dtype(gradient, ScalarType::Float) && gradient.device() == radii.device(),

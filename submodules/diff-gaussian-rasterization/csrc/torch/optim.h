@@ -7,7 +7,9 @@ namespace gs::ops {
 // Every tensor is given and fits the parameter; parameter and averages are contiguous.
 void check_moments(const Tensor& value, const Tensor& gradient, const Tensor& exp_avg, const Tensor& exp_avg_sq);
 void check_counter(const Tensor& step);
-void check_statistics(const Tensor& max_radii, const Tensor& gradient_sums, const Tensor& views, const Tensor& radii);
+// count: of the Gaussians.
+void check_statistics(const Tensor& max_radii, const Tensor& gradient_sums, const Tensor& views, const Tensor& radii,
+                      int64_t count);
 
 // Checks the inputs of a step's guard. `stopped`, one int64, comes with a loss of the parameters' dtype.
 template <class T>

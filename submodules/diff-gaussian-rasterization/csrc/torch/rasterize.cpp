@@ -31,7 +31,7 @@ struct ProjectedTensors {
 
 // rects: whether the caller wants them; with records nothing else needs them.
 ProjectedTensors project(const SceneTensors& in, bool rects) {
-  const int64_t n = in.count();
+  const int64_t n = in.rows();
   const Tensor& like = in.means();
   ProjectedTensors out;
   out.splats = empty({n, kSplatValues}, like);

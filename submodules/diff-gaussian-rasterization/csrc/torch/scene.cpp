@@ -80,6 +80,11 @@ SceneTensors::SceneTensors(const std::array<const Tensor*, kInputs - 1>& gaussia
 
 void SceneTensors::set_awake(const Tensor* awake) {
   if (!awake) return;
+  if (has_dtype(*awake, ScalarType::Int) && device_.is_cuda()) {
+    check_tensor(*awake, "awake", ScalarType::Int, device_, {-1});
+    blocks_ = packed(*awake);
+    return;
+  }
   check_tensor(*awake, "awake", ScalarType::Byte, device_, {gs::sleep_blocks(count())});
   awake_ = packed(*awake);
 }

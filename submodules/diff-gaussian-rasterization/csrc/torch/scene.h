@@ -51,7 +51,7 @@ class SceneTensors {
   SceneTensors(const std::array<const Tensor*, kInputs - 1>& gaussians, const std::array<const Tensor*, 3>& camera,
                List<double> lens, Sizes options);
 
-  // Takes which blocks sleep (gs::Scene::awake), if that is given.
+  // Takes which blocks sleep (gs::Scene::awake), or on a GPU which do not (gs::Scene::blocks), if that is given.
   void set_awake(const Tensor* awake);
 
   // Checks the shape, dtype and device of an input. Returns it contiguous; undefined where it was not given.
@@ -62,6 +62,9 @@ class SceneTensors {
   bool flat_opacities() const { return inputs_[kOpacities].dim() == 1; }  // a row instead of a column
   const Tensor& means() const { return inputs_[kMeans]; }
   int64_t count() const { return inputs_[kMeans].size(0); }
+  const Tensor& blocks() const { return blocks_; }
+  // Rows of what is made of the Gaussians (gs::Scene::rows).
+  int64_t rows() const { return blocks_.defined() ? blocks_.size(0) * gs::kSleepBlock : count(); }
   gs::Image image() const { return image_; }
   ScalarType dtype() const { return dtype_; }
   Device device() const { return device_; }
@@ -93,7 +96,9 @@ class SceneTensors {
             tan_x_,
             tan_y_,
             image_,
-            awake_.defined() ? read<uint8_t>(awake_) : nullptr};
+            awake_.defined() ? read<uint8_t>(awake_) : nullptr,
+            blocks_.defined() ? read<int32_t>(blocks_) : nullptr,
+            blocks_.defined() ? blocks_.size(0) : 0};
   }
 
  private:
@@ -103,7 +108,7 @@ class SceneTensors {
   ScalarType dtype_;
   Device device_;
   InputTensors inputs_;  // means2d stays undefined
-  Tensor view_, projection_, center_, awake_;
+  Tensor view_, projection_, center_, awake_, blocks_;
   double tan_x_, tan_y_, scale_modifier_;
   int sh_degree_;
   bool antialiasing_, raw_;
