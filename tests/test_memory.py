@@ -18,7 +18,7 @@ from splatting.host import memory
 from splatting.host.memory import free_memory, gib, is_out_of_memory, shortage
 from splatting.training import memory_estimate
 from splatting.training.memory_estimate import training_bytes
-from splatting.training.steps import fused, plain
+from splatting.training.steps import fused
 from splatting.training.steps.captured import Graphs
 from utils.system_utils import UserError, run_cli
 
@@ -114,7 +114,7 @@ def _failing(function, call: int, error: Exception):
 def test_the_state_before_is_saved_and_goes_on_to_the_same_end(colmap_scene, tmp_path, monkeypatch):
     monkeypatch.setattr("splatting.training.run.SH_INTERVAL", 5)  # the failing iteration raises the degree
     with monkeypatch.context() as patch:
-        patch.setattr(plain, "render", _failing(plain.render, 2, ON_A_GPU))  # after that of the densification
+        patch.setattr(fused, "draw", _failing(fused.draw, 5, ON_A_GPU))
         with pytest.raises(UserError, match="training ran out of memory in iteration 5") as caught:
             _train(colmap_scene, tmp_path / "cut")
     text = str(caught.value)
