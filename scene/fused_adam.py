@@ -1,6 +1,6 @@
 """Adam's tensors as the rasterizer's backward takes them, so that it steps the Gaussians itself."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
@@ -19,11 +19,15 @@ NOW_WORDS = 23  # int64: what changes from step to step (gs::StepNow)
 
 
 class FusedAdam:
-    """Hands a model's optimiser, and a penalty, to `apply_gradients_`. Make one only if `takes` says so."""
+    """Hands a model's optimiser, and a penalty, to `apply_gradients_`. Make one only if `takes` says so.
 
-    def __init__(self, gaussians: GaussianModel, penalty: Penalty = NO_PENALTY) -> None:
+    left_out: attributes that take no step.
+    """
+
+    def __init__(self, gaussians: GaussianModel, penalty: Penalty = NO_PENALTY, left_out: Collection[str] = ()) -> None:
         self._gaussians = gaussians
         self._penalty = penalty
+        self._left_out = left_out
 
     @staticmethod
     def takes(gaussians: GaussianModel) -> bool:
@@ -116,7 +120,7 @@ class FusedAdam:
         for place, name in enumerate(_STEPPED):
             (param,) = groups[name]["params"]
             active = optimizer.active_columns(name)
-            if not param.numel() or (active == 0 and sparse):
+            if name in self._left_out or not param.numel() or (active == 0 and sparse):
                 continue  # it has no gradient, and the optimiser would pass it over
             yield _Stepping(place, param, optimizer.state_of(param), groups[name]["lr"], active)
 

@@ -1,6 +1,7 @@
 """Our Adam against torch's, and the changes of its state when Gaussians come and go."""
 
 import copy
+import weakref
 
 import pytest
 import torch
@@ -171,3 +172,19 @@ def _assert_rows(gaussians, before: dict, state: dict, rows: torch.Tensor) -> No
         assert torch.equal(values, before[name][rows]), name
         for key in ("exp_avg", "exp_avg_sq"):
             assert torch.equal(moments(gaussians)[name][key], state[name][key][rows]), (name, key)
+
+
+def test_while_rows_change_no_more_than_one_tensor_is_there_twice():
+    """Once a parameter or average has its new rows, nobody has the old ones."""
+    gaussians = model(50)
+    gaussians.training_setup(options())
+    take_steps(gaussians, 1)
+    old, left = [], []
+
+    def change(values: torch.Tensor) -> torch.Tensor:
+        left.append(sum(one() is not None for one in old))
+        old.append(weakref.ref(values.untyped_storage()))
+        return values.clone()
+
+    gaussians.table.change(change, gaussians.table.row_groups())
+    assert len(left) >= 21 and not any(left)

@@ -9,6 +9,7 @@ from processes import in_ranks
 
 import train
 from splatting.distributed import process_group
+from splatting.training.iteration import Iteration
 from splatting.training.steps.fused import FusedStep
 
 COLLECTIVES = ("all_gather", process_group.ALL_GATHER, "all_gather_object", "all_reduce", "all_to_all_single",
@@ -26,7 +27,7 @@ FIRST = "broadcast_object_list"  # once for each photo: its shape
 
 
 def _train(scene: str, out: str, options: list[str]) -> list[dict[str, int]]:
-    """Train: the collective calls of fused steps."""
+    """Train: the collective calls of steps that change no rows."""
     torch.set_num_threads(1)
     calls, counted = Counter(), []
     measure, advance = FusedStep.measure, FusedStep.advance
@@ -44,9 +45,9 @@ def _train(scene: str, out: str, options: list[str]) -> list[dict[str, int]]:
         calls.clear()
         return measure(self, step)
 
-    def advanced(self: FusedStep, *args: object) -> None:
-        advance(self, *args)
-        counted.append(dict(calls))
+    def advanced(self: FusedStep, at: Iteration, *args: object) -> None:
+        advance(self, at, *args)
+        counted.extend([] if at.changes or at.last else [dict(calls)])
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stdout", sys.stdout)  # training stamps it

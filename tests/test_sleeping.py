@@ -35,7 +35,7 @@ from utils.system_utils import UserError
 
 BETAS, EPS = (0.9, 0.999), 1e-15
 MOST_RATIO = 0.1 / math.sqrt(0.001 * (1 - 0.81 / 0.999))  # of |m| / sqrt(v) (csrc/math/sleep.h)
-NAMES = ("default", "white", "masks", "exposure", "depth", "absgrad", "budget", "degree 0")
+NAMES = ("default", "white", "masks", "exposure", "depth", "absgrad", "together", "budget", "degree 0")
 
 
 class Blocks:
@@ -297,7 +297,7 @@ def test_scores_and_saves_between_change_nothing(scene, tmp_path, plain, way):
         assert (tmp_path / ply).read_bytes() == (tmp_path / "plain" / ply).read_bytes()
 
 
-@pytest.mark.parametrize("iteration", [42, 33])  # where all blocks rest, and where some sleep
+@pytest.mark.parametrize("iteration", [42, 33, 19, 20, 30, 59])  # after a rest, some asleep, beside changes
 def test_resumed(scene, tmp_path, plain, iteration):
     checkpoint = tmp_path / "a" / f"chkpnt{iteration}.pth"
     planned = "--checkpoint_iterations", iteration, ITERATIONS
@@ -305,7 +305,7 @@ def test_resumed(scene, tmp_path, plain, iteration):
     assert not differences(_trained(scene, tmp_path / "b", "--start_checkpoint", checkpoint), plain("default"))
     capture, _ = load_checkpoint(checkpoint)
     asleep = further(capture, ASLEEP)
-    assert (asleep is None) == (iteration == 42)
+    assert (asleep is None) == (iteration in (20, 30, 42))
 
 
 def test_a_checkpoint_from_within_a_step_resumes(scene, tmp_path, plain):

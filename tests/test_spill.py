@@ -133,7 +133,7 @@ def test_a_guard_leaves_the_same_model_and_marks(scene, tmp_path, monkeypatch, w
 def test_the_estimate_leaves_out_what_lies_in_the_hosts_memory():
     gaussians = model(50)
     usual, spilled = (training_bytes(gaussians, 1000, 0, spill=spill) for spill in (None, True))
-    assert usual == 1000 * (16 * 59 + memory_estimate.PER_GAUSSIAN)
+    assert usual == 1000 * (4 * (3 * 59 + 45) + memory_estimate.PER_GAUSSIAN)
     assert spilled_bytes(gaussians, 1000) == 1000 * 12 * 45
     seen = memory_estimate.SEEN * (45 * 32 + 14 * 8)
     assert spilled == 1000 * (16 * 14 + 4 + seen + memory_estimate.PER_GAUSSIAN)

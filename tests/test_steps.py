@@ -8,13 +8,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from diff_gaussian_rasterization import ops
 from gaussians import needs_fused_step
 from rasterizer_tools import GPU_MARKS
 from step_ways import Rerun, fused_iterations, take_as  # noqa: F401  (a fixture)
-from trainings import ITERATIONS, OPTIONS, differences, narrow_scene, trained
+from trainings import ITERATIONS, OPTIONS, differences, leaves, narrow_scene, trained, whole_result
 
 from splatting.training import run
 from splatting.training.objective import Losses, Objective
+from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.steps import captured, speculative, step_taker
 from splatting.training.steps.captured import CapturedStep, Graphs
 from splatting.training.steps.fused import FusedStep
@@ -43,6 +45,54 @@ def test_a_host_that_runs_ahead_without_capacity_gives_the_same_bytes(scene, tmp
         monkeypatch.setattr(captured, name, least)
     assert trained(scene, tmp_path / "overflowing", *options) == plain
     assert len(overflows) > 5
+
+
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
+def test_no_gradient_of_a_parameter_is_written(scene, tmp_path, monkeypatch, options):
+    """In a whole training, with the iterations that change rows and the last one."""
+    monkeypatch.setattr(ops, "gradients_of", lambda *_: pytest.fail("autograd has asked for gradients"))
+    trained(scene, tmp_path, *options)
+
+
+@pytest.mark.parametrize("iteration", [20, 30, 36, ITERATIONS])  # growth, a reset, a higher degree, the last
+def test_a_gradient_of_nan_ends_in_the_same_way(scene, tmp_path, monkeypatch, iteration):
+    call = Objective.__call__
+
+    def broken(self, package, at):
+        losses = call(self, package, at)
+        zero = 0.0 * package["render"][0, :8, :8].sum()  # whose root has no finite gradient
+        return losses._replace(total=losses.total + zero.sqrt()) if at.iteration == iteration else losses
+
+    monkeypatch.setattr(Objective, "__call__", broken)
+    ends = []
+    for way in ((), ("--plain_step",)):
+        out, said = tmp_path / f"out{len(way)}", ""
+        try:
+            trained(scene, out, *way, "--train_test_exp", "--checkpoint_iterations", iteration, ITERATIONS)
+        except UserError as error:
+            said = str(error).replace(str(out), "")
+        left = {path.name: leaves(torch.load(path, weights_only=False)) for path in out.glob("*.pth")}
+        ends.append((said, left))
+    assert ends[0] == ends[1] and ends[0][1]
+
+
+@pytest.mark.parametrize("iteration", [20, 25])
+def test_a_training_that_ends_early_leaves_the_same_checkpoint(scene, tmp_path, monkeypatch, iteration):
+    """An observer says so when the loss is known; the view still counts in the statistics."""
+    measured = DivergenceWatch.measured
+
+    def ending(self, step, losses):
+        if step.iteration == iteration:
+            step.end(ITERATIONS)
+        measured(self, step, losses)
+
+    monkeypatch.setattr(DivergenceWatch, "measured", ending)
+    found = []
+    for way in ((), ("--plain_step",)):
+        with pytest.raises(FileNotFoundError):  # of the last iteration
+            trained(scene, tmp_path / str(len(way)), *way)
+        found.append(whole_result(tmp_path / str(len(way)), iteration))
+    assert not differences(*found)
 
 
 def test_losses_that_are_kept_keep_no_image(scene, tmp_path, monkeypatch):
@@ -79,7 +129,7 @@ def test_what_may_want_gradients_takes_the_plain_step(scene, tmp_path, monkeypat
 def test_debug_takes_the_plain_step(scene, tmp_path, monkeypatch):
     fused = fused_iterations(monkeypatch)
     trained(scene, tmp_path / "a", "--debug_from", 15)
-    assert fused == [*range(1, 12), 13, 14, 15]  # the SH degree is raised in 12
+    assert fused == [*range(1, 16)]
 
 
 def of_scales(losses: Losses, package: dict, step: object, scales: torch.Tensor) -> torch.Tensor:
@@ -93,13 +143,13 @@ def of_image(losses: Losses, package: dict, *_: object) -> torch.Tensor:
 # Terms that somebody adds to our objective after so many of its calls, and how many steps are then not plain. The
 # objective is called in the first step, and in the second to capture it.
 TERMS = {
-    "past the image": ("fused", 14, 13, of_scales),
-    "past the image, queued": ("queued", 14, 13, of_scales),
+    "past the image": ("fused", 14, 14, of_scales),
+    "past the image, queued": ("queued", 14, 14, of_scales),
     "past the image from the first step on": ("captured", 0, 0, of_scales),
     "past the image when it is captured": ("captured", 1, 1, of_scales),
-    "of the image": ("captured", 0, 52, of_image),
-    "of the iteration": ("captured", 0, 52, lambda losses, _, at, *__: losses.total * at.iteration),
-    "of the photo's name": ("captured", 0, 52, lambda losses, _, at, *__: losses.total * len(at.camera.image_name)),
+    "of the image": ("captured", 0, 60, of_image),
+    "of the iteration": ("captured", 0, 60, lambda losses, _, at, *__: losses.total * at.iteration),
+    "of the photo's name": ("captured", 0, 60, lambda losses, _, at, *__: losses.total * len(at.camera.image_name)),
 }
 
 

@@ -31,7 +31,13 @@ OPTIONS = {
     "white": ("-w", "--antialiasing"),
     "two phases": ("--densify_until_iter", 30),  # so that two phases have steps to capture
     "tiny": ("-r", 8),  # images of one tile
+    "together": (  # rows and opacities change in the same iterations
+        *("--opacity_reset_interval", 20, "-w", "--absgrad", "--absgrad_threshold", 2e-4, "--train_test_exp"),
+        *("-d", "depths", "--depth_l1_weight_init", 1.0, "--masks", "masks"),
+    ),
     "mcmc": MCMC,
+    "mcmc moves": (*MCMC, "--mcmc_growth", 0),
+    "mcmc idle": ("--strategy", "mcmc", "--mcmc_growth", 0, "--mcmc_min_opacity", 1e-6),
     "mcmc sparse": (*MCMC, "--optimizer_type", "sparse_adam", "--antialiasing"),
     "budget": BUDGET,
     "budget errors": (*BUDGET, "--score_error", "loss", "--score_join", "max", "--score_power", 2, "--train_test_exp"),

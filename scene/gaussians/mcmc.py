@@ -53,6 +53,11 @@ def start_as(gaussians: GaussianParameters, opacity: float, scale: float) -> Non
             gaussians.raw(name).copy_(values)
 
 
+def is_alive(gaussians: GaussianParameters, min_opacity: float) -> Tensor:
+    """Which Gaussians `relocate` leaves where they are, (N,) bool."""
+    return gaussians.opacity_logits().reshape(-1) > logit(min_opacity)
+
+
 def relocate(gaussians: GaussianParameters, min_opacity: float, most_parts: int, *, seed: int, iteration: int) -> int:
     """Move the Gaussians of an opacity <= min_opacity to others, which are drawn in proportion to their opacity.
 
@@ -60,7 +65,7 @@ def relocate(gaussians: GaussianParameters, min_opacity: float, most_parts: int,
     `most_parts`. Adam's averages of all of them restart at zero. seed and iteration decide the random numbers.
     Returns the number of such Gaussians; if all are, nothing changes.
     """
-    live = gaussians.opacity_logits().reshape(-1) > logit(min_opacity)
+    live = is_alive(gaussians, min_opacity)
     dead = (~live).nonzero().reshape(-1)
     counts = gaussians.shards.counts(len(dead))
     count = int(counts.sum())

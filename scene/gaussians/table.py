@@ -95,7 +95,7 @@ class GaussianTable:
     def change(self, change: Change, groups: Iterable[Group]) -> None:
         """Change the rows of groups and of the statistics, one tensor at a time."""
         model = self._model
-        model._take(self._map(groups, lambda values, *_: change(values)))
+        self._map(groups, lambda values, *_: change(values))
         for name in (*NAMES, "tmp_radii"):
             values = getattr(model, name, None)  # users delete those that they do not need
             if values is not None:
@@ -142,20 +142,24 @@ class GaussianTable:
         for group in groups:
             name, old = group.get("name"), group["params"][0].detach()
             value = beside(old, change(old, name, False))
+            del old  # whose memory the averages may need
             params[name] = self._replace(group, value, lambda mean, name=name: change(mean, name, True))
         return params
 
     def _replace(self, group: Group, value: Tensor, change: Change) -> nn.Parameter:
-        """Swap a group's parameter. `change` maps its averages, the state with a row per Gaussian."""
+        """Swap a parameter, in the group and the model. `change` maps its averages: the state with its rows."""
         old, param = group["params"][0], nn.Parameter(value.detach())
-        if old in self.states:
-            state = self.states[old]
+        dims, rows = old.dim(), len(old)
+        state = self.states.pop(old, None)
+        group["params"] = [param]
+        self._model._take({group.get("name"): param})
+        del old  # nobody has it any more, so the averages find its memory free
+        if state is not None:
+            self.states[param] = state
             for key, mean in state.items():
                 # Longer than the parameter: appended just before memory ran out, and now to be cut again.
-                if torch.is_tensor(mean) and mean.dim() == old.dim() and len(mean) >= len(old):
+                if torch.is_tensor(mean) and mean.dim() == dims and len(mean) >= rows:
                     state[key] = beside(mean, change(mean))
-            self.states[param] = self.states.pop(old)
-        group["params"] = [param]
         return param
 
 

@@ -1,7 +1,7 @@
 """The hooks by which a strategy of density control acts on a training (strategies: training/strategies)."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import ClassVar
 
 from torch import Tensor
@@ -20,11 +20,12 @@ AN_ITERATION = 25  # Gaussians for each iteration, at most, where the clock sets
 class DensityControl:
     """Decides how many Gaussians there are. A strategy overrides these hooks, in a file of its own.
 
-    fusable: whether it reads gradients only in iterations that `changes` names. All others are then taken by
-    training/steps/fused.py, which calls `observes` and `after_step` alone. It counts only where the class itself says
-    so: a subclass may want more. queues: whether `after_step` queues operators that change the model; it queues nothing
-    else, unless the iteration is one that `changes` names. most_gaussians: how many it lets there be, 0: any number.
-    penalty: a part of the loss besides the objective, of which steps add the gradients; no loss that is told has it.
+    fusable: whether it needs no gradient besides the statistics. Steps are then taken by training/steps/fused.py, which
+    does not call `after_backward`. It asks `observes`, and in iterations that `changes` names it asks `replaced` and
+    calls `before_step`. It counts only where the class itself says so: a subclass may want more. queues: whether
+    `after_step` queues operators that change the model; it queues nothing else, unless the iteration is one that
+    `changes` names. most_gaussians: how many it lets there be, 0: any number. penalty: a part of the loss besides the
+    objective, of which steps add the gradients; no loss that is told has it.
     absolute_gradients: whether the statistics take the lengths of absolute gradients (Ye et al. 2024); for the whole
     run. clamps: whether the loss takes renders clamped to [0, 1], as the reference's does; then Gaussians brighter than
     white cost nothing before a white background. ends: the iteration of the schedule from which it changes no rows.
@@ -55,6 +56,13 @@ class DensityControl:
         """Whether the view of this iteration counts in the Gaussians' statistics, where the step is fused."""
         return False
 
+    def replaced(self, iteration: int) -> Collection[str]:
+        """Attributes that `before_step` will give other values or rows, so that they take no step in this iteration.
+
+        Asked, where the step is fused, before anything of the iteration changes the model. Every rank must call it.
+        """
+        return ()
+
     def most_after(self, count: int, first: int, last: int) -> int:
         """The most that `count` Gaussians can become from iteration `first` to `last`, both known to the schedule.
 
@@ -72,6 +80,10 @@ class DensityControl:
 
     def after_backward(self, step: Iteration, package: dict[str, Tensor]) -> None:
         """Called with the gradients computed, before the optimiser's step. package: the result of `render`."""
+        self.before_step(step)
+
+    def before_step(self, step: Iteration) -> None:
+        """Change what `replaced` tells of, once the view counts in the statistics."""
 
     def after_step(self, step: Iteration) -> None:
         """Called after the optimiser's step, so not in the last iteration, which takes none."""

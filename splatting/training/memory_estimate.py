@@ -12,7 +12,7 @@ from scene.spilled_model import SpilledGaussians
 from splatting.host.memory import free_memory, gib
 from splatting.host.torchrun import local_size
 
-# Bytes besides the parameters, their gradients and Adam's two averages. 106 and 57 were fitted to the peak memory of
+# Bytes besides the parameters and Adam's two averages. 106 and 57 were fitted to the peak memory of
 # forward and backward in docs/results/kernels.md (100 thousand to 6 million Gaussians, within 4 %). The rest are the
 # statistics of density control, and the images that the loss keeps.
 PER_GAUSSIAN = 106 + 20
@@ -110,8 +110,9 @@ def training_bytes(
 
     absolute: with absolute gradients. spill: with --spill, on the GPU; None: as the model is.
     """
-    values = sum(group["params"][0][:1].numel() for group in gaussians.optimizer.param_groups)
-    each = 4 * 4 * values
+    sizes = [group["params"][0][:1].numel() for group in gaussians.optimizer.param_groups]
+    values = sum(sizes)
+    each = 4 * (3 * values + max(sizes))  # no step writes gradients; rows change in one tensor after the other
     if isinstance(gaussians, SpilledGaussians) if spill is None else spill:
         bands = _bands(gaussians)
         # All rows: the other values, and how many steps were taken. Rows in view: bands and averages, of this view and

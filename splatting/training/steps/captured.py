@@ -83,7 +83,7 @@ class CapturedStep(FusedStep):
         return self._ahead.abort()
 
     def _is_queued(self, at: Iteration) -> bool:
-        return not at.due and self._fuses(at)
+        return not (at.due or at.last) and self._fuses(at)
 
     def _knows_model(self) -> bool:
         knows = super()._knows_model()
@@ -105,6 +105,7 @@ class CapturedStep(FusedStep):
                 return None
             run.gaussians.guard_loss(at.iteration, losses.total)
             self.advance(at, drawn, gradients)
+            self.follow(at)
         return losses
 
     # What speculation asks for, of steps that overflowed
@@ -252,7 +253,9 @@ class Graphs:
             columns=None,  # all count
             ground_truth=lambda _: (target, None),  # the photo on the step's background, and no mask
         )
-        placeholder = SimpleNamespace(camera=any_camera, background=self._background, depth_weight=0.0)
+        placeholder = SimpleNamespace(
+            camera=any_camera, background=self._background, depth_weight=0.0, changes=False, last=False
+        )
         with self._capacity(None):
             launch, losses = self._recorder.capture(lambda: self._body(at.iteration, placeholder))
         if self._fused.drop_further_terms():

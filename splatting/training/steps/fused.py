@@ -11,7 +11,8 @@ from splatting.training.observer import Announcer
 from splatting.training.run import Run
 from splatting.training.steps.plain import PlainStep
 
-Measured = tuple[Drawn, Losses, tuple[Tensor, Tensor | None]]
+Gradients = tuple[Tensor, Tensor | None]  # of image and depth
+Measured = tuple[Drawn, Losses, Gradients]
 
 
 class FusedStep(PlainStep):
@@ -38,12 +39,14 @@ class FusedStep(PlainStep):
             drawn, losses, gradients = self.measure(at)
             if not self.drop_further_terms():
                 observers.measured(at, losses)
-                return None if at.last else self.advance(at, drawn, gradients)
+                self.advance(at, drawn, gradients)
+                del drawn, gradients  # what changes rows needs their memory
+                return self.follow(at)
         super().take(at, observers)
 
     def _fuses(self, at: Iteration) -> bool:
-        """Whether this step can be fused. The last one, and one that changes the Gaussians' rows, use gradients."""
-        if at.changes or at.last or self._run.pipe.debug or self._has_further_terms:
+        """Whether the step of this iteration can be fused."""
+        if self._run.pipe.debug or self._has_further_terms:
             self._is_known = False
             return False
         if at.due or not self._is_known:
@@ -59,10 +62,13 @@ class FusedStep(PlainStep):
     def measure(self, at: Iteration, now: Tensor | None = None) -> Measured:
         """Render: what was drawn, the losses, and their gradients of image and depth. now: as for `Drawn.step`."""
         run = self._run
+        whole = at.changes or at.last  # all blocks wake, as in a plain step
+        if whole and run.sleeping:
+            run.sleeping.rest()
         exposures, objective = run.dataset.train_test_exp, run.objective
         by_bands = run.group.several and not exposures and objective.takes_bands(at)
         wants = {"want_depth": at.depth_weight > 0, "by_bands": by_bands, "bands": self._bands}
-        wants |= {"sleeping": run.sleeping, "now": now}
+        wants |= {"sleeping": None if whole else run.sleeping, "now": now}
         drawn = draw(at.camera, run.gaussians, run.pipe, at.background, **wants)
         with torch.enable_grad():
             image, depth = drawn.image.requires_grad_(), drawn.depth
@@ -87,9 +93,22 @@ class FusedStep(PlainStep):
             self._end_sleep()
         return self._has_further_terms
 
-    def advance(self, at: Iteration, drawn: Drawn, gradients: tuple[Tensor, Tensor | None]) -> None:
-        """Take the step of the Gaussians, and that of the exposures."""
-        run, density = self._run, self._run.density
-        drawn.step(self._adam, *gradients, density.observes(at.iteration), density.absolute_gradients)
-        run.gaussians.exposures.step()
-        run.after_step(at)
+    def advance(self, at: Iteration, drawn: Drawn, gradients: Gradients) -> None:
+        """Take the step of the Gaussians, as far as they take one, and add the view to the statistics."""
+        gaussians, density = self._run.gaussians, self._run.density
+        adam, steps, observes = self._adam, not at.last, density.observes(at.iteration)
+        if at.last or at.changes:
+            left_out = gaussians._attributes if at.last else density.replaced(at.iteration)
+            steps = len(left_out) < len(gaussians._attributes)
+            adam = FusedAdam(gaussians, density.penalty, left_out)
+        if steps or observes:
+            drawn.step(adam, *gradients, observes, density.absolute_gradients)
+
+    def follow(self, at: Iteration) -> None:
+        """Change rows, where it is time to, and take the step of the exposures."""
+        run = self._run
+        if at.changes:
+            run.density.before_step(at)
+        if not at.last:  # as in the reference, the last iteration takes no step
+            run.gaussians.exposures.step()
+            run.after_step(at)

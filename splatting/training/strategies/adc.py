@@ -5,6 +5,7 @@ splits and for clones. --split long_axis splits along the longest axis (scene/ga
 """
 
 import argparse
+from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 from torch import Tensor
@@ -47,15 +48,26 @@ class AdaptiveDensityControl(DensityControl):
         """Whether the view of this iteration counts in the statistics."""
         return self._actions(iteration).observe
 
+    def replaced(self, iteration: int) -> Collection[str]:
+        if self._actions(iteration).densify:
+            return self._gaussians._attributes
+        return ["opacity"] if self._resets(iteration) else ()
+
     def after_backward(self, step: Iteration, package: dict[str, Tensor]) -> None:
-        todo = self._actions(step.iteration)
-        if todo.observe:
+        if self.observes(step.iteration):
             observe = self._gaussians.observe_absolute if self.absolute_gradients else self._gaussians.observe
             observe(package["viewspace_points"], package["radii"])
+        self.before_step(step)
+
+    def before_step(self, step: Iteration) -> None:
+        todo = self._actions(step.iteration)
         if todo.densify:
             self._densify(step.iteration, todo.limit_size)
-        if todo.reset_opacity and not self._ends_too_soon(step.iteration):
+        if self._resets(step.iteration):
             self._gaussians.reset_opacity()
+
+    def _resets(self, iteration: int) -> bool:
+        return self._actions(iteration).reset_opacity and not self._ends_too_soon(iteration)
 
     def _ends_too_soon(self, iteration: int) -> bool:
         """Whether a run by the clock has too few iterations left to recover from a reset of opacities."""

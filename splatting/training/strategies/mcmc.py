@@ -7,14 +7,13 @@ into more than `--mcmc_parts` is corrected for so many.
 """
 
 import argparse
+from collections.abc import Collection
 from typing import TYPE_CHECKING
-
-from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.gaussians.budget import remove_useless
-from scene.gaussians.mcmc import NO_PENALTY, Penalty
+from scene.gaussians.mcmc import NO_PENALTY, Penalty, is_alive
 from scene.gaussians.morton import sort_rows
 from splatting.training.density import DensityControl, default_budget, refuse_empty
 from splatting.training.iteration import Iteration
@@ -60,7 +59,17 @@ class MarkovChain(DensityControl):
             count = max(count, self._grown(count, iteration))
         return count
 
-    def after_backward(self, step: Iteration, package: dict[str, Tensor]) -> None:
+    def replaced(self, iteration: int) -> Collection[str]:
+        """All, unless there is nothing to do: then the Gaussians take their step."""
+        gaussians, least = self._gaussians, self._opt.mcmc_min_opacity
+        if not self.changes(iteration):
+            return ()
+        count, most = gaussians.gaussian_count, self.most(iteration, 0)
+        moves = 0 < most < count or self._grown(count, iteration) > count
+        moves = moves or gaussians.shards.anyone(not is_alive(gaussians, least).all())
+        return gaussians._attributes if moves else ()
+
+    def before_step(self, step: Iteration) -> None:
         if self.changes(step.iteration):
             self._relocate(step.iteration)
             self._grow(step.iteration)
