@@ -8,7 +8,7 @@ iterations all blocks wake, so that what is saved then is whole.
 
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
@@ -20,6 +20,7 @@ from torch import Tensor
 from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.spilled import is_spilled, to_host
 from splatting.distributed.rows import BLOCK
 from utils.system_utils import UserError
 
@@ -136,10 +137,10 @@ class Sleeping:
     def _copied(self) -> list[Tensor]:
         """What a step changes of the rows that sleep; on the host where the device has no memory left."""
         rows, moved = self._sleepers(), self._moved()
-        try:
-            return [values[rows] for values in moved]
-        except torch.OutOfMemoryError:
-            return [values.cpu()[rows.cpu()] for values in moved]
+        if not any(map(is_spilled, moved)):
+            with suppress(torch.OutOfMemoryError):
+                return [values[rows] for values in moved]
+        return [to_host(values, rows) for values in moved]
 
     def _sleepers(self) -> Tensor:
         return (~self.rows()).nonzero().reshape(-1)
