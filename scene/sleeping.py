@@ -21,7 +21,7 @@ from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.spilled import is_spilled, to_host
-from splatting.distributed.rows import BLOCK
+from splatting.distributed.rows import BLOCK, PIECE
 from utils.system_utils import UserError
 
 REST = 100  # iterations
@@ -131,7 +131,8 @@ class Sleeping:
         self._terms.copy_(state["terms"])
         rows = self._sleepers()
         for values, kept in zip(self._moved(), state["rows"], strict=True):
-            values.index_copy_(0, rows, kept.to(values.device))
+            for part, piece in zip(rows.split(PIECE), kept.split(PIECE), strict=True):  # the GPU may have little room
+                values.index_copy_(0, part, piece.to(values.device))
         self._is_whole = False
 
     def _copied(self) -> list[Tensor]:

@@ -1,10 +1,13 @@
 """--gpu_memory: a part of f_rest and its averages in the host's memory changes no byte, and keeps the limit."""
 
 import gc
+import re
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,14 +16,14 @@ from diff_gaussian_rasterization.optim import adam_
 from gaussians import model, needs_59_values, options
 from processes import in_ranks
 from rasterizer_tools import GPU_MARKS
-from trainings import ITERATIONS, OPTIONS, before_steps, differences, narrow_scene, trained
+from trainings import ITERATIONS, OPTIONS, before_steps, differences, narrow_scene, train_on, trained
 
 from scene.gaussians import spilled
 from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
 from scene.readers.point_cloud import write_point_cloud
 from splatting.distributed.ranks import ranks
 from splatting.training import gpu_memory, memory_estimate, run
-from splatting.training.gpu_memory import GpuMemory
+from splatting.training.gpu_memory import GpuMemory, reads_on_host
 from splatting.training.memory_estimate import near_rows, spillable_bytes, training_bytes
 from splatting.training.schedule_file import schedule_of
 from utils.system_utils import UserError
@@ -94,7 +97,32 @@ def test_a_slow_bus_is_told_of_before(monkeypatch):
     assert f"about {2e3 * 0.8 * spilled / 40e9:.0f} ms a step, which concerns 80% of" in second
 
 
-def test_the_cpu_has_one_memory(monkeypatch):
+def test_torch_gets_the_limit_without_the_near_parts(monkeypatch):
+    found, total, living, freed = [], 4 * 2**30, 100, []
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: SimpleNamespace(total_memory=total))
+    monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", lambda share: found.append(share * total))
+    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 2**30 - 1000)
+    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: freed.append(found[-1:]))
+    monkeypatch.setattr(gpu_memory, "bytes_of", lambda: (living, 0))
+    monkeypatch.setattr(gpu_memory, "photo_bytes", lambda images, device: 0)
+    memory = GpuMemory(1.0, model(50), None, 0, False, torch.device("cuda"))
+    memory._limit_torch(200)
+    living = 900
+    memory._limit_torch(200)
+    assert found == [2**30 - 100, 2**30 - 800, 2**30 - 1100] and freed == [[2**30 - 800]]
+
+
+def test_a_large_checkpoint_is_read_on_the_host(tmp_path, monkeypatch):
+    (tmp_path / "start").write_bytes(bytes(1000))
+    start, gpu = str(tmp_path / "start"), torch.device("cuda")
+    monkeypatch.setattr(gpu_memory, "free_memory", lambda device: 4001)
+    assert not reads_on_host(start, 0, gpu) and not reads_on_host(None, 0, gpu)
+    assert reads_on_host(start, 1, gpu) and not reads_on_host(start, 0, torch.device("cpu"))
+    monkeypatch.setattr(gpu_memory, "free_memory", lambda device: 3999)
+    assert reads_on_host(start, 0, gpu)
+
+
+def test_the_cpu_has_one_memory():
     values = torch.ones(4, 3)
     assert empty_rows(values, 5, 1) is None and bytes_of(values) == bytes_of() == (0, 0) and not is_spilled(values)
     with pytest.raises(ValueError, match="at least 0"):
@@ -220,6 +248,18 @@ def test_blocks_sleep_wherever_they_can(scene, tmp_path, monkeypatch, options, s
     monkeypatch.setattr(run.Run, "begin", lambda self: (found.append(self.sleeping is not None), begin(self)))
     _trained(scene, tmp_path, *options)
     assert found == [sleeps]
+
+
+def test_it_is_told_before_what_the_host_has_to_hold(scene, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(GpuMemory, "spilled_bytes", lambda self, count: count * 10**6)
+    monkeypatch.setattr(memory_estimate, "free_memory", lambda device: 10**10)
+    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
+    train_on(scene, tmp_path, "--iterations", 2, "--disable_viewer", "--init_pcd_path", scene / "points.ply", *SPILL)
+    out, err = capfd.readouterr()
+    assert re.search(r"CPU memory: about \S+ GiB of 9.31 GiB: \S+ GiB of 40,000 Gaussians", out)
+    assert "go to the memory of the host, as all of them need more than 1.00 GiB of the GPU; the files stay" in out
+    assert re.search(r"about \d+ ms a step", out)
+    assert "the memory of the CPU seems too small for 40,000 Gaussians; set a lower --max_num_splats" in err
 
 
 def test_what_cannot_be_is_refused(scene, tmp_path):

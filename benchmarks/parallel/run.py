@@ -49,7 +49,7 @@ class WorkloadRun(Run):
         self.schedule = schedule_of(self.opt, None, 0, views)
         images = SimpleNamespace(ahead=0, keep_on=torch.device("cpu"), planned_bytes=0)
         self.gaussians = GaussianModel(3)
-        pixels = workload.width * workload.height
+        pixels = (workload.width // workload.crop) * (workload.height // workload.crop)
         self.memory = GpuMemory(gpu_memory, self.gaussians, images, pixels, False, self.device)
         self._begin(workload)
         if views > 1:

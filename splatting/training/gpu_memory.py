@@ -109,4 +109,4 @@ class GpuMemory:
         if torch.cuda.memory_reserved(self._device) > left:
             torch.cuda.empty_cache()
         total = torch.cuda.get_device_properties(self._device).total_memory
-        torch.cuda.set_per_process_memory_fraction(min(left / total, 1.0), self._device)
+        torch.cuda.set_per_process_memory_fraction(min(left / total, 1.0))
