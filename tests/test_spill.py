@@ -278,13 +278,13 @@ def _filled(shape: tuple[int, ...]) -> torch.Tensor:
 
 
 @ON_A_GPU
-@pytest.mark.parametrize("near", [0, 50_000, 10**9])
+@pytest.mark.parametrize("near", [0, 9_000_000, 10**9])
 def test_a_spilled_tensor_is_as_any_other(near, _):
     before, values = bytes_of(), _filled((100_003, 15, 3))
     made = empty_rows(values, len(values), near).copy_(values)
     size = values.numel() * 4
     there = bytes_of(made[7:])
-    assert there[0] == min(near * 180 // PAGE * PAGE, -(-size // PAGE) * PAGE) and size <= sum(there) < size + 2 * PAGE
+    assert there[0] == min(near // PAGE * PAGE, -(-size // PAGE) * PAGE) and size <= sum(there) < size + 2 * PAGE
     assert bytes_of() == tuple(a + b for a, b in zip(before, there, strict=True)) and not any(bytes_of(values))
     assert torch.equal(made, values) and torch.equal(made.cpu(), values.cpu()) and torch.equal(made.clone(), values)
     order = torch.randperm(len(values), device="cuda")
@@ -309,7 +309,7 @@ def test_a_spilled_tensor_is_as_any_other(near, _):
 def test_memory_is_given_back(_):
     values = _filled((1, 15, 3))
     free, before = torch.cuda.mem_get_info()[0], bytes_of()
-    made = [empty_rows(values, 10**6, 500_000).fill_(k) for k in range(3)]
+    made = [empty_rows(values, 10**6, 90_000_000).fill_(k) for k in range(3)]
     assert torch.cuda.mem_get_info()[0] < free - 3 * 80e6
     assert [float(one[-1, -1, -1]) for one in made] == [0, 1, 2]
     del made

@@ -4,7 +4,6 @@ Both lie in one range of addresses, so kernels and copies take such a tensor for
 the rasterizer). On the CPU there are none.
 """
 
-import math
 from typing import Any
 
 import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
@@ -31,13 +30,15 @@ def placed(model: Any, name: str | None, values: Tensor) -> Tensor:
 
 
 def empty_rows(like: Tensor, rows: int, near: int) -> Tensor | None:
-    """An uninitialised tensor of so many rows like those of `like`, the first `near` of them on its GPU, by pages."""
-    size = near * math.prod(like.shape[1:]) * like.element_size()
+    """An uninitialised tensor of so many rows like those of `like`, its first `near` bytes on the GPU, by whole pages.
+
+    None on the CPU.
+    """
     try:
-        return OPERATORS.spilled(like, rows, size)
+        return OPERATORS.spilled(like, rows, near)
     except torch.OutOfMemoryError:
         torch.cuda.empty_cache()  # torch may keep for later what the driver lacks
-        return OPERATORS.spilled(like, rows, size)
+        return OPERATORS.spilled(like, rows, near)
 
 
 def bytes_of(values: Tensor | None = None) -> tuple[int, int]:
@@ -53,9 +54,7 @@ def is_spilled(values: Tensor) -> bool:
 
 def empty_beside(old: Tensor) -> Tensor | None:
     """An uninitialised tensor that is spilled as another one is; None if that is not."""
-    if not (old.numel() and is_spilled(old)):
-        return None
-    return empty_rows(old, len(old), bytes_of(old)[0] * len(old) // (old.numel() * old.element_size()))
+    return empty_rows(old, len(old), bytes_of(old)[0]) if is_spilled(old) else None
 
 
 def beside(old: Tensor, new: Tensor) -> Tensor:

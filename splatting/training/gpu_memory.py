@@ -25,6 +25,14 @@ def reads_on_host(checkpoint: str | None, limit: float, device: torch.device) ->
     return os.path.getsize(checkpoint) > _MUCH * free_memory(device)
 
 
+def limit_torch(limit: float, device: torch.device) -> None:
+    """Leave torch so many bytes of the GPU; `free_memory` then counts no others."""
+    if torch.cuda.memory_reserved(device) > limit:
+        torch.cuda.empty_cache()
+    total = torch.cuda.get_device_properties(device).total_memory
+    torch.cuda.set_per_process_memory_fraction(min(max(limit / total, 0.0), 1.0))
+
+
 class GpuMemory:
     """Decides how many rows of f_rest and its averages stay on the GPU; `spill` of the model, which it makes room for.
 
@@ -42,8 +50,8 @@ class GpuMemory:
     ) -> None:
         """Take a limit in GiB, 0 for none. pixels: of the largest view. absolute: with absolute gradients."""
         self.limit, self._device = int(limit * 2**30), device
-        self._gaussians, self._pixels, self._absolute = gaussians, pixels, absolute
-        self._photos = photo_bytes(images, device)
+        self._each, self._spillable = training_bytes(gaussians, 1, 0, absolute), spillable_bytes(gaussians, 1)
+        self._fixed = training_bytes(gaussians, 0, pixels) + photo_bytes(images, device)
         gaussians.spill = self.room
         self._limit_torch(0)
 
@@ -62,8 +70,9 @@ class GpuMemory:
         if near >= rows:
             self._limit_torch(0)
             return None
-        self._limit_torch(near * math.prod(like.shape[1:]) * like.element_size())
-        return empty_rows(like, rows, near)
+        size = near * math.prod(like.shape[1:]) * like.element_size()
+        self._limit_torch(size)
+        return empty_rows(like, rows, size)
 
     def near_rows(self, count: int) -> int:
         """How many of so many rows stay on the GPU."""
@@ -71,9 +80,7 @@ class GpuMemory:
 
     def spilled_bytes(self, count: int) -> int:
         """Bytes of so many Gaussians in the host's memory."""
-        if self._device.type != "cuda" or not count:
-            return 0
-        return spillable_bytes(self._gaussians, count) // count * (count - self.near_rows(count))
+        return self._spillable * (count - self.near_rows(count)) if self._device.type == "cuda" else 0
 
     def words(self, count: int, seen: float, same: bool) -> list[str]:
         """What to say before a training of so many Gaussians, if some of it is spilled.
@@ -96,17 +103,11 @@ class GpuMemory:
         return said
 
     def _near(self, limit: int, count: int) -> int:
-        spillable = spillable_bytes(self._gaussians, count)
-        others = training_bytes(self._gaussians, count, self._pixels, self._absolute) - spillable + self._photos
-        return near_rows(limit, count, others, spillable)
+        others = self._fixed + count * (self._each - self._spillable)
+        return near_rows(limit, count, others, count * self._spillable)
 
     def _limit_torch(self, each: int) -> None:
         """Leave torch the limit less the near parts of spilled tensors: three of `each` bytes and the copy of one."""
         if not self.limit or self._device.type != "cuda":
             return
-        living = bytes_of()[0]
-        left = max(self.limit - max(4 * each, living + each), 0)
-        if torch.cuda.memory_reserved(self._device) > left:
-            torch.cuda.empty_cache()
-        total = torch.cuda.get_device_properties(self._device).total_memory
-        torch.cuda.set_per_process_memory_fraction(min(left / total, 1.0))
+        limit_torch(self.limit - max(4 * each, bytes_of()[0] + each), self._device)

@@ -30,7 +30,7 @@ from splatting.exports.splats import Splats
 from splatting.host.clock import seconds_since_start
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.training import checks, schedule_file
-from splatting.training.gpu_memory import GpuMemory, reads_on_host
+from splatting.training.gpu_memory import GpuMemory, limit_torch, reads_on_host
 from splatting.training.iteration import Iteration, ViewOrder
 from splatting.training.memory_estimate import announce_memory, largest_view
 from splatting.training.objective import LossWatch, Objective
@@ -127,7 +127,9 @@ class Run:
         self.group.tell_notes()
 
     def _read_start(self) -> tuple[tuple | None, int]:
-        """The state of the checkpoint that is resumed, and its iteration."""
+        """The state of the checkpoint that is resumed, and its iteration. A limit of the GPU's memory begins before."""
+        if self.opt.gpu_memory and self.device.type == "cuda":
+            limit_torch(self.opt.gpu_memory * 2**30, self.device)
         if not self.start:
             return None, 0
         # Of several processes, each keeps a part of it on its device, and of a large model only a part fits there.
