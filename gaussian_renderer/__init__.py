@@ -189,17 +189,6 @@ def decisive_for(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Nam
     return draw(camera, pc, pipe, pc.get_xyz.detach().new_zeros(3), by_bands=True).decisive()
 
 
-@torch.no_grad()
-def visible_rows(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace) -> Tensor:
-    """Gaussians that the view may draw, or give a radius > 0: (n,) int64, ascending. Reads no SH bands above 0."""
-    geometry, raw = _geometry(pc, pipe.compute_cov3D_python, 1.0)
-    # Only whether colours are finite matters here, and for that any will do in place of those that the bands give.
-    gaussians = Gaussians(pc.get_xyz, **geometry, colors=pc.get_features_dc.reshape(-1, 3))
-    settings = rasterizer_settings(camera, pc, pipe, pc.get_xyz.new_zeros(3))
-    *_, tile_counts, radii = OPERATORS.project(*scene_arguments(gaussians, settings, raw))
-    return ((tile_counts > 0) | (radii > 0)).nonzero().reshape(-1)  # a small one may be drawn with a radius of 0
-
-
 def model_inputs(
     camera: Camera | MiniCam,
     pc: GaussianModel,

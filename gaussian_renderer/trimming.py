@@ -111,7 +111,7 @@ def trim(
         search = Search(every, end=FEW)
     search.unseen = shards.marked(~search.keep)
     kept = search.keep if search.unseen else slice(None)
-    search.cut_bounds = cut_bounds(gaussians.get_features_rest.detach()[kept], shards)
+    search.cut_bounds = cut_bounds(gaussians.get_features_rest.detach(), shards, search.keep)
     degree = gaussians.max_sh_degree if prune_sh < 0 else needed_degree(search.cut_bounds, prune_sh)
     if search.unseen or degree < gaussians.max_sh_degree:
         gaussians = gaussians.part(kept, degree)

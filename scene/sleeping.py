@@ -7,7 +7,7 @@ iterations all blocks wake, so that what is saved then is whole.
 """
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
@@ -19,7 +19,8 @@ from torch import Tensor
 from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
-from splatting.distributed.rows import BLOCK
+from scene.gaussians.spilled import is_spilled, to_host
+from splatting.distributed.rows import BLOCK, PIECE
 from utils.system_utils import UserError
 
 REST = 100  # iterations
@@ -131,16 +132,17 @@ class Sleeping:
         self._terms.copy_(state["terms"])
         rows = self._sleepers()
         for values, kept in zip(self._moved(), state["rows"], strict=True):
-            values.index_copy_(0, rows, kept.to(values.device))
+            for part, piece in zip(rows.split(PIECE), kept.split(PIECE), strict=True):  # the GPU may have little room
+                values.index_copy_(0, part, piece.to(values.device))
         self._is_whole = False
 
     def _copied(self) -> list[Tensor]:
         """What a step changes of the rows that sleep; on the host where the device has no memory left."""
         rows, moved = self._sleepers(), self._moved()
-        try:
-            return [values[rows] for values in moved]
-        except torch.OutOfMemoryError:
-            return [values.cpu()[rows.cpu()] for values in moved]
+        if not any(map(is_spilled, moved)):
+            with suppress(torch.OutOfMemoryError):
+                return [values[rows] for values in moved]
+        return [to_host(values, rows) for values in moved]
 
     def _sleepers(self) -> Tensor:
         return (~self.rows()).nonzero().reshape(-1)

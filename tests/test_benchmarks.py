@@ -141,8 +141,9 @@ def test_runs_of_a_seed_are_compared(capsys):
 def test_ranks_draw_together_what_one_process_draws(name, monkeypatch):
     monkeypatch.setattr(workload, "_PIECE", 300)
     scene = workload.ALL[name].changed(1000, (64, 40))
-    whole = scene.rows(0, 1, torch.device("cpu"))
-    parts = [scene.rows(rank, 3, torch.device("cpu")) for rank in range(3)]
+    cpu = torch.device("cpu")
+    whole = scene.rows(0, 1, cpu, cpu)
+    parts = [scene.rows(rank, 3, cpu, cpu) for rank in range(3)]
     for attribute, values in whole.items():
         assert len(values) == 1000 and torch.equal(torch.cat([part[attribute] for part in parts]), values)
 
@@ -155,7 +156,9 @@ def test_steps_of_ranks_and_of_a_spilled_model_stand_beside_those_of_one_process
     assert [row[1:4] for row in rows] == [["1", "", "gpu"], ["2", "views", "gpu"]]
     assert rows[0][7] == "1.00" and float(rows[1][7]) > 0
     monkeypatch.setattr(steps, "launch", lambda case, limit: steps.measure(case))  # no process of its own
-    monkeypatch.setattr(sys, "argv", ["steps", "--model", "gpu", "spill", "--learn", *words.split()])
+    monkeypatch.setattr(
+        sys, "argv", ["steps", "--model", "sleep", "spill", "--learn", "--cap", "0.001", *words.split()]
+    )
     steps.main()
     rows = _rows(capsys.readouterr().out, "city")
     assert rows[0][-1] == rows[1][-1] != ""
@@ -163,7 +166,7 @@ def test_steps_of_ranks_and_of_a_spilled_model_stand_beside_those_of_one_process
 
 def test_bytes_of_a_gaussian_are_those_of_a_line():
     def found(millions: int, mib: float) -> dict:
-        own = {"ms": [1.0], "peak": mib, "last": 2 * mib, "digest": "", "memory": 2**40}
+        own = {"ms": [1.0], "peak": mib, "last": 2 * mib, "digest": "", "memory": 2**40, "far": 0.0}
         case = {"workload": "city", "ranks": 1, "parallel": "tiles", "model": "gpu", "learn": False}
         return case | {"name": "", "gaussians": millions * 2**20, "by_rank": [own]}
 

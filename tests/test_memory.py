@@ -134,9 +134,7 @@ def test_a_picture_that_does_not_fit_saves_too(colmap_scene, tmp_path, monkeypat
     assert load_checkpoint(tmp_path / "chkpnt4.pth")[1] == 4
 
 
-@pytest.mark.parametrize(
-    ("of", "name", "call", "count"), [(torch, "cat", 7, 300), (torch.Tensor, "index_select", 12, 600)]
-)
+@pytest.mark.parametrize(("of", "name", "call", "count"), [(torch, "cat", 7, 300), (torch, "index_select", 12, 600)])
 def test_a_densification_cut_short_is_saved_whole(colmap_scene, tmp_path, monkeypatch, of, name, call, count):
     """Clone 4 of 300 Gaussians and split 296 in two. tests/test_gaussian_optimizer.py: wherever memory fails."""
     densify = GaussianModel.densify_and_prune

@@ -1,139 +1,355 @@
-"""--spill: rows that step late, in the host's memory, give the bytes of rows that step in time."""
+"""--gpu_memory: a part of f_rest and its averages in the host's memory changes no byte, and keeps the limit."""
 
+import gc
+import re
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
-from diff_gaussian_rasterization.optim import adam_, catch_up_
-from gaussians import cloud, model, needs_59_values, options
-from trainings import OPTIONS, differences, leaves, narrow_scene, trained
+from diff_gaussian_rasterization.optim import adam_
+from gaussians import model, needs_59_values, options
+from processes import in_ranks
+from rasterizer_tools import GPU_MARKS
+from trainings import ITERATIONS, OPTIONS, before_steps, differences, narrow_scene, train_on, trained
 
-from scene import spilled_model
-from scene.gaussian_model import GaussianModel
-from scene.gaussians.checkpoint import load_checkpoint
-from splatting.training import memory_estimate, objective, run
-from splatting.training.memory_estimate import spilled_bytes, training_bytes
+from scene.gaussians import spilled
+from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
+from scene.readers.point_cloud import write_point_cloud
+from splatting.distributed.ranks import ranks
+from splatting.training import gpu_memory, memory_estimate, run
+from splatting.training.gpu_memory import GpuMemory, reads_on_host
+from splatting.training.memory_estimate import near_rows, spillable_bytes, training_bytes
+from splatting.training.schedule_file import schedule_of
 from utils.system_utils import UserError
 
-BETAS, EPS = (0.9, 0.999), 1e-15
+SPILL = ("--gpu_memory", 1)
+ON_A_GPU = pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
+PAGE = 2 << 20
+KINDS = {name: OPTIONS[name] for name in ("default", "sparse", "absgrad", "budget", "degree 0")}
+KINDS["mcmc"] = "--strategy", "mcmc"
 
 
-@pytest.fixture(autouse=True)
-def _awake(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No block sleeps beside the spilled model, which knows no sleep."""
-    monkeypatch.setattr(run, "MOST_SHARE", 0.0)
+# The policy
+
+
+@pytest.mark.parametrize("limit", [0, 10_000, 530_000, 700_000, 1_100_000, 10**9])
+def test_what_stays_near_fits_beside_all_else_and_a_copy(limit):
+    near = near_rows(limit, 1000, 530_000, 540_000)
+    whole = 530_000 + 540_000 * 4 / 3
+    assert near == (0 if limit <= 530_000 else 1000 if limit >= whole else near)
+    if 0 < near < 1000:
+        assert 530_000 + 540 * near * 4 / 3 <= limit < 530_000 + 540 * (near + 1) * 4 / 3
+    assert near_rows(limit, 1000, 530_000, 0) == 1000  # degree 0 has nothing to spill
+
+
+def _memory(monkeypatch: pytest.MonkeyPatch, limit: float, photos: int = 0) -> GpuMemory:
+    """That of a GPU, which need not be there; 50 Gaussians are there."""
+    monkeypatch.setattr(GpuMemory, "_limit_torch", lambda self, each: None)
+    monkeypatch.setattr(gpu_memory, "photo_bytes", lambda images, device: photos)
+    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 0)
+    return GpuMemory(limit, model(50), None, 1000, False, torch.device("cuda"))
+
+
+@needs_59_values
+def test_the_share_follows_the_number_of_gaussians(monkeypatch):
+    gaussians, count, pixels = model(1), 10**6, 1000
+    assert training_bytes(gaussians, count, 0) == count * (16 * 59 + memory_estimate.PER_GAUSSIAN)
+    assert spillable_bytes(gaussians, count) == count * 12 * 45
+    memory = _memory(monkeypatch, 1, photos=2**27)
+    shares = [memory.near_rows(count) / count for count in range(10**5, 4 * 10**6, 10**5)]
+    assert shares[0] == 1 and shares[-1] == 0 and shares == sorted(shares, reverse=True)
+    near = memory.near_rows(count)
+    others = count * (16 * 59 - 12 * 45 + memory_estimate.PER_GAUSSIAN) + pixels * memory_estimate.PER_PIXEL + 2**27
+    assert near == near_rows(2**30, count, others, count * 540) and 0 < near < count
+    assert memory.spilled_bytes(count) == 540 * (count - near)
+    assert _memory(monkeypatch, 0).near_rows(10**9) == 10**9
+
+
+@needs_59_values
+def test_a_limit_begins_where_the_gpu_has_too_little(monkeypatch):
+    memory = _memory(monkeypatch, 0)
+    monkeypatch.setattr(gpu_memory, "free_memory", lambda device: 2**30)
+    memory.expect(500_000)
+    assert memory.limit == 0 and memory.words(500_000, 1.0, True) == []
+    memory.expect(1_000_000)
+    assert memory.limit == int(gpu_memory._USABLE * 2**30)
+    said = memory.words(1_000_000, 0.02, True)
+    assert len(said) == 1 and "GiB of 1,000,000 Gaussians go to the memory of the host" in said[0]
+    assert said[0].endswith("the files stay the same")
+    memory.expect(10**9)  # no other limit
+    assert memory.limit == int(gpu_memory._USABLE * 2**30)
+    there = GpuMemory(0.0, model(50), None, 1000, False, torch.device("cpu"))
+    there.expect(10**12)
+    assert there.limit == 0
+
+
+def test_a_slow_bus_is_told_of_before(monkeypatch):
+    memory = _memory(monkeypatch, 1)
+    spilled = memory.spilled_bytes(2_000_000)
+    first, second = memory.words(2_000_000, 0.8, False)
+    assert first.endswith("the files stay the same up to rounding")
+    assert f"about {2e3 * 0.8 * spilled / 40e9:.0f} ms a step, which concerns 80% of" in second
+
+
+def test_torch_gets_the_limit_without_the_near_parts(monkeypatch):
+    found, total, living, freed = [], 4 * 2**30, 100, []
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: SimpleNamespace(total_memory=total))
+    monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", lambda share: found.append(share * total))
+    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 2**30 - 1000)
+    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: freed.append(found[-1:]))
+    monkeypatch.setattr(gpu_memory, "bytes_of", lambda: (living, 0))
+    monkeypatch.setattr(gpu_memory, "photo_bytes", lambda images, device: 0)
+    memory = GpuMemory(1.0, model(50), None, 0, False, torch.device("cuda"))
+    memory._limit_torch(200)
+    living = 900
+    memory._limit_torch(200)
+    assert found == [2**30 - 100, 2**30 - 800, 2**30 - 1100] and freed == [[2**30 - 800]]
+
+
+def test_a_large_checkpoint_is_read_on_the_host(tmp_path, monkeypatch):
+    (tmp_path / "start").write_bytes(bytes(1000))
+    start, gpu = str(tmp_path / "start"), torch.device("cuda")
+    monkeypatch.setattr(gpu_memory, "free_memory", lambda device: 4001)
+    assert not reads_on_host(start, 0, gpu) and not reads_on_host(None, 0, gpu)
+    assert reads_on_host(start, 1, gpu) and not reads_on_host(start, 0, torch.device("cpu"))
+    monkeypatch.setattr(gpu_memory, "free_memory", lambda device: 3999)
+    assert reads_on_host(start, 0, gpu)
+
+
+def test_the_cpu_has_one_memory():
+    values = torch.ones(4, 3)
+    assert empty_rows(values, 5, 1) is None and bytes_of(values) == bytes_of() == (0, 0) and not is_spilled(values)
+    with pytest.raises(ValueError, match="at least 0"):
+        empty_rows(values, -1, 0)
+
+
+# Trainings
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return narrow_scene(tmp_path_factory.mktemp("spill") / "scene")
+    return _with_points(tmp_path_factory.mktemp("spill"), 1000)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
-@pytest.mark.parametrize("columns", [-1, 0, 9, 24])
-def test_missed_steps_are_steps_without_a_gradient(threads, dtype, columns):
-    count, past = 130, 90
-    generator = torch.Generator().manual_seed(0)
-    state = [torch.randn(count, 15, 3, generator=generator, dtype=dtype) for _ in range(3)]
-    # Averages of all sizes, some of which fade to nothing.
-    scale = 10 ** torch.linspace(-44, 5, count, dtype=torch.float64).reshape(-1, 1, 1).to(dtype)
-    state[1], state[2] = state[1] * scale, (state[2] * scale) ** 2
-    state[1][::5], state[2][::5] = 0, 0
-    rates, numbers = [0.01 / (1 + k % 4) for k in range(past)], [float(40 + k) for k in range(past)]
-    taken = (torch.arange(count, dtype=torch.int32) * 7) % (past + 1)
-    wanted = [t.clone() for t in state]
-    for k in range(past):
-        rows = (taken <= k).nonzero().reshape(-1)
-        part = [t[rows] for t in wanted]
-        lists = [part[0]], [torch.zeros_like(part[0])], [part[1]], [part[2]], [torch.tensor(numbers[k] - 1)]
-        adam_(*lists, [rates[k]], *BETAS, EPS, [columns])
-        for whole, values in zip(wanted, part, strict=True):
-            whole[rows] = values
-    assert (state[0] == wanted[0]).all() == (columns == 0)
-    for threads_now in (1, 3):
-        found = [t.clone() for t in state]
-        threads(threads_now)
-        catch_up_(*found, taken, rates, numbers, *BETAS, EPS, columns)
-        assert all(torch.equal(a, b) for a, b in zip(found, wanted, strict=True))
+def _with_points(folder: Path, count: int) -> Path:
+    """A scene of clusters, of which a view sees a part."""
+    narrow_scene(folder / "scene")
+    rng = np.random.default_rng(0)
+    centers = np.repeat(rng.uniform(-8, 8, (20, 3)), count // 20, 0)
+    points = np.concatenate((0.5 * rng.normal(size=(count, 3)), centers + 0.1 * rng.normal(size=centers.shape)))
+    write_point_cloud(folder / "scene/points.ply", points, rng.integers(0, 255, points.shape))
+    return folder / "scene"
 
 
-def test_what_does_not_fit_is_refused():
-    state = [torch.ones(4, 3) for _ in range(3)]
-    taken = torch.zeros(4, dtype=torch.int32)
-    with pytest.raises(TypeError, match=r"taken must be torch.int32"):
-        catch_up_(*state, taken.long(), [0.1], [1.0], *BETAS, EPS)
-    with pytest.raises(ValueError, match=r"taken must be \(4,\)"):
-        catch_up_(*state, taken[:3], [0.1], [1.0], *BETAS, EPS)
-    with pytest.raises(ValueError, match="a rate for each of the 1 steps, got 2"):
-        catch_up_(*state, taken, [0.1, 0.1], [1.0], *BETAS, EPS)
-    assert all((t == 1).all() for t in state)
+def _trained(scene: Path, out: Path, *options: object) -> dict:
+    return trained(scene, out, "--init_pcd_path", scene / "points.ply", *options)
 
 
-@pytest.mark.parametrize("most", [1, 4])
-def test_a_long_list_of_missed_steps_is_cut(scene, tmp_path, monkeypatch, most):
-    usual = trained(scene, tmp_path / "usual")
-    monkeypatch.setattr(spilled_model, "_MOST_MISSED", most)
-    assert differences(trained(scene, tmp_path / "spilled", "--spill"), usual) == []
+@pytest.fixture(scope="module")
+def usual(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict]:
+    """Trains with the options of a name and nothing spilled, once; blocks sleep."""
+    folder = tmp_path_factory.mktemp("usual")
+
+    def train(name: str) -> dict:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(run, "MOST_SHARE", 2.0)
+            return _trained(scene, folder / name, *KINDS[name])
+
+    return cache(train)
 
 
-def test_a_parameter_without_a_gradient_takes_no_step():
-    gaussians = spilled_model.SpilledGaussians(1)
-    gaussians.create_from_pcd(cloud(20), [], 1.0)
-    gaussians.training_setup(options())
-    gaussians.fetch(torch.arange(5)).get_xyz.sum().backward()
-    gaussians.take_gradients()
-    assert gaussians._xyz.grad.any(dim=1).sum() == 5
-    gaussians.step(torch.ones(20, dtype=torch.int32))
-    assert list(gaussians.optimizer.state) == [gaussians._xyz]
+@contextmanager
+def _half_spilled(patch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    """Let half of the rows be spilled. Where there is no GPU, tensors of the CPU stand for spilled ones.
+
+    Yields the numbers of rows of the tensors that were made.
+    """
+    made, kept, spill, bytes_found = [], [], spilled.OPERATORS.spilled, spilled.OPERATORS.spilled_bytes
+
+    def stand_in(like: torch.Tensor, rows: int, near: int) -> torch.Tensor:
+        made.append(rows)
+        if like.is_cuda:
+            return spill(like, rows, near)
+        kept.append((torch.full((rows, *like.shape[1:]), torch.nan), near))
+        return kept[-1][0]
+
+    def found(values: torch.Tensor | None = None) -> torch.Tensor:
+        if values is None or values.is_cuda:
+            return bytes_found(values)
+        inside = [n for t, n in kept if 0 <= values.data_ptr() - t.data_ptr() < max(t.numel() * t.element_size(), 1)]
+        return torch.tensor([inside[0], 1] if inside else [0, 0])
+
+    patch.setattr(spilled.OPERATORS, "spilled", stand_in)
+    patch.setattr(spilled.OPERATORS, "spilled_bytes", found)
+    patch.setattr(GpuMemory, "near_rows", lambda self, count: count // 2)
+    yield made
 
 
-def _stopped(scene: Path, out: Path, *options: object) -> tuple[str, list[object]]:
-    """What a run says that stops, and the state that it leaves, but for its statistics and learning rates."""
-    with pytest.raises(UserError) as error:
-        trained(scene, out, *options)
-    (path,) = out.glob("chkpnt*.pth")
-    capture, iteration = load_checkpoint(path)
-    said = str(error.value).replace(str(out), "")
-    return said, [iteration, *capture[:7], capture[10]["state"], capture[11]]
+def _check_rows(patch: pytest.MonkeyPatch) -> list[int]:
+    """Check before each step that f_rest and its averages are spilled. The numbers of rows."""
+    counts, set_rates = [], run.Run.set_rates
+
+    def checked(self: run.Run, step: object) -> None:
+        set_rates(self, step)
+        gaussians = self.gaussians
+        counts.append(len(gaussians))
+        if gaussians._features_rest.numel():
+            assert is_spilled(gaussians._features_rest.detach()) and not is_spilled(gaussians._xyz.detach())
+            state = gaussians.optimizer.state.get(gaussians._features_rest, {})
+            assert all(is_spilled(state[name]) for name in ("exp_avg", "exp_avg_sq") if state)
+
+    patch.setattr(run.Run, "set_rates", checked)
+    return counts
 
 
-@pytest.mark.parametrize("kind", ["default", "sparse"])
-@pytest.mark.parametrize("what", ["loss", "f_rest", "xyz"])
-def test_a_guard_leaves_the_same_model_and_marks(scene, tmp_path, monkeypatch, what, kind):
-    """From iteration 34 on, which is found out in 36, where the SH degree is raised."""
-    results = []
-    for name, further in (("usual", ("--plain_step",)), ("spilled", ("--spill",))):
-        calls, loss, step = [], objective.photometric_loss, GaussianModel.step
-
-        def broken(*args: object, calls=calls, loss=loss) -> tuple[torch.Tensor, torch.Tensor]:
-            calls.append(1)
-            total, l1 = loss(*args)
-            return (total * float("nan") if what == "loss" and len(calls) == 34 else total), l1
-
-        def poisoned(self: GaussianModel, radii: torch.Tensor, calls=calls, step=step) -> None:
-            if what != "loss" and len(calls) == 34:
-                row = int(radii.argmax())
-                if what == "f_rest" and self.optimizer.parts:
-                    part = self.optimizer.parts["f_rest"]
-                    part.gradient[(part.rows == row).nonzero(), 1, 2] = float("inf")
-                else:
-                    self.raw(what).grad.view(len(self), -1)[row, 5 if what == "f_rest" else 1] = float("inf")
-            step(self, radii)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(objective, "photometric_loss", broken)
-            patch.setattr(GaussianModel, "step", poisoned)
-            results.append(_stopped(scene, tmp_path / name, *OPTIONS[kind], *further))
-    (said, usual), (told, spilled) = results
-    assert said == told and ("became nan" if what == "loss" else f"{what} of 1 of") in said
-    assert leaves(spilled) == leaves(usual)
+@pytest.mark.parametrize("name", KINDS)
+def test_spilled_rows_are_trained_as_any_others(scene, tmp_path, monkeypatch, usual, name):
+    expected = usual(name)
+    with _half_spilled(monkeypatch) as made:
+        counts = _check_rows(monkeypatch)
+        assert not differences(_trained(scene, tmp_path, *SPILL, *KINDS[name]), expected)
+    assert {*counts} <= {*made} and len({*counts}) > 1
 
 
-@needs_59_values
-def test_the_estimate_leaves_out_what_lies_in_the_hosts_memory():
-    gaussians = model(50)
-    usual, spilled = (training_bytes(gaussians, 1000, 0, spill=spill) for spill in (None, True))
-    assert usual == 1000 * (4 * (3 * 59 + 45) + memory_estimate.PER_GAUSSIAN)
-    assert spilled_bytes(gaussians, 1000) == 1000 * 12 * 45
-    seen = memory_estimate.SEEN * (45 * 32 + 14 * 8)
-    assert spilled == 1000 * (16 * 14 + 4 + seen + memory_estimate.PER_GAUSSIAN)
+@pytest.mark.parametrize(("first", "then"), [((), SPILL), (SPILL, ())])
+def test_resumed(scene, tmp_path, monkeypatch, usual, first, then):
+    expected = usual("default")
+    monkeypatch.setattr(run, "MOST_SHARE", 2.0)
+    _trained(scene, tmp_path / "a", *first, "--checkpoint_iterations", 33, ITERATIONS)
+    start = "--start_checkpoint", tmp_path / "a" / "chkpnt33.pth"
+    assert not differences(_trained(scene, tmp_path / "b", *then, *start), expected)
+
+
+def _in_ranks(scene: Path, folder: Path) -> dict | None:
+    with pytest.MonkeyPatch.context() as patch, _half_spilled(patch):
+        _check_rows(patch)
+        try:
+            return _trained(scene, folder / "ranks", *SPILL)
+        except FileNotFoundError:  # only the first rank writes
+            if ranks().first:
+                raise
+    return None
+
+
+def test_ranks(scene, tmp_path, usual):
+    assert not differences(in_ranks(2, _in_ranks, scene, tmp_path)[0], usual("default"))
+
+
+@pytest.mark.parametrize(("options", "sleeps"), [((), False), (SPILL, True), ((*SPILL, *KINDS["mcmc"]), False)])
+def test_blocks_sleep_wherever_they_can(scene, tmp_path, monkeypatch, options, sleeps):
+    monkeypatch.setattr(run, "MOST_SHARE", 0.0)
+    found, begin = [], run.Run.begin
+    monkeypatch.setattr(run.Run, "begin", lambda self: (found.append(self.sleeping is not None), begin(self)))
+    _trained(scene, tmp_path, *options)
+    assert found == [sleeps]
+
+
+def test_it_is_told_before_what_the_host_has_to_hold(scene, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(GpuMemory, "spilled_bytes", lambda self, count: count * 10**6)
+    monkeypatch.setattr(memory_estimate, "free_memory", lambda device: 10**10)
+    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
+    train_on(scene, tmp_path, "--iterations", 2, "--disable_viewer", "--init_pcd_path", scene / "points.ply", *SPILL)
+    out, err = capfd.readouterr()
+    assert re.search(r"CPU memory: about \S+ GiB of 9.31 GiB: \S+ GiB of 40,000 Gaussians", out)
+    assert "go to the memory of the host, as all of them need more than 1.00 GiB of the GPU; the files stay" in out
+    assert re.search(r"about \d+ ms a step", out)
+    assert "the memory of the CPU seems too small for 40,000 Gaussians; set a lower --max_num_splats" in err
+
+
+def test_what_cannot_be_is_refused(scene, tmp_path):
+    with pytest.raises(UserError, match="--gpu_memory must be at least 0"):
+        _trained(scene, tmp_path, "--gpu_memory", -1)
+    with pytest.raises(UserError, match="use --parallel tiles"):
+        schedule_of(options(gpu_memory=1.0), None, 0, 2)
+
+
+# On a GPU
+
+
+def _filled(shape: tuple[int, ...]) -> torch.Tensor:
+    generator = torch.Generator("cuda").manual_seed(0)
+    return torch.randn(shape, generator=generator, device="cuda")
+
+
+@ON_A_GPU
+@pytest.mark.parametrize("near", [0, 9_000_000, 10**9])
+def test_a_spilled_tensor_is_as_any_other(near, _):
+    before, values = bytes_of(), _filled((100_003, 15, 3))
+    made = empty_rows(values, len(values), near).copy_(values)
+    size = values.numel() * 4
+    there = bytes_of(made[7:])
+    assert there[0] == min(near // PAGE * PAGE, -(-size // PAGE) * PAGE) and size <= sum(there) < size + 2 * PAGE
+    assert bytes_of() == tuple(a + b for a, b in zip(before, there, strict=True)) and not any(bytes_of(values))
+    assert torch.equal(made, values) and torch.equal(made.cpu(), values.cpu()) and torch.equal(made.clone(), values)
+    order = torch.randperm(len(values), device="cuda")
+    out = empty_rows(values, len(values), near)
+    torch.index_select(made, 0, order, out=out)
+    assert torch.equal(out, values[order]) and torch.equal(made[order[:9]], values[order[:9]])
+    made.index_copy_(0, order[:500], values[:500])
+    values.index_copy_(0, order[:500], values[:500].clone())
+    assert torch.equal(made, values)
+    torch.cat((made[:60_000], values[60_000:]), out=out)
+    assert torch.equal(out, values) and not out.zero_().any()
+    made.copy_(values.cpu())  # from memory that is not locked
+    states = [[t, torch.zeros_like(t), torch.zeros_like(t)] for t in (values.clone(), made)]
+    states[1][1:] = (empty_rows(values, len(values), near).zero_() for _ in range(2))
+    for value, mean, square in states:
+        for step in range(3):
+            adam_([value], [values], [mean], [square], [torch.tensor(float(step))], [0.01], 0.9, 0.999, 1e-15, [45])
+    assert all(torch.equal(one, other) for one, other in zip(*states, strict=True))
+
+
+@ON_A_GPU
+def test_memory_is_given_back(_):
+    values = _filled((1, 15, 3))
+    free, before = torch.cuda.mem_get_info()[0], bytes_of()
+    made = [empty_rows(values, 10**6, 90_000_000).fill_(k) for k in range(3)]
+    assert torch.cuda.mem_get_info()[0] < free - 3 * 80e6
+    assert [float(one[-1, -1, -1]) for one in made] == [0, 1, 2]
+    del made
+    assert bytes_of() == before and torch.cuda.mem_get_info()[0] > free - 10e6
+
+
+@ON_A_GPU
+@pytest.mark.parametrize("name", ["default", "absgrad", "mcmc", "budget", "sparse"])
+def test_both_memories_give_the_bytes_of_one(tmp_path, monkeypatch, name, _):
+    """With as many rows as pages need, more of them by density control, and half of them on the host."""
+    scene = _with_points(tmp_path, 40_000)
+    more = ("--max_num_splats", 90_000) if name in ("budget", "mcmc") else ()
+    monkeypatch.setattr(run, "MOST_SHARE", 2.0)
+    expected = _trained(scene, tmp_path / "usual", *KINDS[name], *more)
+    gc.collect()
+    before = bytes_of()
+    with _half_spilled(monkeypatch):
+        counts = _check_rows(monkeypatch)
+        assert not differences(_trained(scene, tmp_path / "spilled", *SPILL, *KINDS[name], *more), expected)
+    gc.collect()
+    assert len({*counts}) > 1 and bytes_of() == before
+    torch.cuda.set_per_process_memory_fraction(1.0)
+
+
+@ON_A_GPU
+def test_a_tight_limit_is_kept(tmp_path, monkeypatch, _):
+    scene = _with_points(tmp_path, 300_000)
+    shares, peaks = [], []
+    before_steps(monkeypatch, lambda step: shares.append(bytes_of()))
+    torch.cuda.empty_cache()
+    torch.cuda.reset_peak_memory_stats()
+    room = GpuMemory.room
+
+    def noted(self: GpuMemory, like: torch.Tensor, rows: int) -> torch.Tensor | None:
+        made = room(self, like, rows)
+        peaks.append(torch.cuda.memory_reserved() + bytes_of()[0])
+        return made
+
+    monkeypatch.setattr(GpuMemory, "room", noted)
+    _trained(scene, tmp_path / "out", "--gpu_memory", 0.5)
+    assert all(near > 0 and far > 0 for near, far in shares)
+    assert max(peaks) <= 0.5 * 2**30 and torch.cuda.max_memory_reserved() <= 0.5 * 2**30
+    torch.cuda.set_per_process_memory_fraction(1.0)

@@ -14,7 +14,6 @@ from step_ways import WAYS, Rerun, fused_iterations, take_as  # noqa: F401  (a f
 from trainings import ITERATIONS, OPTIONS, differences, narrow_scene, trained
 
 from scene.readers.point_cloud import write_point_cloud
-from scene.spilled_model import SpilledGaussians
 from splatting.distributed.ranks import ranks
 from splatting.training import run
 from splatting.training.steps.captured import Graphs
@@ -33,7 +32,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def _awake() -> Iterator[None]:
-    """No block sleeps (tests/test_sleeping.py), as rows of the host's memory do not."""
+    """No block sleeps; tests/test_sleeping.py has those that do."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "MOST_SHARE", 0.0)
         yield
@@ -84,29 +83,10 @@ def test_steps_of_a_gpu(scene, tmp_path, name, _):
 
 
 @EVERY
-def test_spilled_rows(scene, tmp_path, monkeypatch, plain, name):
-    late, steps = [], SpilledGaussians._take_missed
-
-    def noted(self, missed, taken, *others):
-        late.append(len(missed.steps) - int(taken.min()))
-        return steps(self, missed, taken, *others)
-
-    monkeypatch.setattr(SpilledGaussians, "_take_missed", noted)
-    assert not differences(trained(scene, tmp_path, "--spill", *OPTIONS[name]), plain(name))
-    sparse = "sparse_adam" in OPTIONS[name]
-    assert bool(late) != (sparse or name == "degree 0"), name
-    assert not late or max(late) >= 5
-
-
-@pytest.mark.parametrize(
-    ("name", "first", "then"),
-    [*((name, (), ()) for name in OPTIONS)]
-    + [(name, *ways) for name in ("default", "sparse", "mcmc") for ways in (((), ("--spill",)), (("--spill",), ()))],
-)
-def test_resumed(scene, tmp_path, plain, name, first, then):
-    trained(scene, tmp_path / "a", *OPTIONS[name], *first, "--checkpoint_iterations", 33, ITERATIONS)
+def test_resumed(scene, tmp_path, plain, name):
+    trained(scene, tmp_path / "a", *OPTIONS[name], "--checkpoint_iterations", 33, ITERATIONS)
     start = "--start_checkpoint", tmp_path / "a" / "chkpnt33.pth"
-    assert not differences(trained(scene, tmp_path / "b", *OPTIONS[name], *then, *start), plain(name))
+    assert not differences(trained(scene, tmp_path / "b", *OPTIONS[name], *start), plain(name))
 
 
 @pytest.mark.parametrize("name", ["together", "sparse", "mcmc idle", "budget"])
@@ -119,7 +99,7 @@ def test_resumed_beside_a_change(scene, tmp_path, plain, name):
         assert not differences(trained(scene, tmp_path / str(edge), *OPTIONS[name], *start), plain(name)), edge
 
 
-@pytest.mark.parametrize("way", [(), ("--spill",), ("--plain_step",)])
+@pytest.mark.parametrize("way", [(), ("--plain_step",)])
 def test_scores_and_saves_between_change_nothing(scene, tmp_path, plain, way):
     assert not differences(trained(scene, tmp_path, *way, *LOOKS), plain("default"))
     between = trained(scene, tmp_path / "plain", "--plain_step", "--save_iterations", 9, 44)
@@ -147,7 +127,7 @@ def _all(scene: Path, folder: Path, kinds: list[tuple[str, tuple[str, ...]]]) ->
 def test_ranks(scene, tmp_path, plain, size):
     names = OPTIONS if size == 2 else ("sparse", "masks", "tiny", "mcmc", "budget")
     kinds = [(name, ()) for name in names]
-    kinds += [("default", ("--spill",)), ("exposure", ("--plain_step",))] if size == 2 else []
+    kinds += [("exposure", ("--plain_step",))] if size == 2 else []
     found = in_ranks(size, _all, scene, tmp_path, kinds)[0]
     for (name, more), result in zip(kinds, found, strict=True):
         assert not differences(result, plain(name)), (name, more)

@@ -1,6 +1,5 @@
 """A training of a workload by the ranks of this process, by the code of train.py, without a scene folder."""
 
-import argparse
 from types import SimpleNamespace
 
 import torch
@@ -10,10 +9,10 @@ from benchmarks.parallel.workload import Workload
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.morton import sort_rows
 from scene.sleeping import Sleeping
-from scene.spilled_model import SpilledGaussians
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch
 from splatting.host.interrupt import DeferredInterrupt
+from splatting.training.gpu_memory import GpuMemory
 from splatting.training.iteration import ViewOrder
 from splatting.training.objective import LossWatch, Objective
 from splatting.training.resolution import Resolution
@@ -33,26 +32,29 @@ class WorkloadRun(Run):
 
     steps: how many it takes; in the last one the optimisers rest. still: with learning rates of 0, which have the
     arithmetic of a step but leave the scene as it is, so that every step does the same work. sleep: let blocks sleep,
-    with rows in order. spill: as the option.
+    with rows in order. gpu_memory: as the option.
     """
 
     def __init__(
-        self, workload: Workload, parallel: str, steps: int, still: bool, sleep: bool = False, spill: bool = False
+        self, workload: Workload, parallel: str, steps: int, still: bool, sleep: bool = False, gpu_memory: float = 0
     ) -> None:
         here = self.group = ranks()
         views = here.size if parallel == "views" else 1
         words = ["-s", ".", "--iterations", str(steps * views), "--densify_from_iter", "10000", *_STILL * still]
         words += ["--strategy", "adc"]
-        words += ["--parallel", parallel, *["--spill"] * spill]
+        words += ["--parallel", parallel, "--gpu_memory", str(gpu_memory)]
         self.launch, self.dataset, self.opt, self.pipe = train.parse(words)
         self.lost = self.first_iteration = 0
         self.interrupt, self.device = DeferredInterrupt(), compute_device()
         self.schedule = schedule_of(self.opt, None, 0, views)
-        self.gaussians = _model(workload, self.opt, self.device)
+        images = SimpleNamespace(ahead=0, keep_on=torch.device("cpu"), planned_bytes=0)
+        self.gaussians = GaussianModel(3)
+        pixels = (workload.width // workload.crop) * (workload.height // workload.crop)
+        self.memory = GpuMemory(gpu_memory, self.gaussians, images, pixels, False, self.device)
+        self._begin(workload)
         if views > 1:
             self.gaussians.optimizer.set_betas(0.9**views, 0.999**views)
         cameras = workload.cameras()
-        images = SimpleNamespace(ahead=0)
         self.scene = SimpleNamespace(cameras_extent=_EXTENT, images=images, prefetch=lambda _: None, model_path=".")
         self.views = ViewOrder(cameras, self.opt.seed, views, here.rank if views > 1 else 0)
         self.resolution = Resolution(self.schedule, images)
@@ -65,18 +67,17 @@ class WorkloadRun(Run):
             self.sleeping = Sleeping(self.gaussians)
         self._depth_weight = get_expon_lr_func(0.0, 0.0)
 
+    def _begin(self, workload: Workload) -> None:
+        gaussians, here = self.gaussians, self.group
+        gaussians.divide(here)
+        keep = torch.device("cpu") if self.memory.limit else self.device
+        gaussians.set_rows(workload.rows(here.rank, here.size, self.device, keep))
+        gaussians.active_sh_degree, gaussians.spatial_lr_scale = 3, _EXTENT
+        gaussians.start_exposures(())
+        gaussians.training_setup(self.opt)
+        gaussians.limit_columns()
+
     def begin(self) -> None:
         """Start the clocks; nothing is written."""
         self.log, self.rows = SimpleNamespace(seconds_before=0.0), []
         self.losses, self.clock = LossWatch(), Stopwatch()
-
-
-def _model(workload: Workload, opt: argparse.Namespace, device: torch.device) -> GaussianModel:
-    model = (SpilledGaussians if opt.spill else GaussianModel)(3)
-    model.divide(ranks())
-    model.set_rows(workload.rows(ranks().rank, ranks().size, device))
-    model.active_sh_degree, model.spatial_lr_scale = 3, _EXTENT
-    model.start_exposures(())
-    model.training_setup(opt)
-    model.limit_columns()
-    return model

@@ -2,7 +2,7 @@
 
     python -m benchmarks.parallel.steps --ranks 1 2
     python -m benchmarks.parallel.steps --ranks 1 2 --workload city --gaussians 5000000 10000000 20000000
-    python -m benchmarks.parallel.steps --workload city --crop 3 --model gpu spill --learn --cap 16
+    python -m benchmarks.parallel.steps --workload city --crop 3 --model sleep spill --learn --cap 16
 
 A step is that of train.py: draw, loss against a photo, Adam. XL is the workload of the other benchmarks; city has 20 M
 Gaussians at 3840x2160, a plane of blocks seen from above, which each rank draws for itself. Every combination of the
@@ -12,7 +12,8 @@ counts. Steps are timed in blocks, at whose ends the GPU is waited for; the medi
 Learning rates are 0, so that all steps do the same. With --learn they are those of train.py; the table then has digests
 of all parameters after the last step, by rank. The last step of a training needs most memory, since it writes
 gradients as steps do that add or remove Gaussians. Several numbers of Gaussians give the bytes of one, by a line
-through the least and the largest, and how many fit into 92 % of the GPUs.
+through the least and the largest, and how many fit into 92 % of the GPUs. The model `spill` trains with --gpu_memory
+of the cap, and blocks sleep, as in `sleep`; shown is the share of SH bands above 0 that the host's memory then has.
 """
 
 import argparse
@@ -34,6 +35,7 @@ from benchmarks.harness.measuring import describe, print_table
 from benchmarks.parallel.run import WorkloadRun
 from benchmarks.parallel.workload import ALL
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.spilled import bytes_of
 from splatting.distributed.ranks import ranks
 from splatting.host.memory import peak_memory_mib
 from splatting.training.iteration import Iteration
@@ -44,7 +46,7 @@ from utils.system_utils import UserError, compute_device, run_cli
 
 ROOT = Path(__file__).resolve().parents[2]
 HEADER = ["workload", "ranks", "shared", "model", "ms a step", "blocks", "images/s", "times the first",
-          "peak GiB by rank", "in the last step"]  # fmt: skip
+          "peak GiB by rank", "in the last step", "on the host"]  # fmt: skip
 _BLOCK = 5  # steps
 _PIECE = 1 << 20  # Gaussians that are copied to the host at a time
 _USABLE = 0.92  # of a GPU
@@ -90,12 +92,13 @@ def digest(gaussians: GaussianModel) -> str:
 def measure(case: dict[str, Any]) -> dict[str, Any]:
     """Take the steps of a case in this process, one of its ranks; returns the case and what was found by rank."""
     device, here = compute_device(), ranks()
-    if case["cap"] and device.type == "cuda":
+    spills = case["model"] == "spill"
+    if case["cap"] and device.type == "cuda" and not spills:
         total = torch.cuda.get_device_properties(device).total_memory
         torch.cuda.set_per_process_memory_fraction(min(case["cap"] * 2**30 / total, 1.0))
     workload = replace(ALL[case["workload"]].changed(case["gaussians"], case["size"]), crop=case["crop"])
     steps = case["warm_up"] + _BLOCK * case["blocks"] + 1
-    model = {name: case["model"] == name for name in ("sleep", "spill")}
+    model = {"sleep": case["model"] != "gpu", "gpu_memory": case["cap"] * spills}
     run = WorkloadRun(workload, case["parallel"], steps, still=not case["learn"], **model)
     if device.type == "cuda":
         torch.cuda.empty_cache()
@@ -103,7 +106,10 @@ def measure(case: dict[str, Any]) -> dict[str, Any]:
     timing = Timing(device, case["warm_up"])
     run.begin()
     run_training(run, [DivergenceWatch(run), timing])
-    own = {"ms": timing.milliseconds, "peak": timing.peak_mib, "last": peak_memory_mib(device) or 0.0}
+    near, far = bytes_of()
+    peaks = timing.peak_mib, peak_memory_mib(device) or 0.0
+    own = {"ms": timing.milliseconds} | dict(zip(("peak", "last"), (mib + near / 2**20 for mib in peaks), strict=True))
+    own["far"] = far / (near + far) if far else 0.0
     own["digest"] = digest(run.gaussians) if case["learn"] else ""
     own["memory"] = torch.cuda.mem_get_info()[1] if device.type == "cuda" else 0
     count = workload.gaussians
@@ -142,6 +148,7 @@ def row(case: dict[str, Any], found: dict[str, Any] | None, first: dict[str, Any
     cells += [f"{step:.3f}", f"{min(spread):.3f} to {max(spread):.3f}", f"{1e3 * images:.1f}"]
     cells.append(f"{images * milliseconds(first) / _views(first):.2f}")
     cells += [" ".join(f"{own[name] / 1024:.2f}" for own in every) for name in ("peak", "last")]
+    cells.append(" ".join(f"{own['far']:.0%}" for own in every))
     return [found["name"], *cells] + [" ".join(own["digest"] for own in every)] * case["learn"]
 
 

@@ -85,8 +85,11 @@ class Workload:
     def __str__(self) -> str:
         return f"{self.name}, {self.gaussians / 1e6:g} M, {self.width // self.crop}x{self.height // self.crop}"
 
-    def rows(self, rank: int, size: int, device: torch.device) -> dict[str, Tensor]:
-        """The Gaussians of a rank, by the model's names, the same for every number of ranks."""
+    def rows(self, rank: int, size: int, device: torch.device, keep: torch.device) -> dict[str, Tensor]:
+        """The Gaussians of a rank, by the model's names, the same for every number of ranks.
+
+        device: draws them. keep: where those of the city are kept.
+        """
         first, end = (bound(place, self.gaussians, size) for place in (rank, rank + 1))
         if self.name != "city":
             scene = frustum(self.gaussians, self.width, self.height, self.sigma_px, device=device).parameters
@@ -99,7 +102,7 @@ class Workload:
             for name, values in model_rows(drawn).items():
                 values = values[own]
                 if name not in rows:
-                    rows[name] = values.new_empty(end - first, *values.shape[1:])
+                    rows[name] = values.new_empty(end - first, *values.shape[1:], device=keep)
                 at = max(begin - first, 0)
                 rows[name][at : at + len(values)] = values
         return rows

@@ -2,10 +2,10 @@
 
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from operator import itemgetter
-from types import FunctionType, MappingProxyType
-from typing import Any, NamedTuple
+from types import FunctionType
+from typing import Any
 
 import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
@@ -13,7 +13,8 @@ from diff_gaussian_rasterization.optim import adam_, sparse_adam_
 from torch import Tensor
 from torch.optim.optimizer import _global_optimizer_post_hooks, _global_optimizer_pre_hooks
 
-from scene.gaussians.table import Group, beside
+from scene.gaussians.spilled import beside, zeros_beside
+from scene.gaussians.table import Group
 
 # Options of a group that the kernel takes from the optimiser's defaults, or does not know.
 _common = itemgetter("betas", "eps", "weight_decay", "amsgrad", "maximize", "capturable", "differentiable", "fused")
@@ -40,16 +41,6 @@ class StepGuard:
         return int(self.stopped)
 
 
-class Part(NamedTuple):
-    """Some rows of a parameter, which take its step in copies."""
-
-    rows: Tensor  # (n,) indices, ascending
-    value: Tensor  # (n, ...), this and all others
-    gradient: Tensor
-    exp_avg: Tensor
-    exp_avg_sq: Tensor
-
-
 class GaussianAdam(torch.optim.Adam):
     """torch.optim.Adam with one parameter (N, ...) per named group, and the same bits for any number of threads.
 
@@ -57,12 +48,10 @@ class GaussianAdam(torch.optim.Adam):
     guard: see StepGuard. Groups that the kernel cannot step are stepped by torch, unguarded: several parameters, or
     another dtype, device, betas, eps or further option than the optimiser's. Groups may change between any two steps.
     rows: (N,) bool, those that take the next step, None: all.
-    parts: by group, what takes the next step in place of a parameter that has a gradient; its values are not read.
     """
 
     guard: StepGuard | None = None
     rows: Tensor | None = None
-    parts: Mapping[str, Part] = MappingProxyType({})
 
     def __init__(self, groups: list[dict], eps: float = 1e-15) -> None:
         """Take groups: dicts with `params` (a list of one Parameter), `lr` and `name`."""
@@ -135,11 +124,7 @@ class GaussianAdam(torch.optim.Adam):
                     gradient = param
             if gradient is not None:
                 state = self.state_of(param)
-                if part := self.parts.get(group.get("name")):
-                    tensors.append((*part[1:], state["step"]))
-                    active = -1
-                else:
-                    tensors.append((param, gradient, state["exp_avg"], state["exp_avg_sq"], state["step"]))
+                tensors.append((param, gradient, state["exp_avg"], state["exp_avg_sq"], state["step"]))
                 rates.append(group["lr"])
                 columns.append(active)
         if tensors:
@@ -223,8 +208,7 @@ class GaussianAdam(torch.optim.Adam):
         state = self.state[param]
         if not state:
             state["step"] = torch.zeros((), dtype=torch.float32)
-            state["exp_avg"] = beside(param, torch.zeros_like(param))
-            state["exp_avg_sq"] = beside(param, torch.zeros_like(param))
+            state["exp_avg"], state["exp_avg_sq"] = (zeros_beside(param.detach()) for _ in range(2))
         return state
 
     def take_state(self, state_dict: Any) -> list[str]:
@@ -277,8 +261,6 @@ class SparseGaussianAdam(GaussianAdam):
             columns = self._active_columns.get(group.get("name"), -1) or -1  # 0, yet with a gradient: all
             guard = self.guard.arguments if self.guard else ()
             tensors = param, param.grad, state["exp_avg"], state["exp_avg_sq"], visible
-            if part := self.parts.get(group.get("name")):
-                tensors, columns = (*part[1:], visible[part.rows]), -1
             sparse_adam_(*tensors, group["lr"], beta1, beta2, group["eps"], columns, *guard)
         if others:
             self._step_by_torch(others)

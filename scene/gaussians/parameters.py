@@ -3,6 +3,7 @@
 import copy
 import math
 import os
+from collections.abc import Callable
 from operator import attrgetter
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 from scene.gaussians.attributes import Attribute, Rows, attributes
 from scene.gaussians.finite import warn_of_undrawn
 from scene.gaussians.ply import FLAT, column_names, read_ply, row_bytes, write_ply
+from scene.gaussians.spilled import is_spilled, room_for, to_host
 from scene.gaussians.statistics import NAMES, Statistics
 from scene.gaussians.table import GaussianTable
 from splatting.distributed.ranks import Ranks
@@ -44,10 +46,11 @@ class GaussianParameters:
     `_rotation` (N,4) wxyz, any length; `_opacity` (N,1) logit. world_offset: the world's coordinates of the origin
     (scene/readers/world_offset.py), kept in the PLY. Activations are attributes, which `setup_functions` sets.
     The tensors become parameters when rows are taken; an empty model has plain ones, as in the reference. shards: where
-    these rows are among those of all ranks, if several have a part of the model each. max_radii2D, xyz_gradient_accum,
-    denom: observations since the last densification (Statistics has shapes and units). optimizer: any of torch's, with
-    `name` in its groups; None until training is set up. tmp_radii: (N,) pixels of the present view, or None; density
-    control keeps it in step with the rows.
+    these rows are among those of all ranks, if several have a part of the model each. spill: makes room for so many
+    rows like those of a tensor, a part of them in the host's memory, or returns None (scene/gaussians/spilled.py).
+    max_radii2D, xyz_gradient_accum, denom: observations since the last densification (Statistics has shapes and units).
+    optimizer: any of torch's, with `name` in its groups; None until training is set up. tmp_radii: (N,) pixels of the
+    present view, or None; density control keeps it in step with the rows.
     """
 
     # What a subclass need not set whose __init__ sets the reference's attributes and does not call this one.
@@ -55,6 +58,7 @@ class GaussianParameters:
     max_sh_degree = 3
     world_offset = (0.0, 0.0, 0.0)
     shards: Shards = WHOLE
+    spill: Callable[[Tensor, int], Tensor | None] | None = None
     optimizer: torch.optim.Optimizer | None = None
     tmp_radii: Tensor | None = None
 
@@ -262,8 +266,10 @@ class GaussianParameters:
 
     def part(self, keep: Tensor | slice, sh_degree: int) -> "GaussianParameters":
         """A copy of the Gaussians `keep`, (N,) bool or a slice, with the SH bands up to sh_degree; no optimiser."""
-        rows = {name: values[keep] for name, values in raw_rows(self).items()}
-        rows["f_rest"] = rows["f_rest"][:, : (sh_degree + 1) ** 2 - 1].contiguous()
+        rows = raw_rows(self)
+        rest = rows.pop("f_rest")[:, : (sh_degree + 1) ** 2 - 1]
+        rows = {name: values[keep] for name, values in rows.items()}
+        rows["f_rest"] = to_host(rest, keep) if is_spilled(rest) else rest[keep].contiguous()
         other = copy.copy(self)
         other.max_sh_degree, other.active_sh_degree = sh_degree, min(sh_degree, self.active_sh_degree)
         other.optimizer = None
@@ -284,7 +290,12 @@ class GaussianParameters:
         They move to the device that computes.
         """
         device = compute_device()
-        self._take({name: nn.Parameter(rows[name].to(device)) for name in self._attributes})
+        params = {}
+        for name in self._attributes:
+            like = rows[name][:0].to(device)
+            room = room_for(self, name, like, len(rows[name]))
+            params[name] = nn.Parameter(rows[name].to(device) if room is None else room.copy_(rows[name].detach()))
+        self._take(params)
         self.shards = self.shards.of(len(self))
         self._zero_statistics()
 

@@ -3,12 +3,11 @@
 from collections.abc import Callable, Iterable, MutableMapping
 from typing import Any
 
-import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
-from diff_gaussian_rasterization.backend import OPERATORS
 from torch import Tensor, nn
 
 from scene.gaussians.attributes import Rows
+from scene.gaussians.spilled import empty_beside, placed, room_for
 from scene.gaussians.statistics import NAMES
 from splatting.host.memory import is_out_of_memory
 
@@ -47,9 +46,9 @@ class GaussianTable:
         """
         errors = []
 
-        def keep(values: Tensor, *_: object) -> Tensor:
+        def keep(values: Tensor, name: str, _: bool) -> Tensor:
             try:
-                return beside(values, values.index_select(0, indices))
+                return torch.index_select(values, 0, indices, out=room_for(self._model, name, values, len(indices)))
             except (MemoryError, RuntimeError) as error:
                 if not is_out_of_memory(error):
                     raise
@@ -79,7 +78,8 @@ class GaussianTable:
 
         def grow(values: Tensor, name: str, is_state: bool) -> Tensor:
             new = rows[name]
-            return torch.cat((values, values.new_zeros(len(new), *values.shape[1:]) if is_state else new))
+            new = values.new_zeros(len(new), *values.shape[1:]) if is_state else new
+            return torch.cat((values, new.detach()), out=room_for(self._model, name, values, len(values) + len(new)))
 
         try:
             return self._map(groups, grow)
@@ -107,8 +107,10 @@ class GaussianTable:
         for group in (*self.optimised, *self.others):
             if group.get("name") == name:
                 shape = group["params"][0].shape
-                zeros = lambda mean, shape=shape: torch.zeros_like(value if mean.shape == shape else mean)  # noqa: E731
-                params[name] = self._replace(group, value, zeros)
+                zeros = lambda mean, shape=shape: placed(  # noqa: E731
+                    self._model, name, torch.zeros_like(value if mean.shape == shape else mean)
+                )
+                params[name] = self._replace(group, placed(self._model, name, value), zeros)
         return params
 
     @torch.no_grad()
@@ -141,9 +143,10 @@ class GaussianTable:
         params = {}
         for group in groups:
             name, old = group.get("name"), group["params"][0].detach()
-            value = beside(old, change(old, name, False))
+            value = placed(self._model, name, change(old, name, False))
             del old  # whose memory the averages may need
-            params[name] = self._replace(group, value, lambda mean, name=name: change(mean, name, True))
+            changed = lambda mean, name=name: placed(self._model, name, change(mean, name, True))  # noqa: E731
+            params[name] = self._replace(group, value, changed)
         return params
 
     def _replace(self, group: Group, value: Tensor, change: Change) -> nn.Parameter:
@@ -159,7 +162,7 @@ class GaussianTable:
             for key, mean in state.items():
                 # Longer than the parameter: appended just before memory ran out, and now to be cut again.
                 if torch.is_tensor(mean) and mean.dim() == dims and len(mean) >= rows:
-                    state[key] = beside(mean, change(mean))
+                    state[key] = change(mean)
         return param
 
 
@@ -178,7 +181,7 @@ def _move_up(values: Tensor, indices: Tensor) -> Tensor:
 def _permuted(values: Tensor, order: Tensor) -> Tensor:
     """values[order]; column by column in the memory of `values` itself where there is too little for all of them."""
     try:
-        return beside(values, values.index_select(0, order))
+        return torch.index_select(values, 0, order, out=empty_beside(values))
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise
@@ -197,17 +200,3 @@ def trainable(values: Tensor) -> Tensor:
     if not values.is_contiguous():
         values.data = values.data.contiguous()
     return values
-
-
-def in_host_memory(values: Tensor) -> Tensor:
-    """A tensor of the same device in page-locked memory of the host; the same one if it lies there, or on the CPU."""
-    copy = OPERATORS.in_host_memory(values) if values.numel() else None
-    return values if copy is None else copy
-
-
-def beside(old: Tensor, new: Tensor) -> Tensor:
-    """Values that take the place of old ones: in the host's memory if those lie there, else the same tensor."""
-    if not old.is_cuda or not old.numel() or not new.numel():
-        return new
-    copy = OPERATORS.in_host_memory(new.to(old.device), old)
-    return new if copy is None else copy

@@ -317,7 +317,7 @@ def _whole(values: Tensor, ranks: Ranks) -> Tensor:
     total = ranks.before(len(values))[1]
     every = torch.empty(total if ranks.first else 0, *values.shape[1:], dtype=values.dtype)
     filled = 0
-    for piece in _in_order(ranks, len(values), values.detach().__getitem__):
+    for piece in _in_order(ranks, len(values), lambda rows: values.detach()[rows].to(compute_device())):
         every[filled : filled + len(piece)] = piece
         filled += len(piece)
     return every

@@ -57,14 +57,15 @@ def free_memory(device: torch.device | str) -> int | None:
     """Bytes that can still be allocated on a device; None if the system does not tell.
 
     CPU: the kernel's available memory, or less if the container (control group) or a limit of the process (ulimit -v)
-    allows less. GPU: the driver's free memory, and memory that torch holds unused.
+    allows less. GPU: the driver's free memory, and memory that torch holds unused, or less if torch may take less.
     """
     import torch
 
     device = torch.device(device)
     if device.type == "cuda":
-        held = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-        return torch.cuda.mem_get_info(device)[0] + held
+        taken, (free, total) = torch.cuda.memory_allocated(device), torch.cuda.mem_get_info(device)
+        most = int(torch.cuda.get_per_process_memory_fraction() * total)
+        return max(min(free + torch.cuda.memory_reserved(device), most) - taken, 0)
     known = [value for value in (_available(), _group_limit(), _process_limit()) if value is not None]
     return min(known, default=None)
 

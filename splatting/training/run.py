@@ -20,7 +20,6 @@ from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.checkpoint import ASLEEP, further, load_checkpoint, with_further
 from scene.gaussians.morton import sort_rows
 from scene.sleeping import MOST_SHARE, REST, Sleeping, share_seen
-from scene.spilled_model import SpilledGaussians
 from splatting.deterministic.counter_rng import Stream, uniform
 from splatting.distributed.consistency import agree_on_scene
 from splatting.distributed.ranks import ranks
@@ -31,8 +30,9 @@ from splatting.exports.splats import Splats
 from splatting.host.clock import seconds_since_start
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.training import checks, schedule_file
+from splatting.training.gpu_memory import GpuMemory, limit_torch, reads_on_host
 from splatting.training.iteration import Iteration, ViewOrder
-from splatting.training.memory_estimate import announce_memory
+from splatting.training.memory_estimate import announce_memory, largest_view
 from splatting.training.objective import LossWatch, Objective
 from splatting.training.resolution import resolution_of
 from splatting.training.restart import resumed
@@ -84,18 +84,14 @@ class Run:
         self.lost = 0
         self.interrupt = DeferredInterrupt()
         self.device = compute_device()
-        place = "cpu" if self.group.several or opt.spill else self.device  # a part of it is kept there
-        capture, self.first_iteration = (
-            load_checkpoint(self.start, place, self.group.several) if self.start else (None, 0)
-        )
+        capture, self.first_iteration = self._read_start()
         views = self.group.size if launch.parallel == "views" else 1
         self.schedule = schedule_file.schedule_of(opt, self.start, self.first_iteration, views, self.group.shared)
         if isinstance(self.schedule, DecidedSchedule):
             end_in_time(opt)
         self.warnings: list[str] = []
         self._warn(checks.late_reset(opt, dataset.white_background, self.schedule, self.first_iteration))
-        kind = SpilledGaussians if opt.spill else GaussianModel
-        self.gaussians = kind(dataset.sh_degree, opt.optimizer_type)
+        self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
         self.gaussians.divide(self.group)
         sharing = SharedImages(self.group) if views == 1 else None  # all read the same images in the same order
         init_ply = None if self.start else getattr(dataset, "init_ply", None)
@@ -107,6 +103,7 @@ class Run:
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed, views, self.group.rank if views > 1 else 0)
         self.resolution = resolution_of(opt, self.schedule, self.scene.images)
         self._decode_ahead(self.first_iteration + 1)
+        self._begin_memory(capture, first)
         self._begin_model(capture, first)
         self._check_records()
         self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
@@ -114,6 +111,7 @@ class Run:
             opt.strategy = self._strategy_by_the_clock()
         self.schedule.strategy = opt.strategy
         self.density = density_control(self)
+        self._expect(self.density.most_gaussians)
         self.objective = Objective(self)
         self._depth_weight = get_expon_lr_func(
             opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
@@ -127,6 +125,28 @@ class Run:
         if capture is None and first is None:
             self.density.started()
         self.group.tell_notes()
+
+    def _read_start(self) -> tuple[tuple | None, int]:
+        """The state of the checkpoint that is resumed, and its iteration. A limit of the GPU's memory begins before."""
+        if self.opt.gpu_memory and self.device.type == "cuda":
+            limit_torch(self.opt.gpu_memory * 2**30, self.device)
+        if not self.start:
+            return None, 0
+        # Of several processes, each keeps a part of it on its device, and of a large model only a part fits there.
+        on_host = self.group.several or reads_on_host(self.start, self.opt.gpu_memory, self.device)
+        return load_checkpoint(self.start, "cpu" if on_host else self.device, self.group.several)
+
+    def _begin_memory(self, capture: tuple | None, first: Splats | None) -> None:
+        """Decide on the limit of the GPU's memory, before the model begins as `_begin_model` says."""
+        store, pixels = self.scene.images, largest_view(self.scene)
+        self.memory = GpuMemory(self.opt.gpu_memory, self.gaussians, store, pixels, self.opt.absgrad, self.device)
+        points = self.scene.info.point_cloud.points if first is None else first
+        self._expect(len(points if capture is None else capture[1]))
+
+    def _expect(self, count: int) -> None:
+        """Let the memory be divided for a number of Gaussians, of which each rank has its part."""
+        if self.schedule.views == 1:
+            self.memory.expect(-(-count // self.group.size))
 
     def _warn(self, text: str | None) -> None:
         """Print what a check says, and keep it for the log."""
@@ -190,7 +210,8 @@ class Run:
             schedule_file.leave_schedule(Path(folder), self.first_iteration if checks.lies_in(start, folder) else 0)
         density = self.density
         wants = density.most_gaussians, density.absolute_gradients
-        announce_memory(self.scene, self.gaussians, *wants, self.group.size)
+        announce_memory(self.scene, self.gaussians, self.memory, *wants, self.group.size)
+        self._tell_of_spilling()
         self.log, self.rows = checks.continue_records(folder, start, self.first_iteration)
         self.losses = LossWatch(self.log.loss)
         self.clock = Stopwatch(self.group.busy)
@@ -273,14 +294,32 @@ class Run:
         return own and not (self.pipe.compute_cov3D_python or self.pipe.convert_SHs_python)
 
     def _may_sleep(self) -> Sleeping | None:
-        """What lets blocks sleep, where views see few of the scene's points, and a step concerns no other row."""
-        cloud, density = self.scene.info.point_cloud, self.density
+        """What lets blocks sleep, where it saves something, and a step concerns no row that its view does not see."""
+        density = self.density
         dense = type(self.gaussians.optimizer) is GaussianAdam and FusedAdam.takes(self.gaussians)
         alone = not (self.schedule.views > 1 or density.queues or any(density.penalty))
-        if not (dense and alone and self.is_standard and cloud is not None and len(cloud.points)):
+        if not (dense and alone and self.is_standard):
             return None
+        saves = self.group.anyone(self.memory.limit > 0) or self._share_seen() < MOST_SHARE
+        return Sleeping(self.gaussians) if saves else None
+
+    def _share_seen(self) -> float:
+        """The share of the scene's points that a view sees; 1 where there are none."""
+        cloud = self.scene.info.point_cloud
+        if cloud is None or not len(cloud.points):
+            return 1.0
         points = torch.as_tensor(cloud.points, dtype=torch.float32, device=self.device)
-        return Sleeping(self.gaussians) if share_seen(points, self.scene.getTrainCameras()) < MOST_SHARE else None
+        return share_seen(points, self.scene.getTrainCameras())
+
+    def _tell_of_spilling(self) -> None:
+        """Say what lies in the host's memory, now or once there are as many Gaussians as there may be."""
+        count = -(-max(self.gaussians.gaussian_count, self.density.most_gaussians) // self.group.size)
+        if not self.memory.spilled_bytes(count):
+            return
+        share = self._share_seen()
+        dense = self.sleeping is None and self.opt.optimizer_type == "default"
+        same = self.sleeping is None or share < MOST_SHARE  # blocks would sleep in any case
+        print("\n".join(self.memory.words(count, 1.0 if dense else share, same)))
 
     def rests(self, step: Iteration) -> bool:
         """Whether all blocks of Gaussians wake after a step."""

@@ -136,8 +136,8 @@ def _batched(opt: argparse.Namespace, views: int) -> Schedule:
     for name in ("schedule", "time_budget"):
         if getattr(opt, name):
             raise UserError(f"--{name} and --parallel views both give the pace of a run; leave one out")
-    if opt.spill:
-        raise UserError("--spill takes one view in each iteration; use --parallel tiles")
+    if opt.gpu_memory:
+        raise UserError("--gpu_memory takes one view in each iteration; use --parallel tiles")
     return BatchSchedule(opt.iterations, views)
 
 

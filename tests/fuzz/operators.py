@@ -66,11 +66,8 @@ def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict
         "adam_ of visible rows": (ops.adam_, [*sparse, *guard]),
         "run_ahead_": (ops.run_ahead_, [torch.zeros(5, dtype=torch.int64), [1, 1, 1], None]),  # refused: not on a GPU
         "step_now_": (ops.step_now_, _step_now()),
-        "catch_up_": (
-            ops.catch_up_,
-            [*(rand(3, 4) for _ in range(3)), integers([0, 0, 0]), [0.1], [1.0], 0.9, 0.999, 1e-8],
-        ),
-        "in_host_memory": (ops.in_host_memory, [rand(3, 4)]),
+        "spilled": (ops.spilled, [rand(3, 4), 5, 0]),
+        "spilled_bytes": (ops.spilled_bytes, [rand(3, 4)]),
         "observe_": (ops.observe_, [*statistics, single(3, 3)]),
         "displace_": (
             ops.displace_,

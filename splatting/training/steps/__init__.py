@@ -1,22 +1,19 @@
 """The ways to take a step of training: all give the same bytes."""
 
-from scene.spilled_model import SpilledGaussians
 from splatting.distributed.rendering.batch import ViewOfEach
 from splatting.training.run import Run
 from splatting.training.steps.captured import CapturedStep
 from splatting.training.steps.fused import FusedStep
-from splatting.training.steps.plain import PlainStep, SpilledView
+from splatting.training.steps.plain import PlainStep
 
 
 def step_taker(run: Run) -> PlainStep:
     """The fastest way to take the steps of this run.
 
-    It is the plain one where somebody else may need gradients, for several views at once, and with --spill.
+    It is the plain one where somebody else may need gradients, and for several views at once.
     """
     if run.schedule.views > 1:
         return PlainStep(run, ViewOfEach(run))
-    if isinstance(run.gaussians, SpilledGaussians):
-        return PlainStep(run, SpilledView(run))
     if not FusedStep.suits(run):
         return PlainStep(run)
     runs_ahead = run.device.type == "cuda" and not run.group.several  # processes exchange numbers in each step

@@ -1,9 +1,8 @@
 """The plain step: autograd, with every gradient of every parameter there for whoever wants it."""
 
-import torch
 from torch import Tensor
 
-from gaussian_renderer import render, visible_rows, wake
+from gaussian_renderer import render, wake
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Announcer
@@ -26,29 +25,6 @@ class OneView:
     def collect(self, package: Package, losses: Losses) -> tuple[Package, Losses]:
         """Called after backward: give the model its gradients; the package of all its rows, and the losses to show."""
         return package, losses
-
-
-class SpilledView(OneView):
-    """The iteration's view of a `SpilledGaussians`: only the rows that it sees are on the GPU."""
-
-    def render(self, at: Iteration) -> Package:
-        run = self._run
-        gaussians, pipe = run.gaussians, run.pipe
-        seen = gaussians.fetch(visible_rows(at.camera, gaussians, pipe))
-        package = render(at.camera, seen, pipe, at.background, **run.render_options(at))
-        if not (at.last or at.changes):  # after a change of rows, copies would be in vain
-            # As it would see them now; what the step moves into view is copied late.
-            gaussians.fetch_ahead(visible_rows(run.views[at.iteration + 1], gaussians, pipe))
-        return package
-
-    def collect(self, package: Package, losses: Losses) -> tuple[Package, Losses]:
-        gaussians = self._run.gaussians
-        rows, count = gaussians.take_gradients(), len(gaussians)
-        points = package["viewspace_points"]
-        radii = package["radii"].new_zeros(count).index_copy_(0, rows, package["radii"])
-        every = torch.zeros(count, 3, dtype=points.dtype, device=points.device)
-        every.grad = torch.zeros_like(every).index_copy_(0, rows, points.grad)
-        return package | {"viewspace_points": every, "radii": radii}, losses
 
 
 class PlainStep:

@@ -47,9 +47,6 @@ struct RowMemory {
   /* Adam on the visible rows, (rows); where `step` is 0, without bias correction. */                \
   template <class T>                                                                                 \
   void sparse_adam(const Where&, const AdamInput<T>&, const bool* visible, const StepGuard<T>&);     \
-  /* Adam's steps without a gradient that rows have missed (MissedSteps), under no guard. */         \
-  template <class T>                                                                                 \
-  void catch_up(const Where&, const AdamInput<T>&, const MissedSteps<T>&);                           \
   template <class T>                                                                                 \
   void penalise(const Where&, const PenaltyInput<T>&);                                               \
   /* The values of the scene change. */                                                              \

@@ -185,15 +185,6 @@ struct StepGuard {
   int64_t iteration;
 };
 
-// Past steps of Adam, of which each row of a tensor has taken the first ones. The tensor's gradient, rate and step are
-// not read.
-template <class T>
-struct MissedSteps {
-  const T* constants;    // (count, 7): AdamStep in math/adam.h of each step, in their order
-  const int32_t* taken;  // (rows) how many of them a row has taken
-  int32_t count;
-};
-
 // A view to add to the statistics of density control.
 struct ObserveInput {
   int64_t count;

@@ -105,7 +105,6 @@ def _(rows, counts, kept, room):
 
 @_fake("adam_")
 @_fake("apply_gradients_")
-@_fake("catch_up_")
 @_fake("displace_")
 @_fake("observe_")
 @_fake("penalise_")

@@ -17,7 +17,6 @@ from torch import Tensor
 from diff_gaussian_rasterization.backend import OPERATORS
 
 _adam = OPERATORS.adam_
-_catch_up = OPERATORS.catch_up_
 _observe = OPERATORS.observe_
 
 
@@ -72,28 +71,6 @@ def sparse_adam_(
     """
     tensors = [value], [gradient], [exp_avg], [exp_avg_sq], []
     _adam(*tensors, [rate], beta1, beta2, eps, [columns], visible, loss, stopped, iteration)
-
-
-def catch_up_(
-    value: Tensor,
-    exp_avg: Tensor,
-    exp_avg_sq: Tensor,
-    taken: Tensor,
-    rates: Sequence[float],
-    steps: Sequence[float],
-    beta1: float,
-    beta2: float,
-    eps: float,
-    columns: int = -1,
-) -> None:
-    """Takes the steps of Adam that rows have missed, in which they have no gradient: the bits of `adam_` with zeros.
-
-    value and both averages: (N, ...) as for `adam_`. rates, steps: of each past step its learning rate and its number,
-    counted from 1. taken: (N,) int32, how many of these steps a row has taken. columns: as for `adam_`.
-    Changes value, exp_avg and exp_avg_sq, marking steps that are not finite as under a guard; the caller knows then
-    that all rows have taken all steps.
-    """
-    _catch_up(value, exp_avg, exp_avg_sq, taken, rates, steps, beta1, beta2, eps, columns)
 
 
 def observe_(max_radii: Tensor, gradient_sums: Tensor, views: Tensor, radii: Tensor, gradient: Tensor) -> None:

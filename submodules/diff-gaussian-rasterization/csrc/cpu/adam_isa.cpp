@@ -131,22 +131,10 @@ void sparse_adam(const Executor& executor, const AdamInput<T>& in, const bool* v
   if (!finite && *guard.stopped == 0) *guard.stopped = guard.iteration;
 }
 
-template <class T>
-void catch_up(const Executor& executor, const AdamInput<T>& in, const MissedSteps<T>& missed) {
-  static_assert(sizeof(AdamStep<T>) == 7 * sizeof(T), "AdamStep has seven numbers");
-  const auto* steps = reinterpret_cast<const AdamStep<T>*>(missed.constants);
-  const std::vector<T> zero(in.row);
-  for_dynamic(executor, in.rows, 64, [&](int64_t begin, int64_t end) {
-    for (int64_t r = begin; r < end; ++r)
-      for (int32_t k = missed.taken[r]; k < missed.count; ++k) adam_rows(steps[k], in, zero.data(), r, 1, true);
-  });
-}
-
 #define GS_INSTANTIATE(T)                                                                                \
   template bool adam_rows<T>(const AdamStep<T>&, const AdamInput<T>&, const T*, int64_t, int64_t, bool); \
   template void adam<T>(const Executor&, const AdamInput<T>*, int64_t, const StepGuard<T>&);             \
-  template void sparse_adam<T>(const Executor&, const AdamInput<T>&, const bool*, const StepGuard<T>&);  \
-  template void catch_up<T>(const Executor&, const AdamInput<T>&, const MissedSteps<T>&);
+  template void sparse_adam<T>(const Executor&, const AdamInput<T>&, const bool*, const StepGuard<T>&);
 GS_INSTANTIATE(float)
 GS_INSTANTIATE(double)
 

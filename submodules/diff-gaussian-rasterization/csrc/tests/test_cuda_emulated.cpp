@@ -365,38 +365,6 @@ void test_steps() {
     }
 }
 
-// Steps that rows have missed are those of adam with zeros as gradient, to the bit.
-void test_catch_up() {
-  constexpr int64_t rows = 37, row = 45;
-  constexpr int32_t count = 70;
-  const auto rate = [](int32_t k) { return 0.01 / (1 + k % 3); };
-  std::vector<gs::baseline::AdamStep<float>> steps;
-  for (int32_t k = 0; k < count; ++k)
-    steps.push_back(gs::baseline::make_adam_step<float>(rate(k), 0.9, 0.999, 1e-15, 5 + k));
-  std::vector<int32_t> taken;
-  for (int64_t r = 0; r < rows; ++r) taken.push_back(int32_t(r * 2));  // some rows lack none
-  for (const int64_t columns : {int64_t(0), int64_t(9), row}) {
-    std::vector<float> start[3], zero(rows * row);
-    for (std::vector<float>& part : start)
-      for (int64_t i = 0; i < rows * row; ++i) part.push_back(i % 7 ? float(std::abs(normal())) : 0.0f);
-    std::vector<float> got[3] = {start[0], start[1], start[2]}, wanted[3] = {start[0], start[1], start[2]};
-    gs::emulation::Memory memory;
-    const auto rows_of = [&](std::vector<float>(&s)[3], int64_t r, int64_t n, double lr, double step) {
-      float *value = s[0].data() + r * row, *mean = s[1].data() + r * row, *square = s[2].data() + r * row;
-      return gs::AdamInput<float>{value, zero.data(), mean, square, n, row, columns, lr, 0.9, 0.999, 1e-15, step};
-    };
-    for (int64_t r = 0; r < rows; ++r)
-      for (int32_t k = taken[r]; k < count; ++k) {
-        const gs::AdamInput<float> one = rows_of(wanted, r, 1, rate(k), 5 + k);
-        gs::cuda::adam(memory.queue(), &one, 1, gs::StepGuard<float>{});
-      }
-    gs::cuda::catch_up(memory.queue(), rows_of(got, 0, rows, 0, 0),
-                       gs::MissedSteps<float>{reinterpret_cast<const float*>(steps.data()), taken.data(), count});
-    for (int part = 0; part < 3; ++part) CHECK(got[part] == wanted[part]);
-    CHECK((got[0] != start[0]) == (columns > 0));
-  }
-}
-
 // Noise and the children of split Gaussians have the CPU's bits. A halted queue leaves the means alone, and so does a
 // guard that has stopped, of noise.
 void test_displacements() {
@@ -743,7 +711,6 @@ int main() {
                          test_shared_lists_are_blended_as_whole_ones,
                          test_longest_first,
                          test_front_first,
-                         test_catch_up,
                          test_records,
                          test_steps,
                          test_displacements,

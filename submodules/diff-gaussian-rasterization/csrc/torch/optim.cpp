@@ -1,5 +1,5 @@
-// The ops that change parameters, gradients and statistics in place: Adam, the steps that rows have missed, penalties,
-// and what density control observes.
+// The ops that change parameters, gradients and statistics in place: Adam, penalties, and what density control
+// observes.
 #include "optim.h"
 
 #include <utility>
@@ -117,38 +117,6 @@ void observe_op(Tensor& max_radii, Tensor& gradient_sums, Tensor& views, const T
   gs::observe(gs::torch_executor(), in);
 }
 
-// The constants (steps, 7) of past steps, on the device of the values.
-template <class T>
-Tensor constants_of(const Tensor& value, List<double> rates, List<double> steps, double beta1, double beta2,
-                    double eps) {
-  using Step = gs::baseline::AdamStep<T>;
-  static_assert(sizeof(Step) == 7 * sizeof(T), "AdamStep has seven numbers");
-  const Tensor table = torch::stable::empty({int64_t(steps.size()), 7}, value.scalar_type());
-  auto* row = reinterpret_cast<Step*>(write<T>(table));
-  for (size_t k = 0; k < steps.size(); ++k)
-    row[k] = gs::baseline::make_adam_step<T>(rates[k], beta1, beta2, eps, steps[k]);
-  return value.is_cpu() ? table : torch::stable::to(table, value.device());
-}
-
-// Row r takes the steps from number taken[r] on, without a gradient: the bits that adam_ gives it with zeros. A value
-// whose step is not finite is marked as under a guard, which has stopped nothing then.
-void catch_up_op(Tensor& value, Tensor& exp_avg, Tensor& exp_avg_sq, const Tensor& taken, List<double> rates,
-                 List<double> steps, double beta1, double beta2, double eps, int64_t columns) {
-  check_moments(value, value, exp_avg, exp_avg_sq);
-  check_tensor(taken, "taken", ScalarType::Int, value.device(), {rows_of(value)});
-  GS_CHECK_VALUE(rates.size() == steps.size(), "give a rate for each of the ", steps.size(), " steps, got ",
-                 rates.size());
-  if (value.numel() == 0 || steps.empty()) return;
-  const Tensor counts = packed(taken);
-  with_scalar(value.scalar_type(), [&](auto zero) {
-    using T = decltype(zero);
-    const gs::AdamInput<T> in = adam_input<T>(value, value, exp_avg, exp_avg_sq, columns);
-    const Tensor table = constants_of<T>(value, rates, steps, beta1, beta2, eps);
-    const gs::MissedSteps<T> missed{read<T>(table), read<int32_t>(counts), int32_t(steps.size())};
-    GS_RUN(T, value, catch_up, in, missed);
-  });
-}
-
 void penalise_op(const Tensor& logits, const Tensor& log_scales, Tensor& logit_gradients, Tensor& log_scale_gradients,
                  double opacity, double scale) {
   check_given(logits, "logits");
@@ -181,10 +149,6 @@ GS_OPERATORS(diff_gaussian_rasterization, m) {
       "Tensor(d!)[] steps, float[] rates, float beta1, float beta2, float eps, int[] columns, Tensor? visible=None, "
       "Tensor? loss=None, Tensor(e!)? stopped=None, int iteration=0) -> ()",
       TORCH_BOX(&adam_op));
-  m.define(
-      "catch_up_(Tensor(a!) value, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor taken, float[] rates, "
-      "float[] steps, float beta1, float beta2, float eps, int columns=-1) -> ()",
-      TORCH_BOX(&catch_up_op));
   m.define(
       "observe_(Tensor(a!) max_radii, Tensor(b!) gradient_sums, Tensor(c!) views, Tensor radii, Tensor gradient) "
       "-> ()",
