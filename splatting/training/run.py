@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
@@ -22,7 +23,7 @@ from scene.gaussians.morton import sort_rows
 from scene.sleeping import MOST_SHARE, REST, Sleeping, share_seen
 from scene.spilled_model import SpilledGaussians
 from splatting.deterministic.counter_rng import Stream, uniform
-from splatting.distributed.consistency import agree_on_scene
+from splatting.distributed.consistency import agree_on_model, agree_on_scene
 from splatting.distributed.ranks import ranks
 from splatting.distributed.shared_images import SharedImages
 from splatting.evaluation.training_log import Stopwatch
@@ -31,6 +32,7 @@ from splatting.exports.splats import Splats
 from splatting.host.clock import seconds_since_start
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.training import checks, schedule_file
+from splatting.training.division import begins_whole, say_whole
 from splatting.training.iteration import Iteration, ViewOrder
 from splatting.training.memory_estimate import announce_memory
 from splatting.training.objective import LossWatch, Objective
@@ -96,7 +98,6 @@ class Run:
         self._warn(checks.late_reset(opt, dataset.white_background, self.schedule, self.first_iteration))
         kind = SpilledGaussians if opt.spill else GaussianModel
         self.gaussians = kind(dataset.sh_degree, opt.optimizer_type)
-        self.gaussians.divide(self.group)
         sharing = SharedImages(self.group) if views == 1 else None  # all read the same images in the same order
         init_ply = None if self.start else getattr(dataset, "init_ply", None)
         self.scene, first = scene_with(init_ply, dataset, self.gaussians, sharing=sharing)
@@ -104,6 +105,7 @@ class Run:
         checks.hint_of_images(self.scene.getTrainCameras(), self.scene.info, dataset.white_background)
         checks.check_target(opt.target_psnr, len(self.scene.getTestCameras()))
         agree_on_scene(self.scene, self.start)  # before an image is shared
+        self._share(len(capture[1] if capture else self.scene.info.point_cloud.points))
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed, views, self.group.rank if views > 1 else 0)
         self.resolution = resolution_of(opt, self.schedule, self.scene.images)
         self._decode_ahead(self.first_iteration + 1)
@@ -140,6 +142,13 @@ class Run:
         strategy = of_clock(self.opt.time_budget, self.scene.getTrainCameras(), self.device)
         print(f"--time_budget takes --strategy {strategy}, which is best here; name another one to compare")
         return strategy
+
+    def _share(self, count: int) -> None:
+        """Divide the empty model among the processes, or let each train all of its `count` Gaussians on all photos."""
+        if begins_whole(self, count):
+            self.scene.keep_all_images()
+        else:
+            self.gaussians.divide(self.group)
 
     def _begin_model(self, capture: tuple | None, first: Splats | None) -> None:
         """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""
@@ -190,7 +199,9 @@ class Run:
             schedule_file.leave_schedule(Path(folder), self.first_iteration if checks.lies_in(start, folder) else 0)
         density = self.density
         wants = density.most_gaussians, density.absolute_gradients
-        announce_memory(self.scene, self.gaussians, *wants, self.group.size)
+        announce_memory(self.scene, self.gaussians, *wants, self.gaussians.shards.ranks.size)
+        if self.whole:
+            say_whole(self)
         self.log, self.rows = checks.continue_records(folder, start, self.first_iteration)
         self.losses = LossWatch(self.log.loss)
         self.clock = Stopwatch(self.group.busy)
@@ -281,6 +292,24 @@ class Run:
             return None
         points = torch.as_tensor(cloud.points, dtype=torch.float32, device=self.device)
         return Sleeping(self.gaussians) if share_seen(points, self.scene.getTrainCameras()) < MOST_SHARE else None
+
+    @property
+    def whole(self) -> bool:
+        """Whether each of several processes trains the whole model by itself (training/division.py)."""
+        return self.group.size > self.gaussians.shards.ranks.size
+
+    def divide(self) -> None:
+        """Give each process its part of the whole model that all have, after a step in which all blocks woke."""
+        agree_on_model(self.gaussians)
+        self.gaussians.divide(self.group)
+        if self.sleeping:
+            self.sleeping.reset()
+        what = f"{self.gaussians.gaussian_count:,} Gaussians"
+        tqdm.write(f"{what} are divided among {self.group.size} GPUs from here on", file=sys.stdout)
+
+    def wakes_all(self, step: Iteration) -> bool:
+        """Whether no block of Gaussians would sleep after a step."""
+        return step.changes or step.iteration % REST == 0
 
     def rests(self, step: Iteration) -> bool:
         """Whether all blocks of Gaussians wake after a step."""
