@@ -34,9 +34,10 @@ def _assert_interrupted(done: Launched) -> None:
     assert text.count("interrupted") == 1 and text.count("with --start_checkpoint") == 1
 
 
-def test_several_ranks_write_the_files_of_one_and_speak_with_one_voice(colmap_scene, tmp_path):
+@pytest.mark.parametrize("fault", ["warning 1 0", "whole-warning 1 0"])
+def test_several_ranks_write_the_files_of_one_and_speak_with_one_voice(colmap_scene, tmp_path, fault):
     _train(colmap_scene, tmp_path / "one", "--eval")
-    done = launch(tmp_path / "logs", "warning 1 0", *words(colmap_scene, tmp_path / "out", "--eval"))
+    done = launch(tmp_path / "logs", fault, *words(colmap_scene, tmp_path / "out", "--eval"))
     assert done.status == 0
     one, out = tmp_path / "one", tmp_path / "out"
     assert _files(one) == _files(out)
