@@ -64,7 +64,7 @@ class Scene:
         self.images = ImageStore(getattr(args, "images_to_load", None) or 0, place, device, sharing)
         self.train_cameras = {scale: self._cameras(args, scale, shuffle, False) for scale in resolution_scales}
         self.test_cameras = {scale: self._cameras(args, scale, shuffle, True) for scale in resolution_scales}
-        self.images.plan(*(self._pictures(chain(*of.values())) for of in (self.train_cameras, self.test_cameras)))
+        self._plan_images()
 
         gaussians.world_offset = tuple(self.info.offset.tolist())
         if not start:
@@ -113,6 +113,11 @@ class Scene:
     def getTestCameras(self, scale: float = 1.0) -> list[Camera]:
         """Held-out views at a resolution scale that the scene was made with."""
         return self.test_cameras[scale]
+
+    def keep_all_images(self) -> None:
+        """Let this process decode all images by itself, as none was asked for yet."""
+        self.images.sharing = Sharing()
+        self._plan_images()
 
     def prefetch(self, cameras: Sequence[Camera]) -> None:
         """Start to prepare the images of the views that come next, in that order (`images.ahead` of them)."""
@@ -174,6 +179,9 @@ class Scene:
                 camera.exposure_name = name
             if view.image_path in tested:
                 camera.columns = half(camera.image_width, in_test_list)
+
+    def _plan_images(self) -> None:
+        self.images.plan(*(self._pictures(chain(*of.values())) for of in (self.train_cameras, self.test_cameras)))
 
     def _pictures(self, cameras: Iterable[Camera]) -> list[Picture]:
         """Those of our cameras; cameras of other classes have none."""

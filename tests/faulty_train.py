@@ -1,9 +1,11 @@
 """train.py with a fault in one rank, for tests of several: `faulty_train.py FAULT RANK ITERATION OPTIONS...`.
 
 FAULT is one of `_FAULTS`, which come in that iteration; or options (one more), code (other files, in the folder that
-OTHER_CODE names), warning, none. A restarted training has no fault. All ranks print the same lines at first.
+OTHER_CODE names), warning, none. With whole- before it, each rank trains the whole model, with later- until
+iteration 100. A restarted training has no fault. All ranks print the same lines at first.
 """
 
+import math
 import os
 import sys
 
@@ -22,11 +24,19 @@ import torch
 
 import splatting.distributed.watchdog
 import train
+from splatting.training import division
+from splatting.training import run as runs
 from splatting.training.iteration import Iteration
 from splatting.training.run import Run
 from utils.system_utils import run_cli
 
 splatting.distributed.watchdog.PATIENCE = 3.0
+kind, _, fault = fault.rpartition("-")
+division.PAYS = dict.fromkeys(division.PAYS, math.inf if kind else 0.0)
+if kind == "later":
+    division.Division.pays = lambda self, at: at.iteration >= 100
+if kind and fault != "none":
+    runs.REST = 4  # ranks agree as often
 prepare = Run.prepare
 beat = splatting.distributed.watchdog.Watch.beat
 

@@ -34,9 +34,10 @@ def _assert_interrupted(done: Launched) -> None:
     assert text.count("interrupted") == 1 and text.count("with --start_checkpoint") == 1
 
 
-def test_several_ranks_write_the_files_of_one_and_speak_with_one_voice(colmap_scene, tmp_path):
+@pytest.mark.parametrize("fault", ["warning 1 0", "whole-warning 1 0"])
+def test_several_ranks_write_the_files_of_one_and_speak_with_one_voice(colmap_scene, tmp_path, fault):
     _train(colmap_scene, tmp_path / "one", "--eval")
-    done = launch(tmp_path / "logs", "warning 1 0", *words(colmap_scene, tmp_path / "out", "--eval"))
+    done = launch(tmp_path / "logs", fault, *words(colmap_scene, tmp_path / "out", "--eval"))
     assert done.status == 0
     one, out = tmp_path / "one", tmp_path / "out"
     assert _files(one) == _files(out)
@@ -71,6 +72,8 @@ STANDS = "the last checkpoint stands: resume with --start_checkpoint {out}/chkpn
         ("kill 0 7", "error: rank 0 ended without a word (killed, or crashed); " + STANDS),
         ("bug 1 7", "error: rank 1: ValueError: no such thing"),
         ("hang 1 7", "error: rank 1 hung: the others waited"),
+        ("whole-kill 0 7", "error: rank 0 ended without a word (killed, or crashed); " + STANDS),
+        ("whole-overflow 1 7", "error: rank 1: xyz of 1 of 300 (3) had no finite step in iteration 7 (view "),
     ],
     ids=lambda value: value.split()[0] if isinstance(value, str) and value[:5] != "error" else "",
 )
@@ -101,8 +104,10 @@ def test_no_rank_goes_on_after_one_has_stopped(colmap_scene, tmp_path):
     assert differ <= {131}  # row 3 of the second of two parts, if the ranks have parts
 
 
-def test_a_signal_to_one_rank_stops_all_after_one_iteration(colmap_scene, tmp_path):
-    done = launch_fault(colmap_scene, tmp_path, "interrupt 1 7")
+@pytest.mark.parametrize("fault", ["interrupt 1 7", "whole-interrupt 1 7"])
+def test_a_signal_to_one_rank_stops_all_after_one_iteration(colmap_scene, tmp_path, fault):
+    done = launch_fault(colmap_scene, tmp_path, fault)
+    assert done.stdout[0].count("each of 2 GPUs trains the whole model") == fault.count("whole")
     _assert_interrupted(done)
     assert [path.name for path in sorted((tmp_path / "out").glob("chkpnt*.pth"))] == ["chkpnt5.pth", "chkpnt8.pth"]
     records = json.loads((tmp_path / "out" / "train_log.json").read_text())
@@ -174,10 +179,11 @@ def test_ranks_with_other_options_or_other_code_are_refused(colmap_scene, tmp_pa
     assert not (tmp_path / "out").exists()
 
 
-def test_ranks_keep_the_pace_of_the_first(colmap_scene, tmp_path):
+@pytest.mark.parametrize("fault", ["none 0 0", "whole-none 0 0"])
+def test_ranks_keep_the_pace_of_the_first(colmap_scene, tmp_path, fault):
     paced = ("--iterations", "3000", "--eval", "--time_budget", "2", "--target_psnr", "90", "--test_iterations", "-1")
     given = ["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "-r", "2", *paced]
-    done = launch(tmp_path / "logs", "none 0 0", *given)
+    done = launch(tmp_path / "logs", fault, *given)
     assert done.status == 0 and done.errors == []
     schedule = json.loads((tmp_path / "out" / "schedule.json").read_text())
     records = json.loads((tmp_path / "out" / "train_log.json").read_text())

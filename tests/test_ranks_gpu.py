@@ -20,17 +20,21 @@ LONG = (
 )
 
 
-def _train(scene: Path, folder: Path, size: int, *options: str) -> list[object]:
+def _train(scene: Path, folder: Path, size: int, *options: str, fault: str = "none 0 0") -> list[object]:
     """Train; what a checkpoint holds, and the last model."""
-    out = folder / f"{size}"
-    done = launch(folder / f"logs{size}", "none 0 0", "-s", str(scene), "-m", str(out), *LONG, *options, size=size)
+    name = fault.split()[0] + str(size)
+    out = folder / name
+    done = launch(folder / f"logs_{name}", fault, "-s", str(scene), "-m", str(out), *LONG, *options, size=size)
     assert done.status == 0, done.stderr
     return [whole_result(out, 150), (out / "point_cloud/iteration_300/point_cloud.ply").read_bytes()]
 
 
 @pytest.mark.parametrize("options", [(), ("--strategy", "mcmc", "--max_num_splats", "400", "--train_test_exp")])
 def test_two_gpus_write_the_bytes_of_one(colmap_scene, tmp_path, options):
-    assert _train(colmap_scene, tmp_path, 1, *options) == _train(colmap_scene, tmp_path, 2, *options)
+    one = _train(colmap_scene, tmp_path, 1, *options)
+    assert one == _train(colmap_scene, tmp_path, 2, *options)
+    assert one == _train(colmap_scene, tmp_path, 2, *options, fault="whole-none 0 0")
+    assert one == _train(colmap_scene, tmp_path, 2, *options, fault="later-none 0 0")
 
 
 @pytest.mark.parametrize(
@@ -39,6 +43,7 @@ def test_two_gpus_write_the_bytes_of_one(colmap_scene, tmp_path, options):
         ("kill 1 7", "error: rank 1 ended without a word (killed, or crashed); the last checkpoint stands"),
         ("hang 1 7", "error: rank 1 hung: the others waited"),
         ("memory 1 7", "error: rank 1: training ran out of memory in iteration 7 ("),
+        ("whole-hang 1 7", "error: rank 1 hung: the others waited"),
         ("overflow 1 7", "error: xyz of 1 of 300 (153) had no finite step in iteration 7 (view "),
     ],
     ids=lambda value: value.split()[0] if value[:5] != "error" else "",

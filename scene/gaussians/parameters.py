@@ -16,7 +16,7 @@ from scene.gaussians.spilled import is_spilled, room_for, to_host
 from scene.gaussians.statistics import NAMES, Statistics
 from scene.gaussians.table import GaussianTable
 from splatting.distributed.ranks import Ranks
-from splatting.distributed.rows import WHOLE, Divided, Shards
+from splatting.distributed.rows import WHOLE, Divided, Shards, own_rows
 from splatting.host.machine import compute_device
 from utils.general_utils import build_scaling_rotation, inverse_sigmoid, strip_symmetric
 from utils.system_utils import UserError
@@ -123,8 +123,10 @@ class GaussianParameters:
         return self.shards.total(len(self))
 
     def divide(self, ranks: Ranks) -> None:
-        """Let ranks share the Gaussians of an empty model: what is loaded from now on, each keeps its part of."""
+        """Let ranks share the Gaussians, which all have in whole: each keeps its part, also of what is loaded later."""
         if ranks.several:
+            if len(self):
+                self.table.change(lambda values: own_rows(values, ranks), self.table.row_groups())
             self.shards = Divided(ranks, len(self))
 
     def __bool__(self) -> bool:

@@ -152,8 +152,7 @@ class Divided(Shards):
         return Divided(self.ranks, count)
 
     def own(self, values: Tensor) -> Tensor:
-        first, stop = (bound(rank, len(values), self.ranks.size) for rank in (self.ranks.rank, self.ranks.rank + 1))
-        return values[first:stop].clone()  # so that the rest can be freed
+        return own_rows(values, self.ranks)
 
     def whole(self, values: Tensor) -> Tensor:
         return _whole(values, self.ranks)
@@ -249,6 +248,12 @@ WHOLE = Shards()
 def bound(rank: int, total: int, size: int) -> int:
     """The first of all rows that a rank has, once they are divided evenly by blocks."""
     return min(rank * -(-total // BLOCK) // size * BLOCK, total)
+
+
+def own_rows(values: Tensor, ranks: Ranks) -> Tensor:
+    """This rank's part of the values (N, ...) of all rows, as a copy, so that the rest can be freed."""
+    first, stop = (bound(rank, len(values), ranks.size) for rank in (ranks.rank, ranks.rank + 1))
+    return values[first:stop].clone()
 
 
 def changes_rows(method: Callable[..., Any]) -> Callable[..., Any]:

@@ -1,6 +1,7 @@
 """The training loop: the method, and nothing else."""
 
-from collections.abc import Iterator, Sequence
+import gc
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import torch
@@ -21,7 +22,7 @@ def run_training(run: Run, observers: Sequence[Observer]) -> None:
     taker, together = step_taker(run), StepAgreement(run)
     every = Announcer([together, *observers], run.look)
     # Backward runs on this thread: waking autograd's worker costs time in every iteration.
-    with run.interrupt, every, torch.autograd.set_multithreading_enabled(False), _whole_steps(run, taker):
+    with run.interrupt, every, torch.autograd.set_multithreading_enabled(False), _whole_steps(run, lambda: taker):
         for at in run.iterations():
             every.begins(at)
             taker.throttle(at)  # before the learning rates are set, which a replayed step changes
@@ -34,15 +35,20 @@ def run_training(run: Run, observers: Sequence[Observer]) -> None:
             if at.stopping:
                 together.wait()
                 raise at.stopping
+            if together.divides(at):
+                taker.drain()
+                run.divide()
+                taker = step_taker(run)
+                gc.collect()  # the former has captured steps, which keep memory
     together.finish()
     every.ended()  # out here a signal stops at once what is only drawn and printed
 
 
 @contextmanager
-def _whole_steps(run: Run, taker: PlainStep) -> Iterator[None]:
+def _whole_steps(run: Run, taker: Callable[[], PlainStep]) -> Iterator[None]:
     """After an error, leave the model as it was between two steps."""
     try:
         yield
     except BaseException:
-        run.lost = taker.abort()
+        run.lost = taker().abort()
         raise

@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
@@ -21,7 +22,7 @@ from scene.gaussians.checkpoint import ASLEEP, further, load_checkpoint, with_fu
 from scene.gaussians.morton import sort_rows
 from scene.sleeping import MOST_SHARE, REST, Sleeping, share_seen
 from splatting.deterministic.counter_rng import Stream, uniform
-from splatting.distributed.consistency import agree_on_scene
+from splatting.distributed.consistency import agree_on_model, agree_on_scene
 from splatting.distributed.ranks import ranks
 from splatting.distributed.shared_images import SharedImages
 from splatting.evaluation.training_log import Stopwatch
@@ -30,6 +31,7 @@ from splatting.exports.splats import Splats
 from splatting.host.clock import seconds_since_start
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.training import checks, schedule_file
+from splatting.training.division import begins_whole, say_whole
 from splatting.training.gpu_memory import GpuMemory, limit_torch, reads_on_host
 from splatting.training.iteration import Iteration, ViewOrder
 from splatting.training.memory_estimate import announce_memory, largest_view
@@ -92,7 +94,6 @@ class Run:
         self.warnings: list[str] = []
         self._warn(checks.late_reset(opt, dataset.white_background, self.schedule, self.first_iteration))
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
-        self.gaussians.divide(self.group)
         sharing = SharedImages(self.group) if views == 1 else None  # all read the same images in the same order
         init_ply = None if self.start else getattr(dataset, "init_ply", None)
         self.scene, first = scene_with(init_ply, dataset, self.gaussians, sharing=sharing)
@@ -100,10 +101,13 @@ class Run:
         checks.hint_of_images(self.scene.getTrainCameras(), self.scene.info, dataset.white_background)
         checks.check_target(opt.target_psnr, len(self.scene.getTestCameras()))
         agree_on_scene(self.scene, self.start)  # before an image is shared
+        points = self.scene.info.point_cloud.points if first is None else first
+        count = len(points if capture is None else capture[1])
+        self._share(count)
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed, views, self.group.rank if views > 1 else 0)
         self.resolution = resolution_of(opt, self.schedule, self.scene.images)
         self._decode_ahead(self.first_iteration + 1)
-        self._begin_memory(capture, first)
+        self._begin_memory(count)
         self._begin_model(capture, first)
         self._check_records()
         self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
@@ -111,7 +115,8 @@ class Run:
             opt.strategy = self._strategy_by_the_clock()
         self.schedule.strategy = opt.strategy
         self.density = density_control(self)
-        self._expect(self.density.most_gaussians)
+        if not self.whole:
+            self._expect(self.density.most_gaussians)
         self.objective = Objective(self)
         self._depth_weight = get_expon_lr_func(
             opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
@@ -136,17 +141,16 @@ class Run:
         on_host = self.group.several or reads_on_host(self.start, self.opt.gpu_memory, self.device)
         return load_checkpoint(self.start, "cpu" if on_host else self.device, self.group.several)
 
-    def _begin_memory(self, capture: tuple | None, first: Splats | None) -> None:
-        """Decide on the limit of the GPU's memory, before the model begins as `_begin_model` says."""
+    def _begin_memory(self, count: int) -> None:
+        """Decide on the limit of the GPU's memory, before the model begins with `count` Gaussians."""
         store, pixels = self.scene.images, largest_view(self.scene)
         self.memory = GpuMemory(self.opt.gpu_memory, self.gaussians, store, pixels, self.opt.absgrad, self.device)
-        points = self.scene.info.point_cloud.points if first is None else first
-        self._expect(len(points if capture is None else capture[1]))
+        self._expect(count)
 
     def _expect(self, count: int) -> None:
         """Let the memory be divided for a number of Gaussians, of which each rank has its part."""
         if self.schedule.views == 1:
-            self.memory.expect(-(-count // self.group.size))
+            self.memory.expect(-(-count // self.gaussians.shards.ranks.size))
 
     def _warn(self, text: str | None) -> None:
         """Print what a check says, and keep it for the log."""
@@ -160,6 +164,13 @@ class Run:
         strategy = of_clock(self.opt.time_budget, self.scene.getTrainCameras(), self.device)
         print(f"--time_budget takes --strategy {strategy}, which is best here; name another one to compare")
         return strategy
+
+    def _share(self, count: int) -> None:
+        """Divide the empty model among the processes, or let each train all of its `count` Gaussians on all photos."""
+        if begins_whole(self, count):
+            self.scene.keep_all_images()
+        else:
+            self.gaussians.divide(self.group)
 
     def _begin_model(self, capture: tuple | None, first: Splats | None) -> None:
         """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""
@@ -210,8 +221,10 @@ class Run:
             schedule_file.leave_schedule(Path(folder), self.first_iteration if checks.lies_in(start, folder) else 0)
         density = self.density
         wants = density.most_gaussians, density.absolute_gradients
-        announce_memory(self.scene, self.gaussians, self.memory, *wants, self.group.size)
+        announce_memory(self.scene, self.gaussians, self.memory, *wants, self.gaussians.shards.ranks.size)
         self._tell_of_spilling()
+        if self.whole:
+            say_whole(self)
         self.log, self.rows = checks.continue_records(folder, start, self.first_iteration)
         self.losses = LossWatch(self.log.loss)
         self.clock = Stopwatch(self.group.busy)
@@ -313,13 +326,31 @@ class Run:
 
     def _tell_of_spilling(self) -> None:
         """Say what lies in the host's memory, now or once there are as many Gaussians as there may be."""
-        count = -(-max(self.gaussians.gaussian_count, self.density.most_gaussians) // self.group.size)
+        count = -(-max(self.gaussians.gaussian_count, self.density.most_gaussians) // self.gaussians.shards.ranks.size)
         if not self.memory.spilled_bytes(count):
             return
         share = self._share_seen()
         dense = self.sleeping is None and self.opt.optimizer_type == "default"
         same = self.sleeping is None or share < MOST_SHARE  # blocks would sleep in any case
         print("\n".join(self.memory.words(count, 1.0 if dense else share, same)))
+
+    @property
+    def whole(self) -> bool:
+        """Whether each of several processes trains the whole model by itself (training/division.py)."""
+        return self.group.size > self.gaussians.shards.ranks.size
+
+    def divide(self) -> None:
+        """Give each process its part of the whole model that all have, after a step in which all blocks woke."""
+        agree_on_model(self.gaussians)
+        self.gaussians.divide(self.group)
+        if self.sleeping:
+            self.sleeping.reset()
+        what = f"{self.gaussians.gaussian_count:,} Gaussians"
+        tqdm.write(f"{what} are divided among {self.group.size} GPUs from here on", file=sys.stdout)
+
+    def wakes_all(self, step: Iteration) -> bool:
+        """Whether no block of Gaussians would sleep after a step."""
+        return step.changes or step.iteration % REST == 0
 
     def rests(self, step: Iteration) -> bool:
         """Whether all blocks of Gaussians wake after a step."""

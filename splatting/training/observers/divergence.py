@@ -10,6 +10,8 @@ from tqdm import tqdm
 
 from scene.gaussians.adam import StepGuard
 from scene.gaussians.checkpoint import save_checkpoint
+from splatting.distributed.ranks import Ranks
+from splatting.training.division import all_failed
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
@@ -58,7 +60,7 @@ class DivergenceWatch(Observer):
         self._latest.extend(losses.values())
         self._iteration = iteration
         bad = next((t for t, loss in losses.items() if not math.isfinite(loss)), _NEVER)
-        bad, stopped = self._run.group.numbers(bad, self._guard.stopped_in() or _NEVER).amin(0).tolist()
+        bad, stopped = self._ranks.numbers(bad, self._guard.stopped_in() or _NEVER).amin(0).tolist()
         if bad == stopped == _NEVER:
             return
         first = min(bad, stopped)
@@ -89,9 +91,14 @@ class DivergenceWatch(Observer):
                 file=sys.stderr,
             )
 
+    @property
+    def _ranks(self) -> Ranks:
+        """Those that have a part of the model each: this one alone while it has the whole."""
+        return self._gaussians.shards.ranks
+
     def _value_of(self, loss: float) -> float:
         """The loss of an iteration that was not finite, in whatever process."""
-        return next((value for value in self._run.group.everyone(loss) if not math.isfinite(value)), loss)
+        return next((value for value in self._ranks.everyone(loss) if not math.isfinite(value)), loss)
 
     def _unstepped(self) -> str:
         parts = []
@@ -105,13 +112,14 @@ class DivergenceWatch(Observer):
         if iteration == self._run.first_iteration:
             return "no iteration was trained before it; lower the learning rates"
         path = Path(self._run.scene.model_path) / f"chkpnt{iteration}.pth"
-        fault = next(
-            filter(None, self._run.group.everyone(self._fault(lambda: self._gaussians.check_finite(iteration)))), None
-        )
+        faults = self._ranks.everyone(self._fault(lambda: self._gaussians.check_finite(iteration)))
+        fault = next(filter(None, faults), None)
         if fault is None:
             self._gaussians.drop_broken_statistics()
             state = self._gaussians.capture()
-            fault = self._run.group.shared(self._fault(lambda: save_checkpoint(path, state, iteration)))
+            fault = self._ranks.shared(self._fault(lambda: save_checkpoint(path, state, iteration)))
+        if self._run.whole and not all_failed(self._run):
+            return self._run.group.stands()
         if fault is not None:
             return f"and the model could not be saved ({fault}); resume an earlier checkpoint"
         return (

@@ -274,7 +274,8 @@ class Target(Observer):
         run, target = self._run, self._run.opt.target_psnr
         with run.clock.paused("scoring"):
             run.scene.prefetch(self._cameras)
-            self._psnr = run.group.shared(self._views.scores(self._cameras, run.gaussians).get("psnr"))
+            psnr = self._views.scores(self._cameras, run.gaussians).get("psnr")
+            self._psnr = run.gaussians.shards.ranks.shared(psnr)
         if self._psnr is None:  # masks leave no pixel of the views
             return
         step.record = (step.record or {}) | {"test_views_psnr": self._psnr}

@@ -16,5 +16,6 @@ def step_taker(run: Run) -> PlainStep:
         return PlainStep(run, ViewOfEach(run))
     if not FusedStep.suits(run):
         return PlainStep(run)
-    runs_ahead = run.device.type == "cuda" and not run.group.several  # processes exchange numbers in each step
+    exchanges = run.gaussians.shards.ranks.several  # numbers, in each step
+    runs_ahead = run.device.type == "cuda" and not exchanges
     return CapturedStep(run) if runs_ahead else FusedStep(run)

@@ -251,6 +251,7 @@ class Graphs:
             full_proj_transform=numbers[16:32].view(4, 4),
             camera_center=numbers[32:35],
             columns=None,  # all count
+            counts_all_pixels=True,
             ground_truth=lambda _: (target, None),  # the photo on the step's background, and no mask
         )
         placeholder = SimpleNamespace(
