@@ -79,5 +79,6 @@ class WorkloadRun(Run):
 
     def begin(self) -> None:
         """Start the clocks; nothing is written."""
+        self.memory.settle(self.gaussians)
         self.log, self.rows = SimpleNamespace(seconds_before=0.0), []
         self.losses, self.clock = LossWatch(), Stopwatch()

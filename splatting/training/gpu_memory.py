@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.spilled import bytes_of, empty_rows
+from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
 from scene.images.store import ImageStore
 from splatting.host.memory import free_memory, gib
 from splatting.training.memory_estimate import near_rows, photo_bytes, spillable_bytes, training_bytes
@@ -16,6 +16,7 @@ _USABLE = 0.95  # of a GPU's free memory, where nobody has given a limit; torch 
 _BUS = 40e9  # bytes a second that kernels read or write in the host's memory
 _SLOW = 10.0  # milliseconds a step, from which on the bus is named
 _MUCH = 0.25  # of a GPU's free memory
+_PAGE = 2 << 20
 
 
 def reads_on_host(checkpoint: str | None, limit: float, device: torch.device) -> bool:
@@ -36,7 +37,9 @@ def limit_torch(limit: float, device: torch.device) -> None:
 class GpuMemory:
     """Decides how many rows of f_rest and its averages stay on the GPU; `spill` of the model, which it makes room for.
 
-    limit: bytes for torch and spilled tensors together, 0: no limit, so that nothing is spilled.
+    While rows change, new tensors find the GPU's memory taken by the old ones. What lacks room lies on the host until
+    `settle` brings it back. limit: bytes for torch and spilled tensors together, 0: no limit, so that nothing is
+    spilled.
     """
 
     def __init__(
@@ -60,23 +63,52 @@ class GpuMemory:
         if self.limit or self._device.type != "cuda":
             return
         limit = int(_USABLE * (free_memory(self._device) + torch.cuda.memory_allocated(self._device)))
-        if self._near(limit, count) < count:
+        if self._fixed + count * self._each > limit:
             self.limit = limit
             self._limit_torch(0)
 
     def room(self, like: Tensor, rows: int) -> Tensor | None:
         """An uninitialised tensor for so many rows of f_rest; None: all may stay on the GPU."""
-        near = self.near_rows(rows)
-        if near >= rows:
+        if not self._spills(rows):
             self._limit_torch(0)
             return None
-        size = near * math.prod(like.shape[1:]) * like.element_size()
-        self._limit_torch(size)
+        each = self._near_bytes(like, rows)
+        size = max(min(each, 3 * each - bytes_of()[0]), 0) if is_spilled(like) else 0
+        self._limit_torch(max(3 * each, bytes_of()[0] + size))
         return empty_rows(like, rows, size)
+
+    def settle(self, gaussians: GaussianModel) -> None:
+        """Bring rows to the GPU for which there is room, now that rows have changed."""
+        if not self.limit or not self._spills(len(gaussians)):
+            return
+        rest = gaussians.raw("f_rest")
+        state = gaussians.optimizer.state.get(rest, {})
+        rest.data = self._settled(rest.data)
+        for name in ("exp_avg", "exp_avg_sq"):
+            if name in state:
+                state[name] = self._settled(state[name])
+
+    def _settled(self, values: Tensor) -> Tensor:
+        wanted = self._near_bytes(values, len(values))
+        if not is_spilled(values) or bytes_of(values)[0] > wanted - _PAGE:
+            return values
+        return empty_rows(values, len(values), wanted).copy_(values)
+
+    def _near_bytes(self, like: Tensor, rows: int) -> int:
+        """Bytes of so many rows of one tensor that may stay on the GPU."""
+        return self.near_rows(rows) * math.prod(like.shape[1:]) * like.element_size()
+
+    def _spills(self, count: int) -> bool:
+        """Whether so many rows do not fit with all that a change of them needs."""
+        return self.limit > 0 and self._fixed + count * self._each > self.limit
 
     def near_rows(self, count: int) -> int:
         """How many of so many rows stay on the GPU."""
-        return self._near(self.limit, count) if self.limit else count
+        if not self._spills(count):
+            return count
+        # The estimate has room for the copy of one of three tensors while rows change, which here lies on the host.
+        others = self._fixed + count * (self._each - self._spillable * 4 / 3)
+        return near_rows(self.limit, count, others, count * self._spillable)
 
     def spilled_bytes(self, count: int) -> int:
         """Bytes of so many Gaussians in the host's memory."""
@@ -102,12 +134,7 @@ class GpuMemory:
             )
         return said
 
-    def _near(self, limit: int, count: int) -> int:
-        others = self._fixed + count * (self._each - self._spillable)
-        return near_rows(limit, count, others, count * self._spillable)
-
-    def _limit_torch(self, each: int) -> None:
-        """Leave torch the limit less the near parts of spilled tensors: three of `each` bytes and the copy of one."""
-        if not self.limit or self._device.type != "cuda":
-            return
-        limit_torch(self.limit - max(4 * each, bytes_of()[0] + each), self._device)
+    def _limit_torch(self, near: int) -> None:
+        """Leave torch the limit less so many bytes, or those that spilled tensors have now."""
+        if self.limit and self._device.type == "cuda":
+            limit_torch(self.limit - max(near, bytes_of()[0]), self._device)

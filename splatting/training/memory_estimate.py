@@ -125,10 +125,9 @@ def spillable_bytes(gaussians: GaussianModel, count: int) -> int:
 def near_rows(limit: float, count: int, others: float, spillable: float) -> int:
     """How many rows of what may lie in the host's memory stay on a GPU, of which `limit` bytes may be taken.
 
-    others, spillable: bytes of all else, and of these rows. They are three tensors, of which density control rewrites
-    one at a time, beside the old one. So a third more is needed.
+    others, spillable: bytes of all else, and of these rows.
     """
-    return max(min(int(count * (limit - others) / (spillable * 4 / 3)), count), 0) if spillable else count
+    return max(min(int(count * (limit - others) / spillable), count), 0) if spillable else count
 
 
 def photo_bytes(images: ImageStore, device: torch.device) -> int:

@@ -225,6 +225,7 @@ class Run:
         self._tell_of_spilling()
         if self.whole:
             say_whole(self)
+        self.memory.settle(self.gaussians)
         self.log, self.rows = checks.continue_records(folder, start, self.first_iteration)
         self.losses = LossWatch(self.log.loss)
         self.clock = Stopwatch(self.group.busy)
@@ -359,6 +360,8 @@ class Run:
     def after_step(self, step: Iteration) -> None:
         """What follows the optimiser's step."""
         self.density.after_step(step)
+        if step.changes:
+            self.memory.settle(self.gaussians)
         if self.sleeping is None:
             return
         self.gaussians.optimizer.rows = None
