@@ -60,11 +60,6 @@ STRATEGY_OPTIONS: tuple[Option, ...] = (
              "is the part of the growth to --max_num_splats that is left; 1: evenly, higher: earlier"),
     Option("score_views", 10, origin="ours", check=at_least(1),
         help="budget: training views, drawn anew in each densification, whose error says where Gaussians are added"),
-    Option("score_error", "l1", origin="ours", check=one_of("l1", "squared", "loss"),
-        help="budget: error of a pixel. l1: mean absolute difference of the channels; squared: mean squared "
-             "difference; loss: that of the loss, L1 and SSIM"),
-    Option("score_join", "sum", origin="ours", check=one_of("sum", "max"),
-        help="budget: how scores of several views become one. sum, or max: the largest"),
     Option("score_power", 1.0, origin="ours", check=within(0, 100),  # beyond, most chances are 0
         help="budget: Gaussians are drawn for splitting with a chance that grows as their score to this power; "
              "higher: only the worst, 0: any that draws an error"),

@@ -14,7 +14,6 @@ from diff_gaussian_rasterization.reference import render as oracle
 from gaussians import model, moments, options, parameters, pipeline, take_steps
 from PIL import Image
 from scipy import stats
-from skimage.metrics import structural_similarity
 
 import train
 from gaussian_renderer import model_inputs, rasterizer_settings
@@ -88,7 +87,7 @@ def test_scores_are_those_of_a_slow_sum_over_pixels(case):
         gaussians.start_exposures([SimpleNamespace(image_name="photo")])
         with torch.no_grad():
             gaussians.exposures.values += 0.2 * torch.randn(1, 3, 4, generator=torch.Generator().manual_seed(1))
-    scores = error_scores(gaussians, pipeline(), case == "exposure", options(), [camera], GREY)
+    scores = error_scores(gaussians, pipeline(), case == "exposure", [camera], GREY)
     image, weights = _weights(camera, gaussians)
     if case == "exposure":
         matrix = gaussians.get_exposure_from_name("photo").detach().double().numpy()
@@ -110,16 +109,14 @@ def test_scores_are_those_of_a_slow_sum_over_pixels(case):
 def test_scores_of_a_model_drawn_in_python(changes):
     gaussians, camera = model(14, seed=3), View()
     pipes = pipeline(), pipeline(**changes)
-    ours, other = (error_scores(gaussians, pipe, False, options(), [camera], GREY) for pipe in pipes)
+    ours, other = (error_scores(gaussians, pipe, False, [camera], GREY) for pipe in pipes)
     torch.testing.assert_close(ours, other, rtol=1e-4, atol=1e-7)
 
 
-def test_views_are_joined_by_sum_or_maximum():
+def test_scores_of_views_are_added():
     gaussians, views = model(14, seed=3), [View(seed=seed) for seed in range(3)]
-    single = [error_scores(gaussians, pipeline(), False, options(), [view], GREY) for view in views]
-    for join, expected in (("sum", sum(single)), ("max", torch.stack(single).amax(dim=0))):
-        scores = error_scores(gaussians, pipeline(), False, options(score_join=join), views, GREY)
-        assert torch.equal(scores, expected)
+    single = [error_scores(gaussians, pipeline(), False, [view], GREY) for view in views]
+    assert torch.equal(error_scores(gaussians, pipeline(), False, views, GREY), sum(single))
 
 
 def _pair() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -132,30 +129,14 @@ def _pair() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 @pytest.mark.parametrize("columns", [None, slice(0, 20)])
 def test_errors_of_pixels_add_up_to_the_loss(columns):
     image, target, mask = _pair()
-    for kind, weight in (("loss", 0.3), ("l1", 0.0)):
-        total, _ = photometric_loss(image, target, weight, None, columns, clamp=False)
-        torch.testing.assert_close(error_map(kind, image, target, 0.3, None, columns).sum(), total, rtol=1e-5, atol=0)
-    for kind in ("l1", "squared", "loss"):
-        errors = error_map(kind, image, target, 0.3, mask, columns)
-        assert errors.shape == (1, 33, 41) and (errors >= 0).all()
-        counts = mask.clone()
-        if columns is not None:
-            counts[..., 20:] = False
-        assert torch.equal(errors > 0, counts)
-    squared = ((image - target / 255) ** 2).mean()
-    torch.testing.assert_close(error_map("squared", image, target, 0.3).sum(), squared, rtol=1e-5, atol=0)
-
-
-def test_similarity_is_that_of_scikit_image():
-    image, target, _ = _pair()
-    target = target.float() / 255
-    ours = error_map("loss", image, target, 1.0)[0] * image[0].numel()
-    _, theirs = structural_similarity(
-        image.double().numpy(), target.double().numpy(), gaussian_weights=True, sigma=1.5, data_range=1.0,
-        use_sample_covariance=False, channel_axis=0, full=True,
-    )  # fmt: skip
-    inner = slice(5, -5), slice(5, -5)
-    np.testing.assert_allclose(ours[inner].numpy(), (1 - theirs).mean(axis=0)[inner], rtol=1e-4, atol=1e-5)
+    total, _ = photometric_loss(image, target, 0.0, None, columns, clamp=False)
+    torch.testing.assert_close(error_map(image, target, None, columns).sum(), total, rtol=1e-5, atol=0)
+    errors = error_map(image, target, mask, columns)
+    assert errors.shape == (1, 33, 41) and (errors >= 0).all()
+    counts = mask.clone()
+    if columns is not None:
+        counts[..., 20:] = False
+    assert torch.equal(errors > 0, counts)
 
 
 # Draws

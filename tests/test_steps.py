@@ -17,7 +17,7 @@ from trainings import ITERATIONS, OPTIONS, differences, leaves, narrow_scene, tr
 from splatting.training import run
 from splatting.training.objective import Losses, Objective
 from splatting.training.observers.divergence import DivergenceWatch
-from splatting.training.steps import captured, speculative, step_taker
+from splatting.training.steps import speculative, step_taker
 from splatting.training.steps.captured import CapturedStep, Graphs
 from splatting.training.steps.fused import FusedStep
 from splatting.training.steps.plain import PlainStep
@@ -40,9 +40,8 @@ def test_a_host_that_runs_ahead_without_capacity_gives_the_same_bytes(scene, tmp
     plain = trained(scene, tmp_path / "plain", "--plain_step", *options)
     overflows, replay = [], speculative.Speculation._replay
     monkeypatch.setattr(speculative.Speculation, "_replay", lambda *x: (overflows.append(1), replay(*x)))
-    monkeypatch.setattr(speculative, "_with_spare", lambda count: count)
-    for name, least in {"_INSTANCES": 0, "_SLOTS": 0, "_LEAST": 1}.items():
-        monkeypatch.setattr(captured, name, least)
+    monkeypatch.setattr(speculative, "_with_spare", lambda count, *_: count)
+    monkeypatch.setattr(speculative, "_FIRST", (1, 1, 1, 1))
     assert trained(scene, tmp_path / "overflowing", *options) == plain
     assert len(overflows) > 5
 
@@ -226,7 +225,7 @@ def test_memory_that_runs_out_in_a_replay_leaves_the_last_whole_step(scene, tmp_
         replay(self, at, first)
 
     with monkeypatch.context() as patch:
-        patch.setattr(speculative, "_with_spare", lambda count: count)  # so that many steps overflow
+        patch.setattr(speculative, "_with_spare", lambda count, *_: count)  # so that many steps overflow
         patch.setattr(CapturedStep, "replay", again)
         with pytest.raises(UserError, match="the model after iteration .* is saved") as caught:
             trained(scene, tmp_path / "out", *GROWING)
@@ -270,7 +269,7 @@ def replay_and_die(self, report):
     if self._done > 30:
         os.kill(os.getpid(), signal.SIGKILL)
 
-speculative._with_spare = lambda count: count
+speculative._with_spare = lambda count, *_: count
 speculative.Speculation._replay = replay_and_die
 test_steps.trained(Path(sys.argv[1]), Path(sys.argv[2]), *test_steps.GROWING, "--checkpoint_iterations", 25)
 """

@@ -40,7 +40,7 @@ OPTIONS = {
     "mcmc idle": ("--strategy", "mcmc", "--mcmc_growth", 0, "--mcmc_min_opacity", 1e-6),
     "mcmc sparse": (*MCMC, "--optimizer_type", "sparse_adam", "--antialiasing"),
     "budget": BUDGET,
-    "budget errors": (*BUDGET, "--score_error", "loss", "--score_join", "max", "--score_power", 2, "--train_test_exp"),
+    "budget errors": (*BUDGET, "--score_power", 2, "--train_test_exp"),
 }
 
 

@@ -146,17 +146,18 @@ class GaussianTable:
             value = placed(self._model, name, change(old, name, False))
             del old  # whose memory the averages may need
             changed = lambda mean, name=name: placed(self._model, name, change(mean, name, True))  # noqa: E731
-            params[name] = self._replace(group, value, changed)
+            params[name] = self._replace(group, value, changed, takes=True)
         return params
 
-    def _replace(self, group: Group, value: Tensor, change: Change) -> nn.Parameter:
-        """Swap a parameter, in the group and the model. `change` maps its averages: the state with its rows."""
+    def _replace(self, group: Group, value: Tensor, change: Change, takes: bool = False) -> nn.Parameter:
+        """Swap a group's parameter, with `takes` in the model, too. `change` maps its averages, the state with rows."""
         old, param = group["params"][0], nn.Parameter(value.detach())
         dims, rows = old.dim(), len(old)
         state = self.states.pop(old, None)
         group["params"] = [param]
-        self._model._take({group.get("name"): param})
-        del old  # nobody has it any more, so the averages find its memory free
+        if takes:
+            self._model._take({group.get("name"): param})
+        del old  # with `takes` nobody has it any more, so the averages find its memory free
         if state is not None:
             self.states[param] = state
             for key, mean in state.items():

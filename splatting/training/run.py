@@ -107,7 +107,6 @@ class Run:
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed, views, self.group.rank if views > 1 else 0)
         self.resolution = resolution_of(opt, self.schedule, self.scene.images)
         self._decode_ahead(self.first_iteration + 1)
-        self._begin_memory(count)
         self._begin_model(capture, first)
         self._check_records()
         self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
@@ -141,12 +140,6 @@ class Run:
         on_host = self.group.several or reads_on_host(self.start, self.opt.gpu_memory, self.device)
         return load_checkpoint(self.start, "cpu" if on_host else self.device, self.group.several)
 
-    def _begin_memory(self, count: int) -> None:
-        """Decide on the limit of the GPU's memory, before the model begins with `count` Gaussians."""
-        store, pixels = self.scene.images, largest_view(self.scene)
-        self.memory = GpuMemory(self.opt.gpu_memory, self.gaussians, store, pixels, self.opt.absgrad, self.device)
-        self._expect(count)
-
     def _expect(self, count: int) -> None:
         """Let the memory be divided for a number of Gaussians, of which each rank has its part."""
         if self.schedule.views == 1:
@@ -166,11 +159,17 @@ class Run:
         return strategy
 
     def _share(self, count: int) -> None:
-        """Divide the empty model among the processes, or let each train all of its `count` Gaussians on all photos."""
+        """Divide the empty model among the processes, or let each train all of its `count` Gaussians on all photos.
+
+        Then decide on the limit of the GPU's memory.
+        """
         if begins_whole(self, count):
             self.scene.keep_all_images()
         else:
             self.gaussians.divide(self.group)
+        store, pixels = self.scene.images, largest_view(self.scene)
+        self.memory = GpuMemory(self.opt.gpu_memory, self.gaussians, store, pixels, self.opt.absgrad, self.device)
+        self._expect(count)
 
     def _begin_model(self, capture: tuple | None, first: Splats | None) -> None:
         """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""

@@ -21,7 +21,6 @@ from torch import Tensor
 
 from scene.cameras import Camera
 from scene.fused_adam import NOW_WORDS, FusedAdam
-from splatting.distributed.rows import BLOCK
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Announcer
@@ -30,9 +29,6 @@ from splatting.training.steps.fused import FusedStep
 from splatting.training.steps.plain import PlainStep
 from splatting.training.steps.speculative import Speculation
 
-_INSTANCES = 8  # of a Gaussian, for the capacity of the first step
-_SLOTS = 16
-_LEAST = 1 << 16
 _ROWS = 16  # of page-locked memory for numbers of steps; more than are ever pending
 _MOST_KINDS = 4  # photos of more sizes or angles would cost more to capture than they save
 _CAMERA = 16 + 16 + 3  # numbers: two matrices and the centre
@@ -48,10 +44,7 @@ class CapturedStep(FusedStep):
 
     def __init__(self, run: Run) -> None:
         super().__init__(run)
-        count = len(run.gaussians)
-        lists = max(_INSTANCES * count, _LEAST)
-        blocks = -(-count // BLOCK)
-        self._ahead = Speculation(run.device, (lists, max(_SLOTS * count, _LEAST), lists, blocks), self)
+        self._ahead = Speculation(run.device, self)
         self._graphs = Graphs(run, self, self._adam, self._ahead.capacity)
 
     def take(self, at: Iteration, observers: Announcer) -> None:

@@ -36,6 +36,7 @@ _SPARE = 1.25  # times what a view needed before: Gaussians move and multiply un
 _LEAST = 1024
 _LEAST_BLOCKS = 16
 _MOST = 2**31 - 1
+_FIRST = 1 << 20, 1 << 20, 1 << 20, 1 << 13  # capacity of the first step: more costs much memory, less a replay
 _NAP = 1e-4  # seconds; steps of less than this are queued in numbers anyway
 
 Capacity = tuple[int, int, int, int]  # of instances, slots, gradient rows and blocks that are awake (gs::Room)
@@ -49,14 +50,14 @@ class _Pending:
 
 
 class Speculation:
-    """The steps that a GPU has yet to do. first: the capacity of the first step. steps: queues and replays them."""
+    """The steps that a GPU has yet to do. steps: queues and replays them."""
 
-    def __init__(self, device: torch.device, first: Capacity, steps: "CapturedStep") -> None:
+    def __init__(self, device: torch.device, steps: "CapturedStep") -> None:
         self._words = torch.zeros(6, dtype=torch.int64, device=device)
         self._reports = torch.zeros(_REPORTS, 6, dtype=torch.int64, pin_memory=True)
         self._numbers = list(self._reports.numpy())  # the same memory
         self._stream = torch.cuda.current_stream(device)
-        self._first, self._steps = first, steps
+        self._steps = steps
         self._needed: dict[Hashable, Capacity] = {}
         self._pending: deque[_Pending] = deque()
         self._done = 0  # steps, as far as the host knows
@@ -103,13 +104,13 @@ class Speculation:
     def _capacity_of(self, view: Hashable | None) -> Capacity:
         """What a view needed before, and some spare; a new view gets that of the largest."""
         if not self._needed:
-            return self._first
+            return _FIRST
         *lists, blocks = self._needed_by(view)
         instances, slots, rows = map(_with_spare, lists)
         return min(instances, _MOST), slots, min(rows, _MOST), _with_spare(blocks, _LEAST_BLOCKS)
 
     def _needed_by(self, view: Hashable | None) -> Capacity:
-        return self._needed.get(view) or tuple(map(max, zip(*self._needed.values(), strict=True)))
+        return self._needed.get(view) or tuple(map(max, *self._needed.values(), (0, 0, 0, 0)))
 
     def _report(self) -> list[int] | None:
         """Of the first pending step: what it needs, then halted; None until the GPU has written them."""
