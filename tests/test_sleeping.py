@@ -22,6 +22,7 @@ from trainings import ITERATIONS, OPTIONS, differences, narrow_scene, trained
 import train
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import ASLEEP, further, load_checkpoint, save_checkpoint
+from scene.gaussians.table import GaussianTable
 from scene.readers.point_cloud import write_point_cloud
 from scene.saved_model import read_model
 from scene.sleeping import BLOCK, Sleeping
@@ -429,6 +430,19 @@ def test_the_progress_bar_does_not_wake_blocks(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(ProgressBar, "due", lambda self, step: True)
     _trained(scene, tmp_path)
     assert len(looks) < 4
+
+
+@pytest.mark.parametrize("way", [(), ("--plain_step",)])
+def test_memory_that_runs_out_while_rows_change_ends_in_one_sentence(scene, tmp_path, monkeypatch, way):
+    select = GaussianTable.select
+
+    def fails(self: GaussianTable, *arguments: object) -> None:
+        select(self, *arguments)  # which moves the rows, and raises the error afterwards
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.")
+
+    monkeypatch.setattr(GaussianTable, "select", fails)
+    with pytest.raises(UserError, match="ran out of memory in iteration 20"):
+        _trained(scene, tmp_path, *way)
 
 
 def test_where_views_see_most_points_no_block_sleeps(scene, tmp_path, monkeypatch, shares):

@@ -65,12 +65,14 @@ def test_the_share_follows_the_number_of_gaussians(monkeypatch):
     assert shares[0] == 1 and shares[-1] == 0 and shares == sorted(shares, reverse=True)
     count = 1_200_000
     near = memory.near_rows(count)
-    others = count * (12 * 14 + memory_estimate.PER_GAUSSIAN) + pixels * memory_estimate.PER_PIXEL + 2**27
+    fixed = pixels * memory_estimate.PER_PIXEL + 2**27 + gpu_memory._SPARE
+    others = count * (12 * 14 + memory_estimate.PER_GAUSSIAN) + fixed
     assert abs(near - near_rows(2**30, count, others, count * 540)) <= 1 and 0 < near < count
     # Where the copy that a change needs does not fit, all rows may stay, but as spilled ones.
     whole = next(count for count in range(10**5, 10**7, 10**4) if memory._spills(count))
     assert memory.near_rows(whole) == whole
-    assert training_bytes(gaussians, whole, pixels) + 2**27 > 2**30 > training_bytes(gaussians, whole - 10**4, pixels)
+    fit = [training_bytes(gaussians, n, 0) + fixed <= 2**30 for n in (whole, whole - 10**4)]
+    assert fit == [False, True]
     assert memory.spilled_bytes(count) == 540 * (count - near)
     assert _memory(monkeypatch, 0).near_rows(10**9) == 10**9
 
@@ -355,7 +357,7 @@ def test_a_tight_limit_is_kept(tmp_path, monkeypatch, _):
         return made
 
     monkeypatch.setattr(GpuMemory, "room", noted)
-    _trained(scene, tmp_path / "out", "--gpu_memory", 0.5)
+    _trained(scene, tmp_path / "out", "--gpu_memory", 0.7)
     assert all(near > 0 and far > 0 for near, far in shares)
-    assert max(peaks) <= 0.5 * 2**30 and torch.cuda.max_memory_reserved() <= 0.5 * 2**30
+    assert max(peaks) <= 0.7 * 2**30 and torch.cuda.max_memory_reserved() <= 0.7 * 2**30
     torch.cuda.set_per_process_memory_fraction(1.0)

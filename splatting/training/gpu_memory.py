@@ -17,6 +17,7 @@ _BUS = 40e9  # bytes a second that kernels read or write in the host's memory
 _SLOW = 10.0  # milliseconds a step, from which on the bus is named
 _MUCH = 0.25  # of a GPU's free memory
 _PAGE = 2 << 20
+_SPARE = 1 << 27  # bytes for the lists of the first step, and what torch cannot fill of its blocks
 
 
 def reads_on_host(checkpoint: str | None, limit: float, device: torch.device) -> bool:
@@ -54,7 +55,7 @@ class GpuMemory:
         """Take a limit in GiB, 0 for none. pixels: of the largest view. absolute: with absolute gradients."""
         self.limit, self._device = int(limit * 2**30), device
         self._each, self._spillable = training_bytes(gaussians, 1, 0, absolute), spillable_bytes(gaussians, 1)
-        self._fixed = training_bytes(gaussians, 0, pixels) + photo_bytes(images, device)
+        self._fixed = training_bytes(gaussians, 0, pixels) + photo_bytes(images, device) + _SPARE
         gaussians.spill = self.room
         self._limit_torch(0)
 

@@ -115,7 +115,7 @@ class CapturedStep(FusedStep):
     def rewind(self, steps: int) -> None:
         """Take back what the host has counted for steps that will be replayed, or that an error has ended."""
         self._run.gaussians.rewind(steps)
-        if self._run.sleeping:
+        if steps and self._run.sleeping:
             self._run.sleeping.stepped()  # a rest may be among the steps
         self._graphs.clear()
 
@@ -304,9 +304,10 @@ class Recorder:
         torch.cuda.empty_cache()
 
     def is_tight(self) -> bool:
-        """Whether most of the GPU's memory is taken, so that what is kept for later should be given back."""
+        """Whether most of what torch may take is taken, so that what is kept for later should be given back."""
         free, total = torch.cuda.mem_get_info(self._device)
-        return free < total / 4
+        most = torch.cuda.get_per_process_memory_fraction(self._device) * total
+        return min(free, most - torch.cuda.memory_reserved(self._device)) < most / 4
 
     def _graph_of(self, body: Callable[[], Tensor]) -> tuple[torch.cuda.CUDAGraph, Tensor]:
         graph = torch.cuda.CUDAGraph()

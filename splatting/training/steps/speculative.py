@@ -110,7 +110,7 @@ class Speculation:
         return min(instances, _MOST), slots, min(rows, _MOST), _with_spare(blocks, _LEAST_BLOCKS)
 
     def _needed_by(self, view: Hashable | None) -> Capacity:
-        return self._needed.get(view) or tuple(map(max, *self._needed.values(), (0, 0, 0, 0)))
+        return self._needed.get(view) or tuple(map(max, zip((0, 0, 0, 0), *self._needed.values(), strict=True)))
 
     def _report(self) -> list[int] | None:
         """Of the first pending step: what it needs, then halted; None until the GPU has written them."""
