@@ -306,7 +306,7 @@ class Recorder:
     def is_tight(self) -> bool:
         """Whether most of what torch may take is taken, so that what is kept for later should be given back."""
         free, total = torch.cuda.mem_get_info(self._device)
-        most = torch.cuda.get_per_process_memory_fraction(self._device) * total
+        most = torch.cuda.get_per_process_memory_fraction() * total
         return min(free, most - torch.cuda.memory_reserved(self._device)) < most / 4
 
     def _graph_of(self, body: Callable[[], Tensor]) -> tuple[torch.cuda.CUDAGraph, Tensor]:
