@@ -17,7 +17,9 @@ _BUS = 40e9  # bytes a second that kernels read or write in the host's memory
 _SLOW = 10.0  # milliseconds a step, from which on the bus is named
 _MUCH = 0.25  # of a GPU's free memory
 _PAGE = 2 << 20
-_SPARE = 1 << 27  # bytes for the lists of the first step, and what torch cannot fill of its blocks
+_SPARE = 0.03  # of a limit, what torch cannot fill of its blocks; and at least
+_LEAST_SPARE = 1 << 27  # bytes, for the lists of the first step
+_WHOLE_STEP = 20  # bytes of a Gaussian besides the estimate, in steps for which all blocks wake
 
 
 def reads_on_host(checkpoint: str | None, limit: float, device: torch.device) -> bool:
@@ -54,8 +56,9 @@ class GpuMemory:
     ) -> None:
         """Take a limit in GiB, 0 for none. pixels: of the largest view. absolute: with absolute gradients."""
         self.limit, self._device = int(limit * 2**30), device
-        self._each, self._spillable = training_bytes(gaussians, 1, 0, absolute), spillable_bytes(gaussians, 1)
-        self._fixed = training_bytes(gaussians, 0, pixels) + photo_bytes(images, device) + _SPARE
+        self._each = training_bytes(gaussians, 1, 0, absolute) + _WHOLE_STEP
+        self._spillable = spillable_bytes(gaussians, 1)
+        self._fixed = training_bytes(gaussians, 0, pixels) + photo_bytes(images, device)
         gaussians.spill = self.room
         self._limit_torch(0)
 
@@ -64,7 +67,7 @@ class GpuMemory:
         if self.limit or self._device.type != "cuda":
             return
         limit = int(_USABLE * (free_memory(self._device) + torch.cuda.memory_allocated(self._device)))
-        if self._fixed + count * self._each > limit:
+        if self._needed(count, limit) > limit:
             self.limit = limit
             self._limit_torch(0)
 
@@ -101,14 +104,17 @@ class GpuMemory:
 
     def _spills(self, count: int) -> bool:
         """Whether so many rows do not fit with all that a change of them needs."""
-        return self.limit > 0 and self._fixed + count * self._each > self.limit
+        return self.limit > 0 and self._needed(count, self.limit) > self.limit
+
+    def _needed(self, count: int, limit: int) -> int:
+        return self._fixed + max(int(_SPARE * limit), _LEAST_SPARE) + count * self._each
 
     def near_rows(self, count: int) -> int:
         """How many of so many rows stay on the GPU."""
         if not self._spills(count):
             return count
         # The estimate has room for the copy of one of three tensors while rows change, which here lies on the host.
-        others = self._fixed + count * (self._each - self._spillable * 4 / 3)
+        others = self._needed(count, self.limit) - count * self._spillable * 4 / 3
         return near_rows(self.limit, count, others, count * self._spillable)
 
     def spilled_bytes(self, count: int) -> int:
