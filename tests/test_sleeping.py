@@ -36,6 +36,7 @@ from utils.system_utils import UserError
 
 BETAS, EPS = (0.9, 0.999), 1e-15
 MOST_RATIO = 0.1 / math.sqrt(0.001 * (1 - 0.81 / 0.999))  # of |m| / sqrt(v) (csrc/math/sleep.h)
+SCENES = 6  # of random blocks; 1000 for the figures of docs/inside/sleep.md
 NAMES = ("default", "white", "masks", "exposure", "depth", "absgrad", "together", "budget", "degree 0")
 
 
@@ -187,6 +188,36 @@ def test_no_view_shows_a_block_that_sleeps(device, dtype):
         assert all(torch.equal(one, other) for one, other in zip(*(d[:4] for d in drawn), strict=True))
         asleep, woken = asleep + int((~rows).sum()), woken + int(rows.sum())
     assert min(asleep, woken) > 0.1 * (asleep + woken)
+
+
+def test_steps_with_sleep_are_those_of_dense_adam_in_double():
+    """Of Gaussians that a view sees the gradients are random. No other row has one, or is seen."""
+    place, rng, worst = {"device": "cpu", "dtype": torch.float32}, np.random.default_rng(11), [0.0, 0.0]
+    for _ in range(SCENES):
+        slept = _clusters(rng, place, blocks=6)
+        dense = Blocks([value.double() for value in slept.values])
+        dense.averages, dense.steps = [x.double() for x in slept.averages], [x.clone() for x in slept.steps]
+        for _ in range(int(rng.integers(5, 60))):
+            rate, at = 10 ** rng.uniform(-5, -2.5), int(rng.integers(len(slept.values[0])))
+            camera = _looking(rng, slept.values[0][at].numpy(), place)
+            slept.wake(camera, False, rate)
+            rows = slept.awake.bool().repeat_interleave(BLOCK)[: len(slept.values[0])]
+            *_, radii = OPERATORS.project(*slept.scene(camera))
+            assert not ((radii > 0) & ~rows).any()
+            gradients = [1e-3 * torch.randn_like(v) * (radii > 0).view(-1, *[1] * (v.dim() - 1)) for v in slept.values]
+            moved = [*slept.values, *slept.averages]
+            parts = [values[rows] for values in (*moved, *gradients)]
+            lists = parts[:6], parts[18:], parts[6:12], parts[12:18], slept.steps, [rate] * 6
+            adam_(*lists, *BETAS, EPS, [-1] * 6)
+            for values, part in zip(moved, parts[:18], strict=True):
+                values[rows] = part
+            dense.step([gradient.double() for gradient in gradients], rate)
+        slept.wake(camera, True, rate)
+        for one, other in zip(slept.values, dense.values, strict=True):
+            worst[0] = max(worst[0], float(((one - other).abs() / (1 + other.abs())).max()))
+        for one, other in zip(slept.averages, dense.averages, strict=True):
+            worst[1] = max(worst[1], float((one - other).abs().max() / other.abs().max()))
+    assert worst[0] < 2e-6 and worst[1] < 4e-6, worst
 
 
 # Trainings
