@@ -16,7 +16,7 @@ from diff_gaussian_rasterization.scene import Scene
 from gaussians import needs_fused_step
 from processes import in_ranks
 from rasterizer_tools import BOTH_AND_GPU, GPU_MARKS
-from step_ways import WAYS, take_as  # noqa: F401  (a fixture)
+from step_ways import WAYS, Immediate, take_as  # noqa: F401  (a fixture)
 from trainings import ITERATIONS, OPTIONS, differences, narrow_scene, trained
 
 import train
@@ -435,6 +435,32 @@ def test_a_term_that_somebody_adds_to_the_loss_reaches_all_rows(scene, tmp_path,
     asleep = _trained(scene, tmp_path / "asleep", *way)
     monkeypatch.setattr(runs, "MOST_SHARE", 0.0)
     assert not differences(asleep, _trained(scene, tmp_path / "awake", *way))
+
+
+@needs_fused_step
+@pytest.mark.parametrize("way", ["queued", "captured"])
+def test_a_term_ends_no_sleep_before_the_queued_steps_are_done(scene, tmp_path, monkeypatch, take_as, way):  # noqa: F811
+    """Once a step has halted for lack of room, a rest would do nothing, and what blocks have missed would be lost."""
+    made, calls, done, ends = [], [], [], []
+    make, call, end = Objective.__init__, Objective.__call__, runs.Run.end_sleep
+    monkeypatch.setattr(Objective, "__init__", lambda self, run: (made.append(run), make(self, run))[1])
+
+    def more(self: Objective, package: dict, at: Iteration) -> object:
+        losses = call(self, package, at)
+        calls.append(1)
+        return losses._replace(total=losses.total + (len(calls) > 10) * made[-1].gaussians.get_opacity.mean())
+
+    class Queue(Immediate):
+        def __init__(self, *_: object) -> None:
+            super().__init__()
+            self.discard = lambda: done.append(1)
+
+    monkeypatch.setattr(Objective, "__call__", more)
+    monkeypatch.setattr(runs.Run, "end_sleep", lambda self, *x: (ends.append(len(done)), end(self, *x))[1])
+    take_as(way)
+    monkeypatch.setattr(captured, "Speculation", Queue)
+    _trained(scene, tmp_path)
+    assert done and ends and all(ends)
 
 
 def test_a_replaced_report_may_change_the_model(scene, tmp_path, monkeypatch, shares):

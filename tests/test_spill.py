@@ -133,8 +133,9 @@ def test_a_large_checkpoint_is_read_on_the_host(tmp_path, monkeypatch):
 def test_the_cpu_has_one_memory():
     values = torch.ones(4, 3)
     assert empty_rows(values, 5, 1) is None and bytes_of(values) == bytes_of() == (0, 0) and not is_spilled(values)
-    with pytest.raises(ValueError, match="at least 0"):
-        empty_rows(values, -1, 0)
+    for rows in (-1, 2**31):
+        with pytest.raises(ValueError, match="at least 0"):
+            empty_rows(values, rows, 0)
 
 
 # Trainings

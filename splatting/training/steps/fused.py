@@ -84,13 +84,14 @@ class FusedStep(PlainStep):
     def drop_further_terms(self) -> bool:
         """Whether the loss of the last `measure` depends on a parameter by another way than the image.
 
-        Somebody has added a term to it. Its gradients are dropped, and from now on all steps are plain.
+        Somebody has added a term to it. Its gradients are dropped, and from now on all steps are plain. Blocks go on
+        sleeping until a plain step finds that the term reaches them: a rest would be lost here if a step has halted.
         """
         gaussians = self._run.gaussians
         params = [gaussians.raw(name) for name in gaussians._attributes]
         self._has_further_terms = any([param.grad is not None for param in params])
         if self._has_further_terms:
-            self._end_sleep()
+            self._drop_gradients()
         return self._has_further_terms
 
     def advance(self, at: Iteration, drawn: Drawn, gradients: Gradients) -> None:

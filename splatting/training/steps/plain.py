@@ -79,11 +79,14 @@ class PlainStep:
 
     def _end_sleep(self) -> None:
         """Let all blocks wake for good, and drop the gradients of a step that will be taken again."""
+        self._drop_gradients()
+        self._run.gaussians.optimizer.rows = None
+        self._run.end_sleep()
+
+    def _drop_gradients(self) -> None:
         gaussians = self._run.gaussians
         gaussians.optimizer.zero_grad(set_to_none=True)
         gaussians.exposures.optimizer.zero_grad(set_to_none=True)
-        gaussians.optimizer.rows = None
-        self._run.end_sleep()
 
     def throttle(self, at: Iteration) -> None:
         pass

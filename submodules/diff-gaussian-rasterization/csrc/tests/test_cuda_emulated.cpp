@@ -547,8 +547,9 @@ void test_gaussian_step() {
 }
 
 // Blocks wake on the GPU as on the CPU, where some lie behind the camera, one has missed nothing, and one is repeated.
-// They are listed. Without room for them nothing changes.
-void test_wake() {
+// They are listed: none, or so many that the last one sleeps or is awake. Without room for them nothing changes.
+void test_wake(int64_t seen) {
+  const bool some = seen > 0, last = seen == 4;
   for (const int64_t room : {5, 4, 3})
     for (const bool all : {false, true})
       for (const gs::emulation::Order order : gs::emulation::kOrders) {
@@ -556,19 +557,22 @@ void test_wake() {
         constexpr int64_t count = 5 * gs::kSleepBlock - 28;
         Stepping start{Parameters<float>(count)};
         for (int64_t i = 0; i < count; ++i) {
-          start.values.means[3 * i + 2] = i / gs::kSleepBlock % 2 ? -3.0f : 3.0f;
+          const int64_t block = i / gs::kSleepBlock;
+          start.values.means[3 * i + 2] = some && block % 2 == 0 && (block < 4 || last) ? 3.0f : -3.0f;
           for (int k = 0; k < 3; ++k) start.values.scales[3 * i + k] = -5;
         }
         float terms[2][gs::kTerms * gs::kTermColumns];
         for (int64_t k = 0; k < gs::kTerms * gs::kTermColumns; ++k) terms[0][k] = terms[1][k] = float(k % 7) * 1e-4f;
         Stepping got[2] = {start, start};
         uint8_t awake[2][5] = {{7, 7, 7, 7, 7}, {7, 7, 7, 7, 7}};
-        int32_t taken[2][5] = {{2, 1, 100, 101, 9}, {2, 1, 100, 101, 9}}, blocks[5], halted = 0;
+        const std::array<int32_t, 5> start_taken = {2, 1, 100, some ? 101 : 100, 9};
+        std::array<int32_t, 5> taken[2] = {start_taken, start_taken};
+        int32_t blocks[5], halted = 0;
         int64_t done = 6;
         gs::Room needed{1, 1, 1, 1};
         const gs::Ahead ahead{&halted, &needed, &done, {0, 0, 0, room}, nullptr, 1};
         for (const int on_gpu : {0, 1}) {
-          gs::SleepInput<float> in{{}, all, awake[on_gpu], taken[on_gpu], terms[on_gpu], blocks, room, &ahead};
+          gs::SleepInput<float> in{{}, all, awake[on_gpu], taken[on_gpu].data(), terms[on_gpu], blocks, room, &ahead};
           got[on_gpu].inputs({}, nullptr, in.step.attributes);
           for (gs::AdamInput<float>& to : in.step.attributes) to.step = 101;
           const gs::Scene<float> scene = scene_of(got[on_gpu].values, {40, 24}, false);
@@ -580,22 +584,23 @@ void test_wake() {
           else
             gs::GS_ISA::wake(gs::serial_executor(), scene, in);
         }
-        CHECK(halted == (!all && room == 3 ? 7 : 0) && (all || (needed.blocks == 4 && needed.instances == 0)));
+        CHECK(halted == (!all && room < seen ? 7 : 0) && (all || (needed.blocks == seen && needed.instances == 0)));
         if (halted) {
           CHECK(got[1].bytes() == start.bytes() && awake[1][1] == 7 && taken[1][0] == 2);
           continue;
         }
-        const int32_t listed[5] = {0, 2, 3, 4, -1};
-        CHECK(all || std::equal(blocks, blocks + room, listed));
-        const uint8_t wakes[2][5] = {{1, 0, 1, 1, 1}, {1, 1, 1, 1, 1}};
+        const int32_t every[5] = {0, 2, 3, 4, -1};
+        for (int64_t k = 0; k < room; ++k) CHECK(all || blocks[k] == (k < seen ? every[k] : -1));
+        const uint8_t wakes[2][5] = {{some, 0, some, some, last}, {1, 1, 1, 1, 1}};
         for (int block = 0; block < 5; ++block) {
           CHECK(awake[0][block] == wakes[all][block] && awake[1][block] == wakes[all][block]);
-          CHECK(taken[0][block] == taken[1][block] && taken[0][block] == (wakes[all][block] ? 101 - all : 1));
+          CHECK(taken[0][block] == taken[1][block] &&
+                taken[0][block] == (wakes[all][block] ? 101 - all : start_taken[block]));
         }
         for (int a = 0; a < gs::kStepped; ++a) {
           check_near(*got[1].values.all()[a], *got[0].values.all()[a], 1e-6);
           check_near(got[1].mean[a], got[0].mean[a], 1e-6), check_near(got[1].square[a], got[0].square[a], 1e-6);
-          CHECK(*got[1].values.all()[a] != *start.values.all()[a]);
+          CHECK((*got[1].values.all()[a] != *start.values.all()[a]) == (some || all));
         }
         CHECK(std::equal(std::begin(terms[0]), std::end(terms[0]), std::begin(terms[1])));
       }
@@ -699,7 +704,9 @@ int main() {
   return gs::run_shared("CUDA kernels, emulated", before,
                         {test_rows,
                          test_gaussian_step,
-                         test_wake,
+                         [] { test_wake(4); },
+                         [] { test_wake(3); },
+                         [] { test_wake(0); },
                          test_listed_blocks,
                          test_lists,
                          test_lists_without_records,

@@ -172,6 +172,7 @@ void apply_gradients_op(List<Tensor> gaussians, List<Tensor> camera, List<double
   if (!sums.empty()) {
     const SceneGradients added(scene, sums);
     const bool lengths = absolute && sums[kMeans2d].size(0) > 0;
+    GS_CHECK_VALUE(!lengths || !scene.blocks().defined(), "lengths of listed blocks' rows have no place in a sum");
     vjp(scene, GradientSource(scene, SOURCE_ARGUMENTS, absolute, lengths), lengths, [&] { return added; });
     return;
   }
@@ -206,7 +207,8 @@ MaybeTensor wake_op(List<Tensor> gaussians, List<Tensor> camera, List<double> le
   check_tensor(sleep[2], "terms", scene.dtype(), scene.device(), {gs::kTerms, int64_t(gs::kTermColumns)});
   MaybeTensor listed;
   if (!all && scene.device().is_cuda())
-    listed = empty<int32_t>({ahead() ? std::min(ahead()->room.blocks, blocks) : blocks}, sleep[0]);
+    listed =
+        empty<int32_t>({ahead() ? std::min(std::max<int64_t>(ahead()->room.blocks, 1), blocks) : blocks}, sleep[0]);
   with_scalar(scene.dtype(), [&](auto zero) {
     using T = decltype(zero);
     const gs::SleepInput<T> in{step.of<T>(gaussians, {}),    all,

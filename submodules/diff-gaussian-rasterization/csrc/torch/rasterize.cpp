@@ -48,17 +48,23 @@ ProjectedTensors project(const SceneTensors& in, bool rects) {
   return out;
 }
 
-// Names the Gaussians with the most tiles; often a few giants cover nearly all.
-std::string giants(const Tensor& tile_counts) {
+// Names the Gaussians with the most tiles; often a few giants cover nearly all. blocks: of whose Gaussians the counts
+// are (gs::Scene::blocks), if it is defined.
+std::string giants(const Tensor& tile_counts, const Tensor& blocks) {
   const Tensor on_host = torch::stable::to(tile_counts, DeviceType::CPU);
   const auto* counts = read<int32_t>(on_host);
   std::vector<int64_t> rows(on_host.size(0));
   std::iota(rows.begin(), rows.end(), 0);
   const auto end = rows.begin() + std::min<size_t>(3, rows.size());
   std::partial_sort(rows.begin(), end, rows.end(), [&](int64_t a, int64_t b) { return counts[a] > counts[b]; });
+  const Tensor listed = blocks.defined() ? torch::stable::to(blocks, DeviceType::CPU) : blocks;
+  const auto gaussian = [&](int64_t row) {
+    const int64_t place = row / gs::kSleepBlock;
+    return row + (listed.defined() ? read<int32_t>(listed)[place] - place : 0) * gs::kSleepBlock;
+  };
   std::string words;
   for (auto row = rows.begin(); row != end; ++row)
-    words += (row == rows.begin() ? "" : ", ") + joined(*row, " (", counts[*row], ")");
+    words += (row == rows.begin() ? "" : ", ") + joined(gaussian(*row), " (", counts[*row], ")");
   return words;
 }
 
@@ -68,14 +74,14 @@ struct BinnedTensors {
   Tensor slots;        // (S, 0): only carries the number of slots, which sizes the backward's memory
 };
 
-// slots: whether the backward will need them.
-BinnedTensors bin(ProjectedTensors& in, gs::Image image, bool slots) {
+// slots: whether the backward will need them. blocks: as for `giants`.
+BinnedTensors bin(ProjectedTensors& in, gs::Image image, bool slots, const Tensor& blocks = {}) {
   BinnedTensors out;
   out.splat_slots = empty<int64_t>({slots ? in.depths.size(0) + 1 : 0, 2}, in.depths);
   auto allocate = [&](int64_t total, int64_t slot_count) {
     const int64_t n = in.depths.size(0);
     GS_CHECK(total <= std::numeric_limits<int32_t>::max(), n, " Gaussians cover ", total,
-             " tile instances, more than 2^31 - 1; most are those of Gaussian ", giants(in.tile_counts),
+             " tile instances, more than 2^31 - 1; most are those of Gaussian ", giants(in.tile_counts, blocks),
              ": remove such giants, or render at a lower resolution or with fewer Gaussians");
     out.instances = empty<int32_t>({total}, in.depths);
     out.ranges = empty<int64_t>({tiles_of(image) + 1}, in.depths);
@@ -162,7 +168,7 @@ Rasterized rasterize_op(const Tensor& means2d, SCENE_PARAMETERS, const Tensor& b
   scene.set_awake(given(awake));
   scene.checked(kMeans2d, &means2d);  // it only receives a gradient
   ProjectedTensors p = project(scene, false);
-  BinnedTensors b = bin(p, scene.image(), train);
+  BinnedTensors b = bin(p, scene.image(), train, scene.blocks());
   BlendedTensors o = blend(p.splats, b.instances, b.ranges, background, scene.image(), inverse_depth, train);
   return {o.color,     o.transmittance, o.inverse_depth, p.radii, p.splats, p.tile_counts,
           b.instances, b.ranges,        b.splat_slots,   b.slots, o.last,   o.layers};

@@ -82,6 +82,7 @@ void SceneTensors::set_awake(const Tensor* awake) {
   if (!awake) return;
   if (has_dtype(*awake, ScalarType::Int) && device_.is_cuda()) {
     check_tensor(*awake, "awake", ScalarType::Int, device_, {-1});
+    GS_CHECK_VALUE(awake->size(0) || !count(), "a list of the blocks that are awake needs an entry");
     blocks_ = packed(*awake);
     return;
   }

@@ -1,6 +1,7 @@
 // The ops of spilled tensors: of a GPU, with a first part in its memory and the rest in the host's, at one range of
 // addresses.
 #include <algorithm>
+#include <limits>
 
 #include "tensors.h"
 
@@ -105,10 +106,11 @@ class Range {
 
   // Frees all of it, once kernels that may still use it are done.
   void release() noexcept {
-    int before = 0;
-    cudaGetDevice(&before), cudaSetDevice(device_);
+    int before = device_;
+    cudaGetDevice(&before);
+    if (before != device_) cudaSetDevice(device_);
     cudaDeviceSynchronize();
-    cudaSetDevice(before);
+    if (before != device_) cudaSetDevice(before);  // which takes memory of a GPU that nothing has used yet
     if (mapped_) driver().unmap(place_, mapped_);
     driver().free(place_, near_ + far_);
   }
@@ -180,7 +182,8 @@ void release(void* place, void*) {
 // GPU, rounded down to whole pages, and all others in the host's. Null on the CPU, where there is one memory.
 MaybeTensor spilled_op(const Tensor& like, int64_t rows, int64_t near) {
   check_rows(like, "like");
-  GS_CHECK_VALUE(rows >= 0 && near >= 0, "rows and near must be at least 0, got ", rows, " and ", near);
+  GS_CHECK_VALUE(rows >= 0 && rows <= std::numeric_limits<int32_t>::max() && near >= 0,
+                 "rows must be from 0 to 2^31 - 1 and near at least 0, got ", rows, " and ", near);
 #ifdef GS_CUDA
   if (like.is_cuda()) {
     GS_CHECK(torch_from_blob, "spilled tensors need torch 2.11 or newer: update torch");
