@@ -150,7 +150,7 @@ class Speculation:
             self._steps.measure(self._pending[0].at)  # raises an error: its lists are too long for any capacity
         view = _view(self._pending[0].at)
         if not instances:  # it overflowed with blocks, and counted nothing else
-            instances, slots, rows, _ = self._needed_by(view)
+            instances, slots, rows, _ = self._needed_by(view) if self._needed else _FIRST
         # A step that overflowed with instances did not count its rows, of which there are no more.
         self._needed[view] = instances, slots, rows or instances, blocks
         for pending in self._pending:
