@@ -343,6 +343,7 @@ class Run:
         """Give each process its part of the whole model that all have, after a step in which all blocks woke."""
         agree_on_model(self.gaussians)
         self.gaussians.divide(self.group)
+        self._expect(self.density.most_gaussians)
         if self.sleeping:
             self.sleeping.reset()
         what = f"{self.gaussians.gaussian_count:,} Gaussians"
