@@ -146,6 +146,12 @@ def test_a_rank_that_fails_alone_saves_nothing(tmp_path, monkeypatch):
     assert divergence.DivergenceWatch._rescue(watch, 7) == "it stands"
 
 
+def test_a_rank_that_fails_is_met_where_others_share_seconds():
+    waited, failed = [], [[0, 1_500_000], [division.FAULT, 0]]
+    group = SimpleNamespace(several=True, numbers=lambda *_: torch.tensor(failed), anyone=waited.append)
+    assert division.shared_seconds(group, 9.0) == 1.5 and waited == [False]
+
+
 def test_a_model_that_is_divided_expects_each_ranks_part(monkeypatch):
     monkeypatch.setattr(runs, "agree_on_model", lambda _: None)
     run = Mock(sleeping=None, density=SimpleNamespace(most_gaussians=1000))
