@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -22,6 +23,7 @@ from splatting.distributed.ranks import ranks
 from splatting.training import division, loop
 from splatting.training import run as runs
 from splatting.training.iteration import Iteration
+from splatting.training.observers import divergence
 from splatting.training.steps import captured, step_taker
 from utils.system_utils import UserError
 
@@ -134,6 +136,28 @@ def test_faults_end_all_ranks_with_one_sentence(scene, tmp_path, act, said):
     ((one, _),), ((other, _),) = in_ranks(2, _in_rank, scene, tmp_path, [("default", 40, ())], act)
     assert one == other and said in one
     assert (tmp_path / "0/chkpnt39.pth").exists() == (act is _diverge)
+
+
+def test_a_rank_that_fails_alone_saves_nothing(tmp_path, monkeypatch):
+    group = SimpleNamespace(numbers=lambda *_: torch.tensor([[division.FAULT, 0], [0, 0]]), stands=lambda: "it stands")
+    run = SimpleNamespace(whole=True, group=group, first_iteration=0, scene=SimpleNamespace(model_path=tmp_path))
+    monkeypatch.setattr(divergence, "save_checkpoint", lambda *_: pytest.fail("saved"))
+    watch = SimpleNamespace(_run=run, _ranks=ranks(), _fault=divergence.DivergenceWatch._fault, _gaussians=Mock())
+    assert divergence.DivergenceWatch._rescue(watch, 7) == "it stands"
+
+
+def test_a_rank_that_fails_is_met_where_others_share_seconds():
+    waited, failed = [], [[0, 1_500_000], [division.FAULT, 0]]
+    group = SimpleNamespace(several=True, numbers=lambda *_: torch.tensor(failed), anyone=waited.append)
+    assert division.shared_seconds(group, 9.0) == 1.5 and waited == [False]
+
+
+def test_a_model_that_is_divided_expects_each_ranks_part(monkeypatch):
+    monkeypatch.setattr(runs, "agree_on_model", lambda _: None)
+    run = Mock(sleeping=None, density=SimpleNamespace(most_gaussians=1000))
+    run.gaussians.gaussian_count = 9
+    runs.Run.divide(run)
+    run._expect.assert_called_once_with(1000)
 
 
 def _run_of(monkeypatch: pytest.MonkeyPatch, changes: dict[str, object]) -> SimpleNamespace:

@@ -52,6 +52,8 @@ def _memory(monkeypatch: pytest.MonkeyPatch, limit: float, photos: int = 0) -> G
     monkeypatch.setattr(GpuMemory, "_limit_torch", lambda self, each: None)
     monkeypatch.setattr(gpu_memory, "photo_bytes", lambda images, device: photos)
     monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 0)
+    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 0)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (2**31, 2**32))
     return GpuMemory(limit, model(50), None, 1000, False, torch.device("cuda"))
 
 
@@ -97,6 +99,11 @@ def test_a_limit_begins_where_the_gpu_has_too_little(monkeypatch):
     assert there.limit == 0
 
 
+def test_a_limit_is_at_most_what_is_free(monkeypatch):
+    assert _memory(monkeypatch, 1).limit == 2**30
+    assert _memory(monkeypatch, 4).limit == int(gpu_memory._USABLE * 2**31)
+
+
 def test_a_slow_bus_is_told_of_before(monkeypatch):
     memory = _memory(monkeypatch, 1)
     spilled = memory.spilled_bytes(2_000_000)
@@ -110,6 +117,7 @@ def test_torch_gets_the_limit_without_the_near_parts(monkeypatch):
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: SimpleNamespace(total_memory=total))
     monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", lambda share: found.append(share * total))
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 2**30 - 1000)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (total, total))
     monkeypatch.setattr(torch.cuda, "empty_cache", lambda: freed.append(found[-1:]))
     monkeypatch.setattr(gpu_memory, "bytes_of", lambda: (living, 0))
     monkeypatch.setattr(gpu_memory, "photo_bytes", lambda images, device: 0)

@@ -11,6 +11,7 @@ import torch
 
 from scene.images.store import GPU_SHARE
 from scene.sleeping import REST
+from splatting.distributed.ranks import Ranks
 from splatting.host.memory import free_memory
 from splatting.host.torchrun import local_size
 from splatting.training.iteration import Iteration
@@ -60,6 +61,16 @@ def _is_tight(run: "Run", count: int) -> bool:
 def all_failed(run: "Run") -> bool:
     """Let a rank that has to end wait for the others' next agreement; whether all have to end for the same reason."""
     return bool((run.group.numbers(FAULT, 0)[:, 0] == FAULT).all())
+
+
+def shared_seconds(group: Ranks, seconds: float) -> float:
+    """The first rank's seconds, on all. A rank that has to end is met here, too, as where ranks agree on a signal."""
+    if not group.several:
+        return seconds
+    found = group.numbers(0, round(1e6 * seconds))
+    if (found[:, 0] == FAULT).any():
+        group.anyone(False)  # until it is gone
+    return int(found[0, 1]) / 1e6
 
 
 class Division:

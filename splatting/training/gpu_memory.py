@@ -59,6 +59,9 @@ class GpuMemory:
         self._each = training_bytes(gaussians, 1, 0, absolute) + _WHOLE_STEP
         self._spillable = spillable_bytes(gaussians, 1)
         self._fixed = training_bytes(gaussians, 0, pixels) + photo_bytes(images, device)
+        if self.limit and device.type == "cuda":  # other programs may have a part of what was given
+            there = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device)
+            self.limit = min(self.limit, int(_USABLE * there))
         gaussians.spill = self.room
         self._limit_torch(0)
 

@@ -6,6 +6,7 @@ import math
 import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ from splatting.exports.splats import Splats
 from splatting.host.clock import seconds_since_start
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.training import checks, schedule_file
-from splatting.training.division import begins_whole, say_whole
+from splatting.training.division import begins_whole, say_whole, shared_seconds
 from splatting.training.gpu_memory import GpuMemory, limit_torch, reads_on_host
 from splatting.training.iteration import Iteration, ViewOrder
 from splatting.training.memory_estimate import announce_memory, largest_view
@@ -83,12 +84,12 @@ class Run:
         self.start = self.group.shared(resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
         if opt.strategy == AUTO and (self.start or not (opt.time_budget or opt.schedule)):
             opt.strategy = checks.strategy_of(self.start) if self.start else USUAL
-        self.lost = 0
+        self.lost, share = 0, partial(shared_seconds, self.group)
         self.interrupt = DeferredInterrupt()
         self.device = compute_device()
         capture, self.first_iteration = self._read_start()
         views = self.group.size if launch.parallel == "views" else 1
-        self.schedule = schedule_file.schedule_of(opt, self.start, self.first_iteration, views, self.group.shared)
+        self.schedule = schedule_file.schedule_of(opt, self.start, self.first_iteration, views, share)
         if isinstance(self.schedule, DecidedSchedule):
             end_in_time(opt)
         self.warnings: list[str] = []
@@ -343,6 +344,7 @@ class Run:
         """Give each process its part of the whole model that all have, after a step in which all blocks woke."""
         agree_on_model(self.gaussians)
         self.gaussians.divide(self.group)
+        self._expect(self.density.most_gaussians)
         if self.sleeping:
             self.sleeping.reset()
         what = f"{self.gaussians.gaussian_count:,} Gaussians"

@@ -111,6 +111,8 @@ class DivergenceWatch(Observer):
         """Save the model, all processes together, if it is whole on each. Return what was saved, and what to do."""
         if iteration == self._run.first_iteration:
             return "no iteration was trained before it; lower the learning rates"
+        if self._run.whole and not all_failed(self._run):
+            return self._run.group.stands()
         path = Path(self._run.scene.model_path) / f"chkpnt{iteration}.pth"
         faults = self._ranks.everyone(self._fault(lambda: self._gaussians.check_finite(iteration)))
         fault = next(filter(None, faults), None)
@@ -118,8 +120,6 @@ class DivergenceWatch(Observer):
             self._gaussians.drop_broken_statistics()
             state = self._gaussians.capture()
             fault = self._ranks.shared(self._fault(lambda: save_checkpoint(path, state, iteration)))
-        if self._run.whole and not all_failed(self._run):
-            return self._run.group.stands()
         if fault is not None:
             return f"and the model could not be saved ({fault}); resume an earlier checkpoint"
         return (
