@@ -26,7 +26,8 @@ DEVICE = {
     "accuracy": "benchmarks.accuracy.oracle",
     "train": "benchmarks.scenes.training",
 }
-FORWARDING = ("benchmarks.scenes.step_profile", "benchmarks.scenes.training")  # unknown words go to train.py
+SCENES = ("step_profile", "street", "training")
+FORWARDING = [f"benchmarks.scenes.{name}" for name in SCENES]  # unknown words go to train.py
 FOREIGN = {"--eval_steps", "--save_steps", "--nnodes", "--shutdown_timeout"}  # flags of other programs
 
 

@@ -17,6 +17,7 @@ _BUS = 40e9  # bytes a second that kernels read or write in the host's memory
 _SLOW = 10.0  # milliseconds a step, from which on the bus is named
 _MUCH = 0.25  # of a GPU's free memory
 _PAGE = 2 << 20
+_CAN_SPILL = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 11)  # csrc/torch/spilled.cpp
 _SPARE = 0.03  # of a limit, what torch cannot fill of its blocks; and at least
 _LEAST_SPARE = 1 << 27  # bytes, for the lists of the first step
 _WHOLE_STEP = 20  # bytes of a Gaussian besides the estimate, in steps for which all blocks wake
@@ -67,7 +68,7 @@ class GpuMemory:
 
     def expect(self, count: int) -> None:
         """Take note of a number of this process's Gaussians that will come: a limit begins where they do not fit."""
-        if self.limit or self._device.type != "cuda":
+        if self.limit or self._device.type != "cuda" or not _CAN_SPILL:
             return
         limit = int(_USABLE * (free_memory(self._device) + torch.cuda.memory_allocated(self._device)))
         if self._needed(count, limit) > limit:

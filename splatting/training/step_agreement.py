@@ -31,7 +31,9 @@ class StepAgreement(Observer):
 
     def begins(self, step: Iteration) -> None:
         self._group.post(int(step.due), _SIGNALS.index(self._run.interrupt.requested))
-        self._group.prompt = step.iteration - self._run.first_iteration > _WARM
+        # Whole models meet seldom, and each process decodes its photos in the first epoch.
+        slow = len(self._run.scene.getTrainCameras()) if self._run.whole else 0
+        self._group.prompt = step.iteration - self._run.first_iteration > _WARM + slow
 
     def measured(self, step: Iteration, losses: Losses) -> None:
         signal = 0
