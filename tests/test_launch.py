@@ -73,7 +73,6 @@ STANDS = "the last checkpoint stands: resume with --start_checkpoint {out}/chkpn
         ("bug 1 7", "error: rank 1: ValueError: no such thing"),
         ("hang 1 7", "error: rank 1 hung: the others waited"),
         ("whole-kill 0 7", "error: rank 0 ended without a word (killed, or crashed); " + STANDS),
-        ("whole-overflow 1 7", "error: rank 1: xyz of 1 of 300 (3) had no finite step in iteration 7 (view "),
     ],
     ids=lambda value: value.split()[0] if isinstance(value, str) and value[:5] != "error" else "",
 )
@@ -179,11 +178,10 @@ def test_ranks_with_other_options_or_other_code_are_refused(colmap_scene, tmp_pa
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("fault", ["none 0 0", "whole-none 0 0"])
-def test_ranks_keep_the_pace_of_the_first(colmap_scene, tmp_path, fault):
+def test_ranks_keep_the_pace_of_the_first(colmap_scene, tmp_path):
     paced = ("--iterations", "3000", "--eval", "--time_budget", "2", "--target_psnr", "90", "--test_iterations", "-1")
     given = ["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "-r", "2", *paced]
-    done = launch(tmp_path / "logs", fault, *given)
+    done = launch(tmp_path / "logs", "none 0 0", *given)
     assert done.status == 0 and done.errors == []
     schedule = json.loads((tmp_path / "out" / "schedule.json").read_text())
     records = json.loads((tmp_path / "out" / "train_log.json").read_text())

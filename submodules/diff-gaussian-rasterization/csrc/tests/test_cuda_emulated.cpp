@@ -553,6 +553,7 @@ void test_wake(int64_t seen) {
   for (const int64_t room : {5, 4, 3})
     for (const bool all : {false, true})
       for (const gs::emulation::Order order : gs::emulation::kOrders) {
+        if (room != 5 && (all || order != gs::emulation::Order::shuffled)) continue;
         gs::emulation::order = order;
         constexpr int64_t count = 5 * gs::kSleepBlock - 28;
         Stepping start{Parameters<float>(count)};
@@ -610,7 +611,7 @@ void test_wake(int64_t seen) {
 void test_listed_blocks() {
   constexpr int64_t count = 5 * gs::kSleepBlock - 28, most = 4;
   const uint8_t awake[5] = {1, 0, 1, 0, 1};
-  for (const gs::emulation::Order order : gs::emulation::kOrders) {
+  for (const gs::emulation::Order order : {gs::emulation::Order::forward, gs::emulation::Order::shuffled}) {
     gs::emulation::order = order;
     Stepping flagged{Parameters<float>(count)};
     std::fill(flagged.statistics.begin(), flagged.statistics.end(), 0.0f);
