@@ -16,7 +16,7 @@ _USABLE = 0.95  # of a GPU's free memory, where nobody has given a limit; torch 
 _BUS = 40e9  # bytes a second that kernels read or write in the host's memory
 _SLOW = 10.0  # milliseconds a step, from which on the bus is named
 _MUCH = 0.25  # of a GPU's free memory
-_PAGE = 2 << 20
+_PAGE = 2 << 20  # bytes; a spilled tensor has whole pages in each memory
 _CAN_SPILL = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 11)  # csrc/torch/spilled.cpp
 _SPARE = 0.03  # of a limit, what torch cannot fill of its blocks; and at least
 _LEAST_SPARE = 1 << 27  # bytes, for the lists of the first step
@@ -140,8 +140,8 @@ class GpuMemory:
         milliseconds = 1e3 * 2 * spilled * seen / _BUS
         if milliseconds > _SLOW:
             said.append(
-                f"the bus to that memory will bind: about {milliseconds:.0f} ms a step, which concerns {seen:.0%} of "
-                "the Gaussians"
+                f"the bus to that memory will set the pace: about {milliseconds:.0f} ms a step, which concerns "
+                f"{seen:.0%} of the Gaussians"
             )
         return said
 
