@@ -3,10 +3,12 @@
 import math
 import sys
 import types
+from io import BytesIO
 from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 import train
 from splatting.evaluation.peer_curve import read_scalars
@@ -52,6 +54,7 @@ def writer(monkeypatch: pytest.MonkeyPatch) -> type[_Writer]:
     module = types.ModuleType("torch.utils.tensorboard")
     module.SummaryWriter = _Writer
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", module)
+    monkeypatch.setattr(EventWriter, "_add_jpeg", lambda self, *given: self._writer.add_image(*given))
     monkeypatch.setattr(sys, "stdout", sys.stdout)
     return _Writer
 
@@ -119,10 +122,12 @@ def test_an_interrupted_training_ends_its_events(colmap_scene, tmp_path, monkeyp
 
 def test_tensorboard_reads_them(colmap_scene, tmp_path, monkeypatch):
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    monkeypatch.delitem(sys.modules, "torch.utils.tensorboard")
+    monkeypatch.undo()
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
     _train(colmap_scene, tmp_path, "--iterations", "10", "--test_iterations", "10")
     events = accumulator.EventAccumulator(str(tmp_path), {"scalars": 0, "images": 0, "histograms": 0}).Reload()
     assert len(events.Tags()["images"]) == 2 * (3 + 5)  # renders and photos of three test views and five training views
+    assert Image.open(BytesIO(events.Images(events.Tags()["images"][0])[0].encoded_image_string)).size == (24, 16)
     assert events.Tags()["histograms"] == ["scene/opacity_histogram"]
     ours = read_scalars(tmp_path)
     for tag in events.Tags()["scalars"]:

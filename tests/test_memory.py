@@ -245,7 +245,7 @@ def test_the_estimate_counts_what_training_keeps():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU")
 def test_a_full_gpu_saves_the_model(colmap_scene, tmp_path, monkeypatch):
     error = _raised(lambda: torch.empty(1 << 50, dtype=torch.uint8, device="cuda"))
-    monkeypatch.setattr(fused, "draw", _failing(fused.draw, 3, error))
+    monkeypatch.setattr(fused, "draw", _failing(fused.draw, 4, error))
     monkeypatch.setattr(Graphs, "launch", lambda *_: None)  # a captured step calls nothing
     with pytest.raises(UserError, match="GiB asked for, .* GiB free on the GPU.*chkpnt3.pth"):
         _train(colmap_scene, tmp_path)

@@ -104,7 +104,7 @@ def leaves(value: object) -> list:
 
 def whole_result(out: Path, iteration: int) -> dict[str, bytes | list]:
     """The bytes of the PLY of an iteration, and the leaves of its checkpoint."""
-    checkpoint = torch.load(out / f"chkpnt{iteration}.pth", weights_only=False)
+    checkpoint = torch.load(out / f"chkpnt{iteration}.pth", "cpu", weights_only=False)  # where all has room
     ply = out / f"point_cloud/iteration_{iteration}/point_cloud.ply"
     return {"ply": ply.read_bytes(), "checkpoint": leaves(checkpoint)}
 

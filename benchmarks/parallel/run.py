@@ -8,7 +8,7 @@ import train
 from benchmarks.parallel.workload import Workload
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.morton import sort_rows
-from scene.sleeping import Sleeping
+from scene.sleeping import Sleeping, share_seen
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch
 from splatting.host.interrupt import DeferredInterrupt
@@ -54,7 +54,7 @@ class WorkloadRun(Run):
         self._begin(workload)
         if views > 1:
             self.gaussians.optimizer.set_betas(0.9**views, 0.999**views)
-        cameras = workload.cameras()
+        self._cameras = cameras = workload.cameras()
         self.scene = SimpleNamespace(cameras_extent=_EXTENT, images=images, prefetch=lambda _: None, model_path=".")
         self.views = ViewOrder(cameras, self.opt.seed, views, here.rank if views > 1 else 0)
         self.resolution = Resolution(self.schedule, images)
@@ -78,7 +78,10 @@ class WorkloadRun(Run):
         gaussians.limit_columns()
 
     def begin(self) -> None:
-        """Start the clocks; nothing is written."""
+        """Say what is spilled, and start the clocks; nothing is written."""
         self.memory.settle(self.gaussians)
+        seen = share_seen(self.gaussians.get_xyz.detach(), self._cameras)
+        for sentence in self.memory.words(len(self.gaussians), seen, True):
+            print(sentence, flush=True)
         self.log, self.rows = SimpleNamespace(seconds_before=0.0), []
         self.losses, self.clock = LossWatch(), Stopwatch()

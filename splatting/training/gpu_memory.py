@@ -31,7 +31,12 @@ def reads_on_host(checkpoint: str | None, limit: float, device: torch.device) ->
 
 
 def limit_torch(limit: float, device: torch.device) -> None:
-    """Leave torch so many bytes of the GPU; `free_memory` then counts no others."""
+    """Leave torch so many bytes of the GPU; `free_memory` then counts no others. inf: all of it.
+
+    Within a limit its segments grow and shrink, as lists that change their size would leave holes of a fifth of it.
+    """
+    if limit < math.inf and _CAN_SPILL:
+        torch._C._accelerator_setAllocatorSettings("expandable_segments:True")
     if torch.cuda.memory_reserved(device) > limit:
         torch.cuda.empty_cache()
     total = torch.cuda.get_device_properties(device).total_memory
