@@ -136,19 +136,24 @@ def _with_last(parts: Sequence[Tensor], last: Tensor) -> Tensor:
 
 def _packed(views: Sequence[tuple[Tensor, ...]], gaussians: Tensor, sizes: Sequence[int]) -> Tensor:
     """A row of words of 32 bits for each Gaussian, of which the first sizes[0] are of the first view, and so on."""
-    words = sum(t.shape[1:].numel() * t.element_size() for t in views[0]) // 4
-    rows = torch.empty(len(gaussians), words, dtype=torch.int32, device=gaussians.device)
+    words = _words(views[0])
+    rows = torch.empty(len(gaussians), sum(words), dtype=torch.int32, device=gaussians.device)
     for part, splats, own in zip(rows.split(sizes), views, gaussians.split(sizes), strict=True):
-        chosen = [t.index_select(0, own).view(len(own), t[:1].numel()).view(torch.int32) for t in splats]
-        torch.cat(chosen, 1, out=part)
+        for columns, wide, t in zip(part.split(words, 1), words, splats, strict=True):
+            # Into a part of each row: whole rows of 16 bytes are a block of threads each for torch (2.9 ms of 3 M).
+            torch.index_select(t.view(torch.int32).view(len(t), wide), 0, own, out=columns)
     return rows
 
 
 def _unpacked(rows: Tensor, like: Sequence[Tensor]) -> tuple[Tensor, ...]:
     """The tensors that `_packed` has packed."""
-    words = [t.shape[1:].numel() * t.element_size() // 4 for t in like]
-    parts = zip(rows.split(words, 1), like, strict=True)
+    parts = zip(rows.split(_words(like), 1), like, strict=True)
     return tuple(part.contiguous().view(-1).view(t.dtype).view(len(rows), *t.shape[1:]) for part, t in parts)
+
+
+def _words(tensors: Sequence[Tensor]) -> list[int]:
+    """Words of 32 bits in a row of each."""
+    return [t.shape[1:].numel() * t.element_size() // 4 for t in tensors]
 
 
 def move_runs(rows: Tensor, counts: Tensor, places: Tensor) -> Tensor:
