@@ -25,7 +25,7 @@ from scene.gaussians.checkpoint import ASLEEP, further, load_checkpoint, save_ch
 from scene.gaussians.table import GaussianTable
 from scene.readers.point_cloud import write_point_cloud
 from scene.saved_model import read_model
-from scene.sleeping import BLOCK, Sleeping
+from scene.sleeping import BLOCK, REST, Sleeping
 from splatting.distributed.ranks import ranks
 from splatting.training import run as runs
 from splatting.training.iteration import Iteration
@@ -36,7 +36,7 @@ from utils.system_utils import UserError
 
 BETAS, EPS = (0.9, 0.999), 1e-15
 MOST_RATIO = 0.1 / math.sqrt(0.001 * (1 - 0.81 / 0.999))  # of |m| / sqrt(v) (csrc/math/sleep.h)
-SCENES = 6  # of random blocks; 1000 for the figures of docs/inside/sleep.md
+SCENES, STEPS = 6, (5, 60)  # of random blocks; 1000, or 1 and (7000, 7001), for the figures of docs/inside/sleep.md
 NAMES = ("default", "white", "masks", "exposure", "depth", "absgrad", "together", "budget", "degree 0")
 
 
@@ -197,7 +197,7 @@ def test_steps_with_sleep_are_those_of_dense_adam_in_double():
         slept = _clusters(rng, place, blocks=6)
         dense = Blocks([value.double() for value in slept.values])
         dense.averages, dense.steps = [x.double() for x in slept.averages], [x.clone() for x in slept.steps]
-        for _ in range(int(rng.integers(5, 60))):
+        for number in range(1, 1 + int(rng.integers(*STEPS))):
             rate, at = 10 ** rng.uniform(-5, -2.5), int(rng.integers(len(slept.values[0])))
             camera = _looking(rng, slept.values[0][at].numpy(), place)
             slept.wake(camera, False, rate)
@@ -212,6 +212,8 @@ def test_steps_with_sleep_are_those_of_dense_adam_in_double():
             for values, part in zip(moved, parts[:18], strict=True):
                 values[rows] = part
             dense.step([gradient.double() for gradient in gradients], rate)
+            if number % REST == 0:
+                slept.wake(camera, True, rate)
         slept.wake(camera, True, rate)
         for one, other in zip(slept.values, dense.values, strict=True):
             worst[0] = max(worst[0], float(((one - other).abs() / (1 + other.abs())).max()))
