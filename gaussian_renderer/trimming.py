@@ -46,12 +46,17 @@ def decisive_for_any(cameras: Sequence[Camera | MiniCam], gaussians: GaussianMod
     return found
 
 
+def fewest_views(cameras: Sequence[Camera]) -> int:
+    """How many views a walk along the minimum spanning tree of the cameras makes, with the cameras themselves."""
+    return (1 + len(FRACTIONS)) * len(cameras) - len(FRACTIONS)
+
+
 def walk(cameras: Sequence[Camera], most: float) -> tuple[list[tuple[int, int]], int]:
     """Pairs of cameras to walk between, and how many views that makes with the cameras themselves.
 
     As many neighbours count, up to NEAREST, as need at most `most` views; the fewest, if none do.
     """
-    pairs, views = [], (1 + len(FRACTIONS)) * len(cameras) - len(FRACTIONS)  # those of the minimum spanning tree
+    pairs, views = [], fewest_views(cameras)
     for nearest in range(NEAREST, -1, -1) if views <= most else ():
         pairs = neighbours(cameras, nearest)
         views = len(cameras) + len(FRACTIONS) * len(pairs)
@@ -72,11 +77,14 @@ def search_unseen(
     keep = gaussians.raw("opacity").detach()[:, 0] >= FAINT
     shards = gaussians.shards
     search = Search(keep, faint=shards.marked(~keep))
-    pairs, search.views = walk(cameras, iterations / ITERATIONS_PER_VIEW)
-    if search.views > iterations / ITERATIONS_PER_VIEW:
+    most, search.views = iterations / ITERATIONS_PER_VIEW, fewest_views(cameras)
+    if search.views > most:
         search.end = TOO_LONG
         return search
     seen, search.views = decisive_for_any(cameras, gaussians, pipe), len(cameras)
+    # To find neighbours loads SciPy, which takes longer than the search of most models.
+    enough = shards.marked(keep & ~seen) >= WORTH * gaussians.gaussian_count
+    pairs = walk(cameras, most)[0] if enough else []
     walks = chain.from_iterable(views_between(cameras[i], cameras[j]) for i, j in pairs)
     for camera in tqdm(walks, desc="Looking between", total=len(FRACTIONS) * len(pairs), unit="view", leave=False):
         if shards.marked(keep & ~seen) < WORTH * gaussians.gaussian_count:
