@@ -83,13 +83,20 @@ def _rows(said: str, first: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
 
 
-def test_the_kernels_are_timed(monkeypatch, capsys):
+def test_the_kernels_are_timed(colmap_scene, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(rasterizer.CPU_WORKLOADS, "S", (300, 40, 27, 2.4))
     words = "rasterizer --device cpu --workloads S --threads 1 --repeats 1"
     monkeypatch.setattr(sys, "argv", words.split())
     rasterizer.main()
-    (row,) = _rows(capsys.readouterr().out, "0 k, 40x27")
+    (row,) = _rows(capsys.readouterr().out, "S: 0 k, 40x27")
     assert all(float(cell) >= 0 for cell in row[2:9])
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", sys.stdout)  # training stamps it
+        train.main(["-s", str(colmap_scene), "-m", str(tmp_path / "model"), "-r", "24", "--iterations", "3"])
+    monkeypatch.setattr(sys, "argv", words.replace("--workloads S", f"--models {tmp_path}/model").split())
+    rasterizer.main()
+    (row,) = _rows(capsys.readouterr().out, "model: 0 k, 24x16")
+    assert float(row[11]) > 0
     monkeypatch.setattr(sys, "argv", words.replace(" S ", " M+ ").split())
     with pytest.raises(UserError, match="M\\+: on this device there are S, M, L, wide"):
         rasterizer.main()
@@ -99,9 +106,10 @@ def test_tables_of_a_gpu_have_stages_memory_and_marks(monkeypatch, capsys):
     launched = [("project_kernel", 0.25), ("sort", 0.5), ("blend_kernel", 1.0), ("blend_kernel", 0.125)]
     times = dict.fromkeys(("forward", "+ backward", "step"), GpuTime(0.82, launched))
     monkeypatch.setattr(rasterizer, "measure_on_gpu", lambda name, _: rasterizer.Measured(name, times, [20.0, 70.0]))
-    rasterizer.print_gpu(["S", "M"], "morton")
+    rasterizer.print_gpu((name, None) for name in ("S", "M", "lego"))
     said = capsys.readouterr().out
-    assert ["blend", "1.125", "1.125"] in _rows(said, "blend ") and ["bin", "0.500", "0.500"] in _rows(said, "bin ")
+    assert ["blend", *["1.125"] * 3] in _rows(said, "blend ") and ["bin", *["0.500"] * 3] in _rows(said, "bin ")
+    assert ["lego", "forward", "0.820", "1.875", "", "", "", ""] in _rows(said, "lego ")
     assert _rows(said, "S ") == [
         ["S", "20", "29", "50", "70", "133", "54", "70"],
         ["S", "forward", "0.820", "1.875", "0.41", "1.11", "2.00", "0.18"],

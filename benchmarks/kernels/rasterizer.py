@@ -3,6 +3,7 @@
     python -m benchmarks.kernels.rasterizer                  # on the GPU if there is one and the build has CUDA
     python -m benchmarks.kernels.rasterizer --device cpu
     python -m benchmarks.kernels.rasterizer --order morton   # rows as trainings keep them; default: at random
+    python -m benchmarks.kernels.rasterizer --models OUT ...  # models of train.py in place of seeded workloads
 
 Milliseconds are medians. An instance is a splat in a tile. Processed instances are those that the backward reads: in
 each tile, those up to the last one that a pixel of the tile blends. A GPU's tables also have peak memory, and stages
@@ -10,7 +11,9 @@ and kernels of a step; beside them stand figures of other implementations.
 """
 
 import argparse
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 
@@ -27,6 +30,7 @@ from benchmarks.harness.measuring import (
     peak_mib,
     print_table,
 )
+from benchmarks.kernels.trained import trained
 from benchmarks.workloads.splat_scenes import CPU_WORKLOADS, GPU_WORKLOADS, ORDERS, SplatScene, frustum
 from utils.system_utils import UserError, run_cli
 
@@ -74,17 +78,17 @@ def measure_on_cpu(scene: SplatScene, repeats: int) -> dict[str, float]:
     return result | {"instances": len(stages.instances), "processed": stages.processed}
 
 
-def print_cpu(names: list[str], order: str, thread_counts: list[int], repeats: int) -> None:
+def print_cpu(scenes: Iterator[tuple[str, SplatScene]], thread_counts: list[int], repeats: int) -> None:
     """Print times and rates. Evaluations: processed instances x 256 pixels."""
-    header = ["splats, image, sigma", "threads", "forward", "+ backward", *CPU_STAGES, "instances", "processed"]
+    header = ["splats, image", "threads", "forward", "+ backward", *CPU_STAGES, "instances", "processed"]
     rows = []
-    for n, width, height, sigma in (CPU_WORKLOADS[name] for name in names):
-        scene = ORDERS[order](frustum(n, width, height, sigma))
+    for name, scene in scenes:
         for threads in dict.fromkeys(thread_counts):
             torch.set_num_threads(threads)
             found = measure_on_cpu(scene, repeats)
             evaluations = found["processed"] * TILE * TILE / threads / 1e6
-            row = [f"{n // 1000} k, {width}x{height}, {sigma} px", str(threads)]
+            count = len(scene.parameters["means"])
+            row = [f"{name}: {count / 1e3:.0f} k, {scene.width}x{scene.height}", str(threads)]
             row += [f"{found[name]:.1f}" for name in header[2:9]]
             row += [f"{found[name] / 1e3:.0f} k" for name in ("instances", "processed")]
             rows.append([*row, *(f"{evaluations / found[name]:.2f}" for name in ("blend", "blend_rows"))])
@@ -104,9 +108,9 @@ class Measured:
         return by_stage(self.times["step"].launched)
 
 
-def measure_on_gpu(name: str, order: str) -> Measured:
-    """Measure a workload by name."""
-    calls = Calls(ORDERS[order](frustum(*GPU_WORKLOADS[name], device="cuda")))
+def measure_on_gpu(name: str, scene: SplatScene) -> Measured:
+    """Measure a workload."""
+    calls = Calls(scene)
     # Memory first: Adam's averages would not count, but the memory that they leave in the pool could.
     memory = [peak_mib(run, calls.clear) for run in (calls.forward, calls.with_backward)]
     times = {step: gpu_time(run) for step, run in calls.steps().items()}
@@ -115,9 +119,10 @@ def measure_on_gpu(name: str, order: str) -> Measured:
     return Measured(name, times, memory)
 
 
-def print_gpu(names: list[str], order: str) -> None:
+def print_gpu(scenes: Iterator[tuple[str, SplatScene]]) -> None:
     """Measure the workloads and print every table."""
-    found = [measure_on_gpu(name, order) for name in names]
+    found = [measure_on_gpu(name, scene) for name, scene in scenes]
+    names = [workload.name for workload in found]
     for workload in found:
         print(f"\nKernels of a step in order, {workload.name}")
         print_table(["stage", "kernel", "ms"], [[stage, name, f"{ms:.4f}"] for stage, name, ms in workload.kernels()])
@@ -138,17 +143,30 @@ def _memory_row(workload: Measured) -> list[str]:
     for i, own in enumerate(workload.memory):
         others = [of.get(workload.name) for of in (FASTER_GS_MEMORY, GSPLAT_MEMORY)]
         row += [f"{own:.0f}", *(str(other[i]) if other else "" for other in others)]
-    return [*row, str(MEMORY_MARKS[workload.name])]
+    return [*row, str(MEMORY_MARKS.get(workload.name, ""))]
 
 
 def _time_rows(workload: Measured) -> list[list[str]]:
     rows = []
     for i, step in enumerate(workload.times):
         time = workload.times[step]
-        theirs, gsplat, mark = (of[workload.name][i] for of in (FASTER_GS, GSPLAT, MARKS))
-        row = [workload.name, step, f"{time.events:.3f}", f"{time.kernels:.3f}", f"{theirs:.2f}", f"{gsplat:.2f}"]
-        rows.append([*row, f"{time.events / theirs:.2f}", f"{mark:.2f}"])
+        row = [workload.name, step, f"{time.events:.3f}", f"{time.kernels:.3f}"]
+        if workload.name in MARKS:
+            theirs, gsplat, mark = (of[workload.name][i] for of in (FASTER_GS, GSPLAT, MARKS))
+            row += [f"{theirs:.2f}", f"{gsplat:.2f}", f"{time.events / theirs:.2f}", f"{mark:.2f}"]
+        rows.append(row + [""] * (8 - len(row)))
     return rows
+
+
+def workloads(args: argparse.Namespace, device: str) -> Iterator[tuple[str, SplatScene]]:
+    """The requested workloads by name, one after the other: several may not fit into memory."""
+    sizes = GPU_WORKLOADS if device == "cuda" else CPU_WORKLOADS
+    if unknown := [name for name in args.workloads or () if name not in sizes]:
+        raise UserError(f"--workloads {unknown[0]}: on this device there are {', '.join(sizes)}")
+    if args.models:
+        return ((folder.name, trained(folder).to(device)) for folder in args.models)
+    in_order = ORDERS[args.order]
+    return ((name, in_order(frustum(*sizes[name], device=device))) for name in args.workloads or sizes)
 
 
 def main() -> None:
@@ -156,20 +174,18 @@ def main() -> None:
     add = parser.add_argument
     add_device(parser)
     add("--workloads", nargs="+", help=f"CPU: of {', '.join(CPU_WORKLOADS)}; GPU: of {', '.join(GPU_WORKLOADS)}")
+    add("--models", type=Path, nargs="+", default=[], help="folders that train.py wrote, in place of workloads")
     add("--order", choices=list(ORDERS), default="random", help="of the rows (default: random, as drawn)")
     add("--threads", type=int, nargs="+", default=[1, torch.get_num_threads()], help="CPU: numbers of threads to use")
     add("--repeats", type=int, default=9, help="CPU: number of timed calls (default: 9)")
     args = parser.parse_args()
     device = chosen_device(args)
-    known = GPU_WORKLOADS if device == "cuda" else CPU_WORKLOADS
-    names = args.workloads or list(known)
-    if unknown := [name for name in names if name not in known]:
-        raise UserError(f"--workloads {unknown[0]}: on this device there are {', '.join(known)}")
-    print(f"{describe(device)}, rows: {args.order}")
+    scenes = workloads(args, device)
+    print(f"{describe(device)}, rows: {'as trained' if args.models else args.order}")
     if device == "cuda":
-        print_gpu(names, args.order)
+        print_gpu(scenes)
     else:
-        print_cpu(names, args.order, args.threads, args.repeats)
+        print_cpu(scenes, args.threads, args.repeats)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from torch import Tensor
 from scene.gaussians.morton import morton_codes
 
 PARAMETERS = ("means", "opacities", "scales", "rotations", "sh_dc", "sh_rest")
-_COLUMNS = ("xyz", "opacity", "scaling", "rotation", "f_dc", "f_rest")  # of a model, in the same order
+COLUMNS = ("xyz", "opacity", "scaling", "rotation", "f_dc", "f_rest")  # of a model, in the same order
 FOV = math.radians(60)
 # Arguments of `frustum`: splats, width, height, median pixel sigma.
 GPU_WORKLOADS = {
@@ -30,19 +30,21 @@ CPU_WORKLOADS = {
 
 def model_rows(parameters: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return parameters by the names of a model's columns."""
-    return {column: parameters[name] for column, name in zip(_COLUMNS, PARAMETERS, strict=True)}
+    return {column: parameters[name] for column, name in zip(COLUMNS, PARAMETERS, strict=True)}
 
 
 @dataclass
 class SplatScene:
     """Raw parameters by name (PARAMETERS) and an image size.
 
-    Opacities are logits, scales logarithms, rotations unnormalised w x y z; SH have K = 16 coefficients.
+    Opacities are logits, scales logarithms, rotations unnormalised w x y z; SH have K = 16 coefficients. camera: of a
+    trained scene (kernels/trained.py).
     """
 
     parameters: dict[str, Tensor]
     width: int
     height: int
+    camera: GaussianRasterizationSettings | None = None
 
     def leaves(self, dtype: torch.dtype) -> dict[str, Tensor]:
         """Return new leaves that require gradients.
@@ -54,11 +56,14 @@ class SplatScene:
 
     def to(self, device: torch.device | str) -> "SplatScene":
         """Return the same scene on another device."""
-        return SplatScene({k: v.to(device) for k, v in self.parameters.items()}, self.width, self.height)
+        return replace(self, parameters={k: v.to(device) for k, v in self.parameters.items()})
 
     def settings(self, dtype: torch.dtype = torch.float64, **changes) -> GaussianRasterizationSettings:
-        """Return a camera at the origin facing +z, 60 degrees wide, on the device of the parameters."""
-        return on_device(settings(self.width, self.height, dtype, **changes), self.parameters["means"].device)
+        """Return its camera, or one at the origin facing +z, 60 degrees wide, on the device of the parameters."""
+        made = self.camera and self.camera._replace(**changes)
+        made = made or settings(self.width, self.height, dtype, **changes)
+        tensors = {k: v.to(dtype) for k, v in made._asdict().items() if isinstance(v, Tensor)}
+        return on_device(made._replace(**tensors), self.parameters["means"].device)
 
 
 def settings(
