@@ -18,6 +18,7 @@ from arguments import ModelParams, OptimizationParams, OptionParser, PipelinePar
 from gaussian_renderer import network_gui
 from splatting.distributed.consistency import agree_on_options
 from splatting.evaluation.training_log import EventWriter as SummaryWriter
+from splatting.training.gpu_memory import own_limit
 from splatting.training.launch import add_launch_options, launch_options
 from splatting.training.loop import run_training
 from splatting.training.observers.report import training_report
@@ -31,6 +32,7 @@ from utils.system_utils import UserError, mkdir_p, run_cli
 __all__ = ["main", "parse", "prepare_output_and_logger", "train", "training", "training_report"]
 
 
+@own_limit()
 def train(
     dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, launch: argparse.Namespace
 ) -> None:

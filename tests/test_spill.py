@@ -128,6 +128,17 @@ def test_torch_gets_the_limit_without_the_near_parts(monkeypatch):
     assert found == [2**30 - 100, 2**30 - 800, 2**30 - 1100] and freed == [[2**30 - 800]]
 
 
+def test_a_training_leaves_torch_what_it_had(monkeypatch):
+    share = [0.4]
+    monkeypatch.setattr(gpu_memory, "compute_device", lambda: torch.device("cuda"))
+    monkeypatch.setattr(torch.cuda, "get_per_process_memory_fraction", lambda: share[-1])
+    monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", share.append)
+    with pytest.raises(UserError), gpu_memory.own_limit():
+        share.append(0.1)
+        raise UserError("full")
+    assert share == [0.4, 0.1, 0.4]
+
+
 def test_a_large_checkpoint_is_read_on_the_host(tmp_path, monkeypatch):
     (tmp_path / "start").write_bytes(bytes(1000))
     start, gpu = str(tmp_path / "start"), torch.device("cuda")
@@ -350,7 +361,6 @@ def test_both_memories_give_the_bytes_of_one(tmp_path, monkeypatch, name, _):
         assert not differences(_trained(scene, tmp_path / "spilled", *SPILL, *KINDS[name], *more), expected)
     gc.collect()
     assert len({*counts}) > 1 and bytes_of() == before
-    torch.cuda.set_per_process_memory_fraction(1.0)
 
 
 @ON_A_GPU
@@ -371,4 +381,3 @@ def test_a_tight_limit_is_kept(tmp_path, monkeypatch, _):
     _trained(scene, tmp_path / "out", "--gpu_memory", 0.7)
     assert all(near > 0 and far > 0 for near, far in shares)
     assert max(peaks) <= 0.7 * 2**30 and torch.cuda.max_memory_reserved() <= 0.7 * 2**30
-    torch.cuda.set_per_process_memory_fraction(1.0)

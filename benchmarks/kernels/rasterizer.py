@@ -87,8 +87,7 @@ def print_cpu(scenes: Iterator[tuple[str, SplatScene]], thread_counts: list[int]
             torch.set_num_threads(threads)
             found = measure_on_cpu(scene, repeats)
             evaluations = found["processed"] * TILE * TILE / threads / 1e6
-            count = len(scene.parameters["means"])
-            row = [f"{name}: {count / 1e3:.0f} k, {scene.width}x{scene.height}", str(threads)]
+            row = [f"{name}: {len(scene.parameters['means']) / 1e3:.0f} k, {scene.width}x{scene.height}", str(threads)]
             row += [f"{found[name]:.1f}" for name in header[2:9]]
             row += [f"{found[name] / 1e3:.0f} k" for name in ("instances", "processed")]
             rows.append([*row, *(f"{evaluations / found[name]:.2f}" for name in ("blend", "blend_rows"))])
@@ -165,8 +164,8 @@ def workloads(args: argparse.Namespace, device: str) -> Iterator[tuple[str, Spla
         raise UserError(f"--workloads {unknown[0]}: on this device there are {', '.join(sizes)}")
     if args.models:
         return ((folder.name, trained(folder).to(device)) for folder in args.models)
-    in_order = ORDERS[args.order]
-    return ((name, in_order(frustum(*sizes[name], device=device))) for name in args.workloads or sizes)
+    names = args.workloads or sizes
+    return ((name, ORDERS[args.order](frustum(*sizes[name], device=device))) for name in names)
 
 
 def main() -> None:
@@ -180,12 +179,11 @@ def main() -> None:
     add("--repeats", type=int, default=9, help="CPU: number of timed calls (default: 9)")
     args = parser.parse_args()
     device = chosen_device(args)
-    scenes = workloads(args, device)
     print(f"{describe(device)}, rows: {'as trained' if args.models else args.order}")
     if device == "cuda":
-        print_gpu(scenes)
+        print_gpu(workloads(args, device))
     else:
-        print_cpu(scenes, args.threads, args.repeats)
+        print_cpu(workloads(args, device), args.threads, args.repeats)
 
 
 if __name__ == "__main__":

@@ -11,8 +11,6 @@ from benchmarks.workloads.splat_scenes import COLUMNS, PARAMETERS, SplatScene
 from gaussian_renderer import rasterizer_settings, render
 from scene.saved_model import load_saved
 
-_VIEWS = 15  # of a scene, of which one stands for all
-
 
 @torch.no_grad()
 def trained(folder: Path) -> SplatScene:
@@ -26,7 +24,6 @@ def trained(folder: Path) -> SplatScene:
     scene, pipe = load_saved(models.extract(options), -1), pipelines.extract(options)
     gaussians, background = scene.gaussians, torch.zeros(3, device=scene.gaussians.get_xyz.device)
     views = sorted(scene.getTrainCameras(), key=lambda view: view.image_name)
-    views = views[:: -(-len(views) // _VIEWS)]
     seen = [int((render(view, gaussians, pipe, background)["radii"] > 0).sum()) for view in views]
     view = views[sorted(range(len(views)), key=seen.__getitem__)[len(views) // 2]]
     rows = {name: gaussians.raw(column).detach().clone() for name, column in zip(PARAMETERS, COLUMNS, strict=True)}

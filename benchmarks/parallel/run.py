@@ -81,7 +81,6 @@ class WorkloadRun(Run):
         """Say what is spilled, and start the clocks; nothing is written."""
         self.memory.settle(self.gaussians)
         seen = share_seen(self.gaussians.get_xyz.detach(), self._cameras)
-        for sentence in self.memory.words(len(self.gaussians), seen, True):
-            print(sentence, flush=True)
+        print("".join(f"{sentence}\n" for sentence in self.memory.words(len(self.gaussians), seen, True)), end="")
         self.log, self.rows = SimpleNamespace(seconds_before=0.0), []
         self.losses, self.clock = LossWatch(), Stopwatch()

@@ -2,6 +2,8 @@
 
 import math
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -11,6 +13,7 @@ from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
 from scene.images.store import ImageStore
 from splatting.host.memory import free_memory, gib
 from splatting.training.memory_estimate import near_rows, photo_bytes, spillable_bytes, training_bytes
+from utils.system_utils import compute_device
 
 _USABLE = 0.95  # of a GPU's free memory, where nobody has given a limit; torch cannot fill what it holds
 _BUS = 40e9  # bytes a second that kernels read or write in the host's memory
@@ -30,12 +33,23 @@ def reads_on_host(checkpoint: str | None, limit: float, device: torch.device) ->
     return os.path.getsize(checkpoint) > _MUCH * free_memory(device)
 
 
-def limit_torch(limit: float, device: torch.device) -> None:
-    """Leave torch so many bytes of the GPU; `free_memory` then counts no others. inf: all of it.
+@contextmanager
+def own_limit() -> Iterator[None]:
+    """Within it a training may limit torch; afterwards, torch may take what it might before."""
+    before = torch.cuda.get_per_process_memory_fraction() if compute_device().type == "cuda" else 0
+    try:
+        yield
+    finally:
+        if before:
+            torch.cuda.set_per_process_memory_fraction(before)
 
-    Within a limit its segments grow and shrink, as lists that change their size would leave holes of a fifth of it.
+
+def limit_torch(limit: float, device: torch.device) -> None:
+    """Leave torch so many bytes of the GPU; `free_memory` then counts no others.
+
+    Its segments then grow and shrink, as lists that change their size would leave holes of a fifth of the limit.
     """
-    if limit < math.inf and _CAN_SPILL:
+    if _CAN_SPILL:
         torch._C._accelerator_setAllocatorSettings("expandable_segments:True")
     if torch.cuda.memory_reserved(device) > limit:
         torch.cuda.empty_cache()

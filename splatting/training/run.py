@@ -133,8 +133,8 @@ class Run:
 
     def _read_start(self) -> tuple[tuple | None, int]:
         """The state of the checkpoint that is resumed, and its iteration. A limit of the GPU's memory begins before."""
-        if self.device.type == "cuda":  # another training of this process may have left a limit
-            limit_torch(self.opt.gpu_memory * 2**30 or math.inf, self.device)
+        if self.opt.gpu_memory and self.device.type == "cuda":
+            limit_torch(self.opt.gpu_memory * 2**30, self.device)
         if not self.start:
             return None, 0
         # Of several processes, each keeps a part of it on its device, and of a large model only a part fits there.
