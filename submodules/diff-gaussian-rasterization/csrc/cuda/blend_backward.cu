@@ -63,9 +63,16 @@ __global__ void __launch_bounds__(kTile* kTile)
   if (threadIdx.x % 32 == 0) atomicMax(&most, warp_most);
   __syncthreads();
   if (threadIdx.x == 0) processed[tile] = most;
-  for (int k = threadIdx.x; k < most; k += kTile * kTile) {
-    const int64_t slot = slot_of(slots, in.instances[in.ranges[tile] + k], tile % across, tile / across);
-    atomicOr(bits + (slot >> 5), 1u << (slot & 31));
+  constexpr int kThreads = kTile * kTile, kAhead = 4;  // slots that are found at once
+  const int32_t* list = in.instances + in.ranges[tile];
+  for (int k = threadIdx.x; k < most; k += kAhead * kThreads) {
+    int64_t slot[kAhead];
+#pragma unroll
+    for (int j = 0; j < kAhead; ++j)
+      if (k + j * kThreads < most) slot[j] = slot_of(slots, list[k + j * kThreads], tile % across, tile / across);
+#pragma unroll
+    for (int j = 0; j < kAhead; ++j)
+      if (k + j * kThreads < most) atomicOr(bits + (slot[j] >> 5), 1u << (slot[j] & 31));
   }
 }
 

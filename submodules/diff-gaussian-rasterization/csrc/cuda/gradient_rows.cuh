@@ -44,7 +44,7 @@ GradientRows fill_rows(const Queue& queue, const BlendInput<float>& in, const Bl
 template <int kValues>
 struct WarpSums {
   static constexpr int kOwnRows = 48;
-  static constexpr int kStaged = 32;                // rows at a time
+  static constexpr int kStaged = 96;                // rows at a time
   static constexpr int kStage = kStaged * kValues;  // floats of shared memory for each warp
 
   // All lanes of a warp call this, each with its own rows, from `begin` to `end`; there may be none.
@@ -60,8 +60,14 @@ struct WarpSums {
       if (first == ~0u) break;
       const float2* from = reinterpret_cast<const float2*>(rows + int64_t(kValues) * first);
       const int pairs = kValues / 2 * int(last - first < kStaged ? last - first : kStaged);
+      float2 loaded[kStage / 64];  // all are under way at once
+#pragma unroll
+      for (int k = 0; k < kStage / 64; ++k)
+        if (lane + 32 * k < pairs) loaded[k] = from[lane + 32 * k];
       __syncwarp();  // every lane has added the rows before
-      for (int k = lane; k < pairs; k += 32) reinterpret_cast<float2*>(stage)[k] = from[k];
+#pragma unroll
+      for (int k = 0; k < kStage / 64; ++k)
+        if (lane + 32 * k < pairs) reinterpret_cast<float2*>(stage)[lane + 32 * k] = loaded[k];
       __syncwarp();
       if (open)
         for (; next < end && next - first < kStaged; ++next) add(stage + kValues * (next - first), sums);

@@ -17,13 +17,17 @@ __device__ inline bool begin_step(const StepGuard<float>& guard) {
   return false;
 }
 
-// Steps a value that is in registers. Returns whether it took the step; without a guard it does not look.
+// Steps a value that is in registers: baseline::adam_if_finite with a guard, baseline::adam without. Returns whether it
+// took the step. One path for both is half the code, which is repeated often and should stay in the instruction cache.
 __device__ inline bool step_value(bool guarded, const AdamConstants& step, float gradient, float& value, float& mean,
                                   float& square) {
-  using Lanes = baseline::OneLane<float>;
-  if (guarded) return baseline::adam_if_finite<Lanes>(step, gradient, value, mean, square);
-  baseline::adam<Lanes>(step, gradient, value, mean, square);
-  return true;
+  float v = value, m = mean, s = square;
+  baseline::adam<baseline::OneLane<float>>(step, gradient, v, m, s);
+  const bool taken = (baseline::is_finite(v) & baseline::is_finite(m) & baseline::is_finite(s)) || !guarded;
+  value = taken ? v : value;
+  mean = taken ? m : NAN;
+  square = taken ? s : square;
+  return taken;
 }
 
 // Steps value i of a tensor.
