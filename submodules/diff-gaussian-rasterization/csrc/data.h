@@ -11,6 +11,19 @@ struct Image {
   int width, height;
 };
 
+// How a lens makes two numbers of a direction, before it distorts them. kPinhole: no lens.
+enum class Chart : int { kPinhole, kPerspective, kEquidistant, kEquirectangular };
+
+// A lens (math/lens.h) in COLMAP's conventions, but with pixel centres at integers.
+template <class T>
+struct Lens {
+  Chart chart;
+  T limit;                                 // of the sum of squares of the chart's numbers: nothing beyond is shown
+  T focal_x, focal_y, center_x, center_y;  // px
+  T radial[4], divisor[3], tangential[2], prism[2];
+};
+constexpr int kLensNumbers = 17;
+
 // The Gaussians and the camera. The tensors come in the order of Input in torch/scene.h.
 template <class T>
 struct Scene {
@@ -37,6 +50,7 @@ struct Scene {
   const uint8_t* awake = nullptr;   // (sleep_blocks(N)) 0: no Gaussian of the block reaches the image; null: unknown
   const int32_t* blocks = nullptr;  // (listed) on a GPU: the blocks that are awake, ascending, then -1; or null
   int64_t listed = 0;
+  Lens<T> lens = {};
 
   // Rows of what is made of the Gaussians: a row for each, or for those of the listed blocks alone.
   GS_HD int64_t rows() const;

@@ -33,7 +33,7 @@ class Scene(NamedTuple):
     view: Tensor
     projection: Tensor
     center: Tensor
-    lens: tuple[float, ...]  # tan_x, tan_y, scale_modifier
+    lens: tuple[float, ...]  # tan_x, tan_y, scale_modifier, and perhaps Lens.numbers
     options: tuple[int, ...]  # height, width, sh_degree, antialiasing, raw
 
     @property
@@ -83,8 +83,10 @@ def scene_arguments(gaussians: Gaussians, settings: GaussianRasterizationSetting
     for name in _FLAGS:
         if (flag := getattr(settings, name)) is not True and flag is not False and flag is not None:
             check_flag(name, flag)  # the text "no" would count as True
-    lens = settings.tanfovx, settings.tanfovy, settings.scale_modifier
     size = settings.image_height, settings.image_width
+    lens = settings.tanfovx, settings.tanfovy, settings.scale_modifier
+    if settings.lens is not None:
+        lens += settings.lens.numbers(*size[::-1])
     place = settings.viewmatrix, settings.projmatrix, settings.campos
     return Scene(*gaussians, *camera_arguments(*place, lens, *size, settings.sh_degree, settings.antialiasing, raw))
 

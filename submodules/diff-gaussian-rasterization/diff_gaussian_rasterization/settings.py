@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from diff_gaussian_rasterization.lens import Lens
+
 
 class GaussianRasterizationSettings(NamedTuple):
     """The camera, and how to render; the first 13 fields are the reference's, in its order.
@@ -26,3 +28,4 @@ class GaussianRasterizationSettings(NamedTuple):
     debug: bool  # check inputs, image and gradients for NaN and Inf; the error names the tensor and the place
     antialiasing: bool | None = None  # None, as in the 12 fields of 2023: off, and GaussianRasterizer has two results
     inverse_depth: bool = True  # False: the third result is None and nothing is computed for it
+    lens: Lens | None = None  # in place of a pinhole: then tanfovx, tanfovy and projmatrix are not read

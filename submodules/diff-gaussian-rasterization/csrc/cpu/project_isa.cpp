@@ -29,7 +29,7 @@ void cull_all(int64_t count, const Projected<T>& out) {
 template <class T>
 int64_t list_inside(const Scene<T>& s, const Camera<T>& camera, int32_t* inside) {
   for (int32_t i = 0; i < s.count; ++i) inside[i] = i;
-  if (!s.raw || s.cov3d) return s.count;
+  if (!s.raw || s.cov3d || s.lens.chart != Chart::kPinhole) return s.count;
   int64_t found = 0;
   for_packs<T>(inside, s.count, [&](const Pack<T>& pack) {
     using S = Simd<T>;
@@ -53,7 +53,8 @@ struct ProjectedPack {
   typename IntOf<T>::type radii[Simd<T>::kLanes], rects[4][Simd<T>::kLanes];
 
   // Returns a bit for each Gaussian that is visible, unless it reaches no tile.
-  uint32_t project(const Scene<T>& s, const Camera<T>& camera, const Pack<T>& pack) {
+  template <class AnyCamera>
+  uint32_t project(const Scene<T>& s, const AnyCamera& camera, const Pack<T>& pack) {
     using S = Simd<T>;
     using V = typename S::Vec;
     SceneLanes<T> row(s, pack);
@@ -99,8 +100,8 @@ void write_splat(const ProjectedPack<T>& pack, int lane, Image image, int32_t i,
   std::memcpy(out.splats + kSplatValues * i, &splat, sizeof splat);
 }
 
-template <class T>
-void project_block(const Scene<T>& s, const Camera<T>& camera, const Projected<T>& out) {
+template <class T, class AnyCamera>
+void project_block(const Scene<T>& s, const AnyCamera& camera, const Projected<T>& out) {
   int32_t inside[kBlock];
   cull_all(s.count, out);
   for_packs<T>(inside, list_inside(s, camera, inside), [&](const Pack<T>& pack) {
@@ -118,13 +119,14 @@ void project_block(const Scene<T>& s, const Camera<T>& camera, const Projected<T
 
 template <class T>
 void project(const Executor& executor, const Scene<T>& s, const Projected<T>& out) {
-  const Camera<T> camera = camera_of(s);
   const int64_t block = s.awake ? kSleepBlock : kBlock;
-  for_dynamic(executor, s.count, block, [&](int64_t begin, int64_t end) {
-    if (s.awake && !s.awake[begin / block])
-      cull_all(end - begin, part_of(out, begin));
-    else
-      project_block(part_of(s, begin, end - begin), camera, part_of(out, begin));
+  with_camera(s, [&](const auto& camera) {
+    for_dynamic(executor, s.count, block, [&](int64_t begin, int64_t end) {
+      if (s.awake && !s.awake[begin / block])
+        cull_all(end - begin, part_of(out, begin));
+      else
+        project_block(part_of(s, begin, end - begin), camera, part_of(out, begin));
+    });
   });
 }
 

@@ -74,8 +74,8 @@ struct PackGradient {
 };
 
 // At most kBlock Gaussians.
-template <class T>
-GS_ONE_COPY void project_vjp_rows(const Scene<T>& s, const Camera<T>& camera, const int32_t* tile_counts,
+template <class T, class AnyCamera>
+GS_ONE_COPY void project_vjp_rows(const Scene<T>& s, const AnyCamera& camera, const int32_t* tile_counts,
                                   const T* moments, const SceneGradient<T>& out) {
   using V = typename Simd<T>::Vec;
   int32_t seen[kBlock];
@@ -148,17 +148,17 @@ bool step_block(const GaussianStep<T>& in, const AdamStep<T>* steps, int64_t fir
 template <class T>
 void project_vjp(const Executor& executor, const Scene<T>& s, const int32_t* tile_counts, const T* moments,
                  const SceneGradient<T>& out) {
-  const Camera<T> camera = camera_of(s);
-  for_dynamic(executor, s.count, kBlock, [&](int64_t begin, int64_t end) {
-    project_vjp_rows(part_of(s, begin, end - begin), camera, tile_counts + begin, moments + kGradientValues * begin,
-                     part_of(out, begin, s.rest_bands));
+  with_camera(s, [&](const auto& camera) {
+    for_dynamic(executor, s.count, kBlock, [&](int64_t begin, int64_t end) {
+      project_vjp_rows(part_of(s, begin, end - begin), camera, tile_counts + begin, moments + kGradientValues * begin,
+                       part_of(out, begin, s.rest_bands));
+    });
   });
 }
 
 template <class T>
 void project_vjp_step(const Executor& executor, const Scene<T>& s, const int32_t* tile_counts, const T* moments,
                       const GaussianStep<T>& step) {
-  const Camera<T> camera = camera_of(s);
   AdamStep<T> steps[kStepped];
   for (int a = 0; a < kStepped; ++a) steps[a] = adam_step_of(step.attributes[a], step.sparse);
   StepGuard<T> guard = step.guard;
@@ -170,16 +170,19 @@ void project_vjp_step(const Executor& executor, const Scene<T>& s, const int32_t
     }
   const bool may = may_step(guard);
   bool finite = may;
-  for_dynamic(executor, s.count, kBlock, [&](int64_t begin, int64_t end) {
-    if (s.awake && !s.awake[begin / kBlock]) return;
-    const int64_t count = end - begin;
-    BlockGradient<T> gradient;
-    SceneGradient<T> wanted = gradient.pointers();
-    if (!step.attributes[kStepShRest].columns) wanted.sh_rest = nullptr;
-    project_vjp_rows(part_of(s, begin, count), camera, tile_counts + begin, moments + kGradientValues * begin, wanted);
-    observe_block(step.observed, begin, count, gradient);
-    penalise_block(step, begin, count, gradient);
-    if (may && !step_block(step, steps, begin, count, gradient)) __atomic_store_n(&finite, false, __ATOMIC_RELAXED);
+  with_camera(s, [&](const auto& camera) {
+    for_dynamic(executor, s.count, kBlock, [&](int64_t begin, int64_t end) {
+      if (s.awake && !s.awake[begin / kBlock]) return;
+      const int64_t count = end - begin;
+      BlockGradient<T> gradient;
+      SceneGradient<T> wanted = gradient.pointers();
+      if (!step.attributes[kStepShRest].columns) wanted.sh_rest = nullptr;
+      project_vjp_rows(part_of(s, begin, count), camera, tile_counts + begin, moments + kGradientValues * begin,
+                       wanted);
+      observe_block(step.observed, begin, count, gradient);
+      penalise_block(step, begin, count, gradient);
+      if (may && !step_block(step, steps, begin, count, gradient)) __atomic_store_n(&finite, false, __ATOMIC_RELAXED);
+    });
   });
   if (!finite && *guard.stopped == 0) *guard.stopped = guard.iteration;
 }

@@ -99,7 +99,7 @@ struct Addition : StepParameters {};
 // compiler may fuse other products in another, and both must go the same way to the last bit. Step: StepParameters or
 // PenalisedStep, between which nothing differs but a call; or Addition, whose code would cost these registers, and
 // whose sums may therefore differ by rounding.
-template <class Source, class Step>
+template <class AnyCamera, class Source, class Step>
 __global__ void __launch_bounds__(kThreads, kBlocks)
     project_vjp_kernel(const int32_t* halted, Scene<float> s, Source source, SceneGradient<float> out,
                        const __grid_constant__ Step step) {
@@ -109,10 +109,10 @@ __global__ void __launch_bounds__(kThreads, kBlocks)
   constexpr bool kAdds = std::is_same_v<Step, Addition>;
   constexpr int kStage = SlotSums::kStage > WarpGradients::kFloats ? SlotSums::kStage : WarpGradients::kFloats;
   static_assert(32 * RowBefore::kFloats <= kStage, "a warp has memory for the rows of its lanes");
-  __shared__ Camera<float> camera;
+  __shared__ AnyCamera camera;
   __shared__ __align__(16) float rest[kThreads * kRest];
   __shared__ __align__(16) float stage[kThreads / 32 * kStage];
-  if (threadIdx.x == 0) camera = camera_of(s);
+  if (threadIdx.x == 0) set_camera(s, camera);
   __syncthreads();
   const int64_t i = block * kThreads + threadIdx.x, first = i - (threadIdx.x & 31);
   const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x;  // in what the forward has made
@@ -159,8 +159,9 @@ __global__ void __launch_bounds__(kThreads, kBlocks)
 template <class Source, class Step>
 void launch_project_vjp(const Queue& queue, const Scene<float>& s, const Source& source,
                         const SceneGradient<float>& out, const Step& step) {
-  project_vjp_kernel<<<blocks_for(s.rows(), kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, s, source, out,
-                                                                                        step);
+  const auto kernel = s.lens.chart == Chart::kPinhole ? project_vjp_kernel<Camera<float>, Source, Step>
+                                                      : project_vjp_kernel<LensCamera<float>, Source, Step>;
+  kernel<<<blocks_for(s.rows(), kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, s, source, out, step);
   check_launch("project_vjp");
 }
 

@@ -24,6 +24,8 @@ __device__ bool near_view(const Camera<float>& cam, Vec3<float> view) {
          y < cam.height * view.z + spare_y;
 }
 
+__device__ bool near_view(const LensCamera<float>&, Vec3<float>) { return true; }
+
 // A Gaussian that sleeps, or none.
 __device__ void leave_out(int64_t row, int64_t rows, const Projected<float>& out) {
   if (row >= rows) return;
@@ -32,14 +34,15 @@ __device__ void leave_out(int64_t row, int64_t rows, const Projected<float>& out
   if (out.records) out.records[row] = TileRecord{};
 }
 
+template <class AnyCamera>
 __global__ void __launch_bounds__(kThreads)
     project_kernel(const int32_t* halted, Scene<float> s, Projected<float> out) {
   if (is_halted(halted)) return;
   const int64_t row = int64_t(blockIdx.x) * kThreads + threadIdx.x, block = awake_block(s, blockIdx.x);
   if (block < 0) return leave_out(row, s.rows(), out);
-  __shared__ Camera<float> camera;
+  __shared__ AnyCamera camera;
   __shared__ __align__(16) float rest[kThreads * kRest];
-  if (threadIdx.x == 0) camera = camera_of(s);
+  if (threadIdx.x == 0) set_camera(s, camera);
   __syncthreads();
   const int64_t i = block * kThreads + threadIdx.x;
   Splat<float> splat = {};
@@ -78,7 +81,9 @@ __global__ void __launch_bounds__(kThreads)
 template <>
 void project<float>(const Queue& queue, const Scene<float>& s, const Projected<float>& out) {
   if (!s.rows()) return;
-  project_kernel<<<blocks_for(s.rows(), kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, s, out);
+  const auto kernel =
+      s.lens.chart == Chart::kPinhole ? project_kernel<Camera<float>> : project_kernel<LensCamera<float>>;
+  kernel<<<blocks_for(s.rows(), kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, s, out);
   check_launch("project");
 }
 

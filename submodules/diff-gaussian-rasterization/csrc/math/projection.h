@@ -21,21 +21,37 @@ struct Gaussian {
 // 2001, eq. 29, at the ray clamped to 1.3 half images.
 template <class T>
 struct Perspective {
-  T inverse_z;
+  T inverse_depth;  // 1/z
   T ray_x, ray_y, clamped_x, clamped_y;
   Vec3<T> p1, p2;
 };
 
 template <class T, class V>
+GS_HD Truth<V> shown(const Camera<T>&, Vec3<V> view) {
+  return in_front(view.z);
+}
+template <class T, class V>
+GS_HD V depth_of(const Camera<T>&, Vec3<V> view) {
+  return view.z;
+}
+
+template <class T, class V>
 GS_HD Perspective<V> perspective(const Camera<T>& cam, Vec3<V> view) {
   Perspective<V> p;
-  p.inverse_z = 1 / view.z;
-  p.ray_x = view.x * p.inverse_z, p.ray_y = view.y * p.inverse_z;
+  p.inverse_depth = 1 / view.z;
+  p.ray_x = view.x * p.inverse_depth, p.ray_y = view.y * p.inverse_depth;
   p.clamped_x = clamp(p.ray_x, all<V>(cam.ray_min_x), all<V>(cam.ray_max_x));
   p.clamped_y = clamp(p.ray_y, all<V>(cam.ray_min_y), all<V>(cam.ray_max_y));
-  p.p1 = (cam.focal_x * p.inverse_z) * (cam.row_x - p.clamped_x * cam.row_z);
-  p.p2 = (cam.focal_y * p.inverse_z) * (cam.row_y - p.clamped_y * cam.row_z);
+  p.p1 = (cam.focal_x * p.inverse_depth) * (cam.row_x - p.clamped_x * cam.row_z);
+  p.p2 = (cam.focal_y * p.inverse_depth) * (cam.row_y - p.clamped_y * cam.row_z);
   return p;
+}
+
+// Where the image shows the mean; returns whether it does.
+template <class T, class V>
+GS_HD Truth<V> image_point(const Camera<T>& cam, const Perspective<V>& p, V& x, V& y) {
+  x = cam.mean_focal_x * p.ray_x + cam.axis_x, y = cam.mean_focal_y * p.ray_y + cam.axis_y;
+  return is_finite(x) & is_finite(y);
 }
 
 // M = J W R S and its minors. p1 x p2 = fx fy / z^2 (clamped ray, 1) with the dual rows of W, which for a rotation is
@@ -46,7 +62,7 @@ GS_HD Footprint<V> splat_footprint(const Camera<T>& cam, const Perspective<V>& p
   const auto& d = axes.direction;
   const auto& s = axes.scale;
   const Vec3<V> ray = cam.dual_z + p.clamped_x * cam.dual_x + p.clamped_y * cam.dual_y;
-  const V fx = cam.focal_x * p.inverse_z, fy = cam.focal_y * p.inverse_z;
+  const V fx = cam.focal_x * p.inverse_depth, fy = cam.focal_y * p.inverse_depth;
   const Vec3<V> m1 = {s[0] * dot(p.p1, d[0]), s[1] * dot(p.p1, d[1]), s[2] * dot(p.p1, d[2])};
   const Vec3<V> m2 = {s[0] * dot(p.p2, d[0]), s[1] * dot(p.p2, d[1]), s[2] * dot(p.p2, d[2])};
   const Vec3<V> minors = {(fx * s[1]) * (fy * s[2]) * dot(ray, cross(d[1], d[2])),
@@ -57,21 +73,21 @@ GS_HD Footprint<V> splat_footprint(const Camera<T>& cam, const Perspective<V>& p
 
 // Computes a splat except its colour. Opacity, scales and rotation must be finite. Returns false if it is culled:
 // behind the camera, not finite or too large on the image, or too faint to be seen anywhere.
-template <class T, class V>
-GS_HD Truth<V> project_splat(const Camera<T>& cam, const Gaussian<V>& gaussian, bool antialiasing, Splat<V>& splat,
+template <class AnyCamera, class V>
+GS_HD Truth<V> project_splat(const AnyCamera& cam, const Gaussian<V>& gaussian, bool antialiasing, Splat<V>& splat,
                              V& depth, Integer<V>& radius) {
+  using T = Scalar<V>;
   radius = Integer<V>{};
   const Vec3<V> view = to_view(cam, gaussian.mean);
-  Truth<V> visible = in_front(view.z) & finite(view);
+  Truth<V> visible = shown(cam, view) & finite(view);
   if (!any(visible)) return visible;
-  const Perspective<V> p = perspective(cam, view);
+  const auto p = perspective(cam, view);
   const Footprint<V> f = splat_footprint(cam, p, gaussian.axes);
-  splat.x = cam.mean_focal_x * p.ray_x + cam.axis_x;
-  splat.y = cam.mean_focal_y * p.ray_y + cam.axis_y;
+  visible &= image_point(cam, p, splat.x, splat.y);
   splat.l11 = f.l11, splat.l12 = f.l12, splat.l22 = f.l22;
-  splat.inverse_depth = p.inverse_z;
-  depth = view.z;
-  visible &= finite(Vec3<V>{splat.x, splat.y, f.l12}) & (f.l11 > 0) & (f.l22 > 0) & (f.a + f.c < T(kMaxVariance));
+  splat.inverse_depth = p.inverse_depth;
+  depth = depth_of(cam, view);
+  visible &= is_finite(f.l12) & (f.l11 > 0) & (f.l22 > 0) & (f.a + f.c < T(kMaxVariance));
   if (!any(visible)) return visible;
   const Integer<V> wide = footprint_radius(f);
   radius = (visible & radius_on_image(splat.x, splat.y, wide, cam.width, cam.height)) ? wide : radius;
@@ -119,27 +135,52 @@ GS_HD T torque(T off, T a, T b) {
   return low > 0 ? off / low * (a + b) * ((a - b) / high) : T{};
 }
 
+// What the gradient of J needs of dP's rows: their parts along the optical axis.
+template <class T>
+struct Along {
+  T one, two;
+};
+
+// row1, row2: dM's rows, in the Gaussian's own frame.
+template <class T, class V>
+GS_HD Along<V> along_view(const Camera<T>& cam, const Axes<V>& axes, const V (&row1)[3], const V (&row2)[3]) {
+  Along<V> along = {};
+  for (int k = 0; k < 3; ++k) {
+    const V depth = axes.scale[k] * dot(cam.row_z, axes.direction[k]);
+    along.one += row1[k] * depth, along.two += row2[k] * depth;
+  }
+  return along;
+}
+
+// The gradient of the mean through its place on the image and through J. diagonal: of ShapeGradient. A clamped ray is
+// constant: its coordinate gets no gradient through J, and z only through the factor 1/z.
+template <class T, class V>
+GS_HD Vec3<V> position_vjp(const Camera<T>& cam, Vec3<V>, const Perspective<V>& p, const Along<V>& along,
+                           Vec3<V> diagonal, V pixel_x, V pixel_y, V g_inverse_depth) {
+  V g_ray_x = cam.mean_focal_x * pixel_x, g_ray_y = cam.mean_focal_y * pixel_y;
+  g_ray_x = p.clamped_x == p.ray_x ? g_ray_x - cam.focal_x * p.inverse_depth * along.one : g_ray_x;
+  g_ray_y = p.clamped_y == p.ray_y ? g_ray_y - cam.focal_y * p.inverse_depth * along.two : g_ray_y;
+  const V g_z = -(diagonal.x + diagonal.y + diagonal.z + p.ray_x * g_ray_x + p.ray_y * g_ray_y +
+                  p.inverse_depth * g_inverse_depth);
+  return p.inverse_depth * (g_ray_x * cam.row_x + g_ray_y * cam.row_y + g_z * cam.row_z);
+}
+
 // perpendicular: whether the axes are. g_covariance (6, or null): the gradient of the covariance that gave the axes.
-template <class V, class T>
-GS_HD GaussianGradient<V> project_splat_vjp(const Camera<T>& cam, const Gaussian<V>& gaussian, bool antialiasing,
+template <class V, class AnyCamera>
+GS_HD GaussianGradient<V> project_splat_vjp(const AnyCamera& cam, const Gaussian<V>& gaussian, bool antialiasing,
                                             bool perpendicular, V* g_covariance, const Moments<V>& s,
                                             V g_inverse_depth) {
   GaussianGradient<V> g;
   const Vec3<V> view = to_view(cam, gaussian.mean);
-  const Perspective<V> p = perspective(cam, view);
+  const auto p = perspective(cam, view);
   const Footprint<V> f = splat_footprint(cam, p, gaussian.axes);
   g.log_opacity = s.q;
   mean_vjp(f, s, g.pixel_x, g.pixel_y);
 
   const ShapeGradient<V> shape = footprint_vjp(f, s, antialiasing);
-  const auto& d = gaussian.axes.direction;
   const auto& c = gaussian.axes.scale;
   const V row1[3] = {shape.m1.x, shape.m1.y, shape.m1.z}, row2[3] = {shape.m2.x, shape.m2.y, shape.m2.z};
-  V along1 = {}, along2 = {};  // dP's rows on the optical axis
-  for (int k = 0; k < 3; ++k) {
-    const V depth = c[k] * dot(cam.row_z, d[k]);
-    along1 += row1[k] * depth, along2 += row2[k] * depth;
-  }
+  const auto along = along_view(cam, gaussian.axes, row1, row2);
   g.log_scale[0] = shape.diagonal.x, g.log_scale[1] = shape.diagonal.y, g.log_scale[2] = shape.diagonal.z;
   if (perpendicular)
     g.torque = {torque(shape.off.x, c[1], c[2]), torque(shape.off.y, c[2], c[0]), torque(shape.off.z, c[0], c[1])};
@@ -157,13 +198,7 @@ GS_HD GaussianGradient<V> project_splat_vjp(const Camera<T>& cam, const Gaussian
     g_covariance[5] = p.p1.z * a.z + p.p2.z * b.z;
   }
 
-  // A clamped ray is constant: its coordinate gets no gradient through J, and z only through the factor 1/z.
-  V g_ray_x = cam.mean_focal_x * g.pixel_x, g_ray_y = cam.mean_focal_y * g.pixel_y;
-  g_ray_x = p.clamped_x == p.ray_x ? g_ray_x - cam.focal_x * p.inverse_z * along1 : g_ray_x;
-  g_ray_y = p.clamped_y == p.ray_y ? g_ray_y - cam.focal_y * p.inverse_z * along2 : g_ray_y;
-  const V g_z = -(shape.diagonal.x + shape.diagonal.y + shape.diagonal.z + p.ray_x * g_ray_x + p.ray_y * g_ray_y +
-                  p.inverse_z * g_inverse_depth);
-  g.mean = p.inverse_z * (g_ray_x * cam.row_x + g_ray_y * cam.row_y + g_z * cam.row_z);
+  g.mean = position_vjp(cam, view, p, along, shape.diagonal, g.pixel_x, g.pixel_y, g_inverse_depth);
   return g;
 }
 

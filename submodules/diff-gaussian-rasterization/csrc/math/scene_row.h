@@ -3,6 +3,7 @@
 #include <cmath>
 
 #include "../data.h"
+#include "lens_camera.h"
 #include "projection.h"
 
 GS_ISA_BEGIN
@@ -10,6 +11,25 @@ GS_ISA_BEGIN
 template <class T>
 GS_HD Camera<T> camera_of(const Scene<T>& s) {
   return make_camera(s.view, s.projection, s.center, s.tan_x, s.tan_y, s.image.width, s.image.height);
+}
+
+template <class T>
+GS_HD void set_camera(const Scene<T>& s, Camera<T>& camera) {
+  camera = camera_of(s);
+}
+template <class T>
+GS_HD void set_camera(const Scene<T>& s, LensCamera<T>& camera) {
+  static_cast<Camera<T>&>(camera) = camera_of(s);
+  camera.lens = s.lens;
+}
+
+// Calls run(camera) with a Camera, or a LensCamera where the scene has a lens.
+template <class T, class Run>
+void with_camera(const Scene<T>& s, const Run& run) {
+  if (s.lens.chart == Chart::kPinhole) return run(camera_of(s));
+  LensCamera<T> camera;
+  set_camera(s, camera);
+  run(camera);
 }
 
 // A Gaussian's parameters as they are stored. They are read where they are used: a GPU would keep them in registers
@@ -74,8 +94,8 @@ GS_HD Truth<V> finite_shape(const Scene<T>& s, const Row& row) {
 }
 
 // Computes a splat except its colour, and its depth. Returns false if it is culled.
-template <class T, class Row, class V = typename Row::Number>
-GS_HD Truth<V> project_shape(const Scene<T>& s, const Camera<T>& camera, const Row& row, Splat<V>& splat, V& depth,
+template <class T, class AnyCamera, class Row, class V = typename Row::Number>
+GS_HD Truth<V> project_shape(const Scene<T>& s, const AnyCamera& camera, const Row& row, Splat<V>& splat, V& depth,
                              Integer<V>& radius) {
   const Truth<V> good = finite_shape(s, row);
   radius = Integer<V>{};
@@ -157,8 +177,8 @@ GS_HD Vec3<V> color_vjp(const Scene<T>& s, const Camera<T>& camera, const Row& r
 
 // Computes a Gaussian's gradients from its moments m, and writes them to row `to` of `out`, except that of sh_rest.
 // Those of tensors that the scene lacks are not written.
-template <class T, class Row, class V = typename Row::Number>
-GS_HD void project_vjp_row(const Scene<T>& s, const Camera<T>& camera, const Row& row, const V* m, const V* rest,
+template <class T, class AnyCamera, class Row, class V = typename Row::Number>
+GS_HD void project_vjp_row(const Scene<T>& s, const AnyCamera& camera, const Row& row, const V* m, const V* rest,
                            V* g_rest, const SceneGradient<V>& out, int64_t to) {
   const Loaded<V> in = load(s, row);
   const GaussianGradient<V> g =

@@ -21,6 +21,7 @@ struct Parameters {
   int64_t count;
   std::vector<T> means, opacities, scales, rotations, dc, rest;
   T view[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1}, full[16] = {};  // transposed
+  gs::Lens<T> lens = {};
 
   explicit Parameters(int64_t n) : count(n) {
     for (int64_t i = 0; i < n; ++i) {
@@ -72,7 +73,7 @@ gs::Scene<T> scene_of(Parameters<T>& p, gs::Image image, bool antialiasing) {
   scene.dc_stride = 3, scene.rest_stride = 45, scene.rest_bands = 15, scene.sh_degree = 3;
   scene.raw = true, scene.antialiasing = antialiasing, scene.scale_modifier = 1;
   scene.view = p.view, scene.projection = p.full, scene.center = center;
-  scene.tan_x = scene.tan_y = 0.6, scene.image = image;
+  scene.tan_x = scene.tan_y = 0.6, scene.image = image, scene.lens = p.lens;
   return scene;
 }
 

@@ -65,6 +65,14 @@ void test_against_cpu() {
       }
 }
 
+void test_lenses() {
+  for (const gs::Chart chart : {gs::Chart::kPerspective, gs::Chart::kEquidistant, gs::Chart::kEquirectangular}) {
+    Parameters<float> p(100);
+    p.lens = {chart, 4, 30, 31, 34, 17, {-0.05f, 0.01f, 0.001f, 0.0001f}, {0.02f, 0, 0}, {0.003f, 0.002f}, {}};
+    check_scene(p, gs::Image{70, 33}, chart == gs::Chart::kPerspective, false);
+  }
+}
+
 // More tiles than kFewTiles, so that fewer warps share one, and a list of two chunks. One order only, because it is
 // slow.
 void test_many_tiles() {
@@ -714,6 +722,7 @@ int main() {
                          test_ahead,
                          test_pixels_that_end_in_every_chunk,
                          test_against_cpu,
+                         test_lenses,
                          test_lists_of_all_lengths,
                          test_many_tiles,
                          test_shared_lists_are_blended_as_whole_ones,

@@ -8,7 +8,8 @@
 #include "tensors.h"
 
 // The Gaussians, of which some may be null; the view matrix and the full projection, both transposed, and the centre;
-// tan_x, tan_y and scale_modifier; height, width, sh_degree, antialiasing and raw.
+// tan_x, tan_y and scale_modifier, and perhaps the numbers of a gs::Lens; height, width, sh_degree, antialiasing and
+// raw.
 #define CAMERA_SCHEMA "float[] lens, int[] options"
 #define SCENE_SCHEMA                                                                                   \
   "Tensor means, Tensor opacities, Tensor? scales, Tensor? rotations, Tensor? cov3d, Tensor? colors, " \
@@ -59,6 +60,7 @@ class SceneTensors {
 
   bool has(Input input) const { return inputs_[input].defined(); }
   bool raw() const { return raw_; }
+  bool has_lens() const { return lens_[0] != 0; }
   bool flat_opacities() const { return inputs_[kOpacities].dim() == 1; }  // a row instead of a column
   const Tensor& means() const { return inputs_[kMeans]; }
   int64_t count() const { return inputs_[kMeans].size(0); }
@@ -98,10 +100,27 @@ class SceneTensors {
             image_,
             awake_.defined() ? read<uint8_t>(awake_) : nullptr,
             blocks_.defined() ? read<int32_t>(blocks_) : nullptr,
-            blocks_.defined() ? blocks_.size(0) : 0};
+            blocks_.defined() ? blocks_.size(0) : 0,
+            lens<T>()};
   }
 
  private:
+  template <class T>
+  gs::Lens<T> lens() const {
+    const auto& n = lens_;
+    const auto at = [&](int k) { return T(n[k]); };
+    return {gs::Chart(int(n[0])),
+            at(1),
+            at(2),
+            at(3),
+            at(4),
+            at(5),
+            {at(6), at(7), at(8), at(9)},
+            {at(10), at(11), at(12)},
+            {at(13), at(14)},
+            {at(15), at(16)}};
+  }
+
   Tensor checked_rest(const Tensor& t) const;
   void check_settings() const;
 
@@ -110,6 +129,7 @@ class SceneTensors {
   InputTensors inputs_;  // means2d stays undefined
   Tensor view_, projection_, center_, awake_, blocks_;
   double tan_x_, tan_y_, scale_modifier_;
+  std::array<double, gs::kLensNumbers> lens_ = {};  // gs::Lens; a pinhole if it is not given
   int sh_degree_;
   bool antialiasing_, raw_;
   gs::Image image_;

@@ -1,0 +1,83 @@
+"""Lenses: where a camera shows a direction, by COLMAP's models."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+_CHARTS = ("pinhole", "perspective", "equidistant", "equirectangular")  # gs::Chart in csrc/data.h
+_SPARE = 1.3  # of the image's field of view, beyond which no Gaussian is shown, as the Jacobian's clamp of a pinhole
+# Parameters of COLMAP's models behind focal lengths and principal point: name and place.
+_RADIAL, _DIVISOR, _TANGENTIAL, _PRISM = "radial", "divisor", "tangential", "prism"
+_BROWN = ((_RADIAL, 0), (_RADIAL, 1), (_TANGENTIAL, 0), (_TANGENTIAL, 1))
+_MODELS = {
+    "SIMPLE_PINHOLE": ("perspective", 1, ()),
+    "PINHOLE": ("perspective", 2, ()),
+    "SIMPLE_RADIAL": ("perspective", 1, _BROWN[:1]),
+    "RADIAL": ("perspective", 1, _BROWN[:2]),
+    "OPENCV": ("perspective", 2, _BROWN),
+    "FULL_OPENCV": ("perspective", 2, (*_BROWN, (_RADIAL, 2), (_DIVISOR, 0), (_DIVISOR, 1), (_DIVISOR, 2))),
+    "SIMPLE_RADIAL_FISHEYE": ("equidistant", 1, _BROWN[:1]),
+    "RADIAL_FISHEYE": ("equidistant", 1, _BROWN[:2]),
+    "OPENCV_FISHEYE": ("equidistant", 2, tuple((_RADIAL, k) for k in range(4))),
+    "THIN_PRISM_FISHEYE": ("equidistant", 2, (*_BROWN, (_RADIAL, 2), (_RADIAL, 3), (_PRISM, 0), (_PRISM, 1))),
+}
+
+
+class Lens(NamedTuple):
+    """Chart, distortion, focal lengths and principal point (px, pixel centres at integers); csrc/math/lens.h has the
+    formulas.
+
+    The image of an equirectangular lens covers all directions: longitude across, latitude down.
+    """
+
+    chart: str  # perspective, equidistant or equirectangular
+    focal: tuple[float, float]
+    center: tuple[float, float]
+    radial: tuple[float, ...] = (0.0,) * 4
+    divisor: tuple[float, ...] = (0.0,) * 3
+    tangential: tuple[float, ...] = (0.0,) * 2
+    prism: tuple[float, ...] = (0.0,) * 2
+
+    def numbers(self, width: int, height: int) -> tuple[float, ...]:
+        """The operators' form for an image of that size (px). ValueError for numbers that no lens has."""
+        if self.chart not in _CHARTS[1:]:
+            raise ValueError(f"a lens's chart {self.chart!r} is none of {', '.join(_CHARTS[1:])}")
+        more = *self.focal, *self.center, *self.radial, *self.divisor, *self.tangential, *self.prism
+        if not all(map(math.isfinite, more)) or min(self.focal) <= 0:
+            raise ValueError(f"a lens needs finite numbers and focal lengths above 0, got {more}")
+        return float(_CHARTS.index(self.chart)), self.field(width, height) ** 2, *more
+
+    def field(self, width: int, height: int) -> float:
+        """How far from the axis Gaussians are shown: an angle (radians), or its tangent for a perspective chart.
+
+        It ends where the distortion turns back, and a little outside of the image's corners.
+        """
+        if self.chart == "equirectangular":
+            return math.inf
+        over, under = (np.polynomial.Polynomial([1.0, *terms]) for terms in (self.radial, self.divisor))
+        q = np.polynomial.Polynomial([0.0, 1.0])
+        slope = (over + 2 * q * over.deriv()) * under - 2 * q * over * under.deriv()
+        roots = np.concatenate([slope.roots(), under.roots()])
+        turns = [root.real for root in roots if abs(root.imag) < 1e-9 and root.real > 0]
+        turn = math.sqrt(min(turns, default=math.inf))
+        corner = max(
+            math.hypot((x - self.center[0]) / self.focal[0], (y - self.center[1]) / self.focal[1])
+            for x in (-0.5, width - 0.5)
+            for y in (-0.5, height - 0.5)
+        )
+        radii = np.linspace(0, min(turn, 4 * corner, math.pi if self.chart == "equidistant" else math.inf), 4097)
+        shown = radii[radii * over(radii**2) / under(radii**2) <= corner]
+        return min(turn, _SPARE * float(shown[-1]))
+
+
+def lens_of(model: str, params: tuple[float, ...]) -> Lens:
+    """The lens of a COLMAP camera, whose parameters count pixel centres from a half. KeyError for an unknown model."""
+    chart, focals, places = _MODELS[model]
+    focal = (params[0], params[focals - 1])
+    center = (params[focals] - 0.5, params[focals + 1] - 0.5)
+    lens = Lens(chart, focal, center)
+    terms = {name: list(getattr(lens, name)) for name in (_RADIAL, _DIVISOR, _TANGENTIAL, _PRISM)}
+    for (name, place), value in zip(places, params[focals + 2 :], strict=True):
+        terms[name][place] = float(value)
+    return lens._replace(**{name: tuple(values) for name, values in terms.items()})
