@@ -1,5 +1,6 @@
 """Lenses: where a camera shows a direction, by COLMAP's models."""
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -48,6 +49,7 @@ class Lens(NamedTuple):
             raise ValueError(f"a lens needs finite numbers and focal lengths above 0, got {more}")
         return float(_CHARTS.index(self.chart)), self.field(width, height) ** 2, *more
 
+    @functools.lru_cache(maxsize=4096)  # noqa: B019  (a lens is a value)
     def field(self, width: int, height: int) -> float:
         """How far from the axis Gaussians are shown: an angle (radians), or its tangent for a perspective chart.
 

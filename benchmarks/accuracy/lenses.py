@@ -1,0 +1,158 @@
+"""Error of lenses: of their pixels against pycolmap, of float32 against float64, and of EWA against exact rays.
+
+    python -m benchmarks.accuracy.lenses --device cpu   # or on the GPU, if there is one
+
+The first table has 2,000 Gaussians over a lens's whole field. Pixels are those of the means; gradients are those of a
+weighted sum of the image, over the largest value of their tensor. The second has one Gaussian of opacity 0.9 whose
+standard deviation is so many degrees, off the axis of an equidistant fisheye and of a pinhole. An exact ray has the
+alpha opacity * exp(-D^2 / 2), D the ray's least distance from the mean in standard deviations. EWA takes the
+lens's Jacobian at the mean instead (Zwicker et al. 2001). Shown are the largest difference of alpha, and the sum of
+differences over the sum of alphas.
+"""
+
+import argparse
+import math
+
+import numpy as np
+import pycolmap
+import torch
+from diff_gaussian_rasterization import GaussianRasterizationSettings, Gaussians, rasterize
+from diff_gaussian_rasterization.backend import OPERATORS
+from diff_gaussian_rasterization.lens import Lens, lens_of
+from diff_gaussian_rasterization.scene import scene_arguments
+from torch import Tensor
+
+from benchmarks.harness.measuring import add_device, chosen_device, describe, print_table
+from utils.system_utils import run_cli
+
+_WIDTH, _HEIGHT, _COUNT, _DEGREE = 640, 480, 2000, math.pi / 180
+# COLMAP's parameters behind focal lengths and principal point: each moves a corner by a twentieth or more.
+_EXTRAS: dict[str, tuple[float, ...]] = {
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": (-0.15,),
+    "RADIAL": (-0.15, 0.02),
+    "OPENCV": (-0.15, 0.02, 0.003, -0.002),
+    "FULL_OPENCV": (-0.15, 0.02, 0.003, -0.002, 0.01, 0.02, -0.01, 0.005),
+    "SIMPLE_RADIAL_FISHEYE": (0.05,),
+    "RADIAL_FISHEYE": (0.05, -0.01),
+    "OPENCV_FISHEYE": (0.05, -0.01, 0.003, -0.001),
+    "THIN_PRISM_FISHEYE": (0.02, -0.01, 0.001, -0.001, 0.003, -0.001, 0.001, -0.001),
+}
+_PANORAMA = Lens("equirectangular", (_WIDTH / (2 * math.pi), _HEIGHT / math.pi), (_WIDTH / 2 - 0.5, _HEIGHT / 2 - 0.5))
+_ANGLES, _SIZES = (0, 10, 30, 60, 90), (0.2, 1.0, 5.0)  # degrees
+
+
+def camera(lens: Lens, dtype: torch.dtype, device: str, width: int = _WIDTH, height: int = _HEIGHT) -> tuple:
+    """Settings of a camera at the origin."""
+    eye, zero = torch.eye(4, dtype=dtype, device=device), torch.zeros(3, dtype=dtype, device=device)
+    return GaussianRasterizationSettings(height, width, 1.0, 1.0, zero, 1.0, eye, eye, 3, zero, False, False, lens=lens)
+
+
+def field_of(lens: Lens) -> float:
+    """Half the angle that a lens shows, radians."""
+    field = lens.field(_WIDTH, _HEIGHT)
+    return math.atan(field) if lens.chart == "perspective" else min(field, math.pi - 0.1)
+
+
+def spread(lens: Lens) -> dict[str, Tensor]:
+    """Gaussians all over a lens's field, float32 values as float64."""
+    rng, draw = np.random.default_rng(0), torch.Generator().manual_seed(0)
+    theta = field_of(lens) * np.sqrt(rng.uniform(0, 1, _COUNT))
+    phi, away = rng.uniform(0, 2 * math.pi, _COUNT), rng.uniform(1, 5, (_COUNT, 1))
+    ray = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], 1)
+    shapes = {"opacities": (1,), "scales": (3,), "rotations": (4,), "sh_dc": (1, 3), "sh_rest": (15, 3)}
+    drawn = {"means": torch.from_numpy(ray * away)}
+    drawn |= {name: torch.randn(_COUNT, *shape, generator=draw) for name, shape in shapes.items()}
+    drawn["scales"] = 0.5 * drawn["scales"] + torch.log(0.02 * torch.from_numpy(away))
+    return {name: values.float().double() for name, values in drawn.items()}
+
+
+def drawn(
+    lens: Lens, values: dict[str, Tensor], dtype: torch.dtype, device: str
+) -> tuple[Tensor, Tensor, list[Tensor]]:
+    """The means' pixels where they are shown, else NaN, the image, and the gradients."""
+    settings = camera(lens, dtype, device)
+    leaves = {name: value.to(device, dtype).clone().requires_grad_() for name, value in values.items()}
+    splats, _, _, counts, *_ = OPERATORS.project(*scene_arguments(Gaussians(**leaves), settings, True))
+    pixels = torch.where(counts[:, None] > 0, splats[:, :2], math.nan)
+    others = dict(leaves)
+    means, opacities = others.pop("means"), others.pop("opacities")
+    image = rasterize(means, torch.zeros_like(means), opacities, settings, raw=True, **others).color
+    weight = torch.randn(image.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    (weight.to(image) * image).sum().backward()
+    return pixels.double().cpu(), image.detach().double().cpu(), [leaf.grad.double().cpu() for leaf in leaves.values()]
+
+
+def row(name: str, lens: Lens, device: str) -> list[str]:
+    """A row of the first table."""
+    values = spread(lens)
+    exact, single = (drawn(lens, values, *place) for place in ((torch.float64, "cpu"), (torch.float32, device)))
+    against = ""
+    if name in _EXTRAS:
+        shown = pycolmap.Camera(model=name, width=_WIDTH, height=_HEIGHT, params=_params(name))
+        theirs = torch.from_numpy(np.asarray(shown.img_from_cam(values["means"].numpy()))) - 0.5
+        against = f"{(exact[0] - theirs).abs().nan_to_num(0).max():.1e}"
+    pixels, image = ((single[k] - exact[k]).abs().nan_to_num(0).max() for k in range(2))
+    gradients = max((a - b).abs().max() / b.abs().max() for a, b in zip(single[2], exact[2], strict=True))
+    return [name, f"{2 * field_of(lens) / _DEGREE:.0f}", against, f"{pixels:.1e}", f"{image:.1e}", f"{gradients:.1e}"]
+
+
+def _params(model: str) -> list[float]:
+    focals = 2 if model in {"PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"} else 1
+    focal = 180.0 if "FISHEYE" in model else 400.0
+    return [*[focal] * focals, 330.0, 236.0, *_EXTRAS[model]]
+
+
+def ewa_error(chart: str, angle: float, deviations: tuple[float, float, float]) -> tuple[float, float]:
+    """Largest difference of alpha, and the relative sum of differences.
+
+    angle: of the mean from the axis, degrees. deviations: of the Gaussian across (twice) and along the ray, degrees.
+    """
+    pixels, focal = 2048, 16 / _DEGREE  # 16 pixels a degree on the axis
+    middle = focal * (math.tan(angle * _DEGREE) if chart == "perspective" else angle * _DEGREE)
+    lens = Lens(chart, (focal, focal), (pixels / 2 - middle, pixels / 2))
+    ray = np.array([math.sin(angle * _DEGREE), 0.0, math.cos(angle * _DEGREE)])
+    axes = np.stack([np.array([ray[2], 0.0, -ray[0]]), np.array([0.0, 1.0, 0.0]), ray], 1)
+    sizes = np.array(deviations) * _DEGREE
+    covariance = axes * sizes**2 @ axes.T
+    upper = torch.from_numpy(covariance[np.triu_indices(3)])[None]
+    settings = camera(lens, torch.float64, "cpu", pixels, pixels)
+    mean = torch.from_numpy(ray)[None]
+    opacity = torch.full((1, 1), 0.9, dtype=torch.float64)
+    white = torch.ones(1, 3, dtype=torch.float64)
+    ours = rasterize(mean, mean, opacity, settings, cov3d=upper, colors=white).color[0].numpy()
+    y, x = np.mgrid[:pixels, :pixels]
+    a, b = (x - lens.center[0]) / focal, (y - lens.center[1]) / focal
+    if chart == "perspective":
+        rays = np.stack([a, b, np.ones_like(a)], -1)
+    else:
+        theta = np.hypot(a, b)
+        rays = np.stack([a * np.sinc(theta / np.pi), b * np.sinc(theta / np.pi), np.cos(theta)], -1)
+    toward, origin = rays @ axes / sizes, -ray @ axes / sizes
+    square = (np.cross(origin, toward) ** 2).sum(-1) / (toward**2).sum(-1)
+    exact = 0.9 * np.exp(-0.5 * square) * (toward @ origin < 0)
+    exact[exact < 1 / 255] = 0
+    difference = np.abs(ours - exact)
+    return float(difference.max()), float(difference.sum() / exact.sum())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    add_device(parser)
+    device = chosen_device(parser.parse_args())
+    print(describe(device))
+    lenses = {name: lens_of(name, tuple(_params(name))) for name in _EXTRAS} | {"panorama": _PANORAMA}
+    header = ["lens", "degrees", "pixels, against pycolmap", "float32: pixels", "image", "gradients"]
+    print_table(header, [row(name, lens, device) for name, lens in lenses.items()])
+    print("\nEWA against exact rays: largest difference of alpha, share of the sum")
+    rows = []
+    for chart, angles in (("equidistant", _ANGLES), ("perspective", _ANGLES[:-1])):
+        for angle in angles:
+            shapes = [(size,) * 3 for size in _SIZES] + [(5.0, 0.2, 0.2)]
+            found = [ewa_error(chart, angle, shape) for shape in shapes]
+            rows.append([chart, str(angle), *(f"{most:.3f}, {share:.1%}" for most, share in found)])
+    print_table(["chart", "degrees off axis", *(f"{size} degrees" for size in _SIZES), "5 x 0.2 x 0.2"], rows)
+
+
+if __name__ == "__main__":
+    run_cli(main)
