@@ -221,6 +221,7 @@ def rasterizer_settings(
         prefiltered=False,
         debug=pipe.debug,
         antialiasing=getattr(pipe, "antialiasing", False),  # the 2023 release's options have none
+        lens=getattr(camera, "lens", None),
     )
 
 

@@ -57,8 +57,9 @@ class Camera(nn.Module):
     uid: index in its list; colmap_id: intrinsics id. R (3,3) camera-to-world, T (3,) world-to-camera, NumPy float64;
     a scale of R is divided out of both, and UserError is raised where R is sheared or mirrored.
     FoVx, FoVy: radians. fx, fy, cx, cy: pixels at image_width x image_height, pixel centres at .5 (the rasterizer's
-    integer pixel coordinates are half a pixel less). world_view_transform, projection_matrix, full_proj_transform:
-    (4,4) float32, transposed; camera_center (3,) float32; all on `device`. trans, scale: moved the camera's centre c to
+    integer pixel coordinates are half a pixel less). lens: of a photo that is taken as it is, at that size; None: a
+    pinhole. world_view_transform, projection_matrix, full_proj_transform: (4,4) float32, transposed; camera_center (3,)
+    float32; all on `device`. trans, scale: moved the camera's centre c to
     (c + trans) * scale in these. columns: the columns that count in loss and scores, None: all (scene/half_images.py).
     exposure_name: the photo's name among the trained exposures where it is not image_name (scene/half_images.py), else
     None. data_device: where photos in memory lie, and the images and masks below that other code reads.
@@ -99,6 +100,7 @@ class Camera(nn.Module):
         self.fx, self.fy = fov2focal(info.FovX, size[0]), fov2focal(info.FovY, size[1])
         offset = 2 * info.cx / info.width - 1, 2 * info.cy / info.height - 1
         self.cx, self.cy = ((off + 1) * pixels / 2 for off, pixels in zip(offset, size, strict=True))
+        self.lens = info.native and info.native.scaled(size[0] / info.width, size[1] / info.height)
         self.znear, self.zfar = ZNEAR, ZFAR
         self.trans, self.scale = trans, scale
         self.device = compute_device()
@@ -173,6 +175,7 @@ class Camera(nn.Module):
         twin.image_width, twin.image_height = twin._size = size
         twin.fx, twin.fy = fov2focal(self.FoVx, size[0]), fov2focal(self.FoVy, size[1])
         twin.cx, twin.cy = self.cx * size[0] / old, self.cy * size[1] / self._size[1]
+        twin.lens = self.lens and self.lens.scaled(size[0] / old, size[1] / self._size[1])
         if self.columns is not None:
             start, stop, _ = self.columns.indices(old)
             twin.columns = slice(-(-start * size[0] // old), stop * size[0] // old)

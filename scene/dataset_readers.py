@@ -32,7 +32,7 @@ sceneLoadTypeCallbacks: dict[str, Callable[..., SceneInfo]] = {
     NERFSTUDIO: readNerfstudioInfo,
 }
 _OURS = dict(sceneLoadTypeCallbacks)
-_READERS: dict[str, Callable[[Path, str, bool, StartOptions | None, MaskOptions], SceneInfo]] = {
+_READERS: dict[str, Callable[..., SceneInfo]] = {
     COLMAP: read_colmap,
     BLENDER: read_blender,
     NERFSTUDIO: read_nerfstudio,
@@ -49,6 +49,7 @@ def read_scene(
     masks: MaskOptions = NO_MASKS,
     offset: Sequence[float] | None = None,
     kind: str | None = None,
+    native: bool = False,
 ) -> SceneInfo:
     """Read the dataset in a folder, of any kind. UserError says what was looked for and what was found.
 
@@ -57,11 +58,13 @@ def read_scene(
     decides: "sfm" (the dataset's points) or "random". want_cloud: False reads no points, for a model that exists
     already. offset: (3,) of that model's frame (scene/readers/world_offset.py); None: computed for this scene.
     kind: of the folder (`kind_of`), where it is known.
-    Photos of distorting lenses are undistorted into the user's cache folder; nothing else is written.
+    native: take photos of distorting lenses as they are, where the rasterizer knows the camera model. Others are
+    undistorted into the user's cache folder; nothing else is written.
     """
     start = StartOptions(init_pcd_path, init_type) if want_cloud else None
-    read = _READERS[kind or kind_of(source_path)]
-    info = read(Path(source_path), images, hold_out, start, masks)
+    kind = kind or kind_of(source_path)
+    more = {"native": True} if native and kind != BLENDER else {}  # Blender's cameras have no lens
+    info = _READERS[kind](Path(source_path), images, hold_out, start, masks, **more)
     return local(info, world_offset(info) if offset is None else np.asarray(offset, dtype=np.float64))
 
 

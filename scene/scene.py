@@ -95,6 +95,7 @@ class Scene:
             masks=masks,
             offset=None if fresh else read_model_json(self.model_path).get(OFFSET, (0, 0, 0)),
             kind=kind,
+            native=getattr(args, "lenses", "") == "native",
             **_given(args, init_pcd_path="init_pcd_path", init_type="init_type"),
         )
         if fresh:

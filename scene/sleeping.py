@@ -170,7 +170,9 @@ class Sleeping:
 
 
 def share_seen(points: Tensor, cameras: Sequence[Camera]) -> float:
-    """The share of points (N, 3) that a camera sees, on the mean of up to 32 cameras."""
+    """The share of points (N, 3) that a camera sees, on the mean of up to 32 cameras; 1 with lenses, as all wake."""
+    if any(getattr(camera, "lens", None) for camera in cameras):
+        return 1.0
     views = cameras[:: -(-len(cameras) // 32)]
     ones = torch.cat((points, torch.ones_like(points[:, :1])), 1)
     shares = []

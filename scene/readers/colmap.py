@@ -40,6 +40,7 @@ def read_colmap(
     hold_out: bool,
     start: StartOptions | None = OWN_POINTS,
     masks: MaskOptions = NO_MASKS,
+    native: bool = False,
 ) -> SceneInfo:
     """Read a COLMAP scene: the model, photos in `<folder>/<images>`, views sorted by name (bytes).
 
@@ -54,7 +55,7 @@ def read_colmap(
     paths = find_images(folder / images, names, listed_by, "put them there, or name their folder with -i")
     found = find_masks(folder, names, masks)
     cameras = [
-        colmap_camera(photo, model.cameras[photo.camera_id], path, mask, masks.ignore_alpha)
+        colmap_camera(photo, model.cameras[photo.camera_id], path, mask, masks.ignore_alpha, native)
         for photo, path, mask in zip(photos, paths, found, strict=True)
     ]
     views = split_by_order(finished(cameras), hold_out, folder)
@@ -63,12 +64,17 @@ def read_colmap(
 
 
 def colmap_camera(
-    photo: Image, camera: Camera, path: Path, mask: Mask | None = None, ignore_alpha: bool = False
+    photo: Image,
+    camera: Camera,
+    path: Path,
+    mask: Mask | None = None,
+    ignore_alpha: bool = False,
+    native: bool = False,
 ) -> CameraInfo:
-    """The view of a photo that COLMAP registered."""
+    """The view of a photo that COLMAP registered. native: as for `camera_info`."""
     lens = Lens(camera.model, tuple(map(float, camera.params)), camera.width, camera.height)
     rotation, translation = qvec2rotmat(photo.qvec).T.copy(), np.asarray(photo.tvec, dtype=np.float64)
-    return camera_info(camera.id, photo.name, path, lens, rotation, translation, mask, ignore_alpha)
+    return camera_info(camera.id, photo.name, path, lens, rotation, translation, mask, ignore_alpha, native)
 
 
 def _own_cloud(model_folder: Path, model: ColmapModel) -> StartCloud:

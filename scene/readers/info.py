@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from diff_gaussian_rasterization.lens import Lens as NativeLens
 
 from scene.images.decode import picture_size
 from scene.images.lens import Lens
@@ -79,10 +80,10 @@ class CameraInfo(_LikeNamedTuple):
     fx, fy, cx, cy: pixels of that image, pixel centres at .5. Either FovX and FovY or fx and fy must be given; the
     others follow from them. Where they disagree, fx and fy count. The principal point is the middle by default.
     file_size: (width, height) of the photo, None: not read yet. lens: of a photo that has to be undistorted first, else
-    None (scene/readers/pinholes.py). mask: of the photo's shape, None if all pixels count. ignore_alpha: transparent
-    pixels of the photo do not count. depth: inverse depth of a training view that has a map
-    (scene/readers/depth_maps.py). image: the photo in memory, which readers leave out: a PIL image, as the 2023 release
-    gave it, or pixels at training size.
+    None (scene/readers/pinholes.py). native: the lens of a photo that is taken as it is; fx, fy, cx and cy are then
+    those of its axis. mask: of the photo's shape, None if all pixels count. ignore_alpha: transparent pixels of the
+    photo do not count. depth: inverse depth of a training view that has a map (scene/readers/depth_maps.py). image: the
+    photo in memory, which readers leave out: a PIL image, as the 2023 release gave it, or pixels at training size.
     """
 
     uid: int
@@ -104,6 +105,7 @@ class CameraInfo(_LikeNamedTuple):
     cy: float | None = None
     file_size: tuple[int, int] | None = None
     lens: Lens | None = None
+    native: NativeLens | None = None
     mask: Mask | None = None
     ignore_alpha: bool = False
     depth: Decodable | InMemory | None = None

@@ -6,9 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from diff_gaussian_rasterization.lens import MODELS, lens_of
 
 from scene.images.decode import picture_size
-from scene.images.lens import Lens, pinhole_of, undistortion
+from scene.images.lens import Lens, Pinhole, pinhole_of, undistortion
 from scene.images.masks import Mask
 from scene.readers.info import CameraInfo
 from scene.readers.undistortion import undistort
@@ -26,13 +27,20 @@ def camera_info(
     T: np.ndarray,
     mask: Mask | None = None,
     ignore_alpha: bool = False,
+    native: bool = False,
 ) -> CameraInfo:
-    """The view of a photo with any lens. The photo is only read if its lens distorts.
+    """The view of a photo with any lens. The photo is only read if it has to be undistorted.
+
+    native: take photos as they are, through their lenses, where the rasterizer knows the camera model.
 
     UserError names a view that cannot be used: its lens, its pose, or the photo.
     """
-    pinhole = straight = pinhole_of(lens, name)
-    if straight is None:
+    pinhole, through = pinhole_of(lens, name), None
+    distorts = pinhole is None
+    if distorts and native and lens.model in MODELS:
+        through, distorts = lens_of(lens.model, lens.params), False
+        pinhole = Pinhole(*through.focal, *(place + 0.5 for place in through.center), lens.width, lens.height)
+    elif distorts:
         pinhole = undistortion(lens, *picture_size(path)).pinhole
     camera = CameraInfo(
         uid=uid,
@@ -41,7 +49,8 @@ def camera_info(
         **pinhole._asdict(),
         image_path=path,
         image_name=name,
-        lens=lens if straight is None else None,
+        lens=lens if distorts else None,
+        native=through,
         mask=mask,
         ignore_alpha=ignore_alpha,
     )
@@ -54,7 +63,7 @@ def camera_info(
 
 
 def finished(cameras: Sequence[CameraInfo]) -> list[CameraInfo]:
-    """The views with the sizes of their photos, all of them pinholes: photos of other lenses are undistorted.
+    """The views with the sizes of their photos, all of them pinholes or native: other photos are undistorted.
 
     A message says which photos have another shape than their camera. UserError for a photo or mask that cannot be used.
     """

@@ -69,7 +69,12 @@ def read_frames(path: Path, masks: MaskOptions = NO_MASKS, suffixes: Sequence[st
 
 
 def read_nerfstudio(
-    folder: Path, images: str, hold_out: bool, start: StartOptions | None = OWN_POINTS, masks: MaskOptions = NO_MASKS
+    folder: Path,
+    images: str,
+    hold_out: bool,
+    start: StartOptions | None = OWN_POINTS,
+    masks: MaskOptions = NO_MASKS,
+    native: bool = False,
 ) -> SceneInfo:
     """Read a nerfstudio or instant-ngp scene (transforms.json), views sorted by name (bytes).
 
@@ -79,7 +84,7 @@ def read_nerfstudio(
     """
     path = folder / "transforms.json"
     content = _read(path)
-    cameras = _cameras(path, content, masks, SUFFIXES, by_stem=False)
+    cameras = _cameras(path, content, masks, SUFFIXES, by_stem=False, native=native)
     cameras.sort(key=lambda camera: os.fsencode(camera.image_name))
     if not cameras:
         raise UserError(f"{path} lists no frames; export the scene again")
@@ -120,7 +125,12 @@ def _no_camera_file(path: Path, error: Exception) -> UserError:
 
 
 def _cameras(
-    path: Path, content: dict[str, Any], masks: MaskOptions, suffixes: Sequence[str], by_stem: bool
+    path: Path,
+    content: dict[str, Any],
+    masks: MaskOptions,
+    suffixes: Sequence[str],
+    by_stem: bool,
+    native: bool = False,
 ) -> list[CameraInfo]:
     """The views in the order of the frames, named by the stems or by the relative paths of their files."""
     frames = content["frames"]
@@ -136,7 +146,7 @@ def _cameras(
         except (ValueError, TypeError, OverflowError) as error:
             raise _no_camera_file(path, error) from error
         name = photo.stem if by_stem else names[index]
-        cameras.append(camera_info(index, name, photo, lens, R, T, mask, masks.ignore_alpha))
+        cameras.append(camera_info(index, name, photo, lens, R, T, mask, masks.ignore_alpha, native))
     return finished(cameras)
 
 

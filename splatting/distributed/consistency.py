@@ -77,6 +77,7 @@ def _digest(cameras: Sequence[Camera]) -> str:
     digest = hashlib.sha256()
     for camera in cameras:
         kinds = [getattr(source, "suffix", type(source).__name__) for source, _ in getattr(camera, "undecoded", ())]
-        digest.update(f"{camera.image_name} {camera.image_width} {camera.image_height} {kinds}\n".encode())
+        size = camera.image_width, camera.image_height
+        digest.update(f"{camera.image_name} {size} {kinds} {getattr(camera, 'lens', None)}\n".encode())
         digest.update(camera.full_proj_transform.cpu().numpy().tobytes())
     return digest.hexdigest()

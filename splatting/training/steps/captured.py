@@ -203,7 +203,7 @@ class Graphs:
         """The graph for a step, made if it is worth it. The first step of a kind is not, as it may load kernels."""
         camera, run = at.camera, self._run
         phase = run.density.observes(at.iteration), run.gaussians.active_sh_degree
-        kind = (camera.image_height, camera.image_width, camera.FoVx, camera.FoVy, *phase)
+        kind = (camera.image_height, camera.image_width, camera.FoVx, camera.FoVy, camera.lens, *phase)
         graph = self._graphs.get(kind)
         if graph is not None:
             return graph
@@ -240,6 +240,7 @@ class Graphs:
             image_width=camera.image_width,
             FoVx=camera.FoVx,
             FoVy=camera.FoVy,
+            lens=camera.lens,
             world_view_transform=numbers[:16].view(4, 4),
             full_proj_transform=numbers[16:32].view(4, 4),
             camera_center=numbers[32:35],

@@ -11,7 +11,7 @@ _SPARE = 1.3  # of the image's field of view, beyond which no Gaussian is shown,
 # Parameters of COLMAP's models behind focal lengths and principal point: name and place.
 _RADIAL, _DIVISOR, _TANGENTIAL, _PRISM = "radial", "divisor", "tangential", "prism"
 _BROWN = ((_RADIAL, 0), (_RADIAL, 1), (_TANGENTIAL, 0), (_TANGENTIAL, 1))
-_MODELS = {
+MODELS = {
     "SIMPLE_PINHOLE": ("perspective", 1, ()),
     "PINHOLE": ("perspective", 2, ()),
     "SIMPLE_RADIAL": ("perspective", 1, _BROWN[:1]),
@@ -39,6 +39,11 @@ class Lens(NamedTuple):
     divisor: tuple[float, ...] = (0.0,) * 3
     tangential: tuple[float, ...] = (0.0,) * 2
     prism: tuple[float, ...] = (0.0,) * 2
+
+    def scaled(self, across: float, down: float) -> "Lens":
+        """The lens of an image that is so many times as wide and high."""
+        x, y = ((at + 0.5) * by - 0.5 for at, by in zip(self.center, (across, down), strict=True))
+        return self._replace(focal=(self.focal[0] * across, self.focal[1] * down), center=(x, y))
 
     def numbers(self, width: int, height: int) -> tuple[float, ...]:
         """The operators' form for an image of that size (px). ValueError for numbers that no lens has."""
@@ -75,7 +80,7 @@ class Lens(NamedTuple):
 
 def lens_of(model: str, params: tuple[float, ...]) -> Lens:
     """The lens of a COLMAP camera, whose parameters count pixel centres from a half. KeyError for an unknown model."""
-    chart, focals, places = _MODELS[model]
+    chart, focals, places = MODELS[model]
     focal = (params[0], params[focals - 1])
     center = (params[focals] - 0.5, params[focals + 1] - 0.5)
     lens = Lens(chart, focal, center)

@@ -1,0 +1,84 @@
+"""`--lenses native`: photos of distorting lenses as they are, through train.py, render.py and metrics.py."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import torch
+from diff_gaussian_rasterization.backend import OPERATORS
+from diff_gaussian_rasterization.gaussians import Gaussians
+from diff_gaussian_rasterization.scene import scene_arguments
+from lenses import DISTORTIONS
+from PIL import Image
+from synthetic import BROWN, CENTER, FOCAL, HEIGHT, WIDTH, FakeGaussians, make_colmap_scene, options_of, read
+
+import metrics
+import render
+import train
+from gaussian_renderer import rasterizer_settings
+from scene import Scene
+
+FISHEYE = (40.0, 40.0, *CENTER, 0.05, -0.01, 0.003, -0.001)
+
+
+@pytest.mark.parametrize(("model", "params"), [("OPENCV", BROWN), ("OPENCV_FISHEYE", FISHEYE)])
+@pytest.mark.parametrize("resolution", [1, 2])
+def test_views_show_points_where_the_photo_has_them(tmp_path, model, params, resolution):
+    reconstruction = make_colmap_scene(tmp_path / "scene", model=model, params=params, views=3)
+    options = options_of(tmp_path / "scene", tmp_path / "out", lenses="native", resolution=resolution)
+    scene = Scene(options, FakeGaussians(), shuffle=False)
+    points = np.array([point.xyz for point in reconstruction.points3D.values()])
+    count = len(points)
+    values = Gaussians(
+        torch.from_numpy(points), torch.ones(count, 1), torch.full((count, 3), -4.0), torch.ones(count, 4),
+        colors=torch.ones(count, 3),
+    )  # fmt: skip
+    pipe = type("Pipe", (), {"debug": False})
+    for camera in scene.getTrainCameras():
+        assert (camera.image_width, camera.image_height) == (WIDTH // resolution, HEIGHT // resolution)
+        settings = rasterizer_settings(camera, type("Model", (), {"active_sh_degree": 0}), pipe, torch.zeros(3))
+        doubles = Gaussians(*(None if value is None else value.double() for value in values))
+        splats, _, _, counts, *_ = OPERATORS.project(*scene_arguments(doubles, settings, True))
+        image = reconstruction.find_image_with_name(camera.image_name)
+        shown = [index for index in range(count) if counts[index] and image.project_point(points[index]) is not None]
+        assert len(shown) > 20
+        theirs = np.array([image.project_point(points[index]) for index in shown]) / resolution - 0.5
+        assert np.abs(splats[shown, :2].numpy() - theirs).max() < 1e-4  # matrices are float32
+
+
+def test_unknown_models_are_undistorted(tmp_path):
+    make_colmap_scene(tmp_path, model="FOV", params=(FOCAL, FOCAL, *CENTER, *DISTORTIONS["FOV"]), views=2)
+    assert all(view.native is None and view.lens is None for view in read(tmp_path, native=True).train_cameras)
+
+
+@pytest.mark.parametrize(("model", "params"), [("OPENCV", BROWN), ("OPENCV_FISHEYE", FISHEYE)])
+def test_a_training_and_its_renders_have_the_photos(tmp_path, monkeypatch, model, params):
+    scene, out = tmp_path / "scene", tmp_path / "out"
+    make_colmap_scene(scene, model=model, params=params, views=17)
+    words = ["-s", str(scene), "-m", str(out), "--eval", "--lenses", "native"]
+    train.main([*words, "--iterations", "300", "--checkpoint_iterations", "150", "--densify_from_iter", "1000"])
+    assert json.loads((out / "model.json").read_text())["lenses"] == "native"
+    ply = out / "point_cloud/iteration_300/point_cloud.ply"
+    once = ply.read_bytes()
+    ply.unlink()
+    train.main([*words, "--iterations", "300", "--densify_from_iter", "1000", "--start_checkpoint",
+                str(out / "chkpnt150.pth")])  # fmt: skip
+    assert ply.read_bytes() == once
+    monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(out), "--skip_train"])
+    render.main()
+    monkeypatch.setattr(sys, "argv", ["metrics.py", "-m", str(out)])
+    metrics.main()
+    for path in (out / "test/ours_300/renders").iterdir():
+        with Image.open(path) as image:
+            assert image.size == (WIDTH, HEIGHT)
+    photos = sorted((scene / "images").rglob("*.png"))
+    for path in (out / "test/ours_300/gt").iterdir():  # the photo itself, not a resampled one
+        with Image.open(path) as image:
+            shown = np.asarray(image.convert("RGB"))
+        assert any(np.array_equal(shown, np.asarray(Image.open(photo).convert("RGB"))) for photo in photos)
+    train.main(
+        [*words[:2], "-m", str(tmp_path / "resampled"), "--eval", "--iterations", "300", "--test_iterations", "300"]
+    )
+    resampled = json.loads((tmp_path / "resampled/train_log.json").read_text())[-1]["test_psnr"]
+    assert next(iter(json.loads((out / "results.json").read_text()).values()))["PSNR"] > resampled - 1
