@@ -32,7 +32,7 @@ EVEN = 0.8  # share of the best that trainings get on a machine of their own
 WIDEST_STEP = 2.0  # largest ratio of the seconds of two points to interpolate between; a wider gap tells too little
 DECIDING = {  # options of train.py that decide what test views show, and which of their pixels count
     *("--resolution", "-r", "--images", "-i", "--white_background", "-w", "--train_test_exp"),
-    *("--masks", "--invert_masks", "--mask_meaning"),
+    *("--masks", "--invert_masks", "--mask_meaning", "--lenses"),
 }
 
 Run = Mapping[str, Any]
