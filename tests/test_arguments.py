@@ -265,7 +265,8 @@ def test_model_json_has_what_is_stored_there_with_sorted_keys(tmp_path):
     }  # fmt: skip
     write_cfg_args(tmp_path, argparse.Namespace())
     del record["options"]
-    assert read_stored_options(tmp_path) == {**MODEL, **record, "masks": "", "mask_meaning": "auto", "lenses": "undistort"}
+    defaults = {"masks": "", "mask_meaning": "auto", "lenses": "undistort"}
+    assert read_stored_options(tmp_path) == {**MODEL, **record, **defaults}
 
 
 @pytest.mark.parametrize("text", ["", "[1]", '{"antialiasing": 1}', '{"seed": "1"}', '{"masks": false}'])
