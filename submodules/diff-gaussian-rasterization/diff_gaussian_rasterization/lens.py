@@ -26,10 +26,10 @@ MODELS = {
 
 
 class Lens(NamedTuple):
-    """Chart, distortion, focal lengths and principal point (px, pixel centres at integers); csrc/math/lens.h has the
-    formulas.
+    """A lens. csrc/math/lens.h has the formulas of charts and distortion.
 
-    The image of an equirectangular lens covers all directions: longitude across, latitude down.
+    focal, center: focal lengths and principal point, px, pixel centres at integers. The others: coefficients. The
+    image of an equirectangular lens covers all directions: longitude across, latitude down.
     """
 
     chart: str  # perspective, equidistant or equirectangular
