@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cstdio>
 #include <cstdlib>
+#include <deque>
 #include <memory>
 #include <random>
 #include <vector>
@@ -64,7 +65,7 @@ struct Warp {
 };
 
 struct Grid {
-  std::vector<Thread> threads;
+  std::deque<Thread> threads;  // fibers keep references to theirs
   std::vector<Warp> warps;
   std::vector<char> shared;
   ucontext_t context;  // of the scheduler, which is left when a thread begins
@@ -81,12 +82,9 @@ struct Grid {
 Grid grid_state;
 std::mt19937 generator(1);  // of shuffled orders
 
-void to_scheduler(Thread& self, bool for_good) {
+void to_scheduler(Thread& self) {
 #ifdef GS_ASAN
-  __sanitizer_start_switch_fiber(for_good ? nullptr : &self.fake_stack, grid_state.scheduler_stack,
-                                 grid_state.scheduler_size);
-#else
-  (void)for_good;
+  __sanitizer_start_switch_fiber(&self.fake_stack, grid_state.scheduler_stack, grid_state.scheduler_size);
 #endif
   go_on(self.point, grid_state.scheduler);
 #ifdef GS_ASAN
@@ -94,15 +92,18 @@ void to_scheduler(Thread& self, bool for_good) {
 #endif
 }
 
+// A fiber runs its thread of one block after the other: a new one would cost calls of the kernel.
 void start() {
 #ifdef GS_ASAN
   __sanitizer_finish_switch_fiber(nullptr, &grid_state.scheduler_stack, &grid_state.scheduler_size);
 #endif
-  (*grid_state.body)();
-  Thread& self = grid_state.threads[grid_state.current];
-  self.waits_for = Meeting::done;
-  self.runnable = false;
-  to_scheduler(self, true);
+  for (;;) {
+    (*grid_state.body)();
+    Thread& self = grid_state.threads[grid_state.current];
+    self.waits_for = Meeting::done;
+    self.runnable = false;
+    to_scheduler(self);
+  }
 }
 
 void give_turn(unsigned index) {
@@ -162,12 +163,13 @@ unsigned present() {
 
 // Sets a thread to the first line of the kernel.
 void begin(Thread& thread) {
-  getcontext(&thread.context);
-  thread.context.uc_stack.ss_sp = thread.stack.get();
-  thread.context.uc_stack.ss_size = kStack;
-  thread.context.uc_link = nullptr;
-  makecontext(&thread.context, &start, 0);
-  thread.begun = false;
+  if (!thread.begun) {
+    getcontext(&thread.context);
+    thread.context.uc_stack.ss_sp = thread.stack.get();
+    thread.context.uc_stack.ss_size = kStack;
+    thread.context.uc_link = nullptr;
+    makecontext(&thread.context, &start, 0);
+  }
   thread.runnable = true;
   thread.waits_for = Meeting::none;
   thread.votes = 0;
@@ -222,7 +224,7 @@ void meet(Meeting meeting, const char* what) {
   Thread& self = grid_state.threads[grid_state.current];
   self.waits_for = meeting;
   self.what = what;
-  to_scheduler(self, false);
+  to_scheduler(self);
 }
 
 int lane() { return int(grid_state.current % 32); }
