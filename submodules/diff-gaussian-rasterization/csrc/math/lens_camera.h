@@ -31,18 +31,18 @@ GS_HD Truth<V> shown(const LensCamera<T>& cam, Vec3<V> view) {
 }
 
 // By lanes, because vectors have no arc tangent.
-template <class T, class V>
+template <int kOrder, class T, class V>
 GS_HD OnLens<V> on_lens_of(const Lens<T>& lens, Vec3<V> p) {
   if constexpr (kIsScalar<V>) {
-    return on_lens(lens, p);
+    return on_lens<kOrder>(lens, p);
   } else {
-    OnLens<V> out;
+    OnLens<V> out = {};
     for (int lane = 0; lane < int(sizeof(V) / sizeof(T)); ++lane) {
-      const OnLens<T> one = on_lens(lens, Vec3<T>{p.x[lane], p.y[lane], p.z[lane]});
+      const OnLens<T> one = on_lens<kOrder>(lens, Vec3<T>{p.x[lane], p.y[lane], p.z[lane]});
       for (int i = 0; i < 2; ++i) {
         out.value[i][lane] = one.value[i];
         for (int k = 0; k < 3; ++k) out.first[i][k][lane] = one.first[i][k];
-        for (int k = 0; k < 6; ++k) out.second[i][k][lane] = one.second[i][k];
+        for (int k = 0; kOrder > 1 && k < 6; ++k) out.second[i][k][lane] = one.second[i][k];
       }
       out.field[lane] = one.field;
     }
@@ -53,7 +53,7 @@ GS_HD OnLens<V> on_lens_of(const Lens<T>& lens, Vec3<V> p) {
 template <class T, class V>
 GS_HD LensView<V> perspective(const LensCamera<T>& cam, Vec3<V> view) {
   LensView<V> p;
-  p.on = on_lens_of(cam.lens, view);
+  p.on = on_lens_of<1>(cam.lens, view);
   p.inverse_depth = 1 / depth_of(cam, view);
   const auto row = [&](const V* by) { return by[0] * cam.row_x + by[1] * cam.row_y + by[2] * cam.row_z; };
   p.p1 = row(p.on.first[0]), p.p2 = row(p.on.first[1]);
@@ -100,11 +100,12 @@ template <class T, class V>
 GS_HD Vec3<V> position_vjp(const LensCamera<T>& cam, Vec3<V> view, const LensView<V>& p, const AlongAxes<V>& along,
                            Vec3<V>, V pixel_x, V pixel_y, V g_inverse_depth) {
   constexpr int kPair[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
+  const OnLens<V> on = on_lens_of<2>(cam.lens, view);
   V g[3] = {};
   for (int i = 0; i < 2; ++i)
     for (int a = 0; a < 3; ++a) {
       g[a] += (i ? pixel_y : pixel_x) * p.on.first[i][a];
-      for (int b = 0; b < 3; ++b) g[a] += along.of[i][b] * p.on.second[i][kPair[a][b]];
+      for (int b = 0; b < 3; ++b) g[a] += along.of[i][b] * on.second[i][kPair[a][b]];
     }
   const V square = p.inverse_depth * p.inverse_depth * g_inverse_depth;
   if (cam.lens.chart == Chart::kPerspective) {
