@@ -68,14 +68,11 @@ GS_HD Truth<V> image_point(const LensCamera<T>& cam, const LensView<V>& p, V& x,
 
 template <class T, class V>
 GS_HD Footprint<V> splat_footprint(const LensCamera<T>&, const LensView<V>& p, const Axes<V>& axes) {
-  const auto& d = axes.direction;
-  const auto& s = axes.scale;
+  const auto& [d, s] = axes;
   const Vec3<V> normal = cross(p.p1, p.p2);
-  const Vec3<V> m1 = {s[0] * dot(p.p1, d[0]), s[1] * dot(p.p1, d[1]), s[2] * dot(p.p1, d[2])};
-  const Vec3<V> m2 = {s[0] * dot(p.p2, d[0]), s[1] * dot(p.p2, d[1]), s[2] * dot(p.p2, d[2])};
   const Vec3<V> minors = {s[1] * s[2] * dot(normal, cross(d[1], d[2])), s[2] * s[0] * dot(normal, cross(d[2], d[0])),
                           s[0] * s[1] * dot(normal, cross(d[0], d[1]))};
-  return make_footprint(m1, m2, minors);
+  return make_footprint(row_of(p.p1, axes), row_of(p.p2, axes), minors);
 }
 
 // dP's rows on the axes of the view.
