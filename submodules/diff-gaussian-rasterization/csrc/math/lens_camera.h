@@ -16,6 +16,7 @@ struct LensCamera : Camera<T> {
 template <class V>
 struct LensView {
   OnLens<V> on;
+  Vec3<V> clamped;  // where the Jacobian is taken
   V inverse_depth;
   Vec3<V> p1, p2;
 };
@@ -50,13 +51,26 @@ GS_HD OnLens<V> on_lens_of(const Lens<T>& lens, Vec3<V> p) {
   }
 }
 
+// The point of the same depth on the ray clamped as a pinhole's, where the chart has a pinhole's rays.
+template <class T, class V>
+GS_HD Vec3<V> clamped(const LensCamera<T>& cam, Vec3<V> view, V inverse_depth) {
+  if (cam.lens.chart != Chart::kPerspective) return view;
+  const V x = view.x * inverse_depth, y = view.y * inverse_depth;
+  const V to_x = clamp(x, all<V>(cam.ray_min_x), all<V>(cam.ray_max_x));
+  const V to_y = clamp(y, all<V>(cam.ray_min_y), all<V>(cam.ray_max_y));
+  return {to_x == x ? view.x : to_x * view.z, to_y == y ? view.y : to_y * view.z, view.z};
+}
+
 template <class T, class V>
 GS_HD LensView<V> perspective(const LensCamera<T>& cam, Vec3<V> view) {
   LensView<V> p;
   p.on = on_lens_of<1>(cam.lens, view);
   p.inverse_depth = 1 / depth_of(cam, view);
+  p.clamped = clamped(cam, view, p.inverse_depth);
+  const Truth<V> apart = (p.clamped.x != view.x) | (p.clamped.y != view.y);
+  const OnLens<V> there = any(apart) ? on_lens_of<1>(cam.lens, p.clamped) : p.on;
   const auto row = [&](const V* by) { return by[0] * cam.row_x + by[1] * cam.row_y + by[2] * cam.row_z; };
-  p.p1 = row(p.on.first[0]), p.p2 = row(p.on.first[1]);
+  p.p1 = row(there.first[0]), p.p2 = row(there.first[1]);
   return p;
 }
 
@@ -92,18 +106,22 @@ GS_HD AlongAxes<V> along_view(const LensCamera<T>& cam, const Axes<V>& axes, con
   return along;
 }
 
-// dP's rows meet the lens's second derivatives.
+// dP's rows meet the lens's second derivatives. A clamped coordinate follows z alone.
 template <class T, class V>
 GS_HD Vec3<V> position_vjp(const LensCamera<T>& cam, Vec3<V> view, const LensView<V>& p, const AlongAxes<V>& along,
                            Vec3<V>, V pixel_x, V pixel_y, V g_inverse_depth) {
   constexpr int kPair[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
-  const OnLens<V> on = on_lens_of<2>(cam.lens, view);
-  V g[3] = {};
+  const OnLens<V> there = on_lens_of<2>(cam.lens, p.clamped);
+  V g[3] = {}, bent[3] = {};
   for (int i = 0; i < 2; ++i)
     for (int a = 0; a < 3; ++a) {
       g[a] += (i ? pixel_y : pixel_x) * p.on.first[i][a];
-      for (int b = 0; b < 3; ++b) g[a] += along.of[i][b] * on.second[i][kPair[a][b]];
+      for (int b = 0; b < 3; ++b) bent[a] += along.of[i][b] * there.second[i][kPair[a][b]];
     }
+  const Vec3<V> c = p.clamped;
+  g[0] += c.x == view.x ? bent[0] : V{}, g[1] += c.y == view.y ? bent[1] : V{};
+  g[2] += bent[2] + (c.x == view.x ? V{} : bent[0] * c.x * p.inverse_depth) +
+          (c.y == view.y ? V{} : bent[1] * c.y * p.inverse_depth);
   const V square = p.inverse_depth * p.inverse_depth * g_inverse_depth;
   if (cam.lens.chart == Chart::kPerspective) {
     g[2] -= square;
