@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings, rasterize
+from diff_gaussian_rasterization import GaussianRasterizationSettings, rasterize, reference
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.gaussians import Gaussians
 from diff_gaussian_rasterization.lens import Lens, lens_of
@@ -66,10 +66,18 @@ def gaussians(
     return {name: values.to(like.device, like.dtype) for name, values in drawn.items()}
 
 
-def draw(camera: GaussianRasterizationSettings, values: dict[str, torch.Tensor], **more):
+def everywhere(of: Lens, camera: GaussianRasterizationSettings, count: int) -> dict[str, torch.Tensor]:
+    """Far outside of the image, too; each fifth is so large that its footprint reaches into it."""
+    values = gaussians(of, camera, count, spread=1.7 if of.chart == "perspective" else 1.0)
+    values["scales"][::5] += 3
+    values["opacities"] -= 2
+    return values
+
+
+def draw(camera: GaussianRasterizationSettings, values: dict[str, torch.Tensor], by=rasterize, **more):
     values = dict(values)
     means, opacities = values.pop("means"), values.pop("opacities")
-    return rasterize(means, torch.zeros_like(means), opacities, camera, raw=True, **values, **more)
+    return by(means, torch.zeros_like(means), opacities, camera, raw=True, **values, **more)
 
 
 def projected(camera: GaussianRasterizationSettings, values: dict[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
@@ -103,7 +111,7 @@ def test_a_lens_without_distortion_is_a_pinhole():
         tanfovx=WIDTH / (2 * focal[0]),
         tanfovy=HEIGHT / (2 * focal[1]),
     )
-    values = gaussians(camera.lens, camera, 200, spread=0.6)  # within the clamp of a pinhole's Jacobian
+    values = everywhere(camera.lens, camera, 2000)
     leaves = {name: v.clone().requires_grad_() for name, v in values.items()}
     others = {name: v.clone().requires_grad_() for name, v in values.items()}
     one, two = draw(camera, leaves), draw(plain, others)
@@ -113,31 +121,74 @@ def test_a_lens_without_distortion_is_a_pinhole():
         torch.testing.assert_close(leaves[name].grad, others[name].grad, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("antialiasing", [False, True], ids=["plain", "antialiasing"])
-@pytest.mark.parametrize("model", ["OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "panorama"])
-def test_gradients_are_those_of_differences(model, antialiasing):
-    of = lens(model)
-    camera = settings(of, torch.float64, antialiasing=antialiasing)
-    values = gaussians(of, camera, 6, seed=3)
-    weight = torch.randn(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+def pixels_of(of: Lens, point: torch.Tensor) -> torch.Tensor:
+    """Pixels (2, ...) of points (3, ...) by the formulas of COLMAP's models, for autograd."""
+    x, y, z = point
+    if of.chart == "equirectangular":
+        a, b = torch.atan2(x, z), torch.atan2(y, torch.hypot(x, z))
+    else:
+        r = torch.hypot(x, y)
+        stretch = 1 / z if of.chart == "perspective" else torch.atan2(r, z) / r
+        a, b = x * stretch, y * stretch
+    q, (p1, p2) = a * a + b * b, of.tangential
+    over, under = (1 + sum(c * q ** (k + 1) for k, c in enumerate(terms)) for terms in (of.radial, of.divisor))
+    across = a * over / under + 2 * p1 * a * b + p2 * (q + 2 * a * a) + of.prism[0] * q
+    down = b * over / under + 2 * p2 * a * b + p1 * (q + 2 * b * b) + of.prism[1] * q
+    return torch.stack([of.focal[0] * across + of.center[0], of.focal[1] * down + of.center[1]])
 
-    def loss(*given: torch.Tensor) -> torch.Tensor:
-        drawn = draw(camera, dict(zip(values, given, strict=True)), want_inverse_depth=True)
-        return (weight * drawn.color).sum() + drawn.inverse_depth.sum()
 
-    leaves = [v.clone().requires_grad_() for v in values.values()]
-    loss(*leaves).backward()
-    for name, leaf in zip(values, leaves, strict=True):
-        step, numeric = 1e-6, torch.zeros_like(leaf)
-        for index in np.ndindex(*leaf.shape):
-            ends = []
-            for sign in (1, -1):
-                moved = [v.clone() for v in values.values()]
-                moved[list(values).index(name)][index] += sign * step
-                ends.append(loss(*moved))
-            numeric[index] = (ends[0] - ends[1]) / (2 * step)
-        scale = numeric.abs().max()
-        assert (leaf.grad - numeric).abs().max() < 2e-6 * scale + 1e-8, name
+def oracle(of: Lens, width: int, height: int, monkeypatch: pytest.MonkeyPatch):
+    """reference.render through a lens."""
+    _, limit, reach, *_ = of.numbers(width, height)
+    half, center, focal = torch.tensor([[width / 2, height / 2], of.center, of.focal], dtype=torch.float64)
+    low, high = (reach * (half * (1 + by) - 0.5 - center) / focal for by in (-1.3, 1.3))
+    view = None
+
+    def project(means, means2d, camera):
+        nonlocal view
+        view = means @ camera.world_to_view[:3, :3] + camera.world_to_view[3, :3]
+        depth = view[:, 2] if of.chart == "perspective" else view.norm(dim=1)
+        shown = depth > reference.camera.NEAR
+        if of.chart == "perspective":
+            shown &= (view[:, :2] / depth[:, None]).square().sum(1) <= limit
+        view, depth = torch.where(shown[:, None], view, 1.0), torch.where(shown, depth, 1.0)
+        by_depth = torch.stack([depth] * 3, 1)  # its last column decides the order
+        return reference.camera.Points(by_depth, shown, depth, pixels_of(of, view.T).T)
+
+    def world_to_image(points, camera):
+        at = view
+        if of.chart == "perspective":
+            at = torch.cat([torch.clamp(at[:, :2] / at[:, 2:], low, high) * at[:, 2:], at[:, 2:]], 1)
+        jacobian = torch.func.vmap(torch.func.jacrev(lambda point: pixels_of(of, point)))(at)
+        return jacobian @ camera.world_to_view[:3, :3].T
+
+    monkeypatch.setattr(reference, "project", project)
+    monkeypatch.setattr(reference.shape, "world_to_image", world_to_image)
+    return reference.render
+
+
+@pytest.mark.parametrize(
+    ("model", "antialiasing"),
+    [
+        ("PINHOLE", False), ("OPENCV", True), ("FULL_OPENCV", False), ("OPENCV_FISHEYE", True),
+        ("THIN_PRISM_FISHEYE", False), ("panorama", True),
+    ],
+)  # fmt: skip
+def test_images_and_gradients_are_the_oracles(model, antialiasing, monkeypatch):
+    of, width, height = lens(model).scaled(0.5, 0.5), WIDTH // 2, HEIGHT // 2  # for speed
+    camera = settings(of, torch.float64, antialiasing=antialiasing, image_width=width, image_height=height)
+    values = everywhere(of, camera, 2000)
+    weight = torch.randn(3, height, width, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    ours, theirs = ({name: v.clone().requires_grad_() for name, v in values.items()} for _ in range(2))
+    one = draw(camera, ours, want_inverse_depth=True)
+    two = draw(camera, theirs, by=oracle(of, width, height, monkeypatch), cut=1e-9)
+    keep = ~two.near_cut
+    assert keep.double().mean() > 0.99
+    for out in (one, two):
+        ((weight * out.color).sum(0) + out.inverse_depth[0])[keep].sum().backward()
+    assert ((one.color - two.color) * keep).abs().max() < 1e-11
+    for name in values:
+        torch.testing.assert_close(ours[name].grad, theirs[name].grad, rtol=1e-9, atol=1e-9)
 
 
 @BOTH_AND_GPU
@@ -145,7 +196,7 @@ def test_gradients_are_those_of_differences(model, antialiasing):
 def test_single_precision_agrees_with_double(model, device, dtype):
     of = lens(model)
     exact, camera = settings(of, torch.float64), settings(of, dtype, device)
-    values = gaussians(of, exact, 300)
+    values = everywhere(of, exact, 2000)
     leaves = {name: v.to(device, dtype).clone().requires_grad_() for name, v in values.items()}
     precise = {name: v.clone().requires_grad_() for name, v in values.items()}
     one, two = draw(camera, leaves), draw(exact, precise)
@@ -161,6 +212,10 @@ def test_the_field_ends_where_the_distortion_turns_back():
     assert strong.field(WIDTH, HEIGHT) == pytest.approx(math.sqrt(1 / 1.5))  # r (1 - r^2 / 2)
     none = Lens("perspective", (60.0, 60.0), (47.5, 31.5))
     assert none.field(WIDTH, HEIGHT) == pytest.approx(1.3 * math.hypot(48, 32) / 60, rel=1e-3)
+    assert none.numbers(WIDTH, HEIGHT)[1:3] == (math.inf, 1)
+    assert strong.numbers(WIDTH, HEIGHT)[2] == pytest.approx(1.5)  # 1 / (1 - r^2 / 2) there
+    folding = none._replace(tangential=(0.1, 0.0))  # r - 0.3 r^2 upwards
+    assert folding.numbers(WIDTH, HEIGHT)[1] == pytest.approx((1 / 0.6) ** 2)
     camera = settings(strong, torch.float64)
     beyond = (torch.tensor([[1.0, 0.0, 1.0]], dtype=torch.float64) - camera.viewmatrix[3, :3]) @ torch.linalg.inv(
         camera.viewmatrix[:3, :3]

@@ -18,11 +18,13 @@ enum class Chart : int { kPinhole, kPerspective, kEquidistant, kEquirectangular 
 template <class T>
 struct Lens {
   Chart chart;
-  T limit;                                 // of the sum of squares of the chart's numbers: nothing beyond is shown
+  // limit: of the sum of squares of the chart's numbers: nothing beyond is shown. reach: how many times as far as a
+  // pinhole of its focal lengths it sees, at least 1.
+  T limit, reach;
   T focal_x, focal_y, center_x, center_y;  // px
   T radial[4], divisor[3], tangential[2], prism[2];
 };
-constexpr int kLensNumbers = 17;
+constexpr int kLensNumbers = 18;
 
 // The Gaussians and the camera. The tensors come in the order of Input in torch/scene.h.
 template <class T>

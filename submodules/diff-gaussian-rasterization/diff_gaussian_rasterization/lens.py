@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 _CHARTS = ("pinhole", "perspective", "equidistant", "equirectangular")  # gs::Chart in csrc/data.h
-_SPARE = 1.3  # of the image's field of view, beyond which no Gaussian is shown, as the Jacobian's clamp of a pinhole
+_SPARE = 1.3  # of the image's field of view, as the Jacobian's clamp of a pinhole
 # Parameters of COLMAP's models behind focal lengths and principal point: name and place.
 _RADIAL, _DIVISOR, _TANGENTIAL, _PRISM = "radial", "divisor", "tangential", "prism"
 _BROWN = ((_RADIAL, 0), (_RADIAL, 1), (_TANGENTIAL, 0), (_TANGENTIAL, 1))
@@ -52,30 +52,39 @@ class Lens(NamedTuple):
         more = *self.focal, *self.center, *self.radial, *self.divisor, *self.tangential, *self.prism
         if not all(map(math.isfinite, more)) or min(self.focal) <= 0:
             raise ValueError(f"a lens needs finite numbers and focal lengths above 0, got {more}")
-        return float(_CHARTS.index(self.chart)), self.field(width, height) ** 2, *more
+        field, turn, reach = self._bounds(width, height)
+        limit = turn if self.chart == "perspective" else field
+        return float(_CHARTS.index(self.chart)), limit * limit, reach, *more
+
+    def field(self, width: int, height: int) -> float:
+        """How far from the axis lies what matters to an image: an angle (radians), or a perspective chart's tangent.
+
+        It ends where the distortion turns back, and a little outside of the image's corners. A fisheye shows no
+        Gaussian beyond, a perspective lens those before the turn.
+        """
+        return self._bounds(width, height)[0]
 
     @functools.lru_cache(maxsize=4096)  # noqa: B019  (a lens is a value)
-    def field(self, width: int, height: int) -> float:
-        """How far from the axis Gaussians are shown: an angle (radians), or its tangent for a perspective chart.
-
-        It ends where the distortion turns back, and a little outside of the image's corners.
-        """
+    def _bounds(self, width: int, height: int) -> tuple[float, float, float]:
+        """The field, where the distortion turns back, and how many times it widens the view, at least 1."""
         if self.chart == "equirectangular":
-            return math.inf
-        over, under = (np.polynomial.Polynomial([1.0, *terms]) for terms in (self.radial, self.divisor))
-        q = np.polynomial.Polynomial([0.0, 1.0])
-        slope = (over + 2 * q * over.deriv()) * under - 2 * q * over * under.deriv()
+            return math.inf, math.inf, 1.0
+        r = np.polynomial.Polynomial([0.0, 1.0])
+        over, under = (np.polynomial.Polynomial([1.0, *terms])(r * r) for terms in (self.radial, self.divisor))
+        # The derivative of the distorted radius, where tangential and prism terms take most of it.
+        aside = math.hypot(*(3 * p + s for p, s in zip(self.tangential[::-1], self.prism, strict=True)))
+        slope = (over + r * over.deriv() - 2 * aside * r * under) * under - r * over * under.deriv()
         roots = np.concatenate([slope.roots(), under.roots()])
-        turns = [root.real for root in roots if abs(root.imag) < 1e-9 and root.real > 0]
-        turn = math.sqrt(min(turns, default=math.inf))
+        turn = min((float(root.real) for root in roots if abs(root.imag) < 1e-9 and root.real > 0), default=math.inf)
         corner = max(
             math.hypot((x - self.center[0]) / self.focal[0], (y - self.center[1]) / self.focal[1])
             for x in (-0.5, width - 0.5)
             for y in (-0.5, height - 0.5)
         )
         radii = np.linspace(0, min(turn, 4 * corner, math.pi if self.chart == "equidistant" else math.inf), 4097)
-        shown = radii[radii * over(radii**2) / under(radii**2) <= corner]
-        return min(turn, _SPARE * float(shown[-1]))
+        shrunk = over(radii) / under(radii)
+        inside = radii * shrunk <= corner
+        return min(turn, _SPARE * float(radii[inside][-1])), turn, max(1.0, 1 / float(shrunk[inside].min()))
 
 
 def lens_of(model: str, params: tuple[float, ...]) -> Lens:

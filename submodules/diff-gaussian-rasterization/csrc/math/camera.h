@@ -27,6 +27,14 @@ GS_HD bool agree(Vec3<T> a, Vec3<T> b) {
   return magnitude(a.x - b.x) < most && magnitude(a.y - b.y) < most && magnitude(a.z - b.z) < most;
 }
 
+// shift: of the principal point, in half images. tan: of half the field of view.
+template <class T>
+GS_HD void clamp_rays(double shift_x, double shift_y, double tan_x, double tan_y, Camera<T>& cam) {
+  const double limit = kJacobianClamp;
+  cam.ray_min_x = T((-limit - shift_x) * tan_x), cam.ray_max_x = T((limit - shift_x) * tan_x);
+  cam.ray_min_y = T((-limit - shift_y) * tan_y), cam.ray_max_y = T((limit - shift_y) * tan_y);
+}
+
 // Makes a camera from the reference's settings: the view and the full projection matrix, both transposed (for row
 // vectors), row-major. Dot products with the dual rows extract the projection's own entries from the full matrix. They
 // are computed in double, without the part from x . z, which is 0 up to rounding: in a narrow field of view the scale
@@ -58,9 +66,7 @@ GS_HD Camera<T> make_camera(const T* view, const T* full, const T* center, doubl
   const double shift_y = per_z * (dot(clip_y, dual_z) - scale_y * dot(y, dual_z));
   cam.mean_focal_x = T(0.5 * width * scale_x), cam.mean_focal_y = T(0.5 * height * scale_y);
   cam.axis_x = T(0.5 * (width * (1 + shift_x) - 1)), cam.axis_y = T(0.5 * (height * (1 + shift_y) - 1));
-  const double limit = kJacobianClamp;
-  cam.ray_min_x = T((-limit - shift_x) * tan_x), cam.ray_max_x = T((limit - shift_x) * tan_x);
-  cam.ray_min_y = T((-limit - shift_y) * tan_y), cam.ray_max_y = T((limit - shift_y) * tan_y);
+  clamp_rays(shift_x, shift_y, tan_x, tan_y, cam);
   return cam;
 }
 

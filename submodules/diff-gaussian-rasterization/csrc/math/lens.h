@@ -140,8 +140,8 @@ GS_HD Distorted<T> distort(const Lens<T>& lens, T a, T b) {
   return out;
 }
 
-// The pixel of a point of the view, with derivatives.
-template <class T>
+// The pixel of a point of the view, with derivatives; the second ones for kOrder 2.
+template <int kOrder, class T>
 GS_HD OnLens<T> on_lens(const Lens<T>& lens, Vec3<T> p) {
   constexpr int kPairs[6][2] = {{0, 0}, {0, 1}, {0, 2}, {1, 1}, {1, 2}, {2, 2}};
   const OnLens<T> c = on_chart(lens.chart, p);
@@ -149,13 +149,13 @@ GS_HD OnLens<T> on_lens(const Lens<T>& lens, Vec3<T> p) {
   const T focal[2] = {lens.focal_x, lens.focal_y}, center[2] = {lens.center_x, lens.center_y};
   const auto& a = c.first[0];
   const auto& b = c.first[1];
-  OnLens<T> out;
+  OnLens<T> out = {};
   out.field = c.value[0] * c.value[0] + c.value[1] * c.value[1];
   for (int i = 0; i < 2; ++i) {
     const T by_a = focal[i] * d.first[i][0], by_b = focal[i] * d.first[i][1];
     out.value[i] = focal[i] * d.value[i] + center[i];
     for (int k = 0; k < 3; ++k) out.first[i][k] = by_a * a[k] + by_b * b[k];
-    for (int k = 0; k < 6; ++k) {
+    for (int k = 0; kOrder > 1 && k < 6; ++k) {
       const int m = kPairs[k][0], n = kPairs[k][1];
       const T mixed =
           d.second[i][0] * a[m] * a[n] + d.second[i][1] * (a[m] * b[n] + a[n] * b[m]) + d.second[i][2] * b[m] * b[n];

@@ -54,21 +54,25 @@ GS_HD Truth<V> image_point(const Camera<T>& cam, const Perspective<V>& p, V& x, 
   return is_finite(x) & is_finite(y);
 }
 
+// A row of M from that of J W.
+template <class V>
+GS_HD Vec3<V> row_of(Vec3<V> p, const Axes<V>& axes) {
+  const auto& [d, s] = axes;
+  return {s[0] * dot(p, d[0]), s[1] * dot(p, d[1]), s[2] * dot(p, d[2])};
+}
+
 // M = J W R S and its minors. p1 x p2 = fx fy / z^2 (clamped ray, 1) with the dual rows of W, which for a rotation is
 // W^T (clamped ray, 1). The minor of columns i, j is its dot product with axis_i x axis_j: no difference of large
 // products, however thin the splat.
 template <class T, class V>
 GS_HD Footprint<V> splat_footprint(const Camera<T>& cam, const Perspective<V>& p, const Axes<V>& axes) {
-  const auto& d = axes.direction;
-  const auto& s = axes.scale;
+  const auto& [d, s] = axes;
   const Vec3<V> ray = cam.dual_z + p.clamped_x * cam.dual_x + p.clamped_y * cam.dual_y;
   const V fx = cam.focal_x * p.inverse_depth, fy = cam.focal_y * p.inverse_depth;
-  const Vec3<V> m1 = {s[0] * dot(p.p1, d[0]), s[1] * dot(p.p1, d[1]), s[2] * dot(p.p1, d[2])};
-  const Vec3<V> m2 = {s[0] * dot(p.p2, d[0]), s[1] * dot(p.p2, d[1]), s[2] * dot(p.p2, d[2])};
   const Vec3<V> minors = {(fx * s[1]) * (fy * s[2]) * dot(ray, cross(d[1], d[2])),
                           (fx * s[2]) * (fy * s[0]) * dot(ray, cross(d[2], d[0])),
                           (fx * s[0]) * (fy * s[1]) * dot(ray, cross(d[0], d[1]))};
-  return make_footprint(m1, m2, minors);
+  return make_footprint(row_of(p.p1, axes), row_of(p.p2, axes), minors);
 }
 
 // Computes a splat except its colour. Opacity, scales and rotation must be finite. Returns false if it is culled:

@@ -20,7 +20,10 @@ GS_HD void set_camera(const Scene<T>& s, Camera<T>& camera) {
 template <class T>
 GS_HD void set_camera(const Scene<T>& s, LensCamera<T>& camera) {
   static_cast<Camera<T>&>(camera) = camera_of(s);
-  camera.lens = s.lens;
+  const Lens<T>& lens = camera.lens = s.lens;
+  const double width = s.image.width, height = s.image.height, reach = lens.reach;
+  clamp_rays((2 * lens.center_x + 1) / width - 1, (2 * lens.center_y + 1) / height - 1,
+             reach * width / (2 * lens.focal_x), reach * height / (2 * lens.focal_y), camera);
 }
 
 // Calls run(camera) with a Camera, or a LensCamera where the scene has a lens.

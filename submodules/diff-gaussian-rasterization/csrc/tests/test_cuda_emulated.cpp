@@ -68,7 +68,7 @@ void test_against_cpu() {
 void test_lenses() {
   for (const gs::Chart chart : {gs::Chart::kPerspective, gs::Chart::kEquidistant, gs::Chart::kEquirectangular}) {
     Parameters<float> p(100);
-    p.lens = {chart, 4, 30, 31, 34, 17, {-0.05f, 0.01f, 0.001f, 0.0001f}, {0.02f, 0, 0}, {0.003f, 0.002f}, {}};
+    p.lens = {chart, 4, 1, 30, 31, 34, 17, {-0.05f, 0.01f, 0.001f, 0.0001f}, {0.02f, 0, 0}, {0.003f, 0.002f}, {}};
     check_scene(p, gs::Image{70, 33}, chart == gs::Chart::kPerspective, false);
   }
 }
