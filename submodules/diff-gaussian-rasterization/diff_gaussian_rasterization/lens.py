@@ -57,10 +57,10 @@ class Lens(NamedTuple):
         return float(_CHARTS.index(self.chart)), limit * limit, reach, *more
 
     def field(self, width: int, height: int) -> float:
-        """How far from the axis lies what matters to an image: an angle (radians), or a perspective chart's tangent.
+        """The field of an image: an angle from the axis (radians), or its tangent for a perspective chart.
 
         It ends where the distortion turns back, and a little outside of the image's corners. A fisheye shows no
-        Gaussian beyond, a perspective lens those before the turn.
+        Gaussian beyond it, a perspective lens all up to where its distortion turns back.
         """
         return self._bounds(width, height)[0]
 

@@ -20,24 +20,18 @@ struct DoubleBuffer {
 
 struct DeviceRadixSort {
   template <class Key, class Value, class Count>
-  static cudaError_t SortPairs(void* memory, size_t& bytes, const Key* keys, Key* sorted_keys, const Value* values,
-                               Value* sorted_values, Count n, int begin_bit, int end_bit, cudaStream_t) {
+  static cudaError_t SortPairs(void* memory, size_t& bytes, DoubleBuffer<Key>& keys, DoubleBuffer<Value>& values,
+                               Count n, int begin_bit, int end_bit, cudaStream_t) {
     if (!memory) return bytes = 1, cudaSuccess;
     std::vector<int64_t> order(n);
     std::iota(order.begin(), order.end(), int64_t(0));
     const uint64_t mask = end_bit - begin_bit == 64 ? ~uint64_t(0) : (uint64_t(1) << (end_bit - begin_bit)) - 1;
-    const auto part = [&](int64_t i) { return uint64_t(keys[i]) >> begin_bit & mask; };
+    const auto part = [&](int64_t i) { return uint64_t(keys.Current()[i]) >> begin_bit & mask; };
     std::stable_sort(order.begin(), order.end(), [&](int64_t a, int64_t b) { return part(a) < part(b); });
-    for (int64_t i = 0; i < int64_t(n); ++i) sorted_keys[i] = keys[order[i]], sorted_values[i] = values[order[i]];
+    for (int64_t i = 0; i < int64_t(n); ++i)
+      keys.Alternate()[i] = keys.Current()[order[i]], values.Alternate()[i] = values.Current()[order[i]];
+    keys.selector ^= 1, values.selector ^= 1;
     return cudaSuccess;
-  }
-  template <class Key, class Value, class Count>
-  static cudaError_t SortPairs(void* memory, size_t& bytes, DoubleBuffer<Key>& keys, DoubleBuffer<Value>& values,
-                               Count n, int begin_bit, int end_bit, cudaStream_t stream) {
-    const cudaError_t status = SortPairs(memory, bytes, keys.Current(), keys.Alternate(), values.Current(),
-                                         values.Alternate(), n, begin_bit, end_bit, stream);
-    if (memory) keys.selector ^= 1, values.selector ^= 1;
-    return status;
   }
 };
 

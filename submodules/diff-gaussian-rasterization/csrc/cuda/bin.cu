@@ -15,7 +15,8 @@ namespace cuda {
 
 namespace {
 
-constexpr int64_t kLeastShare = 2 * kListThreads, kMostShares = 1024;  // of the splats, for blocks
+constexpr int64_t kLeastShare = 2 * kListThreads, kMostShares = 1024;  // shares of the splats, a block for each
+constexpr int64_t kMostPlaces = 1 << 24;                               // 64 MiB; images of many tiles get fewer shares
 constexpr unsigned kMostBlocks = 8192, kLargeBlocks = 256;
 
 }  // namespace
@@ -28,7 +29,8 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& given
   Projected<float> in = given;
   TileRecord* made = nullptr;
   if (count && !in.records && has_records(image)) in.records = made = make_records(queue, count, in, image);
-  const int64_t splats = std::max<int64_t>(kLeastShare, (count / kMostShares / kListThreads + 1) * kListThreads);
+  const int64_t most = std::clamp<int64_t>(kMostPlaces / tiles, 1, kMostShares);
+  const int64_t splats = std::max<int64_t>(kLeastShare, (count / most / kListThreads + 1) * kListThreads);
   const unsigned shares = unsigned(count / splats) + 1;  // the last has the slots behind all splats
   int32_t *numbers = queue.array<int32_t>(2 * tiles + 2), *begins = queue.array<int32_t>(tiles + 1);
   const ListCounts counts{numbers,

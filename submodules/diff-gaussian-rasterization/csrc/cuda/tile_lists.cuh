@@ -40,13 +40,13 @@ template <class Take>
 __device__ __forceinline__ void each_tile(const Reached& reached, int columns, const Take& take) {
   const TileRect& rect = reached.rect;
   const int wide = rect.x1 - rect.x0, corner = rect.y0 * columns + rect.x0;
-  const float share = 1 / float(wide);
+  const float inverse = 1 / float(wide);
   for (uint64_t mask = reached.mask; mask;) {
     int tiles[kTaken];
 #pragma unroll
     for (int& tile : tiles) {
       // Adding a half keeps the quotient off whole numbers, so that rounding does not matter.
-      const int place = __ffsll(mask) - 1, row = int((float(place) + 0.5f) * share);
+      const int place = __ffsll(mask) - 1, row = int((float(place) + 0.5f) * inverse);
       tile = mask ? corner + place + row * (columns - wide) : -1;
       mask &= mask - 1;
     }
@@ -58,13 +58,13 @@ __device__ __forceinline__ void each_tile(const Reached& reached, int columns, c
 // atomic operations of many blocks on one word of global memory take turns. It takes kWindow tiles at a time.
 constexpr int kWindow = 8192;
 
-// What a block that takes splats has of them.
+// The splats of a block.
 struct Share {
   int64_t first, end;
   __device__ Share(int64_t n, int64_t splats) : first(splats * blockIdx.x), end(min(first + splats, n)) {}
 };
 
-// What is counted. Before that, all but `large` and `places` are 0.
+// What the counting kernels fill in. At first all but `large` and `places` are 0.
 struct ListCounts {
   int32_t* masked;    // (tiles) instances of splats that have a mask
   int32_t* unmasked;  // (tiles) instances of splats that reach too many tiles
@@ -108,8 +108,7 @@ __global__ void __launch_bounds__(kListThreads)
   if (threadIdx.x == 0) of_shares[blockIdx.x] = total;
 }
 
-// Calls take(tile, splat) for the tiles of splats without a mask. Each warp of some blocks takes one splat after the
-// other.
+// Calls take(tile, splat) for the tiles of splats without a mask, which the warps of `blocks` blocks share.
 template <class Take>
 __device__ __forceinline__ void each_large(const Projected<float>& in, Image image, const ListCounts& counts,
                                            unsigned block, unsigned blocks, const Take& take) {
