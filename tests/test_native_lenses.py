@@ -18,11 +18,14 @@ import render
 import train
 from gaussian_renderer import rasterizer_settings
 from scene import Scene
+from scene.readers.start_cloud import random_in_frusta
+from splatting.diagnosis.dataset import check_dataset
 
+PANORAMA = ("EQUIRECTANGULAR", (WIDTH, HEIGHT))
 FISHEYE = (40.0, 40.0, *CENTER, 0.05, -0.01, 0.003, -0.001)
 
 
-@pytest.mark.parametrize(("model", "params"), [("OPENCV", BROWN), ("OPENCV_FISHEYE", FISHEYE)])
+@pytest.mark.parametrize(("model", "params"), [("OPENCV", BROWN), ("OPENCV_FISHEYE", FISHEYE), PANORAMA])
 @pytest.mark.parametrize("resolution", [1, 2])
 def test_views_show_points_where_the_photo_has_them(tmp_path, model, params, resolution):
     reconstruction = make_colmap_scene(tmp_path / "scene", model=model, params=params, views=3)
@@ -47,12 +50,21 @@ def test_views_show_points_where_the_photo_has_them(tmp_path, model, params, res
         assert np.abs(splats[shown, :2].numpy() - theirs).max() < 1e-4  # matrices are float32
 
 
+def test_points_of_panoramas(tmp_path):
+    make_colmap_scene(tmp_path / "scene", model=PANORAMA[0], params=PANORAMA[1])
+    said = check_dataset(str(tmp_path / "scene"), "images")
+    assert not [line for line in said if "of the points are in no photo" in line.text or "other photos" in line.text]
+    view = read(tmp_path / "scene", native=True).train_cameras[0]
+    local = (random_in_frusta([view]).points - view.center) @ view.R
+    assert (local < 0).mean(axis=0) == pytest.approx([0.5] * 3, abs=0.01)  # all around, not in front alone
+
+
 def test_unknown_models_are_undistorted(tmp_path):
     make_colmap_scene(tmp_path, model="FOV", params=(FOCAL, FOCAL, *CENTER, *DISTORTIONS["FOV"]), views=2)
     assert all(view.native is None and view.lens is None for view in read(tmp_path, native=True).train_cameras)
 
 
-@pytest.mark.parametrize(("model", "params"), [("OPENCV", BROWN), ("OPENCV_FISHEYE", FISHEYE)])
+@pytest.mark.parametrize(("model", "params"), [("OPENCV", BROWN), ("OPENCV_FISHEYE", FISHEYE), PANORAMA])
 def test_a_training_and_its_renders_have_the_photos(tmp_path, monkeypatch, model, params):
     scene, out = tmp_path / "scene", tmp_path / "out"
     make_colmap_scene(scene, model=model, params=params, views=17)
@@ -77,6 +89,8 @@ def test_a_training_and_its_renders_have_the_photos(tmp_path, monkeypatch, model
         with Image.open(path) as image:
             shown = np.asarray(image.convert("RGB"))
         assert any(np.array_equal(shown, np.asarray(Image.open(photo).convert("RGB"))) for photo in photos)
+    if model == PANORAMA[0]:
+        return
     train.main(
         [*words[:2], "-m", str(tmp_path / "resampled"), "--eval", "--iterations", "300", "--test_iterations", "300"]
     )

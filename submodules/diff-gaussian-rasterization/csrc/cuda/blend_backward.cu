@@ -175,7 +175,7 @@ __global__ void __launch_bounds__(L::kThreads)
   for (int first = 0; first < length; first += kBatch) {
     const int count = length - first < kBatch ? length - first : kBatch;
     __syncthreads();
-    if (mine < count) batch.put(mine, in.splats, in.instances[begin + first + mine], float(left), float(top));
+    if (mine < count) batch.put(mine, in, in.instances[begin + first + mine], float(left), float(top));
     __syncthreads();
     for (int from = 0; from < count && first + from < pixels.furthest; from += 32)
       front_to_back(batch, at, from, count, [&](int k, int p, float t) {
@@ -304,7 +304,7 @@ __global__ void GS_MAX_REGISTERS((kDepth ? 96 : 80) + (kAbsolute ? 8 : 0))
     __syncthreads();
     for (int k = threadIdx.x; k < count; k += L::kThreads) {
       const int32_t splat = in.instances[begin + first + k];
-      batch.put(k, in.splats, splat, float(left), float(top));
+      batch.put(k, in, splat, float(left), float(top));
       row_of[k] = rows.row(slot_of(g.slots, splat, chunk.tile % across, chunk.tile / across));
     }
     for (int k = threadIdx.x; k < L::kWarps * kBatch * kRow; k += L::kThreads) sums[k] = 0;

@@ -184,8 +184,7 @@ struct Blender {
   __device__ void load(int32_t chunk, int count) const {
     const Place at = place();
     const int32_t* instances = in.instances + item.begin + chunk * kLayerChunk;
-    if (int(threadIdx.x) < count)
-      batch.put(threadIdx.x, in.splats, instances[threadIdx.x], float(at.left), float(at.top));
+    if (int(threadIdx.x) < count) batch.put(threadIdx.x, in, instances[threadIdx.x], float(at.left), float(at.top));
     __syncthreads();
   }
 

@@ -33,7 +33,7 @@ __global__ void __launch_bounds__(L::kThreads, 9)
     if (!__syncthreads_or(open)) break;
     const int count = int(end - first < kBatch ? end - first : kBatch);
     const int mine = threadIdx.x;
-    if (mine < count) batch.put(mine, in.splats, in.instances[first + mine], float(left), float(top));
+    if (mine < count) batch.put(mine, in, in.instances[first + mine], float(left), float(top));
     __syncthreads();
     for (int from = 0; open && from < count; from += 32) {
       front_to_back(batch, at, from, count, [&](int k, int p, float t) {

@@ -59,7 +59,7 @@ __global__ void __launch_bounds__(kThreads)
   fetch(likely);
   const bool visible = i < s.count && project_shape(s, camera, SceneRow<float>{s, i}, splat, depth, radius);
   TileRect rect = {0, 0, 0, 0};
-  if (visible) rect = tile_rect(splat, s.image.width, s.image.height);
+  if (visible) rect = tile_rect(splat, s.image.width, s.image.height, goes_around(camera));
   fetch(rect.x1 > rect.x0);
   uint64_t mask;
   int32_t count = warp_count_tiles(splat, rect, s.image, mask);
