@@ -19,6 +19,7 @@ import train
 from gaussian_renderer import rasterizer_settings
 from scene import Scene
 from scene.readers.start_cloud import random_in_frusta
+from splatting.camera_paths.poses import poses_of
 from splatting.diagnosis.dataset import check_dataset
 
 PANORAMA = ("EQUIRECTANGULAR", (WIDTH, HEIGHT))
@@ -54,6 +55,8 @@ def test_points_of_panoramas(tmp_path):
     make_colmap_scene(tmp_path / "scene", model=PANORAMA[0], params=PANORAMA[1])
     said = check_dataset(str(tmp_path / "scene"), "images")
     assert not [line for line in said if "of the points are in no photo" in line.text or "other photos" in line.text]
+    scene = Scene(options_of(tmp_path / "scene", tmp_path / "out", lenses="native"), FakeGaussians())
+    assert poses_of(scene.getTrainCameras()).fov == pytest.approx(60)  # what shows all is stretched
     view = read(tmp_path / "scene", native=True).train_cameras[0]
     local = (random_in_frusta([view]).points - view.center) @ view.R
     assert (local < 0).mean(axis=0) == pytest.approx([0.5] * 3, abs=0.01)  # all around, not in front alone
