@@ -189,7 +189,7 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_word("cameras.txt", (1, "PINHOLE2")), r"line 4 of .*0/cameras\.txt .*no camera model PINHOLE2"),
         (
             _word("cameras.txt", (1, "EQUIRECTANGULAR"), (4, "96"), (5, "64"), (6, ""), (7, "")),
-            "V03.png is a panorama, which no pinhole image can show; give --lenses native",
+            "V03.png is a panorama, which no pinhole image can show; train on it with --lenses native",
         ),
         (_word("cameras.txt", (1, "EQUIRECTANGULAR"), (6, ""), (7, "")), "camera of Right/V03.png has no usable size"),
         (_word("cameras.txt", (4, "0")), "camera of Right/V03.png has no usable size or focal length"),

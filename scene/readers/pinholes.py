@@ -41,7 +41,9 @@ def camera_info(
         through, distorts = lens_of(lens.model, lens.params), False
         pinhole = Pinhole(*through.focal, *(place + 0.5 for place in through.center), lens.width, lens.height)
     elif distorts and lens.model == PANORAMA:
-        raise UserError(f"the photo {name} is a panorama, which no pinhole image can show; give --lenses native")
+        raise UserError(
+            f"the photo {name} is a panorama, which no pinhole image can show; train on it with --lenses native"
+        )
     elif distorts:
         pinhole = undistortion(lens, *picture_size(path)).pinhole
     camera = CameraInfo(
