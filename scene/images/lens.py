@@ -92,6 +92,14 @@ def pinhole_of(lens: Lens, name: str) -> Pinhole | None:
     return Pinhole(focal[0], focal[-1], *center, lens.width, lens.height)
 
 
+def rays_of(lens: Lens, pixels: np.ndarray) -> np.ndarray:
+    """x / z and y / z (N, 2) of the rays of pixels (N, 2), pixel centres at .5; NaN where a ray has none."""
+    if len(lens.params) == _PINHOLES.get(lens.model):
+        focal, center = np.array(lens.params[:-2]), np.array(lens.params[-2:])
+        return (pixels - center) / focal
+    return np.asarray(_camera(lens).cam_from_img(np.ascontiguousarray(pixels)), dtype=np.float64).reshape(-1, 2)
+
+
 def _check_bounds(lens: Lens, focal: Sequence[float], center: Sequence[float], name: str) -> None:
     size = max(lens.width, lens.height)
     astray = max(abs(center[0] / lens.width - 0.5), abs(center[1] / lens.height - 0.5))

@@ -98,6 +98,18 @@ def check_page(port: int | None, several: bool) -> None:
         raise UserError("--viewer needs a training of one process; leave it out, or start train.py without torchrun")
 
 
+def check_poses(dataset: argparse.Namespace, several: bool) -> None:
+    """Refuse to refine poses in a training of several processes (UserError)."""
+    if several and getattr(dataset, "refine_poses", False):
+        raise UserError("--refine_poses needs a training of one process; leave it out, or start without torchrun")
+
+
+def check_unrefined(poses: object, checkpoint: str) -> None:
+    """Refuse a checkpoint with refined poses that this run would not use (UserError)."""
+    if poses:
+        raise UserError(f"{checkpoint} was trained with --refine_poses; give that option")
+
+
 def check_target(target_psnr: float, test_views: int) -> None:
     """Refuse a target for test views that are not there (UserError)."""
     if target_psnr and not test_views:

@@ -8,11 +8,12 @@ from diff_gaussian_rasterization.scene import GRADIENTS
 # A Gaussian's values in each input; a row of sh_rest depends on the number of bands.
 _ROWS = {"means": (3,), "means2d": (3,), "opacities": (1,), "scales": (3,), "rotations": (4,), "cov3d": (6,)}
 _ROWS |= {"colors": (3,), "sh_dc": (1, 3)}
-# These five are constants of csrc; tests/test_rasterizer_ops.py holds them to it.
+# These six are constants of csrc; tests/test_rasterizer_ops.py holds them to it.
 TILE = 16  # pixels
 SPLAT_VALUES = 10  # of a row of `splats`
 MOMENT_VALUES = 10  # of a row of `moments`, and of `rows`
 ABSOLUTE_VALUES = 2  # of a row of `rows` besides, for absolute gradients
+CAMERA_NUMBERS = 25, 34  # of a pinhole, and of a camera with a lens
 RECORD_BLOCK = 256  # splats whose records are counted together
 
 
@@ -74,6 +75,12 @@ def _(means, opacities, *arguments):
     rows["opacities"] = opacities.shape[1:] if wanted[2] else (1,)
     counts = [means.shape[0] if is_wanted else 0 for is_wanted in wanted]
     return tuple(means.new_empty((count, *rows[name])) for name, count in zip(GRADIENTS, counts, strict=True))
+
+
+@_fake("camera_vjp")
+def _(means, *arguments):
+    lens = arguments[10]
+    return means.new_empty((CAMERA_NUMBERS[len(lens) > 3],), dtype=torch.float64)
 
 
 @_fake("rasterize")
