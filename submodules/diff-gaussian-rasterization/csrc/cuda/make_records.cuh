@@ -19,7 +19,7 @@ __global__ void __launch_bounds__(kRecordThreads)
   if (i < n) reached = reached_by(in, int32_t(i));
   if (reached.count) shape = load_shape(in.splats, i);
   uint64_t mask;
-  const int32_t count = warp_count_tiles(shape, reached.rect, image, mask);
+  const int32_t count = warp_count_tiles<true>(shape, reached.rect, image, mask);
   if (i < n) records[i] = tile_record(reached.rect, count, mask);
 }
 

@@ -1,6 +1,8 @@
 // Projection, and the test of which means lie in front of the camera. A thread takes a Gaussian.
 #include <cuda_runtime.h>
 
+#include <type_traits>
+
 #include "../backend.h"
 #include "../math/scene_row.h"
 #include "awake.cuh"
@@ -62,7 +64,7 @@ __global__ void __launch_bounds__(kThreads)
   if (visible) rect = tile_rect(splat, s.image.width, s.image.height, goes_around(camera));
   fetch(rect.x1 > rect.x0);
   uint64_t mask;
-  int32_t count = warp_count_tiles(splat, rect, s.image, mask);
+  int32_t count = warp_count_tiles<!std::is_same_v<AnyCamera, Camera<float>>>(splat, rect, s.image, mask);
   wait_for_rows();
   if (count && !project_color(s, camera, SceneRow<float>{s, i}, rest + threadIdx.x * kRest, splat)) count = 0;
   if (row >= s.rows()) return;

@@ -132,20 +132,25 @@ __global__ void __launch_bounds__(kListThreads)
              [&](int tile, int32_t) { atomicAdd(counts.unmasked + tile, 1); });
 }
 
+constexpr int kLayRun = 4;  // counts of a thread at a time
+
 // Turns counts(i) into their sums before each, in one block. Returns the sum of all.
 template <class Counts, class To>
 __device__ inline int64_t sums_before(int64_t count, const Counts& counts, To* sums) {
-  const int64_t own = (count + kLayThreads - 1) / kLayThreads, first = own * threadIdx.x;
-  const int64_t end = first + own < count ? first + own : count;
-  int64_t sum = 0, total;
-  for (int64_t i = first; i < end; ++i) sum += counts(i);
-  sum = sum_before(sum, total);
-  for (int64_t i = first; i < end; ++i) {
-    const int64_t value = counts(i);
-    sums[i] = To(sum);
-    sum += value;
+  int64_t before = 0, total;
+  for (int64_t from = 0; from < count; from += kLayRun * kLayThreads, before += total) {
+    const int64_t first = from + kLayRun * int(threadIdx.x);
+    int64_t own[kLayRun], sum = 0;
+#pragma unroll
+    for (int k = 0; k < kLayRun; ++k) own[k] = first + k < count ? counts(first + k) : 0, sum += own[k];
+    sum = before + sum_before(sum, total);
+#pragma unroll
+    for (int k = 0; k < kLayRun; ++k) {
+      if (first + k < count) sums[first + k] = To(sum);
+      sum += own[k];
+    }
   }
-  return total;
+  return before;
 }
 
 // Finds where each tile's list and each share's slots begin, and the totals of both. begins: (tiles + 1). ahead: judges
@@ -269,12 +274,25 @@ struct Buckets {
   }
 };
 
+constexpr int kCompared = 128;  // instances that are not worth buckets
+static_assert(kCompared <= kListThreads);
+
 // Sorts a piece: by buckets, and within each by comparing all with all, because almost all buckets have few instances.
-// Calls put(rank, key). All threads call this.
+// Few instances make one bucket. Calls put(rank, key). All threads call this.
 template <class Put>
 __device__ __forceinline__ void sort_piece(Buckets& shared, const uint64_t* keys, int count, const Put& put) {
-  const int buckets = (count + kListThreads - 1) / kListThreads * kListThreads;
   __syncthreads();
+  if (count <= kCompared) {
+    const int mine = threadIdx.x;
+    if (mine < count) shared.sorted[mine] = keys[mine];
+    __syncthreads();
+    if (mine >= count) return;
+    const uint64_t key = shared.sorted[mine];
+    int rank = 0;
+    for (int k = 0; k < count; ++k) rank += shared.sorted[k] < key;
+    return put(rank, key);
+  }
+  const int buckets = (count + kListThreads - 1) / kListThreads * kListThreads;
   if (threadIdx.x == 0) shared.least = ~0u, shared.most = 0;
   for (int b = threadIdx.x; b < buckets; b += kListThreads) shared.starts[b] = 0;
   __syncthreads();

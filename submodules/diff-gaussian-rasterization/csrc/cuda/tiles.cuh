@@ -28,7 +28,9 @@ __device__ inline TileTest<float> from_lane(TileTest<float> test, int lane) {
 }
 
 // Tests the tiles of every lane's rectangle: 1 to 32 `tiles` in rows of `wide` from (x0, y0). All lanes of a warp call
-// this, and share all tests evenly. Returns a bit for each of the lane's own tiles that is reached.
+// this, and share all tests evenly. Returns a bit for each of the lane's own tiles that is reached. kMayCross: as for
+// tile_reached.
+template <bool kMayCross>
 __device__ inline uint32_t warp_tiles_reached(const TileTest<float>& test, int x0, int y0, int wide, int tiles) {
   const int lane = threadIdx.x & 31;
   const int inverse = int(__fdividef(1024, float(wide))) + 1;  // k * inverse >> 10 is k / wide for all k < 32
@@ -46,7 +48,7 @@ __device__ inline uint32_t warp_tiles_reached(const TileTest<float>& test, int x
     begun += __popc(starts);
     const int k = int(base + lane - from_lane(start, owner)), row = k * from_lane(inverse, owner) >> 10;
     const int tx = from_lane(x0, owner) + k - row * from_lane(wide, owner), ty = from_lane(y0, owner) + row;
-    const unsigned hits = __ballot_sync(kWarp, tile_reached(from_lane(test, owner), float(tx), float(ty)));
+    const unsigned hits = __ballot_sync(kWarp, tile_reached<kMayCross>(from_lane(test, owner), float(tx), float(ty)));
     if (lane == int(base / 32)) kept = hits;
   }
   const uint64_t low = from_lane(kept, start / 32), high = from_lane(kept, start / 32 + 1);
@@ -55,6 +57,7 @@ __device__ inline uint32_t warp_tiles_reached(const TileTest<float>& test, int x
 
 // Returns the number of tiles that the lane's splat reaches, and in `mask` a bit for each of its rectangle's first 64.
 // All lanes of a warp call this; a lane without a splat gives an empty rectangle.
+template <bool kMayCross>
 __device__ inline int32_t warp_count_tiles(const Splat<float>& splat, TileRect rect, Image image, uint64_t& mask) {
   const int lane = threadIdx.x & 31;
   const int wide = rect.x1 - rect.x0, tiles = wide * (rect.y1 - rect.y0);
@@ -64,7 +67,8 @@ __device__ inline int32_t warp_count_tiles(const Splat<float>& splat, TileRect r
   mask = 0;
   const bool shared = tiles > 0 && tiles <= kShared;
   if (__any_sync(kWarp, shared)) {  // lanes without such a splat test one tile in vain
-    const uint32_t reached = warp_tiles_reached(test, rect.x0, rect.y0, shared ? wide : 1, shared ? tiles : 1);
+    const uint32_t reached =
+        warp_tiles_reached<kMayCross>(test, rect.x0, rect.y0, shared ? wide : 1, shared ? tiles : 1);
     if (shared) mask = reached, count = __popc(reached);
   }
   for (unsigned large = __ballot_sync(kWarp, tiles > kShared); large; large &= large - 1) {
@@ -75,7 +79,7 @@ __device__ inline int32_t warp_count_tiles(const Splat<float>& splat, TileRect r
     int32_t found = 0;
     for (int base = 0; base < total; base += 32) {
       const int k = base + lane, tx = x0 + k % across, ty = y0 + k / across;
-      const unsigned hits = __ballot_sync(kWarp, k < total && tile_reached(its, float(tx), float(ty)));
+      const unsigned hits = __ballot_sync(kWarp, k < total && tile_reached<kMayCross>(its, float(tx), float(ty)));
       found += __popc(hits);
       if (lane == owner && base < 64) mask |= uint64_t(hits) << base;
     }

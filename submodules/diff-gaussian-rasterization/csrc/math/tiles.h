@@ -122,13 +122,17 @@ GS_HD auto box_reached(const TileTest<T>& test, V left, V right, V top, V bottom
   return (beside & side) | (above & edge) | ((!outside) & (V{} + test.level >= T(0)));
 }
 
-// Tests tiles given by column and row; V as above.
-template <class T, class V>
+// Tests tiles given by column and row; V as above. kMayCross: whether the splat may cross a panorama's border.
+template <bool kMayCross = true, class T, class V>
 GS_HD auto tile_reached(const TileTest<T>& test, V tile_x, V tile_y) {
-  const V at = tile_x * T(kTile), end = at + T(kTile - 1), top = tile_y * T(kTile), bottom = top + T(kTile - 1);
+  V left = tile_x * T(kTile), right = left + T(kTile - 1), top = tile_y * T(kTile), bottom = top + T(kTile - 1);
   const V last_x = V{} + test.last_x, last_y = V{} + test.last_y;
-  const V left = unrolled(test.splat, at, int(test.last_x) + 1), right = (end < last_x ? end : last_x) + (left - at);
-  return box_reached(test, left, right, top, bottom < last_y ? bottom : last_y);
+  right = right < last_x ? right : last_x, bottom = bottom < last_y ? bottom : last_y;
+  if constexpr (kMayCross) {
+    const V there = unrolled(test.splat, left, int(test.last_x) + 1);
+    right += there - left, left = there;
+  }
+  return box_reached(test, left, right, top, bottom);
 }
 
 GS_ISA_END
