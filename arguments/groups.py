@@ -78,10 +78,11 @@ class ModelParams(OptionTable):
         Option("mask_meaning", "auto", origin="ours", check=one_of("auto", "ignore", "transparent"), stored=MODEL_JSON,
             help="meaning of pixels masked by mask files or by the photos' alpha. ignore: leave them out of loss and "
                  "scores; transparent: they show the background; auto: ignore for mask files, transparent for alpha"),
-        Option("lenses", "undistort", origin="ours", check=one_of("undistort", "native"), stored=MODEL_JSON,
-            help="photos of distorting lenses. undistort: resample them to pinhole images when they are loaded; "
-                 "native: train on the photos as they are, through their lenses, where the rasterizer knows the "
-                 "camera model"),
+        Option("lenses", "auto", origin="ours", check=one_of("auto", "undistort", "native"), stored=MODEL_JSON,
+            help="photos of distorting lenses. native: train on the photos as they are, through their lenses, where "
+                 "the rasterizer knows the camera model; undistort: resample them to pinhole images when they are "
+                 "loaded; auto: native, but as before in a resumed training, and undistort in code that does not "
+                 "train by train.py"),
         Option("refine_poses", False, origin="ours", stored=MODEL_JSON,
             help="train a small correction of each training camera's pose with the Gaussians. The tracks of a COLMAP "
                  "scene hold the cameras, and place the test views; steps are plain ones (--plain_step)"),

@@ -15,14 +15,16 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
+from diff_gaussian_rasterization.lens import MODELS
 
 # Pillow's zlib must be in the process before pycolmap's, or writing a PNG aborts (pycolmap 4.2.1, Pillow 13.0).
 from PIL import Image  # noqa: F401
 
 from utils.system_utils import UserError
 
+PANORAMA = "EQUIRECTANGULAR"
 WIDEST = 60.0  # degrees to either side; farther out, a pinhole stretches the photo more than fourfold
-_PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # number of parameters
+_STRAIGHT = 1e-8  # COLMAP takes smaller parameters for no distortion
 # In sizes of the photo. Beyond these bounds lie damaged files and other units, not lenses: fields of view below a
 # thousandth of a degree, or so near 180 degrees that no pinhole shows anything.
 _SHORTEST, _LONGEST = 1e-4, 1e5  # focal length
@@ -65,31 +67,31 @@ class Undistortion(NamedTuple):
 
 
 def pinhole_of(lens: Lens, name: str) -> Pinhole | None:
-    """The lens as a pinhole, or None if its photos must be undistorted first.
+    """The lens as a pinhole, or None if it distorts.
 
-    name: of a photo, for the message. UserError for a lens that is unusable or a panorama.
+    name: of a photo, for the message. UserError for a lens that is unusable.
     """
     narrow, wide = sorted((lens.width, lens.height))
     if not (np.isfinite(lens.params).all() and narrow > 0 and wide <= _LARGEST):
         raise _unusable(lens, name)
-    if len(lens.params) == _PINHOLES.get(lens.model):  # without pycolmap, which is slow to import
-        focal, center = lens.params[:-2], lens.params[-2:]
+    if lens.model == PANORAMA:
+        if lens.params != (lens.width, lens.height):
+            raise _unusable(lens, name)
+        return None
+    if lens.model in MODELS:  # without pycolmap, which is slow to import
+        chart, focals, places = MODELS[lens.model]
+        if len(lens.params) != focals + 2 + len(places):
+            raise _unusable(lens, name)
+        focal, center, further = lens.params[:focals], lens.params[focals : focals + 2], lens.params[focals + 2 :]
+        straight = chart == "perspective" and max(map(abs, further), default=0.0) < _STRAIGHT
     else:
         camera = _camera(lens, name)
-        if not camera.is_perspective():
-            raise UserError(
-                f"the photo {name} has the camera model {lens.model}, a panorama that no pinhole can show; cut it "
-                "into perspective photos and reconstruct those"
-            )
         focal = tuple(lens.params[index] for index in camera.focal_length_idxs())
         center = tuple(lens.params[index] for index in camera.principal_point_idxs())
         # is_undistorted alone is also true of a fisheye without further parameters.
         straight = camera.is_perspective_pinhole() and camera.is_undistorted()
-        if not straight:
-            _check_bounds(lens, focal, center, name)
-            return None
     _check_bounds(lens, focal, center, name)
-    return Pinhole(focal[0], focal[-1], *center, lens.width, lens.height)
+    return Pinhole(focal[0], focal[-1], *center, lens.width, lens.height) if straight else None
 
 
 def rays_of(lens: Lens, pixels: np.ndarray) -> np.ndarray:
@@ -186,7 +188,7 @@ def import_pycolmap() -> ModuleType:
     """
     if "pycolmap" not in sys.modules and importlib.util.find_spec("pycolmap") is None:
         raise UserError(
-            "pycolmap is not installed, which convert.py and photos with lens distortion need (pip install pycolmap); "
+            "pycolmap is not installed, which convert.py and --lenses undistort need (pip install pycolmap); "
             "where it has no wheel, as on Linux for Arm, convert and undistort the photos on another machine"
         )
     import pycolmap

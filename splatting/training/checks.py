@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import copy
 import os
 import sys
 from collections.abc import Sequence
@@ -300,6 +301,18 @@ def continue_records(model_path: str, checkpoint: str | None, first_iteration: i
 def strategy_of(checkpoint: str) -> str:
     """The strategy of the run that wrote a checkpoint; adc if its folder does not say."""
     return str(_options_of(Path(checkpoint).parent).get("strategy", "adc"))
+
+
+def with_lenses(dataset: argparse.Namespace, checkpoint: str | None) -> argparse.Namespace:
+    """Model options whose --lenses auto is decided: native, or that of the run that wrote a checkpoint to resume.
+
+    A folder that does not say was written when photos were undistorted, as they are where auto stays.
+    """
+    if getattr(dataset, "lenses", None) != "auto":
+        return dataset
+    decided = copy.copy(dataset)
+    decided.lenses = _options_of(Path(checkpoint).parent).get("lenses", "auto") if checkpoint else "native"
+    return decided
 
 
 def _options_of(folder: Path) -> dict[str, object]:

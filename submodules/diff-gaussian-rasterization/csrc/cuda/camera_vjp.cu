@@ -31,7 +31,7 @@ __device__ double block_sum(double value, double* stage) {
 template <class AnyCamera>
 __global__ void __launch_bounds__(kThreads)
     camera_vjp_kernel(const int32_t* halted, Scene<float> s, SlotSums source, double* sums) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   constexpr int kNumbers = kNumbersOf<AnyCamera>;
   __shared__ AnyCamera camera;
   __shared__ __align__(8) float stage[kWarps * SlotSums::kStage];
@@ -52,7 +52,7 @@ __global__ void __launch_bounds__(kThreads)
 
 __global__ void __launch_bounds__(kThreads)
     sum_blocks_kernel(const int32_t* halted, int64_t blocks, const double* sums, double* out) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   __shared__ double of_warps[kWarps];
   double sum = 0;
   for (int64_t block = threadIdx.x; block < blocks; block += kThreads) sum += sums[gridDim.x * block + blockIdx.x];
@@ -61,14 +61,12 @@ __global__ void __launch_bounds__(kThreads)
 }
 
 template <class AnyCamera>
-void launch(const Queue& queue, const Scene<float>& s, const SlotSums& source, double* out) {
+void sum_rows(const Queue& queue, const Scene<float>& s, const SlotSums& source, double* out) {
   constexpr int kNumbers = kNumbersOf<AnyCamera>;
   const unsigned blocks = blocks_for(s.count, kThreads);
   double* sums = queue.array<double>(size_t(kNumbers) * blocks);
-  if (blocks) camera_vjp_kernel<AnyCamera><<<blocks, kThreads, 0, stream_of(queue)>>>(queue.halted, s, source, sums);
-  check_launch("camera_vjp");
-  sum_blocks_kernel<<<kNumbers, kThreads, 0, stream_of(queue)>>>(queue.halted, blocks, sums, out);
-  check_launch("sum_blocks");
+  if (blocks) launch(queue, "camera_vjp", camera_vjp_kernel<AnyCamera>, blocks, kThreads, s, source, sums);
+  launch(queue, "sum_blocks", sum_blocks_kernel, kNumbers, kThreads, blocks, sums, out);
 }
 
 }  // namespace
@@ -76,9 +74,9 @@ void launch(const Queue& queue, const Scene<float>& s, const SlotSums& source, d
 void camera_vjp(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, double* out) {
   const SlotSums source = sums_of(queue, in, {});
   if (s.lens.chart == Chart::kPinhole)
-    launch<Camera<float>>(queue, s, source, out);
+    sum_rows<Camera<float>>(queue, s, source, out);
   else
-    launch<LensCamera<float>>(queue, s, source, out);
+    sum_rows<LensCamera<float>>(queue, s, source, out);
 }
 
 }  // namespace cuda
