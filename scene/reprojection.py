@@ -10,6 +10,7 @@ from scene.readers.tracks import Track
 
 OUTLIER = 1.0  # pixels; larger errors count linearly (Huber 1964)
 _STEPS = 10
+_LESS = 0.9  # of the loss: a pose whose loss falls less stays, since structure from motion has found it
 _NEAR = 1e-3  # of the median depth; nearer points do not count
 
 
@@ -53,7 +54,7 @@ def pull(pose: np.ndarray, track: Track, focal: float, unit: float) -> Pull:
 
 
 def nearest_pose(pose: np.ndarray, track: Track | None, focal: float, unit: float, bound: float) -> np.ndarray:
-    """The pose of least reprojection error near a pose, which stays as it is without a track.
+    """The pose of least reprojection error near a pose, which stays as it is without a track, or where little is won.
 
     bound: of rotation (radians) and translation (units), beyond which it stays, too.
     """
@@ -67,5 +68,5 @@ def nearest_pose(pose: np.ndarray, track: Track | None, focal: float, unit: floa
     change = found @ np.linalg.inv(pose)
     turn = np.arccos(np.clip((np.trace(change[:3, :3]) - 1) / 2, -1, 1))
     apart = np.linalg.norm(change[:3, 3]) / unit
-    better = pull(found, track, focal, unit).loss <= pull(pose, track, focal, unit).loss
+    better = pull(found, track, focal, unit).loss < _LESS * pull(pose, track, focal, unit).loss
     return found if better and turn <= bound and apart <= bound else pose

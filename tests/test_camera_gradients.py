@@ -32,6 +32,15 @@ LENSES = {
 }
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Use one thread: on images of a hundred pixels, more only wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 def _lens(chart: str) -> Lens:
     return Lens(chart, (16.0, 14.0), (8.0, 3.5), *LENSES[chart])
 
@@ -166,6 +175,16 @@ def test_other_gradients_keep_their_bytes(device, dtype):
     assert view.grad.isfinite().all() and view.grad[:, :3].all() and not view.grad[:, 3].any()
     for name, values in plain.items():
         assert torch.equal(values, asked[name]), name
+
+
+def test_threads_give_the_same_bytes():
+    parameters, size = few(1000, 70, 33, dtype=torch.float32)
+    parameters["scales"] -= 2
+    found = []
+    for threads in (1, 3):
+        torch.set_num_threads(threads)
+        found.append(_gradient_of_numbers(parameters, settings(**size)))
+    assert torch.equal(*found)
 
 
 def test_nothing_is_computed_unless_asked(monkeypatch):

@@ -54,10 +54,13 @@ def test_tracks_find_a_pose_again(noise):
     assert np.abs(moved_pose(POSE, TURN, 1.0) - POSE).max() > 0.03
 
 
-def test_tracks_without_a_say_leave_a_pose():
+def test_a_pose_may_stay():
     away = moved_pose(POSE, TURN, 1.0)
     assert nearest_pose(away, None, 500.0, 1.0, BOUND) is away
     assert nearest_pose(away, _track(), 500.0, 1.0, 0.01) is away  # farther than the bound
+    noisy, near = _track(200, 1e-3), moved_pose(POSE, 1e-3 * TURN, 1.0)
+    assert nearest_pose(near, noisy, 500.0, 1.0, BOUND) is near  # by a hundredth of the errors' size
+    assert nearest_pose(moved_pose(POSE, 0.05 * TURN, 1.0), noisy, 500.0, 1.0, BOUND) is not near
 
 
 @pytest.mark.parametrize("params", [BROWN[:4], BROWN], ids=["pinhole", "distorted"])

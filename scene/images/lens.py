@@ -95,8 +95,13 @@ def pinhole_of(lens: Lens, name: str) -> Pinhole | None:
 
 
 def rays_of(lens: Lens, pixels: np.ndarray) -> np.ndarray:
-    """x / z and y / z (N, 2) of the rays of pixels (N, 2), pixel centres at .5; NaN where a ray has none."""
-    if len(lens.params) == _PINHOLES.get(lens.model):
+    """x / z and y / z (N, 2) of the rays of pixels (N, 2), pixel centres at .5; NaN where a ray has none.
+
+    A panorama, most of whose rays have none, gives NaN throughout.
+    """
+    if lens.model == PANORAMA:
+        return np.full(pixels.shape, np.nan)
+    if lens.model in ("SIMPLE_PINHOLE", "PINHOLE"):  # without pycolmap
         focal, center = np.array(lens.params[:-2]), np.array(lens.params[-2:])
         return (pixels - center) / focal
     return np.asarray(_camera(lens).cam_from_img(np.ascontiguousarray(pixels)), dtype=np.float64).reshape(-1, 2)
