@@ -83,6 +83,8 @@ def scene_arguments(gaussians: Gaussians, settings: GaussianRasterizationSetting
     for name in _FLAGS:
         if (flag := getattr(settings, name)) is not True and flag is not False and flag is not None:
             check_flag(name, flag)  # the text "no" would count as True
+    if settings.projection != "ewa":
+        raise ValueError(f"rasterize has the projection 'ewa' alone, got {settings.projection!r}; the oracle has 'ray'")
     size = settings.image_height, settings.image_width
     lens = settings.tanfovx, settings.tanfovy, settings.scale_modifier
     if settings.lens is not None:

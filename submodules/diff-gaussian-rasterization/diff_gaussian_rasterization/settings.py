@@ -29,3 +29,4 @@ class GaussianRasterizationSettings(NamedTuple):
     antialiasing: bool | None = None  # None, as in the 12 fields of 2023: off, and GaussianRasterizer has two results
     inverse_depth: bool = True  # False: the third result is None and nothing is computed for it
     lens: Lens | None = None  # in place of a pinhole: then tanfovx, tanfovy and projmatrix are not read
+    projection: str = "ewa"  # or "ray": a pixel sees a Gaussian along its own ray, not by EWA's affine map
