@@ -52,8 +52,8 @@ def render(
     get_xyz, get_opacity, get_scaling, get_rotation, get_features and active_sh_degree. bg_color: (3,) in [0, 1] on the
     model's device. scaling_modifier multiplies all scales. separate_sh: take get_features_dc and get_features_rest even
     if a subclass has overridden them; the 2023 release has override_color in its place. override_color: (N, 3) instead
-    of SH. pipe: convert_SHs_python, compute_cov3D_python, debug and, if it is there, antialiasing. use_trained_exp:
-    apply the trained exposure of the view's photo, before the clamp; a view without a photo has none.
+    of SH. pipe: convert_SHs_python, compute_cov3D_python, debug and, where they are there, antialiasing and projection.
+    use_trained_exp: apply the trained exposure of the view's photo, before the clamp; a view without a photo has none.
 
     Returns
     `render` (3, H, W), clamped to [0, 1] so that values outside get no gradient; unclamped if clamp is False;
@@ -222,6 +222,7 @@ def rasterizer_settings(
         debug=pipe.debug,
         antialiasing=getattr(pipe, "antialiasing", False),  # the 2023 release's options have none
         lens=getattr(camera, "lens", None),
+        projection=getattr(pipe, "projection", "ewa"),
     )
 
 

@@ -55,6 +55,7 @@ def widened(values: dict[str, torch.Tensor], view: GaussianRasterizationSettings
 
 CASES = {
     "ordinary": ((0.3, -0.2, 2.0), (0.1, 0.2, 0.3)),
+    "on the axis": ((0.0, 0.0, 2.0), (0.1, 0.2, 0.3)),
     "large, and beside the image": ((2.0, 0.5, 2.0), (0.5, 0.3, 0.8)),
     "thin": ((-0.6, 0.4, 1.5), (1e-4, 0.3, 0.9)),
     "flat": ((-0.6, 0.4, 1.5), (0.0, 0.3, 0.5)),

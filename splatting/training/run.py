@@ -100,6 +100,9 @@ class Run:
         self.scene, first = scene_with(init_ply, dataset, self.gaussians, sharing=sharing)
         checks.check_scene(self.scene.info)
         checks.hint_of_images(self.scene.getTrainCameras(), self.scene.info, dataset.white_background)
+        checks.check_projection(
+            getattr(pipe, "projection", "ewa"), self.scene.getTrainCameras(), self.device, self.group.several
+        )
         checks.check_target(opt.target_psnr, len(self.scene.getTestCameras()))
         agree_on_scene(self.scene, self.start)  # before an image is shared
         points = self.scene.info.point_cloud.points if first is None else first

@@ -26,7 +26,7 @@ std::tuple<Tensor, Tensor> blend_rows_op(SOURCE_PARAMETERS, bool absolute) {
   with_scalar(splats.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
     auto take = [&](int64_t count) {
-      rows = empty({count, row_values(absolute)}, splats);
+      rows = empty({count, row_values(absolute, on_rays(splats))}, splats);
       return write<T>(rows);
     };
     using Take = decltype(take);

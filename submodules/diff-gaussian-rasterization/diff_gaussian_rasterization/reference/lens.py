@@ -15,9 +15,9 @@ def pixels(lens: Lens, points: Tensor) -> Tensor:
     if lens.chart == "equirectangular":
         a, b = torch.atan2(x, z), torch.atan2(y, torch.hypot(x, z))
     else:
-        r = torch.hypot(x, y)
-        off_axis = torch.where(r > 0, r, 1.0)
-        angular = torch.where(r > 0, torch.atan2(off_axis, z) / off_axis, 1 / z)
+        square = x * x + y * y
+        r = torch.sqrt(torch.where(square > 0, square, 1.0))
+        angular = torch.where(square > 0, torch.atan2(r, z) / r, 1 / z)
         stretch = 1 / z if lens.chart == "perspective" else angular
         a, b = x * stretch, y * stretch
     found = _distorted(lens, torch.stack([a, b], -1))
