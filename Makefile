@@ -103,12 +103,13 @@ build/%: submodules/%.cpp $$(call objects,$$(call submodule,$$*)) $$(wildcard su
 # CUDA kernels on the CPU: the .cu files, rewritten as C++, instead of a GPU.
 EMULATION := submodules/common/emulation
 build/%/csrc/tests/test_cuda_emulated: submodules/%/csrc/tests/test_cuda_emulated.cpp $(wildcard $(EMULATION)/*) \
-                                       $$(call objects,$$*) $$(wildcard submodules/$$*/csrc/tests/*.h)
+                                       $(wildcard $(EMULATION)/gs/*) $$(call objects,$$*) \
+                                       $$(wildcard submodules/$$*/csrc/tests/*.h)
 	@mkdir -p $(@D)/emulated
 	rm -f $(@D)/emulated/*
 	$(PYTHON) $(EMULATION)/translate.py $(@D)/emulated $(wildcard submodules/$*/csrc/cuda/*.cu*)
 	printf '%s\n' $< $(EMULATION)/emulation.cpp $(@D)/emulated/*.cpp | xargs -P $(CORES) -I SOURCE sh -c \
-	    '$(call compile,$*) -Wno-unknown-pragmas -I$(@D)/emulated -Isubmodules/$*/csrc/cuda -I$(EMULATION) \
+	    '$(call compile,$*) -Wno-unknown-pragmas -I$(@D)/emulated -Isubmodules/$*/csrc/cuda -I$(EMULATION) -iquote$(EMULATION) \
 	    SOURCE -c -o $(@D)/emulated/$$(basename SOURCE).o'
 	$(CXX) $(CXX_TEST_FLAGS) $(@D)/emulated/*.o $(call objects,$*) -o $@
 

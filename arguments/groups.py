@@ -78,10 +78,11 @@ class ModelParams(OptionTable):
         Option("mask_meaning", "auto", origin="ours", check=one_of("auto", "ignore", "transparent"), stored=MODEL_JSON,
             help="meaning of pixels masked by mask files or by the photos' alpha. ignore: leave them out of loss and "
                  "scores; transparent: they show the background; auto: ignore for mask files, transparent for alpha"),
-        Option("lenses", "undistort", origin="ours", check=one_of("undistort", "native"), stored=MODEL_JSON,
-            help="photos of distorting lenses. undistort: resample them to pinhole images when they are loaded; "
-                 "native: train on the photos as they are, through their lenses, where the rasterizer knows the "
-                 "camera model"),
+        Option("lenses", "auto", origin="ours", check=one_of("auto", "undistort", "native"), stored=MODEL_JSON,
+            help="photos of distorting lenses. native: train on the photos as they are, through their lenses, where "
+                 "the rasterizer knows the camera model; undistort: resample them to pinhole images when they are "
+                 "loaded; auto: native, but as before in a resumed training, and undistort in code that does not "
+                 "train by train.py"),
         Option("images_to_load", 0, origin="ours", check=at_least(0),
             help="largest number of decoded images (photos, masks and depth maps) kept in memory, 0: all. The one "
                  "unused for longest goes. Every photo still trains, with the same result; up to 32 that come next "

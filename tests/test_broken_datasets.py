@@ -187,7 +187,11 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_no_views, "COLMAP model in SCENE/sparse/0 has no registered photo"),
         (_word("cameras.txt", (4, "wide")), r"line 4 of SCENE/sparse/0/cameras\.txt .*wide"),
         (_word("cameras.txt", (1, "PINHOLE2")), r"line 4 of .*0/cameras\.txt .*no camera model PINHOLE2"),
-        (_word("cameras.txt", (1, "EQUIRECTANGULAR"), (6, ""), (7, "")), "V03.png has the camera model EQUIREC"),
+        (
+            _word("cameras.txt", (1, "EQUIRECTANGULAR"), (4, "96"), (5, "64"), (6, ""), (7, "")),
+            "V03.png is a panorama, which no pinhole image can show; train on it with --lenses native",
+        ),
+        (_word("cameras.txt", (1, "EQUIRECTANGULAR"), (6, ""), (7, "")), "camera of Right/V03.png has no usable size"),
         (_word("cameras.txt", (4, "0")), "camera of Right/V03.png has no usable size or focal length"),
         (_word("images.txt", (5, "nan")), "pose of .*png is not finite"),
         (_word("images.txt", (5, "1e30")), "more than 1e[+]12 from the origin"),
@@ -233,7 +237,7 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_pose(1, [0, -1, 0, 0]), "pose of r_0 is mirrored"),
     ],
     "nerfstudio": [
-        (_with(camera_model="EQUIRECTANGULAR"), "camera_model EQUIRECTANGULAR in .*cannot be used, only PINHOLE"),
+        (_with(camera_model="SPHERICAL"), "camera_model SPHERICAL in .*cannot be used, only PINHOLE"),
         (_with(k1=0.1, k4=0.1), "has k4, k5 or k6 for the camera_model PERSPECTIVE"),
         (_with(fl_x="wide"), "is not a camera file .*could not convert"),
         (_with(fl_x=[1]), "is not a camera file .*TypeError"),

@@ -121,6 +121,15 @@ def test_a_lens_without_distortion_is_a_pinhole():
         torch.testing.assert_close(leaves[name].grad, others[name].grad, rtol=1e-9, atol=1e-9)
 
 
+def of_nearest_copies(splats, rows, width, alphas=reference.blend.alphas):
+    """The alphas of a panorama, of which each tile shows the nearest copy of a splat."""
+    left = torch.arange(width) // 16 * 16 - splats.pixel[:, :1]
+    turns = (left >= width / 2).int() - (left < -width / 2).int()
+    by_turns = [alphas(splats._replace(pixel=splats.pixel + torch.tensor([turn * width, 0])), rows, width)
+                for turn in (-1, 0, 1)]  # fmt: skip
+    return sum((turns == turn)[:, None] * by_turns[turn + 1] for turn in (-1, 0, 1))
+
+
 @pytest.mark.parametrize(
     ("model", "antialiasing"),
     [
@@ -128,7 +137,9 @@ def test_a_lens_without_distortion_is_a_pinhole():
         ("THIN_PRISM_FISHEYE", False), ("panorama", True),
     ],
 )  # fmt: skip
-def test_images_and_gradients_are_the_oracles(model, antialiasing):
+def test_images_and_gradients_are_the_oracles(model, antialiasing, monkeypatch):
+    if model == "panorama":
+        monkeypatch.setattr(reference.blend, "alphas", of_nearest_copies)
     of, width, height = lens(model).scaled(0.5, 0.5), WIDTH // 2, HEIGHT // 2  # for speed
     camera = settings(of, torch.float64, antialiasing=antialiasing, image_width=width, image_height=height)
     values = everywhere(of, camera, 2000)
@@ -159,6 +170,49 @@ def test_single_precision_agrees_with_double(model, device, dtype):
     for name, leaf in leaves.items():
         scale = precise[name].grad.abs().max()
         assert (leaf.grad.double().cpu() - precise[name].grad).abs().max() < 2e-3 * scale, name
+
+
+def turned(camera: GaussianRasterizationSettings, columns: int) -> GaussianRasterizationSettings:
+    """The camera of a panorama whose columns are moved to the right by so many."""
+    angle = 2 * math.pi * columns / WIDTH
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[0, 0] = turn[2, 2] = math.cos(angle)
+    turn[0, 2], turn[2, 0] = -math.sin(angle), math.sin(angle)
+    return camera._replace(viewmatrix=(camera.viewmatrix.double() @ turn).to(camera.viewmatrix))
+
+
+@BOTH_AND_GPU
+@pytest.mark.parametrize("antialiasing", [False, True])
+def test_a_panorama_has_no_seam(antialiasing, device, dtype):
+    camera = settings(PANORAMA, dtype, device, antialiasing=antialiasing)
+    values = gaussians(PANORAMA, camera, 600)
+    values["scales"][::7] += 1
+    weight = torch.randn(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    weight = weight.to(device, dtype)
+    plain, turn = ({name: v.clone().requires_grad_() for name, v in values.items()} for _ in range(2))
+    one, two = draw(camera, plain).color, draw(turned(camera, 32), turn).color.roll(-32, 2)  # whole tiles
+    crossing = projected(turned(camera, 32), values)[0][:, 2] < 0
+    assert 20 < crossing.sum() < 300
+    rounding = 1e-9 if dtype == torch.float64 else 2e-4
+    assert (one - two).abs().max() < rounding
+    (weight * one).sum().backward(), (weight * two).sum().backward()
+    for name in values:
+        scale = plain[name].grad.abs().max()
+        assert (plain[name].grad - turn[name].grad).abs().max() < 10 * rounding * scale, name
+
+
+@BOTH_AND_GPU
+def test_gaussians_at_a_panoramas_poles_are_shown_with_finite_gradients(device, dtype):
+    camera = settings(PANORAMA, dtype, device)._replace(viewmatrix=torch.eye(4, dtype=dtype, device=device))
+    values = gaussians(PANORAMA, camera, 60)
+    aside = torch.logspace(0, -50, 60, dtype=torch.float64)  # from a radian to nothing that float32 has
+    values["means"] = torch.stack([aside, torch.tensor([2.0, -2.0] * 30), 0.5 * aside], 1).to(device, dtype)
+    leaves = {name: v.clone().requires_grad_() for name, v in values.items()}
+    image = draw(camera, leaves).color
+    image.square().sum().backward()
+    assert image.isfinite().all()
+    assert all(leaf.grad.isfinite().all() for leaf in leaves.values())
+    assert (projected(camera, values)[3] > 0).all()  # they are shown, not left out
 
 
 def test_the_field_ends_where_the_distortion_turns_back():

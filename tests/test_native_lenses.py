@@ -1,4 +1,4 @@
-"""`--lenses native`: photos of distorting lenses as they are, through train.py, render.py and metrics.py."""
+"""Photos of distorting lenses as they are, the default, through train.py, render.py and metrics.py."""
 
 import json
 import sys
@@ -18,11 +18,15 @@ import render
 import train
 from gaussian_renderer import rasterizer_settings
 from scene import Scene
+from scene.readers.start_cloud import random_in_frusta
+from splatting.camera_paths.poses import poses_of
+from splatting.diagnosis.dataset import check_dataset
 
+PANORAMA = ("EQUIRECTANGULAR", (WIDTH, HEIGHT))
 FISHEYE = (40.0, 40.0, *CENTER, 0.05, -0.01, 0.003, -0.001)
 
 
-@pytest.mark.parametrize(("model", "params"), [("OPENCV", BROWN), ("OPENCV_FISHEYE", FISHEYE)])
+@pytest.mark.parametrize(("model", "params"), [("OPENCV", BROWN), ("OPENCV_FISHEYE", FISHEYE), PANORAMA])
 @pytest.mark.parametrize("resolution", [1, 2])
 def test_views_show_points_where_the_photo_has_them(tmp_path, model, params, resolution):
     reconstruction = make_colmap_scene(tmp_path / "scene", model=model, params=params, views=3)
@@ -47,16 +51,27 @@ def test_views_show_points_where_the_photo_has_them(tmp_path, model, params, res
         assert np.abs(splats[shown, :2].numpy() - theirs).max() < 1e-4  # matrices are float32
 
 
+def test_points_of_panoramas(tmp_path):
+    make_colmap_scene(tmp_path / "scene", model=PANORAMA[0], params=PANORAMA[1])
+    said = check_dataset(str(tmp_path / "scene"), "images")
+    assert not [line for line in said if "of the points are in no photo" in line.text or "other photos" in line.text]
+    scene = Scene(options_of(tmp_path / "scene", tmp_path / "out", lenses="native"), FakeGaussians())
+    assert poses_of(scene.getTrainCameras()).fov == pytest.approx(60)  # what shows all is stretched
+    view = read(tmp_path / "scene", native=True).train_cameras[0]
+    local = (random_in_frusta([view]).points - view.center) @ view.R
+    assert (local < 0).mean(axis=0) == pytest.approx([0.5] * 3, abs=0.01)  # all around, not in front alone
+
+
 def test_unknown_models_are_undistorted(tmp_path):
     make_colmap_scene(tmp_path, model="FOV", params=(FOCAL, FOCAL, *CENTER, *DISTORTIONS["FOV"]), views=2)
     assert all(view.native is None and view.lens is None for view in read(tmp_path, native=True).train_cameras)
 
 
-@pytest.mark.parametrize(("model", "params"), [("OPENCV", BROWN), ("OPENCV_FISHEYE", FISHEYE)])
-def test_a_training_and_its_renders_have_the_photos(tmp_path, monkeypatch, model, params):
+@pytest.mark.parametrize(("model", "params"), [("OPENCV", BROWN), ("OPENCV_FISHEYE", FISHEYE), PANORAMA])
+def test_a_training_and_its_renders_have_the_photos(tmp_path, monkeypatch, capsys, model, params):
     scene, out = tmp_path / "scene", tmp_path / "out"
     make_colmap_scene(scene, model=model, params=params, views=17)
-    words = ["-s", str(scene), "-m", str(out), "--eval", "--lenses", "native"]
+    words = ["-s", str(scene), "-m", str(out), "--eval"]
     train.main([*words, "--iterations", "300", "--checkpoint_iterations", "150", "--densify_from_iter", "1000"])
     assert json.loads((out / "model.json").read_text())["lenses"] == "native"
     ply = out / "point_cloud/iteration_300/point_cloud.ply"
@@ -77,8 +92,18 @@ def test_a_training_and_its_renders_have_the_photos(tmp_path, monkeypatch, model
         with Image.open(path) as image:
             shown = np.asarray(image.convert("RGB"))
         assert any(np.array_equal(shown, np.asarray(Image.open(photo).convert("RGB"))) for photo in photos)
-    train.main(
-        [*words[:2], "-m", str(tmp_path / "resampled"), "--eval", "--iterations", "300", "--test_iterations", "300"]
-    )
+    if model == PANORAMA[0]:
+        return
+    words = ["-s", str(scene), "-m", str(tmp_path / "resampled"), "--eval", "--iterations", "300"]
+    words += ["--test_iterations", "300", "--densify_from_iter", "1000"]
+    train.main([*words, "--lenses", "undistort", "--checkpoint_iterations", "150"])
     resampled = json.loads((tmp_path / "resampled/train_log.json").read_text())[-1]["test_psnr"]
     assert next(iter(json.loads((out / "results.json").read_text()).values()))["PSNR"] > resampled - 1
+    ply, model = (tmp_path / "resampled" / name for name in ("point_cloud/iteration_300/point_cloud.ply", "model.json"))
+    once, record = ply.read_bytes(), json.loads(model.read_text())
+    assert record.pop("lenses") == "undistort"
+    model.write_text(json.dumps(record))  # of the time when that was the default
+    capsys.readouterr()
+    train.main([*words, "--start_checkpoint", str(tmp_path / "resampled/chkpnt150.pth")])
+    assert ply.read_bytes() == once and "lenses" not in json.loads(model.read_text())
+    assert "--lenses" not in capsys.readouterr().err

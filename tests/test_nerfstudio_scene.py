@@ -131,6 +131,7 @@ def _lens(fields: dict, shared: dict | None = None) -> Lens:
             (90, 90, 100, 50, 0.1, 0.2, 0.3, 0.4),
         ),
         ({"fl_x": 90, "is_fisheye": True, "k1": 0.1}, "OPENCV_FISHEYE", (90, 90, 100, 50, 0.1, 0, 0, 0)),
+        ({"fl_x": 100, "fl_y": 100, "camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR", (200, 100)),
     ],
 )
 def test_intrinsics(fields, model, params):

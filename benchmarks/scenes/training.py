@@ -14,6 +14,7 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.harness.measuring import describe, print_table
@@ -41,12 +42,15 @@ def seconds_of(model: Path) -> float:
     return json.loads((model / "train_log.json").read_text())[-1]["seconds"]
 
 
-def train(scene: Path, model: Path, seed: int, options: list[str], ranks: int = 1) -> dict:
-    """Train, render and score one model; return seconds, PSNR (dB), SSIM, Gaussians, bytes and a hash of the PLY."""
+def train(scene: Path, model: Path, seed: int, options: list[str], ranks: int = 1, shown: Sequence[str] = ()) -> dict:
+    """Train, render and score one model; return seconds, PSNR (dB), SSIM, Gaussians, bytes and a hash of the PLY.
+
+    shown: further options of render.py.
+    """
     words = ["-s", str(scene), "-m", str(model), "--eval", "--seed", str(seed), "--test_iterations", "-1", "--no_curve"]
     launcher = ["-m", "torch.distributed.run", "--standalone", f"--nproc_per_node={ranks}"] if ranks > 1 else []
     process = run(*launcher, "train.py", *words, *options)
-    run("render.py", "-m", str(model), "--skip_train")
+    run("render.py", "-m", str(model), "--skip_train", *shown)
     run("metrics.py", "-m", str(model))
     record = json.loads((model / "train_log.json").read_text())[-1]
     iteration = record["iteration"]

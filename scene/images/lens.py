@@ -21,6 +21,7 @@ from PIL import Image  # noqa: F401
 
 from utils.system_utils import UserError
 
+PANORAMA = "EQUIRECTANGULAR"
 WIDEST = 60.0  # degrees to either side; farther out, a pinhole stretches the photo more than fourfold
 _PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # number of parameters
 # In sizes of the photo. Beyond these bounds lie damaged files and other units, not lenses: fields of view below a
@@ -65,22 +66,21 @@ class Undistortion(NamedTuple):
 
 
 def pinhole_of(lens: Lens, name: str) -> Pinhole | None:
-    """The lens as a pinhole, or None if its photos must be undistorted first.
+    """The lens as a pinhole, or None if it distorts.
 
-    name: of a photo, for the message. UserError for a lens that is unusable or a panorama.
+    name: of a photo, for the message. UserError for a lens that is unusable.
     """
     narrow, wide = sorted((lens.width, lens.height))
     if not (np.isfinite(lens.params).all() and narrow > 0 and wide <= _LARGEST):
         raise _unusable(lens, name)
+    if lens.model == PANORAMA:
+        if lens.params != (lens.width, lens.height):
+            raise _unusable(lens, name)
+        return None
     if len(lens.params) == _PINHOLES.get(lens.model):  # without pycolmap, which is slow to import
         focal, center = lens.params[:-2], lens.params[-2:]
     else:
         camera = _camera(lens, name)
-        if not camera.is_perspective():
-            raise UserError(
-                f"the photo {name} has the camera model {lens.model}, a panorama that no pinhole can show; cut it "
-                "into perspective photos and reconstruct those"
-            )
         focal = tuple(lens.params[index] for index in camera.focal_length_idxs())
         center = tuple(lens.params[index] for index in camera.principal_point_idxs())
         # is_undistorted alone is also true of a fisheye without further parameters.

@@ -9,7 +9,7 @@ import numpy as np
 from diff_gaussian_rasterization.lens import MODELS, lens_of
 
 from scene.images.decode import picture_size
-from scene.images.lens import Lens, Pinhole, pinhole_of, undistortion
+from scene.images.lens import PANORAMA, Lens, Pinhole, pinhole_of, undistortion
 from scene.images.masks import Mask
 from scene.readers.info import CameraInfo
 from scene.readers.undistortion import undistort
@@ -40,6 +40,10 @@ def camera_info(
     if distorts and native and lens.model in MODELS:
         through, distorts = lens_of(lens.model, lens.params), False
         pinhole = Pinhole(*through.focal, *(place + 0.5 for place in through.center), lens.width, lens.height)
+    elif distorts and lens.model == PANORAMA:
+        raise UserError(
+            f"the photo {name} is a panorama, which no pinhole image can show; train on it with --lenses native"
+        )
     elif distorts:
         pinhole = undistortion(lens, *picture_size(path)).pinhole
     camera = CameraInfo(

@@ -90,8 +90,12 @@ def random_in_frusta(cameras: list[CameraInfo]) -> BasicPointCloud:
     points = np.empty((RANDOM_POINTS, 3))
     for index, camera in enumerate(cameras):
         mine = chosen == index
-        local = [(x[mine] * camera.width - camera.cx) / camera.fx, (y[mine] * camera.height - camera.cy) / camera.fy]
-        local = np.stack([*local, np.ones(mine.sum())], axis=1) * depth[mine, None]
+        across = (x[mine] * camera.width - camera.cx) / camera.fx
+        down = (y[mine] * camera.height - camera.cy) / camera.fy
+        local = [across, down, np.ones(mine.sum())]
+        if camera.native and camera.native.chart == "equirectangular":
+            local = [np.sin(across) * np.cos(down), np.sin(down), np.cos(across) * np.cos(down)]
+        local = np.stack(local, axis=1) * depth[mine, None]
         points[mine] = local @ camera.R.T + camera.center
     return _grey(points)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from scene.images.decode import picture_size
 from scene.images.find import find_images
-from scene.images.lens import Lens
+from scene.images.lens import PANORAMA, Lens
 from scene.images.masks import NO_MASKS, Mask, MaskOptions, find_masks
 from scene.readers.info import CameraInfo, SceneInfo, held_out, split_by_order
 from scene.readers.pinholes import camera_info, finished
@@ -213,8 +213,8 @@ def lens_of(frame: Mapping[str, Any], shared: Mapping[str, Any], size: tuple[int
 
     Fields: fl_x, fl_y in pixels, or camera_angle_x, camera_angle_y in radians (a missing y equals x); cx, cy (default:
     the middle); w, h (default: `size`, the photo's width and height); camera_model, or is_fisheye; k1 ... k6, p1, p2 as
-    in OpenCV. UserError for a lens that cannot be used; TypeError, ValueError, OverflowError for a value that is not a
-    number.
+    in OpenCV. A panorama needs camera_model alone. UserError for a lens that cannot be used; TypeError, ValueError,
+    OverflowError for a value that is not a number.
     """
     fields = {**shared, **frame}
 
@@ -223,6 +223,9 @@ def lens_of(frame: Mapping[str, Any], shared: Mapping[str, Any], size: tuple[int
         return default if value is None else float(value)
 
     width, height = int(number("w", size[0])), int(number("h", size[1]))
+    model = str(fields.get("camera_model") or ("FISHEYE" if fields.get("is_fisheye") else "PERSPECTIVE")).upper()
+    if model == PANORAMA:  # of all directions, whatever its focal lengths are said to be
+        return Lens(PANORAMA, (width, height), width, height)
     for name in ("camera_angle_x", "camera_angle_y"):
         if not 0 < number(name, 1.0) < np.pi:
             raise UserError(f"{name} in {file} must lie between 0 and pi, got {number(name, 1.0)}; give it in radians")
@@ -234,13 +237,12 @@ def lens_of(frame: Mapping[str, Any], shared: Mapping[str, Any], size: tuple[int
     pinhole = (fx, fy, number("cx", width / 2), number("cy", height / 2))
     k1, k2, k3, k4, k5, k6, p1, p2 = (number(name, 0.0) for name in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"))
 
-    model = str(fields.get("camera_model") or ("FISHEYE" if fields.get("is_fisheye") else "PERSPECTIVE")).upper()
     if model in _FISHEYE:
         return Lens("OPENCV_FISHEYE", (*pinhole, k1, k2, k3, k4), width, height)
     if model not in _BROWN:
         raise UserError(
-            f"the camera_model {model} in {file} cannot be used, only {', '.join(_BROWN + _FISHEYE)}; convert the "
-            "photos to one of these"
+            f"the camera_model {model} in {file} cannot be used, only {', '.join((*_BROWN, *_FISHEYE, PANORAMA))}; "
+            "convert the photos to one of these"
         )
     if not any((k1, k2, k3, k4, k5, k6, p1, p2)):
         return Lens("PINHOLE", pinhole, width, height)

@@ -10,6 +10,7 @@ from scene.cameras import Camera
 from splatting.camera_paths.keyframes import Keyframe
 
 SAME_PLACE = 1e-6  # of the distance from the origin, or of 1: float32 tells no smaller distances apart
+WIDEST = 60.0  # degrees; vertical opening of a pinhole view in place of a fisheye's or a panorama's
 # Mean squared sine of the angles between the axes, about, below which no point is found: 1.8 degrees.
 PARALLEL = 1e-3
 
@@ -59,7 +60,14 @@ def poses_of(cameras: Sequence[Camera]) -> Poses:
     views = np.stack([camera.world_view_transform.detach().cpu().double().numpy().T for camera in cameras])
     positions = -np.linalg.solve(views[:, :3, :3], views[:, :3, 3:])[..., 0]
     turns = Rotation.from_matrix(views[:, :3, :3].transpose(0, 2, 1)).as_matrix()
-    return Poses(positions, turns, np.degrees([float(camera.FoVy) for camera in cameras]))
+    return Poses(positions, turns, np.degrees([opening(camera) for camera in cameras]))
+
+
+def opening(camera: Camera) -> float:
+    """Vertical opening angle, radians, of a pinhole view in a camera's place; of a wide lens's, at most WIDEST."""
+    lens = getattr(camera, "lens", None)
+    wide = lens is not None and lens.chart != "perspective"
+    return min(float(camera.FoVy), np.radians(WIDEST)) if wide else float(camera.FoVy)
 
 
 def unit(vector: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 The points on the surfaces are noisy and coloured and have their tracks, as structure from motion would find them.
 
 python -m splatting.demo.make_scene OUT [--views 60] [--size 400 300] [--points 8000] [--seed 0]
+                                        [--camera pinhole]
 """
 
 import os
@@ -19,7 +20,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from splatting.demo.objects import Thing, demo_scene
-from splatting.demo.tracer import View, render_view, ring_views, trace
+from splatting.demo.tracer import CAMERAS, View, render_view, ring_views, trace
 from splatting.host.machine import cores
 from utils.system_utils import UserError, mkdir_p, run_cli
 
@@ -113,13 +114,13 @@ def sample_points(
 
 
 def write_model(folder: Path, names: list[str], views: list[View], points: SurfacePoints) -> None:
-    """Make `folder` with a binary COLMAP model: one PINHOLE camera, an image per view, points with their tracks."""
+    """Make `folder` with a binary COLMAP model: one camera, an image per view, points with their tracks."""
     import pycolmap
 
     first = views[0]
     model = pycolmap.Reconstruction()
-    params = [first.focal, first.focal, first.width / 2, first.height / 2]
-    camera = pycolmap.Camera(model="PINHOLE", width=first.width, height=first.height, params=params, camera_id=1)
+    size = {"width": first.width, "height": first.height}
+    camera = pycolmap.Camera(model=first.model, **size, params=first.params, camera_id=1)
     model.add_camera_with_trivial_rig(camera)
     tracks = [pycolmap.Track() for _ in points.xyz]
     for image_id, (name, view) in enumerate(zip(names, views, strict=True), 1):
@@ -135,19 +136,23 @@ def write_model(folder: Path, names: list[str], views: list[View], points: Surfa
     model.write_binary(folder)
 
 
-def make_scene(out: Path, views: int, width: int, height: int, points: int, seed: int) -> int:
+def make_scene(out: Path, views: int, width: int, height: int, points: int, seed: int, camera: str = "pinhole") -> int:
     """Write the scene to `out` (images/, sparse/0) and return its number of points.
 
-    The same arguments give the same photos and points. `out` appears only when it is complete. UserError if it exists
-    and is not empty, if it cannot be made, or if the scene would have no points.
+    camera: of CAMERAS. The same arguments give the same photos and points. `out` appears only when it is complete.
+    UserError if it exists and is not empty, if it cannot be made, or if the scene would have no points.
     """
     out = out.resolve()
     if out == Path.cwd():
         raise UserError("the scene cannot replace the current folder; name a new folder")
+    if camera == "panorama" and width != 2 * height:
+        raise UserError(
+            f"a panorama is twice as wide as high, got {width} x {height}; give --size {width} {width // 2}"
+        )
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(f"{out} exists and is not an empty folder; choose another one, or delete it first")
     rng = np.random.default_rng(seed)
-    cameras = ring_views(views, width, height, rng)
+    cameras = ring_views(views, width, height, rng, CAMERAS[camera])
     names = [f"view_{k:03d}.png" for k in range(views)]
     mkdir_p(out.parent)
     work = out.with_name(f".{out.name}.{os.getpid()}.tmp")
@@ -181,12 +186,14 @@ def main() -> None:
         help="size of the photos in pixels (400 300)")  # fmt: skip
     add("--points", type=int, default=8000, help="surface points to try; a few are dropped (8000)")
     add("--seed", type=int, default=0, help="seed of the cameras' jitter and of the points (0)")
+    add("--camera", choices=CAMERAS, default="pinhole",
+        help="a fisheye is 200 degrees wide; a panorama shows all, and is twice as wide as high (pinhole)")  # fmt: skip
     args = parser.parse_args()
     for option, least in (("views", 3), ("size", 16), ("points", 1), ("seed", 0)):
         value = np.min(getattr(args, option))
         if value < least:
             raise UserError(f"--{option} must be at least {least}, got {value}")
-    count = make_scene(args.out, args.views, *args.size, args.points, args.seed)
+    count = make_scene(args.out, args.views, *args.size, args.points, args.seed, args.camera)
     print(f"{args.out}: {args.views} photos of {args.size[0]}x{args.size[1]} pixels, {count} points")
 
 

@@ -5,7 +5,7 @@ Its cameras stand on rings around the scene, at three heights.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 
@@ -16,31 +16,60 @@ SUN_COLOUR = np.asarray([[0.74], [0.70], [0.62]], np.float32)
 SKY_COLOUR = np.asarray([[0.40], [0.44], [0.50]], np.float32)
 TARGET = np.asarray([0.1, -0.4, 0.1])  # point that the cameras face, world units
 RINGS = ((12.0, 3.9, 0.40), (28.0, 3.6, 0.35), (50.0, 3.3, 0.25))  # elevation in degrees, distance, share of the views
+NEARER = 0.6  # distances of wide cameras, as a share of the pinholes'
+FISHEYE, PANORAMA = "OPENCV_FISHEYE", "EQUIRECTANGULAR"  # COLMAP's names; an equidistant fisheye without distortion
+CAMERAS = {"pinhole": "PINHOLE", "fisheye": FISHEYE, "panorama": PANORAMA}
 BLOCK = 32768  # rays traced at once; their arrays fit in the cache of a core
 
 
 @dataclass(frozen=True)
 class View:
-    """A pinhole camera, whose principal point is the centre of the image."""
+    """A camera of one of the models of CAMERAS, whose principal point is the centre of the image."""
 
     rotation: np.ndarray  # (3, 3), world to camera: x right, y down, z forward
     center: np.ndarray  # (3,), position in the world
     focal: float  # pixels
     width: int
     height: int
+    _: KW_ONLY
+    model: str = "PINHOLE"
+
+    @property
+    def params(self) -> list[float]:
+        """COLMAP's parameters."""
+        if self.model == PANORAMA:
+            return [self.width, self.height]
+        return [self.focal, self.focal, self.width / 2, self.height / 2, *[0.0] * (4 if self.model == FISHEYE else 0)]
 
     def rays(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return unit directions (3, R) in the world through image positions (R,) in pixels; centres are at .5."""
-        local = np.stack([(x - self.width / 2) / self.focal, (y - self.height / 2) / self.focal, np.ones_like(x)])
-        return normalize((self.rotation.T @ local).astype(np.float32))
+        across, down = (x - self.width / 2) / self.focal, (y - self.height / 2) / self.focal
+        local = [across, down, np.ones_like(x)]
+        if self.model == FISHEYE:
+            angle = np.hypot(across, down)
+            local = [across * np.sinc(angle / np.pi), down * np.sinc(angle / np.pi), np.cos(angle)]
+        elif self.model == PANORAMA:
+            local = [np.sin(across) * np.cos(down), np.sin(down), np.cos(across) * np.cos(down)]
+        return normalize((self.rotation.T @ np.stack(local)).astype(np.float32))
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return image positions x, y (R,) in pixels and depths z (R,) of world points (3, R)."""
+        """Return image positions x, y (R,) in pixels and depths (R,) of world points (3, R).
+
+        The depth is z, but the distance for cameras that show what is beside them.
+        """
         local = self.rotation @ (points - self.center.reshape(3, 1))
+        depth = local[2] if self.model == "PINHOLE" else np.linalg.norm(local, axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            x = self.focal * local[0] / local[2] + self.width / 2
-            y = self.focal * local[1] / local[2] + self.height / 2
-        return x, y, local[2]
+            if self.model == PANORAMA:
+                across, down = np.arctan2(local[0], local[2]), np.arctan2(local[1], np.hypot(local[0], local[2]))
+                return self.focal * across + self.width / 2, self.focal * down + self.height / 2, depth
+            over = local[2]
+            if self.model == FISHEYE:
+                away = np.hypot(local[0], local[1])
+                over = away / np.arctan2(away, local[2])
+            x = self.focal * local[0] / over + self.width / 2
+            y = self.focal * local[1] / over + self.height / 2
+        return x, y, depth
 
 
 def look_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -51,8 +80,13 @@ def look_at(center: np.ndarray, target: np.ndarray) -> np.ndarray:
     return np.stack([right, np.cross(forward, right), forward])
 
 
-def ring_views(count: int, width: int, height: int, rng: np.random.Generator) -> list[View]:
-    """Make `count` cameras around the scene with small random jitter of position and aim; focal length 0.9 widths."""
+def ring_views(count: int, width: int, height: int, rng: np.random.Generator, model: str = "PINHOLE") -> list[View]:
+    """Make `count` cameras around the scene with small random jitter of position and aim.
+
+    A pinhole has a focal length of 0.9 widths. A fisheye is 200 degrees wide. A panorama's camera stands upright.
+    """
+    focal = width * {FISHEYE: 1 / np.radians(200), PANORAMA: 1 / (2 * np.pi)}.get(model, 0.9)
+    near = 1.0 if model == "PINHOLE" else NEARER
     shares = np.round(np.cumsum([share for *_, share in RINGS]) * count).astype(int)
     views: list[View] = []
     for ring, (elevation, distance, _) in enumerate(RINGS):
@@ -61,9 +95,11 @@ def ring_views(count: int, width: int, height: int, rng: np.random.Generator) ->
             azimuth = 2 * np.pi * (k + ring / len(RINGS) + rng.uniform(-0.15, 0.15)) / members
             tilt = np.radians(elevation + rng.uniform(-2, 2))
             outward = np.asarray([np.cos(tilt) * np.sin(azimuth), -np.sin(tilt), np.cos(tilt) * np.cos(azimuth)])
-            center = TARGET + distance * rng.uniform(0.95, 1.05) * outward
+            center = TARGET + near * distance * rng.uniform(0.95, 1.05) * outward
             aim = TARGET + rng.uniform(-0.15, 0.15, 3)
-            views.append(View(look_at(center, aim), center, 0.9 * width, width, height))
+            if model == PANORAMA:
+                aim[1] = center[1]
+            views.append(View(look_at(center, aim), center, focal, width, height, model=model))
     return views
 
 

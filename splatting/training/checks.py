@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import copy
 import os
 import sys
 from collections.abc import Sequence
@@ -109,7 +110,7 @@ def check_projection(projection: str, cameras: Sequence[Camera], device: torch.d
     if several:
         raise UserError("--projection ray needs a training of one process; start train.py without torchrun, or use ewa")
     if any(camera.lens for camera in cameras):
-        raise UserError("--projection ray shows pinholes alone; leave --lenses native out, or use --projection ewa")
+        raise UserError("--projection ray shows pinholes alone; give --lenses undistort, or use --projection ewa")
 
 
 def check_target(target_psnr: float, test_views: int) -> None:
@@ -303,6 +304,18 @@ def continue_records(model_path: str, checkpoint: str | None, first_iteration: i
 def strategy_of(checkpoint: str) -> str:
     """The strategy of the run that wrote a checkpoint; adc if its folder does not say."""
     return str(_options_of(Path(checkpoint).parent).get("strategy", "adc"))
+
+
+def with_lenses(dataset: argparse.Namespace, checkpoint: str | None) -> argparse.Namespace:
+    """Model options whose --lenses auto is decided: native, or that of the run that wrote a checkpoint to resume.
+
+    A folder that does not say was written when photos were undistorted, as they are where auto stays.
+    """
+    if getattr(dataset, "lenses", None) != "auto":
+        return dataset
+    decided = copy.copy(dataset)
+    decided.lenses = _options_of(Path(checkpoint).parent).get("lenses", "auto") if checkpoint else "native"
+    return decided
 
 
 def _options_of(folder: Path) -> dict[str, object]:

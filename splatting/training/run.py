@@ -78,15 +78,15 @@ class Run:
         launch: the options of splatting/training/launch.py.
         """
         given, opt = opt, copy.copy(opt)  # of which the strategy, and windows by the clock, are decided here
-        self.dataset, self.opt, self.pipe, self.launch = dataset, opt, pipe, launch
+        self.opt, self.pipe, self.launch = opt, pipe, launch
         self.group = ranks()
         checks.check_page(launch.viewer, self.group.several)
         self.start = self.group.shared(resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
+        dataset = self.dataset = checks.with_lenses(dataset, self.start)
         if opt.strategy == AUTO and (self.start or not (opt.time_budget or opt.schedule)):
             opt.strategy = checks.strategy_of(self.start) if self.start else USUAL
         self.lost, share = 0, partial(shared_seconds, self.group)
-        self.interrupt = DeferredInterrupt()
-        self.device = compute_device()
+        self.interrupt, self.device = DeferredInterrupt(), compute_device()
         capture, self.first_iteration = self._read_start()
         views = self.group.size if launch.parallel == "views" else 1
         self.schedule = schedule_file.schedule_of(opt, self.start, self.first_iteration, views, share)

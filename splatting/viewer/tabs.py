@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from splatting.camera_paths.poses import opening
 from splatting.viewer import views
 from splatting.viewer.frusta import Frusta
 from splatting.viewer.views import SceneCameras, Settings, Vector
@@ -197,7 +198,7 @@ class ImagesTab:
             initial.position = place = camera_center(camera.R, camera.T)
             initial.look_at = self._cameras.target_of(place, camera.R)
             initial.up = self._cameras.up_at(camera.R)
-            initial.fov = camera.FoVy
+            initial.fov = opening(camera)
 
     def _compare(self, client: "viser.ClientHandle | None") -> None:
         self.slider.visible = self.comparison.value == views.SLIDER

@@ -10,6 +10,7 @@ import numpy as np
 
 from gaussian_renderer.free_view import rotation_matrix
 from scene.cameras import Camera
+from splatting.camera_paths.poses import opening
 from utils.graphics_utils import camera_center
 
 if TYPE_CHECKING:
@@ -142,4 +143,4 @@ def canvas(width: int, height: int, aspect: float) -> tuple[int, int]:
 def fov_of_canvas(camera: Camera, aspect: float) -> float:
     """Vertical opening angle, radians, of a window of this aspect that shows all of a camera's image."""
     _, height = canvas(camera.image_width, camera.image_height, aspect)
-    return 2 * math.atan(math.tan(camera.FoVy / 2) * height / camera.image_height)
+    return 2 * math.atan(math.tan(opening(camera) / 2) * height / camera.image_height)

@@ -22,6 +22,7 @@ MODELS = {
     "RADIAL_FISHEYE": ("equidistant", 1, _BROWN[:2]),
     "OPENCV_FISHEYE": ("equidistant", 2, tuple((_RADIAL, k) for k in range(4))),
     "THIN_PRISM_FISHEYE": ("equidistant", 2, (*_BROWN, (_RADIAL, 2), (_RADIAL, 3), (_PRISM, 0), (_PRISM, 1))),
+    "EQUIRECTANGULAR": ("equirectangular", 0, ()),
 }
 
 
@@ -90,6 +91,9 @@ class Lens(NamedTuple):
 def lens_of(model: str, params: tuple[float, ...]) -> Lens:
     """The lens of a COLMAP camera, whose parameters count pixel centres from a half. KeyError for an unknown model."""
     chart, focals, places = MODELS[model]
+    if chart == "equirectangular":
+        width, height = params
+        return Lens(chart, (width / (2 * math.pi), height / math.pi), ((width - 1) / 2, (height - 1) / 2))
     focal = (params[0], params[focals - 1])
     center = (params[focals] - 0.5, params[focals + 1] - 0.5)
     lens = Lens(chart, focal, center)

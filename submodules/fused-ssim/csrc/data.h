@@ -78,9 +78,8 @@ struct L1SsimCuda {
   float* maps;            // out: what the gradient needs; null if not wanted
   float* loss = nullptr;  // out: l1_weight l1 + dssim_weight (1 - ssim); null if not wanted
   float l1_weight = 0, dssim_weight = 0;
-  const int32_t* halted = nullptr;  // while this is not 0, nothing is done; null: never
-  const RowRange* rows = nullptr;   // of the host
-  double* sums = nullptr;           // with rows, out, and those of other blocks stay as they are; in for l1_ssim_means
+  const RowRange* rows = nullptr;  // of the host
+  double* sums = nullptr;          // with rows, out, and those of other blocks stay as they are; in for l1_ssim_means
 };
 
 // As L1SsimVjp<float>, with every pointer to the device.
@@ -89,7 +88,6 @@ struct L1SsimVjpCuda {
   const float *maps, *grad_l1, *grad_ssim;  // L1SsimCuda::maps
   float* grad_img1;
   float l1_weight = 1, ssim_weight = 1;  // of grad_l1 and grad_ssim
-  const int32_t* halted = nullptr;       // as in L1SsimCuda
   const RowRange* rows = nullptr;        // that are written, and whose maps these are
 };
 
@@ -98,8 +96,7 @@ struct Composite {
   const uint8_t* picture;   // (4, pixels): red, green, blue, straight alpha
   const float* background;  // 3
   int64_t pixels;
-  float* out;                       // (3, pixels)
-  const int32_t* halted = nullptr;  // of the device, as in L1SsimCuda
+  float* out;  // (3, pixels)
 };
 
 }  // namespace gs

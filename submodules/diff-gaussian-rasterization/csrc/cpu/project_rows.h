@@ -73,7 +73,7 @@ struct ProjectedPack {
     typename S::Mask visible = project_shape(s, camera, row, splat, depth, radius);
     std::memcpy(radii, &radius, sizeof radii);
     if (!any(visible)) return 0;
-    const Rect<typename S::Mask> rect = tile_rect(splat, s.image.width, s.image.height);
+    const Rect<typename S::Mask> rect = tile_rect(splat, s.image.width, s.image.height, goes_around(camera));
     visible &= rect.x1 > rect.x0;
     if (!any(visible)) return 0;
     V rest[kMostRest];

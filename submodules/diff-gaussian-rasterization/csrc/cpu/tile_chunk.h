@@ -76,10 +76,11 @@ struct Chunk : ChunkOfRays<T, kChunk, kRays> {
     for (int64_t k = 0; k < count; ++k) {
       SplatOf<T, kRays> splat;
       std::memcpy(&splat, in.splats + kSplatRow<kRays> * int64_t(in.instances[begin + k]), sizeof splat);
-      const auto s = localise(splat, T(tile.x), T(tile.y));
+      const T left = unrolled(splat, T(tile.x), in.image.width);
+      const auto s = localise(splat, left, T(tile.y));
       y[k] = s.y, l11[k] = s.l11, l12[k] = s.l12, l22[k] = s.l22, u[k] = s.u, log2_opacity[k] = s.log2_opacity;
       r[k] = s.r, g[k] = s.g, b[k] = s.b, inverse_depth[k] = s.inverse_depth;
-      x[k] = splat.x - T(tile.x);
+      x[k] = splat.x - left;
       if constexpr (kRays) this->slope_u[k] = s.slope_u, this->slope_v[k] = s.slope_v, this->e[k] = s.e;
     }
   }

@@ -23,7 +23,7 @@ struct Tensors {
 
 __global__ void __launch_bounds__(kThreads)
     adam_kernel(const int32_t* halted, const __grid_constant__ Tensors tensors) {
-  if (is_halted(halted) || !begin_step(tensors.guard)) return;
+  if (!begin_work(halted) || !begin_step(tensors.guard)) return;
   int which = 0;
   while (int64_t(blockIdx.x) >= tensors.end[which]) ++which;
   const AdamInput<float>& in = tensors.in[which];
@@ -51,8 +51,7 @@ void adam<float>(const Queue& queue, const AdamInput<float>* tensors, int64_t co
       some.end[i] = blocks;
     }
     if (!blocks) continue;
-    adam_kernel<<<unsigned(blocks), kThreads, 0, stream_of(queue)>>>(queue.halted, some);
-    check_launch("adam");
+    launch(queue, "adam", adam_kernel, unsigned(blocks), kThreads, some);
   }
 }
 

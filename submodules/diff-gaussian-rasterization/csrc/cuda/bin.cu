@@ -41,14 +41,11 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& given
                           queue.array<int32_t>(shares * tiles)};
   int64_t *of_shares = queue.array<int64_t>(shares), *totals = queue.array<int64_t>(2);
   GS_CUDA_CHECK(cudaMemsetAsync(numbers, 0, (2 * tiles + 2) * sizeof *numbers, stream));
-  count_kernel<<<shares, kListThreads, 0, stream>>>(queue.halted, count, splats, in, image, counts, of_shares);
-  check_launch("count");
+  launch(queue, "count", count_kernel, shares, kListThreads, count, splats, in, image, counts, of_shares);
   const unsigned large_blocks = std::min(kLargeBlocks, blocks_for(count + 1, kListThreads / 32));
-  count_large_kernel<<<large_blocks, kListThreads, 0, stream>>>(queue.halted, in, image, counts);
-  check_launch("count_large");
-  lay_out_kernel<<<1, kLayThreads, 0, stream>>>(queue.halted, tiles, counts, begins, shares, of_shares, totals,
-                                                memory.ahead ? *memory.ahead : Ahead{});
-  check_launch("lay_out");
+  launch(queue, "count_large", count_large_kernel, large_blocks, kListThreads, in, image, counts);
+  launch(queue, "lay_out", lay_out_kernel, 1, kLayThreads, tiles, counts, begins, shares, of_shares, totals,
+         memory.ahead ? *memory.ahead : Ahead{});
   Room room;
   if (memory.ahead) {
     room = memory.ahead->room;
@@ -59,16 +56,13 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& given
   const Binned out = memory.take(memory.context, room.instances, memory.slots ? room.slots : 0);
   const unsigned further = unsigned(room.instances / kPiece), pieces = further + unsigned(tiles);
   const ListWork work{begins, queue.array<uint64_t>(room.instances), counts.further, queue.array<int2>(further)};
-  fill_kernel<<<shares + large_blocks, kListThreads, 0, stream>>>(queue.halted, count, splats, shares, in, image,
-                                                                  counts, of_shares, memory.slots, work);
-  check_launch("fill");
+  launch(queue, "fill", fill_kernel, shares + large_blocks, kListThreads, count, splats, shares, in, image, counts,
+         of_shares, memory.slots, work);
   queue.release(queue.context, counts.large), queue.release(queue.context, counts.places);
   if (made) queue.release(queue.context, made);
   const unsigned blocks = std::min(pieces, kMostBlocks);
-  sort_kernel<<<blocks, kListThreads, 0, stream>>>(queue.halted, work, further, pieces, out);
-  check_launch("sort");
-  if (further) merge_kernel<<<blocks, kListThreads, 0, stream>>>(queue.halted, work, further, pieces, out.instances);
-  check_launch("merge");
+  launch(queue, "sort", sort_kernel, blocks, kListThreads, work, further, pieces, out);
+  if (further) launch(queue, "merge", merge_kernel, blocks, kListThreads, work, further, pieces, out.instances);
 }
 
 }  // namespace cuda

@@ -52,7 +52,7 @@ struct CountBits {
 __global__ void __launch_bounds__(kTile* kTile)
     mark_kernel(const int32_t* halted, BlendInput<float> in, const int32_t* last, const SplatSlots* slots,
                 int32_t* processed, uint32_t* bits) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   __shared__ int32_t most;
   if (threadIdx.x == 0) most = 0;
   __syncthreads();
@@ -76,7 +76,10 @@ __global__ void __launch_bounds__(kTile* kTile)
   }
 }
 
-__global__ void judge_rows_kernel(Ahead ahead, const int32_t* rows) { judge_rows(ahead, *rows); }
+__global__ void judge_rows_kernel(const int32_t* halted, Ahead ahead, const int32_t* rows) {
+  begin_work(halted);  // a halted step is reported, too
+  judge_rows(ahead, *rows);
+}
 
 // Values that a lane sums: kGradientValues, and perhaps kAbsoluteValues.
 template <bool kAbsolute>
@@ -156,7 +159,7 @@ template <class L, bool kDepth>
 __global__ void __launch_bounds__(L::kThreads)
     layers_kernel(const int32_t* halted, BlendInput<float> in, BlendGradient<float> g, const Chunk* chunks,
                   Layer* layers) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   constexpr int kBatch = L::kThreads, kRun = L::kRun;
   __shared__ Batch<kBatch> batch;
   const Chunk chunk = chunks[blockIdx.x];
@@ -172,7 +175,7 @@ __global__ void __launch_bounds__(L::kThreads)
   for (int first = 0; first < length; first += kBatch) {
     const int count = length - first < kBatch ? length - first : kBatch;
     __syncthreads();
-    if (mine < count) batch.put(mine, in.splats, in.instances[begin + first + mine], float(left), float(top));
+    if (mine < count) batch.put(mine, in, in.instances[begin + first + mine], float(left), float(top));
     __syncthreads();
     for (int from = 0; from < count && first + from < pixels.furthest; from += 32)
       front_to_back(batch, at, from, count, [&](int k, int p, float t) {
@@ -274,7 +277,7 @@ __global__ void GS_MAX_REGISTERS((kDepth ? 96 : 80) + (kAbsolute ? 8 : 0))
     blend_vjp_kernel(const int32_t* halted, BlendInput<float> in, BlendGradient<float> g, const int32_t* processed,
                      const Chunk* chunks, int chunk_size, const Layer* layers, MadeLayers made, GradientRows rows,
                      float* absolute) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   using L = Backward;
   constexpr int kBatch = 64, kRow = kSums<kAbsolute>;
   __shared__ Batch<kBatch> batch;
@@ -301,7 +304,7 @@ __global__ void GS_MAX_REGISTERS((kDepth ? 96 : 80) + (kAbsolute ? 8 : 0))
     __syncthreads();
     for (int k = threadIdx.x; k < count; k += L::kThreads) {
       const int32_t splat = in.instances[begin + first + k];
-      batch.put(k, in.splats, splat, float(left), float(top));
+      batch.put(k, in, splat, float(left), float(top));
       row_of[k] = rows.row(slot_of(g.slots, splat, chunk.tile % across, chunk.tile / across));
     }
     for (int k = threadIdx.x; k < L::kWarps * kBatch * kRow; k += L::kThreads) sums[k] = 0;
@@ -331,7 +334,7 @@ __global__ void GS_MAX_REGISTERS((kDepth ? 96 : 80) + (kAbsolute ? 8 : 0))
 
 __global__ void __launch_bounds__(256)
     moments_kernel(const int32_t* halted, int64_t count, SlotSums sums, float* moments) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   const int64_t i = int64_t(blockIdx.x) * 256 + threadIdx.x;
   __shared__ __align__(8) float stage[256 / 32 * SlotSums::kStage];
   float values[kGradientValues];
@@ -344,8 +347,7 @@ template <class L>
 void find_layers(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g,
                  const Schedule& schedule, Layer* layers) {
   const auto kernel = g.inverse_depth ? layers_kernel<L, true> : layers_kernel<L, false>;
-  kernel<<<schedule.blocks, L::kThreads, 0, stream_of(queue)>>>(queue.halted, in, g, schedule.chunks, layers);
-  check_launch("layers");
+  launch(queue, "layers", kernel, schedule.blocks, L::kThreads, in, g, schedule.chunks, layers);
 }
 
 // The kernel that blends back to front, for what is wanted and what is there.
@@ -366,8 +368,7 @@ FilledRows blend_back(const Queue& queue, const BlendInput<float>& in, const Ble
   uint32_t* bits = queue.array<uint32_t>(words + 1);
   int32_t *before = queue.array<int32_t>(words + 1), *processed = queue.array<int32_t>(tiles);
   GS_CUDA_CHECK(cudaMemsetAsync(bits, 0, (words + 1) * sizeof *bits, stream));
-  mark_kernel<<<tiles, kTile * kTile, 0, stream>>>(queue.halted, in, g.last, g.slots, processed, bits);
-  check_launch("mark");
+  launch(queue, "mark", mark_kernel, tiles, kTile * kTile, in, g.last, g.slots, processed, bits);
   const auto counts = thrust::make_transform_iterator(thrust::counting_iterator<int64_t>(0), CountBits{bits, words});
   with_memory(queue, [&](void* memory, size_t& bytes) {
     return cub::DeviceScan::ExclusiveSum(memory, bytes, counts, before, words + 1, stream);
@@ -376,8 +377,7 @@ FilledRows blend_back(const Queue& queue, const BlendInput<float>& in, const Ble
   int64_t rows = g.ahead ? g.ahead->room.rows : g.instance_count;  // an upper bound
   std::optional<HostNumbers<int32_t>> processed_count;
   if (g.ahead) {
-    judge_rows_kernel<<<1, 1, 0, stream>>>(*g.ahead, before + words);
-    check_launch("judge_rows");
+    launch(queue, "judge_rows", judge_rows_kernel, 1, 1, *g.ahead, before + words);
   } else if (exact || rows > kRowsUnasked)
     processed_count.emplace(queue, before + words, 1);
   Schedule schedule = longest_first(queue, tiles, ProcessedLength{processed}, chunk_size, rows);
@@ -390,10 +390,8 @@ FilledRows blend_back(const Queue& queue, const BlendInput<float>& in, const Ble
   const AbsoluteRows lengths{bits, before, queue.array<float>(absolute ? size_t(rows) * kAbsoluteValues : 0)};
   const bool depth = g.inverse_depth;
   const auto kernel = absolute ? blend_vjp_kernel_for<true>(depth, made) : blend_vjp_kernel_for<false>(depth, made);
-  kernel<<<schedule.blocks, Backward::kThreads, 0, stream>>>(queue.halted, in, g, processed, schedule.chunks,
-                                                             chunk_size, layers, layers_at(g.layers, in.instance_count),
-                                                             gradients, lengths.values);
-  check_launch("blend_vjp");
+  launch(queue, "blend_vjp", kernel, schedule.blocks, Backward::kThreads, in, g, processed, schedule.chunks, chunk_size,
+         layers, layers_at(g.layers, in.instance_count), gradients, lengths.values);
   queue.release(queue.context, layers), queue.release(queue.context, schedule.chunks);
   return {gradients, lengths};
 }
@@ -426,8 +424,7 @@ template <>
 void blend_vjp<float>(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
   if (!g.count) return;
   const SlotSums sums{fill_rows(queue, in, g), g.slots};
-  moments_kernel<<<blocks_for(g.count, 256), 256, 0, stream_of(queue)>>>(queue.halted, g.count, sums, g.moments);
-  check_launch("moments");
+  launch(queue, "moments", moments_kernel, blocks_for(g.count, 256), 256, g.count, sums, g.moments);
 }
 
 }  // namespace cuda

@@ -184,8 +184,7 @@ struct Blender {
   __device__ void load(int32_t chunk, int count) const {
     const Place at = place();
     const int32_t* instances = in.instances + item.begin + chunk * kLayerChunk;
-    if (int(threadIdx.x) < count)
-      batch.put(threadIdx.x, in.splats, instances[threadIdx.x], float(at.left), float(at.top));
+    if (int(threadIdx.x) < count) batch.put(threadIdx.x, in, instances[threadIdx.x], float(at.left), float(at.top));
     __syncthreads();
   }
 
@@ -294,7 +293,7 @@ template <bool kDepth, bool kLast>
 __global__ void __launch_bounds__(L::kThreads, 5)
     blend_chunks_kernel(const int32_t* halted, BlendInput<float> in, Progress progress, Layers layers,
                         Blended<float> out) {
-  if (is_halted(halted)) return;  // then nobody has set up `progress` either
+  if (!begin_work(halted)) return;  // then nobody has set up `progress` either
   __shared__ Batch<kPixels> batch;
   __shared__ Item item;
   for (;;) {
@@ -328,9 +327,7 @@ void blend_chunks(const Queue& queue, const BlendInput<float>& in, const Blended
   const auto kernel = depth ? (out.last ? blend_chunks_kernel<true, true> : blend_chunks_kernel<true, false>)
                             : (out.last ? blend_chunks_kernel<false, true> : blend_chunks_kernel<false, false>);
   const unsigned blocks = std::min(schedule.blocks, kMostBlocks);
-  kernel<<<blocks, L::kThreads, 0, stream_of(queue)>>>(queue.halted, in, progress, layers_at(values, in.instance_count),
-                                                       out);
-  check_launch("blend_chunks");
+  launch(queue, "blend_chunks", kernel, blocks, L::kThreads, in, progress, layers_at(values, in.instance_count), out);
 }
 
 }  // namespace cuda

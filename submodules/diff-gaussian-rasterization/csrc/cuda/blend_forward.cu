@@ -14,7 +14,7 @@ using L = Layout<2>;
 template <bool kDepth, bool kLast>
 __global__ void __launch_bounds__(L::kThreads, 9)
     blend_kernel(const int32_t* halted, BlendInput<float> in, Blended<float> out) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   constexpr int kBatch = L::kThreads, kRun = L::kRun;
   __shared__ Batch<kBatch> batch;
   const L at;
@@ -33,7 +33,7 @@ __global__ void __launch_bounds__(L::kThreads, 9)
     if (!__syncthreads_or(open)) break;
     const int count = int(end - first < kBatch ? end - first : kBatch);
     const int mine = threadIdx.x;
-    if (mine < count) batch.put(mine, in.splats, in.instances[first + mine], float(left), float(top));
+    if (mine < count) batch.put(mine, in, in.instances[first + mine], float(left), float(top));
     __syncthreads();
     for (int from = 0; open && from < count; from += 32) {
       front_to_back(batch, at, from, count, [&](int k, int p, float t) {
@@ -76,8 +76,7 @@ void blend<float>(const Queue& queue, const BlendInput<float>& in, const Blended
   if (makes_layers(in.image)) return blend_chunks(queue, in, out);
   const auto kernel = out.inverse_depth ? (out.last ? blend_kernel<true, true> : blend_kernel<true, false>)
                                         : (out.last ? blend_kernel<false, true> : blend_kernel<false, false>);
-  kernel<<<unsigned(tiles_of(in.image)), L::kThreads, 0, stream_of(queue)>>>(queue.halted, in, out);
-  check_launch("blend");
+  launch(queue, "blend", kernel, unsigned(tiles_of(in.image)), L::kThreads, in, out);
 }
 
 }  // namespace cuda

@@ -46,8 +46,10 @@ struct Batch {
   float4 rest[kCount];   // u, log2 opacity, x, inverse depth
   float4 color[kCount];  // r, g, b
 
-  __device__ void put(int k, const float* splats, int32_t index, float left, float top) {
-    const Splat<float> splat = load_splat(splats, index);
+  // from, top: of the tile.
+  __device__ void put(int k, const BlendInput<float>& in, int32_t index, float from, float top) {
+    const Splat<float> splat = load_splat(in.splats, index);
+    const float left = unrolled(splat, from, in.image.width);
     const LocalSplat<float> s = localise(splat, left, top);
     shape[k] = make_float4(s.y, s.l11, s.l12, s.l22);
     rest[k] = make_float4(s.u, s.log2_opacity, splat.x - left, s.inverse_depth);

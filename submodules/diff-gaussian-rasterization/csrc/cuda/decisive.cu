@@ -26,7 +26,8 @@ __global__ void __launch_bounds__(kTile* kTile)
   for (int64_t k = begin; k < end; ++k) {
     const int32_t index = in.instances[k];
     const Splat<float> splat = load_shape(in.splats, index);
-    const RowTerms<float> terms = row_terms(localise(splat, float(left), float(top)), float(row));
+    const float from = unrolled(splat, float(left), in.image.width);
+    const RowTerms<float> terms = row_terms(localise(splat, from, float(top)), float(row));
     if (!(row_exponent(terms, row_u(terms, float(column))) >= float(kLog2MinAlpha))) continue;
     decisive[index] = true;  // many threads write the same
     if (k >= blended) return;

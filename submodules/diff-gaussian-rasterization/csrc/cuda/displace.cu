@@ -13,7 +13,7 @@ namespace {
 constexpr int kThreads = 256;
 
 __global__ void __launch_bounds__(kThreads) displace_kernel(const int32_t* halted, Displacement in) {
-  if (is_halted(halted) || (in.stopped && *in.stopped)) return;
+  if (!begin_work(halted) || (in.stopped && *in.stopped)) return;
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i < in.count) gs::displace(in, i);
 }
@@ -22,8 +22,7 @@ __global__ void __launch_bounds__(kThreads) displace_kernel(const int32_t* halte
 
 void displace(const Queue& queue, const Displacement& in) {
   if (!in.count) return;
-  displace_kernel<<<blocks_for(in.count, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, in);
-  check_launch("displace");
+  launch(queue, "displace", displace_kernel, blocks_for(in.count, kThreads), kThreads, in);
 }
 
 }  // namespace cuda

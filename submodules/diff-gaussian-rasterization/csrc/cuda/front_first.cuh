@@ -46,9 +46,8 @@ inline Schedule front_first(const Queue& queue, int64_t tiles, const int64_t* ra
                             int64_t count) {
   const int64_t chunks = instances / kLayerChunk, blocks = tiles + chunks;
   Chunk* order = queue.array<Chunk>(blocks);
-  order_chunks_kernel<<<1, kOrderThreads, 0, stream_of(queue)>>>(
-      queue.halted, int(tiles), FrontFirst{ranges, int(tiles)}, int(blocks), order, zeros, count);
-  check_launch("order_chunks");
+  launch(queue, "order_chunks", order_chunks_kernel<FrontFirst>, 1, kOrderThreads, int(tiles),
+         FrontFirst{ranges, int(tiles)}, int(blocks), order, zeros, count);
   return {order, unsigned(blocks), unsigned(chunks), kLayerChunk};
 }
 

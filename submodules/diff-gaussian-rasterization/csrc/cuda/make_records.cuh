@@ -12,7 +12,7 @@ constexpr int kRecordThreads = 128;
 // A thread takes a splat; a warp shares the tests of its tiles.
 __global__ void __launch_bounds__(kRecordThreads)
     make_records_kernel(const int32_t* halted, int64_t n, Projected<float> in, Image image, TileRecord* records) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   const int64_t i = int64_t(blockIdx.x) * kRecordThreads + threadIdx.x;
   Reached reached = {};
   Splat<float> shape = {};
@@ -26,9 +26,8 @@ __global__ void __launch_bounds__(kRecordThreads)
 // in: without records, of an image with has_records.
 inline TileRecord* make_records(const Queue& queue, int64_t n, const Projected<float>& in, Image image) {
   TileRecord* records = queue.array<TileRecord>(n);
-  make_records_kernel<<<blocks_for(n, kRecordThreads), kRecordThreads, 0, stream_of(queue)>>>(queue.halted, n, in,
-                                                                                              image, records);
-  check_launch("make_records");
+  launch(queue, "make_records", make_records_kernel, blocks_for(n, kRecordThreads), kRecordThreads, n, in, image,
+         records);
   return records;
 }
 

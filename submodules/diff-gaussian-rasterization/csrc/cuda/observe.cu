@@ -14,7 +14,7 @@ namespace {
 constexpr int kThreads = 256;
 
 __global__ void __launch_bounds__(kThreads) observe_kernel(const int32_t* halted, ObserveInput in) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (at >= in.count || (in.blocks && !in.radii[at])) return;
   const int64_t i = gaussian_at(in.blocks, at);
@@ -30,8 +30,7 @@ __global__ void __launch_bounds__(kThreads) observe_kernel(const int32_t* halted
 
 void observe(const Queue& queue, const ObserveInput& in) {
   if (!in.count) return;
-  observe_kernel<<<blocks_for(in.count, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, in);
-  check_launch("observe");
+  launch(queue, "observe", observe_kernel, blocks_for(in.count, kThreads), kThreads, in);
 }
 
 }  // namespace cuda

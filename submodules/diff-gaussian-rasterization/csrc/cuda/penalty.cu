@@ -13,7 +13,7 @@ namespace {
 constexpr int kThreads = 256;
 
 __global__ void __launch_bounds__(kThreads) penalty_kernel(const int32_t* halted, PenaltyInput<float> in) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= in.count) return;
   penalise_opacity(in.penalty, in.logits + i, in.logit_gradients + i);
@@ -25,8 +25,7 @@ __global__ void __launch_bounds__(kThreads) penalty_kernel(const int32_t* halted
 template <>
 void penalise<float>(const Queue& queue, const PenaltyInput<float>& in) {
   if (!in.count) return;
-  penalty_kernel<<<blocks_for(in.count, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, in);
-  check_launch("penalise");
+  launch(queue, "penalise", penalty_kernel, blocks_for(in.count, kThreads), kThreads, in);
 }
 
 }  // namespace cuda

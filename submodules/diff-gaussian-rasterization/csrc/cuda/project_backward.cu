@@ -103,7 +103,7 @@ template <class AnyCamera, class Source, class Step>
 __global__ void __launch_bounds__(kThreads, kBlocks)
     project_vjp_kernel(const int32_t* halted, Scene<float> s, Source source, SceneGradient<float> out,
                        const __grid_constant__ Step step) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   const int64_t block = awake_block(s, blockIdx.x);
   if (block < 0) return;
   constexpr bool kAdds = std::is_same_v<Step, Addition>;
@@ -161,8 +161,7 @@ void launch_project_vjp(const Queue& queue, const Scene<float>& s, const Source&
                         const SceneGradient<float>& out, const Step& step) {
   const auto kernel = s.lens.chart == Chart::kPinhole ? project_vjp_kernel<Camera<float>, Source, Step>
                                                       : project_vjp_kernel<LensCamera<float>, Source, Step>;
-  kernel<<<blocks_for(s.rows(), kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, s, source, out, step);
-  check_launch("project_vjp");
+  launch(queue, "project_vjp", kernel, blocks_for(s.rows(), kThreads), kThreads, s, source, out, step);
 }
 
 void launch_gradients(const Queue& queue, const Scene<float>& s, const SlotSums& source,

@@ -37,7 +37,7 @@ __device__ void leave_out(int64_t row, int64_t rows, const Projected<float>& out
 template <class AnyCamera>
 __global__ void __launch_bounds__(kThreads)
     project_kernel(const int32_t* halted, Scene<float> s, Projected<float> out) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   const int64_t row = int64_t(blockIdx.x) * kThreads + threadIdx.x, block = awake_block(s, blockIdx.x);
   if (block < 0) return leave_out(row, s.rows(), out);
   __shared__ AnyCamera camera;
@@ -59,7 +59,7 @@ __global__ void __launch_bounds__(kThreads)
   fetch(likely);
   const bool visible = i < s.count && project_shape(s, camera, SceneRow<float>{s, i}, splat, depth, radius);
   TileRect rect = {0, 0, 0, 0};
-  if (visible) rect = tile_rect(splat, s.image.width, s.image.height);
+  if (visible) rect = tile_rect(splat, s.image.width, s.image.height, goes_around(camera));
   fetch(rect.x1 > rect.x0);
   uint64_t mask;
   int32_t count = warp_count_tiles(splat, rect, s.image, mask);
@@ -83,8 +83,7 @@ void project<float>(const Queue& queue, const Scene<float>& s, const Projected<f
   if (!s.rows()) return;
   const auto kernel =
       s.lens.chart == Chart::kPinhole ? project_kernel<Camera<float>> : project_kernel<LensCamera<float>>;
-  kernel<<<blocks_for(s.rows(), kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, s, out);
-  check_launch("project");
+  launch(queue, "project", kernel, blocks_for(s.rows(), kThreads), kThreads, s, out);
 }
 
 }  // namespace cuda

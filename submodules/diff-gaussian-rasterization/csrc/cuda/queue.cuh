@@ -3,6 +3,7 @@
 #include <cuda_runtime.h>
 
 #include "gs/cuda_check.h"
+#include "gs/cuda_launch.h"
 #include "gs/cuda_queue.h"
 
 namespace gs {
@@ -12,7 +13,7 @@ constexpr unsigned kWarp = 0xffffffffu;
 
 inline cudaStream_t stream_of(const Queue& queue) { return static_cast<cudaStream_t>(queue.stream); }
 
-// Whether an earlier kernel halted the work (gs/cuda_queue.h).
+// Whether an earlier kernel halted the work (gs/cuda_queue.h), where `begin_work` was called.
 __device__ __forceinline__ bool is_halted(const int32_t* halted) { return halted && *halted != 0; }
 
 // The blocks of `threads` that `n` items need, a thread each.

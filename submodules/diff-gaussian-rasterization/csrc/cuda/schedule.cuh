@@ -95,7 +95,7 @@ template <class Plan>
 __global__ void __launch_bounds__(kOrderThreads)
     order_chunks_kernel(const int32_t* halted, int tiles, Plan plan, int blocks, Chunk* chunks, int32_t* zeros,
                         int64_t count) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   __shared__ int32_t next[Plan::kClasses], total, places;
   for (int c = threadIdx.x; c < Plan::kClasses; c += kOrderThreads) next[c] = 0;
   if (threadIdx.x == 0) places = 0;
@@ -126,7 +126,7 @@ __global__ void __launch_bounds__(kOrderThreads)
 template <class Length>
 __global__ void __launch_bounds__(kOrderThreads)
     keep_tiles_kernel(const int32_t* halted, int tiles, Length length, Chunk* chunks) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   const int t = blockIdx.x * kOrderThreads + threadIdx.x;
   if (t < tiles) chunks[t] = {t, 0, int32_t(length(t)), 0};
 }
@@ -136,17 +136,15 @@ __global__ void __launch_bounds__(kOrderThreads)
 template <class Length>
 Schedule longest_first(const Queue& queue, int64_t tiles, const Length& length, int32_t size = kWhole,
                        int64_t total = 0) {
-  const cudaStream_t stream = stream_of(queue);
   const bool ordered = tiles <= kMostOrdered;
   const int64_t places = ordered ? total / size : 0;
   Chunk* chunks = queue.array<Chunk>(tiles + places);
   if (ordered)
-    order_chunks_kernel<<<1, kOrderThreads, 0, stream>>>(queue.halted, int(tiles), LongestFirst<Length>{length, size},
-                                                         int(tiles + places), chunks, nullptr, 0);
+    launch(queue, "order_chunks", order_chunks_kernel<LongestFirst<Length>>, 1, kOrderThreads, int(tiles),
+           LongestFirst<Length>{length, size}, int(tiles + places), chunks, nullptr, 0);
   else
-    keep_tiles_kernel<<<blocks_for(tiles, kOrderThreads), kOrderThreads, 0, stream>>>(queue.halted, int(tiles), length,
-                                                                                      chunks);
-  check_launch("order_chunks");
+    launch(queue, "keep_tiles", keep_tiles_kernel<Length>, blocks_for(tiles, kOrderThreads), kOrderThreads, int(tiles),
+           length, chunks);
   return {chunks, unsigned(tiles + places), unsigned(places), size};
 }
 

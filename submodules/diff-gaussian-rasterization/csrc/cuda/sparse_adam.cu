@@ -16,7 +16,7 @@ constexpr int kThreads = 256;
 __global__ void __launch_bounds__(kThreads)
     sparse_adam_kernel(const int32_t* halted, AdamInput<float> in, const bool* visible, AdamConstants step,
                        StepGuard<float> guard) {
-  if (is_halted(halted) || !begin_step(guard)) return;
+  if (!begin_work(halted) || !begin_step(guard)) return;
   const int64_t k = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (k >= in.rows * in.columns) return;
   const int64_t r = k / in.columns;
@@ -33,9 +33,7 @@ void sparse_adam<float>(const Queue& queue, const AdamInput<float>& in, const bo
   const int64_t n = in.rows * in.columns;
   if (!n) return;
   const AdamConstants step = step_constants(in.step == 0, in.lr, in.beta1, in.beta2, in.eps, in.step);
-  sparse_adam_kernel<<<blocks_for(n, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, in, visible, step,
-                                                                                 guard);
-  check_launch("sparse_adam");
+  launch(queue, "sparse_adam", sparse_adam_kernel, blocks_for(n, kThreads), kThreads, in, visible, step, guard);
 }
 
 }  // namespace cuda

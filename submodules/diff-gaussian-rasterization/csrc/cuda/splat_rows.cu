@@ -19,7 +19,7 @@ constexpr int kThreads = 256;
 __global__ void __launch_bounds__(kThreads)
     absolute_kernel(const int32_t* halted, int64_t count, SlotSumsOf<kAbsoluteValues> sums, const float* splats,
                     Image image, float* absolute) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   constexpr int kStage = SlotSumsOf<kAbsoluteValues>::kStage;
   __shared__ __align__(8) float stage[kThreads / 32 * kStage];
@@ -32,7 +32,7 @@ __global__ void __launch_bounds__(kThreads)
 
 __global__ void __launch_bounds__(kThreads) count_rows_kernel(const int32_t* halted, int64_t count, GradientRows rows,
                                                               const SplatSlots* slots, int32_t* counts) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i < count) counts[i] = int32_t(rows.row(slots[i + 1].first) - rows.row(slots[i].first));
 }
@@ -52,7 +52,7 @@ struct Halves {
 
 template <class From, class To>
 __global__ void __launch_bounds__(kThreads) copy_pairs_kernel(const int32_t* halted, int64_t pairs, From from, To to) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   const int64_t k = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (k < pairs) to[k] = from[k];
 }
@@ -61,8 +61,7 @@ template <class From, class To>
 void copy_rows(const Queue& queue, int64_t rows, From from, To to) {
   if (!rows) return;
   const int64_t pairs = kPairs * rows;
-  copy_pairs_kernel<<<blocks_for(pairs, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, pairs, from, to);
-  check_launch("copy_pairs");
+  launch(queue, "copy_pairs", copy_pairs_kernel<From, To>, blocks_for(pairs, kThreads), kThreads, pairs, from, to);
 }
 
 Halves<float2> halves(float* gradients, float* absolute) {
@@ -105,15 +104,12 @@ struct Words {
 
 void find_lengths(const Queue& queue, int64_t count, const SlotSumsOf<kAbsoluteValues>& sums, const float* splats,
                   Image image, float* absolute) {
-  absolute_kernel<<<blocks_for(count, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, count, sums, splats,
-                                                                                  image, absolute);
-  check_launch("absolute");
+  launch(queue, "absolute", absolute_kernel, blocks_for(count, kThreads), kThreads, count, sums, splats, image,
+         absolute);
 }
 
 void count_rows(const Queue& queue, int64_t count, const GradientRows& rows, const SplatSlots* slots, int32_t* counts) {
-  count_rows_kernel<<<blocks_for(count, kThreads), kThreads, 0, stream_of(queue)>>>(queue.halted, count, rows, slots,
-                                                                                    counts);
-  check_launch("count_rows");
+  launch(queue, "count_rows", count_rows_kernel, blocks_for(count, kThreads), kThreads, count, rows, slots, counts);
 }
 
 void join_rows(const Queue& queue, int64_t rows, const FilledRows& from, float* to) {

@@ -78,7 +78,7 @@ struct ListCounts {
 __global__ void __launch_bounds__(kListThreads)
     count_kernel(const int32_t* halted, int64_t n, int64_t splats, Projected<float> in, Image image, ListCounts counts,
                  int64_t* of_shares) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   __shared__ int32_t table[kWindow];
   const Share share(n, splats);
   const int64_t tiles = tiles_of(image);
@@ -127,7 +127,7 @@ __device__ __forceinline__ void each_large(const Projected<float>& in, Image ima
 
 __global__ void __launch_bounds__(kListThreads)
     count_large_kernel(const int32_t* halted, Projected<float> in, Image image, ListCounts counts) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   each_large(in, image, counts, blockIdx.x, gridDim.x,
              [&](int tile, int32_t) { atomicAdd(counts.unmasked + tile, 1); });
 }
@@ -153,7 +153,7 @@ __device__ inline int64_t sums_before(int64_t count, const Counts& counts, To* s
 __global__ void __launch_bounds__(kLayThreads)
     lay_out_kernel(const int32_t* halted, int64_t tiles, ListCounts counts, int32_t* begins, int64_t shares,
                    int64_t* of_shares, int64_t* totals, Ahead ahead) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   const int64_t instances =
       sums_before(tiles, [&](int64_t t) { return int64_t(counts.masked[t]) + counts.unmasked[t]; }, begins);
   const int64_t slots = sums_before(shares, [&](int64_t k) { return of_shares[k]; }, of_shares);
@@ -182,7 +182,7 @@ __device__ __forceinline__ uint64_t list_key(const Projected<float>& in, int32_t
 __global__ void __launch_bounds__(kListThreads)
     fill_kernel(const int32_t* halted, int64_t n, int64_t splats, unsigned shares, Projected<float> in, Image image,
                 ListCounts counts, const int64_t* of_shares, SplatSlots* slots, ListWork work) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   __shared__ int32_t table[kWindow];
   const int64_t tiles = tiles_of(image);
   if (blockIdx.x >= shares) {
@@ -319,7 +319,7 @@ __device__ __forceinline__ void sort_piece(Buckets& shared, const uint64_t* keys
 // Writes the ranges, and the splats of lists of one piece; the keys of other pieces are sorted in place.
 __global__ void __launch_bounds__(kListThreads)
     sort_kernel(const int32_t* halted, ListWork work, unsigned most_further, unsigned pieces, Binned out) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   __shared__ Buckets shared;
   for (unsigned number = blockIdx.x; number < pieces; number += gridDim.x) {
     const Piece piece(work, number, most_further);
@@ -341,7 +341,7 @@ __global__ void __launch_bounds__(kListThreads)
 // Merges the sorted pieces of a list: an instance comes behind those of all pieces that have smaller keys.
 __global__ void __launch_bounds__(kListThreads)
     merge_kernel(const int32_t* halted, ListWork work, unsigned most_further, unsigned pieces, int32_t* instances) {
-  if (is_halted(halted) || !*work.further) return;
+  if (!begin_work(halted) || !*work.further) return;
   for (unsigned number = blockIdx.x; number < pieces; number += gridDim.x) {
     const Piece piece(work, number, most_further);
     if (piece.length <= kPiece) continue;

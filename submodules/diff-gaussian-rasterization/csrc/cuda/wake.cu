@@ -83,7 +83,7 @@ __device__ void write_terms(const SleepInput<float>& in, int attribute, int64_t 
 
 __global__ void __launch_bounds__(kThreads)
     prepare_kernel(const int32_t* halted, Scene<float> s, const __grid_constant__ SleepInput<float> in, Waking* out) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   __shared__ float terms[kTerms * kTermColumns];  // each is read once, one after the other
   for (int k = threadIdx.x; k < kTerms * kTermColumns; k += kThreads) terms[k] = in.terms[k];
   __syncthreads();
@@ -102,7 +102,7 @@ __global__ void __launch_bounds__(kThreads)
 __global__ void __launch_bounds__(kThreads)
     test_kernel(const int32_t* halted, Scene<float> s, const __grid_constant__ SleepInput<float> in,
                 const Waking* waking, uint8_t* seen) {
-  if (is_halted(halted)) return;
+  if (!begin_work(halted)) return;
   const int64_t block = blockIdx.x, i = block * kThreads + threadIdx.x;
   // Read at once, before it is known whether they are needed.
   bool mine = i < s.count;
@@ -125,7 +125,7 @@ __global__ void __launch_bounds__(kThreads)
 __global__ void __launch_bounds__(kThreads)
     take_missed_kernel(const int32_t* halted, int64_t count, const __grid_constant__ SleepInput<float> in,
                        const Waking* waking) {
-  if (is_halted(halted) || has_stopped(in)) return;
+  if (!begin_work(halted) || has_stopped(in)) return;
   const int64_t place = blockIdx.x, blocks = sleep_blocks(count), block = in.all ? place : in.blocks[place];
   if (!in.all) {
     const int64_t before = place ? in.blocks[place - 1] : -1;
@@ -196,19 +196,15 @@ void list_seen(const Queue& queue, const uint8_t* seen, int64_t blocks, const Sl
 template <>
 void wake<float>(const Queue& queue, const Scene<float>& s, const SleepInput<float>& in) {
   if (!s.count) return;
-  const cudaStream_t stream = stream_of(queue);
   const int64_t blocks = sleep_blocks(s.count);
   Waking* waking = queue.array<Waking>(1);
-  prepare_kernel<<<1, kThreads, 0, stream>>>(queue.halted, s, in, waking);
-  check_launch("prepare");
+  launch(queue, "prepare", prepare_kernel, 1, kThreads, s, in, waking);
   if (!in.all) {
     uint8_t* seen = queue.array<uint8_t>(blocks);
-    test_kernel<<<unsigned(blocks), kThreads, 0, stream>>>(queue.halted, s, in, waking, seen);
-    check_launch("test");
+    launch(queue, "test", test_kernel, unsigned(blocks), kThreads, s, in, waking, seen);
     list_seen(queue, seen, blocks, in);
   }
-  take_missed_kernel<<<unsigned(in.all ? blocks : in.room), kThreads, 0, stream>>>(queue.halted, s.count, in, waking);
-  check_launch("take_missed");
+  launch(queue, "take_missed", take_missed_kernel, unsigned(in.all ? blocks : in.room), kThreads, s.count, in, waking);
 }
 
 }  // namespace cuda

@@ -20,12 +20,13 @@ struct LocalSplat {
 
 constexpr double kTileCentre = (kTile - 1) / 2.0;
 
-// u is computed in double: far along a needle it is the small difference of two products in the thousands.
+// left: as `unrolled` gives it. u is computed in double: far along a needle it is the small difference of two products
+// in the thousands.
 template <class T>
-GS_HD LocalSplat<T> localise(const Splat<T>& s, T origin_x, T origin_y) {
-  const double dx = origin_x + kTileCentre - s.x, dy = origin_y + kTileCentre - s.y;
-  const T u = T(multiply_add(double(s.l12), dy, s.l11 * dx));
-  return {s.y - origin_y, s.l11, s.l12, s.l22, u, s.log2_opacity, s.r, s.g, s.b, s.inverse_depth};
+GS_HD LocalSplat<T> localise(const Splat<T>& s, T left, T top) {
+  const double dx = left + kTileCentre - s.x, dy = top + kTileCentre - s.y;
+  const T l11 = magnitude(s.l11), u = T(multiply_add(double(s.l12), dy, l11 * dx));
+  return {s.y - top, l11, s.l12, s.l22, u, s.log2_opacity, s.r, s.g, s.b, s.inverse_depth};
 }
 
 // Along a row of pixels v is constant: log2(alpha) = top - u^2, u = u0 + l11 (x - centre).

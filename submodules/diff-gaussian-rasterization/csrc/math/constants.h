@@ -8,6 +8,7 @@ constexpr int kTile = 16;                // pixels a side
 constexpr double kNear = 0.2;            // culled at or below this view-space z (markVisible has the same rule)
 constexpr double kDilation = 0.3;        // px^2 added to both variances, so that a splat covers at least a pixel
 constexpr double kJacobianClamp = 1.3;   // half images; beyond, the affine approximation explodes
+constexpr double kPole = 1e-3;           // least angle from the poles of a panorama, radians
 constexpr double kMinAlpha = 1.0 / 255;  // a smaller alpha is not blended
 constexpr double kLog2MinAlpha = -7.994353436858857938;  // log2 of the above
 constexpr double kMaxAlpha = 0.99;                       // the gradient passes this cap
@@ -20,6 +21,7 @@ constexpr double kBlack = -1e-6;    // colours >= this get a gradient: points th
 constexpr double kMaxColor = 1e15;  // a larger magnitude is culled as Inf is: its gradients overflow
 constexpr double kMaxVariance = 1e36;     // px^2; culled beyond, for any T: in float32 the squares overflow
 constexpr double kMinQuaternion = 1e-30;  // a shorter one counts as zero: its gradient, 1/|q|, overflows
+constexpr double kPi = 3.14159265358979323846;
 constexpr double kLn2 = 0.693147180559945309417;
 constexpr double kHalfLog2e = 0.5 / kLn2;  // exp(-q/2) = exp2(-kHalfLog2e q)
 

@@ -60,6 +60,16 @@ GS_HD Stretch<T> stretch(T q, T z) {
   return e;
 }
 
+// A panorama stretches what is close to a pole without bound. Points within kPole of it, an angle, count as lying
+// there.
+template <class T>
+GS_HD Vec3<T> off_pole(Vec3<T> p) {
+  const T h = std::sqrt(p.x * p.x + p.z * p.z), least = T(kPole) * magnitude(p.y);
+  if (h >= least) return p;
+  if (h > least * T(1e-12)) return {p.x * (least / h), p.y, p.z * (least / h)};
+  return {T(0), p.y, least};
+}
+
 template <class T>
 GS_HD OnLens<T> on_chart(Chart chart, Vec3<T> p) {
   OnLens<T> c = {};
@@ -86,6 +96,7 @@ GS_HD OnLens<T> on_chart(Chart chart, Vec3<T> p) {
     c.second[0][0] += 2 * s1[0], c.second[0][1] += s1[1], c.second[0][2] += s1[2];
     c.second[1][1] += s1[0], c.second[1][3] += 2 * s1[1], c.second[1][4] += s1[2];
   } else {
+    p = off_pole(p);
     const T h2 = p.x * p.x + p.z * p.z, h = std::sqrt(h2), rho2 = h2 + p.y * p.y;
     const T w = 1 / h2, w2 = w * w, v = 1 / rho2, v2 = v * v, h1 = 1 / h;
     c.value[0] = std::atan2(p.x, p.z), c.value[1] = std::atan2(p.y, h);

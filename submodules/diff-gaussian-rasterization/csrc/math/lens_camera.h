@@ -10,7 +10,17 @@ GS_ISA_BEGIN
 template <class T>
 struct LensCamera : Camera<T> {
   Lens<T> lens;
+  bool around;  // a full panorama, whose left and right border are one
 };
+
+template <class T>
+GS_HD bool goes_around(const Camera<T>&) {
+  return false;
+}
+template <class T>
+GS_HD bool goes_around(const LensCamera<T>& cam) {
+  return cam.around;
+}
 
 // A point of the view on the image; p1 and p2 as in Perspective, but of the lens's Jacobian.
 template <class V>

@@ -11,9 +11,9 @@ struct LocalRaySplat : LocalSplat<T> {
 };
 
 template <class T>
-GS_HD LocalRaySplat<T> localise(const RaySplat<T>& splat, T origin_x, T origin_y) {
+GS_HD LocalRaySplat<T> localise(const RaySplat<T>& splat, T left, T top) {
   const Splat<T>& on_image = splat;
-  return {localise(on_image, origin_x, origin_y), splat.slope_u, splat.slope_v, splat.e};
+  return {localise(on_image, left, top), splat.slope_u, splat.slope_v, splat.e};
 }
 
 // Along a row of pixels: u = row_u(flat, x), v is constant, s = s0 + slope_u u. flat.top is the opacity's.
@@ -114,7 +114,7 @@ GS_HD Extent<T> extent_of(const RaySplat<T>& s) {
 }
 
 template <class T>
-GS_HD Rect<Integer<T>> tile_rect(const RaySplat<T>& s, int width, int height) {
+GS_HD Rect<Integer<T>> tile_rect(const RaySplat<T>& s, int width, int height, bool) {
   const Extent<T> to = extent_of(s);
   const Truth<T> some = s.log2_opacity - Scalar<T>(kLog2MinAlpha) > Scalar<T>(-1e-3);
   return tiles_between<T>(some, s.x - to.left, s.x + to.right, s.y - to.up, s.y + to.down, width, height);

@@ -25,6 +25,9 @@ GS_HD void set_camera(const Scene<T>& s, LensCamera<T>& camera) {
   const double width = s.image.width, height = s.image.height, reach = lens.reach;
   clamp_rays((2 * lens.center_x + 1) / width - 1, (2 * lens.center_y + 1) / height - 1,
              reach * width / (2 * lens.focal_x), reach * height / (2 * lens.focal_y), camera);
+  const double half = kPi * lens.focal_x, least = 1e-2;  // px; floats of a wide image round
+  camera.around = lens.chart == Chart::kEquirectangular && std::abs(lens.center_x + 0.5 - half) < least &&
+                  std::abs(lens.center_x + 0.5 + half - width) < least;
 }
 
 // Calls run(camera) with a Camera, a RayCamera, or a LensCamera where the scene has a lens.

@@ -3,6 +3,7 @@
 #include <type_traits>
 
 #include "gs/isa.h"
+#include "gs/number.h"
 
 GS_ISA_BEGIN
 
@@ -10,12 +11,22 @@ GS_ISA_BEGIN
 template <class T>
 struct Splat {
   T x, y;           // mean, px, pixel centres at integers
-  T l11, l12, l22;  // factor of the conic, log2 units (footprint.h)
+  T l11, l12, l22;  // factor of the conic, log2 units (footprint.h); l11 is negative if the splat crosses a border
   T log2_opacity;   // antialiasing included
   T r, g, b;
   T inverse_depth;  // 1 / view z
 };
 constexpr int kSplatValues = 10;
+
+// The left border of a tile, as seen from a splat. A splat that crosses a border of a panorama goes on at the other
+// one: it has a copy every `width` of the image, and a tile shows the nearest one.
+template <class T, class V>
+GS_HD V unrolled(const Splat<T>& s, V left, int width) {
+  if (!(s.l11 < 0)) return left;
+  const T period = T(width), half = period / 2;
+  const V away = left - s.x;
+  return away < -half ? left + period : away >= half ? left - period : left;
+}
 
 // Gradient sums of a splat over its pixels: moments of the exponent (footprint.h), then colour and inverse depth.
 constexpr int kGradientValues = 10;  // q, qu, qv, quu, quv, qvv, r, g, b, inverse depth

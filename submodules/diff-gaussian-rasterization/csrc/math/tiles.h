@@ -55,9 +55,10 @@ GS_HD Rect<Integer<T>> tiles_between(Truth<T> some, T x0, T x1, T y0, T y1, int 
 }
 
 // The box of tiles that the splat can reach. |dx| is at most sqrt(reach) / |column of L^-1|, with
-// L^-1 = (1/l11, -l12/(l11 l22); 0, 1/l22).
+// L^-1 = (1/l11, -l12/(l11 l22); 0, 1/l22). around: of a full panorama. A splat that crosses its border is marked, and
+// gets whole rows of tiles, which are then tested one by one: few splats do.
 template <class T>
-GS_HD Rect<Integer<T>> tile_rect(const Splat<T>& s, int width, int height) {
+GS_HD Rect<Integer<T>> tile_rect(Splat<T>& s, int width, int height, bool around) {
   using Number = Scalar<T>;
   const T level = s.log2_opacity - Number(kLog2MinAlpha);
   const Integer<T> none = {};
@@ -65,11 +66,19 @@ GS_HD Rect<Integer<T>> tile_rect(const Splat<T>& s, int width, int height) {
   if (!any(some)) return {none, none, none, none};
   const T reach = root(larger(level, T{})) * Number(1.0001) + Number(0.01);
   const T dx = reach * length<T>(all<T>(1), s.l12 / s.l22) / s.l11 + Number(0.01), dy = reach / s.l22 + Number(0.01);
-  return tiles_between<T>(some, s.x - dx, s.x + dx, s.y - dy, s.y + dy, width, height);
+  Rect<Integer<T>> rect = tiles_between<T>(some, s.x - dx, s.x + dx, s.y - dy, s.y + dy, width, height);
+  if (around) {
+    // Not so wide either that a tile of its rectangle may be nearer to another copy.
+    const Truth<T> wide = dx > Number(width) / 2 - Number(kTile);
+    const Truth<T> crosses = (rect.x1 > rect.x0) & (wide | (s.x - dx < 0) | (s.x + dx > Number(width - 1)));
+    rect.x0 = crosses ? none : rect.x0, rect.x1 = crosses ? none + tile_count(width) : rect.x1;
+    s.l11 = crosses ? -s.l11 : s.l11;
+  }
+  return rect;
 }
 
-// The part of one splat's tile tests that does not depend on the tile. l11 and l22 are above 0, because projection
-// culls other splats.
+// The part of one splat's tile tests that does not depend on the tile. l11 is not 0 and l22 above it, because
+// projection culls other splats.
 template <class T>
 struct TileTest {
   Splat<T> splat;
@@ -85,14 +94,15 @@ struct TileTest {
 template <class T>
 GS_HD TileTest<T> make_tile_test(const Splat<T>& s, TileRect rect, int width, int height) {
   const T unit = sizeof(T) == 4 ? T(5.9604644775390625e-8) : T(1.1102230246251565e-16);
+  const T l11 = magnitude(s.l11);
   const T far_x = larger(magnitude(T(rect.x0 * kTile) - s.x), magnitude(T(rect.x1 * kTile) - s.x));
   const T far_y = larger(magnitude(T(rect.y0 * kTile) - s.y), magnitude(T(rect.y1 * kTile) - s.y));
-  const T terms = multiply_add(magnitude(s.l11), far_x, multiply_add(magnitude(s.l12), far_y, T(2)));
+  const T terms = multiply_add(l11, far_x, multiply_add(magnitude(s.l12), far_y, T(2)));
   return {s,
           T(width - 1),
           T(height - 1),
-          -s.l12 / s.l11,
-          -s.l11 * s.l12 / multiply_add(s.l12, s.l12, s.l22 * s.l22),
+          -s.l12 / l11,
+          -l11 * s.l12 / multiply_add(s.l12, s.l12, s.l22 * s.l22),
           multiply_add(48 * unit, terms, s.log2_opacity - T(kLog2MinAlpha))};
 }
 
@@ -125,9 +135,10 @@ GS_HD auto box_reached(const TileTest<T>& test, V left, V right, V top, V bottom
 // Tests tiles given by column and row; V as above. Test: TileTest, or RayTileTest.
 template <class Test, class V, class T = Scalar<V>>
 GS_HD auto tile_reached(const Test& test, V tile_x, V tile_y) {
-  const V left = tile_x * T(kTile), right = left + T(kTile - 1), top = tile_y * T(kTile), bottom = top + T(kTile - 1);
+  const V at = tile_x * T(kTile), end = at + T(kTile - 1), top = tile_y * T(kTile), bottom = top + T(kTile - 1);
   const V last_x = V{} + test.last_x, last_y = V{} + test.last_y;
-  return box_reached(test, left, right < last_x ? right : last_x, top, bottom < last_y ? bottom : last_y);
+  const V left = unrolled(test.splat, at, int(test.last_x) + 1), right = (end < last_x ? end : last_x) + (left - at);
+  return box_reached(test, left, right, top, bottom < last_y ? bottom : last_y);
 }
 
 GS_ISA_END

@@ -71,6 +71,11 @@ void test_lenses() {
     p.lens = {chart, 4, 1, 30, 31, 34, 17, {-0.05f, 0.01f, 0.001f, 0.0001f}, {0.02f, 0, 0}, {0.003f, 0.002f}, {}};
     check_scene(p, gs::Image{70, 33}, chart == gs::Chart::kPerspective, false);
   }
+  Parameters<float> p(100);  // a full panorama: splats cross its border
+  p.lens = {
+      gs::Chart::kEquirectangular, INFINITY, 1, float(70 / (2 * kPi)), float(33 / kPi), 34.5f, 16, {}, {}, {}, {}};
+  for (int64_t i = 0; i < p.count; ++i) p.means[3 * i + 2] *= i % 2 ? 1 : -1;
+  check_scene(p, gs::Image{70, 33}, true, false);
 }
 
 // More tiles than kFewTiles, so that fewer warps share one, and a list of two chunks. One order only, because it is

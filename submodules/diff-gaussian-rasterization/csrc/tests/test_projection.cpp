@@ -49,7 +49,7 @@ void test_surely_outside() {
     double depth;
     int radius;
     const bool visible = project_splat(cam, g, false, splat, depth, radius);
-    const TileRect rect = visible ? tile_rect(splat, kWidth, kHeight) : TileRect{0, 0, 0, 0};
+    const TileRect rect = visible ? tile_rect(splat, kWidth, kHeight, false) : TileRect{0, 0, 0, 0};
     const bool nothing = radius == 0 && rect.x1 == rect.x0,
                found = surely_outside(cam, g.mean, [&] { return largest; });
     CHECK(nothing || !found);

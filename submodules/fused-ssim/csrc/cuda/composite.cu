@@ -3,15 +3,15 @@
 
 #include "../backend.h"
 #include "../math/composite.h"
-#include "gs/cuda_check.h"
+#include "gs/cuda_launch.h"
 
 namespace gs {
 namespace {
 
 constexpr int kThreads = 256;
 
-__global__ void __launch_bounds__(kThreads) composite_kernel(Composite args) {
-  if (args.halted && *args.halted) return;
+__global__ void __launch_bounds__(kThreads) composite_kernel(const int32_t* halted, Composite args) {
+  if (!begin_work(halted)) return;
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= args.pixels) return;
   const uint8_t alpha = args.picture[3 * args.pixels + i];
@@ -26,8 +26,7 @@ __global__ void __launch_bounds__(kThreads) composite_kernel(Composite args) {
 void composite_cuda(const Composite& args, const Queue& queue) {
   if (!args.pixels) return;
   const int64_t blocks = (args.pixels + kThreads - 1) / kThreads;
-  composite_kernel<<<unsigned(blocks), kThreads, 0, static_cast<cudaStream_t>(queue.stream)>>>(args);
-  check_launch("composite_kernel");
+  launch(queue, "composite", composite_kernel, unsigned(blocks), kThreads, args);
 }
 
 }  // namespace gs

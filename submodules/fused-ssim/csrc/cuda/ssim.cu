@@ -8,7 +8,7 @@
 #include "backend.h"
 #include "cuda/ssim_backward.h"
 #include "cuda/ssim_forward.h"
-#include "gs/cuda_check.h"
+#include "gs/cuda_launch.h"
 
 namespace gs {
 namespace {
@@ -57,9 +57,9 @@ struct Part {
 
 template <class Source, bool kGradient>
 __global__ void __launch_bounds__(kColumns, 7)
-    l1_ssim_kernel(ImagePair<float> images, Tiles tiles, Part part, Maps maps, Frame frame, BlockSums* sums,
-                   const int32_t* halted) {
-  if (halted && *halted) return;
+    l1_ssim_kernel(const int32_t* halted, ImagePair<float> images, Tiles tiles, Part part, Maps maps, Frame frame,
+                   BlockSums* sums) {
+  if (!begin_work(halted)) return;
   __shared__ ForwardTile shared;
   Tile tile = tile_of(tiles, blockIdx.x);
   const Plane<Source> plane = plane_of<Source>(images, tile);
@@ -80,9 +80,9 @@ __global__ void __launch_bounds__(kColumns, 7)
 
 constexpr int kSumThreads = 512;
 
-__global__ void __launch_bounds__(kSumThreads)
-    mean_kernel(const BlockSums* sums, int64_t n, double l1_count, double ssim_count, L1SsimCuda out) {
-  if (out.halted && *out.halted) return;
+__global__ void __launch_bounds__(kSumThreads) mean_kernel(const int32_t* halted, const BlockSums* sums, int64_t n,
+                                                           double l1_count, double ssim_count, L1SsimCuda out) {
+  if (!begin_work(halted)) return;
   BlockSums own{};
   for (int64_t i = threadIdx.x; i < n; i += kSumThreads) {
     own.l1 += sums[i].l1;
@@ -136,15 +136,13 @@ Counts counts_of(const ImagePair<float>& images, bool valid) {
 void find_means(const L1SsimCuda& args, const BlockSums* sums, const Queue& queue) {
   const auto& images = args.images;
   const Counts counts = counts_of(images, args.valid);
-  mean_kernel<<<1, kSumThreads, 0, static_cast<cudaStream_t>(queue.stream)>>>(
-      sums, sum_blocks(images.planes, images.height, images.width), counts.l1, counts.ssim, args);
-  check_launch("mean_kernel");
+  launch(queue, "mean", mean_kernel, 1, kSumThreads, sums, sum_blocks(images.planes, images.height, images.width),
+         counts.l1, counts.ssim, args);
 }
 
 template <class Source, bool kGradient>
 void l1_ssim(const L1SsimCuda& args, const Queue& queue) {
   const auto& images = args.images;
-  const auto stream = static_cast<cudaStream_t>(queue.stream);
   const int rows = forward_rows(images.planes, images.height, images.width);
   check_size(images, Tiles::of(kForwardRows, images.planes, {0, images.height}, images.width).count);
   const RowRange band = band_of(images, args.rows), windows = map_rows(band, images.height);
@@ -154,18 +152,16 @@ void l1_ssim(const L1SsimCuda& args, const Queue& queue) {
   const Counts counts = counts_of(images, args.valid);
   const Frame frame{int(images.width), args.valid ? kRadius : 0, float(1 / counts.ssim)};
   BlockSums* sums = args.rows ? reinterpret_cast<BlockSums*>(args.sums) : queue.array<BlockSums>(tiles.count);
-  if (tiles.count) {
-    l1_ssim_kernel<Source, kGradient><<<unsigned(tiles.count), kColumns, 0, stream>>>(
-        images, tiles, part, maps_of(images, args.maps, windows), frame, sums, args.halted);
-    check_launch("l1_ssim_kernel");
-  }
+  if (tiles.count)
+    launch(queue, "l1_ssim", l1_ssim_kernel<Source, kGradient>, unsigned(tiles.count), kColumns, images, tiles, part,
+           maps_of(images, args.maps, windows), frame, sums);
   if (!args.rows) find_means(args, sums, queue);
 }
 
 template <int kRows, class Source>
 __global__ void __launch_bounds__(kColumns, 7)
-    l1_ssim_vjp_kernel(L1SsimVjpCuda args, Tiles tiles, Maps maps, double mean, bool quads) {
-  if (args.halted && *args.halted) return;
+    l1_ssim_vjp_kernel(const int32_t* halted, L1SsimVjpCuda args, Tiles tiles, Maps maps, double mean, bool quads) {
+  if (!begin_work(halted)) return;
   __shared__ BackwardTile<kRows> shared;
   const Tile tile = tile_of(tiles, blockIdx.x);
   const Plane<Source> plane = plane_of<Source>(args.images, tile);
@@ -192,9 +188,8 @@ void l1_ssim_vjp(const L1SsimVjpCuda& args, const Queue& queue) {
                      is_multiple(images.img2, sizeof(Quad<Source>)) && is_multiple(args.grad_img1, sizeof(Four));
   const double mean = 1 / double(images.planes * images.height * images.width);
   const Maps maps = maps_of(images, const_cast<float*>(args.maps), map_rows(band, images.height));
-  l1_ssim_vjp_kernel<kRows, Source>
-      <<<unsigned(tiles.count), kColumns, 0, static_cast<cudaStream_t>(queue.stream)>>>(args, tiles, maps, mean, quads);
-  check_launch("l1_ssim_vjp_kernel");
+  launch(queue, "l1_ssim_vjp", l1_ssim_vjp_kernel<kRows, Source>, unsigned(tiles.count), kColumns, args, tiles, maps,
+         mean, quads);
 }
 
 // Lower tiles read more rows for each of theirs, but a small image needs them to fill a large GPU. A compiler may fuse

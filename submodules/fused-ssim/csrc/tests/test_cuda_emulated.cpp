@@ -126,9 +126,11 @@ void check_halted() {
     float l1 = -1, ssim = -1, loss = -1;
     std::vector<float> maps(gs::map_strips(width) * height * gs::kMapRow, -1), vjp(img1.size(), -1);
     std::vector<float> composited(3 * height * width, -1);
-    gs::l1_ssim_cuda({images, false, &l1, &ssim, maps.data(), &loss, 0.8f, 0.2f, &halted}, memory.queue());
-    gs::l1_ssim_vjp_cuda({images, maps.data(), &one, &one, vjp.data(), 1, 1, &halted}, memory.queue());
-    gs::composite_cuda({picture.data(), background, height * width, composited.data(), &halted}, memory.queue());
+    gs::Queue queue = memory.queue();
+    queue.halted = &halted;
+    gs::l1_ssim_cuda({images, false, &l1, &ssim, maps.data(), &loss, 0.8f, 0.2f}, queue);
+    gs::l1_ssim_vjp_cuda({images, maps.data(), &one, &one, vjp.data(), 1, 1}, queue);
+    gs::composite_cuda({picture.data(), background, height * width, composited.data()}, queue);
     for (const float out : {l1, ssim, loss, maps[0], vjp[0], composited[0]}) CHECK((out == -1) == (halted == 1));
   }
 }

@@ -236,7 +236,7 @@ Tensor vjp(const Backward& in, const Tensor& grad_l1, double l1_weight, const Te
     gs::TorchQueue queue(img1.device());
     gs::l1_ssim_vjp_cuda(
         {image_pair<float>(img1, img2, in.clamp), read<float>(kept), read<float>(grad_l1), read<float>(grad_ssim),
-         write<float>(grad_img1), float(l1_weight), float(ssim_weight), nullptr, in.rows},
+         write<float>(grad_img1), float(l1_weight), float(ssim_weight), in.rows},
         queue.queue());
     return grad_img1;
   }
