@@ -28,6 +28,7 @@ from splatting.distributed.rendering.sharded import (
 )
 from utils.general_utils import check_flags
 from utils.sh_utils import eval_sh
+from utils.system_utils import UserError
 
 
 def render(
@@ -206,7 +207,12 @@ def model_inputs(
 def rasterizer_settings(
     camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace, background: Tensor, scaling: float = 1.0
 ) -> GaussianRasterizationSettings:
-    """The rasterizer's settings for a view of a model; arguments as for `render`."""
+    """The rasterizer's settings for a view of a model; arguments as for `render`. UserError for what rays lack."""
+    lens, projection = getattr(camera, "lens", None), getattr(pipe, "projection", "ewa")  # new in ours
+    if projection == "ray" and background.is_cuda:
+        raise UserError("--projection ray has no CUDA kernels; set CUDA_VISIBLE_DEVICES= for the CPU, or use ewa")
+    if projection == "ray" and lens:
+        raise UserError("--projection ray shows pinholes alone; give --lenses undistort, or use --projection ewa")
     return GaussianRasterizationSettings(
         image_height=int(camera.image_height),
         image_width=int(camera.image_width),
@@ -221,8 +227,8 @@ def rasterizer_settings(
         prefiltered=False,
         debug=pipe.debug,
         antialiasing=getattr(pipe, "antialiasing", False),  # the 2023 release's options have none
-        lens=getattr(camera, "lens", None),
-        projection=getattr(pipe, "projection", "ewa"),
+        lens=lens,
+        projection=projection,
     )
 
 

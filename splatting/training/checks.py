@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 
 from arguments import OPTIONS, other_scene, read_model_json, read_training_options
@@ -99,18 +98,10 @@ def check_page(port: int | None, several: bool) -> None:
         raise UserError("--viewer needs a training of one process; leave it out, or start train.py without torchrun")
 
 
-def check_projection(projection: str, cameras: Sequence[Camera], device: torch.device, several: bool) -> None:
-    """Refuse a training on rays that the rasterizer does not have (UserError)."""
-    if projection == "ewa":
-        return
-    if device.type != "cpu":
-        raise UserError(
-            "--projection ray has no CUDA kernels; set CUDA_VISIBLE_DEVICES= to train on the CPU, or use ewa"
-        )
-    if several:
+def check_projection(projection: str, several: bool) -> None:
+    """Refuse a training on rays by several processes (UserError)."""
+    if projection == "ray" and several:
         raise UserError("--projection ray needs a training of one process; start train.py without torchrun, or use ewa")
-    if any(camera.lens for camera in cameras):
-        raise UserError("--projection ray shows pinholes alone; give --lenses undistort, or use --projection ewa")
 
 
 def check_target(target_psnr: float, test_views: int) -> None:

@@ -81,6 +81,7 @@ class Run:
         self.opt, self.pipe, self.launch = opt, pipe, launch
         self.group = ranks()
         checks.check_page(launch.viewer, self.group.several)
+        checks.check_projection(getattr(pipe, "projection", "ewa"), self.group.several)
         self.start = self.group.shared(resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
         dataset = self.dataset = checks.with_lenses(dataset, self.start)
         if opt.strategy == AUTO and (self.start or not (opt.time_budget or opt.schedule)):
@@ -100,9 +101,6 @@ class Run:
         self.scene, first = scene_with(init_ply, dataset, self.gaussians, sharing=sharing)
         checks.check_scene(self.scene.info)
         checks.hint_of_images(self.scene.getTrainCameras(), self.scene.info, dataset.white_background)
-        checks.check_projection(
-            getattr(pipe, "projection", "ewa"), self.scene.getTrainCameras(), self.device, self.group.several
-        )
         checks.check_target(opt.target_psnr, len(self.scene.getTestCameras()))
         agree_on_scene(self.scene, self.start)  # before an image is shared
         points = self.scene.info.point_cloud.points if first is None else first
