@@ -1,17 +1,23 @@
 """Gaussians on rays, of the CPU's kernels: images and gradients against the oracle, and what is refused."""
 
 import functools
+import json
 import math
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, rasterize, reference
 from diff_gaussian_rasterization.lens import Lens
+from PIL import Image
 from rasterizer_tools import error, few, leaves, loss_of, render
 from test_rasterizer_oracle import CAMERAS, PLANES, SIZE, _activated, _parameters
 from torch import Tensor
 
+import export
+import render as command
+import train
 from benchmarks.workloads.splat_scenes import settings
 from gaussian_renderer import rasterizer_settings
 from utils.system_utils import UserError
@@ -149,3 +155,18 @@ def test_a_view_takes_the_projection_of_the_options():
     camera.lens = Lens("equidistant", (9.0, 9.0), (8.5, 3.0))
     with pytest.raises(UserError, match="--projection ray shows pinholes alone; give --lenses undistort"):
         rasterizer_settings(camera, model, pipe, torch.zeros(3))
+
+
+def test_a_training_on_rays_renders_so_and_exports_say_it(colmap_scene, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    train.main(["-s", str(colmap_scene), "-m", str(out), "--iterations", "30", "--projection", "ray"])
+    assert json.loads((out / "model.json").read_text())["projection"] == "ray"
+    images = []
+    for given in ([], ["--projection", "ewa"]):
+        monkeypatch.setattr("sys.argv", ["render.py", "-m", str(out), "--skip_test", *given])
+        command.main()
+        images.append([np.asarray(Image.open(path)) for path in sorted((out / "train/ours_30/renders").glob("*.png"))])
+    assert 0 < np.abs(np.subtract(*images, dtype=int)).max() < 100
+    monkeypatch.setattr("sys.argv", ["export.py", "-m", str(out), "--to", str(tmp_path / "model.splat")])
+    export.main()
+    assert "trained with --projection ray; other programs show large Gaussians off the axis" in capsys.readouterr().out
