@@ -34,10 +34,10 @@ void cull_all(int64_t count, const Projected<T>& out) {
 }
 
 // Most Gaussians of a trained scene lie outside of a view. This finds them without their shape, and lists the others.
-template <class T>
-int64_t list_inside(const Scene<T>& s, const Camera<T>& camera, int32_t* inside) {
+template <class T, class AnyCamera>
+int64_t list_inside(const Scene<T>& s, const AnyCamera& camera, int32_t* inside) {
   for (int32_t i = 0; i < s.count; ++i) inside[i] = i;
-  if (!s.raw || s.cov3d || s.rays || s.lens.chart != Chart::kPinhole) return s.count;
+  if (!s.raw || s.cov3d || s.lens.chart != Chart::kPinhole) return s.count;
   int64_t found = 0;
   for_packs<T>(inside, s.count, [&](const Pack<T>& pack) {
     using S = Simd<T>;

@@ -75,6 +75,29 @@ GS_HD Truth<V> project_splat(const RayCamera<T>& cam, const Gaussian<V>& gaussia
          (splat.log2_opacity >= T(kLog2MinAlpha) - T(1e-3));
 }
 
+// As for EWA, and of no tile on rays: a ball of the largest scale, with the dilation, lies beyond a plane through the
+// camera and a border of the image. Over the mean's depth, px: its distance along the image, and 3.5 deviations of
+// that.
+template <class T, class V, class Scale>
+GS_HD Truth<V> surely_outside(const RayCamera<T>& cam, Vec3<V> mean, const Scale& largest_scale) {
+  const Camera<T>& flat = cam;
+  const Vec3<V> view = to_view(cam, mean);
+  const Truth<V> out = surely_outside(flat, mean, largest_scale), front = in_front(view.z), off = out & front;
+  if (!any(off)) return out;
+  const V per_depth = 1 / view.z, scale = largest_scale();
+  Truth<V> beyond = !front;
+  const auto test = [&](V at, T sign, T border, T focal, T axis, Vec3<T> row) {
+    const Vec3<T> normal = focal * row - (border - axis) * cam.row_z;
+    const V away = (sign * (focal * at * per_depth + axis - border) - 3) / T(3.5), wide = scale * per_depth;
+    beyond |= (away > 0) & (wide * wide * dot(normal, normal) + 1 < away * away);
+  };
+  test(view.x, -1, T(-1), cam.mean_focal_x, cam.axis_x, cam.row_x);
+  test(view.x, 1, T(cam.width), cam.mean_focal_x, cam.axis_x, cam.row_x);
+  test(view.y, -1, T(-1), cam.mean_focal_y, cam.axis_y, cam.row_y);
+  test(view.y, 1, T(cam.height), cam.mean_focal_y, cam.axis_y, cam.row_y);
+  return out & beyond;
+}
+
 // Sums over a splat's pixels, with x = (u, v) / s, p = q / s^2, a = x - slope p, and w = 1 / (1 + e p)^2, which is the
 // derivative of D^2 by p. Its derivative by the mean's pixel is -2 L^T w a / s.
 template <class T>
