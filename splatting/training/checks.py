@@ -92,16 +92,11 @@ def _report_cameras_apart(info: SceneInfo) -> None:
         )
 
 
-def check_page(port: int | None, several: bool) -> None:
-    """Refuse a page that shows a training of several processes (UserError)."""
-    if several and port is not None:
-        raise UserError("--viewer needs a training of one process; leave it out, or start train.py without torchrun")
-
-
-def check_projection(projection: str, several: bool) -> None:
-    """Refuse a training on rays by several processes (UserError)."""
-    if projection == "ray" and several:
-        raise UserError("--projection ray needs a training of one process; start train.py without torchrun, or use ewa")
+def check_alone(port: int | None, projection: str, several: bool) -> None:
+    """Refuse a page, or rays, of a training of several processes (UserError)."""
+    for name, needs in (("--viewer", port is not None), ("--projection ray", projection == "ray")):
+        if needs and several:
+            raise UserError(f"{name} needs a training of one process; leave it out, or start train.py without torchrun")
 
 
 def check_target(target_psnr: float, test_views: int) -> None:
