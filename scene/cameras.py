@@ -129,6 +129,12 @@ class Camera(nn.Module):
         self.full_proj_transform = self._hand_on((project @ view).T)
         self.camera_center = self._hand_on(torch.from_numpy(camera_center(self.R, moved[:3, 3].copy())))
 
+    def place(self, R: np.ndarray, T: np.ndarray) -> None:
+        """Give it another pose: R, T, and the matrices and centre that follow from them."""
+        self.R, self.T = R, T
+        width, height = self._size
+        self._set_matrices((2 * self.cx / width - 1, 2 * self.cy / height - 1))
+
     def _hand_on(self, matrix: Tensor) -> Tensor:
         return matrix.to(self.device, torch.float32).contiguous()
 

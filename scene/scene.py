@@ -17,6 +17,7 @@ from scene.dataset_readers import read_scene, replaced_reader
 from scene.half_images import half, train_on_all
 from scene.images.masks import MaskOptions, refuse_nothing_to_ignore
 from scene.images.store import ImageStore, Picture, Sharing, image_device
+from scene.pose_file import with_poses, write_poses
 from scene.readers.depth_maps import with_depth_maps
 from scene.readers.info import CameraInfo, SceneInfo, exposure_names, photo_size
 from scene.readers.point_cloud import write_point_cloud
@@ -56,6 +57,7 @@ class Scene:
         if load_iteration is not None and start:
             self.loaded_iter = find_iteration(self.model_path, load_iteration)
         self._halves = bool(getattr(args, "train_test_exp", False))
+        self._refines = bool(getattr(args, "refine_poses", False))
         self.info = self._read(args)
         self.cameras_extent = self.info.extent
 
@@ -103,6 +105,8 @@ class Scene:
             refuse_nothing_to_ignore([(view.image_path, view.mask) for view in views], masks)
         if self._halves:
             info = train_on_all(info)
+        if self._refines and not fresh and not getattr(args, "other_scene", ""):
+            info = with_poses(info, self.model_path)
         if depths and fresh:
             info = with_depth_maps(info, Path(args.source_path), depths)
         return info
@@ -125,13 +129,19 @@ class Scene:
         self.images.prefetch(self._pictures(cameras))
 
     def save(self, iteration: int, gaussians: SceneGaussians | None = None) -> None:
-        """Write `point_cloud/iteration_N/point_cloud.ply`, and the exposures if they are trained.
+        """Write `point_cloud/iteration_N/point_cloud.ply`, and exposures and poses if they are trained.
 
         gaussians: written in place of the scene's own; the exposures are always the scene's.
         """
+        self.save_poses()
         (self.gaussians if gaussians is None else gaussians).save_ply(str(saved_ply(self.model_path, iteration)))
         if self._halves:
             save_exposures(self.gaussians, self.model_path)
+
+    def save_poses(self) -> None:
+        """Write `poses.json`, if poses are refined."""
+        if self._refines:
+            write_poses(self.model_path, self.getTrainCameras(), self.getTestCameras())
 
     def training_pixels(self) -> tuple[int, int]:
         """Pixels of all training views: at training size, and in the photos."""

@@ -195,6 +195,11 @@ def test_a_panorama_has_no_seam(antialiasing, device, dtype):
     assert 20 < crossing.sum() < 300
     rounding = 1e-9 if dtype == torch.float64 else 2e-4
     assert (one - two).abs().max() < rounding
+    size = HEIGHT, WIDTH
+    splats, *tiles, _ = projected(camera, values)  # each stage by itself, as several processes call them
+    instances, ranges, *_ = OPERATORS.bin(splats, *tiles, *size, False)
+    staged = OPERATORS.blend(splats, instances, ranges, camera.bg, *size, False, False)[0]
+    assert torch.equal(staged, one) if device == "cpu" else (staged - one).abs().max() < rounding
     (weight * one).sum().backward(), (weight * two).sum().backward()
     for name in values:
         scale = plain[name].grad.abs().max()

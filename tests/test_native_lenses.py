@@ -62,6 +62,12 @@ def test_points_of_panoramas(tmp_path):
     assert (local < 0).mean(axis=0) == pytest.approx([0.5] * 3, abs=0.01)  # all around, not in front alone
 
 
+def test_known_models_need_no_pycolmap(tmp_path, monkeypatch):
+    make_colmap_scene(tmp_path, model="OPENCV", params=BROWN, views=2)
+    monkeypatch.setattr("scene.images.lens.import_pycolmap", lambda: pytest.fail("pycolmap is imported"))
+    assert all(view.native for view in read(tmp_path, native=True).train_cameras)
+
+
 def test_unknown_models_are_undistorted(tmp_path):
     make_colmap_scene(tmp_path, model="FOV", params=(FOCAL, FOCAL, *CENTER, *DISTORTIONS["FOV"]), views=2)
     assert all(view.native is None and view.lens is None for view in read(tmp_path, native=True).train_cameras)

@@ -33,6 +33,7 @@ RASTERIZER = (
     "rasterize_vjp",
     "rasterize_vjp of rows",
     "blend_rows",
+    "camera_vjp",
     "sum_runs",
 )
 # Tensors that may be None.
@@ -218,6 +219,11 @@ WRONG = {
         (ValueError, "there are 5 rows", {"source": _changed(2, lambda t: t[1:])}),
         *((ValueError, f"got {count} of splat 0", _unseen(count)) for count in (1, -1)),
         (ValueError, "or splats, tile_counts, rows and counts, got 3 tensors", {"source": lambda t: t[:3]}),
+    ],
+    "camera_vjp": [
+        (ValueError, "takes splats, tile_counts, rows and counts, got 3 tensors", {"source": lambda t: t[:3]}),
+        (ValueError, r"rows must be \(-1, 12\)", {"absolute": True}),
+        (ValueError, "there are 5 rows", {"source": _changed(2, lambda t: t[1:])}),
     ],
     "wake_": [
         (ValueError, "blocks of raw Gaussians sleep", {"options": lambda t: [*t[:4], False]}),

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from diff_gaussian_rasterization import fakes
+from diff_gaussian_rasterization.lens import Lens
 from diff_gaussian_rasterization.scene import GRADIENTS, Scene, draw
 from rasterizer_tools import few, ops, render, scene_arguments
 
@@ -13,7 +14,7 @@ def test_the_scene_is_the_operators_first_inputs():
     names = [argument.name for argument in ops.rasterize.default._schema.arguments]
     assert tuple(names[: 1 + len(Scene._fields)]) == ("means2d", *Scene._fields)
     assert tuple(result.name for result in ops.rasterize_vjp.default._schema.returns) == GRADIENTS
-    assert len(vars(ops)) <= 19 and all(len(op.default._schema.arguments) <= 20 for op in vars(ops).values())
+    assert len(vars(ops)) <= 20 and all(len(op.default._schema.arguments) <= 20 for op in vars(ops).values())
 
 
 def test_the_fake_kernels_have_the_sizes_of_the_real_ones():
@@ -27,6 +28,10 @@ def test_the_fake_kernels_have_the_sizes_of_the_real_ones():
     drawn = draw(arguments, camera.bg)
     rows = [ops.blend_rows(drawn.kept(camera.bg), drawn.color, absolute=absolute)[0] for absolute in (False, True)]
     assert rows[0].shape[1] == fakes.MOMENT_VALUES and rows[1].shape[1] == fakes.MOMENT_VALUES + fakes.ABSOLUTE_VALUES
+    rows = [*drawn.kept(camera.bg)[:2], *ops.blend_rows(drawn.kept(camera.bg), drawn.color)]
+    lens = Lens("perspective", (9.0, 9.0), (8.0, 3.0))
+    scenes = arguments, scene_arguments(raw, camera._replace(lens=lens))
+    assert tuple(len(ops.camera_vjp(*scene, rows)) for scene in scenes) == fakes.CAMERA_NUMBERS
     rects, limits = torch.zeros(fakes.RECORD_BLOCK + 1, 4, dtype=torch.int32), torch.zeros(2, 3, dtype=torch.int32)
     for splats, blocks in ((fakes.RECORD_BLOCK, 1), (fakes.RECORD_BLOCK + 1, 2)):
         assert ops.list_records(rects[:splats], rects[:splats, 0], limits, 0)[0].shape == (4, blocks)

@@ -136,6 +136,14 @@ def test_other_projections_and_lenses_are_refused():
         render(parameters, settings(**arguments, projection="ray", lens=lens))
 
 
+def test_cameras_get_no_gradients_on_rays():
+    parameters, arguments = few()
+    view = settings(**arguments, projection="ray")
+    view.viewmatrix.requires_grad_()
+    with pytest.raises(RuntimeError, match="'ray' has no gradients of cameras: take 'ewa'"):
+        render(parameters, view).color.sum().backward()
+
+
 def test_a_gaussian_of_no_extent_along_an_axis_has_gradients():
     parameters, arguments = few(1)
     parameters["scales"][:, 2] = -math.inf

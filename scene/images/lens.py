@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
+from diff_gaussian_rasterization.lens import MODELS
 
 # Pillow's zlib must be in the process before pycolmap's, or writing a PNG aborts (pycolmap 4.2.1, Pillow 13.0).
 from PIL import Image  # noqa: F401
@@ -23,7 +24,7 @@ from utils.system_utils import UserError
 
 PANORAMA = "EQUIRECTANGULAR"
 WIDEST = 60.0  # degrees to either side; farther out, a pinhole stretches the photo more than fourfold
-_PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # number of parameters
+_STRAIGHT = 1e-8  # COLMAP takes smaller parameters for no distortion
 # In sizes of the photo. Beyond these bounds lie damaged files and other units, not lenses: fields of view below a
 # thousandth of a degree, or so near 180 degrees that no pinhole shows anything.
 _SHORTEST, _LONGEST = 1e-4, 1e5  # focal length
@@ -77,19 +78,28 @@ def pinhole_of(lens: Lens, name: str) -> Pinhole | None:
         if lens.params != (lens.width, lens.height):
             raise _unusable(lens, name)
         return None
-    if len(lens.params) == _PINHOLES.get(lens.model):  # without pycolmap, which is slow to import
-        focal, center = lens.params[:-2], lens.params[-2:]
+    if lens.model in MODELS:  # without pycolmap, which is slow to import
+        chart, focals, places = MODELS[lens.model]
+        if len(lens.params) != focals + 2 + len(places):
+            raise _unusable(lens, name)
+        focal, center, further = lens.params[:focals], lens.params[focals : focals + 2], lens.params[focals + 2 :]
+        straight = chart == "perspective" and max(map(abs, further), default=0.0) < _STRAIGHT
     else:
         camera = _camera(lens, name)
         focal = tuple(lens.params[index] for index in camera.focal_length_idxs())
         center = tuple(lens.params[index] for index in camera.principal_point_idxs())
         # is_undistorted alone is also true of a fisheye without further parameters.
         straight = camera.is_perspective_pinhole() and camera.is_undistorted()
-        if not straight:
-            _check_bounds(lens, focal, center, name)
-            return None
     _check_bounds(lens, focal, center, name)
-    return Pinhole(focal[0], focal[-1], *center, lens.width, lens.height)
+    return Pinhole(focal[0], focal[-1], *center, lens.width, lens.height) if straight else None
+
+
+def rays_of(lens: Lens, pixels: np.ndarray) -> np.ndarray:
+    """x / z and y / z (N, 2) of the rays of pixels (N, 2), pixel centres at .5; NaN where a ray has none."""
+    if len(lens.params) == _PINHOLES.get(lens.model):
+        focal, center = np.array(lens.params[:-2]), np.array(lens.params[-2:])
+        return (pixels - center) / focal
+    return np.asarray(_camera(lens).cam_from_img(np.ascontiguousarray(pixels)), dtype=np.float64).reshape(-1, 2)
 
 
 def _check_bounds(lens: Lens, focal: Sequence[float], center: Sequence[float], name: str) -> None:
@@ -178,7 +188,7 @@ def import_pycolmap() -> ModuleType:
     """
     if "pycolmap" not in sys.modules and importlib.util.find_spec("pycolmap") is None:
         raise UserError(
-            "pycolmap is not installed, which convert.py and photos with lens distortion need (pip install pycolmap); "
+            "pycolmap is not installed, which convert.py and --lenses undistort need (pip install pycolmap); "
             "where it has no wheel, as on Linux for Arm, convert and undistort the photos on another machine"
         )
     import pycolmap

@@ -99,6 +99,20 @@ def check_alone(port: int | None, projection: str, several: bool) -> None:
             raise UserError(f"{name} needs a training of one process; leave it out, or start train.py without torchrun")
 
 
+def check_poses(dataset: argparse.Namespace, several: bool, projection: str = "ewa") -> None:
+    """Refuse to refine poses in a training of several processes, or on rays (UserError)."""
+    if several and getattr(dataset, "refine_poses", False):
+        raise UserError("--refine_poses needs a training of one process; leave it out, or start without torchrun")
+    if projection == "ray" and getattr(dataset, "refine_poses", False):
+        raise UserError("--projection ray has no gradients of poses; leave --refine_poses out, or use ewa")
+
+
+def check_unrefined(poses: object, checkpoint: str) -> None:
+    """Refuse a checkpoint with refined poses that this run would not use (UserError)."""
+    if poses:
+        raise UserError(f"{checkpoint} was trained with --refine_poses; give that option")
+
+
 def check_target(target_psnr: float, test_views: int) -> None:
     """Refuse a target for test views that are not there (UserError)."""
     if target_psnr and not test_views:

@@ -19,7 +19,7 @@ from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
-from scene.gaussians.checkpoint import ASLEEP, further, load_checkpoint, with_further
+from scene.gaussians.checkpoint import ASLEEP, POSES, further, load_checkpoint, with_further
 from scene.gaussians.morton import sort_rows
 from scene.sleeping import MOST_SHARE, REST, Sleeping, share_seen
 from splatting.deterministic.counter_rng import Stream, uniform
@@ -37,6 +37,7 @@ from splatting.training.gpu_memory import GpuMemory, limit_torch, reads_on_host
 from splatting.training.iteration import Iteration, ViewOrder
 from splatting.training.memory_estimate import announce_memory, largest_view
 from splatting.training.objective import LossWatch, Objective
+from splatting.training.pose_refinement import PoseRefinement
 from splatting.training.resolution import resolution_of
 from splatting.training.restart import resumed
 from splatting.training.schedule import DecidedSchedule
@@ -131,6 +132,18 @@ class Run:
             self.density.started()
         self.group.tell_notes()
 
+    def _refined_poses(self, capture: tuple | None) -> PoseRefinement | None:
+        """What refines the poses of the views, with the state of a checkpoint; None unless it is asked for."""
+        checks.check_poses(self.dataset, self.group.several, getattr(self.pipe, "projection", "ewa"))
+        state = capture and further(capture, POSES)
+        if not getattr(self.dataset, "refine_poses", False):
+            checks.check_unrefined(state, self.start)
+            return None
+        poses = PoseRefinement(self.scene, self.dataset.source_path, self.opt.iterations)
+        if capture:
+            poses.restore(state)
+        return poses
+
     def _read_start(self) -> tuple[tuple | None, int]:
         """The state of the checkpoint that is resumed, and its iteration. A limit of the GPU's memory begins before."""
         if self.opt.gpu_memory and self.device.type == "cuda":
@@ -174,6 +187,7 @@ class Run:
 
     def _begin_model(self, capture: tuple | None, first: Splats | None) -> None:
         """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""
+        self.poses = self._refined_poses(capture)
         if capture is not None:
             self.gaussians.start_exposures(self.scene.info.train_cameras)
             self.gaussians.restore(capture, self.opt)
@@ -312,7 +326,7 @@ class Run:
         density = self.density
         dense = type(self.gaussians.optimizer) is GaussianAdam and FusedAdam.takes(self.gaussians)
         alone = not (self.schedule.views > 1 or density.queues or any(density.penalty))
-        if not (dense and alone and self.is_standard):
+        if not (dense and alone and self.is_standard) or self.poses:
             return None
         saves = self.group.anyone(self.memory.limit > 0) or self._share_seen() < MOST_SHARE
         return Sleeping(self.gaussians) if saves else None
@@ -360,6 +374,8 @@ class Run:
 
     def after_step(self, step: Iteration) -> None:
         """What follows the optimiser's step."""
+        if self.poses:
+            self.poses.step(self.schedule.schedule_step(step.iteration))
         self.density.after_step(step)
         if step.changes:
             self.memory.settle(self.gaussians)
@@ -380,6 +396,8 @@ class Run:
     def captured(self) -> tuple:
         """The state of the model for a checkpoint, from which a training resumes. Every rank must call it."""
         state = self.gaussians.capture()
+        if self.poses:
+            state = with_further(state, POSES, self.poses.captured())
         asleep = self.sleeping and self.sleeping.captured()
         return with_further(state, ASLEEP, asleep) if asleep else state
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings
+from diff_gaussian_rasterization.camera import camera_numbers
 from diff_gaussian_rasterization.first_order import first_order
 from diff_gaussian_rasterization.gaussians import Gaussians
 from diff_gaussian_rasterization.ops import Rasterized, gradients_of
@@ -30,10 +31,14 @@ def rasterize_over(
     """Render the Gaussians of all ranks. Arguments as of `rasterize`, each rank with its own Gaussians.
 
     Every rank calls it for the same view and gets the whole image, and `radii` of its own Gaussians; backward needs the
-    same gradient of the image on every rank.
+    same gradient of the image on every rank. RuntimeError for settings that require a gradient.
     """
     gaussians = Gaussians(means, opacities, **others)
     scene = scene_arguments(gaussians, settings, raw)
+    if camera_numbers(scene, settings) is not None:
+        raise RuntimeError(
+            "a camera gets no gradient from a model that processes share: detach its tensors, or use one process"
+        )
     train = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in (*gaussians, means2d))
     options = scene.camera, settings.bg, want_inverse_depth, train, want_absolute_gradient
     color, depth, radii = _OverRanks.apply(ranks, options, means2d, *gaussians)

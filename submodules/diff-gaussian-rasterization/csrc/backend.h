@@ -61,14 +61,17 @@ template <class T>
 void sum_runs(const Executor&, const SumInput<T>&);
 
 // What else the CPU offers. sum_rows: the rest of blend_vjp after blend_rows. project_vjp_step: project_vjp, and every
-// Gaussian's step as soon as its gradients are known.
+// Gaussian's step as soon as its gradients are known. camera_vjp: the gradients of the camera's numbers
+// (math/camera_gradient.h).
 #define GS_CPU_BACKEND                                                                                  \
   GS_BACKEND(Executor)                                                                                  \
   template <class T>                                                                                    \
   void sum_rows(const Executor&, const SplatRows<T>&, const RowSums<T>&);                               \
   template <class T>                                                                                    \
   void project_vjp_step(const Executor&, const Scene<T>&, const int32_t* tile_counts, const T* moments, \
-                        const GaussianStep<T>&);
+                        const GaussianStep<T>&);                                                        \
+  template <class T>                                                                                    \
+  void camera_vjp(const Executor&, const Scene<T>&, const int32_t* tile_counts, const T* moments, double* out);
 
 #define GS_DECLARE(isa) \
   namespace isa {       \
@@ -97,6 +100,8 @@ void rasterize_vjp_step(const Queue&, const Scene<float>&, const BlendInput<floa
 void rows_vjp(const Queue&, const Scene<float>&, const SplatRows<float>&, const RowSums<float>&, const GradientMemory&);
 void rows_vjp_step(const Queue&, const Scene<float>&, const SplatRows<float>&, const RowSums<float>&,
                    const GaussianStep<float>&);
+// From the same rows, which it only reads, to the gradients of the camera's numbers.
+void camera_vjp(const Queue&, const Scene<float>&, const SplatRows<float>&, double* out);
 }  // namespace cuda
 
 }  // namespace gs

@@ -14,6 +14,7 @@ SPLAT_VALUES = 10  # of a row of `splats`
 MOMENT_VALUES = 10  # of a row of `moments`, and of `rows`
 RAY_VALUES = 3  # of a row of each besides, of Gaussians on rays
 ABSOLUTE_VALUES = 2  # of a row of `rows` besides, for absolute gradients
+CAMERA_NUMBERS = 25, 34  # of a pinhole, and of a camera with a lens
 RECORD_BLOCK = 256  # splats whose records are counted together
 
 
@@ -80,6 +81,12 @@ def _(means, opacities, *arguments):
     rows["opacities"] = opacities.shape[1:] if wanted[2] else (1,)
     counts = [means.shape[0] if is_wanted else 0 for is_wanted in wanted]
     return tuple(means.new_empty((count, *rows[name])) for name, count in zip(GRADIENTS, counts, strict=True))
+
+
+@_fake("camera_vjp")
+def _(means, *arguments):
+    lens = arguments[10]
+    return means.new_empty((CAMERA_NUMBERS[len(lens) > 3],), dtype=torch.float64)
 
 
 @_fake("rasterize")

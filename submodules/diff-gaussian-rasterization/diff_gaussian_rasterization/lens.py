@@ -2,11 +2,13 @@
 
 import functools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 _CHARTS = ("pinhole", "perspective", "equidistant", "equirectangular")  # gs::Chart in csrc/data.h
+LENS_VALUES = 15  # focal lengths, principal point and coefficients
 _SPARE = 1.3  # of the image's field of view, as the Jacobian's clamp of a pinhole
 # Parameters of COLMAP's models behind focal lengths and principal point: name and place.
 _RADIAL, _DIVISOR, _TANGENTIAL, _PRISM = "radial", "divisor", "tangential", "prism"
@@ -46,11 +48,21 @@ class Lens(NamedTuple):
         x, y = ((at + 0.5) * by - 0.5 for at, by in zip(self.center, (across, down), strict=True))
         return self._replace(focal=(self.focal[0] * across, self.focal[1] * down), center=(x, y))
 
+    @property
+    def values(self) -> tuple[float, ...]:
+        """The 15 numbers of its fields, in their order."""
+        return *self.focal, *self.center, *self.radial, *self.divisor, *self.tangential, *self.prism
+
+    def with_values(self, values: Sequence[float]) -> "Lens":
+        """The lens of the same chart with other `values`."""
+        ends = (2, 4, 8, 11, 13, 15)
+        return Lens(self.chart, *(tuple(values[a:b]) for a, b in zip((0, *ends), ends, strict=False)))
+
     def numbers(self, width: int, height: int) -> tuple[float, ...]:
         """The operators' form for an image of that size (px). ValueError for numbers that no lens has."""
         if self.chart not in _CHARTS[1:]:
             raise ValueError(f"a lens's chart {self.chart!r} is none of {', '.join(_CHARTS[1:])}")
-        more = *self.focal, *self.center, *self.radial, *self.divisor, *self.tangential, *self.prism
+        more = self.values
         if not all(map(math.isfinite, more)) or min(self.focal) <= 0:
             raise ValueError(f"a lens needs finite numbers and focal lengths above 0, got {more}")
         field, turn, reach = self._bounds(width, height)

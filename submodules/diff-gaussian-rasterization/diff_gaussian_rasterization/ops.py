@@ -10,6 +10,7 @@ from torch.utils._pytree import tree_flatten, tree_leaves, tree_unflatten
 import diff_gaussian_rasterization.fakes  # noqa: F401  (registers the fake kernels)
 from diff_gaussian_rasterization.alternatives import shaped
 from diff_gaussian_rasterization.backend import OPERATORS, has_kernels
+from diff_gaussian_rasterization.camera import camera_numbers
 from diff_gaussian_rasterization.checks import check_finite, check_tensors
 from diff_gaussian_rasterization.first_order import direct_apply, first_order, function_of, is_compiled, needs_function
 from diff_gaussian_rasterization.gaussians import Gaussians, lists_gaussians
@@ -17,6 +18,8 @@ from diff_gaussian_rasterization.scene import Drawing, draw, scene_arguments
 from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 
 _NEAR = 0.2  # as in csrc/math/constants.h
+_DIFFERENTIABLE = ("viewmatrix", "projmatrix", "campos", "lens_values")  # of the settings
+_CAMERA = 19  # place of the camera's numbers among the operator's inputs
 
 
 class Rasterized(NamedTuple):
@@ -41,7 +44,7 @@ def rasterize(
     want_absolute_gradient: bool = False,
     **others: Tensor | None,
 ) -> Rasterized:
-    """Renders Gaussians (Kerbl et al. 2023, sections 4 and 6); differentiable in every tensor but the settings'.
+    """Renders Gaussians (Kerbl et al. 2023, sections 4 and 6); differentiable in every tensor but the background.
 
     means, opacities and others: the fields of `Gaussians`, which has their shapes; all float32 or all float64.
     means2d (N, 3): values unused; receives d loss / d mean on the image, per NDC unit, in x and y. The third value is
@@ -57,14 +60,17 @@ def rasterize(
     gaussians = Gaussians(means, opacities, **others)
     try:
         scene = scene_arguments(gaussians, settings, raw)
-        train = needs_function(*gaussians, means2d)
+        camera = camera_numbers(scene, settings)
+        train = camera is not None or needs_function(*gaussians, means2d)
         if settings.debug:
             for name, values in gaussians._asdict().items():
                 if values is not None:
                     check_finite(name, values)
         # torch.compile knows the operator, whose autograd is registered below.
         function = _apply if train and not is_compiled() else OPERATORS.rasterize
-        out = function(means2d, *scene, shaped(settings.bg, 3), want_inverse_depth, train, want_absolute_gradient)
+        further = () if camera is None else (None, camera)
+        planes = want_inverse_depth, train, want_absolute_gradient
+        out = function(means2d, *scene, shaped(settings.bg, 3), *planes, *further)
     except (AttributeError, TypeError, RuntimeError):
         _check_types(gaussians, settings, means2d)
         raise
@@ -72,7 +78,8 @@ def rasterize(
     if settings.debug:
         check_finite("the rendered image", color)
         if train:
-            _check_gradients(gaussians._asdict() | {"means2d": means2d})
+            camera = {name: getattr(settings, name) for name in _DIFFERENTIABLE}
+            _check_gradients(gaussians._asdict() | {"means2d": means2d} | camera)
     return Rasterized(
         color, radii, inverse_depth if want_inverse_depth else None, transmittance if want_transmittance else None
     )
@@ -147,13 +154,18 @@ def _keep(ctx, inputs, output):
 def _backward(ctx, grad_color, grad_transmittance, grad_inverse_depth, *_):
     if not ctx.train:
         raise RuntimeError("this image was rasterized with train=False, so it has no backward")
-    saved, needed = ctx.saved_tensors, ctx.needs_input_grad
+    saved, needed = ctx.saved_tensors, list(ctx.needs_input_grad)
     scene, kept = (*saved[:11], *ctx.numbers), saved[11:]
     if grad_color is None:
         grad_color = kept[-1].new_zeros(3, *kept[-1].shape[1:])
     planes = grad_color, grad_transmittance, grad_inverse_depth if ctx.inverse_depth else None
-    found = gradients_of(scene, kept, planes, needed[:9], ctx.absolute)
-    return *found, *(None,) * (len(needed) - len(found))
+    results = [None] * len(needed)
+    if any(needed[_CAMERA:]):  # both backwards take the rows that the blending's makes once
+        kept, planes = (*kept[:2], *OPERATORS.blend_rows(kept, *planes, ctx.absolute)), ()
+        results[_CAMERA] = OPERATORS.camera_vjp(*scene, kept, ctx.absolute)
+    if planes or any(needed[:9]):
+        results[:9] = gradients_of(scene, kept, planes, needed[:9], ctx.absolute)
+    return tuple(results)
 
 
 def gradients_of(

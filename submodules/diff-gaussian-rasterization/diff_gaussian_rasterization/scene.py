@@ -9,6 +9,7 @@ from diff_gaussian_rasterization.alternatives import shaped
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.checks import check_flag
 from diff_gaussian_rasterization.gaussians import Gaussians
+from diff_gaussian_rasterization.lens import LENS_VALUES, Lens
 from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 
 PROJECTIONS = ("ewa", "ray")
@@ -87,13 +88,21 @@ def scene_arguments(gaussians: Gaussians, settings: GaussianRasterizationSetting
     if settings.projection not in PROJECTIONS:
         raise ValueError(f"projection must be {' or '.join(map(repr, PROJECTIONS))}, got {settings.projection!r}")
     size = settings.image_height, settings.image_width
-    lens = settings.tanfovx, settings.tanfovy, settings.scale_modifier
+    tangents = (t.item() if isinstance(t, Tensor) else t for t in (settings.tanfovx, settings.tanfovy))
+    lens = *tangents, settings.scale_modifier
     if settings.lens is not None:
-        lens += settings.lens.numbers(*size[::-1])
+        shown = settings.lens if settings.lens_values is None else _with_values(settings.lens, settings.lens_values)
+        lens += shown.numbers(*size[::-1])
     place = settings.viewmatrix, settings.projmatrix, settings.campos
     camera = camera_arguments(*place, lens, *size, settings.sh_degree, settings.antialiasing, raw)
     scene = Scene(*gaussians, *camera)
     return scene._replace(options=(*scene.options, True)) if settings.projection == "ray" else scene
+
+
+def _with_values(lens: Lens, values: Tensor) -> Lens:
+    if not isinstance(values, Tensor) or values.shape != (LENS_VALUES,) or not values.is_floating_point():
+        raise ValueError(f"lens_values must be a tensor of {LENS_VALUES} floats, those of Lens.values")
+    return lens.with_values(values.tolist())
 
 
 def camera_arguments(

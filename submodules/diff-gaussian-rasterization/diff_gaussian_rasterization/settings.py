@@ -12,12 +12,15 @@ class GaussianRasterizationSettings(NamedTuple):
 
     Matrices are transposed: they act on row vectors. x points right, y down, z forward; pixel centres lie at integers.
     `projmatrix` is the full projection, view times projection, and contains the principal point.
+
+    viewmatrix, projmatrix, campos and lens_values receive gradients if they require them, and so do tangents given as
+    scalar tensors. Each is a partial derivative: a pose has to make all of matrices and centre (scene/poses.py).
     """
 
     image_height: int
     image_width: int
-    tanfovx: float  # tan of half the field of view
-    tanfovy: float
+    tanfovx: float | Tensor  # tan of half the field of view
+    tanfovy: float | Tensor
     bg: Tensor  # (3,)
     scale_modifier: float
     viewmatrix: Tensor  # (4, 4) world to view, transposed; a rigid motion, or any other invertible map
@@ -29,4 +32,5 @@ class GaussianRasterizationSettings(NamedTuple):
     antialiasing: bool | None = None  # None, as in the 12 fields of 2023: off, and GaussianRasterizer has two results
     inverse_depth: bool = True  # False: the third result is None and nothing is computed for it
     lens: Lens | None = None  # in place of a pinhole: then tanfovx, tanfovy and projmatrix are not read
+    lens_values: Tensor | None = None  # (15,) in place of those of the lens: Lens.values
     projection: str = "ewa"  # or "ray": a pixel sees a Gaussian along its own ray, not by EWA's affine map

@@ -6,7 +6,7 @@ GS_ISA_BEGIN
 template <class T>
 void project(const Executor& executor, const Scene<T>& s, const Projected<T>& out) {
   const int64_t block = s.awake ? kSleepBlock : kProjectBlock;
-  with_camera(s, [&](const auto& camera) {
+  with_any_camera(s, [&](const auto& camera) {
     for_dynamic(executor, s.count, block, [&](int64_t begin, int64_t end) {
       if (s.awake && !s.awake[begin / block])
         cull_all(end - begin, part_of(out, begin));

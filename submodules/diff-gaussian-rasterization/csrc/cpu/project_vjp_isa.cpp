@@ -77,7 +77,7 @@ bool step_block(const GaussianStep<T>& in, const AdamStep<T>* steps, int64_t fir
 template <class T>
 void project_vjp(const Executor& executor, const Scene<T>& s, const int32_t* tile_counts, const T* moments,
                  const SceneGradient<T>& out) {
-  with_camera(s, [&](const auto& camera) {
+  with_any_camera(s, [&](const auto& camera) {
     for_dynamic(executor, s.count, kVjpBlock, [&](int64_t begin, int64_t end) {
       vjp_rows(part_of(s, begin, end - begin), camera, tile_counts + begin, from_moments(s, moments, begin),
                part_of(out, begin, s.rest_bands));
@@ -99,7 +99,7 @@ void project_vjp_step(const Executor& executor, const Scene<T>& s, const int32_t
     }
   const bool may = may_step(guard);
   bool finite = may;
-  with_camera(s, [&](const auto& camera) {
+  with_any_camera(s, [&](const auto& camera) {
     for_dynamic(executor, s.count, kVjpBlock, [&](int64_t begin, int64_t end) {
       if (s.awake && !s.awake[begin / kVjpBlock]) return;
       const int64_t count = end - begin;

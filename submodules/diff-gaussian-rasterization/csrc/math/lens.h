@@ -123,9 +123,14 @@ struct Distorted {
   T value[2], first[2][2], second[2][3];
 };
 
+// R of q = a^2 + b^2 with two derivatives, and its divisor with one.
 template <class T>
-GS_HD Distorted<T> distort(const Lens<T>& lens, T a, T b) {
-  const T q = a * a + b * b;
+struct Radial {
+  T r, r1, r2, divisor, divisor1;
+};
+
+template <class T>
+GS_HD Radial<T> radial_of(const Lens<T>& lens, T q) {
   const T *k = lens.radial, *d = lens.divisor;
   const T n0 = 1 + q * (k[0] + q * (k[1] + q * (k[2] + q * k[3])));
   const T n1 = k[0] + q * (2 * k[1] + q * (3 * k[2] + q * 4 * k[3]));
@@ -133,6 +138,14 @@ GS_HD Distorted<T> distort(const Lens<T>& lens, T a, T b) {
   const T m0 = 1 + q * (d[0] + q * (d[1] + q * d[2])), m1 = d[0] + q * (2 * d[1] + q * 3 * d[2]);
   const T m2 = 2 * d[1] + q * 6 * d[2];
   const T r = n0 / m0, r1 = (n1 - r * m1) / m0, r2 = (n2 - 2 * r1 * m1 - r * m2) / m0;
+  return {r, r1, r2, m0, m1};
+}
+
+template <class T>
+GS_HD Distorted<T> distort(const Lens<T>& lens, T a, T b) {
+  const T q = a * a + b * b;
+  const Radial<T> radial = radial_of(lens, q);
+  const T r = radial.r, r1 = radial.r1, r2 = radial.r2;
   // One formula for both numbers: of u with v beside it, along which the tangential terms are t and o.
   const auto one = [&](T u, T v, T t, T o, T s, T& value, T& by_u, T& by_v, T& uu, T& uv, T& vv) {
     value = u * r + 2 * t * u * v + o * (q + 2 * u * u) + s * q;

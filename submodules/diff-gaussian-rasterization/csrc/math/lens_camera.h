@@ -116,13 +116,14 @@ GS_HD AlongAxes<V> along_view(const LensCamera<T>& cam, const Axes<V>& axes, con
   return along;
 }
 
-// dP's rows meet the lens's second derivatives. A clamped coordinate follows z alone.
+// The gradient of the point of the view. dP's rows meet the lens's second derivatives. A clamped coordinate follows z
+// alone. bent: the gradient of the point that is clamped.
 template <class T, class V>
-GS_HD Vec3<V> position_vjp(const LensCamera<T>& cam, Vec3<V> view, const LensView<V>& p, const AlongAxes<V>& along,
-                           Vec3<V>, V pixel_x, V pixel_y, V g_inverse_depth) {
+GS_HD Vec3<V> view_vjp(const LensCamera<T>& cam, Vec3<V> view, const LensView<V>& p, const AlongAxes<V>& along,
+                       V pixel_x, V pixel_y, V g_inverse_depth, V (&bent)[3]) {
   constexpr int kPair[3][3] = {{0, 1, 2}, {1, 3, 4}, {2, 4, 5}};
   const OnLens<V> there = on_lens_of<2>(cam.lens, p.clamped);
-  V g[3] = {}, bent[3] = {};
+  V g[3] = {};
   for (int i = 0; i < 2; ++i)
     for (int a = 0; a < 3; ++a) {
       g[a] += (i ? pixel_y : pixel_x) * p.on.first[i][a];
@@ -139,7 +140,15 @@ GS_HD Vec3<V> position_vjp(const LensCamera<T>& cam, Vec3<V> view, const LensVie
     const V each = square * p.inverse_depth;
     g[0] -= each * view.x, g[1] -= each * view.y, g[2] -= each * view.z;
   }
-  return g[0] * cam.row_x + g[1] * cam.row_y + g[2] * cam.row_z;
+  return {g[0], g[1], g[2]};
+}
+
+template <class T, class V>
+GS_HD Vec3<V> position_vjp(const LensCamera<T>& cam, Vec3<V> view, const LensView<V>& p, const AlongAxes<V>& along,
+                           Vec3<V>, V pixel_x, V pixel_y, V g_inverse_depth) {
+  V bent[3] = {};
+  const Vec3<V> g = view_vjp(cam, view, p, along, pixel_x, pixel_y, g_inverse_depth, bent);
+  return g.x * cam.row_x + g.y * cam.row_y + g.z * cam.row_z;
 }
 
 GS_ISA_END

@@ -156,17 +156,25 @@ GS_HD Along<V> along_view(const Camera<T>& cam, const Axes<V>& axes, const V (&r
   return along;
 }
 
-// The gradient of the mean through its place on the image and through J. diagonal: of ShapeGradient. A clamped ray is
-// constant: its coordinate gets no gradient through J, and z only through the factor 1/z.
+// The gradient of the point of the view, times its depth, through its place on the image and through J. diagonal: of
+// ShapeGradient. A clamped ray is constant: its coordinate gets no gradient through J, and z only through the factor
+// 1/z.
 template <class T, class V>
-GS_HD Vec3<V> position_vjp(const Camera<T>& cam, Vec3<V>, const Perspective<V>& p, const Along<V>& along,
-                           Vec3<V> diagonal, V pixel_x, V pixel_y, V g_inverse_depth) {
+GS_HD Vec3<V> view_vjp(const Camera<T>& cam, const Perspective<V>& p, const Along<V>& along, Vec3<V> diagonal,
+                       V pixel_x, V pixel_y, V g_inverse_depth) {
   V g_ray_x = cam.mean_focal_x * pixel_x, g_ray_y = cam.mean_focal_y * pixel_y;
   g_ray_x = p.clamped_x == p.ray_x ? g_ray_x - cam.focal_x * p.inverse_depth * along.one : g_ray_x;
   g_ray_y = p.clamped_y == p.ray_y ? g_ray_y - cam.focal_y * p.inverse_depth * along.two : g_ray_y;
   const V g_z = -(diagonal.x + diagonal.y + diagonal.z + p.ray_x * g_ray_x + p.ray_y * g_ray_y +
                   p.inverse_depth * g_inverse_depth);
-  return p.inverse_depth * (g_ray_x * cam.row_x + g_ray_y * cam.row_y + g_z * cam.row_z);
+  return {g_ray_x, g_ray_y, g_z};
+}
+
+template <class T, class V>
+GS_HD Vec3<V> position_vjp(const Camera<T>& cam, Vec3<V>, const Perspective<V>& p, const Along<V>& along,
+                           Vec3<V> diagonal, V pixel_x, V pixel_y, V g_inverse_depth) {
+  const Vec3<V> g = view_vjp(cam, p, along, diagonal, pixel_x, pixel_y, g_inverse_depth);
+  return p.inverse_depth * (g.x * cam.row_x + g.y * cam.row_y + g.z * cam.row_z);
 }
 
 // Fills the gradients that come from a footprint's, and the mean's. perpendicular: whether the axes are. p:

@@ -30,14 +30,20 @@ GS_HD void set_camera(const Scene<T>& s, LensCamera<T>& camera) {
                   std::abs(lens.center_x + 0.5 + half - width) < least;
 }
 
-// Calls run(camera) with a Camera, a RayCamera, or a LensCamera where the scene has a lens.
+// Calls run(camera) with a Camera, or a LensCamera where the scene has a lens.
 template <class T, class Run>
 void with_camera(const Scene<T>& s, const Run& run) {
-  if (s.rays) return run(RayCamera<T>{camera_of(s)});
   if (s.lens.chart == Chart::kPinhole) return run(camera_of(s));
   LensCamera<T> camera;
   set_camera(s, camera);
   run(camera);
+}
+
+// The same, or with a RayCamera.
+template <class T, class Run>
+void with_any_camera(const Scene<T>& s, const Run& run) {
+  if (s.rays) return run(RayCamera<T>{camera_of(s)});
+  with_camera(s, run);
 }
 
 // A Gaussian's parameters as they are stored. They are read where they are used: a GPU would keep them in registers

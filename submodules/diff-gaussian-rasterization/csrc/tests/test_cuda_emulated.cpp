@@ -8,6 +8,7 @@
 #include "front_first.cuh"
 #include "gs/check_shared.h"
 #include "long_lists.h"
+#include "math/camera_gradient.h"
 #include "math/step_now.h"
 #include "rows_run.h"
 #include "step_run.h"
@@ -684,6 +685,47 @@ void test_given_covariances_and_colors() {
   check_near(got, wanted, 2e-5);
 }
 
+// The gradients of a camera's numbers, on an Executor or a Queue.
+std::vector<double> camera_gradient(const gs::Executor& executor, const gs::Scene<float>& scene) {
+  std::vector<double> out(kLensCameraNumbers, NAN);
+  const auto r = render(executor, scene);
+  gs::GS_ISA::blend_vjp(executor, r->input, r->backward);
+  gs::GS_ISA::camera_vjp(executor, scene, r->tile_counts.data(), r->moments.data(), out.data());
+  return out;
+}
+std::vector<double> camera_gradient(const gs::Queue& queue, const gs::Scene<float>& scene) {
+  std::vector<double> out(kLensCameraNumbers, NAN);
+  const auto r = render(queue, scene);
+  const KeptRows rows = keep_rows(queue, r->input, r->backward, false);
+  gs::cuda::camera_vjp(queue, scene, rows.given(*r), out.data());
+  return out;
+}
+
+// Of a pinhole and of lenses, of Gaussians that fill no block, one, or several, and of none.
+void test_cameras() {
+  for (const gs::Chart chart : {gs::Chart::kPinhole, gs::Chart::kPerspective, gs::Chart::kEquidistant})
+    for (const int64_t count : {0, 50, 300}) {
+      const bool pinhole = chart == gs::Chart::kPinhole;
+      Parameters<float> p(count);
+      if (!pinhole)
+        p.lens = {chart, 4, 1, 60, 61, 34, 17, {-0.05f, 0.01f, 0.001f, 0.0001f}, {0.02f, 0, 0}, {0.003f, 0.002f}, {}};
+      const gs::Scene<float> scene = scene_of(p, gs::Image{70, 33}, count == 50);
+      const std::vector<double> wanted = camera_gradient(gs::serial_executor(), scene);
+      std::vector<double> first;
+      for (const gs::emulation::Order order : gs::emulation::kOrders) {
+        gs::emulation::order = order;
+        gs::emulation::Memory memory;
+        const std::vector<double> got = camera_gradient(memory.queue(), scene);
+        const size_t numbers = pinhole ? kPinholeNumbers : kLensCameraNumbers;
+        if (first.empty()) first = got;
+        CHECK(std::equal(got.begin(), got.begin() + numbers, first.begin()));
+        // Some 1e-5 of the largest Gaussian's part, of which others of the other sign leave a hundredth.
+        for (size_t k = 0; k < numbers; ++k) CHECK_NEAR(got[k], wanted[k], 1e-3 * std::abs(wanted[k]));
+        CHECK(std::isnan(got.back()) == pinhole);
+      }
+    }
+}
+
 struct Lengths {
   const int64_t* lengths;
   int64_t operator()(int tile) const { return lengths[tile]; }
@@ -743,5 +785,6 @@ int main() {
                          test_displacements,
                          test_runs,
                          test_runs_that_do_not_fit,
-                         test_given_covariances_and_colors});
+                         test_given_covariances_and_colors,
+                         test_cameras});
 }

@@ -161,6 +161,10 @@ void GradientSource::step(const gs::Queue& queue, const gs::Scene<float>& scene,
   else
     gs::cuda::rows_vjp_step(queue, scene, input<float>(), sums<float>(nullptr, lengths), step);
 }
+
+void GradientSource::camera(const gs::Queue& queue, const gs::Scene<float>& scene, double* out) const {
+  gs::cuda::camera_vjp(queue, scene, input<float>(), out);
+}
 #endif
 
 Tensor absolute_like(const SceneTensors& scene, bool wanted) {

@@ -104,6 +104,7 @@ class GradientSource {
 #ifdef GS_CUDA
   void vjp(const gs::Queue&, const gs::Scene<float>&, const Tensor& lengths, const gs::cuda::GradientMemory&) const;
   void step(const gs::Queue&, const gs::Scene<float>&, const Tensor& lengths, const gs::GaussianStep<float>&) const;
+  void camera(const gs::Queue&, const gs::Scene<float>&, double* out) const;  // of gradient rows
 #endif
 
  private:

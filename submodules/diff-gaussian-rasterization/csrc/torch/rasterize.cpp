@@ -162,9 +162,9 @@ Tensors5 blend_op(const Tensor& splats, const Tensor& instances, const Tensor& r
 using Rasterized =
     std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
-// absolute: what the backward that autograd runs gets; the forward does not depend on it.
+// absolute, camera: what the backward that autograd runs gets; the forward does not depend on them.
 Rasterized rasterize_op(const Tensor& means2d, SCENE_PARAMETERS, const Tensor& background, bool inverse_depth,
-                        bool train, bool /*absolute*/, const MaybeTensor& awake) {
+                        bool train, bool /*absolute*/, const MaybeTensor& awake, const MaybeTensor& /*camera*/) {
   SceneTensors scene(SCENE_ARGUMENTS);
   scene.set_awake(given(awake));
   scene.checked(kMeans2d, &means2d);  // it only receives a gradient
@@ -207,7 +207,8 @@ GS_OPERATORS(diff_gaussian_rasterization, m) {
       TORCH_BOX(&blend_op));
   m.define(
       "rasterize(Tensor means2d, " SCENE_SCHEMA
-      ", Tensor background, bool inverse_depth, bool train, bool absolute=False, Tensor? awake=None) -> (Tensor color, "
+      ", Tensor background, bool inverse_depth, bool train, bool absolute=False, Tensor? awake=None, Tensor? "
+      "camera=None) -> (Tensor color, "
       "Tensor transmittance, Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, "
       "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last, Tensor layers)",
       TORCH_BOX(&rasterize_op));

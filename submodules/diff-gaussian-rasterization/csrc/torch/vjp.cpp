@@ -1,5 +1,6 @@
 // The ops of the backward: to the gradients of the Gaussians, or no further than gradient rows.
 #include "backward.h"
+#include "math/camera_gradient.h"
 
 namespace gs::ops {
 
@@ -37,6 +38,32 @@ std::tuple<Tensor, Tensor> blend_rows_op(SOURCE_PARAMETERS, bool absolute) {
   return {rows, counts};
 }
 
+// The gradients of the camera's numbers (math/camera_gradient.h), from splats, tile_counts, and the rows and counts of
+// blend_rows.
+Tensor camera_vjp_op(SCENE_PARAMETERS, List<Tensor> source, bool absolute) {
+  const SceneTensors scene(SCENE_ARGUMENTS);
+  GS_CHECK(!scene.rays(), "projection='ray' has no gradients of cameras: take 'ewa'");
+  GS_CHECK_VALUE(source.size() == 4, "camera_vjp takes splats, tile_counts, rows and counts, got ", source.size(),
+                 " tensors");
+  const GradientSource from(scene, source, {}, {}, {}, absolute, false);
+  Tensor out =
+      empty<double>({scene.has_lens() ? baseline::kLensCameraNumbers : baseline::kPinholeNumbers}, scene.means());
+#ifdef GS_CUDA
+  if (scene.device().is_cuda()) {
+    gs::TorchQueue queue(scene.device());
+    from.camera(queue.queue(), scene.scene<float>(), write<double>(out));
+    return out;
+  }
+#endif
+  const Tensor moments = from.moments({});
+  with_scalar(scene.dtype(), [&](auto zero) {
+    using T = decltype(zero);
+    GS_DISPATCH(camera_vjp, gs::torch_executor(), scene.scene<T>(), read<int32_t>(from.tile_counts()), read<T>(moments),
+                write<double>(out));
+  });
+  return out;
+}
+
 }  // namespace
 
 GS_OPERATORS(diff_gaussian_rasterization, m) {
@@ -45,6 +72,7 @@ GS_OPERATORS(diff_gaussian_rasterization, m) {
            TORCH_BOX(&rasterize_vjp_op));
   m.define("blend_rows(" SOURCE_SCHEMA ", bool absolute=False) -> (Tensor rows, Tensor counts)",
            TORCH_BOX(&blend_rows_op));
+  m.define("camera_vjp(" SCENE_SCHEMA ", Tensor[] source, bool absolute=False) -> Tensor", TORCH_BOX(&camera_vjp_op));
 }
 
 }  // namespace gs::ops

@@ -1,0 +1,46 @@
+"""Tracks of structure from motion: which points of a COLMAP scene each photo has seen, and where."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from scene.images.lens import Lens, rays_of
+from scene.readers.colmap import find_model, read_model_of_kind
+from scene.readers.info import CameraInfo
+from scene.readers.scene_folder import COLMAP, kind_of
+
+FEWEST = 12  # points of a track; fewer say too little of a pose
+
+
+class Track(NamedTuple):
+    """What a photo has seen: points (K, 3) float64 of the training's frame, and their rays (K, 2), x / z and y / z."""
+
+    points: np.ndarray
+    rays: np.ndarray
+
+
+def read_tracks(scene: str | os.PathLike, views: Sequence[CameraInfo], offset: np.ndarray) -> list[Track | None]:
+    """The tracks of views; None for a view of fewer than FEWEST points, and in scenes that are not COLMAP's.
+
+    offset (3,): of the training's frame (scene/readers/world_offset.py). UserError where the model cannot be read.
+    """
+    if kind_of(scene) != COLMAP:
+        return [None] * len(views)
+    folder, _ = find_model(Path(scene))
+    suffix = "bin" if (folder / "points3D.bin").is_file() else "txt"
+    cameras, images, points = read_model_of_kind(folder, suffix, with_2d_points=True)
+    photos, found = {image.name: image for image in images}, []
+    for view in views:
+        photo = photos.get(view.image_name)
+        if photo is None or not len(points.ids):
+            found.append(None)
+            continue
+        place = np.minimum(np.searchsorted(points.ids, photo.point3D_ids), len(points.ids) - 1)
+        camera = cameras[photo.camera_id]
+        rays = rays_of(Lens(camera.model, tuple(map(float, camera.params)), camera.width, camera.height), photo.xys)
+        seen = (points.ids[place] == photo.point3D_ids) & np.isfinite(rays).all(1)
+        found.append(Track(points.xyz[place[seen]] - offset, rays[seen]) if seen.sum() >= FEWEST else None)
+    return found

@@ -1,0 +1,83 @@
+// The gradient of the camera. A thread takes a Gaussian, a block sums what its threads have, and one more block for
+// each number sums what the blocks have, in an order that depends on the number of Gaussians alone.
+#include <cuda_runtime.h>
+
+#include "../backend.h"
+#include "../math/camera_gradient.h"
+#include "gradient_rows.cuh"
+
+namespace gs {
+namespace cuda {
+
+using namespace baseline;
+
+namespace {
+
+constexpr int kThreads = 128;
+constexpr int kWarps = kThreads / 32;
+
+// Sums a value over the threads of a block, for thread 0. All threads call this; `stage` has a double for each warp.
+__device__ double block_sum(double value, double* stage) {
+  for (int step = 16; step; step /= 2) value += __shfl_xor_sync(kWarp, value, step);
+  __syncthreads();  // the values before have been read
+  if (threadIdx.x % 32 == 0) stage[threadIdx.x / 32] = value;
+  __syncthreads();
+  double sum = 0;
+  for (int warp = 0; warp < kWarps; ++warp) sum += stage[warp];
+  return sum;
+}
+
+// sums (blocks, numbers).
+template <class AnyCamera>
+__global__ void __launch_bounds__(kThreads)
+    camera_vjp_kernel(const int32_t* halted, Scene<float> s, SlotSums source, double* sums) {
+  if (!begin_work(halted)) return;
+  constexpr int kNumbers = kNumbersOf<AnyCamera>;
+  __shared__ AnyCamera camera;
+  __shared__ __align__(8) float stage[kWarps * SlotSums::kStage];
+  __shared__ double of_warps[kWarps];
+  if (threadIdx.x == 0) set_camera(s, camera);
+  __syncthreads();
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const bool seen = i < s.count && source.seen(i);
+  float m[kGradientValues], g[kNumbers] = {};
+  source.read(i, seen, m, stage + threadIdx.x / 32 * SlotSums::kStage);
+  if (seen) camera_vjp_row(s, camera, SceneRow<float>{s, i}, m, g);
+#pragma unroll
+  for (int k = 0; k < kNumbers; ++k) {
+    const double sum = block_sum(g[k], of_warps);
+    if (threadIdx.x == 0) sums[int64_t(kNumbers) * blockIdx.x + k] = sum;
+  }
+}
+
+__global__ void __launch_bounds__(kThreads)
+    sum_blocks_kernel(const int32_t* halted, int64_t blocks, const double* sums, double* out) {
+  if (!begin_work(halted)) return;
+  __shared__ double of_warps[kWarps];
+  double sum = 0;
+  for (int64_t block = threadIdx.x; block < blocks; block += kThreads) sum += sums[gridDim.x * block + blockIdx.x];
+  sum = block_sum(sum, of_warps);
+  if (threadIdx.x == 0) out[blockIdx.x] = sum;
+}
+
+template <class AnyCamera>
+void sum_rows(const Queue& queue, const Scene<float>& s, const SlotSums& source, double* out) {
+  constexpr int kNumbers = kNumbersOf<AnyCamera>;
+  const unsigned blocks = blocks_for(s.count, kThreads);
+  double* sums = queue.array<double>(size_t(kNumbers) * blocks);
+  if (blocks) launch(queue, "camera_vjp", camera_vjp_kernel<AnyCamera>, blocks, kThreads, s, source, sums);
+  launch(queue, "sum_blocks", sum_blocks_kernel, kNumbers, kThreads, blocks, sums, out);
+}
+
+}  // namespace
+
+void camera_vjp(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, double* out) {
+  const SlotSums source = sums_of(queue, in, {});
+  if (s.lens.chart == Chart::kPinhole)
+    sum_rows<Camera<float>>(queue, s, source, out);
+  else
+    sum_rows<LensCamera<float>>(queue, s, source, out);
+}
+
+}  // namespace cuda
+}  // namespace gs

@@ -1,0 +1,142 @@
+#pragma once
+// What one Gaussian adds to the gradient of each number of a camera.
+#include "scene_row.h"
+
+GS_ISA_BEGIN
+
+// The numbers of a camera and where their gradients lie: those of any camera, then a pinhole's own or a lens's.
+// diff_gaussian_rasterization/camera.py makes them of the settings.
+constexpr int kRowX = 0, kRowY = 3, kRowZ = 6, kTranslation = 9, kCenter = 12;
+constexpr int kRays = 15;  // ray_min_x, ray_max_x, ray_min_y, ray_max_y
+constexpr int kFocal = 19, kAxis = 21;
+constexpr int kMeanFocal = 23, kPinholeNumbers = 25;
+constexpr int kRadial = 23, kDivisor = 27, kTangential = 30, kPrism = 32, kLensCameraNumbers = 34;
+
+template <class T>
+GS_HD constexpr int numbers_of(const Camera<T>*) {
+  return kPinholeNumbers;
+}
+template <class T>
+GS_HD constexpr int numbers_of(const LensCamera<T>*) {
+  return kLensCameraNumbers;
+}
+template <class AnyCamera>
+constexpr int kNumbersOf = numbers_of(static_cast<const AnyCamera*>(nullptr));
+
+// The gradients of a splat that reach its camera. p1, p2: of the rows of J W, in the world.
+template <class T>
+struct Arriving {
+  Footprint<T> footprint;
+  ShapeGradient<T> shape;
+  Vec3<T> p1, p2;
+  T pixel[2], inverse_depth;
+};
+
+// Of what J adds to the gradients, those of the limits of a clamped coordinate: all of it, for the limit that holds.
+template <class T>
+GS_HD void limits_vjp(T apart, T g, T* limits) {
+  limits[0] = apart > 0 ? g : 0, limits[1] = apart < 0 ? g : 0;
+}
+
+// A camera's own numbers and its rows in J W; returns the gradient of the point of the view.
+template <class T>
+GS_HD Vec3<T> numbers_vjp(const Camera<T>& cam, Vec3<T>, const Perspective<T>& p, const Along<T>& along,
+                          const Arriving<T>& in, T* g) {
+  const T fx = cam.focal_x * p.inverse_depth, fy = cam.focal_y * p.inverse_depth;
+  store3(g + kRowX, fx * in.p1), store3(g + kRowY, fy * in.p2);
+  store3(g + kRowZ, (-fx * p.clamped_x) * in.p1 - (fy * p.clamped_y) * in.p2);
+  limits_vjp(p.clamped_x - p.ray_x, -fx * along.one, g + kRays);
+  limits_vjp(p.clamped_y - p.ray_y, -fy * along.two, g + kRays + 2);
+  g[kFocal] = dot(in.shape.m1, in.footprint.m1) / cam.focal_x;
+  g[kFocal + 1] = dot(in.shape.m2, in.footprint.m2) / cam.focal_y;
+  g[kAxis] = in.pixel[0], g[kAxis + 1] = in.pixel[1];
+  g[kMeanFocal] = in.pixel[0] * p.ray_x, g[kMeanFocal + 1] = in.pixel[1] * p.ray_y;
+  return p.inverse_depth * view_vjp(cam, p, along, in.shape.diagonal, in.pixel[0], in.pixel[1], in.inverse_depth);
+}
+
+// A lens's numbers: through the pixel of `view`, and through the lens's Jacobian at `clamped`. With by[i] the gradient
+// of distorted number i's derivatives by a and b, a factor h(q) of both numbers, whose coefficient is wanted, gets
+// sum_i pixel_i x_i h + by[i][i] h + 2 h' x_i (by[i][0] a + by[i][1] b); pixels and `by` times the focal lengths.
+template <class T>
+GS_HD void lens_vjp(const Lens<T>& lens, Vec3<T> view, Vec3<T> clamped, const AlongAxes<T>& along, const T (&pixel)[2],
+                    T* g) {
+  const OnLens<T> at = on_chart(lens.chart, view), near = on_chart(lens.chart, clamped);
+  const T a = at.value[0], b = at.value[1], u = near.value[0], v = near.value[1];
+  const Distorted<T> d = distort(lens, a, b), e = distort(lens, u, v);
+  T by[2][2] = {}, px[2];
+  for (int i = 0; i < 2; ++i) {
+    for (int j = 0; j < 2; ++j)
+      for (int k = 0; k < 3; ++k) by[i][j] += along.of[i][k] * near.first[j][k];
+    g[kFocal + i] = pixel[i] * d.value[i] + by[i][0] * e.first[i][0] + by[i][1] * e.first[i][1];
+    g[kAxis + i] = pixel[i];
+    const T focal = i ? lens.focal_y : lens.focal_x;
+    px[i] = focal * pixel[i], by[i][0] *= focal, by[i][1] *= focal;
+  }
+  const T q = a * a + b * b, s = u * u + v * v;
+  const T in_pixel = px[0] * a + px[1] * b, in_first = by[0][0] + by[1][1];
+  const T in_slope = 2 * (u * (by[0][0] * u + by[0][1] * v) + v * (by[1][0] * u + by[1][1] * v));
+  const Radial<T> far = radial_of(lens, q), close = radial_of(lens, s);
+  // The factor q^j / divisor; for a coefficient of the divisor, times -R.
+  T power = 1, power_close = 1;
+  for (int j = 1; j <= 4; ++j) {
+    const T before = power_close;
+    power *= q, power_close *= s;
+    const T h = power / far.divisor, h_close = power_close / close.divisor;
+    const T slope = (j * before - h_close * close.divisor1) / close.divisor;
+    g[kRadial + j - 1] = in_pixel * h + in_first * h_close + in_slope * slope;
+    if (j < 4)
+      g[kDivisor + j - 1] =
+          -(in_pixel * far.r * h + in_first * close.r * h_close + in_slope * (close.r * slope + close.r1 * h_close));
+  }
+  g[kTangential] =
+      px[0] * 2 * a * b + px[1] * (q + 2 * b * b) + 2 * (by[0][0] * v + by[0][1] * u + by[1][0] * u + 3 * by[1][1] * v);
+  g[kTangential + 1] =
+      px[0] * (q + 2 * a * a) + px[1] * 2 * a * b + 2 * (3 * by[0][0] * u + by[0][1] * v + by[1][0] * v + by[1][1] * u);
+  g[kPrism] = px[0] * q + 2 * (by[0][0] * u + by[0][1] * v);
+  g[kPrism + 1] = px[1] * q + 2 * (by[1][0] * u + by[1][1] * v);
+}
+
+template <class T>
+GS_HD Vec3<T> numbers_vjp(const LensCamera<T>& cam, Vec3<T> view, const LensView<T>& p, const AlongAxes<T>& along,
+                          const Arriving<T>& in, T* g) {
+  T bent[3] = {};
+  const Vec3<T> g_view = view_vjp(cam, view, p, along, in.pixel[0], in.pixel[1], in.inverse_depth, bent);
+  const OnLens<T> there = on_lens<1>(cam.lens, p.clamped);
+  for (int k = 0; k < 3; ++k) store3(g + kRowX + 3 * k, there.first[0][k] * in.p1 + there.first[1][k] * in.p2);
+  limits_vjp(p.clamped.x - view.x, bent[0] * view.z, g + kRays);
+  limits_vjp(p.clamped.y - view.y, bent[1] * view.z, g + kRays + 2);
+  lens_vjp(cam.lens, view, p.clamped, along, in.pixel, g);
+  return g_view;
+}
+
+// m: moments, as for project_vjp_row. g (kNumbersOf<AnyCamera>): what the Gaussian adds.
+template <class T, class AnyCamera>
+GS_HD void camera_vjp_row(const Scene<T>& s, const AnyCamera& camera, const SceneRow<T>& row, const T* m, T* g) {
+  const Gaussian<T> gaussian = load(s, row).gaussian;
+  const Vec3<T> mean = gaussian.mean, view = to_view(camera, mean);
+  const auto p = perspective(camera, view);
+  const Moments<T> moments{m[0], m[1], m[2], m[3], m[4], m[5]};
+  Arriving<T> in;
+  in.footprint = splat_footprint(camera, p, gaussian.axes);
+  in.inverse_depth = m[9];
+  mean_vjp(in.footprint, moments, in.pixel[0], in.pixel[1]);
+  in.shape = footprint_vjp(in.footprint, moments, s.antialiasing);
+  const Vec3<T> m1 = in.shape.m1, m2 = in.shape.m2;
+  const auto& [d, c] = gaussian.axes;
+  in.p1 = (c[0] * m1.x) * d[0] + (c[1] * m1.y) * d[1] + (c[2] * m1.z) * d[2];
+  in.p2 = (c[0] * m2.x) * d[0] + (c[1] * m2.y) * d[1] + (c[2] * m2.z) * d[2];
+  const T row1[3] = {m1.x, m1.y, m1.z}, row2[3] = {m2.x, m2.y, m2.z};
+  const Vec3<T> g_view = numbers_vjp(camera, view, p, along_view(camera, gaussian.axes, row1, row2), in, g);
+  store3(g + kRowX, load3(g + kRowX) + g_view.x * mean);
+  store3(g + kRowY, load3(g + kRowY) + g_view.y * mean);
+  store3(g + kRowZ, load3(g + kRowZ) + g_view.z * mean);
+  store3(g + kTranslation, g_view);
+  Vec3<T> toward = {};
+  if (!s.colors) {
+    T* const none = nullptr;
+    toward = color_vjp(s, camera, row, Vec3<T>{m[6], m[7], m[8]}, s.sh_rest + s.rest_stride * row.i, none, none);
+  }
+  store3(g + kCenter, T(-1) * toward);
+}
+
+GS_ISA_END

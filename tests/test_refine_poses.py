@@ -1,0 +1,250 @@
+"""Poses that are refined: by tracks, without drift of the whole, and through trainings, files and checkpoints."""
+
+import json
+from argparse import Namespace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from synthetic import BROWN, make_blender_scene, make_colmap_scene
+from trainings import differences, trained
+
+from scene.gaussian_model import GaussianModel
+from scene.images.lens import Lens, rays_of
+from scene.pose_file import NAME, with_poses
+from scene.readers.colmap import read_colmap
+from scene.readers.tracks import Track, read_tracks
+from scene.reprojection import moved_pose, nearest_pose, pull
+from scene.scene import Scene
+from splatting.training import checks, pose_refinement
+from splatting.training.pose_refinement import BOUND, PoseRefinement
+from utils.graphics_utils import world_to_camera
+from utils.system_utils import UserError
+
+POSE = moved_pose(np.eye(4), np.array([0.3, -0.2, 0.5, 0.1, 0.2, 4.0]), 1.0)
+TURN = np.array([0.01, -0.02, 0.015, 0.01, -0.015, 0.02])
+
+
+def _track(count: int = 60, noise: float = 0.0) -> Track:
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(count, 3))
+    view = points @ POSE[:3, :3].T + POSE[:3, 3]
+    return Track(points, view[:, :2] / view[:, 2:] + noise * rng.normal(size=(count, 2)))
+
+
+def test_the_gradient_and_the_matrix_of_a_pull():
+    track, step = _track(noise=0.01), 1e-5  # errors of about a pixel, on both sides of the outliers' limit
+    pose = moved_pose(POSE, 0.1 * TURN, 2.0)
+    at = pull(pose, track, 90.0, 2.0)
+    ends = [[pull(moved_pose(pose, side * step * one, 2.0), track, 90.0, 2.0) for side in (1, -1)] for one in np.eye(6)]
+    np.testing.assert_allclose(at.gradient, [(a.loss - b.loss) / (2 * step) for a, b in ends], rtol=1e-6, atol=1e-6)
+    inliers = pull(pose, track, 0.9, 2.0)  # all errors are small
+    exact = pull(POSE, _track(), 0.9, 2.0)
+    assert exact.loss < 1e-25 and np.abs(exact.gradient).max() < 1e-12
+    assert np.linalg.eigvalsh(inliers.curvature).min() > 0
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_tracks_find_a_pose_again(noise):
+    track = _track(200, noise)
+    track.rays[::20] += 0.3  # a twentieth are wrong
+    found = nearest_pose(moved_pose(POSE, TURN, 1.0), track, 500.0, 1.0, BOUND)
+    assert np.abs(found - POSE).max() < 5e-3 + noise  # outliers pull with a bounded force
+    assert np.abs(moved_pose(POSE, TURN, 1.0) - POSE).max() > 0.03
+
+
+def test_tracks_without_a_say_leave_a_pose():
+    away = moved_pose(POSE, TURN, 1.0)
+    assert nearest_pose(away, None, 500.0, 1.0, BOUND) is away
+    assert nearest_pose(away, _track(), 500.0, 1.0, 0.01) is away  # farther than the bound
+
+
+@pytest.mark.parametrize("params", [BROWN[:4], BROWN], ids=["pinhole", "distorted"])
+def test_tracks_are_read(params, tmp_path):
+    """pycolmap's points have exact projections."""
+    make_colmap_scene(tmp_path, model="PINHOLE" if len(params) == 4 else "OPENCV", params=params)
+    info = read_colmap(tmp_path, "images", True)
+    views, offset = info.train_cameras + info.test_cameras, np.array([1.0, 2.0, 3.0])
+    tracks = read_tracks(tmp_path, views, offset)
+    assert min(len(track.points) for track in tracks) > 100
+    for view, track in zip(views, tracks, strict=True):
+        seen = (track.points + offset) @ view.R + view.T
+        np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], track.rays, atol=1e-6)
+
+
+def test_rays_of_pinholes_are_those_of_pycolmap():
+    pycolmap = pytest.importorskip("pycolmap")
+    lens, pixels = Lens("PINHOLE", (100.0, 90.0, 40.0, 30.0), 80, 60), np.array([[1.5, 2.5], [60.0, 10.0]])
+    camera = pycolmap.Camera(model=lens.model, width=80, height=60, params=list(lens.params))
+    np.testing.assert_allclose(rays_of(lens, pixels), camera.cam_from_img(pixels), rtol=1e-14)
+
+
+def test_scenes_of_other_kinds_have_no_tracks(tmp_path):
+    make_blender_scene(tmp_path)
+    assert read_tracks(tmp_path, [None, None], np.zeros(3)) == [None, None]
+
+
+def _disturb(folder: Path) -> None:
+    """Turn and move all cameras of a COLMAP scene by TURN in random directions."""
+    import pycolmap
+
+    sparse = str(folder / "sparse/0")
+    model, rng = pycolmap.Reconstruction(sparse), np.random.default_rng(2)
+    for frame in model.frames.values():
+        old = np.eye(4)
+        old[:3] = frame.rig_from_world.matrix()
+        frame.rig_from_world = pycolmap.Rigid3d(moved_pose(old, rng.permuted(TURN), 1.0)[:3])
+    model.write_binary(sparse)
+
+
+def _options(scene: Path, out: Path, **more) -> Namespace:
+    values = {"source_path": str(scene), "model_path": str(out), "images": "images", "resolution": -1, "eval": True}
+    values |= {"white_background": False, "train_test_exp": False, "data_device": "cpu", "refine_poses": True}
+    return Namespace(**values | more)
+
+
+def _refinement(folder: Path) -> tuple[Scene, PoseRefinement]:
+    scene = Scene(_options(folder, folder / "out"), GaussianModel(1), start=False)
+    return scene, PoseRefinement(scene, str(folder), 100)
+
+
+def _poses(scene: Scene) -> np.ndarray:
+    cameras = scene.getTrainCameras() + scene.getTestCameras()
+    return np.array([world_to_camera(c.R, c.T) for c in sorted(cameras, key=lambda camera: camera.image_name)])
+
+
+def test_all_views_begin_where_tracks_place_them(tmp_path):
+    make_colmap_scene(tmp_path)
+    wanted = _poses(Scene(_options(tmp_path, tmp_path / "out"), GaussianModel(1), start=False))
+    _disturb(tmp_path)
+    disturbed = Scene(_options(tmp_path, tmp_path / "out"), GaussianModel(1), start=False)
+    assert np.abs(_poses(disturbed) - wanted).max() > 0.02
+    scene, _ = _refinement(tmp_path)
+    np.testing.assert_allclose(_poses(scene), wanted, atol=1e-6)
+    for camera in scene.getTrainCameras():
+        view = camera.world_view_transform.double().numpy().T
+        np.testing.assert_allclose(view, world_to_camera(camera.R, camera.T), atol=1e-6)
+
+
+def test_what_all_cameras_could_do_together_is_taken_out(tmp_path, monkeypatch):
+    make_colmap_scene(tmp_path)
+    scene, poses = _refinement(tmp_path)
+    cameras, before = scene.getTrainCameras(), _poses(scene)
+    monkeypatch.setattr(pose_refinement, "_ANCHOR", 0.0)
+    rng = np.random.default_rng(3)
+    own = rng.normal(size=poses.twists.shape) * 1e-3
+    basis, inverse = poses._drift
+    own -= (basis.T @ inverse @ basis @ own.reshape(-1)).reshape(own.shape)
+    for _ in range(2):
+        poses.twists[:] = own + (1e-3 * rng.normal(size=7) @ basis).reshape(own.shape)
+        for camera in cameras:  # a pass over all views, without a gradient
+            poses.take_gradient(camera.uid, torch.zeros(6))
+            poses.step(1)
+        np.testing.assert_allclose(poses.twists, own, atol=1e-12)
+    # The basis is that of motions and of growth: a common one of the world is nothing but drift.
+    common = np.array([0.002, -0.001, 0.003, 0.1, 0.2, -0.1])
+    turned = np.array([pose @ moved_pose(np.eye(4), 0.01 * common, 1.0) for pose in poses._starts])
+    change = np.array([turn @ np.linalg.inv(pose) for turn, pose in zip(turned, poses._starts, strict=True)])
+    twists = np.stack([change[:, 2, 1], change[:, 0, 2], change[:, 1, 0], *(change[:, k, 3] for k in range(3))], 1)
+    twists[:, 3:] /= scene.cameras_extent
+    left = twists.reshape(-1) - basis.T @ inverse @ basis @ twists.reshape(-1)
+    assert np.abs(left).max() < 1e-4 * np.abs(twists).max()
+    assert np.abs(_poses(scene) - before).max() > 1e-4
+
+
+def test_steps_are_bounded_and_follow_the_gradient(tmp_path, monkeypatch):
+    make_colmap_scene(tmp_path)
+    _, poses = _refinement(tmp_path)
+    monkeypatch.setattr(pose_refinement, "_ANCHOR", 0.0)
+    poses.take_gradient(2, torch.tensor([1.0, -1, 1, -1, 1, -1]))
+    poses.step(0)
+    assert np.array_equal(np.sign(poses.twists[2]), [-1, 1, -1, 1, -1, 1]) and not poses.twists[[0, 1, 3]].any()
+    poses.twists[2, :3] = 3.0
+    poses.take_gradient(2, torch.ones(6))
+    poses.step(0)
+    assert np.linalg.norm(poses.twists[2, :3]) == pytest.approx(BOUND)
+    before = poses.twists.copy()
+    poses.take_gradient(2, torch.full((6,), torch.nan))
+    poses.step(0)
+    poses._tracks[1] = None
+    poses.take_gradient(1, torch.ones(6))
+    poses.step(0)
+    assert np.array_equal(poses.twists, before)
+
+
+def test_tracks_hold_a_camera(tmp_path):
+    """Against a gradient of the image, a camera comes to rest where the tracks pull as strongly."""
+    make_colmap_scene(tmp_path)
+    _, poses = _refinement(tmp_path)
+    poses._drift = np.zeros((7, poses.twists.size)), np.zeros((7, 7))
+    for step in range(400):
+        poses.take_gradient(0, torch.tensor([0.02, 0, 0, 0, 0, 0]))
+        poses.step(step // 4)
+    track, camera = poses._tracks[0], poses._cameras[0]
+    at = pull(poses._starts[0], track, camera.fx, poses._unit)
+    rest = np.linalg.solve(1e-3 * at.curvature, [-0.02, 0, 0, 0, 0, 0])
+    np.testing.assert_allclose(poses.twists[0], rest, atol=0.1 * np.abs(rest).max())
+
+
+def test_a_scene_without_tracks_is_refused(tmp_path):
+    make_blender_scene(tmp_path)
+    scene = Scene(_options(tmp_path, tmp_path / "out"), GaussianModel(1), start=False)
+    with pytest.raises(UserError, match="--refine_poses needs the tracks of a COLMAP model"):
+        PoseRefinement(scene, str(tmp_path), 100)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("disturbed") / "scene"
+    make_colmap_scene(folder)
+    return folder
+
+
+def test_a_resumed_training_has_the_bytes_of_a_whole_one(scene, tmp_path):
+    options = "--refine_poses", "--resolution_schedule", "pyramid", "--test_iterations", -1
+    whole = trained(scene, tmp_path / "whole", *options, "--checkpoint_iterations", 33, 60)
+    start = "--start_checkpoint", tmp_path / "whole" / "chkpnt33.pth"
+    resumed = trained(scene, tmp_path / "resumed", *options, *start)
+    assert not differences(whole, resumed)
+    tables = [(tmp_path / name / NAME).read_bytes() for name in ("whole", "resumed")]
+    assert tables[0] == tables[1]
+    loaded = Scene(_options(scene, tmp_path / "whole"), GaussianModel(1), load_iteration=60, start=False)
+    table = json.loads(tables[0])
+    for name, cameras in (("train", loaded.getTrainCameras()), ("test", loaded.getTestCameras())):
+        for camera in cameras:
+            entry = table[name][camera.uid]
+            assert entry["img_name"] == camera.image_name and entry["R"] == camera.R.tolist()
+    plain = Scene(_options(scene, tmp_path / "whole", refine_poses=False), GaussianModel(1), 60, start=False)
+    assert np.abs(_poses(plain) - _poses(loaded)).max() > 1e-5
+    with pytest.raises(UserError, match="chkpnt33.pth was trained with --refine_poses; give that option"):
+        trained(scene, tmp_path / "other", *start)
+    trained(scene, tmp_path / "unrefined", "--checkpoint_iterations", 60)
+    assert not (tmp_path / "unrefined" / NAME).exists()
+    with pytest.raises(UserError, match="the checkpoint has no refined poses of this run's views"):
+        trained(scene, tmp_path / "more", "--refine_poses", "--iterations", 61, "--start_checkpoint",
+                tmp_path / "unrefined" / "chkpnt60.pth")  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, "cannot read .*poses.json"),
+        ("[1]", "is no table of poses"),
+        ("{", "is no table of poses"),
+        ('{"train": []}', "is of other views than the scene's"),
+        ('{"train": 1}', "has no list of poses"),
+    ],
+)
+def test_a_broken_file_is_named(content, said, scene, tmp_path):
+    if content is not None:
+        (tmp_path / NAME).write_text(content)
+    with pytest.raises(UserError, match=said):
+        with_poses(read_colmap(scene, "images", True), tmp_path)
+
+
+def test_several_processes_are_refused():
+    with pytest.raises(UserError, match="--refine_poses needs a training of one process"):
+        checks.check_poses(Namespace(refine_poses=True), several=True)
+    checks.check_poses(Namespace(refine_poses=True), several=False)
+    checks.check_poses(Namespace(), several=True)
