@@ -109,6 +109,8 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     if scene is not None and args.max_splats:
         keep = thin_out(scene, keep, degree, args.max_splats, pipe, options, scored=args.crop is None)
     chosen = tidy(with_sh_degree(selected(splats, keep), degree))
+    if getattr(pipe, "projection", "ewa") == "ray":
+        print("The model was trained with --projection ray; other programs show large Gaussians off the axis otherwise")
     start = time.perf_counter()
     background = (1.0, 1.0, 1.0) if options.white_background else (0.0, 0.0, 0.0)
     entry.write(args.to, chosen, *((scene.getTrainCameras(), make_path, background) if entry.of_scene else ()))

@@ -28,6 +28,7 @@ from splatting.distributed.rendering.sharded import (
 )
 from utils.general_utils import check_flags
 from utils.sh_utils import eval_sh
+from utils.system_utils import UserError
 
 
 def render(
@@ -52,8 +53,8 @@ def render(
     get_xyz, get_opacity, get_scaling, get_rotation, get_features and active_sh_degree. bg_color: (3,) in [0, 1] on the
     model's device. scaling_modifier multiplies all scales. separate_sh: take get_features_dc and get_features_rest even
     if a subclass has overridden them; the 2023 release has override_color in its place. override_color: (N, 3) instead
-    of SH. pipe: convert_SHs_python, compute_cov3D_python, debug and, if it is there, antialiasing. use_trained_exp:
-    apply the trained exposure of the view's photo, before the clamp; a view without a photo has none.
+    of SH. pipe: convert_SHs_python, compute_cov3D_python, debug and, where they are there, antialiasing and projection.
+    use_trained_exp: apply the trained exposure of the view's photo, before the clamp; a view without a photo has none.
 
     Returns
     `render` (3, H, W), clamped to [0, 1] so that values outside get no gradient; unclamped if clamp is False;
@@ -206,7 +207,12 @@ def model_inputs(
 def rasterizer_settings(
     camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace, background: Tensor, scaling: float = 1.0
 ) -> GaussianRasterizationSettings:
-    """The rasterizer's settings for a view of a model; arguments as for `render`."""
+    """The rasterizer's settings for a view of a model; arguments as for `render`. UserError for what rays lack."""
+    lens, projection = getattr(camera, "lens", None), getattr(pipe, "projection", "ewa")  # new in ours
+    if projection == "ray" and background.is_cuda:
+        raise UserError("--projection ray has no CUDA kernels; set CUDA_VISIBLE_DEVICES= for the CPU, or use ewa")
+    if projection == "ray" and lens:
+        raise UserError("--projection ray shows pinholes alone; give --lenses undistort, or use --projection ewa")
     return GaussianRasterizationSettings(
         image_height=int(camera.image_height),
         image_width=int(camera.image_width),
@@ -221,7 +227,8 @@ def rasterizer_settings(
         prefiltered=False,
         debug=pipe.debug,
         antialiasing=getattr(pipe, "antialiasing", False),  # the 2023 release's options have none
-        lens=getattr(camera, "lens", None),
+        lens=lens,
+        projection=projection,
     )
 
 

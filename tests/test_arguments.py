@@ -51,6 +51,7 @@ ABSURD = {
     "position_lr_init": "nan", "opacity_lr": "-0.1", "scaling_lr": "inf", "lambda_dssim": "1.5",
     "densification_interval": "0", "densify_grad_threshold": "0", "max_num_splats": "-1", "seed": "-1",
     "optimizer_type": "sgd", "strategy": "mine", "absgrad_threshold": "0 nan", "split": "halves",
+    "projection": "affine",
     "growth_power": "0 inf", "score_views": "0",
     "score_power": "-0.5 100.5", "opacity_decay": "1.01 0.4", "prune_opacity": "0.6 -0.1", "mcmc_until_iter": "-1",
     "prune_sh": "-0.5 nan",
@@ -168,7 +169,7 @@ def test_groups_carry_their_defaults_as_the_references_do():
     assert (
         vars(model).items() >= {f"_{name}" if name in short else name: value for name, value in MODEL.items()}.items()
     )
-    assert vars(pipeline) == PIPELINE
+    assert vars(pipeline) == PIPELINE | {"projection": "ewa"}
     assert vars(optimisation).items() >= OPTIMISATION.items()
     assert vars(ModelParams(argparse.ArgumentParser(), sentinel=True)) == vars(model)
 
@@ -260,7 +261,8 @@ def test_model_json_has_what_is_stored_there_with_sorted_keys(tmp_path):
     record = read_model_json(tmp_path)
     assert list(record) == sorted(record) and record.pop("version")
     assert record == {
-        "antialiasing": True, "invert_masks": True, "optimizer_type": "default", "resolution_schedule": "auto",
+        "antialiasing": True, "invert_masks": True, "optimizer_type": "default", "projection": "ewa",
+        "resolution_schedule": "auto",
         "seed": 7, "strategy": "auto", "options": {"lambda_dssim": 0.5},
     }  # fmt: skip
     write_cfg_args(tmp_path, argparse.Namespace())

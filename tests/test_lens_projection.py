@@ -121,62 +121,13 @@ def test_a_lens_without_distortion_is_a_pinhole():
         torch.testing.assert_close(leaves[name].grad, others[name].grad, rtol=1e-9, atol=1e-9)
 
 
-def pixels_of(of: Lens, point: torch.Tensor) -> torch.Tensor:
-    """Pixels (2, ...) of points (3, ...) by the formulas of COLMAP's models, for autograd."""
-    x, y, z = point
-    if of.chart == "equirectangular":
-        a, b = torch.atan2(x, z), torch.atan2(y, torch.hypot(x, z))
-    else:
-        r = torch.hypot(x, y)
-        stretch = 1 / z if of.chart == "perspective" else torch.atan2(r, z) / r
-        a, b = x * stretch, y * stretch
-    q, (p1, p2) = a * a + b * b, of.tangential
-    over, under = (1 + sum(c * q ** (k + 1) for k, c in enumerate(terms)) for terms in (of.radial, of.divisor))
-    across = a * over / under + 2 * p1 * a * b + p2 * (q + 2 * a * a) + of.prism[0] * q
-    down = b * over / under + 2 * p2 * a * b + p1 * (q + 2 * b * b) + of.prism[1] * q
-    return torch.stack([of.focal[0] * across + of.center[0], of.focal[1] * down + of.center[1]])
-
-
-def oracle(of: Lens, width: int, height: int, monkeypatch: pytest.MonkeyPatch):
-    """reference.render through a lens."""
-    _, limit, reach, *_ = of.numbers(width, height)
-    half, center, focal = torch.tensor([[width / 2, height / 2], of.center, of.focal], dtype=torch.float64)
-    low, high = (reach * (half * (1 + by) - 0.5 - center) / focal for by in (-1.3, 1.3))
-    view = None
-
-    def project(means, means2d, camera):
-        nonlocal view
-        view = means @ camera.world_to_view[:3, :3] + camera.world_to_view[3, :3]
-        depth = view[:, 2] if of.chart == "perspective" else view.norm(dim=1)
-        shown = depth > reference.camera.NEAR
-        if of.chart == "perspective":
-            shown &= (view[:, :2] / depth[:, None]).square().sum(1) <= limit
-        view, depth = torch.where(shown[:, None], view, 1.0), torch.where(shown, depth, 1.0)
-        by_depth = torch.stack([depth] * 3, 1)  # its last column decides the order
-        return reference.camera.Points(by_depth, shown, depth, pixels_of(of, view.T).T)
-
-    def world_to_image(points, camera):
-        at = view
-        if of.chart == "perspective":
-            at = torch.cat([torch.clamp(at[:, :2] / at[:, 2:], low, high) * at[:, 2:], at[:, 2:]], 1)
-        jacobian = torch.func.vmap(torch.func.jacrev(lambda point: pixels_of(of, point)))(at)
-        return jacobian @ camera.world_to_view[:3, :3].T
-
-    alphas = reference.blend.alphas
-
-    def of_nearest_copies(splats, rows, width):
-        """Each tile shows the nearest copy of a splat."""
-        left = torch.arange(width) // 16 * 16 - splats.pixel[:, :1]
-        turns = (left >= width / 2).int() - (left < -width / 2).int()
-        by_turns = [alphas(splats._replace(pixel=splats.pixel + torch.tensor([turn * width, 0])), rows, width)
-                    for turn in (-1, 0, 1)]  # fmt: skip
-        return sum((turns == turn)[:, None] * by_turns[turn + 1] for turn in (-1, 0, 1))
-
-    if of.chart == "equirectangular":
-        monkeypatch.setattr(reference.blend, "alphas", of_nearest_copies)
-    monkeypatch.setattr(reference, "project", project)
-    monkeypatch.setattr(reference.shape, "world_to_image", world_to_image)
-    return reference.render
+def of_nearest_copies(splats, rows, width, alphas=reference.blend.alphas):
+    """The alphas of a panorama, of which each tile shows the nearest copy of a splat."""
+    left = torch.arange(width) // 16 * 16 - splats.pixel[:, :1]
+    turns = (left >= width / 2).int() - (left < -width / 2).int()
+    by_turns = [alphas(splats._replace(pixel=splats.pixel + torch.tensor([turn * width, 0])), rows, width)
+                for turn in (-1, 0, 1)]  # fmt: skip
+    return sum((turns == turn)[:, None] * by_turns[turn + 1] for turn in (-1, 0, 1))
 
 
 @pytest.mark.parametrize(
@@ -187,13 +138,15 @@ def oracle(of: Lens, width: int, height: int, monkeypatch: pytest.MonkeyPatch):
     ],
 )  # fmt: skip
 def test_images_and_gradients_are_the_oracles(model, antialiasing, monkeypatch):
+    if model == "panorama":
+        monkeypatch.setattr(reference.blend, "alphas", of_nearest_copies)
     of, width, height = lens(model).scaled(0.5, 0.5), WIDTH // 2, HEIGHT // 2  # for speed
     camera = settings(of, torch.float64, antialiasing=antialiasing, image_width=width, image_height=height)
     values = everywhere(of, camera, 2000)
     weight = torch.randn(3, height, width, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     ours, theirs = ({name: v.clone().requires_grad_() for name, v in values.items()} for _ in range(2))
     one = draw(camera, ours, want_inverse_depth=True)
-    two = draw(camera, theirs, by=oracle(of, width, height, monkeypatch), cut=1e-9)
+    two = draw(camera, theirs, by=reference.render, cut=1e-9)
     keep = ~two.near_cut
     assert keep.double().mean() > 0.99
     for out in (one, two):

@@ -1,13 +1,14 @@
-"""Error of lenses: of their pixels against pycolmap, of float32 against float64, and of EWA against exact rays.
+"""Error of lenses: of their pixels against pycolmap, of float32 against float64, of EWA and of rays.
 
     python -m benchmarks.accuracy.lenses --device cpu   # or on the GPU, if there is one
 
 The first table has 2,000 Gaussians over a lens's whole field. Pixels are those of the means; gradients are those of a
 weighted sum of the image, over the largest value of their tensor. The second has one Gaussian of opacity 0.9 whose
 standard deviation is so many degrees, off the axis of an equidistant fisheye and of a pinhole. An exact ray has the
-alpha opacity * exp(-D^2 / 2), D the ray's least distance from the mean in standard deviations. EWA takes the
-lens's Jacobian at the mean instead (Zwicker et al. 2001). Shown are the largest difference of alpha, and the sum of
-differences over the sum of alphas.
+alpha opacity * exp(-D^2 / 2), D the ray's least distance from the mean in standard deviations: a Gaussian's largest
+value on a ray, and as well its integral along the ray over that along a parallel one through the mean. EWA takes the
+lens's Jacobian at the mean instead (Zwicker et al. 2001); projection="ray" differs by the dilation alone. Shown are the
+largest difference of alpha, and the sum of differences over the sum of alphas.
 """
 
 import argparse
@@ -16,7 +17,7 @@ import math
 import numpy as np
 import pycolmap
 import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings, Gaussians, rasterize
+from diff_gaussian_rasterization import GaussianRasterizationSettings, Gaussians, rasterize, reference
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.lens import Lens, lens_of
 from diff_gaussian_rasterization.scene import scene_arguments
@@ -39,7 +40,8 @@ _EXTRAS: dict[str, tuple[float, ...]] = {
     "THIN_PRISM_FISHEYE": (0.02, -0.01, 0.001, -0.001, 0.003, -0.001, 0.001, -0.001),
 }
 _PANORAMA = Lens("equirectangular", (_WIDTH / (2 * math.pi), _HEIGHT / math.pi), (_WIDTH / 2 - 0.5, _HEIGHT / 2 - 0.5))
-_ANGLES, _SIZES = (0, 10, 30, 60, 90), (0.2, 1.0, 5.0)  # degrees
+_ANGLES = {"equidistant": (0, 10, 60, 90, 120, 170), "perspective": (0, 10, 30, 60)}  # degrees
+_SHAPES = ((0.2, 0.2, 0.2), (1.0, 1.0, 1.0), (5.0, 5.0, 5.0), (5.0, 0.2, 0.2))  # degrees
 
 
 def camera(lens: Lens, dtype: torch.dtype, device: str, width: int = _WIDTH, height: int = _HEIGHT) -> tuple:
@@ -103,8 +105,8 @@ def _params(model: str) -> list[float]:
     return [*[focal] * focals, 330.0, 236.0, *_EXTRAS[model]]
 
 
-def ewa_error(chart: str, angle: float, deviations: tuple[float, float, float]) -> tuple[float, float]:
-    """Largest difference of alpha, and the relative sum of differences.
+def projection_errors(chart: str, angle: float, deviations: tuple[float, float, float]) -> list[tuple[float, float]]:
+    """Largest difference of alpha, and the relative sum of differences, of EWA and of rays.
 
     angle: of the mean from the axis, degrees. deviations: of the Gaussian across (twice) and along the ray, degrees.
     """
@@ -114,13 +116,6 @@ def ewa_error(chart: str, angle: float, deviations: tuple[float, float, float]) 
     ray = np.array([math.sin(angle * _DEGREE), 0.0, math.cos(angle * _DEGREE)])
     axes = np.stack([np.array([ray[2], 0.0, -ray[0]]), np.array([0.0, 1.0, 0.0]), ray], 1)
     sizes = np.array(deviations) * _DEGREE
-    covariance = axes * sizes**2 @ axes.T
-    upper = torch.from_numpy(covariance[np.triu_indices(3)])[None]
-    settings = camera(lens, torch.float64, "cpu", pixels, pixels)
-    mean = torch.from_numpy(ray)[None]
-    opacity = torch.full((1, 1), 0.9, dtype=torch.float64)
-    white = torch.ones(1, 3, dtype=torch.float64)
-    ours = rasterize(mean, mean, opacity, settings, cov3d=upper, colors=white).color[0].numpy()
     y, x = np.mgrid[:pixels, :pixels]
     a, b = (x - lens.center[0]) / focal, (y - lens.center[1]) / focal
     if chart == "perspective":
@@ -128,12 +123,22 @@ def ewa_error(chart: str, angle: float, deviations: tuple[float, float, float]) 
     else:
         theta = np.hypot(a, b)
         rays = np.stack([a * np.sinc(theta / np.pi), b * np.sinc(theta / np.pi), np.cos(theta)], -1)
+        rays[theta > np.pi] = np.nan
     toward, origin = rays @ axes / sizes, -ray @ axes / sizes
     square = (np.cross(origin, toward) ** 2).sum(-1) / (toward**2).sum(-1)
-    exact = 0.9 * np.exp(-0.5 * square) * (toward @ origin < 0)
+    exact = np.nan_to_num(0.9 * np.exp(-0.5 * square) * (toward @ origin < 0))
     exact[exact < 1 / 255] = 0
-    difference = np.abs(ours - exact)
-    return float(difference.max()), float(difference.sum() / exact.sum())
+    known = torch.from_numpy(np.isfinite(square))
+    settings = camera(lens, torch.float64, "cpu", pixels, pixels)
+    upper = torch.from_numpy((axes * sizes**2 @ axes.T)[np.triu_indices(3)])[None]
+    mean, opacity = torch.from_numpy(ray)[None], torch.full((1, 1), 0.9, dtype=torch.float64)
+    shape = {"cov3d": upper, "colors": torch.ones(1, 3, dtype=torch.float64)}
+    found = []
+    for projection in ("ewa", "ray"):
+        drawn = reference.render(mean, 0 * mean, opacity, settings._replace(projection=projection), **shape)
+        difference = np.abs((drawn.color[0] * known).numpy() - exact)
+        found.append((float(difference.max()), float(difference.sum() / exact.sum())))
+    return found
 
 
 def main() -> None:
@@ -144,14 +149,14 @@ def main() -> None:
     lenses = {name: lens_of(name, tuple(_params(name))) for name in _EXTRAS} | {"panorama": _PANORAMA}
     header = ["lens", "degrees", "pixels, against pycolmap", "float32: pixels", "image", "gradients"]
     print_table(header, [row(name, lens, device) for name, lens in lenses.items()])
-    print("\nEWA against exact rays: largest difference of alpha, share of the sum")
+    print("\nEWA, then rays, against exact rays: largest difference of alpha, share of the sum")
     rows = []
-    for chart, angles in (("equidistant", _ANGLES), ("perspective", _ANGLES[:-1])):
+    for chart, angles in _ANGLES.items():
         for angle in angles:
-            shapes = [(size,) * 3 for size in _SIZES] + [(5.0, 0.2, 0.2)]
-            found = [ewa_error(chart, angle, shape) for shape in shapes]
-            rows.append([chart, str(angle), *(f"{most:.3f}, {share:.1%}" for most, share in found)])
-    print_table(["chart", "degrees off axis", *(f"{size} degrees" for size in _SIZES), "5 x 0.2 x 0.2"], rows)
+            found = [projection_errors(chart, angle, shape) for shape in _SHAPES]
+            for k, name in enumerate(("ewa", "ray")):
+                rows.append([chart, str(angle), name, *(f"{each[k][0]:.3f}, {each[k][1]:.1%}" for each in found)])
+    print_table(["chart", "degrees off axis", "", "0.2 degrees", "1 degree", "5 degrees", "5 x 0.2 x 0.2"], rows)
 
 
 if __name__ == "__main__":

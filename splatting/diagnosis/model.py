@@ -242,7 +242,8 @@ def _other_background(scene: Scene, options: argparse.Namespace, stored: dict[st
 
 def _pipe(scene: Scene) -> argparse.Namespace:
     pipe = PipelineParams(argparse.ArgumentParser()).extract(argparse.Namespace())
-    pipe.antialiasing = read_model_json(scene.model_path).get("antialiasing", False)
+    stored = read_model_json(scene.model_path)
+    pipe.antialiasing, pipe.projection = stored.get("antialiasing", False), stored.get("projection", "ewa")
     return pipe
 
 

@@ -92,16 +92,19 @@ def _report_cameras_apart(info: SceneInfo) -> None:
         )
 
 
-def check_page(port: int | None, several: bool) -> None:
-    """Refuse a page that shows a training of several processes (UserError)."""
-    if several and port is not None:
-        raise UserError("--viewer needs a training of one process; leave it out, or start train.py without torchrun")
+def check_alone(port: int | None, projection: str, several: bool) -> None:
+    """Refuse a page, or rays, of a training of several processes (UserError)."""
+    for name, needs in (("--viewer", port is not None), ("--projection ray", projection == "ray")):
+        if needs and several:
+            raise UserError(f"{name} needs a training of one process; leave it out, or start train.py without torchrun")
 
 
-def check_poses(dataset: argparse.Namespace, several: bool) -> None:
-    """Refuse to refine poses in a training of several processes (UserError)."""
+def check_poses(dataset: argparse.Namespace, several: bool, projection: str = "ewa") -> None:
+    """Refuse to refine poses in a training of several processes, or on rays (UserError)."""
     if several and getattr(dataset, "refine_poses", False):
         raise UserError("--refine_poses needs a training of one process; leave it out, or start without torchrun")
+    if projection == "ray" and getattr(dataset, "refine_poses", False):
+        raise UserError("--projection ray has no gradients of poses; leave --refine_poses out, or use ewa")
 
 
 def check_unrefined(poses: object, checkpoint: str) -> None:

@@ -81,7 +81,7 @@ class Run:
         given, opt = opt, copy.copy(opt)  # of which the strategy, and windows by the clock, are decided here
         self.opt, self.pipe, self.launch = opt, pipe, launch
         self.group = ranks()
-        checks.check_page(launch.viewer, self.group.several)
+        checks.check_alone(launch.viewer, getattr(pipe, "projection", "ewa"), self.group.several)
         self.start = self.group.shared(resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
         dataset = self.dataset = checks.with_lenses(dataset, self.start)
         if opt.strategy == AUTO and (self.start or not (opt.time_budget or opt.schedule)):
@@ -134,7 +134,7 @@ class Run:
 
     def _refined_poses(self, capture: tuple | None) -> PoseRefinement | None:
         """What refines the poses of the views, with the state of a checkpoint; None unless it is asked for."""
-        checks.check_poses(self.dataset, self.group.several)
+        checks.check_poses(self.dataset, self.group.several, getattr(self.pipe, "projection", "ewa"))
         state = capture and further(capture, POSES)
         if not getattr(self.dataset, "refine_poses", False):
             checks.check_unrefined(state, self.start)

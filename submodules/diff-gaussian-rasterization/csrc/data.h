@@ -53,6 +53,7 @@ struct Scene {
   const int32_t* blocks = nullptr;  // (listed) on a GPU: the blocks that are awake, ascending, then -1; or null
   int64_t listed = 0;
   Lens<T> lens = {};
+  bool rays = false;  // Gaussians are seen on rays (math/ray.h), in place of EWA
 
   // Rows of what is made of the Gaussians: a row for each, or for those of the listed blocks alone.
   GS_HD int64_t rows() const;
@@ -77,12 +78,13 @@ struct alignas(16) TileRecord {
 
 template <class T>
 struct Projected {
-  T* splats;       // (N, 10), Splat in math/splat.h; undefined where tile_counts is 0
+  T* splats;       // (N, 10), Splat in math/splat.h, or (N, 13), RaySplat; undefined where tile_counts is 0
   T* depths;       // (N) infinite where tile_counts is 0, so that binning sorts those last
   int32_t* rects;  // (N, 4) tiles x0 y0 x1 y1, undefined where tile_counts is 0; null allowed if there are records
   int32_t* tile_counts;  // (N)
   int32_t* radii;        // (N)
   TileRecord* records;   // (N), or null
+  bool rays = false;     // splats are RaySplats, here and below
 };
 
 // Gradients of the inputs that have one, in the order of Input in torch/scene.h; null where not wanted. Every row is
@@ -138,6 +140,7 @@ struct BlendInput {
   const T* background;  // 3
   Image image;
   int64_t instance_count;  // where the ranges end, or more
+  bool rays = false;
 };
 
 template <class T>
@@ -158,10 +161,10 @@ struct BlendGradient {
   const T* color;                   // dLoss/dcolor
   const T* inverse_depth;           // dLoss/dinverse_depth, or null
   const T* transmittance_gradient;  // or null
-  T* moments;                       // out: (N, 10), Moments in math/footprint.h, then colour and inverse depth
-  const T* layers = nullptr;        // Blended::layers, or null: then blend_vjp makes its own
-  const Ahead* ahead = nullptr;     // on a GPU: take room for gradient rows, and do not wait for their number
-  T* absolute = nullptr;            // out: (N), absolute_length in math/absolute.h; or null
+  T* moments;  // out: (N, 10), Moments in math/footprint.h, then colour and inverse depth; (N, 13) for RayMoments
+  const T* layers = nullptr;     // Blended::layers, or null: then blend_vjp makes its own
+  const Ahead* ahead = nullptr;  // on a GPU: take room for gradient rows, and do not wait for their number
+  T* absolute = nullptr;         // out: (N), absolute_length in math/absolute.h; or null
 };
 
 // Gradient rows that lie by splat: those of a splat side by side, in the order of its slots.
@@ -170,8 +173,9 @@ struct SplatRows {
   int64_t count;
   const int32_t* tile_counts;  // (N)
   const int32_t* counts;       // (N) rows of each splat; 0 where tile_counts is 0
-  const T* rows;               // (R, 10) as in BlendGradient::moments; (R, 12) for lengths of absolute gradients
-  int64_t row_count;           // R
+  const T* rows;      // (R, 10) as in BlendGradient::moments, or 13; two more for lengths of absolute gradients
+  int64_t row_count;  // R
+  bool rays = false;
 };
 
 // Where the sums of a splat's rows go, and what lengths of absolute gradients need besides.

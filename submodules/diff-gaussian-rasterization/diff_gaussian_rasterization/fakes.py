@@ -12,6 +12,7 @@ _ROWS |= {"colors": (3,), "sh_dc": (1, 3)}
 TILE = 16  # pixels
 SPLAT_VALUES = 10  # of a row of `splats`
 MOMENT_VALUES = 10  # of a row of `moments`, and of `rows`
+RAY_VALUES = 3  # of a row of each besides, of Gaussians on rays
 ABSOLUTE_VALUES = 2  # of a row of `rows` besides, for absolute gradients
 CAMERA_NUMBERS = 25, 34  # of a pinhole, and of a camera with a lens
 RECORD_BLOCK = 256  # splats whose records are counted together
@@ -43,11 +44,15 @@ def _blended(like: Tensor, height: int, width: int, inverse_depth: bool, train: 
     )
 
 
+def _splats(means: Tensor, options: tuple[int, ...]) -> Tensor:
+    return means.new_empty((means.shape[0], SPLAT_VALUES + RAY_VALUES * any(options[5:])))
+
+
 @_fake("project")
-def _(means, *_):
+def _(means, *arguments):
     count = means.shape[0]
     ints = [means.new_empty(shape, dtype=torch.int32) for shape in ((count, 4), (count,), (count,))]
-    return means.new_empty((count, SPLAT_VALUES)), means.new_empty((count,)), *ints
+    return _splats(means, arguments[11]), means.new_empty((count,)), *ints
 
 
 @_fake("bin")
@@ -64,7 +69,8 @@ def _(splats, instances, ranges, background, height, width, inverse_depth, train
 def _(source, *arguments):
     absolute = len(arguments) == 4 and arguments[-1]  # the dispatcher leaves a default out
     splats = source[0]
-    rows = splats.new_empty((library.get_ctx().new_dynamic_size(), MOMENT_VALUES + absolute * ABSOLUTE_VALUES))
+    values = splats.shape[1] - SPLAT_VALUES + MOMENT_VALUES + absolute * ABSOLUTE_VALUES
+    rows = splats.new_empty((library.get_ctx().new_dynamic_size(), values))
     return rows, splats.new_empty((splats.shape[0],), dtype=torch.int32)
 
 
@@ -85,11 +91,11 @@ def _(means, *arguments):
 
 @_fake("rasterize")
 def _(means2d, means, *arguments):
-    (height, width, *_), _, inverse_depth, train = arguments[11:15]  # what follows is left out where it has its default
-    count = means.shape[0]
+    options, _, inverse_depth, train = arguments[11:15]  # what follows is left out where it has its default
+    count, (height, width, *_) = means.shape[0], options
     color, transmittance, depth, last, layers = _blended(means, height, width, inverse_depth, train)
     radii, tile_counts = (means.new_empty((count,), dtype=torch.int32) for _ in range(2))
-    projected = radii, means.new_empty((count, SPLAT_VALUES)), tile_counts
+    projected = radii, _splats(means, options), tile_counts
     lists = _binned(means, count, height, width, train)
     return color, transmittance, depth, *projected, *lists, last, layers
 

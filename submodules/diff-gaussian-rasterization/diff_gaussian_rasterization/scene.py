@@ -12,6 +12,7 @@ from diff_gaussian_rasterization.gaussians import Gaussians
 from diff_gaussian_rasterization.lens import LENS_VALUES, Lens
 from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 
+PROJECTIONS = ("ewa", "ray")
 _FLAGS = ("prefiltered", "debug", "antialiasing", "inverse_depth")
 
 _NONE = torch.empty(0)  # stands for a tensor that is not given
@@ -35,7 +36,7 @@ class Scene(NamedTuple):
     projection: Tensor
     center: Tensor
     lens: tuple[float, ...]  # tan_x, tan_y, scale_modifier, and perhaps Lens.numbers
-    options: tuple[int, ...]  # height, width, sh_degree, antialiasing, raw
+    options: tuple[int, ...]  # height, width, sh_degree, antialiasing, raw, and perhaps True: on rays
 
     @property
     def gaussians(self) -> tuple[Tensor | None, ...]:
@@ -65,7 +66,7 @@ class Drawing(NamedTuple):
     transmittance: Tensor  # (1, H, W)
     inverse_depth: Tensor  # (1, H, W), or no rows if it is not wanted
     radii: Tensor  # (N,) int32
-    splats: Tensor  # (N, 10)
+    splats: Tensor  # (N, 10), or (N, 13) on rays
     tile_counts: Tensor  # (N,) int32
     instances: Tensor  # (I,) int32, the splats of all lists
     ranges: Tensor  # (tiles + 1,) int64, of each tile's list
@@ -84,6 +85,8 @@ def scene_arguments(gaussians: Gaussians, settings: GaussianRasterizationSetting
     for name in _FLAGS:
         if (flag := getattr(settings, name)) is not True and flag is not False and flag is not None:
             check_flag(name, flag)  # the text "no" would count as True
+    if settings.projection not in PROJECTIONS:
+        raise ValueError(f"projection must be {' or '.join(map(repr, PROJECTIONS))}, got {settings.projection!r}")
     size = settings.image_height, settings.image_width
     tangents = (t.item() if isinstance(t, Tensor) else t for t in (settings.tanfovx, settings.tanfovy))
     lens = *tangents, settings.scale_modifier
@@ -91,7 +94,9 @@ def scene_arguments(gaussians: Gaussians, settings: GaussianRasterizationSetting
         shown = settings.lens if settings.lens_values is None else _with_values(settings.lens, settings.lens_values)
         lens += shown.numbers(*size[::-1])
     place = settings.viewmatrix, settings.projmatrix, settings.campos
-    return Scene(*gaussians, *camera_arguments(*place, lens, *size, settings.sh_degree, settings.antialiasing, raw))
+    camera = camera_arguments(*place, lens, *size, settings.sh_degree, settings.antialiasing, raw)
+    scene = Scene(*gaussians, *camera)
+    return scene._replace(options=(*scene.options, True)) if settings.projection == "ray" else scene
 
 
 def _with_values(lens: Lens, values: Tensor) -> Lens:

@@ -33,3 +33,4 @@ class GaussianRasterizationSettings(NamedTuple):
     inverse_depth: bool = True  # False: the third result is None and nothing is computed for it
     lens: Lens | None = None  # in place of a pinhole: then tanfovx, tanfovy and projmatrix are not read
     lens_values: Tensor | None = None  # (15,) in place of those of the lens: Lens.values
+    projection: str = "ewa"  # or "ray": a pixel sees a Gaussian along its own ray, not by EWA's affine map

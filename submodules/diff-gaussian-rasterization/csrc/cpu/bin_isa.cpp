@@ -101,6 +101,14 @@ struct Visible {
   }
 };
 
+template <class T, bool kRays>
+void list_again(const Projected<T>& in, int32_t i, TileRect rect, Image image, int32_t* tiles) {
+  SplatOf<T, kRays> splat;
+  uint64_t mask;
+  std::memcpy(&splat, in.splats + kSplatRow<kRays> * int64_t(i), sizeof splat);
+  list_tiles(splat, rect, image, mask, tiles);
+}
+
 // Writes the numbers of the tiles that a splat reaches.
 template <class T>
 void write_tiles(const Projected<T>& in, int32_t i, Image image, int32_t* tiles) {
@@ -113,10 +121,7 @@ void write_tiles(const Projected<T>& in, int32_t i, Image image, int32_t* tiles)
     for (int32_t tile = rect.y0 * columns + rect.x0; left; tile += columns, left = left >> (wide - 1) >> 1)
       for (uint64_t bits = left & row; bits; bits &= bits - 1) *tiles++ = tile + __builtin_ctzll(bits);
   } else {
-    Splat<T> splat;
-    uint64_t mask;
-    std::memcpy(&splat, in.splats + kSplatValues * int64_t(i), sizeof splat);
-    list_tiles(splat, rect, image, mask, tiles);
+    (in.rays ? list_again<T, true> : list_again<T, false>)(in, i, rect, image, tiles);
   }
 }
 

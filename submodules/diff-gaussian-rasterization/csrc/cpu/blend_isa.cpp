@@ -12,19 +12,48 @@ namespace {
 constexpr int kChunk = 128;  // splats held at once, some 6 KB of floats
 constexpr int kChunkWords = kChunk / 64;
 
-// A strip is a vector's part of a tile's row. What it needs of a chunk's splats: their RowTerms, and a bit for each
-// that may reach it. Trained splats reach few rows, so testing a vector of splats at a time is most of the saving.
-template <class T>
-struct Strip {
-  int row, first;  // first: column
+// A splat's RowTerms or RayRow of a row, from arrays of a chunk's splats.
+template <class T, bool kRays>
+struct Rows {
   alignas(64) T top[kChunk], u0[kChunk];
+  void store(int64_t k, const RowTerms<typename Simd<T>::Vec>& terms) {
+    Simd<T>::store(top + k, terms.top), Simd<T>::store(u0 + k, terms.u0);
+  }
+  RowTerms<T> of(const Chunk<T, kChunk, false>& chunk, int k) const { return {top[k], chunk.l11[k], u0[k], T(0)}; }
+};
+template <class T>
+struct Rows<T, true> {
+  alignas(64) T v[kChunk], u0[kChunk];
+  void store(int64_t k, const RayRow<typename Simd<T>::Vec>& terms) {
+    Simd<T>::store(v + k, terms.flat.v), Simd<T>::store(u0 + k, terms.flat.u0);
+  }
+  RayRow<T> of(const Chunk<T, kChunk, true>& chunk, int k) const {
+    return ray_row<T>({chunk.log2_opacity[k], chunk.l11[k], u0[k], v[k]}, chunk.slope_u[k], chunk.slope_v[k],
+                      chunk.e[k]);
+  }
+};
+
+template <class V, class T>
+V exponent_at(const RowTerms<T>& terms, V x) {
+  return row_exponent(terms, row_u(terms, x));
+}
+template <class V, class T>
+V exponent_at(const RayRow<T>& terms, V x) {
+  return ray_exponent(terms, at_pixel(terms, x));
+}
+
+// A strip is a vector's part of a tile's row. What it needs of a chunk's splats: their rows, and a bit for each
+// that may reach it. Trained splats reach few rows, so testing a vector of splats at a time is most of the saving.
+template <class T, bool kRays>
+struct Strip : Rows<T, kRays> {
+  int row, first;  // first: column
   uint64_t reached[kChunkWords];
 
-  Strip(const Chunk<T, kChunk>& chunk, int64_t count, int row, int first) : row(row), first(first), reached() {
+  Strip(const Chunk<T, kChunk, kRays>& chunk, int64_t count, int row, int first) : row(row), first(first), reached() {
     using S = Simd<T>;
     for (int64_t k = 0; k < count; k += S::kLanes) {
-      const RowTerms<typename S::Vec> terms = row_terms(chunk.shapes(k), T(row));
-      S::store(top + k, terms.top), S::store(u0 + k, terms.u0);
+      const auto terms = row_terms(chunk.shapes(k), T(row));
+      this->store(k, terms);
       uint64_t bits = S::bits(row_reached(terms, T(first), T(first + Simd<T>::kLanes - 1)));
       if (count - k < S::kLanes) bits &= (uint64_t(1) << (count - k)) - 1;
       reached[k / 64] |= bits << k % 64;
@@ -35,11 +64,11 @@ struct Strip {
 
   // Calls splat(k, terms) for each splat that may reach the strip, front to back, until that returns false.
   template <class Body>
-  void each(const Chunk<T, kChunk>& chunk, const Body& splat) const {
+  void each(const Chunk<T, kChunk, kRays>& chunk, const Body& splat) const {
     for (int w = 0; w < kChunkWords; ++w)
       for (uint64_t bits = reached[w]; bits; bits &= bits - 1) {
         const int k = 64 * w + __builtin_ctzll(bits);
-        if (!splat(k, RowTerms<T>{top[k], chunk.l11[k], u0[k], T(0)})) return;
+        if (!splat(k, this->of(chunk, k))) return;
       }
   }
 };
@@ -54,8 +83,9 @@ struct ForwardState {
 
 // Blends a chunk into a strip. position: of its first splat in the tile's list. Returns false once all of the strip's
 // pixels have ended.
-template <class T, bool kDepth, bool kLast>
-bool blend_strip(const Chunk<T, kChunk>& chunk, const Strip<T>& strip, int64_t position, ForwardState<T>& state) {
+template <class T, bool kDepth, bool kLast, bool kRays>
+bool blend_strip(const Chunk<T, kChunk, kRays>& chunk, const Strip<T, kRays>& strip, int64_t position,
+                 ForwardState<T>& state) {
   using S = Simd<T>;
   using V = typename S::Vec;
   using M = typename S::Mask;
@@ -69,8 +99,8 @@ bool blend_strip(const Chunk<T, kChunk>& chunk, const Strip<T>& strip, int64_t p
   if (kDepth) depth = S::load(state.depth + at);
   if (kLast) std::memcpy(&last, state.last + at, sizeof last);
   bool open = true;
-  strip.each(chunk, [&](int k, const RowTerms<T>& terms) {
-    const V t = row_exponent(terms, row_u(terms, x));
+  strip.each(chunk, [&](int k, const auto& terms) {
+    const V t = exponent_at(terms, x);
     M reached = t >= threshold;
     if (!S::any(reached)) return true;
     const V alpha = capped<V, T>(exp2_lanes<V, M>(reached ? t : zero, T()));
@@ -98,12 +128,12 @@ bool blend_strip(const Chunk<T, kChunk>& chunk, const Strip<T>& strip, int64_t p
 // Goes through a tile's list front to back, a chunk at a time, for each strip of its pixels. body(chunk, strip,
 // position of the chunk in the list) tells whether a pixel of the strip is still open. Pixels outside the image never
 // are.
-template <class T, class Body>
+template <class T, bool kRays, class Body>
 void through_tile(const BlendInput<T>& in, const Tile& tile, int64_t index, T* threshold, const Body& body) {
   constexpr int kStrips = kTile / Simd<T>::kLanes;
   for (int p = 0; p < kPixels; ++p)
     threshold[p] = p % kTile < tile.columns ? T(kLog2MinAlpha) : std::numeric_limits<T>::infinity();
-  Chunk<T, kChunk> chunk;
+  Chunk<T, kChunk, kRays> chunk;
   const int64_t begin = in.ranges[index], end = in.ranges[index + 1];
   const int open_strips = (tile.columns - 1) / Simd<T>::kLanes + 1;
   bool open[kPixels / Simd<T>::kLanes] = {};
@@ -116,13 +146,13 @@ void through_tile(const BlendInput<T>& in, const Tile& tile, int64_t index, T* t
     any = false;
     for (int s = 0; s < tile.rows * kStrips; ++s) {
       if (!open[s]) continue;
-      const Strip<T> strip(chunk, count, s / kStrips, s % kStrips * Simd<T>::kLanes);
+      const Strip<T, kRays> strip(chunk, count, s / kStrips, s % kStrips * Simd<T>::kLanes);
       any |= open[s] = body(chunk, strip, from - begin);
     }
   }
 }
 
-template <class T, bool kDepth, bool kLast>
+template <class T, bool kDepth, bool kLast, bool kRays>
 void blend_tile(const BlendInput<T>& in, int64_t index, const Blended<T>& out) {
   const Tile tile(index, in.image);
   ForwardState<T> state;
@@ -130,10 +160,10 @@ void blend_tile(const BlendInput<T>& in, int64_t index, const Blended<T>& out) {
   std::fill_n(state.color[0], 3 * kPixels, T(0));
   if (kDepth) std::fill_n(state.depth, kPixels, T(0));
   if (kLast) std::fill_n(state.last, kPixels, 0);
-  through_tile(in, tile, index, state.threshold,
-               [&](const Chunk<T, kChunk>& chunk, const Strip<T>& strip, int64_t position) {
-                 return blend_strip<T, kDepth, kLast>(chunk, strip, position, state);
-               });
+  through_tile<T, kRays>(in, tile, index, state.threshold,
+                         [&](const auto& chunk, const Strip<T, kRays>& strip, int64_t position) {
+                           return blend_strip<T, kDepth, kLast>(chunk, strip, position, state);
+                         });
   for (int c = 0; c < 3; ++c) {
     for (int p = 0; p < kPixels; ++p) state.color[c][p] += state.transmittance[p] * in.background[c];
     write_tile(state.color[c], in.image, tile, out.color + int64_t(c) * in.image.width * in.image.height);
@@ -145,9 +175,9 @@ void blend_tile(const BlendInput<T>& in, int64_t index, const Blended<T>& out) {
 
 // Marks the splats of a chunk that are decisive for a strip: a pixel blends splats up to its `last`, and the next splat
 // that reaches the pixel ends it. Returns false once all the strip's pixels have ended. instances: the chunk's.
-template <class T>
-bool mark_strip(const Chunk<T, kChunk>& chunk, const Strip<T>& strip, const int32_t* instances, int64_t position,
-                const typename IntOf<T>::type* last_of_tile, T* threshold_of_tile, bool* decisive) {
+template <class T, bool kRays>
+bool mark_strip(const Chunk<T, kChunk, kRays>& chunk, const Strip<T, kRays>& strip, const int32_t* instances,
+                int64_t position, const typename IntOf<T>::type* last_of_tile, T* threshold_of_tile, bool* decisive) {
   using S = Simd<T>;
   using V = typename S::Vec;
   using M = typename S::Mask;
@@ -157,8 +187,8 @@ bool mark_strip(const Chunk<T, kChunk>& chunk, const Strip<T>& strip, const int3
   M last;
   std::memcpy(&last, last_of_tile + at, sizeof last);
   bool open = true;
-  strip.each(chunk, [&](int k, const RowTerms<T>& terms) {
-    const M reached = row_exponent(terms, row_u(terms, x)) >= threshold;
+  strip.each(chunk, [&](int k, const auto& terms) {
+    const M reached = exponent_at(terms, x) >= threshold;
     if (!S::any(reached)) return true;
     __atomic_store_n(decisive + instances[k], true, __ATOMIC_RELAXED);
     threshold = (reached & (last <= typename S::Int(position + k))) ? never : threshold;
@@ -168,16 +198,26 @@ bool mark_strip(const Chunk<T, kChunk>& chunk, const Strip<T>& strip, const int3
   return open;
 }
 
-template <class T>
+template <class T, bool kRays>
 void mark_tile(const BlendInput<T>& in, const int32_t* last_plane, int64_t index, bool* decisive) {
   const Tile tile(index, in.image);
   alignas(64) T threshold[kPixels];
   alignas(64) typename IntOf<T>::type last[kPixels] = {};
   read_tile(last_plane, in.image, tile, last);
   const int32_t* instances = in.instances + in.ranges[index];
-  through_tile(in, tile, index, threshold, [&](const Chunk<T, kChunk>& chunk, const Strip<T>& strip, int64_t position) {
-    return mark_strip(chunk, strip, instances + position, position, last, threshold, decisive);
-  });
+  through_tile<T, kRays>(in, tile, index, threshold,
+                         [&](const auto& chunk, const Strip<T, kRays>& strip, int64_t position) {
+                           return mark_strip(chunk, strip, instances + position, position, last, threshold, decisive);
+                         });
+}
+
+template <class T, bool kRays>
+void blend_tiles(const Executor& executor, const BlendInput<T>& in, const Blended<T>& out) {
+  const auto run = out.inverse_depth
+                       ? (out.last ? blend_tile<T, true, true, kRays> : blend_tile<T, true, false, kRays>)
+                       : (out.last ? blend_tile<T, false, true, kRays> : blend_tile<T, false, false, kRays>);
+  const int64_t tiles = tiles_of(in.image);
+  for_dynamic(executor, tiles, 1, [&](int64_t tile, int64_t) { run(in, tile, out); });
 }
 
 }  // namespace
@@ -185,15 +225,13 @@ void mark_tile(const BlendInput<T>& in, const int32_t* last_plane, int64_t index
 template <class T>
 void mark_decisive(const Executor& executor, const BlendInput<T>& in, const int32_t* last, bool* decisive) {
   const int64_t tiles = tiles_of(in.image);
-  for_dynamic(executor, tiles, 1, [&](int64_t tile, int64_t) { mark_tile(in, last, tile, decisive); });
+  const auto run = in.rays ? mark_tile<T, true> : mark_tile<T, false>;
+  for_dynamic(executor, tiles, 1, [&](int64_t tile, int64_t) { run(in, last, tile, decisive); });
 }
 
 template <class T>
 void blend(const Executor& executor, const BlendInput<T>& in, const Blended<T>& out) {
-  const auto run = out.inverse_depth ? (out.last ? blend_tile<T, true, true> : blend_tile<T, true, false>)
-                                     : (out.last ? blend_tile<T, false, true> : blend_tile<T, false, false>);
-  const int64_t tiles = tiles_of(in.image);
-  for_dynamic(executor, tiles, 1, [&](int64_t tile, int64_t) { run(in, tile, out); });
+  (in.rays ? blend_tiles<T, true> : blend_tiles<T, false>)(executor, in, out);
 }
 
 #define GS_INSTANTIATE(T)                                                           \

@@ -72,39 +72,80 @@ template <class T>
 struct ColumnRanges {
   int32_t first[kBatch], last[kBatch];
 
-  void find(const Chunk<T, kBatch>& chunk, int64_t count) {
-    const T end = T(kTile - 1);
+  void find(const Chunk<T, kBatch, false>& chunk, int64_t count) {
     for (int64_t k = 0; k < count; ++k) {
       const T slope = chunk.l12[k] / chunk.l22[k];
       const T level = larger(chunk.log2_opacity[k] - T(kLog2MinAlpha), T(0));
       const T reach = std::sqrt(level) * T(1.0001) + T(0.01);
       const T dx = reach * std::sqrt(1 + slope * slope) / chunk.l11[k] + T(0.01);
-      const T left = chunk.x[k] - dx, right = chunk.x[k] + dx;
-      first[k] = int32_t(left > 0 ? (left < end ? left : end) : T(0));  // what is not a number reaches all columns
-      last[k] = int32_t(right < end ? (right > 0 ? right : T(0)) : end);
+      set(k, chunk.x[k] - dx, chunk.x[k] + dx);
     }
+  }
+  void find(const Chunk<T, kBatch, true>& chunk, int64_t count) {
+    for (int64_t k = 0; k < count; ++k) {
+      RaySplat<T> splat = {};
+      splat.l11 = chunk.l11[k], splat.l12 = chunk.l12[k], splat.l22 = chunk.l22[k];
+      splat.log2_opacity = chunk.log2_opacity[k], splat.slope_u = chunk.slope_u[k];
+      splat.slope_v = chunk.slope_v[k], splat.e = chunk.e[k];
+      const Extent<T> to = extent_of(splat);
+      set(k, chunk.x[k] - to.left, chunk.x[k] + to.right);
+    }
+  }
+
+ private:
+  void set(int64_t k, T left, T right) {
+    const T end = T(kTile - 1);
+    first[k] = int32_t(left > 0 ? (left < end ? left : end) : T(0));  // what is not a number reaches all columns
+    last[k] = int32_t(right < end ? (right > 0 ? right : T(0)) : end);
   }
 };
 
-// The terms of a batch's splats in all rows, and the rows with pixels that each may reach.
-template <class T>
-struct RowTable {
-  static constexpr int kParts = kRows<T> == 1 ? 1 : kTile / kColumns<T>;  // of a row
+// The terms of a batch's splats in all rows, RowTerms or RayRow.
+template <class T, bool kRays>
+struct TermTable {
+  using V = typename Simd<T>::Vec;
   alignas(64) T top[kTile][kBatch], u0[kTile][kBatch], v[kTile][kBatch];
-  alignas(64) typename IntOf<T>::type reached[kParts][kBatch];  // a bit for each row
+  void store(int row, int64_t k, const RowTerms<V>& terms) {
+    using S = Simd<T>;
+    S::store(top[row] + k, terms.top), S::store(u0[row] + k, terms.u0), S::store(v[row] + k, terms.v);
+  }
+  RowTerms<V> of(const Chunk<T, kBatch, false>& chunk, int row, int k) const {
+    return {by_rows<T>(top, row, k), Simd<T>::all(chunk.l11[k]), by_rows<T>(u0, row, k), by_rows<T>(v, row, k)};
+  }
+};
+template <class T>
+struct TermTable<T, true> {
+  using V = typename Simd<T>::Vec;
+  alignas(64) T u0[kTile][kBatch], v[kTile][kBatch];
+  void store(int row, int64_t k, const RayRow<V>& terms) {
+    Simd<T>::store(u0[row] + k, terms.flat.u0), Simd<T>::store(v[row] + k, terms.flat.v);
+  }
+  RayRow<V> of(const Chunk<T, kBatch, true>& chunk, int row, int k) const {
+    using S = Simd<T>;
+    return ray_row<V>(
+        {S::all(chunk.log2_opacity[k]), S::all(chunk.l11[k]), by_rows<T>(u0, row, k), by_rows<T>(v, row, k)},
+        S::all(chunk.slope_u[k]), S::all(chunk.slope_v[k]), S::all(chunk.e[k]));
+  }
+};
+
+// The same, and the rows with pixels that each may reach.
+template <class T, bool kRays>
+struct RowTable : TermTable<T, kRays> {
+  static constexpr int kParts = kRows<T> == 1 ? 1 : kTile / kColumns<T>;  // of a row
+  alignas(64) typename IntOf<T>::type reached[kParts][kBatch];            // a bit for each row
 
   // position: of the first splat in the tile's list.
-  void fill(const Chunk<T, kBatch>& chunk, int64_t count, int64_t position, const BackwardState<T>& state) {
+  void fill(const Chunk<T, kBatch, kRays>& chunk, int64_t count, int64_t position, const BackwardState<T>& state) {
     using S = Simd<T>;
     using Int = typename S::Int;
     const typename S::Mask lanes = __builtin_convertvector(lane_numbers<T>(0), typename S::Mask);
     for (int64_t k = 0; k < count; k += S::kLanes) {
-      const LocalSplat<typename S::Vec> splats = chunk.shapes(k);
+      const auto splats = chunk.shapes(k);
       const typename S::Mask positions = lanes + Int(position + k);
       typename S::Mask bits[kParts] = {};
       for (int row = 0; row < kTile; ++row) {
-        const RowTerms<typename S::Vec> terms = row_terms(splats, T(row));
-        S::store(top[row] + k, terms.top), S::store(u0[row] + k, terms.u0), S::store(v[row] + k, terms.v);
+        const auto terms = row_terms(splats, T(row));
+        this->store(row, k, terms);
         const typename S::Mask wanted = (positions < state.row_last[row]) & Int(1 << row);
         for (int p = 0; p < kParts; ++p) {
           constexpr int kPart = kTile / kParts;
@@ -127,45 +168,83 @@ struct RowTable {
   }
 };
 
-// Sums of an instance: kGradientValues, and perhaps kAbsoluteValues.
-template <bool kAbsolute>
-constexpr int kSums = kGradientValues + (kAbsolute ? kAbsoluteValues : 0);
+// Sums of an instance: kGradientRow, and perhaps kAbsoluteValues.
+template <bool kRays, bool kAbsolute>
+constexpr int kSums = kGradientRow<kRays> + (kAbsolute ? kAbsoluteValues : 0);
+template <class T, bool kRays, bool kAbsolute>
+using Sums = typename Simd<T>::Vec[kSums<kRays, kAbsolute>];
+
+// The moments of a splat's pixels, lane by lane, as a gradient row has them.
+template <class T, bool kRays, bool kAbsolute>
+struct PixelSums {
+  using V = typename Simd<T>::Vec;
+  V q = {}, u = {}, v = {}, uu = {}, uv = {}, vv = {}, absolute_u = {}, absolute_uv = {};
+
+  static V at(const RowTerms<V>& terms, V x) { return row_u(terms, x); }
+  static V exponent(const RowTerms<V>& terms, V u) { return row_exponent(terms, u); }
+  void add(const Chunk<T, kBatch, false>& chunk, int k, const RowTerms<V>& terms, V u_here, V q_here) {
+    const V qu = q_here * u_here, qv = q_here * terms.v;
+    q += q_here, u += qu, v += qv;
+    uu += qu * u_here, uv += qu * terms.v, vv += qv * terms.v;
+    if (kAbsolute) {
+      absolute_u += magnitude(qu);
+      absolute_uv += magnitude(V(chunk.l12[k] * qu + chunk.l22[k] * qv));
+    }
+  }
+};
 template <class T, bool kAbsolute>
-using Sums = typename Simd<T>::Vec[kSums<kAbsolute>];
+struct PixelSums<T, true, kAbsolute> {
+  using V = typename Simd<T>::Vec;
+  V q = {}, u = {}, v = {}, uu = {}, uv = {}, vv = {}, pu = {}, pv = {}, pp = {}, absolute_u = {}, absolute_uv = {};
+
+  static AtPixel<V> at(const RayRow<V>& terms, V x) { return at_pixel(terms, x); }
+  static V exponent(const RayRow<V>& terms, const AtPixel<V>& p) { return ray_exponent(terms, p); }
+  void add(const Chunk<T, kBatch, true>& chunk, int k, const RayRow<V>& terms, const AtPixel<V>& p, V q_here) {
+    const RayWeights<V> at = ray_weights(terms, p, chunk.slope_v[k]);
+    const V weight = q_here * at.w, along = weight * at.u, down = weight * at.v, deep = weight * at.p;
+    const V qu = weight * at.au, qv = weight * at.av;
+    q += q_here, u += qu, v += qv;
+    uu += along * at.u, uv += along * at.v, vv += down * at.v;
+    pu += deep * at.u, pv += deep * at.v, pp += deep * at.p;
+    if (kAbsolute) {
+      absolute_u += magnitude(qu);
+      absolute_uv += magnitude(V(chunk.l12[k] * qu + chunk.l22[k] * qv));
+    }
+  }
+};
 
 // A batch of splats in a tile, to be taken back to front.
-template <class T>
+template <class T, bool kRays>
 struct Batch {
-  Chunk<T, kBatch> chunk;
+  Chunk<T, kBatch, kRays> chunk;
   ColumnRanges<T> columns;
-  RowTable<T> table;
+  RowTable<T, kRays> table;
 };
 
 // Sums one splat's values, lane by lane, over the rows with a bit, in vectors from column `first` on, until `end`.
 // k: the splat in its batch.
-template <class T, bool kDepth, bool kAbsolute>
-__attribute__((always_inline)) inline void sum_rows(const Batch<T>& batch, int k, int64_t position, uint32_t bits,
-                                                    int first, int end, BackwardState<T>& state,
-                                                    Sums<T, kAbsolute>& sums) {
+template <class T, bool kRays, bool kDepth, bool kAbsolute>
+__attribute__((always_inline)) inline void sum_rows(const Batch<T, kRays>& batch, int k, int64_t position,
+                                                    uint32_t bits, int first, int end, BackwardState<T>& state,
+                                                    Sums<T, kRays, kAbsolute>& sums) {
   using S = Simd<T>;
   using V = typename S::Vec;
   using M = typename S::Mask;
-  const Chunk<T, kBatch>& chunk = batch.chunk;
-  const RowTable<T>& table = batch.table;
+  const Chunk<T, kBatch, kRays>& chunk = batch.chunk;
+  const RowTable<T, kRays>& table = batch.table;
   const V zero = {};
-  V q0 = zero, qu = zero, qv = zero, quu = zero, quv = zero, qvv = zero;
-  V red = zero, green = zero, blue = zero, depth = zero, absolute_u = zero, absolute_uv = zero;
+  PixelSums<T, kRays, kAbsolute> moments;
+  V red = zero, green = zero, blue = zero, depth = zero;
   for (; bits; bits &= bits - 1) {
     const int row = __builtin_ctz(bits);
-    const RowTerms<V> terms = {by_rows<T>(table.top, row, k), S::all(chunk.l11[k]), by_rows<T>(table.u0, row, k),
-                               by_rows<T>(table.v, row, k)};
+    const auto terms = table.of(chunk, row, k);
     int column = first;
     do {
       const int at = place<T>(row, column);
       M last;
       std::memcpy(&last, state.last + at, sizeof last);
-      const V u = row_u(terms, columns_from<T>(0) + T(column));
-      const V t = row_exponent(terms, u);
+      const auto pixel = moments.at(terms, columns_from<T>(0) + T(column));
+      const V t = moments.exponent(terms, pixel);
       const M reached = (t >= T(kLog2MinAlpha)) & (last > typename S::Int(position));
       if (!S::any(reached)) continue;
       const V uncapped = reached ? exp2_lanes<V, M>(reached ? t : zero, T()) : zero;
@@ -178,39 +257,40 @@ __attribute__((always_inline)) inline void sum_rows(const Batch<T>& batch, int k
       const V q = uncapped * alpha_gradient<T, V>(alpha, value, left, behind);
       const V weight = alpha * left;
       S::store(state.transmittance + at, left), S::store(state.behind + at, behind);
-      const V qu_here = q * u, qv_here = q * terms.v;
-      q0 += q, qu += qu_here, qv += qv_here;
-      quu += qu_here * u, quv += qu_here * terms.v, qvv += qv_here * terms.v;
+      moments.add(chunk, k, terms, pixel, q);
       red += weight * gr, green += weight * gg, blue += weight * gb;
       if (kDepth) depth += weight * gd;
-      if (kAbsolute) {
-        absolute_u += magnitude(qu_here);
-        absolute_uv += magnitude(V(chunk.l12[k] * qu_here + chunk.l22[k] * qv_here));
-      }
-    } while ((column += kColumns<T>) < end && RowTable<T>::kParts == 1);
+    } while ((column += kColumns<T>) < end && RowTable<T, kRays>::kParts == 1);
   }
-  const V all[] = {q0, qu, qv, quu, quv, qvv, red, green, blue, depth, absolute_u, absolute_uv};
-  std::copy_n(all, kSums<kAbsolute>, sums);
+  const auto& m = moments;
+  if constexpr (kRays) {
+    const V all[] = {m.q,  m.u,   m.v,  m.uu, m.uv, m.vv,         red,          green,
+                     blue, depth, m.pu, m.pv, m.pp, m.absolute_u, m.absolute_uv};
+    std::copy_n(all, kSums<kRays, kAbsolute>, sums);
+  } else {
+    const V all[] = {m.q, m.u, m.v, m.uu, m.uv, m.vv, red, green, blue, depth, m.absolute_u, m.absolute_uv};
+    std::copy_n(all, kSums<kRays, kAbsolute>, sums);
+  }
 }
 
 // Sums one splat's values over the pixels that it reaches, all of them from column `first` to `last`.
-template <class T, bool kDepth, bool kAbsolute>
-void splat_gradient(const Batch<T>& batch, int k, int64_t position, BackwardState<T>& state, T* out) {
-  constexpr int kParts = RowTable<T>::kParts;
+template <class T, bool kRays, bool kDepth, bool kAbsolute>
+void splat_gradient(const Batch<T, kRays>& batch, int k, int64_t position, BackwardState<T>& state, T* out) {
+  constexpr int kParts = RowTable<T, kRays>::kParts;
   const int first = batch.columns.first[k], wide = batch.columns.last[k] - first;
-  Sums<T, kAbsolute> sums;
+  Sums<T, kRays, kAbsolute> sums;
   if (wide < kColumns<T>) {  // one vector a row, which may begin at any column: that changes no sum
     const int begin = std::min(first, kTile - kColumns<T>);
-    sum_rows<T, kDepth, kAbsolute>(batch, k, position, batch.table.rows(k), begin, begin + 1, state, sums);
+    sum_rows<T, kRays, kDepth, kAbsolute>(batch, k, position, batch.table.rows(k), begin, begin + 1, state, sums);
   } else {
     const int vectors = wide / kColumns<T> + 1, begin = std::min(first, kTile - vectors * kColumns<T>);
-    Sums<T, kAbsolute> parts[kParts];
+    Sums<T, kRays, kAbsolute> parts[kParts];
     for (int p = 0; p < kParts; ++p) {
       const int from = kParts > 1 ? p * kColumns<T> : begin;
-      sum_rows<T, kDepth, kAbsolute>(batch, k, position, batch.table.rows(k, p), from, begin + vectors * kColumns<T>,
-                                     state, parts[p]);
+      sum_rows<T, kRays, kDepth, kAbsolute>(batch, k, position, batch.table.rows(k, p), from,
+                                            begin + vectors * kColumns<T>, state, parts[p]);
     }
-    for (int i = 0; i < kSums<kAbsolute>; ++i) {
+    for (int i = 0; i < kSums<kRays, kAbsolute>; ++i) {
       sums[i] = parts[0][i];
       for (int p = 1; p < kParts; ++p) sums[i] += parts[p][i];
     }
@@ -282,14 +362,14 @@ void read_state(const BlendInput<T>& in, const BlendGradient<T>& g, const Tile& 
     interleave<T>(pixels);
 }
 
-template <class T, bool kDepth, bool kAbsolute>
+template <class T, bool kRays, bool kDepth, bool kAbsolute>
 void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t index, int64_t processed,
-                    const GradientRows<T, kSums<kAbsolute>>& rows) {
+                    const GradientRows<T, kSums<kRays, kAbsolute>>& rows) {
   const Tile tile(index, in.image);
   const int64_t begin = in.ranges[index];
   BackwardState<T> state;
   read_state(in, g, tile, state);
-  Batch<T> batch;
+  Batch<T, kRays> batch;
   for (int64_t to = processed; to > 0; to -= std::min<int64_t>(kBatch, to)) {
     const int64_t from = std::max<int64_t>(0, to - kBatch), count = to - from;
     batch.chunk.gather(in, tile, begin + from, count);
@@ -299,16 +379,16 @@ void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t 
     batch.table.fill(batch.chunk, count, from, state);
     for (int64_t position = to - 1; position >= from; --position) {
       T* sums = rows.row(slot_of(g.slots, in.instances[begin + position], tile.x / kTile, tile.y / kTile));
-      splat_gradient<T, kDepth, kAbsolute>(batch, int(position - from), position, state, sums);
+      splat_gradient<T, kRays, kDepth, kAbsolute>(batch, int(position - from), position, state, sums);
     }
   }
 }
 
-template <class T, bool kAbsolute, class Memory>
-GradientRows<T, kSums<kAbsolute>> fill_rows(const Executor& executor, const BlendInput<T>& in,
-                                            const BlendGradient<T>& g, const Memory& memory) {
+template <class T, bool kRays, bool kAbsolute, class Memory>
+GradientRows<T, kSums<kRays, kAbsolute>> fill_rows(const Executor& executor, const BlendInput<T>& in,
+                                                   const BlendGradient<T>& g, const Memory& memory) {
   const int64_t tiles = tiles_of(in.image);
-  GradientRows<T, kSums<kAbsolute>> rows(g.slot_count);
+  GradientRows<T, kSums<kRays, kAbsolute>> rows(g.slot_count);
   std::vector<int32_t> processed(tiles);
   for_dynamic(executor, tiles, 4, [&](int64_t begin, int64_t end) {
     for (int64_t index = begin; index < end; ++index) {
@@ -321,80 +401,94 @@ GradientRows<T, kSums<kAbsolute>> fill_rows(const Executor& executor, const Blen
     }
   });
   rows.allocate(memory);
-  const auto run = g.inverse_depth ? blend_tile_vjp<T, true, kAbsolute> : blend_tile_vjp<T, false, kAbsolute>;
+  const auto run =
+      g.inverse_depth ? blend_tile_vjp<T, kRays, true, kAbsolute> : blend_tile_vjp<T, kRays, false, kAbsolute>;
   for_dynamic(executor, tiles, 1, [&](int64_t tile, int64_t) { run(in, g, tile, processed[tile], rows); });
   return rows;
 }
 
 // Sums the rows of splat i, from `start` to `stop`.
-template <class T, bool kAbsolute>
+template <class T, bool kRays, bool kAbsolute>
 GS_ONE_COPY void sum_splat(const T* start, const T* stop, int64_t i, const RowSums<T>& to) {
-  constexpr int kRow = kSums<kAbsolute>;
+  constexpr int kRow = kSums<kRays, kAbsolute>;
   double sums[kRow] = {};  // a splat may have thousands of tiles
   for (const T* row = start; row < stop; row += kRow)
     for (int v = 0; v < kRow; ++v) sums[v] += row[v];
-  std::copy_n(sums, kGradientValues, to.moments + kGradientValues * i);
+  std::copy_n(sums, kGradientRow<kRays>, to.moments + kGradientRow<kRays> * i);
   if constexpr (kAbsolute) {
-    const double* absolute = sums + kGradientValues;
+    const double* absolute = sums + kGradientRow<kRays>;
     to.absolute[i] = 0;
     if (start < stop)  // else the splat is undefined
-      to.absolute[i] = absolute_length(to.splats[kSplatValues * i + 2], T(absolute[0]), T(absolute[1]), to.image);
+      to.absolute[i] = absolute_length(to.splats[kSplatRow<kRays> * i + 2], T(absolute[0]), T(absolute[1]), to.image);
   }
 }
 
 // begin(i): where the rows of splat i begin, and those of the splat in front of it end.
-template <class T, bool kAbsolute, class Begin>
+template <class T, bool kRays, bool kAbsolute, class Begin>
 void sum_splats(const Executor& executor, int64_t count, const Begin& begin, const RowSums<T>& to) {
   for_dynamic(executor, count, 1024, [&](int64_t first, int64_t end) {
-    for (int64_t i = first; i < end; ++i) sum_splat<T, kAbsolute>(begin(i), begin(i + 1), i, to);
+    for (int64_t i = first; i < end; ++i) sum_splat<T, kRays, kAbsolute>(begin(i), begin(i + 1), i, to);
   });
 }
 
-template <class T, bool kAbsolute>
+template <class T, bool kRays, bool kAbsolute>
 void sum_gradients(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g) {
   std::unique_ptr<T[]> memory;
-  const auto rows = fill_rows<T, kAbsolute>(executor, in, g, [&](int64_t count) {
-    memory.reset(new T[kSums<kAbsolute> * count]);
+  const auto rows = fill_rows<T, kRays, kAbsolute>(executor, in, g, [&](int64_t count) {
+    memory.reset(new T[kSums<kRays, kAbsolute> * count]);
     return memory.get();
   });
-  sum_splats<T, kAbsolute>(executor, g.count, [&](int64_t i) { return rows.row(g.slots[i].first); },
-                           {in.splats, in.image, g.moments, g.absolute});
+  sum_splats<T, kRays, kAbsolute>(executor, g.count, [&](int64_t i) { return rows.row(g.slots[i].first); },
+                                  {in.splats, in.image, g.moments, g.absolute});
 }
 
-template <class T, bool kAbsolute>
+template <class T, bool kRays, bool kAbsolute>
 void keep_rows(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g,
                const RowMemory<T>& memory) {
-  const auto rows =
-      fill_rows<T, kAbsolute>(executor, in, g, [&](int64_t count) { return memory.take(memory.context, count); });
+  const auto rows = fill_rows<T, kRays, kAbsolute>(executor, in, g,
+                                                   [&](int64_t count) { return memory.take(memory.context, count); });
   for_dynamic(executor, g.count, 1024, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i)
-      memory.counts[i] = int32_t((rows.row(g.slots[i + 1].first) - rows.row(g.slots[i].first)) / kSums<kAbsolute>);
+      memory.counts[i] =
+          int32_t((rows.row(g.slots[i + 1].first) - rows.row(g.slots[i].first)) / kSums<kRays, kAbsolute>);
   });
 }
 
-template <class T, bool kAbsolute>
+template <class T, bool kRays, bool kAbsolute>
 void sum_given(const Executor& executor, const SplatRows<T>& in, const RowSums<T>& to) {
   std::vector<const T*> begin(in.count + 1, in.rows);
-  for (int64_t i = 0; i < in.count; ++i) begin[i + 1] = begin[i] + kSums<kAbsolute> * int64_t(in.counts[i]);
-  sum_splats<T, kAbsolute>(executor, in.count, [&](int64_t i) { return begin[i]; }, to);
+  for (int64_t i = 0; i < in.count; ++i) begin[i + 1] = begin[i] + kSums<kRays, kAbsolute> * int64_t(in.counts[i]);
+  sum_splats<T, kRays, kAbsolute>(executor, in.count, [&](int64_t i) { return begin[i]; }, to);
+}
+
+// Calls run(rays, absolute) with constants.
+template <class Run>
+void by_kind(bool rays, bool absolute, const Run& run) {
+  const std::true_type yes;
+  const std::false_type no;
+  if (rays)
+    absolute ? run(yes, yes) : run(yes, no);
+  else
+    absolute ? run(no, yes) : run(no, no);
 }
 
 }  // namespace
 
 template <class T>
 void blend_vjp(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g) {
-  (g.absolute ? sum_gradients<T, true> : sum_gradients<T, false>)(executor, in, g);
+  by_kind(in.rays, g.absolute, [&](auto rays, auto absolute) { sum_gradients<T, rays, absolute>(executor, in, g); });
 }
 
 template <class T>
 void blend_rows(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g,
                 const RowMemory<T>& memory) {
-  (memory.absolute ? keep_rows<T, true> : keep_rows<T, false>)(executor, in, g, memory);
+  by_kind(in.rays, memory.absolute,
+          [&](auto rays, auto absolute) { keep_rows<T, rays, absolute>(executor, in, g, memory); });
 }
 
 template <class T>
 void sum_rows(const Executor& executor, const SplatRows<T>& in, const RowSums<T>& to) {
-  (to.absolute ? sum_given<T, true> : sum_given<T, false>)(executor, in, to);
+  by_kind(in.rays, to.absolute, [&](auto rays, auto absolute) { sum_given<T, rays, absolute>(executor, in, to); });
 }
 
 #define GS_INSTANTIATE(T)                                                                                           \

@@ -14,5 +14,7 @@ inline bool masked(TileRect rect) { return int64_t(rect.x1 - rect.x0) * (rect.y1
 // compiled function: inlined twice, it could round in two ways, and the two must agree.
 template <class T>
 int32_t list_tiles(const Splat<T>& splat, TileRect rect, Image image, uint64_t& mask, int32_t* tiles);
+template <class T>
+int32_t list_tiles(const RaySplat<T>& splat, TileRect rect, Image image, uint64_t& mask, int32_t* tiles);
 
 GS_ISA_END

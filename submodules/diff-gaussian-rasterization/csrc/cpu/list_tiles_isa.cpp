@@ -1,20 +1,23 @@
 // The tiles that a splat reaches.
+#include "../math/ray_pixels.h"
 #include "gs/simd.h"
 #include "list_tiles.h"
 
 GS_ISA_BEGIN
 
+namespace {
+
 // Tests the rectangle's tiles row by row, a vector at a time.
-template <class T>
-__attribute__((noinline)) int32_t list_tiles(const Splat<T>& splat, TileRect rect, Image image, uint64_t& mask,
-                                             int32_t* tiles) {
+template <class T, class AnySplat>
+__attribute__((noinline)) int32_t list_tiles_of(const AnySplat& splat, TileRect rect, Image image, uint64_t& mask,
+                                                int32_t* tiles) {
   using S = Simd<T>;
   using V = typename S::Vec;
   using M = typename S::Mask;
   T lanes[S::kLanes];
   for (int i = 0; i < S::kLanes; ++i) lanes[i] = T(i);
   const V lane = S::load(lanes);
-  const TileTest<T> test = make_tile_test(splat, rect, image.width, image.height);
+  const auto test = make_tile_test(splat, rect, image.width, image.height);
   const int wide = rect.x1 - rect.x0, columns = tile_count(image.width), total = wide * (rect.y1 - rect.y0);
   int32_t count = 0;
   mask = 0;
@@ -37,7 +40,22 @@ __attribute__((noinline)) int32_t list_tiles(const Splat<T>& splat, TileRect rec
   }
   return count;
 }
-template int32_t list_tiles<float>(const Splat<float>&, TileRect, Image, uint64_t&, int32_t*);
-template int32_t list_tiles<double>(const Splat<double>&, TileRect, Image, uint64_t&, int32_t*);
+
+}  // namespace
+
+template <class T>
+int32_t list_tiles(const Splat<T>& splat, TileRect rect, Image image, uint64_t& mask, int32_t* tiles) {
+  return list_tiles_of<T>(splat, rect, image, mask, tiles);
+}
+template <class T>
+int32_t list_tiles(const RaySplat<T>& splat, TileRect rect, Image image, uint64_t& mask, int32_t* tiles) {
+  return list_tiles_of<T>(splat, rect, image, mask, tiles);
+}
+
+#define GS_INSTANTIATE(T)                                                                \
+  template int32_t list_tiles<T>(const Splat<T>&, TileRect, Image, uint64_t&, int32_t*); \
+  template int32_t list_tiles<T>(const RaySplat<T>&, TileRect, Image, uint64_t&, int32_t*);
+GS_INSTANTIATE(float)
+GS_INSTANTIATE(double)
 
 GS_ISA_END

@@ -1,129 +1,17 @@
-// Projection, a vector of Gaussians at a time.
-#include <algorithm>
-#include <cstring>
-
-#include "../backend.h"
-#include "list_tiles.h"
-#include "scene_lanes.h"
+// Projection, by threads.
+#include "project_rows.h"
 
 GS_ISA_BEGIN
 
-namespace {
-
-constexpr int64_t kBlock = 512;
-
-template <class T>
-Projected<T> part_of(const Projected<T>& out, int64_t first) {
-  return {from_row(out.splats, first, kSplatValues), from_row(out.depths, first, 1), from_row(out.rects, first, 4),
-          from_row(out.tile_counts, first, 1),       from_row(out.radii, first, 1),  from_row(out.records, first, 1)};
-}
-
-template <class T>
-void cull_all(int64_t count, const Projected<T>& out) {
-  std::fill_n(out.depths, count, T(INFINITY));
-  std::fill_n(out.tile_counts, count, 0), std::fill_n(out.radii, count, 0);
-  if (out.records) std::fill_n(out.records, count, TileRecord{});
-}
-
-// Most Gaussians of a trained scene lie outside of a view. This finds them without their shape, and lists the others.
-template <class T>
-int64_t list_inside(const Scene<T>& s, const Camera<T>& camera, int32_t* inside) {
-  for (int32_t i = 0; i < s.count; ++i) inside[i] = i;
-  if (!s.raw || s.cov3d || s.lens.chart != Chart::kPinhole) return s.count;
-  int64_t found = 0;
-  for_packs<T>(inside, s.count, [&](const Pack<T>& pack) {
-    using S = Simd<T>;
-    const typename S::Mask outside = surely_outside(camera, read_means(s, pack), [&] {
-      typename S::Vec scales[3];
-      read_rows(s.scales, 3, s.count, 3, pack, scales);
-      return s.scale_modifier * exponential(larger(larger(scales[0], scales[1]), scales[2]));
-    });
-    const uint32_t bits = S::bits(outside);
-    for (int i = 0; i < pack.count; ++i) {
-      inside[found] = pack.row[i];
-      found += ~bits >> i & 1;
-    }
-  });
-  return found;
-}
-
-template <class T>
-struct ProjectedPack {
-  T splats[Simd<T>::kLanes * kSplatValues], depths[Simd<T>::kLanes];
-  typename IntOf<T>::type radii[Simd<T>::kLanes], rects[4][Simd<T>::kLanes];
-
-  // Returns a bit for each Gaussian that is visible, unless it reaches no tile.
-  template <class AnyCamera>
-  uint32_t project(const Scene<T>& s, const AnyCamera& camera, const Pack<T>& pack) {
-    using S = Simd<T>;
-    using V = typename S::Vec;
-    SceneLanes<T> row(s, pack);
-    Splat<V> splat = {};
-    V depth = {};
-    typename S::Mask radius;
-    typename S::Mask visible = project_shape(s, camera, row, splat, depth, radius);
-    std::memcpy(radii, &radius, sizeof radii);
-    if (!any(visible)) return 0;
-    const Rect<typename S::Mask> rect = tile_rect(splat, s.image.width, s.image.height, goes_around(camera));
-    visible &= rect.x1 > rect.x0;
-    if (!any(visible)) return 0;
-    V rest[kMostRest];
-    row.read_colors(s, pack, rest);
-    visible &= project_color(s, camera, row, rest, splat);
-    std::memcpy(rects, &rect, sizeof rects), S::store(depths, depth);
-    V values[kSplatValues];
-    std::memcpy(values, &splat, sizeof values);
-    Pack<T> lanes = {{}, S::kLanes};
-    for (int i = 0; i < S::kLanes; ++i) lanes.row[i] = i;
-    write_rows(values, kSplatValues, kSplatValues, lanes, splats);
-    return S::bits(visible);
-  }
-};
-
-template <class T>
-void write_splat(const ProjectedPack<T>& pack, int lane, Image image, int32_t i, const Projected<T>& out) {
-  const auto& r = pack.rects;
-  const TileRect rect = {int32_t(r[0][lane]), int32_t(r[1][lane]), int32_t(r[2][lane]), int32_t(r[3][lane])};
-  Splat<T> splat;
-  std::memcpy(&splat, pack.splats + kSplatValues * lane, sizeof splat);
-  uint64_t mask;
-  const int32_t count = list_tiles(splat, rect, image, mask, nullptr);
-  if (!count) return;
-  out.tile_counts[i] = count, out.depths[i] = pack.depths[lane];
-  if (out.records)
-    out.records[i] = {masked(rect) ? mask : uint64_t(count), uint16_t(rect.x0), uint16_t(rect.y0), uint16_t(rect.x1),
-                      uint16_t(rect.y1)};
-  if (out.rects) {
-    int32_t* to = out.rects + 4 * i;
-    to[0] = rect.x0, to[1] = rect.y0, to[2] = rect.x1, to[3] = rect.y1;
-  }
-  std::memcpy(out.splats + kSplatValues * i, &splat, sizeof splat);
-}
-
-template <class T, class AnyCamera>
-void project_block(const Scene<T>& s, const AnyCamera& camera, const Projected<T>& out) {
-  int32_t inside[kBlock];
-  cull_all(s.count, out);
-  for_packs<T>(inside, list_inside(s, camera, inside), [&](const Pack<T>& pack) {
-    ProjectedPack<T> projected;
-    const uint32_t visible = projected.project(s, camera, pack);
-    for (int lane = 0; lane < pack.count; ++lane) {
-      const int32_t i = pack.row[lane];
-      out.radii[i] = int32_t(projected.radii[lane]);
-      if (visible >> lane & 1) write_splat(projected, lane, s.image, i, out);
-    }
-  });
-}
-
-}  // namespace
-
 template <class T>
 void project(const Executor& executor, const Scene<T>& s, const Projected<T>& out) {
-  const int64_t block = s.awake ? kSleepBlock : kBlock;
-  with_camera(s, [&](const auto& camera) {
+  const int64_t block = s.awake ? kSleepBlock : kProjectBlock;
+  with_any_camera(s, [&](const auto& camera) {
     for_dynamic(executor, s.count, block, [&](int64_t begin, int64_t end) {
       if (s.awake && !s.awake[begin / block])
         cull_all(end - begin, part_of(out, begin));
+      else if constexpr (kOnRays<std::decay_t<decltype(camera)>>)
+        project_on_rays(part_of(s, begin, end - begin), camera, part_of(out, begin));
       else
         project_block(part_of(s, begin, end - begin), camera, part_of(out, begin));
     });

@@ -5,8 +5,7 @@
 #include <cstring>
 
 #include "../data.h"
-#include "../math/blend.h"
-#include "../math/tiles.h"
+#include "../math/ray_pixels.h"
 #include "gs/simd.h"
 
 GS_ISA_BEGIN
@@ -40,36 +39,49 @@ void write_tile(const From* pixels, Image image, const Tile& tile, To* plane) {
 template <class T>
 void prefetch_splats(const BlendInput<T>& in, int64_t begin, int64_t end) {
   for (int64_t k = begin; k < end; ++k) {
-    const T* splat = in.splats + kSplatValues * int64_t(in.instances[k]);
-    __builtin_prefetch(splat), __builtin_prefetch(splat + kSplatValues - 1);
+    const int row = in.rays ? kSplatRow<true> : kSplatRow<false>;
+    const T* splat = in.splats + row * int64_t(in.instances[k]);
+    __builtin_prefetch(splat), __builtin_prefetch(splat + row - 1);
   }
 }
 
-// The values of at most kChunk splats, an array each, as LocalSplat has them.
+// What a chunk of splats on rays has besides.
+template <class T, int kChunk, bool kRays>
+struct ChunkOfRays {};
 template <class T, int kChunk>
-struct Chunk {
+struct ChunkOfRays<T, kChunk, true> {
+  alignas(64) T slope_u[kChunk], slope_v[kChunk], e[kChunk];
+};
+
+// The values of at most kChunk splats, an array each, as LocalSplat has them, or LocalRaySplat.
+template <class T, int kChunk, bool kRays>
+struct Chunk : ChunkOfRays<T, kChunk, kRays> {
   alignas(64) T y[kChunk], l11[kChunk], l12[kChunk], l22[kChunk], u[kChunk], log2_opacity[kChunk];
   alignas(64) T r[kChunk], g[kChunk], b[kChunk], inverse_depth[kChunk];
   alignas(64) T x[kChunk];  // the mean's, in the tile
 
   // The shapes of a vector of splats from k on; no colours.
-  LocalSplat<typename Simd<T>::Vec> shapes(int64_t k) const {
+  auto shapes(int64_t k) const {
     using S = Simd<T>;
-    LocalSplat<typename S::Vec> s = {};
+    using V = typename S::Vec;
+    std::conditional_t<kRays, LocalRaySplat<V>, LocalSplat<V>> s = {};
     s.y = S::load(y + k), s.l11 = S::load(l11 + k), s.l12 = S::load(l12 + k), s.l22 = S::load(l22 + k);
     s.u = S::load(u + k), s.log2_opacity = S::load(log2_opacity + k);
+    if constexpr (kRays)
+      s.slope_u = S::load(this->slope_u + k), s.slope_v = S::load(this->slope_v + k), s.e = S::load(this->e + k);
     return s;
   }
 
   void gather(const BlendInput<T>& in, const Tile& tile, int64_t begin, int64_t count) {
     for (int64_t k = 0; k < count; ++k) {
-      Splat<T> splat;
-      std::memcpy(&splat, in.splats + kSplatValues * int64_t(in.instances[begin + k]), sizeof splat);
+      SplatOf<T, kRays> splat;
+      std::memcpy(&splat, in.splats + kSplatRow<kRays> * int64_t(in.instances[begin + k]), sizeof splat);
       const T left = unrolled(splat, T(tile.x), in.image.width);
-      const LocalSplat<T> s = localise(splat, left, T(tile.y));
+      const auto s = localise(splat, left, T(tile.y));
       y[k] = s.y, l11[k] = s.l11, l12[k] = s.l12, l22[k] = s.l22, u[k] = s.u, log2_opacity[k] = s.log2_opacity;
       r[k] = s.r, g[k] = s.g, b[k] = s.b, inverse_depth[k] = s.inverse_depth;
       x[k] = splat.x - left;
+      if constexpr (kRays) this->slope_u[k] = s.slope_u, this->slope_v[k] = s.slope_v, this->e[k] = s.e;
     }
   }
 };

@@ -72,15 +72,20 @@ struct ShapeGradient {
   Vec3<T> diagonal, off;  // xx yy zz, yz zx xy
 };
 
-// dM = L^T W (L M): covariance's gradient is L^T W L / 2, and covariance = M M^T + const. So M^T dM = (L M)^T W (L M).
-// The first row of L M is l11 (m1 - (b/c) m2) = l11 (m2 x (m1 x m2) + h m1) / c, without the cancellation.
+// The rows of L M. The first is l11 (m1 - (b/c) m2) = l11 (m2 x (m1 x m2) + h m1) / c, without the cancellation.
+template <class T>
+GS_HD void whitened_rows(const Footprint<T>& f, Vec3<T>& u, Vec3<T>& v) {
+  const T part = 1 / root(f.c);  // scales both factors, because their product overflows
+  u = f.l11 * (cross(part * f.m2, part * f.minors) + (Scalar<T>(kDilation) / f.c) * f.m1), v = f.l22 * f.m2;
+}
+
 // W is 4 ln2^2 W2, W2 the second moments. With antialiasing the opacity carries sqrt(det0/det), which adds
 // L^-T (adj0/det0 - adj/det) L^-1, adj0 and adj the adjugates of the covariance before and after dilation. Multiplied
 // out with det0 = a0 c0 - b^2, its terms in b and c cancel on paper.
 template <class T>
-GS_HD ShapeGradient<T> footprint_vjp(const Footprint<T>& f, const Moments<T>& s, bool antialiasing) {
+GS_HD void second_moments(const Footprint<T>& f, const Moments<T>& s, bool antialiasing, T& uu, T& uv, T& vv) {
   const Scalar<T> h = Scalar<T>(kDilation), four_ln2_sq = Scalar<T>(4 * kLn2 * kLn2);
-  T uu = four_ln2_sq * s.quu, uv = four_ln2_sq * s.quv, vv = four_ln2_sq * s.qvv;
+  uu = four_ln2_sq * s.quu, uv = four_ln2_sq * s.quv, vv = four_ln2_sq * s.qvv;
   if (antialiasing && any(!f.floored)) {
     const T inverse_ratio = 1 / (f.compensation * f.compensation), slope = f.b / f.c;
     const T k = Scalar<T>(kDilation / kHalfLog2e) * s.q * inverse_ratio;
@@ -88,8 +93,15 @@ GS_HD ShapeGradient<T> footprint_vjp(const Footprint<T>& f, const Moments<T>& s,
     uv = f.floored ? uv : uv - k * (slope / root(f.schur) / root(f.c));
     vv = f.floored ? vv : vv + k * ((f.compensation * f.compensation + h * (f.a0 / f.c / f.schur)) / f.c);
   }
-  const T part = 1 / root(f.c);  // scales both factors, because their product overflows
-  const Vec3<T> lm_u = f.l11 * (cross(part * f.m2, part * f.minors) + (h / f.c) * f.m1), lm_v = f.l22 * f.m2;
+}
+
+// dM = L^T W (L M): covariance's gradient is L^T W L / 2, and covariance = M M^T + const. So M^T dM = (L M)^T W (L M).
+template <class T>
+GS_HD ShapeGradient<T> footprint_vjp(const Footprint<T>& f, const Moments<T>& s, bool antialiasing) {
+  T uu, uv, vv;
+  second_moments(f, s, antialiasing, uu, uv, vv);
+  Vec3<T> lm_u, lm_v;
+  whitened_rows(f, lm_u, lm_v);
   const Vec3<T> wu = uu * lm_u + uv * lm_v, wv = uv * lm_u + vv * lm_v;
   return {f.l11 * wu,
           f.l12 * wu + f.l22 * wv,

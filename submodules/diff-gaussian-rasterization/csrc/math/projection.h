@@ -177,6 +177,34 @@ GS_HD Vec3<V> position_vjp(const Camera<T>& cam, Vec3<V>, const Perspective<V>& 
   return p.inverse_depth * (g.x * cam.row_x + g.y * cam.row_y + g.z * cam.row_z);
 }
 
+// Fills the gradients that come from a footprint's, and the mean's. perpendicular: whether the axes are. p:
+// Perspective, or LensView.
+template <class V, class AnyCamera, class View>
+GS_HD void shape_vjp(const AnyCamera& cam, const Gaussian<V>& gaussian, Vec3<V> view, const View& p,
+                     const ShapeGradient<V>& shape, bool perpendicular, V g_inverse_depth, GaussianGradient<V>& g) {
+  const auto& c = gaussian.axes.scale;
+  const V row1[3] = {shape.m1.x, shape.m1.y, shape.m1.z}, row2[3] = {shape.m2.x, shape.m2.y, shape.m2.z};
+  const auto along = along_view(cam, gaussian.axes, row1, row2);
+  g.log_scale[0] = shape.diagonal.x, g.log_scale[1] = shape.diagonal.y, g.log_scale[2] = shape.diagonal.z;
+  if (perpendicular)
+    g.torque = {torque(shape.off.x, c[1], c[2]), torque(shape.off.y, c[2], c[0]), torque(shape.off.z, c[0], c[1])};
+  else
+    for (int k = 0; k < 3; ++k) g.direction[k] = c[k] * (row1[k] * p.p1 + row2[k] * p.p2);
+  g.mean = position_vjp(cam, view, p, along, shape.diagonal, g.pixel_x, g.pixel_y, g_inverse_depth);
+}
+
+// d cov3d = P^T G P, of the gradient c2 of the covariance on the image; off-diagonal entries stand for two.
+template <class V>
+GS_HD void covariance_vjp(Vec3<V> p1, Vec3<V> p2, const V (&c2)[3], V* g) {
+  const Vec3<V> a = c2[0] * p1 + c2[1] * p2, b = c2[1] * p1 + c2[2] * p2;
+  g[0] = p1.x * a.x + p2.x * b.x;
+  g[1] = p1.x * a.y + p2.x * b.y + p1.y * a.x + p2.y * b.x;
+  g[2] = p1.x * a.z + p2.x * b.z + p1.z * a.x + p2.z * b.x;
+  g[3] = p1.y * a.y + p2.y * b.y;
+  g[4] = p1.y * a.z + p2.y * b.z + p1.z * a.y + p2.z * b.y;
+  g[5] = p1.z * a.z + p2.z * b.z;
+}
+
 // perpendicular: whether the axes are. g_covariance (6, or null): the gradient of the covariance that gave the axes.
 template <class V, class AnyCamera>
 GS_HD GaussianGradient<V> project_splat_vjp(const AnyCamera& cam, const Gaussian<V>& gaussian, bool antialiasing,
@@ -189,28 +217,12 @@ GS_HD GaussianGradient<V> project_splat_vjp(const AnyCamera& cam, const Gaussian
   g.log_opacity = s.q;
   mean_vjp(f, s, g.pixel_x, g.pixel_y);
 
-  const ShapeGradient<V> shape = footprint_vjp(f, s, antialiasing);
-  const auto& c = gaussian.axes.scale;
-  const V row1[3] = {shape.m1.x, shape.m1.y, shape.m1.z}, row2[3] = {shape.m2.x, shape.m2.y, shape.m2.z};
-  const auto along = along_view(cam, gaussian.axes, row1, row2);
-  g.log_scale[0] = shape.diagonal.x, g.log_scale[1] = shape.diagonal.y, g.log_scale[2] = shape.diagonal.z;
-  if (perpendicular)
-    g.torque = {torque(shape.off.x, c[1], c[2]), torque(shape.off.y, c[2], c[0]), torque(shape.off.z, c[0], c[1])};
-  else
-    for (int k = 0; k < 3; ++k) g.direction[k] = c[k] * (row1[k] * p.p1 + row2[k] * p.p2);
-  if (g_covariance) {  // d cov3d = P^T G P; off-diagonal entries stand for two
+  if (g_covariance) {
     V c2[3];
     covariance2d_vjp(f, s, antialiasing, c2);
-    const Vec3<V> a = c2[0] * p.p1 + c2[1] * p.p2, b = c2[1] * p.p1 + c2[2] * p.p2;
-    g_covariance[0] = p.p1.x * a.x + p.p2.x * b.x;
-    g_covariance[1] = p.p1.x * a.y + p.p2.x * b.y + p.p1.y * a.x + p.p2.y * b.x;
-    g_covariance[2] = p.p1.x * a.z + p.p2.x * b.z + p.p1.z * a.x + p.p2.z * b.x;
-    g_covariance[3] = p.p1.y * a.y + p.p2.y * b.y;
-    g_covariance[4] = p.p1.y * a.z + p.p2.y * b.z + p.p1.z * a.y + p.p2.z * b.y;
-    g_covariance[5] = p.p1.z * a.z + p.p2.z * b.z;
+    covariance_vjp(p.p1, p.p2, c2, g_covariance);
   }
-
-  g.mean = position_vjp(cam, view, p, along, shape.diagonal, g.pixel_x, g.pixel_y, g_inverse_depth);
+  shape_vjp(cam, gaussian, view, p, footprint_vjp(f, s, antialiasing), perpendicular, g_inverse_depth, g);
   return g;
 }
 

@@ -5,6 +5,7 @@
 #include "../data.h"
 #include "lens_camera.h"
 #include "projection.h"
+#include "ray.h"
 
 GS_ISA_BEGIN
 
@@ -36,6 +37,13 @@ void with_camera(const Scene<T>& s, const Run& run) {
   LensCamera<T> camera;
   set_camera(s, camera);
   run(camera);
+}
+
+// The same, or with a RayCamera.
+template <class T, class Run>
+void with_any_camera(const Scene<T>& s, const Run& run) {
+  if (s.rays) return run(RayCamera<T>{camera_of(s)});
+  with_camera(s, run);
 }
 
 // A Gaussian's parameters as they are stored. They are read where they are used: a GPU would keep them in registers
@@ -100,8 +108,8 @@ GS_HD Truth<V> finite_shape(const Scene<T>& s, const Row& row) {
 }
 
 // Computes a splat except its colour, and its depth. Returns false if it is culled.
-template <class T, class AnyCamera, class Row, class V = typename Row::Number>
-GS_HD Truth<V> project_shape(const Scene<T>& s, const AnyCamera& camera, const Row& row, Splat<V>& splat, V& depth,
+template <class T, class AnyCamera, class Row, class AnySplat, class V = typename Row::Number>
+GS_HD Truth<V> project_shape(const Scene<T>& s, const AnyCamera& camera, const Row& row, AnySplat& splat, V& depth,
                              Integer<V>& radius) {
   const Truth<V> good = finite_shape(s, row);
   radius = Integer<V>{};
@@ -181,15 +189,26 @@ GS_HD Vec3<V> color_vjp(const Scene<T>& s, const Camera<T>& camera, const Row& r
   return sh_direction_vjp(direction, norm, sh_basis_vjp(s.sh_degree, direction, weight));
 }
 
+template <class V>
+GS_HD Moments<V> moments_of(const V* m) {
+  return {m[0], m[1], m[2], m[3], m[4], m[5]};
+}
+
 // Computes a Gaussian's gradients from its moments m, and writes them to row `to` of `out`, except that of sh_rest.
 // Those of tensors that the scene lacks are not written.
 template <class T, class AnyCamera, class Row, class V = typename Row::Number>
 GS_HD void project_vjp_row(const Scene<T>& s, const AnyCamera& camera, const Row& row, const V* m, const V* rest,
                            V* g_rest, const SceneGradient<V>& out, int64_t to) {
   const Loaded<V> in = load(s, row);
-  const GaussianGradient<V> g =
-      project_splat_vjp(camera, in.gaussian, s.antialiasing, s.raw, out.cov3d ? out.cov3d + 6 * to : nullptr,
-                        Moments<V>{m[0], m[1], m[2], m[3], m[4], m[5]}, m[9]);
+  V* g_covariance = out.cov3d ? out.cov3d + 6 * to : nullptr;
+  const auto shape_gradient = [&](const auto& moments) {
+    return project_splat_vjp(camera, in.gaussian, s.antialiasing, s.raw, g_covariance, moments, m[9]);
+  };
+  GaussianGradient<V> g;
+  if constexpr (kOnRays<AnyCamera>)
+    g = shape_gradient(RayMoments<V>{moments_of(m), m[10], m[11], m[12]});
+  else
+    g = shape_gradient(moments_of(m));
   Vec3<V> g_mean = g.mean;
   const Vec3<V> g_color = {m[6], m[7], m[8]};
   if (s.colors) {

@@ -1,5 +1,7 @@
 #pragma once
 // A splat, a Gaussian projected to the image, and the number of values in its rows.
+#include <type_traits>
+
 #include "gs/isa.h"
 #include "gs/number.h"
 
@@ -28,5 +30,21 @@ GS_HD V unrolled(const Splat<T>& s, V left, int width) {
 
 // Gradient sums of a splat over its pixels: moments of the exponent (footprint.h), then colour and inverse depth.
 constexpr int kGradientValues = 10;  // q, qu, qv, quu, quv, qvv, r, g, b, inverse depth
+
+// A splat of which a pixel sees what is on its ray (ray.h).
+template <class T>
+struct RaySplat : Splat<T> {
+  T slope_u, slope_v;
+  T e;  // log2 units
+};
+constexpr int kRayValues = 3;  // of a row besides, and of its gradient sums
+static_assert(sizeof(RaySplat<float>) == (kSplatValues + kRayValues) * sizeof(float), "a row of splats");
+
+template <class T, bool kRays>
+using SplatOf = std::conditional_t<kRays, RaySplat<T>, Splat<T>>;
+template <bool kRays>
+constexpr int kSplatRow = kSplatValues + (kRays ? kRayValues : 0);
+template <bool kRays>
+constexpr int kGradientRow = kGradientValues + (kRays ? kRayValues : 0);
 
 GS_ISA_END

@@ -41,6 +41,19 @@ GS_HD Truth<T> radius_on_image(T x, T y, Integer<T> radius, int width, int heigh
          (clamped_floor((y + r + tile - 1) / tile, ny) > clamped_floor((y - r) / tile, ny));
 }
 
+// The box of tiles with pixels from x0 to x1 and y0 to y1, px, if `some`.
+template <class T>
+GS_HD Rect<Integer<T>> tiles_between(Truth<T> some, T x0, T x1, T y0, T y1, int width, int height) {
+  using Number = Scalar<T>;
+  const Integer<T> none = {};
+  some &= (x1 >= 0) & (y1 >= 0) & (x0 <= Number(width - 1)) & (y0 <= Number(height - 1));
+  if (!any(some)) return {none, none, none, none};
+  const Number tile = Number(kTile);
+  const int nx = tile_count(width), ny = tile_count(height);
+  return {some ? clamped_floor<T>(x0 / tile, nx - 1) : none, some ? clamped_floor<T>(y0 / tile, ny - 1) : none,
+          some ? clamped_floor<T>(x1 / tile, nx - 1) + 1 : none, some ? clamped_floor<T>(y1 / tile, ny - 1) + 1 : none};
+}
+
 // The box of tiles that the splat can reach. |dx| is at most sqrt(reach) / |column of L^-1|, with
 // L^-1 = (1/l11, -l12/(l11 l22); 0, 1/l22). around: of a full panorama. A splat that crosses its border is marked, and
 // gets whole rows of tiles, which are then tested one by one: few splats do.
@@ -49,24 +62,16 @@ GS_HD Rect<Integer<T>> tile_rect(Splat<T>& s, int width, int height, bool around
   using Number = Scalar<T>;
   const T level = s.log2_opacity - Number(kLog2MinAlpha);
   const Integer<T> none = {};
-  const Rect<Integer<T>> nothing = {none, none, none, none};
-  Truth<T> some = level > Number(-1e-3);
-  if (!any(some)) return nothing;
+  const Truth<T> some = level > Number(-1e-3);
+  if (!any(some)) return {none, none, none, none};
   const T reach = root(larger(level, T{})) * Number(1.0001) + Number(0.01);
   const T dx = reach * length<T>(all<T>(1), s.l12 / s.l22) / s.l11 + Number(0.01), dy = reach / s.l22 + Number(0.01);
-  some &= (s.x + dx >= 0) & (s.y + dy >= 0) & (s.x - dx <= Number(width - 1)) & (s.y - dy <= Number(height - 1));
-  if (!any(some)) return nothing;
-  const Number tile = Number(kTile);
-  const int nx = tile_count(width), ny = tile_count(height);
-  Rect<Integer<T>> rect = {some ? clamped_floor<T>((s.x - dx) / tile, nx - 1) : none,
-                           some ? clamped_floor<T>((s.y - dy) / tile, ny - 1) : none,
-                           some ? clamped_floor<T>((s.x + dx) / tile, nx - 1) + 1 : none,
-                           some ? clamped_floor<T>((s.y + dy) / tile, ny - 1) + 1 : none};
+  Rect<Integer<T>> rect = tiles_between<T>(some, s.x - dx, s.x + dx, s.y - dy, s.y + dy, width, height);
   if (around) {
     // Not so wide either that a tile of its rectangle may be nearer to another copy.
-    const Truth<T> wide = dx > Number(width) / 2 - tile;
-    const Truth<T> crosses = some & (wide | (s.x - dx < 0) | (s.x + dx > Number(width - 1)));
-    rect.x0 = crosses ? none : rect.x0, rect.x1 = crosses ? none + nx : rect.x1;
+    const Truth<T> wide = dx > Number(width) / 2 - Number(kTile);
+    const Truth<T> crosses = (rect.x1 > rect.x0) & (wide | (s.x - dx < 0) | (s.x + dx > Number(width - 1)));
+    rect.x0 = crosses ? none : rect.x0, rect.x1 = crosses ? none + tile_count(width) : rect.x1;
     s.l11 = crosses ? -s.l11 : s.l11;
   }
   return rect;
@@ -106,25 +111,31 @@ GS_HD TileTest<T> make_tile_test(const Splat<T>& s, TileRect rect, int width, in
 // between the centres too, so this may keep a tile that no pixel needs, but never drops one that a pixel needs. V is T
 // or a vector of boxes. Products are arranged so that a compiler can fuse them in one way only, because counting must
 // agree with emission.
-template <class T, class V>
-GS_HD auto box_reached(const TileTest<T>& test, V left, V right, V top, V bottom) {
+template <class T, class V, class Level>
+GS_HD auto box_reached(const TileTest<T>& test, Level level, V left, V right, V top, V bottom) {
   const Splat<T>& s = test.splat;
   const V x0 = left - s.x, x1 = right - s.x, y0 = top - s.y, y1 = bottom - s.y;
   const auto within = [&](V dx, V dy) {
     const V u = s.l11 * (dx - test.slope_x * dy), v = s.l22 * dy;
-    return u * u <= test.level - v * v;
+    return u * u <= level - v * v;
   };
   const auto beside = (x0 > T(0)) | (x1 < T(0)), above = (y0 > T(0)) | (y1 < T(0));
   const V dx = x0 > T(0) ? x0 : x1, dy = y0 > T(0) ? y0 : y1;
   const auto side = within(dx, clamp(V(test.slope_y * dx), y0, y1));
   const auto edge = within(clamp(V(test.slope_x * dy), x0, x1), dy);
   const auto outside = beside | above;
-  return (beside & side) | (above & edge) | ((!outside) & (V{} + test.level >= T(0)));
+  return (beside & side) | (above & edge) | ((!outside) & (V{} + level >= T(0)));
 }
 
-// Tests tiles given by column and row; V as above. kMayCross: whether the splat may cross a panorama's border.
-template <bool kMayCross = true, class T, class V>
-GS_HD auto tile_reached(const TileTest<T>& test, V tile_x, V tile_y) {
+template <class T, class V>
+GS_HD auto box_reached(const TileTest<T>& test, V left, V right, V top, V bottom) {
+  return box_reached(test, test.level, left, right, top, bottom);
+}
+
+// Tests tiles given by column and row; V as above. Test: TileTest, or RayTileTest. kMayCross: whether the splat may
+// cross a panorama's border.
+template <bool kMayCross = true, class Test, class V, class T = Scalar<V>>
+GS_HD auto tile_reached(const Test& test, V tile_x, V tile_y) {
   V left = tile_x * T(kTile), right = left + T(kTile - 1), top = tile_y * T(kTile), bottom = top + T(kTile - 1);
   const V last_x = V{} + test.last_x, last_y = V{} + test.last_y;
   right = right < last_x ? right : last_x, bottom = bottom < last_y ? bottom : last_y;

@@ -10,16 +10,19 @@
 
 namespace gs::ops {
 
-using gs::baseline::kAbsoluteValues, gs::baseline::kGradientValues, gs::baseline::kSplatValues;
+using gs::baseline::kAbsoluteValues, gs::baseline::kGradientRow, gs::baseline::kSplatRow;
 using gs::baseline::layer_values, gs::baseline::tiles_of;
 
 void check_splats(const Tensor& splats) {
   check_given(splats, "splats");
   const ScalarType type = splats.scalar_type();
   GS_CHECK_TYPE(is_floating(type), "splats must be float32 or float64, got ", type);
-  GS_CHECK_VALUE(splats.dim() == 2 && splats.size(1) == kSplatValues, "splats must be (N, ", kSplatValues, "), got ",
-                 splats.sizes());
+  GS_CHECK_VALUE(splats.dim() == 2 && (splats.size(1) == kSplatRow<false> || on_rays(splats)), "splats must be (N, ",
+                 kSplatRow<false>, ") or (N, ", kSplatRow<true>, "), got ", splats.sizes());
+  GS_CHECK(!on_rays(splats) || splats.is_cpu(), kRaysOnCpu);
 }
+
+bool on_rays(const Tensor& splats) { return splats.size(1) == kSplatRow<true>; }
 
 void check_lists(const Tensor& instances, const Tensor& ranges, const Tensor& splats, gs::Image image) {
   check_tensor(instances, "instances", ScalarType::Int, splats.device(), {-1});
@@ -44,7 +47,9 @@ Tensor background_like(const Tensor& background, const Tensor& splats) {
   return converted(background, splats);
 }
 
-int64_t row_values(bool absolute) { return kGradientValues + (absolute ? kAbsoluteValues : 0); }
+int64_t row_values(bool absolute, bool rays) {
+  return (rays ? kGradientRow<true> : kGradientRow<false>)+(absolute ? kAbsoluteValues : 0);
+}
 
 BlendBackward::BlendBackward(SOURCE_PARAMETERS) {
   GS_CHECK_VALUE(source.size() == kKept, "a backward takes ", int(kKept), " tensors that a forward has kept, got ",
@@ -97,7 +102,8 @@ GradientSource::GradientSource(const SceneTensors& scene, SOURCE_PARAMETERS, boo
   const bool rows = source.size() == 4 && !grad_color;
   GS_CHECK_VALUE(rows || source.size() == kKept, "the source must be what a forward has kept, ", int(kKept),
                  " tensors, or splats, tile_counts, rows and counts, got ", source.size(), " tensors");
-  check_tensor(source[kSplats], "splats", scene.dtype(), scene.device(), {scene.rows(), kSplatValues});
+  check_tensor(source[kSplats], "splats", scene.dtype(), scene.device(),
+               {scene.rows(), scene.rays() ? kSplatRow<true> : kSplatRow<false>});
   if (!rows) blend_.emplace(SOURCE_ARGUMENTS);
   check_counts(source[kTileCounts], scene.rows(), scene.device());
   tile_counts_ = packed(source[kTileCounts]);
@@ -107,12 +113,12 @@ GradientSource::GradientSource(const SceneTensors& scene, SOURCE_PARAMETERS, boo
 void GradientSource::take_rows(const SceneTensors& scene, List<Tensor> source, bool absolute, bool lengths) {
   Tensor rows = source[2];
   const Tensor& counts = source[3];
-  check_tensor(rows, "rows", scene.dtype(), scene.device(), {-1, row_values(absolute)});
+  check_tensor(rows, "rows", scene.dtype(), scene.device(), {-1, row_values(absolute, scene.rays())});
   check_tensor(counts, "counts", ScalarType::Int, scene.device(), {scene.rows()});
   GS_CHECK(rows.size(0) <= std::numeric_limits<int32_t>::max(), rows.size(0), " rows are more than 2^31 - 1");
   GS_CHECK(rows.is_cpu() || scene.dtype() == ScalarType::Float, kFloatAlone);
   splats_ = aligned(source[kSplats], 2), counts_ = packed(counts);
-  rows_ = aligned(lengths ? rows : torch::stable::narrow(rows, 1, 0, kGradientValues), 2);
+  rows_ = aligned(lengths ? rows : torch::stable::narrow(rows, 1, 0, row_values(false, scene.rays())), 2);
   if (rows.is_cpu()) check_sum();  // reading counts from a GPU waits for it
 }
 
@@ -127,7 +133,7 @@ void GradientSource::check_sum() const {
 
 Tensor GradientSource::moments(const Tensor& lengths) const {
   const Tensor& like = blend_ ? blend_->splats() : splats_;
-  Tensor moments = empty({like.size(0), kGradientValues}, like);
+  Tensor moments = empty({like.size(0), row_values(false, on_rays(like))}, like);
   with_scalar(like.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
     T* to = write<T>(moments);

@@ -37,14 +37,17 @@ void check_counts(const Tensor& tile_counts, int64_t count, Device device);
 gs::Image image_of(const Tensor& last, const Tensor& splats);
 Tensor background_like(const Tensor& background, const Tensor& splats);
 
+// Whether splats are gs::RaySplats, by their values.
+bool on_rays(const Tensor& splats);
+
 // Values of a gradient row, with those of absolute gradients or without.
-int64_t row_values(bool absolute);
+int64_t row_values(bool absolute, bool rays);
 
 template <class T>
 gs::BlendInput<T> blend_input(const Tensor& splats, const Tensor& instances, const Tensor& ranges,
                               const Tensor& background, gs::Image image) {
   return {read<T>(splats), read<int32_t>(instances), read<int64_t>(ranges), read<T>(background),
-          image,           instances.size(0)};
+          image,           instances.size(0),        on_rays(splats)};
 }
 
 // Owns the tensors that the gs::BlendInput and gs::BlendGradient of a backward point into. source: Kept.
@@ -110,7 +113,8 @@ class GradientSource {
 
   template <class T>
   gs::SplatRows<T> input() const {
-    return {counts_.size(0), read<int32_t>(tile_counts_), read<int32_t>(counts_), read<T>(rows_), rows_.size(0)};
+    return {counts_.size(0), read<int32_t>(tile_counts_), read<int32_t>(counts_), read<T>(rows_), rows_.size(0),
+            on_rays(splats_)};
   }
   template <class T>
   gs::RowSums<T> sums(T* moments, const Tensor& lengths) const {

@@ -13,7 +13,7 @@ namespace gs::ops {
 
 namespace {
 
-using gs::baseline::has_records, gs::baseline::kSplatValues, gs::baseline::layer_values, gs::baseline::tiles_of;
+using gs::baseline::has_records, gs::baseline::kSplatRow, gs::baseline::layer_values, gs::baseline::tiles_of;
 
 struct ProjectedTensors {
   Tensor splats, depths, rects, tile_counts, radii;
@@ -25,7 +25,8 @@ struct ProjectedTensors {
             rects.defined() ? write<int32_t>(rects) : nullptr,
             write<int32_t>(tile_counts),
             write<int32_t>(radii),
-            records.defined() ? static_cast<gs::TileRecord*>(records.mutable_data_ptr()) : nullptr};
+            records.defined() ? static_cast<gs::TileRecord*>(records.mutable_data_ptr()) : nullptr,
+            on_rays(splats)};
   }
 };
 
@@ -34,7 +35,7 @@ ProjectedTensors project(const SceneTensors& in, bool rects) {
   const int64_t n = in.rows();
   const Tensor& like = in.means();
   ProjectedTensors out;
-  out.splats = empty({n, kSplatValues}, like);
+  out.splats = empty({n, in.rays() ? kSplatRow<true> : kSplatRow<false>}, like);
   out.depths = empty({n}, like);
   out.tile_counts = empty<int32_t>({n}, like);
   out.radii = empty<int32_t>({n}, like);

@@ -8,8 +8,8 @@
 #include "tensors.h"
 
 // The Gaussians, of which some may be null; the view matrix and the full projection, both transposed, and the centre;
-// tan_x, tan_y and scale_modifier, and perhaps the numbers of a gs::Lens; height, width, sh_degree, antialiasing and
-// raw.
+// tan_x, tan_y and scale_modifier, and perhaps the numbers of a gs::Lens; height, width, sh_degree, antialiasing, raw,
+// and perhaps whether Gaussians are seen on rays.
 #define CAMERA_SCHEMA "float[] lens, int[] options"
 #define SCENE_SCHEMA                                                                                   \
   "Tensor means, Tensor opacities, Tensor? scales, Tensor? rotations, Tensor? cov3d, Tensor? colors, " \
@@ -61,6 +61,7 @@ class SceneTensors {
   bool has(Input input) const { return inputs_[input].defined(); }
   bool raw() const { return raw_; }
   bool has_lens() const { return lens_[0] != 0; }
+  bool rays() const { return rays_; }
   bool flat_opacities() const { return inputs_[kOpacities].dim() == 1; }  // a row instead of a column
   const Tensor& means() const { return inputs_[kMeans]; }
   int64_t count() const { return inputs_[kMeans].size(0); }
@@ -101,7 +102,8 @@ class SceneTensors {
             awake_.defined() ? read<uint8_t>(awake_) : nullptr,
             blocks_.defined() ? read<int32_t>(blocks_) : nullptr,
             blocks_.defined() ? blocks_.size(0) : 0,
-            lens<T>()};
+            lens<T>(),
+            rays_};
   }
 
  private:
@@ -132,7 +134,7 @@ class SceneTensors {
   double tan_x_, tan_y_, scale_modifier_;
   std::array<double, gs::kLensNumbers> lens_ = {};  // gs::Lens; a pinhole if it is not given
   int sh_degree_;
-  bool antialiasing_, raw_;
+  bool antialiasing_, raw_, rays_;
   gs::Image image_;
 };
 

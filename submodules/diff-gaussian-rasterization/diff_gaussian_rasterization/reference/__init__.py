@@ -1,8 +1,8 @@
 """The oracle: 3D Gaussian Splatting (Kerbl et al. 2023) in plain float64 PyTorch; autograd differentiates it.
 
-Start with `render`, which names the five steps, then read camera, shape, colour and blend in this order. The oracle
-shares no code with csrc and decides in disputes. It has no tiles: every Gaussian is evaluated at every pixel, so it
-needs some 100 bytes for each Gaussian and pixel of the rows rendered at once.
+Start with `render`, which names the steps, then read camera, lens, shape, ray, colour and blend in this order. The
+oracle shares no code with csrc and decides in disputes. It has no tiles: every Gaussian is evaluated at every pixel, so
+it needs some 100 bytes for each Gaussian and pixel of the rows rendered at once.
 """
 
 from typing import NamedTuple
@@ -14,6 +14,8 @@ from diff_gaussian_rasterization.gaussians import Gaussians, lists_gaussians
 from diff_gaussian_rasterization.reference.blend import blend_rows, nearest_first
 from diff_gaussian_rasterization.reference.camera import camera_of, project
 from diff_gaussian_rasterization.reference.colour import seen_colors
+from diff_gaussian_rasterization.reference.lens import rays
+from diff_gaussian_rasterization.reference.ray import ray_shapes
 from diff_gaussian_rasterization.reference.shape import activated, compensation, project_shapes, radii
 from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 
@@ -54,14 +56,19 @@ def render(
 
     points = project(gaussians.means, means2d.double(), camera)
     ellipses = project_shapes(gaussians, points, camera, settings.scale_modifier)
+    shapes, slopes, directions = ellipses, None, None
+    if settings.projection == "ray":
+        shapes, slopes = ray_shapes(gaussians, points, camera, settings.scale_modifier)
+        directions = camera.lens and rays(camera.lens, camera.width, camera.height)
     opacity = gaussians.opacities.reshape(-1)
     if settings.antialiasing:
-        opacity = opacity * compensation(ellipses)
+        opacity = opacity * compensation(shapes)
     colors = gaussians.colors if gaussians.colors is not None else seen_colors(gaussians, camera, settings.sh_degree)
 
-    splats = nearest_first(points, ellipses, opacity, colors, cut)
+    splats = nearest_first(points, shapes, slopes, opacity, colors, cut)
     starts = range(0, camera.height, rows_at_once)
     strips = [range(start, min(start + rows_at_once, camera.height)) for start in starts]
-    parts = [blend_rows(splats, settings.bg.double(), rows, camera.width, cut) for rows in strips]
+    background = settings.bg.double()
+    parts = [blend_rows(splats, background, directions, rows, camera.width, cut) for rows in strips]
     color, inverse_depth, transmittance, near_cut = (torch.cat(planes, -2) for planes in zip(*parts, strict=True))
     return Rendered(color, radii(points, ellipses, camera), inverse_depth[None], transmittance[None], near_cut)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from diff_gaussian_rasterization.reference.camera import Points
+from diff_gaussian_rasterization.reference.ray import Slopes
 from diff_gaussian_rasterization.reference.shape import Ellipses
 
 LEAST_ALPHA = 1 / 255  # a pixel blends no smaller alpha
@@ -24,6 +25,7 @@ class Splats(NamedTuple):
     color: Tensor  # (M, 3)
     depth: Tensor  # (M,) world units
     is_tie: Tensor  # (M,) bool: about as deep as the splat before, so that rounding may swap them
+    slopes: Slopes | None  # None for EWA
 
 
 class Planes(NamedTuple):
@@ -35,20 +37,23 @@ class Planes(NamedTuple):
     near_cut: Tensor  # (rows, W) bool
 
 
-def nearest_first(points: Points, ellipses: Ellipses, opacity: Tensor, colors: Tensor, cut: float) -> Splats:
+def nearest_first(
+    points: Points, ellipses: Ellipses, slopes: Slopes | None, opacity: Tensor, colors: Tensor, cut: float
+) -> Splats:
     """Drops the Gaussians that are not in front and sorts the others by depth."""
-    key = torch.where(points.in_front, points.view[:, 2], torch.inf)
+    key = torch.where(points.in_front, points.depth, torch.inf)
     order = torch.argsort(key, stable=True)[: int(points.in_front.sum())]
-    sorted_depth = points.view[order, 2]
+    depth = points.depth[order]
     is_tie = torch.zeros(len(order), dtype=torch.bool)
-    is_tie[1:] = sorted_depth.diff() < 0.01 * cut * sorted_depth[1:]
+    is_tie[1:] = depth.diff() < 0.01 * cut * depth[1:]
     factor = (entry[order] for entry in ellipses[:3])
-    return Splats(points.pixel[order], *factor, opacity[order], colors[order], points.depth[order], is_tie)
+    slopes = slopes and Slopes(*(None if values is None else values[order] for values in slopes))
+    return Splats(points.pixel[order], *factor, opacity[order], colors[order], depth, is_tie, slopes)
 
 
-def blend_rows(splats: Splats, background: Tensor, rows: range, width: int, cut: float) -> Planes:
+def blend_rows(splats: Splats, background: Tensor, rays: Tensor | None, rows: range, width: int, cut: float) -> Planes:
     """Blends image rows: C = sum of c_i alpha_i T_i, where T_i is the product of 1 - alpha_j over nearer splats j."""
-    uncapped = alphas(splats, rows, width)
+    uncapped = alphas(splats, rows, width) if splats.slopes is None else ray_alphas(splats, rays, rows, width)
     reached = uncapped >= LEAST_ALPHA
     alpha = uncapped + (torch.clamp(uncapped, max=LARGEST_ALPHA) - uncapped).detach()  # the gradient passes the cap
     alpha = torch.where(reached, alpha, 0.0)
@@ -67,18 +72,37 @@ def blend_rows(splats: Splats, background: Tensor, rows: range, width: int, cut:
 
 
 def alphas(splats: Splats, rows: range, width: int) -> Tensor:
-    """Opacity times the Gaussian of Kerbl et al. 2023, eq. 4, on the image: (M, rows, W).
+    """Opacity times the Gaussian of Kerbl et al. 2023, eq. 4, on the image: (M, rows, W)."""
+    u, v = _whitened(splats, *_offsets(splats, rows, width))
+    return splats.opacity[:, None, None] * torch.exp(-0.5 * (u * u + v * v))
 
-    With covariance = R^T R and R^T (u, v) = (dx, dy), the exponent is -(u^2 + v^2) / 2: it cannot become positive.
-    """
+
+def ray_alphas(splats: Splats, rays: Tensor | None, rows: range, width: int) -> Tensor:
+    """Opacity times exp(-D^2 / 2) of `reference.ray`: (M, rows, W). rays (H, W, 3): of a lens."""
+    g, e, of_rays = splats.slopes
+    if of_rays is None:
+        (dx, dy), depth = _offsets(splats, rows, width), 1.0
+    else:
+        dx, dy, depth = torch.einsum("nik,hwk->inhw", of_rays, rays[rows.start : rows.stop])
+    s = depth + g[:, 0, None, None] * dx + g[:, 1, None, None] * dy
+    u, v = _whitened(splats, dx, dy)
+    q, hit = u * u + v * v, s > 0
+    square = q / (torch.where(hit, s, 1.0) ** 2 + e[:, None, None] * q)
+    return torch.where(hit, splats.opacity[:, None, None] * torch.exp(-0.5 * square), 0.0)
+
+
+def _offsets(splats: Splats, rows: range, width: int) -> tuple[Tensor, Tensor]:
+    """From a splat's mean to a pixel, px: (M, 1, W) and (M, rows, 1)."""
     x = torch.arange(width, dtype=torch.float64)
     y = torch.arange(rows.start, rows.stop, dtype=torch.float64)
-    dx = x[None, None, :] - splats.pixel[:, 0, None, None]
-    dy = y[None, :, None] - splats.pixel[:, 1, None, None]
-    r11, r12, r22, opacity = (t[:, None, None] for t in (splats.r11, splats.r12, splats.r22, splats.opacity))
+    return x[None, None, :] - splats.pixel[:, 0, None, None], y[None, :, None] - splats.pixel[:, 1, None, None]
+
+
+def _whitened(splats: Splats, dx: Tensor, dy: Tensor) -> tuple[Tensor, Tensor]:
+    """(u, v) with covariance = R^T R and R^T (u, v) = (dx, dy): -(u^2 + v^2) / 2 cannot become positive."""
+    r11, r12, r22 = (t[:, None, None] for t in (splats.r11, splats.r12, splats.r22))
     u = dx / r11
-    v = (dy - r12 * u) / r22
-    return opacity * torch.exp(-0.5 * (u * u + v * v))
+    return u, (dy - r12 * u) / r22
 
 
 def _is_near(values: Tensor, limit: float, cut: float) -> Tensor:

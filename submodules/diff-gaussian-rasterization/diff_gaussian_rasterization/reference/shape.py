@@ -44,14 +44,21 @@ def activated(raw: Gaussians) -> Gaussians:
 
 
 def project_shapes(gaussians: Gaussians, points: Points, camera: Camera, scale_modifier: float) -> Ellipses:
-    """J W Sigma W^T J^T (Kerbl et al. 2023, eq. 5) with Sigma = R S S^T R^T (eq. 6), plus the dilation."""
-    JW = world_to_image(points, camera)
+    """J W Sigma W^T J^T (Kerbl et al. 2023, eq. 5), plus the dilation."""
+    return ellipses_of(world_to_image(points, camera), *in_space(gaussians, scale_modifier))
+
+
+def in_space(gaussians: Gaussians, scale_modifier: float) -> tuple[Tensor | None, Tensor | None]:
+    """R S and None, where Sigma = R S S^T R^T (Kerbl et al. 2023, eq. 6), or None and Sigma: both (N, 3, 3)."""
     if gaussians.cov3d is not None:
-        Sigma = gaussians.cov3d[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-        return _factor_of_covariance(JW @ Sigma @ JW.transpose(1, 2))
+        return None, gaussians.cov3d[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     S = gaussians.scales * scale_modifier  # the diagonal
-    RS = rotation_matrices(gaussians.rotations) * S[:, None, :]
-    return _factor(JW @ RS)
+    return rotation_matrices(gaussians.rotations) * S[:, None, :], None
+
+
+def ellipses_of(JW: Tensor, RS: Tensor | None, Sigma: Tensor | None) -> Ellipses:
+    """The dilated ellipses of Gaussians of `in_space` under linear maps JW (N, 2, 3)."""
+    return _factor_of_covariance(JW @ Sigma @ JW.transpose(1, 2)) if RS is None else _factor(JW @ RS)
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:
