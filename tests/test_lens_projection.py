@@ -175,7 +175,7 @@ def test_single_precision_agrees_with_double(model, device, dtype):
 def turned(camera: GaussianRasterizationSettings, columns: int) -> GaussianRasterizationSettings:
     """The camera of a panorama whose columns are moved to the right by so many."""
     angle = 2 * math.pi * columns / WIDTH
-    turn = torch.eye(4, dtype=torch.float64)
+    turn = torch.eye(4, dtype=torch.float64, device=camera.viewmatrix.device)
     turn[0, 0] = turn[2, 2] = math.cos(angle)
     turn[0, 2], turn[2, 0] = -math.sin(angle), math.sin(angle)
     return camera._replace(viewmatrix=(camera.viewmatrix.double() @ turn).to(camera.viewmatrix))

@@ -45,6 +45,7 @@ class WorkloadRun(Run):
         words += ["--parallel", parallel, "--gpu_memory", str(gpu_memory)]
         self.launch, self.dataset, self.opt, self.pipe = train.parse(words)
         self.lost = self.first_iteration = 0
+        self.poses = None
         self.interrupt, self.device = DeferredInterrupt(), compute_device()
         self.schedule = schedule_of(self.opt, None, 0, views)
         images = SimpleNamespace(ahead=0, keep_on=torch.device("cpu"), planned_bytes=0)

@@ -2,12 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from scene.cameras import Camera
 from splatting.camera_paths.keyframes import Keyframe
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 SAME_PLACE = 1e-6  # of the distance from the origin, or of 1: float32 tells no smaller distances apart
 WIDEST = 60.0  # degrees; vertical opening of a pinhole view in place of a fisheye's or a panorama's
@@ -52,14 +55,20 @@ class Poses:
     @property
     def quaternions(self) -> np.ndarray:
         """The turns as unit quaternions (N,4) wxyz."""
-        return Rotation.from_matrix(self.turns).as_quat(scalar_first=True)
+        return _rotations(self.turns).as_quat(scalar_first=True)
+
+
+def _rotations(turns: np.ndarray) -> "Rotation":
+    from scipy.spatial.transform import Rotation  # takes a while to import
+
+    return Rotation.from_matrix(turns)
 
 
 def poses_of(cameras: Sequence[Camera]) -> Poses:
     """The poses of views, by their matrices."""
     views = np.stack([camera.world_view_transform.detach().cpu().double().numpy().T for camera in cameras])
     positions = -np.linalg.solve(views[:, :3, :3], views[:, :3, 3:])[..., 0]
-    turns = Rotation.from_matrix(views[:, :3, :3].transpose(0, 2, 1)).as_matrix()
+    turns = _rotations(views[:, :3, :3].transpose(0, 2, 1)).as_matrix()
     return Poses(positions, turns, np.degrees([opening(camera) for camera in cameras]))
 
 
@@ -87,7 +96,7 @@ def facing(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 def keyframe(seconds: float, position: np.ndarray, turn: np.ndarray, fov: float) -> Keyframe:
     """A pose with a turn (3,3) as a Keyframe."""
-    wxyz = Rotation.from_matrix(turn).as_quat(scalar_first=True)
+    wxyz = _rotations(turn).as_quat(scalar_first=True)
     return Keyframe(seconds, tuple(position.tolist()), tuple(wxyz.tolist()), float(fov))
 
 

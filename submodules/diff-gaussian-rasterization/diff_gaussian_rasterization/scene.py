@@ -91,6 +91,8 @@ def scene_arguments(gaussians: Gaussians, settings: GaussianRasterizationSetting
     tangents = (t.item() if isinstance(t, Tensor) else t for t in (settings.tanfovx, settings.tanfovy))
     lens = *tangents, settings.scale_modifier
     if settings.lens is not None:
+        if not isinstance(settings.lens, Lens):
+            raise ValueError(f"lens must be a Lens or None, got {settings.lens!r}")
         shown = settings.lens if settings.lens_values is None else _with_values(settings.lens, settings.lens_values)
         lens += shown.numbers(*size[::-1])
     place = settings.viewmatrix, settings.projmatrix, settings.campos
