@@ -97,3 +97,12 @@ def dtype(request: pytest.FixtureRequest) -> Iterator[torch.dtype]:
     device, made = request.param
     with torch.device(device):
         yield made
+
+
+@pytest.fixture
+def one_thread():
+    """Use one thread: on images of a hundred pixels, more only wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)

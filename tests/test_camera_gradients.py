@@ -20,6 +20,7 @@ from scene.cameras import MiniCam
 from scene.poses import motion, moved
 from splatting.distributed.rendering.rasterize import rasterize_over
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 VIEW = rigid((0.95, 0.1, -0.15, 0.05), (0.1, -0.05, 0.2))
 SHEARED = VIEW.clone()
 SHEARED[:3, :3] = torch.tensor([[-1.1, 0.1, 0.0], [0.2, 0.8, 0.15], [0.0, -0.1, 0.9]], dtype=torch.float64)
@@ -30,15 +31,6 @@ LENSES = {
     "equidistant": ((-0.05, 0.02, -0.01, 0.002), (0.01, 0.01, -0.002), (0.003, -0.004), (0.002, 0.001)),
     "equirectangular": ((0.01, 0, 0, 0), (0, 0, 0), (0.003, -0.004), (0.002, 0.001)),
 }
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Use one thread: on images of a hundred pixels, more only wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def _lens(chart: str) -> Lens:
