@@ -17,7 +17,7 @@ namespace {
 
 constexpr int64_t kLeastShare = 2 * kListThreads, kMostShares = 1024;  // shares of the splats, a block for each
 constexpr int64_t kMostPlaces = 1 << 24;                               // 64 MiB; images of many tiles get fewer shares
-constexpr unsigned kMostBlocks = 8192, kLargeBlocks = 256;
+constexpr unsigned kMostBlocks = 8192;
 
 }  // namespace
 
@@ -42,7 +42,7 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& given
   int64_t *of_shares = queue.array<int64_t>(shares), *totals = queue.array<int64_t>(2);
   GS_CUDA_CHECK(cudaMemsetAsync(numbers, 0, (2 * tiles + 2) * sizeof *numbers, stream));
   launch(queue, "count", count_kernel, shares, kListThreads, count, splats, in, image, counts, of_shares);
-  const unsigned large_blocks = std::min(kLargeBlocks, blocks_for(count + 1, kListThreads / 32));
+  const unsigned large_blocks = std::clamp<unsigned>(unsigned(tiles) / 16, 256, 2048);
   launch(queue, "count_large", count_large_kernel, large_blocks, kListThreads, in, image, counts);
   launch(queue, "lay_out", lay_out_kernel, 1, kLayThreads, tiles, counts, begins, shares, of_shares, totals,
          memory.ahead ? *memory.ahead : Ahead{});

@@ -62,6 +62,26 @@ constexpr int kWindow = 8192;
 struct Share {
   int64_t first, end;
   __device__ Share(int64_t n, int64_t splats) : first(splats * blockIdx.x), end(min(first + splats, n)) {}
+
+  // Where the tiles begin and end that splats with a mask may reach; all tiles, if one window holds them. All threads
+  // of the block call this.
+  __device__ int2 span(const Projected<float>& in, Image image) const {
+    const int tiles = int(tiles_of(image)), columns = tile_count(image.width);
+    if (tiles <= kWindow) return make_int2(0, tiles);
+    __shared__ int2 all;
+    if (threadIdx.x == 0) all = make_int2(tiles, 0);
+    __syncthreads();
+    int2 own = make_int2(tiles, 0);
+    for (int64_t i = first + threadIdx.x; i < end; i += kListThreads) {
+      const Reached reached = reached_by(in, int32_t(i));
+      if (!reached.mask) continue;
+      own.x = min(own.x, reached.rect.y0 * columns + reached.rect.x0);
+      own.y = max(own.y, (reached.rect.y1 - 1) * columns + reached.rect.x1);
+    }
+    atomicMin(&all.x, own.x), atomicMax(&all.y, own.y);
+    __syncthreads();
+    return all;
+  }
 };
 
 // What the counting kernels fill in. At first all but `large` and `places` are 0.
@@ -81,29 +101,31 @@ __global__ void __launch_bounds__(kListThreads)
   if (!begin_work(halted)) return;
   __shared__ int32_t table[kWindow];
   const Share share(n, splats);
+  const int2 span = share.span(in, image);
   const int64_t tiles = tiles_of(image);
   int64_t slots = 0, total;
-  for (int64_t window = 0; window < tiles; window += kWindow) {
-    const int wide = int(min(tiles - window, int64_t(kWindow)));
+  int window = span.x;
+  do {
+    const int wide = min(span.y - window, kWindow);
     for (int t = threadIdx.x; t < wide; t += kListThreads) table[t] = 0;
     __syncthreads();
     for (int64_t i = share.first + threadIdx.x; i < share.end; i += kListThreads) {
       const Reached reached = reached_by(in, int32_t(i));
-      if (window == 0) {
+      if (window == span.x) {
         slots += slot_count(reached.rect);
         if (reached.count && !reached.mask) counts.large[atomicAdd(counts.larges, 1)] = int32_t(i);
       }
       each_tile(reached, tile_count(image.width), [&](const int (&its)[kTaken]) {
 #pragma unroll
         for (const int tile : its)
-          if (unsigned(tile - int(window)) < unsigned(wide)) atomicAdd(table + tile - window, 1);
+          if (unsigned(tile - window) < unsigned(wide)) atomicAdd(table + tile - window, 1);
       });
     }
     __syncthreads();
     for (int t = threadIdx.x; t < wide; t += kListThreads)
       if (table[t]) counts.places[tiles * blockIdx.x + window + t] = atomicAdd(counts.masked + window + t, table[t]);
     __syncthreads();
-  }
+  } while ((window += kWindow) < span.y);
   sum_before(slots, total);
   if (threadIdx.x == 0) of_shares[blockIdx.x] = total;
 }
@@ -204,8 +226,9 @@ __global__ void __launch_bounds__(kListThreads)
     return;
   }
   const Share share(n, splats);
-  for (int64_t window = 0; window < tiles; window += kWindow) {
-    const int wide = int(min(tiles - window, int64_t(kWindow)));
+  const int2 span = share.span(in, image);
+  for (int window = span.x; window < span.y; window += kWindow) {
+    const int wide = min(span.y - window, kWindow);
     for (int t = threadIdx.x; t < wide; t += kListThreads)  // where the share has none, any number
       table[t] = work.begins[window + t] + counts.places[tiles * blockIdx.x + window + t];
     __syncthreads();
@@ -216,7 +239,7 @@ __global__ void __launch_bounds__(kListThreads)
       each_tile(reached, tile_count(image.width), [&](const int (&its)[kTaken]) {
 #pragma unroll
         for (const int tile : its)
-          if (unsigned(tile - int(window)) < unsigned(wide)) work.keys[atomicAdd(table + tile - window, 1)] = key;
+          if (unsigned(tile - window) < unsigned(wide)) work.keys[atomicAdd(table + tile - window, 1)] = key;
       });
     }
     __syncthreads();
