@@ -170,13 +170,17 @@ class Sleeping:
 
 
 def share_seen(points: Tensor, cameras: Sequence[Camera]) -> float:
-    """The share of points (N, 3) that a camera sees, on the mean of up to 32 cameras; 1 with lenses, as all wake."""
-    if any(getattr(camera, "lens", None) for camera in cameras):
-        return 1.0
+    """The share of points (N, 3) that a camera sees, on the mean of up to 32 cameras. Distortion is left out."""
     views = cameras[:: -(-len(cameras) // 32)]
     ones = torch.cat((points, torch.ones_like(points[:, :1])), 1)
     shares = []
     for view in views:
-        x, y, _, w = (ones @ view.full_proj_transform.to(points)).unbind(1)
-        shares.append(float(((w > 0) & (x.abs() < w) & (y.abs() < w)).float().mean()))
+        lens = getattr(view, "lens", None)
+        if lens and lens.chart != "perspective":
+            toward = torch.nn.functional.normalize((ones @ view.world_view_transform.to(points))[:, :3], dim=1)
+            seen = toward[:, 2].clamp(-1, 1).acos() < lens.field(view.image_width, view.image_height)
+        else:
+            x, y, _, w = (ones @ view.full_proj_transform.to(points)).unbind(1)
+            seen = (w > 0) & (x.abs() < w) & (y.abs() < w)
+        shares.append(float(seen.float().mean()))
     return sum(shares) / len(shares)

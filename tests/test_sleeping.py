@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from diff_gaussian_rasterization.backend import OPERATORS
+from diff_gaussian_rasterization.lens import Lens
 from diff_gaussian_rasterization.optim import adam_
 from diff_gaussian_rasterization.scene import Scene
 from gaussians import needs_fused_step
@@ -74,14 +75,16 @@ def _rows(count: int, generator: torch.Generator, place: dict) -> list[torch.Ten
     return [torch.randn(count, *shape, generator=generator, dtype=torch.float64).to(**place) for shape in shapes]
 
 
-def _camera(view: torch.Tensor, place: dict, width: int = 96, height: int = 64) -> tuple:
+def _camera(view: torch.Tensor, place: dict, lens: Lens | None = None, width: int = 96, height: int = 64) -> tuple:
     """A camera whose matrix world to view is (4, 4); the fields of Scene behind the Gaussians."""
     near, tan_x, tan_y = 0.01, 0.7, 0.7 * height / width
     full = torch.zeros(4, 4, dtype=torch.float64)
     full[0, 0], full[1, 1], full[3, 2], full[2, 2], full[2, 3] = 1 / tan_x, 1 / tan_y, 1.0, 1.0, -near
     center = torch.linalg.inv(view)[:3, 3]
     matrices = view.T, (full @ view).T, center
-    return *(m.contiguous().to(**place) for m in matrices), (tan_x, tan_y, 1.0), (height, width, 3, False, True)
+    numbers = lens.numbers(width, height) if lens else ()
+    moved = (m.contiguous().to(**place) for m in matrices)
+    return *moved, (tan_x, tan_y, 1.0, *numbers), (height, width, 3, False, True)
 
 
 def _away(place: dict) -> tuple:
@@ -136,15 +139,21 @@ def test_a_value_whose_missed_steps_are_not_finite_stays(device, dtype, mean):
     assert not slept.averages[0][:7].isnan().any()
 
 
-def _clusters(rng: np.random.Generator, place: dict, blocks: int = 24) -> Blocks:
-    """A block a cluster, in a room of 10 units: balls, needles and giants, with averages at their limit."""
+def _clusters(rng: np.random.Generator, place: dict, blocks: int = 24, small: bool = False) -> Blocks:
+    """A block a cluster, in a room of 10 units: balls, needles and giants, with averages at their limit.
+
+    small: the Gaussians of a cluster are almost one, an opaque ball of any size.
+    """
     count = blocks * BLOCK - int(rng.integers(BLOCK))
     values = _rows(count, torch.Generator().manual_seed(int(rng.integers(2**31))), place)
     centers = np.repeat(rng.uniform(-10, 10, (blocks, 3)), BLOCK, 0)[:count]
-    spread = np.repeat(10 ** rng.uniform(-3, 0.3, (blocks, 1)), BLOCK, 0)[:count]
+    spread = np.repeat(10 ** rng.uniform(-3, -2 if small else 0.3, (blocks, 1)), BLOCK, 0)[:count]
     values[0].copy_(torch.tensor(centers + spread * rng.normal(size=(count, 3))))
     needles = np.where(rng.random((count, 3)) < 0.03, rng.uniform(0, 2.5, (count, 3)), 0)
     values[2].copy_(torch.tensor(rng.uniform(-6, -1, (count, 1)) + needles))
+    if small:
+        values[1].fill_(12.0)
+        values[2].copy_(torch.tensor(np.repeat(rng.uniform(-4, 2.5, (blocks, 1)), BLOCK, 0)[:count]))
     out = Blocks(values, step=500)
     for value, mean, square in zip(values, out.averages[:6], out.averages[6:], strict=True):
         square.fill_(1e-6)
@@ -152,26 +161,38 @@ def _clusters(rng: np.random.Generator, place: dict, blocks: int = 24) -> Blocks
     return out
 
 
-def _looking(rng: np.random.Generator, at: np.ndarray, place: dict) -> tuple:
+def _looking(rng: np.random.Generator, at: np.ndarray, place: dict, lens: Lens | None = None) -> tuple:
     """A camera near a point, or far from it, that looks anywhere."""
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     turn *= np.sign(np.linalg.det(turn))
     view = np.eye(4)
     view[:3, :3], view[:3, 3] = turn, -turn @ (at + rng.normal(size=3) * 10 ** rng.uniform(-2, 1))
-    return _camera(torch.tensor(view), place)
+    return _camera(torch.tensor(view), place, lens)
 
 
+LENSES = {
+    "pinhole": None,
+    "barrel": Lens("perspective", (70.0, 68.0), (47.0, 30.0), (-0.3, 0.1, 0.0, 0.0), tangential=(0.003, -0.002)),
+    "pincushion": Lens("perspective", (70.0, 70.0), (60.0, 31.5), (0.1, 0.02, 0.0, 0.0), prism=(0.01, -0.02)),
+    "turning back": Lens("perspective", (50.0, 50.0), (47.5, 31.5), (-0.25, 0.0, 0.0, 0.0)),
+    "rational": Lens("perspective", (70.0, 70.0), (47.5, 31.5), (0.3, 0.1, 0.0, 0.0), (0.5, 0.1, 0.0)),
+    "fisheye": Lens("equidistant", (40.0, 41.0), (47.0, 31.0), (0.02, -0.01, 0.001, 0.0)),
+    "wide fisheye": Lens("equidistant", (34.0, 34.0), (47.5, 31.5)),
+}
+
+
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
 @BOTH_AND_GPU
-def test_no_view_shows_a_block_that_sleeps(device, dtype):
+def test_no_view_shows_a_block_that_sleeps(device, dtype, lens):
     place, rng = {"device": device, "dtype": dtype}, np.random.default_rng(7)
     asleep = woken = 0
-    for _ in range(60):
-        blocks = _clusters(rng, place)
+    for trial in range(60):
+        blocks = _clusters(rng, place, small=trial % 2 > 0)
         missed, rate = int(rng.integers(1, 100)), 10 ** rng.uniform(-5, -2)
         blocks.terms[:, :6] = rate
         for step in blocks.steps:
             step += missed
-        camera = _looking(rng, blocks.values[0][int(rng.integers(len(blocks.values[0])))].cpu().numpy(), place)
+        camera = _looking(rng, blocks.values[0][int(rng.integers(len(blocks.values[0])))].cpu().numpy(), place, lens)
         whole = Blocks([value.clone() for value in blocks.values])
         whole.averages, whole.steps = [x.clone() for x in blocks.averages], blocks.steps
         whole.taken, whole.terms = blocks.taken.clone(), blocks.terms.clone()
@@ -188,6 +209,14 @@ def test_no_view_shows_a_block_that_sleeps(device, dtype):
         assert all(torch.equal(one, other) for one, other in zip(*(d[:4] for d in drawn), strict=True))
         asleep, woken = asleep + int((~rows).sum()), woken + int(rows.sum())
     assert min(asleep, woken) > 0.1 * (asleep + woken)
+
+
+def test_every_view_of_a_panorama_wakes_all():
+    place = {"device": "cpu", "dtype": torch.float32}
+    blocks = _clusters(np.random.default_rng(1), place)
+    lens = Lens("equirectangular", (96 / math.tau, 64 / math.pi), (47.5, 31.5))
+    blocks.wake(_camera(torch.eye(4, dtype=torch.float64), place, lens), False, 0.01)
+    assert blocks.awake.all()
 
 
 def test_steps_with_sleep_are_those_of_dense_adam_in_double():
@@ -228,7 +257,10 @@ def test_steps_with_sleep_are_those_of_dense_adam_in_double():
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of a room of clusters, of which a view sees a part."""
-    folder = narrow_scene(tmp_path_factory.mktemp("sleeping") / "scene")
+    return _with_clusters(narrow_scene(tmp_path_factory.mktemp("sleeping") / "scene"))
+
+
+def _with_clusters(folder: Path) -> Path:
     rng = np.random.default_rng(0)
     centers = np.repeat(rng.uniform(-8, 8, (30, 3)), 200, 0)
     points = np.concatenate((0.5 * rng.normal(size=(1000, 3)), centers + 0.1 * rng.normal(size=centers.shape)))
@@ -275,6 +307,15 @@ def test_fast_steps(scene, tmp_path, take_as, plain, shares, way, name):  # noqa
     take_as(way)
     assert not differences(_trained(scene, tmp_path, *OPTIONS[name]), expected)
     assert min(shares) < 0.9
+
+
+def test_fast_steps_with_a_lens(tmp_path, take_as, shares):  # noqa: F811
+    scene = _with_clusters(narrow_scene(tmp_path / "scene", "OPENCV", (-0.2, 0.05, 0.001, -0.002)))
+    expected = _trained(scene, tmp_path / "plain", "--plain_step")
+    assert min(shares) < 0.9
+    shares.clear()
+    take_as("captured")
+    assert not differences(_trained(scene, tmp_path / "fast"), expected) and min(shares) < 0.9
 
 
 @pytest.mark.parametrize("name", NAMES)

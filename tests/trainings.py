@@ -44,9 +44,9 @@ OPTIONS = {
 }
 
 
-def narrow_scene(folder: Path) -> Path:
+def narrow_scene(folder: Path, model: str = "PINHOLE", distortion: tuple[float, ...] = ()) -> Path:
     """Make a COLMAP scene of which a view sees a part, with a mask and an inverse depth map for each photo."""
-    make_colmap_scene(folder, params=(5 * FOCAL, 5 * FOCAL, 48.0, 32.0))
+    make_colmap_scene(folder, model=model, params=(5 * FOCAL, 5 * FOCAL, 48.0, 32.0, *distortion))
     images = folder / "images"
     photos = [photo.relative_to(images) for photo in images.rglob("*") if photo.is_file()]
     mask = np.full((64, 96), 255, np.uint8)

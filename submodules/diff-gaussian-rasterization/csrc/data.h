@@ -21,10 +21,14 @@ struct Lens {
   // limit: of the sum of squares of the chart's numbers: nothing beyond is shown. reach: how many times as far as a
   // pinhole of its focal lengths it sees, at least 1.
   T limit, reach;
+  // For blocks that sleep. field: of the chart's numbers, beyond which all is at least `beyond` px off the image.
+  // steep: px by which a point moves at most, a unit by which the chart's numbers move within the field, or a direction
+  // turns.
+  T field, steep, beyond;
   T focal_x, focal_y, center_x, center_y;  // px
   T radial[4], divisor[3], tangential[2], prism[2];
 };
-constexpr int kLensNumbers = 18;
+constexpr int kLensNumbers = 21;
 
 // The Gaussians and the camera. The tensors come in the order of Input in torch/scene.h.
 template <class T>

@@ -10,6 +10,7 @@ import numpy as np
 _CHARTS = ("pinhole", "perspective", "equidistant", "equirectangular")  # gs::Chart in csrc/data.h
 LENS_VALUES = 15  # focal lengths, principal point and coefficients
 _SPARE = 1.3  # of the image's field of view, as the Jacobian's clamp of a pinhole
+_TURN = 0.1  # radians that a fisheye's direction may have turned since a block fell asleep (csrc/math/sleep.h)
 # Parameters of COLMAP's models behind focal lengths and principal point: name and place.
 _RADIAL, _DIVISOR, _TANGENTIAL, _PRISM = "radial", "divisor", "tangential", "prism"
 _BROWN = ((_RADIAL, 0), (_RADIAL, 1), (_TANGENTIAL, 0), (_TANGENTIAL, 1))
@@ -65,9 +66,9 @@ class Lens(NamedTuple):
         more = self.values
         if not all(map(math.isfinite, more)) or min(self.focal) <= 0:
             raise ValueError(f"a lens needs finite numbers and focal lengths above 0, got {more}")
-        field, turn, reach = self._bounds(width, height)
+        field, turn, reach, *sleep = self._bounds(width, height)
         limit = turn if self.chart == "perspective" else field
-        return float(_CHARTS.index(self.chart)), limit * limit, reach, *more
+        return float(_CHARTS.index(self.chart)), limit * limit, reach, field, *sleep, *more
 
     def field(self, width: int, height: int) -> float:
         """The field of an image: an angle from the axis (radians), or its tangent for a perspective chart.
@@ -78,10 +79,14 @@ class Lens(NamedTuple):
         return self._bounds(width, height)[0]
 
     @functools.lru_cache(maxsize=4096)  # noqa: B019  (a lens is a value)
-    def _bounds(self, width: int, height: int) -> tuple[float, float, float]:
-        """The field, where the distortion turns back, and how many times it widens the view, at least 1."""
+    def _bounds(self, width: int, height: int) -> tuple[float, ...]:
+        """The field, where the distortion turns back, and how many times it widens the view, at least 1.
+
+        Then, for blocks that sleep, the steepest slope of pixels by the chart's numbers, or by a direction, and how far
+        off the image all is that lies beyond the field.
+        """
         if self.chart == "equirectangular":
-            return math.inf, math.inf, 1.0
+            return math.inf, math.inf, 1.0, math.inf, 0.0
         r = np.polynomial.Polynomial([0.0, 1.0])
         over, under = (np.polynomial.Polynomial([1.0, *terms])(r * r) for terms in (self.radial, self.divisor))
         # The derivative of the distorted radius, where tangential and prism terms take most of it.
@@ -97,7 +102,25 @@ class Lens(NamedTuple):
         radii = np.linspace(0, min(turn, 4 * corner, math.pi if self.chart == "equidistant" else math.inf), 4097)
         shrunk = over(radii) / under(radii)
         inside = radii * shrunk <= corner
-        return min(turn, _SPARE * float(radii[inside][-1])), turn, max(1.0, 1 / float(shrunk[inside].min()))
+        field, reach = min(turn, _SPARE * float(radii[inside][-1])), max(1.0, 1 / float(shrunk[inside].min()))
+        box = (
+            (_SPARE + abs((2 * at + 1) / size - 1)) * reach * size / (2 * focal)
+            for at, size, focal in zip(self.center, (width, height), self.focal, strict=True)
+        )
+        fisheye = self.chart == "equidistant"
+        farthest = field if fisheye else max(field, math.hypot(*box))  # a perspective lens's Jacobian is clamped there
+        radii = np.linspace(0, farthest, 4097)
+        shrunk, slopes = over(radii) / under(radii), slope(radii) / under(radii) ** 2
+        steep = 1.01 * float(np.maximum(np.abs(slopes) + 2 * aside * radii, np.abs(shrunk)).max())
+        steep += 2 * aside * farthest
+        if any(abs(root.imag) < 1e-9 and 0 < root.real <= farthest for root in under.roots()):
+            steep = math.inf
+        steep *= max(self.focal)
+        if fisheye:  # what is beside the axis is stretched by angle / sine
+            edge = min(field + _TURN, 0.999 * math.pi)
+            return field, turn, reach, steep * edge / math.sin(edge), math.inf
+        beyond = field * float(over(field) / under(field)) - aside * field**2 - corner
+        return field, turn, reach, steep, min(self.focal) * beyond
 
 
 def lens_of(model: str, params: tuple[float, ...]) -> Lens:

@@ -15,8 +15,8 @@ GS_ISA_BEGIN
 namespace {
 
 // Whether a view may show one of the Gaussians.
-template <class T>
-bool may_be_seen(const Scene<T>& s, const Watch<T>& watch) {
+template <class T, class AnyCamera>
+bool may_be_seen(const Scene<T>& s, const Watch<AnyCamera>& watch) {
   using S = Simd<T>;
   int32_t rows[kSleepBlock];
   std::iota(rows, rows + s.count, 0);
@@ -57,7 +57,6 @@ void wake(const Executor& executor, const Scene<T>& s, const SleepInput<T>& in) 
   const GaussianStep<T>& step = in.step;
   if (step.guard.stopped && *step.guard.stopped) return;
   const int64_t number = step.now ? step.now->step : int64_t(step.attributes[kStepMeans].step);
-  const Camera<T> camera = camera_of(s);
   MissedSums<T> sums = {};
   for (int64_t k = 0; k < kTerms; ++k) sums.set_decays(step.attributes[kStepMeans], number, k);
   for (int a = 0; a < kStepped; ++a)
@@ -66,16 +65,19 @@ void wake(const Executor& executor, const Scene<T>& s, const SleepInput<T>& in) 
       in.terms[number % kTerms * kTermColumns + a] = constants.rate / constants.root_correction;
       sums.add_up(step.attributes[a], in.terms, a, number);
     }
-  for_dynamic(executor, s.count, kSleepBlock, [&](int64_t begin, int64_t end) {
-    const int64_t block = begin / kSleepBlock, missed = missed_before(number, in.taken[block]);
-    const auto reach = [&](int a) { return missed > 0 ? sums.reach(a, missed) : T(0); };
-    const bool wakes =
-        in.all || missed < 0 ||
-        may_be_seen(part_of(s, begin, end - begin), Watch<T>(camera, reach(kStepMeans), reach(kStepScales)));
-    for (int a = 0; a < kStepped && wakes && missed > 0; ++a)
-      take_missed_of_block(step.attributes[a], sums.of(a, missed), begin, end - begin);
-    in.awake[block] = wakes;
-    if (wakes) in.taken[block] = int32_t(number - in.all);
+  with_camera(s, [&](const auto& camera) {
+    for_dynamic(executor, s.count, kSleepBlock, [&](int64_t begin, int64_t end) {
+      const int64_t block = begin / kSleepBlock, missed = missed_before(number, in.taken[block]);
+      const auto reach = [&](int a) { return missed > 0 ? sums.reach(a, missed) : T(0); };
+      const bool wakes =
+          in.all || missed < 0 ||
+          may_be_seen(part_of(s, begin, end - begin),
+                      Watch<std::decay_t<decltype(camera)>>(camera, reach(kStepMeans), reach(kStepScales)));
+      for (int a = 0; a < kStepped && wakes && missed > 0; ++a)
+        take_missed_of_block(step.attributes[a], sums.of(a, missed), begin, end - begin);
+      in.awake[block] = wakes;
+      if (wakes) in.taken[block] = int32_t(number - in.all);
+    });
   });
 }
 

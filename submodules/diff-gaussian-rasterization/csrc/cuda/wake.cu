@@ -25,7 +25,7 @@ static_assert(kThreads == kTerms, "a thread makes the decays of a number of miss
 
 // What all blocks share.
 struct Waking {
-  Camera<float> camera;
+  LensCamera<float> camera;  // or, of a pinhole, its base
   MissedSums<float> missed;
   int64_t number;  // of the step
 };
@@ -95,10 +95,15 @@ __global__ void __launch_bounds__(kThreads)
     out->missed.add_up(in.step.attributes[a], terms, a, number);
   }
   if (threadIdx.x == 64) out->number = number;
-  if (threadIdx.x == 96) out->camera = camera_of(s);
+  if (threadIdx.x != 96) return;
+  if (s.lens.chart == Chart::kPinhole)
+    set_camera(s, static_cast<Camera<float>&>(out->camera));
+  else
+    set_camera(s, out->camera);
 }
 
 // Tests which blocks a view may show.
+template <class AnyCamera>
 __global__ void __launch_bounds__(kThreads)
     test_kernel(const int32_t* halted, Scene<float> s, const __grid_constant__ SleepInput<float> in,
                 const Waking* waking, uint8_t* seen) {
@@ -111,8 +116,8 @@ __global__ void __launch_bounds__(kThreads)
   const int64_t missed = missed_before(waking->number, in.taken[block]);
   if (mine && missed >= 0) {
     const MissedSums<float>& sums = waking->missed;
-    const Watch<float> watch(waking->camera, missed ? sums.reach(kStepMeans, missed) : 0,
-                             missed ? sums.reach(kStepScales, missed) : 0);
+    const Watch<AnyCamera> watch(waking->camera, missed ? sums.reach(kStepMeans, missed) : 0,
+                                 missed ? sums.reach(kStepScales, missed) : 0);
     const float largest = larger(larger(scales.x, scales.y), scales.z) + watch.log_scale;
     mine = !surely_unseen(watch, mean, s.scale_modifier * exponential(largest));
   }
@@ -201,7 +206,8 @@ void wake<float>(const Queue& queue, const Scene<float>& s, const SleepInput<flo
   launch(queue, "prepare", prepare_kernel, 1, kThreads, s, in, waking);
   if (!in.all) {
     uint8_t* seen = queue.array<uint8_t>(blocks);
-    launch(queue, "test", test_kernel, unsigned(blocks), kThreads, s, in, waking, seen);
+    const auto test = s.lens.chart == Chart::kPinhole ? test_kernel<Camera<float>> : test_kernel<LensCamera<float>>;
+    launch(queue, "test", test, unsigned(blocks), kThreads, s, in, waking, seen);
     list_seen(queue, seen, blocks, in);
   }
   launch(queue, "take_missed", take_missed_kernel, unsigned(in.all ? blocks : in.room), kThreads, s.count, in, waking);

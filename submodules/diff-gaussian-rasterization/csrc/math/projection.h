@@ -101,6 +101,12 @@ GS_HD Truth<V> project_splat(const AnyCamera& cam, const Gaussian<V>& gaussian, 
   return visible & (splat.log2_opacity >= T(kLog2MinAlpha) - T(1e-3));  // the margin of tile_rect
 }
 
+// How far outside of the image's tiles a point lies, px.
+template <class T, class V>
+GS_HD V outside(const Camera<T>& cam, V x, V y) {
+  return larger<V>(larger<V>(-x, x - T(cam.width + kTile)), larger<V>(-y, y - T(cam.height + kTile)));
+}
+
 // Whether a splat certainly has no tile and no radius, for a Gaussian with perpendicular axes and an opacity of at most
 // 1. largest_scale() is asked for its largest scale only if its mean is off the image: its covariance on the image has
 // at most the trace of a ball's of that scale. 3.34 standard deviations reach alpha 1/255, and `radii` count 3. The
@@ -111,8 +117,7 @@ GS_HD Truth<V> surely_outside(const Camera<T>& cam, Vec3<V> mean, const Scale& l
   const Truth<V> front = in_front(view.z);
   const Perspective<V> p = perspective(cam, view);
   const V x = cam.mean_focal_x * p.ray_x + cam.axis_x, y = cam.mean_focal_y * p.ray_y + cam.axis_y;
-  const V away = larger<V>(larger<V>(-x, x - T(cam.width + kTile)), larger<V>(-y, y - T(cam.height + kTile)));
-  const V deviations = (away - 3) / T(3.5);
+  const V deviations = (outside<T, V>(cam, x, y) - 3) / T(3.5);
   const Truth<V> off = front & (deviations > 1);
   if (!any(off)) return !front;
   const V scale = largest_scale();

@@ -12,6 +12,7 @@
 // gradients that m and v are sums of: 7.27 for the usual decays. So A bounds how far a sleeping value can have moved.
 #include "../data.h"
 #include "exponential.h"
+#include "lens_camera.h"
 #include "projection.h"
 
 GS_ISA_BEGIN
@@ -74,8 +75,11 @@ GS_HD void take_missed(const MissedSum<T>& missed, T& value, T& mean, T& square)
 }
 
 // What tests a block: how far the means and the logarithms of scales may have moved, and the camera.
+template <class AnyCamera>
+struct Watch;
+
 template <class T>
-struct Watch {
+struct Watch<Camera<T>> {
   Camera<T> cam;
   T x, y, z;         // the farthest that a mean may have moved in the view
   T wide_x, wide_y;  // px: the deviation on the image of a ball of scale 1 at depth 1 is at most this
@@ -92,9 +96,37 @@ struct Watch {
   }
 };
 
+template <class T>
+struct Watch<LensCamera<T>> {
+  LensCamera<T> cam;
+  T ball;  // the farthest that a mean may have moved in the view
+  T wide;  // px: as those of a pinhole, together
+  T log_scale;
+
+  GS_HD Watch(const LensCamera<T>& camera, T mean_reach, T scale_reach) : cam(camera), log_scale(scale_reach) {
+    const T stretch = std::sqrt(dot(cam.row_x, cam.row_x) + dot(cam.row_y, cam.row_y) + dot(cam.row_z, cam.row_z));
+    ball = mean_reach * T(1.7321) * stretch;
+    T each = stretch, other = stretch;
+    if (cam.lens.chart == Chart::kPerspective) {
+      const T depth = length(cam.row_z);
+      each = length(cam.row_x) + larger(magnitude(cam.ray_min_x), magnitude(cam.ray_max_x)) * depth;
+      other = length(cam.row_y) + larger(magnitude(cam.ray_min_y), magnitude(cam.ray_max_y)) * depth;
+    }
+    wide = cam.lens.steep * std::sqrt(each * each + other * other);
+  }
+};
+
+// Whether a deviation on the image is too small to reach it from where the mean is. 3.34 deviations reach alpha 1/255,
+// and `radii` count 3. The rest is for rounding.
+template <class V>
+GS_HD Truth<V> too_far(V away, V variance) {
+  const V deviations = (away - 3) / Scalar<V>(3.5);
+  return (deviations > 1) & (variance + 1 < deviations * deviations);
+}
+
 // Whether a Gaussian certainly has no tile and no radius, wherever within `watch` it has moved. See surely_outside.
 template <class T, class V>
-GS_HD Truth<V> surely_unseen(const Watch<T>& watch, Vec3<V> mean, V largest_scale) {
+GS_HD Truth<V> surely_unseen(const Watch<Camera<T>>& watch, Vec3<V> mean, V largest_scale) {
   const Camera<T>& cam = watch.cam;
   const Vec3<V> view = to_view(cam, mean);
   const V nearest = view.z - watch.z, per_depth = 1 / nearest;
@@ -104,11 +136,41 @@ GS_HD Truth<V> surely_unseen(const Watch<T>& watch, Vec3<V> mean, V largest_scal
   const V moved_y = magnitude(cam.mean_focal_y) * (watch.y + magnitude(ray_y) * watch.z) * per_depth;
   const V away_x = larger<V>(-x, x - T(cam.width + kTile)) - moved_x;
   const V away_y = larger<V>(-y, y - T(cam.height + kTile)) - moved_y;
-  const V deviations = (larger<V>(away_x, away_y) - 3) / T(3.5);
   const V scale = largest_scale * per_depth;
   const V variance = scale * scale * (watch.wide_x * watch.wide_x + watch.wide_y * watch.wide_y);
   const V farthest = view.z + watch.z;
-  return (!in_front(farthest)) | (in_front(nearest) & (deviations > 1) & (variance + 1 < deviations * deviations));
+  return (!in_front(farthest)) | (in_front(nearest) & too_far<V>(larger<V>(away_x, away_y), variance));
+}
+
+// The least distance from the image, px, of where a lens shows a point of the view that has moved by a ball.
+template <class T>
+GS_HD T least_away(const LensCamera<T>& cam, Vec3<T> view, T ball, T nearest) {
+  const Lens<T>& lens = cam.lens;
+  const bool perspective = lens.chart == Chart::kPerspective;
+  const OnLens<T> c = on_chart(lens.chart, view);
+  const T a = c.value[0], b = c.value[1], r = std::sqrt(a * a + b * b);
+  const T moved = ball * (perspective ? 1 + r : T(1)) / nearest, least = r - moved;
+  if (!perspective && moved > T(kSleepTurn)) return -1;
+  if (least > 0 && least * least > T(1.001) * lens.limit) return T(INFINITY);  // nothing is shown there
+  const T into = r > lens.field ? lens.field / r : T(1);  // which brings no two points farther apart
+  const Distorted<T> d = distort(lens, into * a, into * b);
+  const T x = lens.focal_x * d.value[0] + lens.center_x, y = lens.focal_y * d.value[1] + lens.center_y;
+  const T away = outside(cam, x, y) - lens.steep * moved;
+  return r + moved > lens.field && lens.beyond < away ? lens.beyond : away;
+}
+
+template <class T, class V>
+GS_HD Truth<V> surely_unseen(const Watch<LensCamera<T>>& watch, Vec3<V> mean, V largest_scale) {
+  const Vec3<V> view = to_view(watch.cam, mean);
+  const V depth = depth_of(watch.cam, view), nearest = depth - watch.ball, scale = largest_scale / nearest;
+  V away = {};
+  if constexpr (kIsScalar<V>)
+    away = least_away(watch.cam, view, watch.ball, nearest);
+  else
+    for (int lane = 0; lane < int(sizeof(V) / sizeof(T)); ++lane)
+      away[lane] = least_away(watch.cam, Vec3<T>{view.x[lane], view.y[lane], view.z[lane]}, watch.ball, nearest[lane]);
+  const V variance = scale * scale * (watch.wide * watch.wide), farthest = depth + watch.ball;
+  return (!in_front(farthest)) | (in_front(nearest) & too_far<V>(away, variance));
 }
 
 GS_ISA_END

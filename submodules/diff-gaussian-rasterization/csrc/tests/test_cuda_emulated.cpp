@@ -69,12 +69,25 @@ void test_against_cpu() {
 void test_lenses() {
   for (const gs::Chart chart : {gs::Chart::kPerspective, gs::Chart::kEquidistant, gs::Chart::kEquirectangular}) {
     Parameters<float> p(100);
-    p.lens = {chart, 4, 1, 30, 31, 34, 17, {-0.05f, 0.01f, 0.001f, 0.0001f}, {0.02f, 0, 0}, {0.003f, 0.002f}, {}};
+    p.lens = {
+        chart, 4, 1, 2, 200, 50, 30, 31, 34, 17, {-0.05f, 0.01f, 0.001f, 0.0001f}, {0.02f, 0, 0}, {0.003f, 0.002f}, {}};
     check_scene(p, gs::Image{70, 33}, chart == gs::Chart::kPerspective, false);
   }
   Parameters<float> p(100);  // a full panorama: splats cross its border
-  p.lens = {
-      gs::Chart::kEquirectangular, INFINITY, 1, float(70 / (2 * kPi)), float(33 / kPi), 34.5f, 16, {}, {}, {}, {}};
+  p.lens = {gs::Chart::kEquirectangular,
+            INFINITY,
+            1,
+            INFINITY,
+            INFINITY,
+            0,
+            float(70 / (2 * kPi)),
+            float(33 / kPi),
+            34.5f,
+            16,
+            {},
+            {},
+            {},
+            {}};
   for (int64_t i = 0; i < p.count; ++i) p.means[3 * i + 2] *= i % 2 ? 1 : -1;
   check_scene(p, gs::Image{70, 33}, true, false);
 }
@@ -567,7 +580,7 @@ void test_gaussian_step() {
 
 // Blocks wake on the GPU as on the CPU, where some lie behind the camera, one has missed nothing, and one is repeated.
 // They are listed: none, or so many that the last one sleeps or is awake. Without room for them nothing changes.
-void test_wake(int64_t seen) {
+void test_wake(int64_t seen, gs::Chart chart = gs::Chart::kPinhole) {
   const bool some = seen > 0, last = seen == 4;
   for (const int64_t room : {5, 4, 3})
     for (const bool all : {false, true})
@@ -576,6 +589,7 @@ void test_wake(int64_t seen) {
         gs::emulation::order = order;
         constexpr int64_t count = 5 * gs::kSleepBlock - 28;
         Stepping start{Parameters<float>(count)};
+        start.values.lens = {chart, 4, 1, 2, 200, 50, 30, 31, 20, 12, {-0.05f, 0.01f}, {0.02f}, {0.003f, 0.002f}, {}};
         for (int64_t i = 0; i < count; ++i) {
           const int64_t block = i / gs::kSleepBlock;
           start.values.means[3 * i + 2] = some && block % 2 == 0 && (block < 4 || last) ? 3.0f : -3.0f;
@@ -708,7 +722,9 @@ void test_cameras() {
       const bool pinhole = chart == gs::Chart::kPinhole;
       Parameters<float> p(count);
       if (!pinhole)
-        p.lens = {chart, 4, 1, 60, 61, 34, 17, {-0.05f, 0.01f, 0.001f, 0.0001f}, {0.02f, 0, 0}, {0.003f, 0.002f}, {}};
+        p.lens = {
+            chart, 4, 1, 2, 200, 50, 60, 61, 34, 17, {-0.05f, 0.01f, 0.001f, 0.0001f}, {0.02f, 0, 0}, {0.003f, 0.002f},
+            {}};
       const gs::Scene<float> scene = scene_of(p, gs::Image{70, 33}, count == 50);
       const std::vector<double> wanted = camera_gradient(gs::serial_executor(), scene);
       std::vector<double> first;
@@ -768,6 +784,7 @@ int main() {
                          test_gaussian_step,
                          [] { test_wake(4); },
                          [] { test_wake(3); },
+                         [] { test_wake(3, gs::Chart::kPerspective); },
                          [] { test_wake(0); },
                          test_listed_blocks,
                          test_lists,

@@ -56,7 +56,7 @@ SceneTensors::SceneTensors(const std::array<const Tensor*, kInputs - 1>& gaussia
     : dtype_(ScalarType::Float), device_(DeviceType::CPU) {
   const bool plain = lens.size() == 3;
   GS_CHECK_VALUE((plain || lens.size() == 3 + gs::kLensNumbers) && (options.size() == 5 || options.size() == 6),
-                 "lens must have 3 entries or 20, and options 5 or 6, got ", lens.size(), " and ", options.size());
+                 "lens must have 3 entries or 24, and options 5 or 6, got ", lens.size(), " and ", options.size());
   tan_x_ = lens[0], tan_y_ = lens[1], scale_modifier_ = lens[2];
   for (int k = 0; !plain && k < gs::kLensNumbers; ++k) lens_[k] = lens[3 + k];
   image_ = checked_image(options[0], options[1]);

@@ -118,10 +118,13 @@ class SceneTensors {
             at(4),
             at(5),
             at(6),
-            {at(7), at(8), at(9), at(10)},
-            {at(11), at(12), at(13)},
-            {at(14), at(15)},
-            {at(16), at(17)}};
+            at(7),
+            at(8),
+            at(9),
+            {at(10), at(11), at(12), at(13)},
+            {at(14), at(15), at(16)},
+            {at(17), at(18)},
+            {at(19), at(20)}};
   }
 
   Tensor checked_rest(const Tensor& t) const;
