@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 _MOST = 200  # cameras that are drawn
 _COLOURS = {"train": (0, 80, 255), "test": (255, 90, 0)}
 _LENGTH = 0.06  # of a drawn camera, by the scene's size
+_WIDEST = 1.0  # of its half width and height, by its length: what fisheyes and panoramas are drawn as
 _GONE, _WHOLE = 2.0, 8.0  # lengths of a drawn camera from the browser's: up to here it is not drawn, from here whole
 _SHADES = 8  # between them, so that a browser gets a message for each of these alone
 _NAME = "/cameras"
@@ -42,7 +43,7 @@ class Frusta:
         self._length = _LENGTH * cameras.size
         self._places = np.array([camera_center(camera.R, camera.T) for camera in some]).reshape(-1, 3)
         tangents = [(np.tan(camera.FoVx / 2), np.tan(camera.FoVy / 2), 1.0) for camera in some]
-        self._sizes = self._length * np.array(tangents).reshape(-1, 3)
+        self._sizes = self._length * np.array(tangents).clip(max=_WIDEST).reshape(-1, 3)
         self._turns = np.array([SO3.from_matrix(np.asarray(camera.R)).wxyz for camera in some]).reshape(-1, 4)
         self._colours = np.uint8([_COLOURS[name.split()[0]] for name in self.names]).reshape(-1, 3)
         self._drawn: dict[int, viser.BatchedMeshHandle] = {}
