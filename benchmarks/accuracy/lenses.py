@@ -89,14 +89,41 @@ def row(name: str, lens: Lens, device: str) -> list[str]:
     """A row of the first table."""
     values = spread(lens)
     exact, single = (drawn(lens, values, *place) for place in ((torch.float64, "cpu"), (torch.float32, device)))
-    against = ""
+    against = slopes = ""
     if name in _EXTRAS:
         shown = pycolmap.Camera(model=name, width=_WIDTH, height=_HEIGHT, params=_params(name))
         theirs = torch.from_numpy(np.asarray(shown.img_from_cam(values["means"].numpy()))) - 0.5
         against = f"{(exact[0] - theirs).abs().nan_to_num(0).max():.1e}"
+        slopes = f"{slopes_error(shown, lens, values['means'].numpy()):.1e}"
     pixels, image = ((single[k] - exact[k]).abs().nan_to_num(0).max() for k in range(2))
     gradients = max((a - b).abs().max() / b.abs().max() for a, b in zip(single[2], exact[2], strict=True))
-    return [name, f"{2 * field_of(lens) / _DEGREE:.0f}", against, f"{pixels:.1e}", f"{image:.1e}", f"{gradients:.1e}"]
+    field = f"{2 * field_of(lens) / _DEGREE:.0f}"
+    return [name, field, against, slopes, f"{pixels:.1e}", f"{image:.1e}", f"{gradients:.1e}"]
+
+
+def slopes_error(shown: pycolmap.Camera, lens: Lens, means: np.ndarray) -> float:
+    """Largest relative error of J J^T, from the footprints of balls, against differences of pycolmap's pixels.
+
+    means (N, 3): those in the image count, since beyond it J is that of a clamped ray.
+    """
+    step, away = 3e-4, np.linalg.norm(means, axis=1, keepdims=True)
+    columns = []
+    for axis in np.eye(3):
+        at = [np.asarray(shown.img_from_cam(means + k * step * away * axis)) for k in (-2, -1, 1, 2)]
+        columns.append((at[0] - 8 * at[1] + 8 * at[2] - at[3]) / (12 * step * away))
+    theirs = np.stack(columns, 2) @ np.stack(columns, 1)
+    count, size = len(means), 0.2 * away
+    balls = {"means": means, "scales": np.log(size).repeat(3, 1), "rotations": np.eye(4)[:1].repeat(count, 0)}
+    balls |= {"opacities": np.zeros((count, 1)), "sh_dc": np.zeros((count, 1, 3)), "sh_rest": np.zeros((count, 15, 3))}
+    scene = Gaussians(**{name: torch.from_numpy(values) for name, values in balls.items()})
+    splats, _, _, counts, *_ = OPERATORS.project(*scene_arguments(scene, camera(lens, torch.float64, "cpu"), True))
+    x, y, a, b, c = splats[:, :5].numpy().T
+    factor = np.stack([np.stack([a, b], 1), np.stack([0 * c, c], 1)], 1)
+    inside = (x >= 0) & (x < _WIDTH) & (y >= 0) & (y < _HEIGHT) & (means[:, 2] > 0) & (counts.numpy() > 0)
+    inside &= np.isfinite(theirs).all((1, 2))  # pycolmap shows nothing beyond where a distortion turns back
+    spread = np.linalg.inv(2 * math.log(2) * factor[inside].swapaxes(1, 2) @ factor[inside])
+    ours = (spread - 0.3 * np.eye(2)) / size[inside, :, None] ** 2
+    return float((np.abs(ours - theirs[inside]).max((1, 2)) / np.trace(theirs[inside], axis1=1, axis2=2)).max())
 
 
 def _params(model: str) -> list[float]:
@@ -147,7 +174,7 @@ def main() -> None:
     device = chosen_device(parser.parse_args())
     print(describe(device))
     lenses = {name: lens_of(name, tuple(_params(name))) for name in _EXTRAS} | {"panorama": _PANORAMA}
-    header = ["lens", "degrees", "pixels, against pycolmap", "float32: pixels", "image", "gradients"]
+    header = ["lens", "degrees", "pixels, against pycolmap", "slopes", "float32: pixels", "image", "gradients"]
     print_table(header, [row(name, lens, device) for name, lens in lenses.items()])
     print("\nEWA, then rays, against exact rays: largest difference of alpha, share of the sum")
     rows = []
