@@ -62,7 +62,8 @@ GS_HD AtPixel<V> at_pixel(const RayRow<T>& row, V x) {
 }
 template <class V, class T>
 GS_HD V row_exponent(const RayRow<T>& row, const AtPixel<V>& p) {
-  return p.s > Scalar<V>(0) ? multiply_add(V(-p.q), p.inverse, V(row.flat.top - V{})) : all<V>(2 * kLog2MinAlpha);
+  const V q = p.s > Scalar<V>(0) ? p.q : all<V>(INFINITY);  // not at all behind the camera
+  return multiply_add(V(-q), p.inverse, V(row.flat.top - V{}));
 }
 
 // The same of a splat that is not on rays: u alone.
