@@ -57,11 +57,14 @@ def evaluate(
 ):
     """The planes and gradients by name, the pixels that count, and the radii."""
     inputs = {name: t.to(camera.bg.dtype) for name, t in parameters.items()}
-    loss = lambda out: loss_of(out, ~out.near_cut if keep is None else keep)  # noqa: E731
+
+    def loss(out):
+        return loss_of(out, ~out.near_cut if keep is None else keep)
+
     found = gradients(inputs, camera, device, loss, **options)
-    keep = ~found["near_cut"] if keep is None else keep
-    named = {name: t * keep if name in PLANES else t for name, t in found.items() if name in PLANES or name[:2] == "d "}
-    return named, keep, found["radii"]
+    counted = ~found["near_cut"] if keep is None else keep
+    named = {name: found[name] * counted for name in PLANES} | {n: t for n, t in found.items() if n.startswith("d ")}
+    return named, counted, found["radii"]
 
 
 @functools.cache

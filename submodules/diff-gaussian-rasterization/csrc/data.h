@@ -183,7 +183,7 @@ template <class T>
 struct RowSums {
   const T* splats;  // not read without `absolute`
   Image image;
-  T *moments, *absolute;  // as in BlendGradient; `absolute` null unless the rows are of twelve values
+  T *moments, *absolute;  // as in BlendGradient; `absolute` null unless the rows have its values
 };
 
 // A tensor that takes a step of Adam in place, in the `columns` leading values of each row.
