@@ -209,8 +209,6 @@ def rasterizer_settings(
 ) -> GaussianRasterizationSettings:
     """The rasterizer's settings for a view of a model; arguments as for `render`. UserError for what rays lack."""
     lens, projection = getattr(camera, "lens", None), getattr(pipe, "projection", "ewa")  # new in ours
-    if projection == "ray" and background.is_cuda:
-        raise UserError("--projection ray has no CUDA kernels; set CUDA_VISIBLE_DEVICES= for the CPU, or use ewa")
     if projection == "ray" and lens:
         raise UserError("--projection ray shows pinholes alone; give --lenses undistort, or use --projection ewa")
     return GaussianRasterizationSettings(

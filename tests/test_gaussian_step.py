@@ -67,6 +67,7 @@ class Case:
     columns: int = -1
     degree: int = 3
     antialiasing: bool = False
+    projection: str = "ewa"
     raw: bool = True
     depth: bool = False
     absolute: bool = False  # the statistics take lengths of absolute gradients
@@ -198,6 +199,8 @@ CASES = {
     "absolute, unobserved": Case(absolute=True, observed=False),
     "absolute NaN": Case(absolute=True, guarded=True, broken=math.nan),
     "penalties": Case(penalties=(0.3, 0.2)),
+    "rays": Case(projection="ray", guarded=True, depth=True),
+    "rays, absolute": Case(projection="ray", absolute=True, sparse=True, antialiasing=True),
     "sparse penalty": Case(penalties=(0.3, 0.0), sparse=True, guarded=True, absolute=True),
 }
 
@@ -217,7 +220,8 @@ def start_and_camera(case: Case, device: str, dtype: torch.dtype) -> tuple[State
     values["sh_rest"] = values["sh_rest"][:, : case.bands]
     values = values if case.raw else activated(values)
     state = State.start({name: t.to(device, dtype).contiguous() for name, t in values.items()})
-    camera = scene.to(device).settings(dtype, sh_degree=case.degree, antialiasing=case.antialiasing)
+    how = {"sh_degree": case.degree, "antialiasing": case.antialiasing, "projection": case.projection}
+    camera = scene.to(device).settings(dtype, **how)
     return state, camera
 
 

@@ -104,11 +104,11 @@ def scene_of(kind: str, device: str, dtype: torch.dtype) -> tuple[dict[str, Tens
         raw["means"][[40, 200]], raw["scales"][[40, 200]] = torch.tensor([0.0, 0.0, 3.0]), 1.5
         raw["opacities"][[40, 200]] = -2.0
         raw["opacities"][::7] = torch.nan
-    camera = settings(WIDTH, HEIGHT, dtype)
+    camera = settings(WIDTH, HEIGHT, dtype, projection="ray" if kind == "rays" else "ewa")
     return {name: t.to(device, dtype).contiguous() for name, t in raw.items()}, on_device(camera, device)
 
 
-SCENES = pytest.mark.parametrize("kind", ["empty", "one", "behind", "giants", "many"])
+SCENES = pytest.mark.parametrize("kind", ["empty", "one", "behind", "giants", "many", "rays"])
 DEPTH = pytest.mark.parametrize("depth", [False, True])
 ABSOLUTE = pytest.mark.parametrize("absolute", [False, True])
 
@@ -139,7 +139,8 @@ def test_single_steps_of_the_forward_are_rasterize_to_the_bit(kind, depth, devic
 def test_rows_give_the_gradients_of_the_lists(kind, depth, absolute, device, dtype):
     forward = Forward.of(*scene_of(kind, device, dtype), depth)
     rows = forward.rows(absolute)
-    assert rows.rows.shape == (int(rows.counts.sum()), 12 if absolute else 10) and rows.counts.dtype == torch.int32
+    values = (14 if kind == "rays" else 10) + 2 * absolute
+    assert rows.rows.shape == (int(rows.counts.sum()), values) and rows.counts.dtype == torch.int32
     assert not rows.counts[forward.projected[3] == 0].any()
     for wanted in ([False] * 2 + WANTED[2:], WANTED):
         got, expected = forward.rows_vjp(rows, absolute, wanted), forward.lists_vjp(absolute, wanted)

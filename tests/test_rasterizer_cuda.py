@@ -24,8 +24,8 @@ MIRRORED_AND_SHEARED[:3, :3] = torch.tensor([[-1.1, 0.2, 0.0], [0.1, 0.8, -0.1],
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"antialiasing": True}, {"view": MIRRORED_AND_SHEARED}],
-    ids=["plain", "antialiased", "mirrored and sheared"],
+    [{}, {"antialiasing": True}, {"view": MIRRORED_AND_SHEARED}, {"projection": "ray"}],
+    ids=["plain", "antialiased", "mirrored and sheared", "on rays"],
 )
 @pytest.mark.parametrize("kind", KINDS)
 def test_errors_are_those_of_cpu_float(kind, changes):

@@ -124,7 +124,7 @@ def _all(scene: Path, folder: Path, kinds: list[tuple[str, tuple[str, ...]]]) ->
 
 
 def test_ranks(scene, tmp_path, plain):
-    kinds = [(name, ()) for name in OPTIONS if name not in ("mcmc moves", "mcmc idle")]
+    kinds = [(name, ()) for name in OPTIONS if name not in ("mcmc moves", "mcmc idle", "rays")]
     kinds += [("exposure", ("--plain_step",))]
     found = in_ranks(2, _all, scene, tmp_path, kinds)[0]
     for (name, more), result in zip(kinds, found, strict=True):

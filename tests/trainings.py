@@ -26,6 +26,7 @@ OPTIONS = {
     "depth": ("-d", "depths", "--depth_l1_weight_init", 1.0),
     "masks": ("--masks", "masks"),
     "degree 0": ("--sh_degree", 0),
+    "rays": ("--projection", "ray"),
     "absgrad": ("--absgrad", "--absgrad_threshold", 2e-4, "--max_num_splats", 400),
     "long axis": ("--split", "long_axis", "--percent_dense", 0.001),  # so that some are split
     "white": ("-w", "--antialiasing"),

@@ -3,6 +3,7 @@
     python -m benchmarks.kernels.rasterizer                  # on the GPU if there is one and the build has CUDA
     python -m benchmarks.kernels.rasterizer --device cpu
     python -m benchmarks.kernels.rasterizer --order morton   # rows as trainings keep them; default: at random
+    python -m benchmarks.kernels.rasterizer --projection ray --workloads M L
     python -m benchmarks.kernels.rasterizer --models OUT ...  # models of train.py in place of seeded workloads
 
 Milliseconds are medians. An instance is a splat in a tile. Processed instances are those that the backward reads: in
@@ -12,7 +13,7 @@ and kernels of a step; beside them stand figures of other implementations.
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -163,9 +164,11 @@ def workloads(args: argparse.Namespace, device: str) -> Iterator[tuple[str, Spla
     if unknown := [name for name in args.workloads or () if name not in sizes]:
         raise UserError(f"--workloads {unknown[0]}: on this device there are {', '.join(sizes)}")
     if args.models:
-        return ((folder.name, trained(folder).to(device)) for folder in args.models)
-    names = args.workloads or sizes
-    return ((name, ORDERS[args.order](frustum(*sizes[name], device=device))) for name in names)
+        scenes = ((folder.name, trained(folder).to(device)) for folder in args.models)
+    else:
+        names = args.workloads or sizes
+        scenes = ((name, ORDERS[args.order](frustum(*sizes[name], device=device))) for name in names)
+    return ((name, replace(scene, camera=scene.settings(projection=args.projection))) for name, scene in scenes)
 
 
 def main() -> None:
@@ -175,11 +178,12 @@ def main() -> None:
     add("--workloads", nargs="+", help=f"CPU: of {', '.join(CPU_WORKLOADS)}; GPU: of {', '.join(GPU_WORKLOADS)}")
     add("--models", type=Path, nargs="+", default=[], help="folders that train.py wrote, in place of workloads")
     add("--order", choices=list(ORDERS), default="random", help="of the rows (default: random, as drawn)")
+    add("--projection", choices=["ewa", "ray"], default="ewa", help="how a pixel sees a Gaussian (default: ewa)")
     add("--threads", type=int, nargs="+", default=[1, torch.get_num_threads()], help="CPU: numbers of threads to use")
     add("--repeats", type=int, default=9, help="CPU: number of timed calls (default: 9)")
     args = parser.parse_args()
     device = chosen_device(args)
-    print(f"{describe(device)}, rows: {'as trained' if args.models else args.order}")
+    print(f"{describe(device)}, rows: {'as trained' if args.models else args.order}, projection: {args.projection}")
     if device == "cuda":
         print_gpu(workloads(args, device))
     else:

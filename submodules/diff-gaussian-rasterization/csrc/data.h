@@ -82,7 +82,7 @@ struct alignas(16) TileRecord {
 
 template <class T>
 struct Projected {
-  T* splats;       // (N, 10), Splat in math/splat.h, or (N, 13), RaySplat; undefined where tile_counts is 0
+  T* splats;       // (N, 10), Splat in math/splat.h, or (N, 14), RaySplat; undefined where tile_counts is 0
   T* depths;       // (N) infinite where tile_counts is 0, so that binning sorts those last
   int32_t* rects;  // (N, 4) tiles x0 y0 x1 y1, undefined where tile_counts is 0; null allowed if there are records
   int32_t* tile_counts;  // (N)
@@ -165,7 +165,7 @@ struct BlendGradient {
   const T* color;                   // dLoss/dcolor
   const T* inverse_depth;           // dLoss/dinverse_depth, or null
   const T* transmittance_gradient;  // or null
-  T* moments;  // out: (N, 10), Moments in math/footprint.h, then colour and inverse depth; (N, 13) for RayMoments
+  T* moments;  // out: (N, 10), Moments in math/footprint.h, then colour and inverse depth; (N, 14) for RayMoments
   const T* layers = nullptr;     // Blended::layers, or null: then blend_vjp makes its own
   const Ahead* ahead = nullptr;  // on a GPU: take room for gradient rows, and do not wait for their number
   T* absolute = nullptr;         // out: (N), absolute_length in math/absolute.h; or null
@@ -177,7 +177,7 @@ struct SplatRows {
   int64_t count;
   const int32_t* tile_counts;  // (N)
   const int32_t* counts;       // (N) rows of each splat; 0 where tile_counts is 0
-  const T* rows;      // (R, 10) as in BlendGradient::moments, or 13; two more for lengths of absolute gradients
+  const T* rows;      // (R, 10) as in BlendGradient::moments, or 14; two more for lengths of absolute gradients
   int64_t row_count;  // R
   bool rays = false;
 };
@@ -187,7 +187,7 @@ template <class T>
 struct RowSums {
   const T* splats;  // not read without `absolute`
   Image image;
-  T *moments, *absolute;  // as in BlendGradient; `absolute` null unless the rows are of twelve values
+  T *moments, *absolute;  // as in BlendGradient; `absolute` null unless the rows have its values
 };
 
 // A tensor that takes a step of Adam in place, in the `columns` leading values of each row.

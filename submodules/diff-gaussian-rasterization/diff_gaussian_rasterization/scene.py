@@ -66,7 +66,7 @@ class Drawing(NamedTuple):
     transmittance: Tensor  # (1, H, W)
     inverse_depth: Tensor  # (1, H, W), or no rows if it is not wanted
     radii: Tensor  # (N,) int32
-    splats: Tensor  # (N, 10), or (N, 13) on rays
+    splats: Tensor  # (N, 10), or (N, 14) on rays
     tile_counts: Tensor  # (N,) int32
     instances: Tensor  # (I,) int32, the splats of all lists
     ranges: Tensor  # (tiles + 1,) int64, of each tile's list

@@ -33,15 +33,6 @@ struct Rows<T, true> {
   }
 };
 
-template <class V, class T>
-V exponent_at(const RowTerms<T>& terms, V x) {
-  return row_exponent(terms, row_u(terms, x));
-}
-template <class V, class T>
-V exponent_at(const RayRow<T>& terms, V x) {
-  return ray_exponent(terms, at_pixel(terms, x));
-}
-
 // A strip is a vector's part of a tile's row. What it needs of a chunk's splats: their rows, and a bit for each
 // that may reach it. Trained splats reach few rows, so testing a vector of splats at a time is most of the saving.
 template <class T, bool kRays>

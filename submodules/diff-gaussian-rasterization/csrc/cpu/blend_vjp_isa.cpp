@@ -180,8 +180,6 @@ struct PixelSums {
   using V = typename Simd<T>::Vec;
   V q = {}, u = {}, v = {}, uu = {}, uv = {}, vv = {}, absolute_u = {}, absolute_uv = {};
 
-  static V at(const RowTerms<V>& terms, V x) { return row_u(terms, x); }
-  static V exponent(const RowTerms<V>& terms, V u) { return row_exponent(terms, u); }
   void add(const Chunk<T, kBatch, false>& chunk, int k, const RowTerms<V>& terms, V u_here, V q_here) {
     const V qu = q_here * u_here, qv = q_here * terms.v;
     q += q_here, u += qu, v += qv;
@@ -197,16 +195,15 @@ struct PixelSums<T, true, kAbsolute> {
   using V = typename Simd<T>::Vec;
   V q = {}, u = {}, v = {}, uu = {}, uv = {}, vv = {}, pu = {}, pv = {}, pp = {}, absolute_u = {}, absolute_uv = {};
 
-  static AtPixel<V> at(const RayRow<V>& terms, V x) { return at_pixel(terms, x); }
-  static V exponent(const RayRow<V>& terms, const AtPixel<V>& p) { return ray_exponent(terms, p); }
   void add(const Chunk<T, kBatch, true>& chunk, int k, const RayRow<V>& terms, const AtPixel<V>& p, V q_here) {
     const RayWeights<V> at = ray_weights(terms, p, chunk.slope_v[k]);
-    const V weight = q_here * at.w, along = weight * at.u, down = weight * at.v, deep = weight * at.p;
-    const V qu = weight * at.au, qv = weight * at.av;
-    q += q_here, u += qu, v += qv;
+    const V along = q_here * at.u, down = q_here * at.v, deep = q_here * at.p;
+    // Fused by name: kAbsolute must not matter.
+    q += q_here, u = multiply_add(q_here, at.au, u), v = multiply_add(q_here, at.av, v);
     uu += along * at.u, uv += along * at.v, vv += down * at.v;
     pu += deep * at.u, pv += deep * at.v, pp += deep * at.p;
     if (kAbsolute) {
+      const V qu = q_here * at.au, qv = q_here * at.av;
       absolute_u += magnitude(qu);
       absolute_uv += magnitude(V(chunk.l12[k] * qu + chunk.l22[k] * qv));
     }
@@ -243,8 +240,8 @@ __attribute__((always_inline)) inline void sum_rows(const Batch<T, kRays>& batch
       const int at = place<T>(row, column);
       M last;
       std::memcpy(&last, state.last + at, sizeof last);
-      const auto pixel = moments.at(terms, columns_from<T>(0) + T(column));
-      const V t = moments.exponent(terms, pixel);
+      const auto pixel = at_pixel(terms, columns_from<T>(0) + T(column));
+      const V t = row_exponent(terms, pixel);
       const M reached = (t >= T(kLog2MinAlpha)) & (last > typename S::Int(position));
       if (!S::any(reached)) continue;
       const V uncapped = reached ? exp2_lanes<V, M>(reached ? t : zero, T()) : zero;
@@ -264,8 +261,8 @@ __attribute__((always_inline)) inline void sum_rows(const Batch<T, kRays>& batch
   }
   const auto& m = moments;
   if constexpr (kRays) {
-    const V all[] = {m.q,  m.u,   m.v,  m.uu, m.uv, m.vv,         red,          green,
-                     blue, depth, m.pu, m.pv, m.pp, m.absolute_u, m.absolute_uv};
+    const V all[] = {m.q,  m.u,   m.v,  m.uu, m.uv, m.vv, red,          green,
+                     blue, depth, m.pu, m.pv, m.pp, zero, m.absolute_u, m.absolute_uv};
     std::copy_n(all, kSums<kRays, kAbsolute>, sums);
   } else {
     const V all[] = {m.q, m.u, m.v, m.uu, m.uv, m.vv, red, green, blue, depth, m.absolute_u, m.absolute_uv};

@@ -16,7 +16,7 @@ constexpr int64_t kProjectBlock = 512;
 
 template <class T>
 Projected<T> part_of(const Projected<T>& out, int64_t first) {
-  const int row = out.rays ? kSplatRow<true> : kSplatRow<false>;
+  const int row = splat_row(out.rays);
   return {from_row(out.splats, first, row),
           from_row(out.depths, first, 1),
           from_row(out.rects, first, 4),

@@ -55,7 +55,7 @@ void write_or_add(typename Simd<T>::Vec* values, int row, int64_t n, const Pack<
 
 template <class T>
 const T* from_moments(const Scene<T>& s, const T* moments, int64_t first) {
-  return moments + (s.rays ? kGradientRow<true> : kGradientRow<false>)*first;
+  return moments + gradient_row(s.rays) * first;
 }
 
 // The gradients of a vector of Gaussians.

@@ -39,7 +39,7 @@ void write_tile(const From* pixels, Image image, const Tile& tile, To* plane) {
 template <class T>
 void prefetch_splats(const BlendInput<T>& in, int64_t begin, int64_t end) {
   for (int64_t k = begin; k < end; ++k) {
-    const int row = in.rays ? kSplatRow<true> : kSplatRow<false>;
+    const int row = splat_row(in.rays);
     const T* splat = in.splats + row * int64_t(in.instances[k]);
     __builtin_prefetch(splat), __builtin_prefetch(splat + row - 1);
   }

@@ -6,6 +6,7 @@
 
 #include <cub/cub.cuh>
 #include <optional>
+#include <type_traits>
 
 #include "../backend.h"
 #include "../math/slots.h"
@@ -81,36 +82,37 @@ __global__ void judge_rows_kernel(const int32_t* halted, Ahead ahead, const int3
   judge_rows(ahead, *rows);
 }
 
-// Values that a lane sums: kGradientValues, and perhaps kAbsoluteValues.
-template <bool kAbsolute>
-constexpr int kSums = kGradientValues + (kAbsolute ? kAbsoluteValues : 0);
+// Values that a lane sums: kGradientRow, and perhaps kAbsoluteValues.
+template <bool kRays, bool kAbsolute>
+constexpr int kSums = kGradientRow<kRays> + (kAbsolute ? kAbsoluteValues : 0);
 
-// Sums ten values over a warp in 12 shuffles, or twelve in 13: each step halves the values that a lane keeps and
-// doubles the lanes that are summed. The lane ends with the sum of `value`, or with none (-1).
+// Sums ten values over a warp in 12 shuffles, twelve in 13, or up to sixteen in 16: each step halves the values that a
+// lane keeps and doubles the lanes that are summed. The lane ends with the sum of `value`, or with none (-1).
 template <int kCount>
 __device__ __forceinline__ float transposed_sum(const float (&v)[kCount], int& value) {
-  constexpr int kHalf = kCount / 2;
-  static_assert(kCount == 2 * kHalf && (kHalf == 5 || kHalf == 6), "halves are cut into parts of at most 3, 2, 1");
+  constexpr int kHalf = kCount / 2, kQuarter = (kHalf + 1) / 2;
+  static_assert(kCount == 2 * kHalf && (kQuarter == 3 || kQuarter == 4), "quarters are cut into parts of 2 and 1");
   const int lane = threadIdx.x % 32;
   const bool b16 = lane & 16, b8 = lane & 8, b4 = lane & 4, b2 = lane & 2;
-  float a[kHalf], b[3], c[2];
+  float a[kHalf], b[kQuarter], c[2];
 #pragma unroll
   for (int i = 0; i < kHalf; ++i)
     a[i] = (b16 ? v[i + kHalf] : v[i]) + __shfl_xor_sync(kWarp, b16 ? v[i] : v[i + kHalf], 16);
 #pragma unroll
-  for (int i = 0; i < 3; ++i) {
-    const float high = i + 3 < kHalf ? a[i + 3] : 0;
+  for (int i = 0; i < kQuarter; ++i) {
+    const float high = i + kQuarter < kHalf ? a[i + kQuarter] : 0;
     b[i] = (b8 ? high : a[i]) + __shfl_xor_sync(kWarp, b8 ? a[i] : high, 8);
   }
 #pragma unroll
   for (int i = 0; i < 2; ++i) {
-    const float high = i < 1 ? b[2] : 0;
+    const float high = i + 2 < kQuarter ? b[i + 2] : 0;
     c[i] = (b4 ? high : b[i]) + __shfl_xor_sync(kWarp, b4 ? b[i] : high, 4);
   }
   float sum = (b2 ? c[1] : c[0]) + __shfl_xor_sync(kWarp, b2 ? c[0] : c[1], 2);
   sum += __shfl_xor_sync(kWarp, sum, 1);
-  const int within3 = b4 ? 2 : b2, within = (b8 ? 3 : 0) + within3;
-  const bool exists = !(lane & 1) && !(b4 && b2) && within < kHalf;
+  const bool fourth = b4 && b2;
+  const int in_quarter = b4 ? 2 + (kQuarter > 3 && b2) : b2, within = (b8 ? kQuarter : 0) + in_quarter;
+  const bool exists = !(lane & 1) && !(kQuarter == 3 && fourth) && within < kHalf;
   value = exists ? (b16 ? kHalf : 0) + within : -1;
   return sum;
 }
@@ -155,13 +157,13 @@ struct Pixels {
 };
 
 // Computes the layers of all chunks but the first of each tile, a block each.
-template <class L, bool kDepth>
+template <class L, bool kRays, bool kDepth>
 __global__ void __launch_bounds__(L::kThreads)
     layers_kernel(const int32_t* halted, BlendInput<float> in, BlendGradient<float> g, const Chunk* chunks,
                   Layer* layers) {
   if (!begin_work(halted)) return;
   constexpr int kBatch = L::kThreads, kRun = L::kRun;
-  __shared__ Batch<kBatch> batch;
+  __shared__ Batch<kBatch, kRays> batch;
   const Chunk chunk = chunks[blockIdx.x];
   if (chunk.tile < 0 || chunk.first == 0) return;
   const L at;
@@ -233,54 +235,91 @@ __device__ __forceinline__ void start_before(const Pixels<Backward, kDepth>& pix
   }
 }
 
+// Sums over a lane's pixels, which lie in one row. Along it v is constant, so three of the moments come last.
+struct FlatRowSums {
+  float q = 0, qu = 0, quu = 0;
+
+  __device__ void add(float u, float q_here) {
+    const float qu_here = q_here * u;
+    q += q_here, qu += qu_here, quu += qu_here * u;
+  }
+  __device__ Moments<float> moments(const RowTerms<float>& row) const {
+    return {q, qu, row.v * q, quu, row.v * qu, row.v * row.v * q};
+  }
+};
+
+// What moves the mean, whitened: u and v, or w a / s.
+__device__ float2 pull(const LocalSplat<float>&, const RowTerms<float>& row, float u) { return {u, row.v}; }
+__device__ float2 pull(const LocalRaySplat<float>& splat, const RayRow<float>& row, const AtPixel<float>& at) {
+  const RayWeights<float> weights = ray_weights(row, at, splat.slope_v);
+  return {weights.au, weights.av};
+}
+
 // Steps the lanes over splat k of the batch, whose first splat is the chunk's splat `first`, and leaves the sums over
 // the warp's pixels in `sums`. A splat that reaches none of them changes nothing.
-template <bool kDepth, bool kAbsolute, int kBatch>
-__device__ __forceinline__ void splat_gradient(const Batch<kBatch>& batch, const Pixels<Backward, kDepth>& pixels,
-                                               const Backward& at, int k, int first, OfPixels& transmittance,
-                                               OfPixels& behind, float* sums) {
-  const LocalSplat<float> splat = batch.local(k);
+template <bool kDepth, bool kAbsolute, int kBatch, bool kRays>
+__device__ __forceinline__ void splat_gradient(const Batch<kBatch, kRays>& batch,
+                                               const Pixels<Backward, kDepth>& pixels, const Backward& at, int k,
+                                               int first, OfPixels& transmittance, OfPixels& behind, float* sums) {
+  const auto splat = batch.local(k);
   const float4 c = batch.color[k];
-  const RowTerms<float> row = row_terms(splat, float(at.y));
-  float q0 = 0, qu = 0, quu = 0, r = 0, gr = 0, b = 0, d = 0, absolute_u = 0, absolute_uv = 0;
+  const auto row = row_terms(splat, float(at.y));
+  std::conditional_t<kRays, RayRowSums<float>, FlatRowSums> moments;
+  float r = 0, gr = 0, b = 0, d = 0, absolute_u = 0, absolute_uv = 0;
   bool any = false;
 #pragma unroll
   for (int p = 0; p < Backward::kRun; ++p) {
-    const float u = row_u(row, float(at.x + at.column(p))), t = row_exponent(row, u);
+    const auto here = at_pixel(row, float(at.x + at.column(p)));
+    const float t = row_exponent(row, here);
     if (!(t >= kLeast) || first + k >= pixels.last[p]) continue;
     any = true;
     const float uncapped = exp2_device(t), alpha = capped<float, float>(uncapped);
     const float value = pixels.value(p, c, splat.inverse_depth);
     const float q = uncapped * alpha_gradient<float, float>(alpha, value, transmittance[p], behind[p]);
-    const float weight = alpha * transmittance[p], qu_here = q * u;
-    q0 += q, qu += qu_here, quu += qu_here * u;
+    const float weight = alpha * transmittance[p];
+    moments.add(here, q);
     r += weight * pixels.red[p], gr += weight * pixels.green[p], b += weight * pixels.blue[p];
     if (kDepth) d += weight * pixels.depth[p];
-    if (kAbsolute) absolute_u += fabsf(qu_here), absolute_uv += fabsf(q * (splat.l12 * u + splat.l22 * row.v));
+    if (kAbsolute) {
+      const float2 by = pull(splat, row, here);
+      absolute_u += fabsf(q * by.x), absolute_uv += fabsf(q * (splat.l12 * by.x + splat.l22 * by.y));
+    }
   }
   if (!__any_sync(kWarp, any)) return;
-  // Along a row v is constant, so three of the moments come last.
-  const float all[] = {q0, qu, row.v * q0, quu, row.v * qu, row.v * row.v * q0, r, gr, b, d, absolute_u, absolute_uv};
-  float v[kSums<kAbsolute>];
+  constexpr int kRow = kSums<kRays, kAbsolute>;
+  float v[kRow];
+  const auto keep = [&](const auto& all) {
 #pragma unroll
-  for (int i = 0; i < kSums<kAbsolute>; ++i) v[i] = all[i];
+    for (int i = 0; i < kRow; ++i) v[i] = all[i];
+  };
+  if constexpr (kRays) {
+    const RayMoments<float> rays = moments.moments(row, splat.slope_v);
+    const Moments<float>& m = rays.on_image;
+    const float all[] = {m.q, m.qu, m.qv,    m.quu,   m.quv,   m.qvv, r,          gr,
+                         b,   d,    rays.pu, rays.pv, rays.pp, 0,     absolute_u, absolute_uv};
+    keep(all);
+  } else {
+    const Moments<float> m = moments.moments(row);
+    const float all[] = {m.q, m.qu, m.qv, m.quu, m.quv, m.qvv, r, gr, b, d, absolute_u, absolute_uv};
+    keep(all);
+  }
   int value;
   const float sum = transposed_sum(v, value);
-  if (value >= 0) sums[(threadIdx.x / 32 * kBatch + k) * kSums<kAbsolute> + value] = sum;
+  if (value >= 0) sums[(threadIdx.x / 32 * kBatch + k) * kRow + value] = sum;
 }
 
 // Walks each chunk back to front, a block each, and writes its gradient rows. Within these registers ptxas compiles the
 // loop over splats without spills on sm_90. If blocks per multiprocessor are bounded instead, it makes the loop a tenth
 // longer.
-template <bool kDepth, bool kMade, bool kAbsolute>
-__global__ void GS_MAX_REGISTERS((kDepth ? 96 : 80) + (kAbsolute ? 8 : 0))
+template <bool kRays, bool kDepth, bool kMade, bool kAbsolute>
+__global__ void GS_MAX_REGISTERS((kDepth ? 96 : 80) + (kAbsolute ? 8 : 0) + (kRays ? 16 : 0))
     blend_vjp_kernel(const int32_t* halted, BlendInput<float> in, BlendGradient<float> g, const int32_t* processed,
-                     const Chunk* chunks, int chunk_size, const Layer* layers, MadeLayers made, GradientRows rows,
-                     float* absolute) {
+                     const Chunk* chunks, int chunk_size, const Layer* layers, MadeLayers made,
+                     GradientRows<kRays> rows, float* absolute) {
   if (!begin_work(halted)) return;
   using L = Backward;
-  constexpr int kBatch = 64, kRow = kSums<kAbsolute>;
-  __shared__ Batch<kBatch> batch;
+  constexpr int kBatch = 64, kRow = kSums<kRays, kAbsolute>;
+  __shared__ Batch<kBatch, kRays> batch;
   __shared__ float sums[L::kWarps * kBatch * kRow];
   __shared__ int64_t row_of[kBatch];
   const Chunk chunk = chunks[blockIdx.x];
@@ -324,44 +363,48 @@ __global__ void GS_MAX_REGISTERS((kDepth ? 96 : 80) + (kAbsolute ? 8 : 0))
       for (int w = 0; w < L::kWarps; ++w) sum += sums[w * kBatch * kRow + k];
       const int64_t row = row_of[k / kRow];
       const int value = k % kRow;
-      if (!kAbsolute || value < kGradientValues)
-        rows.values[kGradientValues * row + value] = sum;
+      if (!kAbsolute || value < kGradientRow<kRays>)
+        rows.values[kGradientRow<kRays> * row + value] = sum;
       else
-        absolute[kAbsoluteValues * row + value - kGradientValues] = sum;
+        absolute[kAbsoluteValues * row + value - kGradientRow<kRays>] = sum;
     }
   }
 }
 
+template <bool kRays>
 __global__ void __launch_bounds__(256)
-    moments_kernel(const int32_t* halted, int64_t count, SlotSums sums, float* moments) {
+    moments_kernel(const int32_t* halted, int64_t count, SlotSums<kRays> sums, float* moments) {
   if (!begin_work(halted)) return;
   const int64_t i = int64_t(blockIdx.x) * 256 + threadIdx.x;
-  __shared__ __align__(8) float stage[256 / 32 * SlotSums::kStage];
-  float values[kGradientValues];
-  sums.read(i, i < count && sums.seen(i), values, stage + threadIdx.x / 32 * SlotSums::kStage);
+  constexpr int kRow = kGradientRow<kRays>, kStage = SlotSums<kRays>::kStage;
+  __shared__ __align__(8) float stage[256 / 32 * kStage];
+  float values[kRow];
+  sums.read(i, i < count && sums.seen(i), values, stage + threadIdx.x / 32 * kStage);
   if (i >= count) return;
-  for (int v = 0; v < kGradientValues; ++v) moments[kGradientValues * i + v] = values[v];
+  for (int v = 0; v < kRow; ++v) moments[kRow * i + v] = values[v];
 }
 
-template <class L>
+template <class L, bool kRays>
 void find_layers(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g,
                  const Schedule& schedule, Layer* layers) {
-  const auto kernel = g.inverse_depth ? layers_kernel<L, true> : layers_kernel<L, false>;
+  const auto kernel = g.inverse_depth ? layers_kernel<L, kRays, true> : layers_kernel<L, kRays, false>;
   launch(queue, "layers", kernel, schedule.blocks, L::kThreads, in, g, schedule.chunks, layers);
 }
 
 // The kernel that blends back to front, for what is wanted and what is there.
-template <bool kAbsolute>
+template <bool kRays, bool kAbsolute>
 auto blend_vjp_kernel_for(bool depth, bool made) {
-  return depth ? (made ? blend_vjp_kernel<true, true, kAbsolute> : blend_vjp_kernel<true, false, kAbsolute>)
-               : (made ? blend_vjp_kernel<false, true, kAbsolute> : blend_vjp_kernel<false, false, kAbsolute>);
+  return depth
+             ? (made ? blend_vjp_kernel<kRays, true, true, kAbsolute> : blend_vjp_kernel<kRays, true, false, kAbsolute>)
+             : (made ? blend_vjp_kernel<kRays, false, true, kAbsolute>
+                     : blend_vjp_kernel<kRays, false, false, kAbsolute>);
 }
 
 // Runs the backward up to the rows. take: allocates those of the gradients, for their number, for which the host waits
 // if `exact`, else perhaps for more.
-template <class Take>
-FilledRows blend_back(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g, bool absolute,
-                      bool exact, const Take& take) {
+template <bool kRays, class Take>
+FilledRows<kRays> blend_back(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g,
+                             bool absolute, bool exact, const Take& take) {
   const cudaStream_t stream = stream_of(queue);
   const unsigned tiles = unsigned(tiles_of(in.image));
   const int64_t words = (g.slot_count + 31) / 32;
@@ -382,49 +425,64 @@ FilledRows blend_back(const Queue& queue, const BlendInput<float>& in, const Ble
     processed_count.emplace(queue, before + words, 1);
   Schedule schedule = longest_first(queue, tiles, ProcessedLength{processed}, chunk_size, rows);
   if (processed_count) rows = *processed_count->wait(), schedule = schedule.shortened(rows);
-  const GradientRows gradients{bits, before, take(rows)};
+  const GradientRows<kRays> gradients{{bits, before}, take(rows)};
   const bool made = g.layers && makes_layers(in.image);
   Layer* layers = queue.array<Layer>(made ? 0 : size_t(schedule.places) * kTile * kTile);
   if (schedule.places && !made)
-    (tiles <= kFewTiles ? find_layers<Layout<1>> : find_layers<Layout<2>>)(queue, in, g, schedule, layers);
-  const AbsoluteRows lengths{bits, before, queue.array<float>(absolute ? size_t(rows) * kAbsoluteValues : 0)};
+    (tiles <= kFewTiles ? find_layers<Layout<1>, kRays> : find_layers<Layout<2>, kRays>)(queue, in, g, schedule,
+                                                                                         layers);
+  const AbsoluteRows lengths{{bits, before}, queue.array<float>(absolute ? size_t(rows) * kAbsoluteValues : 0)};
   const bool depth = g.inverse_depth;
-  const auto kernel = absolute ? blend_vjp_kernel_for<true>(depth, made) : blend_vjp_kernel_for<false>(depth, made);
+  const auto kernel =
+      absolute ? blend_vjp_kernel_for<kRays, true>(depth, made) : blend_vjp_kernel_for<kRays, false>(depth, made);
   launch(queue, "blend_vjp", kernel, schedule.blocks, Backward::kThreads, in, g, processed, schedule.chunks, chunk_size,
          layers, layers_at(g.layers, in.instance_count), gradients, lengths.values);
   queue.release(queue.context, layers), queue.release(queue.context, schedule.chunks);
   return {gradients, lengths};
 }
 
-}  // namespace
-
-GradientRows fill_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
-  const FilledRows rows = blend_back(queue, in, g, g.absolute != nullptr, false, [&](int64_t count) {
-    return queue.array<float>(size_t(count) * kGradientValues);
-  });
-  if (g.absolute) find_lengths(queue, g.count, {rows.absolute, g.slots}, in.splats, in.image, g.absolute);
-  queue.release(queue.context, rows.absolute.values);  // the gradients come next, and take most of a step's memory
-  return rows.gradients;
-}
-
-template <>
-void blend_rows<float>(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g,
-                       const RowMemory<float>& memory) {
+template <bool kRays>
+void keep_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g,
+               const RowMemory<float>& memory) {
   float* rows = nullptr;
   int64_t count = 0;
-  const FilledRows filled = blend_back(queue, in, g, memory.absolute, true, [&](int64_t exact) {
+  const auto filled = blend_back<kRays>(queue, in, g, memory.absolute, true, [&](int64_t exact) {
     count = exact, rows = memory.take(memory.context, exact);
-    return memory.absolute ? queue.array<float>(size_t(exact) * kGradientValues) : rows;
+    return memory.absolute ? queue.array<float>(size_t(exact) * kGradientRow<kRays>) : rows;
   });
   if (g.count) count_rows(queue, g.count, filled.gradients, g.slots, memory.counts);
   if (memory.absolute) join_rows(queue, count, filled, rows);
 }
 
+template <bool kRays>
+void sum_moments(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
+  const SlotSums<kRays> sums{fill_rows<kRays>(queue, in, g), g.slots};
+  launch(queue, "moments", moments_kernel<kRays>, blocks_for(g.count, 256), 256, g.count, sums, g.moments);
+}
+
+}  // namespace
+
+template <bool kRays>
+GradientRows<kRays> fill_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
+  const FilledRows<kRays> rows = blend_back<kRays>(queue, in, g, g.absolute != nullptr, false, [&](int64_t count) {
+    return queue.array<float>(size_t(count) * kGradientRow<kRays>);
+  });
+  if (g.absolute) find_lengths(queue, g.count, {rows.absolute, g.slots}, in.splats, kRays, in.image, g.absolute);
+  queue.release(queue.context, rows.absolute.values);  // the gradients come next, and take most of a step's memory
+  return rows.gradients;
+}
+template GradientRows<false> fill_rows<false>(const Queue&, const BlendInput<float>&, const BlendGradient<float>&);
+template GradientRows<true> fill_rows<true>(const Queue&, const BlendInput<float>&, const BlendGradient<float>&);
+
+template <>
+void blend_rows<float>(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g,
+                       const RowMemory<float>& memory) {
+  (in.rays ? keep_rows<true> : keep_rows<false>)(queue, in, g, memory);
+}
+
 template <>
 void blend_vjp<float>(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
-  if (!g.count) return;
-  const SlotSums sums{fill_rows(queue, in, g), g.slots};
-  launch(queue, "moments", moments_kernel, blocks_for(g.count, 256), 256, g.count, sums, g.moments);
+  if (g.count) (in.rays ? sum_moments<true> : sum_moments<false>)(queue, in, g);
 }
 
 }  // namespace cuda

@@ -81,8 +81,8 @@ struct Place {
 };
 
 // Blends the batch. front: the transmittance in front of it, or more; then no pixel ends too early.
-template <bool kDepth, bool kLast>
-__device__ __forceinline__ Seen walk(const Batch<kPixels>& batch, const L& at, int count, float front) {
+template <bool kDepth, bool kLast, bool kRays>
+__device__ __forceinline__ Seen walk(const Batch<kPixels, kRays>& batch, const L& at, int count, float front) {
   Seen seen;
   float threshold = front > 0 ? kLeast : INFINITY;
   bool open = __any_sync(kWarp, front > 0);
@@ -140,13 +140,13 @@ __device__ float follow(const float* through, int32_t from, int32_t to, float fr
   return front;
 }
 
-template <bool kDepth, bool kLast>
+template <bool kRays, bool kDepth, bool kLast>
 struct Blender {
   const BlendInput<float>& in;
   const Progress& progress;
   const Layers& layers;
   const Blended<float>& out;
-  Batch<kPixels>& batch;
+  Batch<kPixels, kRays>& batch;
   Item& item;
 
   __device__ Place place() const { return {in.image, item.chunk.tile}; }
@@ -289,12 +289,12 @@ struct Blender {
 };
 
 // Bounding blocks per multiprocessor limits the kernel to 48 registers on sm_90.
-template <bool kDepth, bool kLast>
+template <bool kRays, bool kDepth, bool kLast>
 __global__ void __launch_bounds__(L::kThreads, 5)
     blend_chunks_kernel(const int32_t* halted, BlendInput<float> in, Progress progress, Layers layers,
                         Blended<float> out) {
   if (!begin_work(halted)) return;  // then nobody has set up `progress` either
-  __shared__ Batch<kPixels> batch;
+  __shared__ Batch<kPixels, kRays> batch;
   __shared__ Item item;
   for (;;) {
     __syncthreads();
@@ -308,8 +308,14 @@ __global__ void __launch_bounds__(L::kThreads, 5)
     }
     __syncthreads();
     if (item.chunk.tile < 0) return;  // there are none behind
-    Blender<kDepth, kLast>{in, progress, layers, out, batch, item}.blend();
+    Blender<kRays, kDepth, kLast>{in, progress, layers, out, batch, item}.blend();
   }
+}
+
+template <bool kRays>
+auto blend_chunks_kernel_for(bool depth, bool last) {
+  return depth ? (last ? blend_chunks_kernel<kRays, true, true> : blend_chunks_kernel<kRays, true, false>)
+               : (last ? blend_chunks_kernel<kRays, false, true> : blend_chunks_kernel<kRays, false, false>);
 }
 
 }  // namespace
@@ -324,8 +330,8 @@ void blend_chunks(const Queue& queue, const BlendInput<float>& in, const Blended
   const bool depth = out.inverse_depth;
   float* values = out.layers;
   if (!values) values = queue.array<float>(layer_values(in.image, in.instance_count, depth));
-  const auto kernel = depth ? (out.last ? blend_chunks_kernel<true, true> : blend_chunks_kernel<true, false>)
-                            : (out.last ? blend_chunks_kernel<false, true> : blend_chunks_kernel<false, false>);
+  const auto kernel =
+      in.rays ? blend_chunks_kernel_for<true>(depth, out.last) : blend_chunks_kernel_for<false>(depth, out.last);
   const unsigned blocks = std::min(schedule.blocks, kMostBlocks);
   launch(queue, "blend_chunks", kernel, blocks, L::kThreads, in, progress, layers_at(values, in.instance_count), out);
 }

@@ -10,13 +10,13 @@ namespace {
 
 using L = Layout<2>;
 
-// Bounding blocks per multiprocessor limits the kernel to 56 registers without spills on sm_90.
-template <bool kDepth, bool kLast>
+// Bounding blocks per multiprocessor limits the kernel to 56 registers on sm_90, without spills but on rays with depth.
+template <bool kRays, bool kDepth, bool kLast>
 __global__ void __launch_bounds__(L::kThreads, 9)
     blend_kernel(const int32_t* halted, BlendInput<float> in, Blended<float> out) {
   if (!begin_work(halted)) return;
   constexpr int kBatch = L::kThreads, kRun = L::kRun;
-  __shared__ Batch<kBatch> batch;
+  __shared__ Batch<kBatch, kRays> batch;
   const L at;
   const int across = tile_count(in.image.width), tile = blockIdx.x;
   const int left = tile % across * kTile, top = tile / across * kTile;
@@ -69,13 +69,18 @@ __global__ void __launch_bounds__(L::kThreads, 9)
   }
 }
 
+template <bool kRays>
+auto blend_kernel_for(const Blended<float>& out) {
+  return out.inverse_depth ? (out.last ? blend_kernel<kRays, true, true> : blend_kernel<kRays, true, false>)
+                           : (out.last ? blend_kernel<kRays, false, true> : blend_kernel<kRays, false, false>);
+}
+
 }  // namespace
 
 template <>
 void blend<float>(const Queue& queue, const BlendInput<float>& in, const Blended<float>& out) {
   if (makes_layers(in.image)) return blend_chunks(queue, in, out);
-  const auto kernel = out.inverse_depth ? (out.last ? blend_kernel<true, true> : blend_kernel<true, false>)
-                                        : (out.last ? blend_kernel<false, true> : blend_kernel<false, false>);
+  const auto kernel = in.rays ? blend_kernel_for<true>(out) : blend_kernel_for<false>(out);
   launch(queue, "blend", kernel, unsigned(tiles_of(in.image)), L::kThreads, in, out);
 }
 

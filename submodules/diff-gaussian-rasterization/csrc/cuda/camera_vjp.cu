@@ -30,18 +30,18 @@ __device__ double block_sum(double value, double* stage) {
 // sums (blocks, numbers).
 template <class AnyCamera>
 __global__ void __launch_bounds__(kThreads)
-    camera_vjp_kernel(const int32_t* halted, Scene<float> s, SlotSums source, double* sums) {
+    camera_vjp_kernel(const int32_t* halted, Scene<float> s, SlotSums<false> source, double* sums) {
   if (!begin_work(halted)) return;
   constexpr int kNumbers = kNumbersOf<AnyCamera>;
   __shared__ AnyCamera camera;
-  __shared__ __align__(8) float stage[kWarps * SlotSums::kStage];
+  __shared__ __align__(8) float stage[kWarps * SlotSums<false>::kStage];
   __shared__ double of_warps[kWarps];
   if (threadIdx.x == 0) set_camera(s, camera);
   __syncthreads();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const bool seen = i < s.count && source.seen(i);
   float m[kGradientValues], g[kNumbers] = {};
-  source.read(i, seen, m, stage + threadIdx.x / 32 * SlotSums::kStage);
+  source.read(i, seen, m, stage + threadIdx.x / 32 * SlotSums<false>::kStage);
   if (seen) camera_vjp_row(s, camera, SceneRow<float>{s, i}, m, g);
 #pragma unroll
   for (int k = 0; k < kNumbers; ++k) {
@@ -61,7 +61,7 @@ __global__ void __launch_bounds__(kThreads)
 }
 
 template <class AnyCamera>
-void sum_rows(const Queue& queue, const Scene<float>& s, const SlotSums& source, double* out) {
+void sum_rows(const Queue& queue, const Scene<float>& s, const SlotSums<false>& source, double* out) {
   constexpr int kNumbers = kNumbersOf<AnyCamera>;
   const unsigned blocks = blocks_for(s.count, kThreads);
   double* sums = queue.array<double>(size_t(kNumbers) * blocks);
@@ -72,7 +72,7 @@ void sum_rows(const Queue& queue, const Scene<float>& s, const SlotSums& source,
 }  // namespace
 
 void camera_vjp(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, double* out) {
-  const SlotSums source = sums_of(queue, in, {});
+  const SlotSums<false> source = sums_of<false>(queue, in, {});
   if (s.lens.chart == Chart::kPinhole)
     sum_rows<Camera<float>>(queue, s, source, out);
   else

@@ -3,8 +3,7 @@
 #include <cuda_runtime.h>
 
 #include "../backend.h"
-#include "../math/blend.h"
-#include "../math/tiles.h"
+#include "../math/ray_pixels.h"
 #include "queue.cuh"
 #include "splat_row.cuh"
 
@@ -15,6 +14,7 @@ using namespace baseline;
 
 namespace {
 
+template <bool kRays>
 __global__ void __launch_bounds__(kTile* kTile)
     decisive_kernel(BlendInput<float> in, const int32_t* last, bool* decisive) {
   const int across = tile_count(in.image.width), tile = blockIdx.x;
@@ -25,10 +25,10 @@ __global__ void __launch_bounds__(kTile* kTile)
   const int64_t blended = begin + last[int64_t(top + row) * in.image.width + left + column];
   for (int64_t k = begin; k < end; ++k) {
     const int32_t index = in.instances[k];
-    const Splat<float> splat = load_shape(in.splats, index);
+    const auto splat = load_shape<kRays>(in.splats, index);
     const float from = unrolled(splat, float(left), in.image.width);
-    const RowTerms<float> terms = row_terms(localise(splat, from, float(top)), float(row));
-    if (!(row_exponent(terms, row_u(terms, float(column))) >= float(kLog2MinAlpha))) continue;
+    const auto terms = row_terms(localise(splat, from, float(top)), float(row));
+    if (!(exponent_at(terms, float(column)) >= float(kLog2MinAlpha))) continue;
     decisive[index] = true;  // many threads write the same
     if (k >= blended) return;
   }
@@ -38,7 +38,8 @@ __global__ void __launch_bounds__(kTile* kTile)
 
 template <>
 void mark_decisive<float>(const Queue& queue, const BlendInput<float>& in, const int32_t* last, bool* decisive) {
-  decisive_kernel<<<unsigned(tiles_of(in.image)), kTile * kTile, 0, stream_of(queue)>>>(in, last, decisive);
+  const auto kernel = in.rays ? decisive_kernel<true> : decisive_kernel<false>;
+  kernel<<<unsigned(tiles_of(in.image)), kTile * kTile, 0, stream_of(queue)>>>(in, last, decisive);
   check_launch("decisive");
 }
 

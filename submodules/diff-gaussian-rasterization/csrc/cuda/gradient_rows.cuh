@@ -12,11 +12,9 @@
 namespace gs {
 namespace cuda {
 
-template <int kValues>
-struct RowsOf {
+struct RowPlaces {
   const uint32_t* bits;
   const int32_t* before;  // bits set before each word
-  float* values;          // (processed, kValues)
 
   // The row of a slot; for a slot without one, the next row.
   __device__ int64_t row(int64_t slot) const {
@@ -25,18 +23,26 @@ struct RowsOf {
   }
 };
 
-using GradientRows = RowsOf<baseline::kGradientValues>;
+template <int kValues>
+struct RowsOf : RowPlaces {
+  float* values;  // (processed, kValues)
+};
+
+template <bool kRays>
+using GradientRows = RowsOf<baseline::kGradientRow<kRays>>;
 using AbsoluteRows = RowsOf<baseline::kAbsoluteValues>;  // of the same instances
 
 // The rows of a backward; those of absolute gradients have no memory unless they are wanted.
+template <bool kRays>
 struct FilledRows {
-  GradientRows gradients;
+  GradientRows<kRays> gradients;
   AbsoluteRows absolute;
 };
 
 // Runs the backward of blending up to the rows, and to BlendGradient::absolute if it is wanted. Waits for the number of
 // rows if there may be many and the host does not run ahead.
-GradientRows fill_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g);
+template <bool kRays>
+GradientRows<kRays> fill_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g);
 
 // Sums the rows of a warp's splats, each in an order that depends on their number alone. The rows of neighbours lie
 // side by side, so they come through shared memory in whole lines. A splat near the camera has thousands of rows, which
@@ -44,8 +50,8 @@ GradientRows fill_rows(const Queue& queue, const BlendInput<float>& in, const Bl
 template <int kValues>
 struct WarpSums {
   static constexpr int kOwnRows = 48;
-  static constexpr int kStaged = 96;                // rows at a time
-  static constexpr int kStage = kStaged * kValues;  // floats of shared memory for each warp
+  static constexpr int kStaged = kValues > 12 ? 64 : 96;  // rows at a time, whose loads a lane has in registers
+  static constexpr int kStage = kStaged * kValues;        // floats of shared memory for each warp
 
   // All lanes of a warp call this, each with its own rows, from `begin` to `end`; there may be none.
   __device__ static void add_up(const float* rows, unsigned begin, unsigned end, float* sums, float* stage) {
@@ -112,20 +118,23 @@ struct SlotSumsOf {
   }
 };
 
-using SlotSums = SlotSumsOf<baseline::kGradientValues>;
+template <bool kRays>
+using SlotSums = SlotSumsOf<baseline::kGradientRow<kRays>>;
 
 // Finds the lengths of absolute gradients (N), 0 where a splat was not seen.
 void find_lengths(const Queue& queue, int64_t count, const SlotSumsOf<baseline::kAbsoluteValues>& sums,
-                  const float* splats, Image image, float* absolute);
+                  const float* splats, bool rays, Image image, float* absolute);
 
 // Counts each splat's rows.
-void count_rows(const Queue& queue, int64_t count, const GradientRows& rows, const SplatSlots* slots, int32_t* counts);
+void count_rows(const Queue& queue, int64_t count, const RowPlaces& rows, const SplatSlots* slots, int32_t* counts);
 
-// Writes rows of both kinds as rows of twelve values.
-void join_rows(const Queue& queue, int64_t rows, const FilledRows& from, float* to);
+// Writes rows of both kinds as rows of all their values.
+template <bool kRays>
+void join_rows(const Queue& queue, int64_t rows, const FilledRows<kRays>& from, float* to);
 
 // Makes rows by splat a source of sums, and finds RowSums::absolute if it is wanted.
-SlotSums sums_of(const Queue& queue, const SplatRows<float>& in, const RowSums<float>& to);
+template <bool kRays>
+SlotSums<kRays> sums_of(const Queue& queue, const SplatRows<float>& in, const RowSums<float>& to);
 
 }  // namespace cuda
 }  // namespace gs

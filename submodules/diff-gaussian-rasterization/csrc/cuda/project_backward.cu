@@ -19,12 +19,14 @@ constexpr int kThreads = kSleepBlock;
 constexpr int kBlocks = 5;  // that an SM is to hold at once: more registers do not pay
 
 // A source of moments for project_vjp_kernel, as SlotSums is: moments that were summed before.
+template <bool kRays>
 struct StoredMoments {
   const float* moments;
   const int32_t* tile_counts;
   __device__ bool seen(int64_t i) const { return tile_counts[i] != 0; }
   __device__ void read(int64_t i, bool wanted, float* m, float* /*stage*/) const {
-    for (int v = 0; wanted && v < kGradientValues; ++v) m[v] = moments[kGradientValues * i + v];
+    constexpr int kRow = kGradientRow<kRays>;
+    for (int v = 0; wanted && v < kRow; ++v) m[v] = moments[kRow * i + v];
   }
 };
 
@@ -107,7 +109,9 @@ __global__ void __launch_bounds__(kThreads, kBlocks)
   const int64_t block = awake_block(s, blockIdx.x);
   if (block < 0) return;
   constexpr bool kAdds = std::is_same_v<Step, Addition>;
-  constexpr int kStage = SlotSums::kStage > WarpGradients::kFloats ? SlotSums::kStage : WarpGradients::kFloats;
+  constexpr bool kRays = kOnRays<AnyCamera>;
+  constexpr int kSums = SlotSums<kRays>::kStage,
+                kStage = kSums > WarpGradients::kFloats ? kSums : WarpGradients::kFloats;
   static_assert(32 * RowBefore::kFloats <= kStage, "a warp has memory for the rows of its lanes");
   __shared__ AnyCamera camera;
   __shared__ __align__(16) float rest[kThreads * kRest];
@@ -123,7 +127,7 @@ __global__ void __launch_bounds__(kThreads, kBlocks)
   if (!s.colors)
     fetch_rows(s.sh_rest, first, s.count, s.rest_stride, 3 * (sh_count(s.sh_degree) - 1), __ballot_sync(kWarp, seen), 0,
                warp_rows);
-  float m[kGradientValues];
+  float m[kGradientRow<kRays>];
   source.read(at, seen, m, warp_stage);
   wait_for_rows();
   RowGradient g = {};
@@ -156,28 +160,43 @@ __global__ void __launch_bounds__(kThreads, kBlocks)
     write_rows(warp_rows, first, int(s.count - first < 32 ? s.count - first : 32), 3 * s.rest_bands, out.sh_rest);
 }
 
-template <class Source, class Step>
+template <bool kRays, class Source, class Step>
 void launch_project_vjp(const Queue& queue, const Scene<float>& s, const Source& source,
                         const SceneGradient<float>& out, const Step& step) {
-  const auto kernel = s.lens.chart == Chart::kPinhole ? project_vjp_kernel<Camera<float>, Source, Step>
-                                                      : project_vjp_kernel<LensCamera<float>, Source, Step>;
-  launch(queue, "project_vjp", kernel, blocks_for(s.rows(), kThreads), kThreads, s, source, out, step);
+  const auto go = [&](auto kernel) {
+    launch(queue, "project_vjp", kernel, blocks_for(s.rows(), kThreads), kThreads, s, source, out, step);
+  };
+  if constexpr (kRays)
+    go(project_vjp_kernel<RayCamera<float>, Source, Step>);
+  else
+    go(s.lens.chart == Chart::kPinhole ? project_vjp_kernel<Camera<float>, Source, Step>
+                                       : project_vjp_kernel<LensCamera<float>, Source, Step>);
 }
 
-void launch_gradients(const Queue& queue, const Scene<float>& s, const SlotSums& source,
+template <bool kRays>
+void launch_gradients(const Queue& queue, const Scene<float>& s, const SlotSums<kRays>& source,
                       const SceneGradient<float>& out) {
   if (out.adds)
-    launch_project_vjp(queue, s, source, out, Addition{});
+    launch_project_vjp<kRays>(queue, s, source, out, Addition{});
   else
-    launch_project_vjp(queue, s, source, out, StepParameters{});
+    launch_project_vjp<kRays>(queue, s, source, out, StepParameters{});
 }
 
-void launch_step(const Queue& queue, const Scene<float>& s, const SlotSums& source, const GaussianStep<float>& step) {
+template <bool kRays>
+void launch_step(const Queue& queue, const Scene<float>& s, const SlotSums<kRays>& source,
+                 const GaussianStep<float>& step) {
   const StepParameters parameters = step_parameters(step);
   if (step.penalty.any())
-    launch_project_vjp(queue, s, source, {}, PenalisedStep{parameters, step.penalty});
+    launch_project_vjp<kRays>(queue, s, source, {}, PenalisedStep{parameters, step.penalty});
   else
-    launch_project_vjp(queue, s, source, {}, parameters);
+    launch_project_vjp<kRays>(queue, s, source, {}, parameters);
+}
+
+// Calls run(rays) with a constant, if there are Gaussians.
+template <class Run>
+void by_kind(const Scene<float>& s, const Run& run) {
+  if (!s.rows()) return;
+  s.rays ? run(std::true_type()) : run(std::false_type());
 }
 
 }  // namespace
@@ -185,31 +204,35 @@ void launch_step(const Queue& queue, const Scene<float>& s, const SlotSums& sour
 template <>
 void project_vjp<float>(const Queue& queue, const Scene<float>& s, const int32_t* tile_counts, const float* moments,
                         const SceneGradient<float>& out) {
-  if (s.rows()) launch_project_vjp(queue, s, StoredMoments{moments, tile_counts}, out, StepParameters{});
+  by_kind(s, [&](auto rays) {
+    launch_project_vjp<rays>(queue, s, StoredMoments<rays>{moments, tile_counts}, out, StepParameters{});
+  });
 }
 
 void rasterize_vjp(const Queue& queue, const Scene<float>& s, const BlendInput<float>& in,
                    const BlendGradient<float>& g, const GradientMemory& memory) {
-  if (!s.rows()) return;
-  const SlotSums source{fill_rows(queue, in, g), g.slots};
-  launch_gradients(queue, s, source, memory.take(memory.context));
+  by_kind(s, [&](auto rays) {
+    const SlotSums<rays> source{fill_rows<rays>(queue, in, g), g.slots};
+    launch_gradients<rays>(queue, s, source, memory.take(memory.context));
+  });
 }
 
 void rasterize_vjp_step(const Queue& queue, const Scene<float>& s, const BlendInput<float>& in,
                         const BlendGradient<float>& g, const GaussianStep<float>& step) {
-  if (s.rows()) launch_step(queue, s, {fill_rows(queue, in, g), g.slots}, step);
+  by_kind(s, [&](auto rays) { launch_step<rays>(queue, s, {fill_rows<rays>(queue, in, g), g.slots}, step); });
 }
 
 void rows_vjp(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, const RowSums<float>& to,
               const GradientMemory& memory) {
-  if (!s.rows()) return;
-  const SlotSums source = sums_of(queue, in, to);
-  launch_gradients(queue, s, source, memory.take(memory.context));
+  by_kind(s, [&](auto rays) {
+    const SlotSums<rays> source = sums_of<rays>(queue, in, to);
+    launch_gradients<rays>(queue, s, source, memory.take(memory.context));
+  });
 }
 
 void rows_vjp_step(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, const RowSums<float>& to,
                    const GaussianStep<float>& step) {
-  if (s.rows()) launch_step(queue, s, sums_of(queue, in, to), step);
+  by_kind(s, [&](auto rays) { launch_step<rays>(queue, s, sums_of<rays>(queue, in, to), step); });
 }
 
 }  // namespace cuda

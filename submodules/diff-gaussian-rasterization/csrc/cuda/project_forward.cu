@@ -47,7 +47,7 @@ __global__ void __launch_bounds__(kThreads)
   if (threadIdx.x == 0) set_camera(s, camera);
   __syncthreads();
   const int64_t i = block * kThreads + threadIdx.x;
-  Splat<float> splat = {};
+  SplatOf<float, kOnRays<AnyCamera>> splat = {};
   float depth = INFINITY;
   int radius = 0;
   unsigned flowing = 0;
@@ -64,7 +64,7 @@ __global__ void __launch_bounds__(kThreads)
   if (visible) rect = tile_rect(splat, s.image.width, s.image.height, goes_around(camera));
   fetch(rect.x1 > rect.x0);
   uint64_t mask;
-  int32_t count = warp_count_tiles<!std::is_same_v<AnyCamera, Camera<float>>>(splat, rect, s.image, mask);
+  int32_t count = warp_count_tiles<std::is_same_v<AnyCamera, LensCamera<float>>>(splat, rect, s.image, mask);
   wait_for_rows();
   if (count && !project_color(s, camera, SceneRow<float>{s, i}, rest + threadIdx.x * kRest, splat)) count = 0;
   if (row >= s.rows()) return;
@@ -83,8 +83,9 @@ __global__ void __launch_bounds__(kThreads)
 template <>
 void project<float>(const Queue& queue, const Scene<float>& s, const Projected<float>& out) {
   if (!s.rows()) return;
-  const auto kernel =
-      s.lens.chart == Chart::kPinhole ? project_kernel<Camera<float>> : project_kernel<LensCamera<float>>;
+  const auto kernel = s.rays                            ? project_kernel<RayCamera<float>>
+                      : s.lens.chart == Chart::kPinhole ? project_kernel<Camera<float>>
+                                                        : project_kernel<LensCamera<float>>;
   launch(queue, "project", kernel, blocks_for(s.rows(), kThreads), kThreads, s, out);
 }
 

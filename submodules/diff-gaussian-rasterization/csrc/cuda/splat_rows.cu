@@ -18,7 +18,7 @@ constexpr int kThreads = 256;
 
 __global__ void __launch_bounds__(kThreads)
     absolute_kernel(const int32_t* halted, int64_t count, SlotSumsOf<kAbsoluteValues> sums, const float* splats,
-                    Image image, float* absolute) {
+                    int row, Image image, float* absolute) {
   if (!begin_work(halted)) return;
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   constexpr int kStage = SlotSumsOf<kAbsoluteValues>::kStage;
@@ -27,21 +27,20 @@ __global__ void __launch_bounds__(kThreads)
   const bool seen = i < count && sums.seen(i);
   sums.read(i, seen, of_pixels, stage + threadIdx.x / 32 * kStage);
   if (i >= count) return;
-  absolute[i] = seen ? absolute_length(splats[kSplatValues * i + 2], of_pixels[0], of_pixels[1], image) : 0;
+  absolute[i] = seen ? absolute_length(splats[row * i + 2], of_pixels[0], of_pixels[1], image) : 0;
 }
 
-__global__ void __launch_bounds__(kThreads) count_rows_kernel(const int32_t* halted, int64_t count, GradientRows rows,
-                                                              const SplatSlots* slots, int32_t* counts) {
+__global__ void __launch_bounds__(kThreads)
+    count_rows_kernel(const int32_t* halted, int64_t count, RowPlaces rows, const SplatSlots* slots, int32_t* counts) {
   if (!begin_work(halted)) return;
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i < count) counts[i] = int32_t(rows.row(slots[i + 1].first) - rows.row(slots[i].first));
 }
 
-// Rows of twelve values, in pairs, and the two arrays that have ten and two of them.
-constexpr int kGradientPairs = kGradientValues / 2, kPairs = kGradientPairs + kAbsoluteValues / 2;
-
-template <class Pair>
+// Rows with the values of absolute gradients, in pairs, and the two arrays of their two parts.
+template <class Pair, bool kRays>
 struct Halves {
+  static constexpr int kGradientPairs = kGradientRow<kRays> / 2, kPairs = kGradientPairs + kAbsoluteValues / 2;
   Pair *gradients, *absolute;
   __device__ Pair& operator[](int64_t pair) const {
     const int64_t row = pair / kPairs;
@@ -58,13 +57,13 @@ __global__ void __launch_bounds__(kThreads) copy_pairs_kernel(const int32_t* hal
 }
 
 template <class From, class To>
-void copy_rows(const Queue& queue, int64_t rows, From from, To to) {
-  if (!rows) return;
-  const int64_t pairs = kPairs * rows;
+void copy_pairs(const Queue& queue, int64_t pairs, From from, To to) {
+  if (!pairs) return;
   launch(queue, "copy_pairs", copy_pairs_kernel<From, To>, blocks_for(pairs, kThreads), kThreads, pairs, from, to);
 }
 
-Halves<float2> halves(float* gradients, float* absolute) {
+template <bool kRays>
+Halves<float2, kRays> halves(float* gradients, float* absolute) {
   return {reinterpret_cast<float2*>(gradients), reinterpret_cast<float2*>(absolute)};
 }
 
@@ -100,41 +99,53 @@ struct Words {
   __host__ __device__ WordAt operator()(int64_t splat) const { return {in, slots, before, splat}; }
 };
 
-}  // namespace
-
-void find_lengths(const Queue& queue, int64_t count, const SlotSumsOf<kAbsoluteValues>& sums, const float* splats,
-                  Image image, float* absolute) {
-  launch(queue, "absolute", absolute_kernel, blocks_for(count, kThreads), kThreads, count, sums, splats, image,
-         absolute);
-}
-
-void count_rows(const Queue& queue, int64_t count, const GradientRows& rows, const SplatSlots* slots, int32_t* counts) {
-  launch(queue, "count_rows", count_rows_kernel, blocks_for(count, kThreads), kThreads, count, rows, slots, counts);
-}
-
-void join_rows(const Queue& queue, int64_t rows, const FilledRows& from, float* to) {
-  copy_rows(queue, rows, halves(from.gradients.values, from.absolute.values), reinterpret_cast<float2*>(to));
-}
-
-SlotSums sums_of(const Queue& queue, const SplatRows<float>& in, const RowSums<float>& to) {
-  SplatSlots* slots = queue.array<SplatSlots>(in.count + 1);
-  int32_t* before = queue.array<int32_t>(in.count + 1);
+void lay_out(const Queue& queue, const SplatRows<float>& in, SplatSlots* slots, int32_t* before) {
   const thrust::counting_iterator<int64_t> splats(0);
   const auto counts = thrust::make_transform_iterator(splats, SeenAndRows{in});
   const auto words = thrust::make_transform_iterator(splats, Words{in, slots, before});
   with_memory(queue, [&](void* memory, size_t& bytes) {
     return cub::DeviceScan::ExclusiveSum(memory, bytes, counts, words, in.count + 1, stream_of(queue));
   });
+}
+
+}  // namespace
+
+void find_lengths(const Queue& queue, int64_t count, const SlotSumsOf<kAbsoluteValues>& sums, const float* splats,
+                  bool rays, Image image, float* absolute) {
+  launch(queue, "absolute", absolute_kernel, blocks_for(count, kThreads), kThreads, count, sums, splats,
+         splat_row(rays), image, absolute);
+}
+
+void count_rows(const Queue& queue, int64_t count, const RowPlaces& rows, const SplatSlots* slots, int32_t* counts) {
+  launch(queue, "count_rows", count_rows_kernel, blocks_for(count, kThreads), kThreads, count, rows, slots, counts);
+}
+
+template <bool kRays>
+void join_rows(const Queue& queue, int64_t rows, const FilledRows<kRays>& from, float* to) {
+  const auto both = halves<kRays>(from.gradients.values, from.absolute.values);
+  copy_pairs(queue, both.kPairs * rows, both, reinterpret_cast<float2*>(to));
+}
+template void join_rows<false>(const Queue&, int64_t, const FilledRows<false>&, float*);
+template void join_rows<true>(const Queue&, int64_t, const FilledRows<true>&, float*);
+
+template <bool kRays>
+SlotSums<kRays> sums_of(const Queue& queue, const SplatRows<float>& in, const RowSums<float>& to) {
+  SplatSlots* slots = queue.array<SplatSlots>(in.count + 1);
+  int32_t* before = queue.array<int32_t>(in.count + 1);
+  lay_out(queue, in, slots, before);
   float* gradients = const_cast<float*>(in.rows);  // sums only read them
   if (to.absolute) {
-    gradients = queue.array<float>(in.row_count * kGradientValues);
+    gradients = queue.array<float>(in.row_count * kGradientRow<kRays>);
     float* absolute = queue.array<float>(in.row_count * kAbsoluteValues);
-    copy_rows(queue, in.row_count, reinterpret_cast<const float2*>(in.rows), halves(gradients, absolute));
-    find_lengths(queue, in.count, {{nullptr, before, absolute}, slots}, to.splats, to.image, to.absolute);
+    const auto both = halves<kRays>(gradients, absolute);
+    copy_pairs(queue, both.kPairs * in.row_count, reinterpret_cast<const float2*>(in.rows), both);
+    find_lengths(queue, in.count, {{{nullptr, before}, absolute}, slots}, to.splats, kRays, to.image, to.absolute);
     queue.release(queue.context, absolute);
   }
-  return {{nullptr, before, gradients}, slots};
+  return {{{nullptr, before}, gradients}, slots};
 }
+template SlotSums<false> sums_of<false>(const Queue&, const SplatRows<float>&, const RowSums<float>&);
+template SlotSums<true> sums_of<true>(const Queue&, const SplatRows<float>&, const RowSums<float>&);
 
 }  // namespace cuda
 }  // namespace gs

@@ -131,14 +131,14 @@ __global__ void __launch_bounds__(kListThreads)
 }
 
 // Calls take(tile, splat) for the tiles of splats without a mask, which the warps of `blocks` blocks share.
-template <class Take>
+template <bool kRays, class Take>
 __device__ __forceinline__ void each_large(const Projected<float>& in, Image image, const ListCounts& counts,
                                            unsigned block, unsigned blocks, const Take& take) {
   constexpr unsigned kWarps = kListThreads / 32;
   for (int k = int(block * kWarps + threadIdx.x / 32), all = *counts.larges; k < all; k += blocks * kWarps) {
     const int32_t splat = counts.large[k];
     const TileRect rect = reached_by(in, splat).rect;
-    const TileTest<float> test = make_tile_test(load_shape(in.splats, splat), rect, image.width, image.height);
+    const auto test = make_tile_test(load_shape<kRays>(in.splats, splat), rect, image.width, image.height);
     const int wide = rect.x1 - rect.x0, area = wide * (rect.y1 - rect.y0);
     for (int place = threadIdx.x % 32; place < area; place += 32) {
       const int x = rect.x0 + place % wide, y = rect.y0 + place / wide;
@@ -147,11 +147,12 @@ __device__ __forceinline__ void each_large(const Projected<float>& in, Image ima
   }
 }
 
+template <bool kRays>
 __global__ void __launch_bounds__(kListThreads)
     count_large_kernel(const int32_t* halted, Projected<float> in, Image image, ListCounts counts) {
   if (!begin_work(halted)) return;
-  each_large(in, image, counts, blockIdx.x, gridDim.x,
-             [&](int tile, int32_t) { atomicAdd(counts.unmasked + tile, 1); });
+  each_large<kRays>(in, image, counts, blockIdx.x, gridDim.x,
+                    [&](int tile, int32_t) { atomicAdd(counts.unmasked + tile, 1); });
 }
 
 constexpr int kLayRun = 4;  // counts of a thread at a time
@@ -206,6 +207,7 @@ __device__ __forceinline__ uint64_t list_key(const Projected<float>& in, int32_t
 
 // Puts each splat's instances into the lists, and stores its slots, if they are wanted; those of splat n are behind
 // all. Blocks behind those of the shares take splats without a mask.
+template <bool kRays>
 __global__ void __launch_bounds__(kListThreads)
     fill_kernel(const int32_t* halted, int64_t n, int64_t splats, unsigned shares, Projected<float> in, Image image,
                 ListCounts counts, const int64_t* of_shares, SplatSlots* slots, ListWork work) {
@@ -220,7 +222,7 @@ __global__ void __launch_bounds__(kListThreads)
       const int32_t first = atomicAdd(counts.further, further);
       for (int32_t k = 0; k < further; ++k) work.pieces[first + k] = make_int2(int(t), k + 1);
     }
-    each_large(in, image, counts, block, blocks, [&](int tile, int32_t splat) {
+    each_large<kRays>(in, image, counts, block, blocks, [&](int tile, int32_t splat) {
       work.keys[work.begins[tile] + atomicAdd(counts.masked + tile, 1)] = list_key(in, splat);
     });
     return;

@@ -1,7 +1,7 @@
 #pragma once
 // Counts the tiles that a splat reaches, by whole warps: a splat over a thousand tiles must not hold up 31 others.
 #include "../data.h"
-#include "../math/tiles.h"
+#include "../math/ray_pixels.h"
 #include "queue.cuh"
 
 namespace gs {
@@ -16,7 +16,7 @@ __device__ V from_lane(V value, int lane) {
   return __shfl_sync(kWarp, value, lane);
 }
 
-// Takes over what tile_reached reads and what differs between lanes.
+// Take over what tile_reached reads and what differs between lanes.
 template <>
 __device__ inline TileTest<float> from_lane(TileTest<float> test, int lane) {
   Splat<float>& s = test.splat;
@@ -26,12 +26,20 @@ __device__ inline TileTest<float> from_lane(TileTest<float> test, int lane) {
   test.level = from_lane(test.level, lane);
   return test;
 }
+template <>
+__device__ inline RayTileTest<float> from_lane(RayTileTest<float> test, int lane) {
+  TileTest<float>& flat = test;
+  flat = from_lane(flat, lane);
+  test.by_x = from_lane(test.by_x, lane), test.by_y = from_lane(test.by_y, lane);
+  test.reach = from_lane(test.reach, lane), test.margin = from_lane(test.margin, lane);
+  return test;
+}
 
 // Tests the tiles of every lane's rectangle: 1 to 32 `tiles` in rows of `wide` from (x0, y0). All lanes of a warp call
 // this, and share all tests evenly. Returns a bit for each of the lane's own tiles that is reached. kMayCross: as for
 // tile_reached.
-template <bool kMayCross>
-__device__ inline uint32_t warp_tiles_reached(const TileTest<float>& test, int x0, int y0, int wide, int tiles) {
+template <bool kMayCross, class Test>
+__device__ inline uint32_t warp_tiles_reached(const Test& test, int x0, int y0, int wide, int tiles) {
   const int lane = threadIdx.x & 31;
   const int inverse = int(__fdividef(1024, float(wide))) + 1;  // k * inverse >> 10 is k / wide for all k < 32
   int end = tiles;
@@ -57,11 +65,13 @@ __device__ inline uint32_t warp_tiles_reached(const TileTest<float>& test, int x
 
 // Returns the number of tiles that the lane's splat reaches, and in `mask` a bit for each of its rectangle's first 64.
 // All lanes of a warp call this; a lane without a splat gives an empty rectangle.
-template <bool kMayCross>
-__device__ inline int32_t warp_count_tiles(const Splat<float>& splat, TileRect rect, Image image, uint64_t& mask) {
+template <bool kMayCross, class AnySplat>
+__device__ inline int32_t warp_count_tiles(const AnySplat& splat, TileRect rect, Image image, uint64_t& mask) {
+  using Test = decltype(make_tile_test(splat, rect, 0, 0));
   const int lane = threadIdx.x & 31;
   const int wide = rect.x1 - rect.x0, tiles = wide * (rect.y1 - rect.y0);
-  TileTest<float> test = {splat, float(image.width - 1), float(image.height - 1), 0, 0, 0};
+  Test test = {};
+  test.splat = splat, test.last_x = float(image.width - 1), test.last_y = float(image.height - 1);
   if (tiles > 0) test = make_tile_test(splat, rect, image.width, image.height);
   int32_t count = 0;
   mask = 0;
@@ -73,7 +83,7 @@ __device__ inline int32_t warp_count_tiles(const Splat<float>& splat, TileRect r
   }
   for (unsigned large = __ballot_sync(kWarp, tiles > kShared); large; large &= large - 1) {
     const int owner = __ffs(large) - 1;
-    const TileTest<float> its = from_lane(test, owner);
+    const Test its = from_lane(test, owner);
     const int x0 = from_lane(rect.x0, owner), y0 = from_lane(rect.y0, owner);
     const int across = from_lane(wide, owner), total = from_lane(tiles, owner);
     int32_t found = 0;

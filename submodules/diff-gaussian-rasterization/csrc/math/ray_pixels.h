@@ -1,7 +1,7 @@
 #pragma once
 // Splats on rays (ray.h) at pixels: the exponent, and which pixels and tiles a splat reaches.
 #include "blend.h"
-#include "tiles.h"
+#include "ray.h"
 
 GS_ISA_BEGIN
 
@@ -39,6 +39,17 @@ struct AtPixel {
   V inverse;  // 1 / (s^2 + e q)
 };
 
+// 1 / a, on a GPU by its own instruction alone: 1 unit in the last place off.
+template <class V>
+GS_HD V reciprocal(V a) {
+#if defined(__CUDACC__) && defined(__CUDA_ARCH__)
+  asm("rcp.approx.ftz.f32 %0, %0;" : "+f"(a));
+  return a;
+#else
+  return 1 / a;
+#endif
+}
+
 // Fused by name, as in blend.h, here and below. T: V or its scalar.
 template <class V, class T>
 GS_HD AtPixel<V> at_pixel(const RayRow<T>& row, V x) {
@@ -46,12 +57,23 @@ GS_HD AtPixel<V> at_pixel(const RayRow<T>& row, V x) {
   p.u = row_u(row.flat, x);
   p.s = multiply_add(V(row.slope_u - V{}), p.u, V(row.s0 - V{}));
   p.q = multiply_add(p.u, p.u, V(row.flat.v * row.flat.v - V{}));
-  p.inverse = 1 / multiply_add(V(row.e - V{}), p.q, V(p.s * p.s));
+  p.inverse = reciprocal(multiply_add(V(row.e - V{}), p.q, V(p.s * p.s)));
   return p;
 }
 template <class V, class T>
-GS_HD V ray_exponent(const RayRow<T>& row, const AtPixel<V>& p) {
-  return p.s > Scalar<V>(0) ? multiply_add(V(-p.q), p.inverse, V(row.flat.top - V{})) : all<V>(2 * kLog2MinAlpha);
+GS_HD V row_exponent(const RayRow<T>& row, const AtPixel<V>& p) {
+  const V q = p.s > Scalar<V>(0) ? p.q : all<V>(INFINITY);  // not at all behind the camera
+  return multiply_add(V(-q), p.inverse, V(row.flat.top - V{}));
+}
+
+// The same of a splat that is not on rays: u alone.
+template <class V, class T>
+GS_HD V at_pixel(const RowTerms<T>& row, V x) {
+  return row_u(row, x);
+}
+template <class Row, class V>
+GS_HD V exponent_at(const Row& row, V x) {
+  return row_exponent(row, at_pixel(row, x));
 }
 
 // As for EWA: u^2 is at least its least in the row's part, and s at most its larger end. D^2 grows with q, so none of
@@ -71,18 +93,40 @@ GS_HD auto row_reached(const RayRow<V>& row, T first, T last) {
 // What RayMoments take of a pixel that is reached, without the gradient's factor; a lane that is not may have anything.
 template <class V>
 struct RayWeights {
-  V w, u, v, p;  // u and v: x
-  V au, av;      // a / s
+  V u, v, p;  // root(w) x and root(w) p, which is D^2
+  V au, av;   // w a / s
 };
 
-// a is multiplied out with s: nothing cancels where s is large.
+// root(w) / s is s / (s^2 + e q). a is multiplied out with s: nothing cancels where s is large.
 template <class V, class T>
 GS_HD RayWeights<V> ray_weights(const RayRow<V>& row, const AtPixel<V>& at, T slope_v) {
-  const V per_s = 1 / (at.s > Scalar<V>(0) ? at.s : all<V>(1)), part = at.s * at.s * at.inverse;
-  const V u = at.u * per_s, v = row.flat.v * per_s, square = per_s * per_s;
-  const V turn = slope_v * at.u - row.slope_u * row.flat.v;
-  return {part * part, u, v, at.q * square, (u + turn * v) * square, (v - turn * u) * square};
+  const V per = at.s * at.inverse, u = per * at.u, v = per * row.flat.v;
+  const V turn = multiply_add(V(slope_v - V{}), at.u, V(-row.slope_u * row.flat.v));
+  return {u, v, at.q * at.inverse, at.inverse * multiply_add(turn, v, u), at.inverse * multiply_add(V(-turn), u, v)};
 }
+
+// The same of all pixels of a row, along which v is constant and s is linear in u: sums of q, of g u^k with
+// g = q s / (s^2 + e q)^2, the q in it the exponent's, and of what weighs p^2.
+template <class T>
+struct RayRowSums {
+  T q = 0, g = 0, gu = 0, guu = 0, guuu = 0, pp = 0;
+
+  GS_HD void add(const AtPixel<T>& at, T q_here) {
+    const T g_here = q_here * (at.s * at.inverse) * at.inverse, gu_here = g_here * at.u, guu_here = gu_here * at.u;
+    const T p = at.q * at.inverse;
+    q += q_here, g += g_here, gu += gu_here, guu += guu_here, guuu += guu_here * at.u, pp += q_here * p * p;
+  }
+
+  GS_HD RayMoments<T> moments(const RayRow<T>& row, T slope_v) const {
+    const T v = row.flat.v, across = row.slope_u * v, square = v * v;
+    const T one = row.s0 * g + row.slope_u * gu, u = row.s0 * gu + row.slope_u * guu;
+    return {{q, row.s0 * gu - across * (v * g), v * g + across * gu - slope_v * guu, row.s0 * guu + row.slope_u * guuu,
+             v * u, square * one},
+            guuu + square * gu,
+            v * (guu + square * g),
+            pp};
+  }
+};
 
 // How far from the mean a splat reaches, px.
 template <class T>

@@ -35,16 +35,19 @@ constexpr int kGradientValues = 10;  // q, qu, qv, quu, quv, qvv, r, g, b, inver
 template <class T>
 struct RaySplat : Splat<T> {
   T slope_u, slope_v;
-  T e;  // log2 units
+  T e;     // log2 units
+  T none;  // 0: a GPU moves values in pairs
 };
-constexpr int kRayValues = 3;  // of a row besides, and of its gradient sums
+constexpr int kRayValues = 4;  // of a row besides, and of its gradient sums, of which the last is 0 as well
 static_assert(sizeof(RaySplat<float>) == (kSplatValues + kRayValues) * sizeof(float), "a row of splats");
 
 template <class T, bool kRays>
 using SplatOf = std::conditional_t<kRays, RaySplat<T>, Splat<T>>;
+GS_HD constexpr int splat_row(bool rays) { return kSplatValues + (rays ? kRayValues : 0); }
+GS_HD constexpr int gradient_row(bool rays) { return kGradientValues + (rays ? kRayValues : 0); }
 template <bool kRays>
-constexpr int kSplatRow = kSplatValues + (kRays ? kRayValues : 0);
+constexpr int kSplatRow = splat_row(kRays);
 template <bool kRays>
-constexpr int kGradientRow = kGradientValues + (kRays ? kRayValues : 0);
+constexpr int kGradientRow = gradient_row(kRays);
 
 GS_ISA_END

@@ -22,6 +22,7 @@ struct Parameters {
   std::vector<T> means, opacities, scales, rotations, dc, rest;
   T view[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1}, full[16] = {};  // transposed
   gs::Lens<T> lens = {};
+  bool rays = false;
 
   explicit Parameters(int64_t n) : count(n) {
     for (int64_t i = 0; i < n; ++i) {
@@ -73,7 +74,7 @@ gs::Scene<T> scene_of(Parameters<T>& p, gs::Image image, bool antialiasing) {
   scene.dc_stride = 3, scene.rest_stride = 45, scene.rest_bands = 15, scene.sh_degree = 3;
   scene.raw = true, scene.antialiasing = antialiasing, scene.scale_modifier = 1;
   scene.view = p.view, scene.projection = p.full, scene.center = center;
-  scene.tan_x = scene.tan_y = 0.6, scene.image = image, scene.lens = p.lens;
+  scene.tan_x = scene.tan_y = 0.6, scene.image = image, scene.lens = p.lens, scene.rays = p.rays;
   return scene;
 }
 
@@ -111,13 +112,17 @@ std::unique_ptr<RenderedOf<T>> bin_scene(const Where& where, const gs::Scene<T>&
   const gs::Image image = scene.image;
   const size_t n = scene.rows();
   r.scene = scene;
-  r.splats.resize(kSplatValues * n), r.depths.resize(n), r.tile_counts.resize(n), r.radii.resize(n);
+  r.splats.resize(splat_row(scene.rays) * n), r.depths.resize(n), r.tile_counts.resize(n), r.radii.resize(n);
   r.rects.assign(4 * n, 0x7fffffff), r.records.resize(n);  // undefined values must not be used
   r.ranges.resize(size_t((image.width + 15) / 16) * ((image.height + 15) / 16) + 1);
   r.slots.resize(asked.slots ? n + 1 : 0);
-  const gs::Projected<T> projected = {
-      r.splats.data(),      r.depths.data(), asked.rects ? r.rects.data() : nullptr,
-      r.tile_counts.data(), r.radii.data(),  asked.records ? r.records.data() : nullptr};
+  const gs::Projected<T> projected = {r.splats.data(),
+                                      r.depths.data(),
+                                      asked.rects ? r.rects.data() : nullptr,
+                                      r.tile_counts.data(),
+                                      r.radii.data(),
+                                      asked.records ? r.records.data() : nullptr,
+                                      scene.rays};
   project(where, scene, projected);
   const auto take = [](void* context, int64_t count, int64_t slots) {
     RenderedOf<T>& to = *static_cast<RenderedOf<T>*>(context);
@@ -145,12 +150,12 @@ std::unique_ptr<RenderedOf<T>> render(const Where& where, const gs::Scene<T>& sc
   const size_t pixels = r.pixels();
   const int64_t room = int64_t(r.instances.size());
   r.color.resize(3 * pixels), r.transmittance.resize(pixels), r.inverse_depth.resize(pixels), r.last.resize(pixels);
-  r.input = {r.splats.data(), r.instances.data(), r.ranges.data(), r.background, scene.image, room};
+  r.input = {r.splats.data(), r.instances.data(), r.ranges.data(), r.background, scene.image, room, scene.rays};
   r.layers = memory_for_layers<T>(where, scene.image, room);
   T* const layers = r.layers.empty() ? nullptr : r.layers.data();
   blend(where, r.input,
         gs::Blended<T>{r.color.data(), r.transmittance.data(), r.inverse_depth.data(), r.last.data(), layers});
-  r.gradient.assign(3 * pixels, T(1)), r.moments.resize(kGradientValues * scene.rows());
+  r.gradient.assign(3 * pixels, T(1)), r.moments.resize(gradient_row(scene.rays) * scene.rows());
   const T* const g = r.gradient.data();
   r.backward = {scene.rows(),     room,   r.slot_count, r.slots.data(), r.transmittance.data(), r.last.data(), g, g, g,
                 r.moments.data(), layers, asked.ahead};

@@ -11,7 +11,8 @@ struct KeptRows {
   int values;  // of a row
 
   gs::SplatRows<float> given(const Rendered& r) const {
-    return {int64_t(counts.size()), r.tile_counts.data(), counts.data(), rows.data(), int64_t(rows.size()) / values};
+    return {int64_t(counts.size()),        r.tile_counts.data(), counts.data(), rows.data(),
+            int64_t(rows.size()) / values, r.scene.rays};
   }
 };
 
@@ -19,7 +20,7 @@ template <class Where>
 KeptRows keep_rows(const Where& where, const gs::BlendInput<float>& in, const gs::BlendGradient<float>& g,
                    bool absolute) {
   using gs::cuda::blend_rows, gs::GS_ISA::blend_rows;
-  KeptRows out{{}, std::vector<int32_t>(g.count, -77), kGradientValues + (absolute ? 2 : 0)};
+  KeptRows out{{}, std::vector<int32_t>(g.count, -77), gradient_row(in.rays) + (absolute ? 2 : 0)};
   const auto take = [](void* context, int64_t count) {
     KeptRows& to = *static_cast<KeptRows*>(context);
     to.rows.assign(size_t(count) * to.values, NAN);
@@ -66,7 +67,7 @@ void check_rows(const Where& where, const gs::Scene<float>& scene, bool depth, b
     for (std::vector<float>& of : lengths) of.assign(absolute ? scene.count : 0, -77.0f);
     const auto to = [&](int which) { return absolute ? lengths[which].data() : nullptr; };
     const auto wanted = gradients_of(*r, static_cast<const KeptRows*>(nullptr), to(1));
-    for (const KeptRows& rows : {whole, summed(where, whole)}) {
+    for (const KeptRows& rows : {whole, scene.rays ? whole : summed(where, whole)}) {
       CHECK(gradients_of(*r, &rows, to(0)) == wanted);
       CHECK(lengths[0] == lengths[1]);
     }

@@ -92,11 +92,33 @@ void test_lenses() {
   check_scene(p, gs::Image{70, 33}, true, false);
 }
 
+// Gaussians on rays. Some lie around the camera, some at its side and some are large.
+Parameters<float> on_rays(int64_t count) {
+  Parameters<float> p(count);
+  p.rays = true;
+  for (int64_t i = 0; i < count; i += 4) {
+    p.means[3 * i + 2] = 1 + float(std::abs(normal()));
+    for (int k = 0; k < 3; ++k) p.scales[3 * i + k] += 2;
+  }
+  return p;
+}
+
+void test_rays() {
+  for (const gs::Image image : {gs::Image{16, 16}, gs::Image{70, 33}, gs::Image{330, 70}})
+    for (int64_t count : {1, 33, 300})
+      for (bool antialiasing : {false, true}) {
+        Parameters<float> p = on_rays(count);
+        if (count == 33) p.distort_view();
+        check_scene(p, image, antialiasing, antialiasing);
+      }
+}
+
 // More tiles than kFewTiles, so that fewer warps share one, and a list of two chunks. One order only, because it is
 // slow.
-void test_many_tiles() {
+void test_many_tiles(bool rays) {
   constexpr gs::Image image{1040, 1024};
   Parameters<float> p(700);
+  p.rays = rays;
   for (int64_t i = 100; i < p.count; ++i) {
     p.means[3 * i] = p.means[3 * i + 1] = 0.1f, p.means[3 * i + 2] = 4 + 0.001f * float(i);
     p.opacities[i] = -4.8f;
@@ -526,6 +548,7 @@ void test_rows() {
   for (const Parameters<float>& p : scenes_for_rows())
     for (const bool depth : {false, true}) check(p, {40, 70}, gs::emulation::kOrders[at++ % 3], depth, !depth);
   check(scenes_for_rows()[3], {120, 70}, gs::emulation::Order::shuffled, true, true);
+  for (const bool depth : {false, true}) check(on_rays(60), {70, 33}, gs::emulation::Order::shuffled, depth, depth);
   const Parameters<float> p = two_long_lists(900);
   for (const bool layers : {false, true}) check(p, {25, 40}, gs::emulation::Order::shuffled, true, layers);
 }
@@ -544,9 +567,9 @@ void put_off(gs::GaussianStep<float>& step, gs::StepNow& now) {
 // Steps taken inside the backward give the bits of steps from gradients in memory, in every order of threads, and with
 // their constants in memory, or from rows. A halted queue changes nothing.
 void test_gaussian_step() {
-  for (const int64_t count : {0, 1, 33, 200})
+  for (const auto& [count, rays] : {std::pair{0, false}, {1, false}, {33, false}, {33, true}, {200, false}})
     for (const StepCase& how : kStepCases) {
-      const Stepping start{Parameters<float>(count)};
+      const Stepping start{rays ? on_rays(count) : Parameters<float>(count)};
       Stepping plain = start, fused = start, stepped = start;
       for (int64_t iteration = 1; iteration <= 3; ++iteration) {
         gs::emulation::order = gs::emulation::kOrders[iteration % 3];
@@ -792,8 +815,10 @@ int main() {
                          test_pixels_that_end_in_every_chunk,
                          test_against_cpu,
                          test_lenses,
+                         test_rays,
                          test_lists_of_all_lengths,
-                         test_many_tiles,
+                         [] { test_many_tiles(false); },
+                         [] { test_many_tiles(true); },
                          test_shared_lists_are_blended_as_whole_ones,
                          test_longest_first,
                          test_front_first,

@@ -46,7 +46,7 @@ bool reaches_image(const RaySplat<double>& splat) {
   for (int y = 0; y < kHeight; ++y) {
     const auto row = row_terms(localise(splat, 0.0, 0.0), double(y));
     for (int x = 0; x < kWidth; ++x)
-      if (ray_exponent(row, at_pixel(row, double(x))) >= kLog2MinAlpha) return true;
+      if (exponent_at(row, double(x)) >= kLog2MinAlpha) return true;
   }
   return false;
 }
@@ -97,11 +97,14 @@ double log_alpha(const RayCamera<double>& cam, const Gaussian<double>& g, int x,
   const RayRow<double> row = row_terms(localise(splat, double(left), double(top)), double(y - top));
   const AtPixel<double> at = at_pixel(row, double(x - left));
   const RayWeights<double> r = ray_weights(row, at, splat.slope_v);
-  m = {{1, r.w * r.au, r.w * r.av, r.w * r.u * r.u, r.w * r.u * r.v, r.w * r.v * r.v},
-       r.w * r.p * r.u,
-       r.w * r.p * r.v,
-       r.w * r.p * r.p};
-  return kLn2 * ray_exponent(row, at);
+  m = {{1, r.au, r.av, r.u * r.u, r.u * r.v, r.v * r.v}, r.p * r.u, r.p * r.v, r.p * r.p};
+  RayRowSums<double> sums;
+  sums.add(at, 1);
+  const RayMoments<double> same = sums.moments(row, splat.slope_v);
+  double largest = 0;
+  for (int k = 0; k < 9; ++k) largest = larger(largest, std::abs((&m.on_image.q)[k]));
+  for (int k = 0; k < 9; ++k) CHECK_NEAR((&same.on_image.q)[k], (&m.on_image.q)[k], 1e-9 * largest);
+  return kLn2 * row_exponent(row, at);
 }
 
 void test_gradients_on_rays() {
@@ -151,7 +154,7 @@ void test_reach_on_rays() {
         for (int y = 0; y < kTile; ++y) {
           const auto row = row_terms(local, double(y));
           bool any_here = false;
-          for (int x = 0; x < kTile; ++x) any_here |= ray_exponent(row, at_pixel(row, double(x))) >= kLog2MinAlpha;
+          for (int x = 0; x < kTile; ++x) any_here |= exponent_at(row, double(x)) >= kLog2MinAlpha;
           CHECK(!any_here || row_reached(row, 0.0, double(kTile - 1)));
           any_pixel |= any_here;
         }

@@ -10,7 +10,7 @@
 
 namespace gs::ops {
 
-using gs::baseline::kAbsoluteValues, gs::baseline::kGradientRow, gs::baseline::kSplatRow;
+using gs::baseline::gradient_row, gs::baseline::kAbsoluteValues, gs::baseline::kSplatRow, gs::baseline::splat_row;
 using gs::baseline::layer_values, gs::baseline::tiles_of;
 
 void check_splats(const Tensor& splats) {
@@ -19,7 +19,6 @@ void check_splats(const Tensor& splats) {
   GS_CHECK_TYPE(is_floating(type), "splats must be float32 or float64, got ", type);
   GS_CHECK_VALUE(splats.dim() == 2 && (splats.size(1) == kSplatRow<false> || on_rays(splats)), "splats must be (N, ",
                  kSplatRow<false>, ") or (N, ", kSplatRow<true>, "), got ", splats.sizes());
-  GS_CHECK(!on_rays(splats) || splats.is_cpu(), kRaysOnCpu);
 }
 
 bool on_rays(const Tensor& splats) { return splats.size(1) == kSplatRow<true>; }
@@ -47,9 +46,7 @@ Tensor background_like(const Tensor& background, const Tensor& splats) {
   return converted(background, splats);
 }
 
-int64_t row_values(bool absolute, bool rays) {
-  return (rays ? kGradientRow<true> : kGradientRow<false>)+(absolute ? kAbsoluteValues : 0);
-}
+int64_t row_values(bool absolute, bool rays) { return gradient_row(rays) + (absolute ? kAbsoluteValues : 0); }
 
 BlendBackward::BlendBackward(SOURCE_PARAMETERS) {
   GS_CHECK_VALUE(source.size() == kKept, "a backward takes ", int(kKept), " tensors that a forward has kept, got ",
@@ -102,8 +99,7 @@ GradientSource::GradientSource(const SceneTensors& scene, SOURCE_PARAMETERS, boo
   const bool rows = source.size() == 4 && !grad_color;
   GS_CHECK_VALUE(rows || source.size() == kKept, "the source must be what a forward has kept, ", int(kKept),
                  " tensors, or splats, tile_counts, rows and counts, got ", source.size(), " tensors");
-  check_tensor(source[kSplats], "splats", scene.dtype(), scene.device(),
-               {scene.rows(), scene.rays() ? kSplatRow<true> : kSplatRow<false>});
+  check_tensor(source[kSplats], "splats", scene.dtype(), scene.device(), {scene.rows(), splat_row(scene.rays())});
   if (!rows) blend_.emplace(SOURCE_ARGUMENTS);
   check_counts(source[kTileCounts], scene.rows(), scene.device());
   tile_counts_ = packed(source[kTileCounts]);

@@ -13,7 +13,7 @@ namespace gs::ops {
 
 namespace {
 
-using gs::baseline::has_records, gs::baseline::kSplatRow, gs::baseline::layer_values, gs::baseline::tiles_of;
+using gs::baseline::has_records, gs::baseline::layer_values, gs::baseline::splat_row, gs::baseline::tiles_of;
 
 struct ProjectedTensors {
   Tensor splats, depths, rects, tile_counts, radii;
@@ -35,7 +35,7 @@ ProjectedTensors project(const SceneTensors& in, bool rects) {
   const int64_t n = in.rows();
   const Tensor& like = in.means();
   ProjectedTensors out;
-  out.splats = empty({n, in.rays() ? kSplatRow<true> : kSplatRow<false>}, like);
+  out.splats = empty({n, splat_row(in.rays())}, like);
   out.depths = empty({n}, like);
   out.tile_counts = empty<int32_t>({n}, like);
   out.radii = empty<int32_t>({n}, like);

@@ -126,7 +126,6 @@ void SceneTensors::check_settings() const {
                  lens_[0]);
   for (const double number : lens_) GS_CHECK_VALUE(!std::isnan(number), "a lens has a number that is NaN");
   GS_CHECK(!rays_ || !has_lens(), "projection='ray' has pinholes alone: undistort the photos, or take 'ewa'");
-  GS_CHECK(!rays_ || device_.is_cpu(), kRaysOnCpu);
   GS_CHECK_VALUE(std::isfinite(scale_modifier_), "scale_modifier must be finite, got ", scale_modifier_);
   GS_CHECK(count() < std::numeric_limits<int32_t>::max(), "more than 2^31 Gaussians");
 }

@@ -19,7 +19,6 @@ const gs::Ahead* ahead();
 // The word at which kernels do nothing (gs::Queue::halted), or null.
 inline const int32_t* halted() { return ahead() ? ahead()->halted : nullptr; }
 
-constexpr const char* kRaysOnCpu = "projection='ray' has no CUDA kernels: use the CPU, or take 'ewa'";
 constexpr const char* kFloatAlone = "the CUDA backend computes in float32, got float64: pass .float(), or use the CPU";
 
 // TypeError for None and for another dtype or device, ValueError for other sizes; a size of -1 allows any.
