@@ -173,6 +173,8 @@ void launch_gradients(const Queue& queue, const Scene<float>& s, const SlotSums&
 }
 
 void launch_step(const Queue& queue, const Scene<float>& s, const SlotSums& source, const GaussianStep<float>& step) {
+  if (step.camera) camera_vjp(queue, s, source, step.camera);
+  if (!s.rows()) return;
   const StepParameters parameters = step_parameters(step);
   if (step.penalty.any())
     launch_project_vjp(queue, s, source, {}, PenalisedStep{parameters, step.penalty});
@@ -197,7 +199,7 @@ void rasterize_vjp(const Queue& queue, const Scene<float>& s, const BlendInput<f
 
 void rasterize_vjp_step(const Queue& queue, const Scene<float>& s, const BlendInput<float>& in,
                         const BlendGradient<float>& g, const GaussianStep<float>& step) {
-  if (s.rows()) launch_step(queue, s, {fill_rows(queue, in, g), g.slots}, step);
+  launch_step(queue, s, s.rows() ? SlotSums{fill_rows(queue, in, g), g.slots} : SlotSums{}, step);
 }
 
 void rows_vjp(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, const RowSums<float>& to,
@@ -209,7 +211,7 @@ void rows_vjp(const Queue& queue, const Scene<float>& s, const SplatRows<float>&
 
 void rows_vjp_step(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, const RowSums<float>& to,
                    const GaussianStep<float>& step) {
-  if (s.rows()) launch_step(queue, s, sums_of(queue, in, to), step);
+  launch_step(queue, s, sums_of(queue, in, to), step);
 }
 
 }  // namespace cuda
