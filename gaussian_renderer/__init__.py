@@ -128,6 +128,13 @@ class Drawn:
         """The gradient of the Gaussians' colours (N, 3), whether these were given or came from SH bands."""
         return gradient_of_colors(self._scene, self._drawing.kept(self._background), (image_gradient, None, None))
 
+    @torch.no_grad()
+    def camera_gradient(self, image_gradient: Tensor, depth_gradient: Tensor | None) -> Tensor:
+        """The gradients of the camera's numbers (diff_gaussian_rasterization/camera.py), float64."""
+        kept = self._drawing.kept(self._background)
+        rows = OPERATORS.blend_rows(kept, image_gradient, None, depth_gradient)
+        return OPERATORS.camera_vjp(*self._scene, [*kept[:2], *rows])
+
     def step(
         self,
         adam: FusedAdam,

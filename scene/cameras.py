@@ -90,7 +90,6 @@ class Camera(nn.Module):
     ) -> None:
         """The view of a record at a size (width, height). The rest: as the attributes."""
         self.uid, self.colmap_id = uid, info.uid
-        self.R, self.T = info.R, info.T
         self.FoVx, self.FoVy = info.FovX, info.FovY
         self.image_name = info.image_name
         self.exposure_name: str | None = None
@@ -115,28 +114,28 @@ class Camera(nn.Module):
         self._assigned: dict[str, Any] = {}
         self._made: dict[str, Tensor] = {}
         self._made_version = 0
-        self._set_matrices(offset)
+        self._offset = offset
+        self.place(info.R, info.T)
 
     def _placed(self, source: Source | InMemory | None) -> Source | InMemory | None:
         return InMemory(source.pixels.to(self._photo_device)) if isinstance(source, InMemory) else source
 
-    def _set_matrices(self, offset: tuple[float, float]) -> None:
-        # Computed in float64, so that product and inverse are rounded only once.
-        moved = world_to_camera(self.R, self.T, self.trans, self.scale)
-        view, project = torch.from_numpy(moved), projection(ZNEAR, ZFAR, self.FoVx, self.FoVy, *offset)
-        self.world_view_transform = self._hand_on(view.T)
-        self.projection_matrix = self._hand_on(project.T)
-        self.full_proj_transform = self._hand_on((project @ view).T)
-        self.camera_center = self._hand_on(torch.from_numpy(camera_center(self.R, moved[:3, 3].copy())))
-
     def place(self, R: np.ndarray, T: np.ndarray) -> None:
         """Give it another pose: R, T, and the matrices and centre that follow from them."""
         self.R, self.T = R, T
-        width, height = self._size
-        self._set_matrices((2 * self.cx / width - 1, 2 * self.cy / height - 1))
+        for name, values in self.matrices(R, T).items():
+            setattr(self, name, values.to(self.device, torch.float32).contiguous())
 
-    def _hand_on(self, matrix: Tensor) -> Tensor:
-        return matrix.to(self.device, torch.float32).contiguous()
+    def matrices(self, R: np.ndarray, T: np.ndarray) -> dict[str, Tensor]:
+        """What `place` would give it, in float64 on the CPU, so that product and inverse are rounded only once."""
+        moved = world_to_camera(R, T, self.trans, self.scale)
+        view, project = torch.from_numpy(moved), projection(ZNEAR, ZFAR, self.FoVx, self.FoVy, *self._offset)
+        return {
+            "world_view_transform": view.T,
+            "projection_matrix": project.T,
+            "full_proj_transform": (project @ view).T,
+            "camera_center": torch.from_numpy(camera_center(R, moved[:3, 3].copy())),
+        }
 
     def __setattr__(self, name: str, value: Any) -> None:
         if not isinstance(getattr(type(self), name, None), property):

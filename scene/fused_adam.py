@@ -16,16 +16,25 @@ from scene.gaussians.mcmc import NO_PENALTY, Penalty
 _STEPPED = ("xyz", "opacity", "scaling", "rotation", "f_dc", "f_rest")
 
 NOW_WORDS = 23  # int64: what changes from step to step (gs::StepNow)
+CAMERA_NUMBERS = 34  # of a camera with a lens; a pinhole has fewer (csrc/math/camera_gradient.h)
 
 
 class FusedAdam:
     """Hands a model's optimiser, and a penalty, to `apply_gradients_`. Make one only if `takes` says so.
 
-    left_out: attributes that take no step.
+    left_out: attributes that take no step. camera_gradient: (CAMERA_NUMBERS,) float64 on the Gaussians' device, gets
+    the gradients of the camera's numbers, if they are asked for.
     """
 
-    def __init__(self, gaussians: GaussianModel, penalty: Penalty = NO_PENALTY, left_out: Collection[str] = ()) -> None:
+    def __init__(
+        self,
+        gaussians: GaussianModel,
+        penalty: Penalty = NO_PENALTY,
+        left_out: Collection[str] = (),
+        camera_gradient: Tensor | None = None,
+    ) -> None:
         self._gaussians = gaussians
+        self._camera_gradient = () if camera_gradient is None else (camera_gradient,)
         self._penalty = penalty
         self._left_out = left_out
 
@@ -55,7 +64,7 @@ class FusedAdam:
         return (
             [one.state[name] for name in ("exp_avg", "exp_avg_sq") for one in stepping],
             [one.state["step"] for one in stepping],
-            self._statistics() if observe else (),
+            (*(self._statistics() if observe else ()), *self._camera_gradient),
             guard,
             [one.attribute for one in stepping],
             [one.rate for one in stepping],

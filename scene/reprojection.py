@@ -9,17 +9,25 @@ from scene.poses import motion
 from scene.readers.tracks import Track
 
 OUTLIER = 1.0  # pixels; larger errors count linearly (Huber 1964)
+BOUND = 0.05  # of a correction: rotation in radians, and translation in extents of the scene
 _STEPS = 10
 _LESS = 0.9  # of the loss: a pose whose loss falls less stays, since structure from motion has found it
-_NEAR = 1e-3  # of the median depth; nearer points do not count
+_NEAR = 1e-3  # units of depth; nearer points do not count
 
 
 class Pull(NamedTuple):
-    """A sum of Huber losses (pixels squared), its gradient (6,), and its Gauss-Newton matrix (6, 6), by a twist."""
+    """A sum of Huber losses (pixels squared), and its gradient (6,) by a twist."""
 
     loss: float
     gradient: np.ndarray
-    curvature: np.ndarray
+    slope: np.ndarray  # (2, 6, K): of the points' pixels
+    weight: np.ndarray  # (K,)
+    size: np.ndarray  # (K,): errors, in pixels
+
+    @property
+    def curvature(self) -> np.ndarray:
+        """The Gauss-Newton matrix (6, 6)."""
+        return 2 * np.einsum("cjk,clk,k->jl", self.slope, self.slope, self.weight)
 
 
 def moved_pose(pose: np.ndarray, twist: np.ndarray, unit: float) -> np.ndarray:
@@ -31,26 +39,34 @@ def _in_world(twist: np.ndarray, unit: float) -> np.ndarray:
     return np.concatenate([twist[:3], unit * twist[3:]])
 
 
+def twist_gradient(pose: np.ndarray, numbers: np.ndarray, unit: float) -> np.ndarray:
+    """The gradient (6,) of a loss by `moved_pose`'s twist at 0, from that by a camera's numbers.
+
+    numbers: in the order of diff_gaussian_rasterization/camera.py, of which rows and translation of the view, and the
+    centre count. A twist (w, v) changes a column c of the rotation by w x c, the translation t by w x t + v, and the
+    centre by -rotation^T v.
+    """
+    turn, shift = pose[:3, :3], pose[:3, 3]
+    pairs = np.einsum("ij,kj->ik", turn, numbers[:9].reshape(3, 3)) + np.outer(shift, numbers[9:12])
+    skew = pairs - pairs.T
+    move = numbers[9:12] - np.einsum("ij,j->i", turn, numbers[12:15])
+    return np.array([skew[1, 2], skew[2, 0], skew[0, 1], *unit * move])
+
+
 def pull(pose: np.ndarray, track: Track, focal: float, unit: float) -> Pull:
     """What the reprojection error of a track says of a pose, by `moved_pose`'s twist at 0. focal: pixels."""
-    view = np.einsum("ij,kj->ki", pose[:3, :3], track.points) + pose[:3, 3]
-    x, y, z = view.T
-    shown = z > _NEAR * abs(np.median(z))
-    inverse = np.where(shown, 1 / np.where(shown, z, 1), 0)
-    u, v, zero = x * inverse, y * inverse, np.zeros_like(x)
-    error = focal * (np.stack([u, v], 1) - track.rays) * shown[:, None]
+    x, y, z = np.einsum("ij,kj->ik", pose[:3, :3], track.points) + pose[:3, 3:]
+    shown = focal * (z > _NEAR * unit)
+    inverse = 1 / np.maximum(z, _NEAR * unit)
+    u, v, zero, near = x * inverse, y * inverse, np.zeros_like(x), unit * inverse
+    error = shown * (np.stack([u, v]) - track.rays.T)
     # d(u, v) of dp = rotation x p + translation.
-    rows = [
-        [-u * v, 1 + u * u, -v, unit * inverse, zero, -unit * u * inverse],
-        [-1 - v * v, u * v, u, zero, unit * inverse, -unit * v * inverse],
-    ]
-    slope = focal * np.array(rows).transpose(2, 0, 1) * shown[:, None, None]
-    size = np.sqrt((error**2).sum(1))
-    weight = np.minimum(1, OUTLIER / np.maximum(size, OUTLIER))
+    rows = [[-u * v, 1 + u * u, -v, near, zero, -u * near], [-1 - v * v, u * v, u, zero, near, -v * near]]
+    slope, size = shown * np.array(rows), np.hypot(*error)
+    weight = OUTLIER / np.maximum(size, OUTLIER)
     loss = np.where(size <= OUTLIER, size**2, OUTLIER * (2 * size - OUTLIER)).sum()
     # einsum has one order of sums, whatever the number of threads.
-    gradient = 2 * np.einsum("kij,ki,k->j", slope, error, weight)
-    return Pull(float(loss), gradient, 2 * np.einsum("kij,kil,k->jl", slope, slope, weight))
+    return Pull(float(loss), 2 * np.einsum("cjk,ck->j", slope, weight * error), slope, weight, size)
 
 
 def nearest_pose(pose: np.ndarray, track: Track | None, focal: float, unit: float, bound: float) -> np.ndarray:
@@ -63,7 +79,8 @@ def nearest_pose(pose: np.ndarray, track: Track | None, focal: float, unit: floa
     found = pose
     for _ in range(_STEPS):
         at = pull(found, track, focal, unit)
-        step = -np.linalg.solve(at.curvature + 1e-9 * np.trace(at.curvature) * np.eye(6), at.gradient)
+        damping = max(1e-9 * np.trace(at.curvature), 1e-30)  # more than 0 where no point lies before the camera
+        step = -np.linalg.solve(at.curvature + damping * np.eye(6), at.gradient)
         found = moved_pose(found, step, unit)
     change = found @ np.linalg.inv(pose)
     turn = np.arccos(np.clip((np.trace(change[:3, :3]) - 1) / 2, -1, 1))

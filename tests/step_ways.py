@@ -1,5 +1,6 @@
 """Ways to take a step of training, those of a GPU on any machine, and notes of which steps took them."""
 
+from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 
@@ -12,6 +13,7 @@ from splatting.training.steps import captured
 from splatting.training.steps.captured import CapturedStep, Graphs
 from splatting.training.steps.fused import FusedStep
 from splatting.training.steps.plain import PlainStep
+from splatting.training.steps.speculative import AHEAD
 
 
 def fused_iterations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
@@ -29,12 +31,18 @@ def fused_iterations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 class Immediate:
-    """Stands for Speculation where there is no GPU: every step is done at once."""
+    """Stands for Speculation where there is no GPU: every step is done at once, and reported as late as may be."""
 
-    def __init__(self, *_: object) -> None:
-        self.drain = self.throttle = self.discard = lambda: None
-        self.add = lambda *_: None
+    def __init__(self, _: object, steps: CapturedStep) -> None:
+        self._pending, self._finished = deque(), steps.finished
+        self.drain = self.discard = self._report
+        self.throttle = lambda: self._report(AHEAD - 1)
+        self.add = lambda at, _: self._pending.append(at)
         self.abort = lambda: 0
+
+    def _report(self, most: int = 0) -> None:
+        while len(self._pending) > most:
+            self._finished(self._pending.popleft())
 
     def capacity(self, at: object) -> AbstractContextManager:
         return nullcontext()

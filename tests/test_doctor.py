@@ -19,6 +19,7 @@ from synthetic import HEIGHT, WIDTH
 import doctor
 import splatting.diagnosis.model
 from arguments import ModelParams, read_cfg_args, write_cfg_args, write_model_json
+from benchmarks.scenes.poses import disturbed
 from gaussian_renderer import render
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
@@ -177,6 +178,17 @@ def test_what_readers_say_becomes_a_line(colmap_scene, tmp_path):
     picture.unlink()
     (line,) = check_dataset(str(colmap_scene), "images")
     assert line.finding and "are missing" in line.text and "-i" in line.remedy
+
+
+def test_poses_that_tracks_correct(colmap_scene, tmp_path):
+    """Turned and moved, with points and photos as they are; poses of the model, and those far from it, get no line."""
+    for number, (degrees, percent, said) in enumerate([(0, 0, False), (0.3, 0.5, True), (9, 20, False)]):
+        folder = disturbed(colmap_scene, tmp_path / str(number), degrees, percent, 1)
+        lines = [line for line in problems(check_dataset(str(folder), "images")) if "with better poses" in line]
+        assert len(lines) == said
+        if said:
+            given, best = map(float, re.findall(r"[\d.e-]+(?= pixels| with better)", lines[0]))
+            assert 0.2 < given < 5 and best < 0.01 and "--refine_poses" in lines[0]
 
 
 def test_what_convert_noted(colmap_scene):

@@ -10,15 +10,17 @@ import torch
 from synthetic import BROWN, make_blender_scene, make_colmap_scene
 from trainings import differences, trained
 
+from benchmarks.scenes.poses import disturbed, errors
 from scene.gaussian_model import GaussianModel
 from scene.images.lens import Lens, rays_of
 from scene.pose_file import NAME, with_poses
+from scene.poses import moved
 from scene.readers.colmap import read_colmap
 from scene.readers.tracks import Track, read_tracks
-from scene.reprojection import moved_pose, nearest_pose, pull
+from scene.reprojection import BOUND, moved_pose, nearest_pose, pull, twist_gradient
 from scene.scene import Scene
 from splatting.training import checks, pose_refinement
-from splatting.training.pose_refinement import BOUND, PoseRefinement
+from splatting.training.pose_refinement import PoseRefinement
 from utils.graphics_utils import world_to_camera
 from utils.system_utils import UserError
 
@@ -52,6 +54,11 @@ def test_tracks_find_a_pose_again(noise):
     found = nearest_pose(moved_pose(POSE, TURN, 1.0), track, 500.0, 1.0, BOUND)
     assert np.abs(found - POSE).max() < 5e-3 + noise  # outliers pull with a bounded force
     assert np.abs(moved_pose(POSE, TURN, 1.0) - POSE).max() > 0.03
+
+
+def test_a_camera_with_all_points_behind_it_stays():
+    behind = np.diag([-1.0, 1, -1, 1]) @ POSE
+    assert nearest_pose(behind, _track(), 500.0, 1.0, BOUND) is behind
 
 
 def test_a_pose_may_stay():
@@ -88,19 +95,6 @@ def test_scenes_of_other_kinds_have_no_tracks(tmp_path):
     assert read_tracks(tmp_path, [None, None], np.zeros(3)) == [None, None]
 
 
-def _disturb(folder: Path) -> None:
-    """Turn and move all cameras of a COLMAP scene by TURN in random directions."""
-    import pycolmap
-
-    sparse = str(folder / "sparse/0")
-    model, rng = pycolmap.Reconstruction(sparse), np.random.default_rng(2)
-    for frame in model.frames.values():
-        old = np.eye(4)
-        old[:3] = frame.rig_from_world.matrix()
-        frame.rig_from_world = pycolmap.Rigid3d(moved_pose(old, rng.permuted(TURN), 1.0)[:3])
-    model.write_binary(sparse)
-
-
 def _options(scene: Path, out: Path, **more) -> Namespace:
     values = {"source_path": str(scene), "model_path": str(out), "images": "images", "resolution": -1, "eval": True}
     values |= {"white_background": False, "train_test_exp": False, "data_device": "cpu", "refine_poses": True}
@@ -120,10 +114,11 @@ def _poses(scene: Scene) -> np.ndarray:
 def test_all_views_begin_where_tracks_place_them(tmp_path):
     make_colmap_scene(tmp_path)
     wanted = _poses(Scene(_options(tmp_path, tmp_path / "out"), GaussianModel(1), start=False))
-    _disturb(tmp_path)
-    disturbed = Scene(_options(tmp_path, tmp_path / "out"), GaussianModel(1), start=False)
-    assert np.abs(_poses(disturbed) - wanted).max() > 0.02
-    scene, _ = _refinement(tmp_path)
+    folder = disturbed(tmp_path, tmp_path / "disturbed", 1.5, 1, 2)
+    given = Scene(_options(folder, tmp_path / "out"), GaussianModel(1), start=False)
+    assert np.abs(_poses(given) - wanted).max() > 0.02
+    assert errors(given.getTrainCameras(), read_colmap(tmp_path, "images", True)) == pytest.approx([1.5, 1], rel=1e-4)
+    scene, _ = _refinement(folder)
     np.testing.assert_allclose(_poses(scene), wanted, atol=1e-6)
     for camera in scene.getTrainCameras():
         view = camera.world_view_transform.double().numpy().T
@@ -142,8 +137,8 @@ def test_what_all_cameras_could_do_together_is_taken_out(tmp_path, monkeypatch):
     for _ in range(2):
         poses.twists[:] = own + (1e-3 * rng.normal(size=7) @ basis).reshape(own.shape)
         for camera in cameras:  # a pass over all views, without a gradient
-            poses.take_gradient(camera.uid, torch.zeros(6))
-            poses.step(1)
+            poses.step(camera.uid, np.zeros(34), 1)
+        poses.place()
         np.testing.assert_allclose(poses.twists, own, atol=1e-12)
     # The basis is that of motions and of growth: a common one of the world is nothing but drift.
     common = np.array([0.002, -0.001, 0.003, 0.1, 0.2, -0.1])
@@ -156,24 +151,52 @@ def test_what_all_cameras_could_do_together_is_taken_out(tmp_path, monkeypatch):
     assert np.abs(_poses(scene) - before).max() > 1e-4
 
 
+def _gradient(poses: PoseRefinement, uid: int, wanted: np.ndarray) -> np.ndarray:
+    """Gradients of a camera's numbers that make a gradient (6,) of its twist in world units."""
+    by_number = [twist_gradient(poses._pose(uid), one, 1.0) for one in np.eye(15)]
+    return np.linalg.lstsq(np.transpose(by_number), wanted, rcond=None)[0]
+
+
+def test_the_gradient_of_a_twist(tmp_path):
+    """Of the view's rows, translation and centre, against torch's through `moved`."""
+    make_colmap_scene(tmp_path)
+    scene, poses = _refinement(tmp_path)
+    camera, twist = scene.getTrainCameras()[1], torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    for name in ("world_view_transform", "full_proj_transform", "camera_center"):
+        setattr(camera, name, getattr(camera, name).double())
+    turned = moved(camera, twist)
+    weights = torch.randn(15, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    view = turned.world_view_transform
+    (torch.cat([view[:3, :3].T.reshape(9), view[3, :3], turned.camera_center]) @ weights).backward()
+    unit = torch.tensor([1.0, 1, 1, 2, 2, 2], dtype=torch.float64)
+    got = twist_gradient(poses._pose(camera.uid), weights.numpy(), 2.0)
+    np.testing.assert_allclose(got, unit * twist.grad, rtol=1e-5, atol=1e-5)
+
+
 def test_steps_are_bounded_and_follow_the_gradient(tmp_path, monkeypatch):
     make_colmap_scene(tmp_path)
     _, poses = _refinement(tmp_path)
     monkeypatch.setattr(pose_refinement, "_ANCHOR", 0.0)
-    poses.take_gradient(2, torch.tensor([1.0, -1, 1, -1, 1, -1]))
-    poses.step(0)
+    poses.step(2, _gradient(poses, 2, np.array([1.0, -1, 1, -1, 1, -1])), 0)
     assert np.array_equal(np.sign(poses.twists[2]), [-1, 1, -1, 1, -1, 1]) and not poses.twists[[0, 1, 3]].any()
     poses.twists[2, :3] = 3.0
-    poses.take_gradient(2, torch.ones(6))
-    poses.step(0)
+    poses.step(2, _gradient(poses, 2, np.ones(6)), 0)
     assert np.linalg.norm(poses.twists[2, :3]) == pytest.approx(BOUND)
     before = poses.twists.copy()
-    poses.take_gradient(2, torch.full((6,), torch.nan))
-    poses.step(0)
+    poses.step(2, np.full(34, np.nan), 0)
     poses._tracks[1] = None
-    poses.take_gradient(1, torch.ones(6))
-    poses.step(0)
+    poses.step(1, np.ones(34), 0)
     assert np.array_equal(poses.twists, before)
+
+
+def test_a_pose_depends_on_its_own_steps_and_on_whole_passes(tmp_path):
+    make_colmap_scene(tmp_path)
+    _, poses = _refinement(tmp_path)
+    count = len(poses.twists)
+    assert poses.depends(1, [0, 1]) and not poses.depends(2, [0, 1])
+    assert poses.depends(2, [0] * count) and not poses.depends(2, [0] * (count - 1))
+    poses.step(0, np.zeros(34), 0)
+    assert poses.depends(2, [0] * (count - 1))
 
 
 def test_tracks_hold_a_camera(tmp_path):
@@ -182,8 +205,7 @@ def test_tracks_hold_a_camera(tmp_path):
     _, poses = _refinement(tmp_path)
     poses._drift = np.zeros((7, poses.twists.size)), np.zeros((7, 7))
     for step in range(400):
-        poses.take_gradient(0, torch.tensor([0.02, 0, 0, 0, 0, 0]))
-        poses.step(step // 4)
+        poses.step(0, _gradient(poses, 0, np.array([0.02, 0, 0, 0, 0, 0])), step // 4)
     track, camera = poses._tracks[0], poses._cameras[0]
     at = pull(poses._starts[0], track, camera.fx, poses._unit)
     rest = np.linalg.solve(1e-3 * at.curvature, [-0.02, 0, 0, 0, 0, 0])

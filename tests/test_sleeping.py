@@ -38,7 +38,7 @@ from utils.system_utils import UserError
 BETAS, EPS = (0.9, 0.999), 1e-15
 MOST_RATIO = 0.1 / math.sqrt(0.001 * (1 - 0.81 / 0.999))  # of |m| / sqrt(v) (csrc/math/sleep.h)
 SCENES, STEPS = 6, (5, 60)  # of random blocks; 1000, or 1 and (7000, 7001), for the figures of docs/inside/sleep.md
-NAMES = ("default", "white", "masks", "exposure", "depth", "absgrad", "together", "budget", "degree 0")
+NAMES = ("default", "poses", "white", "masks", "exposure", "depth", "absgrad", "together", "budget", "degree 0")
 
 
 class Blocks:
@@ -494,8 +494,8 @@ def test_a_term_ends_no_sleep_before_the_queued_steps_are_done(scene, tmp_path, 
         return losses._replace(total=losses.total + (len(calls) > 10) * made[-1].gaussians.get_opacity.mean())
 
     class Queue(Immediate):
-        def __init__(self, *_: object) -> None:
-            super().__init__()
+        def __init__(self, *arguments: object) -> None:
+            super().__init__(*arguments)
             self.discard = lambda: done.append(1)
 
     monkeypatch.setattr(Objective, "__call__", more)

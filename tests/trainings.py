@@ -41,6 +41,8 @@ OPTIONS = {
     "mcmc idle": ("--strategy", "mcmc", "--mcmc_growth", 0, "--mcmc_min_opacity", 1e-6),
     "mcmc sparse": (*MCMC, "--optimizer_type", "sparse_adam", "--antialiasing"),
     "budget": BUDGET,
+    "poses": ("--refine_poses", "--resolution_schedule", "pyramid"),
+    "poses, no graph": ("--refine_poses", "--train_test_exp", "-d", "depths", "--depth_l1_weight_init", 1),
     "budget errors": (*BUDGET, "--score_power", 2, "--train_test_exp"),
 }
 

@@ -17,10 +17,12 @@ from PIL import Image
 
 from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
 from scene.readers.info import APART, camera_centers, standing_apart
+from scene.readers.tracks import read_tracks
+from scene.reprojection import BOUND, nearest_pose, pull
 from splatting.diagnosis import Line, from_error
 from splatting.files.json_files import read_json
 from splatting.files.listing import some
-from utils.graphics_utils import BasicPointCloud
+from utils.graphics_utils import BasicPointCloud, world_to_camera
 from utils.system_utils import UserError
 
 # Learning rates and size limits are fractions of the extent, but depths below 0.2 are culled and float32 is used.
@@ -36,6 +38,8 @@ _SAMPLE = 5000  # most points tested against the views
 _WIDE = 1600
 _COMPARED, _SMALL = 16, 200  # photos whose colours are compared, and their size in pixels
 _GREY = 0.02  # spread of colours, below which they tell nothing
+_ADJUSTED = 0.5  # median error of points with better poses, as a part of that with the given ones,
+_SEEN = 0.2  # if that is more pixels
 _OTHER = 0.9  # error of another photo's colours, as a part of the own one's
 
 
@@ -49,6 +53,7 @@ def check_dataset(source: str, images: str) -> list[Line]:
         return [*_warnings(said.getvalue()), from_error(error)]
     views = info.train_cameras
     checks = check_views(views), check_extent(info), check_lenses(views), check_cloud(info), check_colors(info)
+    checks += (check_poses(source, info),)
     return [*_warnings(said.getvalue()), *chain(*checks, _check_registered(Path(source) / "convert_report.json"))]
 
 
@@ -160,6 +165,28 @@ def check_colors(info: SceneInfo) -> Iterator[Line]:
     if len(cameras) >= 3 and len(names) > len(cameras) / 2:
         text = f"the points have the colours of other photos than those they are seen in ({some(names)})"
         yield Line(text, "the photos have each other's names: restore those that the cameras were reconstructed with")
+
+
+def check_poses(source: str, info: SceneInfo) -> Iterator[Line]:
+    """Tracks that other poses fit far better than the given ones, as after a bundle adjustment they cannot."""
+    views, errors = info.train_cameras[:: max(1, len(info.train_cameras) // _COMPARED)], []
+    try:
+        tracks = read_tracks(source, views, info.offset)
+    except UserError as error:
+        yield from_error(error)
+        return
+    for view, track in zip(views, tracks, strict=True):
+        if track is None:
+            continue
+        given = world_to_camera(view.R, view.T)
+        best = nearest_pose(given, track, view.fx, info.extent, BOUND)
+        errors.append([np.median(pull(pose, track, view.fx, info.extent).size) for pose in (given, best)])
+    if not errors:
+        return
+    given, best = np.median(errors, axis=0)
+    if given > _SEEN and best < _ADJUSTED * given:
+        text = f"points lie {given:.2g} pixels from where photos show them (median), and {best:.2g} with better poses"
+        yield Line(text, "train with --refine_poses, or adjust the model again (COLMAP: bundle_adjuster)")
 
 
 def _pixels(camera: CameraInfo) -> np.ndarray:

@@ -4,22 +4,21 @@ Each has Adam of its own. The tracks of structure from motion hold the cameras: 
 views included, takes the pose of least reprojection error, and then the error stays a part of the loss.
 """
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from scene.cameras import Camera
 from scene.readers.tracks import read_tracks
-from scene.reprojection import moved_pose, nearest_pose, pull
+from scene.reprojection import BOUND, moved_pose, nearest_pose, pull, twist_gradient
 from scene.scene import Scene
 from utils.general_utils import get_expon_lr_func
 from utils.graphics_utils import world_to_camera
 from utils.system_utils import UserError
 
 # Twists are rotations in radians, and translations in extents of the scene.
-BOUND = 0.05  # of a correction's rotation, and of its translation
 _RATES = 1e-4, 1e-6  # of the first and the last step
 _BETAS, _EPS = (0.9, 0.99), 1e-12
 _ANCHOR = 1e-3  # weight of each point's squared reprojection error (pixels) in the loss of its view
@@ -27,7 +26,7 @@ _STATE = ("twists", "mean", "square", "counts")
 
 
 class PoseRefinement:
-    """The corrections of a scene's training cameras. Its cameras always have their current poses.
+    """The corrections of a scene's training cameras. `place` gives the cameras their current poses.
 
     twists (n, 6) float64, by the cameras' uid.
     """
@@ -43,7 +42,8 @@ class PoseRefinement:
                 f"{source_path} has none; leave it out"
             )
         for camera, track in zip(lists[0] + lists[1], tracks, strict=True):
-            _place(camera, nearest_pose(_pose_of(camera), track, camera.fx, self._unit, BOUND))
+            pose = nearest_pose(_pose_of(camera), track, camera.fx, self._unit, BOUND)
+            camera.place(pose[:3, :3].T.copy(), pose[:3, 3].copy())
         self._cameras, self._tracks = lists[0], tracks[: len(lists[0])]
         self._starts = [_pose_of(camera) for camera in self._cameras]
         self._rate = get_expon_lr_func(*_RATES, max_steps=steps)
@@ -51,57 +51,71 @@ class PoseRefinement:
         count = len(self._cameras)
         self.twists, self.mean, self.square = (np.zeros((count, 6)) for _ in range(3))
         self.counts = np.zeros(count)
-        self._gradient: tuple[int, np.ndarray] | None = None
-        held = sum(track is not None for track in tracks)
-        print(f"--refine_poses corrects {held} of {len(tracks)} poses, and takes every step as --plain_step does")
+        self._poses: dict[int, np.ndarray] = {}  # that are known
+        self._moved: set[int] = set()  # since `place`
+        print(f"--refine_poses corrects {sum(track is not None for track in tracks)} of {len(tracks)} poses")
 
-    def settle(self, camera: Camera) -> None:
-        """Give a smaller copy of a training camera its current pose."""
-        if camera is not self._cameras[camera.uid]:
-            _place(camera, self._pose(camera.uid))
+    def pose(self, uid: int) -> tuple[np.ndarray, np.ndarray]:
+        """R and T of a training camera's current pose, as `Camera` has them."""
+        pose = self._pose(uid)
+        return pose[:3, :3].T.copy(), pose[:3, 3].copy()
 
     def _pose(self, uid: int) -> np.ndarray:
-        return moved_pose(self._starts[uid], self.twists[uid], self._unit)
+        if uid not in self._poses:
+            self._poses[uid] = moved_pose(self._starts[uid], self.twists[uid], self._unit)
+        return self._poses[uid]
 
-    def take_gradient(self, uid: int, gradient: Tensor) -> None:
-        """Keep the gradient (6,) of an image's loss by a twist in world units at a camera's pose, for `step`.
+    def place(self, copy: Camera | None = None) -> None:
+        """Give the training cameras their current poses, and a smaller copy of one its own."""
+        for uid in self._moved:
+            self._cameras[uid].place(*self.pose(uid))
+        self._moved.clear()
+        if copy is not None and copy is not self._cameras[copy.uid]:
+            copy.place(*self.pose(copy.uid))
 
-        A camera without a track, which nothing would hold, gets none.
+    def depends(self, uid: int, pending: Collection[int]) -> bool:
+        """Whether a camera's next pose depends on steps that are yet to be taken, of these cameras."""
+        taken, count = int(self.counts.sum()), len(self._cameras)
+        return uid in pending or (taken + len(pending)) // count > taken // count
+
+    def step(self, uid: int, gradient: np.ndarray, step: int) -> None:
+        """Take the step of a camera. step: of the schedule.
+
+        gradient: of the image's loss by the camera's numbers (diff_gaussian_rasterization/camera.py). A camera without
+        a track, which nothing would hold, gets none.
         """
-        found = gradient.double().cpu().numpy()
-        found = np.concatenate([found[:3], self._unit * found[3:]])
-        if (track := self._tracks[uid]) is None:
-            found = np.zeros(6)
-        else:
-            found = found + _ANCHOR * pull(self._pose(uid), track, self._cameras[uid].fx, self._unit).gradient
-        self._gradient = uid, found
-
-    def step(self, step: int) -> None:
-        """Take the step of Adam (Kingma and Ba 2015) of the camera whose gradient was kept. step: of the schedule."""
-        (uid, gradient), self._gradient = self._gradient, None
-        if not np.isfinite(gradient).all():
-            return
         self.counts[uid] += 1
+        track, pose, found = self._tracks[uid], self._pose(uid), np.zeros(6)
+        if track is not None:
+            found = twist_gradient(pose, gradient, self._unit)
+            found += _ANCHOR * pull(pose, track, self._cameras[uid].fx, self._unit).gradient
+        if np.isfinite(found).all():
+            self._step(uid, found, self._rate(step))
+        if self.counts.sum() % len(self._cameras):
+            return self._move([uid])
+        # The scene does not walk, turn or grow: what all cameras could do together is taken out.
+        basis, inverse = self._drift
+        flat = self.twists.reshape(-1)
+        flat -= np.einsum("ak,a->k", basis, np.einsum("ab,b->a", inverse, np.einsum("ak,k->a", basis, flat)))
+        self._move(range(len(self._cameras)))
+
+    def _move(self, uids: Collection[int]) -> None:
+        """Forget the poses of twists that have changed."""
+        for uid in uids:
+            self._poses.pop(uid, None)
+        self._moved.update(uids)
+
+    def _step(self, uid: int, gradient: np.ndarray, rate: float) -> None:
+        """Take a step of Adam (Kingma and Ba 2015)."""
         for average, beta, value in ((self.mean, _BETAS[0], gradient), (self.square, _BETAS[1], gradient**2)):
             average[uid] = beta * average[uid] + (1 - beta) * value
         mean, square = (
             a[uid] / (1 - b ** self.counts[uid]) for a, b in zip((self.mean, self.square), _BETAS, strict=True)
         )
-        twist = self.twists[uid] - self._rate(step) * mean / (np.sqrt(square) + _EPS)
+        twist = self.twists[uid] - rate * mean / (np.sqrt(square) + _EPS)
         for part in (twist[:3], twist[3:]):
             part *= min(1, BOUND / max(np.linalg.norm(part), BOUND))
         self.twists[uid] = twist
-        if self.counts.sum() % len(self._cameras):
-            return _place(self._cameras[uid], self._pose(uid))
-        # The scene does not walk, turn or grow: what all cameras could do together is taken out.
-        basis, inverse = self._drift
-        flat = self.twists.reshape(-1)
-        flat -= np.einsum("ak,a->k", basis, np.einsum("ab,b->a", inverse, np.einsum("ak,k->a", basis, flat)))
-        self._place_all()
-
-    def _place_all(self) -> None:
-        for camera in self._cameras:
-            _place(camera, self._pose(camera.uid))
 
     def captured(self) -> dict[str, Any]:
         """State that a resumed training needs, as plain values."""
@@ -117,15 +131,12 @@ class PoseRefinement:
             raise UserError("the checkpoint has no refined poses of this run's views; leave --refine_poses out")
         for name in _STATE:
             getattr(self, name)[:] = state[name].numpy()
-        self._place_all()
+        self._move(range(len(names)))
+        self.place()
 
 
 def _pose_of(camera: Camera) -> np.ndarray:
     return world_to_camera(camera.R, camera.T)
-
-
-def _place(camera: Camera, pose: np.ndarray) -> None:
-    camera.place(pose[:3, :3].T.copy(), pose[:3, 3].copy())
 
 
 def _drift(poses: list[np.ndarray], unit: float) -> tuple[np.ndarray, np.ndarray]:

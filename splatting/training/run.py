@@ -326,7 +326,7 @@ class Run:
         density = self.density
         dense = type(self.gaussians.optimizer) is GaussianAdam and FusedAdam.takes(self.gaussians)
         alone = not (self.schedule.views > 1 or density.queues or any(density.penalty))
-        if not (dense and alone and self.is_standard) or self.poses:
+        if not (dense and alone and self.is_standard):
             return None
         saves = self.group.anyone(self.memory.limit > 0) or self._share_seen() < MOST_SHARE
         return Sleeping(self.gaussians) if saves else None
@@ -372,10 +372,13 @@ class Run:
         """Whether all blocks of Gaussians wake after a step."""
         return self.sleeping is not None and step.iteration % REST == 0
 
+    def step_pose(self, step: Iteration, gradient: Tensor) -> None:
+        """Take the step of the view's pose. gradient: of the image's loss by the camera's numbers."""
+        self.poses.step(step.camera.uid, gradient.cpu().numpy(), self.schedule.schedule_step(step.iteration))
+        self.poses.place()
+
     def after_step(self, step: Iteration) -> None:
         """What follows the optimiser's step."""
-        if self.poses:
-            self.poses.step(self.schedule.schedule_step(step.iteration))
         self.density.after_step(step)
         if step.changes:
             self.memory.settle(self.gaussians)

@@ -5,7 +5,6 @@ from splatting.training.run import Run
 from splatting.training.steps.captured import CapturedStep
 from splatting.training.steps.fused import FusedStep
 from splatting.training.steps.plain import PlainStep
-from splatting.training.steps.refined import RefinedView
 
 
 def step_taker(run: Run) -> PlainStep:
@@ -15,8 +14,6 @@ def step_taker(run: Run) -> PlainStep:
     """
     if run.schedule.views > 1:
         return PlainStep(run, ViewOfEach(run))
-    if run.poses:
-        return PlainStep(run, RefinedView(run))
     if not FusedStep.suits(run):
         return PlainStep(run)
     exchanges = run.gaussians.shards.ranks.several  # numbers, in each step

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from scene.cameras import Camera
-from scene.fused_adam import NOW_WORDS, FusedAdam
+from scene.fused_adam import CAMERA_NUMBERS, NOW_WORDS, FusedAdam
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Announcer
@@ -46,14 +46,19 @@ class CapturedStep(FusedStep):
         super().__init__(run)
         self._ahead = Speculation(run.device, self)
         self._graphs = Graphs(run, self, self._adam, self._ahead.capacity)
+        pinned = run.device.type == "cuda"
+        self._rows = torch.zeros(_ROWS, CAMERA_NUMBERS, dtype=torch.float64, pin_memory=pinned) if run.poses else None
+        self._fetched: dict[int, _Fetched] = {}  # by iteration: of steps that are pending
 
     def take(self, at: Iteration, observers: Announcer) -> None:
         """Queue a step, unless something is due in it."""
         run = self._run
         if not self._is_queued(at):
-            self._ahead.drain()  # nothing is pending, unless --debug_from has just come into force
+            self.drain()  # nothing is pending, unless --debug_from has just come into force
             run.set_rates(at)
             return super().take(at, observers)
+        if run.poses and run.poses.depends(at.camera.uid, [one.uid for one in self._fetched.values()]):
+            self._ahead.drain()
         losses = self._queue(at)
         if losses is None:
             self._ahead.discard()
@@ -66,14 +71,20 @@ class CapturedStep(FusedStep):
         if self._is_queued(at):
             self._ahead.throttle()
         else:
-            self._ahead.drain()
+            self.drain()
             self._graphs.save_memory()
 
     def drain(self) -> None:
         self._ahead.drain()
+        if self._run.poses:
+            self._run.poses.place()
 
     def abort(self) -> int:
-        return self._ahead.abort()
+        lost = self._ahead.abort()
+        self._fetched.clear()
+        if self._run.poses:
+            self._run.poses.place()
+        return lost
 
     def _is_queued(self, at: Iteration) -> bool:
         return not (at.due or at.last) and self._fuses(at)
@@ -89,6 +100,7 @@ class CapturedStep(FusedStep):
         run, density = self._run, self._run.density
         losses = self._graphs.launch(at)
         if losses is not None:
+            self._fetch(at)
             with self._ahead.capacity(at) if density.queues or run.rests(at) else nullcontext():
                 run.after_step(at)
             return losses
@@ -98,10 +110,29 @@ class CapturedStep(FusedStep):
                 return None
             run.gaussians.guard_loss(at.iteration, losses.total)
             self.advance(at, drawn, gradients)
+            self._fetch(at)
             self.follow(at)
         return losses
 
-    # What speculation asks for, of steps that overflowed
+    def _fetch(self, at: Iteration) -> None:
+        """Queue a copy to the host of the gradient of the view's pose."""
+        if self._rows is None:
+            return
+        row = self._rows[at.iteration % _ROWS]
+        row.copy_(self._camera_gradient, non_blocking=True)
+        copied = torch.cuda.current_stream().record_event() if row.is_pinned() else None
+        self._fetched[at.iteration] = _Fetched(at.camera.uid, row, copied)
+
+    # What speculation asks for, of steps that are done or overflowed
+
+    def finished(self, at: Iteration) -> None:
+        """Take the step of the view's pose, now that the GPU has taken that of the Gaussians."""
+        if self._rows is None:
+            return
+        fetched = self._fetched.pop(at.iteration)
+        if fetched.copied is not None:
+            fetched.copied.synchronize()
+        self._run.poses.step(fetched.uid, fetched.gradient.numpy(), self._run.schedule.schedule_step(at.iteration))
 
     def replay(self, at: Iteration, first: Losses) -> None:
         """Queue a step once more, with the same values, which go into the losses that observers hold (`first`)."""
@@ -118,6 +149,13 @@ class CapturedStep(FusedStep):
         if steps and self._run.sleeping:
             self._run.sleeping.stepped()  # a rest may be among the steps
         self._graphs.clear()
+
+
+@dataclass
+class _Fetched:
+    uid: int
+    gradient: Tensor  # (CAMERA_NUMBERS,) on the host, once it is copied
+    copied: torch.cuda.Event | None
 
 
 @dataclass
@@ -270,7 +308,11 @@ class Graphs:
         return torch.stack([losses.total, losses.l1])
 
     def _numbers_of(self, camera: Camera) -> np.ndarray:
-        """The camera's numbers (35,) on the host, read from the GPU once."""
+        """The camera's numbers (35,) on the host, read from the GPU once; those of a trained pose never lie there."""
+        if poses := self._run.poses:
+            known = camera.matrices(*poses.pose(camera.uid))
+            tensors = (known[name] for name in ("world_view_transform", "full_proj_transform", "camera_center"))
+            return torch.cat([tensor.reshape(-1) for tensor in tensors]).float().numpy()
         tensors = camera.world_view_transform, camera.full_proj_transform, camera.camera_center
         state = [(id(tensor), tensor._version) for tensor in tensors]
         kept = self._cameras.get(camera.uid)

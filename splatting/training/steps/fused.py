@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from gaussian_renderer import Drawn, KnownBands, draw, exposed
-from scene.fused_adam import FusedAdam
+from scene.fused_adam import CAMERA_NUMBERS, FusedAdam
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Announcer
@@ -23,7 +23,9 @@ class FusedStep(PlainStep):
 
     def __init__(self, run: Run) -> None:
         super().__init__(run)
-        self._adam = FusedAdam(run.gaussians, run.density.penalty)
+        pose = torch.zeros(CAMERA_NUMBERS, dtype=torch.float64, device=run.device) if run.poses else None
+        self._camera_gradient = pose  # of the last step
+        self._adam = FusedAdam(run.gaussians, run.density.penalty, camera_gradient=pose)
         self._bands = KnownBands()
         self._is_known = False  # whether the model is one that the operator steps
         self._has_further_terms = False
@@ -41,6 +43,8 @@ class FusedStep(PlainStep):
                 observers.measured(at, losses)
                 self.advance(at, drawn, gradients)
                 del drawn, gradients  # what changes rows needs their memory
+                if self._camera_gradient is not None and not at.last:
+                    self._run.step_pose(at, self._camera_gradient)
                 return self.follow(at)
         super().take(at, observers)
 
@@ -62,6 +66,8 @@ class FusedStep(PlainStep):
     def measure(self, at: Iteration, now: Tensor | None = None) -> Measured:
         """Render: what was drawn, the losses, and their gradients of image and depth. now: as for `Drawn.step`."""
         run = self._run
+        if run.poses and now is None:
+            run.poses.place(at.camera)
         whole = at.changes or at.last  # all blocks wake, as in a plain step
         if whole and run.sleeping:
             run.sleeping.rest()
@@ -101,8 +107,8 @@ class FusedStep(PlainStep):
         if at.last or at.changes:
             left_out = gaussians._attributes if at.last else density.replaced(at.iteration)
             steps = len(left_out) < len(gaussians._attributes)
-            adam = FusedAdam(gaussians, density.penalty, left_out)
-        if steps or observes:
+            adam = FusedAdam(gaussians, density.penalty, left_out, self._camera_gradient)
+        if steps or observes or self._camera_gradient is not None:
             drawn.step(adam, *gradients, observes, density.absolute_gradients)
 
     def follow(self, at: Iteration) -> None:

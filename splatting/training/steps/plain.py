@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from gaussian_renderer import render, wake
+from gaussian_renderer import draw, exposed, render, wake
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Announcer
@@ -27,6 +27,30 @@ class OneView:
         return package, losses
 
 
+class RefinedView(OneView):
+    """Renders a view whose pose is trained, too, and takes the pose's step."""
+
+    def render(self, at: Iteration) -> Package:
+        run, options = self._run, self._run.render_options(at)
+        exposes = options.pop("use_trained_exp")
+        package = render(at.camera, run.gaussians, run.pipe, at.background, **options)
+        self._at, self._planes = at, (package["render"], package["depth"])
+        for plane in self._planes:
+            if plane is not None:
+                plane.retain_grad()
+        if exposes:
+            package["render"] = exposed(package["render"], at.camera, run.gaussians)
+        return package
+
+    def collect(self, package: Package, losses: Losses) -> tuple[Package, Losses]:
+        run, at = self._run, self._at
+        if not at.last:
+            color, depth = (None if plane is None else plane.grad for plane in self._planes)
+            drawn = draw(at.camera, run.gaussians, run.pipe, at.background, depth is not None)
+            run.step_pose(at, drawn.camera_gradient(color, depth))
+        return package, losses
+
+
 class PlainStep:
     """Renders a view, compares it with its photo, follows the gradient, controls density, steps the optimisers.
 
@@ -37,11 +61,13 @@ class PlainStep:
 
     def __init__(self, run: Run, views: OneView | None = None) -> None:
         self._run = run
-        self._views = OneView(run) if views is None else views
+        self._views = views or (RefinedView if run.poses else OneView)(run)
 
     def take(self, at: Iteration, observers: Announcer) -> None:
         """Take a step; the observers are told once the gradients are there."""
         run = self._run
+        if run.poses:
+            run.poses.place(at.camera)
         if run.sleeping:
             self._wake(at)
         package = self._views.render(at)

@@ -120,8 +120,10 @@ class Speculation:
 
     def _finish(self, report: list[int]) -> None:
         """Strike the first pending step off."""
-        self._needed[_view(self._pending.popleft().at)] = tuple(report[:4])
+        at = self._pending.popleft().at
+        self._needed[_view(at)] = tuple(report[:4])
         self._done += 1
+        self._steps.finished(at)
 
     def _collect(self, most: int) -> None:
         """Take back the reports that are there, and wait until at most so many steps are pending."""

@@ -301,6 +301,7 @@ struct GaussianStep {
   bool sparse;            // only Gaussians of observed.radii above 0 take a step, and without bias correction
   ObserveInput observed;  // the view's gradients are not read; with max_radii null nothing is observed
   Penalty<T> penalty;     // whose gradients are added, where opacities and scales take steps
+  double* camera;         // the gradients of the camera's numbers (math/camera_gradient.h), before the step; or null
 };
 
 // The blocks of Gaussians that sleep (math/sleep.h) through a step. Blocks that wake take the steps before it that they

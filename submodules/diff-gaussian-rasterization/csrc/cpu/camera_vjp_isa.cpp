@@ -1,11 +1,43 @@
 // The gradient of the camera: blocks of Gaussians are summed by threads, and their sums one after the other.
 #include <vector>
 
-#include "../backend.h"
 #include "../math/camera_gradient.h"
-#include "../math/splat.h"
+#include "project_vjp_rows.h"
 
 GS_ISA_BEGIN
+
+namespace {
+
+// Adds what a block's Gaussians have: a pinhole's, a vector of them at a time.
+template <class T>
+void add_rows(const Scene<T>& s, const Camera<T>& camera, const int32_t* tile_counts, const T* moments, double* sum) {
+  using V = typename Simd<T>::Vec;
+  int32_t seen[kVjpBlock];
+  SceneGradient<T> none{};
+  none.adds = true;
+  for_packs<T>(seen, list_seen(s, tile_counts, none, seen), [&](const Pack<T>& pack) {
+    V m[kGradientValues], rest[kMostRest], g[kPinholeNumbers];
+    read_rows(moments, kGradientValues, s.count, kGradientValues, pack, m);
+    SceneLanes<T> row(s, pack);
+    row.read_colors(s, pack, rest);
+    camera_vjp_row(s, camera, row, m, rest, g);
+    for (int k = 0; k < kPinholeNumbers; ++k)
+      for (int lane = 0; lane < pack.count; ++lane) sum[k] += g[k][lane];
+  });
+}
+
+template <class T>
+void add_rows(const Scene<T>& s, const LensCamera<T>& camera, const int32_t* tile_counts, const T* moments,
+              double* sum) {
+  for (int64_t i = 0; i < s.count; ++i) {
+    if (!tile_counts[i]) continue;
+    T g[kLensCameraNumbers];
+    camera_vjp_row(s, camera, SceneRow<T>{s, i}, moments + kGradientValues * i, s.sh_rest + s.rest_stride * i, g);
+    for (int k = 0; k < kLensCameraNumbers; ++k) sum[k] += g[k];
+  }
+}
+
+}  // namespace
 
 template <class T>
 void camera_vjp(const Executor& executor, const Scene<T>& s, const int32_t* tile_counts, const T* moments,
@@ -13,14 +45,9 @@ void camera_vjp(const Executor& executor, const Scene<T>& s, const int32_t* tile
   with_camera(s, [&](const auto& camera) {
     constexpr int kNumbers = kNumbersOf<std::decay_t<decltype(camera)>>;
     std::vector<double> sums(kNumbers * sleep_blocks(s.count), 0);
-    for_dynamic(executor, s.count, kSleepBlock, [&](int64_t begin, int64_t end) {
-      double* sum = sums.data() + kNumbers * (begin / kSleepBlock);
-      for (int64_t i = begin; i < end; ++i) {
-        if (!tile_counts[i]) continue;
-        T g[kNumbers];
-        camera_vjp_row(s, camera, SceneRow<T>{s, i}, moments + kGradientValues * i, g);
-        for (int k = 0; k < kNumbers; ++k) sum[k] += g[k];
-      }
+    for_dynamic(executor, s.count, kVjpBlock, [&](int64_t begin, int64_t end) {
+      add_rows(part_of(s, begin, end - begin), camera, tile_counts + begin, from_moments(s, moments, begin),
+               sums.data() + kNumbers * (begin / kVjpBlock));
     });
     for (int k = 0; k < kNumbers; ++k) {
       out[k] = 0;

@@ -88,6 +88,7 @@ void project_vjp(const Executor& executor, const Scene<T>& s, const int32_t* til
 template <class T>
 void project_vjp_step(const Executor& executor, const Scene<T>& s, const int32_t* tile_counts, const T* moments,
                       const GaussianStep<T>& step) {
+  if (step.camera) camera_vjp(executor, s, tile_counts, moments, step.camera);
   AdamStep<T> steps[kStepped];
   for (int a = 0; a < kStepped; ++a) steps[a] = adam_step_of(step.attributes[a], step.sparse);
   StepGuard<T> guard = step.guard;

@@ -4,6 +4,7 @@
 
 #include "../backend.h"
 #include "../math/camera_gradient.h"
+#include "awake.cuh"
 #include "gradient_rows.cuh"
 
 namespace gs {
@@ -13,7 +14,7 @@ using namespace baseline;
 
 namespace {
 
-constexpr int kThreads = 128;
+constexpr int kThreads = kSleepBlock;
 constexpr int kWarps = kThreads / 32;
 
 // Sums a value over the threads of a block, for thread 0. All threads call this; `stage` has a double for each warp.
@@ -27,26 +28,29 @@ __device__ double block_sum(double value, double* stage) {
   return sum;
 }
 
-// sums (blocks, numbers).
+// sums (blocks, numbers): those of blocks that sleep are not written.
 template <class AnyCamera>
 __global__ void __launch_bounds__(kThreads)
     camera_vjp_kernel(const int32_t* halted, Scene<float> s, SlotSums<false> source, double* sums) {
   if (!begin_work(halted)) return;
+  const int64_t block = awake_block(s, blockIdx.x);
+  if (block < 0) return;
   constexpr int kNumbers = kNumbersOf<AnyCamera>;
   __shared__ AnyCamera camera;
   __shared__ __align__(8) float stage[kWarps * SlotSums<false>::kStage];
   __shared__ double of_warps[kWarps];
   if (threadIdx.x == 0) set_camera(s, camera);
   __syncthreads();
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  const bool seen = i < s.count && source.seen(i);
+  const int64_t i = block * kThreads + threadIdx.x;
+  const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x;  // in what the forward has made
+  const bool seen = i < s.count && source.seen(at);
   float m[kGradientValues], g[kNumbers] = {};
-  source.read(i, seen, m, stage + threadIdx.x / 32 * SlotSums<false>::kStage);
-  if (seen) camera_vjp_row(s, camera, SceneRow<float>{s, i}, m, g);
+  source.read(at, seen, m, stage + threadIdx.x / 32 * SlotSums<false>::kStage);
+  if (seen) camera_vjp_row(s, camera, SceneRow<float>{s, i}, m, s.sh_rest + s.rest_stride * i, g);
 #pragma unroll
   for (int k = 0; k < kNumbers; ++k) {
     const double sum = block_sum(g[k], of_warps);
-    if (threadIdx.x == 0) sums[int64_t(kNumbers) * blockIdx.x + k] = sum;
+    if (threadIdx.x == 0) sums[kNumbers * block + k] = sum;
   }
 }
 
@@ -63,20 +67,28 @@ __global__ void __launch_bounds__(kThreads)
 template <class AnyCamera>
 void sum_rows(const Queue& queue, const Scene<float>& s, const SlotSums<false>& source, double* out) {
   constexpr int kNumbers = kNumbersOf<AnyCamera>;
-  const unsigned blocks = blocks_for(s.count, kThreads);
-  double* sums = queue.array<double>(size_t(kNumbers) * blocks);
-  if (blocks) launch(queue, "camera_vjp", camera_vjp_kernel<AnyCamera>, blocks, kThreads, s, source, sums);
+  const int64_t blocks = sleep_blocks(s.count);
+  const size_t values = size_t(kNumbers) * blocks;
+  double* sums = queue.array<double>(values);
+  if (s.blocks || s.awake) GS_CUDA_CHECK(cudaMemsetAsync(sums, 0, values * sizeof *sums, stream_of(queue)));
+  if (s.rows()) {
+    const unsigned launched = blocks_for(s.rows(), kThreads);
+    launch(queue, "camera_vjp", camera_vjp_kernel<AnyCamera>, launched, kThreads, s, source, sums);
+  }
   launch(queue, "sum_blocks", sum_blocks_kernel, kNumbers, kThreads, blocks, sums, out);
 }
 
 }  // namespace
 
-void camera_vjp(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, double* out) {
-  const SlotSums<false> source = sums_of<false>(queue, in, {});
+void camera_vjp(const Queue& queue, const Scene<float>& s, const SlotSums<false>& source, double* out) {
   if (s.lens.chart == Chart::kPinhole)
     sum_rows<Camera<float>>(queue, s, source, out);
   else
     sum_rows<LensCamera<float>>(queue, s, source, out);
+}
+
+void camera_vjp(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, double* out) {
+  camera_vjp(queue, s, sums_of<false>(queue, in, {}), out);
 }
 
 }  // namespace cuda

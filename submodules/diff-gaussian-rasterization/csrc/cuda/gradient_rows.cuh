@@ -125,6 +125,9 @@ using SlotSums = SlotSumsOf<baseline::kGradientRow<kRays>>;
 void find_lengths(const Queue& queue, int64_t count, const SlotSumsOf<baseline::kAbsoluteValues>& sums,
                   const float* splats, bool rays, Image image, float* absolute);
 
+// The gradients of the camera's numbers (math/camera_gradient.h).
+void camera_vjp(const Queue& queue, const Scene<float>& s, const SlotSums<false>& source, double* out);
+
 // Counts each splat's rows.
 void count_rows(const Queue& queue, int64_t count, const RowPlaces& rows, const SplatSlots* slots, int32_t* counts);
 

@@ -185,11 +185,18 @@ void launch_gradients(const Queue& queue, const Scene<float>& s, const SlotSums<
 template <bool kRays>
 void launch_step(const Queue& queue, const Scene<float>& s, const SlotSums<kRays>& source,
                  const GaussianStep<float>& step) {
+  if constexpr (!kRays)
+    if (step.camera) camera_vjp(queue, s, source, step.camera);
   const StepParameters parameters = step_parameters(step);
   if (step.penalty.any())
     launch_project_vjp<kRays>(queue, s, source, {}, PenalisedStep{parameters, step.penalty});
   else
     launch_project_vjp<kRays>(queue, s, source, {}, parameters);
+}
+
+// Without Gaussians, the gradients of the camera are 0.
+void step_of_none(const Queue& queue, const Scene<float>& s, const GaussianStep<float>& step) {
+  if (step.camera) camera_vjp(queue, s, SlotSums<false>{}, step.camera);
 }
 
 // Calls run(rays) with a constant, if there are Gaussians.
@@ -219,6 +226,7 @@ void rasterize_vjp(const Queue& queue, const Scene<float>& s, const BlendInput<f
 
 void rasterize_vjp_step(const Queue& queue, const Scene<float>& s, const BlendInput<float>& in,
                         const BlendGradient<float>& g, const GaussianStep<float>& step) {
+  if (!s.rows()) return step_of_none(queue, s, step);
   by_kind(s, [&](auto rays) { launch_step<rays>(queue, s, {fill_rows<rays>(queue, in, g), g.slots}, step); });
 }
 
@@ -232,6 +240,7 @@ void rows_vjp(const Queue& queue, const Scene<float>& s, const SplatRows<float>&
 
 void rows_vjp_step(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, const RowSums<float>& to,
                    const GaussianStep<float>& step) {
+  if (!s.rows()) return step_of_none(queue, s, step);
   by_kind(s, [&](auto rays) { launch_step<rays>(queue, s, sums_of<rays>(queue, in, to), step); });
 }
 

@@ -1,5 +1,5 @@
 #pragma once
-// What one Gaussian adds to the gradient of each number of a camera.
+// What one Gaussian, or each of several side by side, adds to the gradient of each number of a camera.
 #include "scene_row.h"
 
 GS_ISA_BEGIN
@@ -24,25 +24,25 @@ template <class AnyCamera>
 constexpr int kNumbersOf = numbers_of(static_cast<const AnyCamera*>(nullptr));
 
 // The gradients of a splat that reach its camera. p1, p2: of the rows of J W, in the world.
-template <class T>
+template <class V>
 struct Arriving {
-  Footprint<T> footprint;
-  ShapeGradient<T> shape;
-  Vec3<T> p1, p2;
-  T pixel[2], inverse_depth;
+  Footprint<V> footprint;
+  ShapeGradient<V> shape;
+  Vec3<V> p1, p2;
+  V pixel[2], inverse_depth;
 };
 
 // Of what J adds to the gradients, those of the limits of a clamped coordinate: all of it, for the limit that holds.
-template <class T>
-GS_HD void limits_vjp(T apart, T g, T* limits) {
-  limits[0] = apart > 0 ? g : 0, limits[1] = apart < 0 ? g : 0;
+template <class V>
+GS_HD void limits_vjp(V apart, V g, V* limits) {
+  limits[0] = apart > 0 ? g : V{}, limits[1] = apart < 0 ? g : V{};
 }
 
 // A camera's own numbers and its rows in J W; returns the gradient of the point of the view.
-template <class T>
-GS_HD Vec3<T> numbers_vjp(const Camera<T>& cam, Vec3<T>, const Perspective<T>& p, const Along<T>& along,
-                          const Arriving<T>& in, T* g) {
-  const T fx = cam.focal_x * p.inverse_depth, fy = cam.focal_y * p.inverse_depth;
+template <class T, class V>
+GS_HD Vec3<V> numbers_vjp(const Camera<T>& cam, Vec3<V>, const Perspective<V>& p, const Along<V>& along,
+                          const Arriving<V>& in, V* g) {
+  const V fx = cam.focal_x * p.inverse_depth, fy = cam.focal_y * p.inverse_depth;
   store3(g + kRowX, fx * in.p1), store3(g + kRowY, fy * in.p2);
   store3(g + kRowZ, (-fx * p.clamped_x) * in.p1 - (fy * p.clamped_y) * in.p2);
   limits_vjp(p.clamped_x - p.ray_x, -fx * along.one, g + kRays);
@@ -109,33 +109,31 @@ GS_HD Vec3<T> numbers_vjp(const LensCamera<T>& cam, Vec3<T> view, const LensView
   return g_view;
 }
 
-// m: moments, as for project_vjp_row. g (kNumbersOf<AnyCamera>): what the Gaussian adds.
-template <class T, class AnyCamera>
-GS_HD void camera_vjp_row(const Scene<T>& s, const AnyCamera& camera, const SceneRow<T>& row, const T* m, T* g) {
-  const Gaussian<T> gaussian = load(s, row).gaussian;
-  const Vec3<T> mean = gaussian.mean, view = to_view(camera, mean);
+// m, rest: as for project_vjp_row. g (kNumbersOf<AnyCamera>): what the Gaussian adds.
+template <class T, class AnyCamera, class Row, class V = typename Row::Number>
+GS_HD void camera_vjp_row(const Scene<T>& s, const AnyCamera& camera, const Row& row, const V* m, const V* rest, V* g) {
+  const Gaussian<V> gaussian = load(s, row).gaussian;
+  const Vec3<V> mean = gaussian.mean, view = to_view(camera, mean);
   const auto p = perspective(camera, view);
-  const Moments<T> moments{m[0], m[1], m[2], m[3], m[4], m[5]};
-  Arriving<T> in;
+  const Moments<V> moments = moments_of(m);
+  Arriving<V> in;
   in.footprint = splat_footprint(camera, p, gaussian.axes);
   in.inverse_depth = m[9];
   mean_vjp(in.footprint, moments, in.pixel[0], in.pixel[1]);
   in.shape = footprint_vjp(in.footprint, moments, s.antialiasing);
-  const Vec3<T> m1 = in.shape.m1, m2 = in.shape.m2;
+  const Vec3<V> m1 = in.shape.m1, m2 = in.shape.m2;
   const auto& [d, c] = gaussian.axes;
   in.p1 = (c[0] * m1.x) * d[0] + (c[1] * m1.y) * d[1] + (c[2] * m1.z) * d[2];
   in.p2 = (c[0] * m2.x) * d[0] + (c[1] * m2.y) * d[1] + (c[2] * m2.z) * d[2];
-  const T row1[3] = {m1.x, m1.y, m1.z}, row2[3] = {m2.x, m2.y, m2.z};
-  const Vec3<T> g_view = numbers_vjp(camera, view, p, along_view(camera, gaussian.axes, row1, row2), in, g);
+  const V row1[3] = {m1.x, m1.y, m1.z}, row2[3] = {m2.x, m2.y, m2.z};
+  const Vec3<V> g_view = numbers_vjp(camera, view, p, along_view(camera, gaussian.axes, row1, row2), in, g);
   store3(g + kRowX, load3(g + kRowX) + g_view.x * mean);
   store3(g + kRowY, load3(g + kRowY) + g_view.y * mean);
   store3(g + kRowZ, load3(g + kRowZ) + g_view.z * mean);
   store3(g + kTranslation, g_view);
-  Vec3<T> toward = {};
-  if (!s.colors) {
-    T* const none = nullptr;
-    toward = color_vjp(s, camera, row, Vec3<T>{m[6], m[7], m[8]}, s.sh_rest + s.rest_stride * row.i, none, none);
-  }
+  Vec3<V> toward = {};
+  V* const none = nullptr;
+  if (!s.colors) toward = color_vjp(s, camera, row, Vec3<V>{m[6], m[7], m[8]}, rest, none, none);
   store3(g + kCenter, T(-1) * toward);
 }
 

@@ -1,6 +1,7 @@
 // The CUDA kernels on the CPU (submodules/common/emulation), under the sanitizers, against the CPU backend. Several
 // orders of the threads must give the same bits, and every result must lie within rounding of the CPU's.
 #include <algorithm>
+#include <cstring>
 
 #include "backend_run.h"
 #include "emulated_queue.h"
@@ -565,7 +566,7 @@ void put_off(gs::GaussianStep<float>& step, gs::StepNow& now) {
 }
 
 // Steps taken inside the backward give the bits of steps from gradients in memory, in every order of threads, and with
-// their constants in memory, or from rows. A halted queue changes nothing.
+// their constants in memory, or from rows. A halted queue changes nothing. The camera's gradient is that of before.
 void test_gaussian_step() {
   for (const auto& [count, rays] : {std::pair{0, false}, {1, false}, {33, false}, {33, true}, {200, false}})
     for (const StepCase& how : kStepCases) {
@@ -581,19 +582,23 @@ void test_gaussian_step() {
                      [&](const gs::SceneGradient<float>& g) { emulated_gradients(queue, *r, g); });
         r->scene = scene_of(fused.values, r->scene.image, r->scene.antialiasing);  // has the values of before that step
         const int32_t halted[2] = {1, 0};
+        std::array<double, kLensCameraNumbers> camera{}, apart{};
         const std::vector<uint8_t> unchanged = fused.bytes();
         for (const int32_t& word : halted) {
           queue.halted = &word;
           gs::GaussianStep<float> step = gaussian_step(fused, how, *r, iteration);
           gs::StepNow now;
           if (count == 33 || iteration == 3) put_off(step, now);
+          step.camera = camera.data();
           gs::cuda::rasterize_vjp_step(queue, r->scene, r->input, r->backward, step);
-          CHECK(word == 0 || fused.bytes() == unchanged);
+          CHECK(word == 0 || (fused.bytes() == unchanged && camera == apart));
         }
         CHECK(fused.bytes() == plain.bytes());
         const KeptRows rows = keep_rows(queue, r->input, r->backward, false);
-        gs::cuda::rows_vjp_step(queue, scene_of(stepped.values, r->scene.image, r->scene.antialiasing), rows.given(*r),
-                                {}, gaussian_step(stepped, how, *r, iteration));
+        const gs::Scene<float> before = scene_of(stepped.values, r->scene.image, r->scene.antialiasing);
+        gs::cuda::camera_vjp(queue, before, rows.given(*r), apart.data());
+        CHECK(std::memcmp(camera.data(), apart.data(), sizeof camera) == 0);
+        gs::cuda::rows_vjp_step(queue, before, rows.given(*r), {}, gaussian_step(stepped, how, *r, iteration));
         CHECK(stepped.bytes() == plain.bytes());
       }
       CHECK(count < 200 || (fused.stopped == 2) == (how.guarded && std::isnan(how.gradient)));
@@ -680,15 +685,17 @@ void test_listed_blocks() {
       const auto r = render_with(queue, scene, 1);
       gs::GaussianStep<float> in = gaussian_step(s, {}, *r, 1);
       in.observed.blocks = blocks;
+      std::vector<double> camera(kLensCameraNumbers);
+      in.camera = camera.data();
       gs::cuda::rasterize_vjp_step(queue, r->scene, r->input, r->backward, in);
       std::vector<float> lengths(r->radii.size(), 0.5f);
       in.observed.count = int64_t(lengths.size()), in.observed.lengths = lengths.data();
       if (blocks) gs::cuda::observe(queue, in.observed);  // twice, to see where lengths go
-      return std::make_pair(r->color, r->instances.size());
+      return std::make_tuple(r->color, camera, r->instances.size());
     };
     const int32_t blocks[most] = {0, 2, 4, -1};
     const auto image = step(flagged, nullptr);
-    CHECK(step(listed, blocks) == image && image.second > 0);
+    CHECK(step(listed, blocks) == image && std::get<2>(image) > 0);
     for (int64_t i = 0; i < count; ++i)
       CHECK(listed.statistics[2 * count + i] == 2 * flagged.statistics[2 * count + i]);
     listed.statistics = flagged.statistics;

@@ -163,6 +163,10 @@ void GradientSource::camera(const gs::Queue& queue, const gs::Scene<float>& scen
 }
 #endif
 
+void check_camera_gradients(const SceneTensors& scene) {
+  GS_CHECK(!scene.rays(), "projection='ray' has no gradients of cameras: take 'ewa'");
+}
+
 Tensor absolute_like(const SceneTensors& scene, bool wanted) {
   return wanted ? empty({scene.rows()}, scene.means()) : Tensor();
 }

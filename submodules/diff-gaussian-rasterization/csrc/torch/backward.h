@@ -126,6 +126,9 @@ class GradientSource {
   Tensor splats_, tile_counts_, rows_, counts_;
 };
 
+// Refuses a scene whose camera gets no gradient.
+void check_camera_gradients(const SceneTensors& scene);
+
 // Memory for the lengths of absolute gradients; undefined if they are not wanted.
 Tensor absolute_like(const SceneTensors& scene, bool wanted);
 

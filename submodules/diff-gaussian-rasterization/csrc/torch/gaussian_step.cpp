@@ -3,6 +3,7 @@
 #include <array>
 
 #include "backward.h"
+#include "math/camera_gradient.h"
 #include "math/step_now.h"
 #include "optim.h"
 
@@ -31,8 +32,9 @@ void advance(List<Tensor> steps) {
 }
 
 // What a step takes, in lists with an entry for each attribute that `attributes` names by its place in gs::Stepped.
-// averages: exp_avg of all these, then exp_avg_sq. statistics: max_radii, gradient_sums and views, or nothing. guard:
-// loss and stopped, or nothing. constants: beta1, beta2, eps, and the weights of the penalties on opacities and scales.
+// averages: exp_avg of all these, then exp_avg_sq. statistics: max_radii, gradient_sums and views, or nothing; then, if
+// it is wanted, what gets the gradients of the camera's numbers before the step (camera_vjp). guard: loss and stopped,
+// or nothing. constants: beta1, beta2, eps, and the weights of the penalties on opacities and scales.
 #define STEP_SCHEMA                                                                                         \
   "Tensor? radii, Tensor(c!)[] averages, Tensor(d!)[] steps, Tensor(e!)[] statistics, Tensor(f!)[] guard, " \
   "int[] attributes=[], float[] rates=[], float[] constants=[], int[] columns=[], bool sparse=False, "      \
@@ -62,7 +64,8 @@ struct Step {
   const MaybeTensor& now;
   bool absolute;
 
-  bool observes() const { return statistics.size() != 0; }
+  bool observes() const { return statistics.size() > 1; }
+  MaybeTensor camera() const { return entry(statistics, observes() ? 3 : 0); }
 
   void check(const SceneTensors& scene) const {
     GS_CHECK_VALUE(!scene.has(kCov3d) && !scene.has(kColors),
@@ -70,9 +73,16 @@ struct Step {
     GS_CHECK_TYPE(radii, "radii must be a tensor, got None");
     check_tensor(*radii, "radii", ScalarType::Int, scene.device(), {scene.rows()});
     GS_CHECK(!sparse || !scene.blocks().defined(), "no block sleeps through a sparse step");
-    GS_CHECK(!observes() || statistics.size() == 3, "give max_radii, gradient_sums and views, or none of them");
+    GS_CHECK(!observes() || statistics.size() == 3 || statistics.size() == 4,
+             "give max_radii, gradient_sums and views, or none of them");
     GS_CHECK(!observes() || scene.dtype() == ScalarType::Float, "statistics are of float32 Gaussians, got float64");
     if (observes()) check_statistics(statistics[0], statistics[1], statistics[2], *radii, scene.count());
+    if (const MaybeTensor gradient = camera()) {
+      check_camera_gradients(scene);
+      check_tensor(*gradient, "the camera's gradient", ScalarType::Double, scene.device(),
+                   {baseline::kLensCameraNumbers});
+      GS_CHECK_VALUE(gradient->is_contiguous(), "the camera's gradient must be contiguous");
+    }
     check_adam(scene);
   }
 
@@ -106,6 +116,7 @@ struct Step {
     out.guard = step_guard<T>(gaussians[0], entry(guard, 0), entry(guard, 1), iteration);
     if (now) out.now = reinterpret_cast<const gs::StepNow*>(read<int64_t>(*now));
     out.penalty = {T(constants[3]), T(constants[4])};
+    if (const MaybeTensor gradient = camera()) out.camera = write<double>(*gradient);
     if (!pixels.defined()) return out;
     out.observed = {pixels.numel(), nullptr, nullptr, nullptr, read<int32_t>(pixels), nullptr};
     if (!observes()) return out;

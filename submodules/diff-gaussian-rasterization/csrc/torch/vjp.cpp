@@ -42,7 +42,7 @@ std::tuple<Tensor, Tensor> blend_rows_op(SOURCE_PARAMETERS, bool absolute) {
 // blend_rows.
 Tensor camera_vjp_op(SCENE_PARAMETERS, List<Tensor> source, bool absolute) {
   const SceneTensors scene(SCENE_ARGUMENTS);
-  GS_CHECK(!scene.rays(), "projection='ray' has no gradients of cameras: take 'ewa'");
+  check_camera_gradients(scene);
   GS_CHECK_VALUE(source.size() == 4, "camera_vjp takes splats, tile_counts, rows and counts, got ", source.size(),
                  " tensors");
   const GradientSource from(scene, source, {}, {}, {}, absolute, false);
