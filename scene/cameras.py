@@ -114,7 +114,7 @@ class Camera(nn.Module):
         self._assigned: dict[str, Any] = {}
         self._made: dict[str, Tensor] = {}
         self._made_version = 0
-        self._offset = offset
+        self._projection = projection(ZNEAR, ZFAR, self.FoVx, self.FoVy, *offset)
         self.place(info.R, info.T)
 
     def _placed(self, source: Source | InMemory | None) -> Source | InMemory | None:
@@ -129,7 +129,7 @@ class Camera(nn.Module):
     def matrices(self, R: np.ndarray, T: np.ndarray) -> dict[str, Tensor]:
         """What `place` would give it, in float64 on the CPU, so that product and inverse are rounded only once."""
         moved = world_to_camera(R, T, self.trans, self.scale)
-        view, project = torch.from_numpy(moved), projection(ZNEAR, ZFAR, self.FoVx, self.FoVy, *self._offset)
+        view, project = torch.from_numpy(moved), self._projection
         return {
             "world_view_transform": view.T,
             "projection_matrix": project.T,

@@ -35,7 +35,7 @@ class Immediate:
 
     def __init__(self, _: object, steps: CapturedStep) -> None:
         self._pending, self._finished = deque(), steps.finished
-        self.drain = self.discard = self._report
+        self.drain = self.discard = self.wait = self._report
         self.throttle = lambda: self._report(AHEAD - 1)
         self.add = lambda at, _: self._pending.append(at)
         self.abort = lambda: 0

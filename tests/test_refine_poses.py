@@ -130,6 +130,7 @@ def test_what_all_cameras_could_do_together_is_taken_out(tmp_path, monkeypatch):
     scene, poses = _refinement(tmp_path)
     cameras, before = scene.getTrainCameras(), _poses(scene)
     monkeypatch.setattr(pose_refinement, "_ANCHOR", 0.0)
+    monkeypatch.setattr(pose_refinement, "_PASSES", 1)
     rng = np.random.default_rng(3)
     own = rng.normal(size=poses.twists.shape) * 1e-3
     basis, inverse = poses._drift
@@ -177,6 +178,7 @@ def test_steps_are_bounded_and_follow_the_gradient(tmp_path, monkeypatch):
     make_colmap_scene(tmp_path)
     _, poses = _refinement(tmp_path)
     monkeypatch.setattr(pose_refinement, "_ANCHOR", 0.0)
+    monkeypatch.setattr(pose_refinement, "_PASSES", 1)
     poses.step(2, _gradient(poses, 2, np.array([1.0, -1, 1, -1, 1, -1])), 0)
     assert np.array_equal(np.sign(poses.twists[2]), [-1, 1, -1, 1, -1, 1]) and not poses.twists[[0, 1, 3]].any()
     poses.twists[2, :3] = 3.0
@@ -184,7 +186,7 @@ def test_steps_are_bounded_and_follow_the_gradient(tmp_path, monkeypatch):
     assert np.linalg.norm(poses.twists[2, :3]) == pytest.approx(BOUND)
     before = poses.twists.copy()
     poses.step(2, np.full(34, np.nan), 0)
-    poses._tracks[1] = None
+    poses._pulls[1] = None
     poses.step(1, np.ones(34), 0)
     assert np.array_equal(poses.twists, before)
 
@@ -193,10 +195,12 @@ def test_a_pose_depends_on_its_own_steps_and_on_whole_passes(tmp_path):
     make_colmap_scene(tmp_path)
     _, poses = _refinement(tmp_path)
     count = len(poses.twists)
-    assert poses.depends(1, [0, 1]) and not poses.depends(2, [0, 1])
-    assert poses.depends(2, [0] * count) and not poses.depends(2, [0] * (count - 1))
+    assert poses.independent(2, [0, 1]) == 2 and poses.independent(1, [0, 1, 1, 0, 2]) == 2
+    whole = [0] * (pose_refinement._PASSES * count)
+    assert poses.independent(2, whole) == 0 and poses.independent(2, [*whole, 0, 1]) == 2
+    assert poses.independent(2, whole[1:]) == len(whole) - 1
     poses.step(0, np.zeros(34), 0)
-    assert poses.depends(2, [0] * (count - 1))
+    assert poses.independent(2, whole[1:]) == 0 and poses.independent(0, [*whole, 0, 1]) == 1
 
 
 def test_tracks_hold_a_camera(tmp_path):
@@ -206,9 +210,7 @@ def test_tracks_hold_a_camera(tmp_path):
     poses._drift = np.zeros((7, poses.twists.size)), np.zeros((7, 7))
     for step in range(400):
         poses.step(0, _gradient(poses, 0, np.array([0.02, 0, 0, 0, 0, 0])), step // 4)
-    track, camera = poses._tracks[0], poses._cameras[0]
-    at = pull(poses._starts[0], track, camera.fx, poses._unit)
-    rest = np.linalg.solve(1e-3 * at.curvature, [-0.02, 0, 0, 0, 0, 0])
+    rest = np.linalg.solve(1e-3 * poses._pulls[0].curvature, [-0.02, 0, 0, 0, 0, 0])
     np.testing.assert_allclose(poses.twists[0], rest, atol=0.1 * np.abs(rest).max())
 
 

@@ -70,7 +70,7 @@ def camera_center(R: np.ndarray, t: np.ndarray) -> np.ndarray:
     An R that is no rotation, as of a scaled pose, is inverted.
     """
     R = np.asarray(R)
-    is_rotation = np.allclose(R.T @ R, np.eye(3), rtol=0, atol=1e-3)
+    is_rotation = np.abs(R.T @ R - np.eye(3)).max() <= 1e-3
     return -R @ t if is_rotation else -np.linalg.solve(R.T, t)
 
 

@@ -1,10 +1,11 @@
 """Poses that are trained with the Gaussians (--refine_poses): a bounded correction of each training camera.
 
-Each has Adam of its own. The tracks of structure from motion hold the cameras: before the training every view, test
-views included, takes the pose of least reprojection error, and then the error stays a part of the loss.
+Each has Adam of its own. The tracks of structure from motion hold the cameras. Before the training every view, test
+views included, takes the pose of least reprojection error. The error, to second order about there, then stays a part
+of the loss.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from utils.system_utils import UserError
 _RATES = 1e-4, 1e-6  # of the first and the last step
 _BETAS, _EPS = (0.9, 0.99), 1e-12
 _ANCHOR = 1e-3  # weight of each point's squared reprojection error (pixels) in the loss of its view
+_PASSES = 10  # over all views, after which drift is taken out: each time the GPU is waited for
 _STATE = ("twists", "mean", "square", "counts")
 
 
@@ -44,8 +46,11 @@ class PoseRefinement:
         for camera, track in zip(lists[0] + lists[1], tracks, strict=True):
             pose = nearest_pose(_pose_of(camera), track, camera.fx, self._unit, BOUND)
             camera.place(pose[:3, :3].T.copy(), pose[:3, 3].copy())
-        self._cameras, self._tracks = lists[0], tracks[: len(lists[0])]
+        self._cameras = lists[0]
         self._starts = [_pose_of(camera) for camera in self._cameras]
+        held = zip(self._starts, tracks, self._cameras, strict=False)
+        self._pulls = [track and pull(start, track, camera.fx, self._unit) for start, track, camera in held]
+        self._curvatures = [of_track and of_track.curvature for of_track in self._pulls]
         self._rate = get_expon_lr_func(*_RATES, max_steps=steps)
         self._drift = _drift(self._starts, self._unit)
         count = len(self._cameras)
@@ -73,10 +78,12 @@ class PoseRefinement:
         if copy is not None and copy is not self._cameras[copy.uid]:
             copy.place(*self.pose(copy.uid))
 
-    def depends(self, uid: int, pending: Collection[int]) -> bool:
-        """Whether a camera's next pose depends on steps that are yet to be taken, of these cameras."""
-        taken, count = int(self.counts.sum()), len(self._cameras)
-        return uid in pending or (taken + len(pending)) // count > taken // count
+    def independent(self, uid: int, pending: Sequence[int]) -> int:
+        """On how many of the last steps a camera's next pose does not depend. pending: the cameras of steps to come."""
+        most, taken, all_passes = len(pending), int(self.counts.sum()), _PASSES * len(self._cameras)
+        if (taken + most) // all_passes > taken // all_passes:
+            most = (taken + most) % all_passes
+        return min(most, pending[::-1].index(uid)) if uid in pending else most
 
     def step(self, uid: int, gradient: np.ndarray, step: int) -> None:
         """Take the step of a camera. step: of the schedule.
@@ -85,13 +92,13 @@ class PoseRefinement:
         a track, which nothing would hold, gets none.
         """
         self.counts[uid] += 1
-        track, pose, found = self._tracks[uid], self._pose(uid), np.zeros(6)
-        if track is not None:
-            found = twist_gradient(pose, gradient, self._unit)
-            found += _ANCHOR * pull(pose, track, self._cameras[uid].fx, self._unit).gradient
+        held, found = self._pulls[uid], np.zeros(6)
+        if held is not None:
+            found = twist_gradient(self._pose(uid), gradient, self._unit)
+            found += _ANCHOR * (held.gradient + self._curvatures[uid] @ self.twists[uid])
         if np.isfinite(found).all():
             self._step(uid, found, self._rate(step))
-        if self.counts.sum() % len(self._cameras):
+        if self.counts.sum() % (_PASSES * len(self._cameras)):
             return self._move([uid])
         # The scene does not walk, turn or grow: what all cameras could do together is taken out.
         basis, inverse = self._drift

@@ -57,8 +57,8 @@ class CapturedStep(FusedStep):
             self.drain()  # nothing is pending, unless --debug_from has just come into force
             run.set_rates(at)
             return super().take(at, observers)
-        if run.poses and run.poses.depends(at.camera.uid, [one.uid for one in self._fetched.values()]):
-            self._ahead.drain()
+        if run.poses:
+            self._ahead.wait(run.poses.independent(at.camera.uid, [one.uid for one in self._fetched.values()]))
         losses = self._queue(at)
         if losses is None:
             self._ahead.discard()

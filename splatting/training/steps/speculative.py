@@ -78,6 +78,10 @@ class Speculation:
         """Wait until another step can be queued."""
         self._collect(AHEAD - 1)
 
+    def wait(self, most: int) -> None:
+        """Wait until at most so many steps are pending."""
+        self._collect(most)
+
     def drain(self) -> None:
         """Wait until all steps are done."""
         self._collect(0)
