@@ -30,7 +30,7 @@ def _scene(folder: Path, gaussians: GaussianModel | None = None, out: str = "out
 @pytest.mark.parametrize("lenses", ["native", "undistort"])
 @pytest.mark.parametrize(("model", "params"), [("PINHOLE", BROWN[:4]), ("OPENCV", BROWN), ("OPENCV_FISHEYE", FISHEYE)])
 def test_points_lie_where_pycolmap_shows_them(model, params, lenses, tmp_path):
-    """At half the size, with depths as the renderer has them. Of a pixel's points, the one of least error counts."""
+    """At half the size, with depths as the renderer has them."""
     known = make_colmap_scene(tmp_path, model=model, params=params)
     scene = _scene(tmp_path, lenses=lenses)
     views = scene.info.train_cameras

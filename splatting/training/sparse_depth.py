@@ -14,7 +14,6 @@ from scene.scene import Scene
 from utils.system_utils import UserError
 
 HELD_OUT = 8  # every so many points, by the rank of their ids, are never trained on
-_SHORTEST = 3  # photos of a track; two rays meet nearly anywhere
 _NEAR = 0.01  # depth, as the camera's
 
 
@@ -73,7 +72,7 @@ def points_of(camera: Camera, view: CameraInfo, track: Track, weight: float = 1.
     depths = np.linalg.norm(seen, axis=1) if by_distance else seen[:, 2]
     columns = range(camera.image_width)[camera.columns or slice(None)]
     x, y = np.floor(places).T
-    trust = np.where(track.lengths >= _SHORTEST, 1 / (1 + track.errors**2), 0.0)
+    trust = (track.lengths - 1) / (1 + track.errors**2)
     counts = (depths > _NEAR) & (trust > 0) & (track.ranks % HELD_OUT != 0)
     counts &= (x >= columns.start) & (x < columns.stop) & (y >= 0) & (y < camera.image_height)
     if not counts.any():
