@@ -172,6 +172,8 @@ class OptimizationParams(OptionTable):
             help="screen-space gradient (per NDC unit) that makes a Gaussian clone or split; lower: more Gaussians"),
         Option("depth_l1_weight_init", 1.0, "weight of the depth loss (--depths) at the start", check=at_least(0)),
         Option("depth_l1_weight_final", 0.01, "weight of the depth loss in the last step", check=at_least(0)),
+        Option("sparse_depth", 0.0, origin="ours", check=at_least(0),
+            help="weight of the depth of the scene's own points (COLMAP only), where photos have seen them; 0: off"),
         Option("random_background", False,
             help="a new random background in every step, so that no Gaussian imitates a fixed one"),
         Option("optimizer_type", "default", check=one_of("default", "sparse_adam"), stored=MODEL_JSON,

@@ -32,7 +32,8 @@ def _track(count: int = 60, noise: float = 0.0) -> Track:
     rng = np.random.default_rng(1)
     points = rng.normal(size=(count, 3))
     view = points @ POSE[:3, :3].T + POSE[:3, 3]
-    return Track(points, view[:, :2] / view[:, 2:] + noise * rng.normal(size=(count, 2)))
+    rays = view[:, :2] / view[:, 2:] + noise * rng.normal(size=(count, 2))
+    return Track(points, rays, rays, *np.ones((3, count)))
 
 
 def test_the_gradient_and_the_matrix_of_a_pull():

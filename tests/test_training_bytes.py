@@ -22,7 +22,7 @@ Result = dict[str, bytes | list]
 EVERY = pytest.mark.parametrize("name", OPTIONS)
 LOOKS = ("--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44, "--checkpoint_iterations", 21, ITERATIONS)
 # Whose steps are queued one call after the other.
-WITHOUT_GRAPHS = ("exposure", "depth", "masks", "together", "budget errors", "poses, no graph")
+WITHOUT_GRAPHS = ("exposure", "depth", "masks", "together", "budget errors", "poses, no graph", "points")
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,7 @@ def _all(scene: Path, folder: Path, kinds: list[tuple[str, tuple[str, ...]]]) ->
 
 
 def test_ranks(scene, tmp_path, plain):
-    alone = "mcmc moves", "mcmc idle", "rays"
+    alone = "mcmc moves", "mcmc idle", "rays", "points"
     kinds = [(name, ()) for name in OPTIONS if name not in alone and "poses" not in name]
     kinds += [("exposure", ("--plain_step",))]
     found = in_ranks(2, _all, scene, tmp_path, kinds)[0]

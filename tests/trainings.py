@@ -24,6 +24,7 @@ OPTIONS = {
     "sparse": ("--optimizer_type", "sparse_adam", "--random_background"),
     "exposure": ("--train_test_exp", "--antialiasing"),
     "depth": ("-d", "depths", "--depth_l1_weight_init", 1.0),
+    "points": ("--sparse_depth", 0.5, "--masks", "masks", "--resolution_schedule", "pyramid"),
     "masks": ("--masks", "masks"),
     "degree 0": ("--sh_degree", 0),
     "rays": ("--projection", "ray"),

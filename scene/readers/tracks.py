@@ -16,10 +16,18 @@ FEWEST = 12  # points of a track; fewer say too little of a pose
 
 
 class Track(NamedTuple):
-    """What a photo has seen: points (K, 3) float64 of the training's frame, and their rays (K, 2), x / z and y / z."""
+    """What a photo has seen: points (K, 3) float64 of the training's frame, and their rays (K, 2), x / z and y / z.
+
+    places (K, 2): in the photo, in parts of its width and height. errors: of reprojection, in pixels. lengths: photos
+    that see the point. ranks: of the points' ids. These are (K,).
+    """
 
     points: np.ndarray
     rays: np.ndarray
+    places: np.ndarray
+    errors: np.ndarray
+    lengths: np.ndarray
+    ranks: np.ndarray
 
 
 def read_tracks(scene: str | os.PathLike, views: Sequence[CameraInfo], offset: np.ndarray) -> list[Track | None]:
@@ -33,6 +41,9 @@ def read_tracks(scene: str | os.PathLike, views: Sequence[CameraInfo], offset: n
     suffix = "bin" if (folder / "points3D.bin").is_file() else "txt"
     cameras, images, points = read_model_of_kind(folder, suffix, with_2d_points=True)
     photos, found = {image.name: image for image in images}, []
+    if len(points.ids):
+        every = np.concatenate([image.point3D_ids for image in images])
+        lengths = np.bincount(np.searchsorted(points.ids, every[np.isin(every, points.ids)]), minlength=len(points.ids))
     for view in views:
         photo = photos.get(view.image_name)
         if photo is None or not len(points.ids):
@@ -42,5 +53,7 @@ def read_tracks(scene: str | os.PathLike, views: Sequence[CameraInfo], offset: n
         camera = cameras[photo.camera_id]
         rays = rays_of(Lens(camera.model, tuple(map(float, camera.params)), camera.width, camera.height), photo.xys)
         seen = (points.ids[place] == photo.point3D_ids) & np.isfinite(rays).all(1)
-        found.append(Track(points.xyz[place[seen]] - offset, rays[seen]) if seen.sum() >= FEWEST else None)
+        place, places = place[seen], photo.xys[seen] / (camera.width, camera.height)
+        track = Track(points.xyz[place] - offset, rays[seen], places, points.errors[place], lengths[place], place)
+        found.append(track if len(place) >= FEWEST else None)
     return found

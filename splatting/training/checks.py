@@ -99,10 +99,16 @@ def check_alone(port: int | None, projection: str, several: bool) -> None:
             raise UserError(f"{name} needs a training of one process; leave it out, or start train.py without torchrun")
 
 
+def check_one_process(option: str, several: bool) -> None:
+    """Refuse an option in a training of several processes (UserError)."""
+    if several:
+        raise UserError(f"{option} needs a training of one process; leave it out, or start without torchrun")
+
+
 def check_poses(dataset: argparse.Namespace, several: bool, projection: str = "ewa") -> None:
     """Refuse to refine poses in a training of several processes, or on rays (UserError)."""
-    if several and getattr(dataset, "refine_poses", False):
-        raise UserError("--refine_poses needs a training of one process; leave it out, or start without torchrun")
+    if getattr(dataset, "refine_poses", False):
+        check_one_process("--refine_poses", several)
     if projection == "ray" and getattr(dataset, "refine_poses", False):
         raise UserError("--projection ray has no gradients of poses; leave --refine_poses out, or use ewa")
 

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from scene.cameras import Camera
 from splatting.deterministic.counter_rng import Stream, permutation
+from splatting.training.sparse_depth import PointDepths
 from utils.system_utils import UserError
 
 
@@ -25,11 +26,17 @@ class Iteration:
     changes: bool  # rows of the Gaussians, the SH degree or the size of views change in this iteration
     started: float  # seconds of training before it
     span: range  # steps of the schedule that it stands for (training/schedule.py)
+    points: PointDepths | None = None  # of the depth of points, None: not wanted, or the view has none
     due: bool = False  # the model is read, written or changed, so every loss so far must be checked first
     read: bool = False  # an observer reads the model
     record: dict[str, float] | None = None  # what train_log.json gets of this iteration; None: no record
     scored_at: float | None = None  # seconds of training when the curve scored it, for all records of the same score
     stopping: type[KeyboardInterrupt] | KeyboardInterrupt | None = None  # raised once the step is complete
+
+    @property
+    def wants_depth(self) -> bool:
+        """Whether its loss needs the rendered depth."""
+        return self.depth_weight > 0 or self.points is not None
 
     def takes(self, planned: Collection[int]) -> bool:
         """Whether what is planned for an iteration of the schedule is to be done in it."""

@@ -1,4 +1,4 @@
-"""The loss of a render: photometric, and inverse depth where a depth map supervises. Further terms belong here."""
+"""The loss of a render: photometric, and inverse depth where a map or points supervise. Further terms belong here."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -51,10 +51,12 @@ class Objective:
                 step.depth_weight
                 * inverse_depth_loss(package["depth"], camera.target_inverse_depth, camera.columns, mask)
             )
+        if step.points is not None:
+            terms["points"] = lambda package, mask: step.points.loss(package["depth"], mask)
         return terms
 
     def __call__(self, package: dict[str, Any], step: Iteration) -> Losses:
-        """package: of `render`, with `depth` where step.depth_weight is above 0.
+        """package: of `render`, with `depth` where the step wants it.
 
         Gradients are valid only inside a `band`.
         """

@@ -41,6 +41,7 @@ from splatting.training.pose_refinement import PoseRefinement
 from splatting.training.resolution import resolution_of
 from splatting.training.restart import resumed
 from splatting.training.schedule import DecidedSchedule
+from splatting.training.sparse_depth import SparseDepth
 from splatting.training.strategies import AUTO, USUAL, density_control, end_in_time, of_clock
 from utils.general_utils import get_expon_lr_func
 from utils.system_utils import compute_device
@@ -70,6 +71,7 @@ class Run:
 
     first_done: float | None = None
     sleeping: Sleeping | None = None
+    sparse_depth: SparseDepth | None = None
 
     def __init__(
         self, dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, launch: argparse.Namespace
@@ -188,6 +190,9 @@ class Run:
     def _begin_model(self, capture: tuple | None, first: Splats | None) -> None:
         """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""
         self.poses = self._refined_poses(capture)
+        if weight := self.opt.sparse_depth:
+            checks.check_one_process("--sparse_depth", self.group.several)
+            self.sparse_depth = SparseDepth(self.scene, self.dataset.source_path, weight)
         if capture is not None:
             self.gaussians.start_exposures(self.scene.info.train_cameras)
             self.gaussians.restore(capture, self.opt)
@@ -259,6 +264,7 @@ class Run:
                 changes=self._changes(iteration),
                 started=seconds,
                 span=schedule.span(iteration),
+                points=self.sparse_depth and self.sparse_depth.at(camera),
             )
             if schedule.is_last(iteration):
                 step.end(schedule.length)
@@ -414,7 +420,7 @@ class Run:
         """Options of `render` that make it compute what this step's loss needs, and no more."""
         return {
             "use_trained_exp": self.dataset.train_test_exp,
-            "want_depth": step.depth_weight > 0,
+            "want_depth": step.wants_depth,
             "want_visibility": False,
             "want_inactive_bands": False,
             "want_absolute_gradient": self.density.absolute_gradients and self.density.observes(step.iteration),

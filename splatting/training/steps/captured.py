@@ -234,7 +234,7 @@ class Graphs:
 
     def _is_usual(self, at: Iteration) -> bool:
         """Whether the step has a photo whose pixels all count, and nothing else."""
-        plain = at.depth_weight == 0 and not self._run.dataset.train_test_exp
+        plain = not (at.wants_depth or self._run.dataset.train_test_exp)
         return self._able and plain and at.camera.columns is None and at.camera.counts_all_pixels
 
     def _graph_for(self, at: Iteration) -> _Graph | None:
@@ -287,7 +287,13 @@ class Graphs:
             ground_truth=lambda _: (target, None),  # the photo on the step's background, and no mask
         )
         placeholder = SimpleNamespace(
-            camera=any_camera, background=self._background, depth_weight=0.0, changes=False, last=False
+            camera=any_camera,
+            background=self._background,
+            depth_weight=0.0,
+            points=None,
+            wants_depth=False,
+            changes=False,
+            last=False,
         )
         with self._capacity(None):
             launch, losses = self._recorder.capture(lambda: self._body(at.iteration, placeholder))

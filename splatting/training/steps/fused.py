@@ -73,7 +73,7 @@ class FusedStep(PlainStep):
             run.sleeping.rest()
         exposures, objective = run.dataset.train_test_exp, run.objective
         by_bands = run.group.several and not exposures and objective.takes_bands(at)
-        wants = {"want_depth": at.depth_weight > 0, "by_bands": by_bands, "bands": self._bands}
+        wants = {"want_depth": at.wants_depth, "by_bands": by_bands, "bands": self._bands}
         wants |= {"sleeping": None if whole else run.sleeping, "now": now}
         drawn = draw(at.camera, run.gaussians, run.pipe, at.background, **wants)
         with torch.enable_grad():

@@ -1,0 +1,86 @@
+"""Depth by the points of structure from motion (--sparse_depth): each view's own, where its photo has seen them.
+
+Sparse points as supervision of depth: Deng et al. 2022 (DS-NeRF), section 3. No network is asked.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scene.cameras import Camera
+from scene.readers.info import CameraInfo
+from scene.readers.tracks import Track, read_tracks
+from scene.scene import Scene
+from utils.system_utils import UserError
+
+HELD_OUT = 8  # every so many points, by the rank of their ids, are never trained on
+_NEAR = 0.01  # depth, as the camera's
+
+
+class PointDepths:
+    """Points of a view: pixels (K,) int64, of which none is there twice, inverse depths and weights (K,) float32.
+
+    The sum of the weights is 1 / the mean inverse depth, so that the loss has no unit.
+    """
+
+    def __init__(self, pixels: Tensor, inverse_depths: Tensor, weights: Tensor) -> None:
+        self.pixels, self.inverse_depths, self.weights = pixels, inverse_depths, weights
+
+    def loss(self, inverse_depth: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Weighted sum of |difference| to a rendered inverse depth (1, H, W). mask: (1, H, W) bool, what counts.
+
+        Pixels are read once each, so that its gradient has one order of sums.
+        """
+        weights = self.weights if mask is None else self.weights * mask.flatten()[self.pixels]
+        return (weights * (inverse_depth.flatten()[self.pixels] - self.inverse_depths).abs()).sum()
+
+
+class SparseDepth:
+    """The points of all training views. `at` has those of a view at its size."""
+
+    def __init__(self, scene: Scene, source_path: str, weight: float) -> None:
+        """UserError for a scene without tracks."""
+        self._views, self._weight = scene.info.train_cameras, weight
+        self._tracks = read_tracks(source_path, self._views, scene.info.offset)
+        self._known: dict[tuple[int, int, int], PointDepths | None] = {}
+        if not any(self._tracks):
+            raise UserError(
+                "--sparse_depth needs the tracks of a COLMAP model, the places of its points in photos that are no "
+                f"panoramas, and {source_path} has none; leave it out"
+            )
+
+    def at(self, camera: Camera) -> PointDepths | None:
+        """The points that train a view; None if there are none."""
+        key = camera.uid, camera.image_width, camera.image_height
+        if key not in self._known:
+            track = self._tracks[camera.uid]
+            self._known[key] = track and points_of(camera, self._views[camera.uid], track, self._weight)
+        return self._known[key]
+
+
+def points_of(camera: Camera, view: CameraInfo, track: Track, weight: float = 1.0) -> PointDepths | None:
+    """What a track says of a view's depth, with weights of that sum; of points in one pixel, that of most weight.
+
+    view: has the dataset's pose, so that a resumed training, whose poses may have moved, has the same points.
+    """
+    seen = track.points @ view.R + view.T
+    if camera.lens is None:
+        places = track.rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    else:
+        places = track.places * (camera.image_width, camera.image_height)
+    by_distance = camera.lens is not None and camera.lens.chart != "perspective"
+    depths = np.linalg.norm(seen, axis=1) if by_distance else seen[:, 2]
+    columns = range(camera.image_width)[camera.columns or slice(None)]
+    x, y = np.floor(places).T
+    trust = (track.lengths - 1) / (1 + track.errors**2)
+    counts = (depths > _NEAR) & (trust > 0) & (track.ranks % HELD_OUT != 0)
+    counts &= (x >= columns.start) & (x < columns.stop) & (y >= 0) & (y < camera.image_height)
+    if not counts.any():
+        return None
+    order = np.flatnonzero(counts)[np.argsort(-trust[counts], kind="stable")]
+    pixels, first = np.unique((y * camera.image_width + x)[order].astype(np.int64), return_index=True)
+    inverse, trust = 1 / depths[order][first], trust[order][first]
+    trust *= weight / (trust * inverse).sum()
+    device = camera.device
+    floats = (torch.from_numpy(values).to(device, torch.float32) for values in (inverse, trust))
+    return PointDepths(torch.from_numpy(pixels).to(device), *floats)

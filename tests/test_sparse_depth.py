@@ -1,0 +1,128 @@
+"""Depth by the points of structure from motion (--sparse_depth): where they lie, their loss, and trainings with it."""
+
+from argparse import Namespace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from synthetic import BROWN, make_blender_scene, make_colmap_scene
+from trainings import differences, trained
+
+import train
+from gaussian_renderer import render
+from scene.gaussian_model import GaussianModel
+from scene.readers.tracks import read_tracks
+from scene.scene import Scene
+from splatting.training import checks, sparse_depth
+from splatting.training.sparse_depth import HELD_OUT, PointDepths, SparseDepth, points_of
+from utils.system_utils import UserError, run_cli
+
+FISHEYE = (*BROWN[:4], 0.02, -0.01, 0.003, 0.001)
+
+
+def _scene(folder: Path, gaussians: GaussianModel | None = None, out: str = "out", **more) -> Scene:
+    values = {"source_path": str(folder), "model_path": str(folder / out), "images": "images", "resolution": -1}
+    values |= {"eval": True, "white_background": False, "train_test_exp": False, "data_device": "cpu"}
+    return Scene(Namespace(**values | more), gaussians or GaussianModel(1), start=False)
+
+
+@pytest.mark.parametrize("lenses", ["native", "undistort"])
+@pytest.mark.parametrize(("model", "params"), [("PINHOLE", BROWN[:4]), ("OPENCV", BROWN), ("OPENCV_FISHEYE", FISHEYE)])
+def test_points_lie_where_pycolmap_shows_them(model, params, lenses, tmp_path):
+    """At half the size, with depths as the renderer has them."""
+    known = make_colmap_scene(tmp_path, model=model, params=params)
+    scene = _scene(tmp_path, lenses=lenses)
+    views = scene.info.train_cameras
+    tracks = read_tracks(tmp_path, views, scene.info.offset)
+    ranks = {point: rank for rank, point in enumerate(sorted(known.points3D))}
+    images = {image.name: image for image in known.images.values()}
+    for camera in scene.getTrainCameras():
+        view, image = views[camera.uid], images[camera.image_name]
+        small = camera.at_size((camera.image_width // 2, camera.image_height // 2))
+        found = points_of(small, view, tracks[camera.uid])
+        assert (found.weights * found.inverse_depths).sum() == pytest.approx(1, rel=1e-5)
+        wanted: dict[int, set[float]] = {}
+        for two in image.points2D:
+            if not two.has_point3D() or ranks[two.point3D_id] % HELD_OUT == 0:
+                continue
+            seen = image.cam_from_world() * known.points3D[two.point3D_id].xyz
+            x, y = two.xy * (small.image_width / 96, small.image_height / 64)
+            if camera.lens is None:
+                x, y = seen[0] / seen[2] * small.fx + small.cx, seen[1] / seen[2] * small.fy + small.cy
+            far = np.linalg.norm(seen) if camera.lens and camera.lens.chart == "equidistant" else seen[2]
+            if 0 <= x < small.image_width and 0 <= y < small.image_height:
+                wanted.setdefault(int(y) * small.image_width + int(x), set()).add(1 / far)
+        pixels = found.pixels.tolist()
+        assert len(set(pixels)) == len(pixels) > 60
+        assert len(set(pixels) ^ set(wanted)) <= 2  # on the border of two pixels
+        shown = [(p, d) for p, d in zip(pixels, found.inverse_depths.tolist(), strict=True) if p in wanted]
+        assert all(min(abs(d / other - 1) for other in wanted[p]) < 1e-5 for p, d in shown)
+
+
+def test_the_gradient_is_that_of_finite_differences_and_masks_count():
+    points = PointDepths(torch.tensor([1, 3, 5]), torch.tensor([0.5, 0.2, 0.4]), torch.tensor([1.0, 2.0, 3.0]))
+    depth = torch.tensor([[[0.1, 0.7, 0.3], [0.1, 0.9, 0.8]]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(points.loss, depth)
+    assert points.loss(depth).item() == pytest.approx(0.2 + 2 * 0.1 + 3 * 0.4)
+    mask = torch.tensor([[[True, False, True], [True, True, True]]])
+    assert points.loss(depth, mask).item() == pytest.approx(2 * 0.1 + 3 * 0.4)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("points") / "scene"
+    make_colmap_scene(folder)
+    return folder
+
+
+def test_a_resumed_training_has_the_bytes_of_a_whole_one_with_poses_that_move(scene, tmp_path):
+    options = "--sparse_depth", 0.5, "--refine_poses", "--test_iterations", -1
+    whole = trained(scene, tmp_path / "whole", *options, "--checkpoint_iterations", 33, 60)
+    start = "--start_checkpoint", tmp_path / "whole" / "chkpnt33.pth"
+    assert not differences(whole, trained(scene, tmp_path / "resumed", *options, *start))
+
+
+def _error(scene: Path, folder: Path) -> float:
+    """Median relative error of the inverse depths at points of test views, none of which trained."""
+    gaussians = GaussianModel(3)
+    loaded = _scene(scene)
+    gaussians.load_ply(str(folder / "point_cloud/iteration_60/point_cloud.ply"))
+    pipe = Namespace(antialiasing=False, compute_cov3D_python=False, convert_SHs_python=False, debug=False)
+    views, errors = loaded.info.test_cameras, []
+    for camera, track in zip(
+        sorted(loaded.getTestCameras(), key=lambda one: one.uid),
+        read_tracks(scene, views, loaded.info.offset),
+        strict=True,
+    ):
+        points = points_of(camera, views[camera.uid], track)
+        shown = render(camera, gaussians, pipe, torch.zeros(3), want_depth=True)["depth"].flatten()[points.pixels]
+        errors.append((shown / points.inverse_depths - 1).abs())
+    return torch.cat(errors).median().item()
+
+
+def test_depth_comes_nearer_to_points_of_test_views(scene, tmp_path):
+    for name, options in (("without", ()), ("with", ("--sparse_depth", 1.0))):
+        trained(scene, tmp_path / name, *options, "--test_iterations", -1, "--opacity_reset_interval", 3000)
+    assert _error(scene, tmp_path / "with") < 0.9 * _error(scene, tmp_path / "without")
+
+
+def test_off_reads_no_tracks(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(sparse_depth, "read_tracks", lambda *_: pytest.fail("tracks are read"))
+    trained(scene, tmp_path / "off", "--test_iterations", -1)
+
+
+def test_what_cannot_be_is_refused_in_one_sentence(tmp_path, capsys):
+    make_blender_scene(tmp_path / "scene")
+    words = ["-s", str(tmp_path / "scene"), "-m", str(tmp_path / "out"), "--sparse_depth"]
+    with pytest.raises(SystemExit) as ended:
+        run_cli(lambda: train.main([*words, "1"]))
+    assert ended.value.code == 2
+    assert "--sparse_depth needs the tracks of a COLMAP model" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as ended:
+        run_cli(lambda: train.main([*words, "-1"]))
+    assert ended.value.code == 2 and "sparse_depth" in capsys.readouterr().err
+    with pytest.raises(UserError, match="--sparse_depth needs a training of one process"):
+        checks.check_one_process("--sparse_depth", several=True)
+    with pytest.raises(UserError, match="needs the tracks"):
+        SparseDepth(_scene(tmp_path / "scene"), str(tmp_path / "scene"), 1.0)
