@@ -105,6 +105,8 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="one run of each kind for each")
     parser.add_argument("--iterations", type=int, default=7000, help="of each training (default: 7000)")
     args, options = parser.parse_known_args()
+    if not (args.scene / "sparse" / "0").is_dir():
+        raise UserError(f"{args.scene} is no COLMAP scene with a folder sparse/0; name one")
     if args.out.exists():
         raise UserError(f"{args.out} exists; name a new folder")
     if len(args.degrees) != len(args.percent):

@@ -40,6 +40,7 @@ _COMPARED, _SMALL = 16, 200  # photos whose colours are compared, and their size
 _GREY = 0.02  # spread of colours, below which they tell nothing
 _ADJUSTED = 0.5  # median error of points with better poses, as a part of that with the given ones,
 _SEEN = 0.2  # if that is more pixels
+_WRONG = 5.0  # pixels, beyond which poses are wrong even if no better ones are near
 _OTHER = 0.9  # error of another photo's colours, as a part of the own one's
 
 
@@ -52,8 +53,8 @@ def check_dataset(source: str, images: str) -> list[Line]:
     except UserError as error:
         return [*_warnings(said.getvalue()), from_error(error)]
     views = info.train_cameras
-    checks = check_views(views), check_extent(info), check_lenses(views), check_cloud(info), check_colors(info)
-    checks += (check_poses(source, info),)
+    checks = check_views(views), check_extent(info), check_lenses(views), check_cloud(info), check_poses(source, info)
+    checks += (check_colors(info),)
     return [*_warnings(said.getvalue()), *chain(*checks, _check_registered(Path(source) / "convert_report.json"))]
 
 
@@ -184,9 +185,12 @@ def check_poses(source: str, info: SceneInfo) -> Iterator[Line]:
     if not errors:
         return
     given, best = np.median(errors, axis=0)
+    text = f"points lie {given:.2g} pixels from where photos show them (median)"
     if given > _SEEN and best < _ADJUSTED * given:
-        text = f"points lie {given:.2g} pixels from where photos show them (median), and {best:.2g} with better poses"
-        yield Line(text, "train with --refine_poses, or adjust the model again (COLMAP: bundle_adjuster)")
+        better = "train with --refine_poses, or adjust the model again (COLMAP: bundle_adjuster)"
+        yield Line(f"{text}, and {best:.2g} with better poses", better)
+    elif given > _WRONG:
+        yield Line(text, "adjust the model again (COLMAP: bundle_adjuster); --refine_poses corrects 3 degrees at most")
 
 
 def _pixels(camera: CameraInfo) -> np.ndarray:

@@ -117,8 +117,8 @@ class Lens(NamedTuple):
             steep = math.inf
         steep *= max(self.focal)
         if fisheye:  # what is beside the axis is stretched by angle / sine
-            edge = min(field + _TURN, 0.999 * math.pi)
-            return field, turn, reach, steep * edge / math.sin(edge), math.inf
+            edge = field + _TURN  # a direction that turns past the one behind can jump to any other
+            return field, turn, reach, steep * edge / math.sin(edge) if edge < math.pi else math.inf, math.inf
         beyond = field * float(over(field) / under(field)) - aside * field**2 - corner
         return field, turn, reach, steep, min(self.focal) * beyond
 
