@@ -187,7 +187,7 @@ def test_steps_are_bounded_and_follow_the_gradient(tmp_path, monkeypatch):
     assert np.linalg.norm(poses.twists[2, :3]) == pytest.approx(BOUND)
     before = poses.twists.copy()
     poses.step(2, np.full(34, np.nan), 0)
-    poses._pulls[1] = None
+    poses._held[1] = None
     poses.step(1, np.ones(34), 0)
     assert np.array_equal(poses.twists, before)
 
@@ -211,7 +211,7 @@ def test_tracks_hold_a_camera(tmp_path):
     poses._drift = np.zeros((7, poses.twists.size)), np.zeros((7, 7))
     for step in range(400):
         poses.step(0, _gradient(poses, 0, np.array([0.02, 0, 0, 0, 0, 0])), step // 4)
-    rest = np.linalg.solve(1e-3 * poses._pulls[0].curvature, [-0.02, 0, 0, 0, 0, 0])
+    rest = np.linalg.solve(1e-3 * poses._held[0][1], [-0.02, 0, 0, 0, 0, 0])
     np.testing.assert_allclose(poses.twists[0], rest, atol=0.1 * np.abs(rest).max())
 
 

@@ -48,9 +48,9 @@ class PoseRefinement:
             camera.place(pose[:3, :3].T.copy(), pose[:3, 3].copy())
         self._cameras = lists[0]
         self._starts = [_pose_of(camera) for camera in self._cameras]
-        held = zip(self._starts, tracks, self._cameras, strict=False)
-        self._pulls = [track and pull(start, track, camera.fx, self._unit) for start, track, camera in held]
-        self._curvatures = [of_track and of_track.curvature for of_track in self._pulls]
+        held = zip(self._starts, tracks, self._cameras, strict=False)  # the tracks of test views are left
+        pulls = [track and pull(start, track, camera.fx, self._unit) for start, track, camera in held]
+        self._held = [of_track and (of_track.gradient, of_track.curvature) for of_track in pulls]
         self._rate = get_expon_lr_func(*_RATES, max_steps=steps)
         self._drift = _drift(self._starts, self._unit)
         count = len(self._cameras)
@@ -92,10 +92,11 @@ class PoseRefinement:
         a track, which nothing would hold, gets none.
         """
         self.counts[uid] += 1
-        held, found = self._pulls[uid], np.zeros(6)
-        if held is not None:
+        found = np.zeros(6)
+        if (held := self._held[uid]) is not None:
+            at_start, curvature = held
             found = twist_gradient(self._pose(uid), gradient, self._unit)
-            found += _ANCHOR * (held.gradient + self._curvatures[uid] @ self.twists[uid])
+            found += _ANCHOR * (at_start + curvature @ self.twists[uid])
         if np.isfinite(found).all():
             self._step(uid, found, self._rate(step))
         if self.counts.sum() % (_PASSES * len(self._cameras)):

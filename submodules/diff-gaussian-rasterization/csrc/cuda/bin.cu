@@ -42,6 +42,7 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& given
   int64_t *of_shares = queue.array<int64_t>(shares), *totals = queue.array<int64_t>(2);
   GS_CUDA_CHECK(cudaMemsetAsync(numbers, 0, (2 * tiles + 2) * sizeof *numbers, stream));
   launch(queue, "count", count_kernel, shares, kListThreads, count, splats, in, image, counts, of_shares);
+  // Images of many tiles have many splats without a mask.
   const unsigned large_blocks = std::clamp<unsigned>(unsigned(tiles) / 16, 256, 2048);
   launch(queue, "count_large", in.rays ? count_large_kernel<true> : count_large_kernel<false>, large_blocks,
          kListThreads, in, image, counts);
