@@ -186,7 +186,7 @@ LENSES = {
 def test_no_view_shows_a_block_that_sleeps(device, dtype, lens):
     place, rng = {"device": device, "dtype": dtype}, np.random.default_rng(7)
     asleep = woken = 0
-    for trial in range(60):
+    for trial in range(30):
         blocks = _clusters(rng, place, small=trial % 2 > 0)
         missed, rate = int(rng.integers(1, 100)), 10 ** rng.uniform(-5, -2)
         blocks.terms[:, :6] = rate

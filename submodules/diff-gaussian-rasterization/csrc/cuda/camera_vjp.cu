@@ -17,15 +17,33 @@ namespace {
 constexpr int kThreads = kSleepBlock;
 constexpr int kWarps = kThreads / 32;
 
-// Sums a value over the threads of a block, for thread 0. All threads call this; `stage` has a double for each warp.
-__device__ double block_sum(double value, double* stage) {
-  for (int step = 16; step; step /= 2) value += __shfl_xor_sync(kWarp, value, step);
-  __syncthreads();  // the values before have been read
-  if (threadIdx.x % 32 == 0) stage[threadIdx.x / 32] = value;
-  __syncthreads();
-  double sum = 0;
-  for (int warp = 0; warp < kWarps; ++warp) sum += stage[warp];
-  return sum;
+// Sums numbers over the lanes of a warp, kCount a power of two up to 32: each exchange halves what a lane still sums.
+// Returns the sum of number lane * kCount / 32.
+template <int kCount>
+__device__ double warp_sums(double (&v)[kCount]) {
+#pragma unroll
+  for (int step = 16, kept = kCount / 2; step; step /= 2, kept /= 2) {
+    const bool upper = threadIdx.x & step;
+    if (!kept) v[0] += __shfl_xor_sync(kWarp, v[0], step);
+#pragma unroll
+    for (int k = 0; k < kCount / 2; ++k) {
+      if (k >= kept) break;
+      const double other = __shfl_xor_sync(kWarp, upper ? v[k] : v[k + kept], step);
+      v[k] = (upper ? v[k + kept] : v[k]) + other;
+    }
+  }
+  return v[0];
+}
+
+// Sums numbers `first` to first + kCount of all lanes into the warp's row of them.
+template <int kCount, int kNumbers>
+__device__ void sum_numbers(const float (&g)[kNumbers], int first, double* row) {
+  double v[kCount];
+#pragma unroll
+  for (int k = 0; k < kCount; ++k) v[k] = first + k < kNumbers ? double(g[first + k]) : 0.0;
+  const double sum = warp_sums(v);
+  const int lane = threadIdx.x % 32, number = first + lane * kCount / 32;
+  if (lane % (32 / kCount) == 0 && number < kNumbers) row[number] = sum;
 }
 
 // sums (blocks, numbers): those of blocks that sleep are not written.
@@ -38,30 +56,41 @@ __global__ void __launch_bounds__(kThreads)
   constexpr int kNumbers = kNumbersOf<AnyCamera>;
   __shared__ AnyCamera camera;
   __shared__ __align__(8) float stage[kWarps * SlotSums<false>::kStage];
-  __shared__ double of_warps[kWarps];
+  __shared__ double of_warps[kWarps][kNumbers];
   if (threadIdx.x == 0) set_camera(s, camera);
   __syncthreads();
+  const int warp = threadIdx.x / 32;
   const int64_t i = block * kThreads + threadIdx.x;
   const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x;  // in what the forward has made
   const bool seen = i < s.count && source.seen(at);
-  float m[kGradientValues], g[kNumbers] = {};
-  source.read(at, seen, m, stage + threadIdx.x / 32 * SlotSums<false>::kStage);
-  if (seen) camera_vjp_row(s, camera, SceneRow<float>{s, i}, m, s.sh_rest + s.rest_stride * i, g);
-#pragma unroll
-  for (int k = 0; k < kNumbers; ++k) {
-    const double sum = block_sum(g[k], of_warps);
-    if (threadIdx.x == 0) sums[kNumbers * block + k] = sum;
+  float g[kNumbers] = {};
+  if (__any_sync(kWarp, seen)) {
+    float m[kGradientValues];
+    source.read(at, seen, m, stage + warp * SlotSums<false>::kStage);
+    if (seen) camera_vjp_row(s, camera, SceneRow<float>{s, i}, m, s.sh_rest + s.rest_stride * i, g);
   }
+  sum_numbers<32>(g, 0, of_warps[warp]);
+  if constexpr (kNumbers > 32) sum_numbers<2>(g, 32, of_warps[warp]);
+  __syncthreads();
+  if (threadIdx.x >= kNumbers) return;
+  double sum = 0;
+  for (int k = 0; k < kWarps; ++k) sum += of_warps[k][threadIdx.x];
+  sums[kNumbers * block + threadIdx.x] = sum;
 }
 
 __global__ void __launch_bounds__(kThreads)
     sum_blocks_kernel(const int32_t* halted, int64_t blocks, const double* sums, double* out) {
   if (!begin_work(halted)) return;
   __shared__ double of_warps[kWarps];
-  double sum = 0;
-  for (int64_t block = threadIdx.x; block < blocks; block += kThreads) sum += sums[gridDim.x * block + blockIdx.x];
-  sum = block_sum(sum, of_warps);
-  if (threadIdx.x == 0) out[blockIdx.x] = sum;
+  double sum[1] = {};
+  for (int64_t block = threadIdx.x; block < blocks; block += kThreads) sum[0] += sums[gridDim.x * block + blockIdx.x];
+  const double of_warp = warp_sums(sum);
+  if (threadIdx.x % 32 == 0) of_warps[threadIdx.x / 32] = of_warp;
+  __syncthreads();
+  if (threadIdx.x) return;
+  double all = 0;
+  for (int k = 0; k < kWarps; ++k) all += of_warps[k];
+  out[blockIdx.x] = all;
 }
 
 template <class AnyCamera>

@@ -105,13 +105,12 @@ Parameters<float> on_rays(int64_t count) {
 }
 
 void test_rays() {
-  for (const gs::Image image : {gs::Image{16, 16}, gs::Image{70, 33}, gs::Image{330, 70}})
-    for (int64_t count : {1, 33, 300})
-      for (bool antialiasing : {false, true}) {
-        Parameters<float> p = on_rays(count);
-        if (count == 33) p.distort_view();
-        check_scene(p, image, antialiasing, antialiasing);
-      }
+  for (const auto& [count, image] : {std::pair{1, gs::Image{16, 16}}, {33, {70, 33}}, {300, {330, 70}}})
+    for (bool antialiasing : {false, true}) {
+      Parameters<float> p = on_rays(count);
+      if (count == 33) p.distort_view();
+      check_scene(p, image, antialiasing, antialiasing);
+    }
 }
 
 // More tiles than kFewTiles, so that fewer warps share one, and a list of two chunks. One order only, because it is
