@@ -8,7 +8,6 @@ from collections import Counter
 from functools import partial
 from pathlib import Path
 
-import diff_gaussian_rasterization
 import pytest
 import torch
 from torch.profiler import ProfilerActivity, profile
@@ -18,7 +17,7 @@ from benchmarks.accuracy import oracle
 from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT
 from benchmarks.harness.calls import by_stage
 from benchmarks.harness.measuring import GpuTime, short_name
-from benchmarks.kernels import builds, rasterizer
+from benchmarks.kernels import rasterizer
 from benchmarks.parallel import steps, workload
 from benchmarks.scenes import step_profile, training
 from benchmarks.strategies.figure import draw
@@ -115,16 +114,6 @@ def test_tables_of_a_gpu_have_stages_memory_and_marks(monkeypatch, capsys):
         ["S", "+ backward", "0.820", "1.875", "1.16", "2.47", "0.71", "0.42"],
         ["S", "step", "0.820", "1.875", "1.21", "2.95", "0.68", "0.50"],
     ]
-
-
-def test_two_builds_take_turns(monkeypatch, capsys):
-    folder = str(Path(diff_gaussian_rasterization.__file__).parents[1])
-    words = "--device cpu --workloads S --starts 1 --rounds 1"
-    monkeypatch.setattr(sys, "argv", ["builds", folder, folder, *words.split()])
-    builds.main()
-    rows = _rows(capsys.readouterr().out, "S ")
-    assert [row[1] for row in rows] == list(builds.STEPS)
-    assert all(float(cell) > 0 for row in rows for cell in row[2:])
 
 
 def test_the_profile_of_a_step_adds_up_kernels_by_name():

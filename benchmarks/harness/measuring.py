@@ -72,18 +72,18 @@ def cpu_milliseconds(run: Callable[[], object], repeats: int) -> float:
     return 1e3 * statistics.median(times)
 
 
-def gpu_milliseconds(run: Callable[[], object], warm_ups: int = WARM_UPS, repeats: int = REPEATS) -> float:
-    """Return the median time of a call by events, each on an idle device."""
+def gpu_milliseconds(run: Callable[[], object]) -> float:
+    """Return the median time of REPEATS calls after WARM_UPS by events, each on an idle device."""
     times = []
     begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-    for _ in range(warm_ups + repeats):
+    for _ in range(WARM_UPS + REPEATS):
         torch.cuda.synchronize()
         begin.record()
         run()
         end.record()
         end.synchronize()
         times.append(begin.elapsed_time(end))
-    return statistics.median(times[warm_ups:])
+    return statistics.median(times[WARM_UPS:])
 
 
 def gpu_time(run: Callable[[], object]) -> GpuTime:
