@@ -170,7 +170,6 @@ def test_a_training_of_one_process_loads_nothing_of_several(colmap_scene, tmp_pa
     loaded = done.stderr.splitlines()[-1].split()
     assert loaded[0] == "loaded" and "splatting.distributed.ranks" in loaded
     assert not {
-        f"splatting.distributed.{name}"
-        for name in ("process_group", "launcher", "watchdog", "watched_ranks", "key_value_store")
+        f"splatting.distributed.{name}" for name in ("process_group", "launcher", "watchdog", "key_value_store")
     } & {*loaded}
     assert train.parse(options)[0].parallel == "tiles"
