@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatting.deterministic.counter_rng import Stream
+from splatting.deterministic.counter_rng import Stream, random_bits
+from splatting.deterministic.portable_math import log
 from splatting.distributed.ranks import ALONE, Ranks
-from splatting.distributed.selection import largest, lowest, weighted_choice
 from splatting.host.machine import compute_device
 
 PIECE = 1 << 16  # rows that are sent at a time
@@ -58,22 +58,6 @@ class Shards:
         """Indices (n,) among all rows that any rank has found, by some of the names; of those without any nothing."""
         return found
 
-    def anyone(self, fact: bool) -> bool:
-        """Whether a fact holds on any rank."""
-        return self.ranks.anyone(fact)
-
-    def shared(self, value: int) -> int:
-        """The first rank's value."""
-        return self.ranks.shared(value)
-
-    def before(self, count: int) -> tuple[int, int]:
-        """The sum of all counts of lower ranks, and of all ranks."""
-        return self.ranks.before(count)
-
-    def counts(self, count: int) -> Tensor:
-        """Each rank's count: (size,) int64 on the CPU."""
-        return self.ranks.numbers(count)[:, 0]
-
     def marked(self, mask: Tensor) -> int:
         """How many values of all masks (N,) bool are true."""
         return self.ranks.before(int(mask.sum()))[1]
@@ -83,17 +67,37 @@ class Shards:
         return self.ranks.gather(self.items(mask.nonzero().reshape(-1)))
 
     def choose(self, weights: Tensor, count: int, *, seed: int, stream: Stream, iteration: int) -> Tensor:
-        """Own rows, (n,) int64 ascending, of `count` that are drawn among all by `weighted_choice`."""
-        numbers = {"seed": seed, "stream": stream, "iteration": iteration}
-        return weighted_choice(weights, count, **numbers, first=self.first, ranks=self.ranks)
+        """Own rows, (n,) int64 ascending, of `count` of all, drawn one after another by the weights of those left.
+
+        weights: (N,) float64. A row whose weight is not above 0, or not finite, is never drawn, so there may be fewer.
+        Algorithm A-Res (Efraimidis and Spirakis 2006): with a uniform number u for each row, the largest
+        log(u) / weight are drawn; ties go to the lower row. Same weights, same rows, on every device and number of
+        threads or ranks.
+        """
+        rows = ((weights > 0) & weights.isfinite()).nonzero().reshape(-1)
+        if self.ranks.before(len(rows))[1] <= count:
+            return rows
+        waits = -log(_uniform(random_bits(seed, stream, iteration, rows + self.first))) / weights[rows]
+        return rows[self.lowest(waits, count)].sort().values
 
     def lowest(self, values: Tensor, count: int, *, highest: bool = False) -> Tensor:
-        """Indices of this rank's values (n,) that are among the `count` lowest, or highest, of all; ties by place."""
-        return lowest(values, count, self.ranks, highest=highest)
+        """Indices, in no order, of this rank's values (n,) that are among the `count` lowest of all; ties by place.
+
+        highest: among the highest, ties by place as well. No rank sends more than `count` values.
+        """
+        ranks, count = self.ranks, max(count, 0)
+        mine = torch.argsort(values, descending=highest, stable=True)[:count]
+        if not ranks.several:
+            return mine
+        every = ranks.gather(values[mine])  # of equal values of a rank the first comes first, as ranks do
+        chosen = torch.argsort(every, descending=highest, stable=True)[:count] - ranks.before(len(mine))[0]
+        return mine[chosen[(chosen >= 0) & (chosen < len(mine))]]
 
     def largest(self, values: Tensor) -> Tensor:
         """The largest value, a scalar, of all ranks' values (n,), of which some rank must have one."""
-        return largest(values, self.ranks)
+        if self.ranks.several:
+            values = self.ranks.gather(values.amax(0, keepdim=True) if len(values) else values)
+        return values.max()
 
     def send_draws(self, rows: dict[str, Tensor], draws: Tensor, counts: Tensor) -> dict[str, Tensor]:
         """Rows for the Gaussians that draws are made for, from the ranks that the draws fell on.
@@ -298,6 +302,12 @@ class Redistribution:
         moved[self._here] = values[self._stay]
         moved[self._there] = torch.cat(arrived)
         return moved
+
+
+def _uniform(bits: Tensor) -> Tensor:
+    """Numbers in (0, 1), odd multiples of 2^-53, from rows of 32-bit numbers (n, 4): (n,) float64."""
+    whole = (bits[:, 0] << 20) | (bits[:, 1] >> 12)
+    return (2 * whole + 1).to(torch.float64) * 2.0**-53
 
 
 def _steps(state: dict[str, Any]) -> int:
