@@ -17,8 +17,7 @@ from scene.gaussian_model import GaussianModel
 from splatting.distributed import rank_logging
 from splatting.distributed.consistency import agree_on_scene
 from splatting.distributed.key_value_store import here, is_gone
-from splatting.distributed.ranks import Ranks, using
-from splatting.distributed.replicated import refuse_differences
+from splatting.distributed.ranks import Ranks, refuse_differences, using
 from splatting.distributed.shutdown import DONE, FAULT, HANG, LOST, SIGNAL, End, verdict
 from splatting.host import machine, torchrun
 from splatting.training.restart import newest_checkpoint, what_stands

@@ -14,8 +14,7 @@ import torch.distributed as dist
 from splatting.distributed import rank_logging
 from splatting.distributed.key_value_store import KeyValueStore, here
 from splatting.distributed.process_group import TIMEOUT, RankLost, SeveralRanks
-from splatting.distributed.ranks import using
-from splatting.distributed.replicated import refuse_differences
+from splatting.distributed.ranks import refuse_differences, using
 from splatting.distributed.shutdown import DONE, FAULT, LOST, NO_WORD, SIGNAL, End, Ending
 from splatting.distributed.watchdog import Watch
 from splatting.host import interrupt, torchrun
