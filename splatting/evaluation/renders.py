@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from splatting.evaluation.figures import printable
 from splatting.evaluation.model_folder import json_or_none, load_scores, ply_file
 from splatting.files.image_files import UNREADABLE, open_render
+from splatting.files.listing import as_utf8
 from utils.system_utils import UserError, atomic_write
 
 if TYPE_CHECKING:
@@ -152,13 +152,13 @@ def sheet(
     draw = ImageDraw.Draw(drawn)
     font = ImageFont.load_default(size=15)
     for column, title in enumerate(titles):
-        draw.text((GAP + column * (cell_width + GAP), 4), printable(title), fill="black", font=font)
+        draw.text((GAP + column * (cell_width + GAP), 4), as_utf8(title), fill="black", font=font)
     for place, row in enumerate(cells):
         y = HEADER + place * (cell_height + GAP)
         for column, (label, image) in enumerate(row):
             x = GAP + column * (cell_width + GAP)
             drawn.paste(image, (x, y))
-            draw.text((x + 6, y + 4), printable(label), fill="white", font=font, stroke_width=2, stroke_fill="black")
+            draw.text((x + 6, y + 4), as_utf8(label), fill="white", font=font, stroke_width=2, stroke_fill="black")
     return drawn
 
 
