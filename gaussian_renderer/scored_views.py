@@ -9,7 +9,8 @@ from torch import Tensor
 from gaussian_renderer import render
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from utils.image_utils import as_float, pixels_that_count, right_half
+from scene.half_images import half
+from utils.image_utils import as_float, pixels_that_count
 from utils.loss_utils import l1_and_ssim
 
 
@@ -42,7 +43,7 @@ class ScoredViews:
 
     def part(self, image: Tensor) -> Tensor:
         """The scored part of an image (C, H, W): all of it, or its right half."""
-        return right_half(image).contiguous() if self._halves else image
+        return image[..., half(image.shape[-1], of_test_view=True)].contiguous() if self._halves else image
 
     def image(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
         """The scored part of the render, (3, H, W) float32 in [0, 1]."""

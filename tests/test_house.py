@@ -251,7 +251,7 @@ def test_tensors_are_seen_in_one_folder():
 
 # Words, and the modules and rooms that may say them.
 SAID_IN = {
-    "right_half(": ("gaussian_renderer.scored_views", "utils.image_utils"),
+    "import half": ("gaussian_renderer.scored_views", "scene.scene", "splatting.compat", "utils.camera_utils"),
     "torch.ops.diff_gaussian_rasterization": ("submodules", "benchmarks"),
     # Commands run as modules, but for setup.py, whose builder is in no package, and what the reference runs as a file.
     "sys.path": ("submodules", "setup", "utils.make_depth_scale"),
