@@ -7,7 +7,7 @@
 #include "../math/absolute.h"
 #include "../math/exp2.h"
 #include "../math/slots.h"
-#include "gs/lane_sums.h"
+#include "gs/lane_halves.h"
 #include "one_copy.h"
 #include "tile_chunk.h"
 
