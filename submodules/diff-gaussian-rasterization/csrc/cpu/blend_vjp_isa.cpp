@@ -8,7 +8,6 @@
 #include "../math/exp2.h"
 #include "../math/slots.h"
 #include "gs/lane_halves.h"
-#include "one_copy.h"
 #include "tile_chunk.h"
 
 GS_ISA_BEGIN
