@@ -15,7 +15,7 @@ from arguments import ModelParams
 from scene import Scene
 from scene.gaussian_model import GaussianModel
 from splatting.distributed import rank_logging
-from splatting.distributed.consistency import agree_on_scene
+from splatting.distributed.consistency import agree_on_options, agree_on_scene
 from splatting.distributed.key_value_store import here, is_gone
 from splatting.distributed.ranks import Ranks, refuse_differences, using
 from splatting.distributed.shutdown import DONE, FAULT, HANG, LOST, SIGNAL, End, verdict
@@ -98,6 +98,20 @@ def test_differences_name_what_and_whose():
     with pytest.raises(UserError) as refused:
         refuse_differences([{"a": "1"}, {"a": "1"}, {"a": "2", "b": "3"}], "do so")
     assert str(refused.value) == "rank 2 differs from rank 0 in a (2, not 1), b (3, not nothing); do so"
+
+
+class _Asked(_Second):
+    """Of two ranks the one that was asked for something else."""
+
+    def everyone(self, value: dict[str, str]) -> list[dict[str, str]]:
+        return [{name: "1" if name == "--seed" else found for name, found in value.items()}, value]
+
+
+def test_ranks_with_other_options_are_refused():
+    with using(_Asked()), pytest.raises(UserError) as refused:
+        agree_on_options(argparse.Namespace(iterations=7, seed=2))
+    said = "rank 1 differs from rank 0 in --seed (2, not 1); start all ranks with the same command"
+    assert str(refused.value) == said
 
 
 def test_ranks_of_which_one_lacks_the_masks_are_refused(tmp_path):
