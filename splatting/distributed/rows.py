@@ -44,11 +44,17 @@ class Shards:
         return values
 
     def pieces(self, count: int, part: Callable[[slice], Tensor]) -> Iterator[Tensor]:
-        """All rows in order, piece by piece, on the rank that writes files; others must go through them, too.
+        """All rows in order, piece by piece, on the rank that writes files; others get none, yet must go through all.
 
         count: of this rank's rows; part: gives some of them (n, ...).
         """
-        return _in_order(self.ranks, count, part)
+        ranks = self.ranks
+        for holder, rows in enumerate(ranks.numbers(count)[:, 0].tolist()):
+            for start in range(0, rows, PIECE):
+                piece = part(slice(start, start + PIECE) if holder == ranks.rank else slice(0, 0))
+                received = ranks.exchange([piece, *[piece[:0]] * (ranks.size - 1)])
+                if ranks.first:
+                    yield received[holder]
 
     def items(self, indices: Tensor) -> Tensor:
         """Indices (n,) among all rows, of those of this rank."""
@@ -159,7 +165,13 @@ class Divided(Shards):
         return own_rows(values, self.ranks)
 
     def whole(self, values: Tensor) -> Tensor:
-        return _whole(values, self.ranks)
+        total = self.ranks.before(len(values))[1]
+        every = torch.empty(total if self.ranks.first else 0, *values.shape[1:], dtype=values.dtype)
+        filled = 0
+        for piece in self.pieces(len(values), lambda rows: values.detach()[rows].to(compute_device())):
+            every[filled : filled + len(piece)] = piece
+            filled += len(piece)
+        return every
 
     def items(self, indices: Tensor) -> Tensor:
         return indices + self.first
@@ -312,27 +324,3 @@ def _uniform(bits: Tensor) -> Tensor:
 
 def _steps(state: dict[str, Any]) -> int:
     return int(state.get("step", 0))
-
-
-def _in_order(ranks: Ranks, count: int, part: Callable[[slice], Tensor]) -> Iterator[Tensor]:
-    """Pieces of all ranks' rows, on the rank that writes; other ranks get none, yet must go through all.
-
-    count: of this rank's rows; part: gives some of them (n, ...).
-    """
-    for holder, rows in enumerate(ranks.numbers(count)[:, 0].tolist()):
-        for start in range(0, rows, PIECE):
-            piece = part(slice(start, start + PIECE) if holder == ranks.rank else slice(0, 0))
-            received = ranks.exchange([piece, *[piece[:0]] * (ranks.size - 1)])
-            if ranks.first:
-                yield received[holder]
-
-
-def _whole(values: Tensor, ranks: Ranks) -> Tensor:
-    """All ranks' rows (N, ...), on the CPU of the rank that writes; none elsewhere. Every rank must call it."""
-    total = ranks.before(len(values))[1]
-    every = torch.empty(total if ranks.first else 0, *values.shape[1:], dtype=values.dtype)
-    filled = 0
-    for piece in _in_order(ranks, len(values), lambda rows: values.detach()[rows].to(compute_device())):
-        every[filled : filled + len(piece)] = piece
-        filled += len(piece)
-    return every
