@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from splatting.evaluation.model_folder import json_or_none, load_scores, ply_file
+from scene.saved_iterations import saved_ply
+from splatting.evaluation.model_folder import json_or_none, load_scores
 from splatting.files.image_files import UNREADABLE, open_render
 from splatting.files.listing import as_utf8
 from utils.system_utils import UserError, atomic_write
@@ -57,7 +58,7 @@ def summarise_times(
 
 def model_digest(model: Path, iteration: str) -> str | None:
     """Return the SHA-256 of the PLY of an iteration, None if a model folder has none of it."""
-    ply = ply_file(model, iteration)
+    ply = saved_ply(model, iteration)
     if not ply.is_file():
         return None
     digest = hashlib.sha256()
