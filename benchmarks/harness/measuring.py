@@ -1,7 +1,6 @@
 """Head and form of tables, and run time and memory of a call on the CPU and on a GPU."""
 
 import argparse
-import platform
 import re
 import statistics
 import time
@@ -13,17 +12,13 @@ from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 from splatting.files.listing import markdown_table
-from splatting.host.machine import commit, cpu_name, gpu_name, instruction_set
+from splatting.host.machine import facts, one_line
 from utils.system_utils import UserError, compute_device
 
 
 def describe(device: torch.device | str = "cpu") -> str:
     """Return one line with processor or GPU, threads, instruction set, versions and commit."""
-    python = f"Python {platform.python_version()}, torch {torch.__version__}"
-    if torch.device(device).type == "cuda":
-        python += f", CUDA {torch.version.cuda}"
-        return f"{gpu_name()}, {cpu_name()}, {python}, commit {commit()}"
-    return f"{cpu_name()}, {torch.get_num_threads()} threads, {instruction_set()}, {python}, commit {commit()}"
+    return one_line(facts(device))
 
 
 def print_table(header: list[str], rows: list[list[str]]) -> None:
