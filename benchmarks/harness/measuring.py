@@ -18,7 +18,8 @@ from utils.system_utils import UserError, compute_device
 
 def describe(device: torch.device | str = "cpu") -> str:
     """Return one line with processor or GPU, threads, instruction set, versions and commit."""
-    return one_line(facts(device))
+    found = facts(device)
+    return one_line(found) + (f", CUDA {found['cuda']}" if found["cuda"] else "")
 
 
 def print_table(header: list[str], rows: list[list[str]]) -> None:
