@@ -26,7 +26,6 @@ from arguments import OptionParser
 from splatting.evaluation import plan, stages
 from splatting.evaluation.configs import check_options, read_configs, shipped
 from splatting.evaluation.error_curve import peers_of
-from splatting.evaluation.machine import machine
 from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.report import make_report, write_report
 from splatting.evaluation.results import read_earlier, read_run
@@ -34,6 +33,7 @@ from splatting.evaluation.stages import Failure, StageFailed
 from splatting.evaluation.tables import MAIN, Table, reached_legend, reached_table, result_tables
 from splatting.files.folders import locked
 from splatting.files.listing import markdown_table
+from splatting.host.machine import facts_asked
 from utils.system_utils import UserError, mkdir_p, run_cli
 
 EXPOSURE = (
@@ -132,7 +132,7 @@ def _parse_for_training(words: Sequence[str]) -> None:
 
 def _carry_out(runs: Sequence[Run], args: Namespace, failures: dict[Run, Failure]) -> None:
     """Carry out every run; note and print a failure, and continue with the next run."""
-    facts = {} if args.skip_training else machine()
+    facts = {} if args.skip_training else facts_asked()
     options = _SHORT_FOR["aa"][0] if args.aa else ()
     download = True
     for number, run in enumerate(runs, 1):

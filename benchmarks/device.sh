@@ -5,8 +5,7 @@
 #   benchmarks/device.sh test                      GPU tests, then the rasterizer's CPU tests
 #   benchmarks/device.sh sanitize                  memcheck and racecheck of the GPU tests on small scenes
 #   benchmarks/device.sh kernels [OPTION...]       python3 -m benchmarks.kernels.rasterizer OPTION...
-#   benchmarks/device.sh accuracy                  python3 -m benchmarks.accuracy.oracle --json OUT/accuracy.json;
-#                                                  benchmarks.accuracy.figure draws it on a machine with matplotlib
+#   benchmarks/device.sh accuracy                  python3 -m benchmarks.accuracy.oracle --times
 #   benchmarks/device.sh train SCENE [OPTION...]   python3 -m benchmarks.scenes.training SCENE OPTION...
 #   benchmarks/device.sh ranks COUNT SCENE [PART...]
 #                                                  training over COUNT GPUs; parts: tests, scene, steps, memory
@@ -191,8 +190,8 @@ build
       python3 -m benchmarks.kernels.rasterizer --device cuda "$@"
       ;;
     accuracy)
-      say "error against run time"
-      python3 -m benchmarks.accuracy.oracle --json "$out/accuracy.json"
+      say "errors and run times"
+      python3 -m benchmarks.accuracy.oracle --times
       ;;
     train)
       scene=${1:?a scene}

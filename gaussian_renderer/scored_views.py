@@ -9,7 +9,8 @@ from torch import Tensor
 from gaussian_renderer import render
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from utils.image_utils import as_float, pixels_that_count, right_half
+from scene.half_images import half
+from utils.image_utils import as_float, pixels_that_count
 from utils.loss_utils import l1_and_ssim
 
 
@@ -17,7 +18,8 @@ class ScoredViews:
     """Renders of views and their targets, as they are scored.
 
     By the half-image protocol (train_test_exp), only right halves count, and they are rendered with exposures.
-    draw: renders a camera and a model to (3, H, W) in [0, 1]; None: `render` does.
+    draw: renders a camera and a model to (3, H, W) in [0, 1]; None: `render` does. whole: the same, the render before
+    `part` cuts it.
     """
 
     def __init__(
@@ -30,19 +32,15 @@ class ScoredViews:
         self._pipe = pipe
         self._background = background
         self._halves = train_test_exp
-        self._draw = draw or self._render
+        self.whole = draw or self._render
 
     def _render(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
         options = {"use_trained_exp": self._halves, "want_depth": False, "want_visibility": False}
         return render(camera, gaussians, self._pipe, self._background, **options)["render"]
 
-    def whole(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
-        """The whole render (3, H, W), float32 in [0, 1], before `part` cuts it."""
-        return self._draw(camera, gaussians)
-
     def part(self, image: Tensor) -> Tensor:
         """The scored part of an image (C, H, W): all of it, or its right half."""
-        return right_half(image).contiguous() if self._halves else image
+        return image[..., half(image.shape[-1], of_test_view=True)].contiguous() if self._halves else image
 
     def image(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
         """The scored part of the render, (3, H, W) float32 in [0, 1]."""

@@ -174,7 +174,7 @@ class Camera(nn.Module):
         """This view at a smaller size (width, height), with pictures that are area averages of its own.
 
         They are decoded and computed now, and lie in the copy on `device`; of an image that processes share, one of
-        them does so later (Sharing). Columns that count in it cover no other. What was assigned is left out of it.
+        them does so later (SharedImage). Columns that count in it cover no other. What was assigned is left out of it.
         """
         twin, (old, _) = copy.copy(self), self._size
         twin.image_width, twin.image_height = twin._size = size

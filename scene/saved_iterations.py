@@ -6,7 +6,7 @@ from pathlib import Path
 from utils.system_utils import UserError, saved_iterations, searchForMaxIteration
 
 
-def saved_ply(model_path: str | os.PathLike, iteration: int) -> Path:
+def saved_ply(model_path: str | os.PathLike, iteration: int | str) -> Path:
     """The PLY of an iteration in a model folder."""
     return Path(model_path) / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
 

@@ -16,7 +16,7 @@ from scene.cameras import Camera
 from scene.dataset_readers import read_scene, replaced_reader
 from scene.half_images import half, train_on_all
 from scene.images.masks import MaskOptions, refuse_nothing_to_ignore
-from scene.images.store import ImageStore, Picture, Sharing, image_device
+from scene.images.store import ImageStore, Picture, image_device
 from scene.pose_file import with_poses, write_poses
 from scene.readers.depth_maps import with_depth_maps
 from scene.readers.info import CameraInfo, SceneInfo, exposure_names, photo_size
@@ -25,6 +25,7 @@ from scene.readers.scene_folder import kind_of
 from scene.saved_iterations import find_iteration, saved_ply
 from splatting.compat.models import SceneGaussians, call_of_either_form, load_model, save_exposures
 from splatting.compat.readers import scene_by
+from splatting.distributed.ranks import ALONE, Ranks
 from splatting.files.json_files import OFFSET, read_model_json
 from splatting.host.machine import compute_device
 from utils.system_utils import UserError, atomic_write
@@ -38,7 +39,7 @@ class Scene:
     all of this to the caller. shuffle: mix the order of the views (always the same way). resolution_scales: factors by
     which views are made smaller, one list of cameras each. train_cameras, test_cameras: these lists by scale, which may
     be replaced. info: the dataset as read. cameras_extent: E in world units, from the training views.
-    images: the store of the decoded photos. sharing: processes that divide them (ImageStore).
+    images: the store of the decoded photos. ranks: processes that divide them (ImageStore).
     """
 
     def __init__(
@@ -49,7 +50,7 @@ class Scene:
         shuffle: bool = True,
         resolution_scales: Sequence[float] = (1.0,),
         start: bool = True,
-        sharing: Sharing | None = None,
+        ranks: Ranks = ALONE,
     ) -> None:
         self.model_path = args.model_path
         self.gaussians = gaussians
@@ -63,7 +64,7 @@ class Scene:
 
         device = compute_device()
         place = image_device(args.data_device, device, warn=True)
-        self.images = ImageStore(getattr(args, "images_to_load", None) or 0, place, device, sharing)
+        self.images = ImageStore(getattr(args, "images_to_load", None) or 0, place, device, ranks)
         self.train_cameras = {scale: self._cameras(args, scale, shuffle, False) for scale in resolution_scales}
         self.test_cameras = {scale: self._cameras(args, scale, shuffle, True) for scale in resolution_scales}
         self._plan_images()
@@ -121,7 +122,7 @@ class Scene:
 
     def keep_all_images(self) -> None:
         """Let this process decode all images by itself, as none was asked for yet."""
-        self.images.sharing = Sharing()
+        self.images.ranks = ALONE
         self._plan_images()
 
     def prefetch(self, cameras: Sequence[Camera]) -> None:

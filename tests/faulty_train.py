@@ -1,8 +1,8 @@
 """train.py with a fault in one rank, for tests of several: `faulty_train.py FAULT RANK ITERATION OPTIONS...`.
 
-FAULT is one of `_FAULTS`, which come in that iteration; or options (one more), code (other files, in the folder that
-OTHER_CODE names), warning, none. With whole- before it, each rank trains the whole model, with later- until
-iteration 100. A restarted training has no fault. All ranks print the same lines at first.
+FAULT is one of `_FAULTS`, which come in that iteration; or code (other files, in the folder that OTHER_CODE names),
+warning, none. With whole- before it, each rank trains the whole model, with later- until iteration 100. A restarted
+training has no fault. All ranks print the same lines at first.
 """
 
 import math
@@ -95,7 +95,7 @@ def _main() -> None:
     print("warning: of every rank", file=sys.stderr)
     if mine and fault == "warning":
         print("warning: of one rank alone", file=sys.stderr)
-    train.main([*options, "--random_background"] if mine and fault == "options" else options)
+    train.main(options)
 
 
 Run.prepare = _prepare

@@ -24,7 +24,6 @@ from scene.gaussians.long_axis import long_axis_children
 from scene.saved_model import read_model
 from splatting.deterministic.counter_rng import Stream
 from splatting.distributed.rows import WHOLE
-from splatting.distributed.selection import weighted_choice
 from splatting.training.checks import another_number
 from splatting.training.density import default_budget
 from splatting.training.objective import Objective
@@ -143,7 +142,7 @@ def test_errors_of_pixels_add_up_to_the_loss(columns):
 
 
 def _drawn(weights: list[float], count: int, iteration: int, seed: int = 0) -> list[int]:
-    chosen = weighted_choice(torch.tensor(weights, dtype=torch.float64), count, seed=seed, stream=Stream.DENSIFY,
+    chosen = WHOLE.choose(torch.tensor(weights, dtype=torch.float64), count, seed=seed, stream=Stream.DENSIFY,
                              iteration=iteration)  # fmt: skip
     return chosen.tolist()
 

@@ -15,10 +15,9 @@ from arguments import ModelParams
 from scene import Scene
 from scene.gaussian_model import GaussianModel
 from splatting.distributed import rank_logging
-from splatting.distributed.consistency import agree_on_scene
+from splatting.distributed.consistency import agree_on_options, agree_on_scene
 from splatting.distributed.key_value_store import here, is_gone
-from splatting.distributed.ranks import Ranks, using
-from splatting.distributed.replicated import refuse_differences
+from splatting.distributed.ranks import Ranks, refuse_differences, using
 from splatting.distributed.shutdown import DONE, FAULT, HANG, LOST, SIGNAL, End, verdict
 from splatting.host import machine, torchrun
 from splatting.training.restart import newest_checkpoint, what_stands
@@ -101,6 +100,20 @@ def test_differences_name_what_and_whose():
     assert str(refused.value) == "rank 2 differs from rank 0 in a (2, not 1), b (3, not nothing); do so"
 
 
+class _Asked(_Second):
+    """Of two ranks the one that was asked for something else."""
+
+    def everyone(self, value: dict[str, str]) -> list[dict[str, str]]:
+        return [{name: "1" if name == "--seed" else found for name, found in value.items()}, value]
+
+
+def test_ranks_with_other_options_are_refused():
+    with using(_Asked()), pytest.raises(UserError) as refused:
+        agree_on_options(argparse.Namespace(iterations=7, seed=2))
+    said = "rank 1 differs from rank 0 in --seed (2, not 1); start all ranks with the same command"
+    assert str(refused.value) == said
+
+
 def test_ranks_of_which_one_lacks_the_masks_are_refused(tmp_path):
     source, facts = narrow_scene(tmp_path / "scene"), []
 
@@ -170,7 +183,6 @@ def test_a_training_of_one_process_loads_nothing_of_several(colmap_scene, tmp_pa
     loaded = done.stderr.splitlines()[-1].split()
     assert loaded[0] == "loaded" and "splatting.distributed.ranks" in loaded
     assert not {
-        f"splatting.distributed.{name}"
-        for name in ("process_group", "launcher", "watchdog", "watched_ranks", "key_value_store")
+        f"splatting.distributed.{name}" for name in ("process_group", "launcher", "watchdog", "key_value_store")
     } & {*loaded}
     assert train.parse(options)[0].parallel == "tiles"

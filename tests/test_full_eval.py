@@ -43,7 +43,7 @@ BASE_AND_SH1 = '{"base": [], "sh1": ["--sh_degree", 1]}'
 @pytest.fixture(autouse=True)
 def _stand_ins(monkeypatch):
     monkeypatch.setattr(stages, "_ROOT", STAND_INS)
-    monkeypatch.setattr(full_eval, "machine", lambda: MACHINE)
+    monkeypatch.setattr(full_eval, "facts_asked", lambda: MACHINE)
     monkeypatch.setattr(report_module, "draw_curves", lambda *_: [])  # half a second each; see `figures`
     monkeypatch.setattr(report_module, "draw_fronts", lambda *_: [])
 

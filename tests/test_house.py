@@ -19,7 +19,7 @@ CSRC = ROOT / "submodules"
 LONGEST = 60  # lines of a function
 # Most lines of code and of tests, without blanks, comments and docstrings, files of code, and words of Markdown. A new
 # capability that needs more says so in its commit, and what it let go.
-MOST = {"code": 39_190, "files": 477, "tests": 30_640, "words": 40_990}
+MOST = {"code": 38_790, "files": 465, "tests": 30_630, "words": 40_890}
 
 # What a room may import besides itself and what serves them all: prefixes of module names. The room of a module is its
 # longest prefix here.
@@ -251,7 +251,7 @@ def test_tensors_are_seen_in_one_folder():
 
 # Words, and the modules and rooms that may say them.
 SAID_IN = {
-    "right_half(": ("gaussian_renderer.scored_views", "utils.image_utils"),
+    "import half": ("gaussian_renderer.scored_views", "scene.scene", "splatting.compat", "utils.camera_utils"),
     "torch.ops.diff_gaussian_rasterization": ("submodules", "benchmarks"),
     # Commands run as modules, but for setup.py, whose builder is in no package, and what the reference runs as a file.
     "sys.path": ("submodules", "setup", "utils.make_depth_scale"),

@@ -15,7 +15,7 @@ from test_depth_maps import scene  # noqa: F401  (a fixture)
 import train
 from scene.images.store import ImageStore
 from splatting.distributed.ranks import ranks
-from splatting.distributed.shared_images import SharedImages, holders
+from splatting.distributed.shared_images import holders
 from splatting.training import memory_estimate
 from utils.system_utils import UserError
 
@@ -81,7 +81,7 @@ def test_each_picture_is_decoded_by_one_rank_and_trains_all(scene, tmp_path):  #
 
 def _stores(paths: list[Path], size: tuple[int, int]) -> tuple:
     """What a rank plans and gets, with an error for the file that is no picture."""
-    store = ImageStore(sharing=SharedImages(ranks()))
+    store = ImageStore(ranks=ranks())
     store.plan([(path, size) for path in paths[:4]], [(path, size) for path in paths])
     store.prefetch([(path, size) for path in paths])
     got = []

@@ -17,11 +17,6 @@ def psnr(img1: Tensor, img2: Tensor) -> Tensor:
     return -10.0 * mse(img1, img2).log10()
 
 
-def right_half(image: Tensor) -> Tensor:
-    """Columns from W // 2 on of an image (..., W), which the half-image protocol scores (scene/half_images.py)."""
-    return image[..., image.shape[-1] // 2 :]
-
-
 def as_float(image: Tensor) -> Tensor:
     """Image with uint8 pixels as float32 in [0, 1]; a float image unchanged."""
     return image.to(torch.float32) / 255.0 if image.dtype == torch.uint8 else image

@@ -1,34 +1,29 @@
-"""Error of every output and every gradient of the rasterizer against the float64 oracle, and against run time.
+"""Error of every output and every gradient of the rasterizer against the float64 oracle, and run time.
 
-    python -m benchmarks.accuracy.oracle                                    # print the errors
-    python -m benchmarks.accuracy.oracle --figure accuracy.png              # and draw error against run time
-    python -m benchmarks.accuracy.oracle --json accuracy.json               # and write the numbers; a machine with
-    python -m benchmarks.accuracy.figure accuracy.json accuracy.png         # matplotlib can draw them
+    python -m benchmarks.accuracy.oracle             # print the errors
+    python -m benchmarks.accuracy.oracle --times     # and the kernels' run times
 
 The error of a tensor is max |difference| / max |reference|; the median of |difference| / max |reference| stands beside
 it. Rounding alone can decide a pixel that is within 1e-4 of a cut-off (alpha 1/255, transmittance 1e-4) or that has a
 depth tie. Such pixels are left out of the loss and of the comparison; a row of the table counts them. The oracle gets
 the float32 value of every parameter, so the kernels of CPU and GPU all compute the same function.
 
---figure and --json also time each kernel: forward and backward of one image of a larger scene of the same family, at a
-size where work dominates on a GPU as well.
+--times times forward and backward of one image of a larger scene of the same family, at a size where work dominates on
+a GPU as well.
 """
 
 import argparse
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from benchmarks.accuracy.figure import draw
 from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT, ORACLE, Backend, kernels, run
 from benchmarks.harness.calls import Calls
 from benchmarks.harness.measuring import cpu_milliseconds, describe, gpu_milliseconds, print_table
 from benchmarks.workloads.splat_scenes import KINDS
 from benchmarks.workloads.stability_cases import Problem, all_stiff
-from splatting.files.json_files import write_json
 from utils.system_utils import run_cli
 
 TIMED_SIZES = {
@@ -81,7 +76,7 @@ def error(got: Tensor, expected: Tensor) -> tuple[float, float]:
 
 
 def measure(times: bool) -> tuple[list[dict], Runs]:
-    """Return a record of each run, as --json writes them, and the tensors."""
+    """Return a record of each run, and the tensors."""
     records, runs = [], {}
     for case in tqdm(CASES, unit="scene", leave=False):
         truth = run(problem(case), ORACLE, cut=CUT)
@@ -136,20 +131,13 @@ def print_ratios(runs: Runs) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--figure", type=Path, help="also time the kernels, and draw error against time to this file")
-    parser.add_argument("--json", type=Path, help="also time the kernels, and write every measurement to this file")
+    parser.add_argument("--times", action="store_true", help="also time the kernels")
     args = parser.parse_args()
-    machines = list(dict.fromkeys(describe(kernel.device) for kernel in kernels()))
-    print("\n".join(machines))
-    records, runs = measure(times=bool(args.figure or args.json))
+    print("\n".join(dict.fromkeys(describe(kernel.device) for kernel in kernels())))
+    records, runs = measure(args.times)
     print_errors(records)
     if CUDA_FLOAT in kernels():
         print_ratios(runs)
-    measured = {"machines": machines, "records": records, "timed sizes": TIMED_SIZES}
-    if args.json:
-        write_json(args.json, measured)
-    if args.figure:
-        draw(measured, args.figure)
 
 
 if __name__ == "__main__":

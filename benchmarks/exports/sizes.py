@@ -22,13 +22,14 @@ from torch import Tensor
 from arguments import OptionParser, PipelineParams
 from benchmarks.harness.measuring import describe, print_table
 from gaussian_renderer import render
-from scene.cameras import ZFAR, ZNEAR, MiniCam
+from gaussian_renderer.free_view import free_view
+from scene.cameras import MiniCam
+from splatting.camera_paths.poses import facing, keyframe
 from splatting.exports.formats import FORMATS, read_splats
 from splatting.exports.in_scene import model_of
 from splatting.exports.scene_formats import PRIM
 from splatting.exports.splats import Splats, drawable, logits, selected
 from splatting.exports.web import PROGRAM
-from utils.graphics_utils import projection, world_to_camera
 from utils.system_utils import UserError, compute_device, run_cli
 
 
@@ -96,14 +97,8 @@ def orbit(means: np.ndarray, count: int, side: int) -> list[MiniCam]:
     views = []
     for angle in np.arange(count) * 2 * np.pi / count + 0.3:
         offset = np.array([np.sin(angle), -_UP, np.cos(angle)])
-        forward = -offset / np.linalg.norm(offset)
-        right = np.cross([0.0, 1.0, 0.0], forward)
-        right /= np.linalg.norm(right)
-        turn = np.stack([right, np.cross(forward, right), forward], axis=1)  # camera to world
-        view = torch.from_numpy(world_to_camera(turn, -turn.T @ (middle + radius * offset)))
-        project = projection(ZNEAR, ZFAR, _FOV, _FOV)
-        matrices = [matrix.T.to(torch.float32).contiguous() for matrix in (view, project @ view)]
-        views.append(MiniCam(side, side, _FOV, _FOV, ZNEAR, ZFAR, *matrices))
+        pose = keyframe(0.0, middle + radius * offset, facing(-offset, np.array([0.0, -1.0, 0.0])), 0.0)
+        views.append(free_view(side, side, _FOV, pose.position, pose.wxyz, compute_device()))
     return views
 
 
@@ -128,9 +123,6 @@ def measure(model: Path) -> list[list[str]]:
     splats = read_splats(model)
     splats = selected(splats, drawable(splats))
     cameras = orbit(splats.means, VIEWS, SIDE)
-    for camera in cameras:
-        for name in ("world_view_transform", "full_proj_transform", "camera_center"):
-            setattr(camera, name, getattr(camera, name).to(compute_device()))
     expected, rows = renders(splats, cameras), []
     plain = 4 * (17 + 3 * (splats.sh.shape[1] - 1))
     with tempfile.TemporaryDirectory() as folder:

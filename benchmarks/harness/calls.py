@@ -74,15 +74,14 @@ class TrainingStep:
         self._one = torch.ones((), device=device)
 
     @torch.no_grad()
-    def take(self, camera: GaussianRasterizationSettings) -> Tensor:
-        """Take the step of a view. Returns the tiles of each Gaussian."""
+    def take(self, camera: GaussianRasterizationSettings) -> None:
+        """Take the step of a view."""
         scene = scene_arguments(Gaussians(**self._gaussians), camera, True)
         drawn = draw(scene, camera.bg)
         _, _, kept = torch.ops.fused_ssim.photometric(drawn.color, self._photo, 0.2, True)
         gradient = torch.ops.fused_ssim.photometric_vjp(drawn.color, self._photo, kept, 0.2, self._one)
         source = drawn.kept(camera.bg)
         OPS.apply_gradients_(*scene.lists, source, [gradient], [], drawn.radii, *self._adam)
-        return drawn.tile_counts
 
 
 # Of a training step: kernels that begin a stage, and those behind which another one begins.

@@ -1,7 +1,6 @@
 """Head and form of tables, and run time and memory of a call on the CPU and on a GPU."""
 
 import argparse
-import platform
 import re
 import statistics
 import time
@@ -13,17 +12,14 @@ from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 from splatting.files.listing import markdown_table
-from splatting.host.machine import commit, cpu_name, gpu_name, instruction_set
+from splatting.host.machine import facts, one_line
 from utils.system_utils import UserError, compute_device
 
 
 def describe(device: torch.device | str = "cpu") -> str:
     """Return one line with processor or GPU, threads, instruction set, versions and commit."""
-    python = f"Python {platform.python_version()}, torch {torch.__version__}"
-    if torch.device(device).type == "cuda":
-        python += f", CUDA {torch.version.cuda}"
-        return f"{gpu_name()}, {cpu_name()}, {python}, commit {commit()}"
-    return f"{cpu_name()}, {torch.get_num_threads()} threads, {instruction_set()}, {python}, commit {commit()}"
+    found = facts(device)
+    return one_line(found) + (f", CUDA {found['cuda']}" if found["cuda"] else "")
 
 
 def print_table(header: list[str], rows: list[list[str]]) -> None:
@@ -72,18 +68,18 @@ def cpu_milliseconds(run: Callable[[], object], repeats: int) -> float:
     return 1e3 * statistics.median(times)
 
 
-def gpu_milliseconds(run: Callable[[], object], warm_ups: int = WARM_UPS, repeats: int = REPEATS) -> float:
-    """Return the median time of a call by events, each on an idle device."""
+def gpu_milliseconds(run: Callable[[], object]) -> float:
+    """Return the median time of REPEATS calls after WARM_UPS by events, each on an idle device."""
     times = []
     begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-    for _ in range(warm_ups + repeats):
+    for _ in range(WARM_UPS + REPEATS):
         torch.cuda.synchronize()
         begin.record()
         run()
         end.record()
         end.synchronize()
         times.append(begin.elapsed_time(end))
-    return statistics.median(times[warm_ups:])
+    return statistics.median(times[WARM_UPS:])
 
 
 def gpu_time(run: Callable[[], object]) -> GpuTime:

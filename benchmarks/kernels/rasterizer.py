@@ -18,6 +18,7 @@ from pathlib import Path
 
 import torch
 
+from arguments import ModelParams, PipelineParams, read_cfg_args
 from benchmarks.harness.calls import STAGES, TILE, Calls, Stages, by_stage
 from benchmarks.harness.measuring import (
     REPEATS,
@@ -31,8 +32,17 @@ from benchmarks.harness.measuring import (
     peak_mib,
     print_table,
 )
-from benchmarks.kernels.trained import trained
-from benchmarks.workloads.splat_scenes import CPU_WORKLOADS, GPU_WORKLOADS, ORDERS, SplatScene, frustum
+from benchmarks.workloads.splat_scenes import (
+    COLUMNS,
+    CPU_WORKLOADS,
+    GPU_WORKLOADS,
+    ORDERS,
+    PARAMETERS,
+    SplatScene,
+    frustum,
+)
+from gaussian_renderer import rasterizer_settings, render
+from scene.saved_model import load_saved
 from utils.system_utils import UserError, run_cli
 
 CPU_STAGES = ("project", "bin", "blend", "blend_rows", "rows_vjp")
@@ -156,6 +166,25 @@ def _time_rows(workload: Measured) -> list[list[str]]:
             row += [f"{theirs:.2f}", f"{gsplat:.2f}", f"{time.events / theirs:.2f}", f"{mark:.2f}"]
         rows.append(row + [""] * (8 - len(row)))
     return rows
+
+
+@torch.no_grad()
+def trained(folder: Path) -> SplatScene:
+    """Return the model that train.py has left in a folder, with the view that sees the median number of Gaussians.
+
+    Seeded splats in a frustum are fog, in which three quarters of the instances are hidden; of a trained model few are,
+    and its rows lie in Morton order. UserError where the folder has no model, or its scene is missing.
+    """
+    parser = argparse.ArgumentParser()
+    models, pipelines = ModelParams(parser), PipelineParams(parser)
+    options = argparse.Namespace(**vars(parser.parse_args([])) | read_cfg_args(folder) | {"model_path": str(folder)})
+    scene, pipe = load_saved(models.extract(options), -1), pipelines.extract(options)
+    gaussians, background = scene.gaussians, torch.zeros(3, device=scene.gaussians.get_xyz.device)
+    views = sorted(scene.getTrainCameras(), key=lambda view: view.image_name)
+    seen = [int((render(view, gaussians, pipe, background)["radii"] > 0).sum()) for view in views]
+    view = views[sorted(range(len(views)), key=seen.__getitem__)[len(views) // 2]]
+    rows = {name: gaussians.raw(column).detach().clone() for name, column in zip(PARAMETERS, COLUMNS, strict=True)}
+    return SplatScene(rows, view.image_width, view.image_height, rasterizer_settings(view, gaussians, pipe, background))
 
 
 def workloads(args: argparse.Namespace, device: str) -> Iterator[tuple[str, SplatScene]]:

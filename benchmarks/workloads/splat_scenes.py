@@ -38,7 +38,7 @@ class SplatScene:
     """Raw parameters by name (PARAMETERS) and an image size.
 
     Opacities are logits, scales logarithms, rotations unnormalised w x y z; SH have K = 16 coefficients. camera: of a
-    trained scene (kernels/trained.py).
+    trained scene (kernels/rasterizer.py).
     """
 
     parameters: dict[str, Tensor]

@@ -178,7 +178,7 @@ def _make_children(
         rows["opacity"][first:] = gaussians.raw_opacity(children["opacity"])
     else:
         if seed is None:
-            seed = gaussians.shards.shared(int(torch.randint(2**62, ())))
+            seed = gaussians.shards.ranks.shared(int(torch.randint(2**62, ())))
         items = gaussians.shards.items(parents)
         sampled = [
             rules.split_children(*shapes, items, child, count=count, seed=seed, iteration=iteration)

@@ -30,7 +30,7 @@ def split_in_two(gaussians: GaussianParameters, parents: Tensor) -> None:
     steps are long: with the parent's averages they would stay almost where they are.
     """
     count = len(parents)
-    if not gaussians.shards.anyone(count > 0):
+    if not gaussians.shards.ranks.anyone(count > 0):
         return
     rows = gaussians.rows_at(parents)
     shapes = gaussians.log_scales(), gaussians.opacity_logits()

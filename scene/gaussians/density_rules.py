@@ -98,7 +98,7 @@ def mean_gradient(accumulated: Tensor, count: Tensor) -> Tensor:
 def limit_growth(gradient: Tensor, threshold: float, room: int, shards: Shards = WHOLE) -> Tensor:
     """Zero the gradients of all candidates (>= threshold) except the `room` largest, ties by index: (N,)."""
     candidates = (gradient >= threshold).nonzero().reshape(-1)
-    if shards.before(len(candidates))[1] <= room:
+    if shards.ranks.before(len(candidates))[1] <= room:
         return gradient
     grow = candidates[shards.lowest(gradient[candidates], room, highest=True)]
     return gradient.index_fill(0, candidates, 0.0).index_copy_(0, grow, gradient[grow])

@@ -18,7 +18,7 @@ def check_finite(rows: Rows, where: str, remedy: str, shards: Shards = WHOLE) ->
     """
     for name, values in rows.items():
         finite = torch.cat([part.isfinite().flatten(1).all(dim=1) for part in values.split(_PART)])
-        if shards.anyone(not finite.all()):
+        if shards.ranks.anyone(not finite.all()):
             bad = shards.places(~finite)
             raise UserError(
                 f"{name} of {len(bad)} of {shards.total(len(values))} Gaussians in {where} is not finite "

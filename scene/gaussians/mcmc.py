@@ -67,7 +67,7 @@ def relocate(gaussians: GaussianParameters, min_opacity: float, most_parts: int,
     """
     live = is_alive(gaussians, min_opacity)
     dead = (~live).nonzero().reshape(-1)
-    counts = gaussians.shards.counts(len(dead))
+    counts = gaussians.shards.ranks.numbers(len(dead))[:, 0]
     count = int(counts.sum())
     if 0 < count < gaussians.gaussian_count:
         draws, origins = _divide(gaussians, live, count, most_parts, seed, iteration, _RELOCATION)
@@ -157,7 +157,7 @@ def draw(
         tickets = (share * ends[-1]).to(torch.int64)
         return items, torch.searchsorted(ends, torch.minimum(tickets, ends[-1] - 1), right=True)
     own = int(units.sum())
-    below, total = shards.before(own)
+    below, total = shards.ranks.before(own)
     tickets = (share * total).to(torch.int64).clamp_max(total - 1) - below
     mine = ((tickets >= 0) & (tickets < own)).nonzero().reshape(-1)
     return mine, torch.searchsorted(ends, tickets[mine], right=True)

@@ -3,7 +3,7 @@
 import os
 import sys
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 
 from scene.images.decode import decode
+from splatting.distributed.ranks import ALONE, Ranks
+from splatting.distributed.shared_images import SharedImage, divided
 from splatting.host.machine import threads
 from splatting.host.memory import free_memory
 
@@ -61,29 +63,6 @@ Picture = tuple[Source, Size]
 Key = tuple[str | Decodable, Size]  # files by name, which is faster to hash than a Path
 
 
-class Sharing:
-    """Processes that divide images among themselves; by itself, a process decodes them all.
-
-    splatting/distributed/shared_images.py has the form of several.
-    """
-
-    size = 1
-
-    def anyone(self, fact: bool) -> bool:
-        """Whether a fact holds in any of the processes."""
-        return fact
-
-    def divide(
-        self, sizes: Mapping[Key, int], own: Callable[[Key], Tensor], device: torch.device
-    ) -> tuple[set[Key], dict[Key, "InMemory"]]:
-        """Those of the images, given with their bytes, that this process decodes, and all that others have a part in.
-
-        own: the image of a key, on `device`. An image that is shared has the attributes of InMemory; all processes read
-        its pixels together.
-        """
-        return set(sizes), {}
-
-
 class ImageStore:
     """Images of photos and other sources, each decoded once and kept.
 
@@ -92,7 +71,7 @@ class ImageStore:
     is a GPU, images lie in pinned memory and are copied without waiting. Threads exist only while there is something to
     decode ahead. Call all methods from one thread.
 
-    sharing: processes that have the same `plan`. Each decodes and keeps a part of it, and gives an image of it to the
+    ranks: processes that have the same `plan`. Each decodes and keeps a part of it, and gives an image of it to the
     others whenever it is read: all have to read the same images in the same order. The limit counts for each.
     """
 
@@ -101,16 +80,16 @@ class ImageStore:
         limit: int = 0,
         keep_on: torch.device | str = "cpu",
         device: torch.device | str | None = None,
-        sharing: Sharing | None = None,
+        ranks: Ranks = ALONE,
     ) -> None:
         self.limit = limit
-        self.sharing = sharing or Sharing()
+        self.ranks = ranks
         self.keep_on = torch.device(keep_on)
         self.device = torch.device(keep_on if device is None else device)
         self._kept: OrderedDict[Key, Tensor | Future[Tensor]] = OrderedDict()  # in order of use
         self._planned: set[Key] = set()
         self._awaited: set[Key] = set()  # planned for training, and not decoded yet
-        self._shared: dict[Key, InMemory] = {}
+        self._shared: dict[Key, SharedImage] = {}
         self._workers = threads()
         self._room_for_floats = True
         self._threads: ThreadPoolExecutor | None = None
@@ -124,7 +103,7 @@ class ImageStore:
         """
         training = dict.fromkeys(_key(source, size) for source, size in training)
         keys = dict.fromkeys([*training, *(_key(source, size) for source, size in others)])
-        self._planned, self._shared = self.sharing.divide({key: _bytes(*key) for key in keys}, self._own, self.device)
+        self._planned, self._shared = divided({key: _bytes(*key) for key in keys}, self._own, self.device, self.ranks)
         self._awaited = self._planned & training.keys()
         if self.limit >= len(self._planned):
             self.limit = 0
@@ -152,7 +131,7 @@ class ImageStore:
     @property
     def keeps_floats(self) -> bool:
         """Whether images may also be kept as float32, four times as large, on the device of --data_device."""
-        return not self.limit and self._room_for_floats and self.sharing.size == 1
+        return not self.limit and self._room_for_floats and not self.ranks.several
 
     def get(self, source: Source, size: Size) -> Tensor:
         """Image (3 or 4,H,W) uint8 of a photo, or the tensor that another source decodes to, on the store's device.
@@ -184,7 +163,7 @@ class ImageStore:
         if self.limit or self._awaited:
             most = 1 + 2 * self._workers
             count = min(self.limit, most) if self.limit else most
-        return count * self.sharing.size
+        return count * self.ranks.size
 
     def prefetch(self, coming: Sequence[Picture]) -> None:
         """Start to prepare the images that `get` is asked for next, in that order and at most `limit`; never waits.

@@ -12,8 +12,7 @@ from torch import Tensor
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.scene import Scene
-from splatting.distributed.ranks import ranks
-from splatting.distributed.replicated import refuse_differences
+from splatting.distributed.ranks import ranks, refuse_differences
 from splatting.training.restart import what_stands
 
 _ROOT = Path(__file__).resolve().parents[2]

@@ -13,11 +13,10 @@ import torch.distributed as dist
 
 from splatting.distributed import rank_logging
 from splatting.distributed.key_value_store import KeyValueStore, here
-from splatting.distributed.ranks import using
-from splatting.distributed.replicated import refuse_differences
+from splatting.distributed.process_group import TIMEOUT, RankLost, SeveralRanks
+from splatting.distributed.ranks import refuse_differences, using
 from splatting.distributed.shutdown import DONE, FAULT, LOST, NO_WORD, SIGNAL, End, Ending
 from splatting.distributed.watchdog import Watch
-from splatting.distributed.watched_ranks import TIMEOUT, RankLost, WatchedRanks
 from splatting.host import interrupt, torchrun
 from splatting.host.errors import UserError, first_line
 from splatting.host.machine import compute_device, cores, device_name, instruction_set
@@ -98,7 +97,7 @@ def _join_and_run(main: Callable[[], object], store: KeyValueStore, watch: Watch
 
 
 @contextmanager
-def _joined(store: KeyValueStore) -> Iterator[WatchedRanks]:
+def _joined(store: KeyValueStore) -> Iterator[SeveralRanks]:
     """Make the process group: NCCL on GPUs, one a rank, and gloo on CPUs."""
     device = _own_device()
     store.post("machine", _machine(device))
@@ -115,7 +114,7 @@ def _joined(store: KeyValueStore) -> Iterator[WatchedRanks]:
         timeout=TIMEOUT,
         **options,
     )
-    yield WatchedRanks()
+    yield SeveralRanks()
 
 
 def _own_device() -> torch.device:

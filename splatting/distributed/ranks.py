@@ -5,15 +5,19 @@ torch is imported on first use: not every program needs it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import TYPE_CHECKING, TypeVar
+
+from splatting.files.listing import some
+from splatting.host.errors import UserError
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
 Value = TypeVar("Value")
+_SHORT = 60  # letters of a value that a message shows
 
 
 class Ranks:
@@ -153,3 +157,27 @@ def using(several: Ranks) -> Iterator[Ranks]:
         yield several
     finally:
         _current = before
+
+
+def refuse_differences(facts: Sequence[Mapping[str, str]], remedy: str, shown: bool = True) -> None:
+    """UserError that names the facts by which ranks differ from rank 0, and these ranks.
+
+    facts: by rank, the values by name. shown: with the values of one of these ranks.
+    """
+    first = facts[0]
+    for rank, others in enumerate(facts):
+        names = [name for name in {**first, **others} if first.get(name) != others.get(name)]
+        if names:
+            raise UserError(
+                f"rank {rank} differs from rank 0 in {some(_described(names, first, others, shown))}; {remedy}"
+            )
+
+
+def _described(names: Sequence[str], first: Mapping[str, str], other: Mapping[str, str], shown: bool) -> list[str]:
+    if not shown:
+        return list(names)
+    return [f"{name} ({_short(other.get(name))}, not {_short(first.get(name))})" for name in names]
+
+
+def _short(value: str | None) -> str:
+    return "nothing" if value is None else value if len(value) <= _SHORT else value[:_SHORT] + "..."

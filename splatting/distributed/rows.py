@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatting.deterministic.counter_rng import Stream
+from splatting.deterministic.counter_rng import Stream, random_bits
+from splatting.deterministic.portable_math import log
 from splatting.distributed.ranks import ALONE, Ranks
-from splatting.distributed.selection import largest, lowest, weighted_choice
 from splatting.host.machine import compute_device
 
 PIECE = 1 << 16  # rows that are sent at a time
@@ -44,11 +44,17 @@ class Shards:
         return values
 
     def pieces(self, count: int, part: Callable[[slice], Tensor]) -> Iterator[Tensor]:
-        """All rows in order, piece by piece, on the rank that writes files; others must go through them, too.
+        """All rows in order, piece by piece, on the rank that writes files; others get none, yet must go through all.
 
         count: of this rank's rows; part: gives some of them (n, ...).
         """
-        return _in_order(self.ranks, count, part)
+        ranks = self.ranks
+        for holder, rows in enumerate(ranks.numbers(count)[:, 0].tolist()):
+            for start in range(0, rows, PIECE):
+                piece = part(slice(start, start + PIECE) if holder == ranks.rank else slice(0, 0))
+                received = ranks.exchange([piece, *[piece[:0]] * (ranks.size - 1)])
+                if ranks.first:
+                    yield received[holder]
 
     def items(self, indices: Tensor) -> Tensor:
         """Indices (n,) among all rows, of those of this rank."""
@@ -57,22 +63,6 @@ class Shards:
     def together(self, found: dict[str, Tensor], names: Iterable[str]) -> dict[str, Tensor]:
         """Indices (n,) among all rows that any rank has found, by some of the names; of those without any nothing."""
         return found
-
-    def anyone(self, fact: bool) -> bool:
-        """Whether a fact holds on any rank."""
-        return self.ranks.anyone(fact)
-
-    def shared(self, value: int) -> int:
-        """The first rank's value."""
-        return self.ranks.shared(value)
-
-    def before(self, count: int) -> tuple[int, int]:
-        """The sum of all counts of lower ranks, and of all ranks."""
-        return self.ranks.before(count)
-
-    def counts(self, count: int) -> Tensor:
-        """Each rank's count: (size,) int64 on the CPU."""
-        return self.ranks.numbers(count)[:, 0]
 
     def marked(self, mask: Tensor) -> int:
         """How many values of all masks (N,) bool are true."""
@@ -83,17 +73,37 @@ class Shards:
         return self.ranks.gather(self.items(mask.nonzero().reshape(-1)))
 
     def choose(self, weights: Tensor, count: int, *, seed: int, stream: Stream, iteration: int) -> Tensor:
-        """Own rows, (n,) int64 ascending, of `count` that are drawn among all by `weighted_choice`."""
-        numbers = {"seed": seed, "stream": stream, "iteration": iteration}
-        return weighted_choice(weights, count, **numbers, first=self.first, ranks=self.ranks)
+        """Own rows, (n,) int64 ascending, of `count` of all, drawn one after another by the weights of those left.
+
+        weights: (N,) float64. A row whose weight is not above 0, or not finite, is never drawn, so there may be fewer.
+        Algorithm A-Res (Efraimidis and Spirakis 2006): with a uniform number u for each row, the largest
+        log(u) / weight are drawn; ties go to the lower row. Same weights, same rows, on every device and number of
+        threads or ranks.
+        """
+        rows = ((weights > 0) & weights.isfinite()).nonzero().reshape(-1)
+        if self.ranks.before(len(rows))[1] <= count:
+            return rows
+        waits = -log(_uniform(random_bits(seed, stream, iteration, rows + self.first))) / weights[rows]
+        return rows[self.lowest(waits, count)].sort().values
 
     def lowest(self, values: Tensor, count: int, *, highest: bool = False) -> Tensor:
-        """Indices of this rank's values (n,) that are among the `count` lowest, or highest, of all; ties by place."""
-        return lowest(values, count, self.ranks, highest=highest)
+        """Indices, in no order, of this rank's values (n,) that are among the `count` lowest of all; ties by place.
+
+        highest: among the highest, ties by place as well. No rank sends more than `count` values.
+        """
+        ranks, count = self.ranks, max(count, 0)
+        mine = torch.argsort(values, descending=highest, stable=True)[:count]
+        if not ranks.several:
+            return mine
+        every = ranks.gather(values[mine])  # of equal values of a rank the first comes first, as ranks do
+        chosen = torch.argsort(every, descending=highest, stable=True)[:count] - ranks.before(len(mine))[0]
+        return mine[chosen[(chosen >= 0) & (chosen < len(mine))]]
 
     def largest(self, values: Tensor) -> Tensor:
         """The largest value, a scalar, of all ranks' values (n,), of which some rank must have one."""
-        return largest(values, self.ranks)
+        if self.ranks.several:
+            values = self.ranks.gather(values.amax(0, keepdim=True) if len(values) else values)
+        return values.max()
 
     def send_draws(self, rows: dict[str, Tensor], draws: Tensor, counts: Tensor) -> dict[str, Tensor]:
         """Rows for the Gaussians that draws are made for, from the ranks that the draws fell on.
@@ -155,7 +165,13 @@ class Divided(Shards):
         return own_rows(values, self.ranks)
 
     def whole(self, values: Tensor) -> Tensor:
-        return _whole(values, self.ranks)
+        total = self.ranks.before(len(values))[1]
+        every = torch.empty(total if self.ranks.first else 0, *values.shape[1:], dtype=values.dtype)
+        filled = 0
+        for piece in self.pieces(len(values), lambda rows: values.detach()[rows].to(compute_device())):
+            every[filled : filled + len(piece)] = piece
+            filled += len(piece)
+        return every
 
     def items(self, indices: Tensor) -> Tensor:
         return indices + self.first
@@ -300,29 +316,11 @@ class Redistribution:
         return moved
 
 
+def _uniform(bits: Tensor) -> Tensor:
+    """Numbers in (0, 1), odd multiples of 2^-53, from rows of 32-bit numbers (n, 4): (n,) float64."""
+    whole = (bits[:, 0] << 20) | (bits[:, 1] >> 12)
+    return (2 * whole + 1).to(torch.float64) * 2.0**-53
+
+
 def _steps(state: dict[str, Any]) -> int:
     return int(state.get("step", 0))
-
-
-def _in_order(ranks: Ranks, count: int, part: Callable[[slice], Tensor]) -> Iterator[Tensor]:
-    """Pieces of all ranks' rows, on the rank that writes; other ranks get none, yet must go through all.
-
-    count: of this rank's rows; part: gives some of them (n, ...).
-    """
-    for holder, rows in enumerate(ranks.numbers(count)[:, 0].tolist()):
-        for start in range(0, rows, PIECE):
-            piece = part(slice(start, start + PIECE) if holder == ranks.rank else slice(0, 0))
-            received = ranks.exchange([piece, *[piece[:0]] * (ranks.size - 1)])
-            if ranks.first:
-                yield received[holder]
-
-
-def _whole(values: Tensor, ranks: Ranks) -> Tensor:
-    """All ranks' rows (N, ...), on the CPU of the rank that writes; none elsewhere. Every rank must call it."""
-    total = ranks.before(len(values))[1]
-    every = torch.empty(total if ranks.first else 0, *values.shape[1:], dtype=values.dtype)
-    filled = 0
-    for piece in _in_order(ranks, len(values), lambda rows: values.detach()[rows].to(compute_device())):
-        every[filled : filled + len(piece)] = piece
-        filled += len(piece)
-    return every

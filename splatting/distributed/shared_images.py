@@ -11,21 +11,19 @@ from splatting.host.memory import is_out_of_memory
 from utils.system_utils import UserError
 
 
-class SharedImages:
-    """Ranks that divide images among themselves: the form of several of `scene.images.store.Sharing`."""
+def divided(
+    sizes: Mapping[Hashable, int], own: Callable[[Hashable], Tensor], device: torch.device, ranks: Ranks
+) -> tuple[set[Hashable], dict[Hashable, "SharedImage"]]:
+    """Of images, given with their bytes, those that this rank decodes, and all as shared ones; by itself it has none.
 
-    def __init__(self, ranks: Ranks) -> None:
-        self._ranks, self.size, self.anyone = ranks, ranks.size, ranks.anyone
-
-    def divide(
-        self, sizes: Mapping[Hashable, int], own: Callable[[Hashable], Tensor], device: torch.device
-    ) -> tuple[set[Hashable], dict[Hashable, "SharedImage"]]:
-        """This rank's part of the images, given with their bytes, and all of them as shared ones."""
-        if self.size == 1:
-            return set(sizes), {}
-        chosen = dict(zip(sizes, holders(sizes.values(), self.size), strict=True))
-        shared = {key: SharedImage(self._ranks, chosen[key], partial(own, key), device) for key in sizes}
-        return {key for key in sizes if chosen[key] == self._ranks.rank}, shared
+    own: the image of a key, on `device`. A shared image has the attributes of InMemory; all ranks read its pixels
+    together.
+    """
+    if not ranks.several:
+        return set(sizes), {}
+    chosen = dict(zip(sizes, holders(sizes.values(), ranks.size), strict=True))
+    shared = {key: SharedImage(ranks, chosen[key], partial(own, key), device) for key in sizes}
+    return {key for key in sizes if chosen[key] == ranks.rank}, shared
 
 
 class SharedImage:

@@ -5,9 +5,9 @@ import sys
 import threading
 
 from splatting.distributed.key_value_store import KeyValueStore, is_gone
+from splatting.distributed.process_group import SeveralRanks
 from splatting.distributed.rank_logging import names
 from splatting.distributed.shutdown import DONE, HANG, LOST, NO_WORD, End, Ending
-from splatting.distributed.watched_ranks import WatchedRanks
 from splatting.host.clock import running_seconds
 
 _BEAT = 0.5  # seconds between two beats
@@ -27,7 +27,7 @@ class Watch(threading.Thread):
         super().__init__(name="watch over ranks", daemon=True)
         self._store, self._ending = KeyValueStore(rank, size), ending
         self._over = threading.Event()
-        self.ranks: WatchedRanks | None = None
+        self.ranks: SeveralRanks | None = None
         self._number = 0
         self._seen: dict[int, tuple[int, float]] = {}  # by rank: the number of its last beat, and when it came
         self._fault_since: float | None = None

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatting.evaluation.comparison import COSTS, pareto_front
 from splatting.evaluation.error_curve import SUBSET, Row, best_test, of_whole_sets, read_curve
+from splatting.files.listing import as_utf8
 from utils.system_utils import atomic_write
 
 if TYPE_CHECKING:
@@ -51,11 +52,6 @@ def dissimilarity(row: Row, views: str) -> float | None:
     return None if ssim is None or ssim >= 1 else 1 - ssim
 
 
-def printable(text: str) -> str:
-    """Return the text with the bytes of a file name that are not UTF-8 written as numbers, `\\udcff`."""
-    return text.encode("utf-8", "backslashreplace").decode()
-
-
 def _points(rows: Sequence[Row], value: Value, views: str) -> list[Point]:
     """Seconds and values of the rows that have them for whole sets; the axis of the seconds is logarithmic."""
     pairs = ((row["seconds"], value(row, views)) for row in of_whole_sets(rows))
@@ -63,7 +59,7 @@ def _points(rows: Sequence[Row], value: Value, views: str) -> list[Point]:
 
 
 def _draw(axes: Axes, points: Sequence[Point], label: str | None, **style: Any) -> None:
-    axes.plot([x for x, _ in points], [y for _, y in points], label=label and printable(label), **style)
+    axes.plot([x for x, _ in points], [y for _, y in points], label=label and as_utf8(label), **style)
 
 
 def _draw_rows(
@@ -110,7 +106,7 @@ def _figure(rows: int, size: tuple[float, float], title: str) -> tuple[Figure, A
     from matplotlib.figure import Figure  # imported here: it takes long, and most programs draw nothing
 
     figure = Figure(figsize=size, layout="constrained")
-    figure.suptitle(printable(title))
+    figure.suptitle(as_utf8(title))
     return figure, figure.subplots(rows, 1, sharex=True)
 
 
@@ -262,7 +258,7 @@ def draw_fronts(folder: Path, scene: str, found: Mapping[str, Any], names: Seque
         for name, point in found["sets"].items():
             index, x, y = names.index(name), point[cost], point["PSNR"]
             axes.errorbar(
-                x["mean"], y["mean"], xerr=x["std"], yerr=y["std"], label=printable(name), color=f"C{index % 10}",
+                x["mean"], y["mean"], xerr=x["std"], yerr=y["std"], label=as_utf8(name), color=f"C{index % 10}",
                 marker=MARKERS[index // 10 % len(MARKERS)], markersize=5, linewidth=1, capsize=2,
             )  # fmt: skip
         draw_front(axes, [(point[cost]["mean"], point["PSNR"]["mean"]) for point in found["sets"].values()], -1)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from arguments.stored import read_model_json, read_stored_options
+from scene.saved_iterations import saved_ply
 from splatting.evaluation.error_curve import NAME as CURVE
 from splatting.evaluation.error_curve import Row, read_curve
 from splatting.evaluation.training_log import NAME as LOG
@@ -27,14 +28,9 @@ def json_or_none(path: Path) -> Any | None:
         return None
 
 
-def ply_file(model: Path, iteration: int | str) -> Path:
-    """Return the path of a saved iteration's Gaussians."""
-    return model / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
-
-
 def count_gaussians(model: Path, iteration: int) -> int:
     """Read the number of Gaussians of a saved iteration from the header of its PLY."""
-    ply = ply_file(model, iteration)
+    ply = saved_ply(model, iteration)
     try:
         with open(plain(ply), "rb") as file:
             header = file.read(4096).split(b"end_header")[0]

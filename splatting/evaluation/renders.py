@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from splatting.evaluation.figures import printable
-from splatting.evaluation.model_folder import json_or_none, load_scores, ply_file
+from scene.saved_iterations import saved_ply
+from splatting.evaluation.model_folder import json_or_none, load_scores
 from splatting.files.image_files import UNREADABLE, open_render
+from splatting.files.listing import as_utf8
 from utils.system_utils import UserError, atomic_write
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def summarise_times(
 
 def model_digest(model: Path, iteration: str) -> str | None:
     """Return the SHA-256 of the PLY of an iteration, None if a model folder has none of it."""
-    ply = ply_file(model, iteration)
+    ply = saved_ply(model, iteration)
     if not ply.is_file():
         return None
     digest = hashlib.sha256()
@@ -152,13 +153,13 @@ def sheet(
     draw = ImageDraw.Draw(drawn)
     font = ImageFont.load_default(size=15)
     for column, title in enumerate(titles):
-        draw.text((GAP + column * (cell_width + GAP), 4), printable(title), fill="black", font=font)
+        draw.text((GAP + column * (cell_width + GAP), 4), as_utf8(title), fill="black", font=font)
     for place, row in enumerate(cells):
         y = HEADER + place * (cell_height + GAP)
         for column, (label, image) in enumerate(row):
             x = GAP + column * (cell_width + GAP)
             drawn.paste(image, (x, y))
-            draw.text((x + 6, y + 4), printable(label), fill="white", font=font, stroke_width=2, stroke_fill="black")
+            draw.text((x + 6, y + 4), as_utf8(label), fill="white", font=font, stroke_width=2, stroke_fill="black")
     return drawn
 
 

@@ -19,10 +19,10 @@ from PIL import Image
 from splatting.evaluation import comparison, tables
 from splatting.evaluation.comparison import Sets
 from splatting.evaluation.figures import draw_curves, draw_fronts
-from splatting.evaluation.machine import one_line
 from splatting.evaluation.renders import GAIN, ComparedViews
 from splatting.files.json_files import write_json
 from splatting.files.listing import markdown_table
+from splatting.host.machine import one_line
 from utils.system_utils import UserError, atomic_write
 
 TITLE = "3D Gaussian Splatting: evaluation"

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from scene.readers.info import HOLD
+from scene.saved_iterations import saved_ply
 from splatting.evaluation import model_folder as folder_of
 from splatting.evaluation.comparison import SCORES
 from splatting.evaluation.error_curve import Row
@@ -138,7 +139,7 @@ def _iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, Any]:
         "gaussians_saved": folder_of.count_gaussians(model, iteration),
         # Only of a point at this very iteration: the memory of an earlier one would be a lower bound.
         "peak_memory_mib": point.get("peak_memory_mib"),
-        "ply_mb": folder_of.ply_file(model, iteration).stat().st_size / MB,
+        "ply_mb": saved_ply(model, iteration).stat().st_size / MB,
         "process_seconds": None,
         "render_ms": times.get("median_ms"),
         "seconds": point.get("seconds") if seconds is None else seconds,

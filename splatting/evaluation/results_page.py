@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from splatting.evaluation.comparison import with_values
-from splatting.evaluation.machine import one_line
 from splatting.evaluation.report import markdown
 from splatting.evaluation.tables import result_tables
 from splatting.files.json_files import read_json
+from splatting.host.machine import one_line
 from utils.system_utils import UserError, atomic_write, run_cli
 
 BEGIN = "<!-- results: begin (python -m splatting.evaluation.results_page) -->"

@@ -13,8 +13,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from scene.saved_iterations import saved_ply
 from splatting.evaluation.child import Finished, run_child
-from splatting.evaluation.model_folder import load_scores, logged, ply_file, trained_iterations
+from splatting.evaluation.model_folder import load_scores, logged, trained_iterations
 from splatting.evaluation.plan import Record, Run
 from splatting.evaluation.renders import TIMES, ground_truth_digest, view_names
 from utils.lpips_utils import TOLD
@@ -82,7 +83,7 @@ def train(run: Run, machine: dict[str, Any]) -> None:
 def _remove_stop(run: Run, iteration: int) -> None:
     """Remove what an interrupt has saved, unless that iteration was asked for, too."""
     if str(iteration) not in run.options:
-        shutil.rmtree(ply_file(run.model, iteration).parent, ignore_errors=True)
+        shutil.rmtree(saved_ply(run.model, iteration).parent, ignore_errors=True)
         (run.model / f"chkpnt{iteration}.pth").unlink(missing_ok=True)
 
 
@@ -98,7 +99,7 @@ def _trained(run: Run, record: Record) -> bool:
     done = record.stage("train")
     if not done or run.iterations not in (None, *done["iterations"]):
         return False
-    return all(ply_file(run.model, iteration).is_file() for iteration in done["iterations"])
+    return all(saved_ply(run.model, iteration).is_file() for iteration in done["iterations"])
 
 
 def _checkpoints(run: Run) -> dict[str, list[int]]:
@@ -161,7 +162,7 @@ def render(run: Run, options: Sequence[str]) -> None:
     for iteration in _saved(run, "render"):
         command = _script("render.py", "-m", str(run.model), *_source(run), "--iteration", str(iteration))
         command += ["--skip_train", "--eval", "--quiet", *options]
-        requested = {"model": _stamp(ply_file(run.model, iteration)), "options": list(options)}
+        requested = {"model": _stamp(saved_ply(run.model, iteration)), "options": list(options)}
         say = f"rendering iteration {iteration}"
         _once(
             Record(run.model), f"render_{iteration}", say, command, requested, partial(_rendered, run.model, iteration)
@@ -220,7 +221,7 @@ def page(run: Run, output: Path, options: Sequence[str]) -> None:
     mkdir_p(file.parent)
     command = _script("export.py", "-m", str(run.model), *_source(run), "--iteration", str(last))
     command += ["--to", str(file), *options]
-    requested = {"model": _stamp(ply_file(run.model, last)), "options": list(options)}
+    requested = {"model": _stamp(saved_ply(run.model, last)), "options": list(options)}
     say = "writing the model as a page"
     _once(Record(run.model), "html", say, command, requested, lambda: {} if file.is_file() else None)
 

@@ -1,4 +1,4 @@
-"""Lists of names in messages, and tables in Markdown."""
+"""Names in messages, and tables in Markdown."""
 
 from collections.abc import Sequence
 
@@ -9,6 +9,11 @@ def some(names: Sequence[str], most: int = 5) -> str:
         return "nothing"
     rest = len(names) - most
     return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def as_utf8(text: str) -> str:
+    """A text that can be sent or drawn: bytes of a file's name that are not UTF-8 become numbers, `\\udcff`."""
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]], right: bool = True) -> str:

@@ -1,16 +1,18 @@
 """This machine and this code: the device that computes, processors, names and the commit for reports.
 
-torch is imported on first use: not every program needs it.
+torch is imported on first use: not every program needs it. Run as a module, it prints `facts` as JSON.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import platform
 import subprocess
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import splatting.host.openmp  # noqa: F401  (for programs that imported torch before)
 from splatting.host import torchrun
@@ -22,6 +24,7 @@ _ROOT = Path(__file__).resolve().parents[2]
 _VERSION = _ROOT / "version.txt"  # the one place where the version is written by hand
 VERSION = _VERSION.read_text(encoding="utf-8").strip() if _VERSION.is_file() else "unknown"  # only the code was copied
 MOST_THREADS = 16  # for work on image files: more threads only wait for memory and disk
+_PACKAGES = ("lpips", "numpy", "pillow", "pycolmap", "torch", "torchvision")
 _CGROUPS = Path("/sys/fs/cgroup")
 _OWN_CGROUPS = Path("/proc/self/cgroup")
 
@@ -128,3 +131,53 @@ def _output(*command: str) -> str:
     except OSError:
         return ""
     return done.stdout.strip() if done.returncode == 0 else ""
+
+
+def facts(device: torch.device | str) -> dict[str, Any]:
+    """Processor, threads, versions and commit of this machine and checkout; its GPU, too, if `device` is one."""
+    from importlib.metadata import distributions  # takes a while to import
+
+    import torch
+
+    device = torch.device(device).type
+    return {
+        "commit": commit(),
+        "cpu": cpu_name(),
+        "cuda": torch.version.cuda if device == "cuda" else None,
+        "device": device,
+        "gpu": gpu_name() if device == "cuda" else None,
+        "instruction_set": instruction_set(),
+        "packages": {name: next((one.version for one in distributions(name=name)), None) for name in _PACKAGES},
+        "python": platform.python_version(),
+        "system": platform.platform(),
+        "threads": torch.get_num_threads(),
+        "version": VERSION,
+    }
+
+
+def facts_asked() -> dict[str, Any]:
+    """`facts` of the device that computes; {} if that fails.
+
+    A separate process asks, because asking a GPU for its name occupies GPU memory until the process ends.
+    """
+    command = [sys.executable, "-m", "splatting.host.machine"]
+    done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True, check=False)
+    if done.returncode:
+        print(f"warning: cannot describe this machine:\n{done.stderr}", file=sys.stderr)
+        return {}
+    return json.loads(done.stdout)
+
+
+def one_line(facts: dict[str, Any]) -> str:
+    """Summarise `facts` in one line."""
+    if not facts:
+        return "not known"
+    where = f"{facts['gpu']}, {facts['cpu']}" if facts["gpu"] else f"{facts['cpu']}, {facts['instruction_set']}"
+    return (
+        f"{where}, {facts['threads']} threads, Python {facts['python']}, torch {facts['packages']['torch']}, "
+        f"commit {facts['commit']}"
+    )
+
+
+if __name__ == "__main__":
+    print(json.dumps(facts(compute_device()), sort_keys=True, allow_nan=False))

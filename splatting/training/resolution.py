@@ -68,7 +68,7 @@ class Resolution:
         free = free_memory(torch.device(self._images.device))
         room = free is None or self._images.planned_bytes / factor / factor <= GPU_SHARE * free
         # Ranks that share pictures make the smaller ones together.
-        self._keeps = not self._images.sharing.anyone(self._images.limit > 0 or not room)
+        self._keeps = not self._images.ranks.anyone(self._images.limit > 0 or not room)
 
 
 def smaller(camera: Camera, factor: float) -> tuple[int, int]:

@@ -24,8 +24,7 @@ from scene.gaussians.morton import sort_rows
 from scene.sleeping import MOST_SHARE, REST, Sleeping, share_seen
 from splatting.deterministic.counter_rng import Stream, uniform
 from splatting.distributed.consistency import agree_on_model, agree_on_scene
-from splatting.distributed.ranks import ranks
-from splatting.distributed.shared_images import SharedImages
+from splatting.distributed.ranks import ALONE, ranks
 from splatting.evaluation.training_log import Stopwatch
 from splatting.exports.in_scene import scene_with, start_from
 from splatting.exports.splats import Splats
@@ -98,9 +97,9 @@ class Run:
         self.warnings: list[str] = []
         self._warn(checks.late_reset(opt, dataset.white_background, self.schedule, self.first_iteration))
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
-        sharing = SharedImages(self.group) if views == 1 else None  # all read the same images in the same order
+        sharing = self.group if views == 1 else ALONE  # all read the same images in the same order
         init_ply = None if self.start else getattr(dataset, "init_ply", None)
-        self.scene, first = scene_with(init_ply, dataset, self.gaussians, sharing=sharing)
+        self.scene, first = scene_with(init_ply, dataset, self.gaussians, ranks=sharing)
         checks.check_scene(self.scene.info)
         checks.hint_of_images(self.scene.getTrainCameras(), self.scene.info, dataset.white_background)
         checks.check_target(opt.target_psnr, len(self.scene.getTestCameras()))

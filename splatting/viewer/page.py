@@ -15,6 +15,7 @@ from scene.scene import Scene
 from splatting.exports.in_scene import splats_of
 from splatting.exports.ply import write_plain_ply
 from splatting.exports.splats import drawable, selected, tidy
+from splatting.files.listing import as_utf8
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.host.start import typed_command
 from splatting.viewer import server as servers
@@ -24,7 +25,7 @@ from splatting.viewer.path_tab import PathTab
 from splatting.viewer.server import Address
 from splatting.viewer.tabs import ImagesTab, ViewTab, serialized
 from splatting.viewer.training_tab import Requests
-from splatting.viewer.views import SceneCameras, Settings, Vector, as_utf8, pose_of, window_of
+from splatting.viewer.views import SceneCameras, Settings, Vector, pose_of, window_of
 from splatting.viewer.watchers import Watchers, Wish
 from utils.system_utils import UserError, first_line
 

@@ -11,6 +11,7 @@ import numpy as np
 from gaussian_renderer.free_view import rotation_matrix
 from scene.cameras import Camera
 from splatting.camera_paths.poses import opening
+from splatting.files.listing import as_utf8
 from utils.graphics_utils import camera_center
 
 if TYPE_CHECKING:
@@ -72,11 +73,6 @@ def window_of(camera: "viser.CameraHandle") -> tuple[int, int]:
     """Width and height, in pixels, of a browser's window; sides that cannot be drawn count as the nearest that can."""
     width, height = (min(max(int(side), 1), _WIDEST) for side in (camera.image_width, camera.image_height))
     return max(width, height // _SLIMMEST), max(height, width // _SLIMMEST)
-
-
-def as_utf8(text: str) -> str:
-    """A text that can be sent: names of files that are not UTF-8 have surrogates, which appear as numbers."""
-    return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 class SceneCameras:

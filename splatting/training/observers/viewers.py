@@ -14,6 +14,7 @@ from gaussian_renderer.network_transfer import ViewerLost
 from scene.gaussian_model import GaussianModel
 from scene.saved_iterations import saved_ply
 from scene.saved_model import read_model
+from splatting.files.listing import as_utf8
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
@@ -23,7 +24,6 @@ from splatting.training.run import Run
 from splatting.viewer.page import Page, serve
 from splatting.viewer.server import Address
 from splatting.viewer.training_tab import TrainingTab
-from splatting.viewer.views import as_utf8
 from splatting.viewer.watchers import MOVING, STILL, Budget, Wish
 from utils.system_utils import UserError, first_line
 

@@ -66,7 +66,7 @@ class MarkovChain(DensityControl):
             return ()
         count, most = gaussians.gaussian_count, self.most(iteration, 0)
         moves = 0 < most < count or self._grown(count, iteration) > count
-        moves = moves or gaussians.shards.anyone(not is_alive(gaussians, least).all())
+        moves = moves or gaussians.shards.ranks.anyone(not is_alive(gaussians, least).all())
         return gaussians._attributes if moves else ()
 
     def before_step(self, step: Iteration) -> None:

@@ -4,11 +4,13 @@ Arguments go by place, in the order of the 2024 release. An empty tensor stands 
 `prefiltered` have no effect.
 """
 
+import math
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor
 
 from diff_gaussian_rasterization.alternatives import chosen, given, shaped
-from diff_gaussian_rasterization.byte_buffers import packed, unpacked
 from diff_gaussian_rasterization.fakes import SPLAT_VALUES, TILE
 from diff_gaussian_rasterization.gaussians import Gaussians
 from diff_gaussian_rasterization.ops import gradients_of
@@ -60,9 +62,9 @@ def rasterize_gaussians(
     options = image_height, image_width, degree, not of_2023 and antialiasing, False
     out = draw(Scene(*gaussians, *camera_arguments(*place, lens, *options)), background, True)
     buffers = (
-        packed(out.splat_slots, out.splats, out.tile_counts),
-        packed(out.instances),
-        packed(out.ranges, out.transmittance, out.last),
+        _packed(out.splat_slots, out.splats, out.tile_counts),
+        _packed(out.instances),
+        _packed(out.ranges, out.transmittance, out.last),
     )
     rendered = len(out.instances), out.color, out.radii, *buffers
     return rendered if of_2023 else (*rendered, out.inverse_depth)
@@ -104,11 +106,11 @@ def rasterize_gaussians_backward(
     count, (height, width) = len(means3D), grad_out_color.shape[1:]
     floats, ints, longs = means3D.dtype, torch.int32, torch.int64
     geometry = (longs, (count + 1, 2)), (floats, (count, SPLAT_VALUES)), (ints, (count,))
-    splat_slots, splats, tile_counts = unpacked(geomBuffer, geometry)
-    (instances,) = unpacked(binningBuffer, [(ints, (num_rendered,))])
+    splat_slots, splats, tile_counts = _unpacked(geomBuffer, geometry)
+    (instances,) = _unpacked(binningBuffer, [(ints, (num_rendered,))])
     tiles = -(-height // TILE) * -(-width // TILE)
     image = (longs, (tiles + 1,)), (floats, (1, height, width)), (ints, (height, width))
-    ranges, transmittance, last = unpacked(imgBuffer, image)
+    ranges, transmittance, last = _unpacked(imgBuffer, image)
     slots = instances.new_empty(int(splat_slots[-1, 0]), 0)
 
     place, lens = (viewmatrix, projmatrix, campos), (tan_fovx, tan_fovy, scale_modifier)
@@ -145,3 +147,23 @@ def adamUpdate(
 ) -> None:
     """Takes one step of sparse Adam in place, see `optim.sparse_adam_`. N rows of M values each are not read."""
     sparse_adam_(param, grad, exp_avg, exp_avg_sq, visibility, lr, b1, b2, eps)
+
+
+def _packed(*tensors: Tensor) -> Tensor:
+    """Copies tensors of several types into one of bytes, (B,) uint8, as the reference hands a state around."""
+    return torch.cat([values.contiguous().reshape(-1).view(torch.uint8) for values in tensors])
+
+
+def _unpacked(buffer: Tensor, parts: Iterable[tuple[torch.dtype, tuple[int, ...]]]) -> list[Tensor]:
+    """Copies the tensors of `_packed` out again, given their dtypes and shapes.
+
+    Raises ValueError if the buffer has another size.
+    """
+    parts = list(parts)
+    sizes = [math.prod(shape) * dtype.itemsize for dtype, shape in parts]
+    if buffer.dtype != torch.uint8 or buffer.shape != (sum(sizes),):
+        found = f"{tuple(buffer.shape)} {buffer.dtype}"
+        raise ValueError(f"the buffer must be the one of this rendering, ({sum(sizes)},) uint8, got {found}")
+    pieces = zip(buffer.split(sizes), parts, strict=True)
+    # In memory of their own, since kernels may want more alignment than a place within the buffer has.
+    return [piece.clone().view(dtype).reshape(shape) for piece, (dtype, shape) in pieces]

@@ -25,6 +25,14 @@
 #define GS_FUSES
 #endif
 
+// A compiler must neither inline nor clone what has this mark: each copy could fuse other products, and gradients must
+// have the same bits whether they are written or stepped.
+#ifdef __clang__
+#define GS_ONE_COPY __attribute__((noinline))
+#else
+#define GS_ONE_COPY __attribute__((noipa))
+#endif
+
 // GS_EACH_ISA(use): use(isa) for each instruction set of the library. The builder defines GS_X86 or GS_ARM64.
 #if defined(GS_X86)
 #define GS_EACH_ISA(use) use(baseline) use(avx2) use(avx512)

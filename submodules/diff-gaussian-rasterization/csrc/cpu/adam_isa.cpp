@@ -3,8 +3,8 @@
 #include <vector>
 
 #include "../backend.h"
-#include "adam_rows.h"
 #include "gs/simd.h"
+#include "step_rows.h"
 
 GS_ISA_BEGIN
 

@@ -7,8 +7,7 @@
 #include "../math/absolute.h"
 #include "../math/exp2.h"
 #include "../math/slots.h"
-#include "gs/lane_sums.h"
-#include "one_copy.h"
+#include "gs/lane_halves.h"
 #include "tile_chunk.h"
 
 GS_ISA_BEGIN

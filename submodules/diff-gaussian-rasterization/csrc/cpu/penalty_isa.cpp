@@ -3,7 +3,7 @@
 
 #include "../backend.h"
 #include "../math/penalty.h"
-#include "penalty_rows.h"
+#include "step_rows.h"
 
 GS_ISA_BEGIN
 

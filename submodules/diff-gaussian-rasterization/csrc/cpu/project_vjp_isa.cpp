@@ -3,9 +3,8 @@
 #include <type_traits>
 
 #include "../backend.h"
-#include "adam_rows.h"
-#include "penalty_rows.h"
 #include "project_vjp_rows.h"
+#include "step_rows.h"
 
 GS_ISA_BEGIN
 

@@ -3,7 +3,6 @@
 #include <cstring>
 
 #include "../backend.h"
-#include "one_copy.h"
 #include "scene_lanes.h"
 
 GS_ISA_BEGIN

@@ -4,7 +4,7 @@
 #include <cstdint>
 #include <cstring>
 
-#include "gs/lane_transpose.h"
+#include "gs/lane_halves.h"
 
 GS_ISA_BEGIN
 

@@ -7,8 +7,8 @@
 #include "../backend.h"
 #include "../math/adam.h"
 #include "../math/sleep.h"
-#include "adam_rows.h"
 #include "scene_lanes.h"
+#include "step_rows.h"
 
 GS_ISA_BEGIN
 

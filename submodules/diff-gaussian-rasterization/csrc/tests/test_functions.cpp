@@ -4,7 +4,7 @@
 #include <vector>
 
 #include "gs/check.h"
-#include "gs/lane_sums.h"
+#include "gs/lane_halves.h"
 #include "gs/simd.h"
 #include "math/activation.h"
 #include "math/exp2.h"

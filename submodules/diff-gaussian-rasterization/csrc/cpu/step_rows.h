@@ -1,5 +1,5 @@
 #pragma once
-// Adam's steps of rows, for the optimiser and for the backward that takes steps itself.
+// Adam's steps and penalties of rows, for their ops and for the backward that takes steps itself.
 #include "../data.h"
 #include "../math/adam.h"
 
@@ -10,6 +10,10 @@ GS_ISA_BEGIN
 template <class T>
 bool adam_rows(const AdamStep<T>& step, const AdamInput<T>& in, const T* gradient, int64_t first, int64_t count,
                bool guarded);
+
+// Adds the penalties' gradients. A null pointer to gradients leaves them out.
+template <class T>
+GS_ONE_COPY void penalise_rows(const PenaltyInput<T>& in);
 
 // The constants of an input's step.
 template <class T>
