@@ -315,13 +315,18 @@ def strategy_of(checkpoint: str) -> str:
 def with_lenses(dataset: argparse.Namespace, checkpoint: str | None) -> argparse.Namespace:
     """Model options whose --lenses auto is decided: native, or that of the run that wrote a checkpoint to resume.
 
-    A folder that does not say was written when photos were undistorted, as they are where auto stays.
+    A folder that does not say was written when photos were undistorted, as they are where auto stays. UserError for
+    other photos than those of that run.
     """
-    if getattr(dataset, "lenses", None) != "auto":
-        return dataset
-    decided = copy.copy(dataset)
-    decided.lenses = _options_of(Path(checkpoint).parent).get("lenses", "auto") if checkpoint else "native"
-    return decided
+    given, then = getattr(dataset, "lenses", None), _options_of(Path(checkpoint).parent) if checkpoint else {}
+    before = then.get("lenses", "auto") if checkpoint else "native"
+    if given == "auto":
+        dataset = copy.copy(dataset)
+        dataset.lenses = before
+    elif given and then and given != before and "native" in (given, before):
+        photos = "the photos as they are" if before == "native" else "undistorted photos"
+        raise UserError(f"{checkpoint} was trained on {photos}; leave --lenses {given} out")
+    return dataset
 
 
 def _options_of(folder: Path) -> dict[str, object]:
