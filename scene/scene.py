@@ -1,6 +1,7 @@
 """Views of a dataset, together with the Gaussians that are trained on them or loaded for them."""
 
 import argparse
+import copy
 import json
 import random
 import shutil
@@ -105,6 +106,7 @@ class Scene:
             refuse_nothing_to_ignore([(view.image_path, view.mask) for view in views], masks)
         if self._halves:
             info = train_on_all(info)
+        self._given = info.test_cameras
         if self._refines and not fresh and not getattr(args, "other_scene", ""):
             info = with_poses(info, self.model_path)
         if depths and fresh:
@@ -118,6 +120,13 @@ class Scene:
     def getTestCameras(self, scale: float = 1.0) -> list[Camera]:
         """Held-out views at a resolution scale that the scene was made with."""
         return self.test_cameras[scale]
+
+    def given_test_views(self) -> list[Camera]:
+        """Copies of the held-out views as the dataset has them, where poses are refined; none elsewhere."""
+        views = [copy.copy(camera) for camera in self.getTestCameras()] if self._refines else []
+        for camera in views:
+            camera.place(self._given[camera.uid].R, self._given[camera.uid].T)
+        return views
 
     def keep_all_images(self) -> None:
         """Let this process decode all images by itself, as none was asked for yet."""

@@ -15,6 +15,7 @@ from scene.cameras import Camera
 from scene.readers.tracks import read_tracks
 from scene.reprojection import BOUND, moved_pose, nearest_pose, pull, twist_gradient
 from scene.scene import Scene
+from splatting.evaluation.training_log import DEGREES, PERCENT
 from utils.general_utils import get_expon_lr_func
 from utils.graphics_utils import world_to_camera
 from utils.system_utils import UserError
@@ -43,6 +44,7 @@ class PoseRefinement:
                 "--refine_poses needs the tracks of a COLMAP model, the places of its points in the photos, and "
                 f"{source_path} has none; leave it out"
             )
+        self._given = [_pose_of(camera) for camera in lists[0]]
         for camera, track in zip(lists[0] + lists[1], tracks, strict=True):
             pose = nearest_pose(_pose_of(camera), track, camera.fx, self._unit, BOUND)
             camera.place(pose[:3, :3].T.copy(), pose[:3, 3].copy())
@@ -124,6 +126,15 @@ class PoseRefinement:
         for part in (twist[:3], twist[3:]):
             part *= min(1, BOUND / max(np.linalg.norm(part), BOUND))
         self.twists[uid] = twist
+
+    def corrections(self) -> dict[str, float]:
+        """How far training cameras are from the dataset's poses, on the mean: turn, and percent of the extent."""
+        given, now = np.array(self._given), np.array([self._pose(uid) for uid in range(len(self.twists))])
+        chords = np.linalg.norm(now[:, :3, :3] - given[:, :3, :3], axis=(1, 2)) / np.sqrt(8)
+        centers = [-np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3]) for poses in (now, given)]
+        apart = np.linalg.norm(centers[0] - centers[1], axis=1) / self._unit
+        turns = np.degrees(2 * np.arcsin(np.minimum(chords, 1)))
+        return {DEGREES: round(float(turns.mean()), 6), PERCENT: round(100 * float(apart.mean()), 6)}
 
     def captured(self) -> dict[str, Any]:
         """State that a resumed training needs, as plain values."""
