@@ -106,11 +106,13 @@ def check_one_process(option: str, several: bool) -> None:
 
 
 def check_poses(dataset: argparse.Namespace, several: bool, projection: str = "ewa") -> None:
-    """Refuse to refine poses in a training of several processes, or on rays (UserError)."""
+    """Refuse to refine poses in a training of several processes, or on rays, and lenses without poses (UserError)."""
     if getattr(dataset, "refine_poses", False):
         check_one_process("--refine_poses", several)
     if projection == "ray" and getattr(dataset, "refine_poses", False):
         raise UserError("--projection ray has no gradients of poses; leave --refine_poses out, or use ewa")
+    if getattr(dataset, "refine_lens", False) and not getattr(dataset, "refine_poses", False):
+        raise UserError("--refine_lens corrects lenses together with poses; give --refine_poses, too")
 
 
 def check_unrefined(poses: object, checkpoint: str) -> None:
