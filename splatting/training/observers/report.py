@@ -297,7 +297,10 @@ class Target(Observer):
 
 
 class Records(Observer):
-    """Writes what other observers have put into the step's record, once all of it is there."""
+    """Writes what other observers have put into the step's record, once all of it is there.
+
+    Where poses are refined, it has how far they have moved, at points of the curve, too.
+    """
 
     def __init__(self, run: Run) -> None:
         self._run = run
@@ -305,15 +308,12 @@ class Records(Observer):
 
     def measured(self, step: Iteration, losses: Losses) -> None:
         run = self._run
-        if run.poses and (step.record is not None or step.scored_at is not None):
-            step.record = (step.record or {}) | run.poses.corrections()
-        if step.record is None:
+        if step.record is None and (run.poses is None or step.scored_at is None):
             return
         self._seconds = seconds = run.clock.seconds if step.scored_at is None else step.scored_at
         with run.clock.paused("saving"):
-            run.log.add(
-                step.iteration, seconds, gaussians=run.gaussians.gaussian_count, loss=run.losses.mean, **step.record
-            )
+            values = (step.record or {}) | (run.poses.corrections() if run.poses else {})
+            run.log.add(step.iteration, seconds, gaussians=run.gaussians.gaussian_count, loss=run.losses.mean, **values)
 
     def ended(self, error: Error) -> None:
         """Note the seconds of this process: up to its first iteration, of training, of scoring and of saving."""
