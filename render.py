@@ -19,6 +19,7 @@ if __name__ == "__main__":
 
 import argparse
 import copy
+import shutil
 import time
 from collections.abc import Collection
 from pathlib import Path
@@ -37,7 +38,7 @@ from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
 from scene.scene import Scene
 from splatting.camera_paths.render_path import add_path_options, path_request, render_path
-from splatting.evaluation.renders import INCOMPLETE, TIMES, model_digest, summarise_times
+from splatting.evaluation.renders import GIVEN_POSES, INCOMPLETE, TIMES, model_digest, summarise_times
 from splatting.exports.in_scene import load_file
 from splatting.files.image_files import remove_leftovers, save_png, write_plane
 from splatting.files.json_files import write_json
@@ -145,6 +146,7 @@ def render_sets(
 ) -> None:
     """Render the views of a saved iteration, -1: the last one, by `render_set`.
 
+    Test views of a model with refined poses are also rendered with the dataset's, as ours_N_given_poses.
     dataset: the model options. sh_degree: degree that the PLY must have, None: any. planes: those of PLANES to write,
     too. ply: model of any tool to render instead, into folders that have its name. UserError if nothing can be loaded.
     """
@@ -155,6 +157,11 @@ def render_sets(
         render_set(scene.model_path, "train", scene.loaded_iter, scene.getTrainCameras(), *drawn, planes=planes)
     if not skip_test:
         render_set(scene.model_path, "test", scene.loaded_iter, scene.getTestCameras(), *drawn, planes=planes)
+        method = f"{scene.loaded_iter}_{GIVEN_POSES}"
+        if given := scene.given_test_views():
+            render_set(scene.model_path, "test", method, given, *drawn, planes=planes)
+        else:
+            shutil.rmtree(Path(scene.model_path) / "test" / f"ours_{method}", ignore_errors=True)
 
 
 def _loaded(

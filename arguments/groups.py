@@ -86,6 +86,9 @@ class ModelParams(OptionTable):
         Option("refine_poses", False, origin="ours", stored=MODEL_JSON,
             help="train a small correction of each training camera's pose with the Gaussians. The tracks of a COLMAP "
                  "scene hold the cameras, and place the test views"),
+        Option("refine_lens", False, origin="ours", stored=MODEL_JSON,
+            help="with --refine_poses, train a small correction of each camera's focal lengths, principal point and "
+                 "distortion, too"),
         Option("images_to_load", 0, origin="ours", check=at_least(0),
             help="largest number of decoded images (photos, masks and depth maps) kept in memory, 0: all. The one "
                  "unused for longest goes. Every photo still trains, with the same result; up to 32 that come next "

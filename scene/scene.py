@@ -1,6 +1,7 @@
 """Views of a dataset, together with the Gaussians that are trained on them or loaded for them."""
 
 import argparse
+import copy
 import json
 import random
 import shutil
@@ -17,6 +18,7 @@ from scene.dataset_readers import read_scene, replaced_reader
 from scene.half_images import half, train_on_all
 from scene.images.masks import MaskOptions, refuse_nothing_to_ignore
 from scene.images.store import ImageStore, Picture, image_device
+from scene.lens_correction import shares_of
 from scene.pose_file import with_poses, write_poses
 from scene.readers.depth_maps import with_depth_maps
 from scene.readers.info import CameraInfo, SceneInfo, exposure_names, photo_size
@@ -58,7 +60,8 @@ class Scene:
         if load_iteration is not None and start:
             self.loaded_iter = find_iteration(self.model_path, load_iteration)
         self._halves = bool(getattr(args, "train_test_exp", False))
-        self._refines = bool(getattr(args, "refine_poses", False))
+        self._refines = bool(getattr(args, "refine_poses", False)) and not getattr(args, "other_scene", "")
+        self._refines_lens = bool(getattr(args, "refine_lens", False))
         self.info = self._read(args)
         self.cameras_extent = self.info.extent
 
@@ -106,7 +109,8 @@ class Scene:
             refuse_nothing_to_ignore([(view.image_path, view.mask) for view in views], masks)
         if self._halves:
             info = train_on_all(info)
-        if self._refines and not fresh and not getattr(args, "other_scene", ""):
+        self._given = info.test_cameras
+        if self._refines and not fresh:
             info = with_poses(info, self.model_path)
         if depths and fresh:
             info = with_depth_maps(info, Path(args.source_path), depths)
@@ -119,6 +123,16 @@ class Scene:
     def getTestCameras(self, scale: float = 1.0) -> list[Camera]:
         """Held-out views at a resolution scale that the scene was made with."""
         return self.test_cameras[scale]
+
+    def given_test_views(self) -> list[Camera]:
+        """Copies of the held-out views as the dataset has them, where poses are refined; none elsewhere."""
+        views = [copy.copy(camera) for camera in self.getTestCameras()] if self._refines else []
+        for camera in views:
+            given = self._given[camera.uid]
+            if self._refines_lens:
+                camera.refocus(shares_of(given).tolist())
+            camera.place(given.R, given.T)
+        return views
 
     def keep_all_images(self) -> None:
         """Let this process decode all images by itself, as none was asked for yet."""
@@ -142,7 +156,7 @@ class Scene:
     def save_poses(self) -> None:
         """Write `poses.json`, if poses are refined."""
         if self._refines:
-            write_poses(self.model_path, self.getTrainCameras(), self.getTestCameras())
+            write_poses(self.model_path, self.getTrainCameras(), self.getTestCameras(), self._refines_lens)
 
     def training_pixels(self) -> tuple[int, int]:
         """Pixels of all training views: at training size, and in the photos."""

@@ -34,7 +34,7 @@ class Immediate:
     """Stands for Speculation where there is no GPU: every step is done at once, and reported as late as may be."""
 
     def __init__(self, _: object, steps: CapturedStep) -> None:
-        self._pending, self._finished = deque(), steps.finished
+        self._pending, self._steps = deque(), steps
         self.drain = self.discard = self.wait = self._report
         self.throttle = lambda: self._report(AHEAD - 1)
         self.add = lambda at, _: self._pending.append(at)
@@ -42,7 +42,9 @@ class Immediate:
 
     def _report(self, most: int = 0) -> None:
         while len(self._pending) > most:
-            self._finished(self._pending.popleft())
+            at = self._pending.popleft()
+            self._steps._run.set_rates(at)  # as a replay would
+            self._steps.finished(at)
 
     def capacity(self, at: object) -> AbstractContextManager:
         return nullcontext()

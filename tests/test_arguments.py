@@ -267,7 +267,7 @@ def test_model_json_has_what_is_stored_there_with_sorted_keys(tmp_path):
     }  # fmt: skip
     write_cfg_args(tmp_path, argparse.Namespace())
     del record["options"]
-    defaults = {"masks": "", "mask_meaning": "auto", "lenses": "auto", "refine_poses": False}
+    defaults = {"masks": "", "mask_meaning": "auto", "lenses": "auto", "refine_poses": False, "refine_lens": False}
     assert read_stored_options(tmp_path) == {**MODEL, **record, **defaults}
 
 

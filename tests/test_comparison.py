@@ -207,7 +207,7 @@ def test_seeds_of_different_ground_truth_are_told_so():
 
 
 def test_one_option_set_has_no_comparisons(tmp_path):
-    shown = {"attic": {"curves": [], "fronts": [], "views": []}}
+    shown = {"attic": {"curves": [], "poses": [], "fronts": [], "views": []}}
     page = render("md", make_report(["x"], set_runs()[:2]), shown, tmp_path)
     assert "### Seconds of training to reach a test PSNR" not in page and "### Pareto front" not in page
     page = render("html", make_report(["x"], set_runs()), shown, tmp_path)

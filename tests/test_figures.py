@@ -6,7 +6,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from splatting.evaluation.error_curve import COLUMNS
-from splatting.evaluation.figures import draw_curve, draw_curves, draw_fronts
+from splatting.evaluation.figures import draw_curve, draw_curves, draw_fronts, draw_poses
 
 NAMES = ("seconds", "test_psnr", "test_ssim", "train_psnr", "train_ssim", "subset", "estimated")
 
@@ -116,6 +116,14 @@ def test_other_programs_and_sets_that_stand_apart_are_drawn_and_in_no_front(tmp_
     assert points(left, "Pareto front") == [[[1.0, 20.0], [9.0, 20.0], [9.0, 25.0]]]
     assert left.get_xlabel().endswith("(other programs: as they count)")
     assert not points(right, "other (another program)")  # it has no SSIM
+
+
+def test_corrections_of_poses_have_a_line_for_each_run(tmp_path, drawn):
+    runs = [{"config": name, "poses": [[1.0, 0.1 * i, 2.0], [3.0, 0.2, 2.5]]} for i, name in enumerate("aab")]
+    assert draw_poses(tmp_path, "attic", [*runs, {"config": "c", "poses": []}]) == [tmp_path / "attic_poses.png"]
+    (axes,) = drawn[0].axes
+    assert points(axes, "a") == [[[1.0, 0.0], [3.0, 0.2]]] and points(axes, "b") == [[[1.0, 0.2], [3.0, 0.2]]]
+    assert len(axes.lines) == 3 and not draw_poses(tmp_path, "attic", [{"config": None, "poses": []}])
 
 
 def test_fronts_have_a_point_and_a_bar_for_each_set(tmp_path, drawn):

@@ -21,6 +21,7 @@ from scene import Scene
 from scene.readers.start_cloud import random_in_frusta
 from splatting.camera_paths.poses import poses_of
 from splatting.diagnosis.dataset import check_dataset
+from utils.system_utils import UserError
 
 PANORAMA = ("EQUIRECTANGULAR", (WIDTH, HEIGHT))
 FISHEYE = (40.0, 40.0, *CENTER, 0.05, -0.01, 0.003, -0.001)
@@ -98,6 +99,9 @@ def test_a_training_and_its_renders_have_the_photos(tmp_path, monkeypatch, capsy
         with Image.open(path) as image:
             shown = np.asarray(image.convert("RGB"))
         assert any(np.array_equal(shown, np.asarray(Image.open(photo).convert("RGB"))) for photo in photos)
+    resume = [*words, "--iterations", "300", "--start_checkpoint", str(out / "chkpnt150.pth")]
+    with pytest.raises(UserError, match="was trained on the photos as they are; leave --lenses undistort out"):
+        train.main([*resume, "--lenses", "undistort"])
     if model == PANORAMA[0]:
         return
     words = ["-s", str(scene), "-m", str(tmp_path / "resampled"), "--eval", "--iterations", "300"]
@@ -113,3 +117,5 @@ def test_a_training_and_its_renders_have_the_photos(tmp_path, monkeypatch, capsy
     train.main([*words, "--start_checkpoint", str(tmp_path / "resampled/chkpnt150.pth")])
     assert ply.read_bytes() == once and "lenses" not in json.loads(model.read_text())
     assert "--lenses" not in capsys.readouterr().err
+    with pytest.raises(UserError, match="was trained on undistorted photos; leave --lenses native out"):
+        train.main([*words, "--lenses", "native", "--start_checkpoint", str(tmp_path / "resampled/chkpnt150.pth")])

@@ -1,6 +1,7 @@
 """Poses that are refined: by tracks, without drift of the whole, and through trainings, files and checkpoints."""
 
 import json
+import sys
 from argparse import Namespace
 from pathlib import Path
 
@@ -8,8 +9,10 @@ import numpy as np
 import pytest
 import torch
 from synthetic import BROWN, make_blender_scene, make_colmap_scene
-from trainings import differences, trained
+from trainings import differences, train_on, trained
 
+import metrics
+import render
 from benchmarks.scenes.poses import disturbed, errors
 from scene.gaussian_model import GaussianModel
 from scene.images.lens import Lens, rays_of
@@ -19,6 +22,8 @@ from scene.readers.colmap import read_colmap
 from scene.readers.tracks import Track, read_tracks
 from scene.reprojection import BOUND, moved_pose, nearest_pose, pull, twist_gradient
 from scene.scene import Scene
+from splatting.evaluation.plan import Run, SceneEntry
+from splatting.evaluation.results import read_run
 from splatting.training import checks, pose_refinement
 from splatting.training.pose_refinement import PoseRefinement
 from utils.graphics_utils import world_to_camera
@@ -144,8 +149,9 @@ def test_what_all_cameras_could_do_together_is_taken_out(tmp_path, monkeypatch):
         np.testing.assert_allclose(poses.twists, own, atol=1e-12)
     # The basis is that of motions and of growth: a common one of the world is nothing but drift.
     common = np.array([0.002, -0.001, 0.003, 0.1, 0.2, -0.1])
-    turned = np.array([pose @ moved_pose(np.eye(4), 0.01 * common, 1.0) for pose in poses._starts])
-    change = np.array([turn @ np.linalg.inv(pose) for turn, pose in zip(turned, poses._starts, strict=True)])
+    starts = poses._starts[: len(cameras)]
+    turned = np.array([pose @ moved_pose(np.eye(4), 0.01 * common, 1.0) for pose in starts])
+    change = np.array([turn @ np.linalg.inv(pose) for turn, pose in zip(turned, starts, strict=True)])
     twists = np.stack([change[:, 2, 1], change[:, 0, 2], change[:, 1, 0], *(change[:, k, 3] for k in range(3))], 1)
     twists[:, 3:] /= scene.cameras_extent
     left = twists.reshape(-1) - basis.T @ inverse @ basis @ twists.reshape(-1)
@@ -252,6 +258,30 @@ def test_a_resumed_training_has_the_bytes_of_a_whole_one(scene, tmp_path):
     with pytest.raises(UserError, match="the checkpoint has no refined poses of this run's views"):
         trained(scene, tmp_path / "more", "--refine_poses", "--iterations", 61, "--start_checkpoint",
                 tmp_path / "unrefined" / "chkpnt60.pth")  # fmt: skip
+
+
+def test_test_views_are_scored_with_given_poses_too(tmp_path, monkeypatch):
+    make_colmap_scene(tmp_path / "right")
+    scene, out = disturbed(tmp_path / "right", tmp_path / "scene", 1.5, 1, 2), tmp_path / "out"
+    words = "--eval", "--iterations", 200, "--test_iterations", 200, "--densify_from_iter", 1000, "--disable_viewer"
+    train_on(scene, out, *words, "--refine_poses")
+    log = json.loads((out / "train_log.json").read_text())
+    assert log[-1]["test_psnr"] > log[-1]["test_given_poses_psnr"] + 0.1
+    assert len(log) >= 12 and all(record["pose_degrees"] == pytest.approx(1.5, abs=0.1) for record in log)
+    assert all(record["pose_percent"] == pytest.approx(1, abs=0.1) for record in log)
+    for command, *more in ((render, "--skip_train"), (metrics,)):
+        monkeypatch.setattr(sys, "argv", ["x", "-m", str(out), *more])
+        command.main()
+    scores = json.loads((out / "results.json").read_text())
+    assert scores.keys() == {"ours_200", "ours_200_given_poses"}
+    assert scores["ours_200"]["PSNR"] > scores["ours_200_given_poses"]["PSNR"] + 0.1
+    run = read_run(Run(SceneEntry("x", "scenes", scene), None, None, out, (), ()), tmp_path, None)
+    assert run["iterations"]["200"]["PSNR_given_poses"] == scores["ours_200_given_poses"]["PSNR"]
+    assert run["poses"] == [[record["seconds"], record["pose_degrees"], record["pose_percent"]] for record in log]
+    (out / "model.json").write_text("{}")  # as of a training without refined poses
+    monkeypatch.setattr(sys, "argv", ["x", "-m", str(out), "--skip_train"])
+    render.main()
+    assert [path.name for path in (out / "test").iterdir()] == ["ours_200"]
 
 
 @pytest.mark.parametrize(

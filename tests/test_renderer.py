@@ -65,7 +65,8 @@ def test_depth_unless_it_is_not_wanted(camera):
 def _report(camera, draw, *more: object, halves: bool = False) -> dict[str, float]:
     """Scores of a training report whose views are this camera's, five of training and one of test."""
     camera.target, camera.counted_pixels, camera.image_name = lambda _: torch.ones(3, HEIGHT, WIDTH), None, "a"
-    scene = argparse.Namespace(gaussians=model(5), getTrainCameras=lambda: [camera], getTestCameras=lambda: [camera])
+    views = dict.fromkeys(("getTrainCameras", "getTestCameras"), lambda: [camera])
+    scene = argparse.Namespace(gaussians=model(5), given_test_views=list, **views)
     zero, arguments = torch.zeros(()), (pipeline(), BLACK, *more)
     return report.training_report(None, 1, zero, zero, l1_loss, 0.0, [1], scene, draw, arguments, halves)
 

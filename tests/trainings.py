@@ -44,6 +44,7 @@ OPTIONS = {
     "budget": BUDGET,
     "poses": ("--refine_poses", "--resolution_schedule", "pyramid"),
     "poses, no graph": ("--refine_poses", "--train_test_exp", "-d", "depths", "--depth_l1_weight_init", 1),
+    "poses and lenses": ("--refine_poses", "--refine_lens", "--resolution_schedule", "pyramid"),
     "budget errors": (*BUDGET, "--score_power", 2, "--train_test_exp"),
 }
 

@@ -20,7 +20,7 @@ from splatting.files.json_files import read_json
 SCORES = ("PSNR", "SSIM", "LPIPS")
 QUANTITIES = (
     *(*SCORES, "seconds", "process_seconds", "cpu_seconds", "gaussians", "gaussians_saved", "peak_memory_mib"),
-    *("render_ms", "fps", "ply_mb"),
+    *("render_ms", "fps", "ply_mb", "PSNR_given_poses"),
 )
 COMPARED = (*SCORES, "gaussians")  # with published numbers
 DEFAULT = ("adc", "default", "defaults", "base")  # names of the set that others are compared with, the first there is
@@ -74,11 +74,11 @@ def summarise(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     for (scene, config), members in grouped(runs, "scene", "config").items():
         for at in _moments([run for run in members if not run["failure"]]):
             there = [run for run, _ in at]
-            row = {name: spread(run["iterations"][str(t)][name] for run, t in at) for name in QUANTITIES}
+            row = {name: spread(run["iterations"][str(t)].get(name) for run, t in at) for name in QUANTITIES}
             iterations = sorted({t for _, t in at})
             one = len({run["ground_truth_sha256"] for run in there}) == 1
             if not one:
-                row |= {name: row[name] | {"mean": None, "std": None} for name in SCORES}
+                row |= {name: row[name] | {"mean": None, "std": None} for name in (*SCORES, "PSNR_given_poses")}
             row |= {
                 "apart": any(run["apart"] for run in there),
                 "config": config,

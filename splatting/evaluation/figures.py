@@ -201,6 +201,22 @@ def draw_curves(
     ]
 
 
+def draw_poses(folder: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list[Path]:
+    """Draw how far refined poses have turned, on the mean, against seconds of training; return the file, if any."""
+    shown = [run for run in runs if run.get("poses")]  # reports of older versions lack it
+    configs = list(dict.fromkeys(run["config"] for run in shown))
+
+    def draw(axes: Axes) -> None:
+        for place, run in enumerate(shown):
+            again = any(run["config"] == other["config"] for other in shown[:place])
+            style = {"color": f"C{configs.index(run['config']) % 10}", "marker": "o", "markersize": 3.5}
+            points = [(seconds, degrees) for seconds, degrees, _ in run["poses"]]
+            _draw(axes, points, None if again else run["config"] or "training views", **style)
+
+    labels = LABELS["seconds"], "mean turn of the training views (degrees)"
+    return [_panel(folder / f"{scene}_poses.png", scene, False, labels, draw)] if shown else []
+
+
 def _draw_runs(axes: Axes, runs: Sequence[dict[str, Any]], value: Value, several: bool) -> list[Point]:
     """Draw a line for each run; return the points of those that do not stand apart."""
     configs = list(dict.fromkeys(run["config"] for run in runs))

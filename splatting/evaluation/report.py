@@ -18,7 +18,7 @@ from PIL import Image
 
 from splatting.evaluation import comparison, tables
 from splatting.evaluation.comparison import Sets
-from splatting.evaluation.figures import draw_curves, draw_fronts
+from splatting.evaluation.figures import draw_curves, draw_fronts, draw_poses
 from splatting.evaluation.renders import GAIN, ComparedViews
 from splatting.files.json_files import write_json
 from splatting.files.listing import markdown_table
@@ -35,7 +35,7 @@ _MEANT = re.compile(r"[\\`*\[\]<>&]")  # characters that begin or end Markdown's
 _ENTITIES = {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
 
 Run = dict[str, Any]
-Pictures = Mapping[str, Mapping[str, Any]]  # by scene: paths of `curves` and `fronts`; `views`, by `_views`
+Pictures = Mapping[str, Mapping[str, Any]]  # by scene: paths of `curves`, `poses`, `fronts`; `views`, by `_views`
 
 
 def make_report(
@@ -124,6 +124,7 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
         names, found = list(dict.fromkeys(run["config"] for run in members)), report["fronts"].get(scene)
         pictures[scene] = {
             "curves": _figures(draw_curves, folder, scene, members, peers),
+            "poses": _figures(draw_poses, folder, scene, members),
             "fronts": _figures(draw_fronts, folder, scene, found, names) if found else [],
             "views": _views(output, scene, members, each),
         }

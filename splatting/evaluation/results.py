@@ -14,8 +14,9 @@ from splatting.evaluation import model_folder as folder_of
 from splatting.evaluation.comparison import SCORES
 from splatting.evaluation.error_curve import Row
 from splatting.evaluation.plan import Record, Run, SceneEntry, is_model
-from splatting.evaluation.renders import TIMES, WORST, image_size, photo_namer, view_names
+from splatting.evaluation.renders import GIVEN_POSES, TIMES, WORST, image_size, photo_namer, view_names
 from splatting.evaluation.stages import Failure, page_file
+from splatting.evaluation.training_log import DEGREES, PERCENT
 from splatting.evaluation.what_to_try import peak
 from splatting.files.json_files import read_json
 from utils.system_utils import UserError
@@ -30,7 +31,7 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
     finished: the last iteration is scored and no stage failed. open_ended: the training itself decided when to end. A
     damaged file counts as a failure. options, source, added_options: null if not known. peak: the iteration at which
     test views were clearly better than at the end, its PSNR, and the loss since; shorter_ends_there: whether
-    --iterations with that number gives that model.
+    --iterations with that number gives that model. poses: seconds and the mean correction of refined poses.
     """
     model, record = run.model, Record(run.model)
     trained = record.stage("train") or {}
@@ -72,6 +73,11 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
         or dataclasses.replace(run, options=options).iterations is None,
         "page": os.path.relpath(page, output) if record.stage("html") and page.is_file() else None,
         "peak": best,
+        "poses": [
+            [record["seconds"], record[DEGREES], record[PERCENT]]
+            for record in folder_of.logged(model).values()
+            if DEGREES in record
+        ],
         "scene": run.scene.name,
         "seed": run.seed,
         "source": known and known["scene"],
@@ -131,8 +137,10 @@ def _iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, Any]:
     else:
         times = folder_of.json_or_none(model / "test" / method / TIMES) or {}
     seconds = folder_of.training_seconds(model, iteration)
+    given = (folder_of.json_or_none(model / "results.json") or {}).get(f"{method}_{GIVEN_POSES}", {})
     return {
         **{key: means.get(key) for key in SCORES},
+        "PSNR_given_poses": given.get("PSNR"),
         "cpu_seconds": None,
         "fps": times.get("fps"),
         "gaussians": folder_of.trained_gaussians(model, iteration),

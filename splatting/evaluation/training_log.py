@@ -23,8 +23,10 @@ from utils.system_utils import UserError, compute_device
 
 NAME = "train_log.json"
 SHORT = 2000  # iterations; after trainings up to this length, what training says at its end is short
+DEGREES, PERCENT = "pose_degrees", "pose_percent"  # mean correction of refined poses: turn, and part of the extent
 _FLUSHED = 10  # seconds until events are in the file at the latest
-_FINITE = ("loss", "peak_memory_mib", "wall_seconds", "max_num_splats", "default_budget")  # if present
+_OTHERS = "loss", "peak_memory_mib", "wall_seconds", "max_num_splats", "default_budget"
+_FINITE = (DEGREES, PERCENT, *_OTHERS)  # if present
 
 
 class Stopwatch:

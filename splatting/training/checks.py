@@ -106,11 +106,13 @@ def check_one_process(option: str, several: bool) -> None:
 
 
 def check_poses(dataset: argparse.Namespace, several: bool, projection: str = "ewa") -> None:
-    """Refuse to refine poses in a training of several processes, or on rays (UserError)."""
+    """Refuse to refine poses in a training of several processes, or on rays, and lenses without poses (UserError)."""
     if getattr(dataset, "refine_poses", False):
         check_one_process("--refine_poses", several)
     if projection == "ray" and getattr(dataset, "refine_poses", False):
         raise UserError("--projection ray has no gradients of poses; leave --refine_poses out, or use ewa")
+    if getattr(dataset, "refine_lens", False) and not getattr(dataset, "refine_poses", False):
+        raise UserError("--refine_lens corrects lenses together with poses; give --refine_poses, too")
 
 
 def check_unrefined(poses: object, checkpoint: str) -> None:
@@ -315,13 +317,18 @@ def strategy_of(checkpoint: str) -> str:
 def with_lenses(dataset: argparse.Namespace, checkpoint: str | None) -> argparse.Namespace:
     """Model options whose --lenses auto is decided: native, or that of the run that wrote a checkpoint to resume.
 
-    A folder that does not say was written when photos were undistorted, as they are where auto stays.
+    A folder that does not say was written when photos were undistorted, as they are where auto stays. UserError for
+    other photos than those of that run.
     """
-    if getattr(dataset, "lenses", None) != "auto":
-        return dataset
-    decided = copy.copy(dataset)
-    decided.lenses = _options_of(Path(checkpoint).parent).get("lenses", "auto") if checkpoint else "native"
-    return decided
+    given, then = getattr(dataset, "lenses", None), _options_of(Path(checkpoint).parent) if checkpoint else {}
+    before = then.get("lenses", "auto") if checkpoint else "native"
+    if given == "auto":
+        dataset = copy.copy(dataset)
+        dataset.lenses = before
+    elif given and then and given != before and "native" in (given, before):
+        photos = "the photos as they are" if before == "native" else "undistorted photos"
+        raise UserError(f"{checkpoint} was trained on {photos}; leave --lenses {given} out")
+    return dataset
 
 
 def _options_of(folder: Path) -> dict[str, object]:

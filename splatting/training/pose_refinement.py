@@ -13,134 +13,190 @@ import torch
 
 from scene.cameras import Camera
 from scene.readers.tracks import read_tracks
-from scene.reprojection import BOUND, moved_pose, nearest_pose, pull, twist_gradient
+from scene.reprojection import BOUND, damped, moved_pose, nearest_pose, pull, twist_gradient
 from scene.scene import Scene
+from splatting.evaluation.training_log import DEGREES, PERCENT
+from splatting.training.bounded_adam import BoundedAdam
+from splatting.training.lens_refinement import TOGETHER, LensRefinement
 from utils.general_utils import get_expon_lr_func
 from utils.graphics_utils import world_to_camera
 from utils.system_utils import UserError
 
 # Twists are rotations in radians, and translations in extents of the scene.
 _RATES = 1e-4, 1e-6  # of the first and the last step
-_BETAS, _EPS = (0.9, 0.99), 1e-12
 _ANCHOR = 1e-3  # weight of each point's squared reprojection error (pixels) in the loss of its view
 _PASSES = 10  # over all views, after which drift is taken out: each time the GPU is waited for
 _STATE = ("twists", "mean", "square", "counts")
+LENSES = "lenses"  # key of their state
 
 
 class PoseRefinement:
     """The corrections of a scene's training cameras. `place` gives the cameras their current poses.
 
-    twists (n, 6) float64, by the cameras' uid.
+    twists (n, 6) float64, by the cameras' uid. lens: the corrections of their lenses, or None.
     """
 
-    def __init__(self, scene: Scene, source_path: str, steps: int) -> None:
+    def __init__(self, scene: Scene, source_path: str, steps: int, with_lens: bool = False) -> None:
         """steps: of the schedule. UserError for a scene without tracks."""
         info, self._unit = scene.info, scene.cameras_extent
         lists = [sorted(of, key=lambda camera: camera.uid) for of in (scene.getTrainCameras(), scene.getTestCameras())]
-        tracks = read_tracks(source_path, info.train_cameras + info.test_cameras, info.offset)
-        if not any(tracks[: len(lists[0])]):
+        self._cameras, count = lists[0] + lists[1], len(lists[0])
+        views = info.train_cameras + info.test_cameras
+        tracks, slopes = read_tracks(source_path, views, info.offset), [None] * len(views)
+        if not any(tracks[:count]):
             raise UserError(
                 "--refine_poses needs the tracks of a COLMAP model, the places of its points in the photos, and "
                 f"{source_path} has none; leave it out"
             )
-        for camera, track in zip(lists[0] + lists[1], tracks, strict=True):
-            pose = nearest_pose(_pose_of(camera), track, camera.fx, self._unit, BOUND)
-            camera.place(pose[:3, :3].T.copy(), pose[:3, 3].copy())
-        self._cameras = lists[0]
-        self._starts = [_pose_of(camera) for camera in self._cameras]
-        held = zip(self._starts, tracks, self._cameras, strict=False)  # the tracks of test views are left
-        pulls = [track and pull(start, track, camera.fx, self._unit) for start, track, camera in held]
+        given, focals = [_pose_of(camera) for camera in self._cameras], [camera.fx for camera in self._cameras]
+        self.lens = LensRefinement(views, given, tracks, focals, self._unit) if with_lens else None
+        if self.lens:
+            tracks, slopes = self.lens.tracks, self.lens.slopes
+        of_each = list(zip(tracks, focals, slopes, strict=True))
+        self._given = given[:count]
+        self._starts = [
+            nearest_pose(pose, track, focal, self._unit, BOUND)
+            for pose, (track, focal, _) in zip(given, of_each, strict=True)
+        ]
+        pulls = [
+            track and pull(start, track, focal, self._unit, slope)
+            for start, (track, focal, slope) in zip(self._starts, of_each, strict=True)
+        ]
         self._held = [of_track and (of_track.gradient, of_track.curvature) for of_track in pulls]
         self._rate = get_expon_lr_func(*_RATES, max_steps=steps)
-        self._drift = _drift(self._starts, self._unit)
-        count = len(self._cameras)
-        self.twists, self.mean, self.square = (np.zeros((count, 6)) for _ in range(3))
-        self.counts = np.zeros(count)
+        self._drift = _drift(self._starts[:count], self._unit)
+        self._adam = BoundedAdam(count, (3, 6), BOUND)
+        self.twists, self._counts = self._adam.values, self._adam.counts
         self._poses: dict[int, np.ndarray] = {}  # that are known
-        self._moved: set[int] = set()  # since `place`
-        print(f"--refine_poses corrects {sum(track is not None for track in tracks)} of {len(tracks)} poses")
+        self._moved: set[int] = set(range(len(views)))  # since `place`
+        self.place()
+        lenses = f" and {len(self.lens.seen)} lenses" if self.lens else ""
+        print(f"--refine_poses corrects {sum(track is not None for track in tracks)} of {len(tracks)} poses{lenses}")
 
     def pose(self, uid: int) -> tuple[np.ndarray, np.ndarray]:
         """R and T of a training camera's current pose, as `Camera` has them."""
         pose = self._pose(uid)
         return pose[:3, :3].T.copy(), pose[:3, 3].copy()
 
-    def _pose(self, uid: int) -> np.ndarray:
-        if uid not in self._poses:
-            self._poses[uid] = moved_pose(self._starts[uid], self.twists[uid], self._unit)
-        return self._poses[uid]
+    def _pose(self, view: int) -> np.ndarray:
+        """The pose of a view: of a training camera by its uid; test views follow."""
+        if view not in self._poses:
+            self._poses[view] = moved_pose(self._starts[view], self._twist(view), self._unit)
+        return self._poses[view]
+
+    def _twist(self, view: int) -> np.ndarray:
+        """A test view goes where its track has the least error through the lens of the moment."""
+        if view < len(self.twists):
+            return self.twists[view]
+        if self.lens is None or self._held[view] is None:
+            return np.zeros(6)
+        _, curvature = self._held[view]
+        return -np.linalg.solve(damped(curvature[:6, :6]), curvature[:6, 6:] @ self.lens.change(view))
 
     def place(self, copy: Camera | None = None) -> None:
-        """Give the training cameras their current poses, and a smaller copy of one its own."""
-        for uid in self._moved:
-            self._cameras[uid].place(*self.pose(uid))
-        self._moved.clear()
+        """Give all cameras their current poses and lenses; or a training camera, and a smaller copy of it, its own."""
+        views = self._moved if copy is None else self._moved & {copy.uid}
+        for view in views:
+            self._put(self._cameras[view], view)
+        self._moved = self._moved - views
         if copy is not None and copy is not self._cameras[copy.uid]:
-            copy.place(*self.pose(copy.uid))
+            self._put(copy, copy.uid)
+
+    def _put(self, camera: Camera, view: int) -> None:
+        if self.lens:
+            camera.refocus(self.lens.shares(view).tolist())
+        camera.place(*self.pose(view))
 
     def independent(self, uid: int, pending: Sequence[int]) -> int:
         """On how many of the last steps a camera's next pose does not depend. pending: the cameras of steps to come."""
-        most, taken, all_passes = len(pending), int(self.counts.sum()), _PASSES * len(self._cameras)
-        if (taken + most) // all_passes > taken // all_passes:
-            most = (taken + most) % all_passes
+        taken, most = int(self._counts.sum()), len(pending)
+        for period in self._periods:
+            if (taken + len(pending)) // period > taken // period:
+                most = min(most, (taken + len(pending)) % period)
         return min(most, pending[::-1].index(uid)) if uid in pending else most
 
-    def step(self, uid: int, gradient: np.ndarray, step: int) -> None:
-        """Take the step of a camera. step: of the schedule.
+    @property
+    def _periods(self) -> list[int]:
+        """Steps after which drift is taken out, and after which lenses take theirs."""
+        return [_PASSES * len(self.twists)] + [TOGETHER] * (self.lens is not None)
+
+    def step(self, uid: int, gradient: np.ndarray, step: int, size: tuple[int, int] = (1, 1)) -> None:
+        """Take the step of a camera. step: of the schedule. size: of the image, which its lens needs.
 
         gradient: of the image's loss by the camera's numbers (diff_gaussian_rasterization/camera.py). A camera without
         a track, which nothing would hold, gets none.
         """
-        self.counts[uid] += 1
-        found = np.zeros(6)
+        found, rate = np.zeros(6), self._rate(step)
         if (held := self._held[uid]) is not None:
             at_start, curvature = held
-            found = twist_gradient(self._pose(uid), gradient, self._unit)
-            found += _ANCHOR * (at_start + curvature @ self.twists[uid])
-        if np.isfinite(found).all():
-            self._step(uid, found, self._rate(step))
-        if self.counts.sum() % (_PASSES * len(self._cameras)):
-            return self._move([uid])
+            moved = np.concatenate([self.twists[uid], self.lens.change(uid)]) if self.lens else self.twists[uid]
+            pulled = _ANCHOR * (at_start + curvature @ moved)
+            found = twist_gradient(self._pose(uid), gradient, self._unit) + pulled[:6]
+            if self.lens:
+                self.lens.add(uid, gradient, pulled[6:], size)
+        self._adam.step(uid, found, rate)
+        self._move([uid])
+        taken = self._counts.sum()
+        if self.lens and taken % TOGETHER == 0:
+            self._move(self.lens.step(rate))
+        if taken % (_PASSES * len(self.twists)):
+            return
         # The scene does not walk, turn or grow: what all cameras could do together is taken out.
         basis, inverse = self._drift
         flat = self.twists.reshape(-1)
         flat -= np.einsum("ak,a->k", basis, np.einsum("ab,b->a", inverse, np.einsum("ak,k->a", basis, flat)))
-        self._move(range(len(self._cameras)))
+        self._move(range(len(self.twists)))
 
-    def _move(self, uids: Collection[int]) -> None:
-        """Forget the poses of twists that have changed."""
-        for uid in uids:
-            self._poses.pop(uid, None)
-        self._moved.update(uids)
+    def _move(self, views: Collection[int]) -> None:
+        """Forget the poses of views whose twist or lens has changed."""
+        for view in views:
+            self._poses.pop(view, None)
+        self._moved.update(views)
 
-    def _step(self, uid: int, gradient: np.ndarray, rate: float) -> None:
-        """Take a step of Adam (Kingma and Ba 2015)."""
-        for average, beta, value in ((self.mean, _BETAS[0], gradient), (self.square, _BETAS[1], gradient**2)):
-            average[uid] = beta * average[uid] + (1 - beta) * value
-        mean, square = (
-            a[uid] / (1 - b ** self.counts[uid]) for a, b in zip((self.mean, self.square), _BETAS, strict=True)
-        )
-        twist = self.twists[uid] - rate * mean / (np.sqrt(square) + _EPS)
-        for part in (twist[:3], twist[3:]):
-            part *= min(1, BOUND / max(np.linalg.norm(part), BOUND))
-        self.twists[uid] = twist
+    def corrections(self) -> dict[str, float]:
+        """How far training cameras are from the dataset's poses, on the mean: turn, and percent of the extent."""
+        given, now = np.array(self._given), np.array([self._pose(uid) for uid in range(len(self.twists))])
+        chords = np.linalg.norm(now[:, :3, :3] - given[:, :3, :3], axis=(1, 2)) / np.sqrt(8)
+        centers = [-np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3]) for poses in (now, given)]
+        apart = np.linalg.norm(centers[0] - centers[1], axis=1) / self._unit
+        turns = np.degrees(2 * np.arcsin(np.minimum(chords, 1)))
+        return {DEGREES: round(float(turns.mean()), 6), PERCENT: round(100 * float(apart.mean()), 6)}
 
     def captured(self) -> dict[str, Any]:
         """State that a resumed training needs, as plain values."""
-        arrays = {name: torch.from_numpy(getattr(self, name).copy()) for name in _STATE}
-        return {"names": [camera.image_name for camera in self._cameras], **arrays}
+        state = {"names": self._names, **_tensors(dict(zip(_STATE, self._adam.state, strict=True)))}
+        return state | ({LENSES: _tensors(self.lens.state)} if self.lens else {})
 
     def restore(self, state: dict[str, Any] | None) -> None:
         """Take the state of `captured()`. UserError for one that does not fit, or None."""
-        names = [camera.image_name for camera in self._cameras]
-        shapes = {name: getattr(self, name).shape for name in _STATE}
-        fits = isinstance(state, dict) and state.get("names") == names
-        if not fits or any(getattr(state.get(name), "shape", None) != shape for name, shape in shapes.items()):
+        fits = isinstance(state, dict) and state.get("names") == self._names
+        if not (fits and _fill(dict(zip(_STATE, self._adam.state, strict=True)), state)):
             raise UserError("the checkpoint has no refined poses of this run's views; leave --refine_poses out")
-        for name in _STATE:
-            getattr(self, name)[:] = state[name].numpy()
-        self._move(range(len(names)))
+        if self.lens is None and LENSES in state:
+            raise UserError("the checkpoint was trained with --refine_lens; give that option")
+        if self.lens and not _fill(self.lens.state, state.get(LENSES)):
+            raise UserError("the checkpoint has no refined lenses of this run's cameras; leave --refine_lens out")
+        self._move(range(len(self._cameras)))
         self.place()
+
+    @property
+    def _names(self) -> list[str]:
+        return [camera.image_name for camera in self._cameras[: len(self.twists)]]
+
+
+def _tensors(arrays: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
+    return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
+
+
+def _fill(arrays: dict[str, np.ndarray], state: Any) -> bool:
+    """Give arrays the values of `_tensors`. Returns whether these fit; otherwise nothing changes."""
+    if not isinstance(state, dict):
+        return False
+    if any(getattr(state.get(name), "shape", None) != array.shape for name, array in arrays.items()):
+        return False
+    for name, array in arrays.items():
+        array[:] = state[name].numpy()
+    return True
 
 
 def _pose_of(camera: Camera) -> np.ndarray:

@@ -140,7 +140,8 @@ class Run:
         if not getattr(self.dataset, "refine_poses", False):
             checks.check_unrefined(state, self.start)
             return None
-        poses = PoseRefinement(self.scene, self.dataset.source_path, self.opt.iterations)
+        with_lens = getattr(self.dataset, "refine_lens", False)
+        poses = PoseRefinement(self.scene, self.dataset.source_path, self.opt.iterations, with_lens)
         if capture:
             poses.restore(state)
         return poses
@@ -379,7 +380,8 @@ class Run:
 
     def step_pose(self, step: Iteration, gradient: Tensor) -> None:
         """Take the step of the view's pose. gradient: of the image's loss by the camera's numbers."""
-        self.poses.step(step.camera.uid, gradient.cpu().numpy(), self.schedule.schedule_step(step.iteration))
+        camera, at = step.camera, self.schedule.schedule_step(step.iteration)
+        self.poses.step(camera.uid, gradient.cpu().numpy(), at, (camera.image_width, camera.image_height))
         self.poses.place()
 
     def after_step(self, step: Iteration) -> None:

@@ -61,11 +61,12 @@ class SparseDepth:
 def points_of(camera: Camera, view: CameraInfo, track: Track, weight: float = 1.0) -> PointDepths | None:
     """What a track says of a view's depth, with weights of that sum; of points in one pixel, that of most weight.
 
-    view: has the dataset's pose, so that a resumed training, whose poses may have moved, has the same points.
+    view: has the dataset's pose and lens, so that a resumed training, where they may have moved, has the same points.
     """
     seen = track.points @ view.R + view.T
     if camera.lens is None:
-        places = track.rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        scale = camera.image_width / view.width, camera.image_height / view.height
+        places = (track.rays * (view.fx, view.fy) + (view.cx, view.cy)) * scale
     else:
         places = track.places * (camera.image_width, camera.image_height)
     by_distance = camera.lens is not None and camera.lens.chart != "perspective"

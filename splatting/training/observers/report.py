@@ -14,6 +14,7 @@ from gaussian_renderer import render
 from gaussian_renderer.scored_views import ScoredViews
 from scene import Scene
 from scene.cameras import Camera
+from splatting.evaluation.renders import GIVEN_POSES
 from splatting.evaluation.what_to_try import BUDGET, CAP, PLANNED, STRATEGY, what_to_try
 from splatting.host.clock import wall_seconds
 from splatting.training.density import default_budget
@@ -180,7 +181,8 @@ def training_report(
 
     elapsed: seconds of this iteration; renderArgs: what follows camera and model in renderFunc, (pipe, background) or
     more. train_test_exp: render with exposures (a sixth of renderArgs says so, too), and score right halves only.
-    Returns `<set>_l1` and `<set>_psnr` (dB, mean over views and channels) of the sets scored, {} otherwise.
+    Returns `<set>_l1` and `<set>_psnr` (dB, mean over views and channels) of the sets scored, {} otherwise. Where poses
+    are refined, test views are scored with the dataset's, too.
     """
     if tb_writer and iteration % LOG_INTERVAL == 0:
         tb_writer.add_scalar("train_loss_patches/l1_loss", l1.item(), iteration)
@@ -197,7 +199,8 @@ def training_report(
         lambda camera, gaussians: renderFunc(camera, gaussians, *renderArgs, **options)["render"],
     )
     train = scene.getTrainCameras()
-    sets = {"test": scene.getTestCameras(), "train": [train[i % len(train)] for i in range(5, 30, 5)]}
+    sets = {"test": scene.getTestCameras(), f"test_{GIVEN_POSES}": scene.given_test_views()}
+    sets |= {"train": [train[i % len(train)] for i in range(5, 30, 5)]}
     scores = {}
     for name, cameras in sets.items():
 
@@ -294,21 +297,23 @@ class Target(Observer):
 
 
 class Records(Observer):
-    """Writes what other observers have put into the step's record, once all of it is there."""
+    """Writes what other observers have put into the step's record, once all of it is there.
+
+    Where poses are refined, it has how far they have moved, at points of the curve, too.
+    """
 
     def __init__(self, run: Run) -> None:
         self._run = run
         self._seconds = 0.0
 
     def measured(self, step: Iteration, losses: Losses) -> None:
-        if step.record is None:
-            return
         run = self._run
+        if step.record is None and (run.poses is None or step.scored_at is None):
+            return
         self._seconds = seconds = run.clock.seconds if step.scored_at is None else step.scored_at
         with run.clock.paused("saving"):
-            run.log.add(
-                step.iteration, seconds, gaussians=run.gaussians.gaussian_count, loss=run.losses.mean, **step.record
-            )
+            values = (step.record or {}) | (run.poses.corrections() if run.poses else {})
+            run.log.add(step.iteration, seconds, gaussians=run.gaussians.gaussian_count, loss=run.losses.mean, **values)
 
     def ended(self, error: Error) -> None:
         """Note the seconds of this process: up to its first iteration, of training, of scoring and of saving."""

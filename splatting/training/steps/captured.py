@@ -57,8 +57,6 @@ class CapturedStep(FusedStep):
             self.drain()  # nothing is pending, unless --debug_from has just come into force
             run.set_rates(at)
             return super().take(at, observers)
-        if run.poses:
-            self._ahead.wait(run.poses.independent(at.camera.uid, [one.uid for one in self._fetched.values()]))
         losses = self._queue(at)
         if losses is None:
             self._ahead.discard()
@@ -70,6 +68,8 @@ class CapturedStep(FusedStep):
     def throttle(self, at: Iteration) -> None:
         if self._is_queued(at):
             self._ahead.throttle()
+            if poses := self._run.poses:
+                self._ahead.wait(poses.independent(at.camera.uid, [one.uid for one in self._fetched.values()]))
         else:
             self.drain()
             self._graphs.save_memory()
@@ -129,10 +129,11 @@ class CapturedStep(FusedStep):
         """Take the step of the view's pose, now that the GPU has taken that of the Gaussians."""
         if self._rows is None:
             return
-        fetched = self._fetched.pop(at.iteration)
+        fetched, size = self._fetched.pop(at.iteration), (at.camera.image_width, at.camera.image_height)
         if fetched.copied is not None:
             fetched.copied.synchronize()
-        self._run.poses.step(fetched.uid, fetched.gradient.numpy(), self._run.schedule.schedule_step(at.iteration))
+        step = self._run.schedule.schedule_step(at.iteration)
+        self._run.poses.step(fetched.uid, fetched.gradient.numpy(), step, size)
 
     def replay(self, at: Iteration, first: Losses) -> None:
         """Queue a step once more, with the same values, which go into the losses that observers hold (`first`)."""
@@ -182,7 +183,8 @@ class Graphs:
         self._kinds: set[Kind] = set()
         self._graphs: dict[Kind, _Graph] = {}
         self._baked: tuple = ()
-        self._able = True  # whether the objective can be captured, and memory is there
+        # Whether the objective can be captured, and memory is there. Lenses lie in arguments on the host.
+        self._able = not (run.poses and run.poses.lens)
         self._taken = 0
 
     def launch(self, at: Iteration) -> Losses | None:
