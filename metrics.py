@@ -2,8 +2,8 @@
 
 python metrics.py -m MODEL [MODEL ...] [--lpips_net vgg|alex|both] [--lpips_weights FILE ...]
 
-Reads MODEL/test/<method>/{renders,gt}, and masks if there are any. Writes MODEL/results.json (means), per_view.json,
-and metrics_info.json, which states the convention of each number.
+Reads MODEL/test/<method>/{renders,gt}, masks if there are any, and the errors of depth that render.py --depth writes.
+Writes MODEL/results.json (means), per_view.json, and metrics_info.json, which states the convention of each number.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from arguments import OptionParser, read_cfg_args
 from splatting.evaluation.model_folder import json_or_none
-from splatting.evaluation.renders import INCOMPLETE, TIMES, image_of, image_size, mask_of, model_digest
+from splatting.evaluation.renders import DEPTHS, INCOMPLETE, TIMES, image_of, image_size, mask_of, model_digest
 from splatting.files.json_files import read_json, write_json
 from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, load_network
 from utils.system_utils import UserError, compute_device, run_cli
@@ -35,6 +35,8 @@ CONVENTIONS = {
     "LPIPS": "version 0.1, VGG-16, inputs in [0,1] without mapping, as in the published 3DGS tables",
     "LPIPS_vgg": "version 0.1, VGG-16, inputs mapped to [-1,1]",
     "LPIPS_alex": "version 0.1, AlexNet, inputs mapped to [-1,1]",
+    "DEPTH": "relative error of the inverse depth at held-out points that the photo has seen: the median of a view",
+    "DEPTH_95": "the same: what 95 % of a view's points are below",
 }
 BACKBONES = {"LPIPS": "vgg", "LPIPS_vgg": "vgg", "LPIPS_alex": "alex"}
 
@@ -242,6 +244,13 @@ def evaluate(
         raise UserError("; ".join(failed))
 
 
+def depth_scores(method: Path) -> Scores:
+    """The errors of depth that render.py has written beside the renders of a method; none without a file."""
+    found = json_or_none(method / DEPTHS) or {}
+    keys = dict.fromkeys(key for of_view in found.values() for key in of_view)
+    return {key.upper(): {name: of_view[key] for name, of_view in found.items() if key in of_view} for key in keys}
+
+
 def keep_lpips(model: Path, method: str, scores: Scores) -> list[str]:
     """Add the LPIPS that model/per_view.json has of a method to new scores that lack it; return its metrics.
 
@@ -275,6 +284,7 @@ def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str,
     for name, scores in per_view.items():
         if kept := keep_lpips(model, name, scores):
             print(f"{model} {name}: kept {', '.join(kept)} of an earlier scoring of the same pictures")
+        scores |= depth_scores(model / "test" / name)
     results = {name: {key: mean(values) for key, values in scores.items()} for name, scores in per_view.items()}
     for name, means in results.items():
         shown = "  ".join(f"{key} {'null' if value is None else f'{value:.4f}'}" for key, value in means.items())

@@ -7,7 +7,8 @@ python render.py -s SCENE -m OUT --ply FILE
 Writes MODEL/{train,test}/ours_N/{renders,gt}/00000.png ..., numbered by the views' sorted order, masks/ for views of
 which not every pixel counts, and render_times.json beside these folders: the time of each view without I/O. The device
 is idle before the clock starts, and done when it stops. --depth and --alpha write inverse depth and alpha into folders
-of these names, 16-bit PNGs with their scale in a text chunk (splatting/files/image_files.py).
+of these names, 16-bit PNGs with their scale in a text chunk (splatting/files/image_files.py). Of COLMAP scenes, --depth
+also writes depth_errors.json, the errors at points that no training was supervised by, for metrics.py.
 
 With --path, writes MODEL/videos/ours_N/NAME.mp4 instead (splatting/camera_paths/render_path.py).
 """
@@ -21,7 +22,7 @@ import argparse
 import copy
 import shutil
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
@@ -38,10 +39,11 @@ from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
 from scene.scene import Scene
 from splatting.camera_paths.render_path import add_path_options, path_request, render_path
-from splatting.evaluation.renders import GIVEN_POSES, INCOMPLETE, TIMES, model_digest, summarise_times
+from splatting.evaluation.renders import DEPTHS, GIVEN_POSES, INCOMPLETE, TIMES, model_digest, summarise_times
 from splatting.exports.in_scene import load_file
 from splatting.files.image_files import remove_leftovers, save_png, write_plane
 from splatting.files.json_files import write_json
+from splatting.training.sparse_depth import PointDepths, held_out_points
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p, run_cli
 
@@ -54,10 +56,12 @@ def write_views(
     background: torch.Tensor,
     train_test_exp: bool = False,
     planes: Collection[str] = (),
+    points: Mapping[str, PointDepths] | None = None,
 ) -> list[float]:
     """Write renders, ground truth and masks of `views` under `folder`; seconds of rendering per view (without I/O).
 
-    train_test_exp: render with exposures, and write right halves only. planes: those of PLANES to write, too.
+    train_test_exp: render with exposures, and write right halves only. planes: those of PLANES to write, too. points:
+    score the depth, by image name.
     """
     scored = ScoredViews(pipe, background, train_test_exp)
     for side in ("renders", "gt"):
@@ -68,7 +72,7 @@ def write_views(
     remove_leftovers(folder / "masks", 0)  # some views may have none
     for plane in PLANES:
         remove_leftovers(folder / plane, len(views) if plane in planes else 0)
-    seconds = []
+    seconds, errors = [], {}
     for view in {(view.image_width, view.image_height): view for view in views}.values():
         # The first call of a size also pays for allocations and caches.
         scored.whole(view, gaussians)
@@ -84,9 +88,13 @@ def write_views(
             if plane in planes:
                 path = folder / plane / f"{index:05d}.png"
                 write_plane(path, scored.part(values)[0].cpu().numpy(), PLANES[plane].white)
+            if plane == "depth" and points and view.image_name in points:
+                errors[f"{index:05d}.png"] = points[view.image_name].scores(values, view.counted_pixels)
         if (mask := scored.mask(view)) is not None:  # white where pixels count
             with atomic_write(folder / "masks" / f"{index:05d}.png") as temporary:
                 Image.fromarray(mask[0].to(torch.uint8).mul(255).cpu().numpy()).save(temporary)
+    if errors:
+        write_json(folder / DEPTHS, errors)
     (folder / INCOMPLETE).unlink(missing_ok=True)
     return seconds
 
@@ -109,16 +117,18 @@ def render_set(
     separate_sh: bool = False,
     *,
     planes: Collection[str] = (),
+    points: Mapping[str, PointDepths] | None = None,
 ) -> None:
     """Write renders, ground truth, masks and times of `views` under model_path/name/ours_ITERATION; say how long.
 
     train_test_exp: render with exposures, and write right halves only. separate_sh: accepted for callers of the
-    reference; the SH bands are always passed separately. planes: those of PLANES to write, too.
+    reference; the SH bands are always passed separately. planes, points: as for `write_views`.
     """
     folder = Path(model_path) / name / f"ours_{iteration}"
-    (folder / TIMES).unlink(missing_ok=True)  # times of an interrupted run do not count
+    for of_earlier in (TIMES, DEPTHS):  # of an interrupted run they do not count
+        (folder / of_earlier).unlink(missing_ok=True)
     with memory_errors_explained(gaussians, views):
-        seconds = write_views(folder, views, gaussians, pipeline, background, train_test_exp, planes)
+        seconds = write_views(folder, views, gaussians, pipeline, background, train_test_exp, planes, points)
     if not seconds:
         print(f"{name}: no views" + ("; the model was trained without --eval" if name == "test" else ""))
         return
@@ -156,7 +166,9 @@ def render_sets(
     if not skip_train:
         render_set(scene.model_path, "train", scene.loaded_iter, scene.getTrainCameras(), *drawn, planes=planes)
     if not skip_test:
-        render_set(scene.model_path, "test", scene.loaded_iter, scene.getTestCameras(), *drawn, planes=planes)
+        views = scene.getTestCameras()
+        points = held_out_points(scene, dataset.source_path) if "depth" in planes else None
+        render_set(scene.model_path, "test", scene.loaded_iter, views, *drawn, planes=planes, points=points)
         method = f"{scene.loaded_iter}_{GIVEN_POSES}"
         if given := scene.given_test_views():
             render_set(scene.model_path, "test", method, given, *drawn, planes=planes)

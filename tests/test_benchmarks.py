@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from pycolmap import Reconstruction
 from torch.profiler import ProfilerActivity, profile
 
 import train
@@ -19,9 +20,11 @@ from benchmarks.harness.calls import by_stage
 from benchmarks.harness.measuring import GpuTime, short_name
 from benchmarks.kernels import rasterizer
 from benchmarks.parallel import steps, workload
-from benchmarks.scenes import step_profile, training
+from benchmarks.scenes import options, step_profile, training
 from benchmarks.strategies.figure import draw
 from benchmarks.strategies.tables import at, joined
+from scene.dataset_readers import read_scene
+from splatting.training.sparse_depth import HELD_OUT
 from utils.system_utils import UserError
 
 
@@ -79,6 +82,29 @@ def test_an_iteration_makes_few_calls(colmap_scene, tmp_path):
 def _rows(said: str, first: str) -> list[list[str]]:
     lines = [line for line in said.splitlines() if line.startswith(f"| {first}")]
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+
+
+def test_options_are_compared_with_none_on_every_third_photo(colmap_scene, tmp_path, monkeypatch, capsys):
+    given = []
+
+    def train(scene: Path, model: Path, seed: int, words: list[str], **more: object) -> dict[str, float]:
+        given.append((words, more["judged"]))
+        views = read_scene(scene, "images", hold_out=False).train_cameras
+        every = sorted(view.image_name for view in read_scene(colmap_scene, "images", hold_out=True).train_cameras)
+        assert sorted(view.image_name for view in views) == every[::3]
+        return {"PSNR": 20.0 + seed + 0.5 * (len(words) > 2), "SSIM": 0.5, "DEPTH": None, "seconds": 1, "Gaussians": 7}
+
+    monkeypatch.setattr(options, "train", train)
+    words = f"options {tmp_path}/out --scenes {colmap_scene} --keep 3 --with=--refine_poses --seeds 0 2 -r 4"
+    monkeypatch.setattr(sys, "argv", words.split())
+    options.main()
+    assert given == [(["-r", "4", *more], colmap_scene) for more in [[]] * 2 + [["--refine_poses"]] * 2]
+    rows = _rows(capsys.readouterr().out, colmap_scene.name)
+    assert rows[0][1:] == ["none", "21.00", "0.5000", "", "", "1.0", "7", ""]
+    assert rows[1][1:] == ["--refine_poses", "21.50", "0.5000", "", "", "1.0", "7", "+0.50 (0.00)"]
+    points = (tmp_path / "out" / colmap_scene.name / "thinned/sparse/0/points3D.txt").read_text().splitlines()
+    known = Reconstruction(str(colmap_scene / "sparse/0")).num_points3D()
+    assert len(points) == known - -(-known // HELD_OUT)
 
 
 def test_the_kernels_are_timed(colmap_scene, tmp_path, monkeypatch, capsys):

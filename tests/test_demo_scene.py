@@ -200,10 +200,10 @@ def test_same_seed_same_bytes_and_another_seed_another_scene(tmp_path):
 
 def test_other_processes_give_the_same_pictures(monkeypatch):
     views = ring_views(4, 24, 18, np.random.default_rng(0))
-    alone = maker._images(views)
+    alone = maker._images(views, maker._demo, 2)
     monkeypatch.setattr(maker, "PIXELS_PER_PROCESS", 24 * 18)
     monkeypatch.setattr(maker, "cores", lambda: 2)
-    assert np.array_equal(maker._images(views), alone)
+    assert np.array_equal(maker._images(views, maker._demo, 2), alone)
 
 
 @pytest.mark.parametrize(

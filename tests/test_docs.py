@@ -26,7 +26,7 @@ DEVICE = {
     "accuracy": "benchmarks.accuracy.oracle",
     "train": "benchmarks.scenes.training",
 }
-SCENES = ("step_profile", "lenses", "street", "training")
+SCENES = ("step_profile", "options", "street", "training")
 FORWARDING = [f"benchmarks.scenes.{name}" for name in SCENES]  # unknown words go to train.py
 FOREIGN = {"--eval_steps", "--save_steps", "--nnodes", "--shutdown_timeout"}  # flags of other programs
 

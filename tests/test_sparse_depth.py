@@ -1,19 +1,26 @@
 """Depth by the points of structure from motion (--sparse_depth): where they lie, their loss, and trainings with it."""
 
+import sys
 from argparse import Namespace
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 import torch
 from synthetic import BROWN, make_blender_scene, make_colmap_scene
-from trainings import differences, trained
+from trainings import differences, train_on, trained
 
+import metrics
+import render
 import train
-from gaussian_renderer import render
 from scene.gaussian_model import GaussianModel
 from scene.readers.tracks import read_tracks
 from scene.scene import Scene
+from splatting.evaluation.error_curve import read_curve
+from splatting.files.image_files import read_plane
+from splatting.files.json_files import read_json
 from splatting.training import checks, sparse_depth
 from splatting.training.sparse_depth import HELD_OUT, PointDepths, SparseDepth, points_of
 from utils.system_utils import UserError, run_cli
@@ -83,28 +90,57 @@ def test_a_resumed_training_has_the_bytes_of_a_whole_one_with_poses_that_move(sc
     assert not differences(whole, trained(scene, tmp_path / "resumed", *options, *start))
 
 
-def _error(scene: Path, folder: Path) -> float:
-    """Median relative error of the inverse depths at points of test views, none of which trained."""
-    gaussians = GaussianModel(3)
-    loaded = _scene(scene)
-    gaussians.load_ply(str(folder / "point_cloud/iteration_60/point_cloud.ply"))
-    pipe = Namespace(antialiasing=False, compute_cov3D_python=False, convert_SHs_python=False, debug=False)
-    views, errors = loaded.info.test_cameras, []
-    for camera, track in zip(
-        sorted(loaded.getTestCameras(), key=lambda one: one.uid),
-        read_tracks(scene, views, loaded.info.offset),
-        strict=True,
-    ):
-        points = points_of(camera, views[camera.uid], track)
-        shown = render(camera, gaussians, pipe, torch.zeros(3), want_depth=True)["depth"].flatten()[points.pixels]
-        errors.append((shown / points.inverse_depths - 1).abs())
-    return torch.cat(errors).median().item()
+def _scores(scene: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
+    """What metrics.py makes of the test views' depth."""
+    monkeypatch.setattr("sys.argv", ["render.py", "-m", str(folder), "--skip_train", "--depth", "--quiet"])
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", sys.stdout)  # which rendering stamps
+        render.main()
+    monkeypatch.setenv("GS_DOWNLOAD", "0")
+    metrics.evaluate([folder])
+    return read_json(folder / "results.json")["ours_60"]
 
 
-def test_depth_comes_nearer_to_points_of_test_views(scene, tmp_path):
+def _by_pycolmap(scene: Path, folder: Path) -> list[list[float]]:
+    """Relative errors of each test view at its held-out points, from the files that render.py has written."""
+    known, errors = pycolmap.Reconstruction(str(scene / "sparse/0")), []
+    judging = [point for rank, point in enumerate(sorted(known.points3D)) if rank % HELD_OUT == 0]
+    for place, image in enumerate(sorted(known.images.values(), key=lambda image: image.name)[::8]):
+        plane = read_plane(folder / f"test/ours_60/depth/{place:05d}.png")
+        found: dict[tuple[int, int], list[float]] = {}
+        for two in image.points2D:
+            if two.has_point3D() and two.point3D_id in judging:
+                x, y = (int(value * plane.shape[0] / 64) for value in two.xy)
+                point = known.points3D[two.point3D_id]
+                trust = (point.track.length() - 1) / (1 + point.error**2)
+                depth = (image.cam_from_world() * point.xyz)[2]
+                found.setdefault((x, y), []).append((-trust, abs(plane[y, x] * depth - 1)))
+        errors.append([min(of_pixel, key=itemgetter(0))[1] for of_pixel in found.values()])
+    return errors
+
+
+def test_depth_comes_nearer_to_points_of_test_views(scene, tmp_path, monkeypatch):
+    """They are scored by training's curve, and by render.py and metrics.py, as pycolmap says."""
+    found = {}
     for name, options in (("without", ()), ("with", ("--sparse_depth", 1.0))):
         trained(scene, tmp_path / name, *options, "--test_iterations", -1, "--opacity_reset_interval", 3000)
-    assert _error(scene, tmp_path / "with") < 0.9 * _error(scene, tmp_path / "without")
+        found[name] = _scores(scene, tmp_path / name, monkeypatch)
+    assert found["with"]["DEPTH"] < 0.9 * found["without"]["DEPTH"]
+    errors = _by_pycolmap(scene, tmp_path / "with")
+    for key, share in (("DEPTH", 0.5), ("DEPTH_95", 0.95)):
+        expected = np.mean([np.quantile(of_view, share) for of_view in errors])
+        assert found["with"][key] == pytest.approx(expected, rel=1e-3)
+
+
+def test_the_curve_has_errors_of_depth(scene, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", sys.stdout)
+        words = "--eval", "-r", 48, "--iterations", 60, "--sparse_depth", 1, "--quiet", "--disable_viewer"
+        train_on(scene, tmp_path, *words)
+    (row,) = read_curve(tmp_path / "error_vs_time.csv")
+    scores = _scores(scene, tmp_path, monkeypatch)
+    assert row["test_depth"] == pytest.approx(scores["DEPTH"], rel=1e-5)
+    assert row["test_depth_95"] == pytest.approx(scores["DEPTH_95"], rel=1e-5)
 
 
 def test_off_reads_no_tracks(scene, tmp_path, monkeypatch):

@@ -8,18 +8,14 @@ view sees a small part of it. Without sleep is `MOST_SHARE = 0` in scene/sleepin
 
 import argparse
 import json
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from statistics import mean, stdev
 
 import numpy as np
-from PIL import Image
-from tqdm import tqdm
 
 from benchmarks.harness.measuring import describe, print_table
 from benchmarks.scenes.training import run, seconds_of
-from splatting.demo.make_scene import sample_points, write_model
+from splatting.demo.make_scene import write_scene
 from splatting.demo.objects import (
     Box,
     Ground,
@@ -31,8 +27,7 @@ from splatting.demo.objects import (
     panels,
     stripes,
 )
-from splatting.demo.tracer import View, look_at, render_view
-from splatting.host.machine import cores
+from splatting.demo.tracer import View, look_at
 from utils.system_utils import compute_device, run_cli
 
 _VIEWS, _POINTS = 200, 20_000
@@ -57,7 +52,7 @@ with open(sys.argv[sys.argv.index("-m") + 1] + "/awake.txt", "w") as file:
 """
 
 
-def street() -> list[Thing]:
+def street(_: int | None = None) -> list[Thing]:
     """The houses, the ground and the sky."""
     rng, things = np.random.default_rng(0), []
     for k in range(2 * _HOUSES):
@@ -84,22 +79,6 @@ def walk(width: int, height: int) -> list[View]:
     return views
 
 
-def _image(view: View) -> np.ndarray:
-    return render_view(street(), view, _SAMPLES)
-
-
-def make(out: Path, width: int, height: int) -> None:
-    """Write the scene, as splatting/demo/make_scene.py writes the demo's."""
-    views, names = walk(width, height), [f"view_{k:03d}.png" for k in range(_VIEWS)]
-    with ProcessPoolExecutor(cores(), mp_context=get_context("spawn")) as pool:
-        images = list(tqdm(pool.map(_image, views), total=_VIEWS, desc="Ray tracing"))
-    (out / "images").mkdir(parents=True)
-    for name, image in zip(names, images, strict=True):
-        Image.fromarray(image).save(out / "images" / name)
-    cloud = sample_points(street(), views, images, _POINTS, np.random.default_rng(2))
-    write_model(out / "sparse" / "0", names, views, cloud)
-
-
 def train(scene: Path, out: Path, seed: int, most_share: float, options: list[str]) -> dict[str, float]:
     """Train, render and score: seconds, test PSNR, the share awake, and the number of Gaussians."""
     model = ["-m", str(out)]
@@ -119,7 +98,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(320, 200), help="of the photos (default: 320 200)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="default: 0 1 2")
     args, options = parser.parse_known_args()
-    make(args.out / "scene", *args.size)
+    write_scene(args.out / "scene", walk(*args.size), street, _POINTS, np.random.default_rng(2), _SAMPLES)
     print(describe(compute_device()), "\ntrain.py --eval --no_curve", *options, flush=True)
     runs: dict[str, list[dict[str, float]]] = {"others asleep": [], "all awake": []}
     for seed in args.seeds:

@@ -42,27 +42,36 @@ def seconds_of(model: Path) -> float:
     return json.loads((model / "train_log.json").read_text())[-1]["seconds"]
 
 
-def train(scene: Path, model: Path, seed: int, options: list[str], ranks: int = 1, shown: Sequence[str] = ()) -> dict:
-    """Train, render and score one model; return seconds, PSNR (dB), SSIM, Gaussians, bytes and a hash of the PLY.
+def train(
+    scene: Path,
+    model: Path,
+    seed: int,
+    options: list[str],
+    ranks: int = 1,
+    shown: Sequence[str] = (),
+    judged: Path | None = None,
+) -> dict:
+    """Train, render and score one model; return seconds, scores, Gaussians, bytes and a hash of the PLY.
 
-    shown: further options of render.py.
+    shown: further options of render.py. judged: a scene whose test views are scored, where all views of `scene` train.
     """
-    words = ["-s", str(scene), "-m", str(model), "--eval", "--seed", str(seed), "--test_iterations", "-1", "--no_curve"]
+    words = ["-s", str(scene), "-m", str(model), "--seed", str(seed), "--test_iterations", "-1", "--no_curve"]
+    words += [] if judged else ["--eval"]
+    shown = [*shown, *(["-s", str(judged), "--eval", "--allow_other_scene"] if judged else [])]
     launcher = ["-m", "torch.distributed.run", "--standalone", f"--nproc_per_node={ranks}"] if ranks > 1 else []
     process = run(*launcher, "train.py", *words, *options)
     run("render.py", "-m", str(model), "--skip_train", *shown)
     run("metrics.py", "-m", str(model))
     record = json.loads((model / "train_log.json").read_text())[-1]
     iteration = record["iteration"]
-    scores = json.loads((model / "results.json").read_text())[f"ours_{iteration}"]
+    scores, *_ = json.loads((model / "results.json").read_text()).values()
     ply = model / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
     return {
         "seed": seed,
         "ranks": ranks,
         "seconds": seconds_of(model),
         "process": process,
-        "PSNR": scores["PSNR"],
-        "SSIM": scores["SSIM"],
+        **scores,
         "Gaussians": record["gaussians"],
         "bytes": ply.stat().st_size,
         "hash": hashlib.sha256(ply.read_bytes()).hexdigest()[:16],

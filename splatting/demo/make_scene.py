@@ -9,6 +9,7 @@ python -m splatting.demo.make_scene OUT [--views 60] [--size 400 300] [--points 
 import os
 import shutil
 from argparse import ArgumentParser
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -29,21 +30,28 @@ POSITION_NOISE = 0.004  # standard deviation of a point, as a fraction of its di
 PIXEL_NOISE = 0.3  # standard deviation of an observation in pixels
 MIN_TRACK = 3  # least number of views that see a point
 
-
-def _demo_image(view: View) -> np.ndarray:
-    return render_view(demo_scene(), view)
+Things = Callable[[int | None], list[Thing]]  # that stand in a photo, by its number; None: those that stay
 
 
-def _images(views: list[View]) -> list[np.ndarray]:
+def _demo(_: int | None) -> list[Thing]:
+    return demo_scene()
+
+
+def _image(things: Things, samples: int, number: int, view: View) -> np.ndarray:
+    return render_view(things(number), view, samples)
+
+
+def _images(views: list[View], things: Things, samples: int) -> list[np.ndarray]:
     """Ray-trace the views to photos, (H, W, 3) uint8 each, on several cores if that saves time."""
     pixels = sum(view.width * view.height for view in views)
     workers = min(cores(), 1 + pixels // PIXELS_PER_PROCESS)
     bar = partial(tqdm, total=len(views), desc="Ray tracing", unit="view")
+    image, numbers = partial(_image, things, samples), range(len(views))
     if workers == 1:
-        return list(bar(map(_demo_image, views)))
+        return list(bar(map(image, numbers, views)))
     # Use processes, because numpy holds the interpreter's lock most of the time on blocks this small.
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        return list(bar(pool.map(_demo_image, views)))
+        return list(bar(pool.map(image, numbers, views)))
 
 
 @dataclass(frozen=True)
@@ -136,7 +144,34 @@ def write_model(folder: Path, names: list[str], views: list[View], points: Surfa
     model.write_binary(folder)
 
 
-def make_scene(out: Path, views: int, width: int, height: int, points: int, seed: int, camera: str = "pinhole") -> int:
+def write_scene(
+    out: Path, views: list[View], things: Things, points: int, rng: np.random.Generator, samples: int = 3
+) -> int:
+    """Write photos and a COLMAP model into a folder (images/, sparse/0), and return its number of points.
+
+    things: a function that another process can import. samples: of `render_view`. UserError if there are no points.
+    """
+    (out / "images").mkdir(parents=True)
+    images, names = _images(views, things, samples), [f"view_{k:03d}.png" for k in range(len(views))]
+    for name, image in zip(names, images, strict=True):
+        Image.fromarray(image).save(out / "images" / name)
+    cloud = sample_points(things(None), views, images, points, rng)
+    if not len(cloud.xyz):
+        raise UserError(f"none of {points} points is visible in {MIN_TRACK} views; raise --points or --views")
+    write_model(out / "sparse" / "0", names, views, cloud)
+    return len(cloud.xyz)
+
+
+def make_scene(
+    out: Path,
+    views: int,
+    width: int,
+    height: int,
+    points: int,
+    seed: int,
+    camera: str = "pinhole",
+    things: Things = _demo,
+) -> int:
     """Write the scene to `out` (images/, sparse/0) and return its number of points.
 
     camera: of CAMERAS. The same arguments give the same photos and points. `out` appears only when it is complete.
@@ -153,18 +188,10 @@ def make_scene(out: Path, views: int, width: int, height: int, points: int, seed
         raise UserError(f"{out} exists and is not an empty folder; choose another one, or delete it first")
     rng = np.random.default_rng(seed)
     cameras = ring_views(views, width, height, rng, CAMERAS[camera])
-    names = [f"view_{k:03d}.png" for k in range(views)]
     mkdir_p(out.parent)
     work = out.with_name(f".{out.name}.{os.getpid()}.tmp")
     try:
-        (work / "images").mkdir(parents=True)
-        images = _images(cameras)
-        for name, image in zip(names, images, strict=True):
-            Image.fromarray(image).save(work / "images" / name)
-        cloud = sample_points(demo_scene(), cameras, images, points, rng)
-        if not len(cloud.xyz):
-            raise UserError(f"none of {points} points is visible in {MIN_TRACK} views; raise --points or --views")
-        write_model(work / "sparse" / "0", names, cameras, cloud)
+        count = write_scene(work, cameras, things, points, rng)
         if out.exists():
             out.rmdir()
         work.rename(out)
@@ -174,7 +201,7 @@ def make_scene(out: Path, views: int, width: int, height: int, points: int, seed
         ) from error
     finally:
         shutil.rmtree(work, ignore_errors=True)
-    return len(cloud.xyz)
+    return count
 
 
 def main() -> None:

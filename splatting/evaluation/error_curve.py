@@ -18,9 +18,10 @@ SUBSET = "subset"
 ESTIMATED = "estimated"
 COUNTS = ("iteration", "gaussians", SUBSET, ESTIMATED)
 SCORES = tuple(f"{views}_{score}" for views in ("test", "train") for score in ("l1", "psnr", "ssim"))
+DEPTHS = ("test_depth", "test_depth_95")
 COSTS = ("iteration", "seconds", "wall_seconds", "gaussians", "peak_memory_mib")
-COLUMNS = (*COSTS, *SCORES, SUBSET, ESTIMATED)
-_HEADERS = [list(COLUMNS[:end]) for end in (None, -1, -2)]  # older files have no estimates, or no subsets
+COLUMNS = (*COSTS, *SCORES, SUBSET, ESTIMATED, *DEPTHS)
+_HEADERS = [list(COLUMNS[:end]) for end in (None, -2, -3, -4)]  # without depths; older: estimates; subsets
 PEER_COLUMNS = (*COSTS, *SCORES[:3], "test_lpips", *SCORES[3:])
 PEER_REQUIRED = ("seconds", "test_psnr")
 
@@ -34,7 +35,9 @@ def read_curve(path: str | os.PathLike) -> list[Row]:
     process, with those of earlier parts. peak_memory_mib: the most of all parts so far, of the GPU if it trains.
     `<views>_l1`, `<views>_psnr` (dB), `<views>_ssim`: gaussian_renderer/scored_views.py. subset: number of views of
     each set that were scored; None: all. estimated: 1 where the scores are estimates of those of whole sets; None in a
-    row of a subset: they are those of the subset. UserError if the file is missing or damaged.
+    row of a subset: they are those of the subset. test_depth, test_depth_95: relative errors at held-out points, median
+    and 95 %, means over the views that were scored, never estimates (training/sparse_depth.py). UserError if the file
+    is missing or damaged.
     """
     try:
         header, *lines = _lines(path)
@@ -78,9 +81,13 @@ def _write(path: str | os.PathLike, columns: Sequence[str], lines: Iterable[Sequ
 
 
 def write_curve(path: str | os.PathLike, rows: list[Row]) -> None:
-    """Write rows that have all COLUMNS. A value that is None or not finite (PSNR of equal images) is left empty."""
-    values = ((row[name] for name in COLUMNS) for row in rows)
-    _write(path, COLUMNS, [["" if x is None or not math.isfinite(x) else x for x in line] for line in values])
+    """Write rows that have all COLUMNS, without DEPTHS that none has.
+
+    A value that is None or not finite (PSNR of equal images) is left empty.
+    """
+    columns = [name for name in COLUMNS if name not in DEPTHS or any(row[name] is not None for row in rows)]
+    values = ((row[name] for name in columns) for row in rows)
+    _write(path, columns, [["" if x is None or not math.isfinite(x) else x for x in line] for line in values])
 
 
 def continue_curve(

@@ -52,6 +52,10 @@ def dissimilarity(row: Row, views: str) -> float | None:
     return None if ssim is None or ssim >= 1 else 1 - ssim
 
 
+def depth_error(row: Row, views: str) -> float | None:
+    return row.get(f"{views}_depth")
+
+
 def _points(rows: Sequence[Row], value: Value, views: str) -> list[Point]:
     """Seconds and values of the rows that have them for whole sets; the axis of the seconds is logarithmic."""
     pairs = ((row["seconds"], value(row, views)) for row in of_whole_sets(rows))
@@ -121,7 +125,8 @@ def draw_curve(path: str | os.PathLike, rows: list[Row], title: str, views: Mapp
     views: how many each set has. Raises matplotlib's errors, ImportError if it is missing, and UserError if `path`
     cannot be written.
     """
-    figure, (upper, lower) = _figure(2, (7.5, 7.0), title)
+    judged = any(depth_error(row, "test") is not None for row in rows)
+    figure, (upper, lower, *further) = _figure(2 + judged, (7.5, 7.0 + 3.0 * judged), title)
     for axes, value, unit in ((upper, psnr, " dB"), (lower, dissimilarity, "")):
         for name, color in COLORS.items():
             of_set = [row for row in rows if value(row, name) is not None]
@@ -141,8 +146,14 @@ def draw_curve(path: str | os.PathLike, rows: list[Row], title: str, views: Mapp
             upper, [(best["seconds"], best["test_psnr"])], label, marker="*", color="black", markersize=12, linestyle=""
         )
     _label(upper, "", "PSNR (dB)")
-    _label(lower, "seconds of training, without scoring and saving", "1 - SSIM", log=True)
-    for axes in (upper, lower):
+    seconds = "seconds of training, without scoring and saving"
+    _label(lower, "" if judged else seconds, "1 - SSIM", log=True)
+    for axes in further:
+        _draw_rows(
+            axes, rows, depth_error, "test", "test views; hollow: some of them", marker="o", color=COLORS["test"]
+        )
+        _label(axes, seconds, "depth error at held-out points", log=True)
+    for axes in (upper, lower, *further):
         axes.legend()
     _save(figure, path)
 
@@ -195,8 +206,10 @@ def draw_curves(
         "psnr": (psnr, "PSNR of the test views (dB)", -1),
         "ssim": (dissimilarity, "1 - SSIM of the test views", 1),
     }
+    if any(depth_error(row, "test") is not None for run in runs for row in run["curve"]):
+        panels["depth"] = depth_error, "depth error at held-out points", 1
     return [
-        _panel(folder / f"{scene}_{name}.png", scene, name == "ssim", (x, y), partial(draw, value=value, sign=sign))
+        _panel(folder / f"{scene}_{name}.png", scene, name != "psnr", (x, y), partial(draw, value=value, sign=sign))
         for name, (value, y, sign) in (panels.items() if runs else ())
     ]
 

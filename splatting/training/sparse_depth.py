@@ -1,6 +1,7 @@
 """Depth by the points of structure from motion (--sparse_depth): each view's own, where its photo has seen them.
 
-Sparse points as supervision of depth: Deng et al. 2022 (DS-NeRF), section 3. No network is asked.
+Sparse points as supervision of depth: Deng et al. 2022 (DS-NeRF), section 3. No network is asked. Points that are never
+trained on score the depth of test views.
 """
 
 import numpy as np
@@ -13,7 +14,7 @@ from scene.readers.tracks import Track, read_tracks
 from scene.scene import Scene
 from utils.system_utils import UserError
 
-HELD_OUT = 8  # every so many points, by the rank of their ids, are never trained on
+HELD_OUT = 8  # every so many points, by the rank of their ids, are never trained on, and score
 _NEAR = 0.01  # depth, as the camera's
 
 
@@ -33,6 +34,17 @@ class PointDepths:
         """
         weights = self.weights if mask is None else self.weights * mask.flatten()[self.pixels]
         return (weights * (inverse_depth.flatten()[self.pixels] - self.inverse_depths).abs()).sum()
+
+    def scores(self, inverse_depth: Tensor, mask: Tensor | None = None) -> dict[str, float]:
+        """`depth` and `depth_95`: the median of the relative errors, and what 95 % are below; {} if no point counts.
+
+        Arguments as for `loss`.
+        """
+        errors = (inverse_depth.flatten()[self.pixels] / self.inverse_depths - 1).abs()
+        errors = (errors if mask is None else errors[mask.flatten()[self.pixels]]).cpu().numpy()
+        if not len(errors):
+            return {}
+        return dict(zip(("depth", "depth_95"), np.quantile(errors, (0.5, 0.95)).tolist(), strict=True))
 
 
 class SparseDepth:
@@ -58,10 +70,21 @@ class SparseDepth:
         return self._known[key]
 
 
-def points_of(camera: Camera, view: CameraInfo, track: Track, weight: float = 1.0) -> PointDepths | None:
+def held_out_points(scene: Scene, source_path: str) -> dict[str, PointDepths]:
+    """The points that score the depth of test views, by image name; of views that have some."""
+    views, cameras = scene.info.test_cameras, {camera.image_name: camera for camera in scene.getTestCameras()}
+    tracks = zip(views, read_tracks(source_path, views, scene.info.offset), strict=True)
+    found = {v.image_name: t and points_of(cameras[v.image_name], v, t, held_out=True) for v, t in tracks}
+    return {name: points for name, points in found.items() if points is not None}
+
+
+def points_of(
+    camera: Camera, view: CameraInfo, track: Track, weight: float = 1.0, held_out: bool = False
+) -> PointDepths | None:
     """What a track says of a view's depth, with weights of that sum; of points in one pixel, that of most weight.
 
     view: has the dataset's pose and lens, so that a resumed training, where they may have moved, has the same points.
+    held_out: those that are never trained on, in place of the others.
     """
     seen = track.points @ view.R + view.T
     if camera.lens is None:
@@ -74,7 +97,7 @@ def points_of(camera: Camera, view: CameraInfo, track: Track, weight: float = 1.
     columns = range(camera.image_width)[camera.columns or slice(None)]
     x, y = np.floor(places).T
     trust = (track.lengths - 1) / (1 + track.errors**2)
-    counts = (depths > _NEAR) & (trust > 0) & (track.ranks % HELD_OUT != 0)
+    counts = (depths > _NEAR) & (trust > 0) & ((track.ranks % HELD_OUT == 0) == held_out)
     counts &= (x >= columns.start) & (x < columns.stop) & (y >= 0) & (y < camera.image_height)
     if not counts.any():
         return None

@@ -1,0 +1,128 @@
+"""Trainings with options of train.py and without, over scenes and seeds: scores, errors of depth, seconds, Gaussians.
+
+    python -m benchmarks.scenes.options OUT --scenes SCENE ... --keep 3 --with="--sparse_depth 0.1" --iterations 1000
+    python -m benchmarks.scenes.options OUT --made wall fisheye --with="--lenses undistort" --iterations 1000
+
+--keep N trains on every N-th training photo alone, without the points that judge the depth, and scores all test photos.
+--made ray-traces scenes: the demo's; with balls that roam through 30 % of its training photos; with a wall without
+texture in it; and of fisheyes of 200 degrees and panoramas, which are scored as they are. Other options go to train.py.
+"""
+
+import argparse
+import shlex
+from pathlib import Path
+from statistics import mean, stdev
+
+import numpy as np
+
+from benchmarks.harness.measuring import describe, print_table
+from benchmarks.scenes.training import train
+from scene.readers.info import HOLD
+from splatting.demo.make_scene import make_scene
+from splatting.demo.objects import Box, Sphere, Thing, demo_scene, marble
+from splatting.training.sparse_depth import HELD_OUT
+from utils.system_utils import UserError, compute_device, run_cli
+
+_VIEWS, _POINTS, _SIZE = 48, 8000, (240, 180)
+_BALLS = 3  # in a photo
+FORMS = {"PSNR": ".2f", "SSIM": ".4f", "DEPTH": ".2%", "DEPTH_95": ".1%", "seconds": ".1f", "Gaussians": ",.0f"}
+
+
+def with_balls(photo: int | None) -> list[Thing]:
+    """The demo's things, and in 30 % of the photos balls somewhere among them; never in test photos."""
+    things = demo_scene()
+    if photo is not None and photo % HOLD and photo % 10 in (1, 4, 7):
+        rng = np.random.default_rng(photo)
+        for k in range(_BALLS):
+            x, z, light, dark = *rng.uniform(-1.8, 1.8, 2), *rng.uniform(0, 1, (2, 3, 1)).astype(np.float32)
+            things.append(Thing(Sphere((x, -rng.uniform(0.4, 1.2), z), 0.35), marble(light, dark, photo + k)))
+    return things
+
+
+def with_wall(_: int | None) -> list[Thing]:
+    """The demo's things, and a wall of one colour behind them."""
+    grey = np.full((3, 1), 0.7, np.float32)
+    return [*demo_scene(), Thing(Box((0.1, -1.2, 2.0), (2.4, 1.2, 0.1), 0.0), lambda p: np.broadcast_to(grey, p.shape))]
+
+
+MADE = {
+    "clean": {},
+    "balls": {"things": with_balls},
+    "wall": {"things": with_wall},
+    "fisheye": {"camera": "fisheye"},
+    "panorama": {"camera": "panorama"},
+}
+
+
+def made(name: str, out: Path) -> Path:
+    """Write the scene of a name of MADE."""
+    size = (384, 192) if name == "panorama" else _SIZE
+    make_scene(out, _VIEWS, *size, _POINTS, seed=0, **MADE[name])
+    return out
+
+
+def thinned(scene: Path, out: Path, keep: int) -> Path:
+    """Write a COLMAP scene of every `keep`-th training photo of another, without the points that judge the depth."""
+    import pycolmap  # after Pillow
+
+    folder = out / "sparse" / "0"
+    folder.mkdir(parents=True)
+    pycolmap.Reconstruction(str(scene / "sparse" / "0")).write_text(str(folder))
+    (out / "images").symlink_to((scene / "images").resolve())
+    images, points = ([x for x in (folder / f"{name}.txt").read_text().splitlines() if not x.startswith("#")]
+                      for name in ("images", "points3D"))  # fmt: skip
+    pairs = sorted(zip(images[::2], images[1::2], strict=True), key=lambda pair: pair[0].split(maxsplit=9)[9])
+    trained = [pair for place, pair in enumerate(pairs) if place % HOLD]
+    points.sort(key=lambda line: int(line.split(maxsplit=1)[0]))
+    left = [line for rank, line in enumerate(points) if rank % HELD_OUT]
+    (folder / "images.txt").write_text("".join(f"{line}\n" for pair in trained[::keep] for line in pair))
+    (folder / "points3D.txt").write_text("".join(f"{line}\n" for line in left))
+    return out
+
+
+def compare(
+    scene: Path, out: Path, sets: list[str], seeds: list[int], options: list[str], keep: int
+) -> list[list[str]]:
+    """Train with each set of options, the first of which the others are compared with; a row for each."""
+    given = {"shown": ["--depth", "--lenses", "native"]}
+    if keep > 1:
+        given, scene = given | {"judged": scene}, thinned(scene, out / "thinned", keep)
+    rows, first = [], []
+    for number, words in enumerate(sets):
+        runs = []
+        for seed in seeds:
+            runs.append(train(scene, out / f"{number}_{seed}", seed, [*options, *shlex.split(words)], **given))
+            print(out.name, words, seed, {name: runs[-1].get(name) for name in FORMS}, flush=True)
+        values = {name: [run[name] for run in runs if run.get(name) is not None] for name in FORMS}
+        first = first or values["PSNR"]
+        gains = [psnr - other for psnr, other in zip(values["PSNR"], first, strict=True)]
+        spread = f" ({stdev(gains):.2f})" if len(gains) > 1 else ""
+        cells = [f"{mean(of):{form}}" if (of := values[name]) else "" for name, form in FORMS.items()]
+        rows.append([words or "none", *cells, f"{mean(gains):+.2f}{spread}" if number else ""])
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], allow_abbrev=False)
+    add = parser.add_argument
+    add("out", type=Path, help="new folder for the scenes and the models")
+    add("--scenes", type=Path, nargs="+", default=[], help="COLMAP scenes")
+    add("--made", nargs="+", choices=MADE, default=[], help="scenes to make")
+    add("--with", action="append", dest="sets", default=[], help="options to compare with none; may be repeated")
+    add("--keep", type=int, default=1, help="train on every so many training photos (default: 1, all)")
+    add("--seeds", type=int, nargs="+", default=[0, 1, 2], help="one run each (default: 0 1 2)")
+    args, options = parser.parse_known_args()
+    if args.out.exists():
+        raise UserError(f"{args.out} exists; name a new folder")
+    print(describe(compute_device()), "\ntrain.py --eval", *options, flush=True)
+    out, rows = args.out.resolve(), []
+    scenes = [(path.name, path.resolve()) for path in args.scenes]
+    for name, scene in [*scenes, *((name, made(name, out / "scenes" / name)) for name in args.made)]:
+        found = compare(scene, out / name, ["", *args.sets], args.seeds, options, args.keep)
+        rows += [[name, *row] for row in found]
+    header = ["scene", "options", "PSNR dB", "SSIM", "depth error", "95 %", "training s", "Gaussians", "gain dB"]
+    print_table(header, rows)
+
+
+if __name__ == "__main__":
+    run_cli(main)
