@@ -177,6 +177,9 @@ class OptimizationParams(OptionTable):
         Option("depth_l1_weight_final", 0.01, "weight of the depth loss in the last step", check=at_least(0)),
         Option("sparse_depth", 0.0, origin="ours", check=at_least(0),
             help="weight of the depth of the scene's own points (COLMAP only), where photos have seen them; 0: off"),
+        Option("robust_mask", 0.0, origin="ours", check=within(0, 0.5),
+            help="largest part of a photo that training may leave out because all others disagree with it, as with "
+                 "passers-by; no mask is needed. 0: off"),
         Option("random_background", False,
             help="a new random background in every step, so that no Gaussian imitates a fixed one"),
         Option("optimizer_type", "default", check=one_of("default", "sparse_adam"), stored=MODEL_JSON,

@@ -97,6 +97,18 @@ def test_what_happened_to_a_model_is_named(folder, name):
     assert "train longer" not in problem and "opacity_lr" not in problem
 
 
+def test_a_photo_that_somebody_walked_into_is_named(trained, scene, tmp_path):
+    other = Path(shutil.copytree(scene, tmp_path / "scene"))
+    photo = sorted((other / "images").iterdir())[3]
+    pixels = np.array(Image.open(photo))
+    pixels[30:60, 20:45] = (255, 0, 255)
+    Image.fromarray(pixels).save(photo)
+    for folder, named in ((scene, []), (other, [photo.name])):
+        lines = check_model(str(trained), -1, str(folder))
+        found = [line.text for line in lines if line.note and "passed by" in line.text]
+        assert ["most in " + name + ";" in text for text, name in zip(found, named, strict=True)] == [True] * len(named)
+
+
 def test_photos_with_each_others_names_are_found_before_and_after_a_training(folder, scene, tmp_path):
     other = Path(shutil.copytree(scene, tmp_path / "scene"))
     photos = sorted((other / "images").iterdir())

@@ -51,7 +51,10 @@ MAY_IMPORT = {
         *("arguments", "gaussian_renderer", "scene"),
     ),
     "splatting.viewer": ("splatting.camera_paths", "splatting.exports", "gaussian_renderer", "scene"),
-    "splatting.diagnosis": ("arguments", "gaussian_renderer", "splatting.evaluation", "scene"),
+    "splatting.diagnosis": (
+        *("arguments", "gaussian_renderer", "splatting.evaluation", "scene"),
+        "splatting.training.robust_mask",
+    ),
     "splatting.sfm": ("scene.readers", "scene.images"),
     "splatting.demo": ("arguments", "splatting.evaluation"),
     "splatting": (),

@@ -208,6 +208,10 @@ def test_an_image_is_shown_only_where_it_was_taken_and_drawn_once(gaussians, sce
     for slider, version in ((0.1, 1), (0.2, 1), (0.9, 1), (0.9, 2)):
         frames.draw(replace(asked, slider=slider), pose, False, version)
     assert len(calls) == 2  # until the model changes
+    plain = frames.draw(replace(asked, slider=1.0), pose, False, 3).image.astype(int)
+    frames.masks = lambda of: torch.zeros(1, of.image_height, of.image_width, dtype=torch.bool)
+    masked = frames.draw(replace(asked, slider=1.0), pose, False, 4).image
+    assert (plain - masked).max() > 50 and (masked <= plain).all()
 
 
 @pytest.mark.parametrize("share", [STILL, MOVING])

@@ -25,6 +25,8 @@ from splatting.evaluation.model_folder import closing_lines, curve_of
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
 from splatting.evaluation.what_to_try import what_to_try
+from splatting.files.listing import some
+from splatting.training.robust_mask import RobustMask
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.system_utils import UserError, compute_device
 
@@ -46,6 +48,7 @@ NEAREST = 0.2  # depth below which nothing is drawn
 FEW_GAUSSIANS = 2000
 _CLEARLY = 3.0  # dB
 _VIEWS = 4
+_MOST_PHOTOS, _SHARE = 300, 0.3  # that are searched for passers-by; the largest part of one
 _WIDTH = 200
 _RESET_SAID = "warning: opacities are reset"  # the beginning of what training/checks.py:late_reset says
 
@@ -79,7 +82,8 @@ def check_model(model_path: str, iteration: int, source: str | None = None, imag
     if changed:  # which explains all else, and the training has no say in it
         return [*lines, *(line for line in shapes if not line.finding), renders]
     reset = [] if renders.finding else _late_reset(scene)
-    return [*lines, *shapes, renders, *reset, *check_training(Path(model_path))]
+    odd = [] if renders.finding else _passers_by(scene, options)
+    return [*lines, *shapes, renders, *odd, *reset, *check_training(Path(model_path))]
 
 
 def _fits(model_path: str, stored: dict[str, Any], iteration: int) -> bool:
@@ -149,6 +153,24 @@ def _wrong_values(gaussians: GaussianModel, extent: float) -> Iterator[Line]:
         text = f"{share:.0%} of the opacities are near 0.01, as a reset leaves them, and nothing was trained after it"
         remedy = "check an earlier iteration, or train some 1000 iterations beyond the reset (--opacity_reset_interval)"
         yield Line(text, remedy)
+
+
+@torch.no_grad()
+def _passers_by(scene: Scene, options: argparse.Namespace) -> Iterator[Line]:
+    """A note on photos that show what the model does not."""
+    cameras, views = scene.getTrainCameras(), _scored(scene, options)
+    if len(cameras) > _MOST_PHOTOS or options.train_test_exp:
+        return
+    masks = RobustMask(cameras, _SHARE, compute_device())
+    masks.least, masks.early = 1, 0  # it is trained
+    for camera in cameras:
+        masks.mask(camera, *views.compared(camera, scene.gaussians), learns=True)
+        masks.keep()
+    found = {camera.image_name: masks.counted(camera) for camera in masks.cameras}
+    shares = {name: 1 - float(counts.float().mean()) for name, counts in found.items() if counts is not None}
+    if worst := sorted(shares, key=shares.get, reverse=True):
+        text = f"{len(worst)} of {len(cameras)} photos show what the model does not, as if someone had passed by"
+        yield Line(f"{text}: most in {some(worst)}; try --robust_mask {_SHARE:g}", note=True)
 
 
 def _late_reset(scene: Scene) -> Iterator[Line]:

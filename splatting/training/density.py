@@ -56,6 +56,10 @@ class DensityControl:
         """Whether the view of this iteration counts in the Gaussians' statistics, where the step is fused."""
         return False
 
+    def recovers(self, iteration: int) -> bool:
+        """Whether opacities were reset so recently that renders are not like photos."""
+        return False
+
     def replaced(self, iteration: int) -> Collection[str]:
         """Attributes that `before_step` will give other values or rows, so that they take no step in this iteration.
 

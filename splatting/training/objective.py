@@ -66,6 +66,9 @@ class Objective:
         if (band := package.get("band")) is not None:
             total, l1 = photometric_loss_by_bands(image, target, weight, *band, clamp)
             return Losses(total, l1, depth=None, mask=None)
+        if (robust := self._run.robust_mask) is not None:
+            learns = not self._run.density.recovers(step.iteration)
+            mask = robust.mask(camera, image.detach(), target, mask, learns)
         total, l1 = photometric_loss(image, target, weight, mask, camera.columns, clamp)
         further = {name: term(package, mask) for name, term in self.terms(step).items()}
         return Losses(sum(further.values(), start=total), l1, further.get("depth"), mask)

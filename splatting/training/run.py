@@ -19,7 +19,7 @@ from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
-from scene.gaussians.checkpoint import ASLEEP, POSES, further, load_checkpoint, with_further
+from scene.gaussians.checkpoint import ASLEEP, POSES, RESIDUALS, further, load_checkpoint, with_further
 from scene.gaussians.morton import sort_rows
 from scene.sleeping import MOST_SHARE, REST, Sleeping, share_seen
 from splatting.deterministic.counter_rng import Stream, uniform
@@ -39,6 +39,7 @@ from splatting.training.objective import LossWatch, Objective
 from splatting.training.pose_refinement import PoseRefinement
 from splatting.training.resolution import resolution_of
 from splatting.training.restart import resumed
+from splatting.training.robust_mask import RobustMask
 from splatting.training.schedule import DecidedSchedule
 from splatting.training.sparse_depth import SparseDepth
 from splatting.training.strategies import AUTO, USUAL, density_control, end_in_time, of_clock
@@ -71,6 +72,7 @@ class Run:
     first_done: float | None = None
     sleeping: Sleeping | None = None
     sparse_depth: SparseDepth | None = None
+    robust_mask: RobustMask | None = None
 
     def __init__(
         self, dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, launch: argparse.Namespace
@@ -193,6 +195,11 @@ class Run:
         if weight := self.opt.sparse_depth:
             checks.check_one_process("--sparse_depth", self.group.several)
             self.sparse_depth = SparseDepth(self.scene, self.dataset.source_path, weight)
+        if share := self.opt.robust_mask:
+            checks.check_one_process("--robust_mask", self.group.several)
+            self.robust_mask = RobustMask(self.scene.getTrainCameras(), share, self.device)
+            if capture and (state := further(capture, RESIDUALS)):
+                self.robust_mask.restore(state)
         if capture is not None:
             self.gaussians.start_exposures(self.scene.info.train_cameras)
             self.gaussians.restore(capture, self.opt)
@@ -387,6 +394,8 @@ class Run:
     def after_step(self, step: Iteration) -> None:
         """What follows the optimiser's step."""
         self.density.after_step(step)
+        if self.robust_mask:
+            self.robust_mask.keep()
         if step.changes:
             self.memory.settle(self.gaussians)
         if self.sleeping is None:
@@ -408,6 +417,8 @@ class Run:
         state = self.gaussians.capture()
         if self.poses:
             state = with_further(state, POSES, self.poses.captured())
+        if self.robust_mask:
+            state = with_further(state, RESIDUALS, self.robust_mask.captured())
         asleep = self.sleeping and self.sleeping.captured()
         return with_further(state, ASLEEP, asleep) if asleep else state
 

@@ -2,6 +2,7 @@
 
 import argparse
 import copy
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ from utils.image_utils import as_float
 LONGEST = 1600  # pixels of a frame's longer side, at most
 COARSE = 2  # a frame of a moving camera has a quarter of the pixels
 _BORDER = 0.15  # grey around a target that does not fill the window
+_MASKED = 0.3  # brightness of a photo where it is masked
 _LINE = 2  # pixels of the slider's line
 _NO_PHOTO = "No photo was taken from here. “Go to the camera” (tab Photos) leads to one."
 
@@ -47,6 +49,7 @@ class Frames:
         self._cameras = cameras
         self._pipe = pipe
         self._with_exposures = with_exposures
+        self.masks: Callable[[Camera], Tensor | None] = lambda _: None  # pixels of a photo that train, None: all
         self._compared: tuple[object, tuple[Tensor, Tensor, Legend]] = (None, ())
 
     @torch.no_grad()
@@ -65,7 +68,10 @@ class Frames:
         key = replace(settings, slider=0, comparison=views.ALONE), version
         if self._compared[0] != key:
             target = as_float(camera.target(self._background(settings)))
-            self._compared = key, (target, *self._image(settings, camera, target))
+            drawn = self._image(settings, camera, target)
+            if (counts := self.masks(camera)) is not None:
+                target = torch.where(counts, target, _MASKED * target)
+            self._compared = key, (target, *drawn)
         target, image, words = self._compared[1]
         shown = to_bytes(_fitted(_composed(settings, target, image), pose)).numpy()
         return Frame(shown, words._replace(sides=_sides(settings)))

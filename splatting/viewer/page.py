@@ -43,7 +43,7 @@ PATHS, CROPS = "camera_paths", "crops"  # in the model's folder, which is where 
 class Page:
     """A web page that shows the model of a scene. watchers: who looks, and which frame comes next.
 
-    requests: of its buttons. tabs: the group of tabs, to which others can be added.
+    frames: draws them. requests: of its buttons. tabs: the group of tabs, to which others can be added.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Page:
         gaussians, folder = scene.gaussians, Path(scene.model_path)
         self._gaussians, self._antialiasing = gaussians, pipe.antialiasing
         self._cameras = SceneCameras(scene.getTrainCameras(), scene.getTestCameras())
-        self._frames = Frames(gaussians, self._cameras, pipe, with_exposures)
+        self.frames = Frames(gaussians, self._cameras, pipe, with_exposures)
         self.watchers = Watchers()
         self.requests = Requests(self.watchers.wake)
         self._faults: dict[int, str] = {}  # of the browsers' last frames
@@ -102,7 +102,7 @@ class Page:
 
     def show_model(self, gaussians: GaussianModel, iteration: int) -> None:
         """Show another model from now on. Called by the thread that draws."""
-        self._gaussians = self._frames.gaussians = gaussians
+        self._gaussians = self.frames.gaussians = gaussians
         self.show_numbers(iteration, len(gaussians))
 
     def settings(self) -> Settings:
@@ -113,7 +113,7 @@ class Page:
         """Draw and send the frame of a wish. One that cannot be drawn ends nothing. version: of the model."""
         try:
             self.watchers.drew(wish, version)
-            image, legend = self._frames.draw(self.settings(), wish.pose, wish.coarse, version)
+            image, legend = self.frames.draw(self.settings(), wish.pose, wish.coarse, version)
             client = self.server.get_clients().get(wish.client)
             if client is not None:  # it has not left
                 self._send(client, image, wish.coarse)

@@ -1,11 +1,13 @@
-"""Guards of a training: masks that leave nothing to train on, and memory that runs out."""
+"""Guards of a training: masks that leave nothing to train on, photos with passers-by, and memory that runs out."""
 
+import shutil
 import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
 
@@ -17,8 +19,9 @@ from splatting.host.memory import is_out_of_memory
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
+from splatting.training.robust_mask import FOLDER
 from splatting.training.run import Run
-from utils.system_utils import UserError
+from utils.system_utils import UserError, atomic_write
 
 _ENOUGH = 100  # if so many views have no pixel that counts, and no view has one, the masks are wrong
 _ALMOST_NOTHING = 1e-3  # share of the pixels
@@ -76,6 +79,30 @@ class MaskWatch(Observer):
                 file=sys.stderr,
             )
             self._scanty.clear()
+
+
+class PassersBy(Observer):
+    """Writes what --robust_mask masks at the end as mask files, and names the photos."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+
+    def ended(self, error: Error) -> None:
+        if error is not None:
+            return
+        run, folder, shares = self._run, Path(self._run.scene.model_path) / FOLDER, {}
+        shutil.rmtree(folder, ignore_errors=True)  # of an earlier training
+        for camera in run.robust_mask.cameras:
+            if (counts := run.robust_mask.counted(camera)) is None:
+                continue
+            shares[camera.image_name] = 1 - float(counts.float().mean())
+            with atomic_write(folder / f"{camera.image_name}.png") as temporary:
+                Image.fromarray(counts[0].to(torch.uint8).mul(255).cpu().numpy()).save(temporary)
+        views = len(run.robust_mask.cameras)
+        most = [f"{name} ({shares[name]:.0%})" for name in sorted(shares, key=shares.get, reverse=True)]
+        text = f"--robust_mask leaves out {sum(shares.values()) / views:.1%} of the pixels"
+        text += f", in {len(shares)} of {views} photos"
+        run.log.tell(text + (f", most in {some(most)}; {folder} shows them" if most else ""))
 
 
 class MemoryGuard(Observer):

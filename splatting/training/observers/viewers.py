@@ -44,6 +44,8 @@ class PageObserver(Observer):
         address = Address(run.launch.viewer_host, run.launch.viewer)
         self._page = Page(address, run.scene, run.pipe, run.dataset.white_background, run.dataset.train_test_exp)
         self._requests = self._page.requests
+        if run.robust_mask:
+            self._page.frames.masks = run.robust_mask.counted
         with self._page.tabs.add_tab("Training"):
             self._tab = TrainingTab(self._page.server, self._requests)
         self.budget = Budget()

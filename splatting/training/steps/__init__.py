@@ -17,5 +17,6 @@ def step_taker(run: Run) -> PlainStep:
     if not FusedStep.suits(run):
         return PlainStep(run)
     exchanges = run.gaussians.shards.ranks.several  # numbers, in each step
-    runs_ahead = run.device.type == "cuda" and not exchanges
+    # A step that is queued may be repeated, and would find the residuals of its first time.
+    runs_ahead = run.device.type == "cuda" and not exchanges and run.robust_mask is None
     return CapturedStep(run) if runs_ahead else FusedStep(run)

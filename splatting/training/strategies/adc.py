@@ -48,6 +48,10 @@ class AdaptiveDensityControl(DensityControl):
         """Whether the view of this iteration counts in the statistics."""
         return self._actions(iteration).observe
 
+    def recovers(self, iteration: int) -> bool:
+        now, resets = self.schedule.schedule_step(iteration), self._opt.opacity_reset_interval
+        return resets <= now - now % resets < self.ends and now % resets < rules.RECOVERY
+
     def replaced(self, iteration: int) -> Collection[str]:
         if self._actions(iteration).densify:
             return self._gaussians._attributes

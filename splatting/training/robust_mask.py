@@ -1,0 +1,120 @@
+"""Masks of what one photo shows and the others do not, such as passers-by (--robust_mask), from residuals alone.
+
+Robust masks from residuals: Sabour et al. 2023 (RobustNeRF), section 4; residuals kept over a training, and a level
+over all photos: Sabour et al. 2024 (SpotLessSplats), section 4. No network is asked. Both look at the size of each
+pixel's residual. Here residuals are averaged with their sign over cells: detail that is not learnt yet cancels out
+there, a passer-by does not.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, interpolate, max_pool2d
+
+from scene.cameras import Camera
+from utils.image_utils import as_float
+from utils.system_utils import UserError
+
+FOLDER = "robust_masks"  # of a model folder: mask files of what was masked at the end
+CELLS = 32  # of a photo, across and down
+_NEWEST = 0.5  # weight of the newest residuals in a photo's
+_FACTOR = 9.0  # times the level of all photos is what residuals of detail rarely reach
+_AROUND = 5  # cells across, most of which are outliers somewhere in a passer-by, but not in a highlight
+_STATE = ("residuals", "levels", "visits")
+
+
+class RobustMask:
+    """The residuals of all training photos so far, and the masks that follow from them.
+
+    share: of a photo, at most, that is masked. residuals (n, CELLS, CELLS), by the cameras' uid; levels (n,): what the
+    largest `share` of a photo's residuals are above, NaN before the first. least: visits of a photo until it is masked.
+    early: visits after which its factor is still twice _FACTOR, as not all is learnt.
+    """
+
+    least: ClassVar[int] = 2
+    early: ClassVar[int] = 5
+
+    def __init__(self, cameras: Sequence[Camera], share: float, device: torch.device) -> None:
+        self.cameras = sorted(cameras, key=lambda camera: camera.uid)
+        count = len(cameras)
+        self._below = CELLS**2 - math.floor(share * CELLS**2)
+        self.residuals = torch.zeros(count, CELLS, CELLS, device=device)
+        self.levels = torch.full((count,), math.nan, device=device)
+        self.visits = torch.zeros(count, dtype=torch.int64)
+        self._next: tuple[int, Tensor] | None = None  # uid and residuals of a step that is not taken yet
+
+    @torch.no_grad()
+    def mask(self, camera: Camera, image: Tensor, target: Tensor, mask: Tensor | None, learns: bool) -> Tensor | None:
+        """Pixels of a render that count, (1, H, W) bool, of those of a mask; None if all do.
+
+        learns: whether the residuals of this step tell anything. They are kept once it is taken (`keep`).
+        """
+        uid, self._next = camera.uid, None
+        found = self.residuals[uid]
+        if learns:
+            newest = _in_cells(image, target, mask)
+            found = torch.lerp(found, newest, _NEWEST) if self.visits[uid] else newest
+            self._next = uid, found
+        if self.visits[uid] < self.least:
+            return mask
+        outliers = self._outliers(uid, found)
+        if not outliers.any():
+            return mask
+        counts = ~_enlarged(outliers, image.shape[-2:])
+        return counts if mask is None else counts & mask
+
+    def keep(self) -> None:
+        """Keep the residuals of a step that is taken."""
+        if self._next is not None:
+            uid, found = self._next
+            self.residuals[uid], self.levels[uid], self._next = found, self._level(found), None
+            self.visits[uid] += 1
+
+    def _level(self, residuals: Tensor) -> Tensor:
+        return residuals.flatten().kthvalue(self._below).values
+
+    def _outliers(self, uid: int, residuals: Tensor) -> Tensor:
+        """Cells far beyond the level of all photos, without small groups; of more than may be masked, the largest."""
+        factor = _FACTOR * (1 + self.early / int(self.visits[uid]))
+        outliers = residuals > factor * self.levels.nanmedian()
+        around = {"kernel_size": _AROUND, "stride": 1, "padding": _AROUND // 2}
+        most = avg_pool2d(outliers[None].float(), **around, count_include_pad=False) > 0.5
+        near = max_pool2d((most & outliers).float(), **around)[0] > 0
+        return outliers & near & (residuals > self._level(residuals))
+
+    def counted(self, camera: Camera) -> Tensor | None:
+        """Pixels of a view that are not masked now, (1, H, W) bool; None if none is, as in test views."""
+        if camera not in self.cameras or self.visits[camera.uid] < self.least:
+            return None
+        outliers = self._outliers(camera.uid, self.residuals[camera.uid])
+        return ~_enlarged(outliers, (camera.image_height, camera.image_width)) if outliers.any() else None
+
+    def captured(self) -> dict[str, Any]:
+        """State that a resumed training needs, as plain values."""
+        state = {name: getattr(self, name).clone() for name in _STATE}
+        return {"names": [camera.image_name for camera in self.cameras], **state}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Take the state of `captured()`. UserError for one that does not fit."""
+        fits = isinstance(state, dict) and state.get("names") == [camera.image_name for camera in self.cameras]
+        if not fits or any(getattr(state.get(name), "shape", None) != getattr(self, name).shape for name in _STATE):
+            raise UserError("the checkpoint has residuals of other photos; resume it with its own scene and options")
+        for name in _STATE:
+            getattr(self, name).copy_(state[name])
+
+
+def _in_cells(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+    """|Mean difference| of a render and its photo in the cells, smoothed (CELLS, CELLS); 0 where no pixel counts."""
+    difference = image.clamp(0, 1) - as_float(target)
+    if mask is not None:
+        difference = torch.where(mask, difference, 0.0)
+    cells = adaptive_avg_pool2d(difference, CELLS)
+    return avg_pool2d(cells, 3, stride=1, padding=1, count_include_pad=False).abs().mean(0)
+
+
+def _enlarged(cells: Tensor, size: Sequence[int]) -> Tensor:
+    """Cells (CELLS, CELLS) bool as pixels (1, H, W)."""
+    return interpolate(cells[None, None].float(), size=tuple(size))[0] > 0

@@ -1,0 +1,128 @@
+"""Masks from residuals (--robust_mask): what they find, how much, and trainings with them."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy import ndimage
+from synthetic import make_colmap_scene
+from trainings import differences, trained
+
+import train
+from splatting.evaluation.training_log import read_log
+from splatting.training import checks, robust_mask
+from splatting.training.robust_mask import RobustMask
+from utils.system_utils import UserError, run_cli
+
+ON = "--robust_mask", 0.3, "--test_iterations", -1, "--opacity_reset_interval", 3000
+
+
+def _views(count: int, width: int = 96, height: int = 64) -> list[SimpleNamespace]:
+    return [SimpleNamespace(uid=k, image_name=f"{k}.png", image_width=width, image_height=height) for k in range(count)]
+
+
+def _photo(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """A photo of fine detail, uint8, and a render that is a blurred one."""
+    detail = np.random.default_rng(seed).uniform(64, 192, (3, 64, 96))
+    blurred = ndimage.uniform_filter(detail, (0, 5, 5))
+    return torch.from_numpy(detail).to(torch.uint8), torch.from_numpy(blurred / 255).float()
+
+
+def _visit(masks: RobustMask, views: list, photos: list, times: int) -> list[torch.Tensor | None]:
+    found = []
+    for _ in range(times):
+        found = []
+        for view, (photo, image) in zip(views, photos, strict=True):
+            found.append(masks.mask(view, image, photo, None, learns=True))
+            masks.keep()
+    return found
+
+
+def test_a_passer_by_is_masked_and_detail_is_not():
+    """Detail has large residuals, too, pixel by pixel; only their means over cells are small."""
+    views, photos = _views(10), [_photo(seed) for seed in range(10)]
+    there = np.hypot(*(np.mgrid[:64, :96] - np.array([30, 40])[:, None, None])) < 12
+    photos[3][0][:, there] = 20
+    masks = RobustMask(views, 0.3, torch.device("cpu"))
+    assert _visit(masks, views, photos, RobustMask.least) == [None] * 10
+    found = _visit(masks, views, photos, 1)
+    assert [mask is not None for mask in found] == [k == 3 for k in range(10)]
+    masked = ~found[3][0].numpy()
+    assert masked[ndimage.binary_erosion(there, iterations=3)].all()
+    assert not masked[~ndimage.binary_dilation(there, iterations=6)].any()
+    now = [masks.counted(view) for view in views]
+    assert torch.equal(now.pop(3), found[3]) and now == [None] * 9 and masks.counted(_views(1)[0]) is None
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3])
+def test_no_more_is_masked_than_the_share(share):
+    views, photos = _views(10), [_photo(seed) for seed in range(10)]
+    photos[3][0][:] = 255
+    photos[4][0][:, :, :60] = 0
+    masks = RobustMask(views, share, torch.device("cpu"))
+    found = _visit(masks, views, photos, RobustMask.least + 1)
+    assert all(0 < (~found[k]).float().mean() <= share + 0.05 for k in (3, 4))  # cells of a pixel more or less
+
+
+def test_masks_of_files_stay_and_resets_teach_nothing():
+    views, photos = _views(3), [_photo(seed) for seed in range(3)]
+    masks = RobustMask(views, 0.3, torch.device("cpu"))
+    _visit(masks, views, photos, RobustMask.least)
+    before = masks.captured()
+    given = torch.ones(1, 64, 96, dtype=torch.bool)
+    given[:, :20] = False
+    photo, image = photos[0]
+    assert masks.mask(views[0], torch.zeros_like(image), photo, given, learns=False) is given
+    masks.keep()
+    assert all(torch.equal(before[name], masks.captured()[name]) for name in ("residuals", "levels", "visits"))
+    photo = photo.clone()
+    photo[:, :20] = 0  # where nothing counts
+    assert masks.mask(views[0], image, photo, given, learns=True) is given
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """With a white square in three photos."""
+    folder = tmp_path_factory.mktemp("robust") / "scene"
+    make_colmap_scene(folder)
+    for path in sorted(path for path in (folder / "images").rglob("*") if path.is_file())[1:4]:
+        pixels = np.array(Image.open(path).convert("RGB"))
+        pixels[20:44, 30:60] = 255 - pixels[20:44, 30:60].mean((0, 1)).round().astype(np.uint8)
+        Image.fromarray(pixels).save(path)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In trainings of 60 iterations, whose renders are far from the photos."""
+    monkeypatch.setattr(RobustMask, "early", 0)
+
+
+def test_all_steps_and_a_resumed_training_have_the_same_bytes(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(robust_mask, "_FACTOR", 1.2)
+    whole = trained(scene, tmp_path / "whole", *ON, "--checkpoint_iterations", 45, 60)
+    assert not differences(whole, trained(scene, tmp_path / "plain", *ON, "--plain_step"))
+    start = "--start_checkpoint", tmp_path / "whole" / "chkpnt45.pth"
+    assert not differences(whole, trained(scene, tmp_path / "resumed", *ON, *start))
+    off = trained(scene, tmp_path / "off", *ON[2:])
+    assert off["ply"] != whole["ply"]
+    lines = read_log(tmp_path / "whole" / "train_log.json")[-1]["lines"]
+    (said,) = [line for line in lines if line.startswith("--robust_mask leaves out")]
+    written = [path for path in (tmp_path / "whole" / robust_mask.FOLDER).rglob("*.png")]
+    assert f"in {len(written)} of 14 photos" in said and written
+    again = trained(scene, tmp_path / "again", "--masks", tmp_path / "whole" / robust_mask.FOLDER, *ON[2:])
+    assert again["ply"] != off["ply"]  # they are mask files
+
+
+def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        run_cli(lambda: train.main(["-s", str(scene), "-m", str(tmp_path / "out"), "--robust_mask", "0.7"]))
+    assert ended.value.code == 2 and "robust_mask" in capsys.readouterr().err
+    with pytest.raises(UserError, match="--robust_mask needs a training of one process"):
+        checks.check_one_process("--robust_mask", several=True)
+    masks, others = (RobustMask(_views(n), 0.3, torch.device("cpu")) for n in (3, 4))
+    with pytest.raises(UserError, match="residuals of other photos"):
+        masks.restore(others.captured())
