@@ -451,7 +451,7 @@ def test_a_frame_that_cannot_be_drawn_is_told_once_until_one_can_and_ends_nothin
         client.look(size=(60, 60))
         for told in (1, 2):
             with monkeypatch.context() as patched:
-                patched.setattr(page._frames, "draw", broken)
+                patched.setattr(page.frames, "draw", broken)
                 for step in (1.0, 2.0):
                     client.look((step, 0.0, -4.0), size=(60, 60))
                     wait_for(lambda: answer(page))

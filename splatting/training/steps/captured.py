@@ -27,7 +27,7 @@ from splatting.training.observer import Announcer
 from splatting.training.run import Run
 from splatting.training.steps.fused import FusedStep
 from splatting.training.steps.plain import PlainStep
-from splatting.training.steps.speculative import Speculation
+from splatting.training.steps.speculative import AHEAD, Speculation
 
 _ROWS = 16  # of page-locked memory for numbers of steps; more than are ever pending
 _MOST_KINDS = 4  # photos of more sizes or angles would cost more to capture than they save
@@ -48,7 +48,7 @@ class CapturedStep(FusedStep):
         self._graphs = Graphs(run, self, self._adam, self._ahead.capacity)
         pinned = run.device.type == "cuda"
         self._rows = torch.zeros(_ROWS, CAMERA_NUMBERS, dtype=torch.float64, pin_memory=pinned) if run.poses else None
-        self._fetched: dict[int, _Fetched] = {}  # by iteration: of steps that are pending
+        self._fetched: dict[int, _Fetched] = {}  # by iteration: of poses that have yet to step
 
     def take(self, at: Iteration, observers: Announcer) -> None:
         """Queue a step, unless something is due in it."""
@@ -60,6 +60,7 @@ class CapturedStep(FusedStep):
         losses = self._queue(at)
         if losses is None:
             self._ahead.discard()
+            self._step_poses(0)
             run.set_rates(at)
             return PlainStep.take(self, at, observers)
         self._ahead.add(at, losses)
@@ -69,18 +70,22 @@ class CapturedStep(FusedStep):
         if self._is_queued(at):
             self._ahead.throttle()
             if poses := self._run.poses:
-                self._ahead.wait(poses.independent(at.camera.uid, [one.uid for one in self._fetched.values()]))
+                most = poses.independent(at.camera.uid, [one.uid for one in self._fetched.values()])
+                self._ahead.wait(most)
+                self._step_poses(min(most, AHEAD))
         else:
             self.drain()
             self._graphs.save_memory()
 
     def drain(self) -> None:
         self._ahead.drain()
+        self._step_poses(0)
         if self._run.poses:
             self._run.poses.place()
 
     def abort(self) -> int:
         lost = self._ahead.abort()
+        self._step_poses(sum(not one.done for one in self._fetched.values()))
         self._fetched.clear()
         if self._run.poses:
             self._run.poses.place()
@@ -121,19 +126,28 @@ class CapturedStep(FusedStep):
         row = self._rows[at.iteration % _ROWS]
         row.copy_(self._camera_gradient, non_blocking=True)
         copied = torch.cuda.current_stream().record_event() if row.is_pinned() else None
-        self._fetched[at.iteration] = _Fetched(at.camera.uid, row, copied)
+        size = at.camera.image_width, at.camera.image_height
+        self._fetched[at.iteration] = _Fetched(at.camera.uid, size, row, copied)
+
+    def _step_poses(self, most: int) -> None:
+        """Take the steps of poses that steps of the Gaussians left behind, but at most so many of the last.
+
+        They wait as long as they may: to wait for a step's end here would let the GPU run out of work.
+        """
+        while len(self._fetched) > most:
+            iteration = next(iter(self._fetched))
+            fetched = self._fetched.pop(iteration)
+            if fetched.copied is not None:
+                fetched.copied.synchronize()
+            step = self._run.schedule.schedule_step(iteration)
+            self._run.poses.step(fetched.uid, fetched.gradient.numpy(), step, fetched.size)
 
     # What speculation asks for, of steps that are done or overflowed
 
     def finished(self, at: Iteration) -> None:
-        """Take the step of the view's pose, now that the GPU has taken that of the Gaussians."""
-        if self._rows is None:
-            return
-        fetched, size = self._fetched.pop(at.iteration), (at.camera.image_width, at.camera.image_height)
-        if fetched.copied is not None:
-            fetched.copied.synchronize()
-        step = self._run.schedule.schedule_step(at.iteration)
-        self._run.poses.step(fetched.uid, fetched.gradient.numpy(), step, size)
+        """Note that the GPU takes that step of the Gaussians for good."""
+        if self._rows is not None:
+            self._fetched[at.iteration].done = True
 
     def replay(self, at: Iteration, first: Losses) -> None:
         """Queue a step once more, with the same values, which go into the losses that observers hold (`first`)."""
@@ -155,8 +169,10 @@ class CapturedStep(FusedStep):
 @dataclass
 class _Fetched:
     uid: int
+    size: tuple[int, int]  # of the image
     gradient: Tensor  # (CAMERA_NUMBERS,) on the host, once it is copied
     copied: torch.cuda.Event | None
+    done: bool = False
 
 
 @dataclass
