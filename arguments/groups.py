@@ -180,6 +180,9 @@ class OptimizationParams(OptionTable):
         Option("robust_mask", 0.0, origin="ours", check=within(0, 0.5),
             help="largest part of a photo that training may leave out because all others disagree with it, as with "
                  "passers-by; no mask is needed. 0: off"),
+        Option("filter_3d", False, origin="ours",
+            help="let no Gaussian be finer than the training photos can show, so that views from other distances look "
+                 "right. It is part of the PLY, so that every viewer shows it; best with --antialiasing"),
         Option("random_background", False,
             help="a new random background in every step, so that no Gaussian imitates a fixed one"),
         Option("optimizer_type", "default", check=one_of("default", "sparse_adam"), stored=MODEL_JSON,

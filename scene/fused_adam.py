@@ -10,6 +10,7 @@ from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam, SparseGaussianAdam
+from scene.gaussians.filter_3d import chain_of
 from scene.gaussians.mcmc import NO_PENALTY, Penalty
 
 # In the operator's order (gs::Stepped).
@@ -90,6 +91,10 @@ class FusedAdam:
         awake: of scene/sleeping.py, None: all are.
         """
         gaussians, camera, *options = scene.lists
+        model = self._gaussians
+        if model.filter_3d is not None:
+            raw = model.raw("opacity").detach(), model.raw("scaling").detach()
+            gaussians += [*raw, chain_of(*raw, scene.opacities, scene.scales)]
         camera = camera if awake is None else (*camera, awake)
         # By place: names would cost the operator microseconds.
         arguments = source, planes, [], radii, *self.arguments(observe), now, absolute
@@ -108,7 +113,8 @@ class FusedAdam:
     def places(self) -> tuple[int, ...]:
         """Number of Gaussians, and where all tensors of a step lie, to see whether one was replaced."""
         tensors = [t for one in self._stepping() for t in (one.param, one.state["exp_avg"], one.state["exp_avg_sq"])]
-        return len(self._gaussians), *[tensor.data_ptr() for tensor in (*tensors, *self._statistics())]
+        tensors += [*self._statistics(), *([] if (it := self._gaussians.filter_3d) is None else [it])]
+        return len(self._gaussians), *[tensor.data_ptr() for tensor in tensors]
 
     @property
     def _sparse(self) -> bool:

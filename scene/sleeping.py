@@ -19,6 +19,7 @@ from torch import Tensor
 from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.filter_3d import sampling_rate
 from scene.gaussians.spilled import is_spilled, to_host
 from splatting.distributed.rows import BLOCK, PIECE
 from utils.system_utils import UserError
@@ -172,15 +173,4 @@ class Sleeping:
 def share_seen(points: Tensor, cameras: Sequence[Camera]) -> float:
     """The share of points (N, 3) that a camera sees, on the mean of up to 32 cameras. Distortion is left out."""
     views = cameras[:: -(-len(cameras) // 32)]
-    ones = torch.cat((points, torch.ones_like(points[:, :1])), 1)
-    shares = []
-    for view in views:
-        lens = getattr(view, "lens", None)
-        if lens and lens.chart != "perspective":
-            toward = torch.nn.functional.normalize((ones @ view.world_view_transform.to(points))[:, :3], dim=1)
-            seen = toward[:, 2].clamp(-1, 1).acos() < lens.field(view.image_width, view.image_height)
-        else:
-            x, y, _, w = (ones @ view.full_proj_transform.to(points)).unbind(1)
-            seen = (w > 0) & (x.abs() < w) & (y.abs() < w)
-        shares.append(float(seen.float().mean()))
-    return sum(shares) / len(shares)
+    return sum(float((sampling_rate(points, view) > 0).float().mean()) for view in views) / len(views)

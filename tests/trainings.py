@@ -41,6 +41,7 @@ OPTIONS = {
     "mcmc moves": (*MCMC, "--mcmc_growth", 0),
     "mcmc idle": ("--strategy", "mcmc", "--mcmc_growth", 0, "--mcmc_min_opacity", 1e-6),
     "mcmc sparse": (*MCMC, "--optimizer_type", "sparse_adam", "--antialiasing"),
+    "filter": (*MCMC, "--filter_3d", "--antialiasing"),
     "budget": BUDGET,
     "poses": ("--refine_poses", "--resolution_schedule", "pyramid"),
     "poses, no graph": ("--refine_poses", "--train_test_exp", "-d", "depths", "--depth_l1_weight_init", 1),

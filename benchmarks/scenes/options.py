@@ -2,8 +2,10 @@
 
     python -m benchmarks.scenes.options OUT --scenes SCENE ... --keep 3 --with="--sparse_depth 0.1" --iterations 1000
     python -m benchmarks.scenes.options OUT --made wall fisheye --with="--lenses undistort" --iterations 1000
+    python -m benchmarks.scenes.options OUT --scenes SCENE --with=--filter_3d --widths 34 67 269 538 -r 4
 
 --keep N trains on every N-th training photo alone, without the points that judge the depth, and scores all test photos.
+--widths W ... scores test views of these widths (px) besides, such as a quarter, half and double of the training's.
 --made ray-traces scenes: the demo's; with balls that roam through 30 % of its training photos; with a wall without
 texture in it; and of fisheyes of 200 degrees and panoramas, which are scored as they are. Other options go to train.py.
 """
@@ -81,23 +83,23 @@ def thinned(scene: Path, out: Path, keep: int) -> Path:
 
 
 def compare(
-    scene: Path, out: Path, sets: list[str], seeds: list[int], options: list[str], keep: int
+    scene: Path, out: Path, sets: list[str], args: argparse.Namespace, options: list[str], forms: dict[str, str]
 ) -> list[list[str]]:
     """Train with each set of options, the first of which the others are compared with; a row for each."""
-    given = {"shown": ["--depth", "--lenses", "native"]}
+    given, keep = {"shown": ["--depth", "--lenses", "native"], "widths": args.widths}, args.keep
     if keep > 1:
         given, scene = given | {"judged": scene}, thinned(scene, out / "thinned", keep)
     rows, first = [], []
     for number, words in enumerate(sets):
         runs = []
-        for seed in seeds:
+        for seed in args.seeds:
             runs.append(train(scene, out / f"{number}_{seed}", seed, [*options, *shlex.split(words)], **given))
-            print(out.name, words, seed, {name: runs[-1].get(name) for name in FORMS}, flush=True)
-        values = {name: [run[name] for run in runs if run.get(name) is not None] for name in FORMS}
+            print(out.name, words, seed, {name: runs[-1].get(name) for name in forms}, flush=True)
+        values = {name: [run[name] for run in runs if run.get(name) is not None] for name in forms}
         first = first or values["PSNR"]
         gains = [psnr - other for psnr, other in zip(values["PSNR"], first, strict=True)]
         spread = f" ({stdev(gains):.2f})" if len(gains) > 1 else ""
-        cells = [f"{mean(of):{form}}" if (of := values[name]) else "" for name, form in FORMS.items()]
+        cells = [f"{mean(of):{form}}" if (of := values[name]) else "" for name, form in forms.items()]
         rows.append([words or "none", *cells, f"{mean(gains):+.2f}{spread}" if number else ""])
     return rows
 
@@ -110,17 +112,19 @@ def main() -> None:
     add("--made", nargs="+", choices=MADE, default=[], help="scenes to make")
     add("--with", action="append", dest="sets", default=[], help="options to compare with none; may be repeated")
     add("--keep", type=int, default=1, help="train on every so many training photos (default: 1, all)")
+    add("--widths", type=int, nargs="+", default=[], help="widths of test views to score besides (px)")
     add("--seeds", type=int, nargs="+", default=[0, 1, 2], help="one run each (default: 0 1 2)")
     args, options = parser.parse_known_args()
     if args.out.exists():
         raise UserError(f"{args.out} exists; name a new folder")
     print(describe(compute_device()), "\ntrain.py --eval", *options, flush=True)
     out, rows = args.out.resolve(), []
+    wide = {f"{name}@{width}": FORMS[name] for width in args.widths for name in ("PSNR", "SSIM")}
     scenes = [(path.name, path.resolve()) for path in args.scenes]
     for name, scene in [*scenes, *((name, made(name, out / "scenes" / name)) for name in args.made)]:
-        found = compare(scene, out / name, ["", *args.sets], args.seeds, options, args.keep)
+        found = compare(scene, out / name, ["", *args.sets], args, options, FORMS | wide)
         rows += [[name, *row] for row in found]
-    header = ["scene", "options", "PSNR dB", "SSIM", "depth error", "95 %", "training s", "Gaussians", "gain dB"]
+    header = ["scene", "options", "PSNR dB", "SSIM", "depth error", "95 %", "training s", "Gaussians", *wide, "gain dB"]
     print_table(header, rows)
 
 

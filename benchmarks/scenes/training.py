@@ -42,6 +42,11 @@ def seconds_of(model: Path) -> float:
     return json.loads((model / "train_log.json").read_text())[-1]["seconds"]
 
 
+def scores_of(model: Path) -> dict[str, float]:
+    """Return the scores of the first method of a model folder."""
+    return next(iter(json.loads((model / "results.json").read_text()).values()))
+
+
 def train(
     scene: Path,
     model: Path,
@@ -50,28 +55,35 @@ def train(
     ranks: int = 1,
     shown: Sequence[str] = (),
     judged: Path | None = None,
+    widths: Sequence[int] = (),
 ) -> dict:
     """Train, render and score one model; return seconds, scores, Gaussians, bytes and a hash of the PLY.
 
     shown: further options of render.py. judged: a scene whose test views are scored, where all views of `scene` train.
+    widths: of test views, pixels, that are scored besides, against photos of that size: PSNR@WIDTH and so on.
     """
     words = ["-s", str(scene), "-m", str(model), "--seed", str(seed), "--test_iterations", "-1", "--no_curve"]
     words += [] if judged else ["--eval"]
     shown = [*shown, *(["-s", str(judged), "--eval", "--allow_other_scene"] if judged else [])]
     launcher = ["-m", "torch.distributed.run", "--standalone", f"--nproc_per_node={ranks}"] if ranks > 1 else []
     process = run(*launcher, "train.py", *words, *options)
+    at_width = {}
+    for width in widths:
+        run("render.py", "-m", str(model), "--skip_train", *shown, "-r", str(width))
+        run("metrics.py", "-m", str(model))
+        at_width |= {f"{name}@{width}": value for name, value in scores_of(model).items()}
     run("render.py", "-m", str(model), "--skip_train", *shown)
     run("metrics.py", "-m", str(model))
     record = json.loads((model / "train_log.json").read_text())[-1]
     iteration = record["iteration"]
-    scores, *_ = json.loads((model / "results.json").read_text()).values()
     ply = model / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
     return {
         "seed": seed,
         "ranks": ranks,
         "seconds": seconds_of(model),
         "process": process,
-        **scores,
+        **scores_of(model),
+        **at_width,
         "Gaussians": record["gaussians"],
         "bytes": ply.stat().st_size,
         "hash": hashlib.sha256(ply.read_bytes()).hexdigest()[:16],

@@ -10,7 +10,7 @@ from scene.gaussians import density_rules as rules
 from scene.gaussians.attributes import Rows
 from scene.gaussians.long_axis import long_axis_children
 from scene.gaussians.parameters import GaussianParameters
-from scene.gaussians.statistics import NAMES
+from scene.gaussians.statistics import PER_ROW
 from splatting.distributed.rows import changes_rows
 
 _STANDARD = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")  # the order of densification_postfix
@@ -243,7 +243,7 @@ def prune_points(gaussians: GaussianParameters, mask: Tensor) -> None:
         return
     gaussians._take(gaussians._prune_optimizer(kept))
     gaussians.shards.kept(keep)
-    for name in (*NAMES, "tmp_radii"):
+    for name in PER_ROW:
         values = getattr(gaussians, name, None)  # users delete those that they do not need
         if values is not None:
             setattr(gaussians, name, values.index_select(0, keep))

@@ -25,7 +25,7 @@ _LARGEST = 1e15  # extent; learning rates are multiples of it
 _OPTIMIZER = 10  # which entry its state dict is
 _ENTRIES = 12  # the reference's; the values of further attributes may follow
 EXPOSURES, WRITTEN_BY, ASLEEP, POSES = "exposures", "version", "asleep", "poses"  # keys in the optimiser's state dict
-RESIDUALS = "residuals"  # the same
+RESIDUALS, FILTER = "residuals", "filter_3d"  # the same
 
 
 class State(NamedTuple):
@@ -128,7 +128,7 @@ def pack(state: State) -> tuple:
     )
 
 
-def with_further(entries: tuple, key: str, values: dict[str, Any]) -> tuple:
+def with_further(entries: tuple, key: str, values: Any) -> tuple:
     """The entries with one more key in the optimiser's state dict."""
     return (*entries[:_OPTIMIZER], entries[_OPTIMIZER] | {key: values}, *entries[_OPTIMIZER + 1 :])
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from scene.gaussians.attributes import Attribute, Rows, attributes
+from scene.gaussians.filter_3d import filtered
 from scene.gaussians.finite import warn_of_undrawn
 from scene.gaussians.ply import FLAT, column_names, read_ply, row_bytes, write_ply
 from scene.gaussians.spilled import is_spilled, room_for, to_host
@@ -50,7 +51,8 @@ class GaussianParameters:
     rows like those of a tensor, a part of them in the host's memory, or returns None (scene/gaussians/spilled.py).
     max_radii2D, xyz_gradient_accum, denom: observations since the last densification (Statistics has shapes and units).
     optimizer: any of torch's, with `name` in its groups; None until training is set up. tmp_radii: (N,) pixels of the
-    present view, or None; density control keeps it in step with the rows.
+    present view, or None; density control keeps it in step with the rows. filter_3d: (N, 1) standard deviation of the
+    3D filter (scene/gaussians/filter_3d.py), world units, or None; what is drawn or written as a PLY is behind it.
     """
 
     # What a subclass need not set whose __init__ sets the reference's attributes and does not call this one.
@@ -61,6 +63,7 @@ class GaussianParameters:
     spill: Callable[[Tensor, int], Tensor | None] | None = None
     optimizer: torch.optim.Optimizer | None = None
     tmp_radii: Tensor | None = None
+    filter_3d: Tensor | None = None
 
     _xyz: Tensor
     _features_dc: Tensor
@@ -156,7 +159,7 @@ class GaussianParameters:
     @property
     def get_scaling(self) -> Tensor:
         """Standard deviations (N, 3) along the Gaussian's own axes, world units."""
-        return self.scaling_activation(self._scaling)
+        return self.scaling_activation(self._drawn_shapes()[1])
 
     @property
     def get_rotation(self) -> Tensor:
@@ -166,17 +169,23 @@ class GaussianParameters:
     @property
     def get_opacity(self) -> Tensor:
         """Opacities (N, 1) in (0, 1)."""
-        return self.opacity_activation(self._opacity)
+        return self.opacity_activation(self._drawn_shapes()[0])
 
     def get_covariance(self, scaling_modifier: float = 1.0) -> Tensor:
         """World covariances R S S R^T, S = modifier * scales: (N, 6), order xx xy xz yy yz zz."""
         return self.covariance_activation(self.get_scaling, scaling_modifier, self._rotation)
 
+    def _drawn_shapes(self) -> tuple[Tensor, Tensor]:
+        """Raw opacities and scales behind the 3D filter, if there is one."""
+        raw = self._opacity, self._scaling
+        return raw if self.filter_3d is None else filtered(*raw, self.filter_3d)
+
     def raw_geometry(self) -> dict[str, Tensor]:
         """Raw shapes by the rasterizer's names: opacities (N, 1) logit, scales (N, 3) log, rotations (N, 4) wxyz."""
         if self._scaling.shape[1] == 2:
             raise UserError(f"this model has {FLAT}")
-        return {"opacities": self._opacity, "scales": self._scaling, "rotations": self._rotation}
+        opacities, scales = self._drawn_shapes()
+        return {"opacities": opacities, "scales": scales, "rotations": self._rotation}
 
     @property
     def kernels_activate(self) -> bool:
@@ -258,8 +267,13 @@ class GaussianParameters:
         self.active_sh_degree = self.max_sh_degree
 
     def save_ply(self, path: str | os.PathLike) -> None:
-        """Write the raw parameters as a PLY in the reference's layout."""
-        write_ply(path, raw_rows(self), self._degree_of_tensors(), self.world_offset, shards=self.shards)
+        """Write the raw parameters, behind the 3D filter, as a PLY in the reference's layout."""
+        write_ply(path, self._drawn_rows(), self._degree_of_tensors(), self.world_offset, shards=self.shards)
+
+    def _drawn_rows(self) -> Rows:
+        """Raw values by optimiser group, behind the 3D filter."""
+        opacity, scaling = (values.detach() for values in self._drawn_shapes())
+        return raw_rows(self) | {"opacity": opacity, "scaling": scaling}
 
     @property
     def size_as_ply(self) -> int:
@@ -267,8 +281,11 @@ class GaussianParameters:
         return self.gaussian_count * row_bytes(self.max_sh_degree)
 
     def part(self, keep: Tensor | slice, sh_degree: int) -> "GaussianParameters":
-        """A copy of the Gaussians `keep`, (N,) bool or a slice, with the SH bands up to sh_degree; no optimiser."""
-        rows = raw_rows(self)
+        """A copy of the Gaussians `keep`, (N,) bool or a slice, with the SH bands up to sh_degree; no optimiser.
+
+        It looks the same without a 3D filter.
+        """
+        rows = self._drawn_rows()
         rest = rows.pop("f_rest")[:, : (sh_degree + 1) ** 2 - 1]
         rows = {name: values[keep] for name, values in rows.items()}
         rows["f_rest"] = to_host(rest, keep) if is_spilled(rest) else rest[keep].contiguous()
@@ -287,7 +304,7 @@ class GaussianParameters:
         return {name: values.index_select(0, indices) for name, values in raw_rows(self).items()}
 
     def set_rows(self, rows: Rows) -> None:
-        """Take raw values of any number of Gaussians by optimiser group, with new statistics.
+        """Take raw values of any number of Gaussians by optimiser group, with new statistics and no 3D filter.
 
         They move to the device that computes.
         """
@@ -298,6 +315,7 @@ class GaussianParameters:
             room = room_for(self, name, like, len(rows[name]))
             params[name] = nn.Parameter(rows[name].to(device) if room is None else room.copy_(rows[name].detach()))
         self._take(params)
+        self.filter_3d = None
         self.shards = self.shards.of(len(self))
         self._zero_statistics()
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from scene.gaussians.attributes import Rows
 from scene.gaussians.spilled import empty_beside, placed, room_for
-from scene.gaussians.statistics import NAMES
+from scene.gaussians.statistics import PER_ROW
 from splatting.host.memory import is_out_of_memory
 
 _CHUNK = 1 << 16  # rows moved at a time when memory is too short for all of them
@@ -82,7 +82,10 @@ class GaussianTable:
             return torch.cat((values, new.detach()), out=room_for(self._model, name, values, len(values) + len(new)))
 
         try:
-            return self._map(groups, grow)
+            params = self._map(groups, grow)
+            if (widths := getattr(self._model, "filter_3d", None)) is not None:  # of new rows it is yet to be computed
+                self._model.filter_3d = torch.cat((widths, widths.new_zeros(len(rows["xyz"]), 1)))
+            return params
         except (MemoryError, RuntimeError) as error:
             if is_out_of_memory(error):
                 self._map(groups, lambda values, *_: values[:count])
@@ -96,7 +99,7 @@ class GaussianTable:
         """Change the rows of groups and of the statistics, one tensor at a time."""
         model = self._model
         self._map(groups, lambda values, *_: change(values))
-        for name in (*NAMES, "tmp_radii"):
+        for name in PER_ROW:
             values = getattr(model, name, None)  # users delete those that they do not need
             if values is not None:
                 setattr(model, name, change(values))

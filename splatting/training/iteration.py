@@ -23,7 +23,7 @@ class Iteration:
     camera: Camera
     background: Tensor  # (3,), random or that of the scene
     depth_weight: float  # of the depth loss, 0 if the view has no reliable depth map
-    changes: bool  # rows of the Gaussians, the SH degree or the size of views change in this iteration
+    changes: bool  # rows of the Gaussians, the SH degree, the size of views or the 3D filter change in this iteration
     started: float  # seconds of training before it
     span: range  # steps of the schedule that it stands for (training/schedule.py)
     points: PointDepths | None = None  # of the depth of points, None: not wanted, or the view has none

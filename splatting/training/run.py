@@ -19,7 +19,8 @@ from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
-from scene.gaussians.checkpoint import ASLEEP, POSES, RESIDUALS, further, load_checkpoint, with_further
+from scene.gaussians.checkpoint import ASLEEP, FILTER, POSES, RESIDUALS, further, load_checkpoint, with_further
+from scene.gaussians.filter_3d import filter_widths
 from scene.gaussians.morton import sort_rows
 from scene.sleeping import MOST_SHARE, REST, Sleeping, share_seen
 from splatting.deterministic.counter_rng import Stream, uniform
@@ -44,7 +45,7 @@ from splatting.training.schedule import DecidedSchedule
 from splatting.training.sparse_depth import SparseDepth
 from splatting.training.strategies import AUTO, USUAL, density_control, end_in_time, of_clock
 from utils.general_utils import get_expon_lr_func
-from utils.system_utils import compute_device
+from utils.system_utils import UserError, compute_device
 
 
 def bias_correction(step: int, beta1: float = 0.9, beta2: float = 0.999) -> float:
@@ -56,6 +57,7 @@ def bias_correction(step: int, beta1: float = 0.9, beta2: float = 0.999) -> floa
 
 
 SH_INTERVAL = 1000  # iterations between raises of the active SH degree
+FILTER_INTERVAL = 500  # iterations, at most, between updates of the 3D filter: positions hardly move in as many
 
 
 class Run:
@@ -211,9 +213,25 @@ class Run:
                 start_from(first, self.scene, self.gaussians)
             self.gaussians.training_setup(self.opt)
             sort_rows(self.gaussians)
+        if self.opt.filter_3d:
+            self._begin_filter(capture and further(capture, FILTER))
         self.gaussians.limit_columns()
         if (views := self.schedule.views) > 1:
             self.gaussians.optimizer.set_betas(0.9**views, 0.999**views)
+
+    def _begin_filter(self, kept: Any) -> None:
+        """Compute the 3D filter, or take that of a checkpoint, if it has one."""
+        self._update_filter()
+        if kept is None:
+            return
+        gaussians = self.gaussians
+        if not torch.is_tensor(kept) or kept.shape != (gaussians.gaussian_count, 1):
+            raise UserError("the 3D filter of the checkpoint does not fit its Gaussians; give another one")
+        gaussians.filter_3d = gaussians.shards.own(kept).to(gaussians.filter_3d)
+
+    def _update_filter(self) -> None:
+        views = self.scene.getTrainCameras()
+        self.gaussians.filter_3d = filter_widths(self.gaussians.get_xyz.detach(), views)
 
     def _check_records(self) -> None:
         """Compare this run with those before it, in its folder and beside its checkpoint."""
@@ -283,7 +301,8 @@ class Run:
 
     def _changes(self, iteration: int) -> bool:
         resizes = self.resolution.changes(*map(self.schedule.schedule_step, (iteration - 1, iteration)))
-        return self.density.changes(iteration) or self._raises_degree(iteration) > 0 or resizes
+        filters = self.opt.filter_3d and iteration % FILTER_INTERVAL == 0
+        return self.density.changes(iteration) or self._raises_degree(iteration) > 0 or resizes or filters
 
     def _raises_degree(self, iteration: int) -> int:
         """How often the SH degree is raised in an iteration."""
@@ -338,7 +357,7 @@ class Run:
         """What lets blocks sleep, where it saves something, and a step concerns no row that its view does not see."""
         density = self.density
         dense = type(self.gaussians.optimizer) is GaussianAdam and FusedAdam.takes(self.gaussians)
-        alone = not (self.schedule.views > 1 or density.queues or any(density.penalty))
+        alone = not (self.schedule.views > 1 or density.queues or any(density.penalty) or self.opt.filter_3d)
         if not (dense and alone and self.is_standard):
             return None
         saves = self.group.anyone(self.memory.limit > 0) or self._share_seen() < MOST_SHARE
@@ -397,6 +416,8 @@ class Run:
         if self.robust_mask:
             self.robust_mask.keep()
         if step.changes:
+            if self.opt.filter_3d:
+                self._update_filter()
             self.memory.settle(self.gaussians)
         if self.sleeping is None:
             return
@@ -419,6 +440,9 @@ class Run:
             state = with_further(state, POSES, self.poses.captured())
         if self.robust_mask:
             state = with_further(state, RESIDUALS, self.robust_mask.captured())
+        widths = self.gaussians.filter_3d
+        if widths is not None and len(widths) == len(self.gaussians):  # not where memory ran out on the way
+            state = with_further(state, FILTER, self.gaussians.shards.whole(widths))
         asleep = self.sleeping and self.sleeping.captured()
         return with_further(state, ASLEEP, asleep) if asleep else state
 

@@ -59,6 +59,8 @@ void displace(const Executor&, const Displacement&);
 void list_records(const Executor&, const RecordInput&, const RecordLists&);
 template <class T>
 void sum_runs(const Executor&, const SumInput<T>&);
+template <class T>
+void chain_rows(int64_t count, const T* factors, T* logits, T* log_scales);
 
 // What else the CPU offers. sum_rows: the rest of blend_vjp after blend_rows. project_vjp_step: project_vjp, and every
 // Gaussian's step as soon as its gradients are known. camera_vjp: the gradients of the camera's numbers

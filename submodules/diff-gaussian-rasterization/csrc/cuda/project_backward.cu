@@ -98,9 +98,9 @@ struct RowBefore {
 struct Addition : StepParameters {};
 
 // Computes gradients, and either writes them or takes the Gaussians' steps. It is one kernel for both, because a
-// compiler may fuse other products in another, and both must go the same way to the last bit. Step: StepParameters or
-// PenalisedStep, between which nothing differs but a call; or Addition, whose code would cost these registers, and
-// whose sums may therefore differ by rounding.
+// compiler may fuse other products in another, and both must go the same way to the last bit. Step: StepParameters,
+// PenalisedStep or ChainedStep, between which nothing differs but a call; or Addition, whose code would cost these
+// registers, and whose sums may therefore differ by rounding.
 template <class AnyCamera, class Source, class Step>
 __global__ void __launch_bounds__(kThreads, kBlocks)
     project_vjp_kernel(const int32_t* halted, Scene<float> s, Source source, SceneGradient<float> out,
@@ -147,7 +147,7 @@ __global__ void __launch_bounds__(kThreads, kBlocks)
     if (step.observed.max_radii && i < s.count) observe_one(step.observed, i, at, g.means2d);
     const WarpGradients gradients{warp_stage};
     write_gradient(g, gradients);
-    if (i < s.count) penalise_one(step, i, gradients);
+    if (i < s.count) finish_one(step, i, gradients);
     step_gaussians<kRest>(step, first, s.count, gradients, warp_rows);
     return;
   }
@@ -188,7 +188,9 @@ void launch_step(const Queue& queue, const Scene<float>& s, const SlotSums<kRays
   if constexpr (!kRays)
     if (step.camera) camera_vjp(queue, s, source, step.camera);
   const StepParameters parameters = step_parameters(step);
-  if (step.penalty.any())
+  if (step.chain)
+    launch_project_vjp<kRays>(queue, s, source, {}, ChainedStep{{parameters, step.penalty}, step.chain});
+  else if (step.penalty.any())
     launch_project_vjp<kRays>(queue, s, source, {}, PenalisedStep{parameters, step.penalty});
   else
     launch_project_vjp<kRays>(queue, s, source, {}, parameters);
