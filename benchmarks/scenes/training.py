@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.harness.measuring import describe, print_table
+from splatting.evaluation.renders import FITTED
 from utils.system_utils import UserError, compute_device, run_cli
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -64,7 +65,7 @@ def train(
     run("metrics.py", "-m", str(model))
     record = json.loads((model / "train_log.json").read_text())[-1]
     iteration = record["iteration"]
-    scores, *_ = json.loads((model / "results.json").read_text()).values()
+    (_, scores), *others = json.loads((model / "results.json").read_text()).items()
     ply = model / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
     return {
         "seed": seed,
@@ -72,6 +73,7 @@ def train(
         "seconds": seconds_of(model),
         "process": process,
         **scores,
+        "fitted": next((of["PSNR"] for name, of in others if name.endswith(FITTED)), None),
         "Gaussians": record["gaussians"],
         "bytes": ply.stat().st_size,
         "hash": hashlib.sha256(ply.read_bytes()).hexdigest()[:16],
