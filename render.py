@@ -33,13 +33,14 @@ from tqdm import tqdm
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, read_cfg_args, warn_of_background
 from gaussian_renderer.blending import PLANES, view_planes
 from gaussian_renderer.memory_errors import memory_errors_explained
-from gaussian_renderer.scored_views import ScoredViews
+from gaussian_renderer.scored_views import ScoredViews, fitted_views
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.ppisp import Ppisp
 from scene.saved_model import load_saved
 from scene.scene import Scene
 from splatting.camera_paths.render_path import add_path_options, path_request, render_path
-from splatting.evaluation.renders import DEPTHS, GIVEN_POSES, INCOMPLETE, TIMES, model_digest, summarise_times
+from splatting.evaluation.renders import DEPTHS, FITTED, GIVEN_POSES, INCOMPLETE, TIMES, model_digest, summarise_times
 from splatting.exports.in_scene import load_file
 from splatting.files.image_files import remove_leftovers, save_png, write_plane
 from splatting.files.json_files import write_json
@@ -57,13 +58,14 @@ def write_views(
     train_test_exp: bool = False,
     planes: Collection[str] = (),
     points: Mapping[str, PointDepths] | None = None,
+    scored: ScoredViews | None = None,
 ) -> list[float]:
     """Write renders, ground truth and masks of `views` under `folder`; seconds of rendering per view (without I/O).
 
     train_test_exp: render with exposures, and write right halves only. planes: those of PLANES to write, too. points:
-    score the depth, by image name.
+    score the depth, by image name. scored: how to render and score them, None: by the options.
     """
-    scored = ScoredViews(pipe, background, train_test_exp)
+    scored = scored or ScoredViews(pipe, background, train_test_exp)
     for side in ("renders", "gt"):
         if views:
             mkdir_p(folder / side)
@@ -118,17 +120,18 @@ def render_set(
     *,
     planes: Collection[str] = (),
     points: Mapping[str, PointDepths] | None = None,
+    scored: ScoredViews | None = None,
 ) -> None:
     """Write renders, ground truth, masks and times of `views` under model_path/name/ours_ITERATION; say how long.
 
     train_test_exp: render with exposures, and write right halves only. separate_sh: accepted for callers of the
-    reference; the SH bands are always passed separately. planes, points: as for `write_views`.
+    reference; the SH bands are always passed separately. planes, points, scored: as for `write_views`.
     """
     folder = Path(model_path) / name / f"ours_{iteration}"
     for of_earlier in (TIMES, DEPTHS):  # of an interrupted run they do not count
         (folder / of_earlier).unlink(missing_ok=True)
     with memory_errors_explained(gaussians, views):
-        seconds = write_views(folder, views, gaussians, pipeline, background, train_test_exp, planes, points)
+        seconds = write_views(folder, views, gaussians, pipeline, background, train_test_exp, planes, points, scored)
     if not seconds:
         print(f"{name}: no views" + ("; the model was trained without --eval" if name == "test" else ""))
         return
@@ -156,7 +159,8 @@ def render_sets(
 ) -> None:
     """Render the views of a saved iteration, -1: the last one, by `render_set`.
 
-    Test views of a model with refined poses are also rendered with the dataset's, as ours_N_given_poses.
+    Test views of a model with refined poses are also rendered with the dataset's, as ours_N_given_poses, and those of a
+    model whose photos' appearance is trained with their own (`fitted_views`), as ours_N_fitted_appearance.
     dataset: the model options. sh_degree: degree that the PLY must have, None: any. planes: those of PLANES to write,
     too. ply: model of any tool to render instead, into folders that have its name. UserError if nothing can be loaded.
     """
@@ -169,11 +173,14 @@ def render_sets(
         views = scene.getTestCameras()
         points = held_out_points(scene, dataset.source_path) if "depth" in planes else None
         render_set(scene.model_path, "test", scene.loaded_iter, views, *drawn, planes=planes, points=points)
-        method = f"{scene.loaded_iter}_{GIVEN_POSES}"
-        if given := scene.given_test_views():
-            render_set(scene.model_path, "test", method, given, *drawn, planes=planes)
-        else:
-            shutil.rmtree(Path(scene.model_path) / "test" / f"ours_{method}", ignore_errors=True)
+        own = views if isinstance(scene.gaussians.exposures, Ppisp) else []
+        beside = {GIVEN_POSES: (scene.given_test_views(), None), FITTED: (own, fitted_views(pipeline, background))}
+        for name, (shown, scored) in beside.items():
+            method = f"{scene.loaded_iter}_{name}"
+            if shown:
+                render_set(scene.model_path, "test", method, shown, *drawn, planes=planes, scored=scored)
+            else:
+                shutil.rmtree(Path(scene.model_path) / "test" / f"ours_{method}", ignore_errors=True)
 
 
 def _loaded(

@@ -89,6 +89,10 @@ class ModelParams(OptionTable):
         Option("refine_lens", False, origin="ours", stored=MODEL_JSON,
             help="with --refine_poses, train a small correction of each camera's focal lengths, principal point and "
                  "distortion, too"),
+        Option("appearance", "none", origin="ours", check=one_of("none", "affine", "ppisp"), stored=MODEL_JSON,
+            help="how photos of different exposure train. affine: --train_test_exp; ppisp: exposure and white balance "
+                 "of each photo, vignetting and response of each camera, with the test photos held out; exports and "
+                 "viewers show none of it"),
         Option("images_to_load", 0, origin="ours", check=at_least(0),
             help="largest number of decoded images (photos, masks and depth maps) kept in memory, 0: all. The one "
                  "unused for longest goes. Every photo still trains, with the same result; up to 32 that come next "
@@ -106,6 +110,10 @@ class ModelParams(OptionTable):
         starts = [f"--{name} {value}" for name, value in given.items() if value not in ("", "sfm")]
         if len(starts) > 1:
             raise UserError(f"{' and '.join(starts[:2])} both name the points to start from; leave one out")
+        if getattr(values, "appearance", "") == "affine":
+            values.train_test_exp = True
+        elif getattr(values, "appearance", "") == "ppisp" and getattr(values, "train_test_exp", False):
+            raise UserError("--train_test_exp is --appearance affine; leave it out, or --appearance ppisp")
         if getattr(values, "source_path", ""):
             values.source_path = os.path.abspath(values.source_path)
         return values

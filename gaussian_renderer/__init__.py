@@ -18,6 +18,7 @@ from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.exposure import apply_exposure
 from scene.gaussians.parameters import GaussianParameters
+from scene.gaussians.ppisp import Ppisp
 from scene.sleeping import Sleeping
 from splatting.distributed.rendering.sharded import (
     DividedDrawn,
@@ -239,9 +240,16 @@ def rasterizer_settings(
 
 def exposed(color: Tensor, camera: Camera | MiniCam, pc: GaussianModel) -> Tensor:
     """The image (3, H, W) with the trained exposure of the view's photo; a view without a photo has none."""
-    name = getattr(camera, "exposure_name", None)
-    name = getattr(camera, "image_name", None) if name is None else name
+    name = photo_name(camera)
+    if name is not None and isinstance(exposures := getattr(pc, "exposures", None), Ppisp):
+        return exposures.shown(color, name)
     return color if name is None else apply_exposure(color, pc.get_exposure_from_name(name))
+
+
+def photo_name(camera: Camera | MiniCam) -> str | None:
+    """The name of a view's photo among the trained exposures; None for a view without a photo."""
+    name = getattr(camera, "exposure_name", None)
+    return getattr(camera, "image_name", None) if name is None else name
 
 
 def _geometry(pc: GaussianModel, in_python: bool, scaling_modifier: float) -> tuple[dict[str, Tensor], bool]:

@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterable
 import torch
 from torch import Tensor
 
-from gaussian_renderer import render
+from gaussian_renderer import photo_name, render
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.ppisp import Ppisp
 from scene.half_images import half
 from utils.image_utils import as_float, pixels_that_count
 from utils.loss_utils import l1_and_ssim
@@ -17,7 +18,8 @@ from utils.loss_utils import l1_and_ssim
 class ScoredViews:
     """Renders of views and their targets, as they are scored.
 
-    By the half-image protocol (train_test_exp), only right halves count, and they are rendered with exposures.
+    By the half-image protocol (train_test_exp), only right halves count, and they are rendered with exposures. Photos
+    whose appearance has trained are rendered with that, too.
     draw: renders a camera and a model to (3, H, W) in [0, 1]; None: `render` does. whole: the same, the render before
     `part` cuts it.
     """
@@ -35,7 +37,8 @@ class ScoredViews:
         self.whole = draw or self._render
 
     def _render(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
-        options = {"use_trained_exp": self._halves, "want_depth": False, "want_visibility": False}
+        exposed = self._halves or shown_as_trained(camera, gaussians)
+        options = {"use_trained_exp": exposed, "want_depth": False, "want_visibility": False}
         return render(camera, gaussians, self._pipe, self._background, **options)["render"]
 
     def part(self, image: Tensor) -> Tensor:
@@ -67,6 +70,30 @@ class ScoredViews:
     def scores(self, cameras: Iterable[Camera], gaussians: GaussianModel) -> dict[str, float]:
         """`mean_scores` of views."""
         return mean_scores(self.compared(camera, gaussians) for camera in cameras)
+
+
+def shown_as_trained(camera: Camera, gaussians: GaussianModel) -> bool:
+    """Whether a view is one of a photo whose appearance has trained (scene/gaussians/ppisp.py)."""
+    return isinstance(it := getattr(gaussians, "exposures", None), Ppisp) and photo_name(camera) in it.mapping
+
+
+def fitted_views(pipe: argparse.Namespace, background: Tensor) -> ScoredViews:
+    """Right halves of held-out views, with their photos' exposure and balance from the left ones.
+
+    Of models whose photos' appearance has trained, which stay as they are (the protocol of Martin-Brualla et al. 2021,
+    NeRF in the Wild).
+    """
+
+    def draw(camera: Camera, gaussians: GaussianModel) -> Tensor:
+        options = {"want_depth": False, "want_visibility": False, "clamp": False}
+        image = render(camera, gaussians, pipe, background, **options)["render"]
+        target, mask = camera.ground_truth(background)
+        counts = torch.zeros_like(image[:1], dtype=torch.bool)
+        counts[..., half(image.shape[-1], of_test_view=False)] = True
+        counts = counts if mask is None else counts & mask
+        return gaussians.exposures.fitted(image, as_float(target), counts, camera.colmap_id)
+
+    return ScoredViews(pipe, background, True, draw)
 
 
 def mean_scores(compared: Iterable[tuple[Tensor, Tensor, Tensor | None]]) -> dict[str, float]:

@@ -15,6 +15,7 @@ from scene.gaussians.attributes import INITIAL_OPACITY, Rows
 from scene.gaussians.exposure import Exposures, read_exposures, read_pretrained
 from scene.gaussians.finite import check_finite
 from scene.gaussians.parameters import GaussianParameters, raw_rows
+from scene.gaussians.ppisp import Ppisp, read_appearance
 from scene.gaussians.start import start_rows
 from scene.gaussians.table import trainable
 from scene.readers.info import exposure_names
@@ -37,11 +38,13 @@ class GaussianModel(GaussianParameters):
     """Gaussians as they are trained, with the reference's names.
 
     GaussianParameters has the tensors and their activated forms. optimizer_type: "default" or "sparse_adam", whose step
-    takes a mask of the visible Gaussians. spatial_lr_scale: extent of the scene, world units. percent_dense: largest
+    takes a mask of the visible Gaussians. appearance: kind of the exposures that it starts or loads; `none` and affine
+    are one. spatial_lr_scale: extent of the scene, world units. percent_dense: largest
     scale, as a part of the scene's extent, of a Gaussian that is cloned; a larger one is split.
     """
 
     optimizer_type = "default"
+    appearance = "none"
     spatial_lr_scale = 0.0
     percent_dense = 0.0
 
@@ -142,10 +145,14 @@ class GaussianModel(GaussianParameters):
 
     def start_exposures(self, cam_infos: Sequence) -> None:
         """Give each training camera an exposure that changes nothing."""
-        self.exposures = Exposures(_photo_names(cam_infos))
+        names = _photo_names(cam_infos)
+        self.exposures = Ppisp(names, _cameras(cam_infos)) if self.appearance == Ppisp.kind else Exposures(names)
 
     def load_exposures(self, folder: str | os.PathLike, cam_infos: Sequence) -> None:
         """Take the exposures of the training cameras from a model folder."""
+        if self.appearance == Ppisp.kind:
+            self.exposures = read_appearance(folder, _photo_names(cam_infos), _cameras(cam_infos))
+            return
         image_names = [camera.image_name for camera in cam_infos]
         self.exposures = read_exposures(folder, _photo_names(cam_infos), image_names)
 
@@ -231,7 +238,8 @@ class GaussianModel(GaussianParameters):
         rows_of = self.shards.together(self.optimizer.take_marks(), self._attributes)
         marks = [(name, rows.tolist(), self.gaussian_count) for name, rows in rows_of.items()]
         for name, rows in self.exposures.optimizer.take_marks().items():
-            marks.append((name, [self.exposures.names[row] for row in rows.tolist()], len(self.exposures.names)))
+            owners = self.exposures.rows_named(name)
+            marks.append((name, [owners[row] for row in rows.tolist()], len(owners)))
         return marks
 
     def rewind(self, steps: int) -> None:
@@ -266,3 +274,7 @@ def _photo_names(cam_infos: Sequence) -> list[str]:
     if len(set(names)) == len(names):
         return names
     return exposure_names(cam_infos) if all(hasattr(c, "image_path") for c in cam_infos) else list(dict.fromkeys(names))
+
+
+def _cameras(cam_infos: Sequence) -> list[object]:
+    return [getattr(camera, "uid", 0) for camera in cam_infos]

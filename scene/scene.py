@@ -15,6 +15,7 @@ import numpy as np
 import scene
 from scene.cameras import Camera
 from scene.dataset_readers import read_scene, replaced_reader
+from scene.gaussians.ppisp import UNTRAINED, Ppisp
 from scene.half_images import half, train_on_all
 from scene.images.masks import MaskOptions, refuse_nothing_to_ignore
 from scene.images.store import ImageStore, Picture, image_device
@@ -60,6 +61,7 @@ class Scene:
         if load_iteration is not None and start:
             self.loaded_iter = find_iteration(self.model_path, load_iteration)
         self._halves = bool(getattr(args, "train_test_exp", False))
+        self._appearance = getattr(args, "appearance", "none") == Ppisp.kind
         self._refines = bool(getattr(args, "refine_poses", False)) and not getattr(args, "other_scene", "")
         self._refines_lens = bool(getattr(args, "refine_lens", False))
         self.info = self._read(args)
@@ -148,15 +150,17 @@ class Scene:
 
         gaussians: written in place of the scene's own; the exposures are always the scene's.
         """
-        self.save_poses()
+        self.save_views()
         (self.gaussians if gaussians is None else gaussians).save_ply(str(saved_ply(self.model_path, iteration)))
         if self._halves:
             save_exposures(self.gaussians, self.model_path)
 
-    def save_poses(self) -> None:
-        """Write `poses.json`, if poses are refined."""
+    def save_views(self) -> None:
+        """Write `poses.json` and `appearance.json`, if poses are refined, or the photos' appearance is trained."""
         if self._refines:
             write_poses(self.model_path, self.getTrainCameras(), self.getTestCameras(), self._refines_lens)
+        if self._appearance:
+            self.gaussians.save_exposures(self.model_path)
 
     def training_pixels(self) -> tuple[int, int]:
         """Pixels of all training views: at training size, and in the photos."""
@@ -189,21 +193,23 @@ class Scene:
         ours = [(camera, view) for camera, view in zip(cameras, views, strict=False) if isinstance(camera, Camera)]
         for camera, _ in ours:
             camera.images = self.images
-        if self._halves:
-            self._mark_halves(ours, test)
+        if self._halves or self._appearance:
+            self._name_exposures(ours, test)
         if shuffle:
             # A generator of its own: a resumed run must get the same order, whatever drew random numbers before.
             random.Random(0).shuffle(cameras)
         return cameras
 
-    def _mark_halves(self, cameras: Sequence[tuple[Camera, CameraInfo]], in_test_list: bool) -> None:
-        """Set the columns that count in cameras of views, and exposure names where the views' names clash."""
+    def _name_exposures(self, cameras: Sequence[tuple[Camera, CameraInfo]], in_test_list: bool) -> None:
+        """Set exposure names of cameras where the views' names clash, and the columns that count by halves."""
         training, tested = self.info.train_cameras, {view.image_path for view in self.info.test_cameras}
         names = dict(zip([view.image_path for view in training], exposure_names(training), strict=True))
         for camera, view in cameras:
             if (name := names.get(view.image_path, view.image_name)) != view.image_name:
                 camera.exposure_name = name
-            if view.image_path in tested:
+            if not self._halves:
+                camera.exposure_name = UNTRAINED if in_test_list else camera.exposure_name
+            elif view.image_path in tested:
                 camera.columns = half(camera.image_width, in_test_list)
 
     def _plan_images(self) -> None:

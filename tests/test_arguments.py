@@ -51,7 +51,7 @@ ABSURD = {
     "position_lr_init": "nan", "opacity_lr": "-0.1", "scaling_lr": "inf", "lambda_dssim": "1.5",
     "densification_interval": "0", "densify_grad_threshold": "0", "max_num_splats": "-1", "seed": "-1",
     "optimizer_type": "sgd", "strategy": "mine", "absgrad_threshold": "0 nan", "split": "halves",
-    "projection": "affine", "robust_mask": "0.6 -0.1",
+    "projection": "affine", "robust_mask": "0.6 -0.1", "appearance": "exposure",
     "growth_power": "0 inf", "score_views": "0",
     "score_power": "-0.5 100.5", "opacity_decay": "1.01 0.4", "prune_opacity": "0.6 -0.1", "mcmc_until_iter": "-1",
     "prune_sh": "-0.5 nan",
@@ -267,7 +267,8 @@ def test_model_json_has_what_is_stored_there_with_sorted_keys(tmp_path):
     }  # fmt: skip
     write_cfg_args(tmp_path, argparse.Namespace())
     del record["options"]
-    defaults = {"masks": "", "mask_meaning": "auto", "lenses": "auto", "refine_poses": False, "refine_lens": False}
+    defaults = {"masks": "", "mask_meaning": "auto", "lenses": "auto", "refine_poses": False, "refine_lens": False,
+                "appearance": "none"}  # fmt: skip
     assert read_stored_options(tmp_path) == {**MODEL, **record, **defaults}
 
 

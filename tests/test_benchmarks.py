@@ -92,8 +92,9 @@ def test_options_are_compared_with_none_on_every_third_photo(colmap_scene, tmp_p
         views = read_scene(scene, "images", hold_out=False).train_cameras
         every = sorted(view.image_name for view in read_scene(colmap_scene, "images", hold_out=True).train_cameras)
         assert sorted(view.image_name for view in views) == every[::3]
+        assert more["shown"][-2:] == ["--appearance", "ppisp"]
         at_width = {f"{name}@9": 1.0 * number for number, name in enumerate(("PSNR", "SSIM"))}
-        scores = {"PSNR": 20.0 + seed + 0.5 * (len(words) > 2), "SSIM": 0.5, "DEPTH": None, **at_width}
+        scores = {"PSNR": 20.0 + seed + 0.5 * (len(words) > 2), "fitted": 25.0, "SSIM": 0.5, "DEPTH": None, **at_width}
         return scores | {"seconds": 1, "Gaussians": 7}
 
     monkeypatch.setattr(options, "train", train)
@@ -102,8 +103,8 @@ def test_options_are_compared_with_none_on_every_third_photo(colmap_scene, tmp_p
     options.main()
     assert given == [(["-r", "4", *more], colmap_scene) for more in [[]] * 2 + [["--refine_poses"]] * 2]
     rows = _rows(capsys.readouterr().out, colmap_scene.name)
-    assert rows[0][1:] == ["none", "21.00", "0.5000", "", "", "1.0", "7", "0.00", "1.0000", ""]
-    assert rows[1][1:][:6] == ["--refine_poses", "21.50", "0.5000", "", "", "1.0"] and rows[1][-1] == "+0.50 (0.00)"
+    assert rows[0][1:] == ["none", "21.00", "25.00", "0.5000", "", "", "1.0", "7", "0.00", "1.0000", ""]
+    assert rows[1][1:][:5] == ["--refine_poses", "21.50", "25.00", "0.5000", ""] and rows[1][-1] == "+0.50 (0.00)"
     points = (tmp_path / "out" / colmap_scene.name / "thinned/sparse/0/points3D.txt").read_text().splitlines()
     known = Reconstruction(str(colmap_scene / "sparse/0")).num_points3D()
     assert len(points) == known - -(-known // HELD_OUT)

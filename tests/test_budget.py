@@ -167,7 +167,7 @@ def _control(schedule: Schedule = STEADY, **changes: object) -> budget.BudgetCon
     """The control of a run with four large views."""
     run = SimpleNamespace(opt=options(), pipe=None, gaussians=SimpleNamespace(shards=WHOLE))
     vars(run.opt).update(changes)
-    run.dataset = SimpleNamespace(train_test_exp=False)
+    run.exposes = False
     run.scene = SimpleNamespace(getTrainCameras=lambda: [SimpleNamespace(image_width=6400, image_height=1000)] * 4)
     control = budget.BudgetControl(run)
     control.schedule = schedule
@@ -287,9 +287,8 @@ def test_the_loss_sees_what_is_brighter_than_white(strategy, clamped):
     """Unlike the reference's. Else Gaussians brighter than a white background float before it, and hide test views."""
     bright = torch.full((3, HEIGHT, WIDTH), 1.5, requires_grad=True)
     step = SimpleNamespace(camera=View(), background=GREY, depth_weight=0.0, points=None)
-    Objective(SimpleNamespace(opt=options(), density=strategy, robust_mask=None))(
-        {"render": bright}, step
-    ).total.backward()
+    run = SimpleNamespace(opt=options(), density=strategy, robust_mask=None, gaussians=model(1))
+    Objective(run)({"render": bright}, step).total.backward()
     assert bool(bright.grad.any()) != clamped
 
 

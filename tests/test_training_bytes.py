@@ -22,8 +22,8 @@ Result = dict[str, bytes | list]
 EVERY = pytest.mark.parametrize("name", OPTIONS)
 LOOKS = ("--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44, "--checkpoint_iterations", 21, ITERATIONS)
 # Whose steps are queued one call after the other.
-WITHOUT_GRAPHS = ("exposure", "depth", "masks", "together", "budget errors", "poses, no graph", "points",
-                  "poses and lenses")  # fmt: skip
+WITHOUT_GRAPHS = ("exposure", "appearance", "depth", "masks", "together", "budget errors", "poses, no graph", 
+                  "points", "poses and lenses")  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,7 @@ OPTIONS = {
     "default": (),
     "sparse": ("--optimizer_type", "sparse_adam", "--random_background"),
     "exposure": ("--train_test_exp", "--antialiasing"),
+    "appearance": ("--appearance", "ppisp", "--antialiasing"),
     "depth": ("-d", "depths", "--depth_l1_weight_init", 1.0),
     "points": ("--sparse_depth", 0.5, "--masks", "masks", "--resolution_schedule", "pyramid"),
     "masks": ("--masks", "masks"),

@@ -6,8 +6,10 @@
 
 --keep N trains on every N-th training photo alone, without the points that judge the depth, and scores all test photos.
 --widths W ... scores test views of these widths (px) besides, such as a quarter, half and double of the training's.
---made ray-traces scenes: the demo's; with balls that roam through 30 % of its training photos; with a wall without
-texture in it; and of fisheyes of 200 degrees and panoramas, which are scored as they are. Other options go to train.py.
+--made ray-traces scenes: the demo's; with balls that roam through 30 % of its training photos; with exposures, white
+balance and vignetting of its training photos; with a wall without texture in it; and of fisheyes of 200 degrees and
+panoramas, which are scored as they are. Test photos always show the scene as it is. `fitted` is the PSNR of right
+halves of test photos, with exposure and balance fitted to the left ones. Other options go to train.py.
 """
 
 import argparse
@@ -16,6 +18,7 @@ from pathlib import Path
 from statistics import mean, stdev
 
 import numpy as np
+from PIL import Image
 
 from benchmarks.harness.measuring import describe, print_table
 from benchmarks.scenes.training import train
@@ -27,7 +30,11 @@ from utils.system_utils import UserError, compute_device, run_cli
 
 _VIEWS, _POINTS, _SIZE = 48, 8000, (240, 180)
 _BALLS = 3  # in a photo
-FORMS = {"PSNR": ".2f", "SSIM": ".4f", "DEPTH": ".2%", "DEPTH_95": ".1%", "seconds": ".1f", "Gaussians": ",.0f"}
+_STOPS, _BALANCE, _FALLOFF = 1.0, 0.15, 0.5  # largest exposure; deviation of a channel, stops; (tan of the corner)^2
+FORMS = {
+    **{"PSNR": ".2f", "fitted": ".2f", "SSIM": ".4f", "DEPTH": ".2%", "DEPTH_95": ".1%"},
+    **{"seconds": ".1f", "Gaussians": ",.0f"},
+}
 
 
 def with_balls(photo: int | None) -> list[Thing]:
@@ -50,6 +57,7 @@ def with_wall(_: int | None) -> list[Thing]:
 MADE = {
     "clean": {},
     "balls": {"things": with_balls},
+    "exposure": {},
     "wall": {"things": with_wall},
     "fisheye": {"camera": "fisheye"},
     "panorama": {"camera": "panorama"},
@@ -60,7 +68,47 @@ def made(name: str, out: Path) -> Path:
     """Write the scene of a name of MADE."""
     size = (384, 192) if name == "panorama" else _SIZE
     make_scene(out, _VIEWS, *size, _POINTS, seed=0, **MADE[name])
+    if name == "exposure":
+        photos = sorted((out / "images").iterdir())
+        expose([path for k, path in enumerate(photos) if k % HOLD])
+        by_another_camera(out / "sparse" / "0", [path.name for path in photos[::HOLD]])
     return out
+
+
+def by_another_camera(model: Path, names: list[str]) -> None:
+    """Give photos of a COLMAP model of one camera another one that is the same, as text."""
+    import pycolmap  # after Pillow
+
+    pycolmap.Reconstruction(str(model)).write_text(str(model))
+    for path in model.glob("*.bin"):
+        path.unlink()
+    cameras, images = model / "cameras.txt", model / "images.txt"
+    *head, camera = cameras.read_text().splitlines()
+    cameras.write_text("\n".join([*head, camera, f"2{camera[1:]}", ""]))
+    text = images.read_text()
+    for name in names:
+        text = text.replace(f" 1 {name}\n", f" 2 {name}\n")
+    images.write_text(text)
+
+
+def expose(photos: list[Path]) -> None:
+    """Take photos again, with exposures and balances whose mean over all is 0 stops, and the falloff of a lens.
+
+    In linear light: pixels are those of sRGB (IEC 61966-2-1), and light beyond white is lost. The falloff is the fourth
+    power of a cosine.
+    """
+    rng = np.random.default_rng(0)
+    balance = rng.normal(scale=_BALANCE, size=(len(photos), 3))
+    balance -= balance.mean(1, keepdims=True)
+    stops = rng.permutation(np.linspace(-_STOPS, _STOPS, len(photos)))[:, None] + balance - balance.mean(0)
+    for path, gain in zip(photos, 2**stops, strict=True):
+        pixels = np.asarray(Image.open(path)) / 255
+        rows, columns = (np.arange(side) + 0.5 - side / 2 for side in pixels.shape[:2])
+        square = 4 * (rows[:, None] ** 2 + columns**2) / (pixels.shape[0] ** 2 + pixels.shape[1] ** 2)
+        light = np.where(pixels > 0.04045, ((pixels + 0.055) / 1.055) ** 2.4, pixels / 12.92)
+        light = np.minimum(light * gain / (1 + _FALLOFF * square[..., None]) ** 2, 1)
+        pixels = np.where(light > 0.0031308, 1.055 * light ** (1 / 2.4) - 0.055, 12.92 * light)
+        Image.fromarray(np.floor(255 * pixels + 0.5).astype(np.uint8)).save(path)
 
 
 def thinned(scene: Path, out: Path, keep: int) -> Path:
@@ -86,14 +134,15 @@ def compare(
     scene: Path, out: Path, sets: list[str], args: argparse.Namespace, options: list[str], forms: dict[str, str]
 ) -> list[list[str]]:
     """Train with each set of options, the first of which the others are compared with; a row for each."""
-    given, keep = {"shown": ["--depth", "--lenses", "native"], "widths": args.widths}, args.keep
+    given, shown, keep = {"widths": args.widths}, ["--depth", "--lenses", "native"], args.keep
     if keep > 1:
         given, scene = given | {"judged": scene}, thinned(scene, out / "thinned", keep)
     rows, first = [], []
     for number, words in enumerate(sets):
-        runs = []
+        runs, own = [], [*options, *shlex.split(words)]
+        fits = [] if {"affine", "--train_test_exp"} & set(own) else ["--appearance", "ppisp"]
         for seed in args.seeds:
-            runs.append(train(scene, out / f"{number}_{seed}", seed, [*options, *shlex.split(words)], **given))
+            runs.append(train(scene, out / f"{number}_{seed}", seed, own, shown=[*shown, *fits], **given))
             print(out.name, words, seed, {name: runs[-1].get(name) for name in forms}, flush=True)
         values = {name: [run[name] for run in runs if run.get(name) is not None] for name in forms}
         first = first or values["PSNR"]
@@ -124,8 +173,8 @@ def main() -> None:
     for name, scene in [*scenes, *((name, made(name, out / "scenes" / name)) for name in args.made)]:
         found = compare(scene, out / name, ["", *args.sets], args, options, FORMS | wide)
         rows += [[name, *row] for row in found]
-    header = ["scene", "options", "PSNR dB", "SSIM", "depth error", "95 %", "training s", "Gaussians", *wide, "gain dB"]
-    print_table(header, rows)
+    scores = ["PSNR dB", "fitted dB", "SSIM", "depth error", "95 %"]
+    print_table(["scene", "options", *scores, "training s", "Gaussians", *wide, "gain dB"], rows)
 
 
 if __name__ == "__main__":

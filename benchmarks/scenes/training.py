@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.harness.measuring import describe, print_table
+from splatting.evaluation.renders import FITTED
 from utils.system_utils import UserError, compute_device, run_cli
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -42,9 +43,14 @@ def seconds_of(model: Path) -> float:
     return json.loads((model / "train_log.json").read_text())[-1]["seconds"]
 
 
+def all_scores(model: Path) -> dict[str, dict[str, float]]:
+    """Return the scores of a model folder by method."""
+    return json.loads((model / "results.json").read_text())
+
+
 def scores_of(model: Path) -> dict[str, float]:
     """Return the scores of the first method of a model folder."""
-    return next(iter(json.loads((model / "results.json").read_text()).values()))
+    return next(iter(all_scores(model).values()))
 
 
 def train(
@@ -84,6 +90,7 @@ def train(
         "process": process,
         **scores_of(model),
         **at_width,
+        "fitted": next((of["PSNR"] for name, of in all_scores(model).items() if name.endswith(FITTED)), None),
         "Gaussians": record["gaussians"],
         "bytes": ply.stat().st_size,
         "hash": hashlib.sha256(ply.read_bytes()).hexdigest()[:16],

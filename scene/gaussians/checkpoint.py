@@ -16,6 +16,7 @@ from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.attributes import IN_CHECKPOINT, Attribute, Rows
 from scene.gaussians.finite import check_finite
 from scene.gaussians.parameters import GaussianParameters
+from scene.gaussians.ppisp import exposures_of
 from scene.gaussians.statistics import NAMES, Statistics
 from splatting.files.tensor_files import read_tensors
 from splatting.host.machine import VERSION
@@ -90,7 +91,7 @@ def restore(gaussians: GaussianParameters, model_args: Sequence[Any], training_a
     gaussians.spatial_lr_scale = state.spatial_lr_scale
     gaussians.set_rows(state.rows)
     if state.exposures is not None and not gaussians.exposures.mapping:  # a model without a scene
-        gaussians.exposures.start_as(state.exposures)
+        gaussians.exposures = exposures_of(state.exposures)
     gaussians.training_setup(training_args)
     try:
         if isinstance(gaussians.optimizer, GaussianAdam):

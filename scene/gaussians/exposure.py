@@ -1,11 +1,11 @@
-"""Colour corrections of the training photos, trained with the Gaussians (--train_test_exp), and exposure.json."""
+"""Colour maps of the training photos, trained with the Gaussians (--train_test_exp), and exposure.json."""
 
 import argparse
 import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -28,8 +28,11 @@ class Exposures:
 
     A pixel c, a row vector, becomes c A[:, :3] + A[:, 3] (`apply_exposure`). mapping: index by the photo's name.
     pretrained: None, or maps (3, 4) by name that are used in place of the values. optimizer: of the values, None before
-    training_setup. schedule: the learning rate by iteration.
+    training_setup. schedule: the learning rate by iteration. kind: of --appearance.
     """
+
+    kind: ClassVar[str] = "affine"
+    held = False  # of Ppisp; these learn in any case, as the reference's
 
     def __init__(self, names: Sequence[str] = ()) -> None:
         self.start(names)
@@ -41,12 +44,6 @@ class Exposures:
         """Give each of these photos a map that changes nothing."""
         self.mapping = {name: index for index, name in enumerate(names)}
         self.values: Tensor = nn.Parameter(torch.eye(3, 4, device=compute_device()).repeat(len(names), 1, 1))
-
-    def start_as(self, state: dict[str, Any]) -> None:
-        """`start` with the photos of a state of `capture()`; `restore` refuses what is no list of names."""
-        names = state.get("names")
-        if isinstance(names, list) and all(isinstance(name, str) for name in names):
-            self.start(names)
 
     def __getitem__(self, name: str) -> Tensor:
         """Map (3, 4) of a photo, differentiable. UserError for a photo that was not trained on."""
@@ -92,17 +89,32 @@ class Exposures:
             self.optimizer.step()
             self.optimizer.zero_grad(set_to_none=True)
 
+    def rows_named(self, name: str) -> list[str]:
+        """What the rows of a group of the optimiser belong to."""
+        return self.names
+
     def capture(self) -> dict[str, Any]:
         """State that a resumed training needs, as plain values."""
         return {"names": self.names, "values": self.values.detach(), "optimizer": self.optimizer.state_dict()}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Take the state of `capture()`, after training_setup. UserError for a state that does not fit."""
+        if (kind := state.get("kind", "affine")) != self.kind:
+            raise UserError(f"the checkpoint was trained with --appearance {kind}; give that option")
         if state.get("names") != self.names:
             raise UserError(
                 "the checkpoint's exposures are of other photos than this run's; give the scene and the options "
                 "--eval and --train_test_exp that it was trained with"
             )
+        self.take_values(state)
+        self.check_finite("the checkpoint", "use another checkpoint")
+        try:
+            self.optimizer.take_state(state.get("optimizer"))
+        except ValueError as error:
+            raise UserError(f"the exposures' optimiser state in the checkpoint does not fit ({error})") from error
+
+    def take_values(self, state: dict[str, Any]) -> None:
+        """Take the values of a state of the same photos."""
         values = state.get("values")
         if not torch.is_tensor(values) or values.shape != self.values.shape or values.dtype != torch.float32:
             raise UserError(
@@ -110,11 +122,6 @@ class Exposures:
             )
         with torch.no_grad():
             self.values.copy_(values)
-        self.check_finite("the checkpoint", "use another checkpoint")
-        try:
-            self.optimizer.take_state(state.get("optimizer"))
-        except ValueError as error:
-            raise UserError(f"the exposures' optimiser state in the checkpoint does not fit ({error})") from error
 
     def check_finite(self, where: str, remedy: str) -> None:
         """UserError naming the first photo whose map is not finite."""

@@ -15,12 +15,14 @@ from typing import Any
 
 from splatting.evaluation.error_curve import SUBSET, Row, of_whole_sets
 from splatting.evaluation.plan import DATASETS
+from splatting.evaluation.renders import BESIDE
 from splatting.files.json_files import read_json
 
 SCORES = ("PSNR", "SSIM", "LPIPS")
+OTHER_SCORES = tuple(f"PSNR_{name}" for name in BESIDE)
 QUANTITIES = (
     *(*SCORES, "seconds", "process_seconds", "cpu_seconds", "gaussians", "gaussians_saved", "peak_memory_mib"),
-    *("render_ms", "fps", "ply_mb", "PSNR_given_poses"),
+    *("render_ms", "fps", "ply_mb", *OTHER_SCORES),
 )
 COMPARED = (*SCORES, "gaussians")  # with published numbers
 DEFAULT = ("adc", "default", "defaults", "base")  # names of the set that others are compared with, the first there is
@@ -78,7 +80,7 @@ def summarise(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             iterations = sorted({t for _, t in at})
             one = len({run["ground_truth_sha256"] for run in there}) == 1
             if not one:
-                row |= {name: row[name] | {"mean": None, "std": None} for name in (*SCORES, "PSNR_given_poses")}
+                row |= {name: row[name] | {"mean": None, "std": None} for name in (*SCORES, *OTHER_SCORES)}
             row |= {
                 "apart": any(run["apart"] for run in there),
                 "config": config,

@@ -63,7 +63,8 @@ def shorter_ends_there(model: Path) -> bool:
         return False
     # These schedules follow --iterations: the depth loss's weight, the exposures' learning rate, the views' sizes.
     pyramid = options.get("resolution_schedule", "none") != "none"
-    return not (options.get("depths") or options.get("train_test_exp") or pyramid)
+    exposed = options.get("train_test_exp") or options.get("appearance", "none") != "none"
+    return not (options.get("depths") or exposed or pyramid)
 
 
 def load_scores(model: Path, method: str) -> tuple[dict[str, float | None], dict[str, dict[str, float | None]]]:

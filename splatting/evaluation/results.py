@@ -14,7 +14,7 @@ from splatting.evaluation import model_folder as folder_of
 from splatting.evaluation.comparison import SCORES
 from splatting.evaluation.error_curve import Row
 from splatting.evaluation.plan import Record, Run, SceneEntry, is_model
-from splatting.evaluation.renders import GIVEN_POSES, TIMES, WORST, image_size, photo_namer, view_names
+from splatting.evaluation.renders import BESIDE, TIMES, WORST, image_size, photo_namer, view_names
 from splatting.evaluation.stages import Failure, page_file
 from splatting.evaluation.training_log import DEGREES, PERCENT
 from splatting.evaluation.what_to_try import peak
@@ -137,10 +137,10 @@ def _iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, Any]:
     else:
         times = folder_of.json_or_none(model / "test" / method / TIMES) or {}
     seconds = folder_of.training_seconds(model, iteration)
-    given = (folder_of.json_or_none(model / "results.json") or {}).get(f"{method}_{GIVEN_POSES}", {})
+    scores = folder_of.json_or_none(model / "results.json") or {}
     return {
         **{key: means.get(key) for key in SCORES},
-        "PSNR_given_poses": given.get("PSNR"),
+        **{f"PSNR_{name}": scores.get(f"{method}_{name}", {}).get("PSNR") for name in BESIDE},
         "cpu_seconds": None,
         "fps": times.get("fps"),
         "gaussians": folder_of.trained_gaussians(model, iteration),

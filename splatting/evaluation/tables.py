@@ -6,12 +6,12 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from splatting.evaluation.comparison import COMPARED, COSTS, SCORES
+from splatting.evaluation.comparison import COMPARED, COSTS, OTHER_SCORES, SCORES
 
 QUANTITIES = {  # heading and digits
     **{"PSNR": ("PSNR (dB)", 2), "SSIM": ("SSIM", 4), "LPIPS": ("LPIPS", 4), "seconds": ("training (s)", 1)},
     **{"process_seconds": ("process (s)", 1), "cpu_seconds": ("CPU (s)", 1), "gaussians": ("Gaussians trained", 0)},
-    **{"PSNR_given_poses": ("PSNR, given poses (dB)", 2)},
+    **{name: (f"PSNR, {name[5:].replace('_', ' ')} (dB)", 2) for name in OTHER_SCORES},
     **{"ply_mb": ("PLY (MB)", 1), "peak_memory_mib": ("peak memory (MiB)", 0), "render_ms": ("render (ms)", 2)},
 }
 _LAST_OF_PEER = {  # heading, and digits, of a column of a peer's curve
@@ -20,7 +20,7 @@ _LAST_OF_PEER = {  # heading, and digits, of a column of a peer's curve
 }
 
 
-MAIN = (*SCORES, "PSNR_given_poses", "seconds", "gaussians", "ply_mb")  # what a report shows first
+MAIN = (*SCORES, *OTHER_SCORES, "seconds", "gaussians", "ply_mb")  # what a report shows first
 REST = tuple(name for name in QUANTITIES if name not in MAIN)
 
 
@@ -87,7 +87,7 @@ def means_table(means: Sequence[Mapping[str, Any]]) -> Table:
         "iteration": lambda mean: number(mean["iteration"], 0),
     }
     for name, (head, digits) in QUANTITIES.items():
-        if name == "PSNR_given_poses" and not any(mean.get(name) for mean in means):
+        if name in OTHER_SCORES and not any(mean.get(name) for mean in means):
             continue
         columns[head] = lambda mean, name=name, digits=digits: number(mean[name], digits)
     return table(columns, means)

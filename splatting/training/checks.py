@@ -16,6 +16,7 @@ from arguments.strategies import STRATEGY_OPTIONS
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
+from scene.gaussians.ppisp import Ppisp
 from scene.readers.info import APART, NEAREST, SceneInfo, camera_centers, standing_apart
 from scene.saved_model import saves_in
 from splatting.evaluation import training_log
@@ -127,11 +128,17 @@ def check_target(target_psnr: float, test_views: int) -> None:
         raise UserError("--target_psnr needs held-out views to score, and there are none; give --eval")
 
 
-def check_exposures(gaussians: GaussianModel, train_test_exp: bool, checkpoint: str) -> None:
+def check_photos(appearance: str, count: int) -> None:
+    """Refuse an appearance that one photo cannot tell from the scene's (UserError)."""
+    if appearance == Ppisp.kind and count < 2:
+        raise UserError("--appearance ppisp compares photos, and there is only one to train on; leave it out")
+
+
+def check_exposures(gaussians: GaussianModel, exposes: bool, checkpoint: str) -> None:
     """Refuse a checkpoint with exposures that this run would not use (UserError); report the opposite case."""
-    if gaussians.exposures.trained and not train_test_exp:
+    if gaussians.exposures.trained and not exposes:
         raise UserError(f"{checkpoint} was trained with --train_test_exp; give that option")
-    if train_test_exp and not gaussians.exposures.trained:
+    if exposes and not gaussians.exposures.trained:
         print(f"{checkpoint} has no exposures: all photos start without a correction")
 
 

@@ -7,6 +7,8 @@ import torch
 from fused_ssim import photometric_loss_by_bands
 from torch import Tensor
 
+from gaussian_renderer import photo_name
+from scene.gaussians.ppisp import Ppisp
 from splatting.training.iteration import Iteration
 from utils.loss_utils import inverse_depth_loss, photometric_loss
 
@@ -53,6 +55,8 @@ class Objective:
             )
         if step.points is not None:
             terms["points"] = lambda package, mask: step.points.loss(package["depth"], mask)
+        if isinstance(exposures := self._run.gaussians.exposures, Ppisp):
+            terms["appearance"] = lambda *_: exposures.pull(photo_name(camera))
         return terms
 
     def __call__(self, package: dict[str, Any], step: Iteration) -> Losses:

@@ -22,6 +22,7 @@ from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.checkpoint import ASLEEP, FILTER, POSES, RESIDUALS, further, load_checkpoint, with_further
 from scene.gaussians.filter_3d import filter_widths
 from scene.gaussians.morton import sort_rows
+from scene.gaussians.ppisp import Ppisp
 from scene.sleeping import MOST_SHARE, REST, Sleeping, share_seen
 from splatting.deterministic.counter_rng import Stream, uniform
 from splatting.distributed.consistency import agree_on_model, agree_on_scene
@@ -193,6 +194,8 @@ class Run:
 
     def _begin_model(self, capture: tuple | None, first: Splats | None) -> None:
         """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""
+        self.gaussians.appearance = getattr(self.dataset, "appearance", "none")
+        checks.check_photos(self.gaussians.appearance, len(self.scene.getTrainCameras()))
         self.poses = self._refined_poses(capture)
         if weight := self.opt.sparse_depth:
             checks.check_one_process("--sparse_depth", self.group.several)
@@ -205,7 +208,7 @@ class Run:
         if capture is not None:
             self.gaussians.start_exposures(self.scene.info.train_cameras)
             self.gaussians.restore(capture, self.opt)
-            checks.check_exposures(self.gaussians, self.dataset.train_test_exp, self.start)
+            checks.check_exposures(self.gaussians, self.exposes, self.start)
         else:
             if first is None:
                 self.scene.create_gaussians()
@@ -333,6 +336,7 @@ class Run:
 
     def set_rates(self, step: Iteration) -> None:
         """Set the learning rates of a step, which may be one that is repeated."""
+        self.gaussians.exposures.held = self.density.recovers(step.iteration)
         self.gaussians.update_learning_rate(self.schedule.schedule_step(step.iteration))
         if (factor := self.schedule.rate_factor(step.iteration)) is not None:
             sparse = self.opt.optimizer_type == "sparse_adam" and self.schedule.views == 1
@@ -452,10 +456,15 @@ class Run:
             self.sleeping.rest(guarded)
         self.sleeping = None
 
+    @property
+    def exposes(self) -> bool:
+        """Whether renders are compared with photos as their trained exposures show them."""
+        return self.dataset.train_test_exp or self.gaussians.appearance == Ppisp.kind
+
     def render_options(self, step: Iteration) -> dict[str, bool]:
         """Options of `render` that make it compute what this step's loss needs, and no more."""
         return {
-            "use_trained_exp": self.dataset.train_test_exp,
+            "use_trained_exp": self.exposes,
             "want_depth": step.wants_depth,
             "want_visibility": False,
             "want_inactive_bands": False,

@@ -45,10 +45,11 @@ class ViewOfEach:
     def collect(self, package: dict[str, Tensor | None], losses: Any) -> tuple[dict[str, Tensor | None], Any]:
         """Means of the losses over the ranks; the mask stays that of the rank's own view."""
         run = self._run
-        if run.dataset.train_test_exp:
-            values = run.gaussians.exposures.values
-            own = torch.zeros_like(values) if values.grad is None else values.grad
-            values.grad = run.group.table(own).sum(0)
+        if run.exposes:
+            for group in run.gaussians.exposures.optimizer.param_groups:
+                (values,) = group["params"]
+                own = torch.zeros_like(values) if values.grad is None else values.grad
+                values.grad = run.group.table(own).sum(0)
         own = torch.stack([losses.total.detach(), losses.l1.detach()])
         total, l1 = run.group.table(own).mean(0)
         depth = None if losses.depth is None else losses.depth.detach()

@@ -11,10 +11,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gaussian_renderer import render
-from gaussian_renderer.scored_views import ScoredViews
+from gaussian_renderer.scored_views import ScoredViews, fitted_views, shown_as_trained
 from scene import Scene
 from scene.cameras import Camera
-from splatting.evaluation.renders import GIVEN_POSES
+from scene.gaussian_model import GaussianModel
+from scene.gaussians.ppisp import Ppisp
+from splatting.evaluation.renders import FITTED, GIVEN_POSES
 from splatting.evaluation.what_to_try import BUDGET, CAP, PLANNED, STRATEGY, what_to_try
 from splatting.host.clock import wall_seconds
 from splatting.training.density import default_budget
@@ -182,7 +184,7 @@ def training_report(
     elapsed: seconds of this iteration; renderArgs: what follows camera and model in renderFunc, (pipe, background) or
     more. train_test_exp: render with exposures (a sixth of renderArgs says so, too), and score right halves only.
     Returns `<set>_l1` and `<set>_psnr` (dB, mean over views and channels) of the sets scored, {} otherwise. Where poses
-    are refined, test views are scored with the dataset's, too.
+    are refined, test views are scored with the dataset's, too, and where appearance is trained, by `fitted_views`.
     """
     if tb_writer and iteration % LOG_INTERVAL == 0:
         tb_writer.add_scalar("train_loss_patches/l1_loss", l1.item(), iteration)
@@ -193,22 +195,25 @@ def training_report(
     options = {"use_trained_exp": True} if train_test_exp and len(renderArgs) < 6 else {}
     if renderFunc is render:
         options["want_depth"] = False  # our own addition: only images are scored
-    views = ScoredViews(
-        *renderArgs[:2],
-        train_test_exp,
-        lambda camera, gaussians: renderFunc(camera, gaussians, *renderArgs, **options)["render"],
-    )
-    train = scene.getTrainCameras()
-    sets = {"test": scene.getTestCameras(), f"test_{GIVEN_POSES}": scene.given_test_views()}
-    sets |= {"train": [train[i % len(train)] for i in range(5, 30, 5)]}
+
+    def draw(camera: Camera, gaussians: GaussianModel) -> Tensor:
+        exposed = {"use_trained_exp": True} if shown_as_trained(camera, gaussians) else {}
+        return renderFunc(camera, gaussians, *renderArgs, **options | exposed)["render"]
+
+    views = ScoredViews(*renderArgs[:2], train_test_exp, draw)
+    train, test = scene.getTrainCameras(), scene.getTestCameras()
+    sets = {"test": (views, test), f"test_{GIVEN_POSES}": (views, scene.given_test_views())}
+    if isinstance(getattr(scene.gaussians, "exposures", None), Ppisp):
+        sets |= {f"test_{FITTED}": (fitted_views(*renderArgs[:2]), test)}
+    sets |= {"train": (views, [train[i % len(train)] for i in range(5, 30, 5)])}
     scores = {}
-    for name, cameras in sets.items():
+    for name, (scored, cameras) in sets.items():
 
         def show(camera: Camera, what: str, image: Tensor, name: str = name) -> None:
             if tb_writer:
                 tb_writer.add_image(f"{name}_view_{camera.image_name}/{what}", image, global_step=iteration)
 
-        if means := _means(views, scene, cameras, l1_loss, show, iteration == testing_iterations[0]):
+        if means := _means(scored, scene, cameras, l1_loss, show, iteration == testing_iterations[0]):
             l1_mean, psnr_mean = means
             tqdm.write(f"[ITER {iteration}] Evaluating {name}: L1 {l1_mean} PSNR {psnr_mean}", file=sys.stdout)
             if tb_writer:

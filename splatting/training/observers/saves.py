@@ -80,7 +80,7 @@ class Checkpoints(Observer):
             tqdm.write(f"[ITER {step.iteration}] Saving Checkpoint", file=sys.stdout)
             path = Path(run.scene.model_path) / f"chkpnt{step.iteration}.pth"
             save_schedule(run, step)  # first: a checkpoint never lacks its place in the schedule
-            run.scene.save_poses()
+            run.scene.save_views()
             save_checkpoint(path, run.captured(), step.iteration)
             run.log.add(step.iteration, seconds, gaussians=run.gaussians.gaussian_count, loss=run.losses.mean)
             if step.stopping:

@@ -252,7 +252,7 @@ class Graphs:
 
     def _is_usual(self, at: Iteration) -> bool:
         """Whether the step has a photo whose pixels all count, and nothing else."""
-        plain = not (at.wants_depth or self._run.dataset.train_test_exp)
+        plain = not (at.wants_depth or self._run.exposes)
         return self._able and plain and at.camera.columns is None and at.camera.counts_all_pixels
 
     def _graph_for(self, at: Iteration) -> _Graph | None:

@@ -71,7 +71,7 @@ class FusedStep(PlainStep):
         whole = at.changes or at.last  # all blocks wake, as in a plain step
         if whole and run.sleeping:
             run.sleeping.rest()
-        exposures, objective = run.dataset.train_test_exp, run.objective
+        exposures, objective = run.exposes, run.objective
         by_bands = run.group.several and not exposures and objective.takes_bands(at)
         wants = {"want_depth": at.wants_depth, "by_bands": by_bands, "bands": self._bands}
         wants |= {"sleeping": None if whole else run.sleeping, "now": now}

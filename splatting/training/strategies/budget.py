@@ -44,7 +44,7 @@ class BudgetControl(DensityControl):
         self._gaussians, self._opt = run.gaussians, run.opt
         self._cameras = run.scene.getTrainCameras()
         self.ends = run.opt.densify_until_iter
-        self._scores = partial(error_scores, run.gaussians, run.pipe, run.dataset.train_test_exp)
+        self._scores = partial(error_scores, run.gaussians, run.pipe, run.exposes)
         self.most_gaussians = run.opt.max_num_splats or default_budget(self._cameras)
 
     def changes(self, iteration: int) -> bool:
