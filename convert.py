@@ -89,7 +89,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     add = parser.add_argument
     add("-s", "--source_path", required=True, metavar="SCENE",
         help="scene folder; its sub-folder input has the photos; --video makes a missing one")  # fmt: skip
-    add("--camera", default="OPENCV", help="lens model to fit; for a fisheye lens OPENCV_FISHEYE (default: OPENCV)")
+    add("--camera", default="OPENCV", help="lens model to fit; for a fisheye lens OPENCV_FISHEYE, for panoramas "
+        "EQUIRECTANGULAR (default: OPENCV)")  # fmt: skip
     add("--no_gpu", action="store_true", help="compute features and matches on the CPU even if there is a GPU")
     add("--skip_matching", action="store_true", help="only undistort the largest model in SCENE/distorted/sparse")
     add("--colmap_executable", default="", metavar="FILE",

@@ -134,7 +134,7 @@ class Drawn:
         """The gradients of the camera's numbers (diff_gaussian_rasterization/camera.py), float64."""
         kept = self._drawing.kept(self._background)
         rows = OPERATORS.blend_rows(kept, image_gradient, None, depth_gradient)
-        return OPERATORS.camera_vjp(*self._scene, [*kept[:2], *rows])
+        return OPERATORS.sum_blocks(OPERATORS.camera_vjp(*self._scene, [*kept[:2], *rows]))
 
     def step(
         self,
@@ -144,16 +144,17 @@ class Drawn:
         observe: bool,
         absolute: bool = False,
         now: Tensor | None = None,
+        camera: Tensor | None = None,
     ) -> None:
         """Take the optimiser's step of every Gaussian, without a gradient of a parameter in memory.
 
         Values, averages and statistics get the same bits as by `render`, backward, `observe` and the optimiser's step.
         observe: add the view to the statistics of density control. absolute: with the lengths of absolute gradients
         (`rasterize` of diff_gaussian_rasterization). now: (NOW_WORDS,) int64 on the Gaussians' device of
-        `FusedAdam.write_now`, for a step that is captured.
+        `FusedAdam.write_now`, for a step that is captured. camera: gets what `camera_gradient` gives (`FusedAdam`).
         """
         source, planes = self._drawing.kept(self._background), (image_gradient, None, depth_gradient)
-        adam.apply(self._scene, source, planes, self.radii, observe, absolute and observe, now, self._awake)
+        adam.apply(self._scene, source, planes, self.radii, observe, absolute and observe, now, camera, self._awake)
 
 
 @torch.no_grad()

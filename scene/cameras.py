@@ -27,6 +27,13 @@ ZFAR = 100.0
 _OF_TARGET = frozenset(("original_image", "alpha_mask"))
 _OF_EACH_COPY = ("_assigned", "_made", "_parameters", "_buffers", "_modules")
 _NOT_MOVED = np.zeros(3)
+# Where the values of these lie in `Camera.numbers`, and their shapes.
+_MATRICES = {
+    "world_view_transform": (slice(0, 16), (4, 4)),
+    "full_proj_transform": (slice(16, 32), (4, 4)),
+    "camera_center": (slice(32, 35), (3,)),
+    "projection_matrix": (slice(35, 51), (4, 4)),
+}
 _EDITED = -1  # stands for the version of a tensor that was changed in place; torch counts from 0
 
 
@@ -59,7 +66,7 @@ class Camera(nn.Module):
     FoVx, FoVy: radians. fx, fy, cx, cy: pixels at image_width x image_height, pixel centres at .5 (the rasterizer's
     integer pixel coordinates are half a pixel less). lens: of a photo that is taken as it is, at that size; None: a
     pinhole. world_view_transform, projection_matrix, full_proj_transform: (4,4) float32, transposed; camera_center (3,)
-    float32; all on `device`. trans, scale: moved the camera's centre c to
+    float32; all on `device`, made when they are first read. trans, scale: moved the camera's centre c to
     (c + trans) * scale in these. columns: the columns that count in loss and scores, None: all (scene/half_images.py).
     exposure_name: the photo's name among the trained exposures where it is not image_name (scene/half_images.py), else
     None. data_device: where photos in memory lie, and the images and masks below that other code reads.
@@ -114,7 +121,7 @@ class Camera(nn.Module):
         self._assigned: dict[str, Any] = {}
         self._made: dict[str, Tensor] = {}
         self._made_version = 0
-        self._projection = projection(ZNEAR, ZFAR, self.FoVx, self.FoVy, *offset)
+        self._projection = projection(ZNEAR, ZFAR, self.FoVx, self.FoVy, *offset).numpy()
         self.place(info.R, info.T)
 
     def _placed(self, source: Source | InMemory | None) -> Source | InMemory | None:
@@ -123,8 +130,10 @@ class Camera(nn.Module):
     def place(self, R: np.ndarray, T: np.ndarray) -> None:
         """Give it another pose: R, T, and the matrices and centre that follow from them."""
         self.R, self.T = R, T
-        for name, values in self.matrices(R, T).items():
-            setattr(self, name, values.to(self.device, torch.float32).contiguous())
+        self._pose = np.array(R), np.array(T), self.trans, self.scale  # R and T may be changed in place
+        self._numbers = self._on_device = None
+        for name in _MATRICES:
+            self.__dict__.pop(name, None)
 
     def refocus(self, shares: Sequence[float]) -> None:
         """Give it another lens, before it is `place`d.
@@ -135,7 +144,7 @@ class Camera(nn.Module):
         self.fx, self.fy, self.cx, self.cy = (share * side for share, side in zip(shares[:4], size, strict=True))
         self.FoVx, self.FoVy = focal2fov(self.fx, size[0]), focal2fov(self.fy, size[1])
         offset = (2 * share - 1 for share in shares[2:4])
-        self._projection = projection(ZNEAR, ZFAR, self.FoVx, self.FoVy, *offset)
+        self._projection = projection(ZNEAR, ZFAR, self.FoVx, self.FoVy, *offset).numpy()
         if self.lens:
             self.lens = self.lens.with_values((self.fx, self.fy, self.cx - 0.5, self.cy - 0.5, *shares[4:]))
 
@@ -145,16 +154,30 @@ class Camera(nn.Module):
         of_size = zip((self.fx, self.fy, self.cx, self.cy), self._size * 2, strict=True)
         return [value / side for value, side in of_size] + list(self.lens.values[4:] if self.lens else ())
 
-    def matrices(self, R: np.ndarray, T: np.ndarray) -> dict[str, Tensor]:
-        """What `place` would give it, in float64 on the CPU, so that product and inverse are rounded only once."""
-        moved = world_to_camera(R, T, self.trans, self.scale)
-        view, project = torch.from_numpy(moved), self._projection
-        return {
-            "world_view_transform": view.T,
-            "projection_matrix": project.T,
-            "full_proj_transform": (project @ view).T,
-            "camera_center": torch.from_numpy(camera_center(R, moved[:3, 3].copy())),
-        }
+    @property
+    def numbers(self) -> np.ndarray:
+        """Elements (51,) float32 of world_view_transform, full_proj_transform, camera_center and projection_matrix.
+
+        They are those of `place`, whatever was assigned, on the host. Computed in float64, so that they are rounded
+        only once.
+        """
+        if self._numbers is None:
+            R, T, trans, scale = self._pose
+            view, project = world_to_camera(R, T, trans, scale), self._projection
+            center = camera_center(R, view[:3, 3])
+            parts = view.T.reshape(-1), (project @ view).T.reshape(-1), center, project.T.reshape(-1)
+            self._numbers = np.concatenate(parts, dtype=np.float32, casting="same_kind")
+        return self._numbers
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in _MATRICES:
+            return super().__getattr__(name)
+        if self._on_device is None:
+            with torch.inference_mode(False):  # training may read what a render in that mode has made
+                self._on_device = torch.from_numpy(self.numbers.copy()).to(self.device)
+        place, shape = _MATRICES[name]
+        values = self.__dict__[name] = self._on_device[place].view(shape)
+        return values
 
     def __setattr__(self, name: str, value: Any) -> None:
         if not isinstance(getattr(type(self), name, None), property):

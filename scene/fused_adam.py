@@ -23,19 +23,11 @@ CAMERA_NUMBERS = 34  # of a camera with a lens; a pinhole has fewer (csrc/math/c
 class FusedAdam:
     """Hands a model's optimiser, and a penalty, to `apply_gradients_`. Make one only if `takes` says so.
 
-    left_out: attributes that take no step. camera_gradient: (CAMERA_NUMBERS,) float64 on the Gaussians' device, gets
-    the gradients of the camera's numbers, if they are asked for.
+    left_out: attributes that take no step.
     """
 
-    def __init__(
-        self,
-        gaussians: GaussianModel,
-        penalty: Penalty = NO_PENALTY,
-        left_out: Collection[str] = (),
-        camera_gradient: Tensor | None = None,
-    ) -> None:
+    def __init__(self, gaussians: GaussianModel, penalty: Penalty = NO_PENALTY, left_out: Collection[str] = ()) -> None:
         self._gaussians = gaussians
-        self._camera_gradient = () if camera_gradient is None else (camera_gradient,)
         self._penalty = penalty
         self._left_out = left_out
 
@@ -57,15 +49,18 @@ class FusedAdam:
             and all(_is_plain(gaussians.raw(name)) for name in _STEPPED)
         )
 
-    def arguments(self, observe: bool) -> tuple[Any, ...]:
-        """Arguments of the operator from `averages` to `iteration`, for the next step. observe: with the statistics."""
+    def arguments(self, observe: bool, camera: Tensor | None = None) -> tuple[Any, ...]:
+        """Arguments of the operator from `averages` to `iteration`, for the next step. observe: with the statistics.
+
+        camera: as for `apply`.
+        """
         optimizer, stepping = self._gaussians.optimizer, list(self._stepping())
         each = self._penalty.of_each(self._gaussians.gaussian_count)
         *guard, iteration = (optimizer.guard and optimizer.guard.arguments) or (0,)
         return (
             [one.state[name] for name in ("exp_avg", "exp_avg_sq") for one in stepping],
             [one.state["step"] for one in stepping],
-            (*(self._statistics() if observe else ()), *self._camera_gradient),
+            (*(self._statistics() if observe else ()), *(() if camera is None else (camera,))),
             guard,
             [one.attribute for one in stepping],
             [one.rate for one in stepping],
@@ -84,21 +79,23 @@ class FusedAdam:
         observe: bool,
         absolute: bool,
         now: Tensor | None,
+        camera: Tensor | None = None,
         awake: Tensor | None = None,
     ) -> None:
         """Step from the gradients of a view: scene, source, planes as for `gradients_of`, radii (N,) int32 pixels.
 
-        awake: of scene/sleeping.py, None: all are.
+        camera: (CAMERA_NUMBERS,) float64 on the Gaussians' device, gets the gradients of the camera's numbers before
+        the step. awake: of scene/sleeping.py, None: all are.
         """
-        gaussians, camera, *options = scene.lists
+        gaussians, view, *options = scene.lists
         model = self._gaussians
         if model.filter_3d is not None:
             raw = model.raw("opacity").detach(), model.raw("scaling").detach()
             gaussians += [*raw, chain_of(*raw, scene.opacities, scene.scales)]
-        camera = camera if awake is None else (*camera, awake)
+        view = view if awake is None else (*view, awake)
         # By place: names would cost the operator microseconds.
-        arguments = source, planes, [], radii, *self.arguments(observe), now, absolute
-        OPERATORS.apply_gradients_(gaussians, camera, *options, *arguments)
+        arguments = source, planes, [], radii, *self.arguments(observe, camera), now, absolute
+        OPERATORS.apply_gradients_(gaussians, view, *options, *arguments)
 
     def write_now(self, now: Tensor, iteration: int) -> None:
         """Write what the next step stands for, (NOW_WORDS,) int64 on the CPU, and advance the step counters.

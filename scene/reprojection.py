@@ -15,7 +15,6 @@ _STEPS = 10
 _LESS = 0.9  # of the loss: a pose whose loss falls less stays, since structure from motion has found it
 _RANK = 1e-9  # of the largest curvature: less says nothing of a lens
 _NEAR = 1e-3  # units of depth; nearer points do not count
-_EYE = np.eye(3)
 
 
 class Seen(NamedTuple):
@@ -49,20 +48,30 @@ class Pull(NamedTuple):
 def moved_pose(pose: np.ndarray, twist: np.ndarray, unit: float) -> np.ndarray:
     """A world-to-camera matrix (4, 4) after a twist (6,) in the camera's frame, whose translation counts units.
 
-    By the closed form of `motion` (scene/poses.py) in Murray, Li and Sastry 1994, eq. 2.14 and 2.36: a call for each
-    step of a training must be quick.
+    By the closed form of `motion` (scene/poses.py) in Murray, Li and Sastry 1994, eq. 2.14 and 2.36, in Python's
+    numbers: a call for each step of a training must be quick.
     """
-    a, b, c = twist[:3].tolist()
-    skew = np.array([[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]])
-    square, angle = skew @ skew, math.sqrt(a * a + b * b + c * c)
+    a, b, c, *shift = np.asarray(twist).tolist()
+    angle = math.sqrt(a * a + b * b + c * c)
     near = angle < 1e-3  # terms of the fourth order and above do not count
     first = 1 - angle**2 / 6 if near else math.sin(angle) / angle
     second = 0.5 - angle**2 / 24 if near else 2 * (math.sin(angle / 2) / angle) ** 2
     third = 1 / 6 - angle**2 / 120 if near else (1 - first) / angle**2
-    turn, shift = _EYE + first * skew + second * square, _EYE + second * skew + third * square
-    found = pose.copy()
-    found[:3] = turn @ pose[:3]
-    found[:3, 3] += shift @ (unit * twist[3:])
+
+    def bent(x: float, y: float, z: float, one: float, two: float) -> tuple[float, float, float]:
+        """The vector v + one w x v + two w x (w x v), w the rotation."""
+        u, v, w = b * z - c * y, c * x - a * z, a * y - b * x
+        return (
+            x + one * u + two * (b * w - c * v),
+            y + one * v + two * (c * u - a * w),
+            z + one * w + two * (a * v - b * u),
+        )
+
+    columns = [bent(*column, first, second) for column in pose[:3].T.tolist()]
+    moved = bent(*(unit * value for value in shift), second, third)
+    found = np.array([(*column, 0.0) for column in columns]).T
+    found[:3, 3] += moved
+    found[3, 3] = 1.0
     return found
 
 
@@ -73,11 +82,17 @@ def twist_gradient(pose: np.ndarray, numbers: np.ndarray, unit: float) -> np.nda
     centre count. A twist (w, v) changes a column c of the rotation by w x c, the translation t by w x t + v, and the
     centre by -rotation^T v.
     """
-    turn, shift = pose[:3, :3], pose[:3, 3]
-    pairs = np.einsum("ij,kj->ik", turn, numbers[:9].reshape(3, 3)) + np.outer(shift, numbers[9:12])
-    skew = pairs - pairs.T
-    move = numbers[9:12] - np.einsum("ij,j->i", turn, numbers[12:15])
-    return np.array([skew[1, 2], skew[2, 0], skew[0, 1], *unit * move])
+    columns, given = pose[:3].T.tolist(), numbers[:15].tolist()
+    turn, center = [0.0, 0.0, 0.0], given[12:]
+    for (x, y, z), (u, v, w) in zip(columns, (given[0:9:3], given[1:9:3], given[2:9:3], given[9:12]), strict=True):
+        turn[0] += y * w - z * v
+        turn[1] += z * u - x * w
+        turn[2] += x * v - y * u
+    move = [
+        unit * (of_shift - sum(column[row] * value for column, value in zip(columns, center, strict=False)))
+        for row, of_shift in enumerate(given[9:12])
+    ]
+    return np.array(turn + move)
 
 
 def pull(pose: np.ndarray, track: Track, focal: float, unit: float, slopes: np.ndarray | None = None) -> Pull:

@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import map_coordinates, zoom
 
-SIZE = (240, 180)
+SIZE, PANORAMA = (240, 180), (512, 256)
 FOCAL = 220.0
 
 
@@ -16,12 +16,15 @@ def camera_centers(count: int) -> np.ndarray:
     return np.stack([4 * np.cos(angles), 4 * np.sin(angles), 1.4 + 0.5 * np.sin(5 * angles)], axis=1)
 
 
-def make_photos(folder: Path, count: int, suffix: str = ".png", **save: object) -> None:
-    """Write photo_00, photo_01, ... of SIZE, taken with focal length FOCAL (pixels), into a folder."""
+def make_photos(folder: Path, count: int, suffix: str = ".png", panoramas: bool = False, **save: object) -> None:
+    """Write photo_00, photo_01, ... of SIZE, taken with focal length FOCAL (pixels), into a folder.
+
+    panoramas: of PANORAMA, which show nothing where there is no wall.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     textures = [_texture(seed) for seed in range(3)]
     for number, center in enumerate(camera_centers(count)):
-        picture = Image.fromarray(_photo(center, textures))
+        picture = Image.fromarray(_photo(center, textures, panoramas))
         picture.save(folder / f"photo_{number:02d}{suffix}", **save)
 
 
@@ -32,8 +35,8 @@ def _texture(seed: int) -> np.ndarray:
     return np.clip(sum(layers) / 3 * 1.6 - 0.3, 0, 1)
 
 
-def _photo(center: np.ndarray, textures: list[np.ndarray]) -> np.ndarray:
-    width, height = SIZE
+def _photo(center: np.ndarray, textures: list[np.ndarray], panorama: bool) -> np.ndarray:
+    width, height = PANORAMA if panorama else SIZE
     forward = np.array([0.0, 0.0, 0.6]) - center
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -41,11 +44,14 @@ def _photo(center: np.ndarray, textures: list[np.ndarray]) -> np.ndarray:
     down = np.cross(forward, right)
     # Four rays per pixel give sharp edges without aliasing.
     y, x = (np.mgrid[: 2 * height, : 2 * width] + 0.5) / 2
-    rays = ((x - width / 2) * right[:, None, None] + (y - height / 2) * down[:, None, None]) / FOCAL
-    rays = rays + forward[:, None, None]
+    focal = width / (2 * np.pi) if panorama else FOCAL
+    across, below, ahead = (x - width / 2) / focal, (y - height / 2) / focal, np.ones_like(x)
+    if panorama:
+        across, below, ahead = np.sin(across) * np.cos(below), np.sin(below), np.cos(across) * np.cos(below)
+    rays = sum(along[:, None, None] * part for along, part in ((right, across), (down, below), (forward, ahead)))
     with np.errstate(divide="ignore"):
         distances = np.where(rays < 0, -center[:, None, None] / rays, np.inf)
-    wall = distances.argmin(axis=0)
+    wall = np.where(np.isfinite(distances.min(axis=0)), distances.argmin(axis=0), -1)
     hit = center[:, None, None] + rays * distances.min(axis=0)
     colors = np.zeros((2 * height, 2 * width, 3))
     for axis in range(3):

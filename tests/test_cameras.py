@@ -86,6 +86,23 @@ def test_matrices_are_the_formulas_transposed():
         np.testing.assert_array_equal(got, wanted.astype(np.float32))
 
 
+def test_what_is_read_follows_the_place():
+    """It is made where it is first read, even if somebody has assigned R then, or renders in inference mode."""
+    camera, other = _camera(_info()), _info(R=np.eye(3), T=np.array([1.0, 2.0, 3.0]))
+    wanted = _camera(other)
+    names = ("world_view_transform", "full_proj_transform", "camera_center", "projection_matrix")
+    assert not torch.equal(camera.full_proj_transform, wanted.full_proj_transform)
+    camera.place(other.R, other.T)
+    camera.R = _info().R
+    with torch.inference_mode():
+        read = [getattr(camera, name) for name in names]
+    assert all(torch.equal(one, getattr(wanted, name)) for one, name in zip(read, names, strict=True))
+    np.testing.assert_array_equal(np.concatenate([one.numpy().ravel() for one in read]), camera.numbers)
+    assert not any(one.is_inference() for one in read) and read[0] is camera.world_view_transform
+    with pytest.raises(AttributeError, match="'Camera' object has no attribute 'nothing'"):
+        _ = camera.nothing
+
+
 @pytest.mark.parametrize("size", [1.0, 1.7])  # 1.7: the matrix of a scaled pose, no rotation
 def test_a_camera_is_moved_and_scaled_about_the_origin(size):
     info = _info()

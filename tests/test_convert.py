@@ -79,15 +79,18 @@ def test_every_photo_is_placed_where_it_was_taken(converted):
         # Without distortion the crop is small, and the error of the focal length is below 2 %.
         assert abs(camera.width - SIZE[0]) < 12 and abs(camera.height - SIZE[1]) < 12
         assert camera.fx == pytest.approx(FOCAL, rel=0.02)
-    model = pycolmap.Reconstruction(converted / "sparse" / "0")
-    assert {camera.model_name for camera in model.cameras.values()} == {"PINHOLE"}
-    places = camera_centers(VIEWS)
+    _check_places(pycolmap.Reconstruction(converted / "sparse" / "0"), NAMES, "PINHOLE")
+
+
+def _check_places(model: pycolmap.Reconstruction, names: list[str], camera: str) -> None:
+    assert {camera.model_name for camera in model.cameras.values()} == {camera}
+    places = camera_centers(len(names))
     ransac = pycolmap.RANSACOptions()
     ransac.max_error = 0.05
-    transform = pycolmap.align_reconstruction_to_locations(model, NAMES, places, VIEWS, ransac)
+    transform = pycolmap.align_reconstruction_to_locations(model, names, places, len(names), ransac)
     assert transform is not None
     model.transform(transform)
-    found = np.array([model.find_image_with_name(name).projection_center() for name in NAMES])
+    found = np.array([model.find_image_with_name(name).projection_center() for name in names])
     # The bound is 1 % of the cameras' distance to the corner, some 4.
     assert np.abs(found - places).max() < 0.04
 
@@ -432,8 +435,22 @@ def test_masks_keep_features_away(photos, tmp_path):
     database.close()
 
 
-def test_every_lens_model_but_the_spherical_one_can_be_asked_for():
-    assert {*LENS_MODELS, "INVALID", "EQUIRECTANGULAR"} == set(pycolmap.CameraModelId.__members__)
+def test_every_lens_model_can_be_asked_for():
+    assert {*LENS_MODELS, "INVALID"} == set(pycolmap.CameraModelId.__members__)
+
+
+def test_panoramas_are_placed_and_taken_as_they_are(tmp_path):
+    make_photos(tmp_path / "input", 4, panoramas=True)
+    words = ["-s", str(tmp_path), "--no_gpu", "--camera", "EQUIRECTANGULAR"]
+    convert.main(words)
+    views = read_scene(tmp_path, "images", hold_out=False, native=True).train_cameras
+    assert all(view.native.chart == "equirectangular" and view.width == 512 for view in views)
+    shots = sorted((tmp_path / "input").iterdir())
+    assert [path.read_bytes() for path in shots] == [view.image_path.read_bytes() for view in views]
+    _check_places(pycolmap.Reconstruction(tmp_path / "sparse" / "0"), [path.name for path in shots], "EQUIRECTANGULAR")
+    Image.new("RGB", (60, 40)).save(tmp_path / "input" / "small.png")
+    with pytest.raises(UserError, match="small.png is not twice as wide as high, as panoramas of 360 by 180 degrees"):
+        convert.main(words)
 
 
 @pytest.mark.parametrize("mask", ["a.jpg.png", "a.jpg", "a.png"])

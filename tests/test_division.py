@@ -81,7 +81,7 @@ def _check(found: list[list[tuple]], kinds: list[tuple], alone: Callable[[str], 
 
 def test_ranks_that_never_divide_or_do_so_later_have_the_bytes_of_one_process(scene, tmp_path, alone):
     kinds = [("default", NEVER, CHECKPOINTS), ("default", 33, CHECKPOINTS), ("default", 15, ("--plain_step",))]
-    kinds += [("exposure", 39, ()), ("sparse", 8, ()), ("budget", 20, ()), ("masks", 20, ())]
+    kinds += [("exposure", 39, ()), ("sparse", 8, ()), ("budget", 20, ()), ("masks", 20, ()), ("poses", 20, ())]
     _check(in_ranks(2, _in_rank, scene, tmp_path, kinds), kinds, alone)
     start = tmp_path / "0/chkpnt33.pth"
     assert further(load_checkpoint(start)[0], ASLEEP)  # some blocks slept
@@ -98,7 +98,7 @@ def _captured(source: Path, folder: Path, kinds: list[tuple]) -> tuple[list[tupl
 
 
 def test_steps_are_captured_until_the_model_is_divided(scene, tmp_path, alone):
-    kinds = [("default", 45, ())]
+    kinds = [("default", 45, ()), ("poses", 45, ())]
     found, launches = zip(*in_ranks(2, _captured, scene, tmp_path, kinds), strict=True)
     _check(list(found), kinds, alone)
     assert all(20 < number < 45 for number in launches)  # the first rank captures none that its progress bar looks at
@@ -153,7 +153,7 @@ def test_a_rank_that_fails_is_met_where_others_share_seconds():
 
 
 def test_a_model_that_is_divided_expects_each_ranks_part(monkeypatch):
-    monkeypatch.setattr(runs, "agree_on_model", lambda _: None)
+    monkeypatch.setattr(runs, "agree_on_model", lambda *_: None)
     run = Mock(sleeping=None, density=SimpleNamespace(most_gaussians=1000))
     run.gaussians.gaussian_count = 9
     runs.Run.divide(run)

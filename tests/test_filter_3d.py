@@ -97,7 +97,7 @@ def test_all_steps_and_a_resumed_training_have_the_same_bytes(scene, tmp_path, m
     assert not differences(whole, trained(scene, tmp_path / "resumed", *words, "--start_checkpoint", start))
     assert trained(scene, tmp_path / "off", *ON[1:], *options)["ply"] != whole["ply"]
     capture, iteration = load_checkpoint(start)
-    save_checkpoint(start, with_further(capture, FILTER, further(capture, FILTER)[1:]), iteration)
+    save_checkpoint(start, with_further(capture, {FILTER: further(capture, FILTER)[1:]}), iteration)
     with pytest.raises(UserError, match="the 3D filter of the checkpoint does not fit"):
         trained(scene, tmp_path / "wrong", *words, "--start_checkpoint", start)
 

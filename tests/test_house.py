@@ -19,7 +19,7 @@ CSRC = ROOT / "submodules"
 LONGEST = 60  # lines of a function
 # Most lines of code and of tests, without blanks, comments and docstrings, files of code, and words of Markdown. A new
 # capability that needs more says so in its commit, and what it let go.
-MOST = {"code": 39_860, "files": 473, "tests": 31_390, "words": 42_560}
+MOST = {"code": 40_200, "files": 477, "tests": 31_440, "words": 42_600}
 
 # What a room may import besides itself and what serves them all: prefixes of module names. The room of a module is its
 # longest prefix here.

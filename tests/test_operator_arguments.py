@@ -220,6 +220,7 @@ WRONG = {
         *((ValueError, f"got {count} of splat 0", _unseen(count)) for count in (1, -1)),
         (ValueError, "or splats, tile_counts, rows and counts, got 3 tensors", {"source": lambda t: t[:3]}),
     ],
+    "sum_blocks": [(ValueError, "sums must have columns", {"sums": lambda t: t[:, :0]})],
     "camera_vjp": [
         (ValueError, "takes splats, tile_counts, rows and counts, got 3 tensors", {"source": lambda t: t[:3]}),
         (ValueError, r"rows must be \(-1, 12\)", {"absolute": True}),

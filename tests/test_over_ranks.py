@@ -9,7 +9,9 @@ from typing import Any
 import pytest
 import torch
 from diff_gaussian_rasterization import rasterize
+from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.gaussians import Gaussians
+from diff_gaussian_rasterization.scene import draw, scene_arguments
 from processes import in_ranks
 from rasterizer_tools import leaves
 from torch import Tensor
@@ -20,6 +22,7 @@ from splatting.distributed.rendering.rasterize import rasterize_over
 from splatting.distributed.rendering.views import rasterize_views
 
 SIZES = [2, 3]
+CAMERA = "viewmatrix", "campos"
 # Width, height, and what differs from an ordinary call.
 CASES = [
     (80, 150, {}),
@@ -57,6 +60,7 @@ def _render(function, width: int, height: int, options: dict, rows: slice) -> di
     screen = torch.zeros_like(inputs["means"]).requires_grad_()
     rest = dict(inputs)
     camera = settings(width, height, torch.float32)
+    camera = camera._replace(**{name: getattr(camera, name).clone().requires_grad_() for name in CAMERA})
     out = function(rest.pop("means"), screen, rest.pop("opacities"), settings=camera, raw=True, **rest, **wanted)
     generator = torch.Generator().manual_seed(5)
     loss = (torch.randn(out.color.shape, generator=generator) * out.color).sum()
@@ -64,6 +68,7 @@ def _render(function, width: int, height: int, options: dict, rows: slice) -> di
         loss = loss + (torch.randn(out.inverse_depth.shape, generator=generator) * out.inverse_depth).sum()
     loss.backward()
     gradients = {f"d {name}": values.grad for name, values in inputs.items()} | {"d means2d": screen.grad}
+    gradients |= {name: getattr(camera, name).grad for name in CAMERA}
     planes = {"color": out.color.detach()}
     if out.inverse_depth is not None:
         planes["inverse_depth"] = out.inverse_depth.detach()
@@ -88,8 +93,11 @@ def test_ranks_render_the_image_and_the_gradients_of_one_process(size):
         alone = _render(rasterize, width, height, options, slice(None))
         for name, values in alone.items():
             parts = [of_rank[number][name] for of_rank in found]
-            for whole in parts if name in ("color", "inverse_depth") else [torch.cat(parts)]:
-                assert torch.equal(whole, values), (number, name)
+            for whole in parts if name in ("color", "inverse_depth", *CAMERA) else [torch.cat(parts)]:
+                if name in CAMERA:  # the shards are no whole blocks of rows
+                    torch.testing.assert_close(whole, values, rtol=1e-5, atol=1e-5)
+                else:
+                    assert torch.equal(whole, values), (number, name)
         seen = (alone["radii"] > 0).any()
         assert seen == (options.get("count", 300) > 0 and not options.get("behind"))
 
@@ -117,10 +125,11 @@ def _render_views() -> dict[str, Tensor]:
     inputs = leaves({name: values[rows] for name, values in _scene(80, 50, {}).items()})
     screen = torch.zeros(here.size, *inputs["means"].shape).requires_grad_()
     wants = {"want_inverse_depth": True, "want_absolute_gradient": True}
-    out = rasterize_views(here, Gaussians(**inputs), screen, _cameras(), raw=True, **wants)
+    numbers = torch.zeros(here.size, 34, dtype=torch.float64, requires_grad=True)
+    out = rasterize_views(here, Gaussians(**inputs), screen, _cameras(), numbers, raw=True, **wants)
     _loss(out.color, out.inverse_depth, here.rank).backward()
     gradients = {name: values.grad for name, values in inputs.items()}
-    return {"color": out.color.detach(), "radii": out.radii, "screen": screen.grad} | gradients
+    return {"color": out.color.detach(), "radii": out.radii, "screen": screen.grad, "numbers": numbers.grad} | gradients
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -137,6 +146,15 @@ def test_a_batch_has_the_sum_of_the_gradients_of_its_views(size):
         wants = {"want_inverse_depth": True, "want_absolute_gradient": True, "raw": True}
         out = rasterize(rest.pop("means"), screen, rest.pop("opacities"), settings=camera, **rest, **wants)
         _loss(out.color, out.inverse_depth, view).backward()
+        with torch.no_grad():
+            scene = scene_arguments(Gaussians(**inputs), camera, True)
+            kept = draw(scene, camera.bg, True).kept(camera.bg)
+            planes = [torch.ones_like(x).requires_grad_() for x in (out.color, out.inverse_depth)]
+        _loss(*planes, view).backward()
+        rows = OPERATORS.blend_rows(kept, planes[0].grad, None, planes[1].grad)
+        of_camera = OPERATORS.sum_blocks(OPERATORS.camera_vjp(*scene, [*kept[:2], *rows]))
+        for each in found:
+            torch.testing.assert_close(each["numbers"][view, : len(of_camera)], of_camera, rtol=1e-5, atol=1e-5)
         assert torch.equal(found[view]["color"], out.color)
         assert torch.equal(torch.cat([each["radii"][view] for each in found]), out.radii)
         assert torch.equal(torch.cat([each["screen"][view] for each in found]), screen.grad)

@@ -30,10 +30,12 @@ def _batches(scene: Path, folder: Path, *options: object) -> dict[int, bytes] | 
 
 
 def test_batches_of_views_can_be_resumed_by_as_many_ranks(masked_scene, tmp_path):  # noqa: F811
-    whole = in_ranks(2, _batches, masked_scene, tmp_path / "a", "--random_background")[0]
+    options = "--random_background", "--refine_poses"
+    whole = in_ranks(2, _batches, masked_scene, tmp_path / "a", *options)[0]
     assert whole.keys() == {30}  # of 60 views
-    resume = ("--random_background", "--start_checkpoint", tmp_path / "a" / "chkpnt15.pth")
+    resume = (*options, "--start_checkpoint", tmp_path / "a" / "chkpnt15.pth")
     assert in_ranks(2, _batches, masked_scene, tmp_path / "b", *resume)[0] == whole
+    assert (tmp_path / "a" / "poses.json").read_bytes() == (tmp_path / "b" / "poses.json").read_bytes()
     refused = in_ranks(1, _batches, masked_scene, tmp_path / "c", *resume)[0]
     assert "had 2 views in each iteration, and this one would have 1" in refused
 

@@ -67,6 +67,7 @@ def _train(scene: str, out: str, options: list[str]) -> list[dict[str, int]]:
     [
         (3, ["-r", "96", "--strategy", "adc"], STEP),
         (2, ["-r", "50", "--eval", "--train_test_exp"], WHOLE_STEP),  # exposures need the whole image
+        (2, ["-r", "50", "--eval", "--refine_poses"], STEP | {"all_to_all_single": 5}),  # sums of the pose's gradient
     ],
 )
 def test_a_step_takes_few_collective_calls(colmap_scene, tmp_path, size, options, cost):

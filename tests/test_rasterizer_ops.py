@@ -8,13 +8,14 @@ from diff_gaussian_rasterization.scene import GRADIENTS, Scene, draw
 from rasterizer_tools import few, ops, render, scene_arguments
 
 from benchmarks.workloads.splat_scenes import settings
+from splatting.distributed.rows import BLOCK
 
 
 def test_the_scene_is_the_operators_first_inputs():
     names = [argument.name for argument in ops.rasterize.default._schema.arguments]
     assert tuple(names[: 1 + len(Scene._fields)]) == ("means2d", *Scene._fields)
     assert tuple(result.name for result in ops.rasterize_vjp.default._schema.returns) == GRADIENTS
-    assert len(vars(ops)) <= 20 and all(len(op.default._schema.arguments) <= 20 for op in vars(ops).values())
+    assert len(vars(ops)) <= 21 and all(len(op.default._schema.arguments) <= 20 for op in vars(ops).values())
 
 
 def test_the_fake_kernels_have_the_sizes_of_the_real_ones():
@@ -31,7 +32,10 @@ def test_the_fake_kernels_have_the_sizes_of_the_real_ones():
     rows = [*drawn.kept(camera.bg)[:2], *ops.blend_rows(drawn.kept(camera.bg), drawn.color)]
     lens = Lens("perspective", (9.0, 9.0), (8.0, 3.0))
     scenes = arguments, scene_arguments(raw, camera._replace(lens=lens))
-    assert tuple(len(ops.camera_vjp(*scene, rows)) for scene in scenes) == fakes.CAMERA_NUMBERS
+    sums = [ops.camera_vjp(*scene, rows) for scene in scenes]
+    assert [values.shape for values in sums] == [(1, numbers) for numbers in fakes.CAMERA_NUMBERS]
+    assert fakes.SLEEP_BLOCK == BLOCK
+    assert torch.equal(ops.sum_blocks(torch.cat([sums[0], 3 * sums[0]])), sums[0][0] + 3 * sums[0][0])
     rects, limits = torch.zeros(fakes.RECORD_BLOCK + 1, 4, dtype=torch.int32), torch.zeros(2, 3, dtype=torch.int32)
     for splats, blocks in ((fakes.RECORD_BLOCK, 1), (fakes.RECORD_BLOCK + 1, 2)):
         assert ops.list_records(rects[:splats], rects[:splats, 0], limits, 0)[0].shape == (4, blocks)

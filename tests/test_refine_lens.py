@@ -140,7 +140,7 @@ def test_a_lens_whose_tracks_fit_stays(tmp_path):
 def test_photos_of_a_camera_share_bounded_steps(tmp_path):
     make_colmap_scene(tmp_path)
     scene, poses = _refinement(tmp_path)
-    poses._held = [held and (0 * held[0], 0 * held[1]) for held in poses._held]
+    poses._tracked.held = [held and (0 * held[0], 0 * held[1]) for held in poses._tracked.held]
     cameras = scene.getTrainCameras()
     gradient = np.zeros(34)
     gradient[[19, 22]] = 1.0, -2.0  # of the focal length across, and of the principal point down
@@ -226,8 +226,8 @@ def test_a_checkpoint_without_lenses_is_refused(tmp_path):
 
 def test_lenses_need_poses():
     with pytest.raises(UserError, match="give --refine_poses, too"):
-        checks.check_poses(Namespace(refine_poses=False, refine_lens=True), several=False)
-    checks.check_poses(Namespace(refine_poses=True, refine_lens=True), several=False)
+        checks.check_poses(Namespace(refine_poses=False, refine_lens=True))
+    checks.check_poses(Namespace(refine_poses=True, refine_lens=True))
 
 
 @pytest.mark.parametrize("lens", [[1.0, 1.0, 0.5], [1.0, 1.0, 0.5, "x"], [-1.0, 1.0, 0.5, 0.5], 3, [math.inf] * 4])

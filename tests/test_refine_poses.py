@@ -24,7 +24,7 @@ from scene.reprojection import BOUND, moved_pose, nearest_pose, pull, twist_grad
 from scene.scene import Scene
 from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.results import read_run
-from splatting.training import checks, pose_refinement
+from splatting.training import pose_refinement, tracked_poses
 from splatting.training.pose_refinement import PoseRefinement
 from utils.graphics_utils import world_to_camera
 from utils.system_utils import UserError
@@ -135,7 +135,7 @@ def test_what_all_cameras_could_do_together_is_taken_out(tmp_path, monkeypatch):
     make_colmap_scene(tmp_path)
     scene, poses = _refinement(tmp_path)
     cameras, before = scene.getTrainCameras(), _poses(scene)
-    monkeypatch.setattr(pose_refinement, "_ANCHOR", 0.0)
+    monkeypatch.setattr(tracked_poses, "_ANCHOR", 0.0)
     monkeypatch.setattr(pose_refinement, "_PASSES", 1)
     rng = np.random.default_rng(3)
     own = rng.normal(size=poses.twists.shape) * 1e-3
@@ -149,7 +149,7 @@ def test_what_all_cameras_could_do_together_is_taken_out(tmp_path, monkeypatch):
         np.testing.assert_allclose(poses.twists, own, atol=1e-12)
     # The basis is that of motions and of growth: a common one of the world is nothing but drift.
     common = np.array([0.002, -0.001, 0.003, 0.1, 0.2, -0.1])
-    starts = poses._starts[: len(cameras)]
+    starts = poses._tracked.starts[: len(cameras)]
     turned = np.array([pose @ moved_pose(np.eye(4), 0.01 * common, 1.0) for pose in starts])
     change = np.array([turn @ np.linalg.inv(pose) for turn, pose in zip(turned, starts, strict=True)])
     twists = np.stack([change[:, 2, 1], change[:, 0, 2], change[:, 1, 0], *(change[:, k, 3] for k in range(3))], 1)
@@ -184,7 +184,7 @@ def test_the_gradient_of_a_twist(tmp_path):
 def test_steps_are_bounded_and_follow_the_gradient(tmp_path, monkeypatch):
     make_colmap_scene(tmp_path)
     _, poses = _refinement(tmp_path)
-    monkeypatch.setattr(pose_refinement, "_ANCHOR", 0.0)
+    monkeypatch.setattr(tracked_poses, "_ANCHOR", 0.0)
     monkeypatch.setattr(pose_refinement, "_PASSES", 1)
     poses.step(2, _gradient(poses, 2, np.array([1.0, -1, 1, -1, 1, -1])), 0)
     assert np.array_equal(np.sign(poses.twists[2]), [-1, 1, -1, 1, -1, 1]) and not poses.twists[[0, 1, 3]].any()
@@ -193,7 +193,7 @@ def test_steps_are_bounded_and_follow_the_gradient(tmp_path, monkeypatch):
     assert np.linalg.norm(poses.twists[2, :3]) == pytest.approx(BOUND)
     before = poses.twists.copy()
     poses.step(2, np.full(34, np.nan), 0)
-    poses._held[1] = None
+    poses._tracked.held[1] = None
     poses.step(1, np.ones(34), 0)
     assert np.array_equal(poses.twists, before)
 
@@ -217,7 +217,7 @@ def test_tracks_hold_a_camera(tmp_path):
     poses._drift = np.zeros((7, poses.twists.size)), np.zeros((7, 7))
     for step in range(400):
         poses.step(0, _gradient(poses, 0, np.array([0.02, 0, 0, 0, 0, 0])), step // 4)
-    rest = np.linalg.solve(1e-3 * poses._held[0][1], [-0.02, 0, 0, 0, 0, 0])
+    rest = np.linalg.solve(1e-3 * poses._tracked.held[0][1], [-0.02, 0, 0, 0, 0, 0])
     np.testing.assert_allclose(poses.twists[0], rest, atol=0.1 * np.abs(rest).max())
 
 
@@ -299,10 +299,3 @@ def test_a_broken_file_is_named(content, said, scene, tmp_path):
         (tmp_path / NAME).write_text(content)
     with pytest.raises(UserError, match=said):
         with_poses(read_colmap(scene, "images", True), tmp_path)
-
-
-def test_several_processes_are_refused():
-    with pytest.raises(UserError, match="--refine_poses needs a training of one process"):
-        checks.check_poses(Namespace(refine_poses=True), several=True)
-    checks.check_poses(Namespace(refine_poses=True), several=False)
-    checks.check_poses(Namespace(), several=True)

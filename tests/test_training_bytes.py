@@ -126,8 +126,8 @@ def _all(scene: Path, folder: Path, kinds: list[tuple[str, tuple[str, ...]]]) ->
 
 def test_ranks(scene, tmp_path, plain):
     alone = "mcmc moves", "mcmc idle", "rays", "points"
-    kinds = [(name, ()) for name in OPTIONS if name not in alone and "poses" not in name]
-    kinds += [("exposure", ("--plain_step",))]
+    kinds = [(name, ()) for name in OPTIONS if name not in alone]
+    kinds += [("exposure", ("--plain_step",)), ("poses", ("--plain_step",))]
     found = in_ranks(2, _all, scene, tmp_path, kinds)[0]
     for (name, more), result in zip(kinds, found, strict=True):
         assert not differences(result, plain(name)), (name, more)

@@ -25,8 +25,8 @@ from utils.system_utils import UserError, atomic_write, writes_files
 _LARGEST = 1e15  # extent; learning rates are multiples of it
 _OPTIMIZER = 10  # which entry its state dict is
 _ENTRIES = 12  # the reference's; the values of further attributes may follow
-EXPOSURES, WRITTEN_BY, ASLEEP, POSES = "exposures", "version", "asleep", "poses"  # keys in the optimiser's state dict
-RESIDUALS, FILTER = "residuals", "filter_3d"  # the same
+EXPOSURES, WRITTEN_BY = "exposures", "version"  # keys in the optimiser's state dict
+POSES, RESIDUALS, FILTER, ASLEEP = "poses", "residuals", "filter_3d", "asleep"  # those of further state of a training
 
 
 class State(NamedTuple):
@@ -129,9 +129,9 @@ def pack(state: State) -> tuple:
     )
 
 
-def with_further(entries: tuple, key: str, values: Any) -> tuple:
-    """The entries with one more key in the optimiser's state dict."""
-    return (*entries[:_OPTIMIZER], entries[_OPTIMIZER] | {key: values}, *entries[_OPTIMIZER + 1 :])
+def with_further(entries: tuple, states: dict[str, Any]) -> tuple:
+    """The entries with further state of a training in the optimiser's state dict, by its key."""
+    return (*entries[:_OPTIMIZER], entries[_OPTIMIZER] | states, *entries[_OPTIMIZER + 1 :])
 
 
 def further(entries: Sequence[Any], key: str) -> Any:

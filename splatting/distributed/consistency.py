@@ -3,9 +3,10 @@
 import argparse
 import hashlib
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -43,9 +44,13 @@ def agree_on_scene(scene: Scene, start: str | None) -> None:
     ranks().stands = lambda: what_stands(scene.model_path, start)
 
 
-def agree_on_model(gaussians: GaussianModel) -> None:
-    """UserError if ranks that each trained the whole model have other parameters or averages of Adam than rank 0."""
-    facts, states = {}, gaussians.optimizer.state
+def agree_on_model(gaussians: GaussianModel, poses: Mapping[str, np.ndarray]) -> None:
+    """UserError if ranks that each trained the whole model have other parameters or averages of Adam than rank 0.
+
+    poses: the numbers of poses that are trained, too.
+    """
+    facts = {f"poses ({name})": str(numbers.tolist()) for name, numbers in poses.items()}
+    states = gaussians.optimizer.state
     for group in gaussians.optimizer.param_groups:
         tensors = [tensor for param in group["params"] for tensor in (param, *states.get(param, {}).values())]
         facts[group["name"]] = str([_sums(tensor) for tensor in tensors])

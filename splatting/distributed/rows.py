@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import wraps
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -34,6 +35,11 @@ class Shards:
     def of(self, count: int) -> "Shards":
         """The place of `count` rows in another model, or after a change. Every rank must call it."""
         return self
+
+    @property
+    def blocks(self) -> Sequence[int] | None:
+        """How many blocks of rows each rank has; None for one process."""
+        return None
 
     def own(self, values: Tensor) -> Tensor:
         """This rank's part of the values (N, ...) of all rows."""
@@ -160,6 +166,11 @@ class Divided(Shards):
 
     def of(self, count: int) -> "Shards":
         return Divided(self.ranks, count)
+
+    @property
+    def blocks(self) -> Sequence[int] | None:
+        ends = [-(-bound(rank, self._total, self.ranks.size) // BLOCK) for rank in range(self.ranks.size + 1)]
+        return [end - first for first, end in pairwise(ends)]
 
     def own(self, values: Tensor) -> Tensor:
         return own_rows(values, self.ranks)

@@ -19,8 +19,9 @@ from utils.system_utils import UserError, atomic_write
 
 Command = list[str]
 TOLERANCE = 1e-6  # of the cost in global bundle adjustment, as in the reference: much faster, hardly worse
-# COLMAP's lens models that can be undistorted to a pinhole image.
+PANORAMA = "EQUIRECTANGULAR"  # photos of all directions, twice as wide as high; no pinhole image shows them
 LENS_MODELS = (
+    PANORAMA,
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "FOV"),
     *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
     *("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "EUCM"),

@@ -150,10 +150,19 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
             colmap.copy_database(layout.database, layout.calibrated)
         run(backend.mapping(), "Mapping", rows("images"), _registered_since(layout.log))
 
+    def check_sizes() -> None:
+        """UserError for photos that are no panoramas, if they are said to be."""
+        wrong = [names[0] for (w, h), names in images.sizes(layout).items() if w != 2 * h]
+        if settings.camera == colmap.PANORAMA and wrong:
+            raise UserError(
+                f"{wrong[0]} is not twice as wide as high, as panoramas of 360 by 180 degrees are; remove such photos, "
+                "or name the lens that took them with --camera"
+            )
+
     files = [layout.database.with_name(layout.database.name + end) for end in ("", "-wal", "-shm", "-journal")]
     features_from = [backend.identity, settings.camera, settings.max_num_features, settings.no_gpu]
     return [
-        Stage("features", features_from, lambda: _remove(*files), features),
+        Stage("features", features_from, lambda: _remove(*files), features, check=check_sizes),
         Stage("matching", [settings.matcher], lambda: colmap.forget_matches(layout.database), matching, resumable=True),
         Stage("mapping", [settings.mapper], lambda: _remove(layout.models, layout.calibrated), mapping),
     ]

@@ -7,6 +7,7 @@ since only its own folder is on the path.
 
 import json
 import os
+import shutil
 import sys
 import threading
 from pathlib import Path
@@ -84,7 +85,18 @@ def survey(job: dict[str, Any]) -> None:
 
 
 def undistort(job: dict[str, Any]) -> None:
-    """Write photos and model without lens distortion, in COLMAP's layout, into the folder `out`."""
+    """Write photos and model without lens distortion, in COLMAP's layout, into the folder `out`.
+
+    Panoramas are taken as they are.
+    """
+    model, out = pycolmap.Reconstruction(job["model"]), Path(job["out"])
+    if any(camera.model_name == "EQUIRECTANGULAR" for camera in model.cameras.values()):
+        for name in [model.images[i].name for i in model.reg_image_ids()]:
+            (out / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(Path(job["images"], name), out / "images" / name)
+        (out / "sparse").mkdir()
+        model.write(str(out / "sparse"))
+        return
     pycolmap.undistort_images(job["out"], job["model"], job["images"], jpeg_quality=job["jpeg_quality"])
 
 

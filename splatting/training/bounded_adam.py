@@ -1,5 +1,6 @@
 """Small corrections that are trained on the host: bounded numbers, each row with steps of Adam of its own."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -25,15 +26,15 @@ class BoundedAdam:
 
     def step(self, row: int, gradient: np.ndarray, rate: float) -> None:
         """Take the step of a row. One whose gradient is not finite is only counted."""
-        self.counts[row] += 1
+        count = self.counts[row] = float(self.counts[row]) + 1
         if not np.isfinite(gradient).all():
             return
-        for average, beta, value in ((self.mean, _BETAS[0], gradient), (self.square, _BETAS[1], gradient**2)):
-            average[row] = beta * average[row] + (1 - beta) * value
-        mean, square = (
-            a[row] / (1 - b ** self.counts[row]) for a, b in zip((self.mean, self.square), _BETAS, strict=True)
-        )
-        values = self.values[row] - rate * mean / (np.sqrt(square) + _EPS)
+        mean = self.mean[row] = _BETAS[0] * self.mean[row] + (1 - _BETAS[0]) * gradient
+        square = self.square[row] = _BETAS[1] * self.square[row] + (1 - _BETAS[1]) * gradient**2
+        to_mean, to_square = (1 - beta**count for beta in _BETAS)
+        values = self.values[row] - rate * (mean / to_mean) / (np.sqrt(square / to_square) + _EPS)
         for part in self._parts:
-            values[part] *= min(1, self._bound / max(np.linalg.norm(values[part]), self._bound))
+            length = math.hypot(*values[part].tolist())
+            if length > self._bound:
+                values[part] *= self._bound / length
         self.values[row] = values

@@ -106,10 +106,8 @@ def check_one_process(option: str, several: bool) -> None:
         raise UserError(f"{option} needs a training of one process; leave it out, or start without torchrun")
 
 
-def check_poses(dataset: argparse.Namespace, several: bool, projection: str = "ewa") -> None:
-    """Refuse to refine poses in a training of several processes, or on rays, and lenses without poses (UserError)."""
-    if getattr(dataset, "refine_poses", False):
-        check_one_process("--refine_poses", several)
+def check_poses(dataset: argparse.Namespace, projection: str = "ewa") -> None:
+    """Refuse to refine poses on rays, and lenses without poses (UserError)."""
     if projection == "ray" and getattr(dataset, "refine_poses", False):
         raise UserError("--projection ray has no gradients of poses; leave --refine_poses out, or use ewa")
     if getattr(dataset, "refine_lens", False) and not getattr(dataset, "refine_poses", False):

@@ -1,8 +1,7 @@
 """Poses that are trained with the Gaussians (--refine_poses): a bounded correction of each training camera.
 
-Each has Adam of its own. The tracks of structure from motion hold the cameras. Before the training every view, test
-views included, takes the pose of least reprojection error. The error, to second order about there, then stays a part
-of the loss.
+Each has Adam of its own. The tracks of structure from motion hold the cameras (tracked_poses.py). All numbers lie on
+the host. Of several processes each takes all steps, with the same numbers.
 """
 
 from collections.abc import Collection, Sequence
@@ -13,18 +12,19 @@ import torch
 
 from scene.cameras import Camera
 from scene.readers.tracks import read_tracks
-from scene.reprojection import BOUND, damped, moved_pose, nearest_pose, pull, twist_gradient
+from scene.reprojection import BOUND, moved_pose, twist_gradient
 from scene.scene import Scene
+from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import DEGREES, PERCENT
 from splatting.training.bounded_adam import BoundedAdam
 from splatting.training.lens_refinement import TOGETHER, LensRefinement
+from splatting.training.tracked_poses import TrackedPoses
 from utils.general_utils import get_expon_lr_func
 from utils.graphics_utils import world_to_camera
 from utils.system_utils import UserError
 
 # Twists are rotations in radians, and translations in extents of the scene.
 _RATES = 1e-4, 1e-6  # of the first and the last step
-_ANCHOR = 1e-3  # weight of each point's squared reprojection error (pixels) in the loss of its view
 _PASSES = 10  # over all views, after which drift is taken out: each time the GPU is waited for
 _STATE = ("twists", "mean", "square", "counts")
 LENSES = "lenses"  # key of their state
@@ -38,33 +38,26 @@ class PoseRefinement:
 
     def __init__(self, scene: Scene, source_path: str, steps: int, with_lens: bool = False) -> None:
         """steps: of the schedule. UserError for a scene without tracks."""
-        info, self._unit = scene.info, scene.cameras_extent
+        info, unit = scene.info, scene.cameras_extent
         lists = [sorted(of, key=lambda camera: camera.uid) for of in (scene.getTrainCameras(), scene.getTestCameras())]
         self._cameras, count = lists[0] + lists[1], len(lists[0])
         views = info.train_cameras + info.test_cameras
         tracks, slopes = read_tracks(source_path, views, info.offset), [None] * len(views)
         if not any(tracks[:count]):
             raise UserError(
-                "--refine_poses needs the tracks of a COLMAP model, the places of its points in the photos, and "
-                f"{source_path} has none; leave it out"
+                "--refine_poses needs the tracks of a COLMAP model, the places of its points in photos that are no "
+                f"panoramas, and {source_path} has none; leave it out"
             )
         given, focals = [_pose_of(camera) for camera in self._cameras], [camera.fx for camera in self._cameras]
-        self.lens = LensRefinement(views, given, tracks, focals, self._unit) if with_lens else None
-        if self.lens:
-            tracks, slopes = self.lens.tracks, self.lens.slopes
-        of_each = list(zip(tracks, focals, slopes, strict=True))
-        self._given = given[:count]
-        self._starts = [
-            nearest_pose(pose, track, focal, self._unit, BOUND)
-            for pose, (track, focal, _) in zip(given, of_each, strict=True)
-        ]
-        pulls = [
-            track and pull(start, track, focal, self._unit, slope)
-            for start, (track, focal, slope) in zip(self._starts, of_each, strict=True)
-        ]
-        self._held = [of_track and (of_track.gradient, of_track.curvature) for of_track in pulls]
+        lens = LensRefinement(views, given, tracks, focals, unit) if with_lens else None
+        if lens:
+            tracks, slopes = lens.tracks, lens.slopes
+        tracked = TrackedPoses(given, tracks, focals, slopes, unit)
+        drift = _drift(tracked.starts[:count], unit)
+        # Another kind of processor may round their solutions in another way.
+        self.lens, self._tracked, self._drift = ranks().shared((lens, tracked, drift))
+        self._given, self._unit = given[:count], unit
         self._rate = get_expon_lr_func(*_RATES, max_steps=steps)
-        self._drift = _drift(self._starts[:count], self._unit)
         self._adam = BoundedAdam(count, (3, 6), BOUND)
         self.twists, self._counts = self._adam.values, self._adam.counts
         self._poses: dict[int, np.ndarray] = {}  # that are known
@@ -73,39 +66,32 @@ class PoseRefinement:
         lenses = f" and {len(self.lens.seen)} lenses" if self.lens else ""
         print(f"--refine_poses corrects {sum(track is not None for track in tracks)} of {len(tracks)} poses{lenses}")
 
-    def pose(self, uid: int) -> tuple[np.ndarray, np.ndarray]:
-        """R and T of a training camera's current pose, as `Camera` has them."""
-        pose = self._pose(uid)
-        return pose[:3, :3].T.copy(), pose[:3, 3].copy()
-
     def _pose(self, view: int) -> np.ndarray:
         """The pose of a view: of a training camera by its uid; test views follow."""
         if view not in self._poses:
-            self._poses[view] = moved_pose(self._starts[view], self._twist(view), self._unit)
+            self._poses[view] = moved_pose(self._tracked.starts[view], self._twist(view), self._unit)
         return self._poses[view]
 
     def _twist(self, view: int) -> np.ndarray:
         """A test view goes where its track has the least error through the lens of the moment."""
         if view < len(self.twists):
             return self.twists[view]
-        if self.lens is None or self._held[view] is None:
-            return np.zeros(6)
-        _, curvature = self._held[view]
-        return -np.linalg.solve(damped(curvature[:6, :6]), curvature[:6, 6:] @ self.lens.change(view))
+        return self._tracked.settled(view, self.lens.change(view)) if self.lens else np.zeros(6)
 
     def place(self, copy: Camera | None = None) -> None:
         """Give all cameras their current poses and lenses; or a training camera, and a smaller copy of it, its own."""
-        views = self._moved if copy is None else self._moved & {copy.uid}
+        views = self._moved.copy() if copy is None else self._moved & {copy.uid}
         for view in views:
             self._put(self._cameras[view], view)
-        self._moved = self._moved - views
+        self._moved -= views
         if copy is not None and copy is not self._cameras[copy.uid]:
             self._put(copy, copy.uid)
 
     def _put(self, camera: Camera, view: int) -> None:
         if self.lens:
             camera.refocus(self.lens.shares(view).tolist())
-        camera.place(*self.pose(view))
+        pose = self._pose(view)
+        camera.place(pose[:3, :3].T.copy(), pose[:3, 3].copy())
 
     def independent(self, uid: int, pending: Sequence[int]) -> int:
         """On how many of the last steps a camera's next pose does not depend. pending: the cameras of steps to come."""
@@ -127,10 +113,8 @@ class PoseRefinement:
         a track, which nothing would hold, gets none.
         """
         found, rate = np.zeros(6), self._rate(step)
-        if (held := self._held[uid]) is not None:
-            at_start, curvature = held
-            moved = np.concatenate([self.twists[uid], self.lens.change(uid)]) if self.lens else self.twists[uid]
-            pulled = _ANCHOR * (at_start + curvature @ moved)
+        moved = np.concatenate([self.twists[uid], self.lens.change(uid)]) if self.lens else self.twists[uid]
+        if (pulled := self._tracked.pulled(uid, moved)) is not None:
             found = twist_gradient(self._pose(uid), gradient, self._unit) + pulled[:6]
             if self.lens:
                 self.lens.add(uid, gradient, pulled[6:], size)
@@ -162,15 +146,20 @@ class PoseRefinement:
         turns = np.degrees(2 * np.arcsin(np.minimum(chords, 1)))
         return {DEGREES: round(float(turns.mean()), 6), PERCENT: round(100 * float(apart.mean()), 6)}
 
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All numbers that steps change, but those of lenses."""
+        return dict(zip(_STATE, self._adam.state, strict=True))
+
     def captured(self) -> dict[str, Any]:
         """State that a resumed training needs, as plain values."""
-        state = {"names": self._names, **_tensors(dict(zip(_STATE, self._adam.state, strict=True)))}
+        state = {"names": self._names, **_tensors(self.arrays)}
         return state | ({LENSES: _tensors(self.lens.state)} if self.lens else {})
 
     def restore(self, state: dict[str, Any] | None) -> None:
         """Take the state of `captured()`. UserError for one that does not fit, or None."""
         fits = isinstance(state, dict) and state.get("names") == self._names
-        if not (fits and _fill(dict(zip(_STATE, self._adam.state, strict=True)), state)):
+        if not (fits and _fill(self.arrays, state)):
             raise UserError("the checkpoint has no refined poses of this run's views; leave --refine_poses out")
         if self.lens is None and LENSES in state:
             raise UserError("the checkpoint was trained with --refine_lens; give that option")

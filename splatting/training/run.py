@@ -4,7 +4,7 @@ import argparse
 import copy
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from itertools import count
@@ -140,7 +140,7 @@ class Run:
 
     def _refined_poses(self, capture: tuple | None) -> PoseRefinement | None:
         """What refines the poses of the views, with the state of a checkpoint; None unless it is asked for."""
-        checks.check_poses(self.dataset, self.group.several, getattr(self.pipe, "projection", "ewa"))
+        checks.check_poses(self.dataset, getattr(self.pipe, "projection", "ewa"))
         state = capture and further(capture, POSES)
         if not getattr(self.dataset, "refine_poses", False):
             checks.check_unrefined(state, self.start)
@@ -392,7 +392,7 @@ class Run:
 
     def divide(self) -> None:
         """Give each process its part of the whole model that all have, after a step in which all blocks woke."""
-        agree_on_model(self.gaussians)
+        agree_on_model(self.gaussians, self.poses.arrays if self.poses else {})
         self.gaussians.divide(self.group)
         self._expect(self.density.most_gaussians)
         if self.sleeping:
@@ -408,10 +408,11 @@ class Run:
         """Whether all blocks of Gaussians wake after a step."""
         return self.sleeping is not None and step.iteration % REST == 0
 
-    def step_pose(self, step: Iteration, gradient: Tensor) -> None:
-        """Take the step of the view's pose. gradient: of the image's loss by the camera's numbers."""
-        camera, at = step.camera, self.schedule.schedule_step(step.iteration)
-        self.poses.step(camera.uid, gradient.cpu().numpy(), at, (camera.image_width, camera.image_height))
+    def step_poses(self, step: Iteration, cameras: Sequence[Camera], gradients: Tensor) -> None:
+        """Take the steps of views' poses. gradients (views, numbers): of each image's loss by its camera's numbers."""
+        at = self.schedule.schedule_step(step.iteration)
+        for camera, gradient in zip(cameras, gradients.cpu().numpy(), strict=True):
+            self.poses.step(camera.uid, gradient, at, (camera.image_width, camera.image_height))
         self.poses.place()
 
     def after_step(self, step: Iteration) -> None:
@@ -439,16 +440,15 @@ class Run:
 
     def captured(self) -> tuple:
         """The state of the model for a checkpoint, from which a training resumes. Every rank must call it."""
-        state = self.gaussians.capture()
-        if self.poses:
-            state = with_further(state, POSES, self.poses.captured())
-        if self.robust_mask:
-            state = with_further(state, RESIDUALS, self.robust_mask.captured())
-        widths = self.gaussians.filter_3d
-        if widths is not None and len(widths) == len(self.gaussians):  # not where memory ran out on the way
-            state = with_further(state, FILTER, self.gaussians.shards.whole(widths))
-        asleep = self.sleeping and self.sleeping.captured()
-        return with_further(state, ASLEEP, asleep) if asleep else state
+        state, widths = self.gaussians.capture(), self.gaussians.filter_3d
+        filtered = widths is not None and len(widths) == len(self.gaussians)  # not where memory ran out on the way
+        states = {
+            POSES: self.poses and self.poses.captured(),
+            RESIDUALS: self.robust_mask and self.robust_mask.captured(),
+            FILTER: self.gaussians.shards.whole(widths) if filtered else None,
+            ASLEEP: self.sleeping and self.sleeping.captured(),
+        }
+        return with_further(state, {key: found for key, found in states.items() if found is not None})
 
     def end_sleep(self, guarded: bool = True) -> None:
         """Let all blocks take the steps that they have missed, and sleep no more. guarded: of `Sleeping.rest`."""

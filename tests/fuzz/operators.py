@@ -58,6 +58,7 @@ def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict
         "rasterize_vjp": (ops.rasterize_vjp, [*scene, wanted, state, *planes]),
         "rasterize_vjp of rows": (ops.rasterize_vjp, [*scene, wanted, source]),
         "camera_vjp": (ops.camera_vjp, [*scene, source]),
+        "sum_blocks": (ops.sum_blocks, [torch.rand(3, 5, device=device, dtype=torch.float64)]),
         "apply_gradients_": (ops.apply_gradients_, [*in_lists, state, planes, [], *step]),
         "apply_gradients_ of rows": (ops.apply_gradients_, [*in_lists, source, [], [], *step]),
         "apply_gradients_ to sums": (ops.apply_gradients_, [*in_lists, source, [], sums, None, [], [], [], []]),

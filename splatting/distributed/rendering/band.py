@@ -1,6 +1,6 @@
 """A rank's band of a view: forward to the image, and back to the gradient rows of the rank's Gaussians."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -107,6 +107,22 @@ def gradient_rows(
     """
     rows, counts = OPERATORS.blend_rows(view.drawing.kept(view.background), *gradients, absolute)
     return return_rows(view.ranks, view.sent, len(view.radii), rows, counts, view.inside)
+
+
+def camera_gradient(
+    ranks: Ranks,
+    scene: Scene,
+    source: Sequence[Tensor],
+    absolute: bool = False,
+    blocks: Sequence[int] | None = None,
+) -> Tensor:
+    """Gradients of the camera's numbers (diff_gaussian_rasterization/camera.py) by the Gaussians of all ranks, float64.
+
+    They have the bits of one process where each rank has whole blocks of rows (Shards). source: splats, tile counts,
+    and what `gradient_rows` returns. blocks: how many each rank has, if this is known. Every rank must call it.
+    """
+    own = OPERATORS.camera_vjp(*scene, source, absolute)
+    return OPERATORS.sum_blocks(ranks.gather(own, blocks))
 
 
 def decisive_in(view: View) -> Tensor:

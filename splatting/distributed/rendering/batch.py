@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from gaussian_renderer import exposed, model_inputs, rasterizer_settings
+from scene.fused_adam import CAMERA_NUMBERS
 from splatting.distributed.rendering.views import rasterize_views
 
 
@@ -24,15 +25,19 @@ class ViewOfEach:
         gaussians, pipe = run.gaussians, run.pipe
         options = run.render_options(at)
         inputs, raw = model_inputs(at.camera, gaussians, pipe)
-        settings = [
-            rasterizer_settings(camera, gaussians, pipe, background) for camera, background in run.batch(at.iteration)
-        ]
+        batch = run.batch(at.iteration)
+        for camera, _ in batch if run.poses else ():
+            run.poses.place(camera)
+        settings = [rasterizer_settings(camera, gaussians, pipe, background) for camera, background in batch]
         screen = gaussians.get_xyz.new_zeros(len(settings), len(gaussians), 3).requires_grad_()
+        self._cameras = [camera for camera, _ in batch]
+        self._numbers = screen.new_zeros(len(settings), CAMERA_NUMBERS, dtype=torch.float64)
         drawn = rasterize_views(
             run.group,
             inputs,
             screen,
             settings,
+            self._numbers.requires_grad_(bool(run.poses)),
             raw=raw,
             want_inverse_depth=options["want_depth"],
             want_absolute_gradient=options["want_absolute_gradient"],
@@ -42,9 +47,11 @@ class ViewOfEach:
             image = exposed(image, at.camera, gaussians)
         return {"render": image, "depth": drawn.inverse_depth, "viewspace_points": screen, "radii": drawn.radii}
 
-    def collect(self, package: dict[str, Tensor | None], losses: Any) -> tuple[dict[str, Tensor | None], Any]:
+    def collect(self, at: Any, package: dict[str, Tensor | None], losses: Any) -> tuple[dict[str, Tensor | None], Any]:
         """Means of the losses over the ranks; the mask stays that of the rank's own view."""
         run = self._run
+        if run.poses and not at.last:
+            run.step_poses(at, self._cameras, self._numbers.grad)
         if run.exposes:
             for group in run.gaussians.exposures.optimizer.param_groups:
                 (values,) = group["params"]

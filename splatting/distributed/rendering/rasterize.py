@@ -13,7 +13,7 @@ from diff_gaussian_rasterization.scene import Scene, scene_arguments
 from torch import Tensor
 
 from splatting.distributed.ranks import Ranks
-from splatting.distributed.rendering.band import draw_view, gradient_rows, whole_image
+from splatting.distributed.rendering.band import camera_gradient, draw_view, gradient_rows, whole_image
 
 
 def rasterize_over(
@@ -31,25 +31,25 @@ def rasterize_over(
     """Render the Gaussians of all ranks. Arguments as of `rasterize`, each rank with its own Gaussians.
 
     Every rank calls it for the same view and gets the whole image, and `radii` of its own Gaussians; backward needs the
-    same gradient of the image on every rank. RuntimeError for settings that require a gradient.
+    same gradient of the image on every rank. Tensors of the settings get gradients if they require them on every rank.
     """
     gaussians = Gaussians(means, opacities, **others)
     scene = scene_arguments(gaussians, settings, raw)
-    if camera_numbers(scene, settings) is not None:
-        raise RuntimeError(
-            "a camera gets no gradient from a model that processes share: detach its tensors, or use one process"
-        )
-    train = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in (*gaussians, means2d))
+    numbers = camera_numbers(scene, settings)
+    trained = any(x is not None and x.requires_grad for x in (*gaussians, means2d, numbers))
+    train = torch.is_grad_enabled() and trained
     options = scene.camera, settings.bg, want_inverse_depth, train, want_absolute_gradient
-    color, depth, radii = _OverRanks.apply(ranks, options, means2d, *gaussians)
+    color, depth, radii = _OverRanks.apply(ranks, options, numbers, means2d, *gaussians)
     return Rasterized(color, radii, depth if want_inverse_depth else None, None)
 
 
 class _OverRanks(torch.autograd.Function):
-    """Takes the ranks, what is no Gaussian, means2d, and the Gaussians."""
+    """Takes the ranks, what is no tensor to train, the camera's numbers or None, means2d, and the Gaussians."""
 
     @staticmethod
-    def forward(ctx: Any, ranks: Ranks, options: tuple, _: Tensor, *gaussians: Any) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(
+        ctx: Any, ranks: Ranks, options: tuple, numbers: Tensor | None, _: Tensor, *gaussians: Any
+    ) -> tuple[Tensor, Tensor, Tensor]:
         camera, background, want_depth, train, absolute = options
         view = whole_image(draw_view(ranks, Scene(*gaussians, *camera), background, want_depth, train))
         ctx.mark_non_differentiable(view.radii)
@@ -71,4 +71,5 @@ class _OverRanks(torch.autograd.Function):
             grad_color = torch.zeros_like(view.color)
         gradients = grad_color, None, grad_depth if ctx.want_depth else None
         source = view.splats, view.tile_counts, *gradient_rows(view, gradients, ctx.absolute)
-        return None, None, *gradients_of(scene, source, (), ctx.needs_input_grad[2:], ctx.absolute)
+        of_camera = camera_gradient(view.ranks, scene, source, ctx.absolute) if ctx.needs_input_grad[2] else None
+        return None, None, of_camera, *gradients_of(scene, source, (), ctx.needs_input_grad[3:], ctx.absolute)

@@ -14,6 +14,7 @@ from scene.fused_adam import FusedAdam
 from splatting.distributed.ranks import ALONE, Ranks
 from splatting.distributed.rendering.band import (
     View,
+    camera_gradient,
     decisive_in,
     draw_view,
     gradient_rows,
@@ -59,7 +60,8 @@ def draw_divided(
     view = draw_view(ranks, scene, background, want_depth, train=True, find=find, awake=awake)
     if bands:
         bands.drawn(camera.uid, view.last)
-    return DividedDrawn(surroundings(view) if by_bands else whole_image(view), scene, want_depth, by_bands, awake)
+    view = surroundings(view) if by_bands else whole_image(view)
+    return DividedDrawn(view, scene, want_depth, by_bands, awake, model.shards.blocks)
 
 
 class DividedDrawn:
@@ -68,16 +70,22 @@ class DividedDrawn:
     The image's gradient needs no more rows than the image has.
     """
 
-    def __init__(self, view: View, scene: Scene, want_depth: bool, by_bands: bool, awake: Tensor | None) -> None:
+    def __init__(
+        self, view: View, scene: Scene, want_depth: bool, by_bands: bool, awake: Tensor | None, blocks: Sequence[int]
+    ) -> None:
         self.image, self.depth, self.radii = view.color, view.inverse_depth if want_depth else None, view.radii
         self.band = view.band if by_bands else None
-        self._view, self._scene, self._awake = view, scene, awake
+        self._view, self._scene, self._awake, self._blocks = view, scene, awake, blocks
 
     def decisive(self) -> Tensor:
         return decisive_in(self._view)
 
     def color_gradient(self, image_gradient: Tensor) -> Tensor:
         return gradient_of_colors(self._scene, self._source((image_gradient, None, None), absolute=False), ())
+
+    def camera_gradient(self, image_gradient: Tensor, depth_gradient: Tensor | None) -> Tensor:
+        source = self._source((image_gradient, None, depth_gradient), absolute=False)
+        return camera_gradient(self._view.ranks, self._scene, source, blocks=self._blocks)
 
     def step(
         self,
@@ -87,10 +95,14 @@ class DividedDrawn:
         observe: bool,
         absolute: bool = False,
         now: None = None,
+        camera: Tensor | None = None,
     ) -> None:
         absolute &= observe
         source = self._source((image_gradient, None, depth_gradient), absolute)
-        adam.apply(self._scene, source, (), self.radii, observe, absolute, now, self._awake)
+        if camera is not None:
+            found = camera_gradient(self._view.ranks, self._scene, source, absolute, self._blocks)
+            camera[: len(found)] = found
+        adam.apply(self._scene, source, (), self.radii, observe, absolute, now, awake=self._awake)
 
     def _source(self, planes: tuple[Tensor | None, ...], absolute: bool) -> tuple[Tensor, ...]:
         view = self._view

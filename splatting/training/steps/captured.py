@@ -124,7 +124,7 @@ class CapturedStep(FusedStep):
         if self._rows is None:
             return
         row = self._rows[at.iteration % _ROWS]
-        row.copy_(self._camera_gradient, non_blocking=True)
+        row.copy_(self.camera_gradient, non_blocking=True)
         copied = torch.cuda.current_stream().record_event() if row.is_pinned() else None
         size = at.camera.image_width, at.camera.image_height
         self._fetched[at.iteration] = _Fetched(at.camera.uid, size, row, copied)
@@ -328,15 +328,14 @@ class Graphs:
         run.gaussians.guard_loss(iteration, losses.total)
         density = run.density
         observed = density.observes(iteration), density.absolute_gradients
-        drawn.step(self._adam, *gradients, *observed, now)
+        drawn.step(self._adam, *gradients, *observed, now, self._fused.camera_gradient)
         return torch.stack([losses.total, losses.l1])
 
     def _numbers_of(self, camera: Camera) -> np.ndarray:
         """The camera's numbers (35,) on the host, read from the GPU once; those of a trained pose never lie there."""
         if poses := self._run.poses:
-            known = camera.matrices(*poses.pose(camera.uid))
-            tensors = (known[name] for name in ("world_view_transform", "full_proj_transform", "camera_center"))
-            return torch.cat([tensor.reshape(-1) for tensor in tensors]).float().numpy()
+            poses.place(camera)
+            return camera.numbers[:_CAMERA]
         tensors = camera.world_view_transform, camera.full_proj_transform, camera.camera_center
         state = [(id(tensor), tensor._version) for tensor in tensors]
         kept = self._cameras.get(camera.uid)

@@ -24,8 +24,8 @@ class FusedStep(PlainStep):
     def __init__(self, run: Run) -> None:
         super().__init__(run)
         pose = torch.zeros(CAMERA_NUMBERS, dtype=torch.float64, device=run.device) if run.poses else None
-        self._camera_gradient = pose  # of the last step
-        self._adam = FusedAdam(run.gaussians, run.density.penalty, camera_gradient=pose)
+        self.camera_gradient = pose  # of the last step
+        self._adam = FusedAdam(run.gaussians, run.density.penalty)
         self._bands = KnownBands()
         self._is_known = False  # whether the model is one that the operator steps
         self._has_further_terms = False
@@ -43,8 +43,8 @@ class FusedStep(PlainStep):
                 observers.measured(at, losses)
                 self.advance(at, drawn, gradients)
                 del drawn, gradients  # what changes rows needs their memory
-                if self._camera_gradient is not None and not at.last:
-                    self._run.step_pose(at, self._camera_gradient)
+                if self.camera_gradient is not None and not at.last:
+                    self._run.step_poses(at, [at.camera], self.camera_gradient[None])
                 return self.follow(at)
         super().take(at, observers)
 
@@ -107,9 +107,9 @@ class FusedStep(PlainStep):
         if at.last or at.changes:
             left_out = gaussians._attributes if at.last else density.replaced(at.iteration)
             steps = len(left_out) < len(gaussians._attributes)
-            adam = FusedAdam(gaussians, density.penalty, left_out, self._camera_gradient)
-        if steps or observes or self._camera_gradient is not None:
-            drawn.step(adam, *gradients, observes, density.absolute_gradients)
+            adam = FusedAdam(gaussians, density.penalty, left_out)
+        if steps or observes or self.camera_gradient is not None:
+            drawn.step(adam, *gradients, observes, density.absolute_gradients, camera=self.camera_gradient)
 
     def follow(self, at: Iteration) -> None:
         """Change rows, where it is time to, and take the step of the exposures."""

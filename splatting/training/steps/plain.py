@@ -22,7 +22,7 @@ class OneView:
         run = self._run
         return render(at.camera, run.gaussians, run.pipe, at.background, **run.render_options(at))
 
-    def collect(self, package: Package, losses: Losses) -> tuple[Package, Losses]:
+    def collect(self, at: Iteration, package: Package, losses: Losses) -> tuple[Package, Losses]:
         """Called after backward: give the model its gradients; the package of all its rows, and the losses to show."""
         return package, losses
 
@@ -34,7 +34,7 @@ class RefinedView(OneView):
         run, options = self._run, self._run.render_options(at)
         exposes = options.pop("use_trained_exp")
         package = render(at.camera, run.gaussians, run.pipe, at.background, **options)
-        self._at, self._planes = at, (package["render"], package["depth"])
+        self._planes = package["render"], package["depth"]
         for plane in self._planes:
             if plane is not None:
                 plane.retain_grad()
@@ -42,12 +42,12 @@ class RefinedView(OneView):
             package["render"] = exposed(package["render"], at.camera, run.gaussians)
         return package
 
-    def collect(self, package: Package, losses: Losses) -> tuple[Package, Losses]:
-        run, at = self._run, self._at
+    def collect(self, at: Iteration, package: Package, losses: Losses) -> tuple[Package, Losses]:
+        run = self._run
         if not at.last:
             color, depth = (None if plane is None else plane.grad for plane in self._planes)
             drawn = draw(at.camera, run.gaussians, run.pipe, at.background, depth is not None)
-            run.step_pose(at, drawn.camera_gradient(color, depth))
+            run.step_poses(at, [at.camera], drawn.camera_gradient(color, depth)[None])
         return package, losses
 
 
@@ -76,7 +76,7 @@ class PlainStep:
         if self._reaches_sleepers():
             self._end_sleep()
             return self.take(at, observers)
-        package, losses = self._views.collect(package, losses)
+        package, losses = self._views.collect(at, package, losses)
         if any(run.density.penalty):
             run.gaussians.penalise(run.density.penalty.times(run.schedule.views))
         observers.measured(at, losses)

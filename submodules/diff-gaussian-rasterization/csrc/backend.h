@@ -63,8 +63,8 @@ template <class T>
 void chain_rows(int64_t count, const T* factors, T* logits, T* log_scales);
 
 // What else the CPU offers. sum_rows: the rest of blend_vjp after blend_rows. project_vjp_step: project_vjp, and every
-// Gaussian's step as soon as its gradients are known. camera_vjp: the gradients of the camera's numbers
-// (math/camera_gradient.h).
+// Gaussian's step as soon as its gradients are known. camera_vjp: what each block of kSleepBlock
+// Gaussians adds to the gradients of the camera's numbers, (blocks, numbers) (math/camera_gradient.h).
 #define GS_CPU_BACKEND                                                                                  \
   GS_BACKEND(Executor)                                                                                  \
   template <class T>                                                                                    \
@@ -73,7 +73,7 @@ void chain_rows(int64_t count, const T* factors, T* logits, T* log_scales);
   void project_vjp_step(const Executor&, const Scene<T>&, const int32_t* tile_counts, const T* moments, \
                         const GaussianStep<T>&);                                                        \
   template <class T>                                                                                    \
-  void camera_vjp(const Executor&, const Scene<T>&, const int32_t* tile_counts, const T* moments, double* out);
+  void camera_vjp(const Executor&, const Scene<T>&, const int32_t* tile_counts, const T* moments, double* sums);
 
 #define GS_DECLARE(isa) \
   namespace isa {       \
@@ -102,8 +102,10 @@ void rasterize_vjp_step(const Queue&, const Scene<float>&, const BlendInput<floa
 void rows_vjp(const Queue&, const Scene<float>&, const SplatRows<float>&, const RowSums<float>&, const GradientMemory&);
 void rows_vjp_step(const Queue&, const Scene<float>&, const SplatRows<float>&, const RowSums<float>&,
                    const GaussianStep<float>&);
-// From the same rows, which it only reads, to the gradients of the camera's numbers.
-void camera_vjp(const Queue&, const Scene<float>&, const SplatRows<float>&, double* out);
+// From the same rows, which it only reads, to what blocks add to the gradients of the camera's numbers, as on the CPU;
+// and the sums over blocks.
+void camera_vjp(const Queue&, const Scene<float>&, const SplatRows<float>&, double* sums);
+void sum_blocks(const Queue&, int64_t blocks, int64_t numbers, const double* sums, double* out);
 }  // namespace cuda
 
 }  // namespace gs

@@ -8,12 +8,13 @@ from diff_gaussian_rasterization.scene import GRADIENTS
 # A Gaussian's values in each input; a row of sh_rest depends on the number of bands.
 _ROWS = {"means": (3,), "means2d": (3,), "opacities": (1,), "scales": (3,), "rotations": (4,), "cov3d": (6,)}
 _ROWS |= {"colors": (3,), "sh_dc": (1, 3)}
-# These six are constants of csrc; tests/test_rasterizer_ops.py holds them to it.
+# These seven are constants of csrc; tests/test_rasterizer_ops.py holds them to it.
 TILE = 16  # pixels
 SPLAT_VALUES = 10  # of a row of `splats`
 MOMENT_VALUES = 10  # of a row of `moments`, and of `rows`
 RAY_VALUES = 4  # of a row of each besides, of Gaussians on rays
 ABSOLUTE_VALUES = 2  # of a row of `rows` besides, for absolute gradients
+SLEEP_BLOCK = 128  # Gaussians that sleep together, and whose gradients of a camera are summed together
 CAMERA_NUMBERS = 25, 34  # of a pinhole, and of a camera with a lens
 RECORD_BLOCK = 256  # splats whose records are counted together
 
@@ -86,7 +87,13 @@ def _(means, opacities, *arguments):
 @_fake("camera_vjp")
 def _(means, *arguments):
     lens = arguments[10]
-    return means.new_empty((CAMERA_NUMBERS[len(lens) > 3],), dtype=torch.float64)
+    blocks = -(-means.shape[0] // SLEEP_BLOCK)
+    return means.new_empty((blocks, CAMERA_NUMBERS[len(lens) > 3]), dtype=torch.float64)
+
+
+@_fake("sum_blocks")
+def _(sums):
+    return sums.new_empty(sums.shape[1:])
 
 
 @_fake("rasterize")

@@ -162,7 +162,7 @@ def _backward(ctx, grad_color, grad_transmittance, grad_inverse_depth, *_):
     results = [None] * len(needed)
     if any(needed[_CAMERA:]):  # both backwards take the rows that the blending's makes once
         kept, planes = (*kept[:2], *OPERATORS.blend_rows(kept, *planes, ctx.absolute)), ()
-        results[_CAMERA] = OPERATORS.camera_vjp(*scene, kept, ctx.absolute)
+        results[_CAMERA] = OPERATORS.sum_blocks(OPERATORS.camera_vjp(*scene, kept, ctx.absolute))
     if planes or any(needed[:9]):
         results[:9] = gradients_of(scene, kept, planes, needed[:9], ctx.absolute)
     return tuple(results)

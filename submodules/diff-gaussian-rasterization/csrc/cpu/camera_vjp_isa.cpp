@@ -1,5 +1,5 @@
-// The gradient of the camera: blocks of Gaussians are summed by threads, and their sums one after the other.
-#include <vector>
+// The gradient of the camera, of blocks of Gaussians, which threads share.
+#include <algorithm>
 
 #include "../math/camera_gradient.h"
 #include "project_vjp_rows.h"
@@ -41,18 +41,14 @@ void add_rows(const Scene<T>& s, const LensCamera<T>& camera, const int32_t* til
 
 template <class T>
 void camera_vjp(const Executor& executor, const Scene<T>& s, const int32_t* tile_counts, const T* moments,
-                double* out) {
+                double* sums) {
   with_camera(s, [&](const auto& camera) {
     constexpr int kNumbers = kNumbersOf<std::decay_t<decltype(camera)>>;
-    std::vector<double> sums(kNumbers * sleep_blocks(s.count), 0);
     for_dynamic(executor, s.count, kVjpBlock, [&](int64_t begin, int64_t end) {
-      add_rows(part_of(s, begin, end - begin), camera, tile_counts + begin, from_moments(s, moments, begin),
-               sums.data() + kNumbers * (begin / kVjpBlock));
+      double* const sum = sums + kNumbers * (begin / kVjpBlock);
+      std::fill_n(sum, kNumbers, 0.0);
+      add_rows(part_of(s, begin, end - begin), camera, tile_counts + begin, from_moments(s, moments, begin), sum);
     });
-    for (int k = 0; k < kNumbers; ++k) {
-      out[k] = 0;
-      for (int64_t block = 0; block < sleep_blocks(s.count); ++block) out[k] += sums[kNumbers * block + k];
-    }
   });
 }
 

@@ -1,8 +1,10 @@
 // The backward of projection: to rows of gradients, or straight to every Gaussian's step.
 #include <cstring>
 #include <type_traits>
+#include <vector>
 
 #include "../backend.h"
+#include "../math/camera_gradient.h"
 #include "../math/chain.h"
 #include "project_vjp_rows.h"
 #include "step_rows.h"
@@ -88,7 +90,12 @@ void project_vjp(const Executor& executor, const Scene<T>& s, const int32_t* til
 template <class T>
 void project_vjp_step(const Executor& executor, const Scene<T>& s, const int32_t* tile_counts, const T* moments,
                       const GaussianStep<T>& step) {
-  if (step.camera) camera_vjp(executor, s, tile_counts, moments, step.camera);
+  if (step.camera) {
+    const int64_t numbers = camera_numbers(s);
+    std::vector<double> sums(numbers * sleep_blocks(s.count));
+    camera_vjp(executor, s, tile_counts, moments, sums.data());
+    sum_blocks(sleep_blocks(s.count), numbers, sums.data(), step.camera);
+  }
   AdamStep<T> steps[kStepped];
   for (int a = 0; a < kStepped; ++a) steps[a] = adam_step_of(step.attributes[a], step.sparse);
   StepGuard<T> guard = step.guard;

@@ -93,31 +93,30 @@ __global__ void __launch_bounds__(kThreads)
   out[blockIdx.x] = all;
 }
 
-template <class AnyCamera>
-void sum_rows(const Queue& queue, const Scene<float>& s, const SlotSums<false>& source, double* out) {
-  constexpr int kNumbers = kNumbersOf<AnyCamera>;
-  const int64_t blocks = sleep_blocks(s.count);
-  const size_t values = size_t(kNumbers) * blocks;
-  double* sums = queue.array<double>(values);
+void sum_rows(const Queue& queue, const Scene<float>& s, const SlotSums<false>& source, double* sums) {
+  const size_t values = size_t(camera_numbers(s)) * sleep_blocks(s.count);
   if (s.blocks || s.awake) GS_CUDA_CHECK(cudaMemsetAsync(sums, 0, values * sizeof *sums, stream_of(queue)));
-  if (s.rows()) {
-    const unsigned launched = blocks_for(s.rows(), kThreads);
-    launch(queue, "camera_vjp", camera_vjp_kernel<AnyCamera>, launched, kThreads, s, source, sums);
-  }
-  launch(queue, "sum_blocks", sum_blocks_kernel, kNumbers, kThreads, blocks, sums, out);
+  if (!s.rows()) return;
+  const auto kernel =
+      s.lens.chart == Chart::kPinhole ? camera_vjp_kernel<Camera<float>> : camera_vjp_kernel<LensCamera<float>>;
+  launch(queue, "camera_vjp", kernel, blocks_for(s.rows(), kThreads), kThreads, s, source, sums);
 }
 
 }  // namespace
 
-void camera_vjp(const Queue& queue, const Scene<float>& s, const SlotSums<false>& source, double* out) {
-  if (s.lens.chart == Chart::kPinhole)
-    sum_rows<Camera<float>>(queue, s, source, out);
-  else
-    sum_rows<LensCamera<float>>(queue, s, source, out);
+void sum_blocks(const Queue& queue, int64_t blocks, int64_t numbers, const double* sums, double* out) {
+  launch(queue, "sum_blocks", sum_blocks_kernel, unsigned(numbers), kThreads, blocks, sums, out);
 }
 
-void camera_vjp(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, double* out) {
-  camera_vjp(queue, s, sums_of<false>(queue, in, {}), out);
+void camera_vjp(const Queue& queue, const Scene<float>& s, const SlotSums<false>& source, double* out) {
+  const int64_t blocks = sleep_blocks(s.count), numbers = camera_numbers(s);
+  double* sums = queue.array<double>(size_t(numbers) * blocks);
+  sum_rows(queue, s, source, sums);
+  sum_blocks(queue, blocks, numbers, sums, out);
+}
+
+void camera_vjp(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, double* sums) {
+  sum_rows(queue, s, sums_of<false>(queue, in, {}), sums);
 }
 
 }  // namespace cuda

@@ -22,6 +22,18 @@ GS_HD constexpr int numbers_of(const LensCamera<T>*) {
 }
 template <class AnyCamera>
 constexpr int kNumbersOf = numbers_of(static_cast<const AnyCamera*>(nullptr));
+template <class T>
+GS_HD int camera_numbers(const Scene<T>& s) {
+  return s.lens.chart == Chart::kPinhole ? kPinholeNumbers : kLensCameraNumbers;
+}
+
+// Adds up what blocks of kSleepBlock Gaussians have, (blocks, numbers), one after the other. A GPU has another order.
+inline void sum_blocks(int64_t blocks, int64_t numbers, const double* sums, double* out) {
+  for (int64_t k = 0; k < numbers; ++k) {
+    out[k] = 0;
+    for (int64_t block = 0; block < blocks; ++block) out[k] += sums[numbers * block + k];
+  }
+}
 
 // The gradients of a splat that reach its camera. p1, p2: of the rows of J W, in the world.
 template <class V>

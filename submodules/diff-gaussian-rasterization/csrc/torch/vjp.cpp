@@ -38,16 +38,16 @@ std::tuple<Tensor, Tensor> blend_rows_op(SOURCE_PARAMETERS, bool absolute) {
   return {rows, counts};
 }
 
-// The gradients of the camera's numbers (math/camera_gradient.h), from splats, tile_counts, and the rows and counts of
-// blend_rows.
+// What blocks of gs::kSleepBlock Gaussians add to the gradients of the camera's numbers, (blocks, numbers) float64
+// (math/camera_gradient.h), from splats, tile_counts, and the rows and counts of blend_rows.
 Tensor camera_vjp_op(SCENE_PARAMETERS, List<Tensor> source, bool absolute) {
   const SceneTensors scene(SCENE_ARGUMENTS);
   check_camera_gradients(scene);
   GS_CHECK_VALUE(source.size() == 4, "camera_vjp takes splats, tile_counts, rows and counts, got ", source.size(),
                  " tensors");
   const GradientSource from(scene, source, {}, {}, {}, absolute, false);
-  Tensor out =
-      empty<double>({scene.has_lens() ? baseline::kLensCameraNumbers : baseline::kPinholeNumbers}, scene.means());
+  const int64_t numbers = scene.has_lens() ? baseline::kLensCameraNumbers : baseline::kPinholeNumbers;
+  Tensor out = empty<double>({gs::sleep_blocks(scene.count()), numbers}, scene.means());
 #ifdef GS_CUDA
   if (scene.device().is_cuda()) {
     gs::TorchQueue queue(scene.device());
@@ -64,6 +64,25 @@ Tensor camera_vjp_op(SCENE_PARAMETERS, List<Tensor> source, bool absolute) {
   return out;
 }
 
+// The sum of the rows of camera_vjp, or of all ranks' rows, in one order.
+Tensor sum_blocks_op(const Tensor& sums) {
+  check_given(sums, "sums");
+  check_tensor(sums, "sums", ScalarType::Double, sums.device(), {-1, -1});
+  const int64_t blocks = sums.size(0), numbers = sums.size(1);
+  GS_CHECK_VALUE(numbers > 0, "sums must have columns, got ", sums.sizes());
+  const Tensor from = packed(sums);
+  Tensor out = empty<double>({numbers}, from);
+#ifdef GS_CUDA
+  if (from.is_cuda()) {
+    gs::TorchQueue queue(from.device());
+    gs::cuda::sum_blocks(queue.queue(), blocks, numbers, read<double>(from), write<double>(out));
+    return out;
+  }
+#endif
+  baseline::sum_blocks(blocks, numbers, read<double>(from), write<double>(out));
+  return out;
+}
+
 }  // namespace
 
 GS_OPERATORS(diff_gaussian_rasterization, m) {
@@ -73,6 +92,7 @@ GS_OPERATORS(diff_gaussian_rasterization, m) {
   m.define("blend_rows(" SOURCE_SCHEMA ", bool absolute=False) -> (Tensor rows, Tensor counts)",
            TORCH_BOX(&blend_rows_op));
   m.define("camera_vjp(" SCENE_SCHEMA ", Tensor[] source, bool absolute=False) -> Tensor", TORCH_BOX(&camera_vjp_op));
+  m.define("sum_blocks(Tensor sums) -> Tensor", TORCH_BOX(&sum_blocks_op));
 }
 
 }  // namespace gs::ops
