@@ -43,9 +43,11 @@ def diagnose(source: str | None, images: str | None, model: str | None, iteratio
                 continue
             raise UserError(f"no folder {folder or repr(folder)}; pass an existing folder as {option}")
     if source is not None:
+        from splatting.diagnosis.advice import check_options
         from splatting.diagnosis.dataset import check_dataset
 
-        problems += _show(f"dataset {source}", check_dataset(source, images or "images"))
+        names = source, images or "images"
+        problems += _show(f"dataset {source}", [*check_dataset(*names), *check_options(*names)])
     if model is not None:
         from splatting.diagnosis.model import check_model
 

@@ -3,7 +3,7 @@
 import contextlib
 import io
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from PIL import Image
 
 from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
 from scene.readers.info import APART, camera_centers, standing_apart
-from scene.readers.tracks import read_tracks
+from scene.readers.tracks import Track, read_tracks
 from scene.reprojection import BOUND, nearest_pose, pull
 from splatting.diagnosis import Line, from_error
 from splatting.files.json_files import read_json
@@ -170,27 +170,43 @@ def check_colors(info: SceneInfo) -> Iterator[Line]:
 
 def check_poses(source: str, info: SceneInfo) -> Iterator[Line]:
     """Tracks that other poses fit far better than the given ones, as after a bundle adjustment they cannot."""
-    views, errors = info.train_cameras[:: max(1, len(info.train_cameras) // _COMPARED)], []
+    views = info.train_cameras
     try:
-        tracks = read_tracks(source, views, info.offset)
+        found = pose_errors(views, read_tracks(source, views, info.offset), info.extent)
     except UserError as error:
         yield from_error(error)
         return
-    for view, track in zip(views, tracks, strict=True):
-        if track is None:
-            continue
-        given = world_to_camera(view.R, view.T)
-        best = nearest_pose(given, track, view.fx, info.extent, BOUND)
-        errors.append([np.median(pull(pose, track, view.fx, info.extent).size) for pose in (given, best)])
-    if not errors:
+    if found is None:
         return
-    given, best = np.median(errors, axis=0)
+    given, best = found
     text = f"points lie {given:.2g} pixels from where photos show them (median)"
-    if given > _SEEN and best < _ADJUSTED * given:
+    if poses_differ(given, best):
         better = "train with --refine_poses, or adjust the model again (COLMAP: bundle_adjuster)"
         yield Line(f"{text}, and {best:.2g} with better poses", better)
     elif given > _WRONG:
         yield Line(text, "adjust the model again (COLMAP: bundle_adjuster); --refine_poses corrects 3 degrees at most")
+
+
+def pose_errors(
+    views: Sequence[CameraInfo], tracks: Sequence[Track | None], extent: float
+) -> tuple[float, float] | None:
+    """Pixels from points to where photos show them (median), with their poses and with the best ones; None: no tracks.
+
+    Of _COMPARED views.
+    """
+    errors, step = [], max(1, len(views) // _COMPARED)
+    for view, track in zip(views[::step], tracks[::step], strict=True):
+        if track is None:
+            continue
+        given = world_to_camera(view.R, view.T)
+        best = nearest_pose(given, track, view.fx, extent, BOUND)
+        errors.append([np.median(pull(pose, track, view.fx, extent).size) for pose in (given, best)])
+    return tuple(np.median(errors, axis=0).tolist()) if errors else None
+
+
+def poses_differ(given: float, best: float) -> bool:
+    """Whether better poses fit the tracks far better (`pose_errors`)."""
+    return given > _SEEN and best < _ADJUSTED * given
 
 
 def _pixels(camera: CameraInfo) -> np.ndarray:

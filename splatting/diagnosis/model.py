@@ -48,7 +48,7 @@ NEAREST = 0.2  # depth below which nothing is drawn
 FEW_GAUSSIANS = 2000
 _CLEARLY = 3.0  # dB
 _VIEWS = 4
-_MOST_PHOTOS, _SHARE = 300, 0.3  # that are searched for passers-by; the largest part of one
+_MOST_PHOTOS, MASKED = 300, 0.3  # that are searched for passers-by; the largest part of one
 _WIDTH = 200
 _RESET_SAID = "warning: opacities are reset"  # the beginning of what training/checks.py:late_reset says
 
@@ -155,22 +155,34 @@ def _wrong_values(gaussians: GaussianModel, extent: float) -> Iterator[Line]:
         yield Line(text, remedy)
 
 
-@torch.no_grad()
 def _passers_by(scene: Scene, options: argparse.Namespace) -> Iterator[Line]:
     """A note on photos that show what the model does not."""
-    cameras, views = scene.getTrainCameras(), _scored(scene, options)
+    cameras = scene.getTrainCameras()
     if len(cameras) > _MOST_PHOTOS or options.train_test_exp:
         return
-    masks = RobustMask(cameras, _SHARE, compute_device())
+    shares = _odd_shares(scene, options)
+    if worst := sorted(shares, key=shares.get, reverse=True):
+        text = f"{len(worst)} of {len(cameras)} photos show what the model does not, as if someone had passed by"
+        yield Line(f"{text}: most in {some(worst)}; try --robust_mask {MASKED:g}", note=True)
+
+
+@torch.no_grad()
+def _odd_shares(scene: Scene, options: argparse.Namespace) -> dict[str, float]:
+    """The part of each photo that shows what the model does not, of photos with some."""
+    cameras, views = scene.getTrainCameras(), _scored(scene, options)
+    masks = RobustMask(cameras, MASKED, compute_device())
     masks.least, masks.early = 1, 0  # it is trained
     for camera in cameras:
         masks.mask(camera, *views.compared(camera, scene.gaussians), learns=True)
         masks.keep()
     found = {camera.image_name: masks.counted(camera) for camera in masks.cameras}
-    shares = {name: 1 - float(counts.float().mean()) for name, counts in found.items() if counts is not None}
-    if worst := sorted(shares, key=shares.get, reverse=True):
-        text = f"{len(worst)} of {len(cameras)} photos show what the model does not, as if someone had passed by"
-        yield Line(f"{text}: most in {some(worst)}; try --robust_mask {_SHARE:g}", note=True)
+    return {name: 1 - float(counts.float().mean()) for name, counts in found.items() if counts is not None}
+
+
+def odd_photos(model_path: str) -> float:
+    """The share of the training photos that show what the model in a folder does not."""
+    options, scene = _load(model_path, read_stored_options(model_path), -1)
+    return len(_odd_shares(scene, options)) / len(scene.getTrainCameras())
 
 
 def _late_reset(scene: Scene) -> Iterator[Line]:

@@ -1,0 +1,162 @@
+"""Options of train.py that a scene's own data ask for, each with the number that speaks for it.
+
+`train.py --advise` and `doctor.py -s` print them, and `train.py --options auto` takes them.
+"""
+
+import argparse
+import contextlib
+import copy
+import io
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from arguments import ModelParams
+from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
+from scene.readers.info import CameraInfo
+from scene.readers.tracks import Track, read_tracks
+from scene.scene import Scene
+from splatting.diagnosis import Line
+from splatting.diagnosis.dataset import pose_errors, poses_differ
+from splatting.diagnosis.model import MASKED, odd_photos
+from splatting.exports.in_scene import scene_with
+from utils.image_utils import as_float
+from utils.system_utils import UserError
+
+EXPOSURES = 0.4  # stops; photos of a usual automatic exposure differ by 0.15 to 0.35
+FEW_PHOTOS = 25  # with fewer, depth is held badly
+DISTANCES = 2.0  # the farthest photo of a point over the nearest
+_WIDTH = 200  # pixels of a photo
+_DARK, _LIGHT = 0.02, 0.98  # of a channel; beyond, an exposure cannot be told
+_OUTLIER = 0.6  # stops; a larger difference is no exposure (Tukey's biweight: Beaton and Tukey 1974)
+_ROUNDS = 30
+_ITERATIONS = 1000  # of the short training that passers-by are searched in
+FEW_MASKED = 0.1  # of the photos, may look like passers-by by chance
+_LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear sRGB
+ROOT = Path(__file__).resolve().parents[2]
+
+
+class Advice(NamedTuple):
+    """A number of a scene, and the options that it asks for; none, if it asks for nothing."""
+
+    text: str
+    options: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.text}; try {self.options}" if self.options else self.text
+
+
+def advise(dataset: argparse.Namespace, trains: bool = True) -> list[Advice]:
+    """Advice on a scene. dataset: the model options. trains: look for passers-by by a short training, too.
+
+    UserError as from Scene.
+    """
+    small = copy.copy(dataset)
+    small.resolution, small.model_path, small.depths = _WIDTH, "", ""
+    with contextlib.redirect_stdout(io.StringIO()):  # from the readers
+        scene, _ = scene_with(None, small, GaussianModel(0))
+    tracks = read_tracks(dataset.source_path, scene.info.train_cameras, scene.info.offset)
+    found = [*_of_tracks(scene, tracks)] if any(tracks) else []
+    return [*found, *_of_passers_by(dataset)] if trains else found
+
+
+def check_options(source: str, images: str) -> list[Line]:
+    """Notes of doctor.py on options that a scene asks for; none where it cannot be read. images: as train.py's -i."""
+    dataset = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(source_path=source, images=images))
+    dataset.lenses = "native"
+    try:
+        found = advise(dataset, trains=False)
+    except UserError:
+        return []
+    return [Line(str(advice), note=True) for advice in found if advice.options]
+
+
+def _of_tracks(scene: Scene, tracks: list[Track | None]) -> Iterator[Advice]:
+    """What the tracks of structure from motion say."""
+    views = scene.info.train_cameras
+    cameras = sorted(scene.getTrainCameras(), key=lambda camera: camera.uid)
+    spread = float(np.std(exposures(cameras, tracks)))
+    yield _asked(f"exposures of the photos differ by {spread:.2f} stops", spread > EXPOSURES, "--appearance ppisp")
+    ratio = distances(views, tracks)
+    text = f"the farthest photo of a point is {ratio:.1f} times as far away as the nearest (median)"
+    yield _asked(text, ratio > DISTANCES, "--antialiasing --filter_3d")
+    yield _asked(f"{len(views)} photos train", len(views) < FEW_PHOTOS, "--sparse_depth 0.1")
+    given, best = pose_errors(views, tracks, scene.cameras_extent)
+    text = f"points lie {given:.2g} pixels from where photos show them (median), and {best:.2g} with better poses"
+    yield _asked(text, poses_differ(given, best), "--refine_poses")
+
+
+def _asked(text: str, asks: bool, options: str) -> Advice:
+    return Advice(text, options if asks else "")
+
+
+def exposures(cameras: list[Camera], tracks: list[Track | None]) -> np.ndarray:
+    """Exposures (K,) in stops around their mean, of the photos that have a track.
+
+    A robust fit: log2 of a luminance is the exposure of its photo and the albedo of its point.
+    """
+    logs, points, photos = [], [], []
+    for track, camera in zip(tracks, cameras, strict=True):
+        if track is None:
+            continue
+        image = as_float(camera.target(torch.zeros(3, device=camera.device))).cpu().numpy()
+        column, row = (track.places * image.shape[:0:-1]).astype(int).T
+        inside = (column >= 0) & (column < image.shape[2]) & (row >= 0) & (row < image.shape[1])
+        colors = image[:, row[inside], column[inside]]
+        usable = (colors.max(0) < _LIGHT) & (colors.min(0) > _DARK)
+        logs.append(np.log2(np.tensordot(_LUMINANCE, _linear(colors[:, usable]), 1)))
+        points.append(track.ranks[inside][usable])
+        photos.append(np.full(len(points[-1]), len(photos)))
+    log, point, photo = map(np.concatenate, (logs, points, photos))
+    weight, exposure = np.ones(len(log)), np.zeros(len(logs))
+    for _ in range(_ROUNDS):
+        albedo = _means(point, weight, log - exposure[photo])
+        exposure = _means(photo, weight, log - albedo[point])[: len(logs)]
+        away = log - exposure[photo] - albedo[point]
+        weight = np.maximum(1 - (away / _OUTLIER) ** 2, 1e-3) ** 2
+    return exposure - exposure.mean()
+
+
+def _linear(values: np.ndarray) -> np.ndarray:
+    """sRGB to light (IEC 61966-2-1)."""
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def _means(group: np.ndarray, weight: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Weighted means of the values of each group; 0 for an empty one."""
+    return np.bincount(group, weight * values) / np.maximum(np.bincount(group, weight), 1e-9)
+
+
+def distances(views: list[CameraInfo], tracks: list[Track | None]) -> float:
+    """The median over points of the largest over the smallest depth in focal lengths, of the photos that see it."""
+    seen = [(track.ranks, (track.points @ view.R + view.T)[:, 2] / view.fx)
+            for view, track in zip(views, tracks, strict=True) if track is not None]  # fmt: skip
+    points, depths = map(np.concatenate, zip(*seen, strict=True))
+    near, far = np.full(points.max() + 1, np.inf), np.zeros(points.max() + 1)
+    np.minimum.at(near, points, depths)
+    np.maximum.at(far, points, depths)
+    shared = (np.bincount(points) > 1) & (near > 0)
+    return float(np.median(far[shared] / near[shared])) if shared.any() else 1.0
+
+
+def _of_passers_by(dataset: argparse.Namespace) -> Iterator[Advice]:
+    """What a short training of small photos leaves over."""
+    with tempfile.TemporaryDirectory() as folder:
+        given = {"-s": dataset.source_path, "-m": folder, "-i": dataset.images, "-r": _WIDTH}
+        given |= {"--iterations": _ITERATIONS, "--test_iterations": -1, "--save_iterations": -1}
+        flags = ["--eval"] * dataset.eval + ["-w"] * dataset.white_background
+        flags += ["--quiet", "--no_curve", "--disable_viewer", *map(str, chain(*given.items()))]
+        done = subprocess.run([sys.executable, ROOT / "train.py", *flags], capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise UserError(done.stderr.strip().rpartition("\n")[2])
+        share = odd_photos(folder)
+    text = f"{share:.0%} of the photos show what a short training does not, as if someone had passed by"
+    yield _asked(text, share > FEW_MASKED, f"--robust_mask {MASKED:g}")

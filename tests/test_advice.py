@@ -1,0 +1,39 @@
+"""Advice on options: numbers of a scene whose truth is known, and what train.py and doctor.py make of them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+
+from scene.readers.tracks import Track
+from splatting.diagnosis.advice import distances, exposures
+
+SIDE = 20
+
+
+def _track(points: np.ndarray, ranks: np.ndarray) -> Track:
+    """A track of points that lie at the pixel of their rank."""
+    places = (np.stack([ranks % SIDE, ranks // SIDE], axis=1) + 0.5) / SIDE
+    ones = np.ones(len(ranks))
+    return Track(points, np.zeros((len(ranks), 2)), places, ones, ones, ranks)
+
+
+def test_exposures_are_those_of_the_photos_though_some_points_disagree():
+    rng, given = np.random.default_rng(0), np.array([-0.7, 0.2, 0.4, 0.0, 0.1])
+    albedo, cameras, tracks = rng.uniform(0.1, 0.4, (3, SIDE**2)), [], []
+    for exposure in given:
+        light = albedo * 2**exposure
+        light[:, rng.choice(SIDE**2, 40, replace=False)] = 0.9  # highlights
+        image = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+        pixels = torch.from_numpy(image.reshape(3, SIDE, SIDE))
+        cameras.append(SimpleNamespace(device="cpu", target=lambda _, pixels=pixels: pixels))
+        ranks = np.sort(rng.choice(SIDE**2, 300, replace=False))
+        tracks.append(_track(np.zeros((300, 3)), ranks))
+    np.testing.assert_allclose(exposures(cameras, tracks), given - given.mean(), atol=0.02)
+
+
+def test_photos_of_a_point_from_twice_as_far_have_twice_the_depth_in_focal_lengths():
+    points = np.random.default_rng(0).normal(size=(30, 3))
+    views = [SimpleNamespace(R=np.eye(3), T=np.array([0, 0, z]), fx=f) for z, f in ((100.0, 50.0), (400.0, 100.0))]
+    tracks = [_track(points, np.arange(30)), None, _track(points, np.arange(30))]
+    assert abs(distances([views[0], views[0], views[1]], tracks) - 2) < 0.05
