@@ -25,7 +25,7 @@ _LARGEST = 1e15  # extent; learning rates are multiples of it
 _OPTIMIZER = 10  # which entry its state dict is
 _ENTRIES = 12  # the reference's; the values of further attributes may follow
 EXPOSURES, WRITTEN_BY, ASLEEP, POSES = "exposures", "version", "asleep", "poses"  # keys in the optimiser's state dict
-RESIDUALS, FILTER = "residuals", "filter_3d"  # the same
+RESIDUALS, FILTER, SKY = "residuals", "filter_3d", "sky"  # the same; SKY also in model.json
 
 
 class State(NamedTuple):

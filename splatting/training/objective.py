@@ -49,6 +49,8 @@ class Objective:
         camera, terms = step.camera, {}
         if step.depth_weight > 0:
             terms["depth"] = lambda package, mask: step.depth_weight * _depth_loss(package["depth"], camera, mask)
+        if step.sky is not None:
+            terms["sky"] = lambda package, mask: step.sky.loss(package["depth"], mask)
         if step.points is not None:
             terms["points"] = lambda package, mask: step.points.loss(package["depth"], mask)
         return terms
