@@ -191,6 +191,9 @@ class OptimizationParams(OptionTable):
         Option("filter_3d", False, origin="ours",
             help="let no Gaussian be finer than the training photos can show, so that views from other distances look "
                  "right. It is part of the PLY, so that every viewer shows it; best with --antialiasing"),
+        Option("sky", "off", origin="ours", check=one_of("off", "auto"),
+            help="auto: where directions that photos show have no points, add Gaussians on a far sphere, as a sky "
+                 "behind all; off: add none. By one process, with --strategy adc or budget"),
         Option("random_background", False,
             help="a new random background in every step, so that no Gaussian imitates a fixed one"),
         Option("optimizer_type", "default", check=one_of("default", "sparse_adam"), stored=MODEL_JSON,

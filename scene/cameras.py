@@ -72,6 +72,7 @@ class Camera(nn.Module):
     None. data_device: where photos in memory lie, and the images and masks below that other code reads.
     All may be assigned, and other attributes added; nothing is computed again from an assigned one. `del` of an
     original_image, alpha_mask, depth_reliable, invdepthmap or depth_mask brings the photo's back.
+    depth_has_gaps: whether an inverse depth of 0 is unknown, and not far away.
     A copy shares the store of the decoded photos; what is assigned to it is its own. copy.copy shares tensors,
     copy.deepcopy does not. A pickle leaves the store out, and the photos are decoded again. All keep what was assigned
     and, where the store keeps such images (ImageStore.keeps_floats), changes in place of original_image.
@@ -116,6 +117,7 @@ class Camera(nn.Module):
         if self._mask and self._mask.meaning == TRANSPARENT:
             self._source, self._mask = Cutout(self.image_path, info.mask), None
         self._ignore_alpha = info.ignore_alpha
+        self.depth_has_gaps = getattr(info.depth, "metric", False)
         self._depth = self._placed(info.depth)
         self._reliable = self._depth is not None and depth_fit(info.depth_params).reliable
         self._assigned: dict[str, Any] = {}
@@ -372,8 +374,9 @@ class Camera(nn.Module):
 
     @_assignable
     def invdepthmap(self) -> Tensor | None:
-        """Inverse depth (1,H,W) float32 on the data device, 1 / world units; None without a map."""
-        return None if self._depth is None else self._stored(self._depth).to(self._photo_device)
+        """Inverse depth (1,H,W) float32 on the data device, 1 / world units, 0 where unknown; None without a map."""
+        depth = None if self._depth is None else self._stored(self._depth).to(self._photo_device)
+        return depth.nan_to_num(0.0) if self.depth_has_gaps else depth
 
     @property
     def target_inverse_depth(self) -> Tensor | None:
@@ -381,16 +384,18 @@ class Camera(nn.Module):
         if "invdepthmap" in self._assigned:
             depth = self._assigned["invdepthmap"]
             return None if depth is None else depth.to(self.device)
-        return None if self._depth is None else self._decoded(self._depth)
+        depth = None if self._depth is None else self._decoded(self._depth)
+        return depth.nan_to_num(0.0) if self.depth_has_gaps else depth
 
     @_assignable
     def depth_mask(self) -> Tensor | None:
-        """(1,H,W) float32 on the data device: 1 where the inverse depth counts, 0 outside `columns` and for an
-        unreliable map; None without a map.
+        """(1,H,W) float32 on the data device: 1 where the inverse depth counts, 0 outside `columns`, where it is
+        unknown and for an unreliable map; None without a map.
         """
         if self._depth is None:
             return None
-        return self._within_columns() * float(self._reliable)
+        mask = self._within_columns() * float(self._reliable)
+        return mask * ~self._stored(self._depth).to(mask).isnan() if self.depth_has_gaps else mask
 
     def _within_columns(self, values: Tensor | None = None) -> Tensor:
         """Values (1,H,W), ones by default, in the columns that count; 0 elsewhere."""

@@ -7,7 +7,9 @@ import sys
 from collections import Counter
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from pycolmap import Reconstruction
@@ -24,6 +26,8 @@ from benchmarks.scenes import options, step_profile, training
 from benchmarks.strategies.figure import draw
 from benchmarks.strategies.tables import at, joined
 from scene.dataset_readers import read_scene
+from splatting.demo.tracer import ring_views, trace
+from splatting.files.image_files import write_plane
 from splatting.training.sparse_depth import HELD_OUT
 from utils.system_utils import UserError
 
@@ -103,11 +107,30 @@ def test_options_are_compared_with_none_on_every_third_photo(colmap_scene, tmp_p
     options.main()
     assert given == [(["-r", "4", *more], colmap_scene) for more in [[]] * 2 + [["--refine_poses"]] * 2]
     rows = _rows(capsys.readouterr().out, colmap_scene.name)
-    assert rows[0][1:] == ["none", "21.00", "25.00", "0.5000", "", "", "1.0", "7", "0.00", "1.0000", ""]
-    assert rows[1][1:][:5] == ["--refine_poses", "21.50", "25.00", "0.5000", ""] and rows[1][-1] == "+0.50 (0.00)"
+    assert rows[0][1:] == ["none", "21.00", "25.00", "0.5000", "", "", "", "", "1.0", "7", "0.00", "1.0000", ""]
+    assert rows[1][1:][:9] == ["--refine_poses", "21.50", "25.00", "0.5000", "", "", "", "", "1.0"]
+    assert rows[1][-1] == "+0.50 (0.00)"
     points = (tmp_path / "out" / colmap_scene.name / "thinned/sparse/0/points3D.txt").read_text().splitlines()
     known = Reconstruction(str(colmap_scene / "sparse/0")).num_points3D()
     assert len(points) == known - -(-known // HELD_OUT)
+
+
+def test_floaters_are_counted_where_nothing_was_traced(tmp_path, monkeypatch):
+    """Half transparent planes: a quarter of the columns nearer than a quarter of the extent, all else beyond all."""
+    monkeypatch.setattr(options, "_SIZE", (32, 24))
+    monkeypatch.setattr(options, "read_scene", lambda *_, **__: SimpleNamespace(extent=4.0))
+    inverse, sky = np.full((24, 32), 0.5 / 100), []
+    inverse[:, :8] = 0.5 / 0.9
+    for place, view in enumerate(ring_views(48, 32, 24, np.random.default_rng(0))[::8]):
+        for plane, values in (("depth", inverse), ("alpha", np.full((24, 32), 0.5))):
+            (tmp_path / "test/ours_1" / plane).mkdir(parents=True, exist_ok=True)
+            write_plane(tmp_path / f"test/ours_1/{plane}/{place:05d}.png", values)
+        rows, columns = np.indices((24, 32)) + 0.5
+        rays = view.rays(columns.ravel(), rows.ravel())
+        sky.append(np.isinf(trace(options.with_sky(None), np.float32(view.center)[:, None], rays)[0]).reshape(24, 32))
+    found = options.floaters("sky", tmp_path, tmp_path)
+    assert found["NEAR"] == 0.25 and found["SKY"] == pytest.approx(np.mean(sky, (0, 1))[:8].sum() / np.mean(sky) / 32)
+    assert 0 < found["SKY"] < 1 and options.floaters("clean", tmp_path, tmp_path) == {"NEAR": 0.25}
 
 
 def test_the_kernels_are_timed(colmap_scene, tmp_path, monkeypatch, capsys):

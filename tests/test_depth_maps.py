@@ -7,6 +7,7 @@ import sys
 import zlib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,9 +24,11 @@ from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.readers import depth_maps
 from scene.readers.colmap import read_model, read_model_of_kind
-from scene.readers.depth_maps import DepthMap, read_values, resize, with_depth_maps
+from scene.readers.depth_maps import DepthMap, Metric, read_values, resize, with_depth_maps
 from scene.readers.depth_scale import fit_image, fit_line, make_depth_params, sightings
 from scene.readers.info import CameraInfo
+from splatting.training.objective import Objective
+from utils import make_depth_scale
 from utils.loss_utils import inverse_depth_loss
 from utils.system_utils import UserError
 
@@ -260,6 +263,101 @@ def test_the_command_makes_a_file_that_training_takes(colmap_scene, tmp_path, mo
 def test_scenes_without_points_to_fit_to(blender_scene, tmp_path):
     with pytest.raises(UserError, match="no folder sparse in .*; name a COLMAP scene .*, or train .* without a fit"):
         make_depth_params(blender_scene, tmp_path, "bin")
+
+
+# Metric maps
+
+
+def _save_metric(distances: np.ndarray, stem: Path, kind: str) -> None:
+    """Distances (H, W) in metres, to the millimetre."""
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    if kind == "png":
+        _save(np.nan_to_num(distances * 1000, nan=0, posinf=0).clip(0).round().astype(np.uint16), Path(f"{stem}.png"))
+        (stem.parent / "metric.json").write_text('{"metres_per_step": 0.001}')
+    elif kind == "npy":
+        np.save(f"{stem}.npy", distances.astype(np.float32))
+    else:  # rows from the bottom, of the byte order that the sign of the third number tells
+        height, width = distances.shape
+        sign, order = (-1, "<f4") if kind == "pfm" else (1, ">f4")
+        content = f"Pf\n{width} {height}\n{sign}.0\n".encode() + distances[::-1].astype(order).tobytes()
+        Path(f"{stem}.pfm").write_bytes(content)
+
+
+@pytest.mark.parametrize("kind", ["png", "npy", "pfm", "pfm of big ends"])
+def test_metric_maps_are_distances_with_gaps(tmp_path, kind):
+    distances = np.random.default_rng(0).integers(500, 60_000, (9, 12)) / 1000
+    known = np.ones((9, 12), dtype=bool)
+    for place, gap in enumerate((0.0, np.nan, -1.0, np.inf)):
+        distances[2 * place, 11] = gap
+        known[2 * place, 11] = False
+    _save_metric(distances, tmp_path / "a.b", kind)
+    units = Metric.of(tmp_path)._replace(scale=2.0)
+    found = units.map_of(tmp_path / "a.b").decode((12, 9))[0].numpy()
+    np.testing.assert_array_equal(np.isnan(found[:, 11]), ~known[:, 11])
+    inside = np.isfinite(found)
+    assert inside.mean() > 0.8
+    np.testing.assert_allclose(found[inside], 1 / (2 * distances[inside]), rtol=1e-6)
+    assert units.map_of(tmp_path / "a") is None
+
+
+@pytest.mark.parametrize("kind", ["png", "npy"])
+def test_one_scale_is_fitted_to_all_metric_maps(colmap_scene, kind, monkeypatch, capsys):
+    """Maps of the points themselves, 2.5 units a metre, with gaps elsewhere."""
+    model = read_model_of_kind(colmap_scene / "sparse/0", "bin", with_2d_points=True)
+    for view in model.images:
+        camera, (pixels, depths) = model.cameras[view.camera_id], sightings(view, model.points, "")
+        values = np.zeros((camera.height * 8, camera.width * 8))
+        for (x, y), z in zip(pixels * 8, depths, strict=True):
+            values[max(int(y) - 1, 0) : int(y) + 2, max(int(x) - 1, 0) : int(x) + 2] = z / 2.5
+        _save_metric(values, (colmap_scene / "depths" / view.name).with_suffix(""), kind)
+    if kind == "png":
+        (colmap_scene / "depths/metric.json").write_text('{"metres_per_step": 0.001}')
+    with pytest.raises(UserError, match="no units_per_metre in .*metric.json.*make_depth_scale.py --base_dir"):
+        _depths(colmap_scene)
+    make_depth_scale.main(["--base_dir", str(colmap_scene), "--depths_dir", str(colmap_scene / "depths")])
+    assert "17 of 17 photos have a metric map: 2.5 units of the scene for each metre" in capsys.readouterr().out
+    assert Metric.of(colmap_scene / "depths").scale == pytest.approx(2.5, rel=1e-3)
+    depths = _depths(colmap_scene)
+    assert len(depths) == 17 and all(depth.metric for depth in depths.values())
+    first = next(iter(depths.values()))
+    known = first.decode((768, 512)).isfinite()
+    assert 0.001 < known.float().mean() < 0.5
+    monkeypatch.setattr(sys, "stdout", sys.stdout)
+    train.main(["-s", str(colmap_scene), "-m", str(colmap_scene / "out"), "-d", "depths", "--iterations", "3"])
+    first.path.unlink()
+    assert sum(depth is None for depth in _depths(colmap_scene).values()) == 1
+    assert "1 of 17 training photos have no depth map" in capsys.readouterr().err
+
+
+def test_gaps_have_no_part_in_the_loss():
+    depth, target = torch.tensor([[[0.1, 0.7, 0.3]]], requires_grad=True), torch.tensor([[[0.4, 0.0, 0.2]]])
+    camera = SimpleNamespace(target_inverse_depth=target, depth_has_gaps=True, columns=None)
+    step = SimpleNamespace(camera=camera, depth_weight=2.0, points=None, sky=None)
+    term = Objective(None).terms(step)["depth"]
+    term({"depth": depth}, None).backward()
+    assert depth.grad.tolist() == [[[-1.0, 0.0, 1.0]]]
+    masked = term({"depth": depth}, torch.tensor([[[True, True, False]]]))
+    assert masked.item() == pytest.approx(2 * 0.3)
+
+
+def test_metric_maps_that_cannot_be_are_named(blender_scene):
+    folder = blender_scene / "depths"
+    _save_metric(np.ones((30, 40)), folder / "r_1", "npy")
+    depths = _depths(blender_scene, hold_out=True)
+    assert depths["r_1"] == DepthMap(folder / "r_1.npy", 1.0, metric=True) and depths["r_0"] is None
+    np.save(folder / "r_1.npy", np.ones((40, 30)))
+    with pytest.raises(UserError, match="r_1.npy has 30 x 40 pixels, and its photo has other sides, 40 x 30"):
+        _depths(blender_scene, hold_out=True)
+    np.save(folder / "r_1.npy", np.ones((30, 40), np.uint16))
+    with pytest.raises(UserError, match="cannot read the depth map .*r_1.npy .*no array .height, width. of floats"):
+        _depths(blender_scene, hold_out=True)
+    (folder / "metric.json").write_text('{"metres_per_step": -1}')
+    with pytest.raises(UserError, match="metric.json does not give metres_per_step or units_per_metre"):
+        _depths(blender_scene)
+    (folder / "metric.json").unlink()
+    (folder / "r_1.npy").rename(folder / "other.npy")
+    with pytest.raises(UserError, match="no map in .*depths has the name of a training photo"):
+        _depths(blender_scene)
 
 
 # Training

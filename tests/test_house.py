@@ -19,7 +19,7 @@ CSRC = ROOT / "submodules"
 LONGEST = 60  # lines of a function
 # Most lines of code and of tests, without blanks, comments and docstrings, files of code, and words of Markdown. A new
 # capability that needs more says so in its commit, and what it let go.
-MOST = {"code": 40_200, "files": 477, "tests": 31_440, "words": 42_600}
+MOST = {"code": 40_600, "files": 480, "tests": 31_700, "words": 43_200}
 
 # What a room may import besides itself and what serves them all: prefixes of module names. The room of a module is its
 # longest prefix here.
@@ -27,7 +27,7 @@ BASE = ("utils", *(f"splatting.{name}" for name in ("deterministic", "distribute
 MAY_IMPORT = {
     **dict.fromkeys(BASE, ()),
     "utils.camera_utils": ("scene", "splatting.compat"),
-    "utils.make_depth_scale": ("scene.readers.depth_scale",),  # a command of the reference
+    "utils.make_depth_scale": ("scene.readers.depth_scale", "scene.readers.depth_maps"),  # a command of the reference
     "arguments": (),
     "lpipsPyTorch": (),  # a name of the reference
     "scene.images": (),
@@ -53,7 +53,7 @@ MAY_IMPORT = {
     "splatting.viewer": ("splatting.camera_paths", "splatting.exports", "gaussian_renderer", "scene"),
     "splatting.diagnosis": (
         *("arguments", "gaussian_renderer", "splatting.evaluation", "scene"),
-        "splatting.training.robust_mask",
+        *("splatting.training.robust_mask", "splatting.training.sky"),
     ),
     "splatting.sfm": ("scene.readers", "scene.images"),
     "splatting.demo": ("arguments", "splatting.evaluation"),

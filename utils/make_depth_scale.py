@@ -1,4 +1,7 @@
-"""Fit a scene's depth maps to its COLMAP points and write depth_params.json beside the model, for train.py --depths.
+"""Fit a scene's depth maps to its COLMAP points, for train.py --depths.
+
+Maps of inverse depth get scale and offset each, in depth_params.json beside the model. Metric maps get one scale, in
+metric.json beside them.
 
 python utils/make_depth_scale.py --base_dir SCENE --depths_dir SCENE/depths
 """
@@ -12,20 +15,30 @@ from pathlib import Path
 if not __package__:  # run as a file: Python searches this folder, and the imports lie one folder up
     sys.path[0] = str(Path(__file__).resolve().parents[1])
 
-from scene.readers.depth_scale import make_depth_params  # noqa: E402
+from scene.readers.depth_maps import Metric  # noqa: E402
+from scene.readers.depth_scale import make_depth_params, make_metric_scale  # noqa: E402
 from utils.system_utils import run_cli  # noqa: E402
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description="Fit a scene's depth maps to its COLMAP points: depth_params.json.")
+    parser = argparse.ArgumentParser(description="Fit a scene's depth maps to its COLMAP points, for train.py -d.")
     parser.add_argument("--base_dir", required=True, metavar="SCENE", help="scene folder (COLMAP)")
     parser.add_argument("--depths_dir", required=True, metavar="FOLDER",
-        help="folder of inverse depth maps, grey PNG of 8 or 16 bits, named like the photos")  # fmt: skip
+        help="folder of depth maps, named like the photos: inverse depth as grey PNG of 8 or 16 bits, or metres as "
+        ".npy, .pfm, or 16-bit PNG with a metric.json")  # fmt: skip
     parser.add_argument("--model_type", choices=("bin", "txt"), default="bin",
         help="kind of the COLMAP model's files (default: bin)")  # fmt: skip
     args = parser.parse_args(argv)
-    table, photos = make_depth_params(Path(args.base_dir), Path(args.depths_dir), args.model_type)
+    scene, depths = Path(args.base_dir), Path(args.depths_dir)
+    if metric := Metric.of(depths):
+        scale, spread, maps, photos = make_metric_scale(scene, depths, metric, args.model_type)
+        print(
+            f"{maps} of {photos} photos have a metric map: {scale:.4g} units of the scene for each metre, and half of "
+            f"the points within {spread:.1%} of that"
+        )
+        return
+    table, photos = make_depth_params(scene, depths, args.model_type)
     scales = [entry["scale"] for entry in table.values() if entry["scale"] > 0]
     median = f", median scale {statistics.median(scales):.4g}" if scales else ""
     print(

@@ -6,10 +6,11 @@
 
 --keep N trains on every N-th training photo alone, without the points that judge the depth, and scores all test photos.
 --widths W ... scores test views of these widths (px) besides, such as a quarter, half and double of the training's.
---made ray-traces scenes: the demo's; with balls that roam through 30 % of its training photos; with exposures, white
-balance and vignetting of its training photos; with a wall without texture in it; and of fisheyes of 200 degrees and
-panoramas, which are scored as they are. Test photos always show the scene as it is. `fitted` is the PSNR of right
-halves of test photos, with exposure and balance fitted to the left ones. Other options go to train.py.
+--made ray-traces scenes: the demo's; before a sky without points; with balls that roam through 30 % of its training
+photos; with exposures, white balance and vignetting of its training photos; with a wall without texture in it; and of
+fisheyes of 200 degrees and panoramas, which are scored as they are. Test photos always show the scene as it is. Their
+depth is known, so floaters are counted, too. `fitted` is the PSNR of right halves of test photos, with exposure and
+balance fitted to the left ones. Other options go to train.py.
 """
 
 import argparse
@@ -22,19 +23,22 @@ from PIL import Image
 
 from benchmarks.harness.measuring import describe, print_table
 from benchmarks.scenes.training import train
+from scene.dataset_readers import read_scene
 from scene.readers.info import HOLD
 from splatting.demo.make_scene import make_scene
-from splatting.demo.objects import Box, Sphere, Thing, demo_scene, marble
+from splatting.demo.objects import Box, Sphere, Thing, backdrop_texture, demo_scene, marble
+from splatting.demo.tracer import CAMERAS, ring_views, trace
+from splatting.files.image_files import read_plane
 from splatting.training.sparse_depth import HELD_OUT
 from utils.system_utils import UserError, compute_device, run_cli
 
 _VIEWS, _POINTS, _SIZE = 48, 8000, (240, 180)
 _BALLS = 3  # in a photo
 _STOPS, _BALANCE, _FALLOFF = 1.0, 0.15, 0.5  # largest exposure; deviation of a channel, stops; (tan of the corner)^2
-FORMS = {
-    **{"PSNR": ".2f", "fitted": ".2f", "SSIM": ".4f", "DEPTH": ".2%", "DEPTH_95": ".1%"},
-    **{"seconds": ".1f", "Gaussians": ",.0f"},
-}
+_SKY = 1e4  # units away, where the cameras stand within four of each other
+_BEYOND = 4  # extents, farther than all things but the sky
+FORMS = {"PSNR": ".2f", "fitted": ".2f", "SSIM": ".4f", "DEPTH": ".2%", "DEPTH_95": ".1%", "NEAR": ".2%", "SKY": ".1%"}
+FORMS |= {"seconds": ".1f", "Gaussians": ",.0f"}
 
 
 def with_balls(photo: int | None) -> list[Thing]:
@@ -54,8 +58,18 @@ def with_wall(_: int | None) -> list[Thing]:
     return [*demo_scene(), Thing(Box((0.1, -1.2, 2.0), (2.4, 1.2, 0.1), 0.0), lambda p: np.broadcast_to(grey, p.shape))]
 
 
+def with_sky(photo: int | None) -> list[Thing]:
+    """The demo's things before a sky so far away that it has no points."""
+    things = demo_scene()[1:]
+    if photo is None:
+        return things
+    nearer = np.float32(9 / _SKY)
+    return [Thing(Sphere((0, 0, 0), _SKY, inside=True), lambda p: backdrop_texture(nearer * p), emissive=True), *things]
+
+
 MADE = {
     "clean": {},
+    "sky": {"things": with_sky},
     "balls": {"things": with_balls},
     "exposure": {},
     "wall": {"things": with_wall},
@@ -66,8 +80,7 @@ MADE = {
 
 def made(name: str, out: Path) -> Path:
     """Write the scene of a name of MADE."""
-    size = (384, 192) if name == "panorama" else _SIZE
-    make_scene(out, _VIEWS, *size, _POINTS, seed=0, **MADE[name])
+    make_scene(out, _VIEWS, *_size(name), _POINTS, seed=0, **MADE[name])
     if name == "exposure":
         photos = sorted((out / "images").iterdir())
         expose([path for k, path in enumerate(photos) if k % HOLD])
@@ -111,6 +124,33 @@ def expose(photos: list[Path]) -> None:
         Image.fromarray(np.floor(255 * pixels + 0.5).astype(np.uint8)).save(path)
 
 
+def _size(name: str) -> tuple[int, int]:
+    return (384, 192) if name == "panorama" else _SIZE
+
+
+def floaters(name: str, scene: Path, model: Path) -> dict[str, float]:
+    """What stands in front of a made scene in depth maps of its test views, 1 / (inverse depth / alpha) of render.py.
+
+    `NEAR`: the part of the pixels nearer than a quarter of the extent where the traced depth is not. `SKY`: the part of
+    the sky's pixels nearer than _BEYOND extents; none without a sky.
+    """
+    how, extent = MADE[name], read_scene(scene, "images", hold_out=True, native=True).extent
+    views = ring_views(_VIEWS, *_size(name), np.random.default_rng(0), CAMERAS[how.get("camera", "pinhole")])
+    things, (folder,), found = how.get("things", lambda _: demo_scene())(None), (model / "test").iterdir(), []
+    for place, view in enumerate(views[::HOLD]):
+        inverse, alpha = (read_plane(folder / plane / f"{place:05d}.png") for plane in ("depth", "alpha"))
+        y, x = (np.indices(inverse.shape) + 0.5).reshape(2, -1)
+        directions = view.rays(x * view.width / inverse.shape[1], y * view.height / inverse.shape[0])
+        truth, _ = trace(things, view.center.astype(np.float32).reshape(3, 1), directions)
+        if view.model == "PINHOLE":
+            truth = truth * (view.rotation[2] @ directions)
+        found.append(np.stack([truth, inverse.ravel() * extent, alpha.ravel()]))
+    truth, inverse, alpha = np.concatenate(found, axis=1)
+    sky = np.isinf(truth)
+    near = float(((inverse > 4 * alpha) & (truth > extent / 4)).mean())
+    return {"NEAR": near} | ({"SKY": float((inverse * _BEYOND > alpha)[sky].mean())} if sky.any() else {})
+
+
 def thinned(scene: Path, out: Path, keep: int) -> Path:
     """Write a COLMAP scene of every `keep`-th training photo of another, without the points that judge the depth."""
     import pycolmap  # after Pillow
@@ -131,10 +171,20 @@ def thinned(scene: Path, out: Path, keep: int) -> Path:
 
 
 def compare(
-    scene: Path, out: Path, sets: list[str], args: argparse.Namespace, options: list[str], forms: dict[str, str]
+    scene: Path,
+    out: Path,
+    sets: list[str],
+    args: argparse.Namespace,
+    options: list[str],
+    forms: dict[str, str],
+    name: str,
 ) -> list[list[str]]:
-    """Train with each set of options, the first of which the others are compared with; a row for each."""
-    given, shown, keep = {"widths": args.widths}, ["--depth", "--lenses", "native"], args.keep
+    """Train with each set of options, the first of which the others are compared with; a row for each.
+
+    name: of MADE, for scenes of which the depth is known everywhere; empty for others.
+    """
+    given, keep, whole = {"widths": args.widths}, args.keep, scene
+    shown = ["--depth", "--lenses", "native", *(["--alpha"] if name else [])]
     if keep > 1:
         given, scene = given | {"judged": scene}, thinned(scene, out / "thinned", keep)
     rows, first = [], []
@@ -142,7 +192,9 @@ def compare(
         runs, own = [], [*options, *shlex.split(words)]
         fits = [] if {"affine", "--train_test_exp"} & set(own) else ["--appearance", "ppisp"]
         for seed in args.seeds:
-            runs.append(train(scene, out / f"{number}_{seed}", seed, own, shown=[*shown, *fits], **given))
+            model = out / f"{number}_{seed}"
+            runs.append(train(scene, model, seed, own, shown=[*shown, *fits], **given))
+            runs[-1] |= floaters(name, whole, model) if name else {}
             print(out.name, words, seed, {name: runs[-1].get(name) for name in forms}, flush=True)
         values = {name: [run[name] for run in runs if run.get(name) is not None] for name in forms}
         first = first or values["PSNR"]
@@ -169,11 +221,11 @@ def main() -> None:
     print(describe(compute_device()), "\ntrain.py --eval", *options, flush=True)
     out, rows = args.out.resolve(), []
     wide = {f"{name}@{width}": FORMS[name] for width in args.widths for name in ("PSNR", "SSIM")}
-    scenes = [(path.name, path.resolve()) for path in args.scenes]
-    for name, scene in [*scenes, *((name, made(name, out / "scenes" / name)) for name in args.made)]:
-        found = compare(scene, out / name, ["", *args.sets], args, options, FORMS | wide)
-        rows += [[name, *row] for row in found]
-    scores = ["PSNR dB", "fitted dB", "SSIM", "depth error", "95 %"]
+    scenes = [(path.resolve(), "") for path in args.scenes]
+    for scene, name in [*scenes, *((made(name, out / "scenes" / name), name) for name in args.made)]:
+        found = compare(scene, out / scene.name, ["", *args.sets], args, options, FORMS | wide, name)
+        rows += [[scene.name, *row] for row in found]
+    scores = ["PSNR dB", "fitted dB", "SSIM", "depth error", "95 %", "near", "before sky"]
     print_table(["scene", "options", *scores, "training s", "Gaussians", *wide, "gain dB"], rows)
 
 

@@ -27,6 +27,7 @@ _OPTIMIZER = 10  # which entry its state dict is
 _ENTRIES = 12  # the reference's; the values of further attributes may follow
 EXPOSURES, WRITTEN_BY = "exposures", "version"  # keys in the optimiser's state dict
 POSES, RESIDUALS, FILTER, ASLEEP = "poses", "residuals", "filter_3d", "asleep"  # those of further state of a training
+SKY = "sky"  # the same, and an entry of model.json
 
 
 class State(NamedTuple):

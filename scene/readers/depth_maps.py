@@ -1,4 +1,8 @@
-"""Inverse depth maps that supervise training (--depths): their files, units and decoding."""
+"""Depth maps that supervise training (--depths): their files, units and decoding.
+
+Maps of inverse depth are grey images. Metric maps, of distances along the axis of the view, are .npy and .pfm files of
+metres, and 16-bit PNGs beside a file METRIC, which tells metres.
+"""
 
 import json
 import sys
@@ -18,29 +22,75 @@ from scene.readers.info import CameraInfo, SceneInfo
 from splatting.files.folders import cache_folder
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.listing import some
-from splatting.files.plain_files import plain_text
+from splatting.files.plain_files import plain, plain_text
 from utils.system_utils import UserError
 
 PARAMS = "depth_params.json"
+METRIC = "metric.json"  # in the folder of metric maps: STEP and SCALE
+STEP, SCALE = "metres_per_step", "units_per_metre"  # of the values of PNGs, and of the scene's coordinates
 COLMAP_UNIT = 65536.0  # of a map's values; depth_scale.py divides by 65535; the reference uses both, too
 BLENDER_UNIT = 512.0
+_FLOATS = ".npy", ".pfm"
 RELIABLE = 5.0  # largest factor between a trusted scale and the scene's median scale
 _MAKE = "python utils/make_depth_scale.py --base_dir {scene} --depths_dir {depths}"
 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Inverse depth of a view, 1 / world units: values of the file / unit * scale + offset."""
+    """Inverse depth of a view, 1 / world units: values of the file / unit * scale + offset.
+
+    metric: 1 / (values / unit) instead, and NaN where a value is not a number above 0, or where one is resampled.
+    """
 
     path: Path
     unit: float
     scale: float = 1.0
     offset: float = 0.0
+    metric: bool = False
     pixel_bytes: ClassVar[int] = 4
 
     def decode(self, size: tuple[int, int]) -> Tensor:
         """Inverse depth (1, H, W) float32 at a size (width, height). UserError for a file that cannot be read."""
-        return fitted(read_values(self.path) / self.unit, size, self.scale, self.offset)
+        values = read_values(self.path) / self.unit
+        return fitted(inverses(values) if self.metric else values, size, self.scale, self.offset)
+
+
+class Metric(NamedTuple):
+    """The units of a folder of metric maps: metres of a PNG's step, and units of the scene for each metre."""
+
+    step: float | None
+    scale: float | None
+
+    @classmethod
+    def of(cls, folder: Path) -> "Metric | None":
+        """Units as the file METRIC tells them; None for a folder of inverse depth. UserError for a broken file.
+
+        Metric are .npy and .pfm in a folder without a PNG, and PNGs beside a file METRIC that tells their step.
+        """
+        path, suffixes = folder / METRIC, {file.suffix for file in folder.rglob("*")}
+        try:
+            told = json.loads(plain_text(path)) if path.is_file() else {}
+            step, scale = (None if told.get(key) is None else float(told[key]) for key in (STEP, SCALE))
+            if not all(number is None or 0 < number < np.inf for number in (step, scale)):
+                raise ValueError("a number is not above 0")
+        except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+            raise UserError(f"{path} does not give {STEP} or {SCALE} as a number ({error}); write it again") from error
+        has_floats = not suffixes.isdisjoint(_FLOATS) and ".png" not in suffixes
+        return cls(step, scale) if has_floats or step is not None else None
+
+    def map_of(self, stem: Path) -> DepthMap | None:
+        """The map of a photo in units of the scene, by its path without suffix; None where there is no file."""
+        for suffix, step in ((".png", self.step), *((suffix, 1.0) for suffix in _FLOATS)):
+            path = stem.with_name(stem.name + suffix)
+            if step is not None and path.is_file():
+                return DepthMap(path, 1 / (step * (self.scale or 1.0)), metric=True)
+        return None
+
+
+def inverses(distances: np.ndarray) -> np.ndarray:
+    """1 / distances, and NaN where a distance is not a number above 0."""
+    known = np.isfinite(distances) & (distances > 0)
+    return np.where(known, 1 / np.where(known, distances, 1.0), np.nan)
 
 
 class DepthFit(NamedTuple):
@@ -83,7 +133,9 @@ def with_depth_maps(info: SceneInfo, scene: Path, depths: str) -> SceneInfo:
             f"maps are not ({some(undistorted)}); undistort the scene with `colmap image_undistorter`, and make "
             "maps of the undistorted photos"
         )
-    if (scene / "sparse").is_dir():
+    if metric := Metric.of(folder):
+        cameras = _with_metric_maps(info.train_cameras, scene, folder, metric)
+    elif (scene / "sparse").is_dir():
         cameras = _with_colmap_maps(info.train_cameras, scene, folder)
     else:
         cameras = [with_map(c, _blender_file(c, scene, folder), None, BLENDER_UNIT) for c in info.train_cameras]
@@ -102,9 +154,13 @@ def with_map(camera: CameraInfo, path: str | Path, params: Mapping[str, float] |
 
 
 def read_values(path: Path) -> np.ndarray:
-    """Values (H, W) float64 of a grey image file of 8 or 16 bits, unscaled. UserError for a file that is not grey."""
+    """Values (H, W) float64 of a .npy, a .pfm or a grey image file of 8 or 16 bits, unscaled. UserError for others."""
     try:
+        if path.suffix == ".npy":
+            return _array(path).astype(np.float64)
         with open_image(path) as image:
+            if path.suffix == ".pfm":
+                return np.asarray(image, dtype=np.float64)
             if image.mode not in ("L", "I;16", "I;16B", "I"):
                 if _is_16_bit_color(path):
                     raise UserError(
@@ -113,15 +169,38 @@ def read_values(path: Path) -> np.ndarray:
                 image = image.convert("RGB")
             values = np.asarray(image)
     except (*UNREADABLE, MemoryError) as error:
-        raise UserError(
-            f"cannot read the depth map {path} ({str(error) or type(error).__name__}); make it again"
-        ) from error
+        raise _unreadable(path, error) from error
     if values.ndim == 3:
         # Some tools write grey as three equal channels.
         if (values != values[..., :1]).any():
             raise UserError(f"the depth map {path} is coloured; save inverse depth as grey, best with 16 bits")
         values = values[..., 0]
     return values.astype(np.float64)
+
+
+def _array(path: Path) -> np.ndarray:
+    """The floats (H, W) of a .npy, which stay in the file. ValueError for other arrays."""
+    values = np.load(plain(path), mmap_mode="r", allow_pickle=False)
+    if not isinstance(values, np.ndarray) or values.ndim != 2 or values.dtype.kind != "f":
+        raise ValueError("it is no array (height, width) of floats")
+    return values
+
+
+def map_size(path: Path) -> tuple[int, int]:
+    """Size (width, height) of a map's file, from its header. UserError for a file that cannot be read."""
+    if path.suffix not in _FLOATS:
+        return picture_size(path)
+    try:
+        if path.suffix == ".npy":
+            return _array(path).shape[::-1]
+        with open_image(path) as image:
+            return image.size
+    except (*UNREADABLE, MemoryError) as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> UserError:
+    return UserError(f"cannot read the depth map {path} ({str(error) or type(error).__name__}); make it again")
 
 
 def _is_16_bit_color(path: Path) -> bool:
@@ -139,6 +218,8 @@ def fitted(values: np.ndarray, size: tuple[int, int], scale: float, offset: floa
 
 def resize(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """(h, w) resampled to size (width, height): bilinear between four pixel centres, not antialiased."""
+    if values.shape == size[::-1]:
+        return values
     y, x = ((np.arange(new) + 0.5) * old / new - 0.5 for new, old in zip(size[::-1], values.shape, strict=True))
     return sample(values, *np.meshgrid(x, y))
 
@@ -175,6 +256,31 @@ def _with_colmap_maps(cameras: Sequence[CameraInfo], scene: Path, folder: Path) 
         raise UserError(f"{left_out}; create the file again with `{make}`, or leave -d out")
     if reasons:
         print(left_out, file=sys.stderr)
+    return found
+
+
+def _with_metric_maps(cameras: Sequence[CameraInfo], scene: Path, folder: Path, metric: Metric) -> list[CameraInfo]:
+    is_colmap, found = (scene / "sparse").is_dir(), []
+    if is_colmap and metric.scale is None:
+        make = _MAKE.format(scene=scene, depths=folder)
+        raise UserError(f"no {SCALE} in {folder / METRIC}, which metric maps need; create it with `{make}`")
+    for camera in cameras:
+        photo, name = Path(camera.image_path), Path(camera.image_name)
+        places = [photo.relative_to(scene)] if photo.is_relative_to(scene) else []
+        stems = [name.with_suffix("")] if is_colmap else [*(p.with_suffix("") for p in places), name]
+        depth = next(filter(None, (metric.map_of(folder / stem) for stem in stems)), None)
+        found.append(replace(camera, depth_path=str(depth.path), depth=depth) if depth else camera)
+        width, height = map_size(depth.path) if depth else (camera.width, camera.height)
+        if abs(width * camera.height - height * camera.width) > max(camera.width, camera.height):
+            raise UserError(
+                f"the depth map {depth.path} has {width} x {height} pixels, and its photo has other sides, "
+                f"{camera.width} x {camera.height}; make it of the whole photo"
+            )
+    lacking = [camera.image_name for camera in found if not camera.depth]
+    if len(lacking) == len(found):
+        raise UserError(f"no map in {folder} has the name of a training photo; name them so, or leave -d out")
+    if lacking:
+        print(f"{len(lacking)} of {len(found)} training photos have no depth map ({some(lacking)})", file=sys.stderr)
     return found
 
 
@@ -218,4 +324,4 @@ def _check_files(paths: Sequence[Path]) -> None:
             "the sub-folders of the photos (with COLMAP, give photos names that differ by more than the suffix)"
         )
     for path in paths:
-        picture_size(path)
+        map_size(path)

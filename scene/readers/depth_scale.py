@@ -1,4 +1,4 @@
-"""Fit of a scene's depth maps, whose scale and offset are unknown, to its COLMAP points: depth_params.json."""
+"""Fit of a scene's depth maps to its COLMAP points: scale and offset of each, or one scale of all metric maps."""
 
 import json
 from pathlib import Path
@@ -7,8 +7,8 @@ import numpy as np
 from tqdm import tqdm
 
 from scene.colmap_loader import Image, Points, qvec2rotmat
-from scene.readers.colmap import AGAIN, find_model, read_model_of_kind
-from scene.readers.depth_maps import PARAMS, read_values, sample
+from scene.readers.colmap import AGAIN, ColmapModel, find_model, read_model_of_kind
+from scene.readers.depth_maps import METRIC, PARAMS, SCALE, STEP, Metric, inverses, read_values, sample
 from utils.system_utils import UserError, atomic_write
 
 UNIT = 65535.0  # of a map's values in the fit
@@ -23,13 +23,7 @@ def make_depth_params(scene: Path, depths: Path, model_type: str) -> tuple[dict[
     photo name without extension, both 0 if there are too few points. UserError when no photo has a map, or the scene
     has no COLMAP model.
     """
-    if not (scene / "sparse").is_dir():
-        raise UserError(
-            f"no folder sparse in {scene}: maps are fitted to the points of a COLMAP model; name a COLMAP scene "
-            "(--base_dir), or train a Blender scene (transforms_train.json) without a fit"
-        )
-    folder, _ = find_model(scene)
-    model = read_model_of_kind(folder, model_type, with_2d_points=True)
+    folder, model = _model(scene, model_type)
     table = {}
     for image in tqdm(model.images, desc="Fitting depth maps", unit="map"):
         pixels, z = sightings(image, model.points, f"{folder} as .{model_type}")
@@ -45,6 +39,41 @@ def make_depth_params(scene: Path, depths: Path, model_type: str) -> tuple[dict[
     with atomic_write(folder / PARAMS) as path:
         path.write_text(json.dumps(table, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     return table, len(model.images)
+
+
+def make_metric_scale(scene: Path, depths: Path, metric: Metric, model_type: str) -> tuple[float, float, int, int]:
+    """Fit the scale of a scene to metric maps, and write it into METRIC: the median of depth / metres over all points.
+
+    Returns units of the scene for each metre, how far half of the points are from it, as a part of it, and the numbers
+    of maps and of registered photos. UserError as above, and for fewer than MIN_POINTS points in all maps.
+    """
+    folder, model = _model(scene, model_type)
+    found = []
+    for image in tqdm(model.images, desc="Fitting depth maps", unit="map"):
+        depth = metric._replace(scale=None).map_of(depths / Path(image.name).with_suffix(""))
+        if depth is not None:
+            pixels, z = sightings(image, model.points, f"{folder} as .{model_type}")
+            camera, values = model.cameras[image.camera_id], inverses(read_values(depth.path) / depth.unit)
+            seen, z = _samples(pixels, z, (camera.width, camera.height), values)
+            found.append((seen * z)[np.isfinite(seen)])
+    ratios = np.concatenate(found) if found else np.zeros(0)
+    if len(ratios) < MIN_POINTS:
+        raise UserError(f"the maps in {depths} have depths at {len(ratios)} points of {folder}, too few to fit a scale")
+    scale = float(np.median(ratios))
+    told = {STEP: metric.step} if metric.step else {}
+    with atomic_write(depths / METRIC) as path:
+        path.write_text(json.dumps(told | {SCALE: scale}, indent=2) + "\n", encoding="utf-8")
+    return scale, float(np.median(np.abs(ratios / scale - 1))), len(found), len(model.images)
+
+
+def _model(scene: Path, model_type: str) -> tuple[Path, ColmapModel]:
+    if not (scene / "sparse").is_dir():
+        raise UserError(
+            f"no folder sparse in {scene}: maps are fitted to the points of a COLMAP model; name a COLMAP scene "
+            "(--base_dir), or train a Blender scene (transforms_train.json) without a fit"
+        )
+    folder, _ = find_model(scene)
+    return folder, read_model_of_kind(folder, model_type, with_2d_points=True)
 
 
 def sightings(image: Image, points: Points, model: str) -> tuple[np.ndarray, np.ndarray]:
@@ -65,10 +94,18 @@ def fit_image(pixels: np.ndarray, z: np.ndarray, size: tuple[int, int], depth: n
 
     pixels (n,2) of a photo of a size (width, height), and depths z (n,), as of `sightings`.
     """
+    mono, z = _samples(pixels, z, size, depth)
+    return fit_line(mono, 1 / z)
+
+
+def _samples(
+    pixels: np.ndarray, z: np.ndarray, size: tuple[int, int], depth: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """A map's values, and z, at those of the points that are in front of the camera and in the photo."""
     x, y = pixels.T
     inside = (x >= 0) & (y >= 0) & (x < size[0]) & (y < size[1]) & (z > 0)
     x, y = x[inside] * depth.shape[1] / size[0] - 0.5, y[inside] * depth.shape[0] / size[1] - 0.5
-    return fit_line(sample(depth, x, y), 1 / z[inside])
+    return sample(depth, x, y), z[inside]
 
 
 def fit_line(mono: np.ndarray, colmap: np.ndarray) -> tuple[float, float]:

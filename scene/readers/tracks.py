@@ -1,4 +1,4 @@
-"""Tracks of structure from motion: which points of a COLMAP scene each photo has seen, and where."""
+"""Points that photos show, and where: those that structure from motion has seen, and any by their projection."""
 
 import os
 from collections.abc import Sequence
@@ -6,6 +6,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import torch
+from diff_gaussian_rasterization import GaussianRasterizationSettings, Gaussians
+from diff_gaussian_rasterization.backend import OPERATORS
+from diff_gaussian_rasterization.lens import Lens as NativeLens
+from diff_gaussian_rasterization.scene import scene_arguments
 
 from scene.images.lens import Lens, rays_of
 from scene.readers.colmap import find_model, read_model_of_kind
@@ -57,3 +62,31 @@ def read_tracks(scene: str | os.PathLike, views: Sequence[CameraInfo], offset: n
         track = Track(points.xyz[place] - offset, rays[seen], places, points.errors[place], lengths[place], place)
         found.append(track if len(place) >= FEWEST else None)
     return found
+
+
+def projected(camera: CameraInfo, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixel coordinates x, y of points (N, 3), and whether they are in front of the camera and inside its photo."""
+    local = points @ camera.R + camera.T
+    if camera.native:
+        return _through_lens(camera.native, local, camera.width, camera.height)
+    front = local[:, 2] > 0
+    depth = np.where(front, local[:, 2], 1.0)
+    x = camera.fx * local[:, 0] / depth + camera.cx
+    y = camera.fy * local[:, 1] / depth + camera.cy
+    return x, y, front & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+
+
+def _through_lens(
+    lens: NativeLens, local: np.ndarray, width: int, height: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`projected` of points in the camera's frame, by the rasterizer: it shows small Gaussians there."""
+    means = torch.from_numpy(10 * local / np.linalg.norm(local, axis=1, keepdims=True))  # behind its near plane
+    count, eye, zero = len(means), torch.eye(4, dtype=means.dtype), torch.zeros(3, dtype=means.dtype)
+    ones = means.new_ones(count, 4)
+    gaussians = Gaussians(means, ones[:, :1], scales=1e-3 * ones[:, :3], rotations=ones, colors=ones[:, :3])
+    camera = GaussianRasterizationSettings(
+        height, width, 1.0, 1.0, zero, 1.0, eye, eye, 0, zero, False, False, lens=lens
+    )
+    splats, _, _, tiles, _ = OPERATORS.project(*scene_arguments(gaussians, camera, raw=False))
+    x, y = torch.where(tiles[:, None] > 0, splats[:, :2] + 0.5, -1).numpy().T
+    return x, y, (x >= 0) & (x < width) & (y >= 0) & (y < height)

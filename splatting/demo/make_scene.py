@@ -67,7 +67,7 @@ class SurfacePoints:
 def _found_by_views(
     things: list[Thing], views: list[View], count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return surface points (3, count) under random pixels of random views, and their distances (count,)."""
+    """Return surface points (3, N) under `count` random pixels of random views, and their distances (N,)."""
     owner = np.sort(rng.integers(len(views), size=count))
     u, v = rng.uniform(size=(2, count))
     points = np.empty((3, count))
@@ -78,7 +78,8 @@ def _found_by_views(
         origin = view.center.reshape(3, 1)
         distance[mine], _ = trace(things, origin.astype(np.float32), direction)
         points[:, mine] = origin + distance[mine] * direction
-    return points, distance
+    hits = np.isfinite(distance)
+    return points[:, hits], distance[hits]
 
 
 def _visible(things: list[Thing], view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -103,6 +104,7 @@ def sample_points(
     not depend on the view.
     """
     points, distance = _found_by_views(things, views, count, rng)
+    count = len(distance)
     seen, exact = zip(*(_visible(things, view, points) for view in views), strict=True)
     track = np.bincount(np.concatenate(seen), minlength=count)
     colour = np.zeros((count, 3))

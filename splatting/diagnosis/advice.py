@@ -28,12 +28,14 @@ from splatting.diagnosis import Line
 from splatting.diagnosis.dataset import pose_errors, poses_differ
 from splatting.diagnosis.model import MASKED, odd_photos
 from splatting.exports.in_scene import scene_with
+from splatting.training.sky import FEWEST as LEAST_SKY
+from splatting.training.sky import Sky, find_sky
 from utils.image_utils import as_float
 from utils.system_utils import UserError
 
 EXPOSURES = 0.4  # stops; photos of a usual automatic exposure differ by 0.15 to 0.35
 FEW_PHOTOS = 25  # with fewer, depth is held badly
-DISTANCES = 2.0  # the farthest photo of a point over the nearest
+DISTANCES = 2.5  # the farthest photo of a point over the nearest
 _WIDTH = 200  # pixels of a photo
 _DARK, _LIGHT = 0.02, 0.98  # of a channel; beyond, an exposure cannot be told
 _OUTLIER = 0.6  # stops; a larger difference is no exposure (Tukey's biweight: Beaton and Tukey 1974)
@@ -65,6 +67,10 @@ def advise(dataset: argparse.Namespace, trains: bool = True) -> list[Advice]:
         scene, _ = scene_with(None, small, GaussianModel(0))
     tracks = read_tracks(dataset.source_path, scene.info.train_cameras, scene.info.offset)
     found = [*_of_tracks(scene, tracks)] if any(tracks) else []
+    if len(scene.info.point_cloud.points):
+        _, share = find_sky(scene, Sky.around(scene.info))
+        text = f"{share:.1%} of the directions that several photos show have one colour and no points"
+        found.append(_asked(text, share >= LEAST_SKY, "--sky auto"))
     return [*found, *_of_passers_by(dataset)] if trains else found
 
 
@@ -87,7 +93,7 @@ def _of_tracks(scene: Scene, tracks: list[Track | None]) -> Iterator[Advice]:
     yield _asked(f"exposures of the photos differ by {spread:.2f} stops", spread > EXPOSURES, "--appearance ppisp")
     ratio = distances(views, tracks)
     text = f"the farthest photo of a point is {ratio:.1f} times as far away as the nearest (median)"
-    yield _asked(text, ratio > DISTANCES, "--antialiasing --filter_3d")
+    yield _asked(text, ratio > DISTANCES, "--antialiasing")
     yield _asked(f"{len(views)} photos train", len(views) < FEW_PHOTOS, "--sparse_depth 0.1")
     given, best = pose_errors(views, tracks, scene.cameras_extent)
     text = f"points lie {given:.2g} pixels from where photos show them (median), and {best:.2g} with better poses"
@@ -136,13 +142,13 @@ def _means(group: np.ndarray, weight: np.ndarray, values: np.ndarray) -> np.ndar
 
 
 def distances(views: list[CameraInfo], tracks: list[Track | None]) -> float:
-    """The median over points of the largest over the smallest depth in focal lengths, of the photos that see it."""
-    seen = [(track.ranks, (track.points @ view.R + view.T)[:, 2] / view.fx)
+    """The median over points of the largest over the smallest distance in focal lengths, of the photos that see it."""
+    seen = [(track.ranks, np.linalg.norm(track.points @ view.R + view.T, axis=1) / view.fx)
             for view, track in zip(views, tracks, strict=True) if track is not None]  # fmt: skip
-    points, depths = map(np.concatenate, zip(*seen, strict=True))
+    points, away = map(np.concatenate, zip(*seen, strict=True))
     near, far = np.full(points.max() + 1, np.inf), np.zeros(points.max() + 1)
-    np.minimum.at(near, points, depths)
-    np.maximum.at(far, points, depths)
+    np.minimum.at(near, points, away)
+    np.maximum.at(far, points, away)
     shared = (np.bincount(points) > 1) & (near > 0)
     return float(np.median(far[shared] / near[shared])) if shared.any() else 1.0
 

@@ -8,16 +8,11 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings, Gaussians
-from diff_gaussian_rasterization.backend import OPERATORS
-from diff_gaussian_rasterization.lens import Lens
-from diff_gaussian_rasterization.scene import scene_arguments
 from PIL import Image
 
 from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
 from scene.readers.info import APART, camera_centers, standing_apart
-from scene.readers.tracks import Track, read_tracks
+from scene.readers.tracks import Track, projected, read_tracks
 from scene.reprojection import BOUND, nearest_pose, pull
 from splatting.diagnosis import Line, from_error
 from splatting.files.json_files import read_json
@@ -116,7 +111,7 @@ def check_cloud(info: SceneInfo) -> Iterator[Line]:
         text = f"{far.mean():.1%} of the points are more than {FAR_POINT:g} extents away"
         yield Line(text, "remove them from the cloud (COLMAP: filter by reprojection error and angle)")
     sample = points[:: max(1, len(points) // _SAMPLE)]
-    seen = np.array([_projected(camera, sample)[2] for camera in info.train_cameras])
+    seen = np.array([projected(camera, sample)[2] for camera in info.train_cameras])
     unseen = float((~seen.any(axis=0)).mean())
     counts = seen.sum(axis=1) * len(points) / seen.shape[1]
     away = [c.image_name for c, n in zip(info.train_cameras, counts, strict=True) if n < FEWEST_IN_VIEW]
@@ -126,32 +121,6 @@ def check_cloud(info: SceneInfo) -> Iterator[Line]:
     elif away:
         text = f"{len(away)} cameras have hardly any point in view ({some(away)})"
         yield Line(text, "remove them from the model: they face away from the scene, or their poses are wrong")
-
-
-def _projected(camera: CameraInfo, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixel coordinates x, y of points (N, 3), and whether they are in front of the camera and inside its photo."""
-    local = points @ camera.R + camera.T
-    if camera.native:
-        return _through_lens(camera.native, local, camera.width, camera.height)
-    front = local[:, 2] > 0
-    depth = np.where(front, local[:, 2], 1.0)
-    x = camera.fx * local[:, 0] / depth + camera.cx
-    y = camera.fy * local[:, 1] / depth + camera.cy
-    return x, y, front & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-
-
-def _through_lens(lens: Lens, local: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`_projected` of points in the camera's frame, by the rasterizer: it shows small Gaussians there."""
-    means = torch.from_numpy(10 * local / np.linalg.norm(local, axis=1, keepdims=True))  # behind its near plane
-    count, eye, zero = len(means), torch.eye(4, dtype=means.dtype), torch.zeros(3, dtype=means.dtype)
-    ones = means.new_ones(count, 4)
-    gaussians = Gaussians(means, ones[:, :1], scales=1e-3 * ones[:, :3], rotations=ones, colors=ones[:, :3])
-    camera = GaussianRasterizationSettings(
-        height, width, 1.0, 1.0, zero, 1.0, eye, eye, 0, zero, False, False, lens=lens
-    )
-    splats, _, _, tiles, _ = OPERATORS.project(*scene_arguments(gaussians, camera, raw=False))
-    x, y = torch.where(tiles[:, None] > 0, splats[:, :2] + 0.5, -1).numpy().T
-    return x, y, (x >= 0) & (x < width) & (y >= 0) & (y < height)
 
 
 def check_colors(info: SceneInfo) -> Iterator[Line]:
@@ -220,7 +189,7 @@ def _pixels(camera: CameraInfo) -> np.ndarray:
 
 def _is_another(camera: CameraInfo, place: int, photos: list[np.ndarray], cloud: BasicPointCloud) -> bool:
     """Whether another photo has clearly more of the colours of the points that a camera sees than its own, `place`."""
-    x, y, inside = _projected(camera, cloud.points)
+    x, y, inside = projected(camera, cloud.points)
     errors = []
     for photo in photos:
         rows = (y[inside] / camera.height * photo.shape[0]).astype(int)

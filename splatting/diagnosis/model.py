@@ -16,6 +16,7 @@ from gaussian_renderer.scored_views import ScoredViews
 from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.checkpoint import SKY
 from scene.saved_model import load_saved
 from splatting.diagnosis import Line, from_error
 from splatting.diagnosis.changes import FITS as BAD_PSNR
@@ -27,6 +28,7 @@ from splatting.evaluation.training_log import read_log
 from splatting.evaluation.what_to_try import what_to_try
 from splatting.files.listing import some
 from splatting.training.robust_mask import RobustMask
+from splatting.training.sky import Sky
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.system_utils import UserError, compute_device
 
@@ -72,7 +74,7 @@ def check_model(model_path: str, iteration: int, source: str | None = None, imag
     lines = [Line(f"{name}, {len(gaussians)} Gaussians of SH degree {gaussians.max_sh_degree}")]
     if wrong := [*_not_finite(gaussians)] or [*_wrong_sizes(gaussians, extent)]:
         return [*lines, *wrong]
-    shapes, (renders, changed) = [_opacities(gaussians), _sizes(gaussians, extent)], _renders(scene, options, stored)
+    shapes, (renders, changed) = [_opacities(gaussians), _sizes(scene)], _renders(scene, options, stored)
     if renders.finding and stored != own and _fits(model_path, own, scene.loaded_iter):
         other_scene = stored["source_path"] != own["source_path"]
         what, name, option = ("scene", "source_path", "-s") if other_scene else ("photos", "images", "-i")
@@ -199,9 +201,12 @@ def _opacities(gaussians: GaussianModel) -> Line:
     return Line(f"opacities: {shares}; median {np.median(opacity):.2f}")
 
 
-def _sizes(gaussians: GaussianModel, extent: float) -> Line:
-    """Sizes against the extent of the cameras."""
+def _sizes(scene: Scene) -> Line:
+    """Sizes against the extent of the cameras, but of a sky."""
+    gaussians, extent = scene.gaussians, scene.cameras_extent
     largest = gaussians.get_scaling.detach().max(dim=1).values.cpu().numpy()
+    if state := read_model_json(scene.model_path).get(SKY):
+        largest = largest[~Sky.restored(state).rows(gaussians.get_xyz.detach()).cpu().numpy()]
     huge = float((largest > HUGE * extent).mean())
     if huge <= HUGE_SHARE:
         return Line(f"sizes: median {np.median(largest) / extent:.2g}, largest {largest.max() / extent:.2g} extents")
@@ -328,7 +333,7 @@ def _why_bad(scene: Scene, stored: dict[str, Any], means: Means) -> str:
     faint = float(scene.gaussians.get_opacity.detach().median()) < UNRECOVERED
     if faint and RESET_INTERVAL <= iteration < 15_000 and iteration % RESET_INTERVAL < 500:
         return "this iteration is shortly after opacities were reset; check a later one"
-    if (sizes := _sizes(scene.gaussians, scene.cameras_extent)).finding:
+    if (sizes := _sizes(scene)).finding:
         return sizes.remedy
     if means.psnr < means.plain and iteration >= BEGUN:
         return (

@@ -27,6 +27,7 @@ class Iteration:
     started: float  # seconds of training before it
     span: range  # steps of the schedule that it stands for (training/schedule.py)
     points: PointDepths | None = None  # of the depth of points, None: not wanted, or the view has none
+    sky: PointDepths | None = None  # the same of what is far away
     due: bool = False  # the model is read, written or changed, so every loss so far must be checked first
     read: bool = False  # an observer reads the model
     record: dict[str, float] | None = None  # what train_log.json gets of this iteration; None: no record
@@ -36,7 +37,7 @@ class Iteration:
     @property
     def wants_depth(self) -> bool:
         """Whether its loss needs the rendered depth."""
-        return self.depth_weight > 0 or self.points is not None
+        return self.depth_weight > 0 or self.points is not None or self.sky is not None
 
     def takes(self, planned: Collection[int]) -> bool:
         """Whether what is planned for an iteration of the schedule is to be done in it."""

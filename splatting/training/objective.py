@@ -13,6 +13,7 @@ from splatting.training.iteration import Iteration
 from utils.loss_utils import inverse_depth_loss, photometric_loss
 
 if TYPE_CHECKING:
+    from scene.cameras import Camera
     from splatting.training.run import Run
 
 
@@ -49,10 +50,9 @@ class Objective:
         """What a step adds to the photometric loss, weights included, by name."""
         camera, terms = step.camera, {}
         if step.depth_weight > 0:
-            terms["depth"] = lambda package, mask: (
-                step.depth_weight
-                * inverse_depth_loss(package["depth"], camera.target_inverse_depth, camera.columns, mask)
-            )
+            terms["depth"] = lambda package, mask: step.depth_weight * _depth_loss(package["depth"], camera, mask)
+        if step.sky is not None:
+            terms["sky"] = lambda package, mask: step.sky.loss(package["depth"], mask)
         if step.points is not None:
             terms["points"] = lambda package, mask: step.points.loss(package["depth"], mask)
         if isinstance(exposures := self._run.gaussians.exposures, Ppisp):
@@ -76,6 +76,13 @@ class Objective:
         total, l1 = photometric_loss(image, target, weight, mask, camera.columns, clamp)
         further = {name: term(package, mask) for name, term in self.terms(step).items()}
         return Losses(sum(further.values(), start=total), l1, further.get("depth"), mask)
+
+
+def _depth_loss(inverse_depth: Tensor, camera: "Camera", mask: Tensor | None) -> Tensor:
+    target = camera.target_inverse_depth
+    if camera.depth_has_gaps:
+        mask = target > 0 if mask is None else mask & (target > 0)
+    return inverse_depth_loss(inverse_depth, target, camera.columns, mask)
 
 
 NEWEST = 0.4  # weight of the newest loss in the running mean, as in the reference

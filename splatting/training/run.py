@@ -19,7 +19,7 @@ from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
-from scene.gaussians.checkpoint import ASLEEP, FILTER, POSES, RESIDUALS, further, load_checkpoint, with_further
+from scene.gaussians.checkpoint import ASLEEP, FILTER, POSES, RESIDUALS, SKY, further, load_checkpoint, with_further
 from scene.gaussians.filter_3d import filter_widths
 from scene.gaussians.morton import sort_rows
 from scene.gaussians.ppisp import Ppisp
@@ -43,6 +43,7 @@ from splatting.training.resolution import resolution_of
 from splatting.training.restart import resumed
 from splatting.training.robust_mask import RobustMask
 from splatting.training.schedule import DecidedSchedule
+from splatting.training.sky import Sky, resumed_sky, with_sky
 from splatting.training.sparse_depth import SparseDepth
 from splatting.training.strategies import AUTO, USUAL, density_control, end_in_time, of_clock
 from utils.general_utils import get_expon_lr_func
@@ -76,6 +77,7 @@ class Run:
     sleeping: Sleeping | None = None
     sparse_depth: SparseDepth | None = None
     robust_mask: RobustMask | None = None
+    sky: Sky | None = None
 
     def __init__(
         self, dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, launch: argparse.Namespace
@@ -175,7 +177,7 @@ class Run:
     def _strategy_by_the_clock(self) -> str:
         if self.opt.schedule:
             return self.schedule.strategy or USUAL
-        strategy = of_clock(self.opt.time_budget, self.scene.getTrainCameras(), self.device)
+        strategy = "budget" if self.sky else of_clock(self.opt.time_budget, self.scene.getTrainCameras(), self.device)
         print(f"--time_budget takes --strategy {strategy}, which is best here; name another one to compare")
         return strategy
 
@@ -205,7 +207,11 @@ class Run:
             self.robust_mask = RobustMask(self.scene.getTrainCameras(), share, self.device)
             if capture and (state := further(capture, RESIDUALS)):
                 self.robust_mask.restore(state)
+        if self.opt.sky != "off":
+            checks.check_one_process("--sky", self.group.several)
         if capture is not None:
+            if state := further(capture, SKY):
+                self.sky = resumed_sky(state, self.scene)
             self.gaussians.start_exposures(self.scene.info.train_cameras)
             self.gaussians.restore(capture, self.opt)
             checks.check_exposures(self.gaussians, self.exposes, self.start)
@@ -214,8 +220,12 @@ class Run:
                 self.scene.create_gaussians()
             else:
                 start_from(first, self.scene, self.gaussians)
+            if self.opt.sky != "off":
+                self.sky = with_sky(self.scene, self.gaussians)
             self.gaussians.training_setup(self.opt)
             sort_rows(self.gaussians)
+        if self.sky:
+            self.gaussians.far = self.sky.rows
         if self.opt.filter_3d:
             self._begin_filter(capture and further(capture, FILTER))
         self.gaussians.limit_columns()
@@ -257,7 +267,8 @@ class Run:
     def entries(self) -> dict[str, Any]:
         """Entries of model.json besides the options (`write_model_json`)."""
         views = {checks.VIEWS: self.schedule.views} if self.schedule.views > 1 else {}
-        return {"world_offset": self.gaussians.world_offset} | views
+        sky = {SKY: self.sky.captured()} if self.sky else {}
+        return {"world_offset": self.gaussians.world_offset} | views | sky
 
     def begin(self) -> None:
         """Write the inputs into the output folder, print the memory estimate, start or continue the log."""
@@ -293,6 +304,7 @@ class Run:
                 started=seconds,
                 span=schedule.span(iteration),
                 points=self.sparse_depth and self.sparse_depth.at(camera),
+                sky=self.sky and self.sky.at(camera, self.scene),
             )
             if schedule.is_last(iteration):
                 step.end(schedule.length)
@@ -421,6 +433,8 @@ class Run:
         if self.robust_mask:
             self.robust_mask.keep()
         if step.changes:
+            if self.sky:
+                self.sky.hold(self.gaussians)
             if self.opt.filter_3d:
                 self._update_filter()
             self.memory.settle(self.gaussians)
@@ -446,6 +460,7 @@ class Run:
             POSES: self.poses and self.poses.captured(),
             RESIDUALS: self.robust_mask and self.robust_mask.captured(),
             FILTER: self.gaussians.shards.whole(widths) if filtered else None,
+            SKY: self.sky and self.sky.captured(),
             ASLEEP: self.sleeping and self.sleeping.captured(),
         }
         return with_further(state, {key: found for key, found in states.items() if found is not None})

@@ -21,7 +21,7 @@ _NEAR = 0.01  # depth, as the camera's
 class PointDepths:
     """Points of a view: pixels (K,) int64, of which none is there twice, inverse depths and weights (K,) float32.
 
-    The sum of the weights is 1 / the mean inverse depth, so that the loss has no unit.
+    Weights have the unit of depth, so that the loss has none. Of points, their sum is 1 / the mean inverse depth.
     """
 
     def __init__(self, pixels: Tensor, inverse_depths: Tensor, weights: Tensor) -> None:

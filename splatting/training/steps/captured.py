@@ -309,6 +309,7 @@ class Graphs:
             background=self._background,
             depth_weight=0.0,
             points=None,
+            sky=None,
             wants_depth=False,
             changes=False,
             last=False,

@@ -1,0 +1,120 @@
+"""A sky (--sky): where it is found, that it stays there, and trainings with it."""
+
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from synthetic import options_of
+from trainings import differences, trained
+
+import export
+import train
+from benchmarks.scenes.options import with_sky
+from scene.gaussian_model import GaussianModel
+from scene.readers.tracks import projected
+from scene.scene import Scene
+from splatting.demo.make_scene import Things, write_scene
+from splatting.demo.objects import demo_scene
+from splatting.demo.tracer import ring_views, shade, trace
+from splatting.diagnosis.model import check_model
+from splatting.exports.formats import read_splats
+from splatting.files.json_files import read_model_json
+from splatting.training import checks
+from splatting.training.sky import FEWEST, Sky, find_sky
+from utils.system_utils import UserError, run_cli
+
+ON = "--sky", "auto", "--densify_grad_threshold", 1e-5
+
+
+def _made(folder: Path, things: Things) -> Path:
+    rng = np.random.default_rng(0)
+    write_scene(folder, ring_views(24, 120, 90, rng), things, 6000, rng, samples=1)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    return _made(tmp_path_factory.mktemp("sky") / "scene", with_sky)
+
+
+def _found(folder: Path) -> tuple[Scene, Sky, np.ndarray, np.ndarray, float]:
+    scene = Scene(options_of(folder, folder / "out"), GaussianModel(0), start=False)
+    sky = Sky.around(scene.info)
+    cloud, share = find_sky(scene, sky)
+    return scene, sky, cloud.points, cloud.colors, share
+
+
+def test_it_is_where_rays_meet_nothing_and_has_the_colours_there(scene):
+    """As the tracer says."""
+    loaded, sky, points, colors, share = _found(scene)
+    np.testing.assert_allclose(np.linalg.norm(points - sky.center, axis=1), sky.radius, rtol=1e-9)
+    sky.points, things, shown, hit = points, with_sky(None), 0, 0
+    for camera in loaded.getTrainCameras():
+        view = loaded.info.train_cameras[camera.uid]
+        toward = (points[projected(view, points)[2]] - view.center).T
+        toward, center = (toward / np.linalg.norm(toward, axis=0)).astype(np.float32), np.float32(view.center)[:, None]
+        shown += toward.shape[1]
+        hit += np.isfinite(trace(things, center, toward)[0]).sum()
+        assert (sky.at(camera, loaded) is not None) == (toward.shape[1] > 0)
+    assert shown > 1000 and hit < 0.01 * shown and share > FEWEST
+    toward = ((points - sky.center) / sky.radius).T.astype(np.float32)
+    seen = shade(with_sky(0), np.float32(sky.center)[:, None], toward)
+    assert np.abs(colors - seen.T).mean() < 0.02
+
+
+def test_there_is_none_before_a_backdrop_with_points(tmp_path):
+    assert _found(_made(tmp_path / "clean", lambda _: demo_scene()))[-1] < FEWEST
+
+
+def _model(means: torch.Tensor, log_scale: float) -> GaussianModel:
+    count, gaussians = len(means), GaussianModel(0)
+    rows = {name: torch.zeros(count, *values.shape[1:]) for name, values in gaussians.rows().items()}
+    gaussians.set_rows(rows | {"xyz": means, "scaling": torch.full((count, 3), log_scale)})
+    return gaussians
+
+
+def test_what_is_far_comes_back_to_the_sphere_and_what_is_near_stays():
+    sky = Sky([1.0, 2.0, 3.0], 100.0)
+    means = torch.tensor([[1.0, 2.0, 73.0], [1.0, 2.0, -147.0], [41.0, 2.0, 3.0], [0.0, 0.0, 0.0]])
+    gaussians = _model(means, math.log(20.0))
+    sky.hold(gaussians)
+    expected = torch.tensor([[1.0, 2.0, 103.0], [1.0, 2.0, -97.0]])
+    torch.testing.assert_close(gaussians.get_xyz[:2].detach(), expected)
+    assert torch.equal(gaussians.get_xyz[2:], means[2:])
+    torch.testing.assert_close(gaussians.get_scaling[:, 0].detach(), torch.tensor([6.25, 6.25, 20.0, 20.0]))
+
+
+def test_a_training_and_a_resumed_one_keep_it_and_exports_leave_it_out(scene, tmp_path, monkeypatch):
+    """Rows change, and after a reset of opacities density control removes what is large. Plain steps give the same."""
+    whole = trained(scene, tmp_path / "whole", *ON, "--checkpoint_iterations", 33, 60)
+    start = "--start_checkpoint", tmp_path / "whole" / "chkpnt33.pth"
+    assert not differences(whole, trained(scene, tmp_path / "resumed", *ON, *start, "--plain_step"))
+    known = read_model_json(tmp_path / "whole")["sky"]
+    model = read_splats(tmp_path / "whole/point_cloud/iteration_60/point_cloud.ply")
+    distances = np.linalg.norm(model.means - known["center"], axis=1) / known["radius"]
+    far = distances > 0.5
+    assert far.sum() > len(_found(scene)[2]) and np.exp(model.log_scales[far]).max() > 0.1 * known["radius"] / 100
+    assert np.abs(distances[far] - 1).max() < 1e-3 and distances[~far].max() < 0.1
+    assert not [line for line in check_model(str(tmp_path / "whole"), -1) if "larger than the extent" in line.text]
+    words = f"export.py -m {tmp_path}/whole --no_sky --to {tmp_path}/near.ply --quiet"
+    monkeypatch.setattr(sys, "argv", words.split())
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", sys.stdout)  # which exporting stamps
+        export.main()
+    np.testing.assert_array_equal(read_splats(tmp_path / "near.ply").means, model.means[~far])
+
+
+def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        run_cli(lambda: train.main(["-s", str(scene), "-m", str(tmp_path), "--sky", "auto", "--strategy", "mcmc"]))
+    assert ended.value.code == 2 and "--sky needs --strategy adc or budget" in capsys.readouterr().err
+    with pytest.raises(UserError, match="--sky needs a training of one process"):
+        checks.check_one_process("--sky", several=True)
+    with pytest.raises(UserError, match="--no_sky needs -m of a model that has a sky"):
+        export.sky_of(tmp_path)
+    for broken in (None, {"center": [0, 1], "radius": 2}, {"center": [0, 1, 2], "radius": math.nan}):
+        with pytest.raises(UserError, match="the sky has no center and radius"):
+            Sky.restored(broken)
