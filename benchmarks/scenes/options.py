@@ -28,6 +28,7 @@ from scene.readers.info import HOLD
 from splatting.demo.make_scene import make_scene
 from splatting.demo.objects import Box, Sphere, Thing, backdrop_texture, demo_scene, marble
 from splatting.demo.tracer import CAMERAS, ring_views, trace
+from splatting.evaluation.renders import BESIDE
 from splatting.files.image_files import read_plane
 from splatting.training.sparse_depth import HELD_OUT
 from utils.system_utils import UserError, compute_device, run_cli
@@ -136,7 +137,8 @@ def floaters(name: str, scene: Path, model: Path) -> dict[str, float]:
     """
     how, extent = MADE[name], read_scene(scene, "images", hold_out=True, native=True).extent
     views = ring_views(_VIEWS, *_size(name), np.random.default_rng(0), CAMERAS[how.get("camera", "pinhole")])
-    things, (folder,), found = how.get("things", lambda _: demo_scene())(None), (model / "test").iterdir(), []
+    things, found = how.get("things", lambda _: demo_scene())(None), []
+    (folder,) = (path for path in (model / "test").iterdir() if not path.name.endswith(BESIDE))
     for place, view in enumerate(views[::HOLD]):
         inverse, alpha = (read_plane(folder / plane / f"{place:05d}.png") for plane in ("depth", "alpha"))
         y, x = (np.indices(inverse.shape) + 0.5).reshape(2, -1)

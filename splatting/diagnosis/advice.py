@@ -41,7 +41,8 @@ _DARK, _LIGHT = 0.02, 0.98  # of a channel; beyond, an exposure cannot be told
 _OUTLIER = 0.6  # stops; a larger difference is no exposure (Tukey's biweight: Beaton and Tukey 1974)
 _ROUNDS = 30
 _ITERATIONS = 1000  # of the short training that passers-by are searched in
-FEW_MASKED = 0.1  # of the photos, may look like passers-by by chance
+FEW_MASKED = 0.2  # of the photos, which a bare wall or a sky may reach after a short training
+_CLEAR = 0.11  # mean difference of a passer-by; what is not learnt yet rarely differs so much
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear sRGB
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -163,6 +164,6 @@ def _of_passers_by(dataset: argparse.Namespace) -> Iterator[Advice]:
         done = subprocess.run([sys.executable, ROOT / "train.py", *flags], capture_output=True, text=True, check=False)
         if done.returncode:
             raise UserError(done.stderr.strip().rpartition("\n")[2])
-        share = odd_photos(folder)
+        share = odd_photos(folder, _CLEAR)
     text = f"{share:.0%} of the photos show what a short training does not, as if someone had passed by"
     yield _asked(text, share > FEW_MASKED, f"--robust_mask {MASKED:g}")

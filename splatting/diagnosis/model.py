@@ -162,29 +162,34 @@ def _passers_by(scene: Scene, options: argparse.Namespace) -> Iterator[Line]:
     cameras = scene.getTrainCameras()
     if len(cameras) > _MOST_PHOTOS or options.train_test_exp:
         return
-    shares = _odd_shares(scene, options)
+    masks = _masks(scene, options)
+    found = {camera.image_name: masks.counted(camera) for camera in cameras}
+    shares = {name: 1 - float(counts.float().mean()) for name, counts in found.items() if counts is not None}
     if worst := sorted(shares, key=shares.get, reverse=True):
         text = f"{len(worst)} of {len(cameras)} photos show what the model does not, as if someone had passed by"
         yield Line(f"{text}: most in {some(worst)}; try --robust_mask {MASKED:g}", note=True)
 
 
 @torch.no_grad()
-def _odd_shares(scene: Scene, options: argparse.Namespace) -> dict[str, float]:
-    """The part of each photo that shows what the model does not, of photos with some."""
+def _masks(scene: Scene, options: argparse.Namespace) -> RobustMask:
+    """Masks of what the training photos show and the model does not."""
     cameras, views = scene.getTrainCameras(), _scored(scene, options)
     masks = RobustMask(cameras, MASKED, compute_device())
     masks.least, masks.early = 1, 0  # it is trained
     for camera in cameras:
         masks.mask(camera, *views.compared(camera, scene.gaussians), learns=True)
         masks.keep()
-    found = {camera.image_name: masks.counted(camera) for camera in masks.cameras}
-    return {name: 1 - float(counts.float().mean()) for name, counts in found.items() if counts is not None}
+    return masks
 
 
-def odd_photos(model_path: str) -> float:
-    """The share of the training photos that show what the model in a folder does not."""
+def odd_photos(model_path: str, least: float) -> float:
+    """The share of the training photos that clearly show what the model in a folder does not.
+
+    least: mean difference of what is masked in such a photo, in [0, 1].
+    """
     options, scene = _load(model_path, read_stored_options(model_path), -1)
-    return len(_odd_shares(scene, options)) / len(scene.getTrainCameras())
+    masks = _masks(scene, options)
+    return sum(masks.difference(camera) > least for camera in masks.cameras) / len(masks.cameras)
 
 
 def _late_reset(scene: Scene) -> Iterator[Line]:

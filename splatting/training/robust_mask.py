@@ -92,6 +92,12 @@ class RobustMask:
         outliers = self._outliers(camera.uid, self.residuals[camera.uid])
         return ~_enlarged(outliers, (camera.image_height, camera.image_width)) if outliers.any() else None
 
+    def difference(self, camera: Camera) -> float:
+        """Mean residual of what is masked in a view, in [0, 1]; 0 if nothing is."""
+        residuals = self.residuals[camera.uid]
+        outliers = self._outliers(camera.uid, residuals)
+        return float(residuals[outliers].mean()) if outliers.any() else 0.0
+
     def captured(self) -> dict[str, Any]:
         """State that a resumed training needs, as plain values."""
         state = {name: getattr(self, name).clone() for name in _STATE}
