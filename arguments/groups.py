@@ -132,7 +132,7 @@ class PipelineParams(OptionTable):
             help="keep the total weight of splats smaller than a pixel, so that views from other distances look right"),
         Option("projection", "ewa", origin="ours", check=one_of("ewa", "ray"), stored=MODEL_JSON,
             help="how a pixel sees a Gaussian. ewa: by an ellipse on the image (Zwicker et al. 2001); ray: on the "
-                 "pixel's own ray, exact for any size and angle. For pinholes (--lenses undistort), by one process"),
+                 "pixel's own ray, exact for any size and angle, in training by one process"),
     )
     # fmt: on
 

@@ -29,7 +29,6 @@ from splatting.distributed.rendering.sharded import (
 )
 from utils.general_utils import check_flags
 from utils.sh_utils import eval_sh
-from utils.system_utils import UserError
 
 
 def render(
@@ -123,7 +122,7 @@ class Drawn:
     def decisive(self) -> Tensor:
         """Gaussians that the image depends on (`decisive` of diff_gaussian_rasterization): (N,) bool."""
         it = self._drawing
-        return OPERATORS.decisive(it.splats, it.instances, it.ranges, it.last)
+        return OPERATORS.decisive(it.splats, it.instances, it.ranges, it.last, self._scene.lens)
 
     def color_gradient(self, image_gradient: Tensor) -> Tensor:
         """The gradient of the Gaussians' colours (N, 3), whether these were given or came from SH bands."""
@@ -216,10 +215,7 @@ def model_inputs(
 def rasterizer_settings(
     camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace, background: Tensor, scaling: float = 1.0
 ) -> GaussianRasterizationSettings:
-    """The rasterizer's settings for a view of a model; arguments as for `render`. UserError for what rays lack."""
-    lens, projection = getattr(camera, "lens", None), getattr(pipe, "projection", "ewa")  # new in ours
-    if projection == "ray" and lens:
-        raise UserError("--projection ray shows pinholes alone; give --lenses undistort, or use --projection ewa")
+    """The rasterizer's settings for a view of a model; arguments as for `render`."""
     return GaussianRasterizationSettings(
         image_height=int(camera.image_height),
         image_width=int(camera.image_width),
@@ -234,8 +230,8 @@ def rasterizer_settings(
         prefiltered=False,
         debug=pipe.debug,
         antialiasing=getattr(pipe, "antialiasing", False),  # the 2023 release's options have none
-        lens=lens,
-        projection=projection,
+        lens=getattr(camera, "lens", None),  # new in ours, as is the next
+        projection=getattr(pipe, "projection", "ewa"),
     )
 
 

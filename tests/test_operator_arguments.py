@@ -269,8 +269,8 @@ WRONG = {
         (ValueError, "give 8 tensors of the Gaussians and 3 or 4 of the camera", {"camera": lambda t: t[:2]}),
     ],
     "project": [
-        (ValueError, "lens must have 3 entries or 24, and options 5 or 6, got 2 and 5", {"lens": [0.5, 0.5]}),
-        (ValueError, "lens must have 3 entries or 24, and options 5 or 6, got 3 and 4", {"options": [7, 18, 3, 0]}),
+        (ValueError, "lens must have 3 entries or 25, and options 5 or 6, got 2 and 5", {"lens": [0.5, 0.5]}),
+        (ValueError, "lens must have 3 entries or 25, and options 5 or 6, got 3 and 4", {"options": [7, 18, 3, 0]}),
     ],
     "displace_": [
         (ValueError, "give logits, or items", {"items": torch.arange(3)}),

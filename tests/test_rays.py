@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import test_lens_projection as lens_tests
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, rasterize, reference
 from diff_gaussian_rasterization.lens import Lens
@@ -20,7 +21,6 @@ import render as command
 import train
 from benchmarks.workloads.splat_scenes import settings
 from gaussian_renderer import rasterizer_settings
-from utils.system_utils import UserError
 
 # About twice the largest measured. In float32 that of needles is 8e-5, but for the rotation of one of length 206, at
 # depth 6, which turns by differences of its axes' squares.
@@ -34,6 +34,10 @@ BOUNDS = {
     ("huge and tiny", torch.float32): 2e-5,
     ("wide", torch.float32): 5e-5,
 }
+
+
+FISHEYE = Lens("equidistant", (30.0, 31.0), (22.0, 18.0), radial=(0.05, -0.01, 0.0, 0.0))
+SMALL = Lens("equidistant", (9.0, 9.0), (8.5, 3.0))
 
 
 def wide_scene() -> dict[str, Tensor]:
@@ -93,11 +97,58 @@ def test_outputs_and_gradients_agree_with_the_oracle(device, dtype, kind, camera
         assert torch.equal(found, radii)
 
 
+@functools.cache
+def oracle_through(model: str, antialiasing: bool):
+    """Gaussians all around the camera, a fifth of them large, which a lens shows, and the oracle's image of them."""
+    of = (
+        Lens("equidistant", (14.0, 14.0), (23.0, 15.0))
+        if model == "200 degrees"
+        else lens_tests.lens(model).scaled(0.5, 0.5)
+    )
+    size = {"image_width": lens_tests.WIDTH // 2, "image_height": lens_tests.HEIGHT // 2}
+    view = lens_tests.settings(of, torch.float64, antialiasing=antialiasing, projection="ray", **size)
+    parameters = lens_tests.everywhere(of, view, 300)
+    return parameters, view, evaluate(parameters, view, function=reference.render)
+
+
 @BOTH_AND_GPU
+@pytest.mark.parametrize(
+    ("model", "antialiasing"),
+    [
+        *[("PINHOLE", True), ("FULL_OPENCV", False), ("FULL_OPENCV", True), ("THIN_PRISM_FISHEYE", True)],
+        *[("200 degrees", False), ("200 degrees", True), ("panorama", False), ("panorama", True)],
+    ],
+)
+def test_lenses_agree_with_the_oracle(device, dtype, model, antialiasing):
+    parameters, exact, (wanted, keep, radii) = oracle_through(model, antialiasing)
+    assert keep.double().mean() > 0.99
+    got, _, found = evaluate(parameters, on_device(converted(exact, dtype), device), keep, device)
+    errors = {name: error(got[name], wanted[name]).largest for name in wanted}
+    bound = {torch.float64: 2e-13, torch.float32: 2e-5}[dtype]
+    assert {name: e for name, e in errors.items() if not e <= bound} == {}
+    if dtype == torch.float64:
+        assert torch.equal(found, radii)
+
+
+def converted(view: GaussianRasterizationSettings, dtype: torch.dtype) -> GaussianRasterizationSettings:
+    return view._replace(**{name: t.to(dtype) for name, t in view._asdict().items() if isinstance(t, Tensor)})
+
+
+def test_without_distortion_a_lenss_rays_are_a_pinholes():
+    view = _view("ordinary", "plain", False, torch.float64)
+    focal = SIZE[0] / 2 / view.tanfovx, SIZE[1] / 2 / view.tanfovy
+    center = (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2
+    parameters = {name: values.double() for name, values in wide_scene().items()}
+    one, two = (render(parameters, v).color for v in (view, view._replace(lens=Lens("perspective", focal, center))))
+    assert (one - two).abs().max() < 1e-12
+
+
+@BOTH_AND_GPU
+@pytest.mark.parametrize("lens", [None, FISHEYE], ids=["pinhole", "fisheye"])
 @pytest.mark.parametrize("covariances", [False, True], ids=["scales and rotations", "covariances"])
-def test_activated_parameters_agree_with_the_oracle(device, dtype, covariances):
+def test_activated_parameters_agree_with_the_oracle(device, dtype, covariances, lens):
     parameters = _activated(covariances)
-    exact, camera = (_view("ordinary", "moved", covariances, t) for t in (torch.float64, dtype))
+    exact, camera = (_view("ordinary", "moved", covariances, t)._replace(lens=lens) for t in (torch.float64, dtype))
     wanted, keep, _ = evaluate(parameters, exact, raw=False, function=reference.render)
     got, *_ = evaluate(parameters, camera, keep, device, raw=False)
     bound = {torch.float64: 1e-13, torch.float32: 4e-5}[dtype]
@@ -105,9 +156,10 @@ def test_activated_parameters_agree_with_the_oracle(device, dtype, covariances):
 
 
 @BOTH_AND_GPU
-def test_lengths_of_absolute_gradients_are_those_of_the_oracles_pixels(device, dtype):
+@pytest.mark.parametrize("lens", [None, SMALL], ids=["pinhole", "fisheye"])
+def test_lengths_of_absolute_gradients_are_those_of_the_oracles_pixels(device, dtype, lens):
     parameters, arguments = few()
-    view = settings(**arguments, projection="ray", sh_degree=1)
+    view = settings(**arguments, projection="ray", sh_degree=1, lens=lens)
     inputs, camera = {name: t.to(device, dtype) for name, t in parameters.items()}, on_device(view, device)
     weight = torch.randn(3, 7, 18, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
 
@@ -136,9 +188,12 @@ def test_other_projections_and_lenses_are_refused():
     parameters, arguments = few()
     with pytest.raises(ValueError, match="projection must be 'ewa' or 'ray', got 'affine'"):
         render(parameters, settings(**arguments, projection="affine"))
-    lens = Lens("equidistant", (9.0, 9.0), (8.5, 3.0))
-    with pytest.raises(RuntimeError, match="'ray' has pinholes alone: undistort the photos, or take 'ewa'"):
-        render(parameters, settings(**arguments, projection="ray", lens=lens))
+    for lens, said in [
+        (Lens("equirectangular", (9.0, 9.0), (8.5, 3.0), radial=(0.1, 0, 0, 0)), "panoramas without distortion"),
+        (Lens("equidistant", (6.0, 9.0), (8.5, 3.0)), "needs tiles of 16 pixels to span under 150 degrees"),
+    ]:
+        with pytest.raises(ValueError, match=said):
+            render(parameters, settings(**arguments, projection="ray", lens=lens))
 
 
 def test_cameras_get_no_gradients_on_rays():
@@ -149,12 +204,18 @@ def test_cameras_get_no_gradients_on_rays():
         render(parameters, view).color.sum().backward()
 
 
-def test_a_gaussian_of_no_extent_along_an_axis_has_gradients():
+@pytest.mark.parametrize("lens", [None, SMALL], ids=["pinhole", "fisheye"])
+def test_a_gaussian_of_no_extent_along_an_axis_has_gradients(lens):
     parameters, arguments = few(1)
     parameters["scales"][:, 2] = -math.inf
     inputs = leaves(parameters)
     rasterize(
-        inputs.pop("means"), None, inputs.pop("opacities"), settings(**arguments, projection="ray"), raw=True, **inputs
+        inputs.pop("means"),
+        None,
+        inputs.pop("opacities"),
+        settings(**arguments, projection="ray", lens=lens),
+        raw=True,
+        **inputs,
     ).color.sum().backward()
     assert all(values.grad.isfinite().all() for values in inputs.values())
 
@@ -166,8 +227,7 @@ def test_a_view_takes_the_projection_of_the_options():
     assert rasterizer_settings(camera, model, pipe, torch.zeros(3)).projection == "ray"
     assert rasterizer_settings(camera, model, SimpleNamespace(debug=False), torch.zeros(3)).projection == "ewa"
     camera.lens = Lens("equidistant", (9.0, 9.0), (8.5, 3.0))
-    with pytest.raises(UserError, match="--projection ray shows pinholes alone; give --lenses undistort"):
-        rasterizer_settings(camera, model, pipe, torch.zeros(3))
+    assert rasterizer_settings(camera, model, pipe, torch.zeros(3)).lens is camera.lens
 
 
 def test_a_training_on_rays_renders_so_and_exports_say_it(colmap_scene, tmp_path, monkeypatch, capsys):

@@ -102,7 +102,7 @@ def by_stage(launched: Iterable[tuple[str, float]]) -> list[tuple[str, str, floa
 
 
 class Stages:
-    """The operators of one forward and backward, each as a call of its own."""
+    """The operators of one forward and backward, each as a call of its own; none on the rays of a lens."""
 
     @torch.no_grad()
     def __init__(self, scene: SplatScene) -> None:
@@ -110,6 +110,13 @@ class Stages:
         inputs = {name: scene.parameters[name] for name in PARAMETERS}
         arguments = scene_arguments(Gaussians(**inputs), settings, raw=True)
         wanted = [name in (*PARAMETERS, "means2d") for name in GRADIENTS]
+        drawn = draw(arguments, settings.bg)
+        padded = torch.nn.functional.pad(drawn.last, (0, -scene.width % TILE, 0, -scene.height % TILE))
+        # Of each tile, the instances up to the last one that a pixel blends.
+        self.processed = int(padded.unfold(0, TILE, TILE).unfold(1, TILE, TILE).amax((2, 3)).sum())
+        self.instances, self.calls = drawn.instances, {}
+        if settings.projection == "ray" and settings.lens is not None:
+            return
         projected = OPS.project(*arguments)
         self.splats, counts = projected[0], projected[3]
         self.instances, self.ranges, *slots = OPS.bin(*projected[:4], *size, True)
@@ -118,9 +125,6 @@ class Stages:
         kept = self.splats, counts, self.instances, self.ranges, *slots, self.last, layers, settings.bg, left
         gradient = image_gradient(scene)
         rows = self.splats, counts, *OPS.blend_rows(kept, gradient)
-        padded = torch.nn.functional.pad(self.last, (0, -scene.width % TILE, 0, -scene.height % TILE))
-        # Of each tile, the instances up to the last one that a pixel blends.
-        self.processed = int(padded.unfold(0, TILE, TILE).unfold(1, TILE, TILE).amax((2, 3)).sum())
         self.calls: dict[str, Callable[[], object]] = {
             "project": lambda: OPS.project(*arguments),
             "bin": lambda: OPS.bin(*projected[:4], *size, True),

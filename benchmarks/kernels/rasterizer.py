@@ -3,7 +3,7 @@
     python -m benchmarks.kernels.rasterizer                  # on the GPU if there is one and the build has CUDA
     python -m benchmarks.kernels.rasterizer --device cpu
     python -m benchmarks.kernels.rasterizer --order morton   # rows as trainings keep them; default: at random
-    python -m benchmarks.kernels.rasterizer --projection ray --workloads M L
+    python -m benchmarks.kernels.rasterizer --projection ray --lens fisheye --workloads M L
     python -m benchmarks.kernels.rasterizer --models OUT ...  # models of train.py in place of seeded workloads
 
 Milliseconds are medians. An instance is a splat in a tile. Processed instances are those that the backward reads: in
@@ -12,11 +12,13 @@ and kernels of a step; beside them stand figures of other implementations.
 """
 
 import argparse
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from diff_gaussian_rasterization.lens import Lens
 
 from arguments import ModelParams, PipelineParams, read_cfg_args
 from benchmarks.harness.calls import STAGES, TILE, Calls, Stages, by_stage
@@ -85,6 +87,7 @@ def measure_on_cpu(scene: SplatScene, repeats: int) -> dict[str, float]:
     result = {"forward": cpu_milliseconds(calls.forward, repeats)}
     result["+ backward"] = cpu_milliseconds(calls.with_backward, repeats)
     with torch.no_grad():
+        result |= dict.fromkeys(CPU_STAGES, math.nan)
         result |= {name: cpu_milliseconds(run, repeats) for name, run in stages.calls.items()}
     return result | {"instances": len(stages.instances), "processed": stages.processed}
 
@@ -197,7 +200,21 @@ def workloads(args: argparse.Namespace, device: str) -> Iterator[tuple[str, Spla
     else:
         names = args.workloads or sizes
         scenes = ((name, ORDERS[args.order](frustum(*sizes[name], device=device))) for name in names)
-    return ((name, replace(scene, camera=scene.settings(projection=args.projection))) for name, scene in scenes)
+    return ((name, seen_by(scene, args.projection, args.lens)) for name, scene in scenes)
+
+
+def seen_by(scene: SplatScene, projection: str, lens: str | None) -> SplatScene:
+    """The scene of that projection and kind of lens, whose middle has the pinhole's angle of view, or 360 degrees."""
+    settings = scene.settings(projection=projection)
+    if lens is None:
+        return replace(scene, camera=settings)
+    width, height = scene.width, scene.height
+    focal = width / (2 * settings.tanfovx) if lens == "brown" else width / (2 * math.atan(settings.tanfovx))
+    center = (width - 1) / 2, (height - 1) / 2
+    made = Lens("perspective" if lens == "brown" else "equidistant", (focal, focal), center, radial=(0.01, 0.01, 0, 0))
+    if lens == "panorama":
+        made = Lens("equirectangular", (width / (2 * math.pi), height / math.pi), center)
+    return replace(scene, camera=settings._replace(lens=made))
 
 
 def main() -> None:
@@ -208,11 +225,15 @@ def main() -> None:
     add("--models", type=Path, nargs="+", default=[], help="folders that train.py wrote, in place of workloads")
     add("--order", choices=list(ORDERS), default="random", help="of the rows (default: random, as drawn)")
     add("--projection", choices=["ewa", "ray"], default="ewa", help="how a pixel sees a Gaussian (default: ewa)")
+    add("--lens", choices=["brown", "fisheye", "panorama"], help="in place of a pinhole")
     add("--threads", type=int, nargs="+", default=[1, torch.get_num_threads()], help="CPU: numbers of threads to use")
     add("--repeats", type=int, default=9, help="CPU: number of timed calls (default: 9)")
     args = parser.parse_args()
     device = chosen_device(args)
-    print(f"{describe(device)}, rows: {'as trained' if args.models else args.order}, projection: {args.projection}")
+    print(
+        f"{describe(device)}, rows: {'as trained' if args.models else args.order}, projection: {args.projection}"
+        f", lens: {args.lens or 'none'}"
+    )
     if device == "cuda":
         print_gpu(workloads(args, device))
     else:

@@ -49,6 +49,9 @@ struct RowMemory {
   void sparse_adam(const Where&, const AdamInput<T>&, const bool* visible, const StepGuard<T>&);     \
   template <class T>                                                                                 \
   void penalise(const Where&, const PenaltyInput<T>&);                                               \
+  /* The table of a lens with rays (math/lens_pixels.h). */                                          \
+  template <class T>                                                                                 \
+  void lens_table(const Where&, const Lens<double>&, Image, T* out);                                 \
   /* The values of the scene change. */                                                              \
   template <class T>                                                                                 \
   void wake(const Where&, const Scene<T>&, const SleepInput<T>&);

@@ -25,10 +25,14 @@ struct Lens {
   // steep: px by which a point moves at most, a unit by which the chart's numbers move within the field, or a direction
   // turns.
   T field, steep, beyond;
+  T slope;  // px by which a point moves at most, a unit by which the chart's numbers move within the field
   T focal_x, focal_y, center_x, center_y;  // px
   T radial[4], divisor[3], tangential[2], prism[2];
 };
-constexpr int kLensNumbers = 21;
+constexpr int kLensNumbers = 22;
+
+// How pixels see Gaussians: by EWA, or on their rays (math/ray.h), those of a pinhole or of a lens (math/lens_rays.h).
+enum Rays : int { kNoRays, kPinholeRays, kLensRays };
 
 // The Gaussians and the camera. The tensors come in the order of Input in torch/scene.h.
 template <class T>
@@ -57,8 +61,9 @@ struct Scene {
   const int32_t* blocks = nullptr;  // (listed) on a GPU: the blocks that are awake, ascending, then -1; or null
   int64_t listed = 0;
   Lens<T> lens = {};
-  bool rays = false;  // Gaussians are seen on rays (math/ray.h), in place of EWA
+  bool on_rays = false;  // in place of EWA
 
+  GS_HD Rays rays() const { return !on_rays ? kNoRays : lens.chart == Chart::kPinhole ? kPinholeRays : kLensRays; }
   // Rows of what is made of the Gaussians: a row for each, or for those of the listed blocks alone.
   GS_HD int64_t rows() const;
 };
@@ -82,13 +87,14 @@ struct alignas(16) TileRecord {
 
 template <class T>
 struct Projected {
-  T* splats;       // (N, 10), Splat in math/splat.h, or (N, 14), RaySplat; undefined where tile_counts is 0
-  T* depths;       // (N) infinite where tile_counts is 0, so that binning sorts those last
+  T* splats;  // (N, splat_row(rays)), Splat in math/splat.h or what derives from it; undefined where tile_counts is 0
+  T* depths;  // (N) infinite where tile_counts is 0, so that binning sorts those last
   int32_t* rects;  // (N, 4) tiles x0 y0 x1 y1, undefined where tile_counts is 0; null allowed if there are records
-  int32_t* tile_counts;  // (N)
-  int32_t* radii;        // (N)
-  TileRecord* records;   // (N), or null
-  bool rays = false;     // splats are RaySplats, here and below
+  int32_t* tile_counts;      // (N)
+  int32_t* radii;            // (N)
+  TileRecord* records;       // (N), or null
+  Rays rays = kNoRays;       // what splats are, here and below
+  const T* table = nullptr;  // of a lens with rays (math/lens_pixels.h), here and below
 };
 
 // Gradients of the inputs that have one, in the order of Input in torch/scene.h; null where not wanted. Every row is
@@ -144,7 +150,8 @@ struct BlendInput {
   const T* background;  // 3
   Image image;
   int64_t instance_count;  // where the ranges end, or more
-  bool rays = false;
+  Rays rays = kNoRays;
+  const T* table = nullptr;
 };
 
 template <class T>
@@ -179,7 +186,7 @@ struct SplatRows {
   const int32_t* counts;       // (N) rows of each splat; 0 where tile_counts is 0
   const T* rows;      // (R, 10) as in BlendGradient::moments, or 14; two more for lengths of absolute gradients
   int64_t row_count;  // R
-  bool rays = false;
+  Rays rays = kNoRays;
 };
 
 // Where the sums of a splat's rows go, and what lengths of absolute gradients need besides.

@@ -13,6 +13,7 @@ TILE = 16  # pixels
 SPLAT_VALUES = 10  # of a row of `splats`
 MOMENT_VALUES = 10  # of a row of `moments`, and of `rows`
 RAY_VALUES = 4  # of a row of each besides, of Gaussians on rays
+LENS_RAY_VALUES = 10  # of a row of `splats` besides, on those of a lens
 ABSOLUTE_VALUES = 2  # of a row of `rows` besides, for absolute gradients
 SLEEP_BLOCK = 128  # Gaussians that sleep together, and whose gradients of a camera are summed together
 CAMERA_NUMBERS = 25, 34  # of a pinhole, and of a camera with a lens
@@ -45,15 +46,17 @@ def _blended(like: Tensor, height: int, width: int, inverse_depth: bool, train: 
     )
 
 
-def _splats(means: Tensor, options: tuple[int, ...]) -> Tensor:
-    return means.new_empty((means.shape[0], SPLAT_VALUES + RAY_VALUES * any(options[5:])))
+def _splats(means: Tensor, lens: tuple[float, ...], options: tuple[int, ...]) -> Tensor:
+    rays = any(options[5:])
+    values = SPLAT_VALUES + RAY_VALUES * rays + LENS_RAY_VALUES * (rays and len(lens) > 3)
+    return means.new_empty((means.shape[0], values))
 
 
 @_fake("project")
 def _(means, *arguments):
     count = means.shape[0]
     ints = [means.new_empty(shape, dtype=torch.int32) for shape in ((count, 4), (count,), (count,))]
-    return _splats(means, arguments[11]), means.new_empty((count,)), *ints
+    return _splats(means, *arguments[10:12]), means.new_empty((count,)), *ints
 
 
 @_fake("bin")
@@ -102,7 +105,7 @@ def _(means2d, means, *arguments):
     count, (height, width, *_) = means.shape[0], options
     color, transmittance, depth, last, layers = _blended(means, height, width, inverse_depth, train)
     radii, tile_counts = (means.new_empty((count,), dtype=torch.int32) for _ in range(2))
-    projected = radii, _splats(means, options), tile_counts
+    projected = radii, _splats(means, arguments[10], options), tile_counts
     lists = _binned(means, count, height, width, train)
     return color, transmittance, depth, *projected, *lists, last, layers
 

@@ -83,10 +83,10 @@ class Lens(NamedTuple):
         """The field, where the distortion turns back, and how many times it widens the view, at least 1.
 
         Then, for blocks that sleep, the steepest slope of pixels by the chart's numbers, or by a direction, and how far
-        off the image all is that lies beyond the field.
+        off the image all is that lies beyond the field. Last, for rays, that by the chart's numbers.
         """
         if self.chart == "equirectangular":
-            return math.inf, math.inf, 1.0, math.inf, 0.0
+            return math.inf, math.inf, 1.0, math.inf, 0.0, max(self.focal)
         r = np.polynomial.Polynomial([0.0, 1.0])
         over, under = (np.polynomial.Polynomial([1.0, *terms])(r * r) for terms in (self.radial, self.divisor))
         # The derivative of the distorted radius, where tangential and prism terms take most of it.
@@ -118,9 +118,10 @@ class Lens(NamedTuple):
         steep *= max(self.focal)
         if fisheye:  # what is beside the axis is stretched by angle / sine
             edge = field + _TURN  # a direction that turns past the one behind can jump to any other
-            return field, turn, reach, steep * edge / math.sin(edge) if edge < math.pi else math.inf, math.inf
+            turned = steep * edge / math.sin(edge) if edge < math.pi else math.inf
+            return field, turn, reach, turned, math.inf, steep
         beyond = field * float(over(field) / under(field)) - aside * field**2 - corner
-        return field, turn, reach, steep, min(self.focal) * beyond
+        return field, turn, reach, steep, min(self.focal) * beyond, steep
 
 
 def lens_of(model: str, params: tuple[float, ...]) -> Lens:

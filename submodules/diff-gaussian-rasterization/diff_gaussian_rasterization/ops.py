@@ -103,11 +103,12 @@ def decisive(
     """
     gaussians = Gaussians(means, opacities, **others)
     try:
-        drawn = draw(scene_arguments(gaussians, settings, raw), settings.bg)
+        scene = scene_arguments(gaussians, settings, raw)
+        drawn = draw(scene, settings.bg)
     except RuntimeError:
         _check_types(gaussians, settings)
         raise
-    return OPERATORS.decisive(drawn.splats, drawn.instances, drawn.ranges, drawn.last)
+    return OPERATORS.decisive(drawn.splats, drawn.instances, drawn.ranges, drawn.last, scene.lens)
 
 
 def mark_visible(positions: Tensor, view: Tensor) -> Tensor:

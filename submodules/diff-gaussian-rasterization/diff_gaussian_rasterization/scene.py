@@ -1,5 +1,6 @@
 """Arguments and results of the operators: Gaussians with a camera, and what a forward makes of them."""
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -13,6 +14,7 @@ from diff_gaussian_rasterization.lens import LENS_VALUES, Lens
 from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 
 PROJECTIONS = ("ewa", "ray")
+_WIDEST = 1.35  # radians from the middle of a tile to its corners: tiles are seen as by pinholes
 _FLAGS = ("prefiltered", "debug", "antialiasing", "inverse_depth")
 
 _NONE = torch.empty(0)  # stands for a tensor that is not given
@@ -66,7 +68,7 @@ class Drawing(NamedTuple):
     transmittance: Tensor  # (1, H, W)
     inverse_depth: Tensor  # (1, H, W), or no rows if it is not wanted
     radii: Tensor  # (N,) int32
-    splats: Tensor  # (N, 10), or (N, 14) on rays
+    splats: Tensor  # (N, 10), (N, 14) on rays, or (N, 24) on those of a lens
     tile_counts: Tensor  # (N,) int32
     instances: Tensor  # (I,) int32, the splats of all lists
     ranges: Tensor  # (tiles + 1,) int64, of each tile's list
@@ -95,10 +97,20 @@ def scene_arguments(gaussians: Gaussians, settings: GaussianRasterizationSetting
             raise ValueError(f"lens must be a Lens or None, got {settings.lens!r}")
         shown = settings.lens if settings.lens_values is None else _with_values(settings.lens, settings.lens_values)
         lens += shown.numbers(*size[::-1])
+        if settings.projection == "ray":
+            _check_rays(shown)
     place = settings.viewmatrix, settings.projmatrix, settings.campos
     camera = camera_arguments(*place, lens, *size, settings.sh_degree, settings.antialiasing, raw)
     scene = Scene(*gaussians, *camera)
     return scene._replace(options=(*scene.options, True)) if settings.projection == "ray" else scene
+
+
+def _check_rays(lens: Lens) -> None:
+    """Refuse a lens whose pixels' rays the kernels do not find (ValueError)."""
+    if lens.chart == "equirectangular" and any(lens.values[4:]):
+        raise ValueError("projection='ray' has panoramas without distortion alone; take 'ewa'")
+    if lens.chart != "perspective" and math.hypot(*(8 / focal for focal in lens.focal)) > _WIDEST:
+        raise ValueError(f"projection='ray' needs tiles of 16 pixels to span under 150 degrees, got focal {lens.focal}")
 
 
 def _with_values(lens: Lens, values: Tensor) -> Lens:

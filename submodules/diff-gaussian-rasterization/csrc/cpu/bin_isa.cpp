@@ -101,12 +101,12 @@ struct Visible {
   }
 };
 
-template <class T, bool kRays>
+template <class T, int kRays>
 void list_again(const Projected<T>& in, int32_t i, TileRect rect, Image image, int32_t* tiles) {
   SplatOf<T, kRays> splat;
   uint64_t mask;
   std::memcpy(&splat, in.splats + kSplatRow<kRays> * int64_t(i), sizeof splat);
-  list_tiles(splat, rect, image, mask, tiles);
+  list_tiles(splat, rect, image, in.table, mask, tiles);
 }
 
 // Writes the numbers of the tiles that a splat reaches.
@@ -121,7 +121,10 @@ void write_tiles(const Projected<T>& in, int32_t i, Image image, int32_t* tiles)
     for (int32_t tile = rect.y0 * columns + rect.x0; left; tile += columns, left = left >> (wide - 1) >> 1)
       for (uint64_t bits = left & row; bits; bits &= bits - 1) *tiles++ = tile + __builtin_ctzll(bits);
   } else {
-    (in.rays ? list_again<T, true> : list_again<T, false>)(in, i, rect, image, tiles);
+    const auto list = in.rays == kLensRays ? list_again<T, kLensRays>
+                      : in.rays            ? list_again<T, kPinholeRays>
+                                           : list_again<T, kNoRays>;
+    list(in, i, rect, image, tiles);
   }
 }
 

@@ -44,17 +44,17 @@ __attribute__((noinline)) int32_t list_tiles_of(const AnySplat& splat, TileRect 
 }  // namespace
 
 template <class T>
-int32_t list_tiles(const Splat<T>& splat, TileRect rect, Image image, uint64_t& mask, int32_t* tiles) {
+int32_t list_tiles(const Splat<T>& splat, TileRect rect, Image image, const T*, uint64_t& mask, int32_t* tiles) {
   return list_tiles_of<T>(splat, rect, image, mask, tiles);
 }
 template <class T>
-int32_t list_tiles(const RaySplat<T>& splat, TileRect rect, Image image, uint64_t& mask, int32_t* tiles) {
+int32_t list_tiles(const RaySplat<T>& splat, TileRect rect, Image image, const T*, uint64_t& mask, int32_t* tiles) {
   return list_tiles_of<T>(splat, rect, image, mask, tiles);
 }
 
-#define GS_INSTANTIATE(T)                                                                \
-  template int32_t list_tiles<T>(const Splat<T>&, TileRect, Image, uint64_t&, int32_t*); \
-  template int32_t list_tiles<T>(const RaySplat<T>&, TileRect, Image, uint64_t&, int32_t*);
+#define GS_INSTANTIATE(T)                                                                          \
+  template int32_t list_tiles<T>(const Splat<T>&, TileRect, Image, const T*, uint64_t&, int32_t*); \
+  template int32_t list_tiles<T>(const RaySplat<T>&, TileRect, Image, const T*, uint64_t&, int32_t*);
 GS_INSTANTIATE(float)
 GS_INSTANTIATE(double)
 

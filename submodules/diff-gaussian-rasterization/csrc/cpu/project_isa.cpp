@@ -10,7 +10,7 @@ void project(const Executor& executor, const Scene<T>& s, const Projected<T>& ou
     for_dynamic(executor, s.count, block, [&](int64_t begin, int64_t end) {
       if (s.awake && !s.awake[begin / block])
         cull_all(end - begin, part_of(out, begin));
-      else if constexpr (kOnRays<std::decay_t<decltype(camera)>>)
+      else if constexpr (kOnRays<std::decay_t<decltype(camera)>> != kNoRays)
         project_on_rays(part_of(s, begin, end - begin), camera, part_of(out, begin));
       else
         project_block(part_of(s, begin, end - begin), camera, part_of(out, begin));

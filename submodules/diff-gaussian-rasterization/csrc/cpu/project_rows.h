@@ -4,7 +4,7 @@
 #include <cstring>
 
 #include "../backend.h"
-#include "../math/ray_pixels.h"
+#include "../math/lens_pixels.h"
 #include "list_tiles.h"
 #include "scene_lanes.h"
 
@@ -23,7 +23,8 @@ Projected<T> part_of(const Projected<T>& out, int64_t first) {
           from_row(out.tile_counts, first, 1),
           from_row(out.radii, first, 1),
           from_row(out.records, first, 1),
-          out.rays};
+          out.rays,
+          out.table};
 }
 
 template <class T>
@@ -55,7 +56,7 @@ int64_t list_inside(const Scene<T>& s, const AnyCamera& camera, int32_t* inside)
   return found;
 }
 
-template <class T, bool kRays>
+template <class T, int kRays>
 struct ProjectedPack {
   static constexpr int kRow = kSplatRow<kRays>;
   T splats[Simd<T>::kLanes * kRow], depths[Simd<T>::kLanes];
@@ -73,7 +74,7 @@ struct ProjectedPack {
     typename S::Mask visible = project_shape(s, camera, row, splat, depth, radius);
     std::memcpy(radii, &radius, sizeof radii);
     if (!any(visible)) return 0;
-    const Rect<typename S::Mask> rect = tile_rect(splat, s.image.width, s.image.height, goes_around(camera));
+    const Rect<typename S::Mask> rect = rect_of(camera, splat, s.image);
     visible &= rect.x1 > rect.x0;
     if (!any(visible)) return 0;
     V rest[kMostRest];
@@ -89,14 +90,14 @@ struct ProjectedPack {
   }
 };
 
-template <class T, bool kRays>
+template <class T, int kRays>
 void write_splat(const ProjectedPack<T, kRays>& pack, int lane, Image image, int32_t i, const Projected<T>& out) {
   const auto& r = pack.rects;
   const TileRect rect = {int32_t(r[0][lane]), int32_t(r[1][lane]), int32_t(r[2][lane]), int32_t(r[3][lane])};
   SplatOf<T, kRays> splat;
   std::memcpy(&splat, pack.splats + pack.kRow * lane, sizeof splat);
   uint64_t mask;
-  const int32_t count = list_tiles(splat, rect, image, mask, nullptr);
+  const int32_t count = list_tiles(splat, rect, image, out.table, mask, nullptr);
   if (!count) return;
   out.tile_counts[i] = count, out.depths[i] = pack.depths[lane];
   if (out.records)
@@ -130,5 +131,7 @@ void project_block(const Scene<T>& s, const AnyCamera& camera, const Projected<T
 // a file of their own, and change no bit of the others.
 template <class T>
 void project_on_rays(const Scene<T>& s, const RayCamera<T>& camera, const Projected<T>& out);
+template <class T>
+void project_on_rays(const Scene<T>& s, const LensRayCamera<T>& camera, const Projected<T>& out);
 
 GS_ISA_END

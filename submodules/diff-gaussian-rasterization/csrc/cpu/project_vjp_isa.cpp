@@ -16,7 +16,7 @@ namespace {
 template <class T, class AnyCamera>
 void vjp_rows(const Scene<T>& s, const AnyCamera& camera, const int32_t* tile_counts, const T* moments,
               const SceneGradient<T>& out) {
-  if constexpr (kOnRays<AnyCamera>)
+  if constexpr (kOnRays<AnyCamera> != kNoRays)
     project_vjp_on_rays(s, camera, tile_counts, moments, out);
   else
     project_vjp_rows(s, camera, tile_counts, moments, out);

@@ -54,7 +54,7 @@ void write_or_add(typename Simd<T>::Vec* values, int row, int64_t n, const Pack<
 
 template <class T>
 const T* from_moments(const Scene<T>& s, const T* moments, int64_t first) {
-  return moments + gradient_row(s.rays) * first;
+  return moments + gradient_row(s.rays()) * first;
 }
 
 // The gradients of a vector of Gaussians.
@@ -100,5 +100,8 @@ GS_ONE_COPY void project_vjp_rows(const Scene<T>& s, const AnyCamera& camera, co
 template <class T>
 void project_vjp_on_rays(const Scene<T>& s, const RayCamera<T>& camera, const int32_t* tile_counts, const T* moments,
                          const SceneGradient<T>& out);
+template <class T>
+void project_vjp_on_rays(const Scene<T>& s, const LensRayCamera<T>& camera, const int32_t* tile_counts,
+                         const T* moments, const SceneGradient<T>& out);
 
 GS_ISA_END

@@ -44,8 +44,10 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& given
   launch(queue, "count", count_kernel, shares, kListThreads, count, splats, in, image, counts, of_shares);
   // Images of many tiles have many splats without a mask.
   const unsigned large_blocks = std::clamp<unsigned>(unsigned(tiles) / 16, 256, 2048);
-  launch(queue, "count_large", in.rays ? count_large_kernel<true> : count_large_kernel<false>, large_blocks,
-         kListThreads, in, image, counts);
+  const auto count_large = in.rays == kLensRays ? count_large_kernel<kLensRays>
+                           : in.rays            ? count_large_kernel<kPinholeRays>
+                                                : count_large_kernel<kNoRays>;
+  launch(queue, "count_large", count_large, large_blocks, kListThreads, in, image, counts);
   launch(queue, "lay_out", lay_out_kernel, 1, kLayThreads, tiles, counts, begins, shares, of_shares, totals,
          memory.ahead ? *memory.ahead : Ahead{});
   Room room;
@@ -58,8 +60,11 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& given
   const Binned out = memory.take(memory.context, room.instances, memory.slots ? room.slots : 0);
   const unsigned further = unsigned(room.instances / kPiece), pieces = further + unsigned(tiles);
   const ListWork work{begins, queue.array<uint64_t>(room.instances), counts.further, queue.array<int2>(further)};
-  launch(queue, "fill", in.rays ? fill_kernel<true> : fill_kernel<false>, shares + large_blocks, kListThreads, count,
-         splats, shares, in, image, counts, of_shares, memory.slots, work);
+  const auto fill = in.rays == kLensRays ? fill_kernel<kLensRays>
+                    : in.rays            ? fill_kernel<kPinholeRays>
+                                         : fill_kernel<kNoRays>;
+  launch(queue, "fill", fill, shares + large_blocks, kListThreads, count, splats, shares, in, image, counts, of_shares,
+         memory.slots, work);
   queue.release(queue.context, counts.large), queue.release(queue.context, counts.places);
   if (made) queue.release(queue.context, made);
   const unsigned blocks = std::min(pieces, kMostBlocks);

@@ -83,7 +83,7 @@ __global__ void judge_rows_kernel(const int32_t* halted, Ahead ahead, const int3
 }
 
 // Values that a lane sums: kGradientRow, and perhaps kAbsoluteValues.
-template <bool kRays, bool kAbsolute>
+template <int kRays, bool kAbsolute>
 constexpr int kSums = kGradientRow<kRays> + (kAbsolute ? kAbsoluteValues : 0);
 
 // Sums ten values over a warp in 12 shuffles, twelve in 13, or up to sixteen in 16: each step halves the values that a
@@ -157,7 +157,7 @@ struct Pixels {
 };
 
 // Computes the layers of all chunks but the first of each tile, a block each.
-template <class L, bool kRays, bool kDepth>
+template <class L, int kRays, bool kDepth>
 __global__ void __launch_bounds__(L::kThreads)
     layers_kernel(const int32_t* halted, BlendInput<float> in, BlendGradient<float> g, const Chunk* chunks,
                   Layer* layers) {
@@ -166,7 +166,7 @@ __global__ void __launch_bounds__(L::kThreads)
   __shared__ Batch<kBatch, kRays> batch;
   const Chunk chunk = chunks[blockIdx.x];
   if (chunk.tile < 0 || chunk.first == 0) return;
-  const L at;
+  const PlacesOf<L, kRays> at(in, chunk.tile);
   const int across = tile_count(in.image.width);
   const int left = chunk.tile % across * kTile, top = chunk.tile / across * kTile;
   const Pixels<L, kDepth> pixels(in, g, at, left, top, chunk.first);
@@ -177,7 +177,7 @@ __global__ void __launch_bounds__(L::kThreads)
   for (int first = 0; first < length; first += kBatch) {
     const int count = length - first < kBatch ? length - first : kBatch;
     __syncthreads();
-    if (mine < count) batch.put(mine, in, in.instances[begin + first + mine], float(left), float(top));
+    if (mine < count) batch.put(mine, in, chunk.tile, in.instances[begin + first + mine], float(left), float(top));
     __syncthreads();
     for (int from = 0; from < count && first + from < pixels.furthest; from += 32)
       front_to_back(batch, at, from, count, [&](int k, int p, float t) {
@@ -248,6 +248,26 @@ struct FlatRowSums {
   }
 };
 
+// Of a lane's pixels, on the rays of a lens.
+struct LensRowSums : PlaceSums<float> {
+  using PlaceSums<float>::moments;
+  __device__ RayMoments<float> moments(const LensTerms<float>&, const LensLocal&) const { return moments(); }
+};
+struct RayRowMoments : RayRowSums<float> {
+  using RayRowSums<float>::moments;
+  __device__ RayMoments<float> moments(const RayRow<float>& row, const LocalRaySplat<float>& splat) const {
+    return moments(row, splat.slope_v);
+  }
+};
+template <class Sums, class Row, class Here>
+__device__ __forceinline__ void add_pixel(Sums& sums, const Row&, const Here& here, float q) {
+  sums.add(here, q);
+}
+__device__ __forceinline__ void add_pixel(LensRowSums& sums, const LensTerms<float>& terms, const AtPlace<float>& here,
+                                          float q) {
+  sums.add(terms, here, q);
+}
+
 // What moves the mean, whitened: u and v, or w a / s.
 __device__ float2 pull(const LocalSplat<float>&, const RowTerms<float>& row, float u) { return {u, row.v}; }
 __device__ float2 pull(const LocalRaySplat<float>& splat, const RayRow<float>& row, const AtPixel<float>& at) {
@@ -255,21 +275,34 @@ __device__ float2 pull(const LocalRaySplat<float>& splat, const RayRow<float>& r
   return {weights.au, weights.av};
 }
 
+__device__ float2 pull(const LensLocal&, const LensTerms<float>& terms, const AtPlace<float>& at) {
+  const RayWeights<float> weights = ray_weights(terms, at);
+  return {weights.au, weights.av};
+}
+
+template <class AnySplat>
+__device__ __forceinline__ auto terms_of(const AnySplat& splat, int y) {
+  return row_terms(splat, float(y));
+}
+__device__ __forceinline__ const LensTerms<float>& terms_of(const LensLocal& splat, int) { return splat.terms; }
+
 // Steps the lanes over splat k of the batch, whose first splat is the chunk's splat `first`, and leaves the sums over
 // the warp's pixels in `sums`. A splat that reaches none of them changes nothing.
-template <bool kDepth, bool kAbsolute, int kBatch, bool kRays>
+template <bool kDepth, bool kAbsolute, int kBatch, int kRays>
 __device__ __forceinline__ void splat_gradient(const Batch<kBatch, kRays>& batch,
-                                               const Pixels<Backward, kDepth>& pixels, const Backward& at, int k,
-                                               int first, OfPixels& transmittance, OfPixels& behind, float* sums) {
+                                               const Pixels<Backward, kDepth>& pixels,
+                                               const PlacesOf<Backward, kRays>& at, int k, int first,
+                                               OfPixels& transmittance, OfPixels& behind, float* sums) {
   const auto splat = batch.local(k);
   const float4 c = batch.color[k];
-  const auto row = row_terms(splat, float(at.y));
-  std::conditional_t<kRays, RayRowSums<float>, FlatRowSums> moments;
+  const auto row = terms_of(splat, at.y);
+  std::conditional_t<kRays == kLensRays, LensRowSums, std::conditional_t<kRays == kNoRays, FlatRowSums, RayRowMoments>>
+      moments;
   float r = 0, gr = 0, b = 0, d = 0, absolute_u = 0, absolute_uv = 0;
   bool any = false;
 #pragma unroll
   for (int p = 0; p < Backward::kRun; ++p) {
-    const auto here = at_pixel(row, float(at.x + at.column(p)));
+    const auto here = at_pixel(row, at.place(p));
     const float t = row_exponent(row, here);
     if (!(t >= kLeast) || first + k >= pixels.last[p]) continue;
     any = true;
@@ -277,7 +310,7 @@ __device__ __forceinline__ void splat_gradient(const Batch<kBatch, kRays>& batch
     const float value = pixels.value(p, c, splat.inverse_depth);
     const float q = uncapped * alpha_gradient<float, float>(alpha, value, transmittance[p], behind[p]);
     const float weight = alpha * transmittance[p];
-    moments.add(here, q);
+    add_pixel(moments, row, here, q);
     r += weight * pixels.red[p], gr += weight * pixels.green[p], b += weight * pixels.blue[p];
     if (kDepth) d += weight * pixels.depth[p];
     if (kAbsolute) {
@@ -292,8 +325,8 @@ __device__ __forceinline__ void splat_gradient(const Batch<kBatch, kRays>& batch
 #pragma unroll
     for (int i = 0; i < kRow; ++i) v[i] = all[i];
   };
-  if constexpr (kRays) {
-    const RayMoments<float> rays = moments.moments(row, splat.slope_v);
+  if constexpr (kRays != kNoRays) {
+    const RayMoments<float> rays = moments.moments(row, splat);
     const Moments<float>& m = rays.on_image;
     const float all[] = {m.q, m.qu, m.qv,    m.quu,   m.quv,   m.qvv, r,          gr,
                          b,   d,    rays.pu, rays.pv, rays.pp, 0,     absolute_u, absolute_uv};
@@ -311,8 +344,9 @@ __device__ __forceinline__ void splat_gradient(const Batch<kBatch, kRays>& batch
 // Walks each chunk back to front, a block each, and writes its gradient rows. Within these registers ptxas compiles the
 // loop over splats without spills on sm_90. If blocks per multiprocessor are bounded instead, it makes the loop a tenth
 // longer.
-template <bool kRays, bool kDepth, bool kMade, bool kAbsolute>
-__global__ void GS_MAX_REGISTERS((kDepth ? 96 : 80) + (kAbsolute ? 8 : 0) + (kRays ? 16 : 0))
+template <int kRays, bool kDepth, bool kMade, bool kAbsolute>
+__global__ void GS_MAX_REGISTERS((kDepth ? 96 : 80) + (kAbsolute ? 8 : 0) + (kRays ? 16 : 0) +
+                                 (kRays == kLensRays ? 24 : 0))
     blend_vjp_kernel(const int32_t* halted, BlendInput<float> in, BlendGradient<float> g, const int32_t* processed,
                      const Chunk* chunks, int chunk_size, const Layer* layers, MadeLayers made,
                      GradientRows<kRays> rows, float* absolute) {
@@ -324,7 +358,7 @@ __global__ void GS_MAX_REGISTERS((kDepth ? 96 : 80) + (kAbsolute ? 8 : 0) + (kRa
   __shared__ int64_t row_of[kBatch];
   const Chunk chunk = chunks[blockIdx.x];
   if (chunk.tile < 0) return;
-  const L at;
+  const PlacesOf<L, kRays> at(in, chunk.tile);
   const int across = tile_count(in.image.width);
   const int left = chunk.tile % across * kTile, top = chunk.tile / across * kTile;
   const Pixels<L, kDepth> pixels(in, g, at, left, top, chunk.first);
@@ -343,7 +377,7 @@ __global__ void GS_MAX_REGISTERS((kDepth ? 96 : 80) + (kAbsolute ? 8 : 0) + (kRa
     __syncthreads();
     for (int k = threadIdx.x; k < count; k += L::kThreads) {
       const int32_t splat = in.instances[begin + first + k];
-      batch.put(k, in, splat, float(left), float(top));
+      batch.put(k, in, chunk.tile, splat, float(left), float(top));
       row_of[k] = rows.row(slot_of(g.slots, splat, chunk.tile % across, chunk.tile / across));
     }
     for (int k = threadIdx.x; k < L::kWarps * kBatch * kRow; k += L::kThreads) sums[k] = 0;
@@ -371,7 +405,7 @@ __global__ void GS_MAX_REGISTERS((kDepth ? 96 : 80) + (kAbsolute ? 8 : 0) + (kRa
   }
 }
 
-template <bool kRays>
+template <int kRays>
 __global__ void __launch_bounds__(256)
     moments_kernel(const int32_t* halted, int64_t count, SlotSums<kRays> sums, float* moments) {
   if (!begin_work(halted)) return;
@@ -384,7 +418,7 @@ __global__ void __launch_bounds__(256)
   for (int v = 0; v < kRow; ++v) moments[kRow * i + v] = values[v];
 }
 
-template <class L, bool kRays>
+template <class L, int kRays>
 void find_layers(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g,
                  const Schedule& schedule, Layer* layers) {
   const auto kernel = g.inverse_depth ? layers_kernel<L, kRays, true> : layers_kernel<L, kRays, false>;
@@ -392,7 +426,7 @@ void find_layers(const Queue& queue, const BlendInput<float>& in, const BlendGra
 }
 
 // The kernel that blends back to front, for what is wanted and what is there.
-template <bool kRays, bool kAbsolute>
+template <int kRays, bool kAbsolute>
 auto blend_vjp_kernel_for(bool depth, bool made) {
   return depth
              ? (made ? blend_vjp_kernel<kRays, true, true, kAbsolute> : blend_vjp_kernel<kRays, true, false, kAbsolute>)
@@ -402,7 +436,7 @@ auto blend_vjp_kernel_for(bool depth, bool made) {
 
 // Runs the backward up to the rows. take: allocates those of the gradients, for their number, for which the host waits
 // if `exact`, else perhaps for more.
-template <bool kRays, class Take>
+template <int kRays, class Take>
 FilledRows<kRays> blend_back(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g,
                              bool absolute, bool exact, const Take& take) {
   const cudaStream_t stream = stream_of(queue);
@@ -441,7 +475,7 @@ FilledRows<kRays> blend_back(const Queue& queue, const BlendInput<float>& in, co
   return {gradients, lengths};
 }
 
-template <bool kRays>
+template <int kRays>
 void keep_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g,
                const RowMemory<float>& memory) {
   float* rows = nullptr;
@@ -454,7 +488,7 @@ void keep_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradi
   if (memory.absolute) join_rows(queue, count, filled, rows);
 }
 
-template <bool kRays>
+template <int kRays>
 void sum_moments(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
   const SlotSums<kRays> sums{fill_rows<kRays>(queue, in, g), g.slots};
   launch(queue, "moments", moments_kernel<kRays>, blocks_for(g.count, 256), 256, g.count, sums, g.moments);
@@ -462,7 +496,7 @@ void sum_moments(const Queue& queue, const BlendInput<float>& in, const BlendGra
 
 }  // namespace
 
-template <bool kRays>
+template <int kRays>
 GradientRows<kRays> fill_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
   const FilledRows<kRays> rows = blend_back<kRays>(queue, in, g, g.absolute != nullptr, false, [&](int64_t count) {
     return queue.array<float>(size_t(count) * kGradientRow<kRays>);
@@ -471,18 +505,24 @@ GradientRows<kRays> fill_rows(const Queue& queue, const BlendInput<float>& in, c
   queue.release(queue.context, rows.absolute.values);  // the gradients come next, and take most of a step's memory
   return rows.gradients;
 }
-template GradientRows<false> fill_rows<false>(const Queue&, const BlendInput<float>&, const BlendGradient<float>&);
-template GradientRows<true> fill_rows<true>(const Queue&, const BlendInput<float>&, const BlendGradient<float>&);
+template GradientRows<kNoRays> fill_rows<kNoRays>(const Queue&, const BlendInput<float>&, const BlendGradient<float>&);
+template GradientRows<kPinholeRays> fill_rows<kPinholeRays>(const Queue&, const BlendInput<float>&,
+                                                            const BlendGradient<float>&);
+template GradientRows<kLensRays> fill_rows<kLensRays>(const Queue&, const BlendInput<float>&,
+                                                      const BlendGradient<float>&);
 
 template <>
 void blend_rows<float>(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g,
                        const RowMemory<float>& memory) {
-  (in.rays ? keep_rows<true> : keep_rows<false>)(queue, in, g, memory);
+  (in.rays ? keep_rows<kPinholeRays> : keep_rows<kNoRays>)(queue, in, g, memory);
 }
 
 template <>
 void blend_vjp<float>(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
-  if (g.count) (in.rays ? sum_moments<true> : sum_moments<false>)(queue, in, g);
+  const auto sum = in.rays == kLensRays ? sum_moments<kLensRays>
+                   : in.rays            ? sum_moments<kPinholeRays>
+                                        : sum_moments<kNoRays>;
+  if (g.count) sum(queue, in, g);
 }
 
 }  // namespace cuda

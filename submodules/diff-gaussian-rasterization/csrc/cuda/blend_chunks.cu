@@ -81,8 +81,9 @@ struct Place {
 };
 
 // Blends the batch. front: the transmittance in front of it, or more; then no pixel ends too early.
-template <bool kDepth, bool kLast, bool kRays>
-__device__ __forceinline__ Seen walk(const Batch<kPixels, kRays>& batch, const L& at, int count, float front) {
+template <bool kDepth, bool kLast, int kRays>
+__device__ __forceinline__ Seen walk(const Batch<kPixels, kRays>& batch, const PlacesOf<L, kRays>& at, int count,
+                                     float front) {
   Seen seen;
   float threshold = front > 0 ? kLeast : INFINITY;
   bool open = __any_sync(kWarp, front > 0);
@@ -140,7 +141,7 @@ __device__ float follow(const float* through, int32_t from, int32_t to, float fr
   return front;
 }
 
-template <bool kRays, bool kDepth, bool kLast>
+template <int kRays, bool kDepth, bool kLast>
 struct Blender {
   const BlendInput<float>& in;
   const Progress& progress;
@@ -165,7 +166,7 @@ struct Blender {
     while (open) {
       const int32_t left = item.chunk.end - chunk * kLayerChunk, count = left < kPixels ? left : kPixels;
       if (fresh) load(chunk, count);
-      seen = walk<kDepth, kLast>(batch, L(), count, front);
+      seen = walk<kDepth, kLast>(batch, PlacesOf<L, kRays>(in, item.chunk.tile), count, front);
       if (item.whole()) {
         const float next = seen.ended ? 0 : behind(front, seen.transmittance);
         open = left > kPixels && __syncthreads_or(next > 0);
@@ -184,7 +185,8 @@ struct Blender {
   __device__ void load(int32_t chunk, int count) const {
     const Place at = place();
     const int32_t* instances = in.instances + item.begin + chunk * kLayerChunk;
-    if (int(threadIdx.x) < count) batch.put(threadIdx.x, in, instances[threadIdx.x], float(at.left), float(at.top));
+    if (int(threadIdx.x) < count)
+      batch.put(threadIdx.x, in, item.chunk.tile, instances[threadIdx.x], float(at.left), float(at.top));
     __syncthreads();
   }
 
@@ -289,8 +291,8 @@ struct Blender {
 };
 
 // Bounding blocks per multiprocessor limits the kernel to 48 registers on sm_90.
-template <bool kRays, bool kDepth, bool kLast>
-__global__ void __launch_bounds__(L::kThreads, 5)
+template <int kRays, bool kDepth, bool kLast>
+__global__ void __launch_bounds__(L::kThreads, kRays == kLensRays ? 4 : 5)
     blend_chunks_kernel(const int32_t* halted, BlendInput<float> in, Progress progress, Layers layers,
                         Blended<float> out) {
   if (!begin_work(halted)) return;  // then nobody has set up `progress` either
@@ -312,7 +314,7 @@ __global__ void __launch_bounds__(L::kThreads, 5)
   }
 }
 
-template <bool kRays>
+template <int kRays>
 auto blend_chunks_kernel_for(bool depth, bool last) {
   return depth ? (last ? blend_chunks_kernel<kRays, true, true> : blend_chunks_kernel<kRays, true, false>)
                : (last ? blend_chunks_kernel<kRays, false, true> : blend_chunks_kernel<kRays, false, false>);
@@ -330,8 +332,9 @@ void blend_chunks(const Queue& queue, const BlendInput<float>& in, const Blended
   const bool depth = out.inverse_depth;
   float* values = out.layers;
   if (!values) values = queue.array<float>(layer_values(in.image, in.instance_count, depth));
-  const auto kernel =
-      in.rays ? blend_chunks_kernel_for<true>(depth, out.last) : blend_chunks_kernel_for<false>(depth, out.last);
+  const auto kernel = in.rays == kLensRays ? blend_chunks_kernel_for<kLensRays>(depth, out.last)
+                      : in.rays            ? blend_chunks_kernel_for<kPinholeRays>(depth, out.last)
+                                           : blend_chunks_kernel_for<kNoRays>(depth, out.last);
   const unsigned blocks = std::min(schedule.blocks, kMostBlocks);
   launch(queue, "blend_chunks", kernel, blocks, L::kThreads, in, progress, layers_at(values, in.instance_count), out);
 }

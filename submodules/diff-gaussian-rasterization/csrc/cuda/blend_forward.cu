@@ -11,14 +11,14 @@ namespace {
 using L = Layout<2>;
 
 // Bounding blocks per multiprocessor limits the kernel to 56 registers on sm_90, without spills but on rays with depth.
-template <bool kRays, bool kDepth, bool kLast>
-__global__ void __launch_bounds__(L::kThreads, 9)
+template <int kRays, bool kDepth, bool kLast>
+__global__ void __launch_bounds__(L::kThreads, kRays == kLensRays ? 6 : 9)
     blend_kernel(const int32_t* halted, BlendInput<float> in, Blended<float> out) {
   if (!begin_work(halted)) return;
   constexpr int kBatch = L::kThreads, kRun = L::kRun;
   __shared__ Batch<kBatch, kRays> batch;
-  const L at;
   const int across = tile_count(in.image.width), tile = blockIdx.x;
+  const PlacesOf<L, kRays> at(in, tile);
   const int left = tile % across * kTile, top = tile / across * kTile;
   float transmittance[kRun], red[kRun], green[kRun], blue[kRun], depth[kRun], threshold[kRun];
   int last[kRun];
@@ -33,7 +33,7 @@ __global__ void __launch_bounds__(L::kThreads, 9)
     if (!__syncthreads_or(open)) break;
     const int count = int(end - first < kBatch ? end - first : kBatch);
     const int mine = threadIdx.x;
-    if (mine < count) batch.put(mine, in, in.instances[first + mine], float(left), float(top));
+    if (mine < count) batch.put(mine, in, tile, in.instances[first + mine], float(left), float(top));
     __syncthreads();
     for (int from = 0; open && from < count; from += 32) {
       front_to_back(batch, at, from, count, [&](int k, int p, float t) {
@@ -69,7 +69,7 @@ __global__ void __launch_bounds__(L::kThreads, 9)
   }
 }
 
-template <bool kRays>
+template <int kRays>
 auto blend_kernel_for(const Blended<float>& out) {
   return out.inverse_depth ? (out.last ? blend_kernel<kRays, true, true> : blend_kernel<kRays, true, false>)
                            : (out.last ? blend_kernel<kRays, false, true> : blend_kernel<kRays, false, false>);
@@ -80,7 +80,9 @@ auto blend_kernel_for(const Blended<float>& out) {
 template <>
 void blend<float>(const Queue& queue, const BlendInput<float>& in, const Blended<float>& out) {
   if (makes_layers(in.image)) return blend_chunks(queue, in, out);
-  const auto kernel = in.rays ? blend_kernel_for<true>(out) : blend_kernel_for<false>(out);
+  const auto kernel = in.rays == kLensRays ? blend_kernel_for<kLensRays>(out)
+                      : in.rays            ? blend_kernel_for<kPinholeRays>(out)
+                                           : blend_kernel_for<kNoRays>(out);
   launch(queue, "blend", kernel, unsigned(tiles_of(in.image)), L::kThreads, in, out);
 }
 

@@ -9,7 +9,7 @@
 #include "../math/exp2.h"
 #include "../math/footprint.h"
 #include "../math/layers.h"
-#include "../math/ray_pixels.h"
+#include "../math/lens_pixels.h"
 #include "queue.cuh"
 #include "splat_row.cuh"
 
@@ -39,36 +39,67 @@ struct Layout {
   __device__ static int column(int run) { return run * kColumns; }
 };
 
+// The same, and where the lane's pixels are: their columns, or on a lens's rays their places, and the limits of the
+// warp's, from the lens's table. What the lens does not show is no number, and reached by nothing.
+template <class L, int kRays>
+struct PlacesOf : L {
+  __device__ PlacesOf(const BlendInput<float>&, int) {}
+  __device__ float place(int p) const { return float(this->x + this->column(p)); }
+};
+template <class L>
+struct PlacesOf<L, kLensRays> : L {
+  float px[L::kRun], py[L::kRun];
+  PlaceBox<float> box;
+
+  __device__ PlacesOf(const BlendInput<float>& in, int tile) {
+    const float* from = places_of(in.table, in.image, tile) + kTile * this->y + this->x;
+    float least_x = INFINITY, most_x = -INFINITY, least_y = INFINITY, most_y = -INFINITY;
+    for (int p = 0; p < L::kRun; ++p) {
+      px[p] = from[this->column(p)], py[p] = from[kTile * kTile + this->column(p)];
+      least_x = fminf(least_x, px[p]), most_x = fmaxf(most_x, px[p]);
+      least_y = fminf(least_y, py[p]), most_y = fmaxf(most_y, py[p]);
+    }
+    for (int step = 16; step; step /= 2) {
+      least_x = fminf(least_x, __shfl_xor_sync(kWarp, least_x, step));
+      most_x = fmaxf(most_x, __shfl_xor_sync(kWarp, most_x, step));
+      least_y = fminf(least_y, __shfl_xor_sync(kWarp, least_y, step));
+      most_y = fmaxf(most_y, __shfl_xor_sync(kWarp, most_y, step));
+    }
+    box = {least_x, most_x, least_y, most_y};
+  }
+  __device__ Place<float> place(int p) const { return {px[p], py[p]}; }
+};
+
 // What a batch of splats on rays has besides.
-template <int kCount, bool kRays>
+template <int kCount, int kRays>
 struct BatchOfRays {};
 template <int kCount>
-struct BatchOfRays<kCount, true> {
+struct BatchOfRays<kCount, kPinholeRays> {
   float4 ray[kCount];  // slope_u, slope_v, e
 };
 
 // A batch of splats in shared memory, local to the tile.
-template <int kCount, bool kRays>
+template <int kCount, int kRays>
 struct Batch : BatchOfRays<kCount, kRays> {
   float4 shape[kCount];  // y, l11, l12, l22
   float4 rest[kCount];   // u, log2 opacity, x, inverse depth
   float4 color[kCount];  // r, g, b
 
   // from, top: of the tile.
-  __device__ void put(int k, const BlendInput<float>& in, int32_t index, float from, float top) {
+  __device__ void put(int k, const BlendInput<float>& in, int, int32_t index, float from, float top) {
     const auto splat = load_splat<kRays>(in.splats, index);
     const float left = unrolled(splat, from, in.image.width);
     const auto s = localise(splat, left, top);
     shape[k] = make_float4(s.y, s.l11, s.l12, s.l22);
     rest[k] = make_float4(s.u, s.log2_opacity, splat.x - left, s.inverse_depth);
     color[k] = make_float4(s.r, s.g, s.b, 0);
-    if constexpr (kRays) this->ray[k] = make_float4(s.slope_u, s.slope_v, s.e, 0);
+    if constexpr (kRays != kNoRays) this->ray[k] = make_float4(s.slope_u, s.slope_v, s.e, 0);
   }
 
   __device__ auto local(int k) const {
     const float4 a = shape[k], b = rest[k];
     const LocalSplat<float> flat = {a.x, a.y, a.z, a.w, b.x, b.y, 0, 0, 0, b.w};
-    if constexpr (kRays) {
+    if constexpr (kRays != kNoRays) {
       const float4 c = this->ray[k];
       return LocalRaySplat<float>{flat, c.x, c.y, c.z};
     } else {
@@ -76,23 +107,68 @@ struct Batch : BatchOfRays<kCount, kRays> {
     }
   }
 
-  // Tells whether splat k can reach a box of the tile's pixels.
-  __device__ bool reaches(int k, float x0, float x1, float y0, float y1) const {
+  template <class L>
+  __device__ auto terms(int k, const L& at) const {
+    return row_terms(local(k), float(at.y));
+  }
+
+  // Tells whether splat k can reach the warp's pixels.
+  template <class L>
+  __device__ bool reaches(int k, const L& at) const {
     const float4 a = shape[k], b = rest[k];
     SplatOf<float, kRays> splat = {};
     splat.x = b.z, splat.y = a.x, splat.l11 = a.y, splat.l12 = a.z, splat.l22 = a.w, splat.log2_opacity = b.y;
-    if constexpr (kRays) {
+    if constexpr (kRays != kNoRays) {
       const float4 c = this->ray[k];
       splat.slope_u = c.x, splat.slope_v = c.y, splat.e = c.z;
     }
-    return box_reached(make_tile_test(splat, TileRect{0, 0, 1, 1}, 0, 0), x0, x1, y0, y1);
+    return box_reached(make_tile_test(splat, TileRect{0, 0, 1, 1}, 0, 0), float(at.left), float(at.left + L::kWide - 1),
+                       float(at.top), float(at.top + L::kHigh - 1));
   }
 };
 
-template <class L, int kCount, bool kRays>
+// A splat on the rays of a lens, in a tile.
+struct LensLocal {
+  LensTerms<float> terms;
+  float l12, l22, inverse_depth;
+};
+
+template <int kCount>
+struct Batch<kCount, kLensRays> {
+  float4 u[kCount], v[kCount];  // and e; and log2 opacity
+  float4 rest[kCount];          // s, inverse depth
+  float4 color[kCount];         // r, g, b
+  float4 shape[kCount];         // slope_u, slope_v, l12, l22
+
+  __device__ void put(int k, const BlendInput<float>& in, int tile, int32_t index, float, float) {
+    const auto s = load_splat<kLensRays>(in.splats, index);
+    const LensTerms<float> t = lens_terms(s, frame_at(in.table, tile));
+    u[k] = make_float4(t.u.one, t.u.x, t.u.y, t.e), v[k] = make_float4(t.v.one, t.v.x, t.v.y, t.log2_opacity);
+    rest[k] = make_float4(t.s.one, t.s.x, t.s.y, s.inverse_depth);
+    color[k] = make_float4(s.r, s.g, s.b, 0), shape[k] = make_float4(s.slope_u, s.slope_v, s.l12, s.l22);
+  }
+
+  // Of no slopes.
+  template <class L>
+  __device__ LensTerms<float> terms(int k, const L&) const {
+    const float4 a = u[k], b = v[k], c = rest[k];
+    return {{a.x, a.y, a.z}, {b.x, b.y, b.z}, {c.x, c.y, c.z}, a.w, b.w, 0, 0};
+  }
+  __device__ LensLocal local(int k) const {
+    LensLocal s = {terms(k, 0), shape[k].z, shape[k].w, rest[k].w};
+    s.terms.slope_u = shape[k].x, s.terms.slope_v = shape[k].y;
+    return s;
+  }
+  template <class L>
+  __device__ bool reaches(int k, const L& at) const {
+    return box_reached(terms(k, 0), at.box);
+  }
+};
+
+template <class L, int kCount, int kRays>
 __device__ inline unsigned reached_by_warp(const Batch<kCount, kRays>& batch, const L& at, int from, int count) {
   const int k = from + threadIdx.x % 32;
-  const bool hit = k < count && batch.reaches(k, at.left, at.left + L::kWide - 1, at.top, at.top + L::kHigh - 1);
+  const bool hit = k < count && batch.reaches(k, at);
   return __ballot_sync(kWarp, hit);
 }
 
@@ -102,7 +178,7 @@ constexpr int kTogether = L::kRun == 1 ? 2 : 1;
 
 // Goes front to back through the splats that reach the warp, of 32 from `from`. Calls step(k, p, exponent) for each
 // and for each pixel of the lane.
-template <class L, int kCount, bool kRays, class Step>
+template <class L, int kCount, int kRays, class Step>
 __device__ __forceinline__ void front_to_back(const Batch<kCount, kRays>& batch, const L& at, int from, int count,
                                               const Step& step) {
   for (unsigned hits = reached_by_warp(batch, at, from, count); hits;) {
@@ -113,9 +189,9 @@ __device__ __forceinline__ void front_to_back(const Batch<kCount, kRays>& batch,
       const bool exists = i == 0 || hits;
       k[i] = exists ? from + __ffs(hits) - 1 : k[0];
       hits &= hits - 1;
-      const auto row = row_terms(batch.local(k[i]), float(at.y));
+      const auto row = batch.terms(k[i], at);
 #pragma unroll
-      for (int p = 0; p < L::kRun; ++p) t[i][p] = exists ? exponent_at(row, float(at.x + at.column(p))) : -INFINITY;
+      for (int p = 0; p < L::kRun; ++p) t[i][p] = exists ? exponent_at(row, at.place(p)) : -INFINITY;
     }
 #pragma unroll
     for (int i = 0; i < kTogether<L>; ++i)

@@ -3,7 +3,7 @@
 #include <cuda_runtime.h>
 
 #include "../backend.h"
-#include "../math/ray_pixels.h"
+#include "../math/lens_pixels.h"
 #include "queue.cuh"
 #include "splat_row.cuh"
 
@@ -14,7 +14,7 @@ using namespace baseline;
 
 namespace {
 
-template <bool kRays>
+template <int kRays>
 __global__ void __launch_bounds__(kTile* kTile)
     decisive_kernel(BlendInput<float> in, const int32_t* last, bool* decisive) {
   const int across = tile_count(in.image.width), tile = blockIdx.x;
@@ -26,9 +26,15 @@ __global__ void __launch_bounds__(kTile* kTile)
   for (int64_t k = begin; k < end; ++k) {
     const int32_t index = in.instances[k];
     const auto splat = load_shape<kRays>(in.splats, index);
-    const float from = unrolled(splat, float(left), in.image.width);
-    const auto terms = row_terms(localise(splat, from, float(top)), float(row));
-    if (!(exponent_at(terms, float(column)) >= float(kLog2MinAlpha))) continue;
+    float t;
+    if constexpr (kRays == kLensRays) {
+      const float* place = places_of(in.table, in.image, tile) + kTile * row + column;
+      t = exponent_at(lens_terms(splat, frame_at(in.table, tile)), Place<float>{place[0], place[kTile * kTile]});
+    } else {
+      const float from = unrolled(splat, float(left), in.image.width);
+      t = exponent_at(row_terms(localise(splat, from, float(top)), float(row)), float(column));
+    }
+    if (!(t >= float(kLog2MinAlpha))) continue;
     decisive[index] = true;  // many threads write the same
     if (k >= blended) return;
   }
@@ -38,7 +44,9 @@ __global__ void __launch_bounds__(kTile* kTile)
 
 template <>
 void mark_decisive<float>(const Queue& queue, const BlendInput<float>& in, const int32_t* last, bool* decisive) {
-  const auto kernel = in.rays ? decisive_kernel<true> : decisive_kernel<false>;
+  const auto kernel = in.rays == kLensRays ? decisive_kernel<kLensRays>
+                      : in.rays            ? decisive_kernel<kPinholeRays>
+                                           : decisive_kernel<kNoRays>;
   kernel<<<unsigned(tiles_of(in.image)), kTile * kTile, 0, stream_of(queue)>>>(in, last, decisive);
   check_launch("decisive");
 }

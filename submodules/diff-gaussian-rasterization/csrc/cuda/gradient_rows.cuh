@@ -28,12 +28,12 @@ struct RowsOf : RowPlaces {
   float* values;  // (processed, kValues)
 };
 
-template <bool kRays>
+template <int kRays>
 using GradientRows = RowsOf<baseline::kGradientRow<kRays>>;
 using AbsoluteRows = RowsOf<baseline::kAbsoluteValues>;  // of the same instances
 
 // The rows of a backward; those of absolute gradients have no memory unless they are wanted.
-template <bool kRays>
+template <int kRays>
 struct FilledRows {
   GradientRows<kRays> gradients;
   AbsoluteRows absolute;
@@ -41,7 +41,7 @@ struct FilledRows {
 
 // Runs the backward of blending up to the rows, and to BlendGradient::absolute if it is wanted. Waits for the number of
 // rows if there may be many and the host does not run ahead.
-template <bool kRays>
+template <int kRays>
 GradientRows<kRays> fill_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g);
 
 // Sums the rows of a warp's splats, each in an order that depends on their number alone. The rows of neighbours lie
@@ -118,12 +118,12 @@ struct SlotSumsOf {
   }
 };
 
-template <bool kRays>
+template <int kRays>
 using SlotSums = SlotSumsOf<baseline::kGradientRow<kRays>>;
 
 // Finds the lengths of absolute gradients (N), 0 where a splat was not seen.
 void find_lengths(const Queue& queue, int64_t count, const SlotSumsOf<baseline::kAbsoluteValues>& sums,
-                  const float* splats, bool rays, Image image, float* absolute);
+                  const float* splats, int rays, Image image, float* absolute);
 
 // The gradients of the camera's numbers (math/camera_gradient.h).
 void camera_vjp(const Queue& queue, const Scene<float>& s, const SlotSums<false>& source, double* out);
@@ -132,11 +132,11 @@ void camera_vjp(const Queue& queue, const Scene<float>& s, const SlotSums<false>
 void count_rows(const Queue& queue, int64_t count, const RowPlaces& rows, const SplatSlots* slots, int32_t* counts);
 
 // Writes rows of both kinds as rows of all their values.
-template <bool kRays>
+template <int kRays>
 void join_rows(const Queue& queue, int64_t rows, const FilledRows<kRays>& from, float* to);
 
 // Makes rows by splat a source of sums, and finds RowSums::absolute if it is wanted.
-template <bool kRays>
+template <int kRays>
 SlotSums<kRays> sums_of(const Queue& queue, const SplatRows<float>& in, const RowSums<float>& to);
 
 }  // namespace cuda

@@ -19,7 +19,7 @@ constexpr int kThreads = kSleepBlock;
 constexpr int kBlocks = 5;  // that an SM is to hold at once: more registers do not pay
 
 // A source of moments for project_vjp_kernel, as SlotSums is: moments that were summed before.
-template <bool kRays>
+template <int kRays>
 struct StoredMoments {
   const float* moments;
   const int32_t* tile_counts;
@@ -102,14 +102,14 @@ struct Addition : StepParameters {};
 // PenalisedStep or ChainedStep, between which nothing differs but a call; or Addition, whose code would cost these
 // registers, and whose sums may therefore differ by rounding.
 template <class AnyCamera, class Source, class Step>
-__global__ void __launch_bounds__(kThreads, kBlocks)
+__global__ void __launch_bounds__(kThreads, kOnRays<AnyCamera> == kLensRays ? kBlocks - 1 : kBlocks)
     project_vjp_kernel(const int32_t* halted, Scene<float> s, Source source, SceneGradient<float> out,
                        const __grid_constant__ Step step) {
   if (!begin_work(halted)) return;
   const int64_t block = awake_block(s, blockIdx.x);
   if (block < 0) return;
   constexpr bool kAdds = std::is_same_v<Step, Addition>;
-  constexpr bool kRays = kOnRays<AnyCamera>;
+  constexpr int kRays = kOnRays<AnyCamera>;
   constexpr int kSums = SlotSums<kRays>::kStage,
                 kStage = kSums > WarpGradients::kFloats ? kSums : WarpGradients::kFloats;
   static_assert(32 * RowBefore::kFloats <= kStage, "a warp has memory for the rows of its lanes");
@@ -160,20 +160,22 @@ __global__ void __launch_bounds__(kThreads, kBlocks)
     write_rows(warp_rows, first, int(s.count - first < 32 ? s.count - first : 32), 3 * s.rest_bands, out.sh_rest);
 }
 
-template <bool kRays, class Source, class Step>
+template <int kRays, class Source, class Step>
 void launch_project_vjp(const Queue& queue, const Scene<float>& s, const Source& source,
                         const SceneGradient<float>& out, const Step& step) {
   const auto go = [&](auto kernel) {
     launch(queue, "project_vjp", kernel, blocks_for(s.rows(), kThreads), kThreads, s, source, out, step);
   };
-  if constexpr (kRays)
+  if constexpr (kRays == kLensRays)
+    go(project_vjp_kernel<LensRayCamera<float>, Source, Step>);
+  else if constexpr (kRays == kPinholeRays)
     go(project_vjp_kernel<RayCamera<float>, Source, Step>);
   else
     go(s.lens.chart == Chart::kPinhole ? project_vjp_kernel<Camera<float>, Source, Step>
                                        : project_vjp_kernel<LensCamera<float>, Source, Step>);
 }
 
-template <bool kRays>
+template <int kRays>
 void launch_gradients(const Queue& queue, const Scene<float>& s, const SlotSums<kRays>& source,
                       const SceneGradient<float>& out) {
   if (out.adds)
@@ -182,10 +184,10 @@ void launch_gradients(const Queue& queue, const Scene<float>& s, const SlotSums<
     launch_project_vjp<kRays>(queue, s, source, out, StepParameters{});
 }
 
-template <bool kRays>
+template <int kRays>
 void launch_step(const Queue& queue, const Scene<float>& s, const SlotSums<kRays>& source,
                  const GaussianStep<float>& step) {
-  if constexpr (!kRays)
+  if constexpr (kRays == kNoRays)
     if (step.camera) camera_vjp(queue, s, source, step.camera);
   const StepParameters parameters = step_parameters(step);
   if (step.chain)
@@ -201,11 +203,19 @@ void step_of_none(const Queue& queue, const Scene<float>& s, const GaussianStep<
   if (step.camera) camera_vjp(queue, s, SlotSums<false>{}, step.camera);
 }
 
-// Calls run(rays) with a constant, if there are Gaussians.
+// Calls run(rays) with a constant, if there are Gaussians. There are no rows of those on the rays of a lens.
+template <class Run>
+void by_kind_of_rows(const Scene<float>& s, const Run& run) {
+  if (!s.rows()) return;
+  if (s.rays())
+    run(std::integral_constant<int, kPinholeRays>());
+  else
+    run(std::integral_constant<int, kNoRays>());
+}
 template <class Run>
 void by_kind(const Scene<float>& s, const Run& run) {
-  if (!s.rows()) return;
-  s.rays ? run(std::true_type()) : run(std::false_type());
+  if (s.rows() && s.rays() == kLensRays) return run(std::integral_constant<int, kLensRays>());
+  by_kind_of_rows(s, run);
 }
 
 }  // namespace
@@ -234,7 +244,7 @@ void rasterize_vjp_step(const Queue& queue, const Scene<float>& s, const BlendIn
 
 void rows_vjp(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, const RowSums<float>& to,
               const GradientMemory& memory) {
-  by_kind(s, [&](auto rays) {
+  by_kind_of_rows(s, [&](auto rays) {
     const SlotSums<rays> source = sums_of<rays>(queue, in, to);
     launch_gradients<rays>(queue, s, source, memory.take(memory.context));
   });
@@ -243,7 +253,7 @@ void rows_vjp(const Queue& queue, const Scene<float>& s, const SplatRows<float>&
 void rows_vjp_step(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, const RowSums<float>& to,
                    const GaussianStep<float>& step) {
   if (!s.rows()) return step_of_none(queue, s, step);
-  by_kind(s, [&](auto rays) { launch_step<rays>(queue, s, sums_of<rays>(queue, in, to), step); });
+  by_kind_of_rows(s, [&](auto rays) { launch_step<rays>(queue, s, sums_of<rays>(queue, in, to), step); });
 }
 
 }  // namespace cuda

@@ -61,10 +61,10 @@ __global__ void __launch_bounds__(kThreads)
   fetch(likely);
   const bool visible = i < s.count && project_shape(s, camera, SceneRow<float>{s, i}, splat, depth, radius);
   TileRect rect = {0, 0, 0, 0};
-  if (visible) rect = tile_rect(splat, s.image.width, s.image.height, goes_around(camera));
+  if (visible) rect = rect_of(camera, splat, s.image);
   fetch(rect.x1 > rect.x0);
   uint64_t mask;
-  int32_t count = warp_count_tiles<std::is_same_v<AnyCamera, LensCamera<float>>>(splat, rect, s.image, mask);
+  int32_t count = warp_count_tiles<std::is_same_v<AnyCamera, LensCamera<float>>>(splat, rect, s.image, out.table, mask);
   wait_for_rows();
   if (count && !project_color(s, camera, SceneRow<float>{s, i}, rest + threadIdx.x * kRest, splat)) count = 0;
   if (row >= s.rows()) return;
@@ -83,7 +83,8 @@ __global__ void __launch_bounds__(kThreads)
 template <>
 void project<float>(const Queue& queue, const Scene<float>& s, const Projected<float>& out) {
   if (!s.rows()) return;
-  const auto kernel = s.rays                            ? project_kernel<RayCamera<float>>
+  const auto kernel = s.rays() == kLensRays             ? project_kernel<LensRayCamera<float>>
+                      : s.rays()                        ? project_kernel<RayCamera<float>>
                       : s.lens.chart == Chart::kPinhole ? project_kernel<Camera<float>>
                                                         : project_kernel<LensCamera<float>>;
   launch(queue, "project", kernel, blocks_for(s.rows(), kThreads), kThreads, s, out);

@@ -38,7 +38,7 @@ __global__ void __launch_bounds__(kThreads)
 }
 
 // Rows with the values of absolute gradients, in pairs, and the two arrays of their two parts.
-template <class Pair, bool kRays>
+template <class Pair, int kRays>
 struct Halves {
   static constexpr int kGradientPairs = kGradientRow<kRays> / 2, kPairs = kGradientPairs + kAbsoluteValues / 2;
   Pair *gradients, *absolute;
@@ -62,7 +62,7 @@ void copy_pairs(const Queue& queue, int64_t pairs, From from, To to) {
   launch(queue, "copy_pairs", copy_pairs_kernel<From, To>, blocks_for(pairs, kThreads), kThreads, pairs, from, to);
 }
 
-template <bool kRays>
+template <int kRays>
 Halves<float2, kRays> halves(float* gradients, float* absolute) {
   return {reinterpret_cast<float2*>(gradients), reinterpret_cast<float2*>(absolute)};
 }
@@ -111,7 +111,7 @@ void lay_out(const Queue& queue, const SplatRows<float>& in, SplatSlots* slots, 
 }  // namespace
 
 void find_lengths(const Queue& queue, int64_t count, const SlotSumsOf<kAbsoluteValues>& sums, const float* splats,
-                  bool rays, Image image, float* absolute) {
+                  int rays, Image image, float* absolute) {
   launch(queue, "absolute", absolute_kernel, blocks_for(count, kThreads), kThreads, count, sums, splats,
          splat_row(rays), image, absolute);
 }
@@ -120,15 +120,15 @@ void count_rows(const Queue& queue, int64_t count, const RowPlaces& rows, const 
   launch(queue, "count_rows", count_rows_kernel, blocks_for(count, kThreads), kThreads, count, rows, slots, counts);
 }
 
-template <bool kRays>
+template <int kRays>
 void join_rows(const Queue& queue, int64_t rows, const FilledRows<kRays>& from, float* to) {
   const auto both = halves<kRays>(from.gradients.values, from.absolute.values);
   copy_pairs(queue, both.kPairs * rows, both, reinterpret_cast<float2*>(to));
 }
-template void join_rows<false>(const Queue&, int64_t, const FilledRows<false>&, float*);
-template void join_rows<true>(const Queue&, int64_t, const FilledRows<true>&, float*);
+template void join_rows<kNoRays>(const Queue&, int64_t, const FilledRows<kNoRays>&, float*);
+template void join_rows<kPinholeRays>(const Queue&, int64_t, const FilledRows<kPinholeRays>&, float*);
 
-template <bool kRays>
+template <int kRays>
 SlotSums<kRays> sums_of(const Queue& queue, const SplatRows<float>& in, const RowSums<float>& to) {
   SplatSlots* slots = queue.array<SplatSlots>(in.count + 1);
   int32_t* before = queue.array<int32_t>(in.count + 1);
@@ -144,8 +144,8 @@ SlotSums<kRays> sums_of(const Queue& queue, const SplatRows<float>& in, const Ro
   }
   return {{{nullptr, before}, gradients}, slots};
 }
-template SlotSums<false> sums_of<false>(const Queue&, const SplatRows<float>&, const RowSums<float>&);
-template SlotSums<true> sums_of<true>(const Queue&, const SplatRows<float>&, const RowSums<float>&);
+template SlotSums<kNoRays> sums_of<kNoRays>(const Queue&, const SplatRows<float>&, const RowSums<float>&);
+template SlotSums<kPinholeRays> sums_of<kPinholeRays>(const Queue&, const SplatRows<float>&, const RowSums<float>&);
 
 }  // namespace cuda
 }  // namespace gs

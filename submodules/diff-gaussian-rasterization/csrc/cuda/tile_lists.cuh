@@ -131,23 +131,23 @@ __global__ void __launch_bounds__(kListThreads)
 }
 
 // Calls take(tile, splat) for the tiles of splats without a mask, which the warps of `blocks` blocks share.
-template <bool kRays, class Take>
+template <int kRays, class Take>
 __device__ __forceinline__ void each_large(const Projected<float>& in, Image image, const ListCounts& counts,
                                            unsigned block, unsigned blocks, const Take& take) {
   constexpr unsigned kWarps = kListThreads / 32;
   for (int k = int(block * kWarps + threadIdx.x / 32), all = *counts.larges; k < all; k += blocks * kWarps) {
     const int32_t splat = counts.large[k];
     const TileRect rect = reached_by(in, splat).rect;
-    const auto test = make_tile_test(load_shape<kRays>(in.splats, splat), rect, image.width, image.height);
+    const auto test = test_of(load_shape<kRays>(in.splats, splat), rect, image, in.table);
     const int wide = rect.x1 - rect.x0, area = wide * (rect.y1 - rect.y0);
     for (int place = threadIdx.x % 32; place < area; place += 32) {
       const int x = rect.x0 + place % wide, y = rect.y0 + place / wide;
-      if (tile_reached(test, float(x), float(y))) take(y * tile_count(image.width) + x, splat);
+      if (tile_reached<true>(test, float(x), float(y))) take(y * tile_count(image.width) + x, splat);
     }
   }
 }
 
-template <bool kRays>
+template <int kRays>
 __global__ void __launch_bounds__(kListThreads)
     count_large_kernel(const int32_t* halted, Projected<float> in, Image image, ListCounts counts) {
   if (!begin_work(halted)) return;
@@ -207,7 +207,7 @@ __device__ __forceinline__ uint64_t list_key(const Projected<float>& in, int32_t
 
 // Puts each splat's instances into the lists, and stores its slots, if they are wanted; those of splat n are behind
 // all. Blocks behind those of the shares take splats without a mask.
-template <bool kRays>
+template <int kRays>
 __global__ void __launch_bounds__(kListThreads)
     fill_kernel(const int32_t* halted, int64_t n, int64_t splats, unsigned shares, Projected<float> in, Image image,
                 ListCounts counts, const int64_t* of_shares, SplatSlots* slots, ListWork work) {

@@ -1,7 +1,7 @@
 #pragma once
 // Counts the tiles that a splat reaches, by whole warps: a splat over a thousand tiles must not hold up 31 others.
 #include "../data.h"
-#include "../math/ray_pixels.h"
+#include "../math/lens_pixels.h"
 #include "queue.cuh"
 
 namespace gs {
@@ -32,6 +32,45 @@ __device__ inline RayTileTest<float> from_lane(RayTileTest<float> test, int lane
   flat = from_lane(flat, lane);
   test.by_x = from_lane(test.by_x, lane), test.by_y = from_lane(test.by_y, lane);
   test.reach = from_lane(test.reach, lane), test.margin = from_lane(test.margin, lane);
+  return test;
+}
+
+template <>
+__device__ inline LensTileTest<float> from_lane(LensTileTest<float> test, int lane) {
+  for (Vec3<float>* a : {&test.u, &test.v, &test.s})
+    *a = {from_lane(a->x, lane), from_lane(a->y, lane), from_lane(a->z, lane)};
+  test.e = from_lane(test.e, lane), test.log2_opacity = from_lane(test.log2_opacity, lane);
+  return test;
+}
+
+// As for others, by the frame of the tile.
+template <bool kMayCross>
+__device__ inline bool tile_reached(const LensTileTest<float>& test, float x, float y) {
+  const float4* row = reinterpret_cast<const float4*>(test.table + kFrameValues * (int(y) * test.columns + int(x)));
+  const float4 a = row[0], b = row[1], c = row[2], d = row[3];
+  const float frame[] = {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w, c.x, c.y, c.z, c.w, d.x};
+  return frame_reached(test, frame);
+}
+
+// The test of a splat, whatever it is.
+template <class AnySplat>
+__device__ inline auto test_of(const AnySplat& splat, TileRect rect, Image image, const float*) {
+  return make_tile_test(splat, rect, image.width, image.height);
+}
+__device__ inline LensTileTest<float> test_of(const LensRaySplat<float>& splat, TileRect, Image image,
+                                              const float* table) {
+  return make_tile_test(splat, image, table);
+}
+template <class Test, class AnySplat>
+__device__ inline Test test_of_none(const AnySplat& splat, Image image, const float*) {
+  Test test = {};
+  test.splat = splat, test.last_x = float(image.width - 1), test.last_y = float(image.height - 1);
+  return test;
+}
+template <>
+__device__ inline LensTileTest<float> test_of_none(const LensRaySplat<float>&, Image image, const float* table) {
+  LensTileTest<float> test = {};
+  test.table = table, test.columns = tile_count(image.width);
   return test;
 }
 
@@ -66,13 +105,13 @@ __device__ inline uint32_t warp_tiles_reached(const Test& test, int x0, int y0, 
 // Returns the number of tiles that the lane's splat reaches, and in `mask` a bit for each of its rectangle's first 64.
 // All lanes of a warp call this; a lane without a splat gives an empty rectangle.
 template <bool kMayCross, class AnySplat>
-__device__ inline int32_t warp_count_tiles(const AnySplat& splat, TileRect rect, Image image, uint64_t& mask) {
-  using Test = decltype(make_tile_test(splat, rect, 0, 0));
+__device__ inline int32_t warp_count_tiles(const AnySplat& splat, TileRect rect, Image image, const float* table,
+                                           uint64_t& mask) {
+  using Test = decltype(test_of(splat, rect, image, table));
   const int lane = threadIdx.x & 31;
   const int wide = rect.x1 - rect.x0, tiles = wide * (rect.y1 - rect.y0);
-  Test test = {};
-  test.splat = splat, test.last_x = float(image.width - 1), test.last_y = float(image.height - 1);
-  if (tiles > 0) test = make_tile_test(splat, rect, image.width, image.height);
+  Test test = test_of_none<Test>(splat, image, table);
+  if (tiles > 0) test = test_of(splat, rect, image, table);
   int32_t count = 0;
   mask = 0;
   const bool shared = tiles > 0 && tiles <= kShared;

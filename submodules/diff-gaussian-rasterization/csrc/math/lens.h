@@ -9,6 +9,7 @@
 #include <cmath>
 
 #include "../data.h"
+#include "constants.h"
 #include "vec.h"
 
 GS_ISA_BEGIN

@@ -18,9 +18,9 @@ template <class T>
 struct RayCamera : Camera<T> {};
 
 template <class AnyCamera>
-constexpr bool kOnRays = false;
+constexpr int kOnRays = kNoRays;
 template <class T>
-constexpr bool kOnRays<RayCamera<T>> = true;
+constexpr int kOnRays<RayCamera<T>> = kPinholeRays;
 
 // Of no clamped ray: nothing here explodes.
 template <class T, class V>
@@ -128,22 +128,29 @@ GS_HD ShapeGradient<T> ray_vjp(const Footprint<T>& f, const RayMoments<T>& m, co
            u.x * yu.y + v.x * yv.y - r.x * yp.y}};
 }
 
-// For Gaussians given by cov3d, p3 the row that makes m3: the gradients of C by the moments of a, of k and of c.
+// The moments of a, for the gradient of C, and that of k.
 template <class T>
-GS_HD void ray_covariance_vjp(const Footprint<T>& f, const RayMoments<T>& m, const Slopes<T>& s, bool antialiasing,
-                              Vec3<T> p1, Vec3<T> p2, Vec3<T> p3, T* g) {
+GS_HD Moments<T> pulling_moments(const Footprint<T>& f, const RayMoments<T>& m, const Slopes<T>& s, T k[2]) {
   const T su = s.slope_u, sv = s.slope_v;
   Moments<T> a = m.on_image;
   a.quu += su * (su * m.pp - 2 * m.pu), a.qvv += sv * (sv * m.pp - 2 * m.pv);
   a.quv += su * (sv * m.pp - m.pv) - sv * m.pu;
-  T c2[3], more[6];
-  covariance2d_vjp(f, a, antialiasing, c2);
-  covariance_vjp(p1, p2, c2, g);
   const Scalar<T> four_ln2_sq = Scalar<T>(4 * kLn2 * kLn2);
   const T u = four_ln2_sq * (su * m.pp - m.pu), v = four_ln2_sq * (sv * m.pp - m.pv);
-  const T c3[3] = {T{}, all<T>(0.5), four_ln2_sq / 2 * m.pp};
-  covariance_vjp((f.l11 * u) * p1 + (f.l12 * u + f.l22 * v) * p2, p3, c3, more);
-  for (int k = 0; k < 6; ++k) g[k] += more[k];
+  k[0] = f.l11 * u, k[1] = f.l12 * u + f.l22 * v;
+  return a;
+}
+
+// For Gaussians given by cov3d, p3 the row that makes m3: the gradients of C by the moments of a, of k and of c.
+template <class T>
+GS_HD void ray_covariance_vjp(const Footprint<T>& f, const RayMoments<T>& m, const Slopes<T>& s, bool antialiasing,
+                              Vec3<T> p1, Vec3<T> p2, Vec3<T> p3, T* g) {
+  T c2[3], k[2], more[6];
+  covariance2d_vjp(f, pulling_moments(f, m, s, k), antialiasing, c2);
+  covariance_vjp(p1, p2, c2, g);
+  const T c3[3] = {T{}, all<T>(0.5), Scalar<T>(2 * kLn2 * kLn2) * m.pp};
+  covariance_vjp(k[0] * p1 + k[1] * p2, p3, c3, more);
+  for (int i = 0; i < 6; ++i) g[i] += more[i];
 }
 
 template <class T, class V>

@@ -3,9 +3,7 @@
 #include <cmath>
 
 #include "../data.h"
-#include "lens_camera.h"
-#include "projection.h"
-#include "ray.h"
+#include "lens_rays.h"
 
 GS_ISA_BEGIN
 
@@ -39,11 +37,14 @@ void with_camera(const Scene<T>& s, const Run& run) {
   run(camera);
 }
 
-// The same, or with a RayCamera.
+// The same, or with a camera of rays.
 template <class T, class Run>
 void with_any_camera(const Scene<T>& s, const Run& run) {
-  if (s.rays) return run(RayCamera<T>{camera_of(s)});
-  with_camera(s, run);
+  if (s.rays() == kPinholeRays) return run(RayCamera<T>{camera_of(s)});
+  if (s.rays() == kNoRays) return with_camera(s, run);
+  LensRayCamera<T> camera;
+  set_camera(s, camera);
+  run(camera);
 }
 
 // A Gaussian's parameters as they are stored. They are read where they are used: a GPU would keep them in registers
@@ -205,7 +206,7 @@ GS_HD void project_vjp_row(const Scene<T>& s, const AnyCamera& camera, const Row
     return project_splat_vjp(camera, in.gaussian, s.antialiasing, s.raw, g_covariance, moments, m[9]);
   };
   GaussianGradient<V> g;
-  if constexpr (kOnRays<AnyCamera>)
+  if constexpr (kOnRays<AnyCamera> != kNoRays)
     g = shape_gradient(RayMoments<V>{moments_of(m), m[10], m[11], m[12]});
   else
     g = shape_gradient(moments_of(m));

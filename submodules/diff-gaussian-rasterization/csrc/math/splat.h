@@ -2,8 +2,8 @@
 // A splat, a Gaussian projected to the image, and the number of values in its rows.
 #include <type_traits>
 
-#include "gs/isa.h"
-#include "gs/number.h"
+#include "../data.h"
+#include "vec.h"
 
 GS_ISA_BEGIN
 
@@ -41,13 +41,25 @@ struct RaySplat : Splat<T> {
 constexpr int kRayValues = 4;  // of a row besides, and of its gradient sums, of which the last is 0 as well
 static_assert(sizeof(RaySplat<float>) == (kSplatValues + kRayValues) * sizeof(float), "a row of splats");
 
-template <class T, bool kRays>
-using SplatOf = std::conditional_t<kRays, RaySplat<T>, Splat<T>>;
-GS_HD constexpr int splat_row(bool rays) { return kSplatValues + (rays ? kRayValues : 0); }
-GS_HD constexpr int gradient_row(bool rays) { return kGradientValues + (rays ? kRayValues : 0); }
-template <bool kRays>
+// The same of a lens (lens_rays.h). x, y: the mean's pixel, or of the nearest point of the lens's field.
+template <class T>
+struct LensRaySplat : RaySplat<T> {
+  Vec3<T> to_u, to_v, n;  // factors of a direction of the view
+  T nothing;
+};
+constexpr int kLensRayValues = 10;  // of a row besides
+static_assert(sizeof(LensRaySplat<float>) == (kSplatValues + kRayValues + kLensRayValues) * sizeof(float), "the same");
+
+template <class T, int kRays>
+using SplatOf = std::conditional_t<kRays == kLensRays, LensRaySplat<T>,
+                                   std::conditional_t<kRays == kNoRays, Splat<T>, RaySplat<T>>>;
+GS_HD constexpr int splat_row(int rays) {
+  return kSplatValues + (rays ? kRayValues : 0) + (rays == kLensRays ? kLensRayValues : 0);
+}
+GS_HD constexpr int gradient_row(int rays) { return kGradientValues + (rays ? kRayValues : 0); }
+template <int kRays>
 constexpr int kSplatRow = splat_row(kRays);
-template <bool kRays>
+template <int kRays>
 constexpr int kGradientRow = gradient_row(kRays);
 
 GS_ISA_END

@@ -1,5 +1,6 @@
 #pragma once
 // A random scene, and a forward and a backward pass through a backend, for tests.
+#include <algorithm>
 #include <cmath>
 #include <memory>
 #include <numeric>
@@ -9,6 +10,7 @@
 #include "backend.h"
 #include "gs/check.h"
 #include "math/layers.h"
+#include "math/lens_pixels.h"
 #include "math/splat.h"
 
 using namespace gs::GS_ISA;
@@ -55,6 +57,11 @@ struct Parameters {
 };
 
 template <class T>
+gs::Lens<T> fisheye(T focal, T x, T y) {
+  return {gs::Chart::kEquidistant, 4, 1, 2, 5 * focal, 50, focal, focal, focal, x, y, {}, {}, {}, {}};
+}
+
+template <class T>
 struct Result {
   std::vector<T> color, transmittance, depth, gradient, absolute;
   std::vector<int32_t> radii, tile_counts;
@@ -74,14 +81,14 @@ gs::Scene<T> scene_of(Parameters<T>& p, gs::Image image, bool antialiasing) {
   scene.dc_stride = 3, scene.rest_stride = 45, scene.rest_bands = 15, scene.sh_degree = 3;
   scene.raw = true, scene.antialiasing = antialiasing, scene.scale_modifier = 1;
   scene.view = p.view, scene.projection = p.full, scene.center = center;
-  scene.tan_x = scene.tan_y = 0.6, scene.image = image, scene.lens = p.lens, scene.rays = p.rays;
+  scene.tan_x = scene.tan_y = 0.6, scene.image = image, scene.lens = p.lens, scene.on_rays = p.rays;
   return scene;
 }
 
 // A forward of a scene, and what its backward needs. Allocations are exact, so that a sanitizer sees an access outside.
 template <class T>
 struct RenderedOf {
-  std::vector<T> splats, depths, color, transmittance, inverse_depth, gradient, moments, layers;
+  std::vector<T> splats, depths, color, transmittance, inverse_depth, gradient, moments, layers, table;
   std::vector<int32_t> rects, tile_counts, radii, last, instances;
   std::vector<gs::TileRecord> records;
   std::vector<int64_t> ranges;
@@ -103,26 +110,36 @@ struct Asked {
   const gs::Ahead* ahead = nullptr;
 };
 
+template <class T>
+gs::Lens<double> wide(const gs::Lens<T>& l) {
+  gs::Lens<double> out = {l.chart,   l.limit,    l.reach,    l.field, l.steep, l.beyond, l.slope, l.focal_x,
+                          l.focal_y, l.center_x, l.center_y, {},      {},      {},       {}};
+  std::copy_n(l.radial, 4, out.radial), std::copy_n(l.divisor, 3, out.divisor);
+  std::copy_n(l.tangential, 2, out.tangential), std::copy_n(l.prism, 2, out.prism);
+  return out;
+}
+
 // Projects and bins, on an Executor or a Queue.
 template <class T, class Where>
 std::unique_ptr<RenderedOf<T>> bin_scene(const Where& where, const gs::Scene<T>& scene, const Asked& asked) {
   using gs::cuda::bin, gs::cuda::project, gs::GS_ISA::bin, gs::GS_ISA::project;
+  using gs::cuda::lens_table, gs::GS_ISA::lens_table;
   auto out = std::make_unique<RenderedOf<T>>();
   RenderedOf<T>& r = *out;
   const gs::Image image = scene.image;
   const size_t n = scene.rows();
   r.scene = scene;
-  r.splats.resize(splat_row(scene.rays) * n), r.depths.resize(n), r.tile_counts.resize(n), r.radii.resize(n);
+  r.splats.resize(splat_row(scene.rays()) * n), r.depths.resize(n), r.tile_counts.resize(n), r.radii.resize(n);
   r.rects.assign(4 * n, 0x7fffffff), r.records.resize(n);  // undefined values must not be used
   r.ranges.resize(size_t((image.width + 15) / 16) * ((image.height + 15) / 16) + 1);
   r.slots.resize(asked.slots ? n + 1 : 0);
-  const gs::Projected<T> projected = {r.splats.data(),
-                                      r.depths.data(),
-                                      asked.rects ? r.rects.data() : nullptr,
-                                      r.tile_counts.data(),
-                                      r.radii.data(),
-                                      asked.records ? r.records.data() : nullptr,
-                                      scene.rays};
+  if (scene.rays() == gs::kLensRays) {
+    r.table.resize(lens_table_values(image));
+    lens_table(where, wide(scene.lens), image, r.table.data());
+  }
+  const gs::Projected<T> projected = {r.splats.data(),      r.depths.data(), asked.rects ? r.rects.data() : nullptr,
+                                      r.tile_counts.data(), r.radii.data(),  asked.records ? r.records.data() : nullptr,
+                                      scene.rays(),         r.table.data()};
   project(where, scene, projected);
   const auto take = [](void* context, int64_t count, int64_t slots) {
     RenderedOf<T>& to = *static_cast<RenderedOf<T>*>(context);
@@ -150,12 +167,13 @@ std::unique_ptr<RenderedOf<T>> render(const Where& where, const gs::Scene<T>& sc
   const size_t pixels = r.pixels();
   const int64_t room = int64_t(r.instances.size());
   r.color.resize(3 * pixels), r.transmittance.resize(pixels), r.inverse_depth.resize(pixels), r.last.resize(pixels);
-  r.input = {r.splats.data(), r.instances.data(), r.ranges.data(), r.background, scene.image, room, scene.rays};
+  r.input = {r.splats.data(), r.instances.data(), r.ranges.data(), r.background, scene.image, room,
+             scene.rays(),    r.table.data()};
   r.layers = memory_for_layers<T>(where, scene.image, room);
   T* const layers = r.layers.empty() ? nullptr : r.layers.data();
   blend(where, r.input,
         gs::Blended<T>{r.color.data(), r.transmittance.data(), r.inverse_depth.data(), r.last.data(), layers});
-  r.gradient.assign(3 * pixels, T(1)), r.moments.resize(gradient_row(scene.rays) * scene.rows());
+  r.gradient.assign(3 * pixels, T(1)), r.moments.resize(gradient_row(scene.rays()) * scene.rows());
   const T* const g = r.gradient.data();
   r.backward = {scene.rows(),     room,   r.slot_count, r.slots.data(), r.transmittance.data(), r.last.data(), g, g, g,
                 r.moments.data(), layers, asked.ahead};

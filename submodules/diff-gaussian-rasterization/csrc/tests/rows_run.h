@@ -12,7 +12,7 @@ struct KeptRows {
 
   gs::SplatRows<float> given(const Rendered& r) const {
     return {int64_t(counts.size()),        r.tile_counts.data(), counts.data(), rows.data(),
-            int64_t(rows.size()) / values, r.scene.rays};
+            int64_t(rows.size()) / values, r.scene.rays()};
   }
 };
 
@@ -67,7 +67,7 @@ void check_rows(const Where& where, const gs::Scene<float>& scene, bool depth, b
     for (std::vector<float>& of : lengths) of.assign(absolute ? scene.count : 0, -77.0f);
     const auto to = [&](int which) { return absolute ? lengths[which].data() : nullptr; };
     const auto wanted = gradients_of(*r, static_cast<const KeptRows*>(nullptr), to(1));
-    for (const KeptRows& rows : {whole, scene.rays ? whole : summed(where, whole)}) {
+    for (const KeptRows& rows : {whole, scene.on_rays ? whole : summed(where, whole)}) {
       CHECK(gradients_of(*r, &rows, to(0)) == wanted);
       CHECK(lengths[0] == lengths[1]);
     }

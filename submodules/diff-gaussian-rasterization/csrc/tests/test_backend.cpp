@@ -18,7 +18,8 @@ void test_threads_and_sizes() {
   for (const gs::Image image : {gs::Image{1, 1}, gs::Image{16, 16}, gs::Image{17, 31}, gs::Image{70, 33}})
     for (int64_t count : {0, 1, 700}) {
       Parameters<T> p(count);
-      p.rays = image.width == 70;
+      p.rays = image.width >= 17;
+      if (image.width == 17) p.lens = fisheye<T>(10, 8, 15);
       const Result<T> serial = run(gs::serial_executor(), p, image, true),
                       parallel = run(gs::three_threads(), p, image, true);
       CHECK(serial.color == parallel.color && serial.transmittance == parallel.transmittance);

@@ -71,8 +71,11 @@ void test_lenses() {
   for (const gs::Chart chart : {gs::Chart::kPerspective, gs::Chart::kEquidistant, gs::Chart::kEquirectangular}) {
     Parameters<float> p(100);
     p.lens = {
-        chart, 4, 1, 2, 200, 50, 30, 31, 34, 17, {-0.05f, 0.01f, 0.001f, 0.0001f}, {0.02f, 0, 0}, {0.003f, 0.002f}, {}};
+        chart, 4, 1, 2, 200, 50, 40, 30, 31, 34, 17, {-0.05f, 0.01f, 0.001f, 0.0001f}, {0.02f, 0, 0}, {0.003f, 0.002f},
+        {}};
     check_scene(p, gs::Image{70, 33}, chart == gs::Chart::kPerspective, false);
+    p.rays = chart != gs::Chart::kEquirectangular;
+    if (p.rays) check_scene(p, gs::Image{70, 33}, chart == gs::Chart::kEquidistant, true);
   }
   Parameters<float> p(100);  // a full panorama: splats cross its border
   p.lens = {gs::Chart::kEquirectangular,
@@ -80,6 +83,7 @@ void test_lenses() {
             1,
             INFINITY,
             INFINITY,
+            0,
             0,
             float(70 / (2 * kPi)),
             float(33 / kPi),
@@ -90,6 +94,8 @@ void test_lenses() {
             {},
             {}};
   for (int64_t i = 0; i < p.count; ++i) p.means[3 * i + 2] *= i % 2 ? 1 : -1;
+  check_scene(p, gs::Image{70, 33}, true, false);
+  p.rays = true;
   check_scene(p, gs::Image{70, 33}, true, false);
 }
 
@@ -115,10 +121,11 @@ void test_rays() {
 
 // More tiles than kFewTiles, so that fewer warps share one, and a list of two chunks. One order only, because it is
 // slow.
-void test_many_tiles(bool rays) {
+void test_many_tiles(gs::Rays rays) {
   constexpr gs::Image image{1040, 1024};
   Parameters<float> p(700);
-  p.rays = rays;
+  p.rays = rays != gs::kNoRays;
+  if (rays == gs::kLensRays) p.lens = fisheye(860.0f, 519.5f, 511.5f);
   for (int64_t i = 100; i < p.count; ++i) {
     p.means[3 * i] = p.means[3 * i + 1] = 0.1f, p.means[3 * i + 2] = 4 + 0.001f * float(i);
     p.opacities[i] = -4.8f;
@@ -618,7 +625,8 @@ void test_wake(int64_t seen, gs::Chart chart = gs::Chart::kPinhole) {
         gs::emulation::order = order;
         constexpr int64_t count = 5 * gs::kSleepBlock - 28;
         Stepping start{Parameters<float>(count)};
-        start.values.lens = {chart, 4, 1, 2, 200, 50, 30, 31, 20, 12, {-0.05f, 0.01f}, {0.02f}, {0.003f, 0.002f}, {}};
+        start.values.lens = {chart, 4, 1, 2, 200, 50, 40, 30, 31, 20, 12, {-0.05f, 0.01f}, {0.02f}, {0.003f, 0.002f},
+                             {}};
         for (int64_t i = 0; i < count; ++i) {
           const int64_t block = i / gs::kSleepBlock;
           start.values.means[3 * i + 2] = some && block % 2 == 0 && (block < 4 || last) ? 3.0f : -3.0f;
@@ -757,9 +765,21 @@ void test_cameras() {
       const bool pinhole = chart == gs::Chart::kPinhole;
       Parameters<float> p(count);
       if (!pinhole)
-        p.lens = {
-            chart, 4, 1, 2, 200, 50, 60, 61, 34, 17, {-0.05f, 0.01f, 0.001f, 0.0001f}, {0.02f, 0, 0}, {0.003f, 0.002f},
-            {}};
+        p.lens = {chart,
+                  4,
+                  1,
+                  2,
+                  200,
+                  50,
+                  80,
+                  60,
+                  61,
+                  34,
+                  17,
+                  {-0.05f, 0.01f, 0.001f, 0.0001f},
+                  {0.02f, 0, 0},
+                  {0.003f, 0.002f},
+                  {}};
       const gs::Scene<float> scene = scene_of(p, gs::Image{70, 33}, count == 50);
       const std::vector<double> wanted = camera_gradient(gs::serial_executor(), scene);
       std::vector<double> first;
@@ -827,8 +847,9 @@ int main() {
                          test_lenses,
                          test_rays,
                          test_lists_of_all_lengths,
-                         [] { test_many_tiles(false); },
-                         [] { test_many_tiles(true); },
+                         [] { test_many_tiles(gs::kNoRays); },
+                         [] { test_many_tiles(gs::kPinholeRays); },
+                         [] { test_many_tiles(gs::kLensRays); },
                          test_shared_lists_are_blended_as_whole_ones,
                          test_longest_first,
                          test_front_first,

@@ -17,11 +17,23 @@ void check_splats(const Tensor& splats) {
   check_given(splats, "splats");
   const ScalarType type = splats.scalar_type();
   GS_CHECK_TYPE(is_floating(type), "splats must be float32 or float64, got ", type);
-  GS_CHECK_VALUE(splats.dim() == 2 && (splats.size(1) == kSplatRow<false> || on_rays(splats)), "splats must be (N, ",
-                 kSplatRow<false>, ") or (N, ", kSplatRow<true>, "), got ", splats.sizes());
+  GS_CHECK_VALUE(splats.dim() == 2 && (splats.size(1) == kSplatRow<gs::kNoRays> || rays_of(splats)),
+                 "splats must be (N, ", kSplatRow<gs::kNoRays>, "), (N, ", kSplatRow<gs::kPinholeRays>, ") or (N, ",
+                 kSplatRow<gs::kLensRays>, "), got ", splats.sizes());
 }
 
-bool on_rays(const Tensor& splats) { return splats.size(1) == kSplatRow<true>; }
+void check_staged(const Tensor& splats) {
+  check_splats(splats);
+  GS_CHECK_VALUE(rays_of(splats) != gs::kLensRays,
+                 "splats on the rays of a lens are drawn by `rasterize` alone, not stage by stage");
+}
+
+gs::Rays rays_of(const Tensor& splats) {
+  const int64_t values = splats.size(1);
+  return values == kSplatRow<gs::kLensRays>      ? gs::kLensRays
+         : values == kSplatRow<gs::kPinholeRays> ? gs::kPinholeRays
+                                                 : gs::kNoRays;
+}
 
 void check_lists(const Tensor& instances, const Tensor& ranges, const Tensor& splats, gs::Image image) {
   check_tensor(instances, "instances", ScalarType::Int, splats.device(), {-1});
@@ -46,9 +58,9 @@ Tensor background_like(const Tensor& background, const Tensor& splats) {
   return converted(background, splats);
 }
 
-int64_t row_values(bool absolute, bool rays) { return gradient_row(rays) + (absolute ? kAbsoluteValues : 0); }
+int64_t row_values(bool absolute, gs::Rays rays) { return gradient_row(rays) + (absolute ? kAbsoluteValues : 0); }
 
-BlendBackward::BlendBackward(SOURCE_PARAMETERS) {
+BlendBackward::BlendBackward(SOURCE_PARAMETERS, const Tensor& table) : table_(table) {
   GS_CHECK_VALUE(source.size() == kKept, "a backward takes ", int(kKept), " tensors that a forward has kept, got ",
                  source.size());
   std::copy(source.begin(), source.end(), kept_.begin());
@@ -97,10 +109,11 @@ Tensor BlendBackward::plane(const MaybeTensor& t, int64_t channels) const {
 GradientSource::GradientSource(const SceneTensors& scene, SOURCE_PARAMETERS, bool absolute, bool lengths)
     : image_(scene.image()) {
   const bool rows = source.size() == 4 && !grad_color;
+  GS_CHECK(!rows || scene.rays() != gs::kLensRays, "there are no gradient rows of Gaussians on the rays of a lens");
   GS_CHECK_VALUE(rows || source.size() == kKept, "the source must be what a forward has kept, ", int(kKept),
                  " tensors, or splats, tile_counts, rows and counts, got ", source.size(), " tensors");
   check_tensor(source[kSplats], "splats", scene.dtype(), scene.device(), {scene.rows(), splat_row(scene.rays())});
-  if (!rows) blend_.emplace(SOURCE_ARGUMENTS);
+  if (!rows) blend_.emplace(SOURCE_ARGUMENTS, scene.table());
   check_counts(source[kTileCounts], scene.rows(), scene.device());
   tile_counts_ = packed(source[kTileCounts]);
   if (rows) take_rows(scene, source, absolute, lengths);
@@ -129,7 +142,7 @@ void GradientSource::check_sum() const {
 
 Tensor GradientSource::moments(const Tensor& lengths) const {
   const Tensor& like = blend_ ? blend_->splats() : splats_;
-  Tensor moments = empty({like.size(0), row_values(false, on_rays(like))}, like);
+  Tensor moments = empty({like.size(0), row_values(false, rays_of(like))}, like);
   with_scalar(like.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
     T* to = write<T>(moments);

@@ -37,29 +37,33 @@ void check_counts(const Tensor& tile_counts, int64_t count, Device device);
 gs::Image image_of(const Tensor& last, const Tensor& splats);
 Tensor background_like(const Tensor& background, const Tensor& splats);
 
-// Whether splats are gs::RaySplats, by their values.
-bool on_rays(const Tensor& splats);
+// Refuses splats on the rays of a lens, too: these ops have no lens.
+void check_staged(const Tensor& splats);
+
+// What splats are, by their values.
+gs::Rays rays_of(const Tensor& splats);
 
 // Values of a gradient row, with those of absolute gradients or without.
-int64_t row_values(bool absolute, bool rays);
+int64_t row_values(bool absolute, gs::Rays rays);
 
 template <class T>
 gs::BlendInput<T> blend_input(const Tensor& splats, const Tensor& instances, const Tensor& ranges,
-                              const Tensor& background, gs::Image image) {
+                              const Tensor& background, gs::Image image, const Tensor& table) {
   return {read<T>(splats), read<int32_t>(instances), read<int64_t>(ranges), read<T>(background),
-          image,           instances.size(0),        on_rays(splats)};
+          image,           instances.size(0),        rays_of(splats),       table.defined() ? read<T>(table) : nullptr};
 }
 
-// Owns the tensors that the gs::BlendInput and gs::BlendGradient of a backward point into. source: Kept.
+// Owns the tensors that the gs::BlendInput and gs::BlendGradient of a backward point into. source: Kept. table: of
+// gs::BlendInput, or undefined.
 class BlendBackward {
  public:
-  BlendBackward(SOURCE_PARAMETERS);
+  BlendBackward(SOURCE_PARAMETERS, const Tensor& table);
 
   const Tensor& splats() const { return kept_[kSplats]; }
 
   template <class T>
   gs::BlendInput<T> input() const {
-    return blend_input<T>(kept_[kSplats], kept_[kInstances], kept_[kRanges], kept_[kBackground], image_);
+    return blend_input<T>(kept_[kSplats], kept_[kInstances], kept_[kRanges], kept_[kBackground], image_, table_);
   }
   // absolute: gs::BlendGradient::absolute, if it is defined.
   template <class T>
@@ -87,7 +91,7 @@ class BlendBackward {
 
   std::array<Tensor, kKept> kept_;
   gs::Image image_;
-  Tensor color_, alpha_, depth_;
+  Tensor color_, alpha_, depth_, table_;
 };
 
 // Where the gradients of a scene come from: what a forward has kept (BlendBackward), or gradient rows, then `source` is
@@ -114,7 +118,7 @@ class GradientSource {
   template <class T>
   gs::SplatRows<T> input() const {
     return {counts_.size(0), read<int32_t>(tile_counts_), read<int32_t>(counts_), read<T>(rows_), rows_.size(0),
-            on_rays(splats_)};
+            rays_of(splats_)};
   }
   template <class T>
   gs::RowSums<T> sums(T* moments, const Tensor& lengths) const {

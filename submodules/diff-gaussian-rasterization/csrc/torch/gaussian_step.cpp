@@ -230,7 +230,7 @@ MaybeTensor wake_op(List<Tensor> gaussians, List<Tensor> camera, List<double> le
                     List<double> rates, List<double> constants, Sizes columns, int64_t iteration,
                     const MaybeTensor& now) {
   const SceneTensors scene = scene_of(gaussians, camera, lens, options);
-  all |= scene.rays();  // blocks are tested by EWA
+  all |= scene.rays() != gs::kNoRays;  // blocks are tested by EWA
   const MaybeTensor none;
   const Step step{none,      averages, steps, {},        guard, attributes, rates,
                   constants, columns,  false, iteration, now,   false};

@@ -18,6 +18,7 @@ using gs::baseline::has_records, gs::baseline::layer_values, gs::baseline::splat
 struct ProjectedTensors {
   Tensor splats, depths, rects, tile_counts, radii;
   Tensor records;  // undefined where an image has too many tiles
+  Tensor table;    // gs::Projected::table, undefined where there is none
   template <class T>
   gs::Projected<T> pointers() {
     return {write<T>(splats),
@@ -26,7 +27,8 @@ struct ProjectedTensors {
             write<int32_t>(tile_counts),
             write<int32_t>(radii),
             records.defined() ? static_cast<gs::TileRecord*>(records.mutable_data_ptr()) : nullptr,
-            on_rays(splats)};
+            rays_of(splats),
+            table.defined() ? read<T>(table) : nullptr};
   }
 };
 
@@ -42,6 +44,7 @@ ProjectedTensors project(const SceneTensors& in, bool rects) {
   const bool records = has_records(in.image());
   if (rects || !records) out.rects = empty<int32_t>({n, 4}, like);
   if (records) out.records = empty<uint8_t>({n, int64_t(sizeof(gs::TileRecord))}, like);
+  out.table = in.table();
   with_scalar(in.dtype(), [&](auto zero) {
     using T = decltype(zero);
     GS_RUN(T, out.splats, project, in.scene<T>(), out.pointers<T>());
@@ -107,7 +110,7 @@ struct BlendedTensors {
 
 // train: whether a backward will follow, for which the forward makes `last` and layers.
 BlendedTensors blend(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& background,
-                     gs::Image image, bool inverse_depth, bool train) {
+                     gs::Image image, bool inverse_depth, bool train, const Tensor& table = {}) {
   const int64_t h = image.height, w = image.width;
   const bool layers = train && splats.is_cuda();
   BlendedTensors out{empty({3, h, w}, splats), empty({1, h, w}, splats), empty({inverse_depth ? 1 : 0, h, w}, splats),
@@ -119,7 +122,7 @@ BlendedTensors blend(const Tensor& splats, const Tensor& instances, const Tensor
     const gs::Blended<T> blended{
         write<T>(out.color), write<T>(out.transmittance), inverse_depth ? write<T>(out.inverse_depth) : nullptr,
         train ? write<int32_t>(out.last) : nullptr, out.layers.numel() ? write<T>(out.layers) : nullptr};
-    GS_RUN(T, splats, blend, blend_input<T>(splats, instances, ranges, bg, image), blended);
+    GS_RUN(T, splats, blend, blend_input<T>(splats, instances, ranges, bg, image, table), blended);
   });
   return out;
 }
@@ -136,7 +139,7 @@ Tensors5 project_op(SCENE_PARAMETERS, const MaybeTensor& awake) {
 
 Tensors4 bin_op(const Tensor& splats, const Tensor& depths, const Tensor& rects, const Tensor& tile_counts,
                 int64_t height, int64_t width, bool train) {
-  check_splats(splats);
+  check_staged(splats);
   const Device device = splats.device();
   const int64_t n = splats.size(0);
   check_tensor(depths, "depths", splats.scalar_type(), device, {n});
@@ -151,7 +154,7 @@ Tensors4 bin_op(const Tensor& splats, const Tensor& depths, const Tensor& rects,
 
 Tensors5 blend_op(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& background,
                   int64_t height, int64_t width, bool inverse_depth, bool train) {
-  check_splats(splats);
+  check_staged(splats);
   const gs::Image image = checked_image(height, width);
   check_lists(instances, ranges, splats, image);
   const BlendedTensors b =
@@ -170,22 +173,27 @@ Rasterized rasterize_op(const Tensor& means2d, SCENE_PARAMETERS, const Tensor& b
   scene.checked(kMeans2d, &means2d);  // it only receives a gradient
   ProjectedTensors p = project(scene, false);
   BinnedTensors b = bin(p, scene.image(), train, scene.blocks());
-  BlendedTensors o = blend(p.splats, b.instances, b.ranges, background, scene.image(), inverse_depth, train);
+  BlendedTensors o = blend(p.splats, b.instances, b.ranges, background, scene.image(), inverse_depth, train, p.table);
   return {o.color,     o.transmittance, o.inverse_depth, p.radii, p.splats, p.tile_counts,
           b.instances, b.ranges,        b.splat_slots,   b.slots, o.last,   o.layers};
 }
 
-Tensor decisive_op(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& last) {
+// lens: as in CAMERA_SCHEMA, of Gaussians on the rays of a lens.
+Tensor decisive_op(const Tensor& splats, const Tensor& instances, const Tensor& ranges, const Tensor& last,
+                   List<double> lens) {
   check_splats(splats);
   const gs::Image image = image_of(last, splats);
   check_lists(instances, ranges, splats, image);
+  const bool through_lens = rays_of(splats) == gs::kLensRays;
+  GS_CHECK_VALUE(!through_lens || lens.size() == 3 + gs::kLensNumbers, "give the lens of splats on its rays");
+  const Tensor table = through_lens ? table_of(lens.data() + 3, image, splats) : Tensor();
   Tensor decisive = torch::stable::new_zeros(splats, {splats.size(0)}, ScalarType::Bool);
   const Tensor rows = aligned(splats, 2), no_background = torch::stable::new_zeros(splats, {3});
   const Tensor lists = packed(instances), bounds = packed(ranges), ends = packed(last);
   with_scalar(rows.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    GS_RUN(T, rows, mark_decisive, blend_input<T>(rows, lists, bounds, no_background, image), read<int32_t>(ends),
-           write<bool>(decisive));
+    GS_RUN(T, rows, mark_decisive, blend_input<T>(rows, lists, bounds, no_background, image, table),
+           read<int32_t>(ends), write<bool>(decisive));
   });
   return decisive;
 }
@@ -212,7 +220,8 @@ GS_OPERATORS(diff_gaussian_rasterization, m) {
       "Tensor transmittance, Tensor inverse_depth, Tensor radii, Tensor splats, Tensor tile_counts, Tensor instances, "
       "Tensor ranges, Tensor splat_slots, Tensor slots, Tensor last, Tensor layers)",
       TORCH_BOX(&rasterize_op));
-  m.define("decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last) -> Tensor", TORCH_BOX(&decisive_op));
+  m.define("decisive(Tensor splats, Tensor instances, Tensor ranges, Tensor last, float[] lens=[]) -> Tensor",
+           TORCH_BOX(&decisive_op));
 }
 
 }  // namespace gs::ops

@@ -6,6 +6,7 @@
 #include <string>
 #include <utility>
 
+#include "math/lens_pixels.h"
 #include "math/sh.h"
 #include "math/tiles.h"
 
@@ -56,7 +57,7 @@ SceneTensors::SceneTensors(const std::array<const Tensor*, kInputs - 1>& gaussia
     : dtype_(ScalarType::Float), device_(DeviceType::CPU) {
   const bool plain = lens.size() == 3;
   GS_CHECK_VALUE((plain || lens.size() == 3 + gs::kLensNumbers) && (options.size() == 5 || options.size() == 6),
-                 "lens must have 3 entries or 24, and options 5 or 6, got ", lens.size(), " and ", options.size());
+                 "lens must have 3 entries or 25, and options 5 or 6, got ", lens.size(), " and ", options.size());
   tan_x_ = lens[0], tan_y_ = lens[1], scale_modifier_ = lens[2];
   for (int k = 0; !plain && k < gs::kLensNumbers; ++k) lens_[k] = lens[3 + k];
   image_ = checked_image(options[0], options[1]);
@@ -125,9 +126,21 @@ void SceneTensors::check_settings() const {
   GS_CHECK_VALUE(lens_[0] >= 0 && lens_[0] <= 3 && lens_[0] == int(lens_[0]), "a lens's chart is 1, 2 or 3, got ",
                  lens_[0]);
   for (const double number : lens_) GS_CHECK_VALUE(!std::isnan(number), "a lens has a number that is NaN");
-  GS_CHECK(!rays_ || !has_lens(), "projection='ray' has pinholes alone: undistort the photos, or take 'ewa'");
   GS_CHECK_VALUE(std::isfinite(scale_modifier_), "scale_modifier must be finite, got ", scale_modifier_);
   GS_CHECK(count() < std::numeric_limits<int32_t>::max(), "more than 2^31 Gaussians");
+}
+
+Tensor table_of(const double* numbers, gs::Image image, const Tensor& like) {
+  Tensor table = empty({lens_table_values(image)}, like);
+  with_scalar(like.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    GS_RUN(T, table, lens_table, lens_from<double>(numbers), image, write<T>(table));
+  });
+  return table;
+}
+
+Tensor SceneTensors::table() const {
+  return rays() == gs::kLensRays ? table_of(lens_.data(), image_, means()) : Tensor();
 }
 
 Wanted checked_wanted(const std::vector<bool>& wanted) {

@@ -44,6 +44,30 @@ Wanted checked_wanted(const std::vector<bool>& wanted);
 inline const Tensor* given(const Tensor& t) { return t.defined() ? &t : nullptr; }
 inline const Tensor* given(const MaybeTensor& t) { return t ? given(*t) : nullptr; }
 
+// A lens from its numbers.
+template <class T>
+gs::Lens<T> lens_from(const double* n) {
+  const auto at = [&](int k) { return T(n[k]); };
+  return {gs::Chart(int(n[0])),
+          at(1),
+          at(2),
+          at(3),
+          at(4),
+          at(5),
+          at(6),
+          at(7),
+          at(8),
+          at(9),
+          at(10),
+          {at(11), at(12), at(13), at(14)},
+          {at(15), at(16), at(17)},
+          {at(18), at(19)},
+          {at(20), at(21)}};
+}
+
+// gs::Projected::table of a lens, by its numbers, like `like`.
+Tensor table_of(const double* numbers, gs::Image image, const Tensor& like);
+
 // Checks the inputs, and owns the contiguous tensors that a gs::Scene points into.
 class SceneTensors {
  public:
@@ -61,7 +85,9 @@ class SceneTensors {
   bool has(Input input) const { return inputs_[input].defined(); }
   bool raw() const { return raw_; }
   bool has_lens() const { return lens_[0] != 0; }
-  bool rays() const { return rays_; }
+  gs::Rays rays() const { return !rays_ ? gs::kNoRays : has_lens() ? gs::kLensRays : gs::kPinholeRays; }
+  // gs::Projected::table; undefined where there is none.
+  Tensor table() const;
   bool flat_opacities() const { return inputs_[kOpacities].dim() == 1; }  // a row instead of a column
   const Tensor& means() const { return inputs_[kMeans]; }
   int64_t count() const { return inputs_[kMeans].size(0); }
@@ -102,31 +128,11 @@ class SceneTensors {
             awake_.defined() ? read<uint8_t>(awake_) : nullptr,
             blocks_.defined() ? read<int32_t>(blocks_) : nullptr,
             blocks_.defined() ? blocks_.size(0) : 0,
-            lens<T>(),
+            lens_from<T>(lens_.data()),
             rays_};
   }
 
  private:
-  template <class T>
-  gs::Lens<T> lens() const {
-    const auto& n = lens_;
-    const auto at = [&](int k) { return T(n[k]); };
-    return {gs::Chart(int(n[0])),
-            at(1),
-            at(2),
-            at(3),
-            at(4),
-            at(5),
-            at(6),
-            at(7),
-            at(8),
-            at(9),
-            {at(10), at(11), at(12), at(13)},
-            {at(14), at(15), at(16)},
-            {at(17), at(18)},
-            {at(19), at(20)}};
-  }
-
   Tensor checked_rest(const Tensor& t) const;
   void check_settings() const;
 

@@ -20,14 +20,15 @@ Gradients rasterize_vjp_op(SCENE_PARAMETERS, const std::vector<bool>& wanted, SO
 // parts of the lists, each a run of whole tiles, rasterize_vjp makes the same bits; then those of a splat come in the
 // order of the parts.
 std::tuple<Tensor, Tensor> blend_rows_op(SOURCE_PARAMETERS, bool absolute) {
-  const BlendBackward in(SOURCE_ARGUMENTS);
+  const BlendBackward in(SOURCE_ARGUMENTS, {});
+  check_staged(in.splats());
   GS_CHECK(!ahead(), "blend_rows waits for the number of rows, so the host cannot run ahead");
   const Tensor& splats = in.splats();
   Tensor rows, counts = empty<int32_t>({splats.size(0)}, splats);
   with_scalar(splats.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
     auto take = [&](int64_t count) {
-      rows = empty({count, row_values(absolute, on_rays(splats))}, splats);
+      rows = empty({count, row_values(absolute, rays_of(splats))}, splats);
       return write<T>(rows);
     };
     using Take = decltype(take);

@@ -1,0 +1,523 @@
+#pragma once
+// The backward of blending, up to gradient rows or to their sums. A thread takes a tile, a vector takes pixels of one
+// or two of its rows.
+#include <memory>
+#include <vector>
+
+#include "../backend.h"
+#include "../math/absolute.h"
+#include "../math/exp2.h"
+#include "../math/slots.h"
+#include "gs/lane_halves.h"
+#include "tile_chunk.h"
+
+GS_ISA_BEGIN
+
+namespace {
+
+constexpr int kBatch = 64;  // splats held at once, some 3 KB of floats, and 12 KB of their terms
+
+// A vector has kColumns of a row, or of two rows in turn: most splats reach few columns. Pixels lie in that order.
+template <class T>
+constexpr int kRows = Simd<T>::kLanes > 8 ? 2 : 1;
+template <class T>
+constexpr int kColumns = Simd<T>::kLanes / kRows<T>;
+
+// The place of a pixel, whose row is a multiple of kRows.
+template <class T>
+int place(int row, int column) {
+  return row * kTile + column * kRows<T>;
+}
+
+// Puts a tile's pixels from rows to their places.
+template <class T, class Value>
+void interleave(Value* pixels) {
+  if constexpr (kRows<T> == 2)
+    for (Value* pair = pixels; pair < pixels + kPixels; pair += 2 * kTile) {
+      Value rows[2 * kTile];
+      std::copy_n(pair, 2 * kTile, rows);
+      for (int c = 0; c < kTile; ++c) pair[2 * c] = rows[c], pair[2 * c + 1] = rows[kTile + c];
+    }
+}
+
+// The vector of a row's value, or of two rows' in turn.
+template <class T>
+typename Simd<T>::Vec by_rows(const T (&values)[kTile][kBatch], int row, int k) {
+  using S = Simd<T>;
+  if constexpr (kRows<T> == 1) return S::all(values[row][k]);
+  typename S::Mask odd;
+  for (int i = 0; i < S::kLanes; ++i) odd[i] = -(i % 2);
+  return odd ? S::all(values[row + kRows<T> - 1][k]) : S::all(values[row][k]);
+}
+
+// The columns of a vector's pixels.
+template <class T>
+typename Simd<T>::Vec columns_from(int first) {
+  T x[Simd<T>::kLanes];
+  for (int i = 0; i < Simd<T>::kLanes; ++i) x[i] = T(first + i / kRows<T>);
+  return Simd<T>::load(x);
+}
+
+template <class T, int kRays>
+struct BackwardState {
+  TilePlaces<T, kRays> places, in_place;  // in_place: the same, as all that follows
+  alignas(64) T transmittance[kPixels], behind[kPixels];
+  alignas(64) T color[3][kPixels], depth[kPixels];  // the image's gradient
+  alignas(64) typename IntOf<T>::type last[kPixels];
+  alignas(64) typename IntOf<T>::type row_last[kTile];  // the largest in a row
+};
+
+// The columns that each splat of a chunk can reach, first <= column <= last; the exact test follows. As in tile_rect,
+// with its margins.
+template <class T>
+struct ColumnRanges {
+  int32_t first[kBatch], last[kBatch];
+
+  void find(const Chunk<T, kBatch, kNoRays>& chunk, int64_t count, const TilePlaces<T, kNoRays>&) {
+    for (int64_t k = 0; k < count; ++k) {
+      const T slope = chunk.l12[k] / chunk.l22[k];
+      const T level = larger(chunk.log2_opacity[k] - T(kLog2MinAlpha), T(0));
+      const T reach = std::sqrt(level) * T(1.0001) + T(0.01);
+      const T dx = reach * std::sqrt(1 + slope * slope) / chunk.l11[k] + T(0.01);
+      set(k, chunk.x[k] - dx, chunk.x[k] + dx);
+    }
+  }
+  // By the places of each column's pixels.
+  void find(const Chunk<T, kBatch, kLensRays>& chunk, int64_t count, const TilePlaces<T, kLensRays>& places) {
+    T least[kTile], most[kTile];
+    for (int c = 0; c < kTile; ++c) {
+      least[c] = most[c] = places.x[c];
+      for (int p = c + kTile; p < kPixels; p += kTile)
+        least[c] = std::min(least[c], places.x[p]), most[c] = std::max(most[c], places.x[p]);
+    }
+    for (int64_t k = 0; k < count; ++k) {
+      const XLimits<T> limits = x_limits(chunk.template terms<T>(k));
+      first[k] = 0, last[k] = kTile - 1;
+      while (first[k] < kTile - 1 && most[first[k]] < limits.low) ++first[k];
+      while (last[k] > first[k] && least[last[k]] > limits.high) --last[k];
+    }
+  }
+  void find(const Chunk<T, kBatch, kPinholeRays>& chunk, int64_t count, const TilePlaces<T, kPinholeRays>&) {
+    for (int64_t k = 0; k < count; ++k) {
+      RaySplat<T> splat = {};
+      splat.l11 = chunk.l11[k], splat.l12 = chunk.l12[k], splat.l22 = chunk.l22[k];
+      splat.log2_opacity = chunk.log2_opacity[k], splat.slope_u = chunk.slope_u[k];
+      splat.slope_v = chunk.slope_v[k], splat.e = chunk.e[k];
+      const Extent<T> to = extent_of(splat);
+      set(k, chunk.x[k] - to.left, chunk.x[k] + to.right);
+    }
+  }
+
+ private:
+  void set(int64_t k, T left, T right) {
+    const T end = T(kTile - 1);
+    first[k] = int32_t(left > 0 ? (left < end ? left : end) : T(0));  // what is not a number reaches all columns
+    last[k] = int32_t(right < end ? (right > 0 ? right : T(0)) : end);
+  }
+};
+
+// The terms of a batch's splats in all rows, RowTerms or RayRow.
+template <class T, int kRays>
+struct TermTable {
+  using V = typename Simd<T>::Vec;
+  alignas(64) T top[kTile][kBatch], u0[kTile][kBatch], v[kTile][kBatch];
+  void store(int row, int64_t k, const RowTerms<V>& terms) {
+    using S = Simd<T>;
+    S::store(top[row] + k, terms.top), S::store(u0[row] + k, terms.u0), S::store(v[row] + k, terms.v);
+  }
+  RowTerms<V> of(const Chunk<T, kBatch, kNoRays>& chunk, int row, int k) const {
+    return {by_rows<T>(top, row, k), Simd<T>::all(chunk.l11[k]), by_rows<T>(u0, row, k), by_rows<T>(v, row, k)};
+  }
+};
+template <class T>
+struct TermTable<T, kPinholeRays> {
+  using V = typename Simd<T>::Vec;
+  alignas(64) T u0[kTile][kBatch], v[kTile][kBatch];
+  void store(int row, int64_t k, const RayRow<V>& terms) {
+    Simd<T>::store(u0[row] + k, terms.flat.u0), Simd<T>::store(v[row] + k, terms.flat.v);
+  }
+  RayRow<V> of(const Chunk<T, kBatch, kPinholeRays>& chunk, int row, int k) const {
+    using S = Simd<T>;
+    return ray_row<V>(
+        {S::all(chunk.log2_opacity[k]), S::all(chunk.l11[k]), by_rows<T>(u0, row, k), by_rows<T>(v, row, k)},
+        S::all(chunk.slope_u[k]), S::all(chunk.slope_v[k]), S::all(chunk.e[k]));
+  }
+};
+
+template <class T>
+struct TermTable<T, kLensRays> {
+  LensTerms<T> of(const Chunk<T, kBatch, kLensRays>& chunk, int, int k) const { return chunk.template terms<T>(k); }
+};
+
+// The same, and the rows with pixels that each may reach.
+template <class T, int kRays>
+struct RowTable : TermTable<T, kRays> {
+  static constexpr int kParts = kRows<T> == 1 ? 1 : kTile / kColumns<T>;  // of a row
+  alignas(64) typename IntOf<T>::type reached[kParts][kBatch];            // a bit for each row
+
+  static auto splats_of(const Chunk<T, kBatch, kRays>& chunk, int64_t k) {
+    if constexpr (kRays == kLensRays)
+      return chunk.template terms<typename Simd<T>::Vec>(k);
+    else
+      return chunk.shapes(k);
+  }
+
+  // position: of the first splat in the tile's list.
+  void fill(const Chunk<T, kBatch, kRays>& chunk, int64_t count, int64_t position,
+            const BackwardState<T, kRays>& state) {
+    using S = Simd<T>;
+    using Int = typename S::Int;
+    const typename S::Mask lanes = __builtin_convertvector(lane_numbers<T>(0), typename S::Mask);
+    for (int64_t k = 0; k < count; k += S::kLanes) {
+      const auto splats = splats_of(chunk, k);
+      const typename S::Mask positions = lanes + Int(position + k);
+      typename S::Mask bits[kParts] = {};
+      for (int row = 0; row < kTile; ++row) {
+        constexpr int kPart = kTile / kParts;
+        const typename S::Mask wanted = (positions < state.row_last[row]) & Int(1 << row);
+        if constexpr (kRays == kLensRays) {
+          for (int p = 0; p < kParts; ++p)
+            bits[p] |= box_reached(splats, state.places.box(row * kTile + p * kPart, kPart)) & wanted;
+        } else {
+          const auto terms = row_terms(splats, T(row));
+          this->store(row, k, terms);
+          for (int p = 0; p < kParts; ++p) bits[p] |= row_reached(terms, T(p * kPart), T((p + 1) * kPart - 1)) & wanted;
+        }
+      }
+      for (int p = 0; p < kParts; ++p) std::memcpy(reached[p] + k, &bits[p], sizeof bits[p]);
+    }
+  }
+
+  // A bit for each row with which vectors begin: those of which the splat may reach one of theirs, in any part.
+  uint32_t rows(int k) const {
+    uint32_t bits = 0;
+    for (int p = 0; p < kParts; ++p) bits |= rows(k, p);
+    return bits;
+  }
+  uint32_t rows(int k, int part) const {
+    const uint32_t bits = uint32_t(reached[part][k]);
+    return kRows<T> == 1 ? bits : (bits | bits >> 1) & 0x5555;
+  }
+};
+
+// Sums of an instance: kGradientRow, and perhaps kAbsoluteValues.
+template <int kRays, bool kAbsolute>
+constexpr int kSums = kGradientRow<kRays> + (kAbsolute ? kAbsoluteValues : 0);
+template <class T, int kRays, bool kAbsolute>
+using Sums = typename Simd<T>::Vec[kSums<kRays, kAbsolute>];
+
+// The moments of a splat's pixels, lane by lane, as a gradient row has them.
+template <class T, int kRays, bool kAbsolute>
+struct PixelSums {
+  using V = typename Simd<T>::Vec;
+  V q = {}, u = {}, v = {}, uu = {}, uv = {}, vv = {}, absolute_u = {}, absolute_uv = {};
+
+  void add(const Chunk<T, kBatch, kNoRays>& chunk, int k, const RowTerms<V>& terms, V u_here, V q_here) {
+    const V qu = q_here * u_here, qv = q_here * terms.v;
+    q += q_here, u += qu, v += qv;
+    uu += qu * u_here, uv += qu * terms.v, vv += qv * terms.v;
+    if (kAbsolute) {
+      absolute_u += magnitude(qu);
+      absolute_uv += magnitude(V(chunk.l12[k] * qu + chunk.l22[k] * qv));
+    }
+  }
+};
+template <class T, bool kAbsolute>
+struct PixelSums<T, kPinholeRays, kAbsolute> {
+  using V = typename Simd<T>::Vec;
+  V q = {}, u = {}, v = {}, uu = {}, uv = {}, vv = {}, pu = {}, pv = {}, pp = {}, absolute_u = {}, absolute_uv = {};
+
+  void add(const Chunk<T, kBatch, kPinholeRays>& chunk, int k, const RayRow<V>& terms, const AtPixel<V>& p, V q_here) {
+    add_weights(chunk.l12[k], chunk.l22[k], ray_weights(terms, p, chunk.slope_v[k]), q_here);
+  }
+  void add_weights(T l12, T l22, const RayWeights<V>& at, V q_here) {
+    const V along = q_here * at.u, down = q_here * at.v, deep = q_here * at.p;
+    // Fused by name: kAbsolute must not matter.
+    q += q_here, u = multiply_add(q_here, at.au, u), v = multiply_add(q_here, at.av, v);
+    uu += along * at.u, uv += along * at.v, vv += down * at.v;
+    pu += deep * at.u, pv += deep * at.v, pp += deep * at.p;
+    if (kAbsolute) {
+      const V qu = q_here * at.au, qv = q_here * at.av;
+      absolute_u += magnitude(qu);
+      absolute_uv += magnitude(V(l12 * qu + l22 * qv));
+    }
+  }
+};
+
+template <class T, bool kAbsolute>
+struct PixelSums<T, kLensRays, kAbsolute> : PixelSums<T, kPinholeRays, kAbsolute> {
+  using V = typename Simd<T>::Vec;
+  void add(const Chunk<T, kBatch, kLensRays>& chunk, int k, const LensTerms<T>& terms, const AtPlace<V>& p, V q_here) {
+    this->add_weights(chunk.l12[k], chunk.l22[k], ray_weights(terms, p), q_here);
+  }
+};
+
+// A batch of splats in a tile, to be taken back to front.
+template <class T, int kRays>
+struct Batch {
+  Chunk<T, kBatch, kRays> chunk;
+  ColumnRanges<T> columns;
+  RowTable<T, kRays> table;
+};
+
+// The columns of a vector's pixels, or their places.
+template <class T, int kRays>
+auto pixels_at(const BackwardState<T, kRays>& state, int at, int column) {
+  if constexpr (kRays == kLensRays)
+    return state.in_place.from(at, column);
+  else
+    return columns_from<T>(0) + T(column);
+}
+
+// Sums one splat's values, lane by lane, over the rows with a bit, in vectors from column `first` on, until `end`.
+// k: the splat in its batch.
+template <class T, int kRays, bool kDepth, bool kAbsolute>
+__attribute__((always_inline)) inline void sum_rows(const Batch<T, kRays>& batch, int k, int64_t position,
+                                                    uint32_t bits, int first, int end, BackwardState<T, kRays>& state,
+                                                    Sums<T, kRays, kAbsolute>& sums) {
+  using S = Simd<T>;
+  using V = typename S::Vec;
+  using M = typename S::Mask;
+  const Chunk<T, kBatch, kRays>& chunk = batch.chunk;
+  const RowTable<T, kRays>& table = batch.table;
+  const V zero = {};
+  PixelSums<T, kRays, kAbsolute> moments;
+  V red = zero, green = zero, blue = zero, depth = zero;
+  for (; bits; bits &= bits - 1) {
+    const int row = __builtin_ctz(bits);
+    const auto terms = table.of(chunk, row, k);
+    int column = first;
+    do {
+      const int at = place<T>(row, column);
+      M last;
+      std::memcpy(&last, state.last + at, sizeof last);
+      const auto pixel = at_pixel(terms, pixels_at(state, at, column));
+      const V t = row_exponent(terms, pixel);
+      const M reached = (t >= T(kLog2MinAlpha)) & (last > typename S::Int(position));
+      if (!S::any(reached)) continue;
+      const V uncapped = reached ? exp2_lanes<V, M>(reached ? t : zero, T()) : zero;
+      const V alpha = capped<V, T>(uncapped);
+      V left = S::load(state.transmittance + at), behind = S::load(state.behind + at);
+      const V gr = S::load(state.color[0] + at), gg = S::load(state.color[1] + at), gb = S::load(state.color[2] + at);
+      V gd = zero;
+      V value = chunk.r[k] * gr + chunk.g[k] * gg + chunk.b[k] * gb;
+      if (kDepth) gd = S::load(state.depth + at), value += chunk.inverse_depth[k] * gd;
+      const V q = uncapped * alpha_gradient<T, V>(alpha, value, left, behind);
+      const V weight = alpha * left;
+      S::store(state.transmittance + at, left), S::store(state.behind + at, behind);
+      moments.add(chunk, k, terms, pixel, q);
+      red += weight * gr, green += weight * gg, blue += weight * gb;
+      if (kDepth) depth += weight * gd;
+    } while ((column += kColumns<T>) < end && RowTable<T, kRays>::kParts == 1);
+  }
+  const auto& m = moments;
+  if constexpr (kRays != kNoRays) {
+    const V all[] = {m.q,  m.u,   m.v,  m.uu, m.uv, m.vv, red,          green,
+                     blue, depth, m.pu, m.pv, m.pp, zero, m.absolute_u, m.absolute_uv};
+    std::copy_n(all, kSums<kRays, kAbsolute>, sums);
+  } else {
+    const V all[] = {m.q, m.u, m.v, m.uu, m.uv, m.vv, red, green, blue, depth, m.absolute_u, m.absolute_uv};
+    std::copy_n(all, kSums<kRays, kAbsolute>, sums);
+  }
+}
+
+// Sums one splat's values over the pixels that it reaches, all of them from column `first` to `last`.
+template <class T, int kRays, bool kDepth, bool kAbsolute>
+void splat_gradient(const Batch<T, kRays>& batch, int k, int64_t position, BackwardState<T, kRays>& state, T* out) {
+  constexpr int kParts = RowTable<T, kRays>::kParts;
+  const int first = batch.columns.first[k], wide = batch.columns.last[k] - first;
+  Sums<T, kRays, kAbsolute> sums;
+  if (wide < kColumns<T>) {  // one vector a row, which may begin at any column: that changes no sum
+    const int begin = std::min(first, kTile - kColumns<T>);
+    sum_rows<T, kRays, kDepth, kAbsolute>(batch, k, position, batch.table.rows(k), begin, begin + 1, state, sums);
+  } else {
+    const int vectors = wide / kColumns<T> + 1, begin = std::min(first, kTile - vectors * kColumns<T>);
+    Sums<T, kRays, kAbsolute> parts[kParts];
+    for (int p = 0; p < kParts; ++p) {
+      const int from = kParts > 1 ? p * kColumns<T> : begin;
+      sum_rows<T, kRays, kDepth, kAbsolute>(batch, k, position, batch.table.rows(k, p), from,
+                                            begin + vectors * kColumns<T>, state, parts[p]);
+    }
+    for (int i = 0; i < kSums<kRays, kAbsolute>; ++i) {
+      sums[i] = parts[0][i];
+      for (int p = 1; p < kParts; ++p) sums[i] += parts[p][i];
+    }
+  }
+  LaneSums<T, int(sizeof sums[0])>::store(sums, out);
+}
+
+// Sums of the processed instances, a row of kRow each, in the order of slots: those of a splat lie side by side,
+// whatever tiles they come from. A mark per slot tells which instances were processed, and a prefix sum over the marks
+// tells where a row is. So memory is for these rows only, and nothing is added concurrently.
+template <class T, int kRow>
+class GradientRows {
+ public:
+  explicit GradientRows(int64_t slots) : marks_((slots + 63) / 64 * 64, 0), bits_(marks_.size() / 64) {}
+
+  void mark(int64_t slot) { marks_[slot] = 1; }
+
+  // memory: gives room for as many rows as it is asked for. It need not be zeroed: every row is written.
+  template <class Memory>
+  void allocate(const Memory& memory) {
+    before_.resize(bits_.size() + 1);
+    before_[0] = 0;
+    for (size_t w = 0; w < bits_.size(); ++w) {
+      uint64_t bits = 0;
+      for (int i = 0; i < 8; ++i) {
+        uint64_t marks;  // of 8 slots, the first in the lowest byte
+        std::memcpy(&marks, &marks_[64 * w + 8 * i], sizeof marks);
+        bits |= (marks * 0x0102040810204080 >> 56) << 8 * i;
+      }
+      bits_[w] = bits;
+      before_[w + 1] = before_[w] + __builtin_popcountll(bits);
+    }
+    rows_ = memory(before_.back());
+  }
+
+  // The row of a slot; for a slot without one, the next row.
+  T* row(int64_t slot) const {
+    const uint64_t lower = (uint64_t(1) << (slot & 63)) - 1;
+    const int64_t rank = before_[slot >> 6] + (slot & 63 ? __builtin_popcountll(bits_[slot >> 6] & lower) : 0);
+    return rows_ + kRow * rank;
+  }
+
+ private:
+  std::vector<uint8_t> marks_;
+  std::vector<uint64_t> bits_;
+  std::vector<int64_t> before_;
+  T* rows_ = nullptr;
+};
+
+template <class T, int kRays>
+void read_state(const BlendInput<T>& in, const BlendGradient<T>& g, const Tile& tile, int64_t index,
+                BackwardState<T, kRays>& state) {
+  const int64_t plane = int64_t(in.image.width) * in.image.height;
+  std::fill_n(state.last, kPixels, 0);
+  std::fill_n(state.transmittance, kPixels, T(1));
+  std::fill_n(state.behind, kPixels, T(0));
+  std::fill_n(state.color[0], 3 * kPixels, T(0));
+  std::fill_n(state.depth, kPixels, T(0));
+  read_tile(g.last, in.image, tile, state.last);
+  read_tile(g.transmittance, in.image, tile, state.transmittance);
+  for (int c = 0; c < 3; ++c) read_tile(g.color + c * plane, in.image, tile, state.color[c]);
+  if (g.inverse_depth) read_tile(g.inverse_depth, in.image, tile, state.depth);
+  if (g.transmittance_gradient) read_tile(g.transmittance_gradient, in.image, tile, state.behind);
+  for (int p = 0; p < kPixels; ++p)
+    for (int c = 0; c < 3; ++c) state.behind[p] += in.background[c] * state.color[c][p];
+  for (int row = 0; row < kTile; ++row)
+    state.row_last[row] = *std::max_element(state.last + row * kTile, state.last + (row + 1) * kTile);
+  if constexpr (kRays == kLensRays) {
+    state.in_place = state.places = TilePlaces<T, kRays>(in, index);
+    interleave<T>(state.in_place.x), interleave<T>(state.in_place.y);
+  }
+  interleave<T>(state.last);
+  for (T* pixels : {state.transmittance, state.behind, state.color[0], state.color[1], state.color[2], state.depth})
+    interleave<T>(pixels);
+}
+
+template <class T, int kRays, bool kDepth, bool kAbsolute>
+void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t index, int64_t processed,
+                    const GradientRows<T, kSums<kRays, kAbsolute>>& rows) {
+  const Tile tile(index, in.image);
+  const int64_t begin = in.ranges[index];
+  BackwardState<T, kRays> state;
+  read_state(in, g, tile, index, state);
+  Batch<T, kRays> batch;
+  for (int64_t to = processed; to > 0; to -= std::min<int64_t>(kBatch, to)) {
+    const int64_t from = std::max<int64_t>(0, to - kBatch), count = to - from;
+    batch.chunk.gather(in, tile, index, begin + from, count);
+    for (int64_t k = begin + from; k < begin + to; ++k) __builtin_prefetch(g.slots + in.instances[k]);
+    prefetch_splats(in, begin + std::max<int64_t>(0, from - kBatch), begin + from);
+    batch.columns.find(batch.chunk, count, state.places);
+    batch.table.fill(batch.chunk, count, from, state);
+    for (int64_t position = to - 1; position >= from; --position) {
+      T* sums = rows.row(slot_of(g.slots, in.instances[begin + position], tile.x / kTile, tile.y / kTile));
+      splat_gradient<T, kRays, kDepth, kAbsolute>(batch, int(position - from), position, state, sums);
+    }
+  }
+}
+
+template <class T, int kRays, bool kAbsolute, class Memory>
+GradientRows<T, kSums<kRays, kAbsolute>> fill_rows(const Executor& executor, const BlendInput<T>& in,
+                                                   const BlendGradient<T>& g, const Memory& memory) {
+  const int64_t tiles = tiles_of(in.image);
+  GradientRows<T, kSums<kRays, kAbsolute>> rows(g.slot_count);
+  std::vector<int32_t> processed(tiles);
+  for_dynamic(executor, tiles, 4, [&](int64_t begin, int64_t end) {
+    for (int64_t index = begin; index < end; ++index) {
+      const Tile tile(index, in.image);
+      int32_t last[kPixels] = {};
+      read_tile(g.last, in.image, tile, last);
+      processed[index] = *std::max_element(last, last + kPixels);
+      for (int64_t k = 0; k < processed[index]; ++k)
+        rows.mark(slot_of(g.slots, in.instances[in.ranges[index] + k], tile.x / kTile, tile.y / kTile));
+    }
+  });
+  rows.allocate(memory);
+  const auto run =
+      g.inverse_depth ? blend_tile_vjp<T, kRays, true, kAbsolute> : blend_tile_vjp<T, kRays, false, kAbsolute>;
+  for_dynamic(executor, tiles, 1, [&](int64_t tile, int64_t) { run(in, g, tile, processed[tile], rows); });
+  return rows;
+}
+
+// Sums the rows of splat i, from `start` to `stop`.
+template <class T, int kRays, bool kAbsolute>
+GS_ONE_COPY void sum_splat(const T* start, const T* stop, int64_t i, const RowSums<T>& to) {
+  constexpr int kRow = kSums<kRays, kAbsolute>;
+  double sums[kRow] = {};  // a splat may have thousands of tiles
+  for (const T* row = start; row < stop; row += kRow)
+    for (int v = 0; v < kRow; ++v) sums[v] += row[v];
+  std::copy_n(sums, kGradientRow<kRays>, to.moments + kGradientRow<kRays> * i);
+  if constexpr (kAbsolute) {
+    const double* absolute = sums + kGradientRow<kRays>;
+    to.absolute[i] = 0;
+    if (start < stop)  // else the splat is undefined
+      to.absolute[i] = absolute_length(to.splats[kSplatRow<kRays> * i + 2], T(absolute[0]), T(absolute[1]), to.image);
+  }
+}
+
+// begin(i): where the rows of splat i begin, and those of the splat in front of it end.
+template <class T, int kRays, bool kAbsolute, class Begin>
+void sum_splats(const Executor& executor, int64_t count, const Begin& begin, const RowSums<T>& to) {
+  for_dynamic(executor, count, 1024, [&](int64_t first, int64_t end) {
+    for (int64_t i = first; i < end; ++i) sum_splat<T, kRays, kAbsolute>(begin(i), begin(i + 1), i, to);
+  });
+}
+
+template <class T, int kRays, bool kAbsolute>
+void sum_gradients(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g) {
+  std::unique_ptr<T[]> memory;
+  const auto rows = fill_rows<T, kRays, kAbsolute>(executor, in, g, [&](int64_t count) {
+    memory.reset(new T[kSums<kRays, kAbsolute> * count]);
+    return memory.get();
+  });
+  sum_splats<T, kRays, kAbsolute>(executor, g.count, [&](int64_t i) { return rows.row(g.slots[i].first); },
+                                  {in.splats, in.image, g.moments, g.absolute});
+}
+
+template <class T, int kRays, bool kAbsolute>
+void keep_rows(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g,
+               const RowMemory<T>& memory) {
+  const auto rows = fill_rows<T, kRays, kAbsolute>(executor, in, g,
+                                                   [&](int64_t count) { return memory.take(memory.context, count); });
+  for_dynamic(executor, g.count, 1024, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i)
+      memory.counts[i] =
+          int32_t((rows.row(g.slots[i + 1].first) - rows.row(g.slots[i].first)) / kSums<kRays, kAbsolute>);
+  });
+}
+
+template <class T, int kRays, bool kAbsolute>
+void sum_given(const Executor& executor, const SplatRows<T>& in, const RowSums<T>& to) {
+  std::vector<const T*> begin(in.count + 1, in.rows);
+  for (int64_t i = 0; i < in.count; ++i) begin[i + 1] = begin[i] + kSums<kRays, kAbsolute> * int64_t(in.counts[i]);
+  sum_splats<T, kRays, kAbsolute>(executor, in.count, [&](int64_t i) { return begin[i]; }, to);
+}
+
+}  // namespace
+
+// In a file of its own, as project_on_rays.
+template <class T>
+void blend_vjp_lens_rays(const Executor&, const BlendInput<T>&, const BlendGradient<T>&);
+
+GS_ISA_END
