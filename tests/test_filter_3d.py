@@ -75,7 +75,7 @@ def test_widths_follow_from_the_nearest_view_that_shows_a_point(tmp_path, model,
             shown = np.arccos(seen[:, 2] / depth) < field
         rates = np.maximum(rates, np.where(shown, FOCAL / depth, 0))
     found = filter_widths(torch.from_numpy(points).float(), scene.getTrainCameras())
-    expected = np.divide(math.sqrt(0.2), rates, out=np.zeros(300), where=rates > 0)
+    expected = np.divide(math.sqrt(0.05), rates, out=np.zeros(300), where=rates > 0)
     assert (expected > 0).any() and expected.min() < expected.max()
     np.testing.assert_allclose(found[:, 0].numpy(), expected, rtol=1e-4)
 

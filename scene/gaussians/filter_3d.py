@@ -2,8 +2,8 @@
 
 A Gaussian's covariance is convolved with an isotropic one, whose variance is VARIANCE over the square of the highest
 rate (pixels by unit of length) at which a training view samples it (equations 6 to 9); its opacity falls with the
-square root of the determinant. Both are functions of the raw values that train. Values that enter the model are computed in
-float64: on the CPU by functions whose bits do not depend on the number of threads.
+square root of the determinant. Both are functions of the raw values that train. Values that enter the model are
+computed in float64: on the CPU by functions whose bits do not depend on the number of threads.
 """
 
 import math
