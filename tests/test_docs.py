@@ -28,7 +28,7 @@ DEVICE = {
 }
 SCENES = ("step_profile", "options", "street", "training")
 FORWARDING = [f"benchmarks.scenes.{name}" for name in SCENES]  # unknown words go to train.py
-FOREIGN = {"--eval_steps", "--save_steps", "--nnodes", "--shutdown_timeout"}  # flags of other programs
+FOREIGN = {"--eval_steps", "--save_steps", "--nnodes", "--shutdown_timeout", "--set"}  # flags of other programs
 
 
 def _name(page: Path) -> str:

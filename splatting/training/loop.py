@@ -1,11 +1,11 @@
 """The training loop: the method, and nothing else."""
 
 import gc
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 
 import torch
 
+from splatting.training.iteration import Iteration
 from splatting.training.observer import Announcer, Observer
 from splatting.training.run import Run
 from splatting.training.step_agreement import StepAgreement
@@ -19,36 +19,40 @@ def run_training(run: Run, observers: Sequence[Observer]) -> None:
     Whatever else happens is an observer's business, in the order of the list (training/observers/standard.py).
     Raises KeyboardInterrupt or Terminated, after a complete step, if a signal asked for it.
     """
+    for _ in training_steps(run, observers):
+        pass
+
+
+def training_steps(run: Run, observers: Sequence[Observer]) -> Iterator[tuple[Iteration, PlainStep]]:
+    """`run_training` by iterations. Yields each, and its step's taker.
+
+    Once that is drained, and within `run.look()`, others may read the model.
+    """
     taker, together = step_taker(run), StepAgreement(run)
     every = Announcer([together, *observers], run.look)
     # Backward runs on this thread: waking autograd's worker costs time in every iteration.
-    with run.interrupt, every, torch.autograd.set_multithreading_enabled(False), _whole_steps(run, lambda: taker):
-        for at in run.iterations():
-            every.begins(at)
-            taker.throttle(at)  # before the learning rates are set, which a replayed step changes
-            run.prepare(at)  # learning rates, SH degree, photos of the next views
-            taker.take(at, every)
-            at.stopping = together.stopping  # read once: a signal may come at any moment
-            if at.stopping:
-                taker.drain()
-            every.stepped(at)
-            if at.stopping:
-                together.wait()
-                raise at.stopping
-            if together.divides(at):
-                taker.drain()
-                run.divide()
-                taker = step_taker(run)
-                gc.collect()  # the former has captured steps, which keep memory
+    with run.interrupt, every, torch.autograd.set_multithreading_enabled(False):
+        try:
+            for at in run.iterations():
+                every.begins(at)
+                taker.throttle(at)  # before the learning rates are set, which a replayed step changes
+                run.prepare(at)  # learning rates, SH degree, photos of the next views
+                taker.take(at, every)
+                at.stopping = together.stopping  # read once: a signal may come at any moment
+                if at.stopping:
+                    taker.drain()
+                every.stepped(at)
+                if at.stopping:
+                    together.wait()
+                    raise at.stopping
+                if together.divides(at):
+                    taker.drain()
+                    run.divide()
+                    taker = step_taker(run)
+                    gc.collect()  # the former has captured steps, which keep memory
+                yield at, taker
+        except BaseException:  # leave the model as it was between two steps
+            run.lost = taker.abort()
+            raise
     together.finish()
     every.ended()  # out here a signal stops at once what is only drawn and printed
-
-
-@contextmanager
-def _whole_steps(run: Run, taker: Callable[[], PlainStep]) -> Iterator[None]:
-    """After an error, leave the model as it was between two steps."""
-    try:
-        yield
-    except BaseException:
-        run.lost = taker().abort()
-        raise
