@@ -18,7 +18,6 @@ import torch
 from arguments import ModelParams, OptimizationParams, OptionParser, PipelineParams, write_cfg_args, write_model_json
 from gaussian_renderer import network_gui
 from splatting.distributed.consistency import agree_on_options
-from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import EventWriter as SummaryWriter
 from splatting.training import checks
 from splatting.training.gpu_memory import own_limit
@@ -113,24 +112,13 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, ...]:
     return args, *options
 
 
-def _advice(dataset: argparse.Namespace) -> list[str]:
-    """Print the advice on a scene, and return the options that it asks for, as words of a command line."""
-    if ranks().several:
-        raise UserError("--advise and --options auto need one process; run train.py --advise, and give what it says")
-    from splatting.diagnosis.advice import advise  # which a training does not need
-
-    found = advise(checks.with_lenses(dataset, None))
-    print(*found, sep="\n")
-    words = " ".join(advice.options for advice in found).split()
-    print(f"options that this scene asks for: {' '.join(words) or 'none'}")
-    return words
-
-
 def main(argv: Sequence[str] | None = None) -> None:
     """Train as the command line says."""
     args, dataset, opt, pipe = parse(argv)
     if args.advise or args.options == "auto":
-        words = _advice(dataset)
+        from splatting.diagnosis.advice import asked_options  # which no other training needs
+
+        words = asked_options(checks.with_lenses(dataset, None))
         if args.advise:
             return
         args, dataset, opt, pipe = parse([*words, *(sys.argv[1:] if argv is None else argv)])

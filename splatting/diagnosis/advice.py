@@ -27,7 +27,7 @@ from scene.scene import Scene
 from splatting.diagnosis import Line
 from splatting.diagnosis.dataset import pose_errors, poses_differ
 from splatting.diagnosis.model import MASKED, odd_photos
-from splatting.exports.in_scene import scene_with
+from splatting.distributed.ranks import ranks
 from splatting.training.sky import FEWEST as LEAST_SKY
 from splatting.training.sky import Sky, find_sky
 from utils.image_utils import as_float
@@ -65,7 +65,7 @@ def advise(dataset: argparse.Namespace, trains: bool = True) -> list[Advice]:
     small = copy.copy(dataset)
     small.resolution, small.model_path, small.depths = _WIDTH, "", ""
     with contextlib.redirect_stdout(io.StringIO()):  # from the readers
-        scene, _ = scene_with(None, small, GaussianModel(0))
+        scene = Scene(small, GaussianModel(0), shuffle=False, start=False)
     tracks = read_tracks(dataset.source_path, scene.info.train_cameras, scene.info.offset)
     found = [*_of_tracks(scene, tracks)] if any(tracks) else []
     if len(scene.info.point_cloud.points):
@@ -73,6 +73,17 @@ def advise(dataset: argparse.Namespace, trains: bool = True) -> list[Advice]:
         text = f"{share:.1%} of the directions that several photos show have one colour and no points"
         found.append(_asked(text, share >= LEAST_SKY, "--sky auto"))
     return [*found, *_of_passers_by(dataset)] if trains else found
+
+
+def asked_options(dataset: argparse.Namespace) -> list[str]:
+    """Print the advice on a scene, and return the options that it asks for, as words of a command line."""
+    if ranks().several:
+        raise UserError("--advise and --options auto need one process; run train.py --advise, and give what it says")
+    found = advise(dataset)
+    print(*found, sep="\n")
+    words = " ".join(advice.options for advice in found).split()
+    print(f"options that this scene asks for: {' '.join(words) or 'none'}")
+    return words
 
 
 def check_options(source: str, images: str) -> list[Line]:
