@@ -36,6 +36,7 @@ from utils.system_utils import UserError
 EXPOSURES = 0.4  # stops; photos of a usual automatic exposure differ by 0.15 to 0.35
 FEW_PHOTOS = 25  # with fewer, depth is held badly
 DISTANCES = 2.5  # the farthest photo of a point over the nearest
+_APPEARANCE = "--appearance ppisp --opacity_reset_interval 100000"  # after a reset haze can grow before the cameras
 _WIDTH = 200  # pixels of a photo
 _DARK, _LIGHT = 0.02, 0.98  # of a channel; beyond, an exposure cannot be told
 _OUTLIER = 0.6  # stops; a larger difference is no exposure (Tukey's biweight: Beaton and Tukey 1974)
@@ -102,7 +103,7 @@ def _of_tracks(scene: Scene, tracks: list[Track | None]) -> Iterator[Advice]:
     views = scene.info.train_cameras
     cameras = sorted(scene.getTrainCameras(), key=lambda camera: camera.uid)
     spread = float(np.std(exposures(cameras, tracks)))
-    yield _asked(f"exposures of the photos differ by {spread:.2f} stops", spread > EXPOSURES, "--appearance ppisp")
+    yield _asked(f"exposures of the photos differ by {spread:.2f} stops", spread > EXPOSURES, _APPEARANCE)
     ratio = distances(views, tracks)
     text = f"the farthest photo of a point is {ratio:.1f} times as far away as the nearest (median)"
     yield _asked(text, ratio > DISTANCES, "--antialiasing")
