@@ -40,7 +40,8 @@ from scene.gaussians.ppisp import Ppisp
 from scene.saved_model import load_saved
 from scene.scene import Scene
 from splatting.camera_paths.render_path import add_path_options, path_request, render_path
-from splatting.evaluation.renders import DEPTHS, FITTED, GIVEN_POSES, INCOMPLETE, TIMES, model_digest, summarise_times
+from splatting.evaluation.comparison import FITTED, GIVEN_POSES
+from splatting.evaluation.renders import DEPTHS, INCOMPLETE, TIMES, model_digest, summarise_times
 from splatting.exports.in_scene import load_file
 from splatting.files.image_files import remove_leftovers, save_png, write_plane
 from splatting.files.json_files import write_json

@@ -333,7 +333,8 @@ def test_gaps_have_no_part_in_the_loss():
     depth, target = torch.tensor([[[0.1, 0.7, 0.3]]], requires_grad=True), torch.tensor([[[0.4, 0.0, 0.2]]])
     camera = SimpleNamespace(target_inverse_depth=target, depth_has_gaps=True, columns=None)
     step = SimpleNamespace(camera=camera, depth_weight=2.0, points=None, sky=None)
-    term = Objective(None).terms(step)["depth"]
+    run = SimpleNamespace(gaussians=SimpleNamespace(exposures=None))
+    term = Objective(run).terms(step)["depth"]
     term({"depth": depth}, None).backward()
     assert depth.grad.tolist() == [[[-1.0, 0.0, 1.0]]]
     masked = term({"depth": depth}, torch.tensor([[[True, True, False]]]))

@@ -28,7 +28,7 @@ from scene.readers.info import HOLD
 from splatting.demo.make_scene import make_scene
 from splatting.demo.objects import Box, Sphere, Thing, backdrop_texture, demo_scene, marble
 from splatting.demo.tracer import CAMERAS, ring_views, trace
-from splatting.evaluation.renders import BESIDE
+from splatting.evaluation.comparison import BESIDE
 from splatting.files.image_files import read_plane
 from splatting.training.sparse_depth import HELD_OUT
 from utils.system_utils import UserError, compute_device, run_cli

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.harness.measuring import describe, print_table
-from splatting.evaluation.renders import FITTED
+from splatting.evaluation.comparison import FITTED
 from utils.system_utils import UserError, compute_device, run_cli
 
 ROOT = Path(__file__).resolve().parents[2]

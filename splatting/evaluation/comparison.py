@@ -15,9 +15,11 @@ from typing import Any
 
 from splatting.evaluation.error_curve import SUBSET, Row, of_whole_sets
 from splatting.evaluation.plan import DATASETS
-from splatting.evaluation.renders import BESIDE
 from splatting.files.json_files import read_json
 
+GIVEN_POSES = "given_poses"  # behind the name of renders and scores with the dataset's poses, where others were trained
+FITTED = "fitted_appearance"  # the same of right halves, with the photos' appearance fitted to left ones
+BESIDE = (GIVEN_POSES, FITTED)
 SCORES = ("PSNR", "SSIM", "LPIPS")
 OTHER_SCORES = tuple(f"PSNR_{name}" for name in BESIDE)
 QUANTITIES = (

@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     import torch
 
 INCOMPLETE = "incomplete"  # beside them, until the last image of a set is written
-GIVEN_POSES = "given_poses"  # behind the name of renders and scores with the dataset's poses, where others were trained
-FITTED = "fitted_appearance"  # the same of right halves, with the photos' appearance fitted to left ones
-BESIDE = (GIVEN_POSES, FITTED)
 DEPTHS = "depth_errors.json"  # beside them: of each view, the errors of depth at held-out points
 TIMES = "render_times.json"  # beside the folders of images: the time of each view
 GAIN = 5  # amplification of the difference

@@ -11,10 +11,10 @@ from typing import Any
 from scene.readers.info import HOLD
 from scene.saved_iterations import saved_ply
 from splatting.evaluation import model_folder as folder_of
-from splatting.evaluation.comparison import SCORES
+from splatting.evaluation.comparison import BESIDE, SCORES
 from splatting.evaluation.error_curve import Row
 from splatting.evaluation.plan import Record, Run, SceneEntry, is_model
-from splatting.evaluation.renders import BESIDE, TIMES, WORST, image_size, photo_namer, view_names
+from splatting.evaluation.renders import TIMES, WORST, image_size, photo_namer, view_names
 from splatting.evaluation.stages import Failure, page_file
 from splatting.evaluation.training_log import DEGREES, PERCENT
 from splatting.evaluation.what_to_try import peak

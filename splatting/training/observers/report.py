@@ -16,7 +16,7 @@ from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.ppisp import Ppisp
-from splatting.evaluation.renders import FITTED, GIVEN_POSES
+from splatting.evaluation.comparison import FITTED, GIVEN_POSES
 from splatting.evaluation.what_to_try import BUDGET, CAP, PLANNED, STRATEGY, what_to_try
 from splatting.host.clock import wall_seconds
 from splatting.training.density import default_budget
