@@ -12,7 +12,8 @@ from scene.readers.tracks import Track
 OUTLIER = 1.0  # pixels; larger errors count linearly (Huber 1964)
 BOUND = 0.05  # of a correction: rotation in radians, and translation in extents of the scene
 _STEPS = 10
-_LESS = 0.9  # of the loss: a pose whose loss falls less stays, since structure from motion has found it
+_CHANCE = 10.0  # times what noise makes the loss fall on the mean; poses of structure from motion reach 5
+_LESS = 0.9  # of the loss: a lens whose loss falls less stays
 _RANK = 1e-9  # of the largest curvature: less says nothing of a lens
 _NEAR = 1e-3  # units of depth; nearer points do not count
 
@@ -122,9 +123,10 @@ def damped(curvature: np.ndarray) -> np.ndarray:
 
 
 def nearest_pose(pose: np.ndarray, track: Track | None, focal: float, unit: float, bound: float) -> np.ndarray:
-    """The pose of least reprojection error near a pose, which stays as it is without a track, or where little is won.
+    """The pose of least reprojection error near a pose, which stays without a track, or where noise explains the gain.
 
-    bound: of rotation (radians) and translation (units), beyond which it stays, too.
+    The F statistic of a pose's six numbers tells that (Seber and Lee 2003, section 4.2). bound: of rotation (radians)
+    and translation (units), beyond which it stays, too.
     """
     if track is None:
         return pose
@@ -136,7 +138,8 @@ def nearest_pose(pose: np.ndarray, track: Track | None, focal: float, unit: floa
     change = found @ np.linalg.inv(pose)
     turn = np.arccos(np.clip((np.trace(change[:3, :3]) - 1) / 2, -1, 1))
     apart = np.linalg.norm(change[:3, 3]) / unit
-    better = pull(found, track, focal, unit).loss < _LESS * pull(pose, track, focal, unit).loss
+    before, after = (pull(place, track, focal, unit).loss for place in (pose, found))
+    better = (before - after) * (2 * len(track.points) - 6) > _CHANCE * 6 * after
     return found if better and turn <= bound and apart <= bound else pose
 
 

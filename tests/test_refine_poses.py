@@ -74,6 +74,17 @@ def test_a_pose_may_stay():
     noisy, near = _track(200, 1e-3), moved_pose(POSE, 1e-3 * TURN, 1.0)
     assert nearest_pose(near, noisy, 500.0, 1.0, BOUND) is near  # by a hundredth of the errors' size
     assert nearest_pose(moved_pose(POSE, 0.05 * TURN, 1.0), noisy, 500.0, 1.0, BOUND) is not near
+    tracked = tracked_poses.TrackedPoses([near], [noisy], [500.0], [None], 1.0)
+    assert not tracked.pulled(0, np.zeros(6)).any()  # it is held there
+    assert tracked.pulled(0, TURN).any()
+
+
+def test_many_points_tell_a_small_error_from_noise():
+    track, away = _track(3000, 4e-3), moved_pose(POSE, 0.06 * TURN, 1.0)
+    before, after = (pull(pose, track, 500.0, 1.0).loss for pose in (away, POSE))
+    assert 0.9 * before < after < before  # pixels of noise hide most of it
+    found = nearest_pose(away, track, 500.0, 1.0, BOUND)
+    assert np.linalg.norm(found - POSE) < 0.3 * np.linalg.norm(away - POSE)
 
 
 @pytest.mark.parametrize("params", [BROWN[:4], BROWN], ids=["pinhole", "distorted"])

@@ -14,7 +14,8 @@ class TrackedPoses:
     """The poses of least reprojection error of views. The error, to second order about there, is a part of their loss.
 
     starts: (4, 4) float64 for each view. held: gradient and curvature of the error by the twist there, and by the
-    change of a lens where slopes are given; None for a view without a track, which nothing holds.
+    change of a lens where slopes are given; None for a view without a track, which nothing holds. A start counts as the
+    pose of least error, also where the dataset's pose stayed.
     """
 
     def __init__(
@@ -30,6 +31,8 @@ class TrackedPoses:
         for pose, track, focal, slope in zip(given, tracks, focals, slopes, strict=True):
             start = nearest_pose(pose, track, focal, unit, BOUND)
             of_track = track and pull(start, track, focal, unit, slope)
+            if of_track:
+                of_track.gradient[:6] = 0
             self.starts.append(start)
             self.held.append(of_track and (of_track.gradient, of_track.curvature))
 
