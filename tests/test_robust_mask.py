@@ -14,6 +14,7 @@ from trainings import differences, trained
 import train
 from splatting.evaluation.training_log import read_log
 from splatting.training import checks, robust_mask
+from splatting.training.observers import guards
 from splatting.training.robust_mask import RobustMask
 from utils.system_utils import UserError, run_cli
 
@@ -113,6 +114,12 @@ def test_all_steps_and_a_resumed_training_have_the_same_bytes(scene, tmp_path, m
     (said,) = [line for line in lines if line.startswith("--robust_mask leaves out")]
     written = [path for path in (tmp_path / "whole" / robust_mask.FOLDER).rglob("*.png")]
     assert f"in {len(written)} of 14 photos" in said and written
+    monkeypatch.setattr(guards, "_LEARNT", 60)
+    monkeypatch.setattr(robust_mask, "CLEAR", 0.0)  # differences are small after 60 iterations
+    assert trained(scene, tmp_path / "named", *ON[2:]) == off
+    lines = read_log(tmp_path / "named" / "train_log.json")[-1]["lines"]
+    (said,) = [line for line in lines if "of 14 photos show what the model does not" in line]
+    assert "try --robust_mask 0.3" in said
     again = trained(scene, tmp_path / "again", "--masks", tmp_path / "whole" / robust_mask.FOLDER, *ON[2:])
     assert again["ply"] != off["ply"]  # they are mask files
 

@@ -26,8 +26,9 @@ from scene.readers.tracks import Track, read_tracks
 from scene.scene import Scene
 from splatting.diagnosis import Line
 from splatting.diagnosis.dataset import pose_errors, poses_differ
-from splatting.diagnosis.model import MASKED, odd_photos
+from splatting.diagnosis.model import masks_of
 from splatting.distributed.ranks import ranks
+from splatting.training.robust_mask import FEW, MASKED, odd_photos
 from splatting.training.sky import FEWEST as LEAST_SKY
 from splatting.training.sky import Sky, find_sky
 from utils.image_utils import as_float
@@ -42,8 +43,6 @@ _DARK, _LIGHT = 0.02, 0.98  # of a channel; beyond, an exposure cannot be told
 _OUTLIER = 0.6  # stops; a larger difference is no exposure (Tukey's biweight: Beaton and Tukey 1974)
 _ROUNDS = 30
 _ITERATIONS = 1000  # of the short training that passers-by are searched in
-FEW_MASKED = 0.2  # of the photos, which a bare wall or a sky may reach after a short training
-_CLEAR = 0.11  # mean difference of a passer-by; what is not learnt yet rarely differs so much
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear sRGB
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -176,6 +175,7 @@ def _of_passers_by(dataset: argparse.Namespace) -> Iterator[Advice]:
         done = subprocess.run([sys.executable, ROOT / "train.py", *flags], capture_output=True, text=True, check=False)
         if done.returncode:
             raise UserError(done.stderr.strip().rpartition("\n")[2])
-        share = odd_photos(folder, _CLEAR)
+        masks = masks_of(folder)
+    share = len(odd_photos(masks)) / len(masks.cameras)
     text = f"{share:.0%} of the photos show what a short training does not, as if someone had passed by"
-    yield _asked(text, share > FEW_MASKED, f"--robust_mask {MASKED:g}")
+    yield _asked(text, share > FEW, f"--robust_mask {MASKED:g}")

@@ -27,7 +27,7 @@ from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
 from splatting.evaluation.what_to_try import what_to_try
 from splatting.files.listing import some
-from splatting.training.robust_mask import RobustMask
+from splatting.training.robust_mask import MASKED, MOST_PHOTOS, RobustMask, residuals_of
 from splatting.training.sky import Sky
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.system_utils import UserError, compute_device
@@ -50,7 +50,6 @@ NEAREST = 0.2  # depth below which nothing is drawn
 FEW_GAUSSIANS = 2000
 _CLEARLY = 3.0  # dB
 _VIEWS = 4
-_MOST_PHOTOS, MASKED = 300, 0.3  # that are searched for passers-by; the largest part of one
 _WIDTH = 200
 _RESET_SAID = "warning: opacities are reset"  # the beginning of what training/checks.py:late_reset says
 
@@ -160,9 +159,9 @@ def _wrong_values(gaussians: GaussianModel, extent: float) -> Iterator[Line]:
 def _passers_by(scene: Scene, options: argparse.Namespace) -> Iterator[Line]:
     """A note on photos that show what the model does not."""
     cameras = scene.getTrainCameras()
-    if len(cameras) > _MOST_PHOTOS or options.train_test_exp:
+    if len(cameras) > MOST_PHOTOS or options.train_test_exp:
         return
-    masks = _masks(scene, options)
+    masks = residuals_of(cameras, _scored(scene, options), scene.gaussians)
     found = {camera.image_name: masks.counted(camera) for camera in cameras}
     shares = {name: 1 - float(counts.float().mean()) for name, counts in found.items() if counts is not None}
     if worst := sorted(shares, key=shares.get, reverse=True):
@@ -170,26 +169,10 @@ def _passers_by(scene: Scene, options: argparse.Namespace) -> Iterator[Line]:
         yield Line(f"{text}: most in {some(worst)}; try --robust_mask {MASKED:g}", note=True)
 
 
-@torch.no_grad()
-def _masks(scene: Scene, options: argparse.Namespace) -> RobustMask:
-    """Masks of what the training photos show and the model does not."""
-    cameras, views = scene.getTrainCameras(), _scored(scene, options)
-    masks = RobustMask(cameras, MASKED, compute_device())
-    masks.least, masks.early = 1, 0  # it is trained
-    for camera in cameras:
-        masks.mask(camera, *views.compared(camera, scene.gaussians), learns=True)
-        masks.keep()
-    return masks
-
-
-def odd_photos(model_path: str, least: float) -> float:
-    """The share of the training photos that clearly show what the model in a folder does not.
-
-    least: mean difference of what is masked in such a photo, in [0, 1].
-    """
+def masks_of(model_path: str) -> RobustMask:
+    """Masks of what training photos show and the model in a folder does not."""
     options, scene = _load(model_path, read_stored_options(model_path), -1)
-    masks = _masks(scene, options)
-    return sum(masks.difference(camera) > least for camera in masks.cameras) / len(masks.cameras)
+    return residuals_of(scene.getTrainCameras(), _scored(scene, options), scene.gaussians)
 
 
 def _late_reset(scene: Scene) -> Iterator[Line]:

@@ -14,7 +14,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, interpolate, max_pool2d
 
+from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
 from utils.image_utils import as_float
 from utils.system_utils import UserError
 
@@ -24,6 +26,10 @@ _NEWEST = 0.5  # weight of the newest residuals in a photo's
 _FACTOR = 9.0  # times the level of all photos is what residuals of detail rarely reach
 _AROUND = 5  # cells across, most of which are outliers somewhere in a passer-by, but not in a highlight
 _STATE = ("residuals", "levels", "visits")
+MASKED = 0.3  # of a photo, at most, where photos of passers-by are searched
+MOST_PHOTOS = 300  # that are searched
+CLEAR = 0.11  # mean difference of a passer-by; what is not learnt yet rarely differs so much
+FEW = 0.2  # of the photos, which a bare wall or a sky may reach after a short training
 
 
 class RobustMask:
@@ -110,6 +116,23 @@ class RobustMask:
             raise UserError("the checkpoint has residuals of other photos; resume it with its own scene and options")
         for name in _STATE:
             getattr(self, name).copy_(state[name])
+
+
+@torch.no_grad()
+def residuals_of(cameras: Sequence[Camera], views: ScoredViews, gaussians: GaussianModel) -> RobustMask:
+    """The residuals and masks of photos after a training that did not keep them."""
+    masks = RobustMask(cameras, MASKED, gaussians.get_xyz.device)
+    masks.least, masks.early = 1, 0  # it is trained
+    for camera in cameras:
+        masks.mask(camera, *views.compared(camera, gaussians), learns=True)
+        masks.keep()
+    return masks
+
+
+def odd_photos(masks: RobustMask) -> list[str]:
+    """Names of the photos that clearly show what the model does not, those that differ most first."""
+    differences = {camera.image_name: masks.difference(camera) for camera in masks.cameras}
+    return sorted((name for name in differences if differences[name] > CLEAR), key=differences.get, reverse=True)
 
 
 def _in_cells(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:

@@ -12,6 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gaussian_renderer.memory_errors import situation
+from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
 from scene.gaussians.checkpoint import save_checkpoint
 from splatting.files.listing import some
@@ -19,10 +20,11 @@ from splatting.host.memory import is_out_of_memory
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
-from splatting.training.robust_mask import FOLDER
+from splatting.training.robust_mask import FEW, FOLDER, MASKED, MOST_PHOTOS, odd_photos, residuals_of
 from splatting.training.run import Run
 from utils.system_utils import UserError, atomic_write
 
+_LEARNT = 1000  # iterations, before which much is not explained
 _ENOUGH = 100  # if so many views have no pixel that counts, and no view has one, the masks are wrong
 _ALMOST_NOTHING = 1e-3  # share of the pixels
 _HINT = "is white masked in them (--invert_masks), or do they belong to another scene?"
@@ -103,6 +105,30 @@ class PassersBy(Observer):
         text = f"--robust_mask leaves out {sum(shares.values()) / views:.1%} of the pixels"
         text += f", in {len(shares)} of {views} photos"
         run.log.tell(text + (f", most in {some(most)}; {folder} shows them" if most else ""))
+
+
+class OddPhotos(Observer):
+    """Names the photos that a training without --robust_mask does not explain, where these are many."""
+
+    reads_model = False  # before the end
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+
+    @staticmethod
+    def serves(run: Run) -> bool:
+        """Whether the model is trained and photos are few enough, and no budget counts the time."""
+        long, few = run.opt.iterations >= _LEARNT, len(run.scene.getTrainCameras()) <= MOST_PHOTOS
+        return long and few and not (run.opt.time_budget or run.group.several or run.robust_mask or run.exposes)
+
+    def ended(self, error: Error) -> None:
+        if error is not None:
+            return
+        run, cameras = self._run, self._run.scene.getTrainCameras()
+        odd = odd_photos(residuals_of(cameras, ScoredViews(run.pipe, run.background, False), run.gaussians))
+        if len(odd) > FEW * len(cameras):
+            text = f"{len(odd)} of {len(cameras)} photos show what the model does not, as if someone had passed by"
+            run.log.tell(f"{text}: most in {some(odd)}; try --robust_mask {MASKED:g}")
 
 
 class MemoryGuard(Observer):
