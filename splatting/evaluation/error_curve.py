@@ -148,7 +148,7 @@ def read_peer(path: Path, required: Sequence[str] = PEER_REQUIRED) -> list[Row]:
         if (least := min(row["seconds"] for row in rows)) <= 0:
             raise ValueError(f"seconds are {least:g}, and must be above 0")
     except OSError as error:
-        raise UserError(f"cannot read {path} ({error.strerror}); --peer takes a name and a CSV file") from error
+        raise UserError(f"cannot read {path} ({error.strerror}); give a CSV file of a curve") from error
     except (ValueError, csv.Error) as error:
         raise UserError(
             f"{path} is not a curve ({error}); its columns must be {' and '.join(required)}, others may follow: "
