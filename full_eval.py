@@ -79,6 +79,8 @@ def _parser() -> OptionParser:
         "test_psnr (`python -m splatting.evaluation.peer_curve` makes it); with several "
         "scenes NAME is SCENE/NAME; may be given "
         "again (default: none)")  # fmt: skip
+    add("--weights", type=Path, metavar="FOLDER",
+        help="folder of the weights of LPIPS and DISTS, as for metrics.py (default: none, and no DISTS)")  # fmt: skip
     add("--html_models", **flag,
         help="write each model into models/ beside the report, as one HTML file with a viewer")  # fmt: skip
     for name, (_, text) in _SHORT_FOR.items():
@@ -109,6 +111,10 @@ def _plan(args: Namespace, more: Sequence[str]) -> list[Run]:
         raise UserError(f"--iterations must be at least 1, got {args.iterations}")
     if min(args.seeds, default=0) < 0 or len(set(args.seeds)) < len(args.seeds):
         raise UserError(f"--seeds must be distinct numbers, 0 or more, got {' '.join(map(str, args.seeds))}")
+    if args.weights and not args.skip_metrics:
+        from utils.lpips_utils import weights_file  # here, as it imports torchvision
+
+        weights_file("vgg", args.weights)
     parse = None if args.skip_training else _parse_for_training
     check_options(more, "after --", parse)
     configs = read_configs(args.configs, parse) if args.configs else {}
@@ -143,7 +149,7 @@ def _carry_out(runs: Sequence[Run], args: Namespace, failures: dict[Run, Failure
             if not args.skip_rendering:
                 stages.render(run, options)
             if not args.skip_metrics:
-                download = stages.score(run, download)
+                download = stages.score(run, download, args.weights)
             if args.html_models:
                 stages.page(run, args.output_path.resolve(), options)
         except StageFailed as failed:

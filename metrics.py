@@ -1,6 +1,6 @@
-"""Score rendered test views against their ground truth: PSNR, SSIM and LPIPS.
+"""Score rendered test views against their ground truth: PSNR, SSIM, LPIPS and DISTS.
 
-python metrics.py -m MODEL [MODEL ...] [--lpips_net vgg|alex|both] [--lpips_weights FILE ...]
+python metrics.py -m MODEL [MODEL ...] [--lpips_net vgg|alex|both] [--weights FOLDER]
 
 Reads MODEL/test/<method>/{renders,gt}, masks if there are any, and the errors of depth that render.py --depth writes.
 Writes MODEL/results.json (means), per_view.json, and metrics_info.json, which states the convention of each number.
@@ -26,7 +26,7 @@ from arguments import OptionParser, read_cfg_args
 from splatting.evaluation.model_folder import json_or_none
 from splatting.evaluation.renders import DEPTHS, INCOMPLETE, TIMES, image_of, image_size, mask_of, model_digest
 from splatting.files.json_files import read_json, write_json
-from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, load_network
+from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, load_dists, load_network
 from utils.system_utils import UserError, compute_device, run_cli
 
 CONVENTIONS = {
@@ -35,6 +35,7 @@ CONVENTIONS = {
     "LPIPS": "version 0.1, VGG-16, inputs in [0,1] without mapping, as in the published 3DGS tables",
     "LPIPS_vgg": "version 0.1, VGG-16, inputs mapped to [-1,1]",
     "LPIPS_alex": "version 0.1, AlexNet, inputs mapped to [-1,1]",
+    "DISTS": "package DISTS-pytorch 0.1, VGG-16, inputs in [0,1] at their own size",
     "DEPTH": "relative error of the inverse depth at held-out points that the photo has seen: the median of a view",
     "DEPTH_95": "the same: what 95 % of a view's points are below",
 }
@@ -44,7 +45,9 @@ MASKED = {
     "PSNR": "the mean over the pixels that count",
     "SSIM": "other pixels are 0 in both images, as beyond the border; 1 - SSIM is divided by the share that counts",
     "LPIPS": "other pixels of the render are the ground truth's; the mean of the map over the pixels that count",
+    "DISTS": "other pixels of the render are the ground truth's",
 }
+NETWORKS = ("LPIPS", "DISTS")  # what the names of their scores begin with
 _SAME = 1e-9  # of SSIM, whose sum may differ in its last bits
 Metric = Callable[[np.ndarray, np.ndarray, np.ndarray | None], float | None]
 Scores = dict[str, dict[str, float | None]]
@@ -146,21 +149,31 @@ def _lpips_metric(network: torch.nn.Module, unit_range: bool, device: torch.devi
 
     @torch.no_grad()
     def metric(render: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
-        if mask is not None:
-            render = np.where(mask[..., None], render, truth)
-        images = [torch.from_numpy(image.transpose(2, 0, 1)[None].copy()).to(device) / 255 for image in (render, truth)]
         network.spatial = mask is not None  # without a mask the layers' means are added, as published
-        distance = network(*images, normalize=not unit_range)
+        distance = network(*_tensors(render, truth, mask, device), normalize=not unit_range)
         return float(distance if mask is None else distance[0, 0][torch.from_numpy(mask).to(device)].mean())
 
     return metric
 
 
-def make_metrics(lpips_net: str, weights: list[Path], smallest_side: int) -> dict[str, Metric]:
+def _dists_metric(network: torch.nn.Module, device: torch.device) -> Metric:
+    """Return DISTS by the network of `load_dists`."""
+    return lambda render, truth, mask: float(network(*_tensors(render, truth, mask, device)))
+
+
+def _tensors(
+    render: np.ndarray, truth: np.ndarray, mask: np.ndarray | None, device: torch.device
+) -> list[torch.Tensor]:
+    """Both images (1, 3, H, W) in [0, 1]; pixels of the render that do not count are the ground truth's."""
+    both = (render if mask is None else np.where(mask[..., None], render, truth), truth)
+    return [torch.from_numpy(image.transpose(2, 0, 1)[None].copy()).to(device) / 255 for image in both]
+
+
+def make_metrics(lpips_net: str, weights: Path | None, smallest_side: int) -> dict[str, Metric]:
     """Make the metrics by key, in the order of the files.
 
-    smallest_side: smallest side of all images, in pixels. If a backbone or its weights are missing, a line says so and
-    its metrics return None.
+    weights: folder of the networks' weights, where a missing or wrong one is a UserError. smallest_side: smallest side
+    of all images, in pixels. If a backbone or its weights are missing, a line says so and its metrics return None.
     """
     keys = ["SSIM", "PSNR", "LPIPS"] + [f"LPIPS_{net}" for net in ("vgg", "alex") if lpips_net in (net, "both")]
     metrics: dict[str, Metric] = dict.fromkeys(keys, lambda render, truth, mask: None)
@@ -181,6 +194,11 @@ def make_metrics(lpips_net: str, weights: list[Path], smallest_side: int) -> dic
             print(f"{', '.join(mine)} are null unless scored before: {error}; run pip install -r requirements.txt")
             continue
         metrics.update({key: _lpips_metric(network, key == "LPIPS", device) for key in mine})
+    if weights:
+        try:
+            metrics["DISTS"] = _dists_metric(load_dists(weights, device), device)
+        except LpipsUnavailable as reason:
+            print(f"DISTS is left out: {reason}")
     return metrics
 
 
@@ -220,12 +238,10 @@ def readImages(renders_dir: str | Path, gt_dir: str | Path) -> tuple[list[torch.
     return read(renders_dir), read(gt_dir), names
 
 
-def evaluate(
-    model_paths: Sequence[str | Path], lpips_net: str = "vgg", lpips_weights: Sequence[str | Path] = ()
-) -> None:
+def evaluate(model_paths: Sequence[str | Path], lpips_net: str = "vgg", weights: str | Path | None = None) -> None:
     """Score model folders, print the means and write the files of scores, as the command does.
 
-    lpips_net: "vgg", "alex" or "both". lpips_weights: state dicts of torchvision's vgg16 or alexnet, instead of torch's
+    lpips_net: "vgg", "alex" or "both". weights: folder of torchvision's files of vgg16 and alexnet, instead of torch's
     cache and a download. UserError if a folder cannot be scored, after the others were.
     """
     found, failed = {}, []
@@ -237,7 +253,7 @@ def evaluate(
     if not found:
         raise UserError("; ".join(failed))
     sides = [side for methods in found.values() for pairs in methods.values() for pair in pairs for side in pair.size]
-    metrics = make_metrics(lpips_net, [Path(file) for file in lpips_weights], min(sides))
+    metrics = make_metrics(lpips_net, weights and Path(weights), min(sides))
     for model, methods in found.items():
         _score_model(model, methods, metrics)
     if failed:
@@ -251,8 +267,8 @@ def depth_scores(method: Path) -> Scores:
     return {key.upper(): {name: of_view[key] for name, of_view in found.items() if key in of_view} for key in keys}
 
 
-def keep_lpips(model: Path, method: str, scores: Scores) -> list[str]:
-    """Add the LPIPS that model/per_view.json has of a method to new scores that lack it; return its metrics.
+def keep_networks(model: Path, method: str, scores: Scores) -> list[str]:
+    """Add the LPIPS and DISTS that model/per_view.json has of a method to new scores that lack them; return which.
 
     None are added unless every view has the same PSNR and SSIM as then, which other pictures would change.
     """
@@ -265,7 +281,7 @@ def keep_lpips(model: Path, method: str, scores: Scores) -> list[str]:
         kept = [
             name
             for name, values in earlier.items()
-            if name.startswith("LPIPS")
+            if name.startswith(NETWORKS)
             and set(scores.get(name, {}).values()) <= {None}
             and values.keys() == views
             and all(type(value) is float and math.isfinite(value) for value in values.values())
@@ -282,7 +298,7 @@ def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str,
         print(f"warning: {model} was trained without --eval, so these scores are of training views")
     per_view = {name: score(pairs, metrics, f"{model.name}/{name}") for name, pairs in methods.items()}
     for name, scores in per_view.items():
-        if kept := keep_lpips(model, name, scores):
+        if kept := keep_networks(model, name, scores):
             print(f"{model} {name}: kept {', '.join(kept)} of an earlier scoring of the same pictures")
         scores |= depth_scores(model / "test" / name)
     results = {name: {key: mean(values) for key, values in scores.items()} for name, scores in per_view.items()}
@@ -303,18 +319,18 @@ def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str,
 
 
 def main() -> None:
-    parser = OptionParser(description="Score rendered test views: PSNR, SSIM, LPIPS.")
+    parser = OptionParser(description="Score rendered test views: PSNR, SSIM, LPIPS, DISTS.")
     add = parser.add_argument
     add("-m", "--model_paths", type=Path, nargs="+", required=True,
         help="model folders to score (default: none, must be given)")  # fmt: skip
     add("--lpips_net", choices=("vgg", "alex", "both"), default="vgg",
         help="LPIPS backbone: vgg for LPIPS (as in published tables) and LPIPS_vgg, alex for LPIPS_alex (default: "
         "vgg)")  # fmt: skip
-    add("--lpips_weights", type=Path, nargs="+", default=[], metavar="FILE",
-        help="state dicts of torchvision's vgg16 or alexnet; replace torch's cache and download (default: torch's "
-        "cache, or else a download into it)")  # fmt: skip
+    add("--weights", type=Path, metavar="FOLDER",
+        help="folder of torchvision's files vgg16-397923af.pth, for LPIPS and DISTS, and alexnet-owt-7be5be79.pth; "
+        "nothing is downloaded then (default: torch's cache, or else a download into it, and no DISTS)")  # fmt: skip
     args = parser.parse_args()
-    evaluate(args.model_paths, args.lpips_net, args.lpips_weights)
+    evaluate(args.model_paths, args.lpips_net, args.weights)
 
 
 if __name__ == "__main__":

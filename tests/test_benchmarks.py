@@ -23,7 +23,7 @@ from benchmarks.harness.measuring import GpuTime, short_name
 from benchmarks.kernels import rasterizer
 from benchmarks.parallel import steps, workload
 from benchmarks.scenes import options, step_profile, training
-from benchmarks.strategies.figure import draw
+from benchmarks.strategies.figure import draw, with_peers
 from benchmarks.strategies.tables import at, joined
 from scene.dataset_readers import read_scene
 from splatting.demo.tracer import ring_views, trace
@@ -279,11 +279,20 @@ def test_a_figure_of_whatever_trainings_there_are(tmp_path, monkeypatch):
     clock = {"5s": {"0": _run((5, 30)), "1": _run((5, 31))}, "9s": {"0": None}}
     budget = ["--strategy", "mcmc", "--time_budget", "5"]
     files = [_file(many | clock, **dict.fromkeys(clock, budget)), _file({"set0": {"0": None}}, "nothing")]
-    files.append(_file({"set0": {"0": _run((1, 10), (2, 11)), "1": _run((4, 10), (5, 11))}}, "c"))  # at no time both
+    files.append(
+        _file({"set0": {"0": _run((0, 9), (1, 10), (2, 11)), "1": _run((4, 10), (5, 11))}}, "c")
+    )  # at no time both
     files.append(_file({"set0": {"0": _run((2, 18))}, "set1": {"0": _run((2, 18), whole=False)}}, "d"))
-    draw(joined(files), tmp_path / "figure.png", ["set10"])
+    (tmp_path / "two.csv").write_text("seconds,test_psnr\n2,19\n4,20\n")
+    (tmp_path / "three.csv").write_text("seconds,test_psnr\n2,18\n3,20\n4,21\n")
+    peers = [("c/ends", f"{tmp_path}/two.csv"), ("c/line", *[f"{tmp_path}/three.csv"] * 2)]
+    draw(with_peers(joined(files), peers), tmp_path / "figure.png", ["set10"])
     panels = drawn[0].axes
     assert [panel.get_title() for panel in panels] == ["a", "c", "d", ""]
     assert panels[0].get_legend_handles_labels()[1] == [*(f"set{number}" for number in range(10)), "mcmc by the clock"]
+    lengths = {line.get_label(): len(line.get_xdata()) for line in panels[1].lines if line.get_label()[0] != "_"}
+    assert lengths == {"set0": 1, "ends": 2, "line": 1} and len(panels[1].lines) == 4  # one is a line
+    with pytest.raises(UserError, match="give SCENE/NAME, of the scenes a"):
+        with_peers(joined(files[:1]), [("ends", f"{tmp_path}/two.csv")])
     with pytest.raises(UserError, match="no training is left"):
         draw(joined([_file({"adc": {"0": _run((1, 20))}})]), tmp_path / "none.png", ["adc"])

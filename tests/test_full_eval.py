@@ -29,6 +29,7 @@ from splatting.evaluation.model_folder import SCHEDULE, shorter_ends_there
 from splatting.evaluation.plan import DATASETS, Run, SceneEntry
 from splatting.evaluation.renders import GAIN, GAP, HEADER, ComparedViews
 from splatting.evaluation.results_page import BEGIN, END
+from utils import lpips_utils
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]
@@ -121,9 +122,9 @@ def test_commands_of_a_plain_scene(figures, evaluate):
     assert 0 < first["cpu_seconds"] < 30 and "| process (s) | CPU (s) |" in evaluate.text("md")
     assert first["finished"] and first["failure"] is None and first["model"] == "attic"
     assert first["iterations"]["40"] == {
-        "PSNR": 23.0, "SSIM": 0.9, "LPIPS": None, "fps": 250.0, "gaussians": 16000, "gaussians_saved": 16000,
-        "peak_memory_mib": 340.0, "ply_mb": 36e-6, "render_ms": 4.0, "seconds": 16.0, "views": 2,
-        "PSNR_given_poses": None, "PSNR_fitted_appearance": None,
+        "PSNR": 23.0, "SSIM": 0.9, "LPIPS": None, "DISTS": None, "fps": 250.0, "gaussians": 16000,
+        "gaussians_saved": 16000, "peak_memory_mib": 340.0, "ply_mb": 36e-6, "render_ms": 4.0, "seconds": 16.0,
+        "views": 2, "PSNR_given_poses": None, "PSNR_fitted_appearance": None,
     }  # fmt: skip
     assert first["views"] == {"test": 2, "train": 7} and first["test_sizes"] == [[120, 80]]
     assert first["worst_views"][0] == {"PSNR": 22.0, "file": "00001.png", "picture": "photo_1.jpg"}
@@ -184,6 +185,18 @@ def test_only_the_first_scoring_tries_a_download(evaluate):
     evaluate("attic brick")
     tried = [json.loads((evaluate.out / name / "scored.txt").read_text())[0] for name in ("attic", "brick")]
     assert tried == [None, "told"] and "LPIPS is missing: metrics.py found no weights" in evaluate.text("md")
+
+
+def test_weights_are_checked_first_and_give_dists(evaluate, tmp_path, monkeypatch):
+    assert evaluate("attic")["runs"][0]["iterations"]["40"]["DISTS"] is None and "DISTS" not in evaluate.text("md")
+    done = evaluate.calls()
+    with pytest.raises(UserError, match=f"cannot read {tmp_path}/vgg16-397923af.pth .*; put https://.*vgg16.* there"):
+        evaluate("brick", "--weights", tmp_path)
+    monkeypatch.setattr(lpips_utils, "weights_file", lambda *_: None)
+    assert evaluate("attic", "--weights", tmp_path)["summary"][0]["DISTS"]["mean"] == 0.125
+    assert evaluate.calls() == done and " DISTS |" in evaluate.text("md")
+    scorings = (evaluate.out / "attic" / "scored.txt").read_text().splitlines()
+    assert len(scorings) == 2 and json.loads(scorings[1])[-1] == f"--weights={tmp_path}"
 
 
 def test_other_options_are_not_mixed_in(evaluate):

@@ -19,7 +19,7 @@ CSRC = ROOT / "submodules"
 LONGEST = 60  # lines of a function
 # Most lines of code and of tests, without blanks, comments and docstrings, files of code, and words of Markdown. A new
 # capability that needs more says so in its commit, and what it let go.
-MOST = {"code": 41_900, "files": 488, "tests": 31_930, "words": 45_760}
+MOST = {"code": 42_140, "files": 491, "tests": 32_020, "words": 46_020}
 
 # What a room may import besides itself and what serves them all: prefixes of module names. The room of a module is its
 # longest prefix here.
@@ -61,14 +61,14 @@ MAY_IMPORT = {
     "benchmarks": (),
     "benchmarks.workloads": ("scene.gaussians.morton",),
     "benchmarks.harness": ("benchmarks.workloads",),
-    "benchmarks.strategies": ("benchmarks.harness",),
+    "benchmarks.strategies": ("benchmarks.harness", "splatting.evaluation.error_curve"),
 }
 MAY_IMPORT["splatting.training.observers"] = (
     *("splatting.training", "splatting.viewer"),
     *MAY_IMPORT["splatting.training"],
 )
 MEASURED = ("train", "render", "metrics", *(room for room in ROOMS if room != "benchmarks"))
-for room in ("kernels", "accuracy", "scenes", "exports", "parallel"):
+for room in ("kernels", "accuracy", "scenes", "exports", "parallel", "peers"):
     MAY_IMPORT[f"benchmarks.{room}"] = ("benchmarks.harness", "benchmarks.workloads", *MEASURED)
 MAY_IMPORT["integrations"] = ("train", *(room for room in ROOMS if room != "benchmarks"))
 MAY_IMPORT["benchmarks.gate"] = ("benchmarks.scenes.training", "benchmarks.harness", *MEASURED)

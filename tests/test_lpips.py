@@ -1,7 +1,10 @@
-"""LPIPS: the values of the `lpips` package by both of our ways to it, where weights come from, and errors."""
+"""LPIPS and DISTS: the values of their packages, where weights come from, and errors."""
 
+import hashlib
 import importlib
+import shutil
 import socket
+import sys
 import warnings
 from pathlib import Path
 from typing import NamedTuple
@@ -22,17 +25,20 @@ CPU = torch.device("cpu")
 
 
 class Judges(NamedTuple):
-    """A home of torch, whose cache has stand-in weights by net, and the package's models with these weights."""
+    """A home of torch, whose cache has stand-in weights by net, and the package's models with these weights.
+
+    urls: where torchvision would have them; the names end in the first digits of their digests.
+    """
 
     home: Path
     files: dict[str, Path]
+    urls: dict[str, str]
     models: dict[str, torch.nn.Module]
 
 
 @pytest.fixture(scope="module")
 def judges(tmp_path_factory) -> Judges:
-    package, made = import_lpips(), Judges(tmp_path_factory.mktemp("torch_home"), {}, {})
-    torchvision = importlib.import_module("torchvision.models")
+    package, made = import_lpips(), Judges(tmp_path_factory.mktemp("torch_home"), {}, {}, {})
     cache = made.home / "hub" / "checkpoints"
     cache.mkdir(parents=True)
     for net, name in NETS.items():
@@ -41,8 +47,10 @@ def judges(tmp_path_factory) -> Judges:
             warnings.simplefilter("ignore")  # torchvision's about an argument that lpips still uses
             made.models[net] = package.LPIPS(net=net, pnet_rand=True, verbose=False).eval().requires_grad_(False)
         state = {f"features.{key.split('.', 1)[1]}": value for key, value in made.models[net].net.state_dict().items()}
-        made.files[net] = cache / torchvision.get_model_weights(name).IMAGENET1K_V1.url.rsplit("/", 1)[1]
-        torch.save({**state, "classifier.6.bias": torch.zeros(1000)}, made.files[net])
+        torch.save({**state, "classifier.6.bias": torch.zeros(1000)}, cache / name)
+        digest = hashlib.sha256((cache / name).read_bytes()).hexdigest()[:8]
+        made.files[net] = (cache / name).rename(cache / f"{name}-{digest}.pth")
+        made.urls[net] = f"https://somewhere/{made.files[net].name}"
     return made
 
 
@@ -50,6 +58,7 @@ def judges(tmp_path_factory) -> Judges:
 def _cache_of_torch(judges, monkeypatch) -> None:
     monkeypatch.setenv("TORCH_HOME", str(judges.home))
     monkeypatch.setattr(lpips_utils, "_network_failed", False)
+    monkeypatch.setattr(lpips_utils, "_url", judges.urls.__getitem__)
     lpipsPyTorch._network.cache_clear()
 
 
@@ -73,8 +82,8 @@ def test_values_are_the_packages(net, judges):
     assert torch.equal(LPIPS(net, "0.1")(x, y), distance)
     if net == "squeeze":  # which metrics.py does not have
         return
-    for paths in ([], [judges.files[net]], [judges.files["vgg"], judges.files["alex"]]):  # the one that fits is found
-        ours = metrics.make_metrics(net, paths, 40)
+    for folder in (None, judges.files[net].parent):
+        ours = metrics.make_metrics(net, folder, 40)
         assert ours[f"LPIPS_{net}"](*map(pixels, (x, y)), None) == mapped
         assert net != "vgg" or ours["LPIPS"](*map(pixels, (x, y)), None) == plain
 
@@ -86,7 +95,7 @@ def test_under_a_mask_it_is_the_mean_of_the_packages_map(judges):
     judge.spatial = True
     expected, everywhere = judge(torch.where(mask, x, y), y)[0, 0][mask].mean().item(), judge(x, y).mean().item()
     judge.spatial = False
-    metric = metrics.make_metrics("vgg", [], 40)["LPIPS"]
+    metric = metrics.make_metrics("vgg", None, 40)["LPIPS"]
     assert metric(pixels(x), pixels(y), mask.numpy()) == expected
     hidden = np.where(mask.numpy()[..., None], pixels(x), 255 - pixels(x))
     assert metric(hidden, pixels(y), mask.numpy()) == expected
@@ -133,7 +142,7 @@ def test_downloaded_weights_are_kept_with_a_checked_digest(judges, tmp_path, mon
 
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     monkeypatch.setattr(torch.hub, "download_url_to_file", download)
-    load_network("alex", [], CPU)
+    load_network("alex", None, CPU)
     (kept,) = (tmp_path / "hub" / "checkpoints").iterdir()
     assert kept.read_bytes() == judges.files["alex"].read_bytes()
 
@@ -162,20 +171,49 @@ def test_a_network_that_never_answers_is_given_up(tmp_path, monkeypatch):
         monkeypatch.setenv("https_proxy", f"http://127.0.0.1:{silent.getsockname()[1]}")
         monkeypatch.setattr(lpips_utils, "_DOWNLOAD_TIMEOUT", 0.3)
         with pytest.raises(LpipsUnavailable):
-            load_network("alex", [], CPU)
+            load_network("alex", None, CPU)
     assert socket.getdefaulttimeout() is None
 
 
-def test_weights_of_the_wrong_kind(judges, tmp_path):
-    def refused(content: object, net: str = "vgg") -> str:
-        torch.save(content, tmp_path / "weights.pth")
-        with pytest.raises((UserError, LpipsUnavailable)) as caught:
-            load_network(net, [tmp_path / "weights.pth"], CPU)
-        return str(caught.value)
+def test_weights_of_a_folder_are_checked(judges, tmp_path, monkeypatch):
+    def refused(net: str, words: str) -> None:
+        with pytest.raises(UserError, match=words):
+            metrics.make_metrics(net, tmp_path, 40)
 
-    vgg = torch.load(judges.files["vgg"], weights_only=True)
-    assert "torchvision's vgg16 or alexnet" in refused({"something": torch.zeros(3)})
-    assert "features.28.weight" in refused({name: value for name, value in vgg.items() if "28.weight" not in name})
-    assert "list" in refused([1, 2]) and "alexnet" in refused(vgg, "alex")
-    with pytest.raises(UserError, match="missing.pth"):
-        load_network("vgg", [tmp_path / "missing.pth"], CPU)
+    monkeypatch.setattr(torch.hub, "download_url_to_file", lambda *_, **__: pytest.fail("a download"))
+    refused("vgg", f"cannot read {tmp_path}/{judges.files['vgg'].name} .*; put {judges.urls['vgg']} there")
+    shutil.copyfile(judges.files["alex"], tmp_path / judges.files["alex"].name)
+    metrics.make_metrics("alex", tmp_path, 40)
+    shutil.copyfile(judges.files["alex"], tmp_path / judges.files["vgg"].name)
+    refused("both", f"{judges.files['vgg'].name} is damaged: its SHA-256 begins with")
+    monkeypatch.setattr(lpips_utils, "_url", lambda net: judges.urls["alex"])  # the right digest, but another network
+    refused("vgg", "the weights of vgg16 have .64, 3, 11, 11. as features.0.weight, expected .64, 3, 3, 3.")
+    torch.save([1, 2], tmp_path / "list-.pth")
+    monkeypatch.setattr(lpips_utils, "_url", lambda net: "https://somewhere/list-.pth")
+    refused("vgg", "holds a list")
+
+
+def test_dists_is_the_packages(judges, tmp_path, monkeypatch, capsys):
+    package, folder = pytest.importorskip("DISTS_pytorch"), judges.files["vgg"].parent
+    x, y = images()
+    models = importlib.import_module("torchvision.models")
+    state = torch.load(judges.files["vgg"], weights_only=True)
+    with torch.device("meta"):
+        whole = models.vgg16()
+    whole.load_state_dict(state, strict=False, assign=True)
+    monkeypatch.setattr(models, "vgg16", lambda **_: whole)
+    judge = package.DISTS(load_weights=False)
+    own = torch.load(Path(package.__file__).with_name("weights.pt"), weights_only=True)
+    judge.alpha.data, judge.beta.data = own["alpha"], own["beta"]
+    ours = metrics.make_metrics("vgg", folder, 40)["DISTS"]
+    assert ours(*map(pixels, (x, y)), None) == judge(x, y).item() > 0.01
+    assert ours(*map(pixels, (x, x)), None) == pytest.approx(0, abs=1e-6)
+    mask = np.zeros((48, 40), bool)
+    assert ours(*map(pixels, (x, y)), mask) == pytest.approx(0, abs=1e-6)
+
+    assert "DISTS" not in metrics.make_metrics("vgg", None, 40)
+    shutil.copyfile(judges.files["alex"], tmp_path / judges.files["alex"].name)
+    assert "DISTS" not in metrics.make_metrics("alex", tmp_path, 40)
+    monkeypatch.setitem(sys.modules, "DISTS_pytorch", None)
+    assert "DISTS" not in metrics.make_metrics("vgg", folder, 40)
+    assert capsys.readouterr().out.count("DISTS is left out: ") == 2

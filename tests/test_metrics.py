@@ -79,13 +79,13 @@ def run(tmp_path, monkeypatch, capsys):
 def lpips(monkeypatch):
     """A stand-in for LPIPS: the mean difference in the range that the network gets, and half as much by AlexNet."""
 
-    def network(net: str, weights: list[Path], device: torch.device):
-        assert weights == [Path("w.pth")]
+    def network(net: str, weights: Path, device: torch.device):
+        assert weights == Path("weights")
         part = {"vgg": 1.0, "alex": 0.5}[net]
         return lambda x, y, normalize: part * (1 + normalize) * float((x - y).abs().mean())
 
     monkeypatch.setattr(metrics, "load_network", network)
-    return ["--lpips_net", "both", "--lpips_weights", "w.pth"]
+    return ["--lpips_net", "both", "--weights", "weights"]
 
 
 def test_psnr_is_scikit_images_from_one_error_over_channels():

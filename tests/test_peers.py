@@ -4,12 +4,19 @@ import json
 import struct
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
+from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
 
+import metrics
+import render
+from benchmarks.peers import curve, gsplat_training
 from splatting.evaluation import peer_curve
 from splatting.evaluation.error_curve import COLUMNS, PEER_COLUMNS, peers_of, read_peer, write_curve, write_peer
 from splatting.evaluation.peer_curve import read_scalars
+from utils.graphics_utils import focal2fov, projection
 from utils.system_utils import UserError
 
 
@@ -189,3 +196,82 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     ):
         with pytest.raises(UserError, match=sentence):
             made(*words)
+
+
+def _gsplat(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
+    """Put a stand-in in the place of gsplat, which needs a GPU: our rasterizer; return the calls of its strategies."""
+    called = []
+
+    def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, *, backgrounds, **options):
+        assert options["packed"] is False
+        (fx, _, cx), (_, fy, cy) = Ks[0, :2].tolist()
+        view, fov = viewmats[0].T.contiguous(), (focal2fov(fx, width), focal2fov(fy, height))
+        full = view @ projection(0.01, 100.0, *fov, 2 * cx / width - 1, 2 * cy / height - 1).T.float()
+        tans, eye = (width / (2 * fx), height / (2 * fy)), torch.linalg.inv(viewmats[0])[:3, 3]
+        settings = (
+            height,
+            width,
+            *tans,
+            backgrounds[0],
+            1.0,
+            view,
+            full,
+            options["sh_degree"],
+            eye,
+            False,
+            False,
+            False,
+        )
+        draw = GaussianRasterizer(GaussianRasterizationSettings(*settings))
+        means2d = torch.zeros_like(means[None], requires_grad=True)
+        image = draw(means, means2d[0], opacities, shs=colors, scales=scales, rotations=quats)[0]
+        return image.permute(1, 2, 0)[None], None, {"means2d": means2d}
+
+    class Strategy:
+        def __init__(self, **options):
+            called.append((type(self).__name__, options))
+
+        def initialize_state(self, **options):
+            called.append(("state", options))
+            return {}
+
+        def check_sanity(self, params, optimizers):
+            assert {name: [params[name]] for name in params} == {
+                name: of.param_groups[0]["params"] for name, of in optimizers.items()
+            }
+
+        def step_pre_backward(self, params, optimizers, state, step, info):
+            info["means2d"].retain_grad()
+
+        def step_post_backward(self, params, optimizers, state, step, info, **options):
+            called.append((step, options))
+
+    found = {"rasterization": rasterization, "DefaultStrategy": type("Default", (Strategy,), {})}
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(**found, MCMCStrategy=type("MCMC", (Strategy,), {})))
+    return called
+
+
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_gsplat_trains_on_our_scenes_and_is_scored_as_we_are(strategy, colmap_scene, tmp_path, monkeypatch):
+    called, out = _gsplat(monkeypatch), tmp_path / "model"
+    words = ["-s", str(colmap_scene), "-m", str(out), "--eval", "--iterations", "80", "--save_iterations", "1", "200"]
+    monkeypatch.setattr(sys, "argv", ["gsplat_training", *words, "--strategy", strategy])
+    gsplat_training.main()
+    steps = [options for step, options in called if isinstance(step, int)]
+    assert len(steps) == 80 and called[0] == (("MCMC", {"cap_max": 10**6}) if strategy == "mcmc" else ("Default", {}))
+    rates = [step["lr"] for step in steps] if strategy == "mcmc" else [1.0, 0.01]
+    assert rates[0] / rates[-1] == pytest.approx(100, rel=0.1)
+
+    monkeypatch.setattr(sys, "argv", ["curve", "-m", str(out)])
+    curve.main()
+    first, last = read_peer(out / curve.CURVE)
+    assert (first["iteration"], last["iteration"], last["gaussians"]) == (1, 80, 300)
+    assert 0 < first["seconds"] < last["seconds"] and first["test_psnr"] + 0.3 < last["test_psnr"]
+    for script, more in ((render, ["--skip_train", "--eval"]), (metrics, [])):
+        monkeypatch.setattr(sys, "argv", [script.__name__, "-m", str(out), *more])
+        script.main()
+    (scores,) = json.loads((out / "results.json").read_text()).values()
+    assert last["test_psnr"] == pytest.approx(scores["PSNR"], abs=0.02)  # of 8-bit images
+    with pytest.raises(UserError, match="name a new folder"):
+        monkeypatch.setattr(sys, "argv", ["gsplat_training", *words])
+        gsplat_training.main()

@@ -1,31 +1,34 @@
-"""LPIPS (Zhang et al. 2018, version 0.1) through the `lpips` package, with torchvision's ImageNet weights.
+"""LPIPS (Zhang et al. 2018, version 0.1) and DISTS (Ding et al. 2020) through the packages `lpips` and `DISTS-pytorch`.
 
-The package brings the linear heads. The backbone's weights come from a given file, from torch's cache, or are
-downloaded into it. A backbone without weights is never used.
+The packages bring the weights of features; those of the networks are torchvision's for ImageNet. They come from a given
+folder, or for LPIPS from torch's cache or a download into it. A network without weights is never used.
 """
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import http.client
 import importlib
 import os
 import socket
 import sys
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from unittest import mock
 
 import torch
 from torch import library, nn
 
+from splatting.files.plain_files import plain
 from splatting.files.tensor_files import read_tensors
 from utils.system_utils import UserError
 
 NETS = {"alex": "alexnet", "vgg": "vgg16", "squeeze": "squeezenet1_1"}  # backbones, and torchvision's names for them
-# Of files, the first convolution tells the backbones apart. Images below the smallest side (pixels) shrink to nothing
-# in pooling.
-_FIRST_LAYER = {"vgg": (64, 3, 3, 3), "alex": (64, 3, 11, 11)}
-MIN_SIDE = {"vgg": 16, "alex": 31}
+MIN_SIDE = {"vgg": 16, "alex": 31}  # pixels; smaller images shrink to nothing in pooling
+_OF_DISTS = "f5e65c96230b7f6ca995691647d482237e4cab8a50c5c4a5784f219ef0748218"  # SHA-256 of its package's weights.pt
 _DOWNLOAD_TIMEOUT = 10.0  # seconds without an answer before the network counts as absent
 
 TOLD = "told"  # GS_DOWNLOAD where an earlier command has said what to do
@@ -63,21 +66,54 @@ def _declare_missing_operators() -> None:
             _schemas.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 
 
-def load_network(net: str, weights: list[Path], device: torch.device) -> nn.Module:
+def load_network(net: str, folder: Path | None, device: torch.device) -> nn.Module:
     """Load the module of the `lpips` package with one backbone of NETS, for evaluation, without gradients of its own.
 
-    weights: state-dict files in torchvision's format (parameters `features.*`; others are ignored), of which the one
-    that fits the backbone, `vgg` or `alex`, is used. Without any, torch's cache is tried, and then the network. Raises
-    LpipsUnavailable, or UserError for a file of the wrong kind.
+    folder: where torchvision's file of the backbone lies, under its own name; None: torch's cache, and then the
+    network. Raises LpipsUnavailable without weights, and UserError for a file that is missing or another one.
     """
-    state = _features_from_files(net, weights) if weights else _features_from_cache(net)
+    state = _features_from_cache(net) if folder is None else _load_state(weights_file(net, folder))
     lpips = import_lpips()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torchvision warns of an argument that lpips still uses
-        model = lpips.LPIPS(net=net, pnet_rand=True, verbose=False)  # random only until the next lines
-    trunk = model.net.state_dict()  # names are sliceK.N.weight, N being the layer of torchvision's `features`
-    model.net.load_state_dict({name: _pick(state, name.split(".", 1)[1], trunk[name], net) for name in trunk})
+    with _without_weights(net):
+        model = lpips.LPIPS(net=net, pnet_rand=True, verbose=False)
+    _fill(model.net, state, net)
     return model.to(device).eval().requires_grad_(False)
+
+
+def load_dists(folder: Path, device: torch.device) -> nn.Module:
+    """Load the module of the package DISTS-pytorch, as `load_network` loads that of LPIPS.
+
+    Raises LpipsUnavailable without the package or torchvision's VGG-16 in the folder, and UserError for wrong files.
+    """
+    if not (folder / Path(_url("vgg")).name).is_file():
+        raise LpipsUnavailable(f"its weights are missing; put {_url('vgg')} into {folder}")
+    try:
+        package = importlib.import_module("DISTS_pytorch")
+    except ImportError as error:
+        raise LpipsUnavailable(f"{error}; run pip install DISTS-pytorch") from error
+    with _without_weights("vgg"):
+        model = package.DISTS(load_weights=False)
+    _fill(model, _load_state(weights_file("vgg", folder)), "vgg")
+    file = _checked(Path(package.__file__).with_name("weights.pt"), _OF_DISTS, "install DISTS-pytorch again")
+    model.load_state_dict(_load_state(file), strict=False)
+    return model.to(device).eval().requires_grad_(False)
+
+
+@contextlib.contextmanager
+def _without_weights(net: str) -> Iterator[None]:
+    """Let torchvision's network download and draw no weights: they lie nowhere until `_fill`."""
+    models = importlib.import_module("torchvision.models")
+    with torch.device("meta"):
+        empty = getattr(models, NETS[net])()
+    with mock.patch.object(models, NETS[net], lambda **_: empty):
+        yield
+
+
+def _fill(model: nn.Module, state: dict[str, torch.Tensor], net: str) -> None:
+    """Give convolutions the weights of torchvision's `features`; names end in the layer there, and weight or bias."""
+    own = {name: value for name, value in model.state_dict().items() if name.endswith(("weight", "bias"))}
+    found = {name: _pick(state, name.split(".", 1)[1], value, net) for name, value in own.items()}
+    model.load_state_dict(found, strict=False, assign=True)
 
 
 def _pick(state: dict[str, torch.Tensor], name: str, like: torch.Tensor, net: str) -> torch.Tensor:
@@ -85,48 +121,56 @@ def _pick(state: dict[str, torch.Tensor], name: str, like: torch.Tensor, net: st
     if not isinstance(value, torch.Tensor) or value.shape != like.shape:
         found = "nothing" if value is None else str(tuple(getattr(value, "shape", ())))
         raise UserError(
-            f"the LPIPS weights for {net} have {found} as features.{name}, expected {tuple(like.shape)}; "
-            f"give --lpips_weights the state dict of torchvision's {NETS[net]}"
+            f"the weights of {NETS[net]} have {found} as features.{name}, expected {tuple(like.shape)}; put "
+            f"{_url(net)} in the place of the file"
         )
     return value
 
 
-def _features_from_files(net: str, files: list[Path]) -> dict[str, torch.Tensor]:
-    for file in files:
-        state = _load_state(file)
-        shape = tuple(getattr(state.get("features.0.weight"), "shape", ()))
-        if shape not in _FIRST_LAYER.values():
-            raise UserError(f"{file} has no weights of torchvision's vgg16 or alexnet (features.0.weight ...)")
-        if shape == _FIRST_LAYER[net]:
-            return state
-    raise LpipsUnavailable(f"no file of --lpips_weights holds torchvision's {NETS[net]}; add it there")
+def _checked(file: Path, digest: str, remedy: str) -> Path:
+    """The file, whose SHA-256 begins with `digest`; UserError if it does not, or if there is none."""
+    try:
+        found = hashlib.sha256(plain(file).read_bytes()).hexdigest()
+    except OSError as error:
+        raise UserError(f"cannot read {file} ({error.strerror}); {remedy}") from error
+    if not found.startswith(digest):
+        raise UserError(f"{file} is damaged: its SHA-256 begins with {found[:8]}, not with {digest[:8]}; {remedy}")
+    return file
+
+
+def weights_file(net: str, folder: Path) -> Path:
+    """torchvision's file of a backbone in a folder; UserError if it is missing, damaged or another one."""
+    file = folder / Path(_url(net)).name
+    return _checked(file, _digest_of(file), f"put {_url(net)} there")
+
+
+def _url(net: str) -> str:
+    import_lpips()  # makes torchvision importable
+    return importlib.import_module("torchvision.models").get_model_weights(NETS[net]).IMAGENET1K_V1.url
+
+
+def _digest_of(file: Path) -> str:
+    """The first digits of the SHA-256, with which the names of torchvision's files end."""
+    return file.stem.rpartition("-")[2]
 
 
 def _load_state(file: Path) -> dict[str, torch.Tensor]:
     try:
         state = read_tensors(file, legacy=True)  # torchvision's own files are older than torch 1.6
-    except FileNotFoundError:
-        raise UserError(f"no such file: {file} (--lpips_weights)") from None
     except (OSError, ValueError) as error:
-        raise UserError(
-            f"{file} is not a state dict of torchvision: {error}; give --lpips_weights one that torch has written"
-        ) from error
+        raise UserError(f"{file} is not a state dict of torchvision: {error}; download it again") from error
     if not isinstance(state, dict):
         raise UserError(f"{file} holds a {type(state).__name__}, expected a state dict in torchvision's format")
     return state
 
 
 def _features_from_cache(net: str) -> dict[str, torch.Tensor]:
-    import_lpips()  # makes torchvision importable
-    models = importlib.import_module("torchvision.models")
-    url = models.get_model_weights(NETS[net]).IMAGENET1K_V1.url
+    url = _url(net)
     cached = Path(torch.hub.get_dir()) / "checkpoints" / url.rsplit("/", 1)[1]
     if not cached.is_file() and not _download(url, cached):
         if os.environ.get("GS_DOWNLOAD") == TOLD:
             raise LpipsUnavailable("its weights are missing, as told above")
-        raise LpipsUnavailable(
-            f"its weights are missing; put {url} at {cached}, or name the file with --lpips_weights of metrics.py"
-        )
+        raise LpipsUnavailable(f"its weights are missing; put {url} at {cached}, or into the folder of --weights")
     return _load_state(cached)
 
 
@@ -143,7 +187,7 @@ def _download(url: str, file: Path) -> bool:
     socket.setdefaulttimeout(_DOWNLOAD_TIMEOUT)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        torch.hub.download_url_to_file(url, str(file), hash_prefix=file.stem.rpartition("-")[2])
+        torch.hub.download_url_to_file(url, str(file), hash_prefix=_digest_of(file))
     except (OSError, RuntimeError, http.client.HTTPException):  # no network, refused, or a damaged download
         _network_failed = True
     finally:

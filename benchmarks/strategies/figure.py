@@ -1,10 +1,12 @@
 """Draw error against run time of strategies, from files of `benchmarks.strategies.trainings`.
 
-    python -m benchmarks.strategies.figure docs/curves/strategies.png OUT/trainings.json ... --leave_out adc-absgrad
+    python -m benchmarks.strategies.figure docs/curves/strategies.png OUT/trainings.json ... --leave_out adc-absgrad \
+        --peer fox_full/gsplat seed0/peer.csv seed1/peer.csv
 
-A panel for each scene. Lines are fixed settings: the mean test PSNR over the seeds, between the least and the largest,
-with a square at the mean end. Dots are time budgets: the mean and the range of their ends. Leave out sets whose
-trainings shared a GPU, as their seconds mean nothing.
+A panel for each scene. Lines are fixed settings and other programs: the mean test PSNR over the seeds, between the
+least and the largest, with a square at the mean end. Squares without a line are trainings of which only the ends are
+known. Dots are time budgets: the mean and the range of their ends. Leave out sets whose trainings shared a GPU, as
+their seconds mean nothing.
 """
 
 import argparse
@@ -15,10 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.strategies.tables import BUDGET, DEFAULT, at, joined
+from splatting.evaluation.error_curve import read_peer
 from utils.system_utils import UserError, atomic_write, run_cli
 
 _TIMES = 300  # of a line
 _SHOWN = 5.0  # dB below the best of a scene
+_CURVE = 3  # points of a line; fewer are ends of trainings, each by itself
 _COLORS = {"adc": "tab:blue", "budget": "black", "mcmc": "tab:red"}  # of time budgets, by strategy
 
 
@@ -56,6 +60,19 @@ def draw(found: dict, path: Path, left_out: Sequence[str] = ()) -> None:
         figure.savefig(temporary, dpi=90)
 
 
+def with_peers(found: dict, given: Sequence[Sequence[str]]) -> dict:
+    """Add other programs as sets without options. given: "SCENE/NAME" and the curves (`read_peer`) of its seeds."""
+    for title, *files in given:
+        scene, _, name = title.rpartition("/")
+        if scene not in found["scenes"] or not name or not files:
+            there = ", ".join(found["scenes"])
+            raise UserError(f"--peer {title}: give SCENE/NAME, of the scenes {there}, and the CSV file of each seed")
+        curves = [[row | {"whole": True} for row in read_peer(Path(file))] for file in files]
+        found["sets"].setdefault(name, [])
+        found["scenes"][scene][name] = {str(seed): {"curve": curve} for seed, curve in enumerate(curves)}
+    return found
+
+
 def _runs(sets: dict, left_out: Sequence[str]) -> dict[str, list[dict]]:
     """The trainings of a scene by set, each with the points of its curve that score all test views; none without."""
     found = {}
@@ -87,6 +104,10 @@ def _fit(panel: Any, rows: Sequence[dict]) -> None:
 
 def _draw_line(panel: Any, name: str, curves: Sequence[Sequence[dict]], color: Any) -> None:
     """Draw the mean of the curves from where all have begun to where the first ends, and the mean end."""
+    if max(map(len, curves)) < _CURVE:
+        ends = zip(*((row["seconds"], row["test_psnr"]) for rows in curves for row in rows), strict=True)
+        panel.plot(*ends, color=color, marker="s", linestyle="", label=name)
+        return
     end = [statistics.fmean(rows[-1][key] for rows in curves) for key in ("seconds", "test_psnr")]
     panel.plot(*end, color=color, marker="s", label=name)
     first, last = max(rows[0]["seconds"] for rows in curves), min(rows[-1]["seconds"] for rows in curves)
@@ -116,8 +137,11 @@ def main() -> None:
     add("figure", type=Path, help="image file to write")
     add("files", type=Path, nargs="+", help="trainings.json of benchmarks.strategies.trainings")
     add("--leave_out", nargs="+", default=[], metavar="SET", help="names of sets that are not drawn (default: none)")
+    add("--peer", nargs="+", action="append", default=[], metavar=("SCENE/NAME", "FILE"),
+        help="another program on a scene: the CSV file of each seed, as for full_eval.py (default: none)")  # fmt: skip
     args = parser.parse_args()
-    draw(joined([json.loads(path.read_text()) for path in args.files]), args.figure, args.leave_out)
+    found = joined([json.loads(path.read_text()) for path in args.files])
+    draw(with_peers(found, args.peer), args.figure, args.leave_out)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ class LPIPS(nn.Module):
             raise ValueError(f"LPIPS has version 0.1 here, got {version!r}: leave the argument out")
         if net_type not in NETS:
             raise ValueError(f"net_type must be one of {', '.join(NETS)}, got {net_type!r}")
-        self.net = load_network(net_type, [], torch.device("cpu"))
+        self.net = load_network(net_type, None, torch.device("cpu"))
 
     def forward(self, x: Tensor, y: Tensor) -> Tensor:
         """Distance of images (B, 3, H, W) or (3, H, W): (1, 1, 1, 1), the sum over the batch; differentiable.

@@ -20,13 +20,13 @@ from splatting.files.json_files import read_json
 GIVEN_POSES = "given_poses"  # behind the name of renders and scores with the dataset's poses, where others were trained
 FITTED = "fitted_appearance"  # the same of right halves, with the photos' appearance fitted to left ones
 BESIDE = (GIVEN_POSES, FITTED)
-SCORES = ("PSNR", "SSIM", "LPIPS")
+SCORES = ("PSNR", "SSIM", "LPIPS", "DISTS")
 OTHER_SCORES = tuple(f"PSNR_{name}" for name in BESIDE)
 QUANTITIES = (
     *(*SCORES, "seconds", "process_seconds", "cpu_seconds", "gaussians", "gaussians_saved", "peak_memory_mib"),
     *("render_ms", "fps", "ply_mb", *OTHER_SCORES),
 )
-COMPARED = (*SCORES, "gaussians")  # with published numbers
+COMPARED = (*SCORES[:3], "gaussians")  # with published numbers
 DEFAULT = ("adc", "default", "defaults", "base")  # names of the set that others are compared with, the first there is
 COSTS = ("seconds", "gaussians", "ply_mb")
 DIGITS = 1e6  # of a PSNR in a curve

@@ -132,27 +132,27 @@ def best_test(rows: Iterable[Row]) -> Row | None:
     return max(scored, key=lambda row: row["test_psnr"], default=None)
 
 
-def read_peer(path: Path) -> list[Row]:
+def read_peer(path: Path, required: Sequence[str] = PEER_REQUIRED) -> list[Row]:
     """Read another program's curve: rows in the order of their seconds, with all PEER_COLUMNS, None if not known.
 
-    The first line names the columns, in any order; only PEER_REQUIRED must be there, and other names are ignored.
-    UserError for anything else.
+    The first line names the columns, in any order; only those required, seconds among them, must be there, and other
+    names are ignored. UserError for anything else.
     """
     try:
         header, *lines = _lines(path)
-        if missing := [name for name in PEER_REQUIRED if name not in header]:
+        if missing := [name for name in required if name not in header]:
             raise ValueError(f"it has no column {missing[0]}")
-        rows = [_row(header, line, PEER_COLUMNS, PEER_REQUIRED, ()) for line in lines]
+        rows = [_row(header, line, PEER_COLUMNS, required, ()) for line in lines]
         if not rows:
             raise ValueError("it has no points")
         if (least := min(row["seconds"] for row in rows)) <= 0:
             raise ValueError(f"seconds are {least:g}, and must be above 0")
     except OSError as error:
-        raise UserError(f"cannot read {path} ({error.strerror}); --peer takes a name and a CSV file") from error
+        raise UserError(f"cannot read {path} ({error.strerror}); give a CSV file of a curve") from error
     except (ValueError, csv.Error) as error:
         raise UserError(
-            f"{path} is not a curve ({error}); its columns must be {' and '.join(PEER_REQUIRED)}, others may follow: "
-            f"{', '.join(name for name in PEER_COLUMNS if name not in PEER_REQUIRED)}"
+            f"{path} is not a curve ({error}); its columns must be {' and '.join(required)}, others may follow: "
+            f"{', '.join(name for name in PEER_COLUMNS if name not in required)}"
         ) from error
     return sorted(rows, key=lambda row: row["seconds"])
 

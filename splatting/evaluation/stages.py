@@ -182,8 +182,8 @@ def _rendered(model: Path, iteration: int) -> dict[str, int] | None:
     return {"views": len(renders)} if renders and renders == truth else None
 
 
-def score(run: Run, download: bool = True) -> bool:
-    """Run metrics.py, unless the same renders are already scored.
+def score(run: Run, download: bool = True, weights: Path | None = None) -> bool:
+    """Run metrics.py, unless the same renders are already scored, with the same folder of weights.
 
     download: whether it may try to download the weights of LPIPS; return whether another run may. A try without an
     answer takes 10 seconds.
@@ -198,8 +198,10 @@ def score(run: Run, download: bool = True) -> bool:
         record.forget("metrics")
     before = record.stage("metrics")
     environment = {} if download else {"GS_DOWNLOAD": TOLD}
+    given = {} if weights is None else {"weights": str(weights.resolve())}
+    command = _script("metrics.py", "-m", str(model), *(f"--{name}={folder}" for name, folder in given.items()))
     _once(
-        record, "metrics", "scoring", _script("metrics.py", "-m", str(model)), {"renders": renders}, dict,
+        record, "metrics", "scoring", command, {"renders": renders, **given}, dict,
         lambda: {"ground_truth_sha256": ground_truth_digest(model / "test" / methods[-1])}, **environment,
     )  # fmt: skip
     if record.stage("metrics") is before:

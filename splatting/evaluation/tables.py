@@ -9,8 +9,13 @@ from typing import Any, NamedTuple
 from splatting.evaluation.comparison import COMPARED, COSTS, OTHER_SCORES, SCORES
 
 QUANTITIES = {  # heading and digits
-    **{"PSNR": ("PSNR (dB)", 2), "SSIM": ("SSIM", 4), "LPIPS": ("LPIPS", 4), "seconds": ("training (s)", 1)},
-    **{"process_seconds": ("process (s)", 1), "cpu_seconds": ("CPU (s)", 1), "gaussians": ("Gaussians trained", 0)},
+    **{"PSNR": ("PSNR (dB)", 2), "SSIM": ("SSIM", 4), "LPIPS": ("LPIPS", 4), "DISTS": ("DISTS", 4)},
+    **{
+        "seconds": ("training (s)", 1),
+        "process_seconds": ("process (s)", 1),
+        "cpu_seconds": ("CPU (s)", 1),
+        "gaussians": ("Gaussians trained", 0),
+    },
     **{name: (f"PSNR, {name[5:].replace('_', ' ')} (dB)", 2) for name in OTHER_SCORES},
     **{"ply_mb": ("PLY (MB)", 1), "peak_memory_mib": ("peak memory (MiB)", 0), "render_ms": ("render (ms)", 2)},
 }
@@ -87,7 +92,7 @@ def means_table(means: Sequence[Mapping[str, Any]]) -> Table:
         "iteration": lambda mean: number(mean["iteration"], 0),
     }
     for name, (head, digits) in QUANTITIES.items():
-        if name in OTHER_SCORES and not any(mean.get(name) for mean in means):
+        if name in ("DISTS", *OTHER_SCORES) and not any(mean.get(name) for mean in means):
             continue
         columns[head] = lambda mean, name=name, digits=digits: number(mean[name], digits)
     return table(columns, means)
