@@ -30,7 +30,7 @@ from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.report import make_report, write_report
 from splatting.evaluation.results import read_earlier, read_run
 from splatting.evaluation.stages import Failure, StageFailed
-from splatting.evaluation.tables import MAIN, Table, reached_legend, reached_table, result_tables
+from splatting.evaluation.tables import MAIN, Table, advice_table, reached_legend, reached_table, result_tables
 from splatting.files.folders import locked
 from splatting.files.listing import markdown_table
 from splatting.host.machine import facts_asked
@@ -141,20 +141,33 @@ def _carry_out(runs: Sequence[Run], args: Namespace, failures: dict[Run, Failure
     facts = {} if args.skip_training else facts_asked()
     options = _SHORT_FOR["aa"][0] if args.aa else ()
     download = True
-    for number, run in enumerate(runs, 1):
-        print(f"[{number}/{len(runs)}] {run.title}", flush=True)
-        try:
-            if not args.skip_training:
-                stages.train(run, facts)
-            if not args.skip_rendering:
-                stages.render(run, options)
-            if not args.skip_metrics:
-                download = stages.score(run, download, args.weights)
-            if args.html_models:
-                stages.page(run, args.output_path.resolve(), options)
-        except StageFailed as failed:
-            failures[run] = failed.failure
-            print(f"  FAILED ({failed.failure.stage}): {failed}", flush=True)
+
+    def advise(run: Run) -> None:
+        if not args.skip_training:
+            stages.advise(run, runs)
+
+    def carry_out(run: Run) -> None:
+        nonlocal download
+        if not args.skip_training:
+            stages.train(run, runs, facts)
+        if not args.skip_rendering:
+            stages.render(run, (*options, *stages.fitted_like(run, runs)))
+        if not args.skip_metrics:
+            download = stages.score(run, download, args.weights)
+        if args.html_models:
+            stages.page(run, args.output_path.resolve(), options)
+
+    for do in (advise, carry_out):  # advice first, as it decides how the runs without it are rendered
+        for number, run in enumerate(runs, 1):
+            if run in failures:
+                continue
+            if do is carry_out:
+                print(f"[{number}/{len(runs)}] {run.title}", flush=True)
+            try:
+                do(run)
+            except StageFailed as failed:
+                failures[run] = failed.failure
+                print(f"  FAILED ({failed.failure.stage}): {failed}", flush=True)
 
 
 def _report(
@@ -180,6 +193,8 @@ def _report(
     write_report(report, output)
     for table in result_tables(report["summary"], MAIN):
         print(f"\n{table.title}\n{_text(table)}" if table.title else _text(table))
+    if report["advice"]:
+        print(f"\nadvice by the scenes' data, and what it did\n{_text(advice_table(report['advice']))}")
     for scene, found in report["reached"].items():
         print(f"\n{scene}: seconds of training to reach a test PSNR\n{_text(reached_table(found))}")
         if legend := reached_legend(found):

@@ -118,7 +118,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     if args.advise or args.options == "auto":
         from splatting.diagnosis.advice import asked_options  # which no other training needs
 
-        words = asked_options(checks.with_lenses(dataset, None))
+        words = asked_options(checks.with_lenses(dataset, None), dataset.model_path if args.advise else "")
         if args.advise:
             return
         args, dataset, opt, pipe = parse([*words, *(sys.argv[1:] if argv is None else argv)])

@@ -333,6 +333,37 @@ def test_a_second_one_is_refused_while_the_first_or_its_training_lives(evaluate)
     assert reports[0]["runs"][0]["finished"]  # the remains of the first run do not block it
 
 
+@pytest.mark.parametrize(
+    ("asked", "score", "gains", "word"),
+    [
+        ("", "PSNR", [0, 0], "nothing asked"),
+        ("--sparse_depth 0.1", "PSNR", [0.1, 0.2], "confirmed"),
+        ("--sparse_depth -0.1", "PSNR", [-0.1, -0.2], "refuted"),
+        ("--appearance ppisp", "PSNR_fitted_appearance", [0, 0], "undecided"),
+    ],
+)
+def test_advice_is_taken_and_judged(evaluate, asked, score, gains, word):
+    said = [{"text": "12 photos train", "options": asked}, {"text": "0.2 stops", "options": ""}]
+    (evaluate.scenes / "attic" / "advice.json").write_text(json.dumps(said))
+    given = ("attic", "--seeds", 0, 1, "--configs", "advice")
+    report = evaluate(*given)
+    (row,) = report["advice"]
+    assert (row["word"], row["score"], row["seeds"], row["plain"]) == (word, score, [0, 1], "plain")
+    assert row["found"] == said and row["options"] == [asked] * bool(asked)
+    assert row["difference"]["values"] == pytest.approx(gains) and row["seconds_with"]["mean"] == 16
+    asking, *trained = evaluate.calls("train")
+    assert asking[5] == "--advise" and "auto" not in sum(trained, [])
+    followed = [words[words.index("--whole_curve") + 1 :] for words in trained if "advised" in words[4]]
+    shared = "--eval --test_iterations -1 --iterations 40 --seed"
+    assert list(map(" ".join, followed)) == [f"{asked} {shared} {seed}" for seed in (0, 1) if asked]
+    fitted = ["appearance" in " ".join(words) for words in evaluate.calls("render") if "plain" in words[2]]
+    assert fitted == ["appearance" in asked] * 2 and [run["finished"] for run in report["runs"]] == [True] * 4
+    text = evaluate.text("md")
+    assert f"| attic | {asked or 'nothing'} | {word} | PSNR" in text and "attic: 12 photos train" in text
+    done = evaluate.calls()
+    assert evaluate(*given)["advice"] == [row] and evaluate.calls() == done
+
+
 def test_a_training_that_ends_by_itself(evaluate):
     """The stand-in goes on beyond --iterations until its time is over, with seed 1 longer than with seed 0."""
     given = ("attic", "--seeds", 0, 1, "--", "--time_budget", 20)

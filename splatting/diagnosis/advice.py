@@ -28,11 +28,13 @@ from splatting.diagnosis import Line
 from splatting.diagnosis.dataset import pose_errors, poses_differ
 from splatting.diagnosis.model import masks_of
 from splatting.distributed.ranks import ranks
+from splatting.evaluation.plan import ADVICE
+from splatting.files.json_files import write_json
 from splatting.training.robust_mask import FEW, MASKED, odd_photos
 from splatting.training.sky import FEWEST as LEAST_SKY
 from splatting.training.sky import Sky, find_sky
 from utils.image_utils import as_float
-from utils.system_utils import UserError
+from utils.system_utils import UserError, mkdir_p
 
 EXPOSURES = 0.4  # stops; photos of a usual automatic exposure differ by 0.15 to 0.35
 FEW_PHOTOS = 25  # with fewer, depth is held badly
@@ -75,12 +77,18 @@ def advise(dataset: argparse.Namespace, trains: bool = True) -> list[Advice]:
     return [*found, *_of_passers_by(dataset)] if trains else found
 
 
-def asked_options(dataset: argparse.Namespace) -> list[str]:
-    """Print the advice on a scene, and return the options that it asks for, as words of a command line."""
+def asked_options(dataset: argparse.Namespace, folder: str = "") -> list[str]:
+    """Print the advice on a scene, and return the options that it asks for, as words of a command line.
+
+    folder: gets ADVICE, a list of texts and options, as JSON.
+    """
     if ranks().several:
         raise UserError("--advise and --options auto need one process; run train.py --advise, and give what it says")
     found = advise(dataset)
     print(*found, sep="\n")
+    if folder:
+        mkdir_p(folder)
+        write_json(Path(folder) / ADVICE, [advice._asdict() for advice in found])
     words = " ".join(advice.options for advice in found).split()
     print(f"options that this scene asks for: {' '.join(words) or 'none'}")
     return words

@@ -31,7 +31,8 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
     finished: the last iteration is scored and no stage failed. open_ended: the training itself decided when to end. A
     damaged file counts as a failure. options, source, added_options: null if not known. peak: the iteration at which
     test views were clearly better than at the end, its PSNR, and the loss since; shorter_ends_there: whether
-    --iterations with that number gives that model. poses: seconds and the mean correction of refined poses.
+    --iterations with that number gives that model. poses: seconds and the mean correction of refined poses. advice: the
+    scene's data in words, each with the options that it asks for, if the training followed it.
     """
     model, record = run.model, Record(run.model)
     trained = record.stage("train") or {}
@@ -56,6 +57,7 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
     except UserError as error:
         failure = failure or Failure("report", [], [str(error)])
     return views | {
+        "advice": run.advice,
         "added_options": list(run.added) if known == run.key else None,
         "config": run.config,
         "cpu_seconds": trained.get("cpu_seconds"),

@@ -80,8 +80,12 @@ def _results(rows: Sequence[Mapping[str, Any]], names: Sequence[str], title: str
         if name in SCORES[:2] or any(row[name]["mean"] is not None for row in rows if name in row):
             columns[head] = lambda row, name=name, digits=digits: spread_cell(row[name], digits)
     if any(row["seeds"] != [None] for row in rows):
-        columns["seeds"] = lambda row: " ".join("-" if seed is None else str(seed) for seed in row["seeds"])
+        columns["seeds"] = lambda row: _seeds(row["seeds"])
     return table(columns, rows, title)
+
+
+def _seeds(seeds: Sequence[int | None]) -> str:
+    return " ".join("-" if seed is None else str(seed) for seed in seeds)
 
 
 def means_table(means: Sequence[Mapping[str, Any]]) -> Table:
@@ -186,6 +190,28 @@ def _on_front(beaten: Mapping[str, Any] | None) -> str:
     if beaten is None:
         return "on the Pareto front"
     return f"perhaps beaten by {beaten['by']}" if beaten["clearly"] is False else f"beaten by {beaten['by']}"
+
+
+def advice_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Table of report.json's `advice`."""
+
+    def seconds(row: Mapping[str, Any]) -> str:
+        return f"{spread_cell(row['seconds_without'], 1)}, {spread_cell(row['seconds_with'], 1)}"
+
+    columns = {
+        "scene": lambda row: row["scene"],
+        "advised": lambda row: ", ".join(row["options"]) or "nothing",
+        "result": lambda row: row["word"],
+        "score": lambda row: QUANTITIES[row["score"]][0],
+        "without": lambda row: spread_cell(row["without"], 2),
+        "with": lambda row: spread_cell(row["with"], 2),
+        "difference": lambda row: spread_cell(row["difference"], 2),
+        "training (s): without, with": seconds,
+        "seeds": lambda row: _seeds(row["seeds"]),
+    }
+    if any(row["plain"] for row in rows):
+        columns["option sets"] = lambda row: f"{row['plain'] or '-'}, {row['config']}"
+    return table(columns, rows)
 
 
 def runs_table(runs: Sequence[Mapping[str, Any]]) -> Table:

@@ -35,7 +35,8 @@ def add_launch_options(parser: argparse.ArgumentParser) -> None:
              "allows, as full_eval.py does (default: a part of all views at each point, 5 %% of the time)")
     add("--plain_step", **flag,
         help="take every step by autograd, slower and with the same result (default: the fast step)")
-    add("--advise", **flag, help="print which options the scene's photos, poses and points ask for, and end")
+    add("--advise", **flag, help="print which options the scene's photos, poses and points ask for, and end; with -m "
+             "also write advice.json there")
     add("--options", choices=["given", "auto"], default="given",
         help="auto: take what --advise says, besides the options that are given (default: given)")
     add("--quiet", **flag, help="print nothing but the progress bar and errors")

@@ -11,6 +11,7 @@ parser = argparse.ArgumentParser()
 parser.add_argument("-s", type=Path)
 parser.add_argument("-m", type=Path)
 parser.add_argument("--iteration")
+parser.add_argument("--appearance")
 args = parser.parse_known_args()[0]
 
 if args.s:
@@ -24,4 +25,6 @@ for side in ("gt", "renders"):
         if side == "renders":
             image.paste((110, 90, 90), (0, 0, 120, 20))
         image.save(folder / side / f"{index:05d}.png")
+if args.appearance or json.loads((args.m / "stand_in.json").read_text())["appearance"]:
+    folder.with_name(f"{folder.name}_fitted_appearance").mkdir(exist_ok=True)
 (folder / "render_times.json").write_text(json.dumps({"median_ms": 4.0, "fps": 250.0}))
