@@ -26,6 +26,7 @@ from arguments import OptionParser
 from splatting.evaluation import plan, stages
 from splatting.evaluation.configs import check_options, read_configs, shipped
 from splatting.evaluation.error_curve import peers_of
+from splatting.evaluation.model_folder import trained_iterations
 from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.report import make_report, write_report
 from splatting.evaluation.results import read_earlier, read_run
@@ -64,6 +65,7 @@ def _parser() -> OptionParser:
         help="any COLMAP, Blender or nerfstudio folders; Blender scenes get train.py's -w, as in published "
         "tables")  # fmt: skip
     add("--output_path", type=Path, default=Path("./eval"), metavar="DIR", help="models and report (default: ./eval)")
+    add("--dry", **flag, help="check the scenes and options, print what would run and about how long, and end")
     add("--skip_training", **flag, help="use the models in the output folder, whatever made them")
     add("--skip_rendering", **flag, help="use the existing renders")
     add("--skip_metrics", **flag, help="use the existing scores")
@@ -130,10 +132,20 @@ def _plan(args: Namespace, more: Sequence[str]) -> list[Run]:
     return runs
 
 
-def _parse_for_training(words: Sequence[str]) -> None:
+def _parse_for_training(words: Sequence[str]) -> tuple[Namespace, ...]:
     import train  # imported here because scoring existing models may happen on a machine without the extensions
 
-    train.parse(words)
+    return train.parse(words)
+
+
+def _rehearse(runs: Sequence[Run], args: Namespace, output: Path) -> None:
+    """Print what would be carried out; UserError for what would fail."""
+    from splatting.diagnosis.rehearsal import rehearse  # imports the extensions
+
+    for run in runs:
+        if args.skip_training and not trained_iterations(run.model):
+            raise UserError(f"{run.model} has no saved iteration; train it first")
+    rehearse(runs, output, _parse_for_training, facts_asked(), not args.skip_training)
 
 
 def _carry_out(runs: Sequence[Run], args: Namespace, failures: dict[Run, Failure]) -> None:
@@ -215,6 +227,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     runs = _plan(args, words[end + 1 :])
     peers = peers_of(args.peer, list(dict.fromkeys(run.scene.name for run in runs)))
     output = args.output_path.resolve()
+    if args.dry:
+        _rehearse(runs, args, output)
+        return
     mkdir_p(output)
     failures: dict[Run, Failure] = {}
     busy = "full_eval.py (process {process}), or a training that it started,"

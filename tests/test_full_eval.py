@@ -672,6 +672,32 @@ def test_each_model_becomes_a_page_that_the_report_links(evaluate):
     assert len(evaluate.calls("export")) == 3
 
 
+def test_a_rehearsal_tells_what_would_run_and_how_long_and_writes_nothing(colmap_scene, tmp_path, capsys):
+    evaluate = Evaluation(tmp_path, tmp_path / "out")
+    both, given = ("--seeds", 0, 1), ("--configs", "advice", "--", "-r", 2)
+
+    def told(*more: object) -> list[str]:
+        capsys.readouterr()
+        full_eval.main(evaluate.words("colmap_scene", "--dry", *more))
+        return [re.sub(r" +", " ", line) for line in capsys.readouterr().out.splitlines() if line[:1] in ("|", "a")]
+
+    _, _, first, *_, remark = told(*both, *given)
+    assert first.startswith("| colmap_scene | plain | 0 | 14, 3 | 48x32 | 40 | to train | ") and "timed piece" in first
+    assert remark.startswith("at least") and not evaluate.out.exists()
+    (piece,) = evaluate.calls()  # the scene is the same in all four
+    assert "--iterations 40 -r 2 --seed 0 --time_budget 0 --iterations 200" in " ".join(piece)
+    evaluate("colmap_scene", "--seeds", 0, *given)
+    before, calls = folder_state(evaluate.out), evaluate.calls()
+    _, _, *rows, remark = told(*both, *given)
+    assert [row.split(" | ")[6::2] for row in rows] == [["finished", "- |"], ["to train", "other seeds |"]] * 2
+    assert remark.startswith("about") and folder_state(evaluate.out) == before and evaluate.calls() == calls
+    assert "this scene" in told(*both, "--configs", "strategies")[2]
+    photo = min((colmap_scene / "images").rglob("*.png"))
+    photo.unlink()
+    with pytest.raises(UserError, match=f"colmap_scene, plain, seed 0: .*{photo.name}"):
+        told(*both, *given)
+
+
 def test_for_real(colmap_scene, tmp_path):
     """The real train.py, render.py and metrics.py accept their options, and the report has their results."""
     out = tmp_path / "out"

@@ -20,10 +20,13 @@ from splatting.evaluation.plan import ADVICE, Record, Run
 from splatting.evaluation.renders import TIMES, ground_truth_digest, view_names
 from splatting.files.json_files import read_json
 from utils.lpips_utils import TOLD
-from utils.system_utils import UserError, mkdir_p
+from utils.system_utils import UserError, mkdir_p, temporary_folder
 
 _ROOT = Path(__file__).resolve().parents[2]
 _APPEARANCE = ("--appearance", "ppisp")
+FINISHED, TO_SCORE = "finished", "to render and score"  # states of a run
+REST = ("render_", "metrics", "html")  # beginnings of the names of stages after training
+PIECE = 200  # iterations of a timed piece
 
 
 @dataclass(frozen=True)
@@ -142,6 +145,33 @@ def _remove_stop(run: Run, iteration: int) -> None:
     if str(iteration) not in run.options:
         shutil.rmtree(saved_ply(run.model, iteration).parent, ignore_errors=True)
         (run.model / f"chkpnt{iteration}.pth").unlink(missing_ok=True)
+
+
+def state(run: Run, trains: bool = True) -> str:
+    """Say in a few words what is left to do for a run. trains: False if its model counts as trained."""
+    record = Record(run.model)
+    if not trains or _trained(run, record):
+        return FINISHED if record.stage("metrics") else TO_SCORE
+    return "to resume" if record.stage("train_interrupted") else "to train"
+
+
+def timed_piece(run: Run) -> tuple[float, float]:
+    """Train PIECE iterations elsewhere; return the seconds to start and end, and those of an iteration.
+
+    UserError with the last message of a training that fails.
+    """
+    _say(f"{run.title}: timing {PIECE} iterations")
+    with temporary_folder() as folder:
+        half = str(PIECE // 2)
+        command = _script("train.py", "-s", _source_of(run), "-m", str(folder), "--disable_viewer", "--quiet")
+        command += [*(run.plain or run.options), "--time_budget", "0", "--iterations", str(PIECE), "--no_curve"]
+        done = run_child([*command, "--save_iterations", half])
+        _stop_if_asked(done)
+        if done.status:
+            raise UserError(f"{run.title}: {done.lines[-1] if done.lines else 'train.py failed'}")
+        (_, middle), (_, end) = sorted(logged(folder).items())
+    spent = end["seconds"] - middle["seconds"]  # the first half has what is done once
+    return done.wall_seconds - end["seconds"], spent / (PIECE - PIECE // 2)
 
 
 def _sum(before: dict[str, Any], done: Finished) -> dict[str, float | None]:

@@ -23,6 +23,7 @@ parser.add_argument("--sh_degree", type=int, default=3)
 parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--time_budget", type=float, default=0)
 parser.add_argument("--start_checkpoint")
+parser.add_argument("--save_iterations", type=int, nargs="+", default=[7000, 30000])
 parser.add_argument("--advise", action="store_true")
 parser.add_argument("--appearance")
 parser.add_argument("--sparse_depth", type=float, default=0)
@@ -84,7 +85,7 @@ for t in (end // 4, end // 2, end):
 (args.m / "stand_in.json").write_text(json.dumps({"psnr": best, "appearance": args.appearance}))
 (args.m / "cameras.json").write_text(json.dumps([{"img_name": f"photo_{i}.jpg"} for i in range(9)]))
 log = []
-for t in sorted({7000, 30000, end}):
+for t in sorted({*args.save_iterations, end}):
     if t <= end:
         save(t)
         log.append({"iteration": t, "seconds": t * slowness / 10})
