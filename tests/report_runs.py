@@ -24,7 +24,8 @@ def run_of(config: str | None, seed: int, *points: tuple[float, float, int], sce
         "curve": curve(*points), "failure": None, "final_iteration": end, "finished": True, "group": "scenes",
         "ground_truth_sha256": "a" * 64, "iterations": {str(end): values}, "lines": [], "machine": {},
         "model": f"{scene}/{config}/{seed}", "open_ended": False, "options": [], "page": None, "peak": None,
-        "poses": [], "scene": scene, "seed": seed, "source": None, "split": None, "test_sizes": [[96, 64]],
+        "photos": None, "poses": [], "scene": scene, "seed": seed, "source": None, "split": None,
+        "test_sizes": [[96, 64]],
         "views": {"test": 2, "train": 7}, "wall_seconds": None, "worst_views": [],
     } | more  # fmt: skip
 

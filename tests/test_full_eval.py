@@ -26,7 +26,7 @@ from splatting.evaluation import report as report_module
 from splatting.evaluation import results_page, stages
 from splatting.evaluation.figures import draw_curves, draw_fronts
 from splatting.evaluation.model_folder import SCHEDULE, shorter_ends_there
-from splatting.evaluation.plan import DATASETS, Run, SceneEntry
+from splatting.evaluation.plan import DATASETS, Run, SceneEntry, dataset_scenes, photos_of
 from splatting.evaluation.renders import GAIN, GAP, HEADER, ComparedViews
 from splatting.evaluation.results_page import BEGIN, END
 from utils import lpips_utils
@@ -154,9 +154,13 @@ def test_data_sets_get_the_options_of_the_paper(evaluate, tmp_path):
     (failed,) = (run for run in report["runs"] if run["failure"])
     assert failed["scene"] == "train" and "no such scene folder" in failed["failure"]["lines"][0]
     garden = [row for row in report["published"] if row["scene"] == "garden" and row["iteration"] == 30000]
-    assert [row["table"] for row in garden] == ["Kerbl et al. 2023", "official code, re-run by the gsplat authors"]
+    assert [row["table"].partition(" ")[0] for row in garden] == ["Kerbl", "official", "Deng", "3DGS-MCMC,"]
+    assert {(row["photos"], garden[2]["hardware"]) for row in garden} == {("images_4", "RTX 4090 GPU")}
+    assert {entry.options for entry in dataset_scenes("mipnerf360", mip, resize=True)} == {("-r", "4"), ("-r", "2")}
+    assert photos_of(["--eval", "-r", "4", "--test_iterations", "-1"]) == "images, resized by -r 4"
     assert "LPIPS" not in garden[0]["numbers"] and garden[0]["other_options"] == switches  # our LPIPS is null
     means = {(row["scene"], row["iteration"]) for row in report["published"] if row["scene"].startswith("mean")}
+    assert "images_4, images_2" in [row["photos"] for row in report["published"]]
     assert means == {("mean of mipnerf360", 7000), ("mean of mipnerf360", 30000)}  # Tanks and Temples lacks a scene
     groups = [line.split(":")[0] for line in (evaluate.out / "timing.txt").read_text().splitlines()]
     assert groups == ["mipnerf360", "tanksandtemples"]
@@ -358,8 +362,8 @@ def test_advice_is_taken_and_judged(evaluate, asked, score, gains, word):
     assert list(map(" ".join, followed)) == [f"{asked} {shared} {seed}" for seed in (0, 1) if asked]
     fitted = ["appearance" in " ".join(words) for words in evaluate.calls("render") if "plain" in words[2]]
     assert fitted == ["appearance" in asked] * 2 and [run["finished"] for run in report["runs"]] == [True] * 4
-    text = evaluate.text("md")
-    assert f"| attic | {asked or 'nothing'} | {word} | PSNR" in text and "attic: 12 photos train" in text
+    text = re.sub(" +", " ", evaluate.text("md"))
+    assert f"| attic | {word} | {row['difference']['mean']:.2f} ± " in text and "attic: 12 photos train" in text
     done = evaluate.calls()
     assert evaluate(*given)["advice"] == [row] and evaluate.calls() == done
 

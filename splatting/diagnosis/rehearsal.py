@@ -49,7 +49,7 @@ def rehearse(runs: Sequence[Run], output: Path, parse: Parse, machine: dict[str,
             about, by = opt.time_budget or timed[key][0] + timed[key][1] * opt.iterations, "a timed piece"
         total += about or 0.0
         seed, spent = "-" if run.seed is None else str(run.seed), _duration(about) if about else "-"
-        end = f"{run.iterations:,}" if run.iterations else "by itself"
+        end = "-" if not trains else f"{run.iterations:,}" if run.iterations else "by itself"
         rows.append([run.scene.name, run.config or "-", seed, *photos[key], end, state, spent, by])
     header = ["scene", "options", "seed", "photos: train, test", "size", "iterations", "state", "about", "by"]
     print(markdown_table(header, rows))

@@ -27,12 +27,10 @@ def advice_effects(runs: Sequence[Run]) -> list[dict[str, Any]]:
         if (found := next((run["advice"] for run in members if run["advice"] is not None), None)) is None:
             continue
         options = [said["options"] for said in found if said["options"]]
-        pairs = [(plain, run) for run in members if (plain := _plain(run, runs))]
+        pairs = _pairs(members, runs)
         score = _score(options, pairs)
         ends = [[_end(run)[score] for run in pair] for pair in pairs]
-        pairs = [pair for pair, numbers in zip(pairs, ends, strict=True) if None not in numbers]
-        ends = [numbers for numbers in ends if None not in numbers]
-        gain = spread(after - before for before, after in ends)
+        gain = spread(None if None in (before, after) else after - before for before, after in ends)
         error = None if gain["std"] is None else gain["std"] / math.sqrt(len(ends))
         seconds = [spread(_end(pair[i])["seconds"] for pair in pairs) for i in (0, 1)]
         rows.append(
@@ -56,19 +54,16 @@ def advice_effects(runs: Sequence[Run]) -> list[dict[str, Any]]:
     return rows
 
 
-def _plain(run: Run, runs: Sequence[Run]) -> Run | None:
-    """Return the finished run of the same options but for advice, scored on the same ground truth."""
-    wanted = options_without_advice(run["options"] or ())
-    return next(
-        (
-            other
-            for other in runs
-            if run["finished"] and other["finished"] and other["scene"] == run["scene"]
-            and wanted is not None and tuple(other["options"] or ()) == wanted
-            and other["ground_truth_sha256"] == run["ground_truth_sha256"]
-        ),
-        None,
-    )  # fmt: skip
+def _pairs(members: Sequence[Run], runs: Sequence[Run]) -> list[tuple[Run, Run]]:
+    """Return each run with that of the same options but for advice, if both finished with the same ground truth."""
+
+    def key(run: Run, options: Sequence[str]) -> tuple[Any, ...]:
+        return run["scene"], run["ground_truth_sha256"], tuple(options)
+
+    plain = {key(run, run["options"] or ()): run for run in runs if run["finished"]}
+    followed = [(run, options_without_advice(run["options"] or ())) for run in members if run["finished"]]
+    found = [(plain.get(key(run, options)), run) for run, options in followed if options is not None]
+    return [(other, run) for other, run in found if other]
 
 
 def _end(run: Run) -> dict[str, Any]:

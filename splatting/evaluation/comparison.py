@@ -26,7 +26,7 @@ QUANTITIES = (
     *(*SCORES, "seconds", "process_seconds", "cpu_seconds", "gaussians", "gaussians_saved", "peak_memory_mib"),
     *("render_ms", "fps", "ply_mb", *OTHER_SCORES),
 )
-COMPARED = (*SCORES[:3], "gaussians")  # with published numbers
+COMPARED = (*SCORES[:3], "seconds", "gaussians")  # with published numbers
 DEFAULT = ("adc", "default", "defaults", "base")  # names of the set that others are compared with, the first there is
 COSTS = ("seconds", "gaussians", "ply_mb")
 DIGITS = 1e6  # of a PSNR in a curve
@@ -336,6 +336,7 @@ def published_tables() -> list[dict[str, Any]]:
 
     A table has name, source, hardware and note. `groups` and `requires` tell which runs can be compared with it.
     `scenes` and `means` (of a group) have numbers by iteration. LPIPS: VGG on [0, 1]; seconds: on that hardware.
+    mipnerf360_photos: which ones of that data set.
     """
     return read_json(Path(__file__).parent / "published.json")["tables"]
 
@@ -351,16 +352,16 @@ def compare(
     compared = []
     for table in published_tables():
         for row in rows:
-            run = next(run for run in runs if (run["scene"], run["config"]) == (row["scene"], row["config"]))
+            ours = [run for run in runs if (run["scene"], run["config"]) == (row["scene"], row["config"])]
             theirs = table["scenes"].get(row["scene"], {}).get(str(None if row["open_ended"] else row["iteration"]))
-            if theirs and row["group"] in table["groups"] and _meets(run, table.get("requires", {})):
-                ours = {name: row[name]["mean"] for name in COMPARED}
-                compared.append(_comparison(table, row | ours, row["scene"], theirs, run))
+            if theirs and row["group"] in table["groups"] and _meets(ours[0], table.get("requires", {})):
+                numbers = {name: row[name]["mean"] for name in COMPARED}
+                compared.append(_comparison(table, row | numbers, row["scene"], theirs, ours))
         for mean in means:
             theirs = table["means"].get(mean["group"], {}).get(str(mean["iteration"]))
             if theirs:
-                run = next(run for run in runs if (run["group"], run["config"]) == (mean["group"], mean["config"]))
-                compared.append(_comparison(table, mean, f"mean of {mean['group']}", theirs, run))
+                ours = [run for run in runs if (run["group"], run["config"]) == (mean["group"], mean["config"])]
+                compared.append(_comparison(table, mean, f"mean of {mean['group']}", theirs, ours))
     return compared
 
 
@@ -373,12 +374,14 @@ def _meets(run: dict[str, Any], required: dict[str, Any]) -> bool:
 
 
 def _comparison(
-    table: dict[str, Any], ours: dict[str, Any], scene: str, theirs: dict[str, float], run: dict[str, Any]
+    table: dict[str, Any], ours: dict[str, Any], scene: str, theirs: dict[str, float], runs: list[dict[str, Any]]
 ) -> dict[str, Any]:
     numbers = {
         name: {"difference": ours[name] - theirs[name], "ours": ours[name], "published": theirs[name]}
         for name in COMPARED
         if name in theirs and ours[name] is not None
     }
-    facts = {"config": ours["config"], "iteration": ours["iteration"], "other_options": run["added_options"]}
-    return facts | {"numbers": numbers, "scene": scene, "table": table["name"]}
+    facts = {"config": ours["config"], "iteration": ours["iteration"], "other_options": runs[0]["added_options"]}
+    photos = ", ".join(dict.fromkeys(run["photos"] or "not known" for run in runs))
+    facts |= {"hardware": table["hardware"], "numbers": numbers, "photos": photos}
+    return facts | {"scene": scene, "table": table["name"]}

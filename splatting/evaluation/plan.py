@@ -49,16 +49,18 @@ class SceneEntry:
     options: tuple[str, ...] = ()
 
 
-def dataset_scenes(group: str, root: Path) -> list[SceneEntry]:
+def dataset_scenes(group: str, root: Path, resize: bool = False) -> list[SceneEntry]:
     """List the scenes of one of DATASETS under its root folder, including missing ones, whose run will fail.
 
+    resize: train on the full photos of images/, made smaller here, where others take the data set's own smaller JPEGs.
     UserError if the root has none of them.
     """
     if not any((root / name).is_dir() for name in DATASETS[group]):
         wrong = f"{root} has none of the scenes of {group}" if root.is_dir() else f"no such folder: {root}"
         raise UserError(f"{wrong}; pass the folder that has {', '.join(DATASETS[group])}")
     root = root.resolve()
-    return [SceneEntry(name, group, root / name, options) for name, options in DATASETS[group].items()]
+    chosen = {name: ("-r", words[1][-1]) if resize and words else words for name, words in DATASETS[group].items()}
+    return [SceneEntry(name, group, root / name, options) for name, options in chosen.items()]
 
 
 def folder_scenes(folders: Sequence[Path]) -> list[SceneEntry]:
@@ -150,6 +152,15 @@ def options_without_advice(words: Sequence[str]) -> tuple[str, ...] | None:
     """Return words for train.py without `--options auto`; None where they do not have it."""
     at = next((i for i in range(len(words)) if tuple(words[i : i + 2]) == _AUTO), None)
     return None if at is None else (*words[:at], *words[at + 2 :])
+
+
+def photos_of(options: Sequence[str]) -> str:
+    """Say in a few words which photos words for train.py choose, and how these are made smaller."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("-i", "--images", default="images")
+    parser.add_argument("-r", "--resolution", default="-1")
+    chosen = parser.parse_known_args(list(options))[0]
+    return chosen.images if chosen.resolution == "-1" else f"{chosen.images}, resized by -r {chosen.resolution}"
 
 
 class Record:

@@ -220,6 +220,7 @@ def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
         "cpu_known": known("cpu_seconds"),
         "left_out": any(row["gaussians"]["mean"] != row["gaussians_saved"]["mean"] for row in rows),
         "machines": sorted({one_line(run["machine"]) for run in runs if run["machine"]}),
+        "mipnerf360": any(run["group"] == "mipnerf360" for run in runs),
         "open_ended": any(row["open_ended"] for row in rows),
         "said": [
             (run, said) for run in runs if (said := [x for x in run["lines"] or () if not x.startswith(_WARNING)])

@@ -13,7 +13,7 @@ from scene.saved_iterations import saved_ply
 from splatting.evaluation import model_folder as folder_of
 from splatting.evaluation.comparison import BESIDE, SCORES
 from splatting.evaluation.error_curve import Row
-from splatting.evaluation.plan import Record, Run, SceneEntry, is_model
+from splatting.evaluation.plan import Record, Run, SceneEntry, is_model, photos_of
 from splatting.evaluation.renders import TIMES, WORST, image_size, photo_namer, view_names
 from splatting.evaluation.stages import Failure, page_file
 from splatting.evaluation.training_log import DEGREES, PERCENT
@@ -29,10 +29,10 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
     """Return everything known of a run, as JSON; missing parts are null or empty. Paths are relative to `output`.
 
     finished: the last iteration is scored and no stage failed. open_ended: the training itself decided when to end. A
-    damaged file counts as a failure. options, source, added_options: null if not known. peak: the iteration at which
-    test views were clearly better than at the end, its PSNR, and the loss since; shorter_ends_there: whether
-    --iterations with that number gives that model. poses: seconds and the mean correction of refined poses. advice: the
-    scene's data in words, each with the options that it asks for, if the training followed it.
+    damaged file counts as a failure. options, source, photos (in words), added_options: null if not known. peak: the
+    iteration at which test views were clearly better than at the end, its PSNR, and the loss since; shorter_ends_there:
+    whether --iterations with that number gives that model. poses: seconds and the mean correction of refined poses.
+    advice: the scene's data in words, each with the options that it asks for, if the training followed it.
     """
     model, record = run.model, Record(run.model)
     trained = record.stage("train") or {}
@@ -73,13 +73,10 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
         "options": known and known["options"],
         "open_ended": (model / folder_of.SCHEDULE).is_file()
         or dataclasses.replace(run, options=options).iterations is None,
+        "photos": photos_of(known["options"]) if known else None,
         "page": os.path.relpath(page, output) if record.stage("html") and page.is_file() else None,
         "peak": best,
-        "poses": [
-            [record["seconds"], record[DEGREES], record[PERCENT]]
-            for record in folder_of.logged(model).values()
-            if DEGREES in record
-        ],
+        "poses": [[r["seconds"], r[DEGREES], r[PERCENT]] for r in folder_of.logged(model).values() if DEGREES in r],
         "scene": run.scene.name,
         "seed": run.seed,
         "source": known and known["scene"],

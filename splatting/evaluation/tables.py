@@ -118,15 +118,17 @@ def published_table(compared: Sequence[Mapping[str, Any]]) -> Table:
     """Table of report.json's `published`."""
     columns = {
         "scene": lambda row: row["scene"],
-        "options": _other_options,
-        "iteration": lambda row: number(row["iteration"], 0),
         "table": lambda row: row["table"],
+        "its GPU": lambda row: row["hardware"].removesuffix(" GPU"),
+        "iteration": lambda row: number(row["iteration"], 0),
     }
     for name in COMPARED:
         head, digits = QUANTITIES[name]
-        columns[f"{head}: ours, published, difference"] = lambda row, name=name, digits=digits: _beside(
-            row["numbers"].get(name), digits
+        compares = name != "seconds"  # on different machines
+        columns[f"{head}: ours, published" + compares * ", difference"] = (
+            lambda row, name=name, digits=digits, compares=compares: _beside(row["numbers"].get(name), digits, compares)
         )
+    columns |= {"our photos": lambda row: row["photos"], "our options": _other_options}
     return table(columns, compared)
 
 
@@ -136,11 +138,11 @@ def _other_options(row: Mapping[str, Any]) -> str:
     return f"{row['config']}: {options}" if row["config"] else options
 
 
-def _beside(values: Mapping[str, float] | None, digits: int) -> str:
+def _beside(values: Mapping[str, float] | None, digits: int, compares: bool) -> str:
     if values is None:
         return "-"
     both = f"{number(values['ours'], digits)}, {number(values['published'], digits)}"
-    return f"{both}, {values['difference']:+,.{digits}f}"
+    return f"{both}, {values['difference']:+,.{digits}f}" if compares else both
 
 
 def reached_table(found: Mapping[str, Any]) -> Table:
@@ -200,12 +202,12 @@ def advice_table(rows: Sequence[Mapping[str, Any]]) -> Table:
 
     columns = {
         "scene": lambda row: row["scene"],
-        "advised": lambda row: ", ".join(row["options"]) or "nothing",
         "result": lambda row: row["word"],
-        "score": lambda row: QUANTITIES[row["score"]][0],
+        "difference": lambda row: spread_cell(row["difference"], 2),
+        "advised": lambda row: " ".join(row["options"]) or "nothing",
         "without": lambda row: spread_cell(row["without"], 2),
         "with": lambda row: spread_cell(row["with"], 2),
-        "difference": lambda row: spread_cell(row["difference"], 2),
+        "score": lambda row: QUANTITIES[row["score"]][0],
         "training (s): without, with": seconds,
         "seeds": lambda row: _seeds(row["seeds"]),
     }
@@ -219,6 +221,7 @@ def runs_table(runs: Sequence[Mapping[str, Any]]) -> Table:
     columns = {
         "model": lambda run: run["model"],
         "source": lambda run: run["source"] or "-",
+        "photos": lambda run: run["photos"] or "not known",
         "train views": lambda run: number(run["views"]["train"], 0),
         "test views": lambda run: number(run["views"]["test"], 0),
         "split": lambda run: run["split"] or "not known",
