@@ -22,7 +22,7 @@ from scene.images.store import ImageStore, Picture, image_device
 from scene.lens_correction import shares_of
 from scene.pose_file import with_poses, write_poses
 from scene.readers.depth_maps import with_depth_maps
-from scene.readers.info import CameraInfo, SceneInfo, exposure_names, photo_size
+from scene.readers.info import CameraInfo, SceneInfo, exposure_names, photo_size, without_deciding
 from scene.readers.point_cloud import write_point_cloud
 from scene.readers.scene_folder import kind_of
 from scene.saved_iterations import find_iteration, saved_ply
@@ -41,7 +41,8 @@ class Scene:
     None calls `create_gaussians` and `write_inputs`; -1 loads the last saved iteration, N that one. start: False leaves
     all of this to the caller. shuffle: mix the order of the views (always the same way). resolution_scales: factors by
     which views are made smaller, one list of cameras each. train_cameras, test_cameras: these lists by scale, which may
-    be replaced. info: the dataset as read. cameras_extent: E in world units, from the training views.
+    be replaced. deciding_cameras: the same of views that neither train nor test, but choose what --keep_best saves.
+    info: the dataset as read, without the last. cameras_extent: E in world units, from the training views.
     images: the store of the decoded photos. ranks: processes that divide them (ImageStore).
     """
 
@@ -65,13 +66,18 @@ class Scene:
         self._refines = bool(getattr(args, "refine_poses", False)) and not getattr(args, "other_scene", "")
         self._refines_lens = bool(getattr(args, "refine_lens", False))
         self.info = self._read(args)
+        self.deciding: list[CameraInfo] = []
+        if getattr(args, "keep_best", False):
+            self.info, self.deciding = without_deciding(self.info)
         self.cameras_extent = self.info.extent
 
         device = compute_device()
         place = image_device(args.data_device, device, warn=True)
         self.images = ImageStore(getattr(args, "images_to_load", None) or 0, place, device, ranks)
-        self.train_cameras = {scale: self._cameras(args, scale, shuffle, False) for scale in resolution_scales}
-        self.test_cameras = {scale: self._cameras(args, scale, shuffle, True) for scale in resolution_scales}
+        lists = (self.info.train_cameras, False), (self.info.test_cameras, True), (self.deciding, True)
+        self.train_cameras, self.test_cameras, self.deciding_cameras = (
+            {scale: self._cameras(args, scale, shuffle, *views) for scale in resolution_scales} for views in lists
+        )
         self._plan_images()
 
         gaussians.world_offset = tuple(self.info.offset.tolist())
@@ -181,13 +187,15 @@ class Scene:
         else:
             colors = np.round(info.point_cloud.colors * 255).astype(np.uint8)
             write_point_cloud(folder / "input.ply", info.point_cloud.points, colors)
-        entries = [scene.camera_to_JSON(i, camera) for i, camera in enumerate(info.test_cameras + info.train_cameras)]
+        views = info.test_cameras + info.train_cameras + self.deciding
+        entries = [scene.camera_to_JSON(i, camera) for i, camera in enumerate(views)]
         with atomic_write(folder / "cameras.json") as path:
             path.write_text(json.dumps(entries, allow_nan=False), encoding="utf-8")
 
-    def _cameras(self, args: argparse.Namespace, scale: float, shuffle: bool, test: bool) -> list[Camera]:
-        """Cameras of the training or test list, in the same order at every scale."""
-        views = self.info.test_cameras if test else self.info.train_cameras
+    def _cameras(
+        self, args: argparse.Namespace, scale: float, shuffle: bool, views: Sequence[CameraInfo], test: bool
+    ) -> list[Camera]:
+        """Cameras of views, which are held out (test) or train, in the same order at every scale."""
         # By names of the package, because code of others may replace them there or in utils.camera_utils.
         cameras = list(scene.cameraList_from_camInfos(views, scale, args, self.info.is_nerf_synthetic, test))
         ours = [(camera, view) for camera, view in zip(cameras, views, strict=False) if isinstance(camera, Camera)]
@@ -213,7 +221,8 @@ class Scene:
                 camera.columns = half(camera.image_width, in_test_list)
 
     def _plan_images(self) -> None:
-        self.images.plan(*(self._pictures(chain(*of.values())) for of in (self.train_cameras, self.test_cameras)))
+        others = chain(*self.test_cameras.values(), *self.deciding_cameras.values())
+        self.images.plan(self._pictures(chain(*self.train_cameras.values())), self._pictures(others))
 
     def _pictures(self, cameras: Iterable[Camera]) -> list[Picture]:
         """Those of our cameras; cameras of other classes have none."""

@@ -37,12 +37,12 @@ OF_MCMC = {"iteration": 8000, "strategy": "mcmc"}
 
 TOLD = [
     (FALLING, RISING, COUNTS, {}, [
-        "After iteration 4000 the test views lost 1.50 dB while the training views gained 4.00 dB",
-        "try --strategy mcmc or budget with fewer Gaussians (--max_num_splats 4000, half as many as now), a"]),
-    (FALLING, RISING, COUNTS, OF_MCMC, ["try fewer Gaussians (--max_num_splats 4000, half as many as now), a"]),
-    (FALLING, RISING, COUNTS, OF_BUDGET, ["try --strategy mcmc, fewer Gaussians (--max_num_splats 4000, half as"]),
-    (FALLING, RISING, CAPPED, {"max_num_splats": 4000}, ["it overfits"]),  # a higher cap is no remedy
-    (FALLING, RISING, COUNTS, {"default_budget": 3200}, ["it overfits"]),
+        "From iteration 4000 on only the training photos were fitted (+4.00 dB), and the test views lost 1.50 dB",
+        "try --keep_best, --strategy mcmc or budget with fewer Gaussians (--max_num_splats 4000, half as many as"]),
+    (FALLING, RISING, COUNTS, OF_MCMC, ["try --keep_best, fewer Gaussians (--max_num_splats 4000, half as many as"]),
+    (FALLING, RISING, COUNTS, OF_BUDGET | {"kept_iteration": 4000}, ["try --strategy mcmc, fewer Gaussians (--max"]),
+    (FALLING, RISING, CAPPED, {"max_num_splats": 4000}, ["only the training photos"]),  # a higher cap is no remedy
+    (FALLING, RISING, COUNTS, {"default_budget": 3200}, ["only the training photos"]),
     (RISING, RISING, CAPPED, {"max_num_splats": 4000}, [
         "From iteration 4000 on there was no room for more Gaussians (--max_num_splats 4000)",
         "test views changed by +4.00 dB; try --strategy budget with the same number", "or a higher one"]),
@@ -100,7 +100,7 @@ def test_slower_iterations_towards_the_end_are_told():
 
 
 def test_every_option_named_is_one_of_training():
-    known = {option.name for option in OptimizationParams.options} | {"sh_degree"}
+    known = {option.name for option in OptimizationParams.options} | {"keep_best", "sh_degree"}
     said = [what_to_try(_curve(test, views, counts), [record]) for test, views, counts, record, _ in TOLD]
     named = set(re.findall(r"--(\w+)", str(said)))
     assert len(named) >= 6 and named <= known
@@ -110,7 +110,7 @@ def test_doctor_repeats_it(tmp_path):
     assert check_training(tmp_path) == []
     write_curve(tmp_path / NAME, _curve([20.0, 24.0, 23.0, 22.5], RISING))
     (line,) = check_training(tmp_path)
-    assert line.note and not line.finding and line.text.startswith("After iteration 4000")
+    assert line.note and not line.finding and line.text.startswith("From iteration 4000")
     write_curve(tmp_path / NAME, _curve(RISING, RISING))
     assert check_training(tmp_path) == []
     (tmp_path / LOG).write_text(json.dumps([{"iteration": 8000, "seconds": 80.0, "max_num_splats": 8000}]))

@@ -157,7 +157,7 @@ def unpack(entries: Sequence[Any], table: dict[str, Attribute], max_sh_degree: i
             f"({', '.join(names)}); give a checkpoint of this model"
         )
     rows = {name: tensor.detach() for name, tensor in zip(names, tensors, strict=True)}
-    _check_rows(rows, table, max_sh_degree)
+    check_rows(rows, table, max_sh_degree)
     if not 0 <= active_sh_degree <= max_sh_degree:
         raise UserError(
             f"the active SH degree of the checkpoint is {active_sh_degree}, more than --sh_degree {max_sh_degree}; "
@@ -167,8 +167,8 @@ def unpack(entries: Sequence[Any], table: dict[str, Attribute], max_sh_degree: i
     return State(int(active_sh_degree), rows, statistics, optimizer, float(spatial_lr_scale), exposures)
 
 
-def _check_rows(rows: Rows, table: dict[str, Attribute], max_sh_degree: int) -> None:
-    """UserError for rows that do not have the shapes of the table, or are not finite."""
+def check_rows(rows: Rows, table: dict[str, Attribute], max_sh_degree: int) -> None:
+    """UserError for rows that do not have the names and shapes of the table, or are not finite."""
     for name, values in rows.items():
         shape = table[name].shape
         found = tuple(values.shape[1:])

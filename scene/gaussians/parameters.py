@@ -270,9 +270,9 @@ class GaussianParameters:
 
     def save_ply(self, path: str | os.PathLike) -> None:
         """Write the raw parameters, behind the 3D filter, as a PLY in the reference's layout."""
-        write_ply(path, self._drawn_rows(), self._degree_of_tensors(), self.world_offset, shards=self.shards)
+        write_ply(path, self.drawn_rows(), self._degree_of_tensors(), self.world_offset, shards=self.shards)
 
-    def _drawn_rows(self) -> Rows:
+    def drawn_rows(self) -> Rows:
         """Raw values by optimiser group, behind the 3D filter."""
         opacity, scaling = (values.detach() for values in self._drawn_shapes())
         return raw_rows(self) | {"opacity": opacity, "scaling": scaling}
@@ -287,7 +287,7 @@ class GaussianParameters:
 
         It looks the same without a 3D filter.
         """
-        rows = self._drawn_rows()
+        rows = self.drawn_rows()
         rest = rows.pop("f_rest")[:, : (sh_degree + 1) ** 2 - 1]
         rows = {name: values[keep] for name, values in rows.items()}
         rows["f_rest"] = to_host(rest, keep) if is_spilled(rest) else rest[keep].contiguous()

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from splatting.evaluation.error_curve import COLUMNS, ESTIMATED, FIGURE, NAME, SCORES, SUBSET, Row, write_curve
 from splatting.evaluation.training_log import TrainingLog
-from splatting.evaluation.what_to_try import peak_advice
+from splatting.evaluation.what_to_try import gain_since_peak, peak_advice
 from splatting.host.clock import running_seconds, wall_seconds
 from splatting.host.interrupt import own_session
 from splatting.host.machine import cores
@@ -338,7 +338,8 @@ class CurveRecorder:
             often += f" ({len(sizes)} of them on {some} of {len(self._views['test'])} views)"
         self._log.tell(f"Test PSNR measured {often}, {self._spent['scoring']:.1f} s: {self._folder / FIGURE}")
         if advice := peak_advice(self.rows, saved, steady):
-            self._log.advise(advice)
+            # Where training overfits, `what_to_try` says more, and one line is printed.
+            (self._log.keep if gain_since_peak(self.rows) else self._log.advise)(advice)
 
     def _draw(self) -> None:
         if failure := self._drawer.finish():

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from arguments.stored import read_model_json
 from scene.readers.info import HOLD
 from scene.saved_iterations import saved_ply
 from splatting.evaluation import model_folder as folder_of
@@ -17,7 +18,7 @@ from splatting.evaluation.plan import Record, Run, SceneEntry, is_model, photos_
 from splatting.evaluation.renders import TIMES, WORST, image_size, photo_namer, view_names
 from splatting.evaluation.stages import Failure, page_file
 from splatting.evaluation.training_log import DEGREES, PERCENT
-from splatting.evaluation.what_to_try import peak
+from splatting.evaluation.what_to_try import gain_since_peak, peak
 from splatting.files.json_files import read_json
 from utils.system_utils import UserError
 
@@ -30,8 +31,9 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
 
     finished: the last iteration is scored and no stage failed. open_ended: the training itself decided when to end. A
     damaged file counts as a failure. options, source, photos (in words), added_options: null if not known. peak: the
-    iteration at which test views were clearly better than at the end, its PSNR, and the loss since; shorter_ends_there:
-    whether --iterations with that number gives that model. poses: seconds and the mean correction of refined poses.
+    iteration at which test views were clearly better than at the end, its PSNR, and the loss since; gained: by training
+    views since then, null if not clearly; shorter_ends_there: whether --iterations with that number gives that model.
+    poses: seconds and the mean correction of refined poses.
     advice: the scene's data in words, each with the options that it asks for, if the training followed it.
     """
     model, record = run.model, Record(run.model)
@@ -41,7 +43,8 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
     options = tuple(known["options"]) if known else ()
     curve, best, page = _curve(model), None, page_file(model, output)
     if found := peak(curve):
-        best = {"iteration": found[0]["iteration"], "lost": found[1], "test_psnr": found[0]["test_psnr"],
+        best = {"iteration": found[0]["iteration"], "test_psnr": found[0]["test_psnr"], "lost": found[1],
+                "gained": gain_since_peak(curve),
                 "shorter_ends_there": folder_of.shorter_ends_there(model)}  # fmt: skip
     saved = folder_of.trained_iterations(model)
     views = {"final_iteration": None, "iterations": {}, "split": None, "test_sizes": [], "worst_views": [],
@@ -101,13 +104,14 @@ def _views(model: Path, last: int) -> dict[str, Any]:
     """
     truth = model / "test" / f"ours_{last}" / "gt"
     held_out, cameras = view_names(truth), folder_of.json_or_none(model / "cameras.json")
+    untrained = len(held_out) + len(read_model_json(model).get("kept_best", {}).get("views", ()))
     scores = folder_of.load_scores(model, f"ours_{last}")[1]["PSNR"]
     worst = sorted((value, name) for name, value in scores.items() if value is not None)[:WORST]
     picture_name = photo_namer(model)
     return {
         "split": _split(cameras, len(held_out)),
         "test_sizes": [list(size) for size in sorted({image_size(truth / name) for name in held_out})],
-        "views": {"test": len(scores), "train": len(cameras) - len(held_out) if isinstance(cameras, list) else None},
+        "views": {"test": len(scores), "train": len(cameras) - untrained if isinstance(cameras, list) else None},
         "worst_views": [{"PSNR": value, "file": name, "picture": picture_name(name)} for value, name in worst],
     }
 

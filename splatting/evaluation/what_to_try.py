@@ -8,6 +8,7 @@ from splatting.evaluation.error_curve import Row, best_test, whole_sets
 
 # Entries of the log's last record: options of the training.
 CAP, PLANNED, STRATEGY = "max_num_splats", "iterations_planned", "strategy"
+KEPT = "kept_iteration"  # whose model --keep_best has saved
 BUDGET = "default_budget"  # Gaussians that --strategy budget takes for the scene where no number is given
 FITTED = 18.0  # dB of training views; below, nothing is called overfitting
 CLEAR = 0.1  # dB between two points; those of a settled training differed by up to 0.07
@@ -16,8 +17,8 @@ FULL = 0.99  # of the cap: a densification that removes some Gaussians ends a li
 SETTLED = 1000  # iterations; the default densification begins after 500, so that a shorter training says little
 
 _OVERFITS = (
-    "After iteration {at} the test views lost {lost:.2f} dB while the training views gained {gained:.2f} dB, so it "
-    "overfits; try {others}fewer Gaussians{fewer}, a lower --sh_degree, or more photos"
+    "From iteration {at} on only the training photos were fitted (+{gained:.2f} dB), and the test views lost "
+    "{lost:.2f} dB; try {others}fewer Gaussians{fewer}, a lower --sh_degree, or more photos"
 )
 _AT_CAP = (
     "From iteration {at} on there was no room for more Gaussians (--max_num_splats {cap}){gained}; try --strategy "
@@ -48,26 +49,31 @@ def what_to_try(rows: Sequence[Row], records: Sequence[Mapping[str, Any]]) -> li
     last = records[-1] if records else {}
     strategy = last.get(STRATEGY, "adc")
     # More Gaussians are no remedy for overfitting. Without growth, a cap that is far away is none either.
-    first = _overfitting(scored, strategy) or _at_cap(rows, scored, last.get(CAP)) or _never_grew(rows, strategy)
-    first = first or _many(rows, last.get(BUDGET))
+    first = _overfitting(rows, strategy, KEPT in last) or _at_cap(rows, scored, last.get(CAP))
+    first = first or _never_grew(rows, strategy) or _many(rows, last.get(BUDGET))
     ended_by_itself = last.get(PLANNED) not in (None, last.get("iteration"))
     return [sentence for sentence in (first, None if ended_by_itself else _late(rows, scored)) if sentence]
 
 
-def _overfitting(scored: Sequence[Row], strategy: str) -> str | None:
+def gain_since_peak(rows: Sequence[Row]) -> float | None:
+    """PSNR that training views gained while test views lost (`peak`); None if either is not CLEAR."""
+    found, end = peak(rows), whole_sets(rows)
+    # What does not fit the training views cannot overfit.
+    if found is None or found[0]["train_psnr"] is None or (end[-1]["train_psnr"] or 0.0) < FITTED:
+        return None
+    gained = end[-1]["train_psnr"] - found[0]["train_psnr"]
+    return None if gained < CLEAR else gained
+
+
+def _overfitting(rows: Sequence[Row], strategy: str, keeps_best: bool) -> str | None:
     """Test views lose while training views gain."""
-    best = best_test(scored)
-    if best is None or None in (best["train_psnr"], scored[-1]["train_psnr"]):
+    if (gained := gain_since_peak(rows)) is None:
         return None
-    if scored[-1]["train_psnr"] < FITTED:
-        return None  # what does not fit the training views cannot overfit
-    lost = best["test_psnr"] - scored[-1]["test_psnr"]
-    gained = scored[-1]["train_psnr"] - best["train_psnr"]
-    if min(lost, gained) < CLEAR:
-        return None
-    half = max(1, int((scored[-1]["gaussians"] or 0) / 2))
+    best, lost = peak(rows)
+    half = max(1, int((rows[-1]["gaussians"] or 0) / 2))
     fewer = f" (--max_num_splats {half}, half as many as now)" if half > 1 else ""
     others = {"adc": "--strategy mcmc or budget with ", "budget": "--strategy mcmc, "}.get(strategy, "")
+    others = others if keeps_best else f"--keep_best, {others}"
     return _OVERFITS.format(at=best["iteration"], lost=lost, gained=gained, others=others, fewer=fewer)
 
 

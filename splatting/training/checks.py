@@ -106,6 +106,15 @@ def check_one_process(option: str, several: bool) -> None:
         raise UserError(f"{option} needs a training of one process; leave it out, or start without torchrun")
 
 
+def check_keep_best(dataset: argparse.Namespace, opt: argparse.Namespace, several: bool) -> None:
+    """Refuse --keep_best where more than Gaussians would have to be kept, or a score ends the training (UserError)."""
+    check_one_process("--keep_best", several)
+    apart = {"appearance": "none", "refine_poses": False, "target_psnr": 0.0, "train_test_exp": False}
+    given = vars(dataset) | vars(opt)
+    if wrong := [name for name, default in apart.items() if given.get(name, default) != default]:
+        raise UserError(f"--keep_best does not go with --{wrong[0]}; leave one of them out")
+
+
 def check_poses(dataset: argparse.Namespace, projection: str = "ewa") -> None:
     """Refuse to refine poses on rays, and lenses without poses (UserError)."""
     if projection == "ray" and getattr(dataset, "refine_poses", False):

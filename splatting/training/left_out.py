@@ -106,8 +106,9 @@ def save_last(run: Run, scored: bool, iteration: int) -> LeftOut:
 
     scored: whether to compute the change in PSNR, which is cheap if the test photos are in memory. iteration: the last.
     """
-    scene, trained, opt, halves = run.scene, run.scene.gaussians, run.opt, run.dataset.train_test_exp
-    trained.optimizer.zero_grad(set_to_none=True)  # room for the trimmed copy
+    scene, opt, halves = run.scene, run.opt, run.dataset.train_test_exp
+    scene.gaussians.optimizer.zero_grad(set_to_none=True)  # room for the trimmed copy
+    trained = run.best.model(scene.gaussians, iteration) if run.best else scene.gaussians
     final, search = trim(trained, scene.getTrainCameras(), run.pipe, opt.keep_unseen, opt.prune_sh, iteration)
     change, test = {}, scene.getTestCameras()
     if test and (search.unseen > search.faint or search.cut_bounds[final.max_sh_degree] > 0):

@@ -33,6 +33,7 @@ from splatting.exports.splats import Splats
 from splatting.host.clock import seconds_since_start
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.training import checks, schedule_file
+from splatting.training.best_model import BEST, BestModel
 from splatting.training.division import begins_whole, say_whole, shared_seconds
 from splatting.training.gpu_memory import GpuMemory, limit_torch, reads_on_host
 from splatting.training.iteration import Iteration, ViewOrder
@@ -78,6 +79,7 @@ class Run:
     sparse_depth: SparseDepth | None = None
     robust_mask: RobustMask | None = None
     sky: Sky | None = None
+    best: BestModel | None = None
 
     def __init__(
         self, dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, launch: argparse.Namespace
@@ -226,6 +228,11 @@ class Run:
             sort_rows(self.gaussians)
         if self.sky:
             self.gaussians.far = self.sky.rows
+        if deciding := self.scene.deciding_cameras[1.0]:
+            checks.check_keep_best(self.dataset, self.opt, self.group.several)
+            self.best = BestModel(deciding)
+            if capture:
+                self.best.restore(further(capture, BEST), self.gaussians)
         if self.opt.filter_3d:
             self._begin_filter(capture and further(capture, FILTER))
         self.gaussians.limit_columns()
@@ -461,6 +468,7 @@ class Run:
             RESIDUALS: self.robust_mask and self.robust_mask.captured(),
             FILTER: self.gaussians.shards.whole(widths) if filtered else None,
             SKY: self.sky and self.sky.captured(),
+            BEST: self.best and self.best.captured(),
             ASLEEP: self.sleeping and self.sleeping.captured(),
         }
         return with_further(state, {key: found for key, found in states.items() if found is not None})

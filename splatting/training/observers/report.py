@@ -17,6 +17,7 @@ from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.ppisp import Ppisp
 from splatting.evaluation.comparison import FITTED, GIVEN_POSES
+from splatting.evaluation.error_curve import whole_sets
 from splatting.evaluation.what_to_try import BUDGET, CAP, PLANNED, STRATEGY, what_to_try
 from splatting.host.clock import wall_seconds
 from splatting.training.density import default_budget
@@ -154,9 +155,11 @@ class Summary(Observer):
         self._iteration = run.first_iteration
 
     def measured(self, step: Iteration, losses: Losses) -> None:
-        rows, self._iteration = self._run.rows, step.iteration
-        if step.last and rows and rows[-1]["iteration"] == step.iteration:
-            self._psnr = rows[-1]["test_psnr"]
+        self._iteration = step.iteration
+        if step.last:
+            saved = (self._run.best and self._run.best.iteration) or step.iteration
+            scored = [row["test_psnr"] for row in whole_sets(self._run.rows) if row["iteration"] == saved]
+            self._psnr = scored[0] if scored else None
 
     def ended(self, error: Error) -> None:
         if error is not None:

@@ -9,7 +9,7 @@ from splatting.training.observers.curve import Curve
 from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.observers.guards import MaskWatch, MemoryGuard, OddPhotos, PassersBy
 from splatting.training.observers.report import ProgressBar, Records, Report, Summary, Target, training_report
-from splatting.training.observers.saves import Checkpoints, Saves, ScheduleFile
+from splatting.training.observers.saves import Checkpoints, KeepBest, Saves, ScheduleFile
 from splatting.training.observers.viewers import NetworkViewer, PageObserver
 from splatting.training.run import Run
 from splatting.training.schedule import DecidedSchedule
@@ -29,6 +29,7 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
         MaskWatch(run.scene.getTrainCameras()),  # may refuse the scene before anything is written
         *([Target(run)] if run.opt.target_psnr else []),  # may make this iteration the last, which others look at
         *([Curve(run)] if with_curve else []),  # the scores are those of the model saved at the same iteration
+        *([KeepBest(run)] if run.best else []),
         Report(run, writer, report),
         Saves(run, test_in_memory),  # before the model changes
         Records(run),  # after all that add to the iteration's record

@@ -1,0 +1,117 @@
+"""--keep_best: the photos that decide, the model that is kept, resumes, and what cannot be."""
+
+import json
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from gaussians import pipeline
+from PIL import Image
+from skimage.metrics import peak_signal_noise_ratio
+from synthetic import make_colmap_scene
+from trainings import train_on
+
+from arguments import GroupParams, read_stored_options
+from gaussian_renderer import render
+from scene.readers import info
+from scene.saved_model import load_saved
+from splatting.evaluation.training_log import read_log
+from splatting.training import checks
+from utils.system_utils import UserError
+
+POINTS = 60, 85, 120, 170, 240
+WORDS = ("--eval", "--no_curve", "--iterations", 240, "--disable_viewer", "--keep_unseen", "--quiet",
+         "--densify_from_iter", 10, "--densification_interval", 100, "--densify_grad_threshold", 1e-5,
+         "--opacity_reset_interval", 225, "--densify_until_iter", 230,
+         "--save_iterations", *POINTS, "--checkpoint_iterations", 200)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("scene")
+    make_colmap_scene(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def kept(scene, tmp_path_factory) -> tuple[Path, dict[int, bytes]]:
+    """A training that a late reset of the opacities leaves worse than it was, and its PLYs."""
+    out = tmp_path_factory.mktemp("kept")
+    return out, train_on(scene, out, *WORDS, "--keep_best")
+
+
+def test_the_last_save_is_the_model_that_shows_the_deciding_photos_best(kept, scene):
+    out, plys = kept
+    best = json.loads((out / "model.json").read_text())["kept_best"]
+    scores = {r["iteration"]: r["deciding_psnr"] for r in read_log(out / "train_log.json") if "deciding_psnr" in r}
+    assert best["iteration"] == max(scores, key=scores.get) == 170 and plys[240] == plys[170] != plys[120]
+    loaded = load_saved(GroupParams(**read_stored_options(out)), 170)
+    views = loaded.deciding_cameras[1.0]
+    assert [view.image_name for view in views] == best["views"] and len(best["views"]) == 2
+    black, found = torch.zeros(3), []
+    for view in views:
+        with torch.no_grad():
+            image = render(view, loaded.gaussians, pipeline(), black)["render"].permute(1, 2, 0).numpy()
+        photo = np.asarray(Image.open(scene / "images" / view.image_name)) / 255
+        found.append(peak_signal_noise_ratio(photo, image.astype(float), data_range=1.0))
+    assert np.mean(found) == pytest.approx(scores[170], abs=1e-3) and best["psnr"] == scores[170]
+    (line,) = (x for x in read_log(out / "train_log.json")[-1]["lines"] if x.startswith("--keep_best"))
+    assert "saved the model of iteration 170" in line and f"{best['psnr'] - scores[240]:.2f} dB better" in line
+    names = [camera["img_name"] for camera in json.loads((out / "cameras.json").read_text())]
+    assert names[-2:] == best["views"] and len(names) == len(set(names)) == 17
+    assert len(loaded.getTrainCameras()) == 12 and len(loaded.getTestCameras()) == 3
+
+
+def test_the_deciding_and_the_test_photos_teach_nothing(kept, scene, tmp_path):
+    out, plys = kept
+    loaded = load_saved(GroupParams(**read_stored_options(out)), 240)
+    trained = {camera.image_name for camera in loaded.getTrainCameras()}
+    shutil.copytree(scene, tmp_path / "scene")
+    for photo in (path for path in (tmp_path / "scene" / "images").rglob("*") if path.is_file()):
+        if str(photo.relative_to(tmp_path / "scene" / "images")) not in trained:
+            Image.new("RGB", (96, 64), "red").save(photo)
+    others = train_on(tmp_path / "scene", tmp_path / "out", *WORDS, "--keep_best")
+    assert all(others[t] == plys[t] for t in POINTS[:-1]) and others[240] != plys[240]  # reds choose otherwise
+
+
+def test_a_resumed_training_knows_the_best_so_far(kept, scene, tmp_path):
+    out, plys = kept
+    start = "--start_checkpoint", out / "chkpnt200.pth"
+    resumed = train_on(scene, tmp_path / "resumed", *WORDS, "--keep_best", *start)
+    assert resumed[240] == plys[240]
+    kinds = [json.loads((folder / "model.json").read_text())["kept_best"] for folder in (out, tmp_path / "resumed")]
+    assert kinds[0] == kinds[1]
+    train_on(scene, tmp_path / "plain", *WORDS)
+    with pytest.raises(UserError, match="was trained on the photos that --keep_best would choose by"):
+        train_on(scene, tmp_path / "no", *WORDS, "--keep_best", start[0], tmp_path / "plain" / "chkpnt200.pth")
+    state = torch.load(start[1], weights_only=False)
+    state[0][10]["best"]["rows"]["xyz"] = torch.zeros(2, 2)
+    torch.save(state, tmp_path / "chkpnt200.pth")
+    with pytest.raises(UserError, match="xyz of the checkpoint has the shape"):
+        train_on(scene, tmp_path / "no", *WORDS, "--keep_best", start[0], tmp_path / "chkpnt200.pth")
+
+
+@pytest.mark.parametrize(("count", "places"), [(8, (2, 6)), (31, (7, 22)), (43, (8, 24, 40))])
+def test_every_sixteenth_view_decides_and_two_at_least(count, places):
+    views = load_views(count)
+    left, chosen = info.without_deciding(views)
+    assert [view.uid for view in chosen] == list(places) and all(view.is_test for view in chosen)
+    assert [view.uid for view in left.train_cameras] == [n for n in range(count) if n not in places]
+
+
+def load_views(count: int) -> info.SceneInfo:
+    views = [info.CameraInfo(n, np.eye(3), np.zeros(3), 1.0, 1.0, width=9, height=9) for n in range(count)]
+    return info.SceneInfo(None, views, [], {"radius": 1.0}, None)
+
+
+def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path):
+    with pytest.raises(UserError, match="takes two photos or more away from training, and only 7 train; leave it out"):
+        info.without_deciding(load_views(7))
+    for words in (("--refine_poses",), ("--appearance", "ppisp"), ("--train_test_exp",), ("--target_psnr", 9)):
+        with pytest.raises(UserError, match=f"--keep_best does not go with {words[0]}"):
+            train_on(scene, tmp_path, *WORDS, "--keep_best", *words)
+    with pytest.raises(UserError, match="--keep_best needs a training of one process"):
+        checks.check_keep_best(SimpleNamespace(keep_best=True), SimpleNamespace(), several=True)
