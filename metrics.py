@@ -24,7 +24,17 @@ from tqdm import tqdm
 
 from arguments import OptionParser, read_cfg_args
 from splatting.evaluation.model_folder import json_or_none
-from splatting.evaluation.renders import DEPTHS, INCOMPLETE, TIMES, image_of, image_size, mask_of, model_digest
+from splatting.evaluation.renders import (
+    DEPTHS,
+    INCOMPLETE,
+    TIMES,
+    image_of,
+    image_size,
+    mask_of,
+    model_digest,
+    worst_views,
+    write_error_map,
+)
 from splatting.files.json_files import read_json, write_json
 from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, load_dists, load_network
 from utils.system_utils import UserError, compute_device, run_cli
@@ -202,10 +212,10 @@ def make_metrics(lpips_net: str, weights: Path | None, smallest_side: int) -> di
     return metrics
 
 
-def score(pairs: list[Pair], metrics: dict[str, Metric], title: str) -> Scores:
+def score(pairs: list[Pair], metrics: dict[str, Metric], title: str, errors: bool = False) -> Scores:
     """Compute every metric of every pair, {metric: {file name: value}}, with one pair in memory at a time.
 
-    A pair without pixels that count is left out.
+    A pair without pixels that count is left out. errors: write an error map of each, too.
     """
     scores: Scores = {key: {} for key in metrics}
     for pair in tqdm(pairs, desc=title, unit="view"):
@@ -215,6 +225,8 @@ def score(pairs: list[Pair], metrics: dict[str, Metric], title: str) -> Scores:
             continue
         for key, metric in metrics.items():
             scores[key][pair.name] = metric(render, truth, mask)
+        if errors:
+            write_error_map(pair.truth.parents[1], pair.name, truth, render, mask)
     return scores
 
 
@@ -238,11 +250,17 @@ def readImages(renders_dir: str | Path, gt_dir: str | Path) -> tuple[list[torch.
     return read(renders_dir), read(gt_dir), names
 
 
-def evaluate(model_paths: Sequence[str | Path], lpips_net: str = "vgg", weights: str | Path | None = None) -> None:
+def evaluate(
+    model_paths: Sequence[str | Path],
+    lpips_net: str = "vgg",
+    weights: str | Path | None = None,
+    error_maps: bool = False,
+) -> None:
     """Score model folders, print the means and write the files of scores, as the command does.
 
     lpips_net: "vgg", "alex" or "both". weights: folder of torchvision's files of vgg16 and alexnet, instead of torch's
-    cache and a download. UserError if a folder cannot be scored, after the others were.
+    cache and a download. error_maps: write `test/METHOD/errors`, too. UserError if a folder cannot be scored, after the
+    others were.
     """
     found, failed = {}, []
     for model in map(Path, model_paths):
@@ -255,7 +273,7 @@ def evaluate(model_paths: Sequence[str | Path], lpips_net: str = "vgg", weights:
     sides = [side for methods in found.values() for pairs in methods.values() for pair in pairs for side in pair.size]
     metrics = make_metrics(lpips_net, weights and Path(weights), min(sides))
     for model, methods in found.items():
-        _score_model(model, methods, metrics)
+        _score_model(model, methods, metrics, error_maps)
     if failed:
         raise UserError("; ".join(failed))
 
@@ -292,11 +310,11 @@ def keep_networks(model: Path, method: str, scores: Scores) -> list[str]:
     return kept
 
 
-def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str, Metric]) -> None:
+def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str, Metric], error_maps: bool) -> None:
     held_out = trained_with_eval(model)
     if held_out is False:
         print(f"warning: {model} was trained without --eval, so these scores are of training views")
-    per_view = {name: score(pairs, metrics, f"{model.name}/{name}") for name, pairs in methods.items()}
+    per_view = {name: score(pairs, metrics, f"{model.name}/{name}", error_maps) for name, pairs in methods.items()}
     for name, scores in per_view.items():
         if kept := keep_networks(model, name, scores):
             print(f"{model} {name}: kept {', '.join(kept)} of an earlier scoring of the same pictures")
@@ -305,6 +323,8 @@ def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str,
     for name, means in results.items():
         shown = "  ".join(f"{key} {'null' if value is None else f'{value:.4f}'}" for key, value in means.items())
         print(f"{model} {name} ({len(methods[name])} views): {shown}")
+        if worst := worst_views(model, per_view[name]["PSNR"]):
+            print("worst views:", ", ".join(f"{it['picture']} {it['PSNR']:.2f} dB" for it in worst))
     info = {
         "conventions": {key: CONVENTIONS[key] for scores in per_view.values() for key in scores},
         "trained_with_eval": held_out,
@@ -329,8 +349,10 @@ def main() -> None:
     add("--weights", type=Path, metavar="FOLDER",
         help="folder of torchvision's files vgg16-397923af.pth, for LPIPS and DISTS, and alexnet-owt-7be5be79.pth; "
         "nothing is downloaded then (default: torch's cache, or else a download into it, and no DISTS)")  # fmt: skip
+    add("--error_maps", action="store_true",
+        help="also write error maps into test/METHOD/errors (default: off)")  # fmt: skip
     args = parser.parse_args()
-    evaluate(args.model_paths, args.lpips_net, args.weights)
+    evaluate(args.model_paths, args.lpips_net, args.weights, args.error_maps)
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ from scene.saved_model import load_saved
 from scene.scene import Scene
 from splatting.camera_paths.render_path import add_path_options, path_request, render_path
 from splatting.evaluation.comparison import FITTED, GIVEN_POSES
-from splatting.evaluation.renders import DEPTHS, INCOMPLETE, TIMES, model_digest, summarise_times
+from splatting.evaluation.renders import DEPTHS, ERRORS, INCOMPLETE, TIMES, model_digest, summarise_times
 from splatting.exports.in_scene import load_file
 from splatting.files.image_files import remove_leftovers, save_png, write_plane
 from splatting.files.json_files import write_json
@@ -73,6 +73,7 @@ def write_views(
             (folder / INCOMPLETE).touch()
         remove_leftovers(folder / side, len(views))
     remove_leftovers(folder / "masks", 0)  # some views may have none
+    shutil.rmtree(folder / ERRORS, ignore_errors=True)
     for plane in PLANES:
         remove_leftovers(folder / plane, len(views) if plane in planes else 0)
     seconds, errors = [], {}

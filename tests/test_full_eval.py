@@ -563,7 +563,7 @@ def test_option_sets_of_another_ground_truth_stand_apart(evaluate, tmp_path):
     (model / "results.json").unlink()
     report = evaluate("attic", *sets)
     assert [run["apart"] for run in report["runs"]] == [False, True, False]
-    views = [re.findall(r'alt="(\w+)"', part) for part in evaluate.text("html").split("<h3>Test view")[1:]]
+    views = [re.findall(r'alt="(\w+)"', part) for part in evaluate.text("html").split("<summary>Pictures of all")[1:]]
     assert views == [["photo", *["render", "error"] * 2] * 2, ["photo", "render", "error"] * 2]
     assert "Left out of rankings and the Pareto front: best." in report["warnings"][0]
     first, second = evaluate.text("md").split("Scored on other ground truth", 1)
@@ -635,6 +635,14 @@ def test_names_stay_names_in_the_report(figures, evaluate, name):
         assert image.width > 300
 
 
+def test_a_table_has_all_views_with_their_error_maps_the_worst_first(evaluate):
+    evaluate("attic")
+    (table,) = re.findall(r"<summary>Scores of all 2 test views.*?</details>", evaluate.text("html"), re.DOTALL)
+    map_of = '<a href="attic/test/ours_40/errors/%s">%s</a>'
+    cells = ["photo_1.jpg", map_of % ("00001.jpg", "22.00"), "photo_0.jpg", map_of % ("00000.jpg", "24.00")]
+    assert re.findall("<td>(.*?)</td>", table) == cells
+
+
 def test_each_test_view_has_photo_render_and_error_in_the_page(evaluate, monkeypatch):
     (attic,) = evaluate("attic")["runs"]
     html = evaluate.text("html")
@@ -642,7 +650,7 @@ def test_each_test_view_has_photo_render_and_error_in_the_page(evaluate, monkeyp
     assert all(part.startswith("data:image/") for part in html.split('src="')[1:])
     (page,) = re.findall(r"<h2>attic</h2>(.*)<h2>", html, re.DOTALL)
     shown = re.findall(r'<figure class="comparison">.*?</figure>', page, re.DOTALL)
-    assert len(shown) == 2 and "<details>" in page.split("</figure>")[1]  # the worst one first, the other on a click
+    assert len(shown) == 2 and "<details" in page.split('<figure class="comp')[0]  # on a click
     for figure, name, psnr in zip(shown, ("photo_1.jpg", "photo_0.jpg"), (22, 24), strict=True):
         assert name in figure and f"render: {psnr}.00 dB" in figure and figure.count('<input type="range"') == 1
         found = re.findall(r'src="data:image/jpeg;base64,([^"]+)" alt="(\w+)"', figure)

@@ -87,11 +87,12 @@ def test_a_resumed_training_knows_the_best_so_far(kept, scene, tmp_path):
     train_on(scene, tmp_path / "plain", *WORDS)
     with pytest.raises(UserError, match="was trained on the photos that --keep_best would choose by"):
         train_on(scene, tmp_path / "no", *WORDS, "--keep_best", start[0], tmp_path / "plain" / "chkpnt200.pth")
-    state = torch.load(start[1], weights_only=False)
-    state[0][10]["best"]["rows"]["xyz"] = torch.zeros(2, 2)
-    torch.save(state, tmp_path / "chkpnt200.pth")
-    with pytest.raises(UserError, match="xyz of the checkpoint has the shape"):
-        train_on(scene, tmp_path / "no", *WORDS, "--keep_best", start[0], tmp_path / "chkpnt200.pth")
+    for wrong, words in ((torch.zeros(2, 2), "xyz of the checkpoint has the shape"), (torch.zeros(2, 3), "is damaged")):
+        state = torch.load(start[1], weights_only=False)
+        state[0][10]["best"]["rows"]["xyz"] = wrong
+        torch.save(state, tmp_path / "chkpnt200.pth")
+        with pytest.raises(UserError, match=words):
+            train_on(scene, tmp_path / "no", *WORDS, "--keep_best", start[0], tmp_path / "chkpnt200.pth")
 
 
 @pytest.mark.parametrize(("count", "places"), [(8, (2, 6)), (31, (7, 22)), (43, (8, 24, 40))])

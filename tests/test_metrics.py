@@ -14,7 +14,7 @@ from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import metrics
-from splatting.evaluation.renders import INCOMPLETE
+from splatting.evaluation.renders import GAIN, INCOMPLETE
 from splatting.files import image_files
 from utils import lpips_utils
 from utils.system_utils import UserError, compute_device, run_cli
@@ -167,6 +167,24 @@ def test_a_model_without_renders_is_named_and_the_others_are_scored(tmp_path, ru
     status, out, err = run("-m", unrendered, good)
     assert status == 2 and f"{good} ours_30 (2 views): SSIM" in out and files_of(good)[0]["ours_30"]["PSNR"] > 0
     assert "no rendered test views in" in err and "unrendered" in err
+
+
+def test_error_maps_are_black_where_nothing_counts_and_the_worst_views_are_named(model, run):
+    method, mask = model / "test/ours_30", np.zeros((40, 56, 3), np.uint8)
+    mask[:, 28:] = 255
+    (method / "masks").mkdir()
+    Image.fromarray(mask).save(method / "masks" / "00001.png")
+    (model / "cameras.json").write_text('[{"img_name": "a.jpg"}, {"img_name": "b.jpg"}]')
+    _, said, _ = run("-m", model, "--error_maps")
+    psnrs = {name: value for name, value in files_of(model)[1]["ours_30"]["PSNR"].items()}
+    names = sorted(psnrs, key=psnrs.get)
+    worst = ", ".join(f"{'ab'[int(name[4])]}.jpg {psnrs[name]:.2f} dB" for name in names)
+    assert f"worst views: {worst}\n" in said
+    found = np.asarray(Image.open(method / "errors/00001.jpg").convert("L")).astype(int)
+    truth, render = (np.asarray(Image.open(method / side / "00001.png")).astype(int) for side in ("gt", "renders"))
+    expected = np.minimum(GAIN * np.abs(truth - render), 255).astype(np.uint8)
+    grey = np.asarray(Image.fromarray(expected).convert("L")).astype(int)
+    assert found[:, :16].max() < 8 and np.abs(found - grey)[:, 36:].mean() < 6 < grey[:, 36:].mean()  # of a JPEG
 
 
 def test_images_of_two_folders_as_tensors(model):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from scene.saved_iterations import saved_ply
+from splatting.evaluation.comparison import SCORES
 from splatting.evaluation.model_folder import json_or_none, load_scores
 from splatting.files.image_files import UNREADABLE, open_render
 from splatting.files.listing import as_utf8
@@ -21,6 +22,7 @@ from utils.system_utils import UserError, atomic_write
 if TYPE_CHECKING:
     import torch
 
+ERRORS = "errors"  # folder beside those of the images: error maps of metrics.py
 INCOMPLETE = "incomplete"  # beside them, until the last image of a set is written
 DEPTHS = "depth_errors.json"  # beside them: of each view, the errors of depth at held-out points
 TIMES = "render_times.json"  # beside the folders of images: the time of each view
@@ -133,6 +135,26 @@ def error_image(truth: Image.Image, render: Image.Image) -> Image.Image:
     return Image.fromarray(np.minimum(difference * GAIN, 255).astype(np.uint8))
 
 
+def error_map(method: Path, name: str) -> Path:
+    """The file of a view's error map. method: the folder `ours_N`."""
+    return method / ERRORS / f"{Path(name).stem}.jpg"
+
+
+def write_error_map(method: Path, name: str, truth: np.ndarray, render: np.ndarray, mask: np.ndarray | None) -> None:
+    """Write the `error_image` of images (H, W, 3) uint8, black where a mask (H, W) bool counts no pixel."""
+    if mask is not None:
+        render = np.where(mask[..., None], render, truth)
+    with atomic_write(error_map(method, name)) as temporary:
+        error_image(*map(Image.fromarray, (truth, render))).save(temporary, "JPEG", quality=_QUALITY)
+
+
+def worst_views(model: Path, psnrs: Mapping[str, float | None]) -> list[dict[str, Any]]:
+    """The views of the lowest PSNR, worst first: PSNR, `file`, and `picture`, the name of the photo."""
+    worst = sorted((value, name) for name, value in psnrs.items() if value is not None)[:WORST]
+    picture_name = photo_namer(model)
+    return [{"PSNR": value, "file": name, "picture": picture_name(name)} for value, name in worst]
+
+
 def contact_sheet(views: Sequence[tuple[str, Image.Image, Image.Image]]) -> Image.Image:
     """Draw a row for each view (label, ground truth, render), with the error."""
     rows = [[(label, truth), ("", render), ("", error_image(truth, render))] for label, truth, render in views]
@@ -182,7 +204,8 @@ class ComparedViews:
     def __init__(self, runs: Sequence[dict[str, Any]], output: Path) -> None:
         self.names = [run["config"] or "render" for run in runs]
         self._runs, self._output = runs, output
-        self._scores = [load_scores(output / run["model"], f"ours_{run['final_iteration']}")[1]["PSNR"] for run in runs]
+        self._per_view = [load_scores(output / run["model"], f"ours_{run['final_iteration']}")[1] for run in runs]
+        self._scores = [of_run["PSNR"] for of_run in self._per_view]
         scored = [name for name in self._scores[0] if None not in [scores.get(name) for scores in self._scores]]
         self.files = sorted(scored, key=lambda name: (statistics.fmean(own[name] for own in self._scores), name))
         self._photo_name = photo_namer(output / runs[0]["model"])
@@ -190,6 +213,26 @@ class ComparedViews:
     def _images(self, file: str) -> tuple[Image.Image, list[Image.Image]]:
         pairs = [_pair(run, self._output, file) for run in self._runs]
         return pairs[0][0], [render for _, render in pairs]
+
+    def table(self) -> dict[str, Any]:
+        """Scores of all views: `heads`, and `rows` of (text, path of an error map or None) by column.
+
+        PSNR of each option set, or of one set all its scores.
+        """
+        columns = [(run, scores, "PSNR") for run, scores in zip(self._runs, self._per_view, strict=True)]
+        if len(columns) == 1:
+            (run, scores, _), *_ = columns
+            known = [key for key in SCORES if all(scores.get(key, {}).get(file) is not None for file in self.files)]
+            columns = [(run, scores, key) for key in known]
+        heads = [key if len(self._runs) == 1 else run["config"] for run, _, key in columns]
+        return {"heads": ["test view", *heads], "rows": [self._row(file, columns) for file in self.files]}
+
+    def _row(self, file: str, columns: Sequence[tuple[dict, dict, str]]) -> list[tuple[str, Path | None]]:
+        cells: list[tuple[str, Path | None]] = [(self._photo_name(file), None)]
+        for run, scores, key in columns:
+            path, is_psnr = error_map(_method(run, self._output), file), key == "PSNR"
+            cells.append((f"{scores[key][file]:.{2 if is_psnr else 4}f}", path if is_psnr and path.is_file() else None))
+        return cells
 
     def shown(self, most: int) -> list[dict[str, Any]]:
         """At most `most` views: the worst, and others evenly spread to the best.
@@ -222,9 +265,13 @@ class ComparedViews:
             sheet(titles, rows, WIDEST).save(temporary)
 
 
+def _method(run: dict[str, Any], output: Path) -> Path:
+    return output / run["model"] / "test" / f"ours_{run['final_iteration']}"
+
+
 def _pair(run: dict[str, Any], output: Path, name: str) -> list[Image.Image]:
     """Read ground truth and render of a view, RGB, white where pixels do not count."""
-    method = output / run["model"] / "test" / f"ours_{run['final_iteration']}"
+    method = _method(run, output)
     pair, mask = [image_of(method / side / name) for side in ("gt", "renders")], mask_of(method, name)
     if mask is None:
         return pair

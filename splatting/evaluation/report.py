@@ -164,7 +164,8 @@ def _views(output: Path, scene: str, runs: Sequence[Run], each: int) -> list[dic
         try:
             views = ComparedViews(alike, output)
             views.draw_worst(path)
-            groups.append({"sheet": path, "shown": views.shown(each), "several": len(alike) > 1})
+            groups.append({"sheet": path, "shown": views.shown(each), "several": len(alike) > 1,
+                           "table": views.table()})  # fmt: skip
         except UserError as error:
             titles = "; ".join(map(run_title, alike))
             print(f"warning: no pictures of the test views of {titles}: {error}", file=sys.stderr)
@@ -218,6 +219,7 @@ def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
 
     return {
         "cpu_known": known("cpu_seconds"),
+        "kept": {run["model"]: x for run in runs for x in run["lines"] or () if x.startswith("--keep_best")},
         "left_out": any(row["gaussians"]["mean"] != row["gaussians_saved"]["mean"] for row in rows),
         "machines": sorted({one_line(run["machine"]) for run in runs if run["machine"]}),
         "mipnerf360": any(run["group"] == "mipnerf360" for run in runs),

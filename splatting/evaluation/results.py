@@ -16,6 +16,8 @@ from splatting.evaluation.comparison import BESIDE, SCORES
 from splatting.evaluation.error_curve import Row
 from splatting.evaluation.plan import Record, Run, SceneEntry, is_model, photos_of
 from splatting.evaluation.renders import TIMES, WORST, image_size, photo_namer, view_names
+from splatting.evaluation.plan import Record, Run, SceneEntry, is_model
+from splatting.evaluation.renders import TIMES, image_size, view_names, worst_views
 from splatting.evaluation.stages import Failure, page_file
 from splatting.evaluation.training_log import DEGREES, PERCENT
 from splatting.evaluation.what_to_try import gain_since_peak, peak
@@ -106,13 +108,11 @@ def _views(model: Path, last: int) -> dict[str, Any]:
     held_out, cameras = view_names(truth), folder_of.json_or_none(model / "cameras.json")
     untrained = len(held_out) + len(read_model_json(model).get("kept_best", {}).get("views", ()))
     scores = folder_of.load_scores(model, f"ours_{last}")[1]["PSNR"]
-    worst = sorted((value, name) for name, value in scores.items() if value is not None)[:WORST]
-    picture_name = photo_namer(model)
     return {
         "split": _split(cameras, len(held_out)),
         "test_sizes": [list(size) for size in sorted({image_size(truth / name) for name in held_out})],
         "views": {"test": len(scores), "train": len(cameras) - untrained if isinstance(cameras, list) else None},
-        "worst_views": [{"PSNR": value, "file": name, "picture": picture_name(name)} for value, name in worst],
+        "worst_views": worst_views(model, scores),
     }
 
 

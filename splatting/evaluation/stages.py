@@ -286,7 +286,8 @@ def score(run: Run, download: bool = True, weights: Path | None = None) -> bool:
     before = record.stage("metrics")
     environment = {} if download else {"GS_DOWNLOAD": TOLD}
     given = {} if weights is None else {"weights": str(weights.resolve())}
-    command = _script("metrics.py", "-m", str(model), *(f"--{name}={folder}" for name, folder in given.items()))
+    words = [f"--{name}={folder}" for name, folder in given.items()]
+    command = _script("metrics.py", "-m", str(model), "--error_maps", *words)
     _once(
         record, "metrics", "scoring", command, {"renders": renders, **given}, dict,
         lambda: {"ground_truth_sha256": ground_truth_digest(model / "test" / methods[-1])}, **environment,

@@ -77,5 +77,7 @@ class BestModel:
             self._degree = int(state["degree"])
             self._rows = {name: state["rows"][name].cpu() for name in gaussians.rows()}
             check_rows(self._rows, gaussians._attributes, gaussians.max_sh_degree)
+            if len({*map(len, self._rows.values())}) > 1 or not 0 <= self._degree <= gaussians.max_sh_degree:
+                raise ValueError("its rows or its SH degree do not fit")
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise UserError(f"the checkpoint's best model is damaged ({error}); give another checkpoint") from error
