@@ -23,18 +23,9 @@ from fused_ssim import fused_ssim
 from tqdm import tqdm
 
 from arguments import OptionParser, read_cfg_args
+from splatting.evaluation import renders
 from splatting.evaluation.model_folder import json_or_none
-from splatting.evaluation.renders import (
-    DEPTHS,
-    INCOMPLETE,
-    TIMES,
-    image_of,
-    image_size,
-    mask_of,
-    model_digest,
-    worst_views,
-    write_error_map,
-)
+from splatting.evaluation.renders import DEPTHS, INCOMPLETE, TIMES, image_of, image_size, mask_of, model_digest
 from splatting.files.json_files import read_json, write_json
 from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, load_dists, load_network
 from utils.system_utils import UserError, compute_device, run_cli
@@ -226,7 +217,7 @@ def score(pairs: list[Pair], metrics: dict[str, Metric], title: str, errors: boo
         for key, metric in metrics.items():
             scores[key][pair.name] = metric(render, truth, mask)
         if errors:
-            write_error_map(pair.truth.parents[1], pair.name, truth, render, mask)
+            renders.write_error_map(pair.truth.parents[1], pair.name, truth, render, mask)
     return scores
 
 
@@ -323,7 +314,7 @@ def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str,
     for name, means in results.items():
         shown = "  ".join(f"{key} {'null' if value is None else f'{value:.4f}'}" for key, value in means.items())
         print(f"{model} {name} ({len(methods[name])} views): {shown}")
-        if worst := worst_views(model, per_view[name]["PSNR"]):
+        if worst := renders.worst_views(model, per_view[name]["PSNR"]):
             print("worst views:", ", ".join(f"{it['picture']} {it['PSNR']:.2f} dB" for it in worst))
     info = {
         "conventions": {key: CONVENTIONS[key] for scores in per_view.values() for key in scores},
