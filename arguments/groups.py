@@ -62,7 +62,7 @@ class ModelParams(OptionTable):
         Option("eval", False, stored=CFG_ARGS,
             help="hold out a test set: every 8th photo by name, or Blender's test frames"),
         Option("keep_best", False, origin="ours", stored=MODEL_JSON,
-            help="let every 16th training photo, and at least two, decide instead of train: the last save is the model "
+            help="take every 16th training photo, and at least two, for validation: the last save is the model "
                  "that showed them best, of all points scored"),
         Option("init_pcd_path", "", origin="ours",
             help="file of points to start from instead of the scene's own: PLY, npz (points, colors), or text whose "

@@ -22,7 +22,7 @@ from scene.images.store import ImageStore, Picture, image_device
 from scene.lens_correction import shares_of
 from scene.pose_file import with_poses, write_poses
 from scene.readers.depth_maps import with_depth_maps
-from scene.readers.info import CameraInfo, SceneInfo, exposure_names, photo_size, without_deciding
+from scene.readers.info import CameraInfo, SceneInfo, exposure_names, photo_size, without_validation
 from scene.readers.point_cloud import write_point_cloud
 from scene.readers.scene_folder import kind_of
 from scene.saved_iterations import find_iteration, saved_ply
@@ -41,7 +41,7 @@ class Scene:
     None calls `create_gaussians` and `write_inputs`; -1 loads the last saved iteration, N that one. start: False leaves
     all of this to the caller. shuffle: mix the order of the views (always the same way). resolution_scales: factors by
     which views are made smaller, one list of cameras each. train_cameras, test_cameras: these lists by scale, which may
-    be replaced. deciding_cameras: the same of views that neither train nor test, but choose what --keep_best saves.
+    be replaced. validation_cameras: the same of views that neither train nor test, but choose what --keep_best saves.
     info: the dataset as read, without the last. cameras_extent: E in world units, from the training views.
     images: the store of the decoded photos. ranks: processes that divide them (ImageStore).
     """
@@ -66,16 +66,16 @@ class Scene:
         self._refines = bool(getattr(args, "refine_poses", False)) and not getattr(args, "other_scene", "")
         self._refines_lens = bool(getattr(args, "refine_lens", False))
         self.info = self._read(args)
-        self.deciding: list[CameraInfo] = []
+        self.validation: list[CameraInfo] = []
         if getattr(args, "keep_best", False):
-            self.info, self.deciding = without_deciding(self.info)
+            self.info, self.validation = without_validation(self.info)
         self.cameras_extent = self.info.extent
 
         device = compute_device()
         place = image_device(args.data_device, device, warn=True)
         self.images = ImageStore(getattr(args, "images_to_load", None) or 0, place, device, ranks)
-        lists = (self.info.train_cameras, False), (self.info.test_cameras, True), (self.deciding, True)
-        self.train_cameras, self.test_cameras, self.deciding_cameras = (
+        lists = (self.info.train_cameras, False), (self.info.test_cameras, True), (self.validation, True)
+        self.train_cameras, self.test_cameras, self.validation_cameras = (
             {scale: self._cameras(args, scale, shuffle, *views) for scale in resolution_scales} for views in lists
         )
         self._plan_images()
@@ -187,7 +187,7 @@ class Scene:
         else:
             colors = np.round(info.point_cloud.colors * 255).astype(np.uint8)
             write_point_cloud(folder / "input.ply", info.point_cloud.points, colors)
-        views = info.test_cameras + info.train_cameras + self.deciding
+        views = info.test_cameras + info.train_cameras + self.validation
         entries = [scene.camera_to_JSON(i, camera) for i, camera in enumerate(views)]
         with atomic_write(folder / "cameras.json") as path:
             path.write_text(json.dumps(entries, allow_nan=False), encoding="utf-8")
@@ -221,7 +221,7 @@ class Scene:
                 camera.columns = half(camera.image_width, in_test_list)
 
     def _plan_images(self) -> None:
-        others = chain(*self.test_cameras.values(), *self.deciding_cameras.values())
+        others = chain(*self.test_cameras.values(), *self.validation_cameras.values())
         self.images.plan(self._pictures(chain(*self.train_cameras.values())), self._pictures(others))
 
     def _pictures(self, cameras: Iterable[Camera]) -> list[Picture]:

@@ -1,4 +1,4 @@
-"""--keep_best: the photos that decide, the model that is kept, resumes, and what cannot be."""
+"""--keep_best: the validation photos, the model that is kept, resumes, and what cannot be."""
 
 import json
 import shutil
@@ -43,13 +43,13 @@ def kept(scene, tmp_path_factory) -> tuple[Path, dict[int, bytes]]:
     return out, train_on(scene, out, *WORDS, "--keep_best")
 
 
-def test_the_last_save_is_the_model_that_shows_the_deciding_photos_best(kept, scene):
+def test_the_last_save_is_the_model_that_shows_the_validation_photos_best(kept, scene):
     out, plys = kept
     best = json.loads((out / "model.json").read_text())["kept_best"]
-    scores = {r["iteration"]: r["deciding_psnr"] for r in read_log(out / "train_log.json") if "deciding_psnr" in r}
+    scores = {r["iteration"]: r["validation_psnr"] for r in read_log(out / "train_log.json") if "validation_psnr" in r}
     assert best["iteration"] == max(scores, key=scores.get) == 170 and plys[240] == plys[170] != plys[120]
     loaded = load_saved(GroupParams(**read_stored_options(out)), 170)
-    views = loaded.deciding_cameras[1.0]
+    views = loaded.validation_cameras[1.0]
     assert [view.image_name for view in views] == best["views"] and len(best["views"]) == 2
     black, found = torch.zeros(3), []
     for view in views:
@@ -65,7 +65,7 @@ def test_the_last_save_is_the_model_that_shows_the_deciding_photos_best(kept, sc
     assert len(loaded.getTrainCameras()) == 12 and len(loaded.getTestCameras()) == 3
 
 
-def test_the_deciding_and_the_test_photos_teach_nothing(kept, scene, tmp_path):
+def test_the_validation_and_the_test_photos_teach_nothing(kept, scene, tmp_path):
     out, plys = kept
     loaded = load_saved(GroupParams(**read_stored_options(out)), 240)
     trained = {camera.image_name for camera in loaded.getTrainCameras()}
@@ -96,9 +96,9 @@ def test_a_resumed_training_knows_the_best_so_far(kept, scene, tmp_path):
 
 
 @pytest.mark.parametrize(("count", "places"), [(8, (2, 6)), (31, (7, 22)), (43, (8, 24, 40))])
-def test_every_sixteenth_view_decides_and_two_at_least(count, places):
+def test_every_sixteenth_view_validates_and_two_at_least(count, places):
     views = load_views(count)
-    left, chosen = info.without_deciding(views)
+    left, chosen = info.without_validation(views)
     assert [view.uid for view in chosen] == list(places) and all(view.is_test for view in chosen)
     assert [view.uid for view in left.train_cameras] == [n for n in range(count) if n not in places]
 
@@ -110,7 +110,7 @@ def load_views(count: int) -> info.SceneInfo:
 
 def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path):
     with pytest.raises(UserError, match="takes two photos or more away from training, and only 7 train; leave it out"):
-        info.without_deciding(load_views(7))
+        info.without_validation(load_views(7))
     for words in (("--refine_poses",), ("--appearance", "ppisp"), ("--train_test_exp",), ("--target_psnr", 9)):
         with pytest.raises(UserError, match=f"--keep_best does not go with {words[0]}"):
             train_on(scene, tmp_path, *WORDS, "--keep_best", *words)

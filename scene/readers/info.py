@@ -20,7 +20,7 @@ from utils.graphics_utils import BasicPointCloud, camera_center, focal2fov, fov2
 from utils.system_utils import UserError
 
 HOLD = 8  # every 8th photo by name is a test view (Mip-NeRF 360's split)
-DECIDES = 16  # with --keep_best, every 16th training view by order does not train, and at least two do not
+VALIDATION = 16  # with --keep_best, every 16th training view by order does not train, and at least two do not
 FEWEST = 8  # training views to take these from
 NEAREST = 0.2  # depth from which Gaussians are drawn (the rasterizer's rule)
 APART = 10.0  # median distances from the cameras' median, beyond which a camera stands apart
@@ -199,14 +199,14 @@ def split_by_order(
     return train, test
 
 
-def without_deciding(info: SceneInfo) -> tuple[SceneInfo, list[CameraInfo]]:
+def without_validation(info: SceneInfo) -> tuple[SceneInfo, list[CameraInfo]]:
     """The dataset with fewer training views, and those that were taken away, to choose a model by (--keep_best)."""
     views = info.train_cameras
     if len(views) < FEWEST:
         raise UserError(
             f"--keep_best takes two photos or more away from training, and only {len(views)} train; leave it out"
         )
-    step = min(DECIDES, len(views) // 2)
+    step = min(VALIDATION, len(views) // 2)
     chosen = range(step // 2, len(views), step)
     trained = [view for index, view in enumerate(views) if index not in chosen]
     return info._replace(train_cameras=trained), held_out([replace(views[index], depth=None) for index in chosen])

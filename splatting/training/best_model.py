@@ -19,7 +19,7 @@ BEST = "best"  # key of its state in a checkpoint
 
 
 class BestModel:
-    """The best model so far. cameras: the views that decide; iteration: 0 before the first score; psnr: their mean, dB.
+    """The best model so far. cameras: the validation views; iteration: 0 before the first score; psnr: their mean, dB.
 
     Its rows lie in the memory of the host, as large as the PLY, and in each checkpoint.
     """
@@ -50,7 +50,7 @@ class BestModel:
 
     def line(self, at_end: float | None) -> str:
         """What training says of it. at_end: the score of the last model."""
-        who = f"{len(self.cameras)} photos that did not train ({some(self._names)})"
+        who = f"{len(self.cameras)} validation photos ({some(self._names)})"
         if not self.iteration or at_end is None:
             return f"--keep_best saved the last model: no pixel counts of {who}"
         than = f", {self.psnr - at_end:.2f} dB better than the last one" if self.psnr > at_end else ", the last one"

@@ -228,9 +228,9 @@ class Run:
             sort_rows(self.gaussians)
         if self.sky:
             self.gaussians.far = self.sky.rows
-        if deciding := self.scene.deciding_cameras[1.0]:
+        if validation := self.scene.validation_cameras[1.0]:
             checks.check_keep_best(self.dataset, self.opt, self.group.several)
-            self.best = BestModel(deciding)
+            self.best = BestModel(validation)
             if capture:
                 self.best.restore(further(capture, BEST), self.gaussians)
         if self.opt.filter_3d:

@@ -60,7 +60,7 @@ class Saves(Observer):
 
 
 class KeepBest(Observer):
-    """Scores the views that decide, and notes the model that shows them best, which `Saves` writes at the end."""
+    """Scores the validation views, and notes the model that shows them best, which `Saves` writes at the end."""
 
     def __init__(self, run: Run) -> None:
         self._run, self._cameras = run, run.best.cameras
@@ -81,7 +81,7 @@ class KeepBest(Observer):
             self._psnr = self._views.scores(self._cameras, run.gaussians).get("psnr")
             if self._psnr is not None:  # masks may leave no pixel of the views
                 run.best.offer(run.gaussians, step.iteration, self._psnr)
-                step.record = (step.record or {}) | {"deciding_psnr": self._psnr}
+                step.record = (step.record or {}) | {"validation_psnr": self._psnr}
         if step.last:
             add_to_model_json(run.scene.model_path, kept_best=run.best.facts())
 
