@@ -15,8 +15,6 @@ from splatting.evaluation import model_folder as folder_of
 from splatting.evaluation.comparison import BESIDE, SCORES
 from splatting.evaluation.error_curve import Row
 from splatting.evaluation.plan import Record, Run, SceneEntry, is_model, photos_of
-from splatting.evaluation.renders import TIMES, WORST, image_size, photo_namer, view_names
-from splatting.evaluation.plan import Record, Run, SceneEntry, is_model
 from splatting.evaluation.renders import TIMES, image_size, view_names, worst_views
 from splatting.evaluation.stages import Failure, page_file
 from splatting.evaluation.training_log import DEGREES, PERCENT
