@@ -67,7 +67,7 @@ class Scene:
         self._refines_lens = bool(getattr(args, "refine_lens", False))
         self.info = self._read(args)
         self.validation: list[CameraInfo] = []
-        if getattr(args, "keep_best", False):
+        if getattr(args, "keep_best", False) and not getattr(args, "other_scene", ""):
             self.info, self.validation = without_validation(self.info)
         self.cameras_extent = self.info.extent
 
