@@ -188,13 +188,9 @@ def make_metrics(lpips_net: str, weights: Path | None, smallest_side: int) -> di
             if smallest_side < MIN_SIDE[net]:
                 raise LpipsUnavailable(f"it needs images with sides of at least {MIN_SIDE[net]} pixels")
             network = load_network(net, weights, device)
+            metrics.update({key: _lpips_metric(network, key == "LPIPS", device) for key in mine})
         except LpipsUnavailable as reason:
             print(f"{', '.join(mine)} are null unless scored before: {reason}")
-            continue
-        except ImportError as error:
-            print(f"{', '.join(mine)} are null unless scored before: {error}; run pip install -r requirements.txt")
-            continue
-        metrics.update({key: _lpips_metric(network, key == "LPIPS", device) for key in mine})
     if weights:
         try:
             metrics["DISTS"] = _dists_metric(load_dists(weights, device), device)

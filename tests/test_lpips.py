@@ -187,10 +187,11 @@ def test_weights_of_a_folder_are_checked(judges, tmp_path, monkeypatch):
     shutil.copyfile(judges.files["alex"], tmp_path / judges.files["vgg"].name)
     refused("both", f"{judges.files['vgg'].name} is damaged: its SHA-256 begins with")
     monkeypatch.setattr(lpips_utils, "_url", lambda net: judges.urls["alex"])  # the right digest, but another network
-    refused("vgg", "the weights of vgg16 have .64, 3, 11, 11. as features.0.weight, expected .64, 3, 3, 3.")
-    torch.save([1, 2], tmp_path / "list-.pth")
-    monkeypatch.setattr(lpips_utils, "_url", lambda net: "https://somewhere/list-.pth")
-    refused("vgg", "holds a list")
+    refused("vgg", "the file of vgg16's weights is another one; put https://somewhere/alexnet.* in its place")
+    for wrong in ([1, 2], {}, {"features.0.weight": 1}):
+        torch.save(wrong, tmp_path / "wrong-.pth")
+        monkeypatch.setattr(lpips_utils, "_url", lambda net: "https://somewhere/wrong-.pth")
+        refused("vgg", "is another one")
 
 
 def test_dists_is_the_packages(judges, tmp_path, monkeypatch, capsys):

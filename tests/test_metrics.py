@@ -16,7 +16,6 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 import metrics
 from splatting.evaluation.renders import GAIN, INCOMPLETE
 from splatting.files import image_files
-from utils import lpips_utils
 from utils.system_utils import UserError, compute_device, run_cli
 
 FILES = ("results.json", "per_view.json", "metrics_info.json")
@@ -215,12 +214,9 @@ def test_without_weights_or_package_lpips_is_null_and_says_what_to_do(tmp_path, 
     assert metrics.evaluate([str(second)]) is None
     assert [(second / name).read_bytes() for name in FILES] == [(model / name).read_bytes() for name in FILES]
 
-    def missing():
-        raise ModuleNotFoundError("No module named 'lpips'")
-
-    monkeypatch.setattr(lpips_utils, "import_lpips", missing)
-    status, out, _ = run("-m", model, "--lpips_net", "both")
-    assert status == 0 and out.count("No module named 'lpips'; run pip install") == 2  # one for each network
+    monkeypatch.setitem(sys.modules, "lpips", None)
+    status, out, _ = run("-m", model, "--lpips_net", "both", "--weights", tmp_path)
+    assert status == 0 and out.count("import of lpips halted; None in sys.modules; run pip install") == 3  # and DISTS
 
 
 def test_several_models_and_methods_and_alpha(tmp_path, run):

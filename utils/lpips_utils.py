@@ -43,7 +43,7 @@ def import_lpips() -> ModuleType:
 
     There torchvision's wheel cannot load its compiled operators, and its Python side (0.28) fails when it attaches fake
     kernels to two of them. LPIPS needs neither, so this declares their schemas and repeats the import. It does so only
-    after the failure, because the real operators' schemas would clash with these.
+    after the failure, because the real operators' schemas would clash with these. Raises LpipsUnavailable without it.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -55,7 +55,10 @@ def import_lpips() -> ModuleType:
             for name in [name for name in sys.modules if name.split(".")[0] == "torchvision"]:
                 del sys.modules[name]
             _declare_missing_operators()
-        return importlib.import_module("lpips")
+        try:
+            return importlib.import_module("lpips")
+        except ImportError as error:
+            raise LpipsUnavailable(f"{error}; run pip install -r requirements.txt") from error
 
 
 def _declare_missing_operators() -> None:
@@ -111,20 +114,12 @@ def _without_weights(net: str) -> Iterator[None]:
 
 def _fill(model: nn.Module, state: dict[str, torch.Tensor], net: str) -> None:
     """Give convolutions the weights of torchvision's `features`; names end in the layer there, and weight or bias."""
-    own = {name: value for name, value in model.state_dict().items() if name.endswith(("weight", "bias"))}
-    found = {name: _pick(state, name.split(".", 1)[1], value, net) for name, value in own.items()}
-    model.load_state_dict(found, strict=False, assign=True)
-
-
-def _pick(state: dict[str, torch.Tensor], name: str, like: torch.Tensor, net: str) -> torch.Tensor:
-    value = state.get(f"features.{name}")
-    if not isinstance(value, torch.Tensor) or value.shape != like.shape:
-        found = "nothing" if value is None else str(tuple(getattr(value, "shape", ())))
-        raise UserError(
-            f"the weights of {NETS[net]} have {found} as features.{name}, expected {tuple(like.shape)}; put "
-            f"{_url(net)} in the place of the file"
-        )
-    return value
+    own = [name for name in model.state_dict() if name.endswith(("weight", "bias"))]
+    try:
+        found = {name: state[f"features.{name.split('.', 1)[1]}"] for name in own}
+        model.load_state_dict(found, strict=False, assign=True)
+    except (LookupError, TypeError, RuntimeError) as error:
+        raise UserError(f"the file of {NETS[net]}'s weights is another one; put {_url(net)} in its place") from error
 
 
 def _checked(file: Path, digest: str, remedy: str) -> Path:
@@ -156,12 +151,9 @@ def _digest_of(file: Path) -> str:
 
 def _load_state(file: Path) -> dict[str, torch.Tensor]:
     try:
-        state = read_tensors(file, legacy=True)  # torchvision's own files are older than torch 1.6
+        return read_tensors(file, legacy=True)  # torchvision's own files are older than torch 1.6
     except (OSError, ValueError) as error:
         raise UserError(f"{file} is not a state dict of torchvision: {error}; download it again") from error
-    if not isinstance(state, dict):
-        raise UserError(f"{file} holds a {type(state).__name__}, expected a state dict in torchvision's format")
-    return state
 
 
 def _features_from_cache(net: str) -> dict[str, torch.Tensor]:
