@@ -508,6 +508,7 @@ def test_seeds_and_option_sets(figures, evaluate, tmp_path, capsys, monkeypatch)
         ("--scenes SCENES/attic SCENES/brick --output_path SCENES/brick/eval", "attic would lie in the scene folder"),
         ("--scenes SCENES/attic --output_path SCENES/attic --skip_training", "would lie in the scene folder"),
         ("-m360 SCENES/nowhere", "no such folder: .*nowhere; pass the folder that has bicycle, flowers"),
+        ("--scenes SCENES/attic --resize", "--resize is of Mip-NeRF 360; give -m360, or"),
         ("-m360 SCENES", "scenes has none of the scenes of mipnerf360; pass the folder that has bicycle"),
         ("--scenes SCENES/attic --peer other nowhere.csv", "cannot read nowhere.csv"),
     ],
@@ -686,7 +687,7 @@ def test_each_model_becomes_a_page_that_the_report_links(evaluate):
 
 def test_a_rehearsal_tells_what_would_run_and_how_long_and_writes_nothing(colmap_scene, tmp_path, capsys):
     evaluate = Evaluation(tmp_path, tmp_path / "out")
-    both, given = ("--seeds", 0, 1), ("--configs", "advice", "--", "-r", 2)
+    both, given = ("--seeds", 0, 1), ("--configs", "advice", "--", "-r", 2, "--keep_best")
 
     def told(*more: object) -> list[str]:
         capsys.readouterr()
@@ -694,16 +695,20 @@ def test_a_rehearsal_tells_what_would_run_and_how_long_and_writes_nothing(colmap
         return [re.sub(r" +", " ", line) for line in capsys.readouterr().out.splitlines() if line[:1] in ("|", "a")]
 
     _, _, first, *_, remark = told(*both, *given)
-    assert first.startswith("| colmap_scene | plain | 0 | 14, 3 | 48x32 | 40 | to train | ") and "timed piece" in first
+    assert first.startswith("| colmap_scene | plain | 0 | 12, 3 | 48x32 | 40 | to train | ") and "timed piece" in first
     assert remark.startswith("at least") and not evaluate.out.exists()
     (piece,) = evaluate.calls()  # the scene is the same in all four
-    assert "--iterations 40 -r 2 --seed 0 --time_budget 0 --iterations 200" in " ".join(piece)
+    assert "--seed 0 --time_budget=0 --target_psnr=0 --schedule= --iterations 200" in " ".join(piece)
     evaluate("colmap_scene", "--seeds", 0, *given)
     before, calls = folder_state(evaluate.out), evaluate.calls()
     _, _, *rows, remark = told(*both, *given)
     assert [row.split(" | ")[6::2] for row in rows] == [["finished", "- |"], ["to train", "other seeds |"]] * 2
     assert remark.startswith("about") and folder_state(evaluate.out) == before and evaluate.calls() == calls
     assert "this scene" in told(*both, "--configs", "strategies")[2]
+    (tmp_path / "sets.json").write_text('{"seeded": ["--seed", "5", "-r", "2", "--keep_best"]}')
+    assert "other seeds" in told("--configs", tmp_path / "sets.json")[2]
+    with pytest.raises(UserError, match="--keep_best does not go with --target_psnr"):
+        told("--configs", tmp_path / "sets.json", "--", "--target_psnr", 9)
     photo = min((colmap_scene / "images").rglob("*.png"))
     photo.unlink()
     with pytest.raises(UserError, match=f"colmap_scene, plain, seed 0: .*{photo.name}"):

@@ -109,7 +109,10 @@ def _like(run: Run, known: Sequence[_Finished], state: str, opt: argparse.Namesp
 
 def _unseeded(options: Sequence[str]) -> list[str]:
     words = list(options)
-    return words[: words.index("--seed")] if "--seed" in words else words  # a run's seed comes last
+    if "--seed" in words:
+        at = words.index("--seed")
+        del words[at : at + 2]
+    return words
 
 
 def _remark(seconds: float, timed: bool) -> str:

@@ -27,6 +27,7 @@ _APPEARANCE = ("--appearance", "ppisp")
 FINISHED, TO_SCORE = "finished", "to render and score"  # states of a run
 REST = ("render_", "metrics", "html")  # beginnings of the names of stages after training
 PIECE = 200  # iterations of a timed piece
+_TO_THE_END = ("--time_budget=0", "--target_psnr=0", "--schedule=")  # without the options of plan.ENDING
 
 
 @dataclass(frozen=True)
@@ -164,12 +165,13 @@ def timed_piece(run: Run) -> tuple[float, float]:
     with temporary_folder() as folder:
         half = str(PIECE // 2)
         command = _script("train.py", "-s", _source_of(run), "-m", str(folder), "--disable_viewer", "--quiet")
-        command += [*(run.plain or run.options), "--time_budget", "0", "--iterations", str(PIECE), "--no_curve"]
+        command += [*(run.plain or run.options), *_TO_THE_END, "--iterations", str(PIECE), "--no_curve"]
         done = run_child([*command, "--save_iterations", half])
         _stop_if_asked(done)
         if done.status:
             raise UserError(f"{run.title}: {done.lines[-1] if done.lines else 'train.py failed'}")
-        (_, middle), (_, end) = sorted(logged(folder).items())
+        log = logged(folder)
+        middle, end = log[PIECE // 2], log[PIECE]
     spent = end["seconds"] - middle["seconds"]  # the first half has what is done once
     return done.wall_seconds - end["seconds"], spent / (PIECE - PIECE // 2)
 

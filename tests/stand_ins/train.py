@@ -85,7 +85,7 @@ for t in (end // 4, end // 2, end):
 (args.m / "stand_in.json").write_text(json.dumps({"psnr": best, "appearance": args.appearance}))
 (args.m / "cameras.json").write_text(json.dumps([{"img_name": f"photo_{i}.jpg"} for i in range(9)]))
 log = []
-for t in sorted({*args.save_iterations, end}):
+for t in sorted({*args.save_iterations, *([end // 4] if "--keep_best" in sys.argv else []), end}):
     if t <= end:
         save(t)
         log.append({"iteration": t, "seconds": t * slowness / 10})
