@@ -88,8 +88,10 @@ class Training:
     """Parameters, optimisers and strategy, and how far they have come. strategy: "default" or "mcmc"."""
 
     def __init__(self, scene: Scene, strategy: str, cap: int, iterations: int, seed: int, white: bool) -> None:
-        import gsplat
-
+        try:
+            import gsplat
+        except ImportError as error:
+            raise UserError(f"{error}; run pip install gsplat==1.5.3") from error
         torch.manual_seed(seed)
         self._draw, self._mcmc, self._iterations = gsplat.rasterization, strategy == "mcmc", iterations
         self.frame, device = frame_of(scene.getTrainCameras()), compute_device()
@@ -204,7 +206,7 @@ def main() -> None:
     args = parser.parse_args()
     options, model = model_params.extract(args), Path(args.model_path)
     if not args.model_path or model.exists():
-        raise UserError(f"{model} exists; name a new folder with -m")
+        raise UserError(f"-m must name a new folder, got {args.model_path or 'none'}")
     scene = Scene(options, GaussianModel(DEGREE), shuffle=False, start=False)
     training = Training(scene, args.strategy, args.cap_max, args.iterations, args.seed, options.white_background)
     print(describe(compute_device()))
