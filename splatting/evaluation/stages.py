@@ -169,7 +169,7 @@ def timed_piece(run: Run) -> tuple[float, float]:
         done = run_child([*command, "--save_iterations", half])
         _stop_if_asked(done)
         if done.status:
-            raise UserError(f"{run.title}: {done.lines[-1] if done.lines else 'train.py failed'}")
+            raise UserError(f"{run.title}: {(done.lines or ['train.py failed'])[-1].removeprefix('error: ')}")
         log = logged(folder)
         middle, end = log[PIECE // 2], log[PIECE]
     spent = end["seconds"] - middle["seconds"]  # the first half has what is done once
