@@ -76,7 +76,8 @@ class Scene:
         self.images = ImageStore(getattr(args, "images_to_load", None) or 0, place, device, ranks)
         lists = (self.info.train_cameras, False), (self.info.test_cameras, True), (self.validation, True)
         self.train_cameras, self.test_cameras, self.validation_cameras = (
-            {scale: self._cameras(args, scale, shuffle, *views) for scale in resolution_scales} for views in lists
+            {scale: self._cameras(args, scale, shuffle, *views) for scale in resolution_scales} if asked else {}
+            for asked, views in zip((True, True, self.validation), lists, strict=True)
         )
         self._plan_images()
 

@@ -64,7 +64,7 @@ def test_the_last_save_is_the_model_that_shows_the_validation_photos_best(kept, 
     assert names[-2:] == best["views"] and len(names) == len(set(names)) == 17
     assert len(loaded.getTrainCameras()) == 12 and len(loaded.getTestCameras()) == 3
     elsewhere = load_saved(GroupParams(**read_stored_options(out) | {"other_scene": "scene"}), 170)
-    assert len(elsewhere.getTrainCameras()) == 14 and not elsewhere.validation_cameras[1.0]
+    assert len(elsewhere.getTrainCameras()) == 14 and not elsewhere.validation_cameras
 
 
 def test_the_validation_and_the_test_photos_teach_nothing(kept, scene, tmp_path):

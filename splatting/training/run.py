@@ -228,7 +228,7 @@ class Run:
             sort_rows(self.gaussians)
         if self.sky:
             self.gaussians.far = self.sky.rows
-        if validation := self.scene.validation_cameras[1.0]:
+        if validation := self.scene.validation_cameras.get(1.0):
             checks.check_keep_best(self.dataset, self.opt, self.group.several)
             self.best = BestModel(validation)
             if capture:

@@ -24,7 +24,7 @@ from splatting.training.robust_mask import FEW, FOLDER, MASKED, MOST_PHOTOS, odd
 from splatting.training.run import Run
 from utils.system_utils import UserError, atomic_write
 
-_LEARNT = 1000  # iterations, before which much is not explained
+_LEARNT = 1000  # iterations, until which much is not explained; advice trains so many, and searches itself
 _ENOUGH = 100  # if so many views have no pixel that counts, and no view has one, the masks are wrong
 _ALMOST_NOTHING = 1e-3  # share of the pixels
 _HINT = "is white masked in them (--invert_masks), or do they belong to another scene?"
@@ -118,7 +118,7 @@ class OddPhotos(Observer):
     @staticmethod
     def serves(run: Run) -> bool:
         """Whether the model is trained and photos are few enough, and no budget counts the time."""
-        long, few = run.opt.iterations >= _LEARNT, len(run.scene.getTrainCameras()) <= MOST_PHOTOS
+        long, few = run.opt.iterations > _LEARNT, len(run.scene.getTrainCameras()) <= MOST_PHOTOS
         return long and few and not (run.opt.time_budget or run.group.several or run.robust_mask or run.exposes)
 
     def ended(self, error: Error) -> None:
