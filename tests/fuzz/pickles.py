@@ -23,8 +23,7 @@ _PLAIN = (type(None), bool, int, float, str, torch.Tensor, torch.nn.Parameter)
 class Hostile:
     """Both doors for such files: a sentence that shows nothing of the file, or plain values."""
 
-    # Bytes and seconds of the processor that a case may take: it takes 1.2 where cores are slow, and 2.5 beside others.
-    most, seconds = 200 << 20, 5.0
+    most, seconds = 200 << 20, 2.0  # bytes and seconds of the processor that a case may take
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / "hostile.pth"
