@@ -4,16 +4,7 @@ import argparse
 import os
 from collections.abc import Collection
 
-from arguments.param_group import (
-    CFG_ARGS,
-    GroupParams,
-    Option,
-    OptionTable,
-    above,
-    at_least,
-    one_of,
-    within,
-)
+from arguments.param_group import CFG_ARGS, GroupParams, Option, OptionTable, above, at_least, one_of, within
 from arguments.strategies import STRATEGY_OPTIONS
 from splatting.files.json_files import MODEL_JSON
 from utils.system_utils import UserError

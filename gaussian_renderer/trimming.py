@@ -129,11 +129,7 @@ def trim(
 
 @torch.no_grad()
 def change_on_views(
-    before: GaussianModel,
-    after: GaussianModel,
-    cameras: Sequence[Camera],
-    views: ScoredViews,
-    scored: bool,
+    before: GaussianModel, after: GaussianModel, cameras: Sequence[Camera], views: ScoredViews, scored: bool
 ) -> dict[str, float]:
     """Difference between the renders of two models: `largest`, of a value in [0, 1].
 

@@ -352,13 +352,7 @@ REACH = [
     ("budget", 200, LATE, 1, "160 is not before the end; give --densify_from_iter 8 --densify_until_iter 80"),
     ("budget", 500, LATE, 81, "give --densify_from_iter 84 --densify_until_iter 120"),
     # 300 Gaussians double in 20, 40, 60 and 80, but not in 100.
-    (
-        "budget",
-        10_000,
-        WINDOW | {"densify_until_iter": 100},
-        1,
-        "gets to 4,800 Gaussians, not to 10,000, as they at",
-    ),
+    ("budget", 10_000, WINDOW | {"densify_until_iter": 100}, 1, "gets to 4,800 Gaussians, not to 10,000, as they at"),
     ("mcmc", 200, WINDOW, 1, "it removes none; --strategy budget does"),
     ("mcmc", 1518, MCMC, 1, None),
     ("mcmc", 1519, MCMC, 1, "mcmc gets to 1,518 Gaussians, not to 1,519, as --mcmc_growth 0.5 adds too few each time"),

@@ -242,8 +242,7 @@ def test_published_scenes_add_up_to_the_published_means():
 
 
 @pytest.mark.parametrize(
-    "change",
-    [{}, {"test_sizes": [[400, 400]]}, {"views": {"test": 25, "train": 100}}, {"options": ["--eval"]}],
+    "change", [{}, {"test_sizes": [[400, 400]]}, {"views": {"test": 25, "train": 100}}, {"options": ["--eval"]}]
 )
 def test_synthetic_scenes_compare_at_full_size_over_white_only(change):
     of_table = {"options": ["--eval", "-w"], "test_sizes": [[800, 800]], "views": {"test": 200, "train": 100}}

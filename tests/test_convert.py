@@ -97,7 +97,7 @@ def _check_places(model: pycolmap.Reconstruction, names: list[str], camera: str)
 
 def test_what_is_written(converted):
     assert sorted(path.name for path in converted.iterdir()) == [
-        *("convert_report.json", "distorted", "images", "images_2", "images_4", "images_8", "input", "sparse"),
+        *("convert_report.json", "distorted", "images", "images_2", "images_4", "images_8", "input", "sparse")
     ]
     content = json.loads((converted / "convert_report.json").read_text())
     assert list(content) == sorted(content)

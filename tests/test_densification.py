@@ -245,11 +245,7 @@ def test_the_cap_takes_the_largest_gradients_ties_by_index():
 
 
 @settings(max_examples=25, deadline=None)
-@given(
-    count=st.integers(1, 30),
-    cap=st.integers(1, 50),
-    seed=st.integers(0, 2**16),
-)
+@given(count=st.integers(1, 30), cap=st.integers(1, 50), seed=st.integers(0, 2**16))
 def test_the_cap_is_never_passed_and_reached_when_it_can(count, cap, seed):
     generator = torch.Generator().manual_seed(seed)
     scales = (LIMIT * (0.5 + torch.rand(count, generator=generator))).tolist()

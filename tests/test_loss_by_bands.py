@@ -13,13 +13,7 @@ from torch import Tensor
 from splatting.distributed.ranks import Ranks, ranks
 from splatting.distributed.rendering import bands
 from splatting.distributed.rendering.band import surroundings, whole_image
-from splatting.distributed.rendering.bands import (
-    Bands,
-    KnownBands,
-    find_bands,
-    row_processed,
-    row_widths,
-)
+from splatting.distributed.rendering.bands import Bands, KnownBands, find_bands, row_processed, row_widths
 
 # Height, width, and the rows of tiles where bands begin and the last one ends.
 CASES = [

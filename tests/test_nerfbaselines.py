@@ -152,10 +152,7 @@ def _projected(lens, points):
         scale = 1 + sum(k * r2 ** (i + 1) for i, k in enumerate(lens.radial))
         scale = scale / (1 + sum(k * r2 ** (i + 1) for i, k in enumerate(lens.divisor)))
         p1, p2 = lens.tangential
-        x, y = (
-            x * scale + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * scale + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
-        )
+        x, y = (x * scale + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * scale + 2 * p2 * x * y + p1 * (r2 + 2 * y * y))
     (fx, fy), (cx, cy) = lens.focal, lens.center
     return np.stack([fx * x + cx + 0.5, fy * y + cy + 0.5], -1)
 

@@ -10,14 +10,7 @@ import pytest
 import torch
 
 from utils import system_utils
-from utils.system_utils import (
-    UserError,
-    atomic_write,
-    mkdir_p,
-    run_cli,
-    saved_iterations,
-    searchForMaxIteration,
-)
+from utils.system_utils import UserError, atomic_write, mkdir_p, run_cli, saved_iterations, searchForMaxIteration
 
 ROOT = Path(__file__).resolve().parents[1]
 

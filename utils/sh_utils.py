@@ -43,13 +43,7 @@ def sh_basis(deg: int, dirs: Tensor) -> Tensor:
     if deg >= 1:
         terms += [-C1 * y, C1 * z, -C1 * x]
     if deg >= 2:
-        terms += [
-            C2[0] * x * y,
-            C2[1] * y * z,
-            C2[2] * (2 * zz - xx - yy),
-            C2[3] * x * z,
-            C2[4] * (xx - yy),
-        ]
+        terms += [C2[0] * x * y, C2[1] * y * z, C2[2] * (2 * zz - xx - yy), C2[3] * x * z, C2[4] * (xx - yy)]
     if deg >= 3:
         terms += [
             C3[0] * y * (3 * xx - yy),

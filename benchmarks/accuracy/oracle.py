@@ -26,11 +26,7 @@ from benchmarks.workloads.splat_scenes import KINDS
 from benchmarks.workloads.stability_cases import Problem, all_stiff
 from utils.system_utils import run_cli
 
-TIMED_SIZES = {
-    "ordinary": (200_000, 1200, 900),
-    "needles": (20_000, 1200, 900),
-    "huge and tiny": (3_000, 1200, 900),
-}
+TIMED_SIZES = {"ordinary": (200_000, 1200, 900), "needles": (20_000, 1200, 900), "huge and tiny": (3_000, 1200, 900)}
 CPU_REPEATS = 5
 # Allowed bound on the error of CUDA float over the error of CPU float, both measured against CPU double.
 MOST = 3.0

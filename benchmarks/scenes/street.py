@@ -16,17 +16,7 @@ import numpy as np
 from benchmarks.harness.measuring import describe, print_table
 from benchmarks.scenes.training import run, seconds_of
 from splatting.demo.make_scene import write_scene
-from splatting.demo.objects import (
-    Box,
-    Ground,
-    Sphere,
-    Thing,
-    backdrop_texture,
-    ground_texture,
-    marble,
-    panels,
-    stripes,
-)
+from splatting.demo.objects import Box, Ground, Sphere, Thing, backdrop_texture, ground_texture, marble, panels, stripes
 from splatting.demo.tracer import View, look_at
 from utils.system_utils import compute_device, run_cli
 

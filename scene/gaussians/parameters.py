@@ -336,8 +336,4 @@ _read_statistics = attrgetter(*NAMES)
 
 # Read once, so that a getter is told from one that replaces it, in a subclass or in this class.
 _GEOMETRY = GaussianParameters.get_opacity, GaussianParameters.get_scaling, GaussianParameters.get_rotation
-_FEATURES = (
-    GaussianParameters.get_features,
-    GaussianParameters.get_features_dc,
-    GaussianParameters.get_features_rest,
-)
+_FEATURES = (GaussianParameters.get_features, GaussianParameters.get_features_dc, GaussianParameters.get_features_rest)

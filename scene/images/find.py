@@ -61,12 +61,7 @@ def _folded(name: str) -> str:
 
 
 def find_images(
-    folder: Path,
-    names: Sequence[str],
-    listed_by: str,
-    remedy: str,
-    suffixes: Sequence[str] = (),
-    kind: str = "photos",
+    folder: Path, names: Sequence[str], listed_by: str, remedy: str, suffixes: Sequence[str] = (), kind: str = "photos"
 ) -> list[Path]:
     """The files of photos by their names in a folder. A message says when some were found by a merely similar name.
 

@@ -64,12 +64,7 @@ def read_colmap(
 
 
 def colmap_camera(
-    photo: Image,
-    camera: Camera,
-    path: Path,
-    mask: Mask | None = None,
-    ignore_alpha: bool = False,
-    native: bool = False,
+    photo: Image, camera: Camera, path: Path, mask: Mask | None = None, ignore_alpha: bool = False, native: bool = False
 ) -> CameraInfo:
     """The view of a photo that COLMAP registered. native: as for `camera_info`."""
     lens = Lens(camera.model, tuple(map(float, camera.params)), camera.width, camera.height)

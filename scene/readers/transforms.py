@@ -15,14 +15,7 @@ from scene.images.masks import NO_MASKS, Mask, MaskOptions, find_masks
 from scene.readers.info import CameraInfo, SceneInfo, held_out, split_by_order
 from scene.readers.pinholes import camera_info, finished
 from scene.readers.point_cloud import read_point_cloud
-from scene.readers.start_cloud import (
-    OWN_POINTS,
-    StartCloud,
-    StartOptions,
-    random_in_cube,
-    random_in_frusta,
-    scene_info,
-)
+from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, random_in_cube, random_in_frusta, scene_info
 from splatting.files.image_files import SUFFIXES
 from splatting.files.plain_files import plain_text, relative_to
 from utils.graphics_utils import fov2focal

@@ -29,11 +29,7 @@ COLORS = {"test": "#0072B2", "train": "#D55E00"}  # told apart by the colour-bli
 STYLES = ("-", "-.", ":")
 MARKERS = "osD"  # with ten colours they tell thirty sets apart
 PEER_MARKERS = "xs^vDP*"
-LABELS = {
-    "seconds": "seconds of training",
-    "gaussians": "Gaussians trained",
-    "ply_mb": "megabytes of the PLY",
-}
+LABELS = {"seconds": "seconds of training", "gaussians": "Gaussians trained", "ply_mb": "megabytes of the PLY"}
 PANEL, DPI, FONT = (5.6, 4.2), 140, 12  # of a report's figure: inches, and letters to be read at half the size, too
 DIFFER = 1.02  # times the lowest mean of a cost; where none has more, their points hide each other
 LEGEND = 72  # letters in a line of a legend

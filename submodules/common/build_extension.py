@@ -60,10 +60,7 @@ def extension_options(roots: dict[str, Path]) -> dict[str, Any]:
         "package_dir": {package: os.path.relpath(root / package, here) for package, root in roots.items()},
         # The real source lists are found by the builder; setuptools only needs to know that there are libraries.
         "ext_modules": [Extension(f"{package}._backend", sources=[]) for package in roots],
-        "cmdclass": {
-            "build_ext": type("BuildBackends", (BuildBackends,), {"roots": roots}),
-            "build_py": BuildModules,
-        },
+        "cmdclass": {"build_ext": type("BuildBackends", (BuildBackends,), {"roots": roots}), "build_py": BuildModules},
         "options": {"bdist_wheel": {"py_limited_api": "cp310"}},
         "zip_safe": False,
     }

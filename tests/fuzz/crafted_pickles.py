@@ -266,7 +266,4 @@ FILES: dict[str, Callable[[random.Random], bytes]] = {
     "a short file": lambda rng: old_format(tensor())[: -rng.randint(1, 200)],
 }  # fmt: skip
 
-CRAFTED = {
-    **{what: lambda rng, part=part: _file(rng, part(rng)) for what, part in PARTS.items()},
-    **FILES,
-}
+CRAFTED = {**{what: lambda rng, part=part: _file(rng, part(rng)) for what, part in PARTS.items()}, **FILES}

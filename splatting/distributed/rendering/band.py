@@ -110,11 +110,7 @@ def gradient_rows(
 
 
 def camera_gradient(
-    ranks: Ranks,
-    scene: Scene,
-    source: Sequence[Tensor],
-    absolute: bool = False,
-    blocks: Sequence[int] | None = None,
+    ranks: Ranks, scene: Scene, source: Sequence[Tensor], absolute: bool = False, blocks: Sequence[int] | None = None
 ) -> Tensor:
     """Gradients of the camera's numbers (diff_gaussian_rasterization/camera.py) by the Gaussians of all ranks, float64.
 

@@ -40,11 +40,7 @@ def _mean(errors: Tensor) -> Tensor:
 
 
 def error_scores(
-    gaussians: GaussianModel,
-    pipe: argparse.Namespace,
-    exposures: bool,
-    cameras: Sequence[Camera],
-    background: Tensor,
+    gaussians: GaussianModel, pipe: argparse.Namespace, exposures: bool, cameras: Sequence[Camera], background: Tensor
 ) -> Tensor:
     """Sum over the pixels of the error times each Gaussian's blending weight, over views: (N,) float64.
 

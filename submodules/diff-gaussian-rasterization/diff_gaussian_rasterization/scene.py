@@ -137,11 +137,7 @@ def camera_arguments(
 
 
 def draw(
-    scene: Scene,
-    background: Tensor,
-    want_inverse_depth: bool = False,
-    train: bool = True,
-    awake: Tensor | None = None,
+    scene: Scene, background: Tensor, want_inverse_depth: bool = False, train: bool = True, awake: Tensor | None = None
 ) -> Drawing:
     """Call the operator `rasterize`. train: a backward will follow. awake: of `wake_`, whose sleepers are left out."""
     options = want_inverse_depth, train, False, awake
