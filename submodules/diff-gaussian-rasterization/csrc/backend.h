@@ -110,5 +110,6 @@ void rows_vjp_step(const Queue&, const Scene<float>&, const SplatRows<float>&, c
 void camera_vjp(const Queue&, const Scene<float>&, const SplatRows<float>&, double* sums);
 void sum_blocks(const Queue&, int64_t blocks, int64_t numbers, const double* sums, double* out);
 }  // namespace cuda
+using cuda::observe, cuda::displace, cuda::list_records;
 
 }  // namespace gs

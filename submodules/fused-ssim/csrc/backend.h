@@ -7,8 +7,8 @@
 
 namespace gs {
 
-void composite_cpu(const Composite&, const Executor&);  // compiled once: see gs/rounded.h
-void composite_cuda(const Composite&, const Queue&);
+void composite(const Composite&, const Executor&);  // compiled once: see gs/rounded.h
+void composite(const Composite&, const Queue&);
 
 void l1_ssim_cuda(const L1SsimCuda&, const Queue&);
 void l1_ssim_means_cuda(const L1SsimCuda&, const Queue&);  // from the sums of all bands

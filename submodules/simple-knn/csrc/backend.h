@@ -11,9 +11,9 @@ namespace gs {
 // where there is none. A point with a coordinate that is not finite has no neighbours and is no neighbour.
 // points: n x 3, contiguous. T: float or double.
 template <class T>
-void mean_distance2_cpu(const T* points, int64_t n, T* out, const Executor& executor);
+void mean_distance2(const T* points, int64_t n, T* out, const Executor& executor);
 // n < 2^31; points and out on the device. Waits for the stream once.
 template <class T>
-void mean_distance2_cuda(const T* points, int64_t n, T* out, const Queue& queue);
+void mean_distance2(const T* points, int64_t n, T* out, const Queue& queue);
 
 }  // namespace gs

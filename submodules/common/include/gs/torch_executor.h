@@ -1,11 +1,16 @@
 #pragma once
-// An Executor over torch's intra-op pool, which torch.set_num_threads sizes. For csrc/torch alone.
+// An Executor over torch's intra-op pool, which torch.set_num_threads sizes; and the choice between it and a Queue. For
+// csrc/torch alone.
 #include <torch/csrc/stable/ops.h>
 
 #include <atomic>
 #include <exception>
 
 #include "gs/parallel.h"
+#include "gs/torch_tensor.h"
+#ifdef GS_CUDA
+#include "gs/torch_queue.h"
+#endif
 
 namespace gs {
 
@@ -23,6 +28,18 @@ inline Executor torch_executor() {
             });
             if (error) std::rethrow_exception(error);
           }};
+}
+
+// Calls `run` with what a backend needs where a tensor is: a Queue on a GPU, an Executor elsewhere.
+template <class Run>
+void run_at(const Tensor& like, const Run& run, [[maybe_unused]] const int32_t* halted = nullptr) {
+#ifdef GS_CUDA
+  if (like.is_cuda()) {
+    TorchQueue queue(like.device(), halted);
+    return run(queue.queue());
+  }
+#endif
+  run(torch_executor());
 }
 
 }  // namespace gs

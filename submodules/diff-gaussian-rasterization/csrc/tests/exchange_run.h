@@ -35,7 +35,7 @@ struct SomeRecords {
 };
 template <class Where>
 SomeRecords records(const Where& where, const SomeRects& rects, int64_t room) {
-  using gs::list_records, gs::cuda::list_records;
+  using gs::list_records;
   const gs::RecordInput in = rects.input();
   SomeRecords out{std::vector<int32_t>((in.bands + 1) * gs::record_blocks(in.count), -77),
                   std::vector<int32_t>(room, -77), std::vector<int64_t>(room, -77)};

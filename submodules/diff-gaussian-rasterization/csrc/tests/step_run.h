@@ -87,7 +87,7 @@ std::unique_ptr<Rendered> render_with(const Where& where, const gs::Scene<float>
 template <class Where, class Fill>
 void step_plainly(const Where& where, Stepping& s, const StepCase& how, const Rendered& r, int64_t iteration,
                   const Fill& fill) {
-  using gs::observe, gs::cuda::observe, gs::cuda::adam, gs::cuda::sparse_adam;
+  using gs::observe, gs::cuda::adam, gs::cuda::sparse_adam;
   using gs::cuda::penalise;
   using gs::GS_ISA::adam, gs::GS_ISA::penalise, gs::GS_ISA::sparse_adam;
   GradientsInMemory<float> gradient(s.values.count);

@@ -380,7 +380,7 @@ void take_step(const Where& where, Stepping& s, const StepCase& how, const std::
   });
   gs::ObserveInput lengths = s.observe(how, radii.data(), nullptr);
   lengths.lengths = gradients.data();
-  using gs::observe, gs::cuda::observe;
+  using gs::observe;
   if (how.observed) observe(where, lengths);
 }
 

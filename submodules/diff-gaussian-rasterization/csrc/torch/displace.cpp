@@ -33,13 +33,7 @@ void displace_op(Tensor& means, const Tensor& log_scales, const Tensor& rotation
     in.items = read<int64_t>(one);
   in.seed = uint64_t(seed), in.stream = uint32_t(stream), in.iteration = uint32_t(iteration);
   in.draw = uint32_t(draw), in.first = first, in.stopped = stopped ? read<int64_t>(*stopped) : nullptr;
-#ifdef GS_CUDA
-  if (means.is_cuda()) {
-    gs::TorchQueue queue(device, halted());
-    return gs::cuda::displace(queue.queue(), in);
-  }
-#endif
-  gs::displace(gs::torch_executor(), in);
+  run_at(means, [&](const auto& where) { gs::displace(where, in); }, halted());
 }
 
 }  // namespace

@@ -37,14 +37,7 @@ std::tuple<Tensor, Tensor, Tensor> list_records_op(const Tensor& rects, const Te
   const gs::RecordInput in{boxes.size(0), int(bands.size(1)), read<int32_t>(boxes), read<int32_t>(tiles),
                            read<int32_t>(bands)};
   const gs::RecordLists to{room, write<int32_t>(counts), write<int64_t>(gaussians), write<int32_t>(places)};
-#ifdef GS_CUDA
-  if (rects.is_cuda()) {
-    gs::TorchQueue queue(device);
-    gs::cuda::list_records(queue.queue(), in, to);
-    return {counts, gaussians, places};
-  }
-#endif
-  gs::list_records(gs::torch_executor(), in, to);
+  run_at(rects, [&](const auto& where) { gs::list_records(where, in, to); });
   return {counts, gaussians, places};
 }
 

@@ -108,13 +108,7 @@ void observe_op(Tensor& max_radii, Tensor& gradient_sums, Tensor& views, const T
                             read<int32_t>(pixels),
                             lengths ? nullptr : read<float>(rows),
                             lengths ? read<float>(rows) : nullptr};
-#ifdef GS_CUDA
-  if (radii.is_cuda()) {
-    gs::TorchQueue queue(radii.device(), halted());
-    return gs::cuda::observe(queue.queue(), in);
-  }
-#endif
-  gs::observe(gs::torch_executor(), in);
+  run_at(radii, [&](const auto& where) { gs::observe(where, in); }, halted());
 }
 
 void penalise_op(const Tensor& logits, const Tensor& log_scales, Tensor& logit_gradients, Tensor& log_scale_gradients,

@@ -7,9 +7,6 @@
 #include "gs/torch_executor.h"
 #include "gs/torch_operators.h"
 #include "gs/torch_tensor.h"
-#ifdef GS_CUDA
-#include "gs/torch_queue.h"
-#endif
 
 namespace gs::ops {
 

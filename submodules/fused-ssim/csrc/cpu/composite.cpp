@@ -5,7 +5,7 @@
 
 namespace gs {
 
-void composite_cpu(const Composite& args, const Executor& executor) {
+void composite(const Composite& args, const Executor& executor) {
   constexpr int64_t kGrain = 1 << 15;
   const uint8_t* alpha = args.picture + 3 * args.pixels;
   executor.run(args.pixels, kGrain, [&](int64_t begin, int64_t end) {

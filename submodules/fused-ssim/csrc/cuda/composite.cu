@@ -23,7 +23,7 @@ __global__ void __launch_bounds__(kThreads) composite_kernel(const int32_t* halt
 
 }  // namespace
 
-void composite_cuda(const Composite& args, const Queue& queue) {
+void composite(const Composite& args, const Queue& queue) {
   if (!args.pixels) return;
   const int64_t blocks = (args.pixels + kThreads - 1) / kThreads;
   launch(queue, "composite", composite_kernel, unsigned(blocks), kThreads, args);

@@ -108,9 +108,9 @@ void check_composite(int64_t pixels) {
   for (uint8_t& x : picture) x = uint8_t(byte(random));
   const float background[3] = {0.2f, 0, 1};
   std::vector<float> wanted(3 * pixels), got(3 * pixels);
-  gs::composite_cpu({picture.data(), background, pixels, wanted.data()}, gs::serial_executor());
+  gs::composite({picture.data(), background, pixels, wanted.data()}, gs::serial_executor());
   gs::emulation::Memory memory;
-  gs::composite_cuda({picture.data(), background, pixels, got.data()}, memory.queue());
+  gs::composite({picture.data(), background, pixels, got.data()}, memory.queue());
   CHECK(got == wanted);
 }
 
@@ -130,7 +130,7 @@ void check_halted() {
     queue.halted = &halted;
     gs::l1_ssim_cuda({images, false, &l1, &ssim, maps.data(), &loss, 0.8f, 0.2f}, queue);
     gs::l1_ssim_vjp_cuda({images, maps.data(), &one, &one, vjp.data(), 1, 1}, queue);
-    gs::composite_cuda({picture.data(), background, height * width, composited.data()}, queue);
+    gs::composite({picture.data(), background, height * width, composited.data()}, queue);
     for (const float out : {l1, ssim, loss, maps[0], vjp[0], composited[0]}) CHECK((out == -1) == (halted == 1));
   }
 }

@@ -7,10 +7,6 @@
 #include "gs/torch_operators.h"
 #include "gs/torch_tensor.h"
 
-#ifdef GS_CUDA
-#include "gs/torch_queue.h"
-#endif
-
 namespace gs::ops {
 namespace {
 
@@ -281,14 +277,7 @@ Tensor composite(const Tensor& picture_, const Tensor& background_) {
   Tensor out = empty({3, picture.size(1), picture.size(2)}, background);
   const gs::Composite args{read<uint8_t>(picture), read<float>(background), picture.size(1) * picture.size(2),
                            write<float>(out)};
-#ifdef GS_CUDA
-  if (picture.is_cuda()) {
-    gs::TorchQueue queue(picture.device());
-    gs::composite_cuda(args, queue.queue());
-    return out;
-  }
-#endif
-  gs::composite_cpu(args, gs::torch_executor());
+  run_at(picture, [&](const auto& where) { gs::composite(args, where); });
   return out;
 }
 

@@ -107,7 +107,7 @@ class KdTree {
 }  // namespace
 
 template <class T>
-void mean_distance2_cpu(const T* points, int64_t n, T* out, const Executor& executor) {
+void mean_distance2(const T* points, int64_t n, T* out, const Executor& executor) {
   std::vector<Point<T>> finite;
   finite.reserve(n);
   for (int64_t i = 0; i < n; ++i) {
@@ -122,7 +122,7 @@ void mean_distance2_cpu(const T* points, int64_t n, T* out, const Executor& exec
   });
 }
 
-template void mean_distance2_cpu(const float*, int64_t, float*, const Executor&);
-template void mean_distance2_cpu(const double*, int64_t, double*, const Executor&);
+template void mean_distance2(const float*, int64_t, float*, const Executor&);
+template void mean_distance2(const double*, int64_t, double*, const Executor&);
 
 }  // namespace gs

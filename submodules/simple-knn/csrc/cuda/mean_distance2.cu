@@ -140,7 +140,7 @@ void sort_into_tree(const T* points, int64_t n, cub::DoubleBuffer<int32_t>& orde
 }  // namespace
 
 template <class T>
-void mean_distance2_cuda(const T* points, int64_t n_all, T* out, const Queue& queue) {
+void mean_distance2(const T* points, int64_t n_all, T* out, const Queue& queue) {
   if (n_all == 0) return;
   const auto stream = static_cast<cudaStream_t>(queue.stream);
   GS_CUDA_CHECK(cudaMemsetAsync(out, 0, n_all * sizeof(T), stream));  // the result of points that are not finite
@@ -166,7 +166,7 @@ void mean_distance2_cuda(const T* points, int64_t n_all, T* out, const Queue& qu
   check_launch("search");
 }
 
-template void mean_distance2_cuda(const float*, int64_t, float*, const Queue&);
-template void mean_distance2_cuda(const double*, int64_t, double*, const Queue&);
+template void mean_distance2(const float*, int64_t, float*, const Queue&);
+template void mean_distance2(const double*, int64_t, double*, const Queue&);
 
 }  // namespace gs

@@ -12,12 +12,12 @@ template <class T>
 void check_cloud(const std::vector<T>& points) {
   const int64_t n = points.size() / 3;
   std::vector<T> wanted(n), got(n);
-  gs::mean_distance2_cpu(points.data(), n, wanted.data(), gs::serial_executor());
+  gs::mean_distance2(points.data(), n, wanted.data(), gs::serial_executor());
   for (const auto order : gs::emulation::kOrders) {
     gs::emulation::order = order;
     gs::emulation::Memory memory;
     std::fill(got.begin(), got.end(), T(-1));
-    gs::mean_distance2_cuda(points.data(), n, got.data(), memory.queue());
+    gs::mean_distance2(points.data(), n, got.data(), memory.queue());
     CHECK(got == wanted);
   }
 }

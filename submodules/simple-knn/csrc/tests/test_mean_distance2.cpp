@@ -29,8 +29,8 @@ template <class T>
 void check_cloud(const std::vector<T>& points) {
   const int64_t n = points.size() / 3;
   std::vector<T> serial(n), threaded(n);
-  gs::mean_distance2_cpu(points.data(), n, serial.data(), gs::serial_executor());
-  gs::mean_distance2_cpu(points.data(), n, threaded.data(), gs::three_threads());
+  gs::mean_distance2(points.data(), n, serial.data(), gs::serial_executor());
+  gs::mean_distance2(points.data(), n, threaded.data(), gs::three_threads());
   CHECK(serial == threaded);
   for (int64_t i = 0; i < n; ++i) {
     const double wanted = all_pairs(points, i);

@@ -6,27 +6,16 @@
 #include "gs/torch_operators.h"
 #include "gs/torch_tensor.h"
 
-#ifdef GS_CUDA
-#include "gs/torch_queue.h"
-#endif
-
 namespace gs {
 
 namespace {
 
 template <class T>
 void fill_mean_distance2(const Tensor& rows, const Tensor& out) {
-  const T* points = read<T>(rows);
-#ifdef GS_CUDA
-  if (rows.is_cuda()) {
-    TorchQueue queue(rows.device());
-    return mean_distance2_cuda(points, rows.size(0), write<T>(out), queue.queue());
-  }
-#endif
-  mean_distance2_cpu(points, rows.size(0), write<T>(out), torch_executor());
+  run_at(rows, [&](const auto& where) { mean_distance2(read<T>(rows), rows.size(0), write<T>(out), where); });
 }
 
-Tensor mean_distance2(const Tensor& points) {
+Tensor mean_distance2_op(const Tensor& points) {
   check_given(points, "points");
   GS_CHECK(points.dim() == 2 && points.size(1) == 3, "points must be (N, 3), got ", points.sizes());
   const ScalarType type = points.scalar_type();
@@ -40,6 +29,6 @@ Tensor mean_distance2(const Tensor& points) {
 
 }  // namespace
 
-GS_OPERATORS(simple_knn, m) { m.define("mean_distance2(Tensor points) -> Tensor", TORCH_BOX(&mean_distance2)); }
+GS_OPERATORS(simple_knn, m) { m.define("mean_distance2(Tensor points) -> Tensor", TORCH_BOX(&mean_distance2_op)); }
 
 }  // namespace gs
