@@ -1,7 +1,5 @@
 """fused_ssim against float64 convolutions, scikit-image, finite differences, the CPU and itself."""
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from fused_ssim import allowed_padding, fused_l1_ssim, fused_photometric_loss, fused_ssim
@@ -14,16 +12,8 @@ EPS = {torch.float32: 2**-24, torch.float64: 2**-53}
 LARGEST_SLOPE = 2 / 0.03**2  # of SSIM over a covariance; multiplies an error of the inputs or of the oracle
 both_dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 on_a_gpu = pytest.mark.parametrize("device", [pytest.param("cuda", marks=GPU_MARKS)])
+pytestmark = pytest.mark.usefixtures("one_thread")
 both_paddings = pytest.mark.parametrize("padding", allowed_padding)
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Use one thread: on images this small, threads mostly wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def image_pair(name: str, shape: tuple[int, ...] = (3, 40, 47), dtype: torch.dtype = torch.float64) -> list[Tensor]:

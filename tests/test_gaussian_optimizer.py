@@ -2,6 +2,8 @@
 
 import copy
 import weakref
+from itertools import chain, repeat
+from unittest.mock import DEFAULT, Mock
 
 import pytest
 import torch
@@ -133,15 +135,8 @@ def test_groups_are_the_references():
 
 
 def _failing(function, call: int):
-    calls = []
-
-    def fails(*args: object, **kwargs: object) -> torch.Tensor:
-        calls.append(1)
-        if len(calls) == call:
-            raise MemoryError
-        return function(*args, **kwargs)
-
-    return fails
+    """Wrap `function` so that one call raises."""
+    return Mock(wraps=function, side_effect=chain(repeat(DEFAULT, call - 1), [MemoryError], repeat(DEFAULT)))
 
 
 @pytest.mark.parametrize("call", [1, 2, 3, 9, 18])

@@ -2,7 +2,9 @@
 
 import re
 import sys
+from itertools import chain, repeat
 from pathlib import Path
+from unittest.mock import DEFAULT, Mock
 
 import pytest
 import torch
@@ -99,15 +101,7 @@ def _train(scene: Path, out: Path, *more: object) -> bytes:
 
 def _failing(function, call: int, error: Exception):
     """Wrap `function` so that one call raises."""
-    calls = []
-
-    def fails(*args: object, **kwargs: object) -> object:
-        calls.append(1)
-        if len(calls) == call:
-            raise error
-        return function(*args, **kwargs)
-
-    return fails
+    return Mock(wraps=function, side_effect=chain(repeat(DEFAULT, call - 1), [error], repeat(DEFAULT)))
 
 
 @needs_fused_step

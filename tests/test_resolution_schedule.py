@@ -8,7 +8,7 @@ import pytest
 import torch
 from gaussians import pipeline
 from PIL import Image
-from trainings import train_on
+from trainings import before_steps, train_on
 
 from arguments import ModelParams
 from gaussian_renderer import render
@@ -18,7 +18,6 @@ from scene.gaussian_model import GaussianModel
 from scene.images.sizes import shrink_mask, shrink_photo, shrink_values
 from scene.images.store import InMemory
 from scene.readers.info import CameraInfo
-from splatting.training import loop
 from splatting.training.resolution import Resolution, smaller
 from splatting.training.schedule import PYRAMID, Schedule
 
@@ -167,15 +166,8 @@ def _train(scene: Path, out: Path, *more: object) -> dict[int, bytes]:
 
 
 def test_a_coarse_to_fine_training_is_the_same_by_every_step_and_resumed(colmap_scene, tmp_path, monkeypatch):
-    sizes, chosen = [], loop.step_taker
-
-    def taker(run):
-        taken = chosen(run)
-        take = taken.take
-        taken.take = lambda step, tell: (sizes.append((step.iteration, step.camera.image_width)), take(step, tell))
-        return taken
-
-    monkeypatch.setattr(loop, "step_taker", taker)
+    sizes = []
+    before_steps(monkeypatch, lambda step: sizes.append((step.iteration, step.camera.image_width)))
     coarse = "--resolution_schedule", "pyramid"
     saved = _train(colmap_scene, tmp_path / "a", *coarse, "--checkpoint_iterations", 9)
     widths = [width for _, width in sizes]

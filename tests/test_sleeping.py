@@ -18,7 +18,7 @@ from gaussians import needs_fused_step
 from processes import in_ranks
 from rasterizer_tools import BOTH_AND_GPU, GPU_MARKS
 from step_ways import WAYS, Immediate, take_as  # noqa: F401  (a fixture)
-from trainings import ITERATIONS, OPTIONS, differences, narrow_scene, trained
+from trainings import ITERATIONS, OPTIONS, differences, narrow_scene, trained, with_clusters
 
 import train
 from scene.gaussian_model import GaussianModel
@@ -257,15 +257,7 @@ def test_steps_with_sleep_are_those_of_dense_adam_in_double():
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of a room of clusters, of which a view sees a part."""
-    return _with_clusters(narrow_scene(tmp_path_factory.mktemp("sleeping") / "scene"))
-
-
-def _with_clusters(folder: Path) -> Path:
-    rng = np.random.default_rng(0)
-    centers = np.repeat(rng.uniform(-8, 8, (30, 3)), 200, 0)
-    points = np.concatenate((0.5 * rng.normal(size=(1000, 3)), centers + 0.1 * rng.normal(size=centers.shape)))
-    write_point_cloud(folder / "points.ply", points, rng.integers(0, 255, points.shape))
-    return folder
+    return with_clusters(narrow_scene(tmp_path_factory.mktemp("sleeping") / "scene"), 1000, 30, 200)
 
 
 def _trained(scene: Path, out: Path, *options: object) -> dict:
@@ -310,7 +302,7 @@ def test_fast_steps(scene, tmp_path, take_as, plain, shares, way, name):  # noqa
 
 
 def test_fast_steps_with_a_lens(tmp_path, take_as, shares):  # noqa: F811
-    scene = _with_clusters(narrow_scene(tmp_path / "scene", "OPENCV", (-0.2, 0.05, 0.001, -0.002)))
+    scene = with_clusters(narrow_scene(tmp_path / "scene", "OPENCV", (-0.2, 0.05, 0.001, -0.002)), 1000, 30, 200)
     expected = _trained(scene, tmp_path / "plain", "--plain_step")
     assert min(shares) < 0.9
     shares.clear()

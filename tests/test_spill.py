@@ -9,18 +9,16 @@ from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 from diff_gaussian_rasterization.optim import adam_
 from gaussians import model, needs_59_values, options
 from processes import in_ranks
 from rasterizer_tools import GPU_MARKS
-from trainings import ITERATIONS, OPTIONS, before_steps, differences, narrow_scene, train_on, trained
+from trainings import ITERATIONS, OPTIONS, before_steps, differences, narrow_scene, train_on, trained, with_clusters
 
 from scene.gaussians import spilled
 from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
-from scene.readers.point_cloud import write_point_cloud
 from splatting.distributed.ranks import ranks
 from splatting.training import gpu_memory, memory_estimate, run
 from splatting.training.gpu_memory import GpuMemory, reads_on_host
@@ -162,17 +160,7 @@ def test_the_cpu_has_one_memory():
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return _with_points(tmp_path_factory.mktemp("spill"), 1000)
-
-
-def _with_points(folder: Path, count: int) -> Path:
-    """A scene of clusters, of which a view sees a part."""
-    narrow_scene(folder / "scene")
-    rng = np.random.default_rng(0)
-    centers = np.repeat(rng.uniform(-8, 8, (20, 3)), count // 20, 0)
-    points = np.concatenate((0.5 * rng.normal(size=(count, 3)), centers + 0.1 * rng.normal(size=centers.shape)))
-    write_point_cloud(folder / "scene/points.ply", points, rng.integers(0, 255, points.shape))
-    return folder / "scene"
+    return with_clusters(narrow_scene(tmp_path_factory.mktemp("spill") / "scene"), 1000, 20, 50)
 
 
 def _trained(scene: Path, out: Path, *options: object) -> dict:
@@ -350,7 +338,7 @@ def test_memory_is_given_back(_):
 @pytest.mark.parametrize("name", ["default", "absgrad", "mcmc", "budget", "sparse"])
 def test_both_memories_give_the_bytes_of_one(tmp_path, monkeypatch, name, _):
     """With as many rows as pages need, more of them by density control, and half of them on the host."""
-    scene = _with_points(tmp_path, 40_000)
+    scene = with_clusters(narrow_scene(tmp_path / "scene"), 40_000, 20, 2000)
     more = ("--max_num_splats", 90_000) if name in ("budget", "mcmc") else ()
     monkeypatch.setattr(run, "MOST_SHARE", 2.0)
     expected = _trained(scene, tmp_path / "usual", *KINDS[name], *more)
@@ -365,7 +353,7 @@ def test_both_memories_give_the_bytes_of_one(tmp_path, monkeypatch, name, _):
 
 @ON_A_GPU
 def test_a_tight_limit_is_kept(tmp_path, monkeypatch, _):
-    scene = _with_points(tmp_path, 300_000)
+    scene = with_clusters(narrow_scene(tmp_path / "scene"), 300_000, 20, 15_000)
     shares, peaks = [], []
     before_steps(monkeypatch, lambda step: shares.append(bytes_of()))
     torch.cuda.empty_cache()

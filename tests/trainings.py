@@ -12,6 +12,7 @@ from PIL import Image
 from synthetic import FOCAL, make_colmap_scene
 
 import train
+from scene.readers.point_cloud import write_point_cloud
 from splatting.training import loop, run
 from splatting.training.iteration import Iteration
 from splatting.training.steps.plain import PlainStep
@@ -66,6 +67,15 @@ def narrow_scene(folder: Path, model: str = "PINHOLE", distortion: tuple[float, 
     scales = {str(photo.with_suffix("")): {"scale": 1.0, "offset": 0.0} for photo in photos}
     (folder / "sparse/0/depth_params.json").write_text(json.dumps(scales))
     return folder
+
+
+def with_clusters(scene: Path, near: int, clusters: int, each: int) -> Path:
+    """Give a scene `near` points in the middle, and clusters of `each` points, of which a view sees a part."""
+    rng = np.random.default_rng(0)
+    centers = np.repeat(rng.uniform(-8, 8, (clusters, 3)), each, 0)
+    points = np.concatenate((0.5 * rng.normal(size=(near, 3)), centers + 0.1 * rng.normal(size=centers.shape)))
+    write_point_cloud(scene / "points.ply", points, rng.integers(0, 255, points.shape))
+    return scene
 
 
 def train_on(scene: Path, out: Path, *words: object) -> dict[int, bytes]:
