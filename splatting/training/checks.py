@@ -96,14 +96,13 @@ def _report_cameras_apart(info: SceneInfo) -> None:
 def check_alone(port: int | None, projection: str, several: bool) -> None:
     """Refuse a page, or rays, of a training of several processes (UserError)."""
     for name, needs in (("--viewer", port is not None), ("--projection ray", projection == "ray")):
-        if needs and several:
-            raise UserError(f"{name} needs a training of one process; leave it out, or start train.py without torchrun")
+        check_one_process(name, needs and several)
 
 
 def check_one_process(option: str, several: bool) -> None:
     """Refuse an option in a training of several processes (UserError)."""
     if several:
-        raise UserError(f"{option} needs a training of one process; leave it out, or start without torchrun")
+        raise UserError(f"{option} needs a training of one process; leave it out, or start train.py without torchrun")
 
 
 def check_keep_best(dataset: argparse.Namespace, opt: argparse.Namespace, several: bool) -> None:
