@@ -32,6 +32,18 @@ def test_exposures_are_those_of_the_photos_though_some_points_disagree():
     np.testing.assert_allclose(exposures(cameras, tracks), given - given.mean(), atol=0.02)
 
 
+def test_exposures_that_drift_along_a_walk_are_found():
+    """Each point is seen in eight photos that follow each other."""
+    given, window = 0.7 * np.sin(np.linspace(0, 2 * np.pi, 120)), 8
+    albedo, cameras, tracks = np.random.default_rng(0).uniform(0.1, 0.4, SIDE**2), [], []
+    for place, exposure in enumerate(given):
+        image = 1.055 * (albedo * 2**exposure) ** (1 / 2.4) - 0.055
+        pixels = torch.from_numpy(np.broadcast_to(image.reshape(1, SIDE, SIDE), (3, SIDE, SIDE)).copy())
+        cameras.append(SimpleNamespace(device="cpu", target=lambda _, pixels=pixels: pixels))
+        tracks.append(_track(np.zeros((3 * window, 3)), 3 * place + np.arange(3 * window)))
+    np.testing.assert_allclose(exposures(cameras, tracks), given - given.mean(), atol=0.02)
+
+
 def test_photos_of_a_point_from_twice_as_far_have_twice_the_depth_in_focal_lengths():
     points = np.random.default_rng(0).normal(size=(30, 3))
     views = [SimpleNamespace(R=np.eye(3), T=np.array([0, 0, z]), fx=f) for z, f in ((100.0, 50.0), (400.0, 100.0))]
