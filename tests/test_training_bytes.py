@@ -22,7 +22,7 @@ Result = dict[str, bytes | list]
 EVERY = pytest.mark.parametrize("name", OPTIONS)
 LOOKS = ("--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44, "--checkpoint_iterations", 21, ITERATIONS)
 # Whose steps are queued one call after the other.
-WITHOUT_GRAPHS = ("exposure", "appearance", "depth", "masks", "together", "budget errors", "poses, no graph", 
+WITHOUT_GRAPHS = ("exposure", "depth", "masks", "together", "budget errors", "poses, no graph",
                   "points", "poses and lenses")  # fmt: skip
 
 
@@ -72,8 +72,8 @@ def test_fast_steps(scene, tmp_path, monkeypatch, take_as, plain, way, name):  #
         return
     assert launches > 40
     assert Rerun.made[0].records >= 3  # tensors that density control has replaced are captured anew
-    assert all(len({kind[-2:] for kind in known}) <= 1 for known in kinds)  # graphs of another phase go
-    assert len(set().union(*kinds)) == {"degree 0": 1, "two phases": 5}.get(name, 4)  # four SH degrees
+    assert all(len({kind[-3:] for kind in known}) <= 1 for known in kinds)  # graphs of another phase go
+    assert len(set().union(*kinds)) == {"degree 0": 1, "two phases": 5, "appearance": 5}.get(name, 4)  # four SH degrees
 
 
 @EVERY

@@ -83,6 +83,7 @@ class Ppisp(Exposures):
         self.rows = {camera: row for row, camera in enumerate(dict.fromkeys(self.cameras))}
         device = compute_device()
         self._row_of = torch.tensor([self.rows[camera] for camera in self.cameras], dtype=torch.int64, device=device)
+        self._indices = torch.arange(len(names), device=device).split(1)
         self.numbers = {name: torch.zeros(self._count(name), *_ALL[name][0], device=device) for name in _ALL}
 
     def _count(self, name: str) -> int:
@@ -93,32 +94,38 @@ class Ppisp(Exposures):
         """Those of the photos."""
         return self.numbers["photos"]
 
-    def camera_of(self, colmap_id: object) -> int | None:
-        """The row of the camera of any view of the scene, None for one of which no photo has trained."""
-        return self.rows.get(_SHARED, self.rows.get(str(colmap_id)))
-
-    def photo(self, name: str) -> Tensor:
-        """Exposure, red against blue, and both against green of a photo (3,), in stops from the mean of all photos."""
+    def index(self, name: str | Tensor) -> Tensor:
+        """The index (1,) int64 of a photo, on the device. A recorded step has that in the place of a name."""
+        if isinstance(name, Tensor):
+            return name
         if name not in self.mapping:
             raise UserError(f"there is no trained appearance of {name}; render photos that the model was trained on")
-        photos = self._read("photos")
-        return photos[self.mapping[name]] - photos.detach().mean(0)
+        return self._indices[self.mapping[name]]
 
-    def _response(self, row: int) -> Tensor:
+    def camera_of(self, colmap_id: object) -> Tensor | None:
+        """The row (1,) of the camera of any view of the scene, None for one of which no photo has trained."""
+        row = self.rows.get(_SHARED, self.rows.get(str(colmap_id)))
+        return None if row is None else self._indices[row]
+
+    def photo(self, name: str | Tensor) -> Tensor:
+        """Exposure, red against blue, and both against green of a photo (3,), in stops from the mean of all photos."""
+        photos = self._read("photos")
+        return _row(photos, self.index(name)) - photos.detach().mean(0)
+
+    def _response(self, row: Tensor) -> Tensor:
         """Logarithms of the rises of a camera's response (3, 3), from their mean over all photos."""
         responses = self._read("response")
-        return responses[row] - responses.detach()[self._row_of].mean(0)
+        return _row(responses, row) - responses.detach()[self._row_of].mean(0)
 
-    def shown(self, image: Tensor, name: str) -> Tensor:
+    def shown(self, image: Tensor, name: str | Tensor) -> Tensor:
         """A render (3, H, W), not clamped, as the photo of this name shows it. Differentiable in the image, too."""
-        photo = self.photo(name)
-        return self._seen(image, _gains(photo), self.rows[self.cameras[self.mapping[name]]])
+        return self._seen(image, _gains(self.photo(name)), self._row_of.index_select(0, self.index(name)))
 
-    def pull(self, name: str) -> Tensor:
+    def pull(self, name: str | Tensor) -> Tensor:
         """What a step of this photo adds to the loss: sizes of its numbers and its camera's, weighted and smoothed."""
-        row = self.rows[self.cameras[self.mapping[name]]]
+        row = self._row_of.index_select(0, self.index(name))
         found = {"photos": self.photo(name), "response": self._response(row)}
-        found |= {kind: self._read(kind)[row] for kind in ("vignetting", "middle")}
+        found |= {kind: _row(self._read(kind), row) for kind in ("vignetting", "middle")}
         return sum(_ALL[kind][2] * (numbers.square() + _SMALL**2).sqrt().sum() for kind, numbers in found.items())
 
     @torch.no_grad()
@@ -139,13 +146,14 @@ class Ppisp(Exposures):
             gains = (gains + change.clamp(-1, 1).float()).clamp(-_FARTHEST, _FARTHEST)
         return self._seen(image, gains, row).clamp(0, 1)
 
-    def _seen(self, image: Tensor, gains: Tensor, row: int | None) -> Tensor:
+    def _seen(self, image: Tensor, gains: Tensor, row: Tensor | None) -> Tensor:
         """gains (3, 1, 1) of the channels in stops. row: of the camera; None: one that changes nothing."""
         gains = _LN2 * gains  # the last bit of torch.exp2 depends on the number of threads
         if row is None:
             return image * torch.exp(gains)
         right, down = _places(*image.shape[-2:], image.device)
-        middle, (a, b) = self._read("middle")[row], (_LN2 * self._read("vignetting")[row][..., None, None]).unbind(1)
+        middle, falloff = (_row(self._read(kind), row) for kind in ("middle", "vignetting"))
+        a, b = (_LN2 * falloff[..., None, None]).unbind(1)
         square = (right - middle[:1]).square()[None, :] + (down - middle[1:]).square()[:, None]
         x = image * torch.exp(gains + square * (a + (3 * square - 1.5) * b))
         rises = torch.softmax(self._response(row), 1)
@@ -163,6 +171,7 @@ class Ppisp(Exposures):
         self.numbers = {name: trainable(values) for name, values in self.numbers.items()}
         groups = [{"params": [values], "lr": _ALL[name][1], "name": name} for name, values in self.numbers.items()]
         self.optimizer = GaussianAdam(groups)
+        self._gradients = {name: torch.zeros_like(values) for name, values in self.numbers.items()}
         steps = getattr(opt, "iterations", 30_000)
         self.schedule = get_expon_lr_func(1.0, _FALL, int(_DELAY * steps), 0.0, steps)
 
@@ -170,6 +179,11 @@ class Ppisp(Exposures):
         if self.optimizer is not None:
             for group in self.optimizer.param_groups:
                 group["lr"] = 0.0 if self.held else _ALL[group["name"]][1] * self.schedule(iteration)
+
+    def keep_gradients(self) -> None:
+        """Let the next gradients lie in fixed places, which hold those of the last recorded step."""
+        for name, values in self.numbers.items():
+            values.grad = self._gradients[name]
 
     @torch.no_grad()
     def step(self) -> None:
@@ -209,7 +223,7 @@ class Ppisp(Exposures):
         photos = {name: self.photo(name).tolist() for name in self.mapping}
         cameras = {
             camera: {name: self.numbers[name][row].tolist() for name in _CAMERA}
-            | {"response": self._response(row).tolist()}
+            | {"response": self._response(self._indices[row]).tolist()}
             for camera, row in self.rows.items()
         }
         write_json(Path(folder) / NAME, {"photos": photos, "cameras": cameras})
@@ -243,6 +257,10 @@ def exposures_of(state: dict[str, Any]) -> Exposures:
     if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
         return Exposures()
     return Ppisp(names, cameras) if isinstance(cameras, list) else Exposures(names)
+
+
+def _row(values: Tensor, index: Tensor) -> Tensor:
+    return values.index_select(0, index)[0]
 
 
 def _gains(photo: Tensor) -> Tensor:

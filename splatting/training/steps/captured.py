@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gaussian_renderer import photo_name
 from scene.cameras import Camera
 from scene.fused_adam import CAMERA_NUMBERS, NOW_WORDS, FusedAdam
 from splatting.training.iteration import Iteration
@@ -106,7 +107,9 @@ class CapturedStep(FusedStep):
         losses = self._graphs.launch(at)
         if losses is not None:
             self._fetch(at)
-            with self._ahead.capacity(at) if density.queues or run.rests(at) else nullcontext():
+            queues = density.queues or run.exposes or run.rests(at)
+            with self._ahead.capacity(at) if queues else nullcontext():
+                run.gaussians.exposures.step()
                 run.after_step(at)
             return losses
         with self._ahead.capacity(at):
@@ -190,7 +193,7 @@ class Graphs:
     ) -> None:
         self._run, self._fused, self._adam, self._capacity = run, fused, adam, capacity
         self._recorder = Recorder(run.device)
-        words = NOW_WORDS + (_CAMERA + 1) // 2
+        words = NOW_WORDS + (_CAMERA + 1) // 2 + 1  # the last one: the index of the photo
         self._host = torch.zeros(_ROWS, words, dtype=torch.int64, pin_memory=run.device.type == "cuda")
         self._host_cameras = [row.numpy() for row in self._host[:, NOW_WORDS:].view(torch.float32)[:, :_CAMERA]]
         self._inputs = torch.zeros(words, dtype=torch.int64, device=run.device)
@@ -221,9 +224,15 @@ class Graphs:
         self._taken += 1
         self._host_cameras[row][:] = numbers
         self._adam.write_now(self._host[row, :NOW_WORDS], at.iteration)
+        exposures, exposes = self._run.gaussians.exposures, self._run.exposes
+        if exposes:
+            self._host[row, -1] = exposures.mapping[photo_name(at.camera)]
         self._inputs.copy_(self._host[row], non_blocking=True)
         graph.launch()
         total, l1 = losses.copy_(graph.losses).unbind()
+        if exposes:
+            exposures.keep_gradients()
+            self._run.gaussians.guard_loss(at.iteration, total)
         return Losses(total, l1, None, None)
 
     def clear(self) -> None:
@@ -252,13 +261,14 @@ class Graphs:
 
     def _is_usual(self, at: Iteration) -> bool:
         """Whether the step has a photo whose pixels all count, and nothing else."""
-        plain = not (at.wants_depth or self._run.exposes)
+        plain = not (at.wants_depth or self._run.dataset.train_test_exp)
         return self._able and plain and at.camera.columns is None and at.camera.counts_all_pixels
 
     def _graph_for(self, at: Iteration) -> _Graph | None:
         """The graph for a step, made if it is worth it. The first step of a kind is not, as it may load kernels."""
         camera, run = at.camera, self._run
-        phase = run.density.observes(at.iteration), run.gaussians.active_sh_degree
+        held = run.exposes and run.gaussians.exposures.held
+        phase = run.density.observes(at.iteration), run.gaussians.active_sh_degree, held
         kind = (camera.image_height, camera.image_width, camera.FoVx, camera.FoVy, camera.lens, *phase)
         graph = self._graphs.get(kind)
         if graph is not None:
@@ -266,7 +276,7 @@ class Graphs:
         if kind not in self._kinds:
             self._kinds.add(kind)
             return None
-        self._graphs = {k: known for k, known in self._graphs.items() if k[-2:] == phase}
+        self._graphs = {k: known for k, known in self._graphs.items() if k[-3:] == phase}
         if len(self._graphs) < _MOST_KINDS:
             graph = self._captured(at)
             if graph is not None:
@@ -286,6 +296,8 @@ class Graphs:
             self._able = False
             self._release()
             return None
+        finally:
+            self._run.gaussians.exposures.optimizer.zero_grad()
 
     def _capture(self, at: Iteration) -> _Graph | None:
         camera, target = at.camera, torch.empty_like(at.camera.ground_truth(at.background)[0])
@@ -303,6 +315,7 @@ class Graphs:
             columns=None,  # all count
             counts_all_pixels=True,
             ground_truth=lambda _: (target, None),  # the photo on the step's background, and no mask
+            exposure_name=self._inputs[-1:],
         )
         placeholder = SimpleNamespace(
             camera=any_camera,
@@ -325,6 +338,9 @@ class Graphs:
     def _body(self, iteration: int, placeholder: Any) -> Tensor:
         run = self._run
         now = self._inputs[:NOW_WORDS]
+        if run.exposes:
+            run.gaussians.exposures.keep_gradients()
+            run.gaussians.exposures.optimizer.zero_grad(set_to_none=False)
         drawn, losses, gradients = self._fused.measure(placeholder, now)
         run.gaussians.guard_loss(iteration, losses.total)
         density = run.density
