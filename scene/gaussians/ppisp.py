@@ -181,7 +181,7 @@ class Ppisp(Exposures):
                 group["lr"] = 0.0 if self.held else _ALL[group["name"]][1] * self.schedule(iteration)
 
     def keep_gradients(self) -> None:
-        """Let the next gradients lie in fixed places, which hold those of the last recorded step."""
+        """Let gradients lie in fixed places, where a recorded step writes them, and where `step` then finds them."""
         for name, values in self.numbers.items():
             values.grad = self._gradients[name]
 

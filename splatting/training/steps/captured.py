@@ -297,7 +297,7 @@ class Graphs:
             self._release()
             return None
         finally:
-            self._run.gaussians.exposures.optimizer.zero_grad()
+            self._run.gaussians.exposures.optimizer.zero_grad()  # what was recorded has computed no gradient
 
     def _capture(self, at: Iteration) -> _Graph | None:
         camera, target = at.camera, torch.empty_like(at.camera.ground_truth(at.background)[0])
