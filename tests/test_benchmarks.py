@@ -289,9 +289,9 @@ def test_a_figure_of_whatever_trainings_there_are(tmp_path, monkeypatch):
     draw(with_peers(joined(files), peers), tmp_path / "figure.png", ["set10"])
     panels = drawn[0].axes
     assert [panel.get_title() for panel in panels] == ["a", "c", "d", ""]
-    assert panels[0].get_legend_handles_labels()[1] == [*(f"set{number}" for number in range(10)), "mcmc by the clock"]
+    assert panels[0].get_legend_handles_labels()[1] == [*(f"our set{k}" for k in range(10)), "our mcmc by the clock"]
     lengths = {line.get_label(): len(line.get_xdata()) for line in panels[1].lines if line.get_label()[0] != "_"}
-    assert lengths == {"set0": 1, "ends": 2, "line": 1} and len(panels[1].lines) == 4  # one is a line
+    assert lengths == {"our set0": 1, "ends": 2, "line": 1} and len(panels[1].lines) == 4  # one is a line
     with pytest.raises(UserError, match="give SCENE/NAME, of the scenes a"):
         with_peers(joined(files[:1]), [("ends", f"{tmp_path}/two.csv")])
     with pytest.raises(UserError, match="no training is left"):

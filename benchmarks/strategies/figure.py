@@ -38,15 +38,18 @@ def draw(found: dict, path: Path, left_out: Sequence[str] = ()) -> None:
     budgets = {name: _strategy(words) for name, words in found["sets"].items() if BUDGET in words}
     lines = [name for name in found["sets"] if name not in budgets and any(name in runs for runs in scenes.values())]
     palette = colormaps["tab20" if len(lines) > 8 else "Set2"].colors
+    peers = found.get("peers", ())
+    ours = "our " if peers else ""
     figure = Figure(figsize=(13, 4 * ((len(scenes) + 1) // 2)), layout="constrained")
     panels = figure.subplots((len(scenes) + 1) // 2, 2, squeeze=False).flat
     for panel, (scene, runs) in zip(panels, scenes.items(), strict=False):
         for number, name in enumerate(lines):
             if name in runs:
-                _draw_line(panel, name, [run["curve"] for run in runs[name]], palette[number % len(palette)])
+                label, curves = name if name in peers else ours + name, [run["curve"] for run in runs[name]]
+                _draw_line(panel, label, curves, palette[number % len(palette)])
         for strategy, color in _COLORS.items():
             ends = [runs[name] for name, of in budgets.items() if of == strategy and name in runs]
-            _draw_dots(panel, strategy, ends, color)
+            _draw_dots(panel, f"{ours}{strategy} by the clock", ends, color)
         _fit(panel, [row for name in runs for run in runs[name] for row in _drawn(run, name in budgets)])
         panel.set(title=scene, xlabel="seconds of training", ylabel="PSNR of test views (dB)")
     for panel in panels:
@@ -69,6 +72,7 @@ def with_peers(found: dict, given: Sequence[Sequence[str]]) -> dict:
             raise UserError(f"--peer {title}: give SCENE/NAME, of the scenes {there}, and the CSV file of each seed")
         curves = [[row | {"whole": True} for row in read_peer(Path(file))] for file in files]
         found["sets"].setdefault(name, [])
+        found.setdefault("peers", []).append(name)
         found["scenes"][scene][name] = {str(seed): {"curve": curve} for seed, curve in enumerate(curves)}
     return found
 
@@ -118,7 +122,7 @@ def _draw_line(panel: Any, name: str, curves: Sequence[Sequence[dict]], color: A
         panel.fill_between(times, list(map(min, values)), list(map(max, values)), color=color, alpha=0.3, linewidth=0)
 
 
-def _draw_dots(panel: Any, strategy: str, budgets: Sequence[Sequence[dict]], color: str) -> None:
+def _draw_dots(panel: Any, name: str, budgets: Sequence[Sequence[dict]], color: str) -> None:
     """Draw a dot for each time budget, where its trainings ended."""
     ends = [[run["curve"][-1] for run in runs] for runs in budgets]
     points = sorted((statistics.fmean(end["seconds"] for end in of), [end["test_psnr"] for end in of]) for of in ends)
@@ -128,7 +132,7 @@ def _draw_dots(panel: Any, strategy: str, budgets: Sequence[Sequence[dict]], col
     means = list(map(statistics.fmean, values))
     down = [mean - min(of) for mean, of in zip(means, values, strict=True)]
     up = [max(of) - mean for mean, of in zip(means, values, strict=True)]
-    panel.errorbar(times, means, [down, up], color=color, marker="o", linestyle=":", label=f"{strategy} by the clock")
+    panel.errorbar(times, means, [down, up], color=color, marker="o", linestyle=":", label=name)
 
 
 def main() -> None:

@@ -55,7 +55,7 @@ def train(line: list[str], model: Path, slot: dict) -> None:
     pinned = ["taskset", "-c", slot.pop("cores")] if "cores" in slot else []
     done = subprocess.run([*pinned, *line], cwd=ROOT, env=os.environ | slot, capture_output=True, text=True)
     if done.returncode:
-        tqdm.write(f"{model}: status {done.returncode}: {(done.stdout + done.stderr)[-500:]}", file=sys.stderr)
+        tqdm.write(f"{model}: status {done.returncode}: {(done.stdout + done.stderr)[-3000:]}", file=sys.stderr)
 
 
 def record(model: Path) -> dict | None:
