@@ -212,6 +212,14 @@ def test_without_memory_for_a_graph_steps_are_queued_one_call_after_the_other(sc
 
 
 @pytest.mark.parametrize("_", GPU)
+def test_a_step_that_waits_for_the_gpu_is_not_captured_and_random_numbers_are_there(scene, tmp_path, monkeypatch, _):
+    wanted, body = trained(scene, tmp_path / "captured"), Graphs._body
+    monkeypatch.setattr(Graphs, "_body", lambda self, *of: body(self, *of).sum().item())
+    assert trained(scene, tmp_path / "queued") == wanted
+    assert torch.rand(3, device="cuda").max() < 1
+
+
+@pytest.mark.parametrize("_", GPU)
 @pytest.mark.parametrize("replayed", [0, 1, 3])
 def test_memory_that_runs_out_in_a_replay_leaves_the_last_whole_step(scene, tmp_path, monkeypatch, replayed, _):
     """After so many steps of a queue that overflowed were replayed."""
