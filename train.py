@@ -120,10 +120,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     if args.advise or args.options == "auto":
         from splatting.diagnosis.advice import asked_options  # which no other training needs
 
-        words = asked_options(checks.with_lenses(dataset, None), dataset.model_path if args.advise else "")
+        given = sys.argv[1:] if argv is None else argv
+        words = asked_options(checks.with_lenses(dataset, None), dataset.model_path if args.advise else "", given)
         if args.advise:
             return
-        args, dataset, opt, pipe = parse([*words, *(sys.argv[1:] if argv is None else argv)])
+        args, dataset, opt, pipe = parse([*words, *given])
     safe_state(args.quiet, opt.seed)
     agree_on_options(args)
     torch.autograd.set_detect_anomaly(args.detect_anomaly)

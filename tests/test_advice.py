@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from scene.readers.tracks import Track
-from splatting.diagnosis.advice import distances, exposures
+from splatting.diagnosis.advice import Advice, asked_options, distances, exposures
 
 SIDE = 20
 
@@ -49,3 +49,8 @@ def test_photos_of_a_point_from_twice_as_far_have_twice_the_depth_in_focal_lengt
     views = [SimpleNamespace(R=np.eye(3), T=np.array([0, 0, z]), fx=f) for z, f in ((100.0, 50.0), (400.0, 100.0))]
     tracks = [_track(points, np.arange(30)), None, _track(points, np.arange(30))]
     assert abs(distances([views[0], views[0], views[1]], tracks) - 2) < 0.05
+
+
+def test_advice_on_an_option_that_is_given_is_not_taken(monkeypatch):
+    monkeypatch.setattr(f"{Advice.__module__}.advise", lambda _: [Advice("", "--sky auto"), Advice("", "--appear 1")])
+    assert asked_options(None, "", ["--app=none", "-r", "2"]) == ["--sky", "auto"]

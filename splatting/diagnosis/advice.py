@@ -10,7 +10,7 @@ import io
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
@@ -79,10 +79,11 @@ def advise(dataset: argparse.Namespace, trains: bool = True) -> list[Advice]:
     return [*found, *_of_passers_by(dataset)] if trains else found
 
 
-def asked_options(dataset: argparse.Namespace, folder: str = "") -> list[str]:
+def asked_options(dataset: argparse.Namespace, folder: str = "", given: Sequence[str] = ()) -> list[str]:
     """Print the advice on a scene, and return the options that it asks for, as words of a command line.
 
-    folder: gets ADVICE, a list of texts and options, as JSON.
+    folder: gets ADVICE, a list of texts and options, as JSON. given: words of the command line; advice on an option
+    among them is left out.
     """
     if ranks().several:
         raise UserError("--advise and --options auto need one process; run train.py --advise, and give what it says")
@@ -91,8 +92,9 @@ def asked_options(dataset: argparse.Namespace, folder: str = "") -> list[str]:
     if folder:
         mkdir_p(folder)
         write_json(Path(folder) / ADVICE, [advice._asdict() for advice in found])
-    words = " ".join(advice.options for advice in found).split()
-    print(f"options that this scene asks for: {' '.join(words) or 'none'}")
+    names = tuple(word.partition("=")[0] for word in given if word.startswith("--") and word != "--")
+    words = " ".join(advice.options for advice in found if not advice.options.startswith(names)).split()
+    print(f"options that this scene asks for, besides those given: {' '.join(words) or 'none'}")
     return words
 
 
