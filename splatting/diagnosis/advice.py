@@ -191,13 +191,13 @@ def distances(views: list[CameraInfo], tracks: list[Track | None]) -> float:
 def _of_passers_by(dataset: argparse.Namespace) -> Iterator[Advice]:
     """What a short training of small photos leaves over."""
     with tempfile.TemporaryDirectory() as folder:
-        given = {"-s": dataset.source_path, "-m": folder, "-i": dataset.images, "-r": _WIDTH}
-        given |= {"--iterations": _ITERATIONS, "--test_iterations": -1, "--save_iterations": -1}
-        flags = ["--eval"] * dataset.eval + ["-w"] * dataset.white_background
-        flags += ["--quiet", "--no_curve", "--disable_viewer", *map(str, chain(*given.items()))]
-        done = subprocess.run([sys.executable, ROOT / "train.py", *flags], capture_output=True, text=True, check=False)
+        given = {"-s": dataset.source_path, "-m": folder, "-i": dataset.images, "--masks": dataset.masks}
+        given |= {"-r": _WIDTH, "--iterations": _ITERATIONS, "--test_iterations": -1, "--save_iterations": -1}
+        bare = ["--eval"] * dataset.eval + ["-w"] * dataset.white_background + ["--invert_masks"] * dataset.invert_masks
+        bare += ["--quiet", "--no_curve", "--disable_viewer", *map(str, chain(*given.items()))]
+        done = subprocess.run([sys.executable, ROOT / "train.py", *bare], capture_output=True, text=True, check=False)
         if done.returncode:
-            raise UserError(done.stderr.strip().rpartition("\n")[2])
+            raise UserError(done.stderr.strip().rpartition("\n")[2].removeprefix("error: "))
         masks = masks_of(folder)
     share = len(odd_photos(masks)) / len(masks.cameras)
     text = f"{share:.0%} of the photos show what a short training does not, as if someone had passed by"
