@@ -204,7 +204,7 @@ def without_validation(info: SceneInfo) -> tuple[SceneInfo, list[CameraInfo]]:
     views = info.train_cameras
     if len(views) < FEWEST:
         raise UserError(
-            f"--keep_best takes two photos or more away from training, and only {len(views)} train; leave it out"
+            f"--keep_best takes photos away from training and needs {FEWEST}, and only {len(views)} train; leave it out"
         )
     step = min(VALIDATION, len(views) // 2)
     chosen = range(step // 2, len(views), step)
