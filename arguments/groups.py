@@ -37,8 +37,8 @@ class ModelParams(OptionTable):
         Option("images", "images", short="i", stored=CFG_ARGS,
             help="folder of the photos inside the scene folder (COLMAP only)"),
         Option("depths", "", short="d", stored=CFG_ARGS,
-            help="folder of inverse depth maps inside the scene folder, PNGs with the photos' names; they stabilise "
-                 "regions that few photos show; empty: no depth supervision"),
+            help="folder of depth maps inside the scene folder, with the photos' names: PNGs of inverse depth, or "
+                 "metric PNGs, .npy or .pfm; they stabilise regions that few photos show; empty: no depth supervision"),
         Option("resolution", -1, short="r", check=_resolution, stored=CFG_ARGS,
             help="1, 2, 4, 8: divide the size of the photos by this; -1: keep their size, but at most 1600 pixels "
                  "wide; any other value: width in pixels"),
