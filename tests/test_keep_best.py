@@ -101,12 +101,12 @@ def test_a_resumed_training_knows_the_best_so_far(kept, scene, tmp_path):
 def test_every_sixteenth_view_validates_and_two_at_least(count, places):
     views = load_views(count)
     left, chosen = info.without_validation(views)
-    assert [view.uid for view in chosen] == list(places) and all(view.is_test for view in chosen)
+    assert [view.uid for view in chosen] == list(places) and all(v.is_test and not v.depth_path for v in chosen)
     assert [view.uid for view in left.train_cameras] == [n for n in range(count) if n not in places]
 
 
 def load_views(count: int) -> info.SceneInfo:
-    views = [info.CameraInfo(n, np.eye(3), np.zeros(3), 1.0, 1.0, width=9, height=9) for n in range(count)]
+    views = [info.CameraInfo(n, np.eye(3), np.zeros(3), 1, 1, width=9, height=9, depth_path="d") for n in range(count)]
     return info.SceneInfo(None, views, [], {"radius": 1.0}, None)
 
 

@@ -208,8 +208,8 @@ def without_validation(info: SceneInfo) -> tuple[SceneInfo, list[CameraInfo]]:
         )
     step = min(VALIDATION, len(views) // 2)
     chosen = range(step // 2, len(views), step)
-    trained = [view for index, view in enumerate(views) if index not in chosen]
-    return info._replace(train_cameras=trained), held_out([replace(views[index], depth=None) for index in chosen])
+    left = [view for index, view in enumerate(views) if index not in chosen]
+    return info._replace(train_cameras=left), held_out([replace(views[n], depth=None, depth_path="") for n in chosen])
 
 
 def held_out(cameras: Sequence[CameraInfo]) -> list[CameraInfo]:
