@@ -118,7 +118,7 @@ def test_names_that_others_did_not_tell_apart_are_found(tmp_path):
 def test_a_broken_file_is_named(tmp_path, text, words):
     if text is not None:
         (tmp_path / "exposure.json").write_text(text)
-    with pytest.raises(UserError, match=f"{words}.*; restore the file, or write train_test_exp=False"):
+    with pytest.raises(UserError, match=f"{words}.*; restore the file, or leave --appearance affine out and write"):
         _read(tmp_path, _infos("a.png"))
 
 

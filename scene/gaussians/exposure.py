@@ -18,7 +18,7 @@ from utils.general_utils import get_expon_lr_func
 from utils.system_utils import UserError, atomic_write
 
 NAME = "exposure.json"
-_REMEDY = "restore the file, or write train_test_exp=False into cfg_args to render without exposures"
+_REMEDY = "restore the file, or leave --appearance affine out and write train_test_exp=False into cfg_args"
 # torch's defaults, which the reference uses for exposures; update_learning_rate replaces the rate.
 _ADAM_EPS, _ADAM_RATE = 1e-8, 1e-3
 
