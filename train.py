@@ -121,7 +121,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         from splatting.diagnosis.advice import asked_options  # which no other training needs
 
         given = sys.argv[1:] if argv is None else argv
-        words = asked_options(checks.with_lenses(dataset, None), dataset.model_path if args.advise else "", given)
+        words = asked_options(checks.with_lenses(dataset, None), args, given)
         if args.advise:
             return
         args, dataset, opt, pipe = parse([*words, *given])

@@ -1,12 +1,14 @@
 """Advice on options: numbers of a scene whose truth is known, and what train.py and doctor.py make of them."""
 
+import argparse
+import json
 from types import SimpleNamespace
 
 import numpy as np
 import torch
 
 from scene.readers.tracks import Track
-from splatting.diagnosis.advice import Advice, asked_options, distances, exposures
+from splatting.diagnosis.advice import ADVICE, Advice, asked_options, distances, exposures
 
 SIDE = 20
 
@@ -51,6 +53,11 @@ def test_photos_of_a_point_from_twice_as_far_have_twice_the_depth_in_focal_lengt
     assert abs(distances([views[0], views[0], views[1]], tracks) - 2) < 0.05
 
 
-def test_advice_on_an_option_that_is_given_is_not_taken(monkeypatch):
-    monkeypatch.setattr(f"{Advice.__module__}.advise", lambda _: [Advice("", "--sky auto"), Advice("", "--appear 1")])
-    assert asked_options(None, "", ["--app=none", "-r", "2"]) == ["--sky", "auto"]
+def test_advice_on_a_given_option_or_against_one_is_not_taken(tmp_path, monkeypatch, capsys):
+    found = [Advice("", "--sky auto"), Advice("", "--appearance ppisp --x 1"), Advice("", "--refine_poses")]
+    monkeypatch.setattr(f"{Advice.__module__}.advise", lambda _: found)
+    args = argparse.Namespace(keep_best=False, train_test_exp=False, projection="ray", strategy="adc", advise=True)
+    dataset = argparse.Namespace(model_path=str(tmp_path))
+    assert asked_options(dataset, args, ["--app=none", "-r", "2"]) == ["--sky", "auto"]
+    assert "--refine_poses is left out, as it does not go with --projection" in capsys.readouterr().out
+    assert [one["options"] for one in json.loads((tmp_path / ADVICE).read_text())] == ["--sky auto", "", ""]

@@ -24,7 +24,7 @@ from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.readers import depth_maps
 from scene.readers.colmap import read_model, read_model_of_kind
-from scene.readers.depth_maps import DepthMap, Metric, read_values, resize, with_depth_maps
+from scene.readers.depth_maps import DepthMap, Metric, map_size, read_values, resize, with_depth_maps
 from scene.readers.depth_scale import fit_image, fit_line, make_depth_params, sightings
 from scene.readers.info import CameraInfo
 from splatting.training.objective import Objective
@@ -298,6 +298,10 @@ def test_metric_maps_are_distances_with_gaps(tmp_path, kind):
     assert inside.mean() > 0.8
     np.testing.assert_allclose(found[inside], 1 / (2 * distances[inside]), rtol=1e-6)
     assert units.map_of(tmp_path / "a") is None
+    for file in {*tmp_path.glob("a.b.*")} - {*tmp_path.glob("*.png")}:
+        file.write_bytes(file.read_bytes()[:-1])
+        with pytest.raises(UserError, match="make it again"):
+            map_size(file)
 
 
 @pytest.mark.parametrize("kind", ["png", "npy"])

@@ -187,13 +187,15 @@ def _array(path: Path) -> np.ndarray:
 
 
 def map_size(path: Path) -> tuple[int, int]:
-    """Size (width, height) of a map's file, from its header. UserError for a file that cannot be read."""
+    """Size (width, height) of a map, from its file's header. UserError where that tells of a broken file."""
     if path.suffix not in _FLOATS:
         return picture_size(path)
     try:
         if path.suffix == ".npy":
             return _array(path).shape[::-1]
         with open_image(path) as image:
+            if path.stat().st_size < image.tile[0][2] + 4 * image.width * image.height:
+                raise ValueError("it ends too early")
             return image.size
     except (*UNREADABLE, MemoryError) as error:
         raise _unreadable(path, error) from error

@@ -42,6 +42,11 @@ EXPOSURES = 0.4  # stops; photos of a usual automatic exposure differ by 0.15 to
 FEW_PHOTOS = 16  # 14 gained 0.2 dB by points that hold the depth, 20 and 21 lost as much (docs/results/photos.md)
 DISTANCES = 2.5  # the farthest photo of a point over the nearest
 _APPEARANCE = "--appearance ppisp --opacity_reset_interval 100000"  # after a reset haze can grow before the cameras
+_AGAINST = {  # options that an advised one does not go with, and their value then
+    "--appearance": {"keep_best": True, "train_test_exp": True},
+    "--refine_poses": {"keep_best": True, "projection": "ray"},
+    "--sky": {"strategy": "mcmc"},
+}
 _WIDTH = 200  # pixels of a photo
 _DARK, _LIGHT = 0.02, 0.98  # of a channel; beyond, an exposure cannot be told
 _OUTLIER = 0.6  # stops; a larger difference is no exposure (Tukey's biweight: Beaton and Tukey 1974)
@@ -79,23 +84,33 @@ def advise(dataset: argparse.Namespace, trains: bool = True) -> list[Advice]:
     return [*found, *_of_passers_by(dataset)] if trains else found
 
 
-def asked_options(dataset: argparse.Namespace, folder: str = "", given: Sequence[str] = ()) -> list[str]:
+def asked_options(dataset: argparse.Namespace, args: argparse.Namespace, given: Sequence[str]) -> list[str]:
     """Print the advice on a scene, and return the options that it asks for, as words of a command line.
 
-    folder: gets ADVICE, a list of texts and options, as JSON. given: words of the command line; advice on an option
-    among them is left out.
+    args: the options of the training, from the words `given`. Advice on one of these words, and advice that does not go
+    with these options, is left out. With --advise their model folder gets ADVICE, a list of texts and options, as JSON.
     """
     if ranks().several:
         raise UserError("--advise and --options auto need one process; run train.py --advise, and give what it says")
     found = advise(dataset)
     print(*found, sep="\n")
-    if folder:
-        mkdir_p(folder)
-        write_json(Path(folder) / ADVICE, [advice._asdict() for advice in found])
-    names = tuple(word.partition("=")[0] for word in given if word.startswith("--") and word != "--")
-    words = " ".join(advice.options for advice in found if not advice.options.startswith(names)).split()
+    found = [_taken(advice, args, given) for advice in found]
+    if args.advise and dataset.model_path:
+        mkdir_p(dataset.model_path)
+        write_json(Path(dataset.model_path) / ADVICE, [advice._asdict() for advice in found])
+    words = " ".join(advice.options for advice in found).split()
     print(f"options that this scene asks for, besides those given: {' '.join(words) or 'none'}")
     return words
+
+
+def _taken(advice: Advice, args: argparse.Namespace, given: Sequence[str]) -> Advice:
+    """The advice, without its options where one of them is given, or where they do not go with given ones."""
+    unfit = _AGAINST.get(advice.options.partition(" ")[0], {}).items()
+    against = next((name for name, value in unfit if getattr(args, name) == value), None)
+    if against:
+        print(f"{advice.options} is left out, as it does not go with --{against}")
+    names = tuple(word.partition("=")[0] for word in given if word.startswith("--") and word != "--")
+    return advice._replace(options="") if against or advice.options.startswith(names) else advice
 
 
 def check_options(source: str, images: str) -> list[Line]:
