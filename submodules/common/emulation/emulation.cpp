@@ -50,22 +50,28 @@ struct Thread {
   Point point;
   bool begun = false;
   std::unique_ptr<char[]> stack;
-  Meeting waits_for = Meeting::done;
-  const char* what = nullptr;
-  bool runnable = false;
-  int votes = 0;  // the block's votes that the thread has taken part in
 #ifdef GS_ASAN
   void* fake_stack = nullptr;
 #endif
 };
 
+// What the scheduler reads of all threads again and again, so it lies together.
+struct State {
+  Meeting waits_for;
+  bool runnable;
+  int votes;  // the block's votes that the thread has taken part in
+  const char* what;
+};
+
 struct Warp {
   uint64_t slots[2][32];  // two, since a lane may be one meeting ahead of the slowest reader
   int turn[32];           // each lane uses this one of the two next
+  unsigned absent;        // a bit for each lane that has ended, or that the block lacks
 };
 
 struct Grid {
   std::deque<Thread> threads;  // fibers keep references to theirs
+  std::vector<State> states;
   std::vector<Warp> warps;
   std::vector<char> shared;
   ucontext_t context;  // of the scheduler, which is left when a thread begins
@@ -99,10 +105,10 @@ void start() {
 #endif
   for (;;) {
     (*grid_state.body)();
-    Thread& self = grid_state.threads[grid_state.current];
-    self.waits_for = Meeting::done;
-    self.runnable = false;
-    to_scheduler(self);
+    const unsigned current = grid_state.current;
+    grid_state.states[current].waits_for = Meeting::done;
+    grid_state.warps[current / 32].absent |= 1u << current % 32;
+    to_scheduler(grid_state.threads[current]);
   }
 }
 
@@ -127,7 +133,7 @@ bool release() {
   const unsigned count = grid_state.count;
   bool any = false, whole_block = true;
   for (unsigned i = 0; i < count; ++i) {
-    const Thread& thread = grid_state.threads[i];
+    const State& thread = grid_state.states[i];
     whole_block = whole_block && (thread.waits_for == Meeting::block || thread.waits_for == Meeting::done);
   }
   for (unsigned first = 0; first < count; first += 32) {
@@ -135,15 +141,15 @@ bool release() {
     const char* what = nullptr;
     bool whole_warp = true;
     for (unsigned i = first; i < stop; ++i) {
-      const Thread& thread = grid_state.threads[i];
+      const State& thread = grid_state.states[i];
       if (thread.waits_for == Meeting::done) continue;
       if (thread.waits_for != Meeting::warp) whole_warp = false;
-      if (thread.waits_for == Meeting::warp && what && std::strcmp(what, thread.what))
+      if (thread.waits_for == Meeting::warp && what && what != thread.what && std::strcmp(what, thread.what))
         fail("lanes of a warp meet in different collectives", what);
       if (thread.waits_for == Meeting::warp) what = thread.what;
     }
     for (unsigned i = first; i < stop; ++i) {
-      Thread& thread = grid_state.threads[i];
+      State& thread = grid_state.states[i];
       if (thread.waits_for == Meeting::done || !(whole_warp ? true : whole_block)) continue;
       thread.runnable = true;
       any = true;
@@ -152,17 +158,8 @@ bool release() {
   return any;
 }
 
-// A bit for each lane of the warp that has not ended.
-unsigned present() {
-  const unsigned first = grid_state.current / 32 * 32, stop = std::min(first + 32, grid_state.count);
-  unsigned lanes = 0;
-  for (unsigned i = first; i < stop; ++i)
-    if (grid_state.threads[i].waits_for != Meeting::done) lanes |= 1u << (i - first);
-  return lanes;
-}
-
 // Sets a thread to the first line of the kernel.
-void begin(Thread& thread) {
+void begin(Thread& thread, State& state) {
   if (!thread.begun) {
     getcontext(&thread.context);
     thread.context.uc_stack.ss_sp = thread.stack.get();
@@ -170,28 +167,27 @@ void begin(Thread& thread) {
     thread.context.uc_link = nullptr;
     makecontext(&thread.context, &start, 0);
   }
-  thread.runnable = true;
-  thread.waits_for = Meeting::none;
-  thread.votes = 0;
+  state = {Meeting::none, true, 0, nullptr};
 }
 
 void run_block(const std::function<void()>& body) {
   grid_state.body = &body;
   const unsigned count = grid_state.count;
-  for (unsigned i = 0; i < count; ++i) begin(grid_state.threads[i]);
+  for (unsigned i = 0; i < count; ++i) begin(grid_state.threads[i], grid_state.states[i]);
   std::fill(grid_state.votes, grid_state.votes + 3, false);
-  for (Warp& warp : grid_state.warps) std::fill(warp.turn, warp.turn + 32, 0);
+  for (Warp& warp : grid_state.warps) std::fill(warp.turn, warp.turn + 32, 0), warp.absent = 0;
+  if (count % 32) grid_state.warps.back().absent = ~0u << count % 32;
   std::vector<unsigned> turns(count);
   for (unsigned i = 0; i < count; ++i) turns[i] = order == Order::backward ? count - 1 - i : i;
   for (;;) {
     if (order == Order::shuffled) std::shuffle(turns.begin(), turns.end(), generator);
     for (unsigned index : turns) {
-      if (!grid_state.threads[index].runnable) continue;
-      grid_state.threads[index].runnable = false;
+      if (!grid_state.states[index].runnable) continue;
+      grid_state.states[index].runnable = false;
       give_turn(index);
     }
     bool done = true;
-    for (unsigned i = 0; i < count; ++i) done = done && grid_state.threads[i].waits_for == Meeting::done;
+    for (unsigned i = 0; i < count; ++i) done = done && grid_state.states[i].waits_for == Meeting::done;
     if (done) return;
     if (!release()) fail("threads wait for each other at different barriers", nullptr);
   }
@@ -206,6 +202,7 @@ void run_grid(dim3 grid, dim3 block, size_t shared, const std::function<void()>&
     grid_state.threads.emplace_back();
     grid_state.threads.back().stack.reset(new char[kStack]);
   }
+  grid_state.states.resize(block.x);
   grid_state.warps.resize((block.x + 31) / 32);
   gridDim = grid;
   blockDim = block;
@@ -221,16 +218,16 @@ void restart() { generator.seed(1); }
 void* dynamic_shared() { return grid_state.shared.data(); }
 
 void meet(Meeting meeting, const char* what) {
-  Thread& self = grid_state.threads[grid_state.current];
+  State& self = grid_state.states[grid_state.current];
   self.waits_for = meeting;
   self.what = what;
-  to_scheduler(self);
+  to_scheduler(grid_state.threads[grid_state.current]);
 }
 
 int lane() { return int(grid_state.current % 32); }
 
 bool any_of_block(bool mine) {
-  const int vote = grid_state.threads[grid_state.current].votes++;
+  const int vote = grid_state.states[grid_state.current].votes++;
   grid_state.votes[vote % 3] |= mine;
   meet(Meeting::block, "__syncthreads_or");
   grid_state.votes[(vote + 2) % 3] = false;
@@ -239,8 +236,8 @@ bool any_of_block(bool mine) {
 
 const uint64_t* exchange(uint64_t mine, const char* what, unsigned mask) {
   if (mask != 0xffffffffu) fail("only whole warps are emulated", what);
-  if (present() != 0xffffffffu) fail("a lane of the mask has ended, or the warp is not whole", what);
   Warp& warp = grid_state.warps[grid_state.current / 32];
+  if (warp.absent) fail("a lane of the mask has ended, or the warp is not whole", what);
   uint64_t* slots = warp.slots[warp.turn[lane()]++ % 2];
   slots[lane()] = mine;
   meet(Meeting::warp, what);
