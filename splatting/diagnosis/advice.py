@@ -42,7 +42,7 @@ EXPOSURES = 0.4  # stops; photos of a usual automatic exposure differ by 0.15 to
 FEW_PHOTOS = 16  # 14 gained 0.2 dB by points that hold the depth, 20 and 21 lost as much (docs/results/photos.md)
 DISTANCES = 2.5  # the farthest photo of a point over the nearest
 _APPEARANCE = "--appearance ppisp --opacity_reset_interval 100000"  # after a reset haze can grow before the cameras
-_AGAINST = {  # options that an advised one does not go with, and their value then
+_AGAINST = {  # by an advised option: the options, with these values, that it does not go with
     "--appearance": {"keep_best": True, "train_test_exp": True},
     "--refine_poses": {"keep_best": True, "projection": "ray"},
     "--sky": {"strategy": "mcmc"},

@@ -402,7 +402,7 @@ class Recorder:
             except BaseException:
                 with suppress(RuntimeError):  # which tells of the capture, not of its cause
                     graph.capture_end()
-                # What waited for the GPU has ended the capture, and torch's random numbers would wait for its end.
+                # Where the body has ended the capture, torch's generator would go on as in one, and fail.
                 generator = torch.cuda.default_generators[torch.cuda.current_device()]
                 generator.graphsafe_set_state(generator.clone_state())
                 raise

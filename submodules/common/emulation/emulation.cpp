@@ -55,7 +55,7 @@ struct Thread {
 #endif
 };
 
-// What the scheduler reads of all threads again and again, so it lies together.
+// Of a thread. The scheduler reads all of these again and again, so they lie together.
 struct State {
   Meeting waits_for;
   bool runnable;
