@@ -137,6 +137,18 @@ def activated(parameters: dict[str, Tensor]) -> dict[str, Tensor]:
     return out
 
 
+def keywords(splats: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Arguments of GaussianRasterizer, by their names, of `activated` parameters."""
+    return {
+        "means3D": splats["means"],
+        "means2D": torch.zeros_like(splats["means"]),
+        "opacities": splats["opacities"],
+        "shs": torch.cat([splats["sh_dc"], splats["sh_rest"]], 1),
+        "scales": splats["scales"],
+        "rotations": splats["rotations"],
+    }
+
+
 def rotation_matrix(q: Tensor) -> Tensor:
     """Rotation (3, 3) of a quaternion w x y z of any length, as the product of its left and right multiplication."""
     w, x, y, z = (q.double() / q.double().norm()).tolist()

@@ -5,10 +5,13 @@ import json
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 import torch
 
 from scene.readers.tracks import Track
-from splatting.diagnosis.advice import ADVICE, Advice, asked_options, distances, exposures
+from splatting.diagnosis.advice import ADVICE, Advice, _of_passers_by, asked_options, distances, exposures
+from train import parse
+from utils.system_utils import UserError
 
 SIDE = 20
 
@@ -61,3 +64,13 @@ def test_advice_on_a_given_option_or_against_one_is_not_taken(tmp_path, monkeypa
     assert asked_options(dataset, args, ["--app=none", "-r", "2"]) == ["--sky", "auto"]
     assert "--refine_poses is left out, as it does not go with --projection" in capsys.readouterr().out
     assert [one["options"] for one in json.loads((tmp_path / ADVICE).read_text())] == ["--sky auto", "", ""]
+
+
+def test_the_short_training_reads_the_photos_as_the_training_does(monkeypatch):
+    given = ["-s", "scene", "--masks", "a b", "--mask_meaning", "transparent", "--invert_masks", "-w"]
+    failed, (_, dataset, *_) = SimpleNamespace(returncode=2, stderr="x\nerror: no scene\n"), parse(given)
+    monkeypatch.setattr("subprocess.run", lambda line, **_: vars(failed).update(line=line[2:]) or failed)
+    with pytest.raises(UserError, match="^no scene$"):
+        next(_of_passers_by(dataset))
+    other = {name for name, value in vars(parse(failed.line)[1]).items() if value != vars(dataset)[name]}
+    assert other == {"model_path", "resolution"}

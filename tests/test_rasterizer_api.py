@@ -18,7 +18,7 @@ from diff_gaussian_rasterization import (
     reference,
 )
 from diff_gaussian_rasterization.scene import draw
-from rasterizer_tools import activated, few, leaves, render, scene_arguments
+from rasterizer_tools import activated, few, keywords, leaves, render, scene_arguments
 
 from benchmarks.workloads.splat_scenes import settings
 
@@ -38,15 +38,7 @@ def scene(n: int = 3, dtype: torch.dtype = torch.float32):
 
 def call(splats, camera, **changes):
     """Call the public class with keywords, as users do."""
-    arguments = {
-        "means3D": splats["means"],
-        "means2D": torch.zeros_like(splats["means"]),
-        "opacities": splats["opacities"],
-        "shs": torch.cat([splats["sh_dc"], splats["sh_rest"]], 1),
-        "scales": splats["scales"],
-        "rotations": splats["rotations"],
-    }
-    return GaussianRasterizer(raster_settings=camera)(**(arguments | changes))
+    return GaussianRasterizer(raster_settings=camera)(**(keywords(splats) | changes))
 
 
 @pytest.mark.parametrize(

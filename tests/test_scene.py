@@ -5,10 +5,10 @@ import json
 import os
 import subprocess
 import sys
+from collections import namedtuple
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -94,21 +94,9 @@ def test_a_readers_replacement_gets_the_references_arguments(colmap_scene, blend
     assert len(Scene(_args(colmap_scene, tmp_path / "out"), FakeGaussians(), start=False).getTestCameras()) == 3
 
 
-class TheirInfo2023(NamedTuple):
-    point_cloud: object
-    train_cameras: list
-    test_cameras: list
-    nerf_normalization: dict
-    ply_path: str
-
-
-class TheirInfo2024(NamedTuple):
-    point_cloud: object
-    train_cameras: list
-    test_cameras: list
-    nerf_normalization: dict
-    ply_path: str
-    is_nerf_synthetic: bool
+_FIELDS = ("point_cloud", "train_cameras", "test_cameras", "nerf_normalization", "ply_path")
+TheirInfo2023 = namedtuple("TheirInfo2023", _FIELDS)
+TheirInfo2024 = namedtuple("TheirInfo2024", (*_FIELDS, "is_nerf_synthetic"))
 
 
 @pytest.mark.parametrize("record", [TheirInfo2023, TheirInfo2024])

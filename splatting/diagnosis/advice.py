@@ -206,11 +206,11 @@ def distances(views: list[CameraInfo], tracks: list[Track | None]) -> float:
 def _of_passers_by(dataset: argparse.Namespace) -> Iterator[Advice]:
     """What a short training of small photos leaves over."""
     with tempfile.TemporaryDirectory() as folder:
-        given = {"-s": dataset.source_path, "-m": folder, "-i": dataset.images, "--masks": dataset.masks}
-        given |= {"-r": _WIDTH, "--iterations": _ITERATIONS, "--test_iterations": -1, "--save_iterations": -1}
-        bare = ["--eval"] * dataset.eval + ["-w"] * dataset.white_background + ["--invert_masks"] * dataset.invert_masks
-        bare += ["--quiet", "--no_curve", "--disable_viewer", *map(str, chain(*given.items()))]
-        done = subprocess.run([sys.executable, ROOT / "train.py", *bare], capture_output=True, text=True, check=False)
+        values = {"-s": dataset.source_path, "-m": folder, "-r": _WIDTH, "--iterations": _ITERATIONS}
+        values |= {f"--{name}": getattr(dataset, name) for name in ("images", "masks", "mask_meaning")}
+        flags = [f"--{name}" for name in ("eval", "white_background", "invert_masks") if getattr(dataset, name)]
+        line = [*flags, "--quiet", "--no_curve", "--disable_viewer", *map(str, chain(*values.items()))]
+        done = subprocess.run([sys.executable, ROOT / "train.py", *line], capture_output=True, text=True, check=False)
         if done.returncode:
             raise UserError(done.stderr.strip().rpartition("\n")[2].removeprefix("error: "))
         masks = masks_of(folder)

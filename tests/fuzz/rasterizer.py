@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
-from rasterizer_tools import activated, few
+from rasterizer_tools import activated, few, keywords
 from torch import Tensor
 
 from benchmarks.workloads.splat_scenes import settings
@@ -26,15 +26,7 @@ class Rasterizer:
         self._splats, self._settings = activated(raw), settings(**size)
 
     def run(self, rng: random.Random) -> None:
-        splats = self._splats
-        arguments = {
-            "means3D": splats["means"],
-            "means2D": torch.zeros_like(splats["means"]),
-            "opacities": splats["opacities"],
-            "shs": torch.cat([splats["sh_dc"], splats["sh_rest"]], 1),
-            "scales": splats["scales"],
-            "rotations": splats["rotations"],
-        }
+        arguments = keywords(self._splats)
         if rng.random() < 0.2:
             del arguments["scales"], arguments["rotations"]
             arguments["cov3D_precomp"] = torch.tensor([[0.1, 0.0, 0.0, 0.1, 0.0, 0.1]] * 3)
