@@ -7,8 +7,9 @@ import torch
 
 from scene.cameras import Camera
 from scene.images.store import GPU_SHARE, ImageStore
+from scene.scene import Scene
 from splatting.host.memory import free_memory
-from splatting.training.schedule import PYRAMID, DecidedSchedule, Levels, Schedule
+from splatting.training.schedule import PYRAMID, DecidedSchedule, Schedule
 
 LEAST = 32  # pixels of the shorter side; a picture is not made smaller than that
 
@@ -78,14 +79,11 @@ def smaller(camera: Camera, factor: float) -> tuple[int, int]:
     return tuple(max(1, round(side / factor)) for side in sides)
 
 
-# "auto" is none of them, unless --time_budget chooses the pyramid.
-LEVELS: dict[str, Levels] = {"none": (), "pyramid": PYRAMID}
-
-
-def resolution_of(opt: argparse.Namespace, schedule: Schedule, images: ImageStore) -> Resolution:
+def resolution_of(opt: argparse.Namespace, schedule: Schedule, scene: Scene) -> Resolution:
     """The sizes of the training views by the options, or by the schedule that a run repeats or resumes."""
+    schedule.megapixels = scene.training_pixels()[0] / len(scene.getTrainCameras()) / 1e6
     if not isinstance(schedule, DecidedSchedule):
         schedule.sizes = "none" if opt.resolution_schedule == "auto" else opt.resolution_schedule
     if not schedule.levels:
-        schedule.levels = LEVELS.get(schedule.sizes, ())
-    return Resolution(schedule, images)
+        schedule.levels = PYRAMID if schedule.sizes == "pyramid" else ()
+    return Resolution(schedule, scene.images)

@@ -117,7 +117,7 @@ class Run:
         count = len(points if capture is None else capture[1])
         self._share(count)
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed, views, self.group.rank if views > 1 else 0)
-        self.resolution = resolution_of(opt, self.schedule, self.scene.images)
+        self.resolution = resolution_of(opt, self.schedule, self.scene)
         self._decode_ahead(self.first_iteration + 1)
         self._begin_model(capture, first)
         self._check_records()

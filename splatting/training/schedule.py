@@ -27,7 +27,7 @@ _ROUNDING = 1e-6  # iterations of the schedule; progress is a float, and just be
 PART = 1 / 200  # of the budget that a block takes, so that what is left is known well before the end
 _MOST_GROWTH = 2  # of a block over the one before, while the first iterations are slower than the others
 _KNOWN = 1 / 50  # of the budget, after which the speed says how many iterations there may be
-SHORT = 6.0  # iterations of the schedule for each one, from which on smaller views at first gain more than they lose
+SHORT = 4.0  # megapixels of the schedule's views for each view that trains, from which on smaller ones at first gain
 _LAST = 1.5  # blocks; if no more are left, they are one
 _MOST_SHARE = 2  # times the part of the schedule that an iteration does where no seconds are lost
 _TOLD = 1.02  # times the budget, from which on a run says that it takes longer
@@ -37,11 +37,12 @@ class Schedule:
     """The steady schedule: each iteration stands for itself.
 
     length: of the schedule, in iterations. ends: the last iteration of the run, None: not known yet. views: of each
-    iteration. sizes: the schedule of the views' sizes that is in force (--resolution_schedule); levels: of that.
-    strategy: the one in force (--strategy).
+    iteration. megapixels: of a view. sizes: the schedule of the views' sizes that is in force (--resolution_schedule);
+    levels: of that. strategy: the one in force (--strategy).
     """
 
     views = 1
+    megapixels = 1.0
     sizes = "none"
     levels: Levels = ()
     strategy = ""
@@ -194,9 +195,7 @@ class DecidedSchedule(Schedule):
 
     def recorded(self, iteration: int, last: bool) -> Decided:
         """The schedule of a run that has taken an iteration. last: it ended with it."""
-        if last:
-            return self.up_to(iteration)._replace(ended=iteration)
-        return self._decided
+        return self.up_to(iteration)._replace(ended=iteration) if last else self._decided
 
     def up_to(self, iteration: int) -> Decided:
         """The schedule of a run that went no further than an iteration."""
@@ -228,8 +227,7 @@ class TimeBudget(DecidedSchedule):
         super().__init__(decided)
         self._share = share
         self._open = self.sizes == "auto"
-        if self._open:
-            self.sizes = "none"
+        self.sizes = "none" if self._open else self.sizes
         self._speed: float | None = None  # seconds of an iteration
         self._speeds: list[float] = []  # of the last three blocks
         self._measured = 0  # blocks of this run
@@ -265,11 +263,11 @@ class TimeBudget(DecidedSchedule):
             self._speeds = [*self._speeds[-2:], speed]
 
     def _choose_sizes(self, done: int, seconds: float) -> None:
-        """Take smaller views if few iterations are possible: from the next one on, and all of that is recorded."""
+        """Take smaller views if few pixels can be trained: from the next one on, and all of that is recorded."""
         self._open = False
         now = (self.schedule_step(done) + 0.5) / self.length
         possible = done + max(self.seconds - seconds, 0.0) / self._speed
-        short = self.length / possible >= SHORT and now < PYRAMID[1][0]
+        short = self.megapixels * self.length / possible >= SHORT and now < PYRAMID[1][0]
         self.sizes = "pyramid" if short else "none"
         self.levels = ((now, PYRAMID[0][1]), *PYRAMID[1:]) if short else ()
 
