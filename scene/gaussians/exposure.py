@@ -45,8 +45,13 @@ class Exposures:
         self.mapping = {name: index for index, name in enumerate(names)}
         self.values: Tensor = nn.Parameter(torch.eye(3, 4, device=compute_device()).repeat(len(names), 1, 1))
 
-    def __getitem__(self, name: str) -> Tensor:
-        """Map (3, 4) of a photo, differentiable. UserError for a photo that was not trained on."""
+    def __getitem__(self, name: str | Tensor) -> Tensor:
+        """Map (3, 4) of a photo, differentiable. UserError for a photo that was not trained on.
+
+        A recorded step has its index (1,) int64, on the device, in the place of a name.
+        """
+        if isinstance(name, Tensor):
+            return self.values.index_select(0, name)[0]
         if self.pretrained is not None and name in self.pretrained:
             return self.pretrained[name]
         if self.pretrained is not None or name not in self.mapping:
@@ -70,6 +75,7 @@ class Exposures:
         """
         self.values = trainable(self.values)
         self.optimizer = GaussianAdam([{"params": [self.values], "lr": _ADAM_RATE, "name": "exposure"}], eps=_ADAM_EPS)
+        self._gradients = [torch.zeros_like(self.values)]
         self.schedule = get_expon_lr_func(
             getattr(opt, "exposure_lr_init", 0.01),
             getattr(opt, "exposure_lr_final", 0.001),
@@ -82,6 +88,11 @@ class Exposures:
         """Set the learning rate of this iteration, if there is an optimiser and a schedule."""
         if self.optimizer is not None and self.schedule is not None and self.pretrained is None:
             self.optimizer.param_groups[0]["lr"] = self.schedule(iteration)
+
+    def keep_gradients(self) -> None:
+        """Let gradients lie in fixed places, where a recorded step writes them, and where `step` then finds them."""
+        for group, gradient in zip(self.optimizer.param_groups, self._gradients, strict=True):
+            group["params"][0].grad = gradient
 
     def step(self) -> None:
         """Step if there is a gradient, and drop the gradient."""

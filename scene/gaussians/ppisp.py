@@ -69,7 +69,6 @@ class Ppisp(Exposures):
     """
 
     kind: ClassVar[str] = "ppisp"
-    held = False
 
     def __init__(self, names: Sequence[str] = (), cameras: Sequence[object] = ()) -> None:
         """cameras: the number of each photo's camera."""
@@ -171,7 +170,7 @@ class Ppisp(Exposures):
         self.numbers = {name: trainable(values) for name, values in self.numbers.items()}
         groups = [{"params": [values], "lr": _ALL[name][1], "name": name} for name, values in self.numbers.items()]
         self.optimizer = GaussianAdam(groups)
-        self._gradients = {name: torch.zeros_like(values) for name, values in self.numbers.items()}
+        self._gradients = [torch.zeros_like(values) for values in self.numbers.values()]
         steps = getattr(opt, "iterations", 30_000)
         self.schedule = get_expon_lr_func(1.0, _FALL, int(_DELAY * steps), 0.0, steps)
 
@@ -179,11 +178,6 @@ class Ppisp(Exposures):
         if self.optimizer is not None:
             for group in self.optimizer.param_groups:
                 group["lr"] = 0.0 if self.held else _ALL[group["name"]][1] * self.schedule(iteration)
-
-    def keep_gradients(self) -> None:
-        """Let gradients lie in fixed places, where a recorded step writes them, and where `step` then finds them."""
-        for name, values in self.numbers.items():
-            values.grad = self._gradients[name]
 
     @torch.no_grad()
     def step(self) -> None:

@@ -260,16 +260,16 @@ class Graphs:
         self._recorder.release()
 
     def _is_usual(self, at: Iteration) -> bool:
-        """Whether the step has a photo whose pixels all count, and nothing else."""
-        plain = not (at.wants_depth or self._run.dataset.train_test_exp)
-        return self._able and plain and at.camera.columns is None and at.camera.counts_all_pixels
+        """Whether the step has a photo without a mask, and nothing else."""
+        return self._able and not at.wants_depth and at.camera.counts_all_pixels
 
     def _graph_for(self, at: Iteration) -> _Graph | None:
         """The graph for a step, made if it is worth it. The first step of a kind is not, as it may load kernels."""
         camera, run = at.camera, self._run
         held = run.exposes and run.gaussians.exposures.held
         phase = run.density.observes(at.iteration), run.gaussians.active_sh_degree, held
-        kind = (camera.image_height, camera.image_width, camera.FoVx, camera.FoVy, camera.lens, *phase)
+        size = camera.image_height, camera.image_width, camera.FoVx, camera.FoVy
+        kind = (*size, camera.lens, str(camera.columns), *phase)
         graph = self._graphs.get(kind)
         if graph is not None:
             return graph
@@ -312,7 +312,7 @@ class Graphs:
             world_view_transform=numbers[:16].view(4, 4),
             full_proj_transform=numbers[16:32].view(4, 4),
             camera_center=numbers[32:35],
-            columns=None,  # all count
+            columns=camera.columns,
             counts_all_pixels=True,
             ground_truth=lambda _: (target, None),  # the photo on the step's background, and no mask
             exposure_name=self._inputs[-1:],
