@@ -56,7 +56,7 @@ output/demo_scene: | install
 	$(BIN)/python -m splatting.demo.make_scene $@
 
 test: install lint cpp-test
-	$(BIN)/python -m pytest -m 'not browser' --numprocesses $(shell expr $(CORES) + 2) --maxprocesses 6 --dist worksteal
+	$(BIN)/python -m pytest -m 'not browser' --numprocesses $(shell expr $(CORES) + 1) --maxprocesses 5 --dist worksteal
 
 test-aarch64 test-windows test-macos:
 	$(PYTHON) .ci/cross.py $(@:test-%=%)
