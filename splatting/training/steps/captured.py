@@ -260,7 +260,7 @@ class Graphs:
         self._recorder.release()
 
     def _is_usual(self, at: Iteration) -> bool:
-        """Whether the step has a photo without a mask, and nothing else."""
+        """Whether the photo has no mask, and the loss needs no depth."""
         return self._able and not at.wants_depth and at.camera.counts_all_pixels
 
     def _graph_for(self, at: Iteration) -> _Graph | None:
