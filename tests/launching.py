@@ -86,6 +86,6 @@ def launch(logs: Path, fault: str, *options: str, size: int = 2, restarts: int =
     return outputs(logs, size, statuses[0])
 
 
-def launch_fault(scene: Path, folder: Path, fault: str, **more: Any) -> Launched:
+def launch_fault(scene: Path, folder: Path, fault: str, *options: str, **more: Any) -> Launched:
     """Train into folder/out with a fault."""
-    return launch(folder / "logs", fault, *words(scene, folder / "out", "--no_curve", "--plain_step"), **more)
+    return launch(folder / "logs", fault, *words(scene, folder / "out", "--no_curve", "--plain_step", *options), **more)

@@ -72,13 +72,18 @@ STANDS = "the last checkpoint stands: resume with --start_checkpoint {out}/chkpn
         ("kill 0 7", "error: rank 0 ended without a word (killed, or crashed); " + STANDS),
         ("bug 1 7", "error: rank 1: ValueError: no such thing"),
         ("hang 1 7", "error: rank 1 hung: the others waited"),
+        (
+            "whole-hang 1 27",
+            "error: rank 1 hung: the others waited",
+        ),  # after the first epoch, in which photos are decoded
         ("whole-kill 0 7", "error: rank 0 ended without a word (killed, or crashed); " + STANDS),
     ],
     ids=lambda value: value.split()[0] if isinstance(value, str) and value[:5] != "error" else "",
 )
 def test_a_fault_of_one_rank_ends_all_with_one_sentence(colmap_scene, tmp_path, fault, said):
     began = time.monotonic()
-    done = launch_fault(colmap_scene, tmp_path, fault, size=3 if fault == "kill 0 7" else 2)
+    size = 3 if fault == "kill 0 7" else 2
+    done = launch_fault(colmap_scene, tmp_path, fault, "--iterations", "40", size=size)
     assert time.monotonic() - began < 90  # 30 seconds on a machine that does nothing else
     assert done.status != 0
     (line,) = done.errors

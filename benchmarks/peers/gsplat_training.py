@@ -5,15 +5,12 @@
 
 Photos, poses, points and split are those of train.py, and lie in memory before the clock starts. Rates, schedules and
 weights are the defaults of gsplat's own trainer, in a frame like its own. The loss is our fused kernel and Adam is
-torch's fused one, which only helps. The clock stands while a PLY is written. Writes OUT/point_cloud/iteration_N,
-OUT/cfg_args and OUT/seconds.csv.
+torch's fused one, which only helps. Writes what `benchmarks.peers.timed` says.
 """
 
 import argparse
 import math
-import random
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,27 +18,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from arguments import ModelParams, write_cfg_args
-from benchmarks.harness.measuring import describe
-from benchmarks.peers.curve import SECONDS
+from arguments import ModelParams
+from benchmarks.peers.timed import DEGREE, shuffled, train
 from scene.cameras import Camera
-from scene.gaussian_model import GaussianModel
 from scene.gaussians.ply import write_ply
 from scene.gaussians.start import start_rows
-from scene.saved_iterations import saved_ply
 from scene.scene import Scene
-from splatting.evaluation.error_curve import Row, write_peer
 from utils.graphics_utils import camera_center, world_to_camera
 from utils.loss_utils import photometric_loss
-from utils.system_utils import UserError, compute_device, mkdir_p, run_cli
+from utils.system_utils import UserError, compute_device, run_cli
 
 RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
 LAST_RATE = 0.01  # of the means' rate, which falls to this part of its start exponentially
-DEGREE, DEGREE_EVERY = 3, 1000  # of SH, and iterations until the next band
+DEGREE_EVERY = 1000  # iterations until the next band of SH
 DSSIM = 0.2
 # Of 3DGS-MCMC (Kheradmand et al. 2024): the start, and weights of the mean opacity and of the mean scale in the loss.
 MCMC_OPACITY, MCMC_SIZE, MCMC_WEIGHT = 0.5, 0.1, 0.01
-SAVES = (250, 500, 1000, 2000, 4000, 7000, 10_000, 15_000, 20_000, 30_000)
 
 
 class Frame(NamedTuple):
@@ -85,18 +77,18 @@ def view_of(camera: Camera, frame: Frame, background: Tensor) -> View:
 
 
 class Training:
-    """Parameters, optimisers and strategy, and how far they have come. strategy: "default" or "mcmc"."""
+    """Parameters, optimisers and strategy, and how far they have come."""
 
-    def __init__(self, scene: Scene, strategy: str, cap: int, iterations: int, seed: int, white: bool) -> None:
+    def __init__(self, scene: Scene, options: ModelParams, args: argparse.Namespace) -> None:
         try:
             import gsplat
         except ImportError as error:
             raise UserError(f"{error}; run pip install gsplat==1.5.3") from error
-        torch.manual_seed(seed)
-        self._draw, self._mcmc, self._iterations = gsplat.rasterization, strategy == "mcmc", iterations
+        self._draw, self._mcmc, self._iterations = gsplat.rasterization, args.strategy == "mcmc", args.iterations
         self.frame, device = frame_of(scene.getTrainCameras()), compute_device()
-        self.background = torch.full((3,), float(white), device=device)
-        self._views = _shuffled([view_of(of, self.frame, self.background) for of in scene.getTrainCameras()], seed)
+        self._shift = torch.from_numpy(self.frame.center + scene.info.offset)  # the frame's origin in the world
+        self.background = torch.full((3,), float(options.white_background), device=device)
+        self._views = shuffled([view_of(of, self.frame, self.background) for of in scene.getTrainCameras()], args.seed)
         self._extent = scene.cameras_extent * self.frame.scale
         self.params = torch.nn.ParameterDict(self._start(scene)).to(device)
         self._optimizers = {
@@ -106,7 +98,7 @@ class Training:
             for name, rate in RATES.items()
         }
         if self._mcmc:
-            self._strategy = gsplat.MCMCStrategy(cap_max=cap)
+            self._strategy = gsplat.MCMCStrategy(cap_max=args.cap_max)
             self._state = self._strategy.initialize_state()
         else:
             self._strategy = gsplat.DefaultStrategy()
@@ -127,6 +119,9 @@ class Training:
         if self._mcmc:
             values["opacities"] = torch.full_like(values["opacities"], MCMC_OPACITY).logit()
         return {name: torch.nn.Parameter(value.contiguous()) for name, value in values.items()}
+
+    def __len__(self) -> int:
+        return len(self.params["means"])
 
     def render(self, view: View, step: int) -> tuple[Tensor, dict[str, Any]]:
         """The image (3, H, W) of a view, and gsplat's notes for its strategy."""
@@ -155,65 +150,24 @@ class Training:
             optimizer.zero_grad(set_to_none=True)
         self._strategy.step_post_backward(*both, **({"lr": rate} if self._mcmc else {"packed": False}))
 
-    def save(self, path: Path, offset: np.ndarray) -> None:
-        """Write a PLY in the world. offset: world coordinates (3,) of the origin of the scene's frame."""
+    def save(self, path: Path) -> None:
+        """Write a PLY in the world."""
         p = {name: value.detach() for name, value in self.params.items()}
-        shift = torch.from_numpy(self.frame.center + offset).to(p["means"].device)
-        rows = {"xyz": p["means"].double() / self.frame.scale + shift, "f_dc": p["sh0"], "f_rest": p["shN"]}
+        xyz = p["means"].double() / self.frame.scale + self._shift.to(p["means"].device)
+        rows = {"xyz": xyz, "f_dc": p["sh0"], "f_rest": p["shN"]}
         rows |= {"opacity": p["opacities"][:, None], "rotation": p["quats"]}
-        mkdir_p(path.parent)
         write_ply(path, rows | {"scaling": p["scales"] - math.log(self.frame.scale)}, DEGREE)
-
-
-def _shuffled(views: list[View], seed: int) -> Iterator[View]:
-    """All views in a random order, again and again."""
-    rng = random.Random(seed)
-    while True:
-        yield from rng.sample(views, len(views))
-
-
-def _now() -> float:
-    if compute_device().type == "cuda":
-        torch.cuda.synchronize()
-    return time.perf_counter()
-
-
-def run(training: Training, model: Path, saves: Sequence[int], offset: np.ndarray) -> list[Row]:
-    """Train to the last of `saves`, write a PLY at each, and return rows of SECONDS."""
-    rows, seconds, done = [], 0.0, 0
-    for stop in saves:
-        begin = _now()
-        for step in range(done, stop):
-            training.step(step)
-        seconds, done = seconds + _now() - begin, stop
-        training.save(saved_ply(model, stop), offset)
-        peak = torch.cuda.max_memory_allocated() / 2**20 if compute_device().type == "cuda" else None
-        rows.append({"iteration": stop, "seconds": seconds, "gaussians": len(training.params["means"])})
-        rows[-1]["peak_memory_mib"] = peak
-        print(rows[-1], flush=True)
-        write_peer(model / SECONDS, rows)
-    return rows
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    model_params, add = ModelParams(parser), parser.add_argument
-    add("--strategy", choices=("default", "mcmc"), default="default", help="gsplat's strategy (default: default)")
-    add("--cap_max", type=int, default=1_000_000, help="most Gaussians of mcmc (default: gsplat's, 1000000)")
-    add("--iterations", type=int, default=SAVES[-1], help=f"default: {SAVES[-1]}")
-    add("--save_iterations", type=int, nargs="+", default=SAVES, help=f"default: {' '.join(map(str, SAVES))}")
-    add("--seed", type=int, default=0, help="default: 0")
-    args = parser.parse_args()
-    options, model = model_params.extract(args), Path(args.model_path)
-    if not args.model_path or model.exists():
-        raise UserError(f"-m must name a new folder, got {args.model_path or 'none'}")
-    scene = Scene(options, GaussianModel(DEGREE), shuffle=False, start=False)
-    training = Training(scene, args.strategy, args.cap_max, args.iterations, args.seed, options.white_background)
-    print(describe(compute_device()))
-    mkdir_p(model)
-    write_cfg_args(model, options)
-    saves = sorted({step for step in args.save_iterations if step < args.iterations} | {args.iterations})
-    run(training, model, saves, scene.info.offset)
+    parser.add_argument(
+        "--strategy", choices=("default", "mcmc"), default="default", help="gsplat's (default: default)"
+    )
+    parser.add_argument(
+        "--cap_max", type=int, default=1_000_000, help="most Gaussians of mcmc (default: gsplat's, 1000000)"
+    )
+    train(parser, Training)
 
 
 if __name__ == "__main__":
