@@ -13,7 +13,7 @@ from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianR
 
 import metrics
 import render
-from benchmarks.peers import curve, gsplat_training, reference_training, timed
+from benchmarks.peers import curve, gaussian_splatting_training, gsplat_training, timed
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from splatting.evaluation import peer_curve
@@ -280,7 +280,7 @@ def test_gsplat_trains_on_our_scenes_and_is_scored_as_we_are(strategy, colmap_sc
         gsplat_training.main()
 
 
-def test_the_references_package_trains_on_training_photos_alone(colmap_scene, tmp_path, monkeypatch):
+def test_gaussian_splatting_of_pypi_trains_on_training_photos_alone(colmap_scene, tmp_path, monkeypatch):
     model, seen, steps = GaussianModel(3), [], []
 
     def prepare_training(degree, source, device, mode, **options):
@@ -295,7 +295,7 @@ def test_the_references_package_trains_on_training_photos_alone(colmap_scene, tm
     monkeypatch.setitem(sys.modules, "gaussian_splatting.train", module)
     words = ["peer", "-s", str(colmap_scene), "-m", str(tmp_path / "m"), "--eval", "--iterations", "40"]
     monkeypatch.setattr(sys, "argv", words)
-    timed.train(argparse.ArgumentParser(), reference_training.start)
+    timed.train(argparse.ArgumentParser(), gaussian_splatting_training.start)
     assert seen == [camera.image_name for camera in read_scene(colmap_scene, "images", hold_out=True).train_cameras]
     assert len(steps) == 40 and set(steps) <= set(seen)
     monkeypatch.setattr(sys, "argv", ["curve", "-m", str(tmp_path / "m")])
@@ -304,4 +304,4 @@ def test_the_references_package_trains_on_training_photos_alone(colmap_scene, tm
     assert (last["iteration"], last["gaussians"]) == (40, len(model))
     monkeypatch.setattr(sys, "argv", [*words[:4], str(tmp_path / "other"), "-w"])
     with pytest.raises(UserError, match="black background alone"):
-        timed.train(argparse.ArgumentParser(), reference_training.start)
+        timed.train(argparse.ArgumentParser(), gaussian_splatting_training.start)

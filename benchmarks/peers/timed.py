@@ -23,7 +23,8 @@ from splatting.evaluation.error_curve import Row, write_peer
 from utils.system_utils import UserError, compute_device, mkdir_p
 
 DEGREE = 3  # of SH
-SAVES = (250, 500, 1000, 2000, 4000, 7000, 10_000, 15_000, 20_000, 30_000)
+# Not at multiples of 100, where density control has just changed the model, which scores low for some iterations.
+SAVES = (250, 550, 1050, 2050, 4050, 7050, 10_050, 15_050, 20_050, 30_000)
 T = TypeVar("T")
 
 

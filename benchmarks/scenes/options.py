@@ -21,6 +21,7 @@ from statistics import mean, stdev
 import numpy as np
 from PIL import Image
 
+from benchmarks.harness.colmap_part import but_every, part
 from benchmarks.harness.measuring import describe, print_table
 from benchmarks.scenes.training import train
 from scene.dataset_readers import read_scene
@@ -155,21 +156,7 @@ def floaters(name: str, scene: Path, model: Path) -> dict[str, float]:
 
 def thinned(scene: Path, out: Path, keep: int) -> Path:
     """Write a COLMAP scene of every `keep`-th training photo of another, without the points that judge the depth."""
-    import pycolmap  # after Pillow
-
-    folder = out / "sparse" / "0"
-    folder.mkdir(parents=True)
-    pycolmap.Reconstruction(str(scene / "sparse" / "0")).write_text(str(folder))
-    (out / "images").symlink_to((scene / "images").resolve())
-    images, points = ([x for x in (folder / f"{name}.txt").read_text().splitlines() if not x.startswith("#")]
-                      for name in ("images", "points3D"))  # fmt: skip
-    pairs = sorted(zip(images[::2], images[1::2], strict=True), key=lambda pair: pair[0].split(maxsplit=9)[9])
-    trained = [pair for place, pair in enumerate(pairs) if place % HOLD]
-    points.sort(key=lambda line: int(line.split(maxsplit=1)[0]))
-    left = [line for rank, line in enumerate(points) if rank % HELD_OUT]
-    (folder / "images.txt").write_text("".join(f"{line}\n" for pair in trained[::keep] for line in pair))
-    (folder / "points3D.txt").write_text("".join(f"{line}\n" for line in left))
-    return out
+    return part(scene, out, lambda views: but_every(HOLD, views)[::keep], lambda points: but_every(HELD_OUT, points))
 
 
 def compare(

@@ -61,7 +61,6 @@ class Speculation:
         self._needed: dict[Hashable, Capacity] = {}
         self._pending: deque[_Pending] = deque()
         self._done = 0  # steps, as far as the host knows
-        self.overflows = 0  # so far
 
     def add(self, at: Iteration, losses: Losses) -> None:
         """Take note of a step that was queued with its `capacity`."""
@@ -144,7 +143,6 @@ class Speculation:
 
     def _replay(self, report: list[int]) -> None:
         """Raise the capacity of the step that was halted, and replay it and all later ones."""
-        self.overflows += 1
         self._stream.synchronize()
         self._words[0] = 0
         self._numbers[(self._done + 1) % _REPORTS][5] = 0  # the halted step's report will come once more
