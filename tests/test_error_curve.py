@@ -53,6 +53,12 @@ HEADER = (
 OLD = HEADER.replace(",subset,estimated", "")  # of files without subsets
 
 
+@pytest.fixture(autouse=True)
+def draws(monkeypatch):
+    """Here, trainings draw their curve (see conftest.py)."""
+    monkeypatch.setattr("splatting.evaluation.curve_recorder.CurveDrawer", CurveDrawer)
+
+
 def _row(iteration: int, test: float | None, train: float | None = None, **more: float | None) -> Row:
     row = dict.fromkeys(COLUMNS) | {"iteration": iteration, "seconds": iteration / 10, "wall_seconds": iteration / 9}
     return row | {"test_psnr": test, "train_psnr": train} | more
