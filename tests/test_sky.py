@@ -107,6 +107,14 @@ def test_a_training_and_a_resumed_one_keep_it_and_exports_leave_it_out(scene, tm
     np.testing.assert_array_equal(read_splats(tmp_path / "near.ply").means, model.means[~far])
 
 
+def test_none_begins_in_a_resumed_training(scene, tmp_path, capsys):
+    words = ["-s", str(scene), "-m", str(tmp_path), "--no_curve", "--iterations"]
+    train.main([*words, "2", "--checkpoint_iterations", "2"])
+    train.main([*words, "3", "--sky", "auto", "--start_checkpoint", str(tmp_path / "chkpnt2.pth")])
+    assert "the checkpoint has no sky, and one begins only where a training does" in capsys.readouterr().out
+    assert read_model_json(tmp_path).get("sky") is None
+
+
 def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         run_cli(lambda: train.main(["-s", str(scene), "-m", str(tmp_path), "--sky", "auto", "--strategy", "mcmc"]))

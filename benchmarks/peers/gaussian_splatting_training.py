@@ -18,8 +18,6 @@ from scene.readers.info import HOLD
 from scene.scene import Scene
 from utils.system_utils import UserError, compute_device, run_cli
 
-MODE = "densify"  # "same with original 3DGS"
-
 
 class Training:
     """The package's own trainer of its own model on its own cameras."""
@@ -30,7 +28,7 @@ class Training:
         except ImportError as error:
             raise UserError(f"{error}; run pip install gaussian-splatting==2.11.0 (Python 3.10 or 3.11)") from error
         cameras, self._gaussians, self._trainer = prepare_training(
-            DEGREE, str(source), str(compute_device()), MODE, load_mask=False, load_depth=False
+            DEGREE, str(source), str(compute_device()), "densify", load_mask=False, load_depth=False
         )
         self._views = shuffled([cameras[place] for place in range(len(cameras))], seed)
 

@@ -9,7 +9,7 @@ import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import torch
 
@@ -25,7 +25,6 @@ from utils.system_utils import UserError, compute_device, mkdir_p
 DEGREE = 3  # of SH
 # Not at multiples of 100, where density control has just changed the model, which scores low for some iterations.
 SAVES = (250, 550, 1050, 2050, 4050, 7050, 10_050, 15_050, 20_050, 30_000)
-T = TypeVar("T")
 
 
 class Training(Protocol):
@@ -40,7 +39,7 @@ class Training(Protocol):
         """Write a PLY in the world of the dataset."""
 
 
-def shuffled(views: Sequence[T], seed: int) -> Iterator[T]:
+def shuffled(views: Sequence, seed: int) -> Iterator:
     """All views in a random order, again and again."""
     rng = random.Random(seed)
     while True:

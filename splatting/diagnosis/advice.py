@@ -92,11 +92,12 @@ def asked_options(dataset: argparse.Namespace, args: argparse.Namespace, given: 
     """
     if ranks().several:
         raise UserError("--advise and --options auto need one process; run train.py --advise, and give what it says")
+    if written := args.advise and dataset.model_path:
+        mkdir_p(dataset.model_path)  # if it cannot be, better before the search
     found = advise(dataset)
     print(*found, sep="\n")
     found = [_taken(advice, args, given) for advice in found]
-    if args.advise and dataset.model_path:
-        mkdir_p(dataset.model_path)
+    if written:
         write_json(Path(dataset.model_path) / ADVICE, [advice._asdict() for advice in found])
     words = " ".join(advice.options for advice in found).split()
     print(f"options that this scene asks for, besides those given: {' '.join(words) or 'none'}")

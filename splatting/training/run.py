@@ -214,6 +214,8 @@ class Run:
         if capture is not None:
             if state := further(capture, SKY):
                 self.sky = resumed_sky(state, self.scene)
+            elif self.opt.sky != "off":
+                print("--sky auto: the checkpoint has no sky, and one begins only where a training does")
             self.gaussians.start_exposures(self.scene.info.train_cameras)
             self.gaussians.restore(capture, self.opt)
             checks.check_exposures(self.gaussians, self.exposes, self.start)
