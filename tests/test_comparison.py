@@ -1,12 +1,14 @@
 """Runs beside each other: spread, levels and fronts of option sets, published tables, and the tables of them."""
 
 import json
+import re
 import statistics
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 from report_runs import curve, run_of, set_runs
 
 import train
@@ -207,10 +209,14 @@ def test_seeds_of_different_ground_truth_are_told_so():
 
 
 def test_one_option_set_has_no_comparisons(tmp_path):
-    shown = {"attic": {"curves": [], "poses": [], "fronts": [], "views": []}}
+    shown = {"attic": {"curves": [], "poses": [], "masked": [], "fronts": [], "views": []}}
     page = render("md", make_report(["x"], set_runs()[:2]), shown, tmp_path)
     assert "### Seconds of training to reach a test PSNR" not in page and "### Pareto front" not in page
+    assert "robust_mask" not in page
+    Image.new("RGB", (2, 2)).save(tmp_path / "masked.png")
+    shown["attic"]["masked"] = [tmp_path / "masked.png"]
     page = render("html", make_report(["x"], set_runs()), shown, tmp_path)
+    assert re.search(r"<summary>What --robust_mask leaves out of photos</summary>\s*<figure>", page)
     # Where the table is too wide, a cell is broken here alone.
     assert '<table class="wrap">' in page and "10.0\u00a0±\u00a00.0\u00a0s (50\u00a0%)" in page
 

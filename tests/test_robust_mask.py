@@ -12,6 +12,8 @@ from synthetic import make_colmap_scene
 from trainings import differences, trained
 
 import train
+from splatting.evaluation.model_folder import MASKED_PHOTOS
+from splatting.evaluation.renders import GAP, HEADER
 from splatting.evaluation.training_log import read_log
 from splatting.training import checks, robust_mask
 from splatting.training.observers import guards
@@ -114,6 +116,11 @@ def test_all_steps_and_a_resumed_training_have_the_same_bytes(scene, tmp_path, m
     (said,) = [line for line in lines if line.startswith("--robust_mask leaves out")]
     written = [path for path in (tmp_path / "whole" / robust_mask.FOLDER).rglob("*.png")]
     assert f"in {len(written)} of 14 photos" in said and written
+    with Image.open(tmp_path / "whole" / MASKED_PHOTOS) as picture:
+        pixels = np.asarray(picture, int)
+    wide = (picture.width - 3 * GAP) // 2
+    left, right = pixels[HEADER:, GAP : GAP + wide], pixels[HEADER:, -GAP - wide : -GAP]
+    assert 0.01 < (right < left - 20).any(2).mean() < 0.4  # the same photos, darker where pixels are left out
     monkeypatch.setattr(guards, "_LEARNT", 59)
     monkeypatch.setattr(robust_mask, "CLEAR", 0.0)  # differences are small after 60 iterations
     assert trained(scene, tmp_path / "named", *ON[2:]) == off

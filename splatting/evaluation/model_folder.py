@@ -18,6 +18,7 @@ from splatting.files.plain_files import plain
 from utils.system_utils import UserError, saved_iterations
 
 SCHEDULE = "schedule.json"  # of a training whose iterations followed the clock
+MASKED_PHOTOS = "robust_masks.png"  # photos of which --robust_mask leaves out most
 
 
 def json_or_none(path: Path) -> Any | None:

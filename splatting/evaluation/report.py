@@ -20,6 +20,7 @@ from splatting.evaluation import comparison, tables
 from splatting.evaluation.advised import advice_effects
 from splatting.evaluation.comparison import Sets
 from splatting.evaluation.figures import draw_curves, draw_fronts, draw_poses
+from splatting.evaluation.model_folder import MASKED_PHOTOS
 from splatting.evaluation.renders import GAIN, ComparedViews
 from splatting.files.json_files import write_json
 from splatting.files.listing import markdown_table
@@ -36,7 +37,9 @@ _MEANT = re.compile(r"[\\`*\[\]<>&]")  # characters that begin or end Markdown's
 _ENTITIES = {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
 
 Run = dict[str, Any]
-Pictures = Mapping[str, Mapping[str, Any]]  # by scene: paths of `curves`, `poses`, `fronts`; `views`, by `_views`
+Pictures = Mapping[
+    str, Mapping[str, Any]
+]  # by scene: paths of `curves`, `poses`, `masked`, `fronts`; `views`, by `_views`
 
 
 def make_report(
@@ -127,6 +130,7 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
         pictures[scene] = {
             "curves": _figures(draw_curves, folder, scene, members, peers),
             "poses": _figures(draw_poses, folder, scene, members),
+            "masked": [path for run in members if (path := output / run["model"] / MASKED_PHOTOS).is_file()],
             "fronts": _figures(draw_fronts, folder, scene, found, names) if found else [],
             "views": _views(output, scene, members, each),
         }

@@ -32,6 +32,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "JPEG2000", "TGA")
 SCALE = "scale"  # key of a plane's text chunk: value = pixel * scale
 _STEPS = 65535
+_DIM = 0.3  # brightness of what a mask leaves out
 
 
 def open_image(path: Path) -> Image.Image:
@@ -60,6 +61,13 @@ def to_bytes(image: torch.Tensor) -> torch.Tensor:
     if image.dtype != torch.uint8:
         image = (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
     return image.permute(1, 2, 0).contiguous().cpu()
+
+
+def dimmed(image: torch.Tensor, counts: torch.Tensor) -> torch.Tensor:
+    """An image (3, H, W), float, darker where a mask (1, H, W) bool leaves it out."""
+    import torch
+
+    return torch.where(counts, image, _DIM * image)
 
 
 def save_png(image: torch.Tensor, path: Path) -> None:

@@ -15,7 +15,7 @@ from gaussian_renderer.blending import blend_depth, view_planes
 from gaussian_renderer.free_view import free_view
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
-from splatting.files.image_files import to_bytes
+from splatting.files.image_files import dimmed, to_bytes
 from splatting.viewer import views
 from splatting.viewer.legend import ERROR_SCALE, Legend, count_colors, depth_colors, error_image
 from splatting.viewer.views import Pose, SceneCameras, Settings, Vector, canvas
@@ -24,7 +24,6 @@ from utils.image_utils import as_float
 LONGEST = 1600  # pixels of a frame's longer side, at most
 COARSE = 2  # a frame of a moving camera has a quarter of the pixels
 _BORDER = 0.15  # grey around a target that does not fill the window
-_MASKED = 0.3  # brightness of a photo where it is masked
 _LINE = 2  # pixels of the slider's line
 _NO_PHOTO = "No photo was taken from here. “Go to the camera” (tab Photos) leads to one."
 
@@ -70,7 +69,7 @@ class Frames:
             target = as_float(camera.target(self._background(settings)))
             drawn = self._image(settings, camera, target)
             if (counts := self.masks(camera)) is not None:
-                target = torch.where(counts, target, _MASKED * target)
+                target = dimmed(target, counts)
             self._compared = key, (target, *drawn)
         target, image, words = self._compared[1]
         shown = to_bytes(_fitted(_composed(settings, target, image), pose)).numpy()

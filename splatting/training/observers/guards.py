@@ -15,6 +15,8 @@ from gaussian_renderer.memory_errors import situation
 from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
 from scene.gaussians.checkpoint import save_checkpoint
+from splatting.evaluation.model_folder import MASKED_PHOTOS
+from splatting.files.image_files import dimmed, to_bytes
 from splatting.files.listing import some
 from splatting.host.memory import is_out_of_memory
 from splatting.training.iteration import Iteration
@@ -22,6 +24,7 @@ from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
 from splatting.training.robust_mask import FEW, FOLDER, MASKED, MOST_PHOTOS, odd_photos, residuals_of
 from splatting.training.run import Run
+from utils.image_utils import as_float
 from utils.system_utils import UserError, atomic_write
 
 _LEARNT = 1000  # iterations, until which much is not explained; advice trains so many, and searches itself
@@ -84,7 +87,7 @@ class MaskWatch(Observer):
 
 
 class PassersBy(Observer):
-    """Writes what --robust_mask masks at the end as mask files, and names the photos."""
+    """Writes what --robust_mask masks at the end as mask files, names the photos, and draws the worst."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
@@ -92,8 +95,10 @@ class PassersBy(Observer):
     def ended(self, error: Error) -> None:
         if error is not None:
             return
-        run, folder, shares = self._run, Path(self._run.scene.model_path) / FOLDER, {}
+        run, model, shares = self._run, Path(self._run.scene.model_path), {}
+        folder, picture = model / FOLDER, model / MASKED_PHOTOS
         shutil.rmtree(folder, ignore_errors=True)  # of an earlier training
+        picture.unlink(missing_ok=True)
         for camera in run.robust_mask.cameras:
             if (counts := run.robust_mask.counted(camera)) is None:
                 continue
@@ -101,10 +106,26 @@ class PassersBy(Observer):
             with atomic_write(folder / f"{camera.image_name}.png") as temporary:
                 Image.fromarray(counts[0].to(torch.uint8).mul(255).cpu().numpy()).save(temporary)
         views = len(run.robust_mask.cameras)
-        most = [f"{name} ({shares[name]:.0%})" for name in sorted(shares, key=shares.get, reverse=True)]
+        shares = dict(sorted(shares.items(), key=lambda named: -named[1]))
+        if shares:
+            self._draw(shares, picture)
+        most = [f"{name} ({share:.0%})" for name, share in shares.items()]
         text = f"--robust_mask leaves out {sum(shares.values()) / views:.1%} of the pixels"
         text += f", in {len(shares)} of {views} photos"
         run.log.tell(text + (f", most in {some(most)}; {folder} shows them" if most else ""))
+
+    def _draw(self, shares: dict[str, float], path: Path) -> None:
+        """Draw photos beside themselves with darker masked parts. shares: of what is masked, the largest first."""
+        from splatting.evaluation.renders import WIDEST, WORST, sheet  # here, as few trainings need it
+
+        rows, cameras = [], {camera.image_name: camera for camera in self._run.robust_mask.cameras}
+        for name in list(shares)[:WORST]:
+            photo = as_float(cameras[name].target(self._run.background))
+            both = photo, dimmed(photo, self._run.robust_mask.counted(cameras[name]))
+            images = [Image.fromarray(to_bytes(image).numpy()) for image in both]
+            rows.append(list(zip((name, f"{shares[name]:.0%}"), images, strict=True)))
+        with atomic_write(path) as temporary:
+            sheet(("photo", "left out: dark"), rows, WIDEST).save(temporary)
 
 
 class OddPhotos(Observer):
