@@ -56,6 +56,7 @@ def test_a_passer_by_is_masked_and_detail_is_not():
     masked = ~found[3][0].numpy()
     assert masked[ndimage.binary_erosion(there, iterations=3)].all()
     assert not masked[~ndimage.binary_dilation(there, iterations=6)].any()
+    assert masks.mask(views[3], photos[3][1], photos[3][0], None, learns=False) is not None
     assert _visit(masks, views, photos, 1) == [None] * 10  # as a floater, too, would stay for good
     now = [masks.counted(view) for view in views]
     assert torch.equal(now.pop(3), found[3]) and now == [None] * 9 and masks.counted(_views(1)[0]) is None

@@ -67,7 +67,7 @@ class RobustMask:
             newest = _in_cells(image, target, mask)
             found = torch.lerp(found, newest, _NEWEST) if self.visits[uid] else newest
             self._next = uid, found
-        if self.visits[uid] < self.least or self.visits[uid] % _ALL == _ALL - 1:
+        if self.visits[uid] < self.least or (learns and self.visits[uid] % _ALL == _ALL - 1):
             return mask
         outliers = self._outliers(uid, found)
         if not outliers.any():
