@@ -111,7 +111,7 @@ def test_none_begins_in_a_resumed_training(scene, tmp_path, capsys):
     words = ["-s", str(scene), "-m", str(tmp_path), "--no_curve", "--iterations"]
     train.main([*words, "2", "--checkpoint_iterations", "2"])
     train.main([*words, "3", "--sky", "auto", "--start_checkpoint", str(tmp_path / "chkpnt2.pth")])
-    assert "the checkpoint has no sky, and one begins only where a training does" in capsys.readouterr().out
+    assert "the checkpoint has no sky, and a sky is added only when a training starts" in capsys.readouterr().out
     assert read_model_json(tmp_path).get("sky") is None
 
 

@@ -4,7 +4,8 @@
     python -m benchmarks.peers.curve -m OUT
 
 It has the reference's kernels, and defaults of its own. It reads COLMAP scenes of pinholes itself: here a copy without
-the test photos. What its own loop prints is left out, which only helps. Writes what `benchmarks.peers.timed` says.
+the test photos, in their own size, whatever -r says. What its own loop prints is left out, which only helps. Writes
+what `benchmarks.peers.timed` says.
 """
 
 import argparse

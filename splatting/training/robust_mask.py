@@ -27,7 +27,7 @@ _FACTOR = 9.0  # times the level of all photos is what residuals of detail rarel
 _AROUND = 5  # cells across, most of which are outliers somewhere in a passer-by, but not in a highlight
 # Of so many visits of a photo, the last trains all pixels: else a floater before its camera, which no other photo
 # shows, would be masked for good. A passer-by that is learnt there is unlearnt by other photos.
-_ALL = 4
+_UNMASKED = 4
 _STATE = ("residuals", "levels", "visits")
 MASKED = 0.3  # of a photo, at most, where photos of passers-by are searched
 MOST_PHOTOS = 300  # that are searched
@@ -67,7 +67,7 @@ class RobustMask:
             newest = _in_cells(image, target, mask)
             found = torch.lerp(found, newest, _NEWEST) if self.visits[uid] else newest
             self._next = uid, found
-        if self.visits[uid] < self.least or (learns and self.visits[uid] % _ALL == _ALL - 1):
+        if self.visits[uid] < self.least or (learns and self.visits[uid] % _UNMASKED == _UNMASKED - 1):
             return mask
         outliers = self._outliers(uid, found)
         if not outliers.any():

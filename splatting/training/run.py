@@ -215,7 +215,7 @@ class Run:
             if state := further(capture, SKY):
                 self.sky = resumed_sky(state, self.scene)
             elif self.opt.sky != "off":
-                print("--sky auto: the checkpoint has no sky, and one begins only where a training does")
+                print("--sky auto: the checkpoint has no sky, and a sky is added only when a training starts")
             self.gaussians.start_exposures(self.scene.info.train_cameras)
             self.gaussians.restore(capture, self.opt)
             checks.check_exposures(self.gaussians, self.exposes, self.start)
