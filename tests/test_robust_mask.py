@@ -44,8 +44,9 @@ def _visit(masks: RobustMask, views: list, photos: list, times: int) -> list[tor
     return found
 
 
-def test_a_passer_by_is_masked_and_detail_is_not():
+def test_a_passer_by_is_masked_and_detail_is_not(monkeypatch):
     """Detail has large residuals, too, pixel by pixel; only their means over cells are small."""
+    monkeypatch.setattr(RobustMask, "early", 5)  # the edge does not reach so high a limit
     views, photos = _views(10), [_photo(seed) for seed in range(10)]
     there = np.hypot(*(np.mgrid[:64, :96] - np.array([30, 40])[:, None, None])) < 12
     photos[3][0][:, there] = 20
@@ -54,12 +55,11 @@ def test_a_passer_by_is_masked_and_detail_is_not():
     found = _visit(masks, views, photos, 1)
     assert [mask is not None for mask in found] == [k == 3 for k in range(10)]
     masked = ~found[3][0].numpy()
-    assert masked[ndimage.binary_erosion(there, iterations=3)].all()
-    assert not masked[~ndimage.binary_dilation(there, iterations=6)].any()
+    assert masked[there].all() and not masked[~ndimage.binary_dilation(there, iterations=6)].any()
     assert masks.mask(views[3], photos[3][1], photos[3][0], None, learns=False) is not None
-    assert _visit(masks, views, photos, 1) == [None] * 10  # as a floater, too, would stay for good
+    assert _visit(masks, views, photos, robust_mask._UNMASKED - 3) == [None] * 10  # or a floater would stay, too
     now = [masks.counted(view) for view in views]
-    assert torch.equal(now.pop(3), found[3]) and now == [None] * 9 and masks.counted(_views(1)[0]) is None
+    assert not now.pop(3)[~found[3]].any() and now == [None] * 9 and masks.counted(_views(1)[0]) is None
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3])

@@ -3,7 +3,8 @@
 Robust masks from residuals: Sabour et al. 2023 (RobustNeRF), section 4; residuals kept over a training, and a level
 over all photos: Sabour et al. 2024 (SpotLessSplats), section 4. No network is asked. Both look at the size of each
 pixel's residual. Here residuals are averaged with their sign over cells: detail that is not learnt yet cancels out
-there, a passer-by does not.
+there, a passer-by does not. Canny 1986, "A computational approach to edge detection": a second, lower limit for what is
+beside it (hysteresis), as a cell at its edge shows both.
 """
 
 import math
@@ -24,10 +25,11 @@ FOLDER = "robust_masks"  # of a model folder: mask files of what was masked at t
 CELLS = 32  # of a photo, across and down
 _NEWEST = 0.5  # weight of the newest residuals in a photo's
 _FACTOR = 9.0  # times the level of all photos is what residuals of detail rarely reach
+_BESIDE = 3.0  # for a cell beside an outlier, so many times less
 _AROUND = 5  # cells across, most of which are outliers somewhere in a passer-by, but not in a highlight
 # Of so many visits of a photo, the last trains all pixels: else a floater before its camera, which no other photo
 # shows, would be masked for good. A passer-by that is learnt there is unlearnt by other photos.
-_UNMASKED = 4
+_UNMASKED = 16
 _STATE = ("residuals", "levels", "visits")
 MASKED = 0.3  # of a photo, at most, where photos of passers-by are searched
 MOST_PHOTOS = 300  # that are searched
@@ -69,11 +71,8 @@ class RobustMask:
             self._next = uid, found
         if self.visits[uid] < self.least or (learns and self.visits[uid] % _UNMASKED == _UNMASKED - 1):
             return mask
-        outliers = self._outliers(uid, found)
-        if not outliers.any():
-            return mask
-        counts = ~_enlarged(outliers, image.shape[-2:])
-        return counts if mask is None else counts & mask
+        counts = self._counts(uid, found, image.shape[-2:])
+        return counts if mask is None else mask if counts is None else counts & mask
 
     def keep(self) -> None:
         """Keep the residuals of a step that is taken."""
@@ -85,27 +84,33 @@ class RobustMask:
     def _level(self, residuals: Tensor) -> Tensor:
         return residuals.flatten().kthvalue(self._below).values
 
+    def _limit(self, uid: int) -> Tensor:
+        return _FACTOR * (1 + self.early / int(self.visits[uid])) * self.levels.nanmedian()
+
     def _outliers(self, uid: int, residuals: Tensor) -> Tensor:
         """Cells far beyond the level of all photos, without small groups; of more than may be masked, the largest."""
-        factor = _FACTOR * (1 + self.early / int(self.visits[uid]))
-        outliers = residuals > factor * self.levels.nanmedian()
+        outliers = residuals > self._limit(uid)
         around = {"kernel_size": _AROUND, "stride": 1, "padding": _AROUND // 2}
         most = avg_pool2d(outliers[None].float(), **around, count_include_pad=False) > 0.5
         near = max_pool2d((most & outliers).float(), **around)[0] > 0
         return outliers & near & (residuals > self._level(residuals))
 
+    def _counts(self, uid: int, residuals: Tensor, size: Sequence[int]) -> Tensor | None:
+        """Pixels (1, H, W) bool but those of outliers and of cells beside them; None if all count."""
+        beside = max_pool2d(self._outliers(uid, residuals)[None].float(), 3, stride=1, padding=1)[0] > 0
+        masked = beside & (residuals > self._limit(uid) / _BESIDE) & (residuals > self._level(residuals))
+        return interpolate(masked[None, None].float(), size=tuple(size))[0] == 0 if masked.any() else None
+
     def counted(self, camera: Camera) -> Tensor | None:
         """Pixels of a view that are not masked now, (1, H, W) bool; None if none is, as in test views."""
         if camera not in self.cameras or self.visits[camera.uid] < self.least:
             return None
-        outliers = self._outliers(camera.uid, self.residuals[camera.uid])
-        return ~_enlarged(outliers, (camera.image_height, camera.image_width)) if outliers.any() else None
+        return self._counts(camera.uid, self.residuals[camera.uid], (camera.image_height, camera.image_width))
 
     def difference(self, camera: Camera) -> float:
-        """Mean residual of what is masked in a view, in [0, 1]; 0 if nothing is."""
+        """Mean residual of a view's outliers, in [0, 1]; 0 without any."""
         residuals = self.residuals[camera.uid]
-        outliers = self._outliers(camera.uid, residuals)
-        return float(residuals[outliers].mean()) if outliers.any() else 0.0
+        return float(residuals[self._outliers(camera.uid, residuals)].mean().nan_to_num())
 
     def captured(self) -> dict[str, Any]:
         """State that a resumed training needs, as plain values."""
@@ -145,8 +150,3 @@ def _in_cells(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
         difference = torch.where(mask, difference, 0.0)
     cells = adaptive_avg_pool2d(difference, CELLS)
     return avg_pool2d(cells, 3, stride=1, padding=1, count_include_pad=False).abs().mean(0)
-
-
-def _enlarged(cells: Tensor, size: Sequence[int]) -> Tensor:
-    """Cells (CELLS, CELLS) bool as pixels (1, H, W)."""
-    return interpolate(cells[None, None].float(), size=tuple(size))[0] > 0
