@@ -35,11 +35,10 @@ sources = $(shell find submodules/common submodules/$(1) \( -name build -o -name
 
 install: $(EXTENSIONS:%=$(VENV)/.built-%)
 
-# Without --no-compile, half of the time makes bytecode of modules that nothing imports.
 $(VENV)/.requirements: requirements.txt requirements-dev.txt
 	@$(PYTHON) -c '$(CHECK_PYTHON)'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -r requirements-dev.txt
+	$(BIN)/pip install --quiet --disable-pip-version-check -r requirements-dev.txt
 	@touch $@
 
 .SECONDEXPANSION:
@@ -126,7 +125,7 @@ docs: $(DOCS_VENV)/.requirements
 $(DOCS_VENV)/.requirements: requirements-docs.txt
 	@$(PYTHON) -c '$(CHECK_PYTHON)'
 	$(PYTHON) -m venv $(DOCS_VENV)
-	$(DOCS_VENV)/bin/pip install --quiet --disable-pip-version-check --no-compile -r $<
+	$(DOCS_VENV)/bin/pip install --quiet --disable-pip-version-check -r $<
 	@touch $@
 
 clean:
