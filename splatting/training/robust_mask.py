@@ -24,8 +24,8 @@ from utils.system_utils import UserError
 FOLDER = "robust_masks"  # of a model folder: mask files of what was masked at the end
 CELLS = 32  # of a photo, across and down
 _NEWEST = 0.5  # weight of the newest residuals in a photo's
-_FACTOR = 9.0  # times the level of all photos is what residuals of detail rarely reach
-_BESIDE = 3.0  # for a cell beside an outlier, so many times less
+_FACTOR = 13.0  # times the level of all photos is what residuals of detail rarely reach
+_BESIDE = 3.0  # times it for a cell beside an outlier
 _AROUND = 5  # cells across, most of which are outliers somewhere in a passer-by, but not in a highlight
 # Of so many visits of a photo, the last trains all pixels: else a floater before its camera, which no other photo
 # shows, would be masked for good. A passer-by that is learnt there is unlearnt by other photos.
@@ -42,7 +42,7 @@ class RobustMask:
 
     share: of a photo, at most, that is masked. residuals (n, CELLS, CELLS), by the cameras' uid; levels (n,): what the
     largest `share` of a photo's residuals are above, NaN before the first. least: visits of a photo until it is masked.
-    early: visits after which its factor is still twice _FACTOR, as not all is learnt.
+    early: visits after which limits are still twice as high, as not all is learnt.
     """
 
     least: ClassVar[int] = 2
@@ -84,12 +84,12 @@ class RobustMask:
     def _level(self, residuals: Tensor) -> Tensor:
         return residuals.flatten().kthvalue(self._below).values
 
-    def _limit(self, uid: int) -> Tensor:
-        return _FACTOR * (1 + self.early / int(self.visits[uid])) * self.levels.nanmedian()
+    def _limit(self, uid: int, factor: float) -> Tensor:
+        return factor * (1 + self.early / int(self.visits[uid])) * self.levels.nanmedian()
 
     def _outliers(self, uid: int, residuals: Tensor) -> Tensor:
         """Cells far beyond the level of all photos, without small groups; of more than may be masked, the largest."""
-        outliers = residuals > self._limit(uid)
+        outliers = residuals > self._limit(uid, _FACTOR)
         around = {"kernel_size": _AROUND, "stride": 1, "padding": _AROUND // 2}
         most = avg_pool2d(outliers[None].float(), **around, count_include_pad=False) > 0.5
         near = max_pool2d((most & outliers).float(), **around)[0] > 0
@@ -98,7 +98,7 @@ class RobustMask:
     def _counts(self, uid: int, residuals: Tensor, size: Sequence[int]) -> Tensor | None:
         """Pixels (1, H, W) bool but those of outliers and of cells beside them; None if all count."""
         beside = max_pool2d(self._outliers(uid, residuals)[None].float(), 3, stride=1, padding=1)[0] > 0
-        masked = beside & (residuals > self._limit(uid) / _BESIDE) & (residuals > self._level(residuals))
+        masked = beside & (residuals > self._limit(uid, _BESIDE)) & (residuals > self._level(residuals))
         return interpolate(masked[None, None].float(), size=tuple(size))[0] == 0 if masked.any() else None
 
     def counted(self, camera: Camera) -> Tensor | None:
