@@ -24,8 +24,8 @@ from utils.system_utils import UserError
 FOLDER = "robust_masks"  # of a model folder: mask files of what was masked at the end
 CELLS = 32  # of a photo, across and down
 _NEWEST = 0.5  # weight of the newest residuals in a photo's
-_FACTOR = 13.0  # times the level of all photos is what residuals of detail rarely reach
-_BESIDE = 3.0  # times it for a cell beside an outlier
+_FACTOR = 13.0  # times the level of all photos is what detail and highlights rarely reach
+_BESIDE = 3.0  # times that level suffice beside an outlier
 _AROUND = 5  # cells across, most of which are outliers somewhere in a passer-by, but not in a highlight
 # Of so many visits of a photo, the last trains all pixels: else a floater before its camera, which no other photo
 # shows, would be masked for good. A passer-by that is learnt there is unlearnt by other photos.
