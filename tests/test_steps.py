@@ -212,6 +212,30 @@ def test_without_memory_for_a_graph_steps_are_queued_one_call_after_the_other(sc
 
 
 @pytest.mark.parametrize("_", GPU)
+def test_a_graph_without_any_memory_is_an_error_and_no_abort(_):
+    """Torch allocates as a capture begins; in a process of its own, as the abort would end this one."""
+    code = """
+import torch
+from splatting.training.steps.captured import Recorder
+recorder, word = Recorder(torch.device("cuda")), torch.zeros(1, device="cuda")
+recorder.capture(word.zero_)
+recorder.release()
+total = torch.cuda.get_device_properties(0).total_memory
+torch.cuda.set_per_process_memory_fraction(torch.cuda.memory_reserved() / total)
+try:
+    recorder.capture(word.zero_)
+except torch.OutOfMemoryError:
+    print("out of memory")
+torch.cuda.set_per_process_memory_fraction(1.0)
+recorder.capture(word.fill_(3.0).zero_)[0]()
+print(word.item())
+"""
+    root = Path(__file__).resolve().parents[1]
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "out of memory\n0.0\n"), done.stderr
+
+
+@pytest.mark.parametrize("_", GPU)
 def test_a_step_that_waits_for_the_gpu_is_not_captured_and_random_numbers_are_there(scene, tmp_path, monkeypatch, _):
     wanted, body = trained(scene, tmp_path / "captured"), Graphs._body
     monkeypatch.setattr(Graphs, "_body", lambda self, *of: body(self, *of).sum().item())

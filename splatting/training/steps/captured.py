@@ -393,9 +393,13 @@ class Recorder:
         return min(free, most - torch.cuda.memory_reserved(self._device)) < most / 4
 
     def _graph_of(self, body: Callable[[], Tensor]) -> tuple[torch.cuda.CUDAGraph, Tensor]:
-        graph = torch.cuda.CUDAGraph()
         self._stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(self._stream):
+            # capture_begin allocates two words for the random generator. Where that fails, torch's destructor of the
+            # graph throws, which aborts the process. Here it fails before there is a graph.
+            words = [torch.empty(1, dtype=torch.int64, device=self._device) for _ in range(2)]
+            del words  # to the cache of this stream, which the next allocations take
+            graph = torch.cuda.CUDAGraph()
             graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
             try:
                 result = body()
