@@ -1,5 +1,6 @@
 """The ways to take a step of training: the fast ones give the bytes of the plain one."""
 
+import gc
 import re
 import signal
 import subprocess
@@ -18,7 +19,7 @@ from splatting.training import run
 from splatting.training.objective import Losses, Objective
 from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.steps import speculative, step_taker
-from splatting.training.steps.captured import CapturedStep, Graphs
+from splatting.training.steps.captured import CapturedStep, Graphs, Recorder
 from splatting.training.steps.fused import FusedStep
 from splatting.training.steps.plain import PlainStep
 from utils.system_utils import UserError
@@ -236,11 +237,32 @@ print(word.item())
 
 
 @pytest.mark.parametrize("_", GPU)
+def test_graphs_that_nobody_has_any_more_do_not_end_a_capture(_):
+    recorder, word = Recorder(torch.device("cuda")), torch.zeros(1, device="cuda")
+    unreachable = [recorder.capture(word.zero_)[0]]
+    unreachable.append(unreachable)
+    del unreachable
+    threshold = gc.get_threshold()
+    try:
+        gc.set_threshold(1, 1, 1)
+        launch, _ = recorder.capture(lambda: [[[] for _ in range(1000)], word.fill_(3.0)][1])
+    finally:
+        gc.set_threshold(*threshold)
+    launch()
+    assert word.item() == 3
+
+
+@pytest.mark.parametrize("_", GPU)
 def test_a_step_that_waits_for_the_gpu_is_not_captured_and_random_numbers_are_there(scene, tmp_path, monkeypatch, _):
     wanted, body = trained(scene, tmp_path / "captured"), Graphs._body
     monkeypatch.setattr(Graphs, "_body", lambda self, *of: body(self, *of).sum().item())
     assert trained(scene, tmp_path / "queued") == wanted
     assert torch.rand(3, device="cuda").max() < 1
+    held = torch.empty(2**28, dtype=torch.uint8, device="cuda")
+    reserved = torch.cuda.memory_reserved()
+    del held
+    torch.cuda.empty_cache()  # gives nothing back while torch believes that it captures
+    assert torch.cuda.memory_reserved() <= reserved - 2**28
 
 
 @pytest.mark.parametrize("_", GPU)

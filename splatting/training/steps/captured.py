@@ -9,8 +9,9 @@ A graph is good for one kind of step (size and angle of the image, SH degree, st
 tensors are replaced, as density control does, or their lists outgrow its capacity (training/steps/speculative.py).
 """
 
-from collections.abc import Callable, Hashable
-from contextlib import AbstractContextManager, nullcontext, suppress
+import gc
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -394,7 +395,7 @@ class Recorder:
 
     def _graph_of(self, body: Callable[[], Tensor]) -> tuple[torch.cuda.CUDAGraph, Tensor]:
         self._stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(self._stream):
+        with torch.cuda.stream(self._stream), _no_collection():
             # capture_begin allocates two words for the random generator. Where that fails, torch's destructor of the
             # graph throws, which aborts the process. Here it fails before there is a graph.
             words = [torch.empty(1, dtype=torch.int64, device=self._device) for _ in range(2)]
@@ -403,12 +404,34 @@ class Recorder:
             graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
             try:
                 result = body()
+                graph.capture_end()
             except BaseException:
-                with suppress(RuntimeError):  # which tells of the capture, not of its cause
-                    graph.capture_end()
-                # Where the body has ended the capture, torch's generator would go on as in one, and fail.
-                generator = torch.cuda.default_generators[torch.cuda.current_device()]
-                generator.graphsafe_set_state(generator.clone_state())
+                self._end(graph)
                 raise
-            graph.capture_end()
         return graph, result
+
+    def _end(self, graph: torch.cuda.CUDAGraph) -> None:
+        """End a capture that has failed, so that torch's allocator and generator take part in it no longer."""
+        index = torch.cuda.current_device()
+        try:
+            graph.capture_end()
+        except RuntimeError:  # which tells of the capture, not of its cause, and ends nothing else
+            with suppress(RuntimeError):
+                # Within a capture, torch gives no memory back to the driver.
+                torch._C._cuda_endAllocateToPool(index, self._pool)
+                torch._C._cuda_releasePool(index, self._pool)
+        # Where the body has ended the capture, torch's generator would go on as in one, and fail.
+        generator = torch.cuda.default_generators[index]
+        generator.graphsafe_set_state(generator.clone_state())
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Within it Python collects no garbage: to destroy the graph of an earlier training would invalidate a capture."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
