@@ -205,9 +205,10 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_written(PHOTO, "version https://git-lfs.github.com/spec/v1\noid sha256:4\n"), "left/v02.png .*git lfs pull"),
         (_floats, "cannot read .*v02.png .*floating-point"),
         (_one_photo, "SCENE has too few photos for --eval"),
-        (_own(XYZ, "0 0 0"), "points3D.ply has no red, green, blue"),
-        (_own(f"{XYZ}, {RGB.replace('uchar', 'float')}", "0 0 0 255 128 0"), "colours in .*points3D.ply are neither"),
-        (_mine("float x", "", element="face 0"), "has no x, y, z, red, green, blue"),
+        (_own(f"{XYZ}, uchar red, uchar green", "0 0 0 1 1"), "points3D.ply has red but no blue"),
+        (_own(f"{XYZ}, {RGB.replace('uchar', 'float')}", "0 0 0 256 128 0"), "colours in .*points3D.ply are neither"),
+        (_own(f"{XYZ}, {RGB.replace('uchar', 'int')}", "0 0 0 70000 128 0"), "colours in .*points3D.ply are neither"),
+        (_mine("float x", "", element="face 0"), "has no x, y, z; it needs"),
         (
             _mine(f"{XYZ}, {RGB}", "0 0 0 1 1 1\n0 nan 0 1 1 1", "vertex 2"),
             r"1 of 2 points .* finite \(first: number 1\)",

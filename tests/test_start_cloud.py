@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from plyfile import PlyData, PlyElement
 from synthetic import FakeGaussians, options_of, read
 
 from scene import Scene
 from scene.readers.point_cloud import read_point_cloud, write_point_cloud
 from scene.readers.start_cloud import random_in_frusta
+from utils.sh_utils import C0
 from utils.system_utils import UserError
 
 POINTS = np.array([[0.25, -1.5, 3.0], [4.0, 5.5, -6.0]])
@@ -26,10 +28,20 @@ BYTES = np.array([[255, 0, 51], [102, 255, 204]])
         "x,y,z,r,g,b\n0.25,-1.5,3,255,0,51\n4,5.5,-6,102,255,204",
         "# by hand\n0.25 -1.5 3e0   1 0 0.2\n\n4 5.5 -6 0.4 1 0.8\n",
         "0.25;-1.5;3;255;0;51\r\n4;5.5;-6;102;255;204\r\n",
+        "0,25;-1,5;3,0;255;0;51\n4;5,5;-6;102;255;204\n",
+        "//X Y Z R G B\n0.25 -1.5 3 255 0 51\n4 5.5 -6 102 255 204\n",
+        "//X,Y,Z,Rf,Gf,Bf\n2\n0.25,-1.5,3,1,0,0.2\n4,5.5,-6,0.4,1,0.8\n",
+        '"Red" "Green" "Blue" "x" "y" "z"\n255 0 51 0.25 -1.5 3\n102 255 204 4 5.5 -6\n',
+        "2\n0.25 -1.5 3 17 255 0 51\n4 5.5 -6 99 102 255 204\n",
+        "0.25 -1.5 3 255 0 51 0.7\n4 5.5 -6 102 255 204 0.8\n",
+        "0.25 -1.5 3 -1200 255 0 51\n4 5.5 -6 -800 102 255 204\n",
+        "0.25 -1.5 3 255 0 51 0 0 -1\n4 5.5 -6 102 255 204 0.6 0.8 0\n",
+        "0.25 -1.5 3 0 0 -1 255 0 51\n4 5.5 -6 0.6 0.8 0 102 255 204\n",
+        "# in Gr\xf6\xdfe\n0.25 -1.5 3 255 0 51\n4 5.5 -6 102 255 204\n",
     ],
 )
 def test_text(tmp_path, text):
-    (tmp_path / "a.xyz").write_text(text)
+    (tmp_path / "a.xyz").write_bytes(text.encode("latin-1"))
     cloud = read_point_cloud(tmp_path / "a.xyz")
     np.testing.assert_array_equal(cloud.points, np.float32(POINTS))
     np.testing.assert_allclose(cloud.colors, BYTES / 255, atol=1e-7)
@@ -39,7 +51,7 @@ def test_text(tmp_path, text):
 
 
 @pytest.mark.parametrize("keys", [("points", "colors"), ("xyz", "rgb")])
-@pytest.mark.parametrize("colors", [BYTES.astype(np.uint8), BYTES / 255])
+@pytest.mark.parametrize("colors", [BYTES.astype(np.uint8), BYTES.astype(np.uint16) * 257, BYTES / 255])
 def test_npz(tmp_path, keys, colors):
     np.savez(tmp_path / "a.npz", **dict(zip(keys, (POINTS, colors), strict=True)), other=np.zeros(3))
     cloud = read_point_cloud(tmp_path / "a.npz")
@@ -47,13 +59,43 @@ def test_npz(tmp_path, keys, colors):
     np.testing.assert_allclose(cloud.colors, BYTES / 255, atol=1e-7)
 
 
-def test_points_without_colours_are_grey(tmp_path):
+def _write_ply(path: Path, columns: list[tuple[str, str]], rows: np.ndarray) -> None:
+    vertices = np.array([tuple(row) for row in rows], dtype=columns)
+    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(path))
+
+
+@pytest.mark.parametrize(
+    "names", ["red green blue", "Red Green Blue", "diffuse_red diffuse_green diffuse_blue", "r g b"]
+)
+@pytest.mark.parametrize(
+    ("kind", "part"), [("u1", 255), ("i4", 255), ("u2", 255), ("u2", 65535), ("i4", 65535), ("f4", 1), ("f4", 255)]
+)
+def test_colours_of_a_ply(tmp_path, names, kind, part):
+    """Integers up to 255 are bytes, whatever their type."""
+    columns = [*((axis, "f8") for axis in "XYZ"), *((name, kind) for name in names.split())]
+    _write_ply(tmp_path / "a.ply", columns, np.column_stack([POINTS, BYTES / 255 * part]))
+    cloud = read_point_cloud(tmp_path / "a.ply")
+    np.testing.assert_array_equal(cloud.points, POINTS)
+    np.testing.assert_allclose(cloud.colors, BYTES / 255, atol=1e-7)
+
+
+def test_a_gaussian_model_gives_its_points_their_colours(tmp_path):
+    columns = [(name, "f4") for name in ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2")]
+    _write_ply(tmp_path / "a.ply", columns, np.column_stack([POINTS, (BYTES / 255 - 0.5) / C0]))
+    np.testing.assert_allclose(read_point_cloud(tmp_path / "a.ply").colors, BYTES / 255, atol=1e-6)
+
+
+def test_points_without_colours_are_grey(tmp_path, capsys):
     np.savez_compressed(tmp_path / "a.npz", points=POINTS)
     (tmp_path / "a.txt").write_text("0.25 -1.5 3\n4 5.5 -6\n")
-    for name in ("a.npz", "a.txt"):
+    (tmp_path / "b.txt").write_text("x y z intensity\n0.25 -1.5 3 7\n4 5.5 -6 9\n")
+    (tmp_path / "c.txt").write_text("0.25 -1.5 3 0 0 -1\n4 5.5 -6 0.6 0.8 0\n")
+    _write_ply(tmp_path / "a.ply", [("x", "f4"), ("y", "f4"), ("z", "f4")], POINTS)
+    for name in ("a.npz", "a.txt", "b.txt", "c.txt", "a.ply"):
         cloud = read_point_cloud(tmp_path / name)
         np.testing.assert_array_equal(cloud.points, np.float32(POINTS))
         assert (cloud.colors == np.float32(127 / 255)).all()
+        assert f"{name} has no colours; its points begin grey" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -66,6 +108,8 @@ def test_points_without_colours_are_grey(tmp_path):
         ("a.xyz", b"1 2 nan\n", r"1 of 1 points .* are not finite \(first: number 0\)"),
         ("a.xyz", b"1 2 1e99\n", "are not finite"),
         ("a.xyz", b"1 2 3 400 0 0\n", "neither integers nor between 0 and 1"),
+        ("a.xyz", b"1 2 3 0.5 1.1 0\n", "between 0 and 1: they range from 0 to 1.1"),
+        ("a.xyz", b"1 2 3 4 5 6 7 8\n", "8 columns, whose first line does not name them"),
         ("a.npz", b"PK\x03\x04 broken", "not a readable npz"),
     ],
 )

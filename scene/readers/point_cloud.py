@@ -2,17 +2,20 @@
 
 import io
 import os
-import warnings
+import sys
 import zipfile
 import zlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
+from scene.readers.point_text import read_text
 from splatting.files.plain_files import check_packed_rows
 from splatting.files.ply_header import read_elements
 from utils.graphics_utils import BasicPointCloud
+from utils.sh_utils import SH2RGB
 from utils.system_utils import UserError, atomic_write
 
 # What NumPy and the reader of archives raise for damaged files: the last two for compression and encryption.
@@ -24,7 +27,9 @@ _LONGEST_HEADER = 1 << 14  # bytes; those of arrays of numbers have 128, and Num
 _NEEDS = "it needs an array points (N,3), and may have colors (N,3)"
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
-_COLOR = ("red", "green", "blue")
+_SH = ("f_dc_0", "f_dc_1", "f_dc_2")
+_COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"), _SH)
+_GREY = 127 / 255
 
 
 def is_ply(path: Path) -> bool:
@@ -35,9 +40,9 @@ def is_ply(path: Path) -> bool:
 def read_point_cloud(path: Path) -> BasicPointCloud:
     """Points (float64) with colours (float32) and normals (0 where missing) of a file, whose content decides its kind.
 
-    PLY: x y z red green blue, integers as fractions of their type's maximum. npz: `points` or `xyz` (N,3), `colors` or
-    `rgb` (N,3). Text: three or six numbers a line, x y z and red green blue, split by spaces or commas. In the last two
-    kinds colours range to 1, or to 255 if any is above 1; points without colours are grey.
+    PLY: x y z and red green blue by their usual names. npz: `points` or `xyz` (N,3), `colors` or `rgb` (N,3). Text: as
+    in scene/readers/point_text.py. Colours range to 255, or of floats to 1 if none is above 1, or of integers to 65,535
+    if one is above 255. Points without colours are grey, and a message says so.
     UserError for a file that is missing, of another kind, or has points that are not finite.
     """
     cloud = _read(path)
@@ -66,15 +71,15 @@ def _read(path: Path) -> BasicPointCloud:
     if not os.path.isfile(path):  # Path.is_file raises an error for a name that is too long
         raise UserError(f"no point cloud {path}; give the path of a PLY, npz or text file of points")
     if is_ply(path) or path.suffix.lower() == ".ply":
-        cloud = _read_ply(path)
+        points, colors, normals = _read_ply(path)
     else:
-        table = _read_npz(path) if _begins_with(path, b"PK") else _read_text(path)
-        cloud = _from_table(table)
-    check_finite(cloud.points, path)
-    colors = cloud.colors.astype(np.float32)
-    if not ((colors >= 0) & (colors <= 1)).all():
-        raise UserError(f"colours in {path} are neither integers nor between 0 and 1; save red green blue as uchar")
-    return cloud
+        points, colors = _read_npz(path) if _begins_with(path, b"PK") else read_text(path)
+        normals = np.zeros_like(points, dtype=np.float32)
+    check_finite(points, path)
+    if colors is None:
+        print(f"{path} has no colours; its points begin grey", file=sys.stderr)
+        return BasicPointCloud(points, np.full(points.shape, _GREY), normals)
+    return BasicPointCloud(points, _fractions(colors, path), normals)
 
 
 def _begins_with(path: Path, magic: bytes) -> bool:
@@ -85,29 +90,58 @@ def _begins_with(path: Path, magic: bytes) -> bool:
         raise UserError(f"cannot read the point cloud {path} ({error.strerror}); fix its permissions") from error
 
 
-def _read_ply(path: Path) -> BasicPointCloud:
+def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+    """Points, colours (None: there are none) and normals, (N,3) each."""
     try:
         ply = read_elements(path)
     except (PlyParseError, ValueError, OverflowError, OSError, EOFError, MemoryError) as error:
         raise UserError(f"{path} is not a readable PLY file ({error}); export the point cloud again") from error
     vertices = ply["vertex"].data if "vertex" in ply else np.zeros(0, dtype=[])
-    names = vertices.dtype.names or ()
-    missing = [name for name in _POSITION + _COLOR if name not in names]
+    names = {name.lower().removeprefix("scalar_"): name for name in vertices.dtype.names or ()}
+    missing = [name for name in _POSITION if name not in names]
     if missing:
-        raise UserError(f"the point cloud {path} has no {', '.join(missing)}; it needs x y z red green blue per vertex")
+        raise UserError(f"the point cloud {path} has no {', '.join(missing)}; it needs x y z and red green blue")
     try:
-        points = np.stack([vertices[name] for name in _POSITION], axis=1).astype(np.float64)
-        colors = np.stack([_fraction(vertices[name]) for name in _COLOR], axis=1)
-        has_normals = all(name in names for name in _NORMAL)
+        points = _columns(vertices, names, _POSITION).astype(np.float64)
         normals = np.zeros_like(points, dtype=np.float32)
-        if has_normals:
-            normals[:] = np.stack([vertices[name] for name in _NORMAL], axis=1)
+        if names.keys() >= set(_NORMAL):
+            normals[:] = _columns(vertices, names, _NORMAL)
+        channels = next((group for group in _COLORS if names.keys() & set(group)), None)
+        if channels is None:
+            return points, None, normals
+        missing = [name for name in channels if name not in names]
+        if missing:
+            raise UserError(f"the point cloud {path} has {channels[0]} but no {', '.join(missing)}; export it again")
+        colors = _columns(vertices, names, channels)
     except (TypeError, ValueError) as error:
         raise UserError(f"the point cloud {path} has lists instead of numbers; export it again") from error
-    return BasicPointCloud(points, colors, normals)
+    if channels == _SH:  # a Gaussian model
+        colors = np.clip(SH2RGB(colors), 0, 1)
+    return points, colors, normals
 
 
-def _read_npz(path: Path) -> np.ndarray:
+def _columns(vertices: np.ndarray, names: Mapping[str, str], wanted: Sequence[str]) -> np.ndarray:
+    return np.stack([vertices[names[name]] for name in wanted], axis=1)
+
+
+def _fractions(colors: np.ndarray, path: Path) -> np.ndarray:
+    """Colours (N,3) as parts of the greatest value that their numbers tell of."""
+    if colors.dtype == np.int8:
+        colors = colors.view(np.uint8)  # bytes, as C's char has them
+    low, high = (colors.min(), colors.max()) if colors.size else (0, 0)
+    whole = np.issubdtype(colors.dtype, np.integer)
+    nearly_one = not whole and 1 < high < 2 and (colors % 1).any()  # neither range, and black as part of 255
+    if nearly_one or not (low >= 0 and high <= (65535 if whole else 255)):
+        raise UserError(
+            f"colours in {path} are neither integers nor between 0 and 1: they range from {low:g} to {high:g}; "
+            "save red green blue as uchar"
+        )
+    if whole:
+        return colors / (65535 if high > 255 else 255)
+    return colors / (255 if high > 1 else 1.0)
+
+
+def _read_npz(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     try:
         with np.load(path, allow_pickle=False) as arrays:
             points, colors = (
@@ -116,7 +150,9 @@ def _read_npz(path: Path) -> np.ndarray:
             )
         if points is None:
             raise ValueError(_NEEDS)
-        return np.concatenate([points] if colors is None else [points, colors], axis=1)
+        if colors is not None and len(colors) != len(points):
+            raise ValueError(f"{len(points)} points and {len(colors)} colours")
+        return points.astype(np.float64, copy=False), colors
     except _NPZ_FAULTS as error:
         raise UserError(
             f"{path} is not a readable npz file of points ({error}); save points and colors (N,3) by numpy.savez"
@@ -124,7 +160,7 @@ def _read_npz(path: Path) -> np.ndarray:
 
 
 def _read_array(arrays: np.lib.npyio.NpzFile, name: str, size: int) -> np.ndarray:
-    """An array (N,3) of an npz file of `size` bytes, float64. ValueError before memory is taken for another one."""
+    """An array (N,3) of an npz file of `size` bytes. ValueError before memory is taken for another one."""
     with arrays.zip.open(f"{name}.npy") as file:
         member = io.BytesIO(file.read(_LONGEST_HEADER))
         first = np.lib.format.read_magic(member) == (1, 0)
@@ -133,35 +169,7 @@ def _read_array(arrays: np.lib.npyio.NpzFile, name: str, size: int) -> np.ndarra
     if len(shape) != 2 or shape[1] != 3 or kind.kind not in "biuf":
         raise ValueError(_NEEDS)
     check_packed_rows(shape[0], size)
-    return arrays[name].astype(np.float64, copy=False)
-
-
-def _read_text(path: Path) -> np.ndarray:
-    try:
-        lines = path.read_text(encoding="utf-8").replace(",", " ").replace(";", " ").splitlines()
-        # A first line that starts with a letter names the columns.
-        skip = 1 if lines and lines[0].lstrip()[:1].isalpha() else 0
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # about an empty file
-            table = np.loadtxt(lines[skip:], dtype=np.float64, ndmin=2)
-        if not table.size or table.shape[1] not in (3, 6):
-            raise ValueError(f"{table.shape[1]} columns" if table.size else "no numbers")
-    except (ValueError, OSError, MemoryError) as error:
-        raise UserError(
-            f"{path} is neither PLY nor npz, and not text with x y z or x y z red green blue a line ({error}); export "
-            "the point cloud again"
-        ) from error
-    return table
-
-
-def _from_table(table: np.ndarray) -> BasicPointCloud:
-    """Cloud of a table (N, 3 or 6) of x y z and red green blue."""
-    points, colors = table[:, :3], table[:, 3:]
-    if not colors.shape[1]:
-        colors = np.full_like(table[:, :3], 127 / 255)
-    elif colors.size and colors.max() > 1:
-        colors = colors / 255
-    return BasicPointCloud(points, colors, np.zeros_like(points, dtype=np.float32))
+    return arrays[name]
 
 
 def check_finite(points: np.ndarray, path: Path) -> None:
@@ -177,16 +185,11 @@ def check_finite(points: np.ndarray, path: Path) -> None:
 
 def write_point_cloud(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
     """Write points (N,3), stored as float32, with colours (N,3) uint8 and zero normals, in the reference's layout."""
-    columns = [(name, "<f4") for name in _POSITION + _NORMAL] + [(name, "u1") for name in _COLOR]
+    columns = [(name, "<f4") for name in _POSITION + _NORMAL] + [(name, "u1") for name in _COLORS[0]]
     vertices = np.zeros(len(points), dtype=columns)
     for index, name in enumerate(_POSITION):
         vertices[name] = points[:, index]
-    for index, name in enumerate(_COLOR):
+    for index, name in enumerate(_COLORS[0]):
         vertices[name] = colors[:, index]
     with atomic_write(path) as temporary:
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(temporary))
-
-
-def _fraction(values: np.ndarray) -> np.ndarray:
-    top = np.iinfo(values.dtype).max if np.issubdtype(values.dtype, np.integer) else 1.0
-    return values / top

@@ -1,5 +1,6 @@
 """Files that a user or a dataset names: devices, pipes, endless texts and failed downloads are refused."""
 
+import codecs
 import errno
 import os
 import stat
@@ -23,13 +24,26 @@ def plain(path: Name) -> Name:
 
 
 def plain_text(path: str | os.PathLike, errors: str = "strict") -> str:
-    """The UTF-8 text of a file. OSError if it cannot be read, or has more than MOST bytes; ValueError for other bytes.
+    """The text of a file, as of `encoding_of`. OSError if it cannot be read, or has more than MOST bytes; ValueError
+    for other bytes.
 
     errors: as for `open`.
     """
     if os.path.getsize(plain(path)) > MOST:
         raise OSError(errno.EFBIG, f"it has more than {MOST >> 20} MiB", os.fspath(path))
-    return Path(path).read_text(encoding="utf-8", errors=errors)
+    return Path(path).read_text(encoding=encoding_of(path), errors=errors)
+
+
+def encoding_of(path: str | os.PathLike) -> str:
+    """UTF-16 or UTF-32 where the first bytes of a file say so, as of PowerShell; else UTF-8 with or without a mark."""
+    with open(plain(path), "rb") as file:
+        head = file.read(4)
+    if head.startswith((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)):
+        return "utf-32"
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    zeros = [byte == 0 for byte in head]  # without a mark, every second byte of plain letters is zero
+    return {(False, True) * 2: "utf-16-le", (True, False) * 2: "utf-16-be"}.get(tuple(zeros), "utf-8-sig")
 
 
 def not_the_file(path: str | os.PathLike) -> str | None:
