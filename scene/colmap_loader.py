@@ -8,13 +8,13 @@ import functools
 import math
 import os
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, TypeVar
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 import numpy as np
 
-from splatting.files.plain_files import not_the_file
+from splatting.files.plain_files import encoding_of, not_the_file
 from utils.system_utils import UserError, first_line
 
 StrPath = str | os.PathLike
@@ -196,23 +196,50 @@ def read_next_bytes(
 
 def read_cameras(path: StrPath, binary: bool) -> dict[int, Camera]:
     """Cameras of a cameras file by their ids."""
-    return {camera.id: camera for camera in _file(path, binary).records("camera", _camera)}
+    return _by_ids(_file(path, binary), "camera", _camera)
 
 
 def read_images(path: StrPath, binary: bool, with_points: bool = True) -> dict[int, Image]:
     """Photos of an images file by their ids. with_points: and their 2D points, which take time and memory."""
-    images = _file(path, binary).records("photo", lambda file: _image(file, with_points))
-    return {image.id: image for image in images}
+    return _by_ids(_file(path, binary), "photo", lambda file: _image(file, with_points))
 
 
 def read_points(path: StrPath, binary: bool) -> Points:
-    """Points of a points3D file."""
-    if binary:
-        return _BinaryFile(path).points()
-    rows = list(_TextFile(path).records("point", _point))
-    table = np.array(rows, dtype=np.float64).reshape(-1, 8)
-    ids = np.array([row[0] for row in rows], dtype=np.int64)  # not from the floats, which hold ids to 2^53 only
-    return Points(ids, table[:, 1:4], table[:, 4:7], table[:, 7])
+    """Points of a points3D file. UserError where two have one id, or where colours of a text range to 1."""
+    file = _file(path, binary)
+    points, places = file.points()
+    order = np.argsort(points.ids, kind="stable")
+    again = np.flatnonzero(np.diff(points.ids[order]) == 0)
+    if len(again):
+        first, second = (places.of(place) for place in sorted(order[again[0] : again[0] + 2]))
+        raise _twice(file, first, second, f"the id {points.ids[order[again[0]]]}")
+    part = (points.rgb % 1).any(axis=1)
+    if part.any() and points.rgb.max() <= 1:
+        first = part.argmax()
+        raise UserError(
+            f"{places.of(first)} of {path} has the colour {' '.join(map(str, points.rgb[first]))}, and COLMAP's "
+            "range from 0 to 255; multiply the colours of the file by 255"
+        )
+    return points
+
+
+def _by_ids(file: "_BinaryFile | _TextFile", what: str, parse: Callable[[Any], Record]) -> dict[int, Record]:
+    """The records by their ids. UserError where two have the same id, or photos the same name."""
+    found: dict[int, Record] = {}
+    places: dict[str, str] = {}
+    for record in file.records(what, parse):
+        for key in (f"the id {record.id}", *([f"the name {record.name}"] if what == "photo" else ())):
+            if key in places:
+                raise _twice(file, places[key], file.place, key)
+            places[key] = file.place
+        found[record.id] = record
+    return found
+
+
+def _twice(file: "_BinaryFile | _TextFile", first: str, second: str, key: str) -> UserError:
+    return UserError(
+        f"{first} and {second} of {file.path} both have {key}; keep one of them, or export the model again"
+    )
 
 
 def _camera(file: "_BinaryFile | _TextFile") -> Camera:
@@ -236,6 +263,16 @@ def _point(file: "_TextFile") -> tuple[int | float, ...]:
     return tuple(values)  # many lists would keep the garbage collector busy
 
 
+class _Numbered(NamedTuple):
+    """Names of places in a file, made when they are asked for."""
+
+    what: str
+    numbers: Sequence[int]
+
+    def of(self, index: int) -> str:
+        return f"{self.what} {self.numbers[index]}"
+
+
 def _file(path: StrPath, binary: bool) -> "_BinaryFile | _TextFile":
     return _BinaryFile(path) if binary else _TextFile(path)
 
@@ -248,23 +285,25 @@ class _BinaryFile:
     _POINT_2D = np.dtype([("xy", "<f8", 2), ("id", "<i8")])
 
     def __init__(self, path: StrPath) -> None:
-        self._path, self._content, self._at = path, Path(path).read_bytes(), 0
+        self.path, self._content, self._at = path, Path(path).read_bytes(), 0
+        self.place = ""  # of the record that was read last
 
     def records(self, what: str, parse: Callable[["_BinaryFile"], Record]) -> Iterator[Record]:
         count, number = 1, 1
         try:
             (count,) = self.take("Q")
             while number <= count:
+                self.place = f"{what} {number}"
                 yield parse(self)
                 number += 1
         except UnicodeDecodeError as error:
-            fault = f"the name of {what} {number} in {self._path} is not UTF-8; rename it in plain letters"
+            fault = f"the name of {what} {number} in {self.path} is not UTF-8; rename it in plain letters"
             raise UserError(fault) from error
         except (struct.error, ValueError, OverflowError) as error:
             raise self._cut_short(what, number, count) from error
         except KeyError as error:
             raise UserError(
-                f"{what} {number} in {self._path} has the unknown camera model {error}; convert the model with a "
+                f"{what} {number} in {self.path} has the unknown camera model {error}; convert the model with a "
                 "COLMAP that knows it"
             ) from error
 
@@ -293,7 +332,8 @@ class _BinaryFile:
         rows = np.frombuffer(self._content[begin : self._at] if needed else b"", self._POINT_2D)
         return rows["xy"].copy(), rows["id"].copy()
 
-    def points(self) -> Points:
+    def points(self) -> tuple[Points, "_Numbered"]:
+        """The points, and the place of each."""
         content, starts, count = self._content, [], 1
         number, record, seen_at = struct.Struct("<Q"), self._POINT.itemsize, self._POINT.fields["seen"][1]
         at = number.size
@@ -311,12 +351,12 @@ class _BinaryFile:
         places = len(content) - self._POINT.itemsize + 1
         view = np.ndarray((places,), self._POINT, content, strides=(1,)) if starts else np.zeros(0, self._POINT)
         rows = view[starts]
-        return Points(rows["id"], rows["xyz"], rows["rgb"], rows["error"])
+        return Points(rows["id"], rows["xyz"], rows["rgb"], rows["error"]), _Numbered("point", range(1, count + 1))
 
     def _cut_short(self, what: str, number: int, count: int) -> UserError:
-        fault = not_the_file(self._path)
+        fault = not_the_file(self.path)
         fault = f"is {fault}" if fault else f"ends within {what} {number:,} of {count:,}, or is no such file"
-        return UserError(f"{self._path} {fault}; copy the file again from where it was made")
+        return UserError(f"{self.path} {fault}; copy the file again from where it was made")
 
 
 @functools.cache
@@ -334,27 +374,40 @@ class _TextFile:
     }
 
     def __init__(self, path: StrPath) -> None:
-        self._path, self._number, self._rest = path, 0, ""
+        self.path, self._number, self._line, self._rest = path, 0, "", ""
+        self.place = ""  # of the record that was read last
         self._lines: Iterator[tuple[int, str]] = iter(())
 
     def records(self, what: str, parse: Callable[["_TextFile"], Record]) -> Iterator[Record]:
-        with open(self._path, encoding="utf-8-sig") as file:
+        with open(self.path, encoding=encoding_of(self.path), errors="surrogateescape") as file:
             self._lines = enumerate(file, start=1)
             try:
                 for number, line in self._lines:
-                    if line.strip() and not line.startswith("#"):
-                        self._number, self._rest = number, line
+                    if (rest := line.lstrip()) and not rest.startswith("#"):
+                        self._number, self.place = number, f"line {number}"
+                        self._line = self._rest = rest
                         yield parse(self)
-            except UnicodeDecodeError as error:
-                raise UserError(f"{self._path} is not UTF-8 text; rename its photos in plain letters") from error
             except (ValueError, OverflowError) as error:
-                if other := not_the_file(self._path):
-                    fault = f"{self._path} is {other}; copy the file again from where it was made"
+                if any("\udc80" <= letter <= "\udcff" for letter in self._line):
+                    raise UserError(f"{self.path} is not UTF-8 text; rename its photos in plain letters") from error
+                if other := not_the_file(self.path):
+                    fault = f"{self.path} is {other}; copy the file again from where it was made"
                     raise UserError(fault) from error
                 raise UserError(
-                    f"line {self._number} of {self._path} does not list {self._LISTED[what]} ({first_line(error)}); "
+                    f"line {self._number} of {self.path} does not list {self._LISTED[what]} ({first_line(error)}); "
                     "fix it, or copy the file again"
                 ) from error
+
+    def points(self) -> tuple[Points, "_Numbered"]:
+        """The points, and the place of each."""
+        numbers: list[int] = []
+        rows = []
+        for row in self.records("point", _point):
+            rows.append(row)
+            numbers.append(self._number)
+        table = np.array(rows, dtype=np.float64).reshape(-1, 8)
+        ids = np.array([row[0] for row in rows], dtype=np.int64)  # not from the floats, which hold ids to 2^53 only
+        return Points(ids, table[:, 1:4], table[:, 4:7], table[:, 7]), _Numbered("line", numbers)
 
     def take(self, kinds: str) -> list[int | float]:
         """A value for each letter: a float for d, else an integer."""
@@ -377,6 +430,7 @@ class _TextFile:
     def name(self) -> str:
         if not self._rest.strip():
             raise ValueError("no name")
+        self._rest.encode()  # UnicodeEncodeError for bytes of another encoding; in a comment they do no harm
         return self._rest.strip()
 
     def points_2d(self, needed: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -63,6 +63,45 @@ def _word(file: str, *places: tuple[int, str]) -> Change:
     return change
 
 
+def _twice(file: str, number: int, *places: tuple[int, str]) -> Change:
+    """A record of a text file again, with other words, behind the first `number` data lines."""
+
+    def change(scene: Path) -> None:
+        as_text(scene)
+        path = scene / SPARSE / file
+        lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+        words = lines[0].split()
+        for place, word in places:
+            words[place] = word
+        again = [" ".join(words), *lines[1:2]] if file == "images.txt" else [" ".join(words)]
+        path.write_text("\n".join([*lines[:number], *again, *lines[number:], ""]))
+
+    return change
+
+
+def _same_ids(file: str, length: int, width: int, at: int, each: int) -> Change:
+    """The first two records of a binary file get the same id, of `width` bytes.
+
+    length: of a record without its list, whose count is at `at`, before values of `each` bytes.
+    """
+
+    def change(scene: Path) -> None:
+        path = scene / SPARSE / file
+        content = bytearray(path.read_bytes())
+        second = 8 + length + each * int.from_bytes(content[8 + at : 16 + at], "little")
+        content[second : second + width] = content[8 : 8 + width]
+        path.write_bytes(content)
+
+    return change
+
+
+def _small_colours(scene: Path) -> None:
+    as_text(scene)
+    path = scene / SPARSE / "points3D.txt"
+    rows = [line.split() for line in path.read_text().splitlines() if not line.startswith("#")]
+    path.write_text("".join(" ".join([*row[:4], "0", "1", "0.25", *row[7:]]) + "\n" for row in rows))
+
+
 def _cloud(name: str, properties: str, rows: str, element: str = "vertex 1", kind: str = "ascii") -> Change:
     header = [f"ply\nformat {kind} 1.0\nelement {element}", *(f"property {p}" for p in properties.split(", "))]
     return _written(name, "\n".join([*header, "end_header", rows]) + "\n")
@@ -197,6 +236,16 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_word("images.txt", (5, "1e30")), "more than 1e[+]12 from the origin"),
         (_word("images.txt", (8, "77")), r"SCENE/sparse/0/images\.txt has the camera 77"),
         (_word("points3D.txt", (2, "nan")), r"line 4 of SCENE/sparse/0/points3D\.txt .*nan"),
+        (_twice("cameras.txt", 1), "^line 1 and line 2 of .*cameras.txt both have the id 1; keep one"),
+        (_twice("images.txt", 4, (9, "other.png")), r"^line 1 and line 5 of .*images\.txt both have the id \d"),
+        (_twice("images.txt", 4, (0, "999")), r"^line 1 and line 5 of .*images\.txt both have the name left/v08.png"),
+        (_twice("points3D.txt", 3), r"^line 1 and line 4 of .*points3D\.txt both have the id 1;"),
+        (
+            _same_ids("images.bin", 64 + 13 + 8, 4, 64 + 13, 24),
+            r"^photo 1 and photo 2 of .*images\.bin both have the id",
+        ),
+        (_same_ids("points3D.bin", 51, 8, 43, 8), r"^point 1 and point 2 of .*points3D\.bin both have the id"),
+        (_small_colours, r"^line 1 of .*points3D\.txt has the colour 0.0 1.0 0.25, and COLMAP's range from 0 to 255;"),
         (_gone(PHOTO), "1 of 9 photos .*are missing: SCENE/images/left/v02.png"),
         (_seven_gone, r"7 of 9 photos that .* lists are missing: .*Right/V03.png, .* and 2 more \(the folder has .*-i"),
         (_converted, r"9 of 9 photos .*Right/V03.png.*\(Right/V03.jpg is there instead\)"),

@@ -207,6 +207,25 @@ def test_a_file_cut_anywhere_is_refused_by_name(folder, tmp_path, name, what):
             READERS[name][0](path)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-32"])
+def test_text_of_any_encoding_and_indented_comments(folder, tmp_path, encoding):
+    text = (folder / "images.txt").read_text(encoding="utf-8")
+    (tmp_path / "images.txt").write_bytes(f"# comment\n  # indented\n{text}".encode(encoding))
+    assert [image.name for image in read_extrinsics_text(tmp_path / "images.txt").values()] == [
+        image.name for image in read_extrinsics_text(folder / "images.txt").values()
+    ]
+
+
+def test_a_comment_may_have_bytes_of_any_encoding(folder, tmp_path):
+    content = "# Größe\n".encode("latin-1") + (folder / "cameras.txt").read_bytes()
+    (tmp_path / "cameras.txt").write_bytes(content)
+    assert len(read_intrinsics_text(tmp_path / "cameras.txt")) == len(MODELS)
+    name = (folder / "images.txt").read_text(encoding="utf-8").encode("latin-1")
+    (tmp_path / "images.txt").write_bytes(name)
+    with pytest.raises(UserError, match="not UTF-8 text; rename its photos"):
+        read_extrinsics_text(tmp_path / "images.txt")
+
+
 def test_foreign_content_is_refused_in_words(folder, tmp_path):
     path = tmp_path / "file"
     path.write_bytes(b"\xff" * 500)

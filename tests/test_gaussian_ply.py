@@ -10,6 +10,7 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import attributes
 from scene.readers.point_cloud import read_point_cloud
 from scene.saved_model import read_model
+from splatting.exports.formats import is_point_cloud, read_splats
 from utils.system_utils import UserError
 
 ORDER = (
@@ -215,6 +216,28 @@ def test_gaussians_that_are_not_drawn_are_told_of(tmp_path, capsys):
     capsys.readouterr()
     _loaded(tmp_path / "point_cloud.ply")
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary"])
+@pytest.mark.parametrize("line", ["comment Größe", "  comment indented", "\tcomment 漢字", "obj_info Straße ", ""])
+def test_a_header_may_have_any_letters_and_blanks(tmp_path, kind, line):
+    gaussians = model(3)
+    gaussians.save_ply(tmp_path / "a.ply")
+    PlyData(PlyData.read(tmp_path / "a.ply", mmap=False), text=kind == "ascii", byte_order="<").write(
+        tmp_path / "a.ply"
+    )
+    content = (tmp_path / "a.ply").read_bytes()
+    for encoding in ("utf-8", "latin-1", "utf-8-sig", "utf-16"):
+        if encoding == "utf-16" and kind == "ascii":
+            whole = content.decode().replace("\nelement", f"\n{line}\nelement", 1).encode(encoding)
+        elif encoding != "utf-16":
+            mark = b"\xef\xbb\xbf" if encoding == "utf-8-sig" else b""
+            encoded = line.encode(encoding.removesuffix("-sig"), "replace")
+            whole = mark + content.replace(b"\nelement", b"\n" + encoded + b"\nelement", 1)
+        (tmp_path / "b.ply").write_bytes(whole)
+        _assert_equal(gaussians, _loaded(tmp_path / "b.ply"))
+        assert not is_point_cloud(tmp_path / "b.ply") and len(read_splats(tmp_path / "b.ply")) == 3
+        assert len(read_point_cloud(tmp_path / "b.ply").points) == 3
 
 
 def test_a_header_without_an_end_is_refused_at_once(tmp_path, monkeypatch):

@@ -93,8 +93,8 @@ def read_splats(path: str | os.PathLike) -> Splats:
             begin = file.read(4)
     except OSError as error:
         raise UserError(f"cannot read {path} ({error.strerror}); fix its permissions") from error
-    if begin.startswith(b"ply"):
-        read = read_compressed_ply if "packed_position" in (_properties(path) or ()) else read_plain_ply
+    if (properties := _properties(path)) is not None:
+        read = read_compressed_ply if "packed_position" in properties else read_plain_ply
     elif begin.startswith(_SPZ):
         read = read_spz
     elif Path(path).suffix.lower() == ".splat":  # it has no sign of its own
