@@ -1,16 +1,21 @@
 """point_cloud.ply: the reference's layout byte for byte, files of other writers, clear messages."""
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
-from gaussians import FURTHER, model, parameters
+from gaussians import FURTHER, model, options, parameters
 from plyfile import PlyData, PlyElement
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import attributes
+from scene.gaussians.checkpoint import save_checkpoint
 from scene.readers.point_cloud import read_point_cloud
 from scene.saved_model import read_model
 from splatting.exports.formats import is_point_cloud, read_splats
+from splatting.exports.splats import drawable
 from utils.system_utils import UserError
 
 ORDER = (
@@ -89,6 +94,78 @@ def test_foreign_files_load(tmp_path, kind):
         [PlyElement.describe(foreign, "vertex")], text=kind == "text", byte_order=">" if kind == "big endian" else "<"
     ).write(tmp_path / "foreign.ply")
     _assert_equal(gaussians, _loaded(tmp_path / "foreign.ply"))
+
+
+def _rewritten(source: Path, target: Path, rename: Callable[[str], str], **more: np.ndarray) -> None:
+    data = PlyData.read(source, mmap=False)["vertex"].data
+    names = [rename(name) for name in data.dtype.names]
+    columns = [(name, "f4") for name in (*names, *more) if name]
+    foreign = np.zeros(len(data), dtype=columns)
+    for name, old in zip(names, data.dtype.names, strict=True):
+        if name:
+            foreign[name] = data[old]
+    for name, values in more.items():
+        foreign[name] = values
+    PlyData([PlyElement.describe(foreign, "vertex")]).write(target)
+
+
+@pytest.mark.parametrize("degree", [4, 5])
+def test_bands_above_degree_3_are_left_out(tmp_path, capsys, degree):
+    gaussians = model(4)
+    gaussians.save_ply(tmp_path / "a.ply")
+    each = (degree + 1) ** 2 - 1
+
+    def place(name: str) -> str:
+        number = int(name.removeprefix("f_rest_")) if name.startswith("f_rest_") else None
+        return name if number is None else f"f_rest_{number // 15 * each + number % 15}"
+
+    taken = {place(f"f_rest_{i}") for i in range(45)}
+    more = {name: np.full(4, 9) for i in range(3 * each) if (name := f"f_rest_{i}") not in taken}
+    _rewritten(tmp_path / "a.ply", tmp_path / "b.ply", place, **more)
+    capsys.readouterr()
+    _assert_equal(gaussians, _loaded(tmp_path / "b.ply"))
+    assert f"SH bands of degree {degree} are left out; models have at most degree 3" in capsys.readouterr().err
+    np.testing.assert_array_equal(read_splats(tmp_path / "b.ply").sh, gaussians.get_features.detach().numpy())
+
+
+def test_names_of_cloudcompare(tmp_path):
+    gaussians = model(4)
+    gaussians.save_ply(tmp_path / "a.ply")
+    _rewritten(tmp_path / "a.ply", tmp_path / "b.ply", lambda name: name if name[0] in "xyz" else f"scalar_{name}")
+    _assert_equal(gaussians, _loaded(tmp_path / "b.ply"))
+    assert not is_point_cloud(tmp_path / "b.ply")
+
+
+def test_colours_in_place_of_coefficients_are_named(tmp_path):
+    model(4).save_ply(tmp_path / "a.ply")
+    colors = {name: np.full(4, 255) for name in ("red", "green", "blue")}
+    _rewritten(tmp_path / "a.ply", tmp_path / "b.ply", lambda name: "" if "f_dc" in name else name, **colors)
+    with pytest.raises(
+        UserError, match="as red, green, blue instead of f_dc_0, f_dc_1, f_dc_2; export the model again"
+    ):
+        read_model(tmp_path / "b.ply")
+
+
+def test_scales_of_0_are_tiny_however_they_are_loaded(tmp_path, capsys):
+    gaussians = model(6)
+    with torch.no_grad():
+        gaussians._scaling[2, 1], gaussians._scaling[3] = -torch.inf, -torch.inf
+    gaussians.save_ply(tmp_path / "a.ply")
+    gaussians.training_setup(options())
+    save_checkpoint(tmp_path / "a.pth", gaussians.capture(), 1)
+    for path in (tmp_path / "a.ply", tmp_path / "a.pth"):
+        scales = read_model(path)._scaling
+        assert (scales[2, 1], scales[3, 0]) == (-80, -80) and scales.isfinite().all()
+        assert scales[2, 0] == gaussians._scaling[2, 0]
+    assert drawable(read_splats(tmp_path / "a.ply")).all() and capsys.readouterr().err == ""
+
+
+def test_an_endless_scale_is_drawn_from_no_file(tmp_path):
+    gaussians = model(6)
+    with torch.no_grad():
+        gaussians._scaling[4, 0] = torch.inf
+    gaussians.save_ply(tmp_path / "a.ply")
+    assert drawable(read_splats(tmp_path / "a.ply")).tolist() == [True] * 4 + [False, True]
 
 
 def test_a_model_of_two_scales_has_as_many_columns_as_values(tmp_path):

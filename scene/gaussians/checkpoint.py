@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.attributes import IN_CHECKPOINT, Attribute, Rows
-from scene.gaussians.finite import check_finite
+from scene.gaussians.finite import check_finite, with_scales
 from scene.gaussians.parameters import GaussianParameters
 from scene.gaussians.ppisp import exposures_of
 from scene.gaussians.statistics import NAMES, Statistics
@@ -157,6 +157,7 @@ def unpack(entries: Sequence[Any], table: dict[str, Attribute], max_sh_degree: i
             f"({', '.join(names)}); give a checkpoint of this model"
         )
     rows = {name: tensor.detach() for name, tensor in zip(names, tensors, strict=True)}
+    rows["scaling"] = with_scales(rows["scaling"])
     check_rows(rows, table, max_sh_degree)
     if not 0 <= active_sh_degree <= max_sh_degree:
         raise UserError(

@@ -1,13 +1,16 @@
 """Check that the values of Gaussians are finite."""
 
+import math
 import sys
 
 import torch
+from torch import Tensor
 
 from scene.gaussians.attributes import Rows
 from splatting.distributed.rows import WHOLE, Shards
 from utils.system_utils import UserError
 
+SMALLEST = -80.0  # exp(-80) is 1.8e-35, which float32 still holds with all its digits
 _PART = 1 << 16  # rows checked at a time, as there may be little memory left
 
 
@@ -24,6 +27,12 @@ def check_finite(rows: Rows, where: str, remedy: str, shards: Shards = WHOLE) ->
                 f"{name} of {len(bad)} of {shards.total(len(values))} Gaussians in {where} is not finite "
                 f"(the first is Gaussian {int(bad[0])}); {remedy}"
             )
+
+
+def with_scales(log_scales: Tensor) -> Tensor:
+    """Logarithms of scales (N, 2 or 3), raised to SMALLEST where they are those of 0, which is drawn as a tiny one."""
+    zero = log_scales == -math.inf
+    return log_scales.masked_fill(zero, SMALLEST) if zero.any() else log_scales
 
 
 def warn_of_undrawn(rows: Rows, source: object) -> None:

@@ -1,20 +1,25 @@
 """PLY files of trained models, with the columns of the reference in its order, as other tools read them."""
 
 import os
+import sys
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import numpy as np
 import torch
+from numpy.lib.recfunctions import rename_fields, repack_fields
 from plyfile import PlyParseError
 from torch import Tensor
 
 from scene.gaussians.attributes import IN_CHECKPOINT, Rows, attributes
+from scene.gaussians.finite import with_scales
 from splatting.distributed.rows import WHOLE, Shards
 from splatting.files.ply_header import read_elements
 from utils.system_utils import UserError, atomic_write, writes_files
 
 FLAT = "flat Gaussians of two scales (2DGS), which this rasterizer cannot draw; give a 3DGS model"
+MOST_BANDS = 3  # the highest SH degree of a model
+_HIGHEST = 8  # and that of a file
 _NORMALS = ["nx", "ny", "nz"]  # zeros after the positions, as in the reference's files
 
 
@@ -80,7 +85,7 @@ def offset_comments(world_offset: Sequence[float]) -> list[str]:
 
 def _degree(names: Iterable[str]) -> int | None:
     rest = sum(name.startswith("f_rest_") for name in names)
-    return next((degree for degree in range(4) if 3 * ((degree + 1) ** 2 - 1) == rest), None)
+    return next((degree for degree in range(_HIGHEST + 1) if 3 * ((degree + 1) ** 2 - 1) == rest), None)
 
 
 @np.errstate(over="ignore")  # doubles that float32 cannot hold become Inf
@@ -90,11 +95,12 @@ def read_ply(path: str | os.PathLike, sh_degree: int | None, flat: bool = False,
     flat: take Gaussians of two scales, too, for models that draw them by other code. further: read attributes beyond
     the paper's six, too.
 
-    SH bands that the file lacks are zero: the last save of a training leaves out those that are. sh_degree: None: that
-    of the file. UserError when the file is missing or unreadable, lacks properties (the message names them), or has a
-    higher degree.
+    SH bands that the file lacks are zero: the last save of a training leaves out those that are. Bands above degree 3
+    are left out, with a warning. Scales of 0 become tiny (`with_scales`). Names may begin with scalar_, as CloudCompare
+    writes them. sh_degree: None: that of the file, up to 3. UserError when the file is missing or unreadable, lacks
+    properties (the message names them), or has a higher degree.
     """
-    vertices = read_vertices(path)
+    vertices = _as_named(read_vertices(path))
     present = set(vertices.dtype.names or ())
     degree = _degree(present)
     if sh_degree is None:
@@ -120,9 +126,31 @@ def read_ply(path: str | os.PathLike, sh_degree: int | None, flat: bool = False,
             bands, channels = attribute.shape
             values = values.reshape(len(vertices), channels, bands).transpose(1, 2).contiguous()
         rows[name] = values
+    rows["scaling"] = with_scales(rows["scaling"])
     absent = attributes(sh_degree)["f_rest"].shape[0] - rows["f_rest"].shape[1]
     rows["f_rest"] = torch.nn.functional.pad(rows["f_rest"], (0, 0, 0, absent))
     return rows
+
+
+def _as_named(vertices: np.ndarray) -> np.ndarray:
+    """The vertices without CloudCompare's prefix of names, and without the SH bands above a model's highest degree."""
+    names = list(vertices.dtype.names or ())
+    if "scalar_f_dc_0" in names:
+        vertices = rename_fields(vertices, {name: name.removeprefix("scalar_") for name in names})
+        names = list(vertices.dtype.names)
+    degree = _degree(names)
+    if degree is None or degree <= MOST_BANDS:
+        return vertices
+    print(
+        f"warning: SH bands of degree {degree} are left out; models have at most degree {MOST_BANDS}", file=sys.stderr
+    )
+    each, kept = (degree + 1) ** 2 - 1, (MOST_BANDS + 1) ** 2 - 1
+    rest = [f"f_rest_{channel * each + index}" for channel in range(3) for index in range(kept)]
+    if not set(rest) <= set(names):
+        return vertices  # whose properties the caller names
+    others = [name for name in names if not name.startswith("f_rest_")]
+    cut = repack_fields(vertices[others + rest])
+    return rename_fields(cut, {name: f"f_rest_{index}" for index, name in enumerate(rest)})
 
 
 def _why_no_model(path: str | os.PathLike, missing: Sequence[str], present: Collection[str]) -> str:
@@ -131,6 +159,11 @@ def _why_no_model(path: str | os.PathLike, missing: Sequence[str], present: Coll
     if "packed_position" in present:
         return f"{path} is a compressed PLY; unpack it with export.py --ply {path} --to FILE.ply, and give FILE.ply"
     remedy = "give a trained model"
+    if {"red", "green", "blue"} <= set(present) and all(name.startswith("f_dc") for name in missing):
+        return (
+            f"{path} has the colours of its Gaussians as red, green, blue instead of {', '.join(missing)}; export the "
+            "model again with its SH coefficients"
+        )
     if {"x", "y", "z"} <= set(present) and not any(name.startswith(("f_dc", "opacity", "scale")) for name in present):
         remedy += ", or start a training from this point cloud with train.py --init_pcd_path"
     return f"{path} is not a Gaussian model: it lacks the properties {', '.join(missing)}; {remedy}"

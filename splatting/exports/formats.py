@@ -78,9 +78,10 @@ def is_point_cloud(path: str | os.PathLike) -> bool:
 
 
 def _properties(path: str | os.PathLike) -> set[str] | None:
-    """The names of a PLY's properties, None for another file."""
+    """The names of a PLY's properties, without CloudCompare's prefix; None for another file."""
     lines = [line.split() for line in header_lines(path)]
-    return {words[-1] for words in lines if words[:1] == ["property"]} if lines else None
+    names = (words[-1] for words in lines if words[:1] == ["property"])
+    return {name.removeprefix("scalar_") for name in names} if lines else None
 
 
 @np.errstate(over="ignore", invalid="ignore")  # what float32 cannot hold becomes Inf or NaN, which is not drawn
