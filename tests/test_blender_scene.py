@@ -14,6 +14,8 @@ from synthetic import FakeGaussians, folder_state, options_of, read
 
 from scene import Scene
 from scene.readers.point_cloud import write_point_cloud
+from splatting.compat.readers import readNerfSyntheticInfo
+from utils.system_utils import UserError
 
 _read = partial(read, hold_out=True)
 
@@ -69,6 +71,34 @@ def test_suffix_is_appended_only_when_missing(blender_scene):
     _edit(blender_scene, change)
     names = [(c.image_path.name, c.image_name) for c in _read(blender_scene).train_cameras]
     assert names[:3] == [("r_0.png", "r_0"), ("dotted.7.jpg", "dotted.7"), ("r_2.png", "r_2")]
+
+
+def test_test_views_may_be_missing_without_eval(blender_scene, capsys):
+    whole = read(blender_scene)
+    for path in sorted((blender_scene / "test").iterdir()):
+        path.unlink()
+    train = [camera.image_name for camera in read(blender_scene).train_cameras]
+    assert "transforms_test.json do not train: " in capsys.readouterr().err
+    (blender_scene / "transforms_test.json").unlink()
+    assert [camera.image_name for camera in read(blender_scene).train_cameras] == train
+    assert len(train) == 4 < len(whole.train_cameras) and readNerfSyntheticInfo(blender_scene).train_cameras
+    with pytest.raises(
+        UserError, match="no transforms_test.json in .*, which --eval needs; export it, or leave --eval"
+    ):
+        read(blender_scene, hold_out=True)
+
+
+def test_no_photo_both_trains_and_tests(blender_scene, capsys):
+    train, test = (json.loads((blender_scene / f"transforms_{name}.json").read_text()) for name in ("train", "test"))
+    test["frames"].append(train["frames"][1])
+    (blender_scene / "transforms_test.json").write_text(json.dumps(test))
+    info = read(blender_scene, hold_out=True)
+    assert len(info.train_cameras) == 3 and len(info.test_cameras) == len(test["frames"])
+    assert "1 photos of" in capsys.readouterr().err
+    assert len(read(blender_scene).train_cameras) == 3 + len(test["frames"])
+    (blender_scene / "transforms_test.json").write_text(json.dumps(train))
+    with pytest.raises(UserError, match="all training photos of .* are test photos, too; .*leave --eval out"):
+        read(blender_scene, hold_out=True)
 
 
 def test_random_cloud(blender_scene):

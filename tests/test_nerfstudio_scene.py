@@ -79,6 +79,98 @@ def test_split_lists(scene):
         read(scene, hold_out=True)
 
 
+@pytest.mark.parametrize("again", [0, 3])
+def test_test_frames_are_the_test_views(scene, capsys, again):
+    """Also where some of them are among the frames, as a copy or by another way to write their path."""
+    names = sorted(camera.image_name for camera in read(scene).train_cameras)
+
+    def move(content):
+        frames = sorted(content["frames"], key=lambda frame: frame["file_path"].removeprefix("./"))
+        test = frames[::4]
+        twins = [{**frame, "file_path": "images/../" + frame["file_path"]} for frame in test[:again]]
+        content.update(frames=[frame for frame in frames if frame not in test] + twins, test_frames=test)
+
+    _edit(scene, move)
+    info = read(scene, hold_out=True)
+    assert [Path(view.image_path).resolve() for view in info.test_cameras] == [scene / name for name in names[::4]]
+    train = {Path(view.image_path).resolve() for view in info.train_cameras}
+    assert train == {scene / name for name in set(names) - set(names[::4])}
+    assert (f"{again} frames of" in capsys.readouterr().err) == bool(again)
+    assert len(read(scene).train_cameras) == 17
+
+
+def test_a_photo_has_one_pose(scene, capsys):
+    _edit(scene, lambda content: content["frames"].append(content["frames"][0]))
+    assert len(read(scene).train_cameras) == 17
+    assert "1 frames of" in capsys.readouterr().err
+
+    def moved(content):
+        content["frames"][-1]["transform_matrix"][0][3] += 0.1
+
+    _edit(scene, moved)
+    with pytest.raises(UserError, match=r"lists the photo .* twice, with different poses; keep one"):
+        read(scene)
+
+
+@pytest.mark.parametrize("panorama", [{"camera_model": "latlong"}, {"latlong": True}, {"camera_model": "LATLONG"}])
+def test_panoramas_of_instant_ngp(panorama):
+    assert lens_of(panorama, {"fl_x": 3.0}, (64, 32), Path("a.json")) == Lens("EQUIRECTANGULAR", (64, 32), 64, 32)
+
+
+@pytest.mark.parametrize("lens", [{"ftheta_p1": 0.1}, {"equirectangular": True}, {"orthographic": True}])
+def test_other_lenses_of_instant_ngp_are_refused(lens):
+    with pytest.raises(
+        UserError, match=f"a.json has {next(iter(lens))}, a lens of instant-ngp that cannot be used; convert"
+    ):
+        lens_of(lens, {"fl_x": 30.0}, (64, 32), Path("a.json"))
+
+
+def test_fields_that_are_not_used_are_named(scene, capsys):
+    read(scene)
+    assert capsys.readouterr().err == ""
+
+    def change(content):
+        content["frames"][1].update(is_bad=True, time=0.5)
+        for frame in content["frames"]:
+            frame.update(depth_file_path="depths/a.png", is_bad=frame.get("is_bad", False))
+
+    _edit(scene, change)
+    read(scene)
+    said = capsys.readouterr().err
+    assert "transforms.json that are not used: is_bad (1 frames), depth_file_path (17 frames), time (1 frames)" in said
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("slash", ["\\", "\\\\", "/"])
+def test_camera_files_of_windows(scene, encoding, slash):
+    """A lone backslash is no JSON, or an escape: of images\\new.png the letter n."""
+    names = [camera.image_name for camera in read(scene).train_cameras]
+    text = (scene / "transforms.json").read_text().replace("./images", "images")
+    content = json.loads(text)
+    for frame in content["frames"]:
+        text = text.replace(frame["file_path"], frame["file_path"].replace("/", slash))
+    (scene / "transforms.json").write_text(text, encoding=encoding)
+    assert [camera.image_name for camera in read(scene).train_cameras] == names
+
+
+def test_a_lone_backslash_that_makes_an_escape(scene):
+    shutil.copy(read(scene).train_cameras[0].image_path, scene / "images" / "new.png")
+    _edit(scene, lambda content: content.update(frames=[{**content["frames"][0], "file_path": "images\new.png"}]))
+    assert [camera.image_name for camera in read(scene).train_cameras] == ["images/new.png"]
+
+
+@pytest.mark.parametrize("name", ["points3D.ply", "points3d.ply", "Points3D.PLY"])
+def test_points_beside_the_camera_file(scene, blender_scene, name):
+    shutil.copy(scene / "sparse_pc.ply", blender_scene / name)
+    (scene / "sparse_pc.ply").rename(scene / name)
+    _edit(scene, lambda content: content.pop("ply_file_path"))
+    for folder in (scene, blender_scene):
+        info = read(folder)
+        assert len(info.point_cloud.points) == 300 and info.ply_path == folder / name
+    _edit(scene, lambda content: content.update(ply_file_path=f".\\{name.upper()}"))
+    assert len(read(scene).point_cloud.points) == 300
+
+
 def test_masks_of_frames(scene):
     (scene / "masks").mkdir()
     grey = np.full((64, 96), 255, np.uint8)

@@ -1,7 +1,7 @@
 """Scenes whose camera file has poses in OpenGL axes: Blender's transforms_train.json, nerfstudio's transforms.json."""
 
-import json
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from scene.images.decode import picture_size
-from scene.images.find import find_images
+from scene.images.find import FileIndex, find_images
 from scene.images.lens import PANORAMA, Lens
 from scene.images.masks import NO_MASKS, Mask, MaskOptions, find_masks
 from scene.readers.info import CameraInfo, SceneInfo, held_out, split_by_order
@@ -17,12 +17,17 @@ from scene.readers.pinholes import camera_info, finished
 from scene.readers.point_cloud import read_point_cloud
 from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, random_in_cube, random_in_frusta, scene_info
 from splatting.files.image_files import SUFFIXES
-from splatting.files.plain_files import plain_text, relative_to
+from splatting.files.json_files import read_json
+from splatting.files.plain_files import relative_to
 from utils.graphics_utils import fov2focal
 from utils.system_utils import UserError
 
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 _BROWN = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+_OTHER_LENSES = ("equirectangular", "orthographic")  # the first one's rows are steps of the sine of the latitude
+_UNUSED = ("is_bad", "depth_file_path", "depth_path", "time", "rolling_shutter", "rolling_shutter_time")
+_ESCAPED = {8: "\\b", 9: "\\t", 10: "\\n", 12: "\\f", 13: "\\r"}  # what a lone backslash in a path made of its letter
+_SAME = 1e-6  # of poses, which decimals may have rounded
 _FISHEYE = ("FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 
 
@@ -36,21 +41,22 @@ def read_blender(
 ) -> SceneInfo:
     """Read a Blender scene (transforms_train.json, transforms_test.json), views in the order of the files.
 
-    A scene without a cloud of its own starts from grey points spread evenly over a cube. suffixes: of photos that the
+    Without hold_out, test views train, too, and are left out with a message where their file or photos are missing. A
+    scene without a cloud of its own starts from grey points spread evenly over a cube. suffixes: of photos that the
     files name without one. Other arguments and errors as for `scene.dataset_readers.read_scene`; images has no effect.
     """
     files = [folder / "transforms_train.json", folder / "transforms_test.json"]
-    for path in files:
+    for path in files[: 2 if hold_out else 1]:
         if not path.is_file():
-            raise UserError(f"no {path.name} in {folder}; a Blender scene needs {files[0].name} and {files[1].name}")
-    train, test = (read_frames(path, masks, suffixes) for path in files)
-    train, test = (train, held_out(test)) if hold_out else (train + test, [])
+            raise UserError(f"no {path.name} in {folder}, which --eval needs; export it, or leave --eval out")
+    train, test = read_frames(files[0], masks, suffixes), _test_frames(files[1], masks, suffixes, hold_out)
+    train, test = _apart(train, held_out(test), folder) if hold_out else (_once(train + test, str(folder)), [])
     if not train:
         raise UserError(f"{files[0]} lists no frames; export the scene again")
 
     def own() -> StartCloud:
-        ply = folder / "points3d.ply"
-        return StartCloud(read_point_cloud(ply), ply) if ply.is_file() else StartCloud(random_in_cube(), None)
+        ply = _ply_in(folder)
+        return StartCloud(read_point_cloud(ply), ply) if ply else StartCloud(random_in_cube(), None)
 
     lacking = f"{folder / 'points3d.ply'} has no points"
     return scene_info((train, test), start, own, random_in_cube, lacking, is_nerf_synthetic=True)
@@ -59,6 +65,53 @@ def read_blender(
 def read_frames(path: Path, masks: MaskOptions = NO_MASKS, suffixes: Sequence[str] = SUFFIXES) -> list[CameraInfo]:
     """The views of one of a Blender scene's two files, in its order."""
     return _cameras(path, _read(path), masks, suffixes, by_stem=True)
+
+
+def _test_frames(path: Path, masks: MaskOptions, suffixes: Sequence[str], needed: bool) -> list[CameraInfo]:
+    if not needed and not path.is_file():
+        return []
+    try:
+        return read_frames(path, masks, suffixes)
+    except UserError as error:
+        if needed:
+            raise
+        print(f"the views of {path} do not train: {error}", file=sys.stderr)
+        return []
+
+
+def _apart(
+    train: list[CameraInfo], test: list[CameraInfo], listed_by: Path
+) -> tuple[list[CameraInfo], list[CameraInfo]]:
+    """Training and test views, of which no photo is both: it is a test view."""
+    tests = {_file(view) for view in test}
+    left = [view for view in train if _file(view) not in tests]
+    if train and not left:
+        raise UserError(f"all training photos of {listed_by} are test photos, too; give it others, or leave --eval out")
+    if len(left) < len(train):
+        count = len(train) - len(left)
+        print(f"{count} photos of {listed_by} are listed for training and for tests, and only test", file=sys.stderr)
+    return left, test
+
+
+def _once(views: list[CameraInfo], listed_by: str) -> list[CameraInfo]:
+    """The views without those of a photo that has one already. UserError where the poses of the two differ."""
+    found: dict[str, CameraInfo] = {}
+    for view in views:
+        first = found.setdefault(_file(view), view)
+        if not (np.allclose(first.R, view.R, atol=_SAME) and np.allclose(first.center, view.center, _SAME, _SAME)):
+            raise UserError(f"{listed_by} lists the photo {view.image_path} twice, with different poses; keep one")
+    if len(found) < len(views):
+        print(f"{len(views) - len(found)} frames of {listed_by} repeat a photo and are left out", file=sys.stderr)
+    return list(found.values())
+
+
+def _file(view: CameraInfo) -> str:
+    return os.path.normpath(view.image_path)
+
+
+def _ply_in(folder: Path) -> Path | None:
+    """points3d.ply of a folder, in letters of any case."""
+    return max((path for path in folder.iterdir() if path.name.lower() == "points3d.ply"), default=None)
 
 
 def read_nerfstudio(
@@ -71,30 +124,39 @@ def read_nerfstudio(
 ) -> SceneInfo:
     """Read a nerfstudio or instant-ngp scene (transforms.json), views sorted by name (bytes).
 
-    hold_out: the file's own split if it has one (test_filenames, else val_filenames, are the test views), else every
-    8th view. Frames may name masks, which --masks replaces. Points come from the file's ply_file_path. Arguments and
-    errors as for `scene.dataset_readers.read_scene`; images has no effect.
+    hold_out: the file's own split if it has one (test_frames, and test_filenames, else val_filenames, are the test
+    views), else every 8th view. Frames may name masks, which --masks replaces. Points come from the file's
+    ply_file_path, else from a points3D.ply beside it. Arguments and errors as for `scene.dataset_readers.read_scene`;
+    images has no effect.
     """
     path = folder / "transforms.json"
     content = _read(path)
     cameras = _cameras(path, content, masks, SUFFIXES, by_stem=False, native=native)
+    tests = {_file(view) for view in cameras[len(cameras) - len(content["test_frames"]) :]}
+    cameras = _once(cameras, str(path))
     cameras.sort(key=lambda camera: os.fsencode(camera.image_name))
     if not cameras:
         raise UserError(f"{path} lists no frames; export the scene again")
-    views = _own_split(path, content, cameras, hold_out) or split_by_order(cameras, hold_out, folder)
+    views = _own_split(path, content, cameras, tests, hold_out) or split_by_order(cameras, hold_out, folder)
 
     def own() -> StartCloud | None:
         name = content.get("ply_file_path")
-        return StartCloud(read_point_cloud(folder / str(name)), folder / str(name)) if name else None
+        ply = (FileIndex(folder).find(str(name)) or folder / str(name)) if name else _ply_in(folder)
+        return StartCloud(read_point_cloud(ply), ply) if ply else None
 
     return scene_info(views, start, own, lambda: random_in_frusta(views[0]), f"{path} names no points (ply_file_path)")
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """A camera file's content, with a list of frames that have a file_path and a transform_matrix."""
+    """A camera file's content, with a list of frames that have a file_path and a transform_matrix.
+
+    Those of test_frames are the last of them. A message names fields that are not used.
+    """
     try:
-        content = json.loads(plain_text(path))
-        content["frames"] = list(content["frames"])
+        content = read_json(path)
+        frames = list(content["frames"])
+        content["test_frames"] = list(content.get("test_frames") or ())
+        content["frames"] = frames + content["test_frames"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise _no_camera_file(path, error) from error
     for number, frame in enumerate(content["frames"], start=1):
@@ -102,7 +164,21 @@ def _read(path: Path) -> dict[str, Any]:
         if lacking:
             fault = f"has no {' and no '.join(lacking)}; fix the frame, or take it out"
             raise UserError(f"{_where(path, number, frame)} {fault}")
+        for key in frame:
+            if key.endswith("_path") and isinstance(frame[key], str):
+                frame[key] = frame[key].translate(_ESCAPED)
+    _say_what_is_unused(path, content)
     return content
+
+
+def _say_what_is_unused(path: Path, content: dict[str, Any]) -> None:
+    """Name the fields that would change the result in the programs that write them."""
+    fields = [{**content, **frame} for frame in content["frames"]]
+    counts = {name: sum(bool(frame.get(name)) for frame in fields) for name in _UNUSED}
+    if len({str(frame.get("time")) for frame in fields}) < 2:
+        counts["time"] = 0  # the photos are of one moment
+    if said := [f"{name} ({count} frames)" for name, count in counts.items() if count]:
+        print(f"fields of {path} that are not used: {', '.join(said)}", file=sys.stderr)
 
 
 def _where(path: Path, number: int, frame: Any) -> str:
@@ -174,9 +250,11 @@ def _masks(path: Path, frames: list[dict[str, Any]], names: list[str], masks: Ma
 
 
 def _own_split(
-    path: Path, content: dict[str, Any], cameras: list[CameraInfo], hold_out: bool
+    path: Path, content: dict[str, Any], cameras: list[CameraInfo], tests: set[str], hold_out: bool
 ) -> tuple[list[CameraInfo], list[CameraInfo]] | None:
-    """Training and test views by the file's lists; None without hold_out or without such lists."""
+    """Training and test views by the file's lists, and by the photos of its test_frames; None without any of them, or
+    without hold_out.
+    """
     lists = []
     for name in SPLITS:
         listed = content.get(name) or []
@@ -184,19 +262,19 @@ def _own_split(
             raise UserError(f"{name} in {path} must be a list of file names; fix it, or leave it out")
         lists.append({os.path.normpath(str(entry)) for entry in listed})
     train_names, test_names = lists[0], lists[2] or lists[1]
-    if not hold_out or not test_names:
+    if not hold_out or not (test_names or tests):
         return None
     test, train = [], []
     for camera in cameras:
         name = os.path.normpath(camera.image_name)
-        if name in test_names:
+        if name in test_names or _file(camera) in tests:
             test.append(camera)
         elif name in train_names or not train_names:
             train.append(camera)
     if not test or not train:
         raise UserError(
             f"of the photos in {path}, {len(train)} are in train_filenames and {len(test)} in test_filenames (or "
-            "val_filenames), but each list needs at least one; fix the lists or leave --eval out"
+            "val_filenames, or test_frames), but each list needs at least one; fix the lists or leave --eval out"
         )
     return train, held_out(test)
 
@@ -217,6 +295,13 @@ def lens_of(frame: Mapping[str, Any], shared: Mapping[str, Any], size: tuple[int
 
     width, height = int(number("w", size[0])), int(number("h", size[1]))
     model = str(fields.get("camera_model") or ("FISHEYE" if fields.get("is_fisheye") else "PERSPECTIVE")).upper()
+    if model == "LATLONG" or fields.get("latlong"):
+        model = PANORAMA
+    other = [name for name, value in fields.items() if value and (name in _OTHER_LENSES or name.startswith("ftheta_p"))]
+    if other:
+        raise UserError(
+            f"{file} has {other[0]}, a lens of instant-ngp that cannot be used; convert the photos to pinhole images"
+        )
     if model == PANORAMA:  # of all directions, whatever its focal lengths are said to be
         return Lens(PANORAMA, (width, height), width, height)
     for name in ("camera_angle_x", "camera_angle_y"):

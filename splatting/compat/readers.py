@@ -142,10 +142,13 @@ def readNerfSyntheticInfo(
     if isinstance(depths, bool):
         extension = eval if isinstance(eval, str) else extension
         depths, eval = "", depths
-    info = read_blender(Path(path), "", hold_out=True, suffixes=(extension, *SUFFIXES))
-    train, test = info.train_cameras, info.test_cameras
-    train, test = (train, test) if eval else (train + test, [])
-    return _published_scene(info, train, test, Path(path), depths)
+    suffixes = (extension, *SUFFIXES)
+    info = read_blender(Path(path), "", hold_out=bool(eval), suffixes=suffixes)
+    train = info.train_cameras
+    if not eval:  # the reference marks them in either case
+        files = {view.image_path for view in read_frames(Path(path) / "transforms_train.json", suffixes=suffixes)}
+        train = [replace(view, is_test=view.image_path not in files) for view in train]
+    return _published_scene(info, train, info.test_cameras, Path(path), depths)
 
 
 def readNerfstudioInfo(

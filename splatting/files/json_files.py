@@ -5,20 +5,31 @@ arguments/stored.py says which options are in it.
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
 from splatting.files.plain_files import plain_text
 from utils.system_utils import UserError, atomic_write
 
+_BACKSLASH = re.compile(r'\\(?:[\\"/]|u[0-9a-fA-F]{4})?')  # with what it escapes in a text that has lone ones
 MODEL_JSON = "model.json"
 OFFSET = "world_offset"  # (3,) world coordinates of the origin of the model's frame (scene/readers/world_offset.py)
 LARGEST_OFFSET = 1e15  # beyond, the steps of doubles are larger than 0.1
 
 
 def read_json(path: Path) -> Any:
-    """Content of a file. OSError if it cannot be read; ValueError or RecursionError if it is not JSON."""
-    return json.loads(plain_text(path))
+    """Content of a file. OSError if it cannot be read; ValueError or RecursionError if it is not JSON.
+
+    A backslash that begins no escape stands for itself, as in paths that were written by hand on Windows.
+    """
+    text = plain_text(path)
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        if not error.msg.startswith("Invalid \\"):
+            raise
+    return json.loads(_BACKSLASH.sub(lambda found: found[0] if len(found[0]) > 1 else "\\\\", text))
 
 
 def write_json(path: Path, content: Any, sort_keys: bool = True) -> None:
