@@ -13,15 +13,19 @@ import pycolmap
 import pytest
 import torch
 from PIL import Image
-from synthetic import CENTER, FOCAL, FakeGaussians, folder_state, options_of, read
+from synthetic import CENTER, FOCAL, FakeGaussians, as_text, folder_state, options_of, read
 
 from scene import Scene
 from scene.dataset_readers import scene_extent
 from scene.images.store import image_device
 from scene.readers.colmap import read_model
-from scene.readers.depth_scale import make_depth_params
+from scene.readers.depth_maps import Metric
+from scene.readers.depth_scale import make_depth_params, make_metric_scale
 from scene.readers.point_cloud import read_point_cloud, write_point_cloud
+from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
+
+CLOUD = BasicPointCloud(np.eye(3), np.eye(3), np.zeros((3, 3)))
 
 
 def _assert_same(a, b) -> None:
@@ -66,6 +70,59 @@ def test_broken_binary_falls_back_to_text(colmap_scene):
     pycolmap.Reconstruction(str(sparse)).write_text(str(sparse))
     (sparse / "cameras.bin").write_bytes((sparse / "cameras.bin").read_bytes()[:-5])
     _assert_same(read(colmap_scene), whole)
+
+
+@pytest.mark.parametrize("text", [["cameras"], ["images", "points3D"], ["cameras", "images"]])
+def test_a_model_may_have_files_of_both_kinds(colmap_scene, text):
+    whole = read(colmap_scene)
+    sparse = colmap_scene / "sparse" / "0"
+    pycolmap.Reconstruction(str(sparse)).write_text(str(sparse))
+    for name in ("cameras", "images", "points3D"):
+        (sparse / f"{name}.{'bin' if name in text else 'txt'}").unlink()
+    _assert_same(read(colmap_scene), whole)
+
+
+@pytest.mark.parametrize("start", [{"init_type": "random"}, {"init_pcd_path": "cloud.ply"}, {"init_pcd_path": CLOUD}])
+def test_a_model_may_have_no_points(colmap_scene, start):
+    sparse = colmap_scene / "sparse" / "0"
+    (sparse / "points3D.bin").unlink()
+    with pytest.raises(UserError, match="has no points; start from random points with --init_type random, or from a"):
+        read(colmap_scene)
+    write_point_cloud(colmap_scene / "cloud.ply", CLOUD.points, 255 * CLOUD.colors)
+    if start.get("init_pcd_path") == "cloud.ply":
+        start = {"init_pcd_path": str(colmap_scene / "cloud.ply")}
+    assert len(read(colmap_scene, **start).point_cloud.points) in (3, 100_000)
+    (colmap_scene / "cloud.ply").rename(sparse / "points3D.ply")
+    info = read(colmap_scene)
+    np.testing.assert_array_equal(info.point_cloud.points, CLOUD.points)
+    assert info.ply_path == sparse / "points3D.ply"
+
+
+def test_names_of_one_file_are_refused(colmap_scene):
+    as_text(colmap_scene)
+    path = colmap_scene / "sparse" / "0" / "images.txt"
+    path.write_text(path.read_text().replace("left/v02.png", "left/./V04.png"))
+    with pytest.raises(UserError, match=r"left/\./V04.png and left/v04.png in .* are one file, .*; rename one"):
+        read(colmap_scene)
+
+
+@pytest.mark.parametrize("metric", [False, True])
+def test_maps_without_2d_points_have_one_reason_and_one_way_out(colmap_scene, metric):
+    as_text(colmap_scene)
+    path = colmap_scene / "sparse" / "0" / "images.txt"
+    rows = [line for line in path.read_text().split("\n") if not line.startswith("#")]
+    path.write_text("".join(f"{line}\n\n" for line in rows[::2] if line))
+    depths = colmap_scene / "depths"
+    for view in read(colmap_scene).train_cameras:
+        (depths / view.image_name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.full((view.height, view.width), 100, np.uint8)).save(depths / view.image_name)
+    said = "at 0 points of .* too few" if metric else "can be fitted: .* see 0 points at most"
+    with pytest.raises(UserError, match=f"{said}.*; export the model with the 2D points of its photos, or train"):
+        if metric:
+            make_metric_scale(colmap_scene, depths, Metric(0.01, None), "txt")
+        else:
+            make_depth_params(colmap_scene, depths, "txt")
+    assert not (colmap_scene / "sparse" / "0" / "depth_params.json").exists()
 
 
 def test_hold_out_takes_every_8th_and_extent_comes_from_training_views(colmap_scene):
@@ -211,7 +268,7 @@ def test_a_count_beyond_the_file_is_refused(colmap_scene, name, what, bit):
 def test_a_file_that_nobody_may_read_and_a_point_that_is_missing(colmap_scene, monkeypatch):
     sparse = colmap_scene / "sparse" / "0"
     (sparse / "points3D.bin").write_bytes(bytes(8))
-    with pytest.raises(UserError, match=r"in .* as .bin sees a point that is not in points3D; copy all three"):
+    with pytest.raises(UserError, match=r"in .* as .bin sees a point that is not in points3D; copy all"):
         make_depth_params(colmap_scene, colmap_scene, "bin")
 
     def refuse(path: Path) -> bytes:

@@ -22,12 +22,15 @@ from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, rand
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 
-_FILES, _SUFFIXES = ("cameras", "images", "points3D"), ("bin", "txt")
-AGAIN = "copy all three files of the model again from where they were made"
+_NEEDED, _POINTS, _SUFFIXES = ("cameras", "images"), "points3D", ("bin", "txt")
+AGAIN = "copy all files of the model again from where they were made"
+
+
+_NO_POINTS = Points(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
 
 class ColmapModel(NamedTuple):
-    """Cameras by their ids; photos in the order of theirs; points in the order of theirs."""
+    """Cameras by their ids; photos in the order of theirs; points in the order of theirs, none without their file."""
 
     cameras: dict[int, Camera]
     images: list[Image]
@@ -53,6 +56,10 @@ def read_colmap(
     names = [photo.name for photo in photos]
     listed_by = f"the COLMAP model in {model_folder}"
     paths = find_images(folder / images, names, listed_by, "put them there, or name their folder with -i")
+    by_file: dict[str, str] = {}
+    for name, path in zip(names, paths, strict=True):
+        if (first := by_file.setdefault(os.path.normpath(path), name)) != name:
+            raise UserError(f"{first} and {name} in {listed_by} are one file, {path}; rename one, or take it out")
     found = find_masks(folder, names, masks)
     cameras = [
         colmap_camera(photo, model.cameras[photo.camera_id], path, mask, masks.ignore_alpha, native)
@@ -72,14 +79,15 @@ def colmap_camera(
     return camera_info(camera.id, photo.name, path, lens, rotation, translation, mask, ignore_alpha, native)
 
 
-def _own_cloud(model_folder: Path, model: ColmapModel) -> StartCloud:
-    source = next(path for path in (model_folder / "points3D.bin", model_folder / "points3D.txt") if path.is_file())
-    ply = model_folder / "points3D.ply"
+def _own_cloud(model_folder: Path, model: ColmapModel) -> StartCloud | None:
+    source, ply = _file(model_folder, _POINTS, "bin"), model_folder / f"{_POINTS}.ply"
     if ply.is_file():
-        if ply.stat().st_mtime >= source.stat().st_mtime:
+        if source is None or ply.stat().st_mtime >= source.stat().st_mtime:
             return StartCloud(read_point_cloud(ply), ply)
         remedy = f"to use it, give --init_pcd_path {ply}"
         print(f"{ply} is older than {source.name} and is not used; {remedy}", file=sys.stderr)
+    if source is None:
+        return None
     check_finite(model.points.xyz, source)
     colors = model.points.rgb.astype(np.uint8).astype(np.float32) / 255
     return StartCloud(BasicPointCloud(model.points.xyz, colors, np.zeros_like(colors)), None)
@@ -93,17 +101,16 @@ def find_model(scene: Path) -> tuple[Path, ColmapModel]:
     """
     sparse = scene / "sparse"
     inside = sorted(path for path in sparse.iterdir() if path.is_dir())
-    folders = [folder for folder in dict.fromkeys([sparse / "0", sparse, *inside]) if _kinds(folder)]
+    folders = [folder for folder in dict.fromkeys([sparse / "0", sparse, *inside]) if not _lacking(folder)]
     if not folders:
         for folder in (sparse / "0", sparse, *inside):
-            missing = [name for name in _FILES if not any((folder / f"{name}.{kind}").is_file() for kind in _SUFFIXES)]
-            if len(missing) < len(_FILES):
-                no = " and no ".join(missing)
-                raise UserError(f"{folder} has no {no} as .bin or .txt; copy the whole model there")
+            missing = _lacking(folder)
+            if len(missing) < len(_NEEDED):
+                raise UserError(f"{folder} has no {missing[0]} as .bin or .txt; copy the whole model there")
         found = sorted(str(path.relative_to(scene)) for path in sparse.glob("**/*"))[:8]
         raise UserError(
-            f"no COLMAP model in {sparse / '0'}, {sparse} or its other folders: looked for cameras, images and "
-            f"points3D as .bin or .txt, found {', '.join(found) or 'nothing'}; copy the whole model there"
+            f"no COLMAP model in {sparse / '0'}, {sparse} or its other folders: looked for cameras and images "
+            f"as .bin or .txt, found {', '.join(found) or 'nothing'}; copy the whole model there"
         )
     models, errors = {}, []
     for folder in folders:
@@ -123,32 +130,43 @@ def find_model(scene: Path) -> tuple[Path, ColmapModel]:
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """Read a binary model, or a text model if that is missing or broken. UserError when neither can be read."""
-    errors = [UserError(f"no COLMAP model in {folder}; copy the whole model there")]
-    for suffix in _kinds(folder):
+    """Read a binary model, or a text model if that is missing or broken. UserError when neither can be read.
+
+    A file that is missing in one kind is taken in the other.
+    """
+    kinds, errors = _kinds(folder), []
+    for suffix in kinds:
         try:
-            return read_model_of_kind(folder, suffix)
+            model = read_model_of_kind(folder, suffix)
         except UserError as error:
             errors.append(error)
-    raise errors[:2][-1]
+            continue
+        for error in errors:
+            print(f"{error}; the .{suffix} files are used", file=sys.stderr)
+        return model
+    raise errors[0] if errors else UserError(f"no COLMAP model in {folder}; copy the whole model there")
 
 
 def read_model_of_kind(folder: Path, suffix: str, with_2d_points: bool = False) -> ColmapModel:
-    """Read a model in .bin or .txt files. UserError where one cannot be read or a photo's camera is missing."""
+    """Read a model in .bin or .txt files, and what it lacks in the other kind.
+
+    UserError where one cannot be read or a photo's camera is missing.
+    """
     if suffix not in _kinds(folder):
         raise UserError(f"no COLMAP model in {folder} as .{suffix}; choose the other kind with --model_type")
-    binary = suffix == "bin"
+    paths = [_file(folder, name, suffix) for name in (*_NEEDED, _POINTS)]
+    binary = [path is not None and path.suffix == ".bin" for path in paths]
     try:
-        cameras = read_cameras(folder / f"cameras.{suffix}", binary)
-        images = read_images(folder / f"images.{suffix}", binary, with_2d_points)
-        points = read_points(folder / f"points3D.{suffix}", binary)
+        cameras = read_cameras(paths[0], binary[0])
+        images = read_images(paths[1], binary[1], with_2d_points)
+        points = read_points(paths[2], binary[2]) if paths[2] else _NO_POINTS
     except OSError as error:
         raise UserError(f"cannot read {error.filename} ({error.strerror}); fix its permissions, or {AGAIN}") from error
     for image in images.values():
         if image.camera_id not in cameras:
             raise UserError(
-                f"the photo {image.name} in {folder / f'images.{suffix}'} has the camera {image.camera_id}, which is "
-                f"not in cameras.{suffix}; {AGAIN}"
+                f"the photo {image.name} in {paths[1]} has the camera {image.camera_id}, which is "
+                f"not in {paths[0].name}; {AGAIN}"
             )
     order = np.argsort(points.ids, kind="stable")
     return ColmapModel(
@@ -156,6 +174,18 @@ def read_model_of_kind(folder: Path, suffix: str, with_2d_points: bool = False) 
     )
 
 
+def _file(folder: Path, name: str, suffix: str) -> Path | None:
+    """A file of a model, of this kind if there is one, else of the other; None if there is neither."""
+    paths = (folder / f"{name}.{kind}" for kind in sorted(_SUFFIXES, key=lambda kind: kind != suffix))
+    return next((path for path in paths if path.is_file()), None)
+
+
 def _kinds(folder: Path) -> list[str]:
-    """Suffixes of the models in a folder, the binary one first."""
-    return [kind for kind in _SUFFIXES if all((folder / f"{name}.{kind}").is_file() for name in _FILES)]
+    """The kinds of a model's files, the binary one first; none where a file that every model has is missing."""
+    there = [kind for kind in _SUFFIXES if any((folder / f"{name}.{kind}").is_file() for name in (*_NEEDED, _POINTS))]
+    return [] if _lacking(folder) else there
+
+
+def _lacking(folder: Path) -> list[str]:
+    """What a folder lacks of what every model has."""
+    return [name for name in _NEEDED if not _file(folder, name, "bin")]

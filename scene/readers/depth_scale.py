@@ -11,6 +11,7 @@ from scene.readers.colmap import AGAIN, ColmapModel, find_model, read_model_of_k
 from scene.readers.depth_maps import METRIC, PARAMS, SCALE, STEP, Metric, inverses, read_values, sample
 from utils.system_utils import UserError, atomic_write
 
+_WITH_POINTS = "export the model with the 2D points of its photos, or train without depth maps"
 UNIT = 65535.0  # of a map's values in the fit
 MIN_POINTS = 11
 MIN_RANGE = 1e-3  # of the points' inverse depths, 1 / world units
@@ -20,11 +21,11 @@ def make_depth_params(scene: Path, depths: Path, model_type: str) -> tuple[dict[
     """Fit every registered photo that has a map in `depths`, and write depth_params.json into the model's folder.
 
     model_type: bin or txt. Returns the table and the number of registered photos. The table has `scale` and `offset` by
-    photo name without extension, both 0 if there are too few points. UserError when no photo has a map, or the scene
-    has no COLMAP model.
+    photo name without extension, both 0 if there are too few points. UserError when no photo has a map, no map
+    can be fitted, or the scene has no COLMAP model.
     """
     folder, model = _model(scene, model_type)
-    table = {}
+    table, most = {}, 0
     for image in tqdm(model.images, desc="Fitting depth maps", unit="map"):
         pixels, z = sightings(image, model.points, f"{folder} as .{model_type}")
         name = Path(image.name).with_suffix("").as_posix()
@@ -32,9 +33,15 @@ def make_depth_params(scene: Path, depths: Path, model_type: str) -> tuple[dict[
         if path.is_file():
             scale, offset = fit_image(pixels, z, (camera.width, camera.height), read_values(path) / UNIT)
             table[name] = {"scale": scale, "offset": offset}
+            most = max(most, len(z))
     if not table:
         raise UserError(
             f"no depth map in {depths} belongs to a photo of {folder}; name maps like the photos, with .png"
+        )
+    if not any(entry["scale"] for entry in table.values()):
+        raise UserError(
+            f"none of {len(table)} maps in {depths} can be fitted: the photos of {folder} as .{model_type} see {most} "
+            f"points at most, and a fit needs {MIN_POINTS} of different depths; {_WITH_POINTS}"
         )
     with atomic_write(folder / PARAMS) as path:
         path.write_text(json.dumps(table, indent=2, allow_nan=False) + "\n", encoding="utf-8")
@@ -58,7 +65,10 @@ def make_metric_scale(scene: Path, depths: Path, metric: Metric, model_type: str
             found.append((seen * z)[np.isfinite(seen)])
     ratios = np.concatenate(found) if found else np.zeros(0)
     if len(ratios) < MIN_POINTS:
-        raise UserError(f"the maps in {depths} have depths at {len(ratios)} points of {folder}, too few to fit a scale")
+        raise UserError(
+            f"the maps in {depths} have depths at {len(ratios)} points of {folder}, too few to fit a scale; "
+            f"{_WITH_POINTS}"
+        )
     scale = float(np.median(ratios))
     told = {STEP: metric.step} if metric.step else {}
     with atomic_write(depths / METRIC) as path:
