@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from synthetic import BROWN, make_blender_scene, make_colmap_scene
+from synthetic import BROWN, as_text, make_blender_scene, make_colmap_scene
 from trainings import differences, train_on, trained
 
 import metrics
@@ -98,6 +98,32 @@ def test_tracks_are_read(params, tmp_path):
     for view, track in zip(views, tracks, strict=True):
         seen = (track.points + offset) @ view.R + view.T
         np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], track.rays, atol=1e-6)
+
+
+@pytest.mark.parametrize("value", ["nan", "1e300", "inf"])
+@pytest.mark.parametrize("of", ["errors", "places"])
+def test_what_no_track_can_have_is_left_out(of, value, tmp_path, capsys):
+    make_colmap_scene(tmp_path)
+    views = read_colmap(tmp_path, "images", False).train_cameras
+    before = {view.image_name: len(track.points) for view, track in zip(views, _tracks(tmp_path, views), strict=True)}
+    assert "not used" not in capsys.readouterr().err
+    as_text(tmp_path)
+    path = tmp_path / "sparse" / "0" / ("points3D.txt" if of == "errors" else "images.txt")
+    lines = path.read_text().split("\n")
+    first = next(number for number, line in enumerate(lines) if line and line[0] != "#") + (of == "places")
+    words = lines[first].split()
+    place = 7 if of == "errors" else next(i for i in range(0, len(words), 3) if words[i + 2] != "-1")
+    words[place] = value
+    lines[first] = " ".join(words)
+    path.write_text("\n".join(lines))
+    after = {view.image_name: len(track.points) for view, track in zip(views, _tracks(tmp_path, views), strict=True)}
+    lost = sum(before.values()) - sum(after.values())
+    assert lost == 1 if of == "places" else lost > 1
+    assert f"{lost} 2D points of {tmp_path / 'sparse/0'} are not used: " in capsys.readouterr().err
+
+
+def _tracks(scene: Path, views: list) -> list[Track]:
+    return read_tracks(scene, views, np.zeros(3))
 
 
 def test_rays_of_pinholes_are_those_of_pycolmap():

@@ -129,7 +129,7 @@ def find_model(scene: Path) -> tuple[Path, ColmapModel]:
     return best, models[best]
 
 
-def read_model(folder: Path) -> ColmapModel:
+def read_model(folder: Path, with_2d_points: bool = False) -> ColmapModel:
     """Read a binary model, or a text model if that is missing or broken. UserError when neither can be read.
 
     A file that is missing in one kind is taken in the other.
@@ -137,7 +137,7 @@ def read_model(folder: Path) -> ColmapModel:
     kinds, errors = _kinds(folder), []
     for suffix in kinds:
         try:
-            model = read_model_of_kind(folder, suffix)
+            model = read_model_of_kind(folder, suffix, with_2d_points)
         except UserError as error:
             errors.append(error)
             continue

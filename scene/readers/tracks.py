@@ -1,6 +1,7 @@
 """Points that photos show, and where: those that structure from motion has seen, and any by their projection."""
 
 import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -13,10 +14,11 @@ from diff_gaussian_rasterization.lens import Lens as NativeLens
 from diff_gaussian_rasterization.scene import scene_arguments
 
 from scene.images.lens import Lens, rays_of
-from scene.readers.colmap import find_model, read_model_of_kind
+from scene.readers.colmap import find_model, read_model
 from scene.readers.info import CameraInfo
 from scene.readers.scene_folder import COLMAP, kind_of
 
+_FAR = 1.5  # sizes of the photo from its middle; undistortion moves 2D points out of it by less
 FEWEST = 12  # points of a track; fewer say too little of a pose
 
 
@@ -43,9 +45,8 @@ def read_tracks(scene: str | os.PathLike, views: Sequence[CameraInfo], offset: n
     if kind_of(scene) != COLMAP:
         return [None] * len(views)
     folder, _ = find_model(Path(scene))
-    suffix = "bin" if (folder / "points3D.bin").is_file() else "txt"
-    cameras, images, points = read_model_of_kind(folder, suffix, with_2d_points=True)
-    photos, found = {image.name: image for image in images}, []
+    cameras, images, points = read_model(folder, with_2d_points=True)
+    photos, found, dropped = {image.name: image for image in images}, [], 0
     if len(points.ids):
         every = np.concatenate([image.point3D_ids for image in images])
         lengths = np.bincount(np.searchsorted(points.ids, every[np.isin(every, points.ids)]), minlength=len(points.ids))
@@ -57,10 +58,19 @@ def read_tracks(scene: str | os.PathLike, views: Sequence[CameraInfo], offset: n
         place = np.minimum(np.searchsorted(points.ids, photo.point3D_ids), len(points.ids) - 1)
         camera = cameras[photo.camera_id]
         rays = rays_of(Lens(camera.model, tuple(map(float, camera.params)), camera.width, camera.height), photo.xys)
-        seen = (points.ids[place] == photo.point3D_ids) & np.isfinite(rays).all(1)
-        place, places = place[seen], photo.xys[seen] / (camera.width, camera.height)
+        known = points.ids[place] == photo.point3D_ids
+        places = photo.xys / (camera.width, camera.height)
+        sound = (np.abs(points.errors[place]) <= max(camera.width, camera.height)) & (np.abs(places - 0.5) < _FAR).all(
+            1
+        )
+        dropped += int((known & ~sound).sum())
+        seen = known & sound & np.isfinite(rays).all(1)
+        place, places = place[seen], places[seen]
         track = Track(points.xyz[place] - offset, rays[seen], places, points.errors[place], lengths[place], place)
         found.append(track if len(place) >= FEWEST else None)
+    if dropped:
+        fault = "lie far outside of their photo, or have a reprojection error that is larger than it or no number"
+        print(f"{dropped} 2D points of {folder} are not used: they {fault}", file=sys.stderr)
     return found
 
 
