@@ -311,6 +311,23 @@ for name, further in (("PINHOLE", ""), ("OPENCV", " 0.1 0 0 0")):
         FAULTS["colmap"].append((_word("cameras.txt", *places), "camera of Right/V03.png has no usable size or focal"))
 
 
+# Distortions that fold the photo, or that no lens has.
+for name, further in (
+    ("OPENCV", "-9 0 0 0"),
+    ("OPENCV", "1e6 0 0 0"),
+    ("OPENCV", "1e300 -1e300 0 0"),
+    ("OPENCV", "0 0 1e3 0"),
+    ("OPENCV", "nan 0 0 0"),
+    ("OPENCV_FISHEYE", "-9 0 0 0"),
+    ("THIN_PRISM_FISHEYE", "0 0 0 0 0 0 1e3 0"),
+    ("FOV", "1e5"),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", "-90 0 0 0 0 0 0 0 0 0 0 0"),
+):
+    places = (1, name), (4, f"{FOCAL} {FOCAL} 45 34 {further}"), (5, ""), (6, ""), (7, "")
+    said = "camera of Right/V03.png " + ("has no usable size" if "nan" in further else "folds its photo or changes")
+    FAULTS["colmap"].append((_word("cameras.txt", *places), said))
+
+
 @pytest.fixture(scope="module")
 def masters(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """The intact scenes, by kind."""

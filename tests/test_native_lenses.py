@@ -18,6 +18,7 @@ import render
 import train
 from gaussian_renderer import rasterizer_settings
 from scene import Scene
+from scene.images.lens import Lens, pinhole_of
 from scene.readers.start_cloud import random_in_frusta
 from splatting.camera_paths.poses import poses_of
 from splatting.diagnosis.dataset import check_dataset
@@ -119,3 +120,20 @@ def test_a_training_and_its_renders_have_the_photos(tmp_path, monkeypatch, capsy
     assert "--lenses" not in capsys.readouterr().err
     with pytest.raises(UserError, match="was trained on undistorted photos; leave --lenses native out"):
         train.main([*words, "--lenses", "native", "--start_checkpoint", str(tmp_path / "resampled/chkpnt150.pth")])
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("OPENCV", (500, 500, 320, 240, -0.3, 0.1, 1e-3, 1e-3)),
+        ("SIMPLE_RADIAL", (300, 320, 240, -0.2)),
+        ("FULL_OPENCV", (500, 500, 320, 240, 0.8, 0.2, 0, 0, 0.01, 1.1, 0.4, 0.05)),
+        ("OPENCV_FISHEYE", (120, 120, 320, 240, -0.05, 0.01, -0.006, 0.001)),
+        ("OPENCV_FISHEYE", (60, 60, 320, 240, 0, -0.02, 0, 0)),  # a whole picture within the photo
+        ("FOV", (500, 500, 320, 240, 0.9)),
+        ("EUCM", (250, 250, 320, 240, 0.6, 1.1)),
+        ("SIMPLE_FISHEYE", (150, 320, 240)),
+    ],
+)
+def test_distortions_of_real_lenses_are_taken(model, params):
+    assert pinhole_of(Lens(model, tuple(map(float, params)), 640, 480), "a.png") is None

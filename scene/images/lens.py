@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from diff_gaussian_rasterization.lens import MODELS
+from diff_gaussian_rasterization.lens import lens_of as native_of
 
 # Pillow's zlib must be in the process before pycolmap's, or writing a PNG aborts (pycolmap 4.2.1, Pillow 13.0).
 from PIL import Image  # noqa: F401
@@ -30,6 +31,8 @@ _STRAIGHT = 1e-8  # COLMAP takes smaller parameters for no distortion
 _SHORTEST, _LONGEST = 1e-4, 1e5  # focal length
 _FARTHEST = 100.0  # principal point, from the middle; parts cut out of a large photo have it outside
 _LARGEST = 1 << 20  # pixels a side
+_STRETCH = 10.0  # times that a distortion may change an angle; lenses in use change it less than threefold
+_WIDE = 1.4  # radians from a fisheye's axis, beyond which the edge of its picture lies
 _ROUND_TRIP = 0.5  # pixels: largest error of a usable ray, from a pixel to the ray and back
 
 
@@ -91,6 +94,11 @@ def pinhole_of(lens: Lens, name: str) -> Pinhole | None:
         # is_undistorted alone is also true of a fisheye without further parameters.
         straight = camera.is_perspective_pinhole() and camera.is_undistorted()
     _check_bounds(lens, focal, center, name)
+    if not straight and not _is_plausible(lens, min(focal)):
+        raise UserError(
+            f"the distortion of the camera of {name} folds its photo or changes angles more than {_STRETCH:g} times "
+            f"({lens.model}, {lens.params}); calibrate the camera again, or export the cameras again"
+        )
     return Pinhole(focal[0], focal[-1], *center, lens.width, lens.height) if straight else None
 
 
@@ -112,6 +120,36 @@ def _check_bounds(lens: Lens, focal: Sequence[float], center: Sequence[float], n
     astray = max(abs(center[0] / lens.width - 0.5), abs(center[1] / lens.height - 0.5))
     if not (_SHORTEST * size <= min(focal) <= max(focal) <= _LONGEST * size and astray <= _FARTHEST):
         raise _unusable(lens, name)
+
+
+@functools.lru_cache(maxsize=4096)
+@np.errstate(all="ignore")
+def _is_plausible(lens: Lens, focal: float) -> bool:
+    """Whether a lens shows each direction once, and nearly where it would without distortion.
+
+    Directions of the circle that touches the photo's nearer sides are asked for; beyond it, many calibrated polynomials
+    turn back. So do those of fisheyes behind the edge of a smaller picture.
+    """
+    inner = min(lens.width, lens.height) / 2
+    if lens.model not in MODELS:
+        around = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+        circle = inner / 2 * np.column_stack([np.cos(around), np.sin(around)])  # wider, a fisheye has rays behind it
+        camera = _camera(lens)
+        return bool(
+            _round_trip(camera, circle + (camera.principal_point_x, camera.principal_point_y)).max() < _ROUND_TRIP
+        )
+    native = native_of(lens.model, lens.params)
+    fisheye = native.chart == "equidistant"
+    r = np.linspace(0, min(_STRETCH * inner / focal, math.pi if fisheye else math.inf), 4097)
+    over, under = (np.polyval([*terms[::-1], 1.0], r * r) for terms in (native.radial, native.divisor))
+    aside = math.hypot(*(3 * p + s for p, s in zip(native.tangential[::-1], native.prism, strict=True)))
+    shown = r * over / under
+    rises = np.diff(shown) > 2 * aside * r[1:] * r[1]  # where tangential and prism terms take most of the slope
+    end = len(rises) if rises.all() else int(rises.argmin())
+    reached = shown[: end + 1] * focal >= inner
+    if not reached.any():
+        return fisheye and r[end] >= _WIDE
+    return bool(r[reached.argmax()] * focal * _STRETCH > inner)
 
 
 def _unusable(lens: Lens, name: str) -> UserError:
