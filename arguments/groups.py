@@ -66,12 +66,14 @@ class ModelParams(OptionTable):
                  "points in the cameras' frusta, or in the reference's cube for Blender scenes"),
         Option("masks", "", origin="ours", stored=MODEL_JSON,
             help="folder of mask files inside the scene folder, or an absolute path; black is masked. A mask has its "
-                 "photo's name, with .png appended or with another suffix. Empty: the masks that a nerfstudio scene "
-                 "names"),
+                 "photo's name, with .png, .mask.png or _mask.png appended or with another suffix. Empty: the masks "
+                 "that a nerfstudio scene names"),
         Option("invert_masks", False, "white is masked instead of black", "ours", stored=MODEL_JSON),
-        Option("mask_meaning", "auto", origin="ours", check=one_of("auto", "ignore", "transparent"), stored=MODEL_JSON,
+        Option("mask_meaning", "auto", origin="ours", check=one_of("auto", "ignore", "transparent", "none"),
+            stored=MODEL_JSON,
             help="meaning of pixels masked by mask files or by the photos' alpha. ignore: leave them out of loss and "
-                 "scores; transparent: they show the background; auto: ignore for mask files, transparent for alpha"),
+                 "scores; transparent: they show the background; auto: ignore for mask files, transparent for alpha; "
+                 "none: ignore for mask files, and photos count as opaque"),
         Option("lenses", "auto", origin="ours", check=one_of("auto", "undistort", "native"), stored=MODEL_JSON,
             help="photos of distorting lenses. native: train on the photos as they are, through their lenses, where "
                  "the rasterizer knows the camera model; undistort: resample them to pinhole images when they are "

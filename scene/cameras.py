@@ -13,7 +13,7 @@ import torch
 from fused_ssim import composite
 from torch import Tensor, nn
 
-from scene.images.masks import TRANSPARENT, Cutout
+from scene.images.masks import TRANSPARENT, Cutout, Opaque
 from scene.images.sizes import shrink_mask, shrink_photo, shrink_values
 from scene.images.store import ImageStore, InMemory, Picture, Size, Source, at_hand, image_device
 from scene.readers.depth_maps import depth_fit
@@ -116,6 +116,8 @@ class Camera(nn.Module):
         self._source, self._mask = self._placed(info.image) or self.image_path, info.mask
         if self._mask and self._mask.meaning == TRANSPARENT:
             self._source, self._mask = Cutout(self.image_path, info.mask), None
+        elif info.opaque:
+            self._source = Opaque(self.image_path)
         self._ignore_alpha = info.ignore_alpha
         self.depth_has_gaps = getattr(info.depth, "metric", False)
         self._depth = self._placed(info.depth)

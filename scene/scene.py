@@ -17,7 +17,7 @@ from scene.cameras import Camera
 from scene.dataset_readers import read_scene, replaced_reader
 from scene.gaussians.ppisp import UNTRAINED, Ppisp
 from scene.half_images import half, train_on_all
-from scene.images.masks import MaskOptions, refuse_nothing_to_ignore
+from scene.images.masks import MaskOptions, check_masks
 from scene.images.store import ImageStore, Picture, image_device
 from scene.lens_correction import shares_of
 from scene.pose_file import with_poses, write_poses
@@ -115,7 +115,7 @@ class Scene:
         )
         if fresh:
             views = info.train_cameras + info.test_cameras
-            refuse_nothing_to_ignore([(view.image_path, view.mask) for view in views], masks)
+            check_masks([(view.image_path, view.mask) for view in views], masks)
         if self._halves:
             info = train_on_all(info)
         self._given = info.test_cameras

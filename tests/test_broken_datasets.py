@@ -187,7 +187,8 @@ def _seven_gone(scene: Path) -> None:
 
 def _converted(scene: Path) -> None:
     for path in sorted((scene / "images").rglob("*.png")):
-        Image.open(path).save(path.with_suffix(".jpg"))
+        for suffix in (".jpg", ".bmp"):  # which of them is the photo, nobody knows
+            Image.open(path).save(path.with_suffix(suffix))
         path.unlink()
 
 
@@ -248,7 +249,7 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_small_colours, r"^line 1 of .*points3D\.txt has the colour 0.0 1.0 0.25, and COLMAP's range from 0 to 255;"),
         (_gone(PHOTO), "1 of 9 photos .*are missing: SCENE/images/left/v02.png"),
         (_seven_gone, r"7 of 9 photos that .* lists are missing: .*Right/V03.png, .* and 2 more \(the folder has .*-i"),
-        (_converted, r"9 of 9 photos .*Right/V03.png.*\(Right/V03.jpg is there instead\)"),
+        (_converted, r"9 of 9 photos .*Right/V03.png.*the folder has Right/V03.bmp, .*go on without.*image_deleter"),
         (_cut(PHOTO, 40), "cannot read SCENE/images/left/v02.png .*truncated"),
         (_written(PHOTO, b""), "SCENE/images/left/v02.png is empty"),
         (_written(PHOTO, "version https://git-lfs.github.com/spec/v1\noid sha256:4\n"), "left/v02.png .*git lfs pull"),

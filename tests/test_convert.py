@@ -456,7 +456,7 @@ def test_panoramas_are_placed_and_taken_as_they_are(tmp_path):
 @pytest.mark.parametrize("mask", ["a.jpg.png", "a.jpg", "a.png"])
 def test_masks_have_the_names_of_their_photos(tmp_path, mask):
     (tmp_path / mask).touch()
-    assert find_masks(["a.jpg", "b.jpg"], tmp_path) == {"a.jpg": tmp_path / mask}
+    assert find_masks(["a.jpg", "b.jpg"], tmp_path, tmp_path / "input") == {"a.jpg": tmp_path / mask}
 
 
 def test_photos_and_masks_that_can_not_be_used_are_named_at_once(tmp_path):

@@ -1,6 +1,7 @@
 """The choice of the COLMAP model, the search for photos by name, and photos of every format in a scene."""
 
 import os
+import re
 import shutil
 import unicodedata
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from PIL import EpsImagePlugin, Image
 from synthetic import HEIGHT, WIDTH, make_colmap_scene, read
 
+from scene.images.find import find_images
 from utils.system_utils import UserError
 
 
@@ -68,6 +70,37 @@ def test_names_that_match_but_for_case_accents_or_slashes(colmap_scene, capsys):
     shutil.copyfile(pictures / olds[1].upper(), pictures / olds[1].upper().replace("PNG", "Png"))
     with pytest.raises(UserError, match="1 of 17 photos"):
         read(colmap_scene)
+
+
+def test_photos_of_another_format_are_used_and_named(colmap_scene, capsys):
+    first, second = [camera.image_path for camera in read(colmap_scene).train_cameras][:2]
+    Image.open(first).save(first.with_suffix(".jpg"))
+    first.unlink()
+    capsys.readouterr()
+    assert read(colmap_scene).train_cameras[0].image_path == first.with_suffix(".jpg")
+    said = f"1 of 17 photos are used although their file names have another suffix .* is {first.stem}.jpg for "
+    assert re.search(said.replace("is ", "is .*"), capsys.readouterr().err)
+
+    # One file for two photos, or two files for one photo: the reader must not guess.
+    assert find_images(first.parent, [f"{first.stem}.bmp"], "", "") == [first.with_suffix(".jpg")]
+    with pytest.raises(UserError, match="2 of 2 photos"):
+        find_images(first.parent, [first.name, f"{first.stem}.bmp"], "", "")
+    second.unlink()
+    with pytest.raises(UserError, match=f"1 of 17 photos .*{second.name}.* on without: .*colmap image_deleter --input"):
+        read(colmap_scene)
+
+
+def test_a_text_model_that_is_newer_is_named(colmap_scene, capsys):
+    sparse = colmap_scene / "sparse" / "0"
+    pycolmap.Reconstruction(str(sparse)).write_text(str(sparse))
+    for path, time in [(path, 1000 + (path.name == "images.txt")) for path in sparse.iterdir()]:
+        os.utime(path, (time, time))
+    read(colmap_scene)
+    said = f"{sparse} has its model twice: the .bin files are used, although images.txt is newer; to use the .txt"
+    assert said in capsys.readouterr().err
+    os.utime(sparse / "images.txt", (1000, 1000))
+    read(colmap_scene)
+    assert capsys.readouterr().err == ""
 
 
 def test_the_largest_of_several_models(colmap_scene, capsys):

@@ -1,6 +1,8 @@
 """Masks: their files, and their two meanings in loss, views, renders and scores."""
 
 import json
+import os
+import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +20,8 @@ import render
 import train
 from scene import Scene
 from scene.images.decode import decode
-from scene.images.masks import IGNORE, TRANSPARENT, Mask
+from scene.images.masks import IGNORE, TRANSPARENT, Mask, MaskOptions, find_masks
+from scene.images.side_files import names_below
 from splatting.training.observers.guards import MaskWatch
 from utils.image_utils import pixels_that_count
 from utils.loss_utils import photometric_loss
@@ -109,6 +112,39 @@ def test_true_and_false_saved_as_bytes(tmp_path, meaning):
         assert torch.equal(written, plain) and set(plain.unique().tolist()) == {0, 255}
 
 
+def _with_noise(grey: np.ndarray) -> np.ndarray:
+    return (grey + np.random.default_rng(0).integers(0, 4, grey.shape)).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "values", "white"),
+    [
+        (np.uint16, (0, 1), 1),
+        (np.uint16, (0, 255), 255),
+        (np.uint16, (0, 65535), 65535),
+        (np.uint16, (0, 40_000), 40_000),
+        (np.uint8, (0, 3), 3),
+        (np.uint8, (0, 100), 100),
+        (np.uint8, (1, 0, 2, 3), 1),
+        (np.uint8, (0, 0), 1),
+    ],
+)
+def test_the_values_of_a_mask_tell_what_is_white_in_it(tmp_path, dtype, values, white):
+    labels = np.array(values, dtype)[np.arange(64).reshape(8, 8) * len(values) // 64]
+    pixels = Mask(_save(tmp_path / "m.png", labels)).decode((8, 8))[0].numpy()
+    np.testing.assert_array_equal(pixels, np.where(labels >= white, 255, 0))
+
+
+def test_a_dark_grey_mask_with_soft_edges_is_bright_and_noise_is_black(tmp_path):
+    wide = np.zeros((64, 64))
+    wide[:, 32:] = 100
+    wide[:, 30:34] = (20, 40, 60, 80)
+    pixels = Mask(_save(tmp_path / "m.jpg", wide.astype(np.uint8))).decode((64, 64))[0].numpy()
+    assert (pixels[:, :29] == 0).all() and (pixels[:, 35:] == 255).all()
+    for name, grey in (("m.jpg", _with_noise(np.zeros((64, 64)))), ("m.png", np.tile(np.linspace(60, 0, 64), (64, 1)))):
+        assert not Mask(_save(tmp_path / name, grey.astype(np.uint8))).decode((64, 64)).any()
+
+
 @pytest.mark.parametrize("size", [(60, 45), (40, 30), (23, 17), (90, 67), (240, 180)])
 def test_at_other_sizes_what_counts_is_free_of_what_is_masked(tmp_path, size):
     mask = np.full((90, 120), 255, np.uint8)
@@ -174,6 +210,71 @@ def test_masks_are_found_by_the_names_of_the_pictures(masked_scene, capsys):
     assert f"1 of 17 photos have no mask and count whole: {lacking}" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("way", ["{0}.mask.png", "{1}.mask.png", "{1}_mask.png", "{0}_mask.png", "{1}_mask.JPG"])
+def test_masks_have_the_names_that_tools_give_them(tmp_path, way):
+    photo = _save(tmp_path / "images" / "a" / "x.jpg", np.full((8, 8), 200, np.uint8))
+    mask = _save(tmp_path / "masks" / "a" / way.format("x.jpg", "x"), np.zeros((8, 8), np.uint8))
+    assert find_masks(tmp_path, ["a/x.jpg"], MaskOptions("masks"), [photo])[0].path == mask
+
+
+def _of_photos(tmp_path: Path, names: list[str], masks: list[str], folder: str = "masks") -> list[Path | None]:
+    """Masks in a folder of photos whose names count from the folder images."""
+    photos = [tmp_path / "images" / name for name in names]
+    for path in photos:
+        _save(path, np.full((8, 8), 200, np.uint8))
+    for name in masks:
+        _save(tmp_path / "masks" / name, np.zeros((8, 8), np.uint8))
+    found = find_masks(tmp_path, names, MaskOptions(folder), photos, "images")
+    return [mask and mask.path.relative_to(tmp_path / "masks").as_posix() for mask in found]
+
+
+@pytest.mark.parametrize("prefix", ["", "../images/", "{}/images/", "./"])
+@pytest.mark.parametrize("deep", ["left/1.png", "images/left/1.png", "left/1.png.png"])
+def test_masks_are_found_below_their_folder_wherever_photos_are_said_to_be(tmp_path, prefix, deep, capsys):
+    names = [prefix.format(tmp_path) + name for name in ("left/1.png", "right/1.png", "right/2.png")]
+    names = [f"images/{name}" for name in names] if deep.startswith("images") and prefix in ("", "./") else names
+    masks = [deep, "right/2.png"] if not deep.startswith("images") else [deep.removeprefix("images/")]
+    assert _of_photos(tmp_path, names, masks)[:2] == [masks[0], None]
+    assert "1 of 3 photos have no mask" in capsys.readouterr().err or len(masks) == 1
+
+
+def test_a_bare_name_is_used_where_one_photo_and_one_mask_have_it(tmp_path, capsys):
+    names = ["left/1.png", "right/1.png", "right/2.png", "right/3.png"]
+    found = _of_photos(tmp_path, names, ["1.png", "2.png", "deep/3.png"])
+    assert found == [None, None, "2.png", "deep/3.png"]
+    assert "1 masks lie in other sub-folders than their photos" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("way", ["absolute", "link", "hard link", "copy", "folder of photos"])
+def test_a_photo_is_not_its_own_mask(tmp_path, way):
+    photo = _save(tmp_path / "images" / "x.png", np.full((8, 8), 200, np.uint8))
+    (tmp_path / "masks").mkdir()
+    mask, folder = tmp_path / "masks" / "x.png", "masks"
+    if way == "folder of photos":
+        folder = "images"
+    elif way != "absolute":
+        {"link": os.symlink, "hard link": os.link, "copy": shutil.copyfile}[way](photo, mask)
+    words = "no mask in .* belongs" if way == "absolute" else "has the photos themselves .*x.png. and no mask of them"
+    with pytest.raises(UserError, match=words):
+        _of_photos(tmp_path, [str(photo)], [], folder)
+    _save(tmp_path / folder / "x.png.png", np.zeros((8, 8), np.uint8))
+    assert find_masks(tmp_path, [str(photo)], MaskOptions(folder), [photo])[0].path.name == "x.png.png"
+
+
+def test_masks_of_several_photos_are_refused(blender_scene):
+    for name in ("r_0", "r_1"):
+        _save(blender_scene / "masks" / f"{name}.png", np.zeros((30, 40), np.uint8))
+    with pytest.raises(UserError, match="2 masks belong to several photos each, the first is .*r_0.png for .*sub-fold"):
+        _views(blender_scene, masks="masks")
+
+
+def test_names_below_a_folder():
+    base = Path("/data/scene")
+    assert names_below(["a/x.png", "a/./y.png"], base) == ["a/x.png", "a/y.png"]
+    assert names_below(["../b/x.png", "a/x.png", "/data/c/y.png"], base) == ["b/x.png", "scene/a/x.png", "c/y.png"]
+    assert names_below(["/data/x.png"], base) == ["x.png"]
+
+
 def test_a_transparent_mask_is_alpha(masked_scene):
     first = _views(masked_scene)[0]
     with Image.open(first.image_path) as image:
@@ -205,6 +306,14 @@ def test_alpha_is_background_unless_it_is_to_be_ignored(colmap_scene):
     view, other = _views(colmap_scene, mask_meaning="ignore")[:2]
     assert view.counted_pixels[:, 21:].all() and not view.counted_pixels[:, :21].any() and other.counted_pixels is None
     assert torch.equal(view.target(torch.ones(3)), torch.from_numpy(pixels[..., :3].transpose(2, 0, 1).copy()))
+
+    view = _views(colmap_scene, mask_meaning="none")[0]
+    assert view.counts_all_pixels and view.target(torch.ones(3)).dtype == torch.uint8
+    assert torch.equal(view.target(torch.ones(3)), torch.from_numpy(pixels[..., :3].transpose(2, 0, 1).copy()))
+    half = [_views(colmap_scene, mask_meaning="none", resolution=48)[0].target(torch.ones(3))]
+    Image.fromarray(pixels[..., :3]).save(colmap_scene / "images" / name)
+    assert torch.equal(half[0], _views(colmap_scene, resolution=48)[0].target(torch.ones(3)))
+    Image.fromarray(pixels).save(colmap_scene / "images" / name)
 
     _save(colmap_scene / "masks" / name, np.repeat(np.uint8([[0, 255]]), 48, 1).repeat(HEIGHT, 0))
     view = _views(colmap_scene, masks="masks", mask_meaning="ignore")[0]
@@ -328,9 +437,7 @@ def test_masks_that_leave_nothing_do_not_train_silently(masked_scene, tmp_path, 
     paths = [path for path in sorted(masked_scene.rglob("masks/**/*")) if path.is_file()]
     for path in paths:
         _save(path, np.zeros((HEIGHT, WIDTH), np.uint8))
-    said = (
-        r"the masks of all 14 views seen so far leave no pixel to train on; is white masked in them \(--invert_masks\)"
-    )
+    said = "the masks of all 14 views seen so far leave no pixel to train on; white must be where photos count; make"
     with pytest.raises(UserError, match=said):
         _train(masked_scene, tmp_path / "out", "--masks", "masks")
     assert not (tmp_path / "out" / "point_cloud").exists()

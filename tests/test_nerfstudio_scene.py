@@ -188,6 +188,12 @@ def test_masks_of_frames(scene):
         read(scene)
 
 
+def test_a_frame_that_names_its_photo_as_its_mask(scene):
+    _edit(scene, lambda content: content["frames"][3].update(mask_path=content["frames"][3]["file_path"]))
+    with pytest.raises(UserError, match="frame 4 .* names the photo itself as its mask .*; name a mask file, or take"):
+        read(scene)
+
+
 def test_no_points(scene):
     _edit(scene, lambda content: content.pop("ply_file_path"))
     with pytest.raises(UserError, match="names no points .*--init_type random"):

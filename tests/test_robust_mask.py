@@ -133,6 +133,25 @@ def test_all_steps_and_a_resumed_training_have_the_same_bytes(scene, tmp_path, m
     assert again["ply"] != off["ply"]  # they are mask files
 
 
+@pytest.mark.parametrize("above", ["../", "{}/images/"])
+def test_masks_are_written_below_the_model_folder(tmp_path, above):
+    """Wherever the dataset says that its photos are."""
+    names = [above.format(tmp_path) + f"{side}/1.png" for side in ("left", "right")]
+    cameras = [SimpleNamespace(image_name=name) for name in names]
+    masks = SimpleNamespace(cameras=cameras, counted=lambda camera: torch.ones(1, 4, 4))
+    run = SimpleNamespace(
+        scene=SimpleNamespace(model_path=tmp_path / "model" / "of" / "it"),
+        dataset=SimpleNamespace(source_path=str(tmp_path / "scene")),
+        robust_mask=masks,
+        log=SimpleNamespace(tell=lambda text: None),
+    )
+    observer = guards.PassersBy(run)
+    observer._draw = lambda *_: None
+    observer.ended(None)
+    written = [path.relative_to(run.scene.model_path).as_posix() for path in tmp_path.rglob("*.png")]
+    assert sorted(written) == ["robust_masks/left/1.png.png", "robust_masks/right/1.png.png"]
+
+
 def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         run_cli(lambda: train.main(["-s", str(scene), "-m", str(tmp_path / "out"), "--robust_mask", "0.7"]))

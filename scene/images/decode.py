@@ -42,11 +42,11 @@ def may_be_transparent(path: Path) -> bool:
         return image.has_transparency_data
 
 
-def decode(path: Path, size: tuple[int, int]) -> Tensor:
+def decode(path: Path, size: tuple[int, int], opaque: bool = False) -> Tensor:
     """Do as `pixels_of` for a file; EXIF orientation is ignored, as in COLMAP. UserError if it cannot be read."""
     try:
         with open_image(path) as image:
-            return pixels_of(image, size)
+            return pixels_of(image, size, opaque)
     except UNREADABLE as error:
         raise _unreadable(path, error) from error
     except MemoryError as error:
@@ -55,13 +55,28 @@ def decode(path: Path, size: tuple[int, int]) -> Tensor:
         ) from error
 
 
-def pixels_of(image: Image.Image, size: tuple[int, int]) -> Tensor:
+def grey_values(path: Path) -> np.ndarray:
+    """The alpha (H, W) of an image file if it has any, else its brightness: uint8, or uint16 of 16-bit grey.
+
+    UserError for a file that cannot be read.
+    """
+    try:
+        with open_image(path) as image:
+            if image.mode.startswith("I"):
+                return np.clip(np.asarray(image), 0, 65535).astype(np.uint16)
+            pixels = pixels_of(image, image.size).numpy()
+    except (*UNREADABLE, MemoryError) as error:
+        raise _unreadable(path, error) from error
+    return pixels[3] if len(pixels) == 4 else pixels.max(axis=0)
+
+
+def pixels_of(image: Image.Image, size: tuple[int, int], opaque: bool = False) -> Tensor:
     """Image (3,H,W) uint8, or (4,H,W) with straight alpha if it has any, at size (width, height).
 
     Resized by Pillow's bicubic filter, antialiased when shrinking, with colours weighted by alpha (premultiplied).
-    Grey, palette, CMYK and 16-bit images become 8-bit RGB.
+    Grey, palette, CMYK and 16-bit images become 8-bit RGB. opaque: alpha is dropped first.
     """
-    image = _to_rgb_or_rgba(image)
+    image = _to_rgb_or_rgba(image, opaque)
     if image.size != size:
         image = image.resize(size, Image.Resampling.BICUBIC)
     pixels = np.asarray(image)
@@ -92,12 +107,12 @@ def _refuse_float(image: Image.Image) -> None:
         raise ValueError("floating-point pixels; save it with 8 or 16 bits")
 
 
-def _to_rgb_or_rgba(image: Image.Image) -> Image.Image:
+def _to_rgb_or_rgba(image: Image.Image, opaque: bool) -> Image.Image:
     if image.mode.startswith("I"):
         # Pillow's own conversion of 16-bit grey clips at 255.
         grey = np.asarray(image)
         grey = grey if grey.dtype == np.uint16 else np.clip(grey, 0, 65535)
         return Image.fromarray(_EIGHT_BITS[grey]).convert("RGB")
     _refuse_float(image)
-    has_alpha = image.has_transparency_data
+    has_alpha = image.has_transparency_data and not opaque
     return image.convert("RGBA" if has_alpha else "RGB")

@@ -3,10 +3,14 @@
 import os
 import sys
 import unicodedata
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 
+from splatting.files.image_files import SUFFIXES
 from splatting.files.listing import some
+from splatting.files.plain_files import relative_to
 from utils.system_utils import UserError
 
 
@@ -20,38 +24,52 @@ class FileIndex:
     def __init__(self, folder: Path) -> None:
         self.merely_alike: dict[str, Path] = {}
         self._folder = folder
-        self._folded_paths: dict[str, list[Path]] | None = None  # built at the first miss: a large folder takes time
 
-    def find(self, *names: str) -> Path | None:
-        """The file of the first name that has one; None if none has, or if several files match but none exactly."""
+    def find(self, *names: str, but: Callable[[Path], bool] = lambda path: False) -> Path | None:
+        """The file of the first name that has one; None if none has, or if several files match but none exactly.
+
+        but: whether a file is passed over.
+        """
         for name in names:
             # Path.is_file raises an error for a name that is too long for the system; here it counts as missing.
-            if os.path.isfile(exact := self._folder / name):
+            if os.path.isfile(exact := self._folder / name) and not but(exact):
                 return exact
-        if self._folded_paths is None:
-            self._folded_paths = {}
-            for folder, _, files in os.walk(self._folder):
-                # A pipe is no file, and whoever opens one waits for ever; a link may lead to nothing.
-                for path in (Path(folder, file) for file in files if os.path.isfile(os.path.join(folder, file))):
-                    self._folded_paths.setdefault(_folded(str(path.relative_to(self._folder))), []).append(path)
         for name in names:
-            alike = self._folded_paths.get(_folded(name), [])
-            if len(alike) == 1:
+            alike = self._folded.get(_folded(name), [])
+            if len(alike) == 1 and not but(alike[0]):
                 self.merely_alike[name] = alike[0]
                 return alike[0]
         return None
 
-    def with_another_suffix(self, name: str) -> Path | None:
-        """After a miss: a file of this name with another suffix, likely the same photo in another format."""
+    @cached_property
+    def _folded(self) -> dict[str, list[Path]]:
+        """Files by folded name, made at the first miss: a large folder takes time."""
+        found: dict[str, list[Path]] = {}
+        for folder, _, files in os.walk(self._folder):
+            # A pipe is no file, and whoever opens one waits for ever; a link may lead to nothing.
+            for path in (Path(folder, file) for file in files if os.path.isfile(os.path.join(folder, file))):
+                found.setdefault(_folded(str(path.relative_to(self._folder))), []).append(path)
+        return found
+
+    @cached_property
+    def _bare(self) -> dict[str, list[Path]]:
+        found: dict[str, list[Path]] = {}
+        for folded, paths in self._folded.items():
+            found.setdefault(folded.rpartition("/")[2], []).extend(paths)
+        return found
+
+    def named(self, name: str) -> list[Path]:
+        """All files of a bare name, in any sub-folder."""
+        return self._bare.get(_folded(name), [])
+
+    def with_another_suffix(self, name: str) -> list[Path]:
+        """Images of this name with another suffix, likely the same photo in another format."""
         stem = os.path.splitext(_folded(name))[0]
-        alike = (
-            paths[0] for folded, paths in (self._folded_paths or {}).items() if os.path.splitext(folded)[0] == stem
-        )
-        return next(alike, None)
+        return [path for suffix in SUFFIXES for path in self._folded.get(stem + suffix, [])]
 
     def description(self) -> str:
-        """After a miss: what the folder has, in brackets."""
-        there = sorted(str(path.relative_to(self._folder)) for paths in self._folded_paths.values() for path in paths)
+        """What the folder has, in brackets."""
+        there = sorted(str(path.relative_to(self._folder)) for paths in self._folded.values() for path in paths)
         return f" (the folder has {some(there)})" if there else " (the folder is empty)"
 
 
@@ -72,26 +90,39 @@ def find_images(
         raise UserError(f"there is no folder {folder}, where {listed_by} has its {kind}; {remedy}")
     index = FileIndex(folder)
     paths = [index.find(name, *(name + suffix for suffix in suffixes)) for name in names]
+    others = _in_another_format(index, names, paths)
+    paths = [others.get(name, path) for name, path in zip(names, paths, strict=True)]
     missing = [name for name, path in zip(names, paths, strict=True) if path is None]
     if missing:
         if suffixes:
             missing = [name if name.lower().endswith(tuple(suffixes)) else name + suffixes[0] for name in missing]
-        other = index.with_another_suffix(missing[0])
-        if other:
-            instead = f" ({other.relative_to(folder)} is there instead)"
-        else:
-            instead = index.description()
-            if os.path.lexists(folder / missing[0]):
-                instead = " (it is there, but a link to nothing or no file)"
+        instead = index.description()
+        if os.path.lexists(folder / missing[0]):
+            instead = " (it is there, but a link to nothing or no file)"
         raise UserError(
             f"{len(missing)} of {len(paths)} {kind} that {listed_by} lists are missing: "
             f"{some([str(folder / name) for name in missing])}{instead}; {remedy}"
         )
-    if index.merely_alike:
-        name, path = next(iter(index.merely_alike.items()))
-        print(
-            f"{len(index.merely_alike)} of {len(paths)} {kind} are used although their file names differ slightly "
-            f"from those in {listed_by}; the first is {path.relative_to(folder)} for {name}",
-            file=sys.stderr,
-        )
+    for changed, difference in ((others, "have another suffix than"), (index.merely_alike, "differ slightly from")):
+        if changed:
+            name, path = next(iter(changed.items()))
+            print(
+                f"{len(changed)} of {len(paths)} {kind} are used although their file names {difference} those in "
+                f"{listed_by}; the first is {relative_to(path, folder)} for {name}",
+                file=sys.stderr,
+            )
     return paths
+
+
+def _in_another_format(index: FileIndex, names: Sequence[str], paths: Sequence[Path | None]) -> dict[str, Path]:
+    """Files of missing photos that were converted, by name: one of the same name but for its suffix, of no other."""
+    missing = {name for name, path in zip(names, paths, strict=True) if path is None}
+    if not missing:
+        return {}
+    found = {name: index.with_another_suffix(name) for name in missing}
+    taken = Counter(path for alike in [*found.values(), filter(None, paths)] for path in alike)
+    return {name: found[name][0] for name in names if name in missing and _only(found[name], taken)}
+
+
+def _only(alike: Sequence[Path], taken: Mapping[Path, int]) -> bool:
+    return len(alike) == 1 and taken[alike[0]] == 1

@@ -55,17 +55,21 @@ def read_colmap(
     photos = sorted(model.images, key=lambda image: os.fsencode(image.name))
     names = [photo.name for photo in photos]
     listed_by = f"the COLMAP model in {model_folder}"
-    paths = find_images(folder / images, names, listed_by, "put them there, or name their folder with -i")
+    without = (
+        f"run `colmap image_deleter --input_path {model_folder} --output_path {model_folder} --image_names_path LIST`"
+    )
+    remedy = f"put them there, name their folder with -i, or go on without: list their names in a file, and {without}"
+    paths = find_images(folder / images, names, listed_by, remedy)
     by_file: dict[str, str] = {}
     for name, path in zip(names, paths, strict=True):
         if (first := by_file.setdefault(os.path.normpath(path), name)) != name:
             raise UserError(f"{first} and {name} in {listed_by} are one file, {path}; rename one, or take it out")
-    found = find_masks(folder, names, masks)
+    found = find_masks(folder, names, masks, paths, images)
     cameras = [
         colmap_camera(photo, model.cameras[photo.camera_id], path, mask, masks.ignore_alpha, native)
         for photo, path, mask in zip(photos, paths, found, strict=True)
     ]
-    views = split_by_order(finished(cameras), hold_out, folder)
+    views = split_by_order(finished(cameras, masks.drop_alpha), hold_out, folder)
     own, lacking = partial(_own_cloud, model_folder, model), f"{listed_by} has no points"
     return scene_info(views, start, own, partial(random_in_frusta, views[0]), lacking)
 
@@ -126,7 +130,21 @@ def find_model(scene: Path) -> tuple[Path, ColmapModel]:
     if len(models) > 1:
         others = ", ".join(f"{folder} {len(models[folder].images)}" for folder in models if folder != best)
         print(f"{best} registers {len(models[best].images)} photos and is used; {others}", file=sys.stderr)
+    _say_if_text_is_newer(best)
     return best, models[best]
+
+
+def _say_if_text_is_newer(folder: Path) -> None:
+    binary = [folder / f"{name}.bin" for name in (*_NEEDED, _POINTS)]
+    text = [path.with_suffix(".txt") for path in binary]
+    both = [(b, t) for b, t in zip(binary, text, strict=True) if b.is_file() and t.is_file()]
+    newer = [t.name for b, t in both if t.stat().st_mtime > b.stat().st_mtime]
+    if newer:
+        print(
+            f"{folder} has its model twice: the .bin files are used, although {', '.join(newer)} is newer; to use the "
+            ".txt files, move the .bin files elsewhere",
+            file=sys.stderr,
+        )
 
 
 def read_model(folder: Path, with_2d_points: bool = False) -> ColmapModel:

@@ -84,8 +84,9 @@ class CameraInfo(_LikeNamedTuple):
     file_size: (width, height) of the photo, None: not read yet. lens: of a photo that has to be undistorted first, else
     None (scene/readers/pinholes.py). native: the lens of a photo that is taken as it is; fx, fy, cx and cy are then
     those of its axis. mask: of the photo's shape, None if all pixels count. ignore_alpha: transparent pixels of the
-    photo do not count. depth: inverse depth of a training view that has a map (scene/readers/depth_maps.py). image: the
-    photo in memory, which readers leave out: a PIL image, as the 2023 release gave it, or pixels at training size.
+    photo do not count. opaque: the photo's alpha is dropped. depth: inverse depth of a training view that has a map
+    (scene/readers/depth_maps.py). image: the photo in memory, which readers leave out: a PIL image, as the 2023 release
+    gave it, or pixels at training size.
     """
 
     uid: int
@@ -110,6 +111,7 @@ class CameraInfo(_LikeNamedTuple):
     native: NativeLens | None = None
     mask: Mask | None = None
     ignore_alpha: bool = False
+    opaque: bool = False
     depth: Decodable | InMemory | None = None
     image: Any = None
 

@@ -66,12 +66,14 @@ def camera_info(
     return camera
 
 
-def finished(cameras: Sequence[CameraInfo]) -> list[CameraInfo]:
+def finished(cameras: Sequence[CameraInfo], opaque: bool = False) -> list[CameraInfo]:
     """The views with the sizes of their photos, all of them pinholes or native: other photos are undistorted.
+
+    opaque: alpha of the photos is dropped, before undistortion mixes it with colours.
 
     A message says which photos have another shape than their camera. UserError for a photo or mask that cannot be used.
     """
-    cameras = [replace(camera, file_size=picture_size(camera.image_path)) for camera in cameras]
+    cameras = [replace(c, file_size=picture_size(c.image_path), opaque=opaque) for c in cameras]
     _warn_of_other_shapes(cameras)
     for camera in cameras:
         if camera.mask is not None:

@@ -205,9 +205,10 @@ def _cameras(
     frames = content["frames"]
     poses = [_pose(path, number, frame) for number, frame in enumerate(frames, start=1)]
     listed = [str(frame["file_path"]) for frame in frames]
-    photos = find_images(path.parent, listed, str(path), "put them there", suffixes)
+    remedy = f"put them there, or take their frames out of {path.name} to go on without"
+    photos = find_images(path.parent, listed, str(path), remedy, suffixes)
     names = [relative_to(photo, path.parent).as_posix() for photo in photos]
-    found = _masks(path, frames, names, masks)
+    found = _masks(path, frames, names, photos, masks)
     cameras = []
     for index, (frame, photo, mask, (R, T)) in enumerate(zip(frames, photos, found, poses, strict=True)):
         try:
@@ -216,7 +217,7 @@ def _cameras(
             raise _no_camera_file(path, error) from error
         name = photo.stem if by_stem else names[index]
         cameras.append(camera_info(index, name, photo, lens, R, T, mask, masks.ignore_alpha, native))
-    return finished(cameras)
+    return finished(cameras, masks.drop_alpha)
 
 
 def _pose(path: Path, number: int, frame: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
@@ -240,13 +241,22 @@ def _pose(path: Path, number: int, frame: dict[str, Any]) -> tuple[np.ndarray, n
     return inverse[:3, :3].T.copy(), inverse[:3, 3].copy()
 
 
-def _masks(path: Path, frames: list[dict[str, Any]], names: list[str], masks: MaskOptions) -> list[Mask | None]:
+def _masks(
+    path: Path, frames: list[dict[str, Any]], names: list[str], photos: list[Path], masks: MaskOptions
+) -> list[Mask | None]:
     listed = [frame.get("mask_path") for frame in frames]
     if masks.folder or not any(listed):
-        return find_masks(path.parent, names, masks)
+        return find_masks(path.parent, names, masks, photos)
     named = [str(name) for name in listed if name]
-    paths = iter(find_images(path.parent, named, str(path), "put them there", kind="masks"))
-    return [masks.mask(next(paths)) if name else None for name in listed]
+    remedy = f"put them there, or take mask_path out of {path.name} to go on without"
+    paths = iter(find_images(path.parent, named, str(path), remedy, kind="masks"))
+    found = [masks.mask(next(paths)) if name else None for name in listed]
+    for number, (photo, mask) in enumerate(zip(photos, found, strict=True), start=1):
+        if mask and mask.path.samefile(photo):
+            fault = "names the photo itself as its mask (mask_path)"
+            remedy = "name a mask file, or take mask_path out and use alpha channels by --mask_meaning ignore"
+            raise UserError(f"{_where(path, number, frames[number - 1])} {fault}; {remedy}")
+    return found
 
 
 def _own_split(

@@ -85,6 +85,8 @@ def _key(photo: CameraInfo, version: str) -> str:
     digest = hashlib.blake2b(digest_size=20)
     mask = photo.mask and (photo.mask.inverted, photo.mask.meaning)
     digest.update(repr((_FORMAT, version, tuple(photo.lens), photo.file_size, mask, photo.ignore_alpha)).encode())
+    if photo.opaque:
+        digest.update(b"opaque")
     for path in (photo.image_path, photo.mask.path if photo.mask else None):
         if path is not None:
             try:
@@ -117,12 +119,12 @@ def _mask_path(path: Path) -> Path:
 def _result(photo: CameraInfo, path: Path) -> CameraInfo:
     mask = Mask(_mask_path(path)) if _mask_path(path).is_file() else None
     size = photo.width, photo.height
-    return replace(photo, image_path=path, file_size=size, mask=mask, ignore_alpha=False, lens=None)
+    return replace(photo, image_path=path, file_size=size, mask=mask, ignore_alpha=False, opaque=False, lens=None)
 
 
 def _make(photo: CameraInfo, path: Path) -> None:
     plan = undistortion(photo.lens, *photo.file_size)
-    pixels = decode(photo.image_path, photo.file_size).permute(1, 2, 0).numpy()
+    pixels = decode(photo.image_path, photo.file_size, photo.opaque).permute(1, 2, 0).numpy()
     counts = np.ones(pixels.shape[:2], bool)
     if photo.ignore_alpha and pixels.shape[2] == 4:
         counts &= pixels[..., 3] == 255

@@ -13,6 +13,8 @@ from tqdm import tqdm
 from tqdm.contrib.concurrent import thread_map
 
 from scene.images.decode import picture_size
+from scene.images.masks import Mask, mask_names
+from scene.images.side_files import SideFiles
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.host.machine import threads
 from splatting.sfm.layout import Layout, image_names
@@ -33,7 +35,7 @@ def prepare_images(layout: Layout, names: Sequence[str], masks: Path | None) -> 
     COLMAP cannot read, is rewritten, with upright pixels and the other EXIF data kept. Masks: see `_prepare_mask`.
     `check_images` must have passed before; UserError for files whose pixels turn out to be broken.
     """
-    with_mask = find_masks(names, masks) if masks else {}
+    with_mask = find_masks(names, masks, layout.input) if masks else {}
 
     def prepare(name: str) -> None:
         prepared = _prepare_image(layout.input / name, layout.prepared / name)
@@ -46,7 +48,7 @@ def prepare_images(layout: Layout, names: Sequence[str], masks: Path | None) -> 
 
 def check_images(layout: Layout, names: Sequence[str], masks: Path | None) -> None:
     """Raise a UserError that names every photo and mask that is broken or does not fit; decode no intact one."""
-    with_mask = find_masks(names, masks) if masks else {}
+    with_mask = find_masks(names, masks, layout.input) if masks else {}
 
     def check(name: str) -> None:
         size = _upright_size(layout.input / name)
@@ -56,21 +58,18 @@ def check_images(layout: Layout, names: Sequence[str], masks: Path | None) -> No
     _in_threads(check, names, "Checking photos")
 
 
-def find_masks(names: Sequence[str], folder: Path) -> dict[str, Path]:
-    """Return the masks by name of photo. A mask is called `<name>.png` as in COLMAP, `<name>`, or has the suffix .png.
+def find_masks(names: Sequence[str], folder: Path, photos: Path) -> dict[str, Path]:
+    """Return the masks by name of photo, found in a folder as `scene.images.masks.find_masks` finds them.
 
-    UserError if no photo has a mask.
+    photos: folder of the photos. UserError if no photo has a mask.
     """
-    found = {}
-    for name in names:
-        candidates = (folder / f"{name}.png", folder / name, (folder / name).with_suffix(".png"))
-        mask = next((path for path in candidates if path.is_file()), None)
-        if mask:
-            found[name] = mask
+    files = SideFiles(folder, names, [photos / name for name in names], photos)
+    masks = {name: files.find(place, mask_names) for place, name in enumerate(names)}
+    found = {name: mask for name, mask in masks.items() if mask}
     if not found:
         raise UserError(
             f"none of {len(names)} photos has a mask in {folder}; looked for names like {names[0]}.png and "
-            f"{Path(names[0]).with_suffix('.png')}"
+            f"{Path(names[0]).with_suffix('.png')}, which are no photos; name the folder of the masks"
         )
     return found
 
@@ -139,12 +138,8 @@ def _prepare_mask(source: Path | None, target: Path, photo: Path) -> None:
     if source is None:
         Image.new("L", picture_size(photo), 255).save(target)
         return
-    try:
-        with open_image(source) as image:
-            mask = image.convert("L")
-    except UNREADABLE as error:
-        raise UserError(f"cannot read the mask {source} ({error}); replace or remove it") from error
-    mask.save(target)
+    kept = Mask(source).decode(picture_size(source))[0].numpy()
+    Image.fromarray(kept).save(target)
 
 
 def _save(image: Image.Image, target: Path, like: Image.Image, **options: object) -> None:

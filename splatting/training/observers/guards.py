@@ -15,6 +15,7 @@ from gaussian_renderer.memory_errors import situation
 from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
 from scene.gaussians.checkpoint import save_checkpoint
+from scene.images.side_files import names_below
 from splatting.evaluation.model_folder import MASKED_PHOTOS
 from splatting.files.image_files import dimmed, to_bytes
 from splatting.files.listing import some
@@ -30,7 +31,8 @@ from utils.system_utils import UserError, atomic_write
 _LEARNT = 1000  # iterations, until which much is not explained; advice trains so many, and searches itself
 _ENOUGH = 100  # if so many views have no pixel that counts, and no view has one, the masks are wrong
 _ALMOST_NOTHING = 1e-3  # share of the pixels
-_HINT = "is white masked in them (--invert_masks), or do they belong to another scene?"
+_INVERT = "is white masked in them (--invert_masks), or do they belong to another scene?"
+_BLACK = "white must be where photos count; make the masks again, or leave them out"
 
 
 class MaskWatch(Observer):
@@ -43,7 +45,7 @@ class MaskWatch(Observer):
         self._left = {view.uid for view in views}
         self._views = len(views)
         self._new: list[tuple[str, Tensor]] = []  # name, and share of its pixels that count
-        self._nothing = 0
+        self._nothing = self._partly = 0
         self._scanty: list[str] = []
         self._seen = 0
 
@@ -72,15 +74,18 @@ class MaskWatch(Observer):
             for (name, _), part in zip(self._new, torch.stack([part for _, part in self._new]).tolist(), strict=True):
                 self._seen += 1
                 self._nothing += part == 0
+                self._partly += part > 0
                 if part < _ALMOST_NOTHING:
                     self._scanty.append(name)
             self._new.clear()
         if self._nothing == self._seen >= min(self._views, _ENOUGH):
-            raise UserError(f"the masks of all {self._seen} views seen so far leave no pixel to train on; {_HINT}")
+            raise UserError(f"the masks of all {self._seen} views seen so far leave no pixel to train on; {_BLACK}")
         if self._scanty and (last or not self._left):
             tqdm.write(
                 f"warning: the masks of {len(self._scanty)} of {self._seen} views leave none or almost none of their "
-                f"pixels ({some(self._scanty)}), so these views teach nothing; {_HINT}",
+                f"pixels ({some(self._scanty)}), so these views teach nothing; "
+                # Where all are black, inverted masks would keep everything.
+                f"{_INVERT if self._partly else _BLACK}",
                 file=sys.stderr,
             )
             self._scanty.clear()
@@ -99,11 +104,13 @@ class PassersBy(Observer):
         folder, picture = model / FOLDER, model / MASKED_PHOTOS
         shutil.rmtree(folder, ignore_errors=True)  # of an earlier training
         picture.unlink(missing_ok=True)
+        given = [camera.image_name for camera in run.robust_mask.cameras]
+        names = dict(zip(given, names_below(given, Path(run.dataset.source_path)), strict=True))
         for camera in run.robust_mask.cameras:
             if (counts := run.robust_mask.counted(camera)) is None:
                 continue
             shares[camera.image_name] = 1 - float(counts.float().mean())
-            with atomic_write(folder / f"{camera.image_name}.png") as temporary:
+            with atomic_write(folder / f"{names[camera.image_name]}.png") as temporary:
                 Image.fromarray(counts[0].to(torch.uint8).mul(255).cpu().numpy()).save(temporary)
         views = len(run.robust_mask.cameras)
         shares = dict(sorted(shares.items(), key=lambda named: -named[1]))
