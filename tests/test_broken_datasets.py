@@ -345,7 +345,7 @@ def _train(scene: Path, out: Path, change: Change) -> None:
     options = {"source_path": str(scene), "model_path": str(out), "eval": scene.name == "blender"}
     extracted = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**options | (change(scene) or {})))
     taken = Scene(extracted, GaussianModel(3), start=False)
-    check_scene(taken.info)
+    check_scene(taken, extracted, False)
     taken.create_gaussians()
     for camera in taken.getTrainCameras():
         camera.target(torch.zeros(3))

@@ -34,6 +34,7 @@ MAY_IMPORT = {
     "scene.colmap_loader": (),
     "scene.readers": ("scene.images", "scene.colmap_loader"),
     "scene.gaussians": (),
+    "scene.check": ("scene.readers", "scene.images", "scene.gaussians.copies"),
     "scene.gaussian_model": ("scene.gaussians", "scene.readers.info"),
     "scene.dataset_readers": ("scene.readers", "scene.images", "splatting.compat"),
     "scene.cameras": ("scene.readers", "scene.images", "splatting.compat"),

@@ -7,6 +7,7 @@ import torch
 from simple_knn._C import distCUDA2
 
 from scene.gaussians.attributes import Rows, attributes
+from scene.gaussians.copies import places_of
 from utils.graphics_utils import BasicPointCloud
 from utils.sh_utils import RGB2SH
 from utils.system_utils import UserError
@@ -43,9 +44,15 @@ def start_rows(cloud: BasicPointCloud, extent: float, sh_degree: int) -> Rows:
 
 
 def _initial_scales(points: np.ndarray, extent: float) -> np.ndarray:
-    """Scales (N,) float32, world units: the root mean squared distance to the three nearest neighbours."""
+    """Scales (N,) float32, world units: the root mean squared distance to the three nearest neighbours.
+
+    Neighbours are in other places, where so many points share one that their distances would say nothing.
+    """
     if len(points) < 4:
         return np.full(len(points), LONE_POINT_SCALE * max(extent, 1e-3), dtype=np.float32)
+    places = places_of(points)
+    if places.misleads:
+        return _initial_scales(points[places.points], extent)[places.of_point]
     scale = np.sqrt(np.maximum(distCUDA2(torch.from_numpy(points)).numpy(), np.float32(MIN_DISTANCE2)))
     return _without_outliers(scale, extent)
 

@@ -2,6 +2,7 @@
 
 import os
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from splatting.files.image_files import UNREADABLE, open_image
+from splatting.files.listing import some
 from splatting.files.plain_files import not_the_file
 from utils.system_utils import UserError
 
@@ -34,6 +36,24 @@ def picture_size(path: Path) -> tuple[int, int]:
     except (*UNREADABLE, MemoryError) as error:
         raise _unreadable(path, error) from error
     return size
+
+
+def picture_sizes(paths: Sequence[Path]) -> list[tuple[int, int]]:
+    """The sizes of image files. A UserError names all that are broken or cut short."""
+    sizes, errors = [], []
+    for path in paths:
+        try:
+            sizes.append(picture_size(Path(path)))
+        except UserError as error:
+            errors.append((path, error))
+    if len(errors) > 1:
+        names = some([str(path) for path, _ in errors])
+        raise UserError(
+            f"{len(errors)} of {len(paths)} photos cannot be read: {names}; replace them or take them out of the scene"
+        ) from errors[0][1]
+    if errors:
+        raise errors[0][1]
+    return sizes
 
 
 def may_be_transparent(path: Path) -> bool:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
+from scene.images.decode import picture_size
 from splatting.files.image_files import SUFFIXES
 from splatting.files.listing import some
 from splatting.files.plain_files import relative_to
@@ -78,6 +79,17 @@ def _folded(name: str) -> str:
     return name.replace(os.sep, "/")
 
 
+def _broken(paths: Sequence[Path | None]) -> str:
+    """Words on the files that are there and cannot be read, so that one message tells of all; empty without any."""
+    broken = []
+    for path in paths:
+        try:
+            path and picture_size(path)
+        except UserError:
+            broken.append(str(path))
+    return f", and {len(broken)} cannot be read: {some(broken)}" if broken else ""
+
+
 def find_images(
     folder: Path, names: Sequence[str], listed_by: str, remedy: str, suffixes: Sequence[str] = (), kind: str = "photos"
 ) -> list[Path]:
@@ -101,7 +113,7 @@ def find_images(
             instead = " (it is there, but a link to nothing or no file)"
         raise UserError(
             f"{len(missing)} of {len(paths)} {kind} that {listed_by} lists are missing: "
-            f"{some([str(folder / name) for name in missing])}{instead}; {remedy}"
+            f"{some([str(folder / name) for name in missing])}{instead}{_broken(paths)}; {remedy}"
         )
     for changed, difference in ((others, "have another suffix than"), (index.merely_alike, "differ slightly from")):
         if changed:

@@ -232,6 +232,23 @@ def photo_size(view: CameraInfo) -> tuple[int, int]:
         return view.width, view.height
 
 
+def are_exchanged(photo: tuple[int, int], camera: tuple[int, int]) -> bool:
+    """Whether a photo's size (width, height) has a camera's sides exchanged, perhaps at another scale."""
+    (width, height), (w, h) = photo, camera
+    return abs(width * w / h - height) <= 1 < abs(width * h / w - height)
+
+
+def turned(names: Sequence[str], count: int, photo: tuple[int, int], camera: tuple[int, int]) -> tuple[str, str]:
+    """What to say of photos whose sides are exchanged, the first of these sizes, of `count`; and the remedy."""
+    size, other = (f"{width} x {height}" for width, height in (photo, camera))
+    return (
+        f"{len(names)} of {count} photos have the sides of their camera exchanged, the first {names[0]} ({size}, "
+        f"camera {other})",
+        "turn the photos as their EXIF orientation says (mogrify -auto-orient), or exchange width and height of the "
+        "camera",
+    )
+
+
 def exposure_names(cameras: Sequence[CameraInfo]) -> list[str]:
     """A unique name for each view: its image name, or its path from the views' common folder if several share the name,
     as Blender's train/r_0 and test/r_0 do. A view without a path keeps its name.

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from diff_gaussian_rasterization.lens import MODELS, lens_of
 
-from scene.images.decode import picture_size
+from scene.images.decode import picture_size, picture_sizes
 from scene.images.lens import PANORAMA, Lens, Pinhole, pinhole_of, undistortion
 from scene.images.masks import Mask
-from scene.readers.info import CameraInfo
+from scene.readers.info import CameraInfo, are_exchanged, turned
 from scene.readers.undistortion import undistort
 from utils.system_utils import UserError
 
@@ -71,9 +71,12 @@ def finished(cameras: Sequence[CameraInfo], opaque: bool = False) -> list[Camera
 
     opaque: alpha of the photos is dropped, before undistortion mixes it with colours.
 
-    A message says which photos have another shape than their camera. UserError for a photo or mask that cannot be used.
+    A message says which photos have another shape than their camera. UserError for photos that cannot be read or are
+    turned against their camera, and for a mask that cannot be used.
     """
-    cameras = [replace(c, file_size=picture_size(c.image_path), opaque=opaque) for c in cameras]
+    sizes = picture_sizes([camera.image_path for camera in cameras])
+    cameras = [replace(camera, file_size=size, opaque=opaque) for camera, size in zip(cameras, sizes, strict=True)]
+    _refuse_turned(cameras)
     _warn_of_other_shapes(cameras)
     for camera in cameras:
         if camera.mask is not None:
@@ -91,6 +94,18 @@ def _check_mask(mask: Path, size: tuple[int, int]) -> None:
             f"the mask {mask} is {mask_size[0]} x {mask_size[1]} pixels and its photo {size[0]} x {size[1]}; "
             "make masks of the same shape as the photos"
         )
+
+
+def _refuse_turned(cameras: Sequence[CameraInfo]) -> None:
+    """UserError if photos would be stretched from upright to lying, or the other way round."""
+    wrong = []
+    for camera in cameras:
+        lens = camera.lens or camera
+        if are_exchanged(camera.file_size, (lens.width, lens.height)):
+            wrong.append((camera, (lens.width, lens.height)))
+    if wrong:
+        (camera, size), names = wrong[0], [camera.image_name for camera, _ in wrong]
+        raise UserError("; ".join(turned(names, len(cameras), camera.file_size, size)))
 
 
 def _warn_of_other_shapes(cameras: Sequence[CameraInfo]) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from scene.images.decode import picture_size
+from scene.images.decode import picture_sizes
 from scene.images.find import FileIndex, find_images
 from scene.images.lens import PANORAMA, Lens
 from scene.images.masks import NO_MASKS, Mask, MaskOptions, find_masks
@@ -209,10 +209,10 @@ def _cameras(
     photos = find_images(path.parent, listed, str(path), remedy, suffixes)
     names = [relative_to(photo, path.parent).as_posix() for photo in photos]
     found = _masks(path, frames, names, photos, masks)
-    cameras = []
+    sizes, cameras = picture_sizes(photos), []
     for index, (frame, photo, mask, (R, T)) in enumerate(zip(frames, photos, found, poses, strict=True)):
         try:
-            lens = lens_of(frame, content, picture_size(photo), path)
+            lens = lens_of(frame, content, sizes[index], path)
         except (ValueError, TypeError, OverflowError) as error:
             raise _no_camera_file(path, error) from error
         name = photo.stem if by_stem else names[index]

@@ -22,6 +22,7 @@ from scipy.sparse.linalg import spsolve
 
 from arguments import ModelParams
 from scene.cameras import Camera
+from scene.check import of_options, tell
 from scene.gaussian_model import GaussianModel
 from scene.readers.info import CameraInfo
 from scene.readers.tracks import Track, read_tracks
@@ -66,15 +67,17 @@ class Advice(NamedTuple):
         return f"{self.text}; try {self.options}" if self.options else self.text
 
 
-def advise(dataset: argparse.Namespace, trains: bool = True) -> list[Advice]:
+def advise(dataset: argparse.Namespace, trains: bool = True, warns: bool = False) -> list[Advice]:
     """Advice on a scene. dataset: the model options. trains: look for passers-by by a short training, too.
 
-    UserError as from Scene.
+    warns: print what the check of the scene finds, too. UserError as from Scene, and where the scene cannot be trained.
     """
     small = copy.copy(dataset)
     small.resolution, small.model_path, small.depths = _WIDTH, "", ""
     with contextlib.redirect_stdout(io.StringIO()):  # from the readers
         scene = Scene(small, GaussianModel(0), shuffle=False, start=False)
+    if trains:
+        tell(of_options(scene.info, dataset), dataset.source_path, quiet=not warns)
     tracks = read_tracks(dataset.source_path, scene.info.train_cameras, scene.info.offset)
     found = [*_of_tracks(scene, tracks)] if any(tracks) else []
     if len(scene.info.point_cloud.points):
@@ -94,7 +97,7 @@ def asked_options(dataset: argparse.Namespace, args: argparse.Namespace, given: 
         raise UserError("--advise and --options auto need one process; run train.py --advise, and give what it says")
     if written := args.advise and dataset.model_path:
         mkdir_p(dataset.model_path)  # if it cannot be, better before the search
-    found = advise(dataset)
+    found = advise(dataset, warns=args.advise)  # a training that follows prints them itself
     print(*found, sep="\n")
     found = [_taken(advice, args, given) for advice in found]
     if written:

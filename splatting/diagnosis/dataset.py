@@ -8,16 +8,16 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
+from scene.check import findings
 from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
-from scene.readers.info import APART, camera_centers, standing_apart
-from scene.readers.tracks import Track, projected, read_tracks
+from scene.readers.info import NEAREST
+from scene.readers.tracks import Track, read_tracks
 from scene.reprojection import BOUND, nearest_pose, pull
 from splatting.diagnosis import Line, from_error
+from splatting.diagnosis.colors import UNITS, check_colors
 from splatting.files.json_files import read_json
-from splatting.files.listing import some
-from utils.graphics_utils import BasicPointCloud, world_to_camera
+from utils.graphics_utils import world_to_camera
 from utils.system_utils import UserError
 
 # Learning rates and size limits are fractions of the extent, but depths below 0.2 are culled and float32 is used.
@@ -25,18 +25,14 @@ EXTENT = (0.1, 100.0)
 FEWEST_VIEWS = 20
 FEWEST_POINTS = 1000
 REGISTERED = 0.9  # share of the photos
-FAR_POINT = 100.0  # extents from the cameras; a sky is some tens away
-FAR_SHARE = 0.01
-OPENING = (10.0, 150.0)  # degrees; outside, the focal length is doubtful
-FEWEST_IN_VIEW = 10  # points of the cloud in a photo
-_SAMPLE = 5000  # most points tested against the views
+MOST_PHOTOS = 100  # that are decoded
 _WIDE = 1600
-_COMPARED, _SMALL = 16, 200  # photos whose colours are compared, and their size in pixels
-_GREY = 0.02  # spread of colours, below which they tell nothing
+_COMPARED = 16  # views whose tracks are looked at
+_MOST = 0.75  # share of the views that another cause makes better
+_LONGER = 0.03  # difference of a focal length that counts; tracks tell a hundredth of it
 _ADJUSTED = 0.5  # median error of points with better poses, as a part of that with the given ones,
 _SEEN = 0.2  # if that is more pixels
 _WRONG = 5.0  # pixels, beyond which poses are wrong even if no better ones are near
-_OTHER = 0.9  # error of another photo's colours, as a part of the own one's
 
 
 def check_dataset(source: str, images: str) -> list[Line]:
@@ -48,8 +44,10 @@ def check_dataset(source: str, images: str) -> list[Line]:
     except UserError as error:
         return [*_warnings(said.getvalue()), from_error(error)]
     views = info.train_cameras
-    checks = check_views(views), check_extent(info), check_lenses(views), check_cloud(info), check_poses(source, info)
-    checks += (check_colors(info),)
+    found = findings(info, MOST_PHOTOS)
+    checks = [check_views(views), check_extent(info), check_cloud(info), [Line(*one[:2]) for one in found]]
+    if not any(one.of_lens for one in found):  # else poses and colours have that cause
+        checks.append(check_geometry(source, info))
     return [*_warnings(said.getvalue()), *chain(*checks, _check_registered(Path(source) / "convert_report.json"))]
 
 
@@ -66,85 +64,81 @@ def check_views(cameras: list[CameraInfo]) -> Iterator[Line]:
 
 
 def check_extent(info: SceneInfo) -> Iterator[Line]:
-    """Scale of the scene, and cameras far away from the others."""
-    centers = camera_centers(info.train_cameras)
+    """Scale of the scene."""
     low, high = EXTENT
-    spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
-    if len(centers) > 1 and spread < 1e-3 * info.extent:
-        text = "all cameras stand in one place, so depth cannot be found"
-        yield Line(text, "take photos from places some steps apart")
     if low <= info.extent <= high:
         yield Line(f"extent {info.extent:.3g}")
     else:
         remedy = f"scale cameras and points by {10.0 ** round(np.log10(5 / info.extent)):g}"
         text = f"the extent is {info.extent:.3g}, outside {low:g} to {high:g}"
-        yield Line(text, f"{remedy}; depths below 0.2 are never drawn")
-    far = [c.image_name for c, apart in zip(info.train_cameras, standing_apart(centers), strict=True) if apart]
-    if far:
-        text = f"{len(far)} cameras are more than {APART:g} times as far out as usual ({some(far)})"
-        yield Line(text, "remove them from the model, as their poses are likely wrong; the extent leaves them out")
-
-
-def check_lenses(cameras: list[CameraInfo]) -> Iterator[Line]:
-    """Opening angles that no usual lens has."""
-    low, high = np.radians(OPENING)
-    odd = [camera for camera in cameras if not low <= camera.FovX <= high]
-    if odd:
-        example = f"{odd[0].image_name}: {np.degrees(odd[0].FovX):.1f} degrees"
-        remedy = "check the focal length and the size of the photos, or reconstruct the scene again"
-        yield Line(f"{len(odd)} cameras have odd opening angles ({example})", remedy)
+        yield Line(text, f"{remedy}; depths below {NEAREST} are never drawn")
 
 
 def check_cloud(info: SceneInfo) -> Iterator[Line]:
-    """Number of points, points far away, and points that no camera sees."""
-    points = info.point_cloud.points.astype(np.float64)
-    text = f"{len(points)} points to start from"
-    if len(points) < FEWEST_POINTS:
+    """Number of points."""
+    text = f"{len(info.point_cloud.points)} points to start from"
+    if len(info.point_cloud.points) < FEWEST_POINTS:
         more = "start from more points (--init_pcd_path), or reconstruct with more photos or features"
         yield Line(f"only {text}; {FEWEST_POINTS} or more are good", more)
     else:
         yield Line(text)
-    if not len(points):
-        return
-    far = np.linalg.norm(points - camera_centers(info.train_cameras).mean(axis=0), axis=1) > FAR_POINT * info.extent
-    if far.mean() > FAR_SHARE:
-        text = f"{far.mean():.1%} of the points are more than {FAR_POINT:g} extents away"
-        yield Line(text, "remove them from the cloud (COLMAP: filter by reprojection error and angle)")
-    sample = points[:: max(1, len(points) // _SAMPLE)]
-    seen = np.array([projected(camera, sample)[2] for camera in info.train_cameras])
-    unseen = float((~seen.any(axis=0)).mean())
-    counts = seen.sum(axis=1) * len(points) / seen.shape[1]
-    away = [c.image_name for c, n in zip(info.train_cameras, counts, strict=True) if n < FEWEST_IN_VIEW]
-    if unseen > 0.5:
-        remedy = "poses and points do not belong together: check the axes (x right, y down, z forward) and the scale"
-        yield Line(f"{unseen:.0%} of the points are in no photo", remedy)
-    elif away:
-        text = f"{len(away)} cameras have hardly any point in view ({some(away)})"
-        yield Line(text, "remove them from the model: they face away from the scene, or their poses are wrong")
 
 
-def check_colors(info: SceneInfo) -> Iterator[Line]:
-    """Colours of the points beside those of the photos where they are seen: photos may have each other's names."""
-    step = max(1, len(info.point_cloud.points) // _SAMPLE)
-    cloud = BasicPointCloud(*(values[::step] for values in info.point_cloud))
-    if len(cloud.points) < FEWEST_IN_VIEW or cloud.colors.std(axis=0).max() < _GREY:
-        return
-    cameras = info.train_cameras[:: max(1, len(info.train_cameras) // _COMPARED)][:_COMPARED]
-    photos = [_pixels(camera) for camera in cameras]
-    names = [one.image_name for place, one in enumerate(cameras) if _is_another(one, place, photos, cloud)]
-    if len(cameras) >= 3 and len(names) > len(cameras) / 2:
-        text = f"the points have the colours of other photos than those they are seen in ({some(names)})"
-        yield Line(text, "the photos have each other's names: restore those that the cameras were reconstructed with")
-
-
-def check_poses(source: str, info: SceneInfo) -> Iterator[Line]:
-    """Tracks that other poses fit far better than the given ones, as after a bundle adjustment they cannot."""
+def check_geometry(source: str, info: SceneInfo) -> Iterator[Line]:
+    """Lenses and poses beside the tracks, then colours: wrong lenses or poses would look like exchanged photos."""
     views = info.train_cameras
     try:
-        found = pose_errors(views, read_tracks(source, views, info.offset), info.extent)
+        tracks = read_tracks(source, views, info.offset)
     except UserError as error:
         yield from_error(error)
+        tracks = [None] * len(views)
+    lines = [*check_focal(views, tracks)] or [*check_poses(views, tracks, info.extent)]
+    yield from lines or check_colors(info)
+
+
+def check_focal(views: Sequence[CameraInfo], tracks: Sequence[Track | None]) -> Iterator[Line]:
+    """Another focal length, or another unit of the points, with which the tracks fit far better."""
+    step = max(1, len(views) // _COMPARED)
+    pairs = [pair for pair in zip(views[::step], tracks[::step], strict=True) if pair[1] is not None]
+    if not pairs:
         return
+    given = np.array([_missed(view, track) for view, track in pairs])
+    units = {k: np.array([_missed(*pair, unit=k) for pair in pairs]) for k in UNITS}
+    unit = min(units, key=lambda k: np.median(units[k]))
+    # The rays are those of the given focal length, so that they are too short where that is too long.
+    factor = float(np.median([_longer(*pair) for pair in pairs]))
+    longer = np.array([_missed(*pair, factor=factor) for pair in pairs])
+    best = units[unit] if np.median(units[unit]) < np.median(longer) else longer
+    if (best < _ADJUSTED * given).mean() < _MOST:
+        return
+    if best is longer and abs(factor - 1) > _LONGER:
+        text = f"points fit the photos with focal lengths {factor:.3g} times as long as the given ones"
+        yield Line(text, "check the focal lengths and the size of the photos that they belong to")
+    elif best is not longer:
+        text = f"points fit the photos if those are scaled by {unit:g}: cameras and points have different units"
+        yield Line(text, f"scale the points by {unit:g}")
+
+
+def _longer(view: CameraInfo, track: Track) -> float:
+    """The focal length that fits a track best, by the given one."""
+    places = _places(track.points @ view.R + view.T)
+    return float(np.median((track.rays * places).sum(axis=1) / np.maximum((places**2).sum(axis=1), 1e-9)))
+
+
+def _missed(view: CameraInfo, track: Track, unit: float = 1.0, factor: float = 1.0) -> float:
+    """Median distance of points from their rays, in parts of the focal length."""
+    local = unit * track.points @ view.R + view.T
+    away = np.where(local[:, 2] > 0, np.linalg.norm(track.rays - factor * _places(local), axis=1), np.inf)
+    return float(np.median(away))
+
+
+def _places(local: np.ndarray) -> np.ndarray:
+    return local[:, :2] / np.where(local[:, 2:] > 0, local[:, 2:], np.inf)
+
+
+def check_poses(views: Sequence[CameraInfo], tracks: Sequence[Track | None], extent: float) -> Iterator[Line]:
+    """Tracks that other poses fit far better than the given ones, as after a bundle adjustment they cannot."""
+    found = pose_errors(views, tracks, extent)
     if found is None:
         return
     given, best = found
@@ -176,26 +170,6 @@ def pose_errors(
 def poses_differ(given: float, best: float) -> bool:
     """Whether better poses fit the tracks far better (`pose_errors`)."""
     return given > _SEEN and best < _ADJUSTED * given
-
-
-def _pixels(camera: CameraInfo) -> np.ndarray:
-    """A photo, small, (H, W, 3) in [0, 1]."""
-    with Image.open(camera.image_path) as image:
-        image.draft("RGB", (_SMALL, _SMALL))
-        image = image.convert("RGB")
-        image.thumbnail((_SMALL, _SMALL))
-        return np.asarray(image) / 255
-
-
-def _is_another(camera: CameraInfo, place: int, photos: list[np.ndarray], cloud: BasicPointCloud) -> bool:
-    """Whether another photo has clearly more of the colours of the points that a camera sees than its own, `place`."""
-    x, y, inside = projected(camera, cloud.points)
-    errors = []
-    for photo in photos:
-        rows = (y[inside] / camera.height * photo.shape[0]).astype(int)
-        columns = (x[inside] / camera.width * photo.shape[1]).astype(int)
-        errors.append(np.abs(photo[rows, columns] - cloud.colors[inside]).mean() if inside.any() else 0.0)
-    return min(errors) < _OTHER * errors[place]
 
 
 def _check_registered(path: Path) -> Iterator[Line]:

@@ -8,17 +8,15 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from PIL import Image
-
 from arguments import OPTIONS, other_scene, read_model_json, read_training_options
 from arguments.strategies import STRATEGY_OPTIONS
-from scene.cameras import Camera
+from scene.check import of_options, tell
+from scene.check.photos import hints
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.gaussians.ppisp import Ppisp
-from scene.readers.info import APART, NEAREST, SceneInfo, camera_centers, standing_apart
 from scene.saved_model import saves_in
+from scene.scene import Scene
 from splatting.evaluation import training_log
 from splatting.evaluation.error_curve import NAME as CURVE
 from splatting.evaluation.error_curve import Row, continue_curve
@@ -28,68 +26,25 @@ from splatting.training.density import DensityControl
 from splatting.training.schedule import DecidedSchedule, Schedule
 from utils.system_utils import UserError
 
-_SAMPLE = 16  # cameras whose depths are checked
-_FEWEST_BEYOND = 0.01  # share of the points in front of them that must lie beyond the nearest depth
-SMALL = 32  # pixels; a smaller side has few more than SSIM's window
-
 
 def _warn(text: str) -> None:
     print(f"warning: {text}", file=sys.stderr)
 
 
-def hint_of_images(views: Sequence[Camera], info: SceneInfo, white_background: bool) -> None:
-    """Warn of images that are too small to learn from, and of transparent ones that are to be black behind."""
-    width, height = min((view.image_width, view.image_height) for view in views)
-    if min(width, height) < SMALL:
-        _warn(f"images of {width}x{height} pixels are too small to learn from; give a larger --resolution")
-    path = info.train_cameras[0].image_path
-    if info.is_nerf_synthetic and not white_background and path is not None and _has_alpha(path):
-        _warn(
-            "transparent parts of the images count as black; with -w they count as white, as in published results of "
-            "such scenes"
-        )
+def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> None:
+    """Refuse a scene that cannot be trained (UserError), warn of its faults, and say where its frame is moved.
 
-
-def _has_alpha(path: Path) -> bool:
-    with contextlib.suppress(OSError), Image.open(path) as image:
-        return image.mode in ("RGBA", "LA")
-    return False
-
-
-def check_scene(info: SceneInfo) -> None:
-    """Refuse a scene that cannot be trained (UserError); print where training departs from the dataset's files."""
-    _check_scale(info)
-    _report_cameras_apart(info)
+    A resumed training goes on with what its start was told of.
+    """
+    info, views = scene.info, scene.getTrainCameras()
+    if not resumed:
+        smallest = min((view.image_width, view.image_height) for view in views)
+        found = [*of_options(info, options), *hints(info, smallest, options.white_background)]
+        tell(found, options.source_path)
     if info.offset.any():
         print(
             f"the scene's coordinates are large against its extent: training subtracts {tuple(info.offset.tolist())}, "
             "which model.json keeps; python -m scene.export_world writes the model in the scene's own coordinates"
-        )
-
-
-def _check_scale(info: SceneInfo) -> None:
-    """UserError if hardly any point lies beyond the nearest depth that is drawn."""
-    cameras = info.train_cameras[:: max(1, len(info.train_cameras) // _SAMPLE)]
-    depths = np.concatenate([(info.point_cloud.points @ camera.R + camera.T)[:, 2] for camera in cameras])
-    depths = depths[depths > 0]
-    if len(depths) and (depths > NEAREST).mean() < _FEWEST_BEYOND:
-        middle = float(np.median(depths))
-        raise UserError(
-            f"the points lie {middle:.2g} units from the cameras, and nothing nearer than {NEAREST} is drawn; scale "
-            f"cameras and points of the scene by {10.0 ** np.ceil(np.log10(5 / middle)):g}"
-        )
-
-
-def _report_cameras_apart(info: SceneInfo) -> None:
-    """Name the training cameras that the extent leaves out."""
-    apart = standing_apart(camera_centers(info.train_cameras))
-    if apart.any():
-        names = [info.train_cameras[index].image_name for index in apart.nonzero()[0]]
-        print(
-            f"{len(names)} of {len(apart)} cameras are more than {APART:g} times as far from the middle as the median "
-            f"camera ({some(names)}) and are left out of the scene's extent, {info.extent:.3g}; check their "
-            "poses",
-            file=sys.stderr,
         )
 
 

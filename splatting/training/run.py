@@ -109,8 +109,7 @@ class Run:
         sharing = self.group if views == 1 else ALONE  # all read the same images in the same order
         init_ply = None if self.start else getattr(dataset, "init_ply", None)
         self.scene, first = scene_with(init_ply, dataset, self.gaussians, ranks=sharing)
-        checks.check_scene(self.scene.info)
-        checks.hint_of_images(self.scene.getTrainCameras(), self.scene.info, dataset.white_background)
+        checks.check_scene(self.scene, dataset, bool(self.start))
         checks.check_target(opt.target_psnr, len(self.scene.getTestCameras()))
         agree_on_scene(self.scene, self.start)  # before an image is shared
         points = self.scene.info.point_cloud.points if first is None else first

@@ -1,0 +1,117 @@
+"""Faults of cameras: sides of photos, opening angles, principal points, places."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from scene.check.findings import Finding
+from scene.readers.info import (
+    APART,
+    NARROW,
+    CameraInfo,
+    SceneInfo,
+    are_exchanged,
+    camera_centers,
+    photo_size,
+    standing_apart,
+    turned,
+)
+from splatting.files.listing import some
+
+OPENING = (10.0, 150.0)  # degrees, of a pinhole; outside, the focal length is doubtful
+_FISHEYE = (10.0, 359.0)  # degrees, of a fisheye: its focal length times the angle is the photo's size
+_EDGE = 0.02  # of a side: a principal point so near to an edge
+_CORNER = 0.3  # of both sides, from the middle
+_ASPECT = 2.0  # most of one focal length over the other; anamorphic lenses have up to 1.8
+
+
+def of_cameras(info: SceneInfo) -> Iterator[Finding]:
+    """What is wrong with the cameras."""
+    views = [*info.train_cameras, *info.test_cameras]
+    yield from _exchanged(views)
+    pinholes = [view for view in views if _chart(view) != "equirectangular"]
+    yield from _angles(pinholes)
+    yield from _principal_points(pinholes)
+    yield from _places(info)
+
+
+def _chart(view: CameraInfo) -> str:
+    native = getattr(view, "native", None)
+    return native.chart if native else "perspective"
+
+
+def _exchanged(views: Sequence[CameraInfo]) -> Iterator[Finding]:
+    """Photos of whose camera the width is their height; our own readers refuse them."""
+    wrong = [(view, size) for view in views if are_exchanged(size := photo_size(view), (view.width, view.height))]
+    if wrong:
+        (view, size), names = wrong[0], [view.image_name for view, _ in wrong]
+        text, remedy = turned(names, len(views), size, (view.width, view.height))
+        yield Finding(text, remedy, severe=True)
+
+
+def opening(view: CameraInfo) -> tuple[float, float]:
+    """Horizontal and vertical opening angles of a view, degrees."""
+    if _chart(view) == "equidistant":
+        return tuple(np.degrees([view.width / view.fx, view.height / view.fy]).tolist())
+    return tuple(np.degrees([view.FovX, view.FovY]).tolist())
+
+
+def _angles(views: Sequence[CameraInfo]) -> Iterator[Finding]:
+    """Angles that no usual lens has, and pixels that are far from square."""
+    odd: Counter[str] = Counter()
+    examples: dict[str, tuple[CameraInfo, float]] = {}
+    for view in views:
+        low, high = _FISHEYE if _chart(view) == "equidistant" else OPENING
+        angle = max(opening(view))
+        if low <= angle <= high:
+            continue
+        # Focal lengths as parts of the size are about 1, and those in millimetres some tens.
+        unit = "parts of the size" if view.fx < 5 else "millimetres" if view.fx < 0.1 * view.width else "another unit"
+        odd[unit] += 1
+        examples.setdefault(unit, (view, angle))
+    for unit, count in odd.items():
+        view, angle = examples[unit]
+        example = f"{view.image_name}: {angle:.1f} degrees, a focal length of {view.fx:.4g} pixels"
+        remedy = f"give focal lengths in pixels (these may be in {unit}), or check the size of the photos"
+        yield Finding(f"{count} cameras have odd opening angles ({example})", remedy, of_lens=True)
+    flat = [v for v in views if not 1 / _ASPECT <= v.fx / v.fy <= _ASPECT]
+    if flat:
+        example = f"{flat[0].image_name}: {flat[0].fx:.4g} and {flat[0].fy:.4g} pixels"
+        text = f"{len(flat)} cameras have focal lengths in x and y that differ more than twofold ({example})"
+        yield Finding(text, "check the focal lengths and the size of the photos", of_lens=True)
+
+
+def _principal_points(views: Sequence[CameraInfo]) -> Iterator[Finding]:
+    """Principal points at an edge or toward a corner of the photo; a photo cut out of a larger one may have any."""
+    odd = []
+    for view in views:
+        across, down = view.cx / view.width, view.cy / view.height
+        edge = any(min(abs(part), abs(part - 1)) < _EDGE for part in (across, down))
+        if edge or min(abs(across - 0.5), abs(down - 0.5)) > _CORNER:
+            odd.append(view)
+    if odd:
+        view = odd[0]
+        at = f"{view.image_name}: {view.cx:.4g}, {view.cy:.4g} of {view.width} x {view.height}"
+        text = f"{len(odd)} cameras have their principal point in a corner or at an edge of the photo ({at})"
+        yield Finding(text, "give cx and cy in pixels of a photo of that size, or leave them out", of_lens=True)
+
+
+def _places(info: SceneInfo) -> Iterator[Finding]:
+    """Cameras in one place, or far away from the others."""
+    cameras = info.train_cameras
+    centers = camera_centers(cameras)
+    spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    # Where they do, the extent is not theirs but the distance of the points (`scene_extent`).
+    if len(centers) > 1 and info.extent and spread < NARROW * info.extent:
+        text = f"all cameras stand in one place, {spread:.2g} units apart and {info.extent:.2g} from the points"
+        text += ", so depth cannot be found"
+        yield Finding(text, "take photos from places some steps apart, or give cameras and points in one unit")
+    apart = standing_apart(centers)
+    if apart.any():
+        names = [camera.image_name for camera, far in zip(cameras, apart, strict=True) if far]
+        text = (
+            f"{len(names)} of {len(apart)} cameras are more than {APART:g} times as far from the middle as the median "
+            f"camera ({some(names)})"
+        )
+        yield Finding(text, f"check their poses; the scene's extent, {info.extent or 0:.3g}, leaves them out")

@@ -1,0 +1,104 @@
+"""Faults of the points that a training starts from: too near, in no photo, far away, several in one place."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from scene.check.findings import Finding
+from scene.gaussians.copies import places_of
+from scene.readers.info import NEAREST, SceneInfo, camera_centers
+from scene.readers.tracks import projected
+from splatting.files.listing import some
+
+FAR_POINT = 100.0  # extents from the cameras; a sky is some tens away
+FAR_SHARE = 0.01
+FEWEST_IN_VIEW = 10  # points of the cloud in a photo
+NEAR_SHARE = 0.03  # of the points in view; with 20 % too near, a scene lost 2.5 dB
+_UNSEEN = 0.5
+_CAMERAS = 16  # whose depths are looked at
+_SAMPLE = 5000  # most points tested against the views,
+_TESTS = 1_000_000  # and most tests
+_FEWEST_BEYOND = 0.01  # share of the points in front of them that must lie beyond the nearest depth
+
+
+def of_points(info: SceneInfo) -> Iterator[Finding]:
+    """What is wrong with the points; nothing where a model is loaded and there are none."""
+    if info.point_cloud is None or not len(info.point_cloud.points):
+        return
+    points = np.asarray(info.point_cloud.points, dtype=np.float64)
+    if not np.isfinite(points).all():
+        return  # which is refused with the model's start
+    nothing_drawn = [*_scale(points, info)]
+    yield from nothing_drawn
+    if not nothing_drawn:
+        yield from _near(points, info)
+    yield from _far(points, info)
+    yield from _unseen(points, info)
+    places = places_of(points)
+    if places.misleads:
+        text = f"{places.shared:.0%} of the {len(points)} points share a place with others"
+        text += f", up to {places.counts.max()} in one"
+        yield Finding(text, "remove the copies from the cloud, as a program that merges clouds may have left them")
+
+
+def _some(info: SceneInfo) -> list:
+    return info.train_cameras[:: max(1, len(info.train_cameras) // _CAMERAS)][:_CAMERAS]
+
+
+def _scale(points: np.ndarray, info: SceneInfo) -> Iterator[Finding]:
+    """A scene of which hardly any point lies beyond the nearest depth that is drawn."""
+    depths = np.concatenate([(points @ camera.R + camera.T)[:, 2] for camera in _some(info)])
+    depths = depths[depths > 0]
+    if len(depths) and (depths > NEAREST).mean() < _FEWEST_BEYOND:
+        middle = float(np.median(depths))
+        text = f"the points lie {middle:.2g} units from the cameras, and nothing nearer than {NEAREST} is drawn"
+        factor = 10.0 ** np.ceil(np.log10(5 / middle))
+        yield Finding(text, f"scale cameras and points of the scene by {factor:g}", severe=True)
+
+
+def _near(points: np.ndarray, info: SceneInfo) -> Iterator[Finding]:
+    """A scene of which a part is nearer to its cameras than the nearest depth."""
+    sample, depths = points[:: max(1, len(points) // _SAMPLE)], []
+    for camera in _some(info):
+        local = sample @ camera.R + camera.T
+        away = np.linalg.norm(local, axis=1) if getattr(camera, "native", None) else local[:, 2]
+        depths.append(away[projected(camera, sample)[2]])
+    depths = np.concatenate(depths)
+    share = float((depths < NEAREST).mean()) if len(depths) else 0.0
+    if share >= NEAR_SHARE:
+        factor = NEAREST / max(float(np.quantile(depths, NEAR_SHARE / 10)), 1e-9)
+        factor = next(x for x in _round_numbers() if x >= factor)
+        text = f"{share:.0%} of what the cameras see is nearer than {NEAREST} units, where nothing is drawn"
+        yield Finding(text, f"scale cameras and points of the scene by {factor:g}")
+
+
+def _round_numbers() -> Iterator[float]:
+    power = 1.0
+    while True:
+        yield from (2 * power, 5 * power, 10 * power)
+        power *= 10
+
+
+def _far(points: np.ndarray, info: SceneInfo) -> Iterator[Finding]:
+    """Points far behind all that is shown."""
+    away = np.linalg.norm(points - camera_centers(info.train_cameras).mean(axis=0), axis=1)
+    far = (away > FAR_POINT * (info.extent or np.inf)).mean()
+    if far > FAR_SHARE:
+        text = f"{far:.1%} of the points are more than {FAR_POINT:g} extents away"
+        yield Finding(text, "remove them from the cloud (COLMAP: filter by reprojection error and angle)")
+
+
+def _unseen(points: np.ndarray, info: SceneInfo) -> Iterator[Finding]:
+    """Points in no photo, and photos without points."""
+    count = min(_SAMPLE, max(200, _TESTS // len(info.train_cameras)))
+    sample = points[:: max(1, len(points) // count)]
+    seen = np.array([projected(camera, sample)[2] for camera in info.train_cameras])
+    unseen = float((~seen.any(axis=0)).mean())
+    counts = seen.sum(axis=1) * len(points) / seen.shape[1]
+    away = [c.image_name for c, n in zip(info.train_cameras, counts, strict=True) if n < FEWEST_IN_VIEW]
+    if unseen > _UNSEEN:
+        remedy = "poses and points do not belong together: check the axes (x right, y down, z forward) and the scale"
+        yield Finding(f"{unseen:.0%} of the points are in no photo", remedy)
+    elif away and len(points) >= 2 * FEWEST_IN_VIEW:
+        text = f"{len(away)} cameras have hardly any point in view ({some(away)})"
+        yield Finding(text, "remove them from the model: they face away from the scene, or their poses are wrong")

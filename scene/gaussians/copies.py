@@ -1,0 +1,52 @@
+"""Points of a cloud that lie in one place, exactly or but for rounding, as in clouds that were merged."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+NEAR = 1e-5  # of the median distance from the cloud's middle; points of real scenes that are nearer are the same point
+MANY = 0.25  # share of a cloud's points that share a place; structure from motion leaves up to 0.08, all of them pairs
+HIDING = 4  # points in one place: each has three neighbours at no distance, and with them no size
+_MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
+
+
+class Places(NamedTuple):
+    """The places of a cloud: a point of each, by index (P,); the place of each point (N,); and points by place (P,)."""
+
+    points: np.ndarray
+    of_point: np.ndarray
+    counts: np.ndarray
+
+    @property
+    def shared(self) -> float:
+        """Share of the points that have others in their place."""
+        return float(self.counts[self.counts > 1].sum() / max(len(self.of_point), 1))
+
+    @property
+    def misleads(self) -> bool:
+        """Whether distances between points say little of the distances between places."""
+        return self.shared > MANY or int(self.counts.max(initial=0)) >= HIDING
+
+
+def places_of(points: np.ndarray) -> Places:
+    """The places of points (N, 3), which are finite. Two points are in one place if they are nearer than NEAR."""
+    points = np.asarray(points, dtype=np.float64)
+    middle = np.median(points, axis=0) if len(points) else np.zeros(3)
+    size = float(np.median(np.linalg.norm(points - middle, axis=1))) if len(points) else 0.0
+    cell = 2 * NEAR * size or 1e-30
+    chosen, places = np.arange(len(points)), np.arange(len(points))
+    for shift in (0.0, 0.5):  # a border of cells parts neighbours, but hardly two that are shifted against each other
+        chosen, places = _merged(points, middle, cell, shift, chosen, places)
+    return Places(chosen, places, np.bincount(places, minlength=len(chosen)))
+
+
+def _merged(
+    points: np.ndarray, middle: np.ndarray, cell: float, shift: float, chosen: np.ndarray, places: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The places that are left when those in one cell of a grid are made one."""
+    cells = np.clip(np.floor((points[chosen] - middle) / cell + shift), -(2.0**62), 2.0**62).astype(np.int64)
+    with np.errstate(over="ignore"):
+        keys = (cells.view(np.uint64) * _MIX).sum(axis=1, dtype=np.uint64)
+        keys = (keys ^ (keys >> np.uint64(29))) * _MIX[0]
+    _, first, of_place = np.unique(keys, return_index=True, return_inverse=True)
+    return chosen[first], of_place.reshape(-1)[places]
