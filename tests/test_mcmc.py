@@ -51,16 +51,17 @@ def test_growth_ends_at_the_limit(colmap_scene, tmp_path):
         assert [len(load_checkpoint(out / f"chkpnt{t}.pth")[0][1]) for t in every] == counts
 
 
-@pytest.mark.parametrize("stride", [1.0, 10.0])
-def test_a_start_larger_than_the_clock_can_train_loses_the_faintest(stride):
-    """25 Gaussians for each iteration; without a clock, or with enough of it, nothing is removed."""
+@pytest.mark.parametrize(("stride", "random"), [(1.0, True), (10.0, True), (10.0, False)])
+def test_a_random_start_larger_than_the_clock_can_train_loses_the_faintest(stride, random):
+    """25 Gaussians for each iteration; without a clock, with enough of it, or else, nothing is removed."""
     gaussians = model(200)
     with torch.no_grad():
         gaussians._opacity[:, 0] = torch.linspace(2.0, -2.0, 200)
     control, kept = MarkovChain(gaussians, options()), gaussians._xyz.detach().clone()
     control.schedule = DecidedSchedule(Decided(60, [Block(30, 0.0, stride / 60, 0.0)], None, 9.0))
+    control.random = random
     control._relocate(1)
-    left = 200 if stride == 1.0 else 25 * 6
+    left = 25 * 6 if random and stride == 10.0 else 200
     assert len(gaussians) == left and torch.equal(gaussians._xyz, kept[:left])
 
 

@@ -15,6 +15,7 @@ from trainings import before_steps, train_on
 from scene.gaussians import density_rules as rules
 from scene.gaussians.checkpoint import load_checkpoint
 from splatting.evaluation.training_log import Stopwatch
+from splatting.training.density import DensityControl
 from splatting.training.iteration import Iteration
 from splatting.training.observers import report
 from splatting.training.observers.report import ProgressBar
@@ -564,3 +565,30 @@ def test_no_strategy_grows_beyond_what_the_clock_can_train(colmap_scene, tmp_pat
                      "--densify_from_iter", 2, "--max_num_splats", 3000)  # fmt: skip
     counts = [int(re.search(rb"element vertex (\d+)", plies[max(plies)])[1]) for plies in (by_clock, without)]
     assert 300 < counts[0] <= 25 * 75 < counts[1]
+
+
+@pytest.mark.parametrize("sizes", ["none", "pyramid"])
+def test_the_clock_ends_growth_at_the_pace_of_whole_views_and_removes_nothing(sizes, capsys):
+    """Growth to 25 Gaussians for each iteration, of which each takes the longer, and a quarter of it in half the size.
+
+    A program that slows all down late in the run leaves the Gaussians there.
+    """
+    schedule = TimeBudget(Decided(30_000, [], None, 20.0, sizes))
+    control = DensityControl()
+    control.schedule, control.most_gaussians, counts = schedule, 50_000, [14_000]
+
+    def cost(iteration: int, step: int) -> float:
+        if step // 1000 > schedule.schedule_step(iteration - 1) // 1000 and step < 15_000:
+            counts.append(max(counts[-1], min(int(1.05 * counts[-1]) + 1, control.most(iteration, counts[-1], 50_000))))
+            assert control.most(iteration, counts[-1], 50_000) >= counts[-1]
+        pixels = Resolution(schedule, None).factor_at(step) ** -2
+        return (0.005 + counts[-1] * 1e-6) * (0.2 + 0.8 * pixels) * (3 if step > 13_000 else 1)
+
+    _run(schedule, cost)
+    assert schedule.sizes == sizes and control.most(10, 9, 7) == 7
+    fits = 25 * 20.0 / (0.005 + counts[-1] * 1e-6)  # at the pace of whole views with so many
+    assert counts[-1] == pytest.approx(fits, rel=0.12)
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said.startswith("--time_budget 20 is time for some ") and said.endswith(
+        ", not the 50,000 of --max_num_splats"
+    )

@@ -1,10 +1,12 @@
 """The hooks by which a strategy of density control acts on a training (strategies: training/strategies)."""
 
 import math
+import sys
 from collections.abc import Collection, Sequence
 from typing import ClassVar
 
 from torch import Tensor
+from tqdm import tqdm
 
 from scene.cameras import Camera
 from scene.gaussians.mcmc import NO_PENALTY
@@ -30,7 +32,8 @@ class DensityControl:
     run. clamps: whether the loss takes renders clamped to [0, 1], as the reference's does; then Gaussians brighter than
     white cost nothing before a white background. ends: the iteration of the schedule from which it changes no rows.
     schedule: tells how far it is in an iteration (training/schedule.py). Rules that are windows of the schedule ask it;
-    rules that count steps take the iteration itself.
+    rules that count steps take the iteration itself. random: whether the model began as random points, of which the
+    clock may remove those that it cannot train.
     """
 
     fusable: ClassVar[bool] = False
@@ -41,6 +44,8 @@ class DensityControl:
     clamps: ClassVar[bool] = True
     ends = math.inf
     schedule: Schedule = STEADY
+    random = False
+    _told = False
 
     def started(self) -> None:
         """Called before the first iteration of a model that was made from points, not read from a file."""
@@ -74,13 +79,32 @@ class DensityControl:
         """
         return self.most_gaussians
 
-    def most(self, iteration: int, limit: int) -> int:
-        """`limit`, 0: none; with a time budget, not more than so few iterations can train. 0: no limit."""
-        stride = self.schedule.stride(iteration)
-        if not isinstance(self.schedule, DecidedSchedule) or stride <= 1:
+    def most(self, iteration: int, count: int, limit: int) -> int:
+        """How many Gaussians there may be after an iteration, 0: any number. limit: as an option has it, 0: none.
+
+        With a time budget not more than so few iterations can train, but the `count` that are there all stay, except of
+        a random start.
+        """
+        schedule = self.schedule
+        if not isinstance(schedule, DecidedSchedule) or (possible := schedule.possible(iteration)) >= schedule.length:
             return limit
-        trained = max(int(AN_ITERATION * self.schedule.length / stride), 1)
-        return min(limit, trained) if limit else trained
+        trained = max(int(AN_ITERATION * possible), 1)
+        if limit and trained >= limit:
+            return limit
+        self._tell(int(possible), trained)
+        most = trained if self.random else max(trained, count)
+        return min(limit, most) if limit else most
+
+    def _tell(self, iterations: int, trained: int) -> None:
+        """Say once how many Gaussians a time budget trains."""
+        if not self._told:
+            self._told = True
+            given = f", not the {self.most_gaussians:,} of --max_num_splats" if self.most_gaussians else ""
+            tqdm.write(
+                f"--time_budget {self.schedule.seconds:g} is time for some {iterations:,} iterations, which train at "
+                f"most about {trained:,} Gaussians, {AN_ITERATION} for each{given}",
+                file=sys.stderr,
+            )
 
     def after_backward(self, step: Iteration, package: dict[str, Tensor]) -> None:
         """Called with the gradients computed, before the optimiser's step. package: the result of `render`."""

@@ -1,7 +1,6 @@
 """Coarse to fine: views that are smaller at first, by how far the schedule is (--resolution_schedule)."""
 
 import argparse
-from bisect import bisect_right
 
 import torch
 
@@ -32,9 +31,7 @@ class Resolution:
 
     def factor_at(self, schedule_step: int) -> float:
         """The factor at an iteration of the schedule."""
-        levels, length = self._schedule.levels, self._schedule.length
-        index = bisect_right(levels, schedule_step, key=lambda level: level[0] * length) - 1
-        return levels[index][1] if index >= 0 else 1.0
+        return self._schedule.factor_at(schedule_step)
 
     def changes(self, before: int, now: int) -> bool:
         """Whether the factor differs between two iterations of the schedule."""
@@ -84,6 +81,5 @@ def resolution_of(opt: argparse.Namespace, schedule: Schedule, scene: Scene) -> 
     schedule.megapixels = scene.training_pixels()[0] / len(scene.getTrainCameras()) / 1e6
     if not isinstance(schedule, DecidedSchedule):
         schedule.sizes = "none" if opt.resolution_schedule == "auto" else opt.resolution_schedule
-    if not schedule.levels:
         schedule.levels = PYRAMID if schedule.sizes == "pyramid" else ()
     return Resolution(schedule, scene.images)

@@ -9,7 +9,7 @@ file says (--schedule).
 import math
 import statistics
 import sys
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -18,6 +18,7 @@ from tqdm import tqdm
 USUAL = 30_000  # iterations that the default learning rates are for
 LONGER = 2.0  # times the root of the stride
 MOST_RATE = 8.0  # about the best for 1,300 iterations in place of 30,000 (docs/results/tried.md)
+_PACE = 5  # blocks that tell the pace of a run
 SETTLING = 0.7  # part of the schedule from which on steps get shorter
 LEAST_RATE = 0.1  # part of a rate that is left at the end
 Levels = Sequence[tuple[float, float]]  # part of the schedule that is done (0 to 1), and factor of sizes from then on
@@ -73,6 +74,11 @@ class Schedule:
     def stride(self, iteration: int) -> float:
         """Iterations of the schedule that one of the run stands for, at that place."""
         return 1.0
+
+    def factor_at(self, schedule_step: float) -> float:
+        """Factor of the views' sizes at an iteration of the schedule."""
+        index = bisect_right(self.levels, schedule_step, key=lambda level: level[0] * self.length) - 1
+        return self.levels[index][1] if index >= 0 else 1.0
 
     def rate_factor(self, iteration: int) -> float | None:
         """Factor of the learning rates that have no schedule. None: they are left as they are."""
@@ -187,6 +193,21 @@ class DecidedSchedule(Schedule):
     def stride(self, iteration: int) -> float:
         return self._block(iteration)[1].step * self.length
 
+    def possible(self, iteration: int) -> float:
+        """Iterations that fit into the budget at the pace of its end, as far as a block before this iteration tells it.
+
+        Smaller views at first say nothing of that pace. Where no block has it, iterations at the present stride.
+        """
+        index, present = self._block(iteration)
+        spans = zip([0, *(block.last for block in self.blocks)], self.blocks[:index], self.blocks[1:], strict=False)
+        speeds = [
+            (after.seconds - block.seconds) / (block.last - before)
+            for before, block, after in spans
+            if self.factor_at(self.length * (block.start + block.step)) == 1
+        ]
+        speed = statistics.median(speeds[-_PACE:]) if speeds else 0.0
+        return self.seconds / speed if speed > 0 else 1 / present.step
+
     def rate_factor(self, iteration: int) -> float:
         return longer_steps(USUAL * self._block(iteration)[1].step, self.progress(iteration))
 
@@ -226,8 +247,9 @@ class TimeBudget(DecidedSchedule):
     def __init__(self, decided: Decided, share: Callable[[float], float] = lambda seconds: seconds) -> None:
         super().__init__(decided)
         self._share = share
-        self._open = self.sizes == "auto"
-        self.sizes = "none" if self._open else self.sizes
+        self._open = self.sizes != "none" and not self.levels
+        self._asked = self.sizes == "pyramid"
+        self.sizes = "none" if self.sizes == "auto" else self.sizes
         self._speed: float | None = None  # seconds of an iteration
         self._speeds: list[float] = []  # of the last three blocks
         self._measured = 0  # blocks of this run
@@ -263,13 +285,18 @@ class TimeBudget(DecidedSchedule):
             self._speeds = [*self._speeds[-2:], speed]
 
     def _choose_sizes(self, done: int, seconds: float) -> None:
-        """Take smaller views if few pixels can be trained: from the next one on, and all of that is recorded."""
+        """Take smaller views if asked to, or if few pixels can be trained: from the next one on, as is recorded.
+
+        The first views are never smaller, as they tell the pace of the end.
+        """
         self._open = False
         now = (self.schedule_step(done) + 0.5) / self.length
         possible = done + max(self.seconds - seconds, 0.0) / self._speed
         short = self.megapixels * self.length / possible >= SHORT and now < PYRAMID[1][0]
-        self.sizes = "pyramid" if short else "none"
-        self.levels = ((now, PYRAMID[0][1]), *PYRAMID[1:]) if short else ()
+        if short or self._asked:
+            self.sizes = "pyramid"
+            begun = [factor for start, factor in PYRAMID if start <= now][-1]
+            self.levels = ((now, begun), *(level for level in PYRAMID if level[0] > now))
 
     def _decide(self, seconds: float) -> None:
         """Add the block that comes next."""

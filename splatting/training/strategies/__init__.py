@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 
 from scene.cameras import Camera
+from scene.readers.start_cloud import RANDOM_POINTS
+from scene.scene import Scene
 from splatting.training.density import DensityControl
 
 if TYPE_CHECKING:
@@ -25,6 +27,14 @@ def of_clock(seconds: float, cameras: Sequence[Camera], device: torch.device) ->
     return "mcmc" if few and device.type == "cuda" else "budget"
 
 
+def is_random(scene: Scene) -> bool:
+    """Whether a scene has no points but random ones."""
+    cloud = scene.info.point_cloud
+    if cloud is None or scene.info.ply_path is not None or len(cloud.points) != RANDOM_POINTS:
+        return False
+    return bool((cloud.colors == cloud.colors[0]).all())
+
+
 def end_in_time(opt: argparse.Namespace) -> None:
     """Let rows change no longer than by default, 1/2 or 5/6 of the schedule, where that is to go on to its end.
 
@@ -37,4 +47,6 @@ def end_in_time(opt: argparse.Namespace) -> None:
 
 def density_control(run: "Run") -> DensityControl:
     """The strategy that --strategy names, for the model and the scene of a run: `of_run` of the file of that name."""
-    return import_module(f"{__name__}.{run.opt.strategy}").of_run(run)
+    control = import_module(f"{__name__}.{run.opt.strategy}").of_run(run)
+    control.random = is_random(run.scene)
+    return control

@@ -92,7 +92,7 @@ class AdaptiveDensityControl(DensityControl):
             rules.MAX_SCREEN_SIZE if limit_size else None,
             seed=self._opt.seed,
             iteration=iteration,
-            max_splats=self.most(iteration, self.most_gaussians),
+            max_splats=self.most(iteration, self._gaussians.gaussian_count, self.most_gaussians),
             long_axis=self._opt.split == "long_axis",
         )
         refuse_empty(iteration, self._gaussians.gaussian_count == 0, "raise --opacity_reset_interval")

@@ -75,7 +75,7 @@ class BudgetControl(DensityControl):
 
     def _aim(self, now: int, iteration: int) -> int:
         """How many Gaussians there are to be after the densification of an iteration, `now` before it."""
-        most = self.most(iteration, self.most_gaussians)
+        most = self.most(iteration, now, self.most_gaussians)
         return count_after(now, most, self._remaining(iteration), self._opt.growth_power)
 
     def _grows(self, iteration: int) -> bool:

@@ -65,8 +65,8 @@ class MarkovChain(DensityControl):
         gaussians, least = self._gaussians, self._opt.mcmc_min_opacity
         if not self.changes(iteration):
             return ()
-        count, most = gaussians.gaussian_count, self.most(iteration, 0)
-        moves = 0 < most < count or self._grown(count, iteration) > count
+        count = gaussians.gaussian_count
+        moves = 0 < self.most(iteration, count, 0) < count or self._grown(count, iteration) > count
         moves = moves or gaussians.shards.ranks.anyone(not is_alive(gaussians, least).all())
         return gaussians._attributes if moves else ()
 
@@ -85,10 +85,10 @@ class MarkovChain(DensityControl):
         self._gaussians.add_noise(rate, *gate, seed=opt.seed, iteration=step.iteration)
 
     def _relocate(self, iteration: int) -> None:
-        """Move what nobody sees (the paper's relocation of dead Gaussians), or remove what the clock cannot train."""
+        """Move what nobody sees (the paper's relocation of dead Gaussians), or remove random points (`most`)."""
         least, parts, seed = self._opt.mcmc_min_opacity, self._opt.mcmc_parts, self._opt.seed
-        most = self.most(iteration, 0)
-        if most and self._gaussians.gaussian_count > most:
+        count = self._gaussians.gaussian_count
+        if 0 < (most := self.most(iteration, count, 0)) < count:
             remove_useless(self._gaussians, least, most)
         dead = self._gaussians.relocate(least, parts, seed=seed, iteration=iteration)
         empty = dead == self._gaussians.gaussian_count
@@ -104,7 +104,8 @@ class MarkovChain(DensityControl):
     def _grown(self, count: int, iteration: int) -> int:
         """The number after a growth: more by a part of it (the paper's rule of adding Gaussians), at least by one."""
         growth = self._opt.mcmc_growth
-        return min(max(int((1 + growth) * count), count + (growth > 0)), self.most(iteration, self.most_gaussians))
+        most = self.most(iteration, count, self.most_gaussians)
+        return min(max(int((1 + growth) * count), count + (growth > 0)), most)
 
 
 def of_run(run: "Run") -> MarkovChain:
