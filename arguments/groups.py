@@ -172,7 +172,8 @@ class OptimizationParams(OptionTable):
             help="weight of 1 - SSIM in the loss; the weight of the L1 term is 1 minus this"),
         Option("densification_interval", 100, "steps between densifications", "paper", check=at_least(1)),
         Option("opacity_reset_interval", 3000, origin="paper", check=at_least(1),
-            help="steps between resets of all opacities to at most 0.01"),
+            help="steps between resets of all opacities to at most 0.01; one with less than half of them to go is left "
+                 "out, and all at the default with --appearance ppisp"),
         Option("densify_from_iter", 500, "densification starts after this step", check=at_least(0)),
         Option("densify_until_iter", 15_000, "densification ends before this step", "paper", check=at_least(0)),
         Option("densify_grad_threshold", 0.0002, origin="paper", check=above(0),

@@ -1,6 +1,7 @@
 """Adaptive density control: the reference's rules on toy sets, its windows, and Adam's state after it."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,10 @@ from hypothesis import strategies as st
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.gaussians.long_axis import long_axis_children
+from splatting.training.checks import late_reset
+from splatting.training.schedule import BatchSchedule, Block, Decided, DecidedSchedule, Schedule
+from splatting.training.strategies import adc
+from splatting.training.strategies.adc import AdaptiveDensityControl
 from utils.general_utils import build_rotation
 
 EXTENT = 2.0
@@ -254,3 +259,53 @@ def test_the_cap_is_never_passed_and_reached_when_it_can(count, cap, seed):
     candidates = int((rules.mean_gradient(gaussians.xyz_gradient_accum, gaussians.denom) >= THRESHOLD).sum())
     _densify(gaussians, max_splats=cap)
     assert len(gaussians) == max(count, min(cap, count + candidates))
+
+
+LEFT_OUT = [
+    ({"iterations": 7000}, False, [3000]),
+    ({"iterations": 7500}, False, [3000, 6000]),  # with half of an interval to go
+    ({"iterations": 700, "opacity_reset_interval": 300, "densify_from_iter": 50}, True, [50, 300]),
+    ({"iterations": 1999}, True, []),
+    ({"iterations": 2000}, True, [500]),
+    ({"iterations": 7000, "opacity_reset_interval": 100_000}, True, [500]),  # as it has no others
+]
+
+
+@pytest.mark.parametrize(("changes", "white", "kept"), LEFT_OUT)
+def test_a_reset_with_less_than_half_an_interval_to_go_is_left_out(changes, white, kept):
+    control = AdaptiveDensityControl(model(4), options(**changes), white, 1.0)
+    control.schedule = Schedule(changes["iterations"])
+    every = range(1, changes["iterations"])
+    assert [t for t in every if control.resets(t)] == kept
+    regular = [t for t in kept if t != control._opt.densify_from_iter]
+    assert [t for t in every if control.recovers(t) and not control.recovers(t - 1)] == regular
+    left = changes["iterations"] - kept[-1] if kept else rules.RECOVERY
+    assert (late_reset(control, control._opt, 0) is None) == (left >= rules.RECOVERY)
+
+
+@pytest.mark.parametrize("views", [1, 4])
+def test_views_of_an_iteration_count_where_resets_are_left_out(views):
+    control = AdaptiveDensityControl(model(4), options(iterations=7000), False, 1.0)
+    control.schedule = BatchSchedule(7000, views) if views > 1 else Schedule(7000)
+    assert [t for t in range(1, control.schedule.ends) if control.resets(t)] == [3000 // views]
+
+
+def test_a_run_by_the_clock_recovers_from_no_reset_that_it_leaves_out():
+    """3,000 steps in 300 iterations: too few for a reset."""
+    control = AdaptiveDensityControl(model(4), options(), True, 1.0)
+    control.schedule = DecidedSchedule(Decided(30_000, [Block(3000, 0.0, 1 / 3000, 0.0)], 3000, 9.0))
+    assert not any(control.resets(t) or control.recovers(t) for t in range(1, 3000))
+
+
+@pytest.mark.parametrize(
+    ("appearance", "interval", "resets"), [("none", 3000, 5), ("ppisp", 3000, 0), ("ppisp", 2500, 6)]
+)
+def test_an_appearance_wants_no_resets(appearance, interval, resets):
+    gaussians = model(4)
+    gaussians.appearance = appearance
+    run = SimpleNamespace(gaussians=gaussians, opt=options(opacity_reset_interval=interval))
+    run.dataset, run.scene = SimpleNamespace(white_background=True), SimpleNamespace(cameras_extent=1.0)
+    control = adc.of_run(run)
+    control.schedule = Schedule(30_000)
+    assert sum(control.resets(t) for t in range(1, 30_000)) == resets
+    assert run.opt.opacity_reset_interval == interval

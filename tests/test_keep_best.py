@@ -16,6 +16,7 @@ from trainings import train_on
 
 from arguments import GroupParams, read_stored_options
 from gaussian_renderer import render
+from scene.gaussians import density_rules
 from scene.readers import info
 from scene.saved_model import load_saved
 from splatting.evaluation.training_log import read_log
@@ -27,6 +28,14 @@ WORDS = ("--eval", "--no_curve", "--iterations", 240, "--disable_viewer", "--kee
          "--densify_from_iter", 10, "--densification_interval", 100, "--densify_grad_threshold", 1e-5,
          "--opacity_reset_interval", 225, "--densify_until_iter", 230,
          "--save_iterations", *POINTS, "--checkpoint_iterations", 200)  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def late_resets():
+    """A reset that leaves the end worse than the middle, which trainings otherwise leave out."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(density_rules, "reset_pays", lambda *_: True)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -41,20 +41,20 @@ def _steps(checkpoint: Path) -> list[float]:
 
 def test_order_of_a_step(colmap_scene, tmp_path):
     """A save precedes the step. The last iteration and densifications take no step, nor do opacities in a reset."""
-    every = [str(t) for t in range(1, 13)]
+    every = [str(t) for t in range(1, 16)]
     _train(
         colmap_scene, tmp_path, "--save_iterations", *every, "--checkpoint_iterations", *every,
         "--densify_from_iter", 5,
         "--densification_interval", 8, "--opacity_reset_interval", 10, "--densify_grad_threshold", 1e-5,
-        iterations=12,
+        iterations=15,
     )  # fmt: skip
-    steps = {t: _steps(tmp_path / f"chkpnt{t}.pth") for t in range(1, 13)}
+    steps = {t: _steps(tmp_path / f"chkpnt{t}.pth") for t in range(1, 16)}
     assert steps[1] == [1] * 6
     assert steps[7] == [7] * 6 and steps[8] == [7] * 6  # 8 densified
     assert steps[9] == [8] * 6
     assert steps[10] == [9, 9, 9, 8, 9, 9]  # 10 reset the opacities
-    assert steps[11] == [10, 10, 10, 9, 10, 10] and steps[12] == steps[11]  # no step in the last
-    for t in (3, 7, 11, 12):
+    assert steps[11] == [10, 10, 10, 9, 10, 10] and steps[15] == steps[14]  # no step in the last
+    for t in (3, 7, 11, 15):
         saved = read_model(tmp_path / f"point_cloud/iteration_{t}/point_cloud.ply")
         assert torch.equal(saved._xyz, load_checkpoint(tmp_path / f"chkpnt{t - 1}.pth")[0][1])
     first = read_model(tmp_path / "point_cloud/iteration_1/point_cloud.ply")._xyz

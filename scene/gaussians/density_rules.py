@@ -19,6 +19,7 @@ SHRINK = 0.8  # N children of a split have 1 / (0.8 N) of the parent's scale: 1 
 PRUNE_EXTENT = 0.1  # a Gaussian wider than this part of the scene's extent is removed, once sizes are limited
 RESET_OPACITY = 0.01
 RECOVERY = 1000  # iterations that a model needs to recover from a reset of its opacities
+USUAL_RESETS = 3000  # iterations from one reset to the next, the default of --opacity_reset_interval
 FEW_DENSIFICATIONS = 20  # a run that takes fewer steps than its schedule still has so many
 MIN_OPACITY = 0.005  # a Gaussian below it is removed
 MAX_SCREEN_SIZE = 20  # pixels
@@ -58,21 +59,31 @@ def actions(
 
     span, stride: the iterations of the schedule that it stands for, and their mean number there; by default itself.
     The options' windows and resets are of the schedule; densifications come every `interval` iterations, as their
-    statistics need views (views: of each iteration). Resets that a model would not recover from before the next one
-    are left out.
+    statistics need views (views: of each iteration). Resets that do not pay are left out.
     """
     before, now = (iteration - 1, iteration) if span is None else (span.start - 1, span.stop - 1)
     active, resets = now < opt.densify_until_iter, opt.opacity_reset_interval
-    recovers = stride <= 1 or resets >= RECOVERY * stride / views
-    reset = now // resets > before // resets or (white_background and before < opt.densify_from_iter <= now)
+    of_white = white_background and before < opt.densify_from_iter <= now
+    kinds = (now // resets > before // resets, False), (of_white, True)
     return Actions(
         observe=active,
         densify=active
         and now > opt.densify_from_iter
         and iteration % interval(opt, opt.densify_until_iter, stride, views) == 0,
         limit_size=now > resets,
-        reset_opacity=active and reset and recovers,
+        reset_opacity=active and any(is_due and reset_pays(now, opt, stride, views, white) for is_due, white in kinds),
     )
+
+
+def reset_pays(step: int, opt: argparse.Namespace, stride: float = 1.0, views: int = 1, of_white: bool = False) -> bool:
+    """Whether a model recovers from a reset at an iteration of the schedule, before the next one and before the end.
+
+    With less than half an interval to go it keeps haze. of_white: the reset at densify_from_iter, where the interval
+    counts no more than the usual one, as a longer one is to mean no other resets.
+    """
+    resets = opt.opacity_reset_interval
+    half = (min(resets, USUAL_RESETS) if of_white else resets) / 2
+    return opt.iterations - step >= half and (stride <= 1 or resets >= RECOVERY * stride / views)
 
 
 def logit(p: float) -> float:

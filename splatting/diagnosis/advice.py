@@ -42,7 +42,6 @@ from utils.system_utils import UserError, mkdir_p
 EXPOSURES = 0.4  # stops; photos of a usual automatic exposure differ by 0.15 to 0.35
 FEW_PHOTOS = 16  # 14 gained 0.2 dB by points that hold the depth, 20 and 21 lost as much (docs/results/photos.md)
 DISTANCES = 2.5  # the farthest photo of a point over the nearest
-_APPEARANCE = "--appearance ppisp --opacity_reset_interval 100000"  # after a reset haze can grow before the cameras
 _AGAINST = {  # by an advised option: the options, with these values, that it does not go with
     "--appearance": {"keep_best": True, "train_test_exp": True},
     "--refine_poses": {"keep_best": True, "projection": "ray"},
@@ -133,7 +132,7 @@ def _of_tracks(scene: Scene, tracks: list[Track | None]) -> Iterator[Advice]:
     views = scene.info.train_cameras
     cameras = sorted(scene.getTrainCameras(), key=lambda camera: camera.uid)
     spread = float(np.std(exposures(cameras, tracks)))
-    yield _asked(f"exposures of the photos differ by {spread:.2f} stops", spread > EXPOSURES, _APPEARANCE)
+    yield _asked(f"exposures of the photos differ by {spread:.2f} stops", spread > EXPOSURES, "--appearance ppisp")
     ratio = distances(views, tracks)
     text = f"the farthest photo of a point is {ratio:.1f} times as far away as the nearest (median)"
     yield _asked(text, ratio > DISTANCES, "--antialiasing")

@@ -23,7 +23,7 @@ from splatting.evaluation.error_curve import Row, continue_curve
 from splatting.evaluation.training_log import TrainingLog
 from splatting.files.listing import some
 from splatting.training.density import DensityControl
-from splatting.training.schedule import DecidedSchedule, Schedule
+from splatting.training.schedule import DecidedSchedule
 from utils.system_utils import UserError
 
 
@@ -111,24 +111,24 @@ def without_effect(opt: argparse.Namespace, strategy: str) -> str | None:
     return f"--strategy {strategy} has no use for {some(given)}" if given else None
 
 
-def late_reset(opt: argparse.Namespace, white_background: bool, schedule: Schedule, done: int) -> str | None:
-    """What to say if adaptive density control resets opacities so late that the model cannot recover.
+def late_reset(density: DensityControl, opt: argparse.Namespace, done: int) -> str | None:
+    """What to say if a strategy resets opacities so late that the model cannot recover.
 
     done: iterations before this run, which may have been the reset. A run with a time budget leaves such resets out.
     """
-    if opt.strategy != "adc" or isinstance(schedule, DecidedSchedule):
+    schedule = density.schedule
+    if isinstance(schedule, DecidedSchedule):
         return None
     last = range(max(done, schedule.ends - rules.RECOVERY) + 1, schedule.ends)
-    resets = [rules.actions(t, opt, white_background, schedule.span(t), schedule.stride(t)).reset_opacity for t in last]
-    due = [t for t, is_reset in zip(last, resets, strict=True) if is_reset]
-    if not due:
+    if not (due := [iteration for iteration in last if density.resets(iteration)]):
         return None
-    cause = "--opacity_reset_interval"
-    if white_background and schedule.schedule_step(due[-1]) % opt.opacity_reset_interval:
-        cause = "--densify_from_iter, where a white background has one"
+    of_white = schedule.schedule_step(due[-1]) % opt.opacity_reset_interval >= schedule.views
+    remedy = "raise --opacity_reset_interval"
+    if of_white:
+        remedy = "lower --densify_from_iter, where a white background has a reset"
     return (
         f"opacities are reset in iteration {due[-1]}, and {schedule.ends - due[-1]} iterations are too few to recover "
-        f"from that; change --iterations or {cause}"
+        f"from that; {remedy}"
     )
 
 

@@ -65,6 +65,10 @@ class DensityControl:
         """Whether opacities were reset so recently that renders are not like photos."""
         return False
 
+    def resets(self, iteration: int) -> bool:
+        """Whether all opacities are reset in this iteration."""
+        return False
+
     def replaced(self, iteration: int) -> Collection[str]:
         """Attributes that `before_step` will give other values or rows, so that they take no step in this iteration.
 

@@ -104,7 +104,6 @@ class Run:
         if isinstance(self.schedule, DecidedSchedule):
             end_in_time(opt)
         self.warnings: list[str] = []
-        self._warn(checks.late_reset(opt, dataset.white_background, self.schedule, self.first_iteration))
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
         sharing = self.group if views == 1 else ALONE  # all read the same images in the same order
         init_ply = None if self.start else getattr(dataset, "init_ply", None)
@@ -135,6 +134,7 @@ class Run:
         self.sleeping = self._may_sleep()
         if self.sleeping and capture and (asleep := further(capture, ASLEEP)):
             self.sleeping.restore(asleep)
+        self._warn(checks.late_reset(self.density, opt, self.first_iteration))
         self._warn(checks.without_effect(given, opt.strategy))
         self._warn(checks.another_number(self.density, opt, self.gaussians.gaussian_count, self.first_iteration + 1))
         if capture is None and first is None:

@@ -5,6 +5,8 @@ splits and for clones. --split long_axis splits along the longest axis (scene/ga
 """
 
 import argparse
+import copy
+import sys
 from collections.abc import Collection
 from typing import TYPE_CHECKING
 
@@ -13,6 +15,7 @@ from torch import Tensor
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.gaussians.morton import sort_rows
+from scene.gaussians.ppisp import Ppisp
 from splatting.training.density import DensityControl, refuse_empty
 from splatting.training.iteration import Iteration
 from splatting.training.schedule import DecidedSchedule
@@ -50,12 +53,15 @@ class AdaptiveDensityControl(DensityControl):
 
     def recovers(self, iteration: int) -> bool:
         now, resets = self.schedule.schedule_step(iteration), self._opt.opacity_reset_interval
-        return resets <= now - now % resets < self.ends and now % resets < rules.RECOVERY
+        last = now - now % resets
+        recovers = resets <= last < self.ends and now % resets < rules.RECOVERY
+        pays = rules.reset_pays(last, self._opt, self.schedule.stride(iteration), self.schedule.views)
+        return recovers and pays and not self._ends_too_soon(last, iteration)
 
     def replaced(self, iteration: int) -> Collection[str]:
         if self._actions(iteration).densify:
             return self._gaussians._attributes
-        return ["opacity"] if self._resets(iteration) else ()
+        return ["opacity"] if self.resets(iteration) else ()
 
     def after_backward(self, step: Iteration, package: dict[str, Tensor]) -> None:
         if self.observes(step.iteration):
@@ -67,16 +73,17 @@ class AdaptiveDensityControl(DensityControl):
         todo = self._actions(step.iteration)
         if todo.densify:
             self._densify(step.iteration, todo.limit_size)
-        if self._resets(step.iteration):
+        if self.resets(step.iteration):
             self._gaussians.reset_opacity()
 
-    def _resets(self, iteration: int) -> bool:
-        return self._actions(iteration).reset_opacity and not self._ends_too_soon(iteration)
+    def resets(self, iteration: int) -> bool:
+        step = self.schedule.schedule_step(iteration)
+        return self._actions(iteration).reset_opacity and not self._ends_too_soon(step, iteration)
 
-    def _ends_too_soon(self, iteration: int) -> bool:
-        """Whether a run by the clock has too few iterations left to recover from a reset of opacities."""
+    def _ends_too_soon(self, step: int, iteration: int) -> bool:
+        """Whether a run by the clock, at the pace of an iteration, could not recover from a reset at a step."""
         schedule = self.schedule
-        left = (schedule.length - schedule.schedule_step(iteration)) / schedule.stride(iteration)
+        left = (schedule.length - step) / schedule.stride(iteration)
         return isinstance(schedule, DecidedSchedule) and left < rules.RECOVERY
 
     def _actions(self, iteration: int) -> rules.Actions:
@@ -100,5 +107,12 @@ class AdaptiveDensityControl(DensityControl):
 
 
 def of_run(run: "Run") -> AdaptiveDensityControl:
-    """The control of a run."""
-    return AdaptiveDensityControl(run.gaussians, run.opt, run.dataset.white_background, run.scene.cameras_extent)
+    """The control of a run. With --appearance ppisp it resets no opacities, unless an interval is given for it.
+
+    Haze can grow before the cameras after a reset, and cameras would learn from it.
+    """
+    opt, white = run.opt, run.dataset.white_background
+    if run.gaussians.appearance == Ppisp.kind and opt.opacity_reset_interval == rules.USUAL_RESETS:
+        opt, white = copy.copy(opt), False
+        opt.opacity_reset_interval = sys.maxsize
+    return AdaptiveDensityControl(run.gaussians, opt, white, run.scene.cameras_extent)
