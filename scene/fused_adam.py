@@ -146,5 +146,5 @@ class _Stepping(NamedTuple):
 
 
 def _is_plain(param: Tensor) -> bool:
-    """Whether nobody but the optimiser waits for the parameter's gradient."""
-    return param.requires_grad and param.grad is None and not param._backward_hooks
+    """Whether the operator takes the parameter, and nobody but the optimiser waits for its gradient."""
+    return param.is_contiguous() and param.requires_grad and param.grad is None and not param._backward_hooks

@@ -49,6 +49,36 @@ def test_steps_are_those_of_the_models_optimiser():
     assert not torch.equal(start[0], values(ours)[0])
 
 
+def column_major(tensor: torch.Tensor) -> torch.Tensor:
+    return tensor.mT.contiguous().mT
+
+
+@pytest.mark.parametrize("kind", [SparseGaussianAdam, OfTheModel])
+@pytest.mark.parametrize("what", ["parameters", "gradients", "visible", "loaded averages"])
+def test_any_strides_take_the_same_step(kind, what):
+    plain, odd = (kind(groups(), lr=0.0, eps=1e-15) if kind is SparseGaussianAdam else kind(groups()) for _ in range(2))
+    params = [group["params"][0] for group in odd.param_groups]
+    if what == "parameters":  # of (N, 3) points, as the reference's reader makes them; before or after the first step
+        for param in params:
+            param.data = column_major(param.data)
+    for seed in range(3):
+        visible = give_gradients(plain, seed)
+        give_gradients(odd, seed)
+        if what == "gradients":
+            for param in params:
+                param.grad = column_major(param.grad)
+        elif what == "loaded averages" and seed:
+            state = odd.state_dict()
+            for of_one in state["state"].values():
+                of_one |= {name: column_major(of_one[name]) for name in ("exp_avg", "exp_avg_sq")}
+            odd.load_state_dict(state)
+        plain.step(visible)
+        odd.step(torch.stack([visible] * 2, 1)[:, 0] if what == "visible" else visible)
+        for got, wanted in zip(values(odd), values(plain), strict=True):
+            assert torch.equal(got, wanted)
+    assert all(param is group["params"][0] for param, group in zip(params, odd.param_groups, strict=True))
+
+
 def test_it_is_an_adam_of_torch():
     optimizer = SparseGaussianAdam(groups(), 0.0, 1e-15)
     assert isinstance(optimizer, torch.optim.Adam)

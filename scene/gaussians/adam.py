@@ -52,6 +52,7 @@ class GaussianAdam(torch.optim.Adam):
 
     guard: StepGuard | None = None
     rows: Tensor | None = None
+    _any_strides = False  # of the parameters that the kernel's call takes
 
     def __init__(self, groups: list[dict], eps: float = 1e-15) -> None:
         """Take groups: dicts with `params` (a list of one Parameter), `lr` and `name`."""
@@ -152,10 +153,16 @@ class GaussianAdam(torch.optim.Adam):
         by_kernel, by_torch, kind, options = [], [], None, _common(self.defaults)
         for group in self.param_groups:
             params = group["params"]
-            own = _kind(params[0]) if len(params) == 1 and _common(group) == options else None
+            own = self._kind(params[0]) if len(params) == 1 and _common(group) == options else None
             kind = own if kind is None else kind
             (by_torch if own is None or own != kind else by_kernel).append(group)
         return by_kernel, by_torch
+
+    def _kind(self, param: Tensor) -> tuple[torch.dtype, torch.device] | None:
+        """Dtype and device of a parameter, None for one of a dtype or layout that the kernel does not take."""
+        known = param.dtype == torch.float32 or (param.dtype == torch.float64 and not param.is_cuda)
+        fits = known and param.dim() > 0 and (self._any_strides or param.is_contiguous())
+        return (param.dtype, param.device) if fits else None
 
     def _step_by_torch(self, groups: list[Group]) -> None:
         step = torch.optim.Adam.step
@@ -204,11 +211,14 @@ class GaussianAdam(torch.optim.Adam):
         return not self._has_step_hooks() and not self._groups()[1]
 
     def state_of(self, param: Tensor) -> dict[str, Tensor]:
-        """Step counter and averages of a parameter, zero before its first step."""
+        """Step counter and averages of a parameter, zero before its first step, and contiguous."""
         state = self.state[param]
         if not state:
             state["step"] = torch.zeros((), dtype=torch.float32)
             state["exp_avg"], state["exp_avg_sq"] = (zeros_beside(param.detach()) for _ in range(2))
+        for key in ("exp_avg", "exp_avg_sq"):
+            if not state[key].is_contiguous():  # as a state may be that was loaded
+                state[key] = state[key].contiguous()
         return state
 
     def take_state(self, state_dict: Any) -> list[str]:
@@ -240,6 +250,8 @@ class SparseGaussianAdam(GaussianAdam):
     Rows that were not seen keep values and averages exactly. State and state dict keep their form. `step` counts the
     steps of the tensor, and no formula uses it.
     """
+
+    _any_strides = True  # torch would step all rows
 
     @torch.no_grad()
     def step(self, visible: Tensor, N: int | None = None) -> None:
@@ -274,12 +286,6 @@ def undecorated(method: Callable) -> Callable:
     """
     hidden = isinstance(method, FunctionType) and method.__globals__.get("__name__") == "torch._compile"
     return method.__wrapped__ if hidden and "torch._dynamo" not in sys.modules else method
-
-
-def _kind(param: Tensor) -> tuple[torch.dtype, torch.device] | None:
-    """Dtype and device of a parameter, None for one of a dtype or layout that the kernel does not take."""
-    known = param.dtype == torch.float32 or (param.dtype == torch.float64 and not param.is_cuda)
-    return (param.dtype, param.device) if known and param.dim() > 0 and param.is_contiguous() else None
 
 
 def _has_gradient(groups: list[Group], name: str) -> bool:

@@ -66,11 +66,16 @@ def sparse_adam_(
 ) -> None:
     """Takes one step of sparse Adam (Mallick et al. 2024, Taming 3DGS) of one parameter's visible rows.
 
-    value, gradient and both averages: (N, ...) as for `adam_`. visible: (N,) bool. There is no bias correction.
-    Changes value, exp_avg, exp_avg_sq and `stopped`; rows that are not visible keep every bit.
+    value, gradient and both averages: (N, ...) as for `adam_`, but with any strides. visible: (N,) bool. There is no
+    bias correction. Changes value, exp_avg, exp_avg_sq and `stopped`; rows that are not visible keep every bit.
     """
-    tensors = [value], [gradient], [exp_avg], [exp_avg_sq], []
+    given = value, exp_avg, exp_avg_sq
+    packed = [tensor.contiguous() for tensor in given]  # the same tensor, unless its strides are others
+    tensors = [packed[0]], [gradient], [packed[1]], [packed[2]], []
     _adam(*tensors, [rate], beta1, beta2, eps, [columns], visible, loss, stopped, iteration)
+    for old, new in zip(given, packed, strict=True):
+        if new is not old:
+            old.copy_(new)
 
 
 def observe_(max_radii: Tensor, gradient_sums: Tensor, views: Tensor, radii: Tensor, gradient: Tensor) -> None:

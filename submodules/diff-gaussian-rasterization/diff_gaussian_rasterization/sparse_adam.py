@@ -15,7 +15,7 @@ class SparseGaussianAdam(torch.optim.Adam):
     """
 
     def __init__(self, params: Iterable, lr: float, eps: float) -> None:
-        """Take params as torch's Adam does; each group has one parameter (N, ...)."""
+        """Take params as torch's Adam does; each group has one parameter (N, ...), of any strides."""
         super().__init__(params, lr=lr, eps=eps)
 
     @torch.no_grad()
