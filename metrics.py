@@ -31,7 +31,8 @@ from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, load_dists, load_netwo
 from utils.system_utils import UserError, compute_device, run_cli
 
 CONVENTIONS = {
-    "PSNR": "dB, from one mean squared error over pixels and channels of the 8-bit images; null where infinite",
+    "PSNR": "dB, from one mean squared error over pixels and channels of the 8-bit images; null where infinite, which "
+    "no mean counts",
     "SSIM": "11x11 Gaussian window, sigma 1.5, zero padding, C1 0.01^2, C2 0.03^2, mean over pixels and channels",
     "LPIPS": "version 0.1, VGG-16, inputs in [0,1] without mapping, as in the published 3DGS tables",
     "LPIPS_vgg": "version 0.1, VGG-16, inputs mapped to [-1,1]",
@@ -218,9 +219,9 @@ def score(pairs: list[Pair], metrics: dict[str, Metric], title: str, errors: boo
 
 
 def mean(values: dict[str, float | None]) -> float | None:
-    """Return the mean over the views; None if a view has no number, or if there are no views."""
-    numbers = list(values.values())
-    return None if None in numbers or not numbers else math.fsum(numbers) / len(numbers)
+    """Return the mean over the views that have a number, as all have, or none, but for infinite PSNRs; else None."""
+    numbers = [value for value in values.values() if value is not None]
+    return math.fsum(numbers) / len(numbers) if numbers else None
 
 
 def readImages(renders_dir: str | Path, gt_dir: str | Path) -> tuple[list[torch.Tensor], list[torch.Tensor], list[str]]:
@@ -310,6 +311,8 @@ def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str,
     for name, means in results.items():
         shown = "  ".join(f"{key} {'null' if value is None else f'{value:.4f}'}" for key, value in means.items())
         print(f"{model} {name} ({len(methods[name])} views): {shown}")
+        if equal := sum(value is None for value in per_view[name]["PSNR"].values()):
+            print(f"{equal} of these views are shown exactly; their PSNR is infinite and not part of the mean")
         if worst := renders.worst_views(model, per_view[name]["PSNR"]):
             print("worst views:", ", ".join(f"{it['picture']} {it['PSNR']:.2f} dB" for it in worst))
     info = {

@@ -11,7 +11,7 @@ from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.ppisp import Ppisp
 from scene.half_images import half
-from utils.image_utils import as_float, pixels_that_count
+from utils.image_utils import as_float, mean_psnr, pixels_that_count
 from utils.loss_utils import l1_and_ssim
 
 
@@ -101,7 +101,8 @@ def mean_scores(compared: Iterable[tuple[Tensor, Tensor, Tensor | None]]) -> dic
 
     mask: (1, H, W) bool, the pixels that count, or None (utils/loss_utils.py); a view in which none counts is left out.
     render: (3, H, W) float32 in [0, 1]; target: the same, or uint8 meaning value / 255. PSNR is from one mean squared
-    error over pixels and channels of a pair, infinite if both are equal. metrics.py scores the same views from 8-bit
+    error over pixels and channels of a pair; pairs that are equal are left out of it, and without others there is no
+    `psnr`. metrics.py scores the same views from 8-bit
     PNGs, with rounded renders; the training report takes the mean of the three channels' PSNRs. Without masks it waits
     for a GPU once.
     """
@@ -113,5 +114,6 @@ def mean_scores(compared: Iterable[tuple[Tensor, Tensor, Tensor | None]]) -> dic
             l1, ssim = l1_and_ssim(image, target, mask)
             mse = pixels_that_count(image - as_float(target), mask).square().mean()
             scores.append(torch.stack([l1, -10.0 * mse.log10(), ssim]))
-        means = torch.stack(scores).double().mean(0).tolist() if scores else []
-    return dict(zip(("l1", "psnr", "ssim"), means, strict=False))
+        columns = torch.stack(scores).double().T.tolist() if scores else []
+    means = {name: mean_psnr(values) for name, values in zip(("l1", "psnr", "ssim"), columns, strict=False)}
+    return {name: value for name, value in means.items() if value is not None}

@@ -212,7 +212,8 @@ class TestScores:
     def test_equal_images_and_no_images(self):
         image = torch.full((3, 12, 12), 51 / 255)
         means = mean_scores([(image, torch.full((3, 12, 12), 51, dtype=torch.uint8), None), (image, image * 0, None)])
-        assert means["psnr"] == math.inf and means["l1"] == pytest.approx(0.1)
+        assert means["psnr"] == pytest.approx(-20 * math.log10(0.2)) and means["l1"] == pytest.approx(0.1)
+        assert mean_scores([(image, image, None)]) == {"l1": 0.0, "ssim": pytest.approx(1.0)}
         assert mean_scores([]) == {}
 
     def test_masks(self):

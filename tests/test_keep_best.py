@@ -16,6 +16,7 @@ from trainings import train_on
 
 from arguments import GroupParams, read_stored_options
 from gaussian_renderer import render
+from gaussian_renderer.scored_views import ScoredViews
 from scene.gaussians import density_rules
 from scene.readers import info
 from scene.saved_model import load_saved
@@ -104,6 +105,17 @@ def test_a_resumed_training_knows_the_best_so_far(kept, scene, tmp_path):
         torch.save(state, tmp_path / "chkpnt200.pth")
         with pytest.raises(UserError, match=words):
             train_on(scene, tmp_path / "no", *WORDS, "--keep_best", start[0], tmp_path / "chkpnt200.pth")
+
+
+def test_a_validation_photo_that_is_shown_exactly_has_no_say(scene, tmp_path, monkeypatch):
+    target = ScoredViews.target
+    exact = iter([True, False] * 99)
+    monkeypatch.setattr(ScoredViews, "compared", lambda views, camera, gaussians: (
+        image := views.image(camera, gaussians), image if next(exact) else target(views, camera), None))  # fmt: skip
+    train_on(scene, tmp_path, "-r", 4, "--eval", "--no_curve", "--iterations", 6, "--disable_viewer", "--quiet",
+             "--test_iterations", -1, "--keep_best")  # fmt: skip
+    best = json.loads((tmp_path / "model.json").read_text())["kept_best"]
+    assert best["iteration"] == 6 and 5 < best["psnr"] < 99
 
 
 @pytest.mark.parametrize(("count", "places"), [(8, (2, 6)), (31, (7, 22)), (43, (8, 24, 40))])

@@ -97,6 +97,11 @@ def test_psnr_is_scikit_images_from_one_error_over_channels():
     assert metrics.psnr(render, black) == pytest.approx(-10 * math.log10(0.04 / 3), abs=1e-9)
 
 
+def test_a_view_that_is_shown_exactly_is_no_part_of_the_mean():
+    assert metrics.mean({"a": 20.0, "b": None, "c": 30.0}) == 25.0
+    assert metrics.mean({"a": None}) is None and metrics.mean({}) is None
+
+
 def test_ssim_is_scikit_images_inside_and_zero_padded_at_the_border():
     truth = picture(3)
     render = noisy(truth, 4)

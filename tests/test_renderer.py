@@ -71,6 +71,19 @@ def _report(camera, draw, *more: object, halves: bool = False) -> dict[str, floa
     return report.training_report(None, 1, zero, zero, l1_loss, 0.0, [1], scene, draw, arguments, halves)
 
 
+@pytest.mark.parametrize("blue", [1.0, 0.5])
+def test_the_report_leaves_equal_channels_out_and_names_the_other_mean(camera, capsys, blue):
+    image = torch.ones(3, HEIGHT, WIDTH)
+    image[1:] = torch.tensor([[[0.9]], [[blue]]])
+    scores = _report(camera, lambda *_, **__: {"render": image})
+    errors = [error for error in (0.1, 1 - blue) if error]
+    assert scores["test_psnr"] == pytest.approx(sum(-20 * math.log10(e) for e in errors) / len(errors), abs=1e-4)
+    whole = -10 * math.log10(sum(e * e for e in errors) / 3)
+    assert f"(mean of the channels'; {whole:.3f} as metrics.py)" in capsys.readouterr().out
+    exact = _report(camera, lambda *_, **__: {"render": torch.ones_like(image)})
+    assert exact == {"test_l1": 0.0, "train_l1": 0.0}
+
+
 def test_scores_are_computed_without_depth(camera, monkeypatch):
     """Neither the scores nor the training report computes an inverse depth, which nothing reads."""
     asked = []

@@ -1,5 +1,9 @@
 """Scores of image pairs for the training report. metrics.py has its own, of 8-bit files with one MSE per image."""
 
+import math
+from collections.abc import Iterable
+from statistics import fmean
+
 import torch
 from torch import Tensor
 
@@ -15,6 +19,12 @@ def mse(img1: Tensor, img2: Tensor) -> Tensor:
 def psnr(img1: Tensor, img2: Tensor) -> Tensor:
     """Peak signal-to-noise ratio in dB for values in [0, 1], one per entry of the first axis: (B, ...) to (B, 1)."""
     return -10.0 * mse(img1, img2).log10()
+
+
+def mean_psnr(values: Iterable[float | None]) -> float | None:
+    """Mean of PSNRs in dB without those of equal images, which are infinite or None; None if no other is left."""
+    finite = [value for value in values if value is not None and not math.isinf(value)]
+    return fmean(finite) if finite else None
 
 
 def as_float(image: Tensor) -> Tensor:

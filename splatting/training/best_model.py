@@ -52,7 +52,7 @@ class BestModel:
         """What training says of it. at_end: the score of the last model."""
         who = f"{len(self.cameras)} validation photos ({some(self._names)})"
         if not self.iteration or at_end is None:
-            return f"--keep_best saved the last model: no pixel counts of {who}"
+            return f"--keep_best saved the last model: {who} have no PSNR, as no pixel counts, or none differs"
         than = f", {self.psnr - at_end:.2f} dB better than the last one" if self.psnr > at_end else ", the last one"
         return f"--keep_best saved the model of iteration {self.iteration}{than}, by {who}: {self.psnr:.2f} dB"
 
@@ -70,7 +70,7 @@ class BestModel:
             raise UserError(
                 "the checkpoint was trained on the photos that --keep_best would choose by; leave it out, or train anew"
             )
-        if not state.get("iteration"):
+        if not state.get("iteration") or state.get("psnr") == math.inf:  # as version 0.1 kept it
             return
         try:
             self.iteration, self.psnr = int(state["iteration"]), float(state["psnr"])

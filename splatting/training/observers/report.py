@@ -26,7 +26,7 @@ from splatting.training.objective import Losses, LossWatch
 from splatting.training.observer import Error, Observer
 from splatting.training.output_folder import view_command
 from splatting.training.run import Run
-from utils.image_utils import as_float, pixels_that_count, psnr
+from utils.image_utils import as_float, mean_psnr, mse, pixels_that_count, psnr
 from utils.loss_utils import l1_loss
 
 # Without a rate: that of the schedule is not that of iterations.
@@ -217,12 +217,14 @@ def training_report(
                 tb_writer.add_image(f"{name}_view_{camera.image_name}/{what}", image, global_step=iteration)
 
         if means := _means(scored, scene, cameras, l1_loss, show, iteration == testing_iterations[0]):
-            l1_mean, psnr_mean = means
-            tqdm.write(f"[ITER {iteration}] Evaluating {name}: L1 {l1_mean} PSNR {psnr_mean}", file=sys.stdout)
-            if tb_writer:
-                tb_writer.add_scalar(f"{name}/loss_viewpoint - l1_loss", l1_mean, iteration)
-                tb_writer.add_scalar(f"{name}/loss_viewpoint - psnr", psnr_mean, iteration)
-            scores |= {f"{name}_l1": l1_mean, f"{name}_psnr": psnr_mean}
+            line = f"[ITER {iteration}] Evaluating {name}: L1 {means['l1']}"
+            if "psnr" in means:
+                line += f" PSNR {means['psnr']} (mean of the channels'; {means.pop('whole'):.3f} as metrics.py)"
+            tqdm.write(line, file=sys.stdout)
+            for kind, title in (("l1", "l1_loss"), ("psnr", "psnr")) if tb_writer else ():
+                if kind in means:
+                    tb_writer.add_scalar(f"{name}/loss_viewpoint - {title}", means[kind], iteration)
+            scores |= {f"{name}_{kind}": value for kind, value in means.items()}
     if tb_writer:
         tb_writer.add_histogram("scene/opacity_histogram", scene.gaussians.get_opacity, iteration)
         tb_writer.add_scalar("total_points", len(scene.gaussians), iteration)
@@ -237,10 +239,11 @@ def _means(
     l1_loss: Callable[[Tensor, Tensor], Tensor],
     show: Callable[[Camera, str, Tensor], None],
     photos: bool,
-) -> list[float]:
-    """Mean L1, and mean PSNR of the channels, over the views with a pixel that counts; nothing without any.
+) -> dict[str, float]:
+    """`l1`, `psnr` by channels and `whole`, by one error over them, the means over the views with a pixel that counts.
 
-    show: gets the renders of the first views, and with `photos` their photos.
+    PSNRs of equal images or channels are left out, and so is what no view has. show: gets the renders of the first
+    views, and with `photos` their photos.
     """
     scores = []
     for index, camera in enumerate(cameras):
@@ -249,12 +252,17 @@ def _means(
             continue
         target = as_float(target)
         counted = [pixels_that_count(x, mask) for x in (image, target)]
-        scores.append((l1_loss(*counted).item(), psnr(*counted).mean().item()))
+        of_channels = psnr(*counted).flatten()
+        own = of_channels[~of_channels.isinf()]
+        whole = -10.0 * mse(*counted).mean().log10()
+        scores.append((l1_loss(*counted).item(), own.mean().item() if len(own) else None, whole.item()))
         if index < SHOWN:
             show(camera, "render", image)
             if photos:
                 show(camera, "ground_truth", target)
-    return [sum(values) / len(values) for values in zip(*scores, strict=True)]
+    columns = dict(zip(("l1", "psnr", "whole"), zip(*scores, strict=True), strict=False))
+    means = {name: mean_psnr(values) for name, values in columns.items()}
+    return {name: value for name, value in means.items() if value is not None}
 
 
 EVERY = 100  # iterations between scorings, at least
@@ -287,7 +295,7 @@ class Target(Observer):
             run.scene.prefetch(self._cameras)
             psnr = self._views.scores(self._cameras, run.gaussians).get("psnr")
             self._psnr = run.gaussians.shards.ranks.shared(psnr)
-        if self._psnr is None:  # masks leave no pixel of the views
+        if self._psnr is None:  # masks leave no pixel of the views, or all are shown exactly
             return
         step.record = (step.record or {}) | {"test_views_psnr": self._psnr}
         if self._psnr >= target:
@@ -300,7 +308,7 @@ class Target(Observer):
     def ended(self, error: Error) -> None:
         target = self._run.opt.target_psnr
         if error is None and not (self._psnr or 0.0) >= target:
-            what = "have no pixel to score" if self._psnr is None else f"have {self._psnr:.3f} dB"
+            what = "have no PSNR" if self._psnr is None else f"have {self._psnr:.3f} dB"
             self._run.log.tell(f"Test views {what}, and --target_psnr {target:g} was not reached")
 
 

@@ -79,7 +79,7 @@ class KeepBest(Observer):
         with run.clock.paused("scoring"):
             run.scene.prefetch(self._cameras)
             self._psnr = self._views.scores(self._cameras, run.gaussians).get("psnr")
-            if self._psnr is not None:  # masks may leave no pixel of the views
+            if self._psnr is not None:  # masks may leave no pixel of the views, or all are shown exactly
                 run.best.offer(run.gaussians, step.iteration, self._psnr)
                 step.record = (step.record or {}) | {"validation_psnr": self._psnr}
         if step.last:
