@@ -1,6 +1,7 @@
 """Depth maps: decoding, the choice of reliable ones, and the fit in depth_params.json."""
 
 import json
+import re
 import struct
 import subprocess
 import sys
@@ -22,11 +23,20 @@ from gaussian_renderer import render
 from scene import Scene
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
-from scene.readers import depth_maps
+from scene.readers import depth_maps, depth_scale
 from scene.readers.colmap import read_model, read_model_of_kind
-from scene.readers.depth_maps import DepthMap, Metric, map_size, read_values, resize, with_depth_maps
+from scene.readers.depth_maps import (
+    DepthMap,
+    Metric,
+    inverses,
+    map_names,
+    map_size,
+    read_values,
+    resize,
+    with_depth_maps,
+)
 from scene.readers.depth_scale import fit_image, fit_line, make_depth_params, sightings
-from scene.readers.info import CameraInfo
+from scene.readers.info import CameraInfo, SceneInfo
 from splatting.training.objective import Objective
 from utils import make_depth_scale
 from utils.loss_utils import inverse_depth_loss
@@ -195,11 +205,82 @@ def test_blender_maps_are_found_by_name_or_by_path(blender_scene):
         _save(np.full((30, 40), 256 * (index + 1), np.uint16), blender_scene / f"depths/r_{index}.png")
     depths = _depths(blender_scene, hold_out=True)
     assert depths["r_1"].decode((4, 4)).unique().tolist() == [1.0]  # 512 / 512
-    with pytest.raises(UserError, match="the same depth map: .*r_0.png.*sub-folders"):
-        _depths(blender_scene)
+    with pytest.raises(UserError, match="4 of 6 depth maps are missing: .*depths/train/r_0.png"):
+        _depths(blender_scene)  # nobody knows whether they belong to train or test
     for path in [*blender_scene.glob("train/*.png"), *blender_scene.glob("test/*.png")]:
-        _save(np.zeros((30, 40), np.uint16), blender_scene / "depths" / path.relative_to(blender_scene))
+        _save(np.ones((30, 40), np.uint16), blender_scene / "depths" / path.relative_to(blender_scene))
     assert all(depth.path.parent.name in ("train", "test") for depth in _depths(blender_scene).values())
+
+
+@pytest.mark.parametrize("prefix", ["", "../images/", "{}/images/"])
+@pytest.mark.parametrize("place", ["{}.png", "{}.jpg.png", "images/{}.png"])
+def test_maps_are_found_below_their_folder_and_a_photo_is_no_map(tmp_path, prefix, place):
+    """Grey photos, which could pass for maps."""
+    names, cameras = [f"{side}/1" for side in ("left", "right")], []
+    for name in names:
+        photo = _save(np.full((30, 40), 9, np.uint8), tmp_path / "images" / f"{name}.jpg")
+        named = f"{prefix.format(tmp_path)}{name}.jpg"
+        cameras.append(CameraInfo(0, np.eye(3), np.zeros(3), 1.0, 1.0, None, photo, named, width=40, height=30))
+        _save(np.full((30, 40), 512, np.uint16), tmp_path / "depths" / place.format(name))
+        photo.with_suffix(".png").hardlink_to(photo)
+    info = SceneInfo(None, cameras, [], {"radius": 1.0, "translate": np.zeros(3)}, None)
+    found = [view.depth.path for view in with_depth_maps(info, tmp_path, "depths").train_cameras]
+    assert found == [tmp_path / "depths" / place.format(name) for name in names]
+    with pytest.raises(UserError, match="2 of 2 depth maps are missing: .*/images/.*left/1.png"):
+        with_depth_maps(info, tmp_path, "images")
+    if place == "{}.png":
+        (tmp_path / "sparse" / "0").mkdir(parents=True)
+        model = SimpleNamespace(images=[SimpleNamespace(name=camera.image_name) for camera in cameras])
+        assert depth_scale._maps(tmp_path, tmp_path / "depths", model, None) == found
+        assert depth_scale._maps(tmp_path, tmp_path / "images", model, None) == [None, None]
+
+
+@pytest.mark.parametrize("empty", [0.0, -2.0, np.nan, np.inf, -np.inf, 1e-310])
+@pytest.mark.parametrize("metric", [True, False])
+def test_maps_without_a_depth_are_named_and_left_out(blender_scene, empty, metric, capsys):
+    def save(index: int, value: float) -> None:
+        stem = blender_scene / "depths" / f"r_{index}"
+        if metric:
+            stem.parent.mkdir(exist_ok=True)
+            np.save(f"{stem}.npy", np.full((30, 40), float(value)))
+        else:
+            _save(np.full((30, 40), 0 if value != 5 else 5, np.uint16), Path(f"{stem}.png"))
+
+    for index in range(4):
+        save(index, empty if index == 1 else 5)
+    depths = _depths(blender_scene, hold_out=True)
+    assert [name for name, depth in depths.items() if depth is None] == ["r_1"]
+    assert re.search(r"1 of 4 depth maps in .*depths have no pixel .* left out: r_1\n", capsys.readouterr().err)
+    for index in range(4):
+        save(index, empty)
+    with pytest.raises(UserError, match="4 of 4 depth maps in .*depths have no pixel with a depth above 0"):
+        _depths(blender_scene, hold_out=True)
+
+
+@pytest.mark.parametrize("shape", [(0, 0), (1, 1), (1, 40), (30, 1), (0, 40)])
+@pytest.mark.parametrize("suffix", [".npy", ".png"])
+def test_maps_of_almost_no_pixels_are_refused(blender_scene, shape, suffix):
+    if suffix == ".png" and 0 in shape:
+        return
+    (blender_scene / "depths").mkdir()
+    for index in range(4):
+        size, stem = shape if index == 2 else (30, 40), blender_scene / "depths" / f"r_{index}"
+        if suffix == ".npy":
+            np.save(f"{stem}.npy", np.ones(size))
+        else:
+            _save(np.ones(size, np.uint16), stem.with_suffix(suffix))
+    said = (
+        f"depth map .*r_2{suffix} has only {shape[1]} x {shape[0]} pixels|r_2.npy has .* and its photo has other sides"
+    )
+    with pytest.raises(UserError, match=said):
+        _depths(blender_scene, hold_out=True)
+
+
+def test_one_pixel_at_the_camera_does_not_outweigh_the_map():
+    distances = np.full((30, 40), 4.0)
+    distances[3, 4], distances[5, 6], distances[7, 8] = 1e-310, 1e-5, 1e-2
+    found = inverses(distances)
+    assert np.isnan(found[3, 4]) and np.isnan(found[5, 6]) and found[7, 8] == 100 and np.nansum(found == 0.25) == 1197
 
 
 # The fit
@@ -292,12 +373,13 @@ def test_metric_maps_are_distances_with_gaps(tmp_path, kind):
         known[2 * place, 11] = False
     _save_metric(distances, tmp_path / "a.b", kind)
     units = Metric.of(tmp_path)._replace(scale=2.0)
-    found = units.map_of(tmp_path / "a.b").decode((12, 9))[0].numpy()
+    (place,) = tmp_path.glob("a.b.*")
+    assert place.name in map_names(units)("a.b.jpg") and place.name in map_names(units)("a.b")
+    found = units.map_of(place).decode((12, 9))[0].numpy()
     np.testing.assert_array_equal(np.isnan(found[:, 11]), ~known[:, 11])
     inside = np.isfinite(found)
     assert inside.mean() > 0.8
     np.testing.assert_allclose(found[inside], 1 / (2 * distances[inside]), rtol=1e-6)
-    assert units.map_of(tmp_path / "a") is None
     for file in {*tmp_path.glob("a.b.*")} - {*tmp_path.glob("*.png")}:
         file.write_bytes(file.read_bytes()[:-1])
         with pytest.raises(UserError, match="make it again"):

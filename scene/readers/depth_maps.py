@@ -5,9 +5,11 @@ metres, and 16-bit PNGs beside a file METRIC, which tells metres.
 """
 
 import json
+import os
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, NamedTuple
@@ -17,12 +19,14 @@ import torch
 from torch import Tensor
 
 from scene.images.decode import picture_size
+from scene.images.side_files import SideFiles
 from scene.readers.colmap import find_model
 from scene.readers.info import CameraInfo, SceneInfo
 from splatting.files.folders import cache_folder
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.listing import some
-from splatting.files.plain_files import plain, plain_text
+from splatting.files.plain_files import plain, plain_text, relative_to
+from splatting.host.machine import threads
 from utils.system_utils import UserError
 
 PARAMS = "depth_params.json"
@@ -31,6 +35,9 @@ STEP, SCALE = "metres_per_step", "units_per_metre"  # of the values of PNGs, and
 COLMAP_UNIT = 65536.0  # of a map's values; depth_scale.py divides by 65535; the reference uses both, too
 BLENDER_UNIT = 512.0
 _FLOATS = ".npy", ".pfm"
+NEAREST_PART = 1e-4  # of a map's median distance, which real maps do not reach
+LEAST = 1e-12  # world units; distances below it are damaged
+SMALLEST = 64  # pixels of a photo for a map's
 RELIABLE = 5.0  # largest factor between a trusted scale and the scene's median scale
 _MAKE = "python utils/make_depth_scale.py --base_dir {scene} --depths_dir {depths}"
 
@@ -54,6 +61,11 @@ class DepthMap:
         values = read_values(self.path) / self.unit
         return fitted(inverses(values) if self.metric else values, size, self.scale, self.offset)
 
+    def has_depth(self) -> bool:
+        """Whether any value of the file tells a depth. UserError for a file that cannot be read."""
+        values = read_values(self.path) / self.unit
+        return bool((np.isfinite(inverses(values)) if self.metric else values > 0).any())
+
 
 class Metric(NamedTuple):
     """The units of a folder of metric maps: metres of a PNG's step, and units of the scene for each metre."""
@@ -67,7 +79,7 @@ class Metric(NamedTuple):
 
         Metric are .npy and .pfm in a folder without a PNG, and PNGs beside a file METRIC that tells their step.
         """
-        path, suffixes = folder / METRIC, {file.suffix for file in folder.rglob("*")}
+        path, suffixes = folder / METRIC, {file.suffix.lower() for file in folder.rglob("*")}
         try:
             told = json.loads(plain_text(path)) if path.is_file() else {}
             step, scale = (None if told.get(key) is None else float(told[key]) for key in (STEP, SCALE))
@@ -78,18 +90,26 @@ class Metric(NamedTuple):
         has_floats = not suffixes.isdisjoint(_FLOATS) and ".png" not in suffixes
         return cls(step, scale) if has_floats or step is not None else None
 
-    def map_of(self, stem: Path) -> DepthMap | None:
-        """The map of a photo in units of the scene, by its path without suffix; None where there is no file."""
-        for suffix, step in ((".png", self.step), *((suffix, 1.0) for suffix in _FLOATS)):
-            path = stem.with_name(stem.name + suffix)
-            if step is not None and path.is_file():
-                return DepthMap(path, 1 / (step * (self.scale or 1.0)), metric=True)
-        return None
+    def map_of(self, path: Path) -> DepthMap:
+        """The map in a file, in units of the scene."""
+        step = self.step if path.suffix.lower() == ".png" else 1.0
+        return DepthMap(path, 1 / (step * (self.scale or 1.0)), metric=True)
+
+
+def map_names(metric: Metric | None) -> Callable[[str], list[str]]:
+    """File names of a map for a photo's name: with the map's suffix in place of the photo's, or behind it."""
+    suffixes = (*([".png"] if metric is None or metric.step is not None else []), *(_FLOATS if metric else ()))
+    return lambda name: [base + suffix for base in (os.path.splitext(name)[0], name) for suffix in suffixes]
 
 
 def inverses(distances: np.ndarray) -> np.ndarray:
-    """1 / distances, and NaN where a distance is not a number above 0."""
-    known = np.isfinite(distances) & (distances > 0)
+    """1 / distances, and NaN where a distance is not a number above 0.
+
+    NaN also below NEAREST_PART of the median distance, as one such pixel would outweigh all others.
+    """
+    known = np.isfinite(distances) & (distances > LEAST)
+    if known.any():
+        known &= distances >= NEAREST_PART * np.median(distances[known])
     return np.where(known, 1 / np.where(known, distances, 1.0), np.nan)
 
 
@@ -133,14 +153,51 @@ def with_depth_maps(info: SceneInfo, scene: Path, depths: str) -> SceneInfo:
             f"maps are not ({some(undistorted)}); undistort the scene with `colmap image_undistorter`, and make "
             "maps of the undistorted photos"
         )
-    if metric := Metric.of(folder):
-        cameras = _with_metric_maps(info.train_cameras, scene, folder, metric)
-    elif (scene / "sparse").is_dir():
-        cameras = _with_colmap_maps(info.train_cameras, scene, folder)
+    metric, is_colmap = Metric.of(folder), (scene / "sparse").is_dir()
+    files = _files(info.train_cameras, scene, folder, is_colmap)
+    paths = [files.find(place, map_names(metric)) for place in range(len(info.train_cameras))]
+    files.tell_elsewhere("depth maps")
+    if metric:
+        cameras = _with_metric_maps(info.train_cameras, paths, scene, folder, metric)
     else:
-        cameras = [with_map(c, _blender_file(c, scene, folder), None, BLENDER_UNIT) for c in info.train_cameras]
-    _check_files([camera.depth.path for camera in cameras if camera.depth])
-    return replace(info, train_cameras=cameras)
+        # A map that is missing is named as it should be called.
+        paths = [
+            path or folder / f"{os.path.splitext(name)[0]}.png" for path, name in zip(paths, files.names, strict=True)
+        ]
+        if is_colmap:
+            cameras = _with_colmap_maps(info.train_cameras, paths, scene, folder)
+        else:
+            pairs = zip(info.train_cameras, paths, strict=True)
+            cameras = [with_map(camera, path, None, BLENDER_UNIT) for camera, path in pairs]
+    _check_files([camera for camera in cameras if camera.depth])
+    return replace(info, train_cameras=_with_depth(cameras, folder))
+
+
+def _files(cameras: Sequence[CameraInfo], scene: Path, folder: Path, is_colmap: bool) -> SideFiles:
+    photos = [Path(camera.image_path) for camera in cameras]
+    names = [
+        camera.image_name if is_colmap or not camera.image_path else relative_to(photo, scene).as_posix()
+        for camera, photo in zip(cameras, photos, strict=True)
+    ]
+    return SideFiles(folder, names, photos, scene)
+
+
+def _with_depth(cameras: list[CameraInfo], folder: Path) -> list[CameraInfo]:
+    """The views without the maps that tell no depth, which a message names. UserError if all are such."""
+    views = [camera for camera in cameras if camera.depth]
+    with ThreadPoolExecutor(threads()) as pool:
+        told = pool.map(lambda view: view.depth.has_depth(), views)
+        empty = [view for view, has_depth in zip(views, told, strict=True) if not has_depth]
+    if not empty:
+        return cameras
+    said = f"{len(empty)} of {len(views)} depth maps in {folder} have no pixel with a depth above 0"
+    if len(empty) == len(views):
+        raise UserError(f"{said} ({some([str(view.depth.path) for view in empty])}); make them again, or leave -d out")
+    print(f"{said} and are left out: {some([view.image_name for view in empty])}", file=sys.stderr)
+    left = set(map(id, empty))
+    return [
+        replace(view, depth=None, depth_path="", depth_params=None) if id(view) in left else view for view in cameras
+    ]
 
 
 def with_map(camera: CameraInfo, path: str | Path, params: Mapping[str, float] | None, unit: float) -> CameraInfo:
@@ -156,10 +213,10 @@ def with_map(camera: CameraInfo, path: str | Path, params: Mapping[str, float] |
 def read_values(path: Path) -> np.ndarray:
     """Values (H, W) float64 of a .npy, a .pfm or a grey image file of 8 or 16 bits, unscaled. UserError for others."""
     try:
-        if path.suffix == ".npy":
+        if path.suffix.lower() == ".npy":
             return _array(path).astype(np.float64)
         with open_image(path) as image:
-            if path.suffix == ".pfm":
+            if path.suffix.lower() == ".pfm":
                 return np.asarray(image, dtype=np.float64)
             if image.mode not in ("L", "I;16", "I;16B", "I"):
                 if _is_16_bit_color(path):
@@ -188,10 +245,10 @@ def _array(path: Path) -> np.ndarray:
 
 def map_size(path: Path) -> tuple[int, int]:
     """Size (width, height) of a map, from its file's header. UserError where that tells of a broken file."""
-    if path.suffix not in _FLOATS:
+    if path.suffix.lower() not in _FLOATS:
         return picture_size(path)
     try:
-        if path.suffix == ".npy":
+        if path.suffix.lower() == ".npy":
             return _array(path).shape[::-1]
         with open_image(path) as image:
             if path.stat().st_size < image.tile[0][2] + 4 * image.width * image.height:
@@ -233,7 +290,9 @@ def sample(values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return map_coordinates(values, [y, x], order=1, mode="nearest")
 
 
-def _with_colmap_maps(cameras: Sequence[CameraInfo], scene: Path, folder: Path) -> list[CameraInfo]:
+def _with_colmap_maps(
+    cameras: Sequence[CameraInfo], paths: Sequence[Path], scene: Path, folder: Path
+) -> list[CameraInfo]:
     path = find_model(scene)[0] / PARAMS
     make = _MAKE.format(scene=scene, depths=folder)
     if not path.is_file():
@@ -241,9 +300,9 @@ def _with_colmap_maps(cameras: Sequence[CameraInfo], scene: Path, folder: Path) 
     table = _read_params(path, make)
     found = []
     unknown, unreliable = [], []
-    for camera in cameras:
+    for camera, map_path in zip(cameras, paths, strict=True):
         name = Path(camera.image_name).with_suffix("").as_posix()
-        named = with_map(camera, folder / f"{name}.png", table[name], COLMAP_UNIT) if name in table else camera
+        named = with_map(camera, map_path, table[name], COLMAP_UNIT) if name in table else camera
         if not named.depth:
             (unreliable if name in table else unknown).append(camera.image_name)
         found.append(named if named.depth else camera)
@@ -261,16 +320,15 @@ def _with_colmap_maps(cameras: Sequence[CameraInfo], scene: Path, folder: Path) 
     return found
 
 
-def _with_metric_maps(cameras: Sequence[CameraInfo], scene: Path, folder: Path, metric: Metric) -> list[CameraInfo]:
+def _with_metric_maps(
+    cameras: Sequence[CameraInfo], paths: Sequence[Path | None], scene: Path, folder: Path, metric: Metric
+) -> list[CameraInfo]:
     is_colmap, found = (scene / "sparse").is_dir(), []
     if is_colmap and metric.scale is None:
         make = _MAKE.format(scene=scene, depths=folder)
         raise UserError(f"no {SCALE} in {folder / METRIC}, which metric maps need; create it with `{make}`")
-    for camera in cameras:
-        photo, name = Path(camera.image_path), Path(camera.image_name)
-        places = [photo.relative_to(scene)] if photo.is_relative_to(scene) else []
-        stems = [name.with_suffix("")] if is_colmap else [*(p.with_suffix("") for p in places), name]
-        depth = next(filter(None, (metric.map_of(folder / stem) for stem in stems)), None)
+    for camera, path in zip(cameras, paths, strict=True):
+        depth = metric.map_of(path) if path else None
         found.append(replace(camera, depth_path=str(depth.path), depth=depth) if depth else camera)
         width, height = map_size(depth.path) if depth else (camera.width, camera.height)
         if abs(width * camera.height - height * camera.width) > max(camera.width, camera.height):
@@ -303,17 +361,8 @@ def _read_params(path: Path, make: str) -> dict[str, dict[str, float]]:
     return {name: {**entry, "med_scale": median} for name, entry in params.items()}
 
 
-def _blender_file(camera: CameraInfo, scene: Path, folder: Path) -> Path:
-    """File named by the photo's path, which is unique, else by its name."""
-    photo = Path(camera.image_path)
-    if photo.is_relative_to(scene):
-        by_path = folder / photo.relative_to(scene).with_suffix(".png")
-        if by_path.is_file():
-            return by_path
-    return folder / f"{camera.image_name}.png"
-
-
-def _check_files(paths: Sequence[Path]) -> None:
+def _check_files(cameras: Sequence[CameraInfo]) -> None:
+    paths = [camera.depth.path for camera in cameras]
     missing = [str(path) for path in paths if not path.is_file()]
     if missing:
         raise UserError(
@@ -325,5 +374,9 @@ def _check_files(paths: Sequence[Path]) -> None:
             f"several training photos have the same depth map: {some(shared)}; put a map for each into the folder, in "
             "the sub-folders of the photos (with COLMAP, give photos names that differ by more than the suffix)"
         )
-    for path in paths:
-        map_size(path)
+    for camera, (width, height) in zip(cameras, map(map_size, paths), strict=True):
+        if min(width, height) < 2 or width * SMALLEST < camera.width or height * SMALLEST < camera.height:
+            raise UserError(
+                f"the depth map {camera.depth.path} has only {width} x {height} pixels, and its photo {camera.width} x "
+                f"{camera.height}; make it larger"
+            )

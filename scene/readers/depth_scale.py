@@ -7,8 +7,9 @@ import numpy as np
 from tqdm import tqdm
 
 from scene.colmap_loader import Image, Points, qvec2rotmat
+from scene.images.side_files import SideFiles
 from scene.readers.colmap import AGAIN, ColmapModel, find_model, read_model_of_kind
-from scene.readers.depth_maps import METRIC, PARAMS, SCALE, STEP, Metric, inverses, read_values, sample
+from scene.readers.depth_maps import METRIC, PARAMS, SCALE, STEP, Metric, inverses, map_names, read_values, sample
 from utils.system_utils import UserError, atomic_write
 
 _WITH_POINTS = "export the model with the 2D points of its photos, or train without depth maps"
@@ -26,11 +27,14 @@ def make_depth_params(scene: Path, depths: Path, model_type: str) -> tuple[dict[
     """
     folder, model = _model(scene, model_type)
     table, most = {}, 0
-    for image in tqdm(model.images, desc="Fitting depth maps", unit="map"):
+    paths = _maps(scene, depths, model, None)
+    for image, path in tqdm(
+        zip(model.images, paths, strict=True), total=len(paths), desc="Fitting depth maps", unit="map"
+    ):
         pixels, z = sightings(image, model.points, f"{folder} as .{model_type}")
         name = Path(image.name).with_suffix("").as_posix()
-        path, camera = depths / f"{name}.png", model.cameras[image.camera_id]
-        if path.is_file():
+        camera = model.cameras[image.camera_id]
+        if path is not None:
             scale, offset = fit_image(pixels, z, (camera.width, camera.height), read_values(path) / UNIT)
             table[name] = {"scale": scale, "offset": offset}
             most = max(most, len(z))
@@ -55,10 +59,12 @@ def make_metric_scale(scene: Path, depths: Path, metric: Metric, model_type: str
     of maps and of registered photos. UserError as above, and for fewer than MIN_POINTS points in all maps.
     """
     folder, model = _model(scene, model_type)
-    found = []
-    for image in tqdm(model.images, desc="Fitting depth maps", unit="map"):
-        depth = metric._replace(scale=None).map_of(depths / Path(image.name).with_suffix(""))
-        if depth is not None:
+    found, paths = [], _maps(scene, depths, model, metric)
+    for image, path in tqdm(
+        zip(model.images, paths, strict=True), total=len(paths), desc="Fitting depth maps", unit="map"
+    ):
+        if path is not None:
+            depth = metric._replace(scale=None).map_of(path)
             pixels, z = sightings(image, model.points, f"{folder} as .{model_type}")
             camera, values = model.cameras[image.camera_id], inverses(read_values(depth.path) / depth.unit)
             seen, z = _samples(pixels, z, (camera.width, camera.height), values)
@@ -74,6 +80,13 @@ def make_metric_scale(scene: Path, depths: Path, metric: Metric, model_type: str
     with atomic_write(depths / METRIC) as path:
         path.write_text(json.dumps(told | {SCALE: scale}, indent=2) + "\n", encoding="utf-8")
     return scale, float(np.median(np.abs(ratios / scale - 1))), len(found), len(model.images)
+
+
+def _maps(scene: Path, depths: Path, model: ColmapModel, metric: Metric | None) -> list[Path | None]:
+    """The files of the maps of a model's photos, found as training finds them."""
+    names = [image.name for image in model.images]
+    files = SideFiles(depths, names, [scene / "images" / name for name in names], scene)
+    return [files.find(place, map_names(metric)) for place in range(len(names))]
 
 
 def _model(scene: Path, model_type: str) -> tuple[Path, ColmapModel]:
