@@ -66,8 +66,13 @@ def test_learning_rate_delay_and_zero_rates():
     assert rate(50) == pytest.approx(0.1 * (0.2 + 0.8 * math.sin(math.pi / 4)))
     assert rate(100) == rate(500) == pytest.approx(0.1)
     assert {get_expon_lr_func(0.0, 0.0, max_steps=10)(t) for t in (0, 5, 10, 20)} == {0.0}
-    half = get_expon_lr_func(0.1, 0.0, max_steps=10)
-    assert (half(0), half(5), half(10)) == (pytest.approx(0.1), 0.0, 0.0)
+
+
+@pytest.mark.parametrize(("first", "last"), [(0.1, 0.0), (0.0, 0.1)])
+def test_a_rate_that_begins_or_ends_at_zero_is_linear(first, last):
+    """Powers would switch it off from the first step on, or until the last."""
+    rate = get_expon_lr_func(first, last, max_steps=10)
+    assert [rate(t) for t in (0, 5, 10, 20)] == pytest.approx([first, 0.05, last, last])
 
 
 def test_stdout_lines_are_stamped_once_and_seeds_set(capsys, monkeypatch):

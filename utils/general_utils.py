@@ -60,7 +60,7 @@ def strip_symmetric(sym: Tensor) -> Tensor:
 def get_expon_lr_func(
     lr_init: float, lr_final: float, lr_delay_steps: int = 0, lr_delay_mult: float = 1.0, max_steps: int = 1_000_000
 ) -> Callable[[int], float]:
-    """Learning rate by step: log-linear from lr_init to lr_final at max_steps, constant after.
+    """Learning rate by step: log-linear from lr_init to lr_final at max_steps, constant after; linear if one is 0.
 
     With lr_delay_steps, a quarter sine from lr_delay_mult up to 1 damps the start. The rate is 0 before step 0.
     """
@@ -73,7 +73,8 @@ def get_expon_lr_func(
             part = min(max(step / lr_delay_steps, 0.0), 1.0)
             delay = lr_delay_mult + (1 - lr_delay_mult) * float(np.sin(0.5 * np.pi * part))
         t = min(step / max_steps, 1.0)
-        # Powers instead of exp of logs, so that rates of zero need no special case.
+        if lr_init == 0 or lr_final == 0:  # of which powers would be 0 from the first step on, or until the last
+            return delay * (lr_init * (1 - t) + lr_final * t)
         return delay * lr_init ** (1 - t) * lr_final**t
 
     return rate
