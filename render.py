@@ -33,6 +33,7 @@ from tqdm import tqdm
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, read_cfg_args, warn_of_background
 from gaussian_renderer.blending import PLANES, view_planes
 from gaussian_renderer.memory_errors import memory_errors_explained
+from gaussian_renderer.rays import check_views
 from gaussian_renderer.scored_views import ScoredViews, fitted_views
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
@@ -196,6 +197,7 @@ def _loaded(
         scene.loaded_iter = f"{scene.loaded_iter}_{dataset.other_scene}"
     if len(scene.gaussians) == 0:
         raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
+    check_views(pipeline, (*scene.getTrainCameras(), *scene.getTestCameras()))
     return scene, torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
 
 

@@ -25,7 +25,7 @@ from splatting.training.launch import add_launch_options, launch_options
 from splatting.training.loop import run_training
 from splatting.training.observers.report import training_report
 from splatting.training.observers.standard import standard_observers
-from splatting.training.output_folder import new_folder, own_folder
+from splatting.training.output_folder import new_folder, own_folder, records_kept
 from splatting.training.run import Run
 from splatting.viewer.server import checked_address
 from utils.general_utils import safe_state
@@ -51,7 +51,7 @@ def train(
     # No process of several can draw a view for the remote viewer by itself.
     address = None if launch.disable_viewer or run.group.several else (launch.ip, launch.port)
     # Write nothing before every input check has passed: a mistyped option must not overwrite a finished model.
-    with own_folder(dataset.model_path), network_gui.listening(address):
+    with own_folder(folder := dataset.model_path), records_kept(folder), network_gui.listening(address):
         writer = prepare_output_and_logger(run.options, **run.entries) if run.group.first else None
         run.begin()
         run_training(run, standard_observers(run, writer, training_report))

@@ -147,8 +147,8 @@ class OptimizationParams(OptionTable):
         Option("position_lr_init", 0.00016, origin="paper", check=at_least(0),
             help="learning rate of positions at the start, times the scene extent"),
         Option("position_lr_final", 0.0000016, origin="paper", check=at_least(0),
-            help="learning rate of positions at position_lr_max_steps, times the scene extent. Between both it falls evenly "
-                 "in its logarithm; linearly where one is 0, as do exposure_lr and depth_l1_weight"),
+            help="learning rate of positions at position_lr_max_steps, times the scene extent. Between both it falls "
+                 "evenly in its logarithm; linearly where one is 0, as do exposure_lr and depth_l1_weight"),
         Option("position_lr_delay_mult", 0.01, check=at_least(0),
             help="no effect, there are no delay steps; kept for old commands"),
         Option("position_lr_max_steps", 30_000, check=at_least(1),

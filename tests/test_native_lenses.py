@@ -137,3 +137,21 @@ def test_a_training_and_its_renders_have_the_photos(tmp_path, monkeypatch, capsy
 )
 def test_distortions_of_real_lenses_are_taken(model, params):
     assert pinhole_of(Lens(model, tuple(map(float, params)), 640, 480), "a.png") is None
+
+
+SHORT = ("OPENCV_FISHEYE", (12.0, 12.0, *CENTER, 0, 0, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("lens", "words", "size"),
+    [(SHORT, ("-r", 4), "24 x 16"), (SHORT, ("--resolution_schedule", "pyramid"), "48 x 32"),
+     (SHORT, ("--time_budget", 9), "48 x 32"), (PANORAMA, ("-r", 4), "24 x 16")],
+)  # fmt: skip
+def test_rays_that_are_not_there_leave_a_finished_model_as_it_was(tmp_path, lens, words, size):
+    make_colmap_scene(tmp_path / "scene", model=lens[0], params=lens[1], views=3)
+    given = ["-s", tmp_path / "scene", "-m", tmp_path / "out", "--iterations", 1, "--disable_viewer", "--quiet"]
+    train.main([*map(str, given)])
+    before = {file: file.read_bytes() for file in (tmp_path / "out").rglob("*") if file.is_file()}
+    with pytest.raises(UserError, match=f"cannot be drawn at {size} pixels, as projection='ray' needs tiles"):
+        train.main([*map(str, (*given, "--projection", "ray", *words))])
+    assert before == {file: file.read_bytes() for file in (tmp_path / "out").rglob("*") if file.is_file()}

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from splatting.files.folders import locked, remove_temporary_files
-from splatting.training.output_folder import own_folder
+from splatting.training.output_folder import own_folder, records_kept
 from utils.system_utils import UserError, atomic_write
 
 ROOT = Path(__file__).parents[1]
@@ -109,3 +109,18 @@ def test_points_that_were_missing_before_a_resumed_run_are_no_news(tmp_path, cap
         for name in ("cfg_args", "model.json", "cameras.json"):
             (tmp_path / name).touch()
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("saves", [False, True])
+def test_records_stay_with_the_model_that_is_saved(tmp_path, saves):
+    ply = tmp_path / "point_cloud" / "iteration_7" / "point_cloud.ply"
+    for path in (ply, tmp_path / "cfg_args"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("old")
+    with pytest.raises(ValueError, match="odd"), records_kept(str(tmp_path)):
+        (tmp_path / "cfg_args").write_text("new")
+        if saves:
+            ply.with_name("point_cloud.ply").unlink()
+            (tmp_path / "chkpnt3.pth").touch()
+        raise ValueError("odd")
+    assert (tmp_path / "cfg_args").read_text() == ("new" if saves else "old")

@@ -13,8 +13,9 @@ from splatting.distributed.ranks import ranks
 from splatting.files.folders import locked, remove_temporary_files
 from splatting.files.listing import some
 from splatting.host.start import typed_command
-from utils.system_utils import mkdir_p
+from utils.system_utils import atomic_write, mkdir_p
 
+_RECORDS = ("cfg_args", "model.json", "cameras.json", "train_log.json", "error_vs_time.csv", "schedule.json")
 _INPUTS = ("cfg_args", "model.json", "cameras.json", "input.ply")
 
 
@@ -29,6 +30,29 @@ def view_command(model_path: str, iteration: int | None = None) -> str:
     older = iteration is not None and max(saves_in(Path(model_path)), default=iteration) > iteration
     which = f" --iteration {iteration}" if older else ""
     return f"{typed_command('view.py')} -m {shlex.quote(model_path)}{which}"
+
+
+@contextlib.contextmanager
+def records_kept(model_path: str) -> Iterator[None]:
+    """Put the records of a saved model back, if an error ends a training of its folder before that has saved another.
+
+    A photo that cannot be read, for one, is found when it is needed. Of several ranks, the first does so for all.
+    """
+    folder = Path(model_path)
+    saves = _stamps(folder) if ranks().first else {}
+    kept = {name: (folder / name).read_bytes() for name in _RECORDS if saves and (folder / name).is_file()}
+    try:
+        yield
+    except BaseException:
+        if kept and _stamps(folder) == saves:
+            for name, content in kept.items():
+                with atomic_write(folder / name) as temporary:
+                    temporary.write_bytes(content)
+        raise
+
+
+def _stamps(folder: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in saves_in(folder).values()}
 
 
 @contextlib.contextmanager

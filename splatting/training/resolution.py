@@ -1,6 +1,7 @@
 """Coarse to fine: views that are smaller at first, by how far the schedule is (--resolution_schedule)."""
 
 import argparse
+from collections.abc import Callable
 
 import torch
 
@@ -74,6 +75,13 @@ def smaller(camera: Camera, factor: float) -> tuple[int, int]:
     sides = camera.image_width, camera.image_height
     factor = max(1.0, min(factor, min(sides) / LEAST))
     return tuple(max(1, round(side / factor)) for side in sides)
+
+
+def smallest(opt: argparse.Namespace, schedule: Schedule) -> Callable[[Camera], tuple[int, int]]:
+    """A function that gives the smallest size (width, height) in which a view may train. A clock may choose PYRAMID."""
+    by_clock = isinstance(schedule, DecidedSchedule) and opt.resolution_schedule == "auto"
+    factors = [factor for _, factor in schedule.levels or (PYRAMID if by_clock else ())]
+    return lambda camera: smaller(camera, max(factors, default=1.0))
 
 
 def resolution_of(opt: argparse.Namespace, schedule: Schedule, scene: Scene) -> Resolution:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from gaussian_renderer.rays import check_views
 from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
@@ -40,7 +41,7 @@ from splatting.training.iteration import Iteration, ViewOrder
 from splatting.training.memory_estimate import announce_memory, largest_view
 from splatting.training.objective import LossWatch, Objective
 from splatting.training.pose_refinement import PoseRefinement
-from splatting.training.resolution import resolution_of
+from splatting.training.resolution import Resolution, resolution_of, smallest
 from splatting.training.restart import resumed
 from splatting.training.robust_mask import RobustMask
 from splatting.training.schedule import DecidedSchedule
@@ -115,7 +116,7 @@ class Run:
         count = len(points if capture is None else capture[1])
         self._share(count)
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed, views, self.group.rank if views > 1 else 0)
-        self.resolution = resolution_of(opt, self.schedule, self.scene)
+        self.resolution = self._sizes()
         self._decode_ahead(self.first_iteration + 1)
         self._begin_model(capture, first)
         self._check_records()
@@ -163,6 +164,13 @@ class Run:
         # Of several processes, each keeps a part of it on its device, and of a large model only a part fits there.
         on_host = self.group.several or reads_on_host(self.start, self.opt.gpu_memory, self.device)
         return load_checkpoint(self.start, "cpu" if on_host else self.device, self.group.several)
+
+    def _sizes(self) -> Resolution:
+        """The sizes of the views, in all of which they can be drawn."""
+        found = resolution_of(self.opt, self.schedule, self.scene)
+        check_views(self.pipe, self.scene.getTrainCameras(), smallest(self.opt, self.schedule))
+        check_views(self.pipe, [*self.scene.getTestCameras(), *self.scene.validation_cameras.get(1.0, ())])
+        return found
 
     def _expect(self, count: int) -> None:
         """Let the memory be divided for a number of Gaussians, of which each rank has its part."""

@@ -98,14 +98,14 @@ def scene_arguments(gaussians: Gaussians, settings: GaussianRasterizationSetting
         shown = settings.lens if settings.lens_values is None else _with_values(settings.lens, settings.lens_values)
         lens += shown.numbers(*size[::-1])
         if settings.projection == "ray":
-            _check_rays(shown)
+            check_rays(shown)
     place = settings.viewmatrix, settings.projmatrix, settings.campos
     camera = camera_arguments(*place, lens, *size, settings.sh_degree, settings.antialiasing, raw)
     scene = Scene(*gaussians, *camera)
     return scene._replace(options=(*scene.options, True)) if settings.projection == "ray" else scene
 
 
-def _check_rays(lens: Lens) -> None:
+def check_rays(lens: Lens) -> None:
     """Refuse a lens whose pixels' rays the kernels do not find (ValueError)."""
     if lens.chart == "equirectangular" and any(lens.values[4:]):
         raise ValueError("projection='ray' has panoramas without distortion alone; take 'ewa'")
