@@ -319,6 +319,7 @@ def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str,
         "conventions": {key: CONVENTIONS[key] for scores in per_view.values() for key in scores},
         "trained_with_eval": held_out,
         "views": {name: len(pairs) for name, pairs in methods.items()},
+        "sizes": {name: sorted({pair.size for pair in pairs}) for name, pairs in methods.items()},
     }
     masked = {name: sum(pair.masked for pair in pairs) for name, pairs in methods.items()}
     if any(masked.values()):

@@ -162,8 +162,10 @@ def render_sets(
 ) -> None:
     """Render the views of a saved iteration, -1: the last one, by `render_set`.
 
-    Test views of a model with refined poses are also rendered with the dataset's, as ours_N_given_poses, and those of a
-    model whose photos' appearance is trained with their own (`fitted_views`), as ours_N_fitted_appearance.
+    Folders of pictures that options draw or compare in another way than the model's have names that say so, as in
+    ours_30000_r2. Test views of a model with refined poses are also rendered with the dataset's, as
+    ours_N_given_poses, and those of a model whose photos' appearance is trained with their own (`fitted_views`), as
+    ours_N_fitted_appearance.
     dataset: the model options. sh_degree: degree that the PLY must have, None: any. planes: those of PLANES to write,
     too. ply: model of any tool to render instead, into folders that have its name. UserError if nothing can be loaded.
     """
@@ -195,6 +197,7 @@ def _loaded(
     scene = load_file(options, ply, pipeline) if ply else load_saved(options, iteration, sh_degree)
     if not ply and getattr(dataset, "other_scene", ""):
         scene.loaded_iter = f"{scene.loaded_iter}_{dataset.other_scene}"
+    scene.loaded_iter = f"{scene.loaded_iter}{dataset.marks}" if getattr(dataset, "marks", "") else scene.loaded_iter
     if len(scene.gaussians) == 0:
         raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
     check_views(pipeline, (*scene.getTrainCameras(), *scene.getTestCameras()))
@@ -220,7 +223,7 @@ def main() -> None:
     parser.add_argument("--quiet", action="store_true", help="print nothing to stdout (default: off)")
     args = get_combined_args(parser)
     options, pipeline = model_params.extract(args), pipeline_params.extract(args)
-    options.other_scene = args.other_scene
+    options.other_scene, options.marks = args.other_scene, args.marks
     safe_state(args.quiet)
     if args.other_scene and not (args.allow_other_scene or args.ply):
         trained = read_cfg_args(args.model_path)["source_path"]

@@ -3,8 +3,9 @@
 import argparse
 import ast
 import os
+import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from utils.system_utils import UserError, atomic_write
 _IN_CFG_ARGS = {option.name: option.default for option in OPTIONS if option.stored == CFG_ARGS}
 _IN_MODEL_JSON = {option.name: option.default for option in OPTIONS if option.stored == MODEL_JSON}
 _OF_TRAINING = {option.name: option.default for option in OPTIONS if not option.stored and option.compared}
+# Options of a model that change no picture, or whose change of it has a name of its own.
+_UNSEEN = {"sh_degree", "source_path", "model_path", "depths", "data_device", "refine_lens", "seed", "optimizer_type"}
 _OF_MODEL = {option.name for option in ModelParams.options if option.stored == MODEL_JSON}
 
 
@@ -128,7 +131,8 @@ def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | Non
     Typed options win; flags can only be switched on. The parser's model options must default to None
     (`ModelParams(parser, sentinel=True)`). `typed_sh_degree` is the degree that was typed, or None, since a saved PLY
     may have another degree than cfg_args; `other_scene` the name of the scene if -s names another one than the model's,
-    else empty. With --ply, the folder may be a new one. UserError without -m or without a readable cfg_args.
+    else empty; `marks` what names of folders of pictures end with, by the options that draw or compare them in another
+    way than the model's. With --ply, the folder may be a new one. UserError without -m or without a readable cfg_args.
     """
     args = parser.parse_args(argv)
     if not getattr(args, "model_path", None):
@@ -137,8 +141,20 @@ def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | Non
     is_new = getattr(args, "ply", None) and not (Path(args.model_path) / CFG_ARGS).is_file()
     stored = {} if is_new else read_stored_options(args.model_path)
     other = other_scene(stored.get("source_path", ""), typed.get("source_path", ""))
-    known = {"typed_sh_degree": typed.get("sh_degree"), "other_scene": other}
+    drawn = {name: value for name, value in typed.items() if not (is_new and name == "eval")}
+    marks = _marks(_IN_CFG_ARGS | _IN_MODEL_JSON | stored, drawn)
+    known = {"typed_sh_degree": typed.get("sh_degree"), "other_scene": other, "marks": "".join(marks)}
     return argparse.Namespace(**vars(args) | stored | typed | known)
+
+
+def _marks(stored: Mapping[str, Value], typed: Mapping[str, Value]) -> Iterator[str]:
+    """The ends of names: of each option that was typed and is not as stored, sorted; as in _r2."""
+    for name in sorted(stored.keys() & typed.keys() - _UNSEEN):
+        value = typed[name]
+        if value == stored[name] or (name, stored[name]) == ("appearance", "none"):  # then nothing has trained
+            continue
+        word = f"r{value}" if name == "resolution" else name if value is True else f"{name}_{value or 'none'}"
+        yield "_" + re.sub(r"[^\w.-]+", "-", word)
 
 
 def other_scene(trained: str, named: str) -> str:

@@ -404,9 +404,11 @@ def test_training_rendering_and_scores_ignore_what_is_masked(masked_scene, tmp_p
     assert _train(masked_scene, tmp_path / "masked_again", *masks, "--images_to_load", 3) == masked
     assert _train(masked_scene, tmp_path / "plain_again") != plain
 
-    # Rendering without masks removes the earlier ones.
+    # Rendering without masks leaves the others alone, and removes earlier ones of its own.
+    (without := folder.with_name("ours_40_masks_none") / "masks").mkdir(parents=True)
+    (without / "00000.png").touch()
     run(render, "-m", tmp_path / "masked", "--skip_train", "--quiet", "--masks", "")
-    assert list((folder / "masks").iterdir()) == []
+    assert list(without.iterdir()) == [] and len(list((folder / "masks").iterdir())) == 3
 
 
 def test_a_view_that_is_masked_whole_has_no_score(masked_scene, tmp_path):

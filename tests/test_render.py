@@ -199,6 +199,21 @@ def test_another_scene_is_rendered_only_where_that_is_said(folder, run, colmap_s
     assert (folder / "test" / "ours_7").is_dir()
 
 
+@pytest.mark.parametrize(
+    ("words", "mark"),
+    [(("-r", "2"), "_r2"), (("-r", "-1"), ""), (("-w",), "_white_background"), (("--antialiasing",), "_antialiasing"),
+     (("--projection", "ray", "-r", "2"), "_projection_ray_r2"), (("--appearance", "ppisp"), ""),
+     (("-i", "images/a"), "_images_images-a"), (("--mask_meaning", "ignore"), "_mask_meaning_ignore"), ((), "")],
+)  # fmt: skip
+def test_folders_are_named_after_options_that_are_not_the_models(folder, run, colmap_scene, words, mark):
+    if "-i" in words:
+        shutil.copytree(colmap_scene / "images", colmap_scene / "images" / "a")
+    (method := folder / "test" / "ours_7").mkdir(parents=True)
+    run("--skip_train", *words)
+    written = [path.name for path in (folder / "test").iterdir() if (path / "gt" / "00000.png").is_file()]
+    assert f"ours_7{mark}" in written and method.exists() and ("ours_7" in written) == (not mark)
+
+
 def test_help_says_what_happens_without_an_option(monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["render.py", "-h"])
     with pytest.raises(SystemExit):

@@ -60,9 +60,13 @@ def summarise_times(
 
 
 def model_digest(model: Path, iteration: str) -> str | None:
-    """Return the SHA-256 of the PLY of an iteration, None if a model folder has none of it."""
-    ply = saved_ply(model, iteration)
-    if not ply.is_file():
+    """Return the SHA-256 of the PLY of an iteration, None if a model folder has none of it.
+
+    iteration: with what the folder's name says besides, as in 30000_given_poses.
+    """
+    number = iteration.partition("_")[0]
+    ply = saved_ply(model, number)
+    if not number.isdecimal() or not ply.is_file():
         return None
     digest = hashlib.sha256()
     with open(ply, "rb") as file:
