@@ -23,7 +23,9 @@ from fused_ssim import fused_ssim
 from tqdm import tqdm
 
 from arguments import OptionParser, read_cfg_args
+from scene.half_images import half
 from splatting.evaluation import renders
+from splatting.evaluation.comparison import FITTED
 from splatting.evaluation.model_folder import json_or_none
 from splatting.evaluation.renders import DEPTHS, INCOMPLETE, TIMES, image_of, image_size, mask_of, model_digest
 from splatting.files.json_files import read_json, write_json
@@ -38,6 +40,7 @@ CONVENTIONS = {
     "LPIPS_vgg": "version 0.1, VGG-16, inputs mapped to [-1,1]",
     "LPIPS_alex": "version 0.1, AlexNet, inputs mapped to [-1,1]",
     "DISTS": "package DISTS-pytorch 0.1, VGG-16, inputs in [0,1] at their own size",
+    "PSNR_UNFITTED": "the PSNR of the same right halves in the views whose appearance is not fitted",
     "DEPTH": "relative error of the inverse depth at held-out points that the photo has seen: the median of a view",
     "DEPTH_95": "the same: what 95 % of a view's points are below",
 }
@@ -218,6 +221,14 @@ def score(pairs: list[Pair], metrics: dict[str, Metric], title: str, errors: boo
     return scores
 
 
+def _right_half(pair: Pair) -> float | None:
+    """The PSNR of the right half of a pair."""
+    images = (np.asarray(image_of(file)) for file in (pair.render, pair.truth))
+    columns = half(pair.size[0], of_test_view=True)
+    mask = mask_of(pair.truth.parents[1], pair.name)
+    return psnr(*(image[:, columns] for image in images), None if mask is None else mask[:, columns])
+
+
 def mean(values: dict[str, float | None]) -> float | None:
     """Return the mean over the views that have a number, as all have, or none, but for infinite PSNRs; else None."""
     numbers = [value for value in values.values() if value is not None]
@@ -307,6 +318,8 @@ def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str,
         if kept := keep_networks(model, name, scores):
             print(f"{model} {name}: kept {', '.join(kept)} of an earlier scoring of the same pictures")
         scores |= depth_scores(model / "test" / name)
+        if (plain := methods.get(name.removesuffix(f"_{FITTED}"), methods[name])) is not methods[name]:
+            scores |= {"PSNR_UNFITTED": {pair.name: _right_half(pair) for pair in plain if pair.name in scores["PSNR"]}}
     results = {name: {key: mean(values) for key, values in scores.items()} for name, scores in per_view.items()}
     for name, means in results.items():
         shown = "  ".join(f"{key} {'null' if value is None else f'{value:.4f}'}" for key, value in means.items())

@@ -10,6 +10,7 @@ import torch
 from gaussians import options
 from PIL import Image
 from scipy.optimize import minimize
+from skimage.metrics import peak_signal_noise_ratio
 from synthetic import make_blender_scene, make_colmap_scene, options_of
 from trainings import leaves, train_on, trained
 
@@ -219,6 +220,12 @@ def test_from_photos_of_different_exposure_to_scores_of_fitted_halves(tmp_path, 
     assert scores.keys() == {"ours_200", "ours_200_fitted_appearance"}
     fitted = scores["ours_200_fitted_appearance"]["PSNR"]
     assert fitted == pytest.approx(log["test_fitted_appearance_psnr"], abs=0.6)  # which is a mean over channels
+    pairs = [[np.asarray(Image.open(out / f"test/ours_200/{side}/{n:05d}.png"))[:, 16:] for side in ("gt", "renders")]
+             for n in range(3)]  # fmt: skip
+    unfitted = scores["ours_200_fitted_appearance"]["PSNR_UNFITTED"]
+    assert unfitted < fitted
+    assert unfitted == pytest.approx(np.mean([peak_signal_noise_ratio(*pair) for pair in pairs]), abs=1e-9)
+    assert log["test_right_halves_psnr"] == pytest.approx(unfitted, abs=0.6)
     run = read_run(Run(SceneEntry("x", "scenes", scene), None, None, out, (), ()), tmp_path, None)
     assert run["iterations"]["200"]["PSNR_fitted_appearance"] == fitted
     assert Image.open(out / "test/ours_200_fitted_appearance/gt/00000.png").size == (16, 21)

@@ -83,8 +83,8 @@ def test_learning_and_what_is_said(colmap_scene, tmp_path, capfd):
         rf"Optimizing {tmp_path}",
         rf"Output folder: {tmp_path}",
         r"Number of points at initialisation :  300",
-        r"\[ITER 1\] Evaluating test: L1 [\d.e-]+ PSNR [\d.]+",
-        r"\[ITER 300\] Evaluating train: L1 [\d.e-]+ PSNR [\d.]+",
+        r"\[ITER 1\] Evaluating test: L1 [\d.e-]+ PSNR [\d.]+ \(mean of the channels'; [\d.]+ as metrics.py\)",
+        r"\[ITER 300\] Evaluating train: L1 [\d.e-]+ PSNR [\d.]+ \(mean of the channels'; [\d.]+ as metrics.py\)",
         r"\[ITER 300\] Saving Gaussians",
         r"Training complete\.",
     ):

@@ -207,7 +207,8 @@ def training_report(
     train, test = scene.getTrainCameras(), scene.getTestCameras()
     sets = {"test": (views, test), f"test_{GIVEN_POSES}": (views, scene.given_test_views())}
     if isinstance(getattr(scene.gaussians, "exposures", None), Ppisp):
-        sets |= {f"test_{FITTED}": (fitted_views(*renderArgs[:2]), test)}
+        halves = ScoredViews(*renderArgs[:2], True, draw)  # what the fitted ones compare with
+        sets |= {"test_right_halves": (halves, test), f"test_{FITTED}": (fitted_views(*renderArgs[:2]), test)}
     sets |= {"train": (views, [train[i % len(train)] for i in range(5, 30, 5)])}
     scores = {}
     for name, (scored, cameras) in sets.items():
