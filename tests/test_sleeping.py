@@ -38,7 +38,9 @@ from utils.system_utils import UserError
 BETAS, EPS = (0.9, 0.999), 1e-15
 MOST_RATIO = 0.1 / math.sqrt(0.001 * (1 - 0.81 / 0.999))  # of |m| / sqrt(v) (csrc/math/sleep.h)
 SCENES, STEPS = 6, (5, 60)  # of random blocks; 1000, or 1 and (7000, 7001), for the figures of docs/inside/sleep.md
-NAMES = ("default", "poses", "white", "masks", "exposure", "depth", "absgrad", "together", "budget", "degree 0")
+VIEWS = 30  # random ones of each lens; 1000 for the figures of docs/inside/sleep.md
+NAMES = ("default", "poses", "white", "masks", "exposure", "depth", "absgrad", "together", "budget", "degree 0", "rays")
+WITH_RAYS = "default", "depth", "together"  # or all that sleep and have rays: those of OPTIONS without MCMC and poses
 
 
 class Blocks:
@@ -75,8 +77,9 @@ def _rows(count: int, generator: torch.Generator, place: dict) -> list[torch.Ten
     return [torch.randn(count, *shape, generator=generator, dtype=torch.float64).to(**place) for shape in shapes]
 
 
-def _camera(view: torch.Tensor, place: dict, lens: Lens | None = None, width: int = 96, height: int = 64) -> tuple:
+def _camera(view: torch.Tensor, place: dict, lens: Lens | None = None, rays: bool = False) -> tuple:
     """A camera whose matrix world to view is (4, 4); the fields of Scene behind the Gaussians."""
+    width, height = 96, 64
     near, tan_x, tan_y = 0.01, 0.7, 0.7 * height / width
     full = torch.zeros(4, 4, dtype=torch.float64)
     full[0, 0], full[1, 1], full[3, 2], full[2, 2], full[2, 3] = 1 / tan_x, 1 / tan_y, 1.0, 1.0, -near
@@ -84,7 +87,7 @@ def _camera(view: torch.Tensor, place: dict, lens: Lens | None = None, width: in
     matrices = view.T, (full @ view).T, center
     numbers = lens.numbers(width, height) if lens else ()
     moved = (m.contiguous().to(**place) for m in matrices)
-    return *moved, (tan_x, tan_y, 1.0, *numbers), (height, width, 3, False, True)
+    return *moved, (tan_x, tan_y, 1.0, *numbers), (height, width, 3, False, True, *[rays] * rays)
 
 
 def _away(place: dict) -> tuple:
@@ -161,13 +164,15 @@ def _clusters(rng: np.random.Generator, place: dict, blocks: int = 24, small: bo
     return out
 
 
-def _looking(rng: np.random.Generator, at: np.ndarray, place: dict, lens: Lens | None = None) -> tuple:
+def _looking(
+    rng: np.random.Generator, at: np.ndarray, place: dict, lens: Lens | None = None, rays: bool = False
+) -> tuple:
     """A camera near a point, or far from it, that looks anywhere."""
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     turn *= np.sign(np.linalg.det(turn))
     view = np.eye(4)
     view[:3, :3], view[:3, 3] = turn, -turn @ (at + rng.normal(size=3) * 10 ** rng.uniform(-2, 1))
-    return _camera(torch.tensor(view), place, lens)
+    return _camera(torch.tensor(view), place, lens, rays)
 
 
 LENSES = {
@@ -178,26 +183,32 @@ LENSES = {
     "rational": Lens("perspective", (70.0, 70.0), (47.5, 31.5), (0.3, 0.1, 0.0, 0.0), (0.5, 0.1, 0.0)),
     "fisheye": Lens("equidistant", (40.0, 41.0), (47.0, 31.0), (0.02, -0.01, 0.001, 0.0)),
     "wide fisheye": Lens("equidistant", (34.0, 34.0), (47.5, 31.5)),
+    "panorama": Lens("equirectangular", (96 / math.tau, 64 / math.pi), (47.5, 31.5)),
 }
 
 
-@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+@pytest.mark.parametrize("rays", [False, True], ids=["ewa", "ray"])
+@pytest.mark.parametrize("name", LENSES)
 @BOTH_AND_GPU
-def test_no_view_shows_a_block_that_sleeps(device, dtype, lens):
-    place, rng = {"device": device, "dtype": dtype}, np.random.default_rng(7)
+def test_no_view_shows_a_block_that_sleeps(device, dtype, name, rays):
+    place, rng, lens = {"device": device, "dtype": dtype}, np.random.default_rng(7), LENSES[name]
     asleep = woken = 0
-    for trial in range(30):
+    for trial in range(VIEWS):
         blocks = _clusters(rng, place, small=trial % 2 > 0)
         missed, rate = int(rng.integers(1, 100)), 10 ** rng.uniform(-5, -2)
         blocks.terms[:, :6] = rate
         for step in blocks.steps:
             step += missed
-        camera = _looking(rng, blocks.values[0][int(rng.integers(len(blocks.values[0])))].cpu().numpy(), place, lens)
+        camera = _looking(
+            rng, blocks.values[0][int(rng.integers(len(blocks.values[0])))].cpu().numpy(), place, lens, rays
+        )
         whole = Blocks([value.clone() for value in blocks.values])
         whole.averages, whole.steps = [x.clone() for x in blocks.averages], blocks.steps
         whole.taken, whole.terms = blocks.taken.clone(), blocks.terms.clone()
         whole.wake(camera, True, rate)
         blocks.wake(camera, False, rate)
+        assert (whole.taken == 500 + missed).all()  # no step follows yet
+        assert torch.equal(blocks.taken, torch.where(blocks.awake.bool(), 501 + missed, 500).int())
         rows = blocks.awake.bool().repeat_interleave(BLOCK)[: len(blocks.values[0])]
         for scene in (whole.scene(camera), blocks.scene(camera)):
             *_, tiles, radii = OPERATORS.project(*scene)
@@ -208,15 +219,12 @@ def test_no_view_shows_a_block_that_sleeps(device, dtype, lens):
         ]
         assert all(torch.equal(one, other) for one, other in zip(*(d[:4] for d in drawn), strict=True))
         asleep, woken = asleep + int((~rows).sum()), woken + int(rows.sum())
-    assert min(asleep, woken) > 0.1 * (asleep + woken)
-
-
-def test_every_view_of_a_panorama_wakes_all():
-    place = {"device": "cpu", "dtype": torch.float32}
-    blocks = _clusters(np.random.default_rng(1), place)
-    lens = Lens("equirectangular", (96 / math.tau, 64 / math.pi), (47.5, 31.5))
-    blocks.wake(_camera(torch.eye(4, dtype=torch.float64), place, lens), False, 0.01)
-    assert blocks.awake.all()
+    if rays:
+        assert woken and not asleep
+    elif name == "panorama":  # all but what is too near
+        assert woken > 0.9 * (asleep + woken)
+    else:
+        assert min(asleep, woken) > 0.1 * (asleep + woken)
 
 
 def test_steps_with_sleep_are_those_of_dense_adam_in_double():
@@ -298,7 +306,7 @@ def test_fast_steps(scene, tmp_path, take_as, plain, shares, way, name):  # noqa
     shares.clear()
     take_as(way)
     assert not differences(_trained(scene, tmp_path, *OPTIONS[name]), expected)
-    assert min(shares) < 0.9
+    assert (min(shares) < 0.9) == (name != "rays")  # every view wakes all for them
 
 
 def test_fast_steps_with_a_lens(tmp_path, take_as, shares):  # noqa: F811
@@ -354,11 +362,12 @@ def test_a_rank_without_rows(scene, tmp_path):
     assert not differences(result, _trained(scene, tmp_path / "alone", "--init_pcd_path", few))
 
 
+@pytest.mark.parametrize("name", ["default", "rays"])
 @pytest.mark.parametrize("way", [(), ("--plain_step",)])
-def test_scores_and_saves_between_change_nothing(scene, tmp_path, plain, way):
-    looks = "--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44
-    assert not differences(_trained(scene, tmp_path, *way, *looks), plain("default"))
-    _trained(scene, tmp_path / "plain", "--plain_step", "--save_iterations", 9, 44)
+def test_scores_and_saves_between_change_nothing(scene, tmp_path, plain, way, name):
+    way, looks = (*way, *OPTIONS[name]), ("--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44)
+    assert not differences(_trained(scene, tmp_path, *way, *looks), plain(name))
+    _trained(scene, tmp_path / "plain", "--plain_step", *OPTIONS[name], "--save_iterations", 9, 44)
     for iteration in (9, 44):
         ply = f"point_cloud/iteration_{iteration}/point_cloud.ply"
         assert (tmp_path / ply).read_bytes() == (tmp_path / "plain" / ply).read_bytes()
@@ -384,6 +393,18 @@ def test_a_checkpoint_from_within_a_step_resumes(scene, tmp_path, plain):
     save_checkpoint(tmp_path / "within.pth", capture, iteration)
     start = "--start_checkpoint", tmp_path / "within.pth"
     assert not differences(_trained(scene, tmp_path / "b", *start), plain("default"))
+
+
+@pytest.mark.parametrize("name", WITH_RAYS)
+def test_rays_have_the_bytes_of_a_training_in_which_nothing_sleeps(scene, tmp_path, monkeypatch, name):
+    """Also with scores and saves between, and resumed."""
+    words = *OPTIONS[name], *OPTIONS["rays"]
+    looks = "--test_iterations", 3, 17, 31, "--save_iterations", 9, "--checkpoint_iterations", 33, ITERATIONS
+    looked = _trained(scene, tmp_path / "a", *words, *looks)
+    resumed = _trained(scene, tmp_path / "b", *words, "--start_checkpoint", tmp_path / "a/chkpnt33.pth")
+    monkeypatch.setattr(runs, "MOST_SHARE", 0.0)
+    awake = _trained(scene, tmp_path / "awake", *words)
+    assert looked["ply"] == resumed["ply"] == awake["ply"]
 
 
 @pytest.mark.parametrize("what", ["rows", "taken", "terms"])

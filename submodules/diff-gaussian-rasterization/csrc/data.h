@@ -317,9 +317,10 @@ struct GaussianStep {
 template <class T>
 struct SleepInput {
   GaussianStep<T> step;
-  bool all;        // all blocks wake, for no step yet; or those that a view may show, unless the guard has stopped
+  bool all;        // all blocks wake, or those that a view may show; none where the guard has stopped
+  bool rests;      // no step follows yet
   uint8_t* awake;  // (blocks) written
-  int32_t* taken;  // (blocks) the number of the last step that a block takes part in: this one, unless all wake
+  int32_t* taken;  // (blocks) the number of the last step that a block takes part in: this one, unless it rests
   // (kTerms, kTermColumns): of each attribute lr sqrt(1 - beta2^s) / (1 - beta1^s) of step s, in row s modulo kTerms.
   T* terms;
   int32_t* blocks = nullptr;  // (room) written on a GPU unless all wake: those that are awake (Scene::blocks)

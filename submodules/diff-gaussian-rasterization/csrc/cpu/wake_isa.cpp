@@ -76,7 +76,7 @@ void wake(const Executor& executor, const Scene<T>& s, const SleepInput<T>& in) 
       for (int a = 0; a < kStepped && wakes && missed > 0; ++a)
         take_missed_of_block(step.attributes[a], sums.of(a, missed), begin, end - begin);
       in.awake[block] = wakes;
-      if (wakes) in.taken[block] = int32_t(number - in.all);
+      if (wakes) in.taken[block] = int32_t(number - in.rests);
     });
   });
 }

@@ -148,7 +148,7 @@ __global__ void __launch_bounds__(kThreads)
     if (in.step.attributes[a].columns)
       take_missed_of_block(in.step.attributes[a], waking->missed.of(a, missed), first, rows);
   __syncthreads();  // all have read `taken`
-  if (threadIdx.x == 0) in.awake[block] = 1, in.taken[block] = int32_t(waking->number - in.all);
+  if (threadIdx.x == 0) in.awake[block] = 1, in.taken[block] = int32_t(waking->number - in.rests);
 }
 
 struct IsAwake {

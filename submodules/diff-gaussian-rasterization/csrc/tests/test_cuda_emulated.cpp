@@ -615,12 +615,14 @@ void test_gaussian_step() {
 }
 
 // Blocks wake on the GPU as on the CPU, where some lie behind the camera, one has missed nothing, and one is repeated.
-// They are listed: none, or so many that the last one sleeps or is awake. Without room for them nothing changes.
+// They are listed: none, or so many that the last one sleeps or is awake. Without room for them nothing changes. Where
+// all wake for a step, they take part in it; where they rest, no step follows yet.
 void test_wake(int64_t seen, gs::Chart chart = gs::Chart::kPinhole) {
   const bool some = seen > 0, last = seen == 4;
   for (const int64_t room : {5, 4, 3})
-    for (const bool all : {false, true})
+    for (const int wakes_all : {0, 1, 2})
       for (const gs::emulation::Order order : gs::emulation::kOrders) {
+        const bool all = wakes_all, rests = wakes_all == 2;
         if (room != 5 && (all || order != gs::emulation::Order::shuffled)) continue;
         gs::emulation::order = order;
         constexpr int64_t count = 5 * gs::kSleepBlock - 28;
@@ -643,7 +645,8 @@ void test_wake(int64_t seen, gs::Chart chart = gs::Chart::kPinhole) {
         gs::Room needed{1, 1, 1, 1};
         const gs::Ahead ahead{&halted, &needed, &done, {0, 0, 0, room}, nullptr, 1};
         for (const int on_gpu : {0, 1}) {
-          gs::SleepInput<float> in{{}, all, awake[on_gpu], taken[on_gpu].data(), terms[on_gpu], blocks, room, &ahead};
+          gs::SleepInput<float> in{{},     all,  rests, awake[on_gpu], taken[on_gpu].data(), terms[on_gpu],
+                                   blocks, room, &ahead};
           got[on_gpu].inputs({}, nullptr, in.step.attributes);
           for (gs::AdamInput<float>& to : in.step.attributes) to.step = 101;
           const gs::Scene<float> scene = scene_of(got[on_gpu].values, {40, 24}, false);
@@ -666,7 +669,7 @@ void test_wake(int64_t seen, gs::Chart chart = gs::Chart::kPinhole) {
         for (int block = 0; block < 5; ++block) {
           CHECK(awake[0][block] == wakes[all][block] && awake[1][block] == wakes[all][block]);
           CHECK(taken[0][block] == taken[1][block] &&
-                taken[0][block] == (wakes[all][block] ? 101 - all : start_taken[block]));
+                taken[0][block] == (wakes[all][block] ? 101 - rests : start_taken[block]));
         }
         for (int a = 0; a < gs::kStepped; ++a) {
           check_near(*got[1].values.all()[a], *got[0].values.all()[a], 1e-6);

@@ -222,15 +222,14 @@ void apply_gradients_op(List<Tensor> gaussians, List<Tensor> camera, List<double
 }
 
 // Before a step of Adam, decides which blocks of Gaussians sleep through it, and lets the others take the steps that
-// they have missed (math/sleep.h). sleep: awake, taken and terms of gs::SleepInput, as is all. The other
-// arguments are those of apply_gradients_; no counter advances. Returns on a GPU, unless all wake, the blocks that are
-// awake (gs::Scene::blocks), with room for all of them, or for those that a host that runs ahead expects.
+// they have missed (math/sleep.h). sleep: awake, taken and terms of gs::SleepInput. rests: all wake, for no step yet.
+// The other arguments are those of apply_gradients_; no counter advances. Returns on a GPU, unless all wake, the blocks
+// that are awake (gs::Scene::blocks), with room for all of them, or for those that a host that runs ahead expects.
 MaybeTensor wake_op(List<Tensor> gaussians, List<Tensor> camera, List<double> lens, Sizes options, List<Tensor> sleep,
-                    bool all, List<Tensor> averages, List<Tensor> steps, List<Tensor> guard, Sizes attributes,
+                    bool rests, List<Tensor> averages, List<Tensor> steps, List<Tensor> guard, Sizes attributes,
                     List<double> rates, List<double> constants, Sizes columns, int64_t iteration,
                     const MaybeTensor& now) {
   const SceneTensors scene = scene_of(gaussians, camera, lens, options);
-  all |= scene.rays() != gs::kNoRays;  // blocks are tested by EWA
   const MaybeTensor none;
   const Step step{none,      averages, steps, {},        guard, attributes, rates,
                   constants, columns,  false, iteration, now,   false};
@@ -241,16 +240,22 @@ MaybeTensor wake_op(List<Tensor> gaussians, List<Tensor> camera, List<double> le
   check_tensor(sleep[0], "awake", ScalarType::Byte, scene.device(), {blocks});
   check_tensor(sleep[1], "taken", ScalarType::Int, scene.device(), {blocks});
   check_tensor(sleep[2], "terms", scene.dtype(), scene.device(), {gs::kTerms, int64_t(gs::kTermColumns)});
+  const bool all = rests || scene.rays() != gs::kNoRays;  // blocks are tested by EWA
   MaybeTensor listed;
   if (!all && scene.device().is_cuda())
     listed =
         empty<int32_t>({ahead() ? std::min(std::max<int64_t>(ahead()->room.blocks, 1), blocks) : blocks}, sleep[0]);
   with_scalar(scene.dtype(), [&](auto zero) {
     using T = decltype(zero);
-    const gs::SleepInput<T> in{step.of<T>(gaussians, {}),    all,
-                               write<uint8_t>(sleep[0]),     write<int32_t>(sleep[1]),
-                               write<T>(sleep[2]),           listed ? write<int32_t>(*listed) : nullptr,
-                               listed ? listed->size(0) : 0, ahead()};
+    const gs::SleepInput<T> in{step.of<T>(gaussians, {}),
+                               all,
+                               rests,
+                               write<uint8_t>(sleep[0]),
+                               write<int32_t>(sleep[1]),
+                               write<T>(sleep[2]),
+                               listed ? write<int32_t>(*listed) : nullptr,
+                               listed ? listed->size(0) : 0,
+                               ahead()};
     GS_RUN(T, scene.means(), wake, scene.scene<T>(), in);
   });
   return listed;
@@ -280,7 +285,7 @@ GS_OPERATORS(diff_gaussian_rasterization, m) {
       ") -> ()",
       TORCH_BOX(&apply_gradients_op));
   m.define("wake_(Tensor(a!)[] gaussians, Tensor[] camera, " CAMERA_SCHEMA
-           ", Tensor(b!)[] sleep, bool all, Tensor(c!)[] averages, Tensor[] steps, Tensor[] guard, int[] attributes, "
+           ", Tensor(b!)[] sleep, bool rests, Tensor(c!)[] averages, Tensor[] steps, Tensor[] guard, int[] attributes, "
            "float[] rates, float[] constants, int[] columns, int iteration=0, Tensor? now=None) -> Tensor?",
            TORCH_BOX(&wake_op));
   m.define(
