@@ -159,15 +159,15 @@ class Scene:
         """
         self.save_views()
         (self.gaussians if gaussians is None else gaussians).save_ply(str(saved_ply(self.model_path, iteration)))
-        if self._halves:
-            save_exposures(self.gaussians, self.model_path)
 
     def save_views(self) -> None:
-        """Write `poses.json` and `appearance.json`, if poses are refined, or the photos' appearance is trained."""
+        """Write `poses.json`, and `exposure.json` or `appearance.json`, if poses or the photos' look are trained."""
         if self._refines:
             write_poses(self.model_path, self.getTrainCameras(), self.getTestCameras(), self._refines_lens)
         if self._appearance:
             self.gaussians.save_exposures(self.model_path)
+        if self._halves:
+            save_exposures(self.gaussians, self.model_path)
 
     def training_pixels(self) -> tuple[int, int]:
         """Pixels of all training views: at training size, and in the photos."""

@@ -4,6 +4,7 @@ import argparse
 import re
 import shutil
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -15,10 +16,11 @@ import export
 import render
 from arguments import ModelParams
 from scene.gaussians import ply
-from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
+from scene.gaussians.checkpoint import FILTER, load_checkpoint, save_checkpoint, with_further
 from scene.saved_model import find_save, load_saved, read_model
 from splatting.evaluation.training_log import read_log
 from splatting.host.start import typed_command
+from splatting.training.iteration import Iteration
 from utils.system_utils import UserError
 
 PAGES = Path(__file__).parents[1] / "docs" / "api"
@@ -58,6 +60,38 @@ def test_both_kinds_have_the_same_gaussians(tmp_path):
     assert of_checkpoint.active_sh_degree == of_checkpoint.max_sh_degree == 2
     with pytest.raises(UserError, match="--sh_degree"):
         read_model(tmp_path / "chkpnt7.pth", 3)
+
+
+def test_a_checkpoint_is_shown_behind_its_3d_filter(tmp_path):
+    gaussians = model(5, degree=2)
+    gaussians.filter_3d = torch.rand(5, 1)
+    capture = with_further(gaussians.capture(), {FILTER: gaussians.filter_3d})
+    save_checkpoint(tmp_path / "chkpnt7.pth", capture, 7)
+    gaussians.save_ply(tmp_path / "point_cloud.ply")
+    of_ply, of_checkpoint = (parameters(read_model(tmp_path / name)) for name in ("point_cloud.ply", "chkpnt7.pth"))
+    for name, values in of_ply.items():
+        assert torch.equal(values, of_checkpoint[name]), name
+    assert not torch.equal(of_checkpoint["scaling"], capture[4])
+    save_checkpoint(tmp_path / "chkpnt7.pth", with_further(capture, {FILTER: torch.rand(4, 1)}), 7)
+    with pytest.raises(UserError, match="the 3D filter of the checkpoint does not fit"):
+        read_model(tmp_path / "chkpnt7.pth")
+
+
+@pytest.mark.parametrize("options", [("--train_test_exp",), ("--appearance", "ppisp"), ("--refine_poses",)])
+def test_a_planned_checkpoint_alone_can_be_loaded(colmap_scene, tmp_path, monkeypatch, options):
+    """What belongs to the photos is written beside it."""
+
+    def stop(step: Iteration) -> None:
+        if step.iteration == 4:
+            raise RuntimeError("killed")
+
+    before_steps(monkeypatch, stop)
+    with pytest.raises(RuntimeError, match="killed"):
+        train_on(colmap_scene, tmp_path, *WORDS, *options, "--iterations", 40, "--checkpoint_iterations", 3)
+    shutil.rmtree(tmp_path / "point_cloud", ignore_errors=True)
+    monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(tmp_path), "--quiet"])
+    render.main()
+    assert any((tmp_path / "test/ours_3/renders").rglob("*.png"))
 
 
 def test_a_ply_is_opened_once_to_be_rendered(colmap_scene, tmp_path, monkeypatch):

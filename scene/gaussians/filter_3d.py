@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from splatting.deterministic import portable_math
+from utils.system_utils import UserError
 
 # In squared pixels. The paper's 0.2 goes with renders that add 0.1. Ours, and those of all viewers, add 0.3 already.
 VARIANCE = 0.05
@@ -53,6 +54,12 @@ def filter_widths(points: Tensor, views: Sequence[Any]) -> Tensor:
     for view in views:
         rates = torch.maximum(rates, sampling_rate(points, view))
     return torch.where(rates > 0, math.sqrt(VARIANCE) / rates, 0.0)[:, None]
+
+
+def check_widths(widths: Any, count: int) -> None:
+    """UserError for what a checkpoint has as its filter, if it does not fit so many Gaussians."""
+    if not torch.is_tensor(widths) or widths.shape != (count, 1) or widths.dtype != torch.float32:
+        raise UserError("the 3D filter of the checkpoint does not fit its Gaussians; give another one")
 
 
 def filtered(logits: Tensor, log_scales: Tensor, widths: Tensor) -> tuple[Tensor, Tensor]:

@@ -21,7 +21,7 @@ from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.checkpoint import ASLEEP, FILTER, POSES, RESIDUALS, SKY, further, load_checkpoint, with_further
-from scene.gaussians.filter_3d import filter_widths
+from scene.gaussians.filter_3d import check_widths, filter_widths
 from scene.gaussians.morton import sort_rows
 from scene.gaussians.ppisp import Ppisp
 from scene.sleeping import MOST_SHARE, REST, Sleeping, share_seen
@@ -49,7 +49,7 @@ from splatting.training.sky import Sky, resumed_sky, with_sky
 from splatting.training.sparse_depth import SparseDepth
 from splatting.training.strategies import AUTO, USUAL, density_control, end_in_time, of_clock
 from utils.general_utils import get_expon_lr_func
-from utils.system_utils import UserError, compute_device
+from utils.system_utils import compute_device
 
 
 def bias_correction(step: int, beta1: float = 0.9, beta2: float = 0.999) -> float:
@@ -254,8 +254,7 @@ class Run:
         if kept is None:
             return
         gaussians = self.gaussians
-        if not torch.is_tensor(kept) or kept.shape != (gaussians.gaussian_count, 1):
-            raise UserError("the 3D filter of the checkpoint does not fit its Gaussians; give another one")
+        check_widths(kept, gaussians.gaussian_count)
         gaussians.filter_3d = gaussians.shards.own(kept).to(gaussians.filter_3d)
 
     def _update_filter(self) -> None:
