@@ -20,7 +20,7 @@ from synthetic import FakeGaussians
 import train
 from arguments import ModelParams, OptionParser
 from gaussian_renderer import render
-from scene import Scene
+from scene import Scene, colmap_loader
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.readers import depth_maps, depth_scale
@@ -321,7 +321,8 @@ def test_the_command_makes_a_file_that_training_takes(colmap_scene, tmp_path, mo
     model = read_model_of_kind(colmap_scene / "sparse/0", "bin", with_2d_points=True)
     for view in model.images:
         scale, offset = rng.uniform(0.5, 1.5), rng.uniform(-0.02, 0.02)
-        camera, (pixels, depths) = model.cameras[view.camera_id], sightings(view, model.points, "")
+        camera = model.cameras[view.camera_id]
+        pixels, depths = sightings(view, model.points, camera, "")
         values = np.zeros((camera.height * 8, camera.width * 8))
         for (x, y), z in zip(pixels * 8, depths, strict=True):
             values[max(int(y) - 1, 0) : int(y) + 2, max(int(x) - 1, 0) : int(x) + 2] = (1 / z - offset) / scale
@@ -339,6 +340,25 @@ def test_the_command_makes_a_file_that_training_takes(colmap_scene, tmp_path, mo
         assert (params[name]["scale"], params[name]["offset"]) == pytest.approx((scale, offset), rel=0.05, abs=0.02)
     (tmp_path / "maps").rename(colmap_scene / "depths")
     train.main(["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "-d", "depths", "--iterations", "3", "-r", "24"])
+
+
+@pytest.mark.parametrize("kind", ["OPENCV_FISHEYE", "EQUIRECTANGULAR"])
+def test_depths_of_fisheyes_and_panoramas_are_distances(kind):
+    """Also behind the camera, and also where the point is beside it."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(60, 3)) * (1, 1, 3)
+    params = np.array([20.0, 20, 32, 32, 0, 0, 0, 0] if kind == "OPENCV_FISHEYE" else [64.0, 64])
+    camera = colmap_loader.Camera(1, kind, 64, 64, params)
+    turn, pixels = np.array([0.5, 0.5, -0.5, 0.5]), rng.uniform(0, 64, (60, 2))
+    image = colmap_loader.Image(1, turn, np.array([0.1, 0.2, 0.3]), 1, "a.png", pixels, np.arange(60))
+    cloud = colmap_loader.Points(np.arange(60), points, np.zeros((60, 3)), np.ones(60))
+    center = -colmap_loader.qvec2rotmat(turn).T @ image.tvec
+    found, depths = sightings(image, cloud, camera, "")
+    np.testing.assert_allclose(depths, np.linalg.norm(points - center, axis=1))
+    np.testing.assert_array_equal(found, pixels)
+    local = points @ colmap_loader.qvec2rotmat(turn).T + image.tvec
+    _, of_pinhole = sightings(image, cloud, camera._replace(model="PINHOLE"), "")
+    np.testing.assert_allclose(of_pinhole, local[:, 2])
 
 
 def test_scenes_without_points_to_fit_to(blender_scene, tmp_path):
@@ -391,7 +411,8 @@ def test_one_scale_is_fitted_to_all_metric_maps(colmap_scene, kind, monkeypatch,
     """Maps of the points themselves, 2.5 units a metre, with gaps elsewhere."""
     model = read_model_of_kind(colmap_scene / "sparse/0", "bin", with_2d_points=True)
     for view in model.images:
-        camera, (pixels, depths) = model.cameras[view.camera_id], sightings(view, model.points, "")
+        camera = model.cameras[view.camera_id]
+        pixels, depths = sightings(view, model.points, camera, "")
         values = np.zeros((camera.height * 8, camera.width * 8))
         for (x, y), z in zip(pixels * 8, depths, strict=True):
             values[max(int(y) - 1, 0) : int(y) + 2, max(int(x) - 1, 0) : int(x) + 2] = z / 2.5

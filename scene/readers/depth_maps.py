@@ -1,7 +1,7 @@
 """Depth maps that supervise training (--depths): their files, units and decoding.
 
-Maps of inverse depth are grey images. Metric maps, of distances along the axis of the view, are .npy and .pfm files of
-metres, and 16-bit PNGs beside a file METRIC, which tells metres.
+Maps of inverse depth are grey images. Metric maps, of distances along the axis of the view, or from the camera for
+fisheyes and panoramas, are .npy and .pfm files of metres, and 16-bit PNGs beside a file METRIC, which tells metres.
 """
 
 import json

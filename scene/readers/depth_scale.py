@@ -4,9 +4,10 @@ import json
 from pathlib import Path
 
 import numpy as np
+from diff_gaussian_rasterization.lens import MODELS
 from tqdm import tqdm
 
-from scene.colmap_loader import Image, Points, qvec2rotmat
+from scene.colmap_loader import Camera, Image, Points, qvec2rotmat
 from scene.images.side_files import SideFiles
 from scene.readers.colmap import AGAIN, ColmapModel, find_model, read_model_of_kind
 from scene.readers.depth_maps import METRIC, PARAMS, SCALE, STEP, Metric, inverses, map_names, read_values, sample
@@ -31,9 +32,9 @@ def make_depth_params(scene: Path, depths: Path, model_type: str) -> tuple[dict[
     for image, path in tqdm(
         zip(model.images, paths, strict=True), total=len(paths), desc="Fitting depth maps", unit="map"
     ):
-        pixels, z = sightings(image, model.points, f"{folder} as .{model_type}")
-        name = Path(image.name).with_suffix("").as_posix()
         camera = model.cameras[image.camera_id]
+        pixels, z = sightings(image, model.points, camera, f"{folder} as .{model_type}")
+        name = Path(image.name).with_suffix("").as_posix()
         if path is not None:
             scale, offset = fit_image(pixels, z, (camera.width, camera.height), read_values(path) / UNIT)
             table[name] = {"scale": scale, "offset": offset}
@@ -65,8 +66,8 @@ def make_metric_scale(scene: Path, depths: Path, metric: Metric, model_type: str
     ):
         if path is not None:
             depth = metric._replace(scale=None).map_of(path)
-            pixels, z = sightings(image, model.points, f"{folder} as .{model_type}")
             camera, values = model.cameras[image.camera_id], inverses(read_values(depth.path) / depth.unit)
+            pixels, z = sightings(image, model.points, camera, f"{folder} as .{model_type}")
             seen, z = _samples(pixels, z, (camera.width, camera.height), values)
             found.append((seen * z)[np.isfinite(seen)])
     ratios = np.concatenate(found) if found else np.zeros(0)
@@ -99,23 +100,27 @@ def _model(scene: Path, model_type: str) -> tuple[Path, ColmapModel]:
     return folder, read_model_of_kind(folder, model_type, with_2d_points=True)
 
 
-def sightings(image: Image, points: Points, model: str) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (n,2), centres at .5, and depths z (n,) of the points that a photo sees, of all points sorted by id.
+def sightings(image: Image, points: Points, camera: Camera, model: str) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (n,2), centres at .5, and depths (n,) of the points that a photo sees, of all points sorted by id.
 
-    UserError, naming the model, for a point that is not among them.
+    The depth is z, and of a fisheye or a panorama the distance from the camera, as renders have it. UserError, naming
+    the model, for a point that is not among them.
     """
     seen = image.point3D_ids >= 0
     ids = image.point3D_ids[seen]
     places = np.searchsorted(points.ids, ids)
     if (places == np.searchsorted(points.ids, ids, side="right")).any():
         raise UserError(f"the photo {image.name} in {model} sees a point that is not in points3D; {AGAIN}")
-    return image.xys[seen], points.xyz[places] @ qvec2rotmat(image.qvec)[2] + image.tvec[2]
+    turn, shift = qvec2rotmat(image.qvec), image.tvec
+    if camera.model in MODELS and MODELS[camera.model][0] != "perspective":
+        return image.xys[seen], np.linalg.norm(points.xyz[places] @ turn.T + shift, axis=1)
+    return image.xys[seen], points.xyz[places] @ turn[2] + shift[2]
 
 
 def fit_image(pixels: np.ndarray, z: np.ndarray, size: tuple[int, int], depth: np.ndarray) -> tuple[float, float]:
     """Scale and offset of a map (h, w) of any resolution, from the points in front of the camera and in the photo.
 
-    pixels (n,2) of a photo of a size (width, height), and depths z (n,), as of `sightings`.
+    pixels (n,2) of a photo of a size (width, height), and their depths z (n,), as of `sightings`.
     """
     mono, z = _samples(pixels, z, size, depth)
     return fit_line(mono, 1 / z)

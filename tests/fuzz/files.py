@@ -46,7 +46,7 @@ class Colmap:
             _read_and_train(rng, scene)
             model = read_model_of_kind(path.parent, suffix, with_2d_points=True)
             for image in model.images:
-                pixels, depths = sightings(image, model.points, "the model")
+                pixels, depths = sightings(image, model.points, model.cameras[image.camera_id], "the model")
                 assert len(pixels) == len(depths), "a photo's points and their depths differ in number"
         finally:
             path.write_bytes(whole)
