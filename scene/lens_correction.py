@@ -1,13 +1,14 @@
 """Corrections of a lens by 15 numbers (--refine_lens), and what its pixels say of them.
 
 A focal length f becomes f / (1 - q), and the principal point moves by s of the new one; coefficients add up. So the
-ray of a pinhole's pixel, (pixel - center) / f, becomes ray (1 - q) - s. None of the numbers has a unit.
+ray of a pinhole's pixel, (pixel - center) / f, becomes ray (1 - q) - s. None of the numbers has a unit. A fisheye has
+the numbers of its chart (scene/readers/tracks.py) in place of a pinhole's rays.
 """
 
 import numpy as np
 import torch
 from diff_gaussian_rasterization.lens import LENS_VALUES, Lens
-from diff_gaussian_rasterization.reference.lens import pixels
+from diff_gaussian_rasterization.reference.lens import pixels_of
 
 from scene.readers.info import CameraInfo
 
@@ -48,8 +49,8 @@ def ray_slopes(lens: Lens, rays: np.ndarray) -> np.ndarray:
     """Derivatives (2, 15, K) of the rays (K, 2) of fixed pixels by a change, at 0; 0 by what may not change."""
 
     def shown(change: np.ndarray, shift: np.ndarray) -> np.ndarray:
-        points = torch.from_numpy(np.column_stack([rays + shift, np.ones(len(rays))]))
-        return pixels(lens.with_values(corrected(np.array(lens.values), change).tolist()), points).numpy()
+        moved = lens.with_values(corrected(np.array(lens.values), change).tolist())
+        return pixels_of(moved, torch.from_numpy(rays + shift)).numpy()
 
     used, slopes = np.flatnonzero(np.diag(allowed(lens))), np.zeros((2, LENS_VALUES, len(rays)))
     still, fixed = np.zeros(LENS_VALUES), np.zeros(2)

@@ -15,7 +15,8 @@ _STEPS = 10
 _CHANCE = 10.0  # times what noise makes the loss fall on the mean; poses of structure from motion reach 5
 _LESS = 0.9  # of the loss: a lens whose loss falls less stays
 _RANK = 1e-9  # of the largest curvature: less says nothing of a lens
-_NEAR = 1e-3  # units of depth; nearer points do not count
+_NEAR = 1e-3  # units of depth, or of distance from a fisheye; nearer points do not count
+_BEHIND = 3.0  # radians from the axis; beyond, the smallest turn moves a fisheye's points across the image
 
 
 class Seen(NamedTuple):
@@ -101,20 +102,43 @@ def pull(pose: np.ndarray, track: Track, focal: float, unit: float, slopes: np.n
 
     slopes: as of `Seen`; then what it says of the lens, too.
     """
-    x, y, z = np.einsum("ij,kj->ik", pose[:3, :3], track.points) + pose[:3, 3:]
-    shown = focal * (z > _NEAR * unit)
-    inverse = 1 / np.maximum(z, _NEAR * unit)
-    u, v, zero, near = x * inverse, y * inverse, np.zeros_like(x), unit * inverse
-    error = shown * (np.stack([u, v]) - track.rays.T)
-    # d(u, v) of dp = rotation x p + translation.
-    rows = [[-u * v, 1 + u * u, -v, near, zero, -u * near], [-1 - v * v, u * v, u, zero, near, -v * near]]
-    slope, size = shown * np.array(rows), np.hypot(*error)
+    local = np.einsum("ij,kj->ik", pose[:3, :3], track.points) + pose[:3, 3:]
+    rays, rows, seen = (_angular if track.angular else _straight)(local, unit)
+    shown = focal * seen
+    error = shown * (rays - track.rays.T)
+    slope, size = shown * rows, np.hypot(*error)
     if slopes is not None:
         slope = np.concatenate([slope, -shown * slopes], 1)
     weight = OUTLIER / np.maximum(size, OUTLIER)
     loss = np.where(size <= OUTLIER, size**2, OUTLIER * (2 * size - OUTLIER)).sum()
     # einsum has one order of sums, whatever the number of threads.
     return Pull(float(loss), 2 * np.einsum("cjk,ck->j", slope, weight * error), slope, weight, size)
+
+
+def _straight(local: np.ndarray, unit: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rays (2, K), x / z and y / z, of a view's points (3, K), their slopes (2, 6, K) by a twist, and who counts."""
+    x, y, z = local
+    inverse = 1 / np.maximum(z, _NEAR * unit)
+    u, v, zero, near = x * inverse, y * inverse, np.zeros_like(x), unit * inverse
+    # d(u, v) of dp = rotation x p + translation.
+    rows = [[-u * v, 1 + u * u, -v, near, zero, -u * near], [-1 - v * v, u * v, u, zero, near, -v * near]]
+    return np.stack([u, v]), np.array(rows), z > _NEAR * unit
+
+
+def _angular(local: np.ndarray, unit: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same with rays of angles from the axis, as fisheyes show them (`Track.angular`), up to nearly 180 degrees."""
+    x, y, z = local
+    aside = np.maximum(np.hypot(x, y), 1e-9 * _NEAR * unit)
+    square, angle, zero = aside * aside + z * z, np.arctan2(aside, z), np.zeros_like(x)
+    stretch = angle / aside
+    more = (z / square - stretch) / (aside * aside)
+    mixed = more * x * y
+    slopes = np.array(  # (2, 3, K), by the point
+        [[stretch + more * x * x, mixed, -x / square], [mixed, stretch + more * y * y, -y / square]]
+    )
+    moves = np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]])  # (3, 3, K): of the point, by turns about the axes
+    rows = np.concatenate([np.einsum("cik,ijk->cjk", slopes, moves), unit * slopes], 1)
+    return stretch * np.stack([x, y]), rows, (square > (_NEAR * unit) ** 2) & (angle < _BEHIND)
 
 
 def damped(curvature: np.ndarray) -> np.ndarray:

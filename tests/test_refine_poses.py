@@ -1,13 +1,16 @@
 """Poses that are refined: by tracks, without drift of the whole, and through trainings, files and checkpoints."""
 
 import json
+import math
 import sys
 from argparse import Namespace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from diff_gaussian_rasterization.reference.lens import pixels_of
 from synthetic import BROWN, as_text, make_blender_scene, make_colmap_scene
 from trainings import differences, train_on, trained
 
@@ -22,6 +25,9 @@ from scene.readers.colmap import read_colmap
 from scene.readers.tracks import Track, read_tracks
 from scene.reprojection import BOUND, moved_pose, nearest_pose, pull, twist_gradient
 from scene.scene import Scene
+from splatting.demo.make_scene import write_scene
+from splatting.demo.objects import demo_scene
+from splatting.demo.tracer import FISHEYE, ring_views
 from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.results import read_run
 from splatting.training import pose_refinement, tracked_poses
@@ -41,14 +47,43 @@ def _track(count: int = 60, noise: float = 0.0) -> Track:
     return Track(points, rays, rays, *np.ones((3, count)))
 
 
-def test_the_gradient_and_the_matrix_of_a_pull():
-    track, step = _track(noise=0.01), 1e-5  # errors of about a pixel, on both sides of the outliers' limit
+def _wide_track(count: int = 60, noise: float = 0.0, degrees: float = 120.0) -> Track:
+    """What a fisheye sees up to so many degrees from its axis. noise: radians."""
+    rng = np.random.default_rng(1)
+    angle, turn = np.radians(degrees) * np.sqrt(rng.uniform(size=count)), math.tau * rng.uniform(size=count)
+    rays = angle[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+    view = np.column_stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)])
+    points = (rng.uniform(2, 5, (count, 1)) * view - POSE[:3, 3]) @ POSE[:3, :3]
+    rays += noise * rng.normal(size=rays.shape)
+    return Track(points, rays, rays, *np.ones((3, count)), angular=True)
+
+
+@pytest.mark.parametrize("degrees", [60.0, 80.0, 92.0])
+def test_fisheyes_find_a_pose_as_well_as_noise_allows(degrees):
+    """Of 0.3 pixels in 200: points at the border do not count more, and those beyond 90 degrees do count."""
+    track = _wide_track(300, 3e-3, degrees)
+    assert nearest_pose(POSE, track, 100.0, 1.0, BOUND) is POSE  # which noise alone does not move
+    found = nearest_pose(moved_pose(POSE, 0.3 * TURN, 1.0), track, 100.0, 1.0, BOUND)
+    assert np.abs(found - POSE).max() < 2e-3
+
+
+@pytest.mark.parametrize("axis", [[0.0, 0.0, 2.0], [0.0, 0.0, -2.0], [0.0, 0.0, 0.0]])
+def test_points_on_a_fisheyes_axis_or_at_its_centre_give_numbers(axis):
+    track = _wide_track(20)
+    track.points[0] = POSE[:3, :3].T @ (np.array(axis) - POSE[:3, 3])
+    at = pull(POSE, track, 100.0, 1.0)
+    assert np.isfinite(at.gradient).all() and np.isfinite(at.curvature).all()
+
+
+@pytest.mark.parametrize("track", [_track(noise=0.01), _wide_track(noise=0.01)], ids=["pinhole", "fisheye"])
+def test_the_gradient_and_the_matrix_of_a_pull(track):
+    step = 1e-5  # errors of about a pixel, on both sides of the outliers' limit
     pose = moved_pose(POSE, 0.1 * TURN, 2.0)
     at = pull(pose, track, 90.0, 2.0)
     ends = [[pull(moved_pose(pose, side * step * one, 2.0), track, 90.0, 2.0) for side in (1, -1)] for one in np.eye(6)]
     np.testing.assert_allclose(at.gradient, [(a.loss - b.loss) / (2 * step) for a, b in ends], rtol=1e-6, atol=1e-6)
     inliers = pull(pose, track, 0.9, 2.0)  # all errors are small
-    exact = pull(POSE, _track(), 0.9, 2.0)
+    exact = pull(POSE, _wide_track() if track.angular else _track(), 0.9, 2.0)
     assert exact.loss < 1e-25 and np.abs(exact.gradient).max() < 1e-12
     assert np.linalg.eigvalsh(inliers.curvature).min() > 0
 
@@ -124,6 +159,22 @@ def test_what_no_track_can_have_is_left_out(of, value, tmp_path, capsys):
 
 def _tracks(scene: Path, views: list) -> list[Track]:
     return read_tracks(scene, views, np.zeros(3))
+
+
+def test_tracks_of_a_fisheye_reach_beyond_90_degrees(tmp_path):
+    """They are the angles at which its lens shows their places."""
+    folder, size, rng = tmp_path / "scene", 64, np.random.default_rng(0)
+    views = [replace(v, focal=size / np.radians(200)) for v in ring_views(6, size, size, rng, FISHEYE)]
+    write_scene(folder, views, lambda _: demo_scene(), 300, rng, samples=1)
+    info = read_colmap(folder, "images", False, native=True)
+    angles = []
+    for view, track in zip(info.train_cameras, read_tracks(folder, info.train_cameras, np.zeros(3)), strict=True):
+        shown = pixels_of(view.native, torch.from_numpy(track.rays)).numpy() + 0.5
+        np.testing.assert_allclose(shown, track.places * size, atol=1e-5)
+        at = pull(world_to_camera(view.R, view.T), track, view.fx, info.extent)
+        assert track.angular and np.median(at.size) < 2  # pixels
+        angles.append(np.hypot(*track.rays.T).max())
+    assert max(angles) > np.radians(91)
 
 
 def test_rays_of_pinholes_are_those_of_pycolmap():

@@ -24,6 +24,7 @@ from PIL import Image  # noqa: F401
 from utils.system_utils import UserError
 
 PANORAMA = "EQUIRECTANGULAR"
+PERSPECTIVE = *(model for model, (chart, *_) in MODELS.items() if chart == "perspective"), "SIMPLE_DIVISION", "DIVISION"
 WIDEST = 60.0  # degrees to either side; farther out, a pinhole stretches the photo more than fourfold
 _STRAIGHT = 1e-8  # COLMAP takes smaller parameters for no distortion
 # In sizes of the photo. Beyond these bounds lie damaged files and other units, not lenses: fields of view below a

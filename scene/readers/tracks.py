@@ -11,9 +11,12 @@ import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, Gaussians
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.lens import Lens as NativeLens
+from diff_gaussian_rasterization.lens import lens_of
+from diff_gaussian_rasterization.reference.lens import numbers_of
 from diff_gaussian_rasterization.scene import scene_arguments
 
-from scene.images.lens import Lens, rays_of
+from scene.colmap_loader import Camera
+from scene.images.lens import PERSPECTIVE, Lens, rays_of
 from scene.readers.colmap import find_model, read_model
 from scene.readers.info import CameraInfo
 from scene.readers.scene_folder import COLMAP, kind_of
@@ -25,8 +28,9 @@ FEWEST = 12  # points of a track; fewer say too little of a pose
 class Track(NamedTuple):
     """What a photo has seen: points (K, 3) float64 of the training's frame, and their rays (K, 2), x / z and y / z.
 
-    places (K, 2): in the photo, in parts of its width and height. errors: of reprojection, in pixels. lengths: photos
-    that see the point. ranks: of the points' ids. These are (K,).
+    angular: a ray is the angle from the axis (radians) times the direction in the image, as a fisheye shows it: it may
+    be 90 degrees or more. places (K, 2): in the photo, in parts of its width and height. errors: of reprojection, in
+    pixels. lengths: photos that see the point. ranks: of the points' ids. These are (K,).
     """
 
     points: np.ndarray
@@ -35,6 +39,7 @@ class Track(NamedTuple):
     errors: np.ndarray
     lengths: np.ndarray
     ranks: np.ndarray
+    angular: bool = False
 
 
 def read_tracks(scene: str | os.PathLike, views: Sequence[CameraInfo], offset: np.ndarray) -> list[Track | None]:
@@ -56,22 +61,41 @@ def read_tracks(scene: str | os.PathLike, views: Sequence[CameraInfo], offset: n
             found.append(None)
             continue
         place = np.minimum(np.searchsorted(points.ids, photo.point3D_ids), len(points.ids) - 1)
-        camera = cameras[photo.camera_id]
-        rays = rays_of(Lens(camera.model, tuple(map(float, camera.params)), camera.width, camera.height), photo.xys)
+        camera, angular = cameras[photo.camera_id], view.native is not None and view.native.chart == "equidistant"
+        rays = _angles(camera, photo.xys) if angular else _rays(camera, photo.xys, view)
         known = points.ids[place] == photo.point3D_ids
-        places = photo.xys / (camera.width, camera.height)
-        sound = (np.abs(points.errors[place]) <= max(camera.width, camera.height)) & (np.abs(places - 0.5) < _FAR).all(
-            1
-        )
+        places, longest = photo.xys / (camera.width, camera.height), max(camera.width, camera.height)
+        sound = (np.abs(points.errors[place]) <= longest) & (np.abs(places - 0.5) < _FAR).all(1)
         dropped += int((known & ~sound).sum())
         seen = known & sound & np.isfinite(rays).all(1)
         place, places = place[seen], places[seen]
-        track = Track(points.xyz[place] - offset, rays[seen], places, points.errors[place], lengths[place], place)
+        track = Track(
+            points.xyz[place] - offset, rays[seen], places, points.errors[place], lengths[place], place, angular
+        )
         found.append(track if len(place) >= FEWEST else None)
     if dropped:
         fault = "lie far outside of their photo, or have a reprojection error that is larger than it or no number"
         print(f"{dropped} 2D points of {folder} are not used: they {fault}", file=sys.stderr)
     return found
+
+
+def _angles(camera: Camera, places: np.ndarray) -> np.ndarray:
+    """Angular rays (N, 2) of a fisheye's places (N, 2); NaN where it shows nothing."""
+    lens = lens_of(camera.model, tuple(map(float, camera.params)))
+    return numbers_of(lens, torch.from_numpy(places - 0.5), camera.width, camera.height).numpy()
+
+
+def _rays(camera: Camera, places: np.ndarray, view: CameraInfo) -> np.ndarray:
+    """Rays (N, 2) x / z and y / z of places (N, 2) in a camera's photo; NaN where there is none.
+
+    Of a wide lens that is undistorted, those that the pinhole in its place shows: farther out, noise grows without end.
+    """
+    rays = rays_of(Lens(camera.model, tuple(map(float, camera.params)), camera.width, camera.height), places)
+    if view.lens is None or camera.model in PERSPECTIVE:
+        return rays
+    x, y = (rays * (view.fx, view.fy) + (view.cx, view.cy)).T
+    shown = (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)
+    return np.where(shown[:, None], rays, np.nan)
 
 
 def projected(camera: CameraInfo, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -20,8 +20,13 @@ def pixels(lens: Lens, points: Tensor) -> Tensor:
         angular = torch.where(square > 0, torch.atan2(r, z) / r, 1 / z)
         stretch = 1 / z if lens.chart == "perspective" else angular
         a, b = x * stretch, y * stretch
-    found = _distorted(lens, torch.stack([a, b], -1))
-    return found * torch.tensor(lens.focal, dtype=points.dtype) + torch.tensor(lens.center, dtype=points.dtype)
+    return pixels_of(lens, torch.stack([a, b], -1))
+
+
+def pixels_of(lens: Lens, numbers: Tensor) -> Tensor:
+    """Pixels (..., 2) of numbers (..., 2) of the lens's chart."""
+    found = _distorted(lens, numbers)
+    return found * torch.tensor(lens.focal, dtype=numbers.dtype) + torch.tensor(lens.center, dtype=numbers.dtype)
 
 
 def jacobians(lens: Lens, points: Tensor) -> Tensor:
@@ -30,13 +35,20 @@ def jacobians(lens: Lens, points: Tensor) -> Tensor:
 
 
 def rays(lens: Lens, width: int, height: int) -> Tensor:
-    """Directions (H, W, 3) of the pixels, of any length; 0 where the lens shows none.
+    """Directions (H, W, 3) of the pixels, of any length; 0 where the lens shows none."""
+    y, x = (t.double() for t in torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij"))
+    found = numbers_of(lens, torch.stack([x, y], -1).reshape(-1, 2), width, height)
+    solved = found.isfinite().all(1)
+    return torch.where(solved[:, None], _directions(lens, found), 0.0).reshape(height, width, 3)
+
+
+def numbers_of(lens: Lens, places: Tensor, width: int, height: int) -> Tensor:
+    """Numbers (N, 2) of the chart, at which the lens shows pixels (N, 2) float64; NaN where it shows nothing.
 
     Newton's method, from the pixel's numbers as if there were no distortion.
     """
-    y, x = (t.double() for t in torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij"))
     focal, center = (torch.tensor(t, dtype=torch.float64) for t in (lens.focal, lens.center))
-    wanted = (torch.stack([x, y], -1).reshape(-1, 2) - center) / focal
+    wanted = (places - center) / focal
     found, of_one = wanted.clone(), torch.func.jacrev(lambda numbers: _distorted(lens, numbers))
     for _ in range(_STEPS):
         off = _distorted(lens, found) - wanted
@@ -48,7 +60,7 @@ def rays(lens: Lens, width: int, height: int) -> Tensor:
     solved = (_distorted(lens, found) - wanted).abs().amax(1) < _SOLVED
     _, limit, _, *_ = lens.numbers(width, height)
     solved &= found.square().sum(1) <= limit
-    return torch.where(solved[:, None], _directions(lens, found), 0.0).reshape(height, width, 3)
+    return torch.where(solved[:, None], found, torch.nan)
 
 
 def _distorted(lens: Lens, numbers: Tensor) -> Tensor:
