@@ -175,6 +175,10 @@ def test_tracks_of_a_fisheye_reach_beyond_90_degrees(tmp_path):
         assert track.angular and np.median(at.size) < 2  # pixels
         angles.append(np.hypot(*track.rays.T).max())
     assert max(angles) > np.radians(91)
+    views = read_colmap(folder, "images", False, native=False).train_cameras  # which cuts 60 degrees from the axis
+    for view, track in zip(views, read_tracks(folder, views, np.zeros(3)), strict=True):
+        at = np.abs(track.rays * (view.fx, view.fy) + (view.cx, view.cy) - np.array([view.width, view.height]) / 2)
+        assert not track.angular and (at <= np.array([view.width, view.height]) / 2).all()
 
 
 def test_rays_of_pinholes_are_those_of_pycolmap():

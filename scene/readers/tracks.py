@@ -91,7 +91,7 @@ def _rays(camera: Camera, places: np.ndarray, view: CameraInfo) -> np.ndarray:
     Of a wide lens that is undistorted, those that the pinhole in its place shows: farther out, noise grows without end.
     """
     rays = rays_of(Lens(camera.model, tuple(map(float, camera.params)), camera.width, camera.height), places)
-    if view.lens is None or camera.model in PERSPECTIVE:
+    if camera.model in PERSPECTIVE:
         return rays
     x, y = (rays * (view.fx, view.fy) + (view.cx, view.cy)).T
     shown = (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)
