@@ -13,6 +13,7 @@ from scene.dataset_readers import sceneLoadTypeCallbacks
 from scene.images.lens import Lens
 from scene.readers.info import CameraInfo, SceneInfo
 from scene.readers.pinholes import camera_info
+from scene.readers.point_cloud import color_fractions
 from scene.readers.scene_folder import COLMAP
 from scene.readers.start_cloud import StartCloud, StartOptions, random_in_cube, random_in_frusta, scene_info
 from utils.graphics_utils import BasicPointCloud
@@ -66,7 +67,7 @@ def scene_of(dataset: Mapping[str, Any], start: StartOptions) -> SceneInfo:
         points, colors = dataset["points3D_xyz"], dataset["points3D_rgb"]
         if points is None:
             return StartCloud(random(), None)
-        colors = np.full(points.shape, 0.5) if colors is None else np.asarray(colors) / 255
+        colors = np.full(points.shape, 0.5) if colors is None else color_fractions(np.asarray(colors), "points3D_rgb")
         return StartCloud(BasicPointCloud(points.astype(np.float32), colors, np.zeros_like(points)), None)
 
     def random() -> BasicPointCloud:

@@ -79,7 +79,7 @@ def _read(path: Path) -> BasicPointCloud:
     if colors is None:
         print(f"{path} has no colours; its points begin grey", file=sys.stderr)
         return BasicPointCloud(points, np.full(points.shape, _GREY), normals)
-    return BasicPointCloud(points, _fractions(colors, path), normals)
+    return BasicPointCloud(points, color_fractions(colors, path), normals)
 
 
 def _begins_with(path: Path, magic: bytes) -> bool:
@@ -124,8 +124,11 @@ def _columns(vertices: np.ndarray, names: Mapping[str, str], wanted: Sequence[st
     return np.stack([vertices[names[name]] for name in wanted], axis=1)
 
 
-def _fractions(colors: np.ndarray, path: Path) -> np.ndarray:
-    """Colours (N,3) as parts of the greatest value that their numbers tell of."""
+def color_fractions(colors: np.ndarray, path: object) -> np.ndarray:
+    """Colours (N,3) in [0,1], by the greatest value that their numbers tell of. UserError, naming the path, for others.
+
+    Floats range to 1 or 255, integers to 255 or 65,535.
+    """
     if colors.dtype == np.int8:
         colors = colors.view(np.uint8)  # bytes, as C's char has them
     low, high = (colors.min(), colors.max()) if colors.size else (0, 0)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from splatting.files.plain_files import plain
+from splatting.files.plain_files import encoding_of
 from utils.system_utils import UserError, atomic_write
 
 NAME = "error_vs_time.csv"
@@ -56,7 +56,7 @@ def read_curve(path: str | os.PathLike) -> list[Row]:
 
 def _lines(path: str | os.PathLike) -> list[list[str]]:
     """Lines of a CSV file, stripped fields, the header first."""
-    with open(plain(path), encoding="utf-8", newline="") as file:
+    with open(path, encoding=encoding_of(path), newline="") as file:
         return [[field.strip() for field in line] for line in csv.reader(file, strict=True) if line] or [[]]
 
 
