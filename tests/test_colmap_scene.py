@@ -96,6 +96,8 @@ def test_a_model_may_have_no_points(colmap_scene, start):
     info = read(colmap_scene)
     np.testing.assert_array_equal(info.point_cloud.points, CLOUD.points)
     assert info.ply_path == sparse / "points3D.ply"
+    (sparse / "points3D.txt").write_text("# none\n")
+    assert read(colmap_scene).ply_path == sparse / "points3D.ply"  # although it is older
 
 
 def test_names_of_one_file_are_refused(colmap_scene):

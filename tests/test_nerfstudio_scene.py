@@ -132,12 +132,17 @@ def test_fields_that_are_not_used_are_named(scene, capsys):
     def change(content):
         content["frames"][1].update(is_bad=True, time=0.5)
         for frame in content["frames"]:
-            frame.update(depth_file_path="depths/a.png", is_bad=frame.get("is_bad", False))
+            frame.update(
+                depth_file_path="depths/a.png", rolling_shutter=[0.0, 0.0, 0.0, 0.0], is_bad=frame.get("is_bad", False)
+            )
+
+        content["val_frames"] = content["frames"][:2]
 
     _edit(scene, change)
     read(scene)
     said = capsys.readouterr().err
-    assert "transforms.json that are not used: is_bad (1 frames), depth_file_path (17 frames), time (1 frames)" in said
+    named = "is_bad (1 frames), depth_file_path (17 frames), time (1 frames), val_frames (2 frames)"
+    assert f"transforms.json that are not used: {named}" in said
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])

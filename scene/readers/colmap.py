@@ -86,7 +86,7 @@ def colmap_camera(
 def _own_cloud(model_folder: Path, model: ColmapModel) -> StartCloud | None:
     source, ply = _file(model_folder, _POINTS, "bin"), model_folder / f"{_POINTS}.ply"
     if ply.is_file():
-        if source is None or ply.stat().st_mtime >= source.stat().st_mtime:
+        if source is None or not len(model.points.ids) or ply.stat().st_mtime >= source.stat().st_mtime:
             return StartCloud(read_point_cloud(ply), ply)
         remedy = f"to use it, give --init_pcd_path {ply}"
         print(f"{ply} is older than {source.name} and is not used; {remedy}", file=sys.stderr)

@@ -174,11 +174,16 @@ def _read(path: Path) -> dict[str, Any]:
 def _say_what_is_unused(path: Path, content: dict[str, Any]) -> None:
     """Name the fields that would change the result in the programs that write them."""
     fields = [{**content, **frame} for frame in content["frames"]]
-    counts = {name: sum(bool(frame.get(name)) for frame in fields) for name in _UNUSED}
+    counts = {name: sum(bool(np.any(frame.get(name) or 0)) for frame in fields) for name in _UNUSED}
     if len({str(frame.get("time")) for frame in fields}) < 2:
         counts["time"] = 0  # the photos are of one moment
+    counts |= {name: len(listed) for name, listed in content.items() if _lists_other_frames(name, listed)}
     if said := [f"{name} ({count} frames)" for name, count in counts.items() if count]:
         print(f"fields of {path} that are not used: {', '.join(said)}", file=sys.stderr)
+
+
+def _lists_other_frames(name: str, listed: Any) -> bool:
+    return name.endswith("_frames") and name != "test_frames" and isinstance(listed, list)
 
 
 def _where(path: Path, number: int, frame: Any) -> str:
