@@ -99,6 +99,19 @@ def test_test_frames_are_the_test_views(scene, capsys, again):
     assert len(read(scene).train_cameras) == 17
 
 
+def test_test_frames_may_be_missing_without_eval(scene, capsys):
+    names = [camera.image_name for camera in read(scene).train_cameras]
+    lost = {"file_path": "images/gone.png", "transform_matrix": np.eye(4).tolist()}
+    _edit(scene, lambda content: content.update(test_frames=[lost]))
+    assert [camera.image_name for camera in read(scene).train_cameras] == names
+    assert "the test_frames of" in capsys.readouterr().err
+    with pytest.raises(UserError, match="1 of 18 photos .*gone.png"):
+        read(scene, hold_out=True)
+    (scene / names[0]).unlink()
+    with pytest.raises(UserError, match=f"1 of 17 photos .*{names[0]}"):
+        read(scene)
+
+
 def test_a_photo_has_one_pose(scene, capsys):
     _edit(scene, lambda content: content["frames"].append(content["frames"][0]))
     assert len(read(scene).train_cameras) == 17

@@ -3,6 +3,7 @@
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +75,7 @@ def _test_frames(path: Path, masks: MaskOptions, suffixes: Sequence[str], needed
         return read_frames(path, masks, suffixes)
     except UserError as error:
         if needed:
-            raise
+            raise UserError(f"{error}, or leave --eval out") from error
         print(f"the views of {path} do not train: {error}", file=sys.stderr)
         return []
 
@@ -131,7 +132,15 @@ def read_nerfstudio(
     """
     path = folder / "transforms.json"
     content = _read(path)
-    cameras = _cameras(path, content, masks, SUFFIXES, by_stem=False, native=native)
+    read = partial(_cameras, path, masks=masks, suffixes=SUFFIXES, by_stem=False, native=native)
+    try:
+        cameras = read(content)
+    except UserError as error:
+        if hold_out or not content["test_frames"]:
+            raise
+        content = {**content, "frames": content["frames"][: -len(content["test_frames"])], "test_frames": []}
+        cameras = read(content)
+        print(f"the test_frames of {path} do not train: {error}", file=sys.stderr)
     tests = {_file(view) for view in cameras[len(cameras) - len(content["test_frames"]) :]}
     cameras = _once(cameras, str(path))
     cameras.sort(key=lambda camera: os.fsencode(camera.image_name))
