@@ -12,6 +12,7 @@ from PIL import Image
 from synthetic import FakeGaussians, folder_state, make_nerfstudio_scene, options_of, read
 
 from scene import Scene
+from scene.dataset_readers import read_scene
 from scene.images.lens import Lens
 from scene.readers.transforms import lens_of
 from utils.system_utils import UserError
@@ -210,6 +211,15 @@ def test_a_frame_that_names_its_photo_as_its_mask(scene):
     _edit(scene, lambda content: content["frames"][3].update(mask_path=content["frames"][3]["file_path"]))
     with pytest.raises(UserError, match="frame 4 .* names the photo itself as its mask .*; name a mask file, or take"):
         read(scene)
+
+
+def test_a_folder_of_photos_that_is_not_used_is_named(scene, blender_scene, capsys):
+    for folder, file in ((scene, "transforms.json"), (blender_scene, "transforms_train.json")):
+        read_scene(folder, "images_2", True)
+        assert f"-i images_2 is not used: {file} names its photos itself, the first is" in capsys.readouterr().err
+    for folder, images in ((scene, "images"), (scene, "images/Right"), (blender_scene, "train")):
+        read_scene(folder, images, True)
+        assert "is not used" not in capsys.readouterr().err
 
 
 def test_no_points(scene):

@@ -59,6 +59,7 @@ def read_blender(
         ply = _ply_in(folder)
         return StartCloud(read_point_cloud(ply), ply) if ply else StartCloud(random_in_cube(), None)
 
+    _say_if_unused(images, files[0], train)
     lacking = f"{folder / 'points3d.ply'} has no points"
     return scene_info((train, test), start, own, random_in_cube, lacking, is_nerf_synthetic=True)
 
@@ -146,6 +147,7 @@ def read_nerfstudio(
     cameras.sort(key=lambda camera: os.fsencode(camera.image_name))
     if not cameras:
         raise UserError(f"{path} lists no frames; export the scene again")
+    _say_if_unused(images, path, cameras)
     views = _own_split(path, content, cameras, tests, hold_out) or split_by_order(cameras, hold_out, folder)
 
     def own() -> StartCloud | None:
@@ -193,6 +195,18 @@ def _say_what_is_unused(path: Path, content: dict[str, Any]) -> None:
 
 def _lists_other_frames(name: str, listed: Any) -> bool:
     return name.endswith("_frames") and name != "test_frames" and isinstance(listed, list)
+
+
+def _say_if_unused(images: str, path: Path, cameras: Sequence[CameraInfo]) -> None:
+    """Say that -i has no effect, where it names another folder than that of the photos and not the default."""
+    photos = [Path(camera.image_path) for camera in cameras]
+    if images in ("", "images") or any(photo.is_relative_to(path.parent / images) for photo in photos):
+        return
+    print(
+        f"-i {images} is not used: {path.name} names its photos itself, the first is {photos[0]}; leave -i out, change "
+        "file_path in the file, or give -r 2, 4 or 8 for smaller photos",
+        file=sys.stderr,
+    )
 
 
 def _where(path: Path, number: int, frame: Any) -> str:
