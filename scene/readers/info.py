@@ -245,7 +245,7 @@ def turned(names: Sequence[str], count: int, photo: tuple[int, int], camera: tup
         f"{len(names)} of {count} photos have the sides of their camera exchanged, the first {names[0]} ({size}, "
         f"camera {other})",
         "turn the photos as their EXIF orientation says (mogrify -auto-orient), or exchange width and height of the "
-        "camera",
+        "camera" + (", or restore the names of these photos" if len(names) < count else ""),
     )
 
 

@@ -17,7 +17,7 @@ _SAMPLE = 5000  # most points
 _FEWEST = 10  # points in a photo, and in all
 _GREY = 0.02  # spread of colours, below which they tell nothing
 _CAMERAS = 16  # that geometric causes are tried on
-_PHOTOS = 200  # most photos that are compared, and their size in pixels
+_PHOTOS, _SMALL = 400, 200  # most photos that are compared, and their size in pixels
 _SUSPECTS = 24  # photos that fit their cameras worst
 _CLEARLY = 0.8  # error with another cause or photo, as a part of the given one's
 _MOST = 0.75  # share of the cameras that a geometric cause makes better
@@ -51,9 +51,9 @@ def check_colors(info: SceneInfo) -> Iterator[Line]:
 def _pixels(camera: CameraInfo) -> np.ndarray:
     """A photo, small, (H, W, 3) in [0, 1]."""
     with Image.open(camera.image_path) as image:
-        image.draft("RGB", (_PHOTOS, _PHOTOS))
+        image.draft("RGB", (_SMALL, _SMALL))
         image = image.convert("RGB")
-        image.thumbnail((_PHOTOS, _PHOTOS))
+        image.thumbnail((_SMALL, _SMALL))
         return np.asarray(image) / 255
 
 
@@ -104,13 +104,18 @@ def _exchanged(photos: _Photos) -> Iterator[Line]:
     """Photos that show clearly more of what another camera should see than its photo does, and than of their own."""
     own = _own(photos)
     suspects = np.argsort(np.where(np.isfinite(own), -own, 0))[:_SUSPECTS]
-    names, shapes = [], np.array([camera.width / camera.height for camera in photos.cameras])
+    shapes = np.array([camera.width / camera.height for camera in photos.cameras])
+    pairs: set[tuple[int, int]] = set()  # a photo, and the camera that it fits
     for camera in suspects:
         errors = _errors(photos.cameras[camera], photos.pixels, photos.cloud)
         errors[~np.isclose(shapes, shapes[camera], rtol=0.02)] = np.inf
         best = int(errors.argmin())
         if errors[best] < _CLEARLY * min(own[camera], own[best]):
-            names.append(f"{photos.cameras[best].image_name} shows what {photos.cameras[camera].image_name} should")
-    if names:
-        text = f"photos have each other's names ({some(sorted(names))})"
+            pairs.add((best, camera))
+            back = _errors(photos.cameras[best], [photos.pixels[camera]], photos.cloud)[0]
+            pairs |= {(int(camera), best)} if back < own[best] else set()
+    if pairs:
+        shown = [[photos.cameras[n].image_name for n in pair] for pair in sorted(pairs)]
+        names = [f"{photo} shows what {camera} should" for photo, camera in shown]
+        text = f"photos have each other's names ({some(names)})"
         yield Line(text, "restore the names that the cameras were reconstructed with")

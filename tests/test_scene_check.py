@@ -1,0 +1,285 @@
+"""scene/check: each fault of photos, cameras and points is named, and nothing is said of sound scenes."""
+
+import argparse
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from synthetic import as_text, make_colmap_scene, options_of, read
+
+from scene import Scene
+from scene.check import Finding, findings, tell
+from scene.check.photos import of_photos
+from scene.dataset_readers import read_scene
+from scene.gaussian_model import GaussianModel
+from scene.gaussians.copies import places_of
+from scene.gaussians.start import start_rows
+from scene.images.masks import Mask
+from scene.readers.info import CameraInfo, SceneInfo
+from splatting.diagnosis.dataset import check_dataset
+from splatting.training.checks import check_scene
+from utils.graphics_utils import BasicPointCloud
+from utils.system_utils import UserError
+
+RANDOM = np.random.default_rng(0)
+GREY = RANDOM.integers(0, 256, (48, 64)).astype(np.float64)
+COLORS = RANDOM.integers(0, 256, (48, 64, 3)).astype(np.uint8)
+
+
+def said(info: SceneInfo, **options) -> str:
+    return "\n".join(str(one) for one in findings(info, **options))
+
+
+def _with_photos(*photos: np.ndarray, **fields) -> SceneInfo:
+    """A scene of photos in memory, with cameras in different places and no points."""
+    views = [
+        CameraInfo(n, np.eye(3), np.array([n, 0.0, 0]), FovX=1, FovY=1, image_name=f"v{n}", width=64, height=48,
+                   image=Image.fromarray(photo), **fields)
+        for n, photo in enumerate(photos)
+    ]  # fmt: skip
+    return SceneInfo(None, views, [], {"radius": 1.0}, None)
+
+
+def _alpha(*values: float | np.ndarray) -> SceneInfo:
+    return _with_photos(*(np.dstack([COLORS, np.broadcast_to(np.uint8(value), (48, 64))]) for value in values))
+
+
+@pytest.mark.parametrize(
+    ("info", "severe", "text"),
+    [
+        (_alpha(0, 0, 0), True, "3 of the 3 photos that were looked at are invisible, as their alpha is at most 0"),
+        (_alpha(1, 1), True, "alpha is at most 1 of 255; save them without alpha"),
+        (_alpha(255, 0, 255), False, "1 of the 3 photos that were looked at are invisible"),
+        (_alpha(128, 128), False, "no pixel of the photos is opaque: their alpha is at most 128"),
+        (_alpha(GREY, GREY), False, "of the 2 photos that were looked at are half transparent"),
+        (_with_photos((GREY * 16).astype(np.uint16)), False, "use 6.2% of the range, from 0 to 4080 of 65535; mult"),
+        (_with_photos((GREY * 4).astype(np.uint16)), False, "multiply their values by 64"),
+        (_with_photos((29000 + 8 * GREY).astype(np.uint16)), False, "from 29000 to 31040 of 65535; stretch"),
+        (_with_photos(COLORS * 0), False, "the photos are all black"),
+        (_with_photos(COLORS * 0 + 255), False, "the photos are all white"),
+        (_with_photos(COLORS, COLORS * 0 + 90), False, "1 of the 2 photos that were looked at are nearly one"),
+        (_with_photos(GREY > 99), False, "only two values, as masks have"),
+    ],
+)  # fmt: skip
+def test_photos(info, severe, text):
+    (one,) = of_photos(info, 16)
+    assert text in str(one) and one.severe == severe
+
+
+def test_sound_photos_are_passed():
+    edges = np.where(np.indices((48, 64))[1] < 30, 255, 0) + np.where(np.indices((48, 64))[1] == 30, 100, 0)
+    for info in (_with_photos(COLORS), _with_photos((GREY * 257).astype(np.uint16)), _alpha(edges, 255)):
+        assert said(info) == ""
+    assert said(_alpha(0, 0), alpha=False) == ""
+
+
+def test_masks_that_leave_out_everything(tmp_path):
+    Image.new("L", (64, 48)).save(tmp_path / "black.png")
+    (one,) = findings(_with_photos(COLORS, COLORS, mask=Mask(tmp_path / "black.png")))
+    assert one.severe and "the masks of 2 of the 2 photos that were looked at leave out every pixel" in one.text
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("sound") / "scene"
+    make_colmap_scene(folder)
+    return folder
+
+
+def _cameras(info: SceneInfo, **fields) -> SceneInfo:
+    return info._replace(train_cameras=[replace(view, **fields) for view in info.train_cameras])
+
+
+def test_a_sound_scene_is_passed(sound):
+    for hold_out in (False, True):
+        assert findings(read(sound, hold_out)) == []
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        (
+            {"fx": 1.2, "fy": 1.7},
+            "a focal length of 1.2 pixels); give focal lengths in pixels (these may be in parts of",
+        ),
+        ({"fx": 6.0, "fy": 6.0}, "these may be in millimetres"),
+        ({"fx": 5000.0, "fy": 5000.0}, "17 cameras have odd opening angles"),
+        ({"cx": 0.5, "cy": 0.5}, "principal point in a corner or at an edge"),
+        ({"cx": 0.0, "cy": 0.0}, "principal point in a corner or at an edge"),
+        ({"cx": 192.0, "cy": 128.0}, "principal point in a corner or at an edge"),
+        ({"fy": 300.0}, "focal lengths in x and y that differ more than twofold"),
+        ({"file_size": (64, 96)}, "17 of 17 photos have the sides of their camera exchanged"),
+    ],
+)
+def test_cameras(sound, fields, text):
+    assert text in said(_cameras(read(sound), **fields))
+
+
+def test_a_part_of_a_large_photo_is_passed(sound):
+    """As of a test with a true lens: the principal point may lie far outside."""
+    assert "principal" not in said(_cameras(read(sound), cx=-900.0))
+
+
+@pytest.mark.parametrize("exif", [False, True])
+def test_photos_turned_against_their_camera_are_refused(sound, tmp_path, exif):
+    scene = Path(shutil.copytree(sound, tmp_path / "scene"))
+    for path in (scene / "images").rglob("*.png"):
+        turned = Image.open(path).transpose(Image.Transpose.ROTATE_90)
+        orientation = turned.getexif()
+        orientation.update({0x0112: 6} if exif else {})
+        turned.save(path, exif=orientation)
+    with pytest.raises(UserError, match=r"17 of 17 photos have the sides .* \(64 x 96, camera 96 x 64\); turn"):
+        read(scene)
+    (line,) = check_dataset(str(scene), "images")
+    assert "sides of their camera exchanged" in line.text
+
+
+def test_points_that_are_too_near(sound):
+    info = read(sound)
+
+    def scaled(factor: float) -> SceneInfo:
+        smaller = info._replace(point_cloud=info.point_cloud._replace(points=info.point_cloud.points * factor))
+        views = [replace(view, T=view.T * factor) for view in info.train_cameras]
+        return smaller._replace(train_cameras=views, nerf_normalization={"radius": info.extent * factor})
+
+    near = next(factor for factor in np.geomspace(1, 0.01, 40) if "is nearer than 0.2 units" in said(scaled(factor)))
+    (one,) = findings(scaled(near))
+    assert one.remedy.startswith("scale cameras and points of the scene by ") and not one.severe
+    assert said(scaled(near * float(one.remedy.rpartition(" ")[2]))) == ""
+    (one,) = findings(scaled(1e-3))
+    assert one.severe and "nothing nearer than 0.2 is drawn" in one.text
+
+
+@pytest.mark.parametrize("apart", [0.0, 1e-6])
+@pytest.mark.parametrize("size", [0.1, 1.0, 1000.0])
+def test_points_that_are_there_several_times(apart, size):
+    """Sizes are those of the cloud without copies, which at a few borders of cells are some percent off."""
+    points = RANDOM.normal(size=(2000, 3)).astype(np.float32) * np.float32(size)
+    copies = np.concatenate([points] * 4) + RANDOM.normal(scale=apart * size, size=(8000, 3)).astype(np.float32)
+    assert places_of(copies).misleads and not places_of(points).misleads
+    scales = [
+        start_rows(BasicPointCloud(x, x, x), size, 0)["scaling"][:2000, 0].exp().numpy() for x in (points, copies)
+    ]
+    np.testing.assert_allclose(np.median(scales[1] / scales[0]), 1, rtol=1e-3)
+    assert (np.abs(scales[1] / scales[0] - 1) < 0.3).mean() > 0.98
+
+
+def test_a_few_pairs_change_nothing(sound):
+    """Structure from motion leaves some: the bytes of trainings that start from them are kept."""
+    info = read(sound)
+    points = info.point_cloud.points
+    pairs = BasicPointCloud(*(np.concatenate([values, values[:20]]) for values in info.point_cloud))
+    assert not places_of(pairs.points).misleads and said(info._replace(point_cloud=pairs)) == ""
+    four = BasicPointCloud(*(np.concatenate([values] * 4) for values in info.point_cloud))
+    assert f"100% of the {4 * len(points)} points share a place with others, up to 4 in one" in said(
+        info._replace(point_cloud=four)
+    )
+
+
+def test_photos_that_are_there_twice(sound, tmp_path):
+    info = read(sound)
+    first, second = info.train_cameras[:2]
+    copy = tmp_path / "copy.png"
+    shutil.copyfile(first.image_path, copy)
+    twin = replace(first, image_path=copy, image_name="copy.png")
+    for again in (first, twin):
+        assert "photos are there twice (" in said(info._replace(train_cameras=[*info.train_cameras, again]))
+        leaked = info._replace(test_cameras=[again])
+        assert f"1 of 1 test photos also train ({again.image_name}), so their scores" in said(leaked)
+        assert said(leaked, halves=True) == ""
+    elsewhere = [replace(twin, R=second.R, T=second.T), *info.train_cameras]
+    assert "the same picture belongs to cameras in different places (" in said(info._replace(train_cameras=elsewhere))
+    same = [replace(view, image_path=copy) for view in info.train_cameras]
+    assert "all 17 photos are the same picture" in said(info._replace(train_cameras=same))
+
+
+def test_what_a_training_prints(capsys):
+    found = [Finding(f"fault {n}", "repair it") for n in range(7)]
+    tell(found, "garden")
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [*(f"warning: fault {n}; repair it" for n in range(5)), "2 more: python doctor.py -s garden"]
+    with pytest.raises(UserError, match="fault; repair it"):
+        tell([Finding("fault", "repair it", severe=True), *found], "garden")
+
+
+def test_a_resumed_training_is_not_told_again(sound, tmp_path, capsys):
+    options = options_of(sound, tmp_path / "out")
+    scene = Scene(options, GaussianModel(0), start=False)
+    scene.info = _cameras(scene.info, cx=0.0, cy=0.0)
+    for resumed in (False, True):
+        check_scene(scene, options, resumed)
+        assert ("principal point" in capsys.readouterr().err) != resumed
+
+
+def test_two_exchanged_photos_are_named(sound, tmp_path):
+    scene = Path(shutil.copytree(sound, tmp_path / "scene"))
+    assert not any("each other's names" in line.text for line in check_dataset(str(scene), "images"))
+    photos = sorted((scene / "images").rglob("*.png"))
+    names = [path.relative_to(scene / "images").as_posix() for path in (photos[2], photos[12])]
+    one, other = (scene / "images" / name for name in names)
+    contents = one.read_bytes(), other.read_bytes()
+    one.write_bytes(contents[1])
+    other.write_bytes(contents[0])
+    (line,) = [line for line in check_dataset(str(scene), "images") if "each other's names" in line.text]
+    assert f"{names[0]} shows what {names[1]} should" in line.text
+    assert line.text.count("shows what") == 2
+
+
+def _longer(model) -> None:
+    for camera in model.cameras.values():
+        camera.params = [1.3 * value for value in camera.params[:2]] + [*camera.params[2:]]
+
+
+def _farther(model) -> None:
+    for point in model.points3D.values():
+        point.xyz = 10 * point.xyz
+
+
+@pytest.mark.parametrize("tracks", [True, False])
+@pytest.mark.parametrize(
+    ("change", "text"), [(_longer, "with focal lengths 0.769 times as long"), (_farther, "if those are scaled by 0.1")]
+)
+def test_a_geometric_cause_is_named_before_colours(sound, tmp_path, change, text, tracks):
+    import pycolmap
+
+    scene = Path(shutil.copytree(sound, tmp_path / "scene"))
+    model = pycolmap.Reconstruction(scene / "sparse" / "0")
+    change(model)
+    model.write_binary(str(scene / "sparse" / "0"))
+    if not tracks:
+        as_text(scene)
+        path = scene / "sparse" / "0" / "images.txt"
+        path.write_text("".join(f"{line}\n\n" for line in path.read_text().splitlines() if line.endswith(".png")))
+        text = text.replace("0.769", "about 0.75")
+    lines = "\n".join(line.text for line in check_dataset(str(scene), "images") if line.finding)
+    assert text in lines and "each other's names" not in lines
+
+
+def test_missing_and_broken_photos_are_told_together(sound, tmp_path):
+    scene = Path(shutil.copytree(sound, tmp_path / "scene"))
+    gone, *broken = sorted((scene / "images").rglob("*.png"))[:3]
+    for path in broken:
+        path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(UserError, match=rf"2 of 17 photos cannot be read: {broken[0]}, {broken[1]}; replace them"):
+        read(scene)
+    gone.unlink()
+    with pytest.raises(UserError, match=rf"1 of 17 photos .*{gone.name}.* and 2 cannot be read: {broken[0]}"):
+        read(scene)
+
+
+def test_real_scenes_are_passed(shared_dir):
+    for name in ("fox_tiny", "fox_raw", "monstree_mixed", "bonsai_small", "nerf_lego200_tiny"):
+        assert findings(read_scene(shared_dir / "scenes" / name, "images", True, native=True)) == [], name
+
+
+def test_records_of_other_readers_are_judged(sound):
+    """They may lack what our records have besides the reference's fields."""
+    names = CameraInfo._fields
+    info = read(sound)
+    plain = [argparse.Namespace(**{name: getattr(view, name) for name in names}) for view in info.train_cameras]
+    assert findings(info._replace(train_cameras=plain)) == []
+    plain[0].FovX = 3.1
+    assert "1 cameras have odd opening angles" in said(info._replace(train_cameras=plain))
