@@ -7,13 +7,16 @@ _PAPER = "ours, from the MCMC paper"
 _RELEASED = "ours, from the release of the MCMC paper"
 
 
+STRATEGIES = ("adc", "mcmc", "budget")
+
+
 def _between(value: float) -> str | None:
     return None if 0 < value < 1 else "between 0 and 1, and neither of them"
 
 
 # fmt: off
 STRATEGY_OPTIONS: tuple[Option, ...] = (
-    Option("strategy", "auto", origin="ours", check=one_of("auto", "adc", "mcmc", "budget"), stored=MODEL_JSON,
+    Option("strategy", "auto", origin="ours", check=one_of("auto", *STRATEGIES), stored=MODEL_JSON,
         help="how many Gaussians there are, and where. auto: adc; with --time_budget budget, or on a GPU mcmc for at "
              "most 50 photos and 0.25 seconds or more for each; a resumed run keeps its own. adc: adaptive density "
              "control, the method's own; mcmc: Gaussians that nobody sees are moved to others, and positions get "
@@ -68,7 +71,7 @@ STRATEGY_OPTIONS: tuple[Option, ...] = (
     Option("prune_opacity", 0.005, origin="ours, and adaptive density control's", check=within(0, 0.5),
         help="budget: Gaussians of a lower opacity are removed, every densification_interval steps"),
 
-    Option("time_budget", 0.0, origin="ours", check=at_least(0),
+    Option("time_budget", 0.0, origin="ours", check=within(0, 31_536_000),  # a year
         help="seconds of training that the run takes, without scoring and saving, to 3 %; 0: no budget. It goes "
              "through the whole schedule of --iterations in them, in fewer or more iterations, with learning rates "
              "that follow their number, and writes schedule.json"),

@@ -58,7 +58,8 @@ ABSURD = {
     "mcmc_growth": "-0.1 1.1", "mcmc_min_opacity": "0 1", "mcmc_parts": "1 52", "mcmc_noise": "-1 inf 1e300",
     "mcmc_gate_steepness": "-1 10001", "mcmc_gate_opacity": "1.5", "mcmc_opacity_reg": "-0.01",
     "mcmc_scale_reg": "-0.01", "mcmc_init_opacity": "1", "mcmc_init_scale": "-0.1", "resolution_schedule": "fine",
-    "target_psnr": "-3", "time_budget": "-1 inf", "exposure_lr_init": "-0.1", "exposure_lr_delay_steps": "-1",
+    "target_psnr": "-3", "time_budget": "-1 inf 1e300", "gpu_memory": "-1 nan 1e300",
+    "exposure_lr_init": "-0.1", "exposure_lr_delay_steps": "-1",
     "exposure_lr_delay_mult": "1.5", "depth_l1_weight_final": "-1",
 }
 # fmt: on

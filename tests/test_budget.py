@@ -360,6 +360,15 @@ REACH = [
     ("mcmc", 9999, MCMC | {"mcmc_until_iter": 25_000}, 1, "gets to 5,122 Gaussians"),
     ("mcmc", 0, MCMC, 1, None),
     ("adc", 301, WINDOW, 1, None),
+    (
+        "adc",
+        0,
+        WINDOW | {"densify_from_iter": 130},
+        1,
+        "130 is not before --densify_until_iter 130, so no Gaussians are",
+    ),
+    ("mcmc", 0, MCMC | {"densify_from_iter": 120}, 1, "120 is not before --mcmc_until_iter 100, so no Gaussians are"),
+    ("adc", 0, WINDOW | {"densify_until_iter": 0}, 81, None),  # as one asks for who wants none
     ("adc", 100, WINDOW, 1, "the start has 300 Gaussians, more than --max_num_splats 100; adc adds none"),
 ]
 

@@ -6,6 +6,7 @@ import random
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -24,7 +25,7 @@ from splatting.training.resolution import Resolution
 from splatting.training.run import Run
 from splatting.training.schedule import Block, Decided, DecidedSchedule, Schedule, SettlingSchedule, TimeBudget
 from splatting.training.schedule_file import read_schedule, write_schedule
-from splatting.training.strategies import of_clock
+from splatting.training.strategies import density_control, of_clock
 from utils.system_utils import UserError
 
 OPTIONS = ["-r", 24, "--eval", "--no_curve", "--test_iterations", -1, "--densify_grad_threshold", 1e-4,
@@ -186,7 +187,10 @@ def _with_block(index: int, **values: object) -> dict:
         ("[" * 100_000, "is no schedule of a run"),
         ([], "it is not a table"),
         ({name: GOOD[name] for name in GOOD if name != "blocks"}, "'blocks' is missing"),
-        (GOOD | {"iterations": 0}, "0 is no whole number from 1 on"),
+        (GOOD | {"iterations": 0}, "0 is no whole number from 1 to 2147483647"),
+        (_with_block(1, last=2**70) | {"ended": 2**70}, "is no whole number from 1 to 2147483647"),
+        (GOOD | {"strategy": "error_scores"}, "'error_scores' is no strategy"),
+        (GOOD | {"strategy": ["adc"]}, "is no strategy"),
         (GOOD | {"iterations": True}, "True is no whole number"),
         (GOOD | {"blocks": []}, "its blocks do not follow each other"),
         (GOOD | {"blocks": [3]}, "is no schedule of a run"),
@@ -592,3 +596,9 @@ def test_the_clock_ends_growth_at_the_pace_of_whole_views_and_removes_nothing(si
     assert said.startswith("--time_budget 20 is time for some ") and said.endswith(
         ", not the 50,000 of --max_num_splats"
     )
+
+
+def test_a_strategy_of_a_damaged_file_is_none():
+    """model.json of a resumed run, whose words nobody has checked."""
+    with pytest.raises(UserError, match="^there is no strategy 'error_scores'; give --strategy adc or mcmc or budget$"):
+        density_control(SimpleNamespace(opt=SimpleNamespace(strategy="error_scores")))

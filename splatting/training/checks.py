@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from arguments import OPTIONS, other_scene, read_model_json, read_training_options
-from arguments.strategies import STRATEGY_OPTIONS
+from arguments.strategies import STRATEGIES, STRATEGY_OPTIONS
 from scene.check import of_options, tell
 from scene.check.photos import hints
 from scene.gaussian_model import GaussianModel
@@ -105,7 +105,7 @@ def check_exposures(gaussians: GaussianModel, exposes: bool, checkpoint: str) ->
 
 def without_effect(opt: argparse.Namespace, strategy: str) -> str | None:
     """What to say of given options that belong to another strategy; their help begins with its name."""
-    other = {"adc", "mcmc", "budget"} - {strategy}
+    other = {*STRATEGIES} - {strategy}
     given = [f"--{o.name}" for o in STRATEGY_OPTIONS
              if o.help.partition(":")[0] in other and getattr(opt, o.name) != o.default]  # fmt: skip
     return f"--strategy {strategy} has no use for {some(given)}" if given else None
@@ -140,6 +140,10 @@ def another_number(density: DensityControl, opt: argparse.Namespace, count: int,
     schedule, aim = density.schedule, density.most_gaussians
     if opt.schedule or schedule.ends is None or schedule.schedule_step(first) >= density.ends > 0:
         return None  # what is repeated or resumed has no say in it any more
+    if 0 < density.ends <= opt.densify_from_iter < schedule.length:
+        until = "mcmc_until_iter" if opt.strategy == "mcmc" else "densify_until_iter"
+        what = f"--densify_from_iter {opt.densify_from_iter} is not before --{until} {density.ends}"
+        return f"{what}, so no Gaussians are added; lower --densify_from_iter"
     reached = density.most_after(count, first, schedule.ends)
     too_many, too_late = 0 < opt.max_num_splats < count, opt.densify_from_iter >= schedule.length
     if opt.strategy == "adc":

@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from arguments.strategies import STRATEGIES
 from splatting.files.json_files import read_json, write_json
 from splatting.training.schedule import (
     BatchSchedule,
@@ -24,6 +25,7 @@ from splatting.training.schedule import (
 from utils.system_utils import UserError
 
 NAME = "schedule.json"
+_MOST = 2**31 - 1  # iterations, as of --iterations
 
 
 def write_schedule(path: Path, decided: Decided) -> None:
@@ -82,7 +84,9 @@ def _decided(content: Any) -> Decided:
     levels = [(_number(part, 0.0), _number(factor, 1.0)) for part, factor in content["levels"]]
     if levels != sorted(levels):
         raise ValueError("its levels do not ascend")
-    named = str(content["resolution_schedule"]), levels, str(content.get("strategy", ""))
+    if (strategy := content.get("strategy", "")) not in ("", *STRATEGIES):
+        raise ValueError(f"{strategy!r} is no strategy")
+    named = str(content["resolution_schedule"]), levels, strategy
     decided = Decided(length, blocks, ended, _number(content["time_budget"], 0.0), *named)
     if max(map(DecidedSchedule(decided).progress, lasts)) > 1 + 1e-6:
         raise ValueError("its progress goes beyond its end")
@@ -95,8 +99,8 @@ def _block(one: dict[str, Any]) -> Block:
 
 
 def _whole(value: Any, least: int) -> int:
-    if type(value) is not int or value < least:
-        raise ValueError(f"{value!r} is no whole number from {least} on")
+    if type(value) is not int or not least <= value <= _MOST:
+        raise ValueError(f"{value!r} is no whole number from {least} to {_MOST}")
     return value
 
 

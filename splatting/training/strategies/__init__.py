@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from arguments.strategies import STRATEGIES
 from scene.cameras import Camera
 from scene.readers.start_cloud import RANDOM_POINTS
 from scene.scene import Scene
 from splatting.training.density import DensityControl
+from utils.system_utils import UserError
 
 if TYPE_CHECKING:
     from splatting.training.run import Run
@@ -46,7 +48,12 @@ def end_in_time(opt: argparse.Namespace) -> None:
 
 
 def density_control(run: "Run") -> DensityControl:
-    """The strategy that --strategy names, for the model and the scene of a run: `of_run` of the file of that name."""
-    control = import_module(f"{__name__}.{run.opt.strategy}").of_run(run)
+    """The strategy that --strategy names, for the model and the scene of a run: `of_run` of the file of that name.
+
+    UserError for a name that is none of a strategy: a file of another run may say anything.
+    """
+    if (name := run.opt.strategy) not in STRATEGIES:
+        raise UserError(f"there is no strategy {name!r}; give --strategy {' or '.join(STRATEGIES)}")
+    control = import_module(f"{__name__}.{name}").of_run(run)
     control.random = is_random(run.scene)
     return control

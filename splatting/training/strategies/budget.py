@@ -68,7 +68,7 @@ class BudgetControl(DensityControl):
         sort_rows(self._gaussians)
 
     def most_after(self, count: int, first: int, last: int) -> int:
-        for iteration in filter(self.changes, range(first, last)):  # the last iteration takes no step
+        for iteration in filter(self.changes, range(first, min(last, self.ends))):  # the last iteration takes no step
             if self._grows(iteration):
                 count = min(self._aim(count, iteration), 2 * count)
         return count

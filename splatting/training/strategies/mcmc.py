@@ -56,7 +56,9 @@ class MarkovChain(DensityControl):
         return within and iteration % rules.interval(opt, opt.mcmc_until_iter, stride, self.schedule.views) == 0
 
     def most_after(self, count: int, first: int, last: int) -> int:
-        for iteration in filter(self.changes, range(first, last)):  # the last one is saved before its change
+        for iteration in filter(
+            self.changes, range(first, min(last, self.ends))
+        ):  # the last is saved before its change
             count = max(count, self._grown(count, iteration))
         return count
 
