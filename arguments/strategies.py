@@ -84,6 +84,7 @@ STRATEGY_OPTIONS: tuple[Option, ...] = (
         help="stop, and save, once the mean PSNR (dB) of the test views (--eval) is at least this; 0: no target. They "
              "are scored every 100 iterations, or every 20 times their number if that is more"),
     Option("schedule", "", origin="ours",
-        help="schedule.json of a run with --time_budget: train as that run did, without looking at the clock"),
+        help="schedule.json of a run with --time_budget: train as that run did, without looking at the clock. Or a "
+             "number: so many iterations, which go through the whole schedule of --iterations in equal parts"),
 )
 # fmt: on

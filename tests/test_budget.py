@@ -347,9 +347,16 @@ LATE = {"densify_from_iter": 160, "densification_interval": 20, "densify_until_i
 MCMC = WINDOW | {"mcmc_growth": 0.5, "mcmc_until_iter": 100}
 REACH = [
     ("budget", 2000, WINDOW | {"densify_until_iter": 100}, 1, None),
-    ("budget", 2000, WINDOW | {"densify_until_iter": 300}, 1, "is not before the end; give --densify_until_iter 80"),
+    (
+        "budget",
+        2000,
+        WINDOW | {"densify_until_iter": 300},
+        1,
+        "is not before the end; give --schedule 160 in place of --iterations 160",
+    ),
     ("budget", 200, LATE, 1, "more than --max_num_splats 200; only faint ones are removed, as --densify_from_iter 160"),
     ("budget", 200, LATE, 1, "160 is not before the end; give --densify_from_iter 8 --densify_until_iter 80"),
+    ("budget", 2000, LATE | {"densify_until_iter": 300}, 1, "160 is not before the end; give --schedule 160 in place"),
     ("budget", 500, LATE, 81, "give --densify_from_iter 84 --densify_until_iter 120"),
     # 300 Gaussians double in 20, 40, 60 and 80, but not in 100.
     ("budget", 10_000, WINDOW | {"densify_until_iter": 100}, 1, "gets to 4,800 Gaussians, not to 10,000, as they at"),

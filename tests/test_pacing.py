@@ -24,7 +24,7 @@ from splatting.training.observers.saves import ScheduleFile
 from splatting.training.resolution import Resolution
 from splatting.training.run import Run
 from splatting.training.schedule import Block, Decided, DecidedSchedule, Schedule, SettlingSchedule, TimeBudget
-from splatting.training.schedule_file import read_schedule, write_schedule
+from splatting.training.schedule_file import read_schedule, schedule_of, write_schedule
 from splatting.training.strategies import density_control, of_clock
 from utils.system_utils import UserError
 
@@ -602,3 +602,17 @@ def test_a_strategy_of_a_damaged_file_is_none():
     """model.json of a resumed run, whose words nobody has checked."""
     with pytest.raises(UserError, match="^there is no strategy 'error_scores'; give --strategy adc or mcmc or budget$"):
         density_control(SimpleNamespace(opt=SimpleNamespace(strategy="error_scores")))
+
+
+def test_a_number_of_iterations_goes_through_the_whole_schedule(tmp_path):
+    """In equal parts, and with no limit of Gaussians, as no clock sets their number."""
+    opt = options(schedule="1000", strategy="budget", iterations=30_000)
+    schedule = schedule_of(opt, None, 0)
+    steps = [schedule.schedule_step(t) for t in range(1001)]
+    assert steps[::500] == [0, 15_000, 30_000] and schedule.is_last(1000)
+    assert DensityControl.most(SimpleNamespace(schedule=schedule), 100, 10, 90_000) == 90_000
+    write_schedule(tmp_path / "schedule.json", schedule.recorded(1000, True))
+    assert read_schedule(tmp_path / "schedule.json").blocks == schedule.blocks
+    for words, reason in (({"schedule": "0"}, "between 1 and 2147483647"), ({"time_budget": 9.0}, "leave one out")):
+        with pytest.raises(UserError, match=reason):
+            schedule_of(options(**{"schedule": "7"} | words), None, 0)

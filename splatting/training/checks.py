@@ -23,7 +23,7 @@ from splatting.evaluation.error_curve import Row, continue_curve
 from splatting.evaluation.training_log import TrainingLog
 from splatting.files.listing import some
 from splatting.training.density import DensityControl
-from splatting.training.schedule import DecidedSchedule
+from splatting.training.schedule import USUAL, DecidedSchedule
 from utils.system_utils import UserError
 
 
@@ -156,20 +156,23 @@ def another_number(density: DensityControl, opt: argparse.Namespace, count: int,
         return None
     done = schedule.schedule_step(first) - 1
     until = f"--densify_until_iter {done + (schedule.length - done) // 2}"
+    scaled = None
+    if not done and schedule.views == 1 and opt.densify_from_iter < density.ends < USUAL:
+        scaled = f"--schedule {schedule.length} in place of --iterations {schedule.length}"
     if too_late:
         window = f"--densify_from_iter {done + (schedule.length - done) // 20}"
         if opt.strategy != "mcmc":
             window += f" {until}"
-        why = f"--densify_from_iter {opt.densify_from_iter} is not before the end; give {window}"
+        why = f"--densify_from_iter {opt.densify_from_iter} is not before the end; give {scaled or window}"
         if too_many and opt.strategy == "budget":
             return f"{_start_of(count, opt)}; only faint ones are removed, as {why}"
     elif opt.strategy == "mcmc":
-        why = f"--mcmc_growth {opt.mcmc_growth:g} adds too few each time; raise it, or lower --densification_interval"
+        why = f"--mcmc_growth {opt.mcmc_growth:g} adds too few each time; raise it"
         why = "it removes none; --strategy budget does" if too_many else why
     elif schedule.length < density.ends:
-        why = f"--densify_until_iter {opt.densify_until_iter} is not before the end; give {until}"
+        why = f"--densify_until_iter {opt.densify_until_iter} is not before the end; give {scaled or until}"
     else:
-        why = "they at most double each time; lower --densification_interval, or raise --densify_until_iter"
+        why = "they at most double each time; lower --densification_interval"
     return f"--strategy {opt.strategy} gets to {reached:,} Gaussians, not to {aim:,}, as {why}"
 
 

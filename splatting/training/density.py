@@ -90,7 +90,9 @@ class DensityControl:
         a random start.
         """
         schedule = self.schedule
-        if not isinstance(schedule, DecidedSchedule) or (possible := schedule.possible(iteration)) >= schedule.length:
+        if not isinstance(schedule, DecidedSchedule) or not schedule.seconds:
+            return limit
+        if (possible := schedule.possible(iteration)) >= schedule.length:
             return limit
         trained = max(int(AN_ITERATION * possible), 1)
         if limit and trained >= limit:

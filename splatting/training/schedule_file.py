@@ -14,6 +14,7 @@ from typing import Any
 from arguments.strategies import STRATEGIES
 from splatting.files.json_files import read_json, write_json
 from splatting.training.schedule import (
+    PYRAMID,
     BatchSchedule,
     Block,
     Decided,
@@ -148,6 +149,8 @@ def _batched(opt: argparse.Namespace, views: int) -> Schedule:
 def _chosen(
     opt: argparse.Namespace, checkpoint: str | None, first_iteration: int, share: Callable[[float], float]
 ) -> Schedule:
+    if opt.schedule.isdecimal() and not Path(opt.schedule).exists():
+        return DecidedSchedule(_even(int(opt.schedule), opt))
     if opt.schedule:
         return DecidedSchedule(_recorded(Path(opt.schedule), opt))
     path = Path(checkpoint).parent / NAME if checkpoint else None
@@ -173,6 +176,17 @@ def _tell_of_budget(checkpoint: str, first_iteration: int, iterations: int) -> N
         f"{first_iteration} of {iterations}",
         file=sys.stderr,
     )
+
+
+def _even(count: int, opt: argparse.Namespace) -> Decided:
+    """The schedule that so many iterations go through in equal parts, with no budget of seconds."""
+    if opt.time_budget:
+        raise UserError("--time_budget and --schedule both give the pace of a run; leave one out")
+    if not 1 <= count <= _MOST:
+        raise UserError(f"--schedule must name iterations between 1 and {_MOST}, or a file, got {count}")
+    sizes = "none" if opt.resolution_schedule == "auto" else opt.resolution_schedule
+    levels = PYRAMID if sizes == "pyramid" else ()
+    return Decided(opt.iterations, [Block(count, 0.0, 1 / count, 0.0)], count, 0.0, sizes, levels)
 
 
 def _recorded(path: Path, opt: argparse.Namespace) -> Decided:
