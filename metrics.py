@@ -12,7 +12,7 @@ if __name__ == "__main__":
     import splatting.host.early  # noqa: F401  (before the other imports, which take a second)
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +23,6 @@ from fused_ssim import fused_ssim
 from tqdm import tqdm
 
 from arguments import OptionParser, read_cfg_args
-from scene.half_images import half
 from splatting.evaluation import renders
 from splatting.evaluation.comparison import FITTED
 from splatting.evaluation.model_folder import json_or_none
@@ -221,12 +220,15 @@ def score(pairs: list[Pair], metrics: dict[str, Metric], title: str, errors: boo
     return scores
 
 
-def _right_half(pair: Pair) -> float | None:
-    """The PSNR of the right half of a pair."""
-    images = (np.asarray(image_of(file)) for file in (pair.render, pair.truth))
-    columns = half(pair.size[0], of_test_view=True)
-    mask = mask_of(pair.truth.parents[1], pair.name)
-    return psnr(*(image[:, columns] for image in images), None if mask is None else mask[:, columns])
+def _unfitted(whole: list[Pair], fitted: list[Pair], scored: Container[str]) -> dict[str, float | None]:
+    """The PSNR of whole views in the right parts that the fitted ones show, by file name, of those that are scored."""
+    found, widths = {}, {pair.name: pair.size[0] for pair in fitted if pair.name in scored}
+    for pair in (pair for pair in whole if pair.name in widths):
+        mask = mask_of(pair.truth.parents[1], pair.name)
+        images = (np.asarray(image_of(file)) for file in (pair.render, pair.truth))
+        parts = (None if image is None else image[:, -widths[pair.name] :] for image in (*images, mask))
+        found[pair.name] = psnr(*parts)
+    return found
 
 
 def mean(values: dict[str, float | None]) -> float | None:
@@ -319,7 +321,7 @@ def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str,
             print(f"{model} {name}: kept {', '.join(kept)} of an earlier scoring of the same pictures")
         scores |= depth_scores(model / "test" / name)
         if (plain := methods.get(name.removesuffix(f"_{FITTED}"), methods[name])) is not methods[name]:
-            scores |= {"PSNR_UNFITTED": {pair.name: _right_half(pair) for pair in plain if pair.name in scores["PSNR"]}}
+            scores |= {"PSNR_UNFITTED": _unfitted(plain, methods[name], scores["PSNR"])}
     results = {name: {key: mean(values) for key, values in scores.items()} for name, scores in per_view.items()}
     for name, means in results.items():
         shown = "  ".join(f"{key} {'null' if value is None else f'{value:.4f}'}" for key, value in means.items())

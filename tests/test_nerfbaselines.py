@@ -14,6 +14,7 @@ import pytest
 
 from integrations.nerfbaselines.datasets import MODELS, scene_of, view_of
 from scene.readers.start_cloud import OWN_POINTS
+from splatting.training.launch import launch_options
 
 pycolmap = pytest.importorskip("pycolmap")
 SPEC = Path(__file__).resolve().parents[1] / "integrations" / "nerfbaselines" / "spec.py"
@@ -115,6 +116,22 @@ def test_options_that_need_files_are_refused(method):
         "--random_background",
         "--sh_degree=1",
     ]
+
+
+@pytest.mark.parametrize(
+    "given",
+    [("keep_best", True), ("keep_best", "true"), ("options", "auto"), ("advise", True), ("target_psnr", 20),
+     ("resolution", 4), ("viewer", 8080), ("checkpoint_iterations", 7), ("start_checkpoint", "chkpnt7.pth")],
+)  # fmt: skip
+def test_options_that_nothing_would_follow_are_refused(method, given):
+    with pytest.raises(method.UserError, match=f"--{given[0]} {given[1]} has no effect in NerfBaselines"):
+        method.words_of(dict([given]))
+    assert method.words_of({"keep_best": "False", "options": "given", "resolution": 1})
+
+
+def test_every_launch_option_is_known_to_work_or_refused(method):
+    works = {"debug_from", "plain_step", "disable_viewer", "no_curve", "quiet", "ip", "port"}
+    assert vars(launch_options()).keys() == works | {*vars(launch_options())} & {*method._FIXED, *method._LISTS}
 
 
 def test_pixels_that_a_mask_leaves_out_do_not_count():

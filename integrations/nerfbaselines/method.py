@@ -38,12 +38,24 @@ INTERVAL = 100  # iterations between losses that are told: reading one waits for
 # Test views are held out by NerfBaselines. Full-size photos, no viewer, and nothing written but by `save`.
 _ALWAYS = ("--eval", "--resolution=1", "--disable_viewer", "--no_curve", "--test_iterations=-1", "--save_iterations=-1")
 _OF_FILES = ("appearance", "init_ply", "depths", "masks", "train_test_exp", "refine_poses", "sparse_depth")
+# Options that nothing follows here, with the value that is the case. Our other observers score, save and show.
+_FIXED = dict.fromkeys(
+    ("keep_best", "advise", "viewer", "viewer_exit", "viewer_host", "whole_curve", "detect_anomaly", "target_psnr",
+     "start_checkpoint", "source_path", "model_path", "images", "invert_masks", "refine_lens")
+    , "",
+) | {"options": "given", "parallel": "tiles", "resolution": "1", "mask_meaning": "auto"}  # fmt: skip
+_LISTS = ("test_iterations", "save_iterations", "checkpoint_iterations")
 
 
 def words_of(options: Mapping[str, Any]) -> list[str]:
-    """Options of train.py, by name, as words of its command line. UserError for those that need files of the scene."""
+    """Options of train.py, by name, as words of its command line.
+
+    UserError for those that need files of the scene, and for those that would have no effect.
+    """
     words = []
     for name, value in options.items():
+        if name in (*_FIXED, *_LISTS) and str(value).lower() not in ("false", "none", "", "0", _FIXED.get(name, "-1")):
+            raise UserError(f"--{name} {value} has no effect in NerfBaselines, which scores and saves; leave it out")
         if name in _OF_FILES:
             raise UserError(f"--{name} needs the scene's files, and NerfBaselines gives photos in memory; leave it out")
         if str(value).lower() not in ("true", "false"):

@@ -222,9 +222,8 @@ def training_report(
             if "psnr" in means:
                 line += f" PSNR {means['psnr']} (mean of the channels'; {means.pop('whole'):.3f} as metrics.py)"
             tqdm.write(line, file=sys.stdout)
-            for kind, title in (("l1", "l1_loss"), ("psnr", "psnr")) if tb_writer else ():
-                if kind in means:
-                    tb_writer.add_scalar(f"{name}/loss_viewpoint - {title}", means[kind], iteration)
+            for kind, value in means.items() if tb_writer else ():
+                tb_writer.add_scalar(f"{name}/loss_viewpoint - {kind.replace('l1', 'l1_loss')}", value, iteration)
             scores |= {f"{name}_{kind}": value for kind, value in means.items()}
     if tb_writer:
         tb_writer.add_histogram("scene/opacity_histogram", scene.gaussians.get_opacity, iteration)
