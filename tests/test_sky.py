@@ -12,18 +12,20 @@ from trainings import differences, trained
 
 import export
 import train
+from benchmarks.harness.colmap_part import part
 from benchmarks.scenes.options import with_sky
 from scene.gaussian_model import GaussianModel
 from scene.readers.tracks import projected
 from scene.scene import Scene
 from splatting.demo.make_scene import Things, write_scene
-from splatting.demo.objects import demo_scene
+from splatting.demo.objects import Box, Thing, demo_scene
 from splatting.demo.tracer import ring_views, shade, trace
 from splatting.diagnosis.model import check_model
 from splatting.exports.formats import read_splats
 from splatting.files.json_files import read_model_json
 from splatting.training import checks
-from splatting.training.sky import FEWEST, Sky, find_sky
+from splatting.training.sky import Sky, find_sky
+from splatting.training.sky_directions import FEWEST
 from utils.system_utils import UserError, run_cli
 
 ON = "--sky", "auto", "--densify_grad_threshold", 1e-5
@@ -67,6 +69,30 @@ def test_it_is_where_rays_meet_nothing_and_has_the_colours_there(scene):
 
 def test_there_is_none_before_a_backdrop_with_points(tmp_path):
     assert _found(_made(tmp_path / "clean", lambda _: demo_scene()))[-1] < FEWEST
+
+
+def _indoors(photo: int | None) -> list[Thing]:
+    """The demo's things in a room whose smooth walls differ a little, and have no points."""
+    box, _, *things = Thing(Box((0, -1.5, 0), (5.5, 3.0, 5.5), 0.0), _walls, emissive=True), *demo_scene()
+    return things if photo is None else [box, *things]
+
+
+def _walls(points: np.ndarray) -> np.ndarray:
+    """One colour for each wall."""
+    wall = np.abs((points - [[0], [-1.5], [0]]) / [[5.5], [3.0], [5.5]]).argmax(0)
+    return np.float32([[0.85, 0.90, 0.80], [0.83, 0.90, 0.84], [0.78, 0.90, 0.86]])[:, wall]
+
+
+def test_there_is_none_in_a_room_of_smooth_walls_without_points(tmp_path):
+    """Its edges move from photo to photo as those of near walls."""
+    assert _found(_made(tmp_path / "room", _indoors))[-1] == 0
+
+
+def test_there_is_none_where_few_points_tell_of_one(scene, tmp_path):
+    few = part(scene, tmp_path / "few", list, lambda points: points[::4])
+    assert _found(few)[-1] == 0
+    fewer = part(scene, tmp_path / "fewer", list, lambda points: points[::2])
+    assert _found(fewer)[-1] >= FEWEST
 
 
 def _model(means: torch.Tensor, log_scale: float) -> GaussianModel:
