@@ -37,6 +37,7 @@ SH_RANGE = 8.0  # coefficients from -4 to 4
 _LOG_SCALES = 20.0  # beyond this, readers clamp
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _VISIBLE = ("packed_position", "packed_scale", "packed_color")  # all zero in padding
+_SMALLEST = 10  # the part of the splats that tells whether most are a sky: one of these
 _FAR = 10.0  # usual distances from the middle, of positions or of colours
 _COLUMNS = {  # of a chunk
     "position": [f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"],
@@ -184,8 +185,7 @@ def _in_chunks(splats: Splats) -> tuple[np.ndarray, np.ndarray]:
     Those within _FAR usual distances come first, then those within _FAR times that, and so on.
     """
     shells = np.zeros(len(splats))
-    for values in (splats.means, splats.sh[:, 0]):
-        _, distances, usual = spread(values)
+    for distances, usual in (_from_the_middle(splats), spread(splats.sh[:, 0])[1:]):
         shells = np.maximum(shells, np.ceil(np.log(np.maximum(distances / usual, 1)) / np.log(_FAR)) - 1)
     order, padding = np.zeros(0, np.int64), np.zeros(0, bool)
     for shell in np.unique(shells):
@@ -195,6 +195,20 @@ def _in_chunks(splats: Splats) -> tuple[np.ndarray, np.ndarray]:
         order = np.concatenate([order, np.repeat(order[-1:], missing), own])
         padding = np.concatenate([padding, np.ones(missing, bool), np.zeros(len(own), bool)])
     return order, padding
+
+
+def _from_the_middle(splats: Splats) -> tuple[np.ndarray, float]:
+    """Distances (N,) from the middle, and the usual one; of the smallest splats, if they stand far closer together.
+
+    So they do amid a sky of more splats than all else.
+    """
+    _, distances, usual = spread(splats.means)
+    sizes = splats.log_scales.max(axis=1, initial=-np.inf)
+    smallest = np.argsort(sizes, kind="stable")[: -(-len(sizes) // _SMALLEST)]
+    middle, _, close = spread(splats.means[smallest])
+    if close * _FAR >= usual:
+        return distances, usual
+    return np.linalg.norm(splats.means.astype(np.float64) - middle, axis=1), close
 
 
 def _table(name: str, columns: list[str], values: np.ndarray, kind: str) -> PlyElement:

@@ -64,7 +64,7 @@ def write_spz(path: str | os.PathLike, splats: Splats) -> None:
     if splats.sh_degree:  # readers refuse an empty stream
         tables.append(to_bytes(splats.sh[:, 1:] * 128 + 128))
     streams = [table.tobytes() for table in tables]
-    compressor = zstandard.ZstdCompressor(level=_LEVEL)
+    compressor = zstandard.ZstdCompressor(level=_LEVEL, write_checksum=True)
     packed = [compressor.compress(stream) for stream in streams]
     table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
     flags = _ANTIALIASED if splats.antialiasing else 0
@@ -171,7 +171,8 @@ def _read_gzip(content: bytes) -> Splats:
     header = _header(stream.read(_HEADER.size), (2, 3), len(content))
     # No more than that, however much is packed.
     parts = [stream.read(width * header.count) for width in _widths(header)]
-    stream.read(1)  # at the end it checks the sum
+    if stream.read(1):  # at the end it checks the sum
+        raise ValueError("it holds more than its header says")
     return _splats(parts, header)
 
 
