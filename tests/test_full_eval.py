@@ -21,9 +21,11 @@ from synthetic import folder_state
 from waiting import LIMIT, wait_for
 
 import full_eval
+import train
 from arguments import write_cfg_args
 from splatting.evaluation import report as report_module
 from splatting.evaluation import results_page, stages
+from splatting.evaluation.configs import check_options
 from splatting.evaluation.figures import draw_curves, draw_fronts
 from splatting.evaluation.model_folder import SCHEDULE, shorter_ends_there
 from splatting.evaluation.plan import DATASETS, Run, SceneEntry, dataset_scenes, photos_of
@@ -732,3 +734,13 @@ def test_for_real(colmap_scene, tmp_path):
     assert run["views"] == {"test": 3, "train": 14} and run["test_sizes"] == [[96, 64]]
     assert run["curve"][-1]["iteration"] == 20 and run["curve"][-1]["test_psnr"] > 5
     assert run["machine"]["packages"]["torch"] and run["machine"]["commit"]
+
+
+@pytest.mark.parametrize(("words", "said"), [
+    (["--advise"], "--advise trains nothing; give --options auto"), (["--adv"], "--advise trains nothing"),
+    (["--viewer"], "--viewer waits for its page to be closed; add --viewer_exit"), (["--viewer", "--viewer_exit"], ""),
+    (["--options", "auto"], ""),
+])  # fmt: skip
+def test_options_with_which_a_training_does_not_end_by_itself_are_refused(words, said):
+    with pytest.raises(UserError, match=f"^after --: {said}") if said else contextlib.nullcontext():
+        check_options(words, "after --", train.parse)

@@ -80,10 +80,15 @@ def check_options(words: Sequence[str], where: str, parse: Parse | None) -> None
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
-            parse(words)
+            found = parse(words)
     except SystemExit as error:  # raised by argparse; without a message for -h
         line = said.getvalue().strip().rpartition("error: ")[2]  # and where to find all options, which follows
         reason = line.rpartition(" (")[0] or f"{' '.join(words)} trains nothing"
         raise UserError(f"{where}: {reason}; train.py -h lists the options") from error
     except UserError as error:
         raise UserError(f"{where}: {error}") from error
+    args = found[0] if isinstance(found, tuple) else None
+    if getattr(args, "advise", False):
+        raise UserError(f"{where}: --advise trains nothing; give --options auto to follow it, or run train.py --advise")
+    if getattr(args, "viewer", None) is not None and not args.viewer_exit:
+        raise UserError(f"{where}: --viewer waits for its page to be closed; add --viewer_exit, or leave it out")
