@@ -47,7 +47,7 @@ def diagnose(source: str | None, images: str | None, model: str | None, iteratio
         from splatting.diagnosis.dataset import check_dataset
 
         names = source, images or "images"
-        problems += _show(f"dataset {source}", [*check_dataset(*names), *check_options(*names)])
+        problems += _show(f"dataset {source}", [*check_dataset(*names), *check_options(*names, model)])
     if model is not None:
         from splatting.diagnosis.model import check_model
 

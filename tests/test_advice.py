@@ -2,14 +2,29 @@
 
 import argparse
 import json
+import os
+import signal
+import sys
+import threading
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+import splatting.diagnosis.advice
 from scene.readers.tracks import Track
-from splatting.diagnosis.advice import ADVICE, Advice, _of_passers_by, asked_options, distances, exposures
+from splatting.diagnosis.advice import (
+    ADVICE,
+    Advice,
+    _of_passers_by,
+    _trained,
+    asked_options,
+    check_options,
+    distances,
+    exposures,
+)  # fmt: skip
+from splatting.files.json_files import write_json
 from train import parse
 from utils.system_utils import UserError
 
@@ -66,11 +81,38 @@ def test_advice_on_a_given_option_or_against_one_is_not_taken(tmp_path, monkeypa
     assert [one["options"] for one in json.loads((tmp_path / ADVICE).read_text())] == ["--sky auto", "", ""]
 
 
-def test_the_short_training_reads_the_photos_as_the_training_does(monkeypatch):
+@pytest.mark.parametrize("more", [["--init_type", "random"], ["--init_ply=a.ply"], ["--init_pcd_path=b"], ["-i=c"]])
+def test_the_short_training_reads_the_data_as_the_training_does(more, monkeypatch):
     given = ["-s", "scene", "--masks", "a b", "--mask_meaning", "transparent", "--invert_masks", "-w"]
-    failed, (_, dataset, *_) = SimpleNamespace(returncode=2, stderr="x\nerror: no scene\n"), parse(given)
-    monkeypatch.setattr("subprocess.run", lambda line, **_: vars(failed).update(line=line[2:]) or failed)
+    lines, (_, dataset, *_) = [], parse([*given, *more])
+
+    def fail(line: list[str]) -> None:
+        lines.append(line[2:])
+        raise UserError("no scene")
+
+    monkeypatch.setattr(splatting.diagnosis.advice, "_trained", fail)
     with pytest.raises(UserError, match="^no scene$"):
         next(_of_passers_by(dataset))
-    other = {name for name, value in vars(parse(failed.line)[1]).items() if value != vars(dataset)[name]}
+    other = {name for name, value in vars(parse(lines[0])[1]).items() if value != vars(dataset)[name]}
     assert other == {"model_path", "resolution"}
+
+
+def test_a_short_training_that_fails_says_why_and_one_that_is_interrupted_leaves_no_process(tmp_path):
+    with pytest.raises(UserError, match="^no scene$"):
+        _trained([sys.executable, "-c", "import sys; sys.exit('x\\nerror: no scene')"])
+    number = tmp_path / "number"
+    code = f"import os, time; open({str(number)!r}, 'w').write(str(os.getpid())); time.sleep(60)"
+    timer = threading.Timer(1.0, signal.raise_signal, [signal.SIGINT])
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        _trained([sys.executable, "-c", code])
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(number.read_text()), 0)
+
+
+def test_a_model_is_not_told_to_take_what_it_was_trained_with(tmp_path, monkeypatch):
+    monkeypatch.setattr(f"{Advice.__module__}.advise", lambda *_, **__: [Advice("far", "--sky auto")])
+    assert len(check_options("scene", "images", str(tmp_path / "none"))) == 1
+    (tmp_path / "cfg_args").write_text("Namespace()")
+    write_json(tmp_path / "model.json", {"options": {"sky": "auto"}})
+    assert check_options("scene", "images", str(tmp_path)) == []

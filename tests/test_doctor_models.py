@@ -20,6 +20,7 @@ from scene.saved_model import read_model
 from splatting.demo.make_scene import make_scene
 from splatting.diagnosis.dataset import check_dataset
 from splatting.diagnosis.model import check_model
+from splatting.files.json_files import read_model_json, write_json
 
 N = 400
 SWAP = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, 1, 0]])
@@ -177,3 +178,58 @@ def test_a_good_model_without_a_ply_or_a_curve(folder):
     assert _problems(folder) == []
     (folder / "error_vs_time.csv").unlink()
     assert _problems(folder) == []
+
+
+def _with_photos(folder: Path, scene: Path, tmp_path: Path) -> list[Path]:
+    """Photos of a copy of the scene that the model says it was trained on."""
+    other = Path(shutil.copytree(scene, tmp_path / "scene"))
+    options = folder / "cfg_args"
+    options.write_text(options.read_text().replace(str(scene), str(other)))
+    return sorted((other / "images").iterdir())
+
+
+def test_two_photos_with_each_others_names_are_named_and_no_others(folder, scene, tmp_path):
+    photos = _with_photos(folder, scene, tmp_path)
+    first, second = photos[3], photos[13]
+    contents = first.read_bytes(), second.read_bytes()
+    second.write_bytes(contents[0])
+    first.write_bytes(contents[1])
+    (problem,) = _problems(folder)
+    assert f"{first.name} shows what {second.name} should, {second.name} shows what {first.name}" in problem
+
+
+def _enlarged(photo: Image.Image) -> Image.Image:
+    width, height = photo.size
+    return photo.crop((width // 6, height // 6, width - width // 6, height - height // 6)).resize(photo.size)
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    (_enlarged, "the cameras have 0.6"),
+    (lambda photo: photo.transpose(Image.Transpose.ROTATE_90), "photos have other sides than their cameras"),
+], ids=["focal length", "sides"])  # fmt: skip
+def test_a_geometric_cause_comes_before_colours_and_names(folder, scene, tmp_path, change, words):
+    for path in _with_photos(folder, scene, tmp_path):
+        with Image.open(path) as photo:
+            photo.load()
+        change(photo).save(path)
+    (problem,) = _problems(folder)
+    assert words in problem
+    assert "names" not in problem
+
+
+def test_a_sky_does_not_make_a_model_broken(folder):
+    """Most of its Gaussians are the sky's, which are larger than the extent, and the folder says so."""
+    kept = read_model_json(folder)
+    write_json(folder / "model.json", kept | {"sky": {"center": [0, 0, 0], "radius": 1000.0}})
+
+    def add(rows: Rows) -> Rows:
+        count = 3 * len(rows["xyz"])
+        sky = {name: values[:1].repeat(count, *[1] * (values.dim() - 1)) for name, values in rows.items()}
+        sky["xyz"] = torch.tensor([[0.0, 1000.0, 0.0]]).repeat(count, 1)  # below, where no view looks
+        sky["scaling"] = torch.full_like(sky["scaling"], math.log(60.0))
+        return {name: torch.cat([values, sky[name]]) for name, values in rows.items()}
+
+    _edit(folder, add)
+    lines = check_model(str(folder), -1)
+    assert not [line for line in lines if line.finding and "too large" in line.text]
+    assert not [line for line in lines if "larger than the extent" in line.text]

@@ -11,7 +11,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +19,7 @@ import torch
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
-from arguments import ModelParams
+from arguments import ModelParams, read_training_options
 from scene.cameras import Camera
 from scene.check import of_options, tell
 from scene.gaussian_model import GaussianModel
@@ -35,7 +34,7 @@ from splatting.evaluation.plan import ADVICE
 from splatting.files.json_files import write_json
 from splatting.training.robust_mask import FEW, MASKED, odd_photos
 from splatting.training.sky import FEWEST as LEAST_SKY
-from splatting.training.sky import Sky, find_sky
+from splatting.training.sky import Sky, find_sky, said_of_sky
 from utils.image_utils import as_float
 from utils.system_utils import UserError, mkdir_p
 
@@ -47,6 +46,11 @@ _AGAINST = {  # by an advised option: the options, with these values, that it do
     "--refine_poses": {"keep_best": True, "projection": "ray"},
     "--sky": {"strategy": "mcmc"},
 }
+_OFF = (False, "", "none", "off")  # values of options that do nothing; 0 is equal to False
+_NOT_OF_DATA = {  # model options that the short training of small photos has itself, or does without
+    "sh_degree", "model_path", "resolution", "depths", "keep_best", "train_test_exp", "refine_poses", "refine_lens",
+    "appearance",
+}  # fmt: skip
 _WIDTH = 200  # pixels of a photo
 _DARK, _LIGHT = 0.02, 0.98  # of a channel; beyond, an exposure cannot be told
 _OUTLIER = 0.6  # stops; a larger difference is no exposure (Tukey's biweight: Beaton and Tukey 1974)
@@ -81,8 +85,7 @@ def advise(dataset: argparse.Namespace, trains: bool = True, warns: bool = False
     found = [*_of_tracks(scene, tracks)] if any(tracks) else []
     if len(scene.info.point_cloud.points):
         _, share = find_sky(scene, Sky.around(scene.info))
-        text = f"{share:.1%} of the directions that several photos show have one colour and no points"
-        found.append(_asked(text, share >= LEAST_SKY, "--sky auto"))
+        found.append(_asked(said_of_sky(share), share >= LEAST_SKY, "--sky auto"))
     return [*found, *_of_passers_by(dataset)] if trains else found
 
 
@@ -116,15 +119,28 @@ def _taken(advice: Advice, args: argparse.Namespace, given: Sequence[str]) -> Ad
     return advice._replace(options="") if against or advice.options.startswith(names) else advice
 
 
-def check_options(source: str, images: str) -> list[Line]:
-    """Notes of doctor.py on options that a scene asks for; none where it cannot be read. images: as train.py's -i."""
+def check_options(source: str, images: str, model: str | None = None) -> list[Line]:
+    """Notes of doctor.py on options that a scene asks for; none where it cannot be read.
+
+    images: as train.py's -i. model: folder of a model; what it was trained with is not asked for.
+    """
+    then = _trained_with(model) if model else []
     dataset = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(source_path=source, images=images))
     dataset.lenses = "native"
     try:
         found = advise(dataset, trains=False)
     except UserError:
         return []
-    return [Line(str(advice), note=True) for advice in found if advice.options]
+    found = [advice for advice in found if advice.options and advice.options.split()[0] not in then]
+    return [Line(str(advice), note=True) for advice in found]
+
+
+def _trained_with(model: str) -> list[str]:
+    """Options that a training has switched on, as words of a command line; none where no model is."""
+    try:
+        return [f"--{name}" for name, value in read_training_options(model).items() if value not in _OFF]
+    except UserError:
+        return []
 
 
 def _of_tracks(scene: Scene, tracks: list[Track | None]) -> Iterator[Advice]:
@@ -206,16 +222,34 @@ def distances(views: list[CameraInfo], tracks: list[Track | None]) -> float:
     return float(np.median(far[shared] / near[shared])) if shared.any() else 1.0
 
 
+def _data_words(dataset: argparse.Namespace) -> list[str]:
+    """Words for train.py that choose and read the data as model options say: all but _NOT_OF_DATA."""
+    words = []
+    for option in ModelParams.options:
+        value = getattr(dataset, option.name, option.default)
+        if option.name not in _NOT_OF_DATA and value != option.default:
+            words.append(f"--{option.name}" if value is True else f"--{option.name}={value}")
+    return words
+
+
+def _trained(line: list[str]) -> None:
+    """Run a training to its end, also where a signal interrupts it. UserError with the last message if it fails."""
+    with subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as child:
+        try:
+            said = child.communicate()[1]
+        except BaseException:  # Popen itself leaves a child behind after Ctrl-C
+            child.kill()
+            child.wait()
+            raise
+    if child.returncode:
+        raise UserError(said.strip().rpartition("\n")[2].removeprefix("error: ") or "the short training failed")
+
+
 def _of_passers_by(dataset: argparse.Namespace) -> Iterator[Advice]:
     """What a short training of small photos leaves over."""
     with tempfile.TemporaryDirectory() as folder:
-        values = {"-s": dataset.source_path, "-m": folder, "-r": _WIDTH, "--iterations": _ITERATIONS}
-        values |= {f"--{name}": getattr(dataset, name) for name in ("images", "masks", "mask_meaning")}
-        flags = [f"--{name}" for name in ("eval", "white_background", "invert_masks") if getattr(dataset, name)]
-        line = [*flags, "--quiet", "--no_curve", "--disable_viewer", *map(str, chain(*values.items()))]
-        done = subprocess.run([sys.executable, ROOT / "train.py", *line], capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise UserError(done.stderr.strip().rpartition("\n")[2].removeprefix("error: "))
+        own = ["-m", folder, "-r", _WIDTH, "--iterations", _ITERATIONS, "--quiet", "--no_curve", "--disable_viewer"]
+        _trained([sys.executable, str(ROOT / "train.py"), *map(str, own), *_data_words(dataset)])
         masks = masks_of(folder)
     share = len(odd_photos(masks)) / len(masks.cameras)
     text = f"{share:.0%} of the photos show what a short training does not, as if someone had passed by"

@@ -3,34 +3,34 @@
 from collections.abc import Callable, Iterator
 from itertools import permutations, product
 from pathlib import Path
-from statistics import median
 from typing import NamedTuple
 
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from arguments import read_model_json
 from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import Rows
+from scene.gaussians.checkpoint import SKY
 from scene.readers.point_cloud import read_point_cloud
 from scene.scene import Scene
 from splatting.diagnosis import Line
+from splatting.diagnosis.photos import CLEARLY, FITS, other_focal_length, others_photos, turned
 from splatting.evaluation.model_folder import curve_of
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
+from splatting.training.sky import Sky
 from utils.general_utils import build_rotation
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.system_utils import UserError
 
-FITS = 18.0  # dB of training views; models that converge reach 22 and more
-CLEARLY = 3.0  # dB that undoing a change has to gain, unless it comes to what was recorded
 NEAR = 1.5  # dB between the record and a score of small renders
 LOST = 6.0  # dB below the record, from which on something has changed
 _SCALES = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
 _TRIED = 2  # views that changes are tried on
-_COMPARED = 12  # views that may have each other's photos
 
 
 class Change(NamedTuple):
@@ -39,6 +39,13 @@ class Change(NamedTuple):
     text: str
     remedy: str
     undo: Callable[[Rows], Rows]
+
+
+def without_sky(scene: Scene) -> GaussianModel:
+    """The Gaussians but those of a sky, which is far away, large and opaque by intent."""
+    gaussians, state = scene.gaussians, read_model_json(scene.model_path).get(SKY)
+    near = ~Sky.restored(state).rows(gaussians.get_xyz.detach()) if state else None
+    return gaussians.part(near, gaussians.max_sh_degree) if near is not None and near.any() else gaussians
 
 
 def recorded_psnr(model: Path, iteration: int) -> float | None:
@@ -56,14 +63,18 @@ def what_changed(scene: Scene, views: list[Camera], scored: ScoredViews, now: fl
 
     then: their PSNR in training, None if it is not known.
     """
+    least = FITS if then is None else min(FITS, then - NEAR)
+    # Where the geometry is wrong, another colour may fit better by chance.
+    if geometric := turned(scene) or other_focal_length(scene, views, scored, least):
+        return geometric
     few = views[:: max(1, len(views) // _TRIED)][:_TRIED]
     tried = {change: _score(few, _with(scene.gaussians, change.undo), scored) for change in _changes(scene)}
     change = max(tried, key=lambda one: tried[one])
     best = _score(views, _with(scene.gaussians, change.undo), scored)
-    explains = best >= now + CLEARLY and best >= (FITS if then is None else min(FITS, then - NEAR))
+    explains = best >= now + CLEARLY and best >= least
     if explains or (then is not None and best >= max(then - NEAR, now + 1)):
         return Line(f"{change.text}: without that it is {best:.1f} dB", change.remedy)
-    if swapped := _others_photos(scene, scored):
+    if swapped := others_photos(scene, scored):
         return swapped
     if then is None or now > then - LOST:
         return None
@@ -161,22 +172,3 @@ def _turned(back: Tensor) -> Change:
         return rows | {"xyz": rows["xyz"] @ turn.T, "rotation": quaternions, "f_rest": plain}
 
     return Change(f"the axes were changed: x, y, z are {axes}", "use the axes of the cameras (COLMAP's)", undo)
-
-
-@torch.no_grad()
-def _others_photos(scene: Scene, scored: ScoredViews) -> Line | None:
-    """Line if most views look like the photo of another view."""
-    views = [view for view in scene.getTrainCameras() if view.columns is None]
-    views = [view for view in views if view.image_height == views[0].image_height][:_COMPARED]
-    if len(views) < 3:
-        return None
-    images = [scored.image(view, scene.gaussians) for view in views]
-    photos = [as_float(scored.target(view)) for view in views]
-    table = [[float(psnr(image, photo).mean()) for photo in photos] for image in images]
-    gains = [max(row) - row[index] for index, row in enumerate(table)]
-    if median(gains) < CLEARLY:
-        return None
-    view, row = next((view, row) for view, row, gain in zip(views, table, gains, strict=True) if gain >= CLEARLY)
-    other = views[row.index(max(row))]
-    text = f"the photos have each other's names: {view.image_name} shows what {other.image_name} should"
-    return Line(text, "restore the names that the cameras were reconstructed with")

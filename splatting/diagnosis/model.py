@@ -10,25 +10,24 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from arguments import ModelParams, PipelineParams, read_model_json, read_stored_options
+from arguments import ModelParams, PipelineParams, read_model_json, read_stored_options, read_training_options
 from gaussian_renderer import render
 from gaussian_renderer.scored_views import ScoredViews
 from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.checkpoint import SKY
 from scene.saved_model import load_saved
 from splatting.diagnosis import Line, from_error
 from splatting.diagnosis.changes import FITS as BAD_PSNR
-from splatting.diagnosis.changes import LOST, NEAR, recorded_psnr, what_changed
+from splatting.diagnosis.changes import LOST, NEAR, recorded_psnr, what_changed, without_sky
 from splatting.diagnosis.dataset import check_dataset
+from splatting.diagnosis.photos import others_photos
 from splatting.evaluation.model_folder import closing_lines, curve_of
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
 from splatting.evaluation.what_to_try import what_to_try
 from splatting.files.listing import some
 from splatting.training.robust_mask import MASKED, MOST_PHOTOS, RobustMask, residuals_of
-from splatting.training.sky import Sky
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.system_utils import UserError, compute_device
 
@@ -71,9 +70,10 @@ def check_model(model_path: str, iteration: int, source: str | None = None, imag
     if not len(gaussians):
         return [Line(f"{name} has no Gaussians, so renders show the background", "train it again")]
     lines = [Line(f"{name}, {len(gaussians)} Gaussians of SH degree {gaussians.max_sh_degree}")]
-    if wrong := [*_not_finite(gaussians)] or [*_wrong_sizes(gaussians, extent)]:
+    own_rows = without_sky(scene)
+    if wrong := [*_not_finite(gaussians)] or [*_wrong_sizes(own_rows, extent)]:
         return [*lines, *wrong]
-    shapes, (renders, changed) = [_opacities(gaussians), _sizes(scene)], _renders(scene, options, stored)
+    shapes, (renders, changed) = [_opacities(own_rows), _sizes(scene)], _renders(scene, options, stored)
     if renders.finding and stored != own and _fits(model_path, own, scene.loaded_iter):
         other_scene = stored["source_path"] != own["source_path"]
         what, name, option = ("scene", "source_path", "-s") if other_scene else ("photos", "images", "-i")
@@ -159,7 +159,8 @@ def _wrong_values(gaussians: GaussianModel, extent: float) -> Iterator[Line]:
 def _passers_by(scene: Scene, options: argparse.Namespace) -> Iterator[Line]:
     """A note on photos that show what the model does not."""
     cameras = scene.getTrainCameras()
-    if len(cameras) > MOST_PHOTOS or options.train_test_exp:
+    taken = bool(read_training_options(scene.model_path).get("robust_mask"))
+    if len(cameras) > MOST_PHOTOS or options.train_test_exp or taken:
         return
     masks = residuals_of(cameras, _scored(scene, options), scene.gaussians)
     found = {camera.image_name: masks.counted(camera) for camera in cameras}
@@ -177,7 +178,7 @@ def masks_of(model_path: str) -> RobustMask:
 
 def _late_reset(scene: Scene) -> Iterator[Line]:
     """What training said at its start of a reset, if the opacities have not recovered from it."""
-    faint = float(scene.gaussians.get_opacity.detach().median()) < UNRECOVERED
+    faint = float(without_sky(scene).get_opacity.detach().median()) < UNRECOVERED
     said = closing_lines(Path(scene.model_path)) if faint else []
     yield from (from_error(UserError(line.partition(": ")[2])) for line in said if line.startswith(_RESET_SAID))
 
@@ -191,10 +192,8 @@ def _opacities(gaussians: GaussianModel) -> Line:
 
 def _sizes(scene: Scene) -> Line:
     """Sizes against the extent of the cameras, but of a sky."""
-    gaussians, extent = scene.gaussians, scene.cameras_extent
-    largest = gaussians.get_scaling.detach().max(dim=1).values.cpu().numpy()
-    if state := read_model_json(scene.model_path).get(SKY):
-        largest = largest[~Sky.restored(state).rows(gaussians.get_xyz.detach()).cpu().numpy()]
+    extent = scene.cameras_extent
+    largest = without_sky(scene).get_scaling.detach().max(dim=1).values.cpu().numpy()
     huge = float((largest > HUGE * extent).mean())
     if huge <= HUGE_SHARE:
         return Line(f"sizes: median {np.median(largest) / extent:.2g}, largest {largest.max() / extent:.2g} extents")
@@ -219,12 +218,14 @@ def _renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) 
     changed = None
     if not good or (then is not None and means.psnr < then - NEAR):
         changed = what_changed(scene, views, _scored(scene, options), means.psnr, then)
+    elif swapped := others_photos(scene, _scored(scene, options)):  # a few of them leave a good mean
+        return swapped, True
     if good and changed is None:
         return Line(f"{len(views)} training views rendered {_WIDTH} pixels wide: PSNR {means.psnr:.1f} dB"), False
     text = "renders of the training views are black"
     text = text if black else f"training views have a PSNR of only {means.psnr:.1f} dB"
     wrong = _other_background(scene, options, stored, means.psnr)
-    wrong = wrong or changed or next(_wrong_values(scene.gaussians, scene.cameras_extent), None)
+    wrong = wrong or changed or next(_wrong_values(without_sky(scene), scene.cameras_extent), None)
     wrong = wrong or next(_late_reset(scene), None)
     wrong = wrong or (_why_black(scene, views, means) if black else Line("", _why_bad(scene, stored, means)))
     return wrong._replace(text=f"{text}: {wrong.text}" if wrong.text else text), wrong is changed
@@ -297,7 +298,7 @@ def _measure(camera: Camera, scene: Scene, options: argparse.Namespace) -> tuple
 
 
 def _why_black(scene: Scene, cameras: list[Camera], means: Means) -> Line:
-    gaussians = scene.gaussians
+    gaussians = without_sky(scene)
     if means.drawn < 0.01:
         depths = torch.cat([_depths(camera, gaussians.get_xyz) for camera in cameras])
         if float(((depths > 0) & (depths < NEAREST)).float().mean()) > 0.5:
@@ -318,7 +319,7 @@ def _depths(camera: Camera, points: torch.Tensor) -> torch.Tensor:
 
 def _why_bad(scene: Scene, stored: dict[str, Any], means: Means) -> str:
     iteration = scene.loaded_iter
-    faint = float(scene.gaussians.get_opacity.detach().median()) < UNRECOVERED
+    faint = float(without_sky(scene).get_opacity.detach().median()) < UNRECOVERED
     if faint and RESET_INTERVAL <= iteration < 15_000 and iteration % RESET_INTERVAL < 500:
         return "this iteration is shortly after opacities were reset; check a later one"
     if (sizes := _sizes(scene)).finding:
