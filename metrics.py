@@ -20,7 +20,6 @@ import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import numpy as np
 import torch
 from fused_ssim import fused_ssim
-from tqdm import tqdm
 
 from arguments import OptionParser, read_cfg_args
 from splatting.evaluation import renders
@@ -28,6 +27,7 @@ from splatting.evaluation.comparison import FITTED
 from splatting.evaluation.model_folder import json_or_none
 from splatting.evaluation.renders import DEPTHS, INCOMPLETE, TIMES, image_of, image_size, mask_of, model_digest
 from splatting.files.json_files import read_json, write_json
+from splatting.host.progress import Bar
 from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, load_dists, load_network
 from utils.system_utils import UserError, compute_device, run_cli
 
@@ -208,7 +208,7 @@ def score(pairs: list[Pair], metrics: dict[str, Metric], title: str, errors: boo
     A pair without pixels that count is left out. errors: write an error map of each, too.
     """
     scores: Scores = {key: {} for key in metrics}
-    for pair in tqdm(pairs, desc=title, unit="view"):
+    for pair in Bar(pairs, desc=title, unit="view"):
         render, truth = (np.asarray(image_of(file)) for file in (pair.render, pair.truth))
         mask = mask_of(pair.truth.parents[1], pair.name)
         if mask is not None and not mask.any():

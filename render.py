@@ -28,7 +28,6 @@ from pathlib import Path
 import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
 from PIL import Image
-from tqdm import tqdm
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, read_cfg_args, warn_of_background
 from gaussian_renderer.blending import PLANES, view_planes
@@ -46,6 +45,7 @@ from splatting.evaluation.renders import DEPTHS, ERRORS, INCOMPLETE, TIMES, mode
 from splatting.exports.in_scene import load_file
 from splatting.files.image_files import remove_leftovers, save_png, write_plane
 from splatting.files.json_files import write_json
+from splatting.host.progress import Bar
 from splatting.training.sparse_depth import PointDepths, held_out_points
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p, run_cli
@@ -81,7 +81,7 @@ def write_views(
     for view in {(view.image_width, view.image_height): view for view in views}.values():
         # The first call of a size also pays for allocations and caches.
         scored.whole(view, gaussians)
-    for index, view in enumerate(tqdm(views, desc=f"Rendering {folder.parent.name}", unit="view", disable=not views)):
+    for index, view in enumerate(Bar(views, desc=f"Rendering {folder.parent.name}", unit="view", disable=not views)):
         _wait(background.device)
         start = time.perf_counter()
         image = scored.whole(view, gaussians)

@@ -25,7 +25,7 @@ from splatting.training.launch import add_launch_options, launch_options
 from splatting.training.loop import run_training
 from splatting.training.observers.report import training_report
 from splatting.training.observers.standard import standard_observers
-from splatting.training.output_folder import new_folder, own_folder, records_kept
+from splatting.training.output_folder import folder_of, new_folder, own_folder, records_kept
 from splatting.training.run import Run
 from splatting.viewer.server import checked_address
 from utils.general_utils import safe_state
@@ -42,11 +42,11 @@ def train(
 
     launch: the options of splatting/training/launch.py.
     """
-    dataset.model_path = dataset.model_path or new_folder()
-    if not launch.start_checkpoint:
-        print(f"Optimizing {dataset.model_path}")
+    dataset.model_path = dataset.model_path or folder_of(launch.start_checkpoint) or new_folder()
     run = Run(dataset, opt, pipe, launch)
-    if run.start:
+    if not run.start:
+        print(f"Optimizing {dataset.model_path}")
+    else:
         print(f"Resuming {dataset.model_path} at iteration {run.first_iteration}")
     # No process of several can draw a view for the remote viewer by itself.
     address = None if launch.disable_viewer or run.group.several else (launch.ip, launch.port)

@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from gaussian_renderer import draw, render
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
+from splatting.host.progress import Bar
 
 
 class Plane(NamedTuple):
@@ -47,7 +47,7 @@ def blending_weights(gaussians: GaussianModel, cameras: Sequence[Camera | MiniCa
     """Sum of each Gaussian's blending weights over all pixels of all views: (N,) float64."""
     black = gaussians.get_xyz.detach().new_zeros(3)
     sums = torch.zeros(len(gaussians), dtype=torch.float64, device=black.device)
-    for camera in tqdm(cameras, desc="Weighing Gaussians", unit="view", leave=False):
+    for camera in Bar(cameras, desc="Weighing Gaussians", unit="view", leave=False):
         sums += weighted_sums(camera, gaussians, pipe, black, torch.ones_like)[:, 0]
     return sums
 

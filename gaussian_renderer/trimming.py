@@ -9,7 +9,6 @@ from itertools import chain
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from gaussian_renderer import decisive_for
 from gaussian_renderer.free_view import FRACTIONS, NEAREST, neighbours, views_between
@@ -17,6 +16,7 @@ from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.sh_bands import cut_bounds, needed_degree
+from splatting.host.progress import Bar
 
 FAINT = -math.log(254) - 1e-4  # logit of opacity 1/255, below which no pixel draws a Gaussian, less some rounding
 WORTH = 0.01  # share of the Gaussians; fewer unseen ones stay, because leaving them out saves little and is a risk
@@ -41,7 +41,7 @@ class Search:
 def decisive_for_any(cameras: Sequence[Camera | MiniCam], gaussians: GaussianModel, pipe: argparse.Namespace) -> Tensor:
     """(N,) bool: the Gaussians that the image of any camera, at its size, depends on."""
     found = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.get_xyz.device)
-    for camera in tqdm(cameras, desc="Looking for unseen Gaussians", unit="view", leave=False):
+    for camera in Bar(cameras, desc="Looking for unseen Gaussians", unit="view", leave=False):
         found |= decisive_for(camera, gaussians, pipe)
     return found
 
@@ -86,7 +86,8 @@ def search_unseen(
     enough = shards.marked(keep & ~seen) >= WORTH * gaussians.gaussian_count
     pairs = walk(cameras, most)[0] if enough else []
     walks = chain.from_iterable(views_between(cameras[i], cameras[j]) for i, j in pairs)
-    for camera in tqdm(walks, desc="Looking between", total=len(FRACTIONS) * len(pairs), unit="view", leave=False):
+    total = len(FRACTIONS) * len(pairs)
+    for camera in Bar(walks, desc="Looking between", total=total, unit="view", leave=False, disable=not total):
         if shards.marked(keep & ~seen) < WORTH * gaussians.gaussian_count:
             break
         seen |= decisive_for(camera, gaussians, pipe)

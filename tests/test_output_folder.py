@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from splatting.files.folders import locked, remove_temporary_files
-from splatting.training.output_folder import own_folder, records_kept
+from splatting.training.output_folder import folder_of, own_folder, records_kept
 from utils.system_utils import UserError, atomic_write
 
 ROOT = Path(__file__).parents[1]
@@ -124,3 +124,9 @@ def test_records_stay_with_the_model_that_is_saved(tmp_path, saves):
             (tmp_path / "chkpnt3.pth").touch()
         raise ValueError("odd")
     assert (tmp_path / "cfg_args").read_text() == ("new" if saves else "old")
+
+
+def test_a_checkpoint_is_resumed_in_its_folder(tmp_path):
+    assert folder_of(None) is None and folder_of(str(tmp_path / "chkpnt7.pth")) is None
+    (tmp_path / "cfg_args").touch()
+    assert folder_of(str(tmp_path / "chkpnt7.pth")) == str(tmp_path)

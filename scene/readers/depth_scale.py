@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 from diff_gaussian_rasterization.lens import MODELS
-from tqdm import tqdm
 
 from scene.colmap_loader import Camera, Image, Points, qvec2rotmat
 from scene.images.side_files import SideFiles
 from scene.readers.colmap import AGAIN, ColmapModel, find_model, read_model_of_kind
 from scene.readers.depth_maps import METRIC, PARAMS, SCALE, STEP, Metric, inverses, map_names, read_values, sample
+from splatting.host.progress import Bar
 from utils.system_utils import UserError, atomic_write
 
 _WITH_POINTS = "export the model with the 2D points of its photos, or train without depth maps"
@@ -29,9 +29,7 @@ def make_depth_params(scene: Path, depths: Path, model_type: str) -> tuple[dict[
     folder, model = _model(scene, model_type)
     table, most = {}, 0
     paths = _maps(scene, depths, model, None)
-    for image, path in tqdm(
-        zip(model.images, paths, strict=True), total=len(paths), desc="Fitting depth maps", unit="map"
-    ):
+    for image, path in _in_pairs(model, paths):
         camera = model.cameras[image.camera_id]
         pixels, z = sightings(image, model.points, camera, f"{folder} as .{model_type}")
         name = Path(image.name).with_suffix("").as_posix()
@@ -61,9 +59,7 @@ def make_metric_scale(scene: Path, depths: Path, metric: Metric, model_type: str
     """
     folder, model = _model(scene, model_type)
     found, paths = [], _maps(scene, depths, model, metric)
-    for image, path in tqdm(
-        zip(model.images, paths, strict=True), total=len(paths), desc="Fitting depth maps", unit="map"
-    ):
+    for image, path in _in_pairs(model, paths):
         if path is not None:
             depth = metric._replace(scale=None).map_of(path)
             camera, values = model.cameras[image.camera_id], inverses(read_values(depth.path) / depth.unit)
@@ -88,6 +84,10 @@ def _maps(scene: Path, depths: Path, model: ColmapModel, metric: Metric | None) 
     names = [image.name for image in model.images]
     files = SideFiles(depths, names, [scene / "images" / name for name in names], scene)
     return [files.find(place, map_names(metric)) for place in range(len(names))]
+
+
+def _in_pairs(model: ColmapModel, paths: list[Path | None]) -> Bar:
+    return Bar(list(zip(model.images, paths, strict=True)), desc="Fitting depth maps", unit="map")
 
 
 def _model(scene: Path, model_type: str) -> tuple[Path, ColmapModel]:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
@@ -20,6 +19,7 @@ from scene.scene import Scene
 from splatting.camera_paths.keyframes import KeyframePath, TimedPath, frame_count, frame_moment, read_camera_path
 from splatting.camera_paths.video import find_ffmpeg, write_video
 from splatting.files.image_files import remove_leftovers, save_png, to_bytes
+from splatting.host.progress import Bar
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ def render_path(scene: Scene, pipe: argparse.Namespace, background: torch.Tensor
     remove_leftovers(images, count if request.frames else 0)
 
     def frames() -> Iterator[np.ndarray]:
-        for number in tqdm(range(count), desc=f"Rendering {request.name}", unit="frame"):
+        for number in Bar(range(count), desc=f"Rendering {request.name}", unit="frame"):
             pose = path.at(frame_moment(path, request.fps, number))
             view = free_view(width, height, math.radians(pose.fov), pose.position, pose.wxyz, background.device)
             with memory_errors_explained(scene.gaussians, [view], remedy):

@@ -18,11 +18,11 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from tqdm import tqdm
 
 from splatting.demo.objects import Thing, demo_scene
 from splatting.demo.tracer import CAMERAS, View, render_view, ring_views, trace
 from splatting.host.machine import cores
+from splatting.host.progress import Bar
 from utils.system_utils import UserError, mkdir_p, run_cli
 
 PIXELS_PER_PROCESS = 1_000_000  # with fewer, starting another process (2 s) costs more time than it saves
@@ -45,7 +45,7 @@ def _images(views: list[View], things: Things, samples: int) -> list[np.ndarray]
     """Ray-trace the views to photos, (H, W, 3) uint8 each, on several cores if that saves time."""
     pixels = sum(view.width * view.height for view in views)
     workers = min(cores(), 1 + pixels // PIXELS_PER_PROCESS)
-    bar = partial(tqdm, total=len(views), desc="Ray tracing", unit="view")
+    bar = partial(Bar, total=len(views), desc="Ray tracing", unit="view")
     image, numbers = partial(_image, things, samples), range(len(views))
     if workers == 1:
         return list(bar(map(image, numbers, views)))

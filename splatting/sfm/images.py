@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from PIL import Image, ImageOps
-from tqdm import tqdm
 from tqdm.contrib.concurrent import thread_map
 
 from scene.images.decode import picture_size
@@ -17,6 +16,7 @@ from scene.images.masks import Mask, mask_names
 from scene.images.side_files import SideFiles
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.host.machine import threads
+from splatting.host.progress import Bar
 from splatting.sfm.layout import Layout, image_names
 from utils.system_utils import UserError
 
@@ -192,7 +192,7 @@ def extract_frames(video: Path, folder: Path, count: int) -> None:
         total, _ = decoder.count_frames_and_secs(str(video))
         total = max(total, 1)
         spans = min(count, total)
-        frames = enumerate(tqdm(_frames(decoder, video), total=total, desc="Reading video", unit="frame"))
+        frames = enumerate(Bar(_frames(decoder, video), total=total, desc="Reading video", unit="frame"))
         by_span = groupby(frames, lambda entry: min(entry[0] * spans // total, spans - 1))
         for number, (_, entries) in enumerate(by_span, 1):
             sharpest = max((frame for _, frame in entries), key=sharpness)

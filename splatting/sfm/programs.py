@@ -10,9 +10,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-from tqdm import tqdm
-
 from splatting.host.interrupt import DeferredInterrupt
+from splatting.host.progress import Bar
 from utils.system_utils import UserError
 
 try:
@@ -31,7 +30,7 @@ def run_programs(
 
     UserError with the last line of the output if a command fails. Ctrl-C and SIGTERM end the command first.
     """
-    with tqdm(total=total, desc=title, dynamic_ncols=True) as bar, open(log, "ab") as output:
+    with Bar(total=total, desc=title, dynamic_ncols=True) as bar, open(log, "ab") as output:
         _lock(output)
 
         def look() -> None:

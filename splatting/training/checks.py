@@ -205,6 +205,9 @@ def check_folder(
         )
     new = {".ply": saving_iterations, ".pth": (*saving_iterations, *checkpoint_iterations)}
     stay = [n for n, path in saved.items() if n > first_iteration and n not in new[path.suffix]]
+    if not lies_in(checkpoint, folder) and (replaced := sorted(saved.keys() - {*stay})):
+        which = ", ".join(map(str, replaced))
+        _warn(f"this training starts over and replaces iteration {which} in {folder}; -m names another folder")
     if not stay:
         return
     kept = f"{folder} keeps iteration {', '.join(map(str, sorted(stay)))} of an earlier training"

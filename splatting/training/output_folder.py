@@ -25,6 +25,12 @@ def new_folder() -> str:
     return os.path.join("./output/", ranks().shared(name)[:10])
 
 
+def folder_of(checkpoint: str | None) -> str | None:
+    """The model folder that a checkpoint lies in, where a resumed training goes on unless another one is named."""
+    folder = Path(checkpoint or "").parent
+    return str(folder) if checkpoint and (folder / "cfg_args").is_file() else None
+
+
 def view_command(model_path: str, iteration: int | None = None) -> str:
     """The command that shows a model; iteration: None, the newest one."""
     older = iteration is not None and max(saves_in(Path(model_path)), default=iteration) > iteration

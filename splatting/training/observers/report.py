@@ -20,6 +20,7 @@ from splatting.evaluation.comparison import FITTED, GIVEN_POSES
 from splatting.evaluation.error_curve import whole_sets
 from splatting.evaluation.what_to_try import BUDGET, CAP, PLANNED, STRATEGY, what_to_try
 from splatting.host.clock import wall_seconds
+from splatting.host.progress import Bar
 from splatting.training.density import default_budget
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses, LossWatch
@@ -47,7 +48,7 @@ class ProgressBar(Observer):
         self._updated, self._done = -math.inf, run.first_iteration
         first = run.schedule.schedule_step(run.first_iteration)
         form = {"bar_format": BY_CLOCK} if run.opt.time_budget else {}
-        self._bar = tqdm(initial=first, total=run.schedule.length, desc="Training progress", dynamic_ncols=True, **form)
+        self._bar = Bar(initial=first, total=run.schedule.length, desc="Training progress", dynamic_ncols=True, **form)
 
     def due(self, step: Iteration) -> bool:
         shown = step.iteration % BAR_INTERVAL == 0 and time.monotonic() - self._updated >= BAR_SECONDS
