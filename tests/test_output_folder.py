@@ -4,11 +4,13 @@ import os
 import shutil
 import subprocess
 import sys
+from argparse import Namespace
 from pathlib import Path
 
 import pytest
 
 from splatting.files.folders import locked, remove_temporary_files
+from splatting.training.checks import check_folder
 from splatting.training.output_folder import folder_of, own_folder, records_kept
 from utils.system_utils import UserError, atomic_write
 
@@ -130,3 +132,13 @@ def test_a_checkpoint_is_resumed_in_its_folder(tmp_path):
     assert folder_of(None) is None and folder_of(str(tmp_path / "chkpnt7.pth")) is None
     (tmp_path / "cfg_args").touch()
     assert folder_of(str(tmp_path / "chkpnt7.pth")) == str(tmp_path)
+
+
+@pytest.mark.parametrize(("start", "warned"), [(None, True), ("chkpnt7.pth", False)])
+def test_a_training_that_starts_over_says_what_it_replaces(tmp_path, capsys, start, warned):
+    ply = tmp_path / "point_cloud" / "iteration_30" / "point_cloud.ply"
+    ply.parent.mkdir(parents=True)
+    ply.touch()
+    now = Namespace(model_path=str(tmp_path), source_path="")
+    check_folder(now, [30], start and str(tmp_path / start), 7)
+    assert ("starts over and replaces iteration 30 in" in capsys.readouterr().err) == warned
