@@ -134,11 +134,14 @@ def test_a_checkpoint_is_resumed_in_its_folder(tmp_path):
     assert folder_of(str(tmp_path / "chkpnt7.pth")) == str(tmp_path)
 
 
-@pytest.mark.parametrize(("start", "warned"), [(None, True), ("chkpnt7.pth", False)])
-def test_a_training_that_starts_over_says_what_it_replaces(tmp_path, capsys, start, warned):
-    ply = tmp_path / "point_cloud" / "iteration_30" / "point_cloud.ply"
-    ply.parent.mkdir(parents=True)
-    ply.touch()
+@pytest.mark.parametrize(
+    ("start", "said"), [(None, "; this one starts over and replaces iteration 30, and"), (7, ", and")]
+)
+def test_a_warning_of_what_stays_says_that_a_training_starts_over(tmp_path, capsys, start, said):
+    for iteration in (30, 60):
+        ply = tmp_path / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
+        ply.parent.mkdir(parents=True)
+        ply.touch()
     now = Namespace(model_path=str(tmp_path), source_path="")
-    check_folder(now, [30], start and str(tmp_path / start), 7)
-    assert ("starts over and replaces iteration 30 in" in capsys.readouterr().err) == warned
+    check_folder(now, [30], start and str(tmp_path / f"chkpnt{start}.pth"), start or 0)
+    assert f"keeps iteration 60 of an earlier training{said}, and other commands take" in capsys.readouterr().err

@@ -205,9 +205,6 @@ def check_folder(
         )
     new = {".ply": saving_iterations, ".pth": (*saving_iterations, *checkpoint_iterations)}
     stay = [n for n, path in saved.items() if n > first_iteration and n not in new[path.suffix]]
-    if not lies_in(checkpoint, folder) and (replaced := sorted(saved.keys() - {*stay})):
-        which = ", ".join(map(str, replaced))
-        _warn(f"this training starts over and replaces iteration {which} in {folder}; -m names another folder")
     if not stay:
         return
     kept = f"{folder} keeps iteration {', '.join(map(str, sorted(stay)))} of an earlier training"
@@ -217,8 +214,11 @@ def check_folder(
         raise UserError(
             f"{kept} with {before}, which {after} would not fit; name another folder by -m, or remove the old one"
         )
+    over = "" if lies_in(checkpoint, folder) else "; this one starts over"
+    if over and (replaced := sorted(saved.keys() - {*stay})):
+        over += f" and replaces iteration {', '.join(map(str, replaced))}"
     _warn(
-        f"{kept}, and other commands take the highest unless --iteration is given; remove the old ones, or "
+        f"{kept}{over}, and other commands take the highest unless --iteration is given; remove the old ones, or "
         "name another folder by -m"
     )
 
