@@ -19,6 +19,7 @@ import metrics
 import render
 import train
 from scene import Scene
+from scene.check.photos import hints
 from scene.images.decode import decode
 from scene.images.masks import IGNORE, TRANSPARENT, Mask, MaskOptions, find_masks
 from scene.images.side_files import names_below
@@ -496,3 +497,10 @@ def test_scores_are_those_of_the_definition():
     hidden = np.where(mask[..., None], shown, 255 - shown)
     for metric in (metrics.ssim, metrics.psnr):
         assert metric(hidden, truth, mask) == metric(shown, truth, mask) != metric(shown, truth)
+
+
+@pytest.mark.parametrize("meaning", ["auto", "ignore", "none"])
+def test_a_background_is_spoken_of_only_where_alpha_shows_one(blender_scene, meaning):
+    info = read(blender_scene, masks=MaskOptions(meaning=meaning))
+    said = [str(one) for one in hints(info, (40, 30), white_background=False)]
+    assert any("count as black" in text for text in said) == (meaning == "auto")

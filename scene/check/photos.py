@@ -69,8 +69,15 @@ def hints(info: SceneInfo, smallest: tuple[int, int], white_background: bool) ->
     if min(smallest) < SMALL:
         text = f"images of {smallest[0]}x{smallest[1]} pixels are too small to learn from"
         yield Finding(text, "give a larger --resolution")
-    path = info.train_cameras[0].image_path
-    if info.is_nerf_synthetic and not white_background and path and _has_alpha(Path(path)):
+    first = info.train_cameras[0]
+    counts = not (getattr(first, "opaque", False) or getattr(first, "ignore_alpha", False))
+    if (
+        info.is_nerf_synthetic
+        and not white_background
+        and counts
+        and first.image_path
+        and _has_alpha(Path(first.image_path))
+    ):
         text = "transparent parts of the images count as black"
         yield Finding(text, "with -w they count as white, as in published results of such scenes")
 
