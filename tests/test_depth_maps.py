@@ -37,6 +37,9 @@ from scene.readers.depth_maps import (
 )
 from scene.readers.depth_scale import fit_image, fit_line, make_depth_params, sightings
 from scene.readers.info import CameraInfo, SceneInfo
+from splatting.demo.make_scene import write_scene
+from splatting.demo.objects import demo_scene
+from splatting.demo.tracer import FISHEYE, PANORAMA, ring_views, trace
 from splatting.training.objective import Objective
 from utils import make_depth_scale
 from utils.loss_utils import inverse_depth_loss
@@ -359,6 +362,21 @@ def test_depths_of_fisheyes_and_panoramas_are_distances(kind):
     local = points @ colmap_loader.qvec2rotmat(turn).T + image.tvec
     _, of_pinhole = sightings(image, cloud, camera._replace(model="PINHOLE"), "")
     np.testing.assert_allclose(of_pinhole, local[:, 2])
+
+
+@pytest.mark.parametrize("model", [FISHEYE, PANORAMA])
+def test_traced_distances_of_wide_cameras_have_one_scale(tmp_path, model):
+    """Metric maps, 2.5 units a metre. Points are off by 0.4 % of their distance, and maps have coarse pixels."""
+    rng, width = np.random.default_rng(0), {FISHEYE: 96, PANORAMA: 192}[model]
+    views = ring_views(6, width, 96, rng, model)
+    write_scene(tmp_path, views, lambda _: demo_scene(), 400, rng, samples=1)
+    for number, view in enumerate(views):
+        y, x = (axis.reshape(-1) + 0.5 for axis in np.mgrid[:96, :width])
+        distances, _ = trace(demo_scene(), view.center.astype(np.float32)[:, None], view.rays(x, y))
+        _save_metric(distances.reshape(96, width) / 2.5, tmp_path / f"depths/view_{number:03d}", "npy")
+    metric = Metric.of(tmp_path / "depths")
+    scale, spread, maps, _ = depth_scale.make_metric_scale(tmp_path, tmp_path / "depths", metric, "bin")
+    assert scale == pytest.approx(2.5, rel=0.01) and spread < 0.02 and maps == 6
 
 
 def test_scenes_without_points_to_fit_to(blender_scene, tmp_path):
