@@ -29,7 +29,10 @@ def check_packages() -> list[Line]:
     if missing := [name for name, found in versions.items() if not found]:
         return [Line(f"packages are missing: {', '.join(missing)}", f"run `{_INSTALL}`")]
     found = ", ".join(f"{name} {version}" for name, version in versions.items())
-    return [Line(f"Python {platform.python_version()}, {found}")]
+    lines = [Line(f"Python {platform.python_version()}, {found}")]
+    if not _version("tensorboard"):
+        lines.append(Line("no TensorBoard, so trainings write no event files (pip install tensorboard brings it)"))
+    return lines
 
 
 def check_build() -> list[Line]:
