@@ -77,7 +77,7 @@ def test_test_views_may_be_missing_without_eval(blender_scene, capsys):
     whole = read(blender_scene)
     for path in sorted((blender_scene / "test").iterdir()):
         path.unlink()
-    with pytest.raises(UserError, match="photos that .* lists are missing: .*; put them there, or leave --eval out"):
+    with pytest.raises(UserError, match="photos that .* lists are missing: .*; put them there, .*or leave --eval out"):
         read(blender_scene, hold_out=True)
     train = [camera.image_name for camera in read(blender_scene).train_cameras]
     assert "transforms_test.json do not train: " in capsys.readouterr().err

@@ -1,7 +1,6 @@
 """GaussianModel: start from clouds, activations, schedules, capture and restore."""
 
 import copy
-import math
 
 import numpy as np
 import pytest
@@ -40,14 +39,9 @@ def test_start_from_a_cloud(degree):
     assert gaussians.active_sh_degree == 0
 
 
-def test_points_at_one_place_get_the_smallest_size():
-    log_scales = _started(np.ones((5, 3), np.float32))._scaling.detach().numpy()
-    np.testing.assert_allclose(log_scales, 0.5 * math.log(1e-7), rtol=1e-6)
-
-
-@pytest.mark.parametrize("count", [1, 2, 3])
-def test_few_points_take_their_size_from_the_extent(count):
-    np.testing.assert_allclose(_started(cloud(count).points, 2.0).get_scaling.detach().numpy(), 0.02, rtol=1e-6)
+@pytest.mark.parametrize("points", [*(cloud(count).points for count in (1, 2, 3)), np.ones((5, 3), np.float32)])
+def test_few_places_take_their_size_from_the_extent(points):
+    np.testing.assert_allclose(_started(points, 2.0).get_scaling.detach().numpy(), 0.02, rtol=1e-6)
 
 
 def test_an_empty_or_broken_cloud_is_refused():

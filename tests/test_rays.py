@@ -235,10 +235,11 @@ def test_a_training_on_rays_renders_so_and_exports_say_it(colmap_scene, tmp_path
     train.main(["-s", str(colmap_scene), "-m", str(out), "--iterations", "30", "--projection", "ray"])
     assert json.loads((out / "model.json").read_text())["projection"] == "ray"
     images = []
-    for given in ([], ["--projection", "ewa"]):
+    for given, mark in (([], ""), (["--projection", "ewa"], "_projection_ewa")):
         monkeypatch.setattr("sys.argv", ["render.py", "-m", str(out), "--skip_test", *given])
         command.main()
-        images.append([np.asarray(Image.open(path)) for path in sorted((out / "train/ours_30/renders").glob("*.png"))])
+        renders = out / f"train/ours_30{mark}/renders"
+        images.append([np.asarray(Image.open(path)) for path in sorted(renders.glob("*.png"))])
     assert 0 < np.abs(np.subtract(*images, dtype=int)).max() < 100
     monkeypatch.setattr("sys.argv", ["export.py", "-m", str(out), "--to", str(tmp_path / "model.splat")])
     export.main()

@@ -281,7 +281,7 @@ def test_it_is_told_before_what_the_host_has_to_hold(scene, tmp_path, monkeypatc
 
 
 def test_what_cannot_be_is_refused(scene, tmp_path):
-    with pytest.raises(UserError, match="--gpu_memory must be at least 0"):
+    with pytest.raises(UserError, match="--gpu_memory must be between 0 and 1000000"):
         _trained(scene, tmp_path, "--gpu_memory", -1)
     with pytest.raises(UserError, match="use --parallel tiles"):
         schedule_of(options(gpu_memory=1.0), None, 0, 2)

@@ -56,7 +56,10 @@ class WorkloadRun(Run):
         if views > 1:
             self.gaussians.optimizer.set_betas(0.9**views, 0.999**views)
         self._cameras = cameras = workload.cameras()
-        self.scene = SimpleNamespace(cameras_extent=_EXTENT, images=images, prefetch=lambda _: None, model_path=".")
+        info = SimpleNamespace(point_cloud=None)
+        self.scene = SimpleNamespace(
+            cameras_extent=_EXTENT, images=images, prefetch=lambda _: None, model_path=".", info=info
+        )
         self.views = ViewOrder(cameras, self.opt.seed, views, here.rank if views > 1 else 0)
         self.resolution = Resolution(self.schedule, images)
         self.background = torch.zeros(3, device=self.device)

@@ -18,7 +18,7 @@ from scene.gaussians.checkpoint import SKY
 from scene.readers.point_cloud import read_point_cloud
 from scene.scene import Scene
 from splatting.diagnosis import Line
-from splatting.diagnosis.photos import CLEARLY, FITS, other_focal_length, others_photos, turned
+from splatting.diagnosis.photos import CLEARLY, FITS, other_focal_length, others_photos
 from splatting.evaluation.model_folder import curve_of
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
@@ -65,7 +65,7 @@ def what_changed(scene: Scene, views: list[Camera], scored: ScoredViews, now: fl
     """
     least = FITS if then is None else min(FITS, then - NEAR)
     # Where the geometry is wrong, another colour may fit better by chance.
-    if geometric := turned(scene) or other_focal_length(scene, views, scored, least):
+    if geometric := other_focal_length(scene, views, scored, least):
         return geometric
     few = views[:: max(1, len(views) // _TRIED)][:_TRIED]
     tried = {change: _score(few, _with(scene.gaussians, change.undo), scored) for change in _changes(scene)}

@@ -1,4 +1,4 @@
-"""Photos that do not belong to their cameras: turned, of another focal length, or with each other's names."""
+"""Photos that do not belong to their cameras: of another focal length, or with each other's names."""
 
 import torch
 from torch import Tensor
@@ -19,25 +19,7 @@ _SUSPECTS = 12  # views whose photos are looked for among all, those that fit wo
 _TRIED = 2  # views that focal lengths are tried on
 _WIDEST, _STEP, _FINE = 2.5, 1.16, 1.03  # factors of focal lengths: the largest, between two, and between two at last
 _NO_FACTOR = 1.08  # a smaller one is told by no image of 200 pixels
-_ALIKE = 0.02  # sides over sides
 _INSIDE = 0.2  # of a photo that a changed focal length has to leave
-
-
-def turned(scene: Scene) -> Line | None:
-    """Line if photos have the sides of their cameras exchanged, as where programs read their EXIF orientation apart."""
-    views = [view for view in scene.info.train_cameras if _exchanged(view)]
-    if not views:
-        return None
-    (across, down), first = views[0].file_size, views[0]
-    text = f"{len(views)} photos have other sides than their cameras: {first.image_name} is {across} x {down} pixels"
-    remedy = "turn the photos as they were when the cameras were found (EXIF orientation), or reconstruct the scene"
-    return Line(f"{text}, and its camera {first.width} x {first.height}", remedy)
-
-
-def _exchanged(view: CameraInfo) -> bool:
-    if view.file_size is None or abs(view.width / view.height - 1) < 2 * _ALIKE:
-        return False
-    return abs(view.file_size[0] / view.file_size[1] * view.width / view.height - 1) < _ALIKE
 
 
 @torch.no_grad()
