@@ -102,10 +102,15 @@ def test_a_short_training_that_fails_says_why_and_one_that_is_interrupted_leaves
         _trained([sys.executable, "-c", "import sys; sys.exit('x\\nerror: no scene')"])
     number = tmp_path / "number"
     code = f"import os, time; open({str(number)!r}, 'w').write(str(os.getpid())); time.sleep(60)"
-    timer = threading.Timer(1.0, signal.raise_signal, [signal.SIGINT])
+    # The handler of SIGINT, which a program in the background ignores, runs where the main thread is interrupted.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    timer = threading.Timer(1.0, signal.pthread_kill, [threading.main_thread().ident, signal.SIGINT])
     timer.start()
-    with pytest.raises(KeyboardInterrupt):
-        _trained([sys.executable, "-c", code])
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            _trained([sys.executable, "-c", code])
+    finally:
+        signal.signal(signal.SIGINT, before)
     with pytest.raises(ProcessLookupError):
         os.kill(int(number.read_text()), 0)
 
