@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,6 +24,7 @@ from scene.check.photos import hints
 from scene.images.decode import decode
 from scene.images.masks import IGNORE, TRANSPARENT, Mask, MaskOptions, find_masks
 from scene.images.side_files import names_below
+from scene.readers.pinholes import _check_mask
 from splatting.training.observers.guards import MaskWatch
 from utils.image_utils import pixels_that_count
 from utils.loss_utils import photometric_loss
@@ -503,3 +505,12 @@ def test_a_background_is_spoken_of_only_where_alpha_shows_one(blender_scene, mea
     info = read(blender_scene, masks=MaskOptions(meaning=meaning))
     said = [str(one) for one in hints(info, (40, 30), white_background=False)]
     assert any("count as black" in text for text in said) == (meaning == "auto")
+
+
+@pytest.mark.parametrize(
+    ("mask", "fits"), [((134, 240), True), ((135, 240), True), ((240, 134), False), ((134, 200), False)]
+)
+def test_a_smaller_mask_may_have_rounded_sides(tmp_path, mask, fits):
+    _save(tmp_path / "mask.png", np.full(mask[::-1], 255, np.uint8))
+    with nullcontext() if fits else pytest.raises(UserError, match="make masks of the same shape"):
+        _check_mask(tmp_path / "mask.png", (269, 480))

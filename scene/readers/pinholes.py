@@ -89,7 +89,8 @@ def finished(cameras: Sequence[CameraInfo], opaque: bool = False) -> list[Camera
 
 def _check_mask(mask: Path, size: tuple[int, int]) -> None:
     mask_size = picture_size(mask)
-    if abs(size[0] * mask_size[1] / mask_size[0] - size[1]) > 1:
+    # A smaller mask has whole pixels, too: half of 269 is 134 or 135.
+    if abs(size[0] * mask_size[1] - size[1] * mask_size[0]) > max(*size, *mask_size):
         raise UserError(
             f"the mask {mask} is {mask_size[0]} x {mask_size[1]} pixels and its photo {size[0]} x {size[1]}; "
             "make masks of the same shape as the photos"
