@@ -73,6 +73,15 @@ def test_suffix_is_appended_only_when_missing(blender_scene):
     assert names[:3] == [("r_0.png", "r_0"), ("dotted.7.jpg", "dotted.7"), ("r_2.png", "r_2")]
 
 
+@pytest.mark.parametrize("hold_out", [False, True])
+def test_a_frame_that_is_listed_twice_is_used_once(blender_scene, hold_out, capsys):
+    whole = read(blender_scene, hold_out=hold_out)
+    _edit(blender_scene, lambda content: content["frames"].append(content["frames"][0]))
+    twice = read(blender_scene, hold_out=hold_out)
+    assert [c.image_path for c in twice.train_cameras] == [c.image_path for c in whole.train_cameras]
+    assert "1 frames of" in capsys.readouterr().err
+
+
 def test_test_views_may_be_missing_without_eval(blender_scene, capsys):
     whole = read(blender_scene)
     for path in sorted((blender_scene / "test").iterdir()):

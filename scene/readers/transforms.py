@@ -51,7 +51,10 @@ def read_blender(
         if not path.is_file():
             raise UserError(f"no {path.name} in {folder}, which --eval needs; export it, or leave --eval out")
     train, test = read_frames(files[0], masks, suffixes), _test_frames(files[1], masks, suffixes, hold_out)
-    train, test = _apart(train, held_out(test), folder) if hold_out else (_once(train + test, str(folder)), [])
+    if hold_out:
+        train, test = _apart(_once(train, str(files[0])), held_out(_once(test, str(files[1]))), folder)
+    else:
+        train, test = _once(train + test, str(folder)), []
     if not train:
         raise UserError(f"{files[0]} lists no frames; export the scene again")
 

@@ -67,7 +67,7 @@ def what_changed(scene: Scene, views: list[Camera], scored: ScoredViews, now: fl
     # Where the geometry is wrong, another colour may fit better by chance.
     if geometric := other_focal_length(scene, views, scored, least):
         return geometric
-    few = views[:: max(1, len(views) // _TRIED)][:_TRIED]
+    few = views[:: -(-len(views) // _TRIED) or 1]
     tried = {change: _score(few, _with(scene.gaussians, change.undo), scored) for change in _changes(scene)}
     change = max(tried, key=lambda one: tried[one])
     best = _score(views, _with(scene.gaussians, change.undo), scored)

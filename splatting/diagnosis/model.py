@@ -247,7 +247,7 @@ class Means(NamedTuple):
 
 def _looked_at(scene: Scene) -> list[Camera]:
     cameras = [camera for camera in scene.getTrainCameras() if camera.columns is None]  # whole views
-    return cameras[:: max(1, len(cameras) // _VIEWS)][:_VIEWS]
+    return cameras[:: -(-len(cameras) // _VIEWS) or 1]
 
 
 def _means(cameras: list[Camera], scene: Scene, options: argparse.Namespace) -> Means | None:

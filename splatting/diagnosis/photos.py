@@ -30,7 +30,7 @@ def other_focal_length(scene: Scene, views: list[Camera], scored: ScoredViews, l
     """
     infos = scene.info.train_cameras
     views = [view for view in views if infos[view.uid].native is None]
-    views = views[:: max(1, len(views) // _TRIED)][:_TRIED]
+    views = views[:: -(-len(views) // _TRIED) or 1]
     pairs = [(scored.image(view, scene.gaussians), as_float(scored.target(view)), infos[view.uid]) for view in views]
     if not pairs:
         return None
