@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any, ClassVar, NoReturn
 
+from arguments.removed import REMOVED
 from utils.system_utils import UserError
 
 Value = bool | int | float | str
@@ -98,7 +99,10 @@ class OptionParser(argparse.ArgumentParser):
         if not word.startswith("-"):
             folder = "; name a model folder by -m" if "-m" in self._option_string_actions else ""
             return f"{word} belongs to no option{folder}"
-        near = difflib.get_close_matches(word.partition("=")[0], self._option_string_actions, 1)
+        name = word.partition("=")[0]
+        if remedy := REMOVED.get(name.removeprefix("--")):
+            return f"{name} was removed; {remedy}"
+        near = difflib.get_close_matches(name, self._option_string_actions, 1)
         return f"there is no option {word}" + (f"; did you mean {near[0]}?" if near else "")
 
     def error(self, message: str) -> NoReturn:
