@@ -167,7 +167,7 @@ ranks() {
         part 210 "steps by ranks" "${steps[@]}" --ranks 1 "$count" --limit 75 || status=1
         ;;
       memory)
-        part 150 "memory of ranks" "${steps[@]}" --ranks 1 "$count" --parallel tiles --workload city \
+        part 150 "memory of ranks" "${steps[@]}" --ranks 1 "$count" --workload city \
           --gaussians 5000000 20000000 --blocks 1 --rounds 1 || status=1
         ;;
       *) say "no part is named $name" && status=2 ;;

@@ -143,11 +143,6 @@ class Scene:
             camera.place(given.R, given.T)
         return views
 
-    def keep_all_images(self) -> None:
-        """Let this process decode all images by itself, as none was asked for yet."""
-        self.images.ranks = ALONE
-        self._plan_images()
-
     def prefetch(self, cameras: Sequence[Camera]) -> None:
         """Start to prepare the images of the views that come next, in that order (`images.ahead` of them)."""
         self.images.prefetch(self._pictures(cameras))

@@ -1,11 +1,9 @@
 """train.py with a fault in one rank, for tests of several: `faulty_train.py FAULT RANK ITERATION OPTIONS...`.
 
-FAULT is one of `_FAULTS`, which come in that iteration; or code (other files, in the folder that OTHER_CODE names),
-warning, none. With whole- before it, each rank trains the whole model, with later- until iteration 100. A restarted
-training has no fault. All ranks print the same lines at first.
+FAULT is one of `_FAULTS`, which come in that iteration; or code (other files, in the folder that OTHER_CODE names), or
+none. A restarted training has no fault. All ranks print the same lines at first, and wait five seconds for each other.
 """
 
-import math
 import os
 import sys
 
@@ -17,36 +15,19 @@ if mine and fault == "code":
 # ruff: noqa: E402
 import splatting.host.early  # noqa: F401  isort: skip  (as train.py begins)
 import signal
-import time
 from collections.abc import Callable
+from datetime import timedelta
 
 import torch
 
-import splatting.distributed.watchdog
 import train
-from splatting.training import division
-from splatting.training import run as runs
+from splatting.distributed import launcher
 from splatting.training.iteration import Iteration
 from splatting.training.run import Run
 from utils.system_utils import run_cli
 
-splatting.distributed.watchdog.PATIENCE = 3.0
-kind, _, fault = fault.rpartition("-")
-division.PAYS = dict.fromkeys(division.PAYS, math.inf if kind else 0.0)
-if kind == "later":
-    division.Division.pays = lambda self, at: at.iteration >= 100
-if kind and fault != "none":
-    runs.REST = 4  # ranks agree as often
+launcher.TIMEOUT = timedelta(seconds=5)
 prepare = Run.prepare
-beat = splatting.distributed.watchdog.Watch.beat
-
-
-def _long_beat(watch: splatting.distributed.watchdog.Watch) -> None:
-    """As with a slow store. A process that ends while its watch asks the store aborts."""
-    beat(watch)
-    until = time.monotonic() + 0.5
-    while watch.is_alive() and time.monotonic() < until:
-        watch._store.read("here")
 
 
 def _raise(error: Exception) -> Callable[[Run], None]:
@@ -54,11 +35,6 @@ def _raise(error: Exception) -> Callable[[Run], None]:
         raise error
 
     return fail
-
-
-def _hang(run: Run) -> None:
-    while True:
-        signal.pause()
 
 
 def _overflow(run: Run) -> None:
@@ -79,7 +55,7 @@ _FAULTS = {
     "interrupt": lambda run: os.kill(os.getpid(), signal.SIGINT),
     "memory": _raise(MemoryError()),
     "bug": _raise(ValueError("no such thing")),
-    "hang": _hang,
+    "hang": lambda run: os.kill(os.getpid(), signal.SIGSTOP),
     "overflow": _overflow,
 }
 
@@ -93,12 +69,9 @@ def _prepare(run: Run, step: Iteration) -> None:
 def _main() -> None:
     print("printed by every rank")
     print("warning: of every rank", file=sys.stderr)
-    if mine and fault == "warning":
-        print("warning: of one rank alone", file=sys.stderr)
     train.main(options)
 
 
 Run.prepare = _prepare
-splatting.distributed.watchdog.Watch.beat = _long_beat
 if __name__ == "__main__":
     run_cli(_main, several=True)

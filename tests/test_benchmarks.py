@@ -201,11 +201,11 @@ def test_steps_of_ranks_and_of_a_spilled_model_stand_beside_those_of_one_process
     launch = steps.launch  # one rank needs no process of its own
     here = lambda case, limit: steps.measure(case) if case["ranks"] == 1 else launch(case, limit)  # noqa: E731
     monkeypatch.setattr(steps, "launch", here)
-    monkeypatch.setattr(sys, "argv", ["steps", "--ranks", "1", "2", "--parallel", "views", *words.split()])
+    monkeypatch.setattr(sys, "argv", ["steps", "--ranks", "1", "2", *words.split()])
     steps.main()
     rows = _rows(capsys.readouterr().out, "city")
-    assert [row[1:4] for row in rows] == [["1", "", "gpu"], ["2", "views", "gpu"]]
-    assert rows[0][7] == "1.00" and float(rows[1][7]) > 0
+    assert [row[1:3] for row in rows] == [["1", "gpu"], ["2", "gpu"]]
+    assert rows[0][6] == "1.00" and float(rows[1][6]) > 0
     monkeypatch.setattr(
         sys, "argv", ["steps", "--model", "sleep", "spill", "--learn", "--cap", "0.001", *words.split()]
     )
@@ -217,12 +217,12 @@ def test_steps_of_ranks_and_of_a_spilled_model_stand_beside_those_of_one_process
 def test_bytes_of_a_gaussian_are_those_of_a_line():
     def found(millions: int, mib: float) -> dict:
         own = {"ms": [1.0], "peak": mib, "last": 2 * mib, "digest": "", "memory": 2**40, "far": 0.0}
-        case = {"workload": "city", "ranks": 1, "parallel": "tiles", "model": "gpu", "learn": False}
+        case = {"workload": "city", "ranks": 1, "model": "gpu", "learn": False}
         return case | {"name": "", "gaussians": millions * 2**20, "by_rank": [own]}
 
     said = steps.bytes_each([found(1, 1000), found(3, 2000), found(2, 9999)])
-    assert said[0].startswith("city, 1 ranks,  gpu: 500 bytes a Gaussian before the last step, so 2")
-    assert said[1].startswith("city, 1 ranks,  gpu: 1000 bytes a Gaussian in the last step, so 1")
+    assert said[0].startswith("city, 1 ranks, gpu: 500 bytes a Gaussian before the last step, so 2")
+    assert said[1].startswith("city, 1 ranks, gpu: 1000 bytes a Gaussian in the last step, so 1")
 
 
 def test_error_is_of_the_largest_reference_value():

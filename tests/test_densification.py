@@ -14,7 +14,7 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.gaussians.long_axis import long_axis_children
 from splatting.training.checks import late_reset
-from splatting.training.schedule import BatchSchedule, Block, Decided, DecidedSchedule, Schedule
+from splatting.training.schedule import Block, Decided, DecidedSchedule, Schedule
 from splatting.training.strategies import adc
 from splatting.training.strategies.adc import AdaptiveDensityControl
 from utils.general_utils import build_rotation
@@ -281,13 +281,6 @@ def test_a_reset_with_less_than_half_an_interval_to_go_is_left_out(changes, whit
     assert [t for t in every if control.recovers(t) and not control.recovers(t - 1)] == regular
     left = changes["iterations"] - kept[-1] if kept else rules.RECOVERY
     assert (late_reset(control, control._opt, 0) is None) == (left >= rules.RECOVERY)
-
-
-@pytest.mark.parametrize("views", [1, 4])
-def test_views_of_an_iteration_count_where_resets_are_left_out(views):
-    control = AdaptiveDensityControl(model(4), options(iterations=7000), False, 1.0)
-    control.schedule = BatchSchedule(7000, views) if views > 1 else Schedule(7000)
-    assert [t for t in range(1, control.schedule.ends) if control.resets(t)] == [3000 // views]
 
 
 def test_a_run_by_the_clock_recovers_from_no_reset_that_it_leaves_out():

@@ -1,7 +1,6 @@
 """Parts of a launch on several ranks that need no second process."""
 
 import argparse
-import io
 import os
 import subprocess
 import sys
@@ -14,12 +13,10 @@ import train
 from arguments import ModelParams
 from scene import Scene
 from scene.gaussian_model import GaussianModel
-from splatting.distributed import rank_logging
 from splatting.distributed.consistency import agree_on_options, agree_on_scene
-from splatting.distributed.key_value_store import here, is_gone
 from splatting.distributed.ranks import Ranks, refuse_differences, using
-from splatting.distributed.shutdown import DONE, FAULT, HANG, LOST, SIGNAL, End, verdict
 from splatting.host import machine, torchrun
+from splatting.training import checks
 from splatting.training.restart import newest_checkpoint, what_stands
 from utils.system_utils import UserError, atomic_write, run_cli
 
@@ -73,26 +70,6 @@ def test_only_the_first_rank_writes(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["b"]
 
 
-@pytest.mark.parametrize(
-    ("ends", "gone", "expected"),
-    [
-        ({0: End(DONE, 0), 1: End(DONE, 0)}, [], (0, "", 0, False)),
-        ({0: End(FAULT, 2, "error: a"), 1: End(FAULT, 2, "error: a")}, [], (0, "error: a", 2, False)),
-        ({0: End(FAULT, 2, "error: a"), 1: End(FAULT, 2, "error: b")}, [], (0, "error: rank 0: a", 2, False)),
-        ({0: End(LOST, 1), 1: End(FAULT, 2, "error: b")}, [], (1, "error: rank 1: b", 2, False)),
-        ({0: End(SIGNAL, 143, "terminated"), 1: End(FAULT, 2, "error: b")}, [], (1, "error: rank 1: b", 2, False)),
-        ({1: End(SIGNAL, 143, "terminated")}, [0], (1, "error: rank 0 ended without a word", 1, True)),
-        ({0: End(LOST, 1), 1: End(HANG, 1, "error: rank 2 hung")}, [], (1, "error: rank 2 hung", 1, True)),
-        ({0: End(SIGNAL, 130, "interrupted"), 1: End(SIGNAL, 130, "interrupted")}, [], (0, "interrupted", 130, False)),
-        ({0: End(LOST, 1, "error: x"), 1: End(LOST, 1, "error: x")}, [], (0, "error: x", 1, True)),
-    ],
-)
-def test_one_rank_speaks_for_all(ends, gone, expected):
-    speaker, line, status, lost = verdict(ends, gone, 2)
-    assert (speaker, status, lost) == (expected[0], *expected[2:])
-    assert line == expected[1] or gone and line.startswith(expected[1])
-
-
 def test_differences_name_what_and_whose():
     refuse_differences([{"a": "1"}, {"a": "1"}], "remedy")
     with pytest.raises(UserError) as refused:
@@ -133,32 +110,6 @@ def test_ranks_of_which_one_lacks_the_masks_are_refused(tmp_path):
             agree_on_scene(without, None)
 
 
-def test_lines_are_told_once_with_the_ranks_that_say_them(monkeypatch):
-    said = io.StringIO()
-    first = rank_logging.Noted(said, printed=True)
-    first.write("\r 50%|##   |\rwarning: of all\n")
-    monkeypatch.setattr(rank_logging, "_noted", first)
-    others = ["warning: of all", "warning: of two"]
-    for _ in range(2):
-        rank_logging.tell({1: others, 2: [*others, "warning: of one"]})
-    told = said.getvalue().splitlines()[-2:]
-    assert told == ["ranks 1, 2: warning: of two", "rank 2: warning: of one"]
-    assert said.getvalue().count("of two") == 1
-
-
-def test_a_process_of_this_host_is_gone_once_it_has_ended():
-    process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
-    host, _, space = here()
-    who = [host, process.pid, space]
-    assert not is_gone(who)
-    process.kill()
-    os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
-    assert is_gone(who)  # although nobody has asked for its status
-    process.communicate()
-    assert is_gone(who)
-    assert not is_gone(["another", *who[1:]])
-
-
 def test_checkpoints_of_earlier_trainings_do_not_stand(tmp_path):
     for iteration, age in ((5, 0), (40, 0), (300, 1e9)):
         path = tmp_path / f"chkpnt{iteration}.pth"
@@ -182,7 +133,11 @@ def test_a_training_of_one_process_loads_nothing_of_several(colmap_scene, tmp_pa
     done = subprocess.run([sys.executable, "-c", code, *options], cwd=ROOT, capture_output=True, text=True, check=True)
     loaded = done.stderr.splitlines()[-1].split()
     assert loaded[0] == "loaded" and "splatting.distributed.ranks" in loaded
-    assert not {
-        f"splatting.distributed.{name}" for name in ("process_group", "launcher", "watchdog", "key_value_store")
-    } & {*loaded}
-    assert train.parse(options)[0].parallel == "tiles"
+    assert not {f"splatting.distributed.{name}" for name in ("process_group", "launcher")} & {*loaded}
+
+
+def test_a_scene_that_one_gpu_trains_faster_gets_a_sentence_with_the_estimate():
+    said = checks.faster_alone(2, True, 1_000_000)
+    assert "1,000,000 Gaussians takes it about 1." in said and "without torchrun" in said
+    for alone in ((1, True, 1_000_000), (2, False, 1_000_000), (2, True, 20_000_000)):
+        assert checks.faster_alone(*alone) is None

@@ -9,9 +9,6 @@ from typing import Any
 import pytest
 import torch
 from diff_gaussian_rasterization import rasterize
-from diff_gaussian_rasterization.backend import OPERATORS
-from diff_gaussian_rasterization.gaussians import Gaussians
-from diff_gaussian_rasterization.scene import draw, scene_arguments
 from processes import in_ranks
 from rasterizer_tools import leaves
 from torch import Tensor
@@ -19,7 +16,6 @@ from torch import Tensor
 from benchmarks.workloads.splat_scenes import settings
 from splatting.distributed.ranks import ranks
 from splatting.distributed.rendering.rasterize import rasterize_over
-from splatting.distributed.rendering.views import rasterize_views
 
 SIZES = [2, 3]
 CAMERA = "viewmatrix", "campos"
@@ -102,78 +98,14 @@ def test_ranks_render_the_image_and_the_gradients_of_one_process(size):
         assert seen == (options.get("count", 300) > 0 and not options.get("behind"))
 
 
-VIEWS = [(80, 50, 0.0), (40, 70, 0.4), (64, 33, -0.3)]  # width, height, and where the camera stands
-
-
-def _cameras() -> list:
-    cameras = []
-    for width, height, x in VIEWS[: ranks().size]:
-        view = torch.eye(4)
-        view[0, 3] = x
-        cameras.append(settings(width, height, torch.float32, view=view))
-    return cameras
-
-
-def _loss(color: Tensor, depth: Tensor, view: int) -> Tensor:
-    generator = torch.Generator().manual_seed(view)
-    return sum((torch.randn(x.shape, generator=generator) * x).sum() for x in (color, depth))
-
-
-def _render_views() -> dict[str, Tensor]:
-    here = ranks()
-    rows = slice(20 * here.rank, 20 * here.rank + 20 if here.rank < here.size - 1 else None)
-    inputs = leaves({name: values[rows] for name, values in _scene(80, 50, {}).items()})
-    screen = torch.zeros(here.size, *inputs["means"].shape).requires_grad_()
-    wants = {"want_inverse_depth": True, "want_absolute_gradient": True}
-    numbers = torch.zeros(here.size, 34, dtype=torch.float64, requires_grad=True)
-    out = rasterize_views(here, Gaussians(**inputs), screen, _cameras(), numbers, raw=True, **wants)
-    _loss(out.color, out.inverse_depth, here.rank).backward()
-    gradients = {name: values.grad for name, values in inputs.items()}
-    return {"color": out.color.detach(), "radii": out.radii, "screen": screen.grad, "numbers": numbers.grad} | gradients
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_a_batch_has_the_sum_of_the_gradients_of_its_views(size):
-    found = in_ranks(size, _render_views)
-    inputs = leaves(_scene(80, 50, {}))
-    total: dict[str, Tensor] = {}
-    for view in range(size):
-        screen = torch.zeros_like(inputs["means"]).requires_grad_()
-        rest = dict(inputs)
-        view_matrix = torch.eye(4)
-        view_matrix[0, 3] = VIEWS[view][2]
-        camera = settings(*VIEWS[view][:2], torch.float32, view=view_matrix)
-        wants = {"want_inverse_depth": True, "want_absolute_gradient": True, "raw": True}
-        out = rasterize(rest.pop("means"), screen, rest.pop("opacities"), settings=camera, **rest, **wants)
-        _loss(out.color, out.inverse_depth, view).backward()
-        with torch.no_grad():
-            scene = scene_arguments(Gaussians(**inputs), camera, True)
-            kept = draw(scene, camera.bg, True).kept(camera.bg)
-            planes = [torch.ones_like(x).requires_grad_() for x in (out.color, out.inverse_depth)]
-        _loss(*planes, view).backward()
-        rows = OPERATORS.blend_rows(kept, planes[0].grad, None, planes[1].grad)
-        of_camera = OPERATORS.sum_blocks(OPERATORS.camera_vjp(*scene, [*kept[:2], *rows]))
-        for each in found:
-            torch.testing.assert_close(each["numbers"][view, : len(of_camera)], of_camera, rtol=1e-5, atol=1e-5)
-        assert torch.equal(found[view]["color"], out.color)
-        assert torch.equal(torch.cat([each["radii"][view] for each in found]), out.radii)
-        assert torch.equal(torch.cat([each["screen"][view] for each in found]), screen.grad)
-        for name, values in inputs.items():
-            total[name] = total[name] + values.grad if view else values.grad
-            values.grad = None
-    for name, values in total.items():
-        assert torch.equal(torch.cat([each[name] for each in found]), values), name
-
-
 def _tensors_left() -> dict[str, int]:
-    """Tensors that a view or a batch leaves behind, once nothing refers to its results."""
+    """Tensors that a view leaves behind, once nothing refers to its results."""
     width, height, options = CASES[1]
     renders = {
         "one process": lambda: _render(rasterize, width, height, options, slice(None)),
         "a view": lambda: _render(
             lambda *x, **y: rasterize_over(ranks(), *x, **y), width, height, options, slice(None)
         ),
-        "a batch": _render_views,
     }
     return {name: _left_by(render) for name, render in renders.items()}
 

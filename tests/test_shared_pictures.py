@@ -30,7 +30,6 @@ TRAININGS = {
     "smaller": ("--masks", "masks", "-d", "depths", "--resolution_schedule", "pyramid"),
     "smaller, limit": ("--resolution_schedule", "pyramid", "--images_to_load", 3),
     "exposures": ("--train_test_exp", "--eval"),
-    "views": ("--parallel", "views", "--masks", "masks", "--eval"),
 }
 
 
@@ -66,10 +65,6 @@ def test_each_picture_is_decoded_by_one_rank_and_trains_all(scene, tmp_path):  #
     for name, (model, decoded, line) in one.items():
         assert "photos" in line and "each" not in line
         here = [rank[name] for rank in found]
-        if name == "views":
-            assert here[0][0] and all(set(part.values()) == {1} for _, part, _ in here)
-            assert sum(part.total() for _, part, _ in here) > decoded.total()  # each for itself
-            continue
         assert here[0][0] == model, name
         if "limit" not in name:
             assert sum((part for _, part, _ in here), Counter()) == decoded and set(decoded.values()) == {1}

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from diff_gaussian_rasterization.optim import adam_
-from gaussians import model, needs_59_values, options
+from gaussians import model, needs_59_values
 from processes import in_ranks
 from rasterizer_tools import GPU_MARKS
 from trainings import ITERATIONS, OPTIONS, before_steps, differences, narrow_scene, train_on, trained, with_clusters
@@ -23,7 +23,6 @@ from splatting.distributed.ranks import ranks
 from splatting.training import gpu_memory, memory_estimate, run
 from splatting.training.gpu_memory import GpuMemory, reads_on_host
 from splatting.training.memory_estimate import near_rows, spillable_bytes, training_bytes
-from splatting.training.schedule_file import schedule_of
 from utils.system_utils import UserError
 
 SPILL = ("--gpu_memory", 1)
@@ -283,8 +282,6 @@ def test_it_is_told_before_what_the_host_has_to_hold(scene, tmp_path, monkeypatc
 def test_what_cannot_be_is_refused(scene, tmp_path):
     with pytest.raises(UserError, match="--gpu_memory must be between 0 and 1000000"):
         _trained(scene, tmp_path, "--gpu_memory", -1)
-    with pytest.raises(UserError, match="use --parallel tiles"):
-        schedule_of(options(gpu_memory=1.0), None, 0, 2)
 
 
 # On a GPU

@@ -35,32 +35,26 @@ class WorkloadRun(Run):
     with rows in order. gpu_memory: as the option.
     """
 
-    def __init__(
-        self, workload: Workload, parallel: str, steps: int, still: bool, sleep: bool = False, gpu_memory: float = 0
-    ) -> None:
-        here = self.group = ranks()
-        views = here.size if parallel == "views" else 1
-        words = ["-s", ".", "--iterations", str(steps * views), "--densify_from_iter", "10000", *_STILL * still]
-        words += ["--strategy", "adc"]
-        words += ["--parallel", parallel, "--gpu_memory", str(gpu_memory)]
+    def __init__(self, workload: Workload, steps: int, still: bool, sleep: bool = False, gpu_memory: float = 0) -> None:
+        self.group = ranks()
+        words = ["-s", ".", "--iterations", str(steps), "--densify_from_iter", "10000", *_STILL * still]
+        words += ["--strategy", "adc", "--gpu_memory", str(gpu_memory)]
         self.launch, self.dataset, self.opt, self.pipe = train.parse(words)
         self.lost = self.first_iteration = 0
         self.poses = None
         self.interrupt, self.device = DeferredInterrupt(), compute_device()
-        self.schedule = schedule_of(self.opt, None, 0, views)
+        self.schedule = schedule_of(self.opt, None, 0)
         images = SimpleNamespace(ahead=0, keep_on=torch.device("cpu"), planned_bytes=0)
         self.gaussians = GaussianModel(3)
         pixels = (workload.width // workload.crop) * (workload.height // workload.crop)
         self.memory = GpuMemory(gpu_memory, self.gaussians, images, pixels, False, self.device)
         self._begin(workload)
-        if views > 1:
-            self.gaussians.optimizer.set_betas(0.9**views, 0.999**views)
         self._cameras = cameras = workload.cameras()
         info = SimpleNamespace(point_cloud=None)
         self.scene = SimpleNamespace(
             cameras_extent=_EXTENT, images=images, prefetch=lambda _: None, model_path=".", info=info
         )
-        self.views = ViewOrder(cameras, self.opt.seed, views, here.rank if views > 1 else 0)
+        self.views = ViewOrder(cameras, self.opt.seed)
         self.resolution = Resolution(self.schedule, images)
         self.background = torch.zeros(3, device=self.device)
         self.objective = Objective(self)

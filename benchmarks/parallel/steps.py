@@ -45,7 +45,7 @@ from splatting.training.observers.divergence import DivergenceWatch
 from utils.system_utils import UserError, compute_device, run_cli
 
 ROOT = Path(__file__).resolve().parents[2]
-HEADER = ["workload", "ranks", "shared", "model", "ms a step", "blocks", "images/s", "times the first",
+HEADER = ["workload", "ranks", "model", "ms a step", "blocks", "images/s", "times the first",
           "peak GiB by rank", "in the last step", "on the host"]  # fmt: skip
 _BLOCK = 5  # steps
 _PIECE = 1 << 20  # Gaussians that are copied to the host at a time
@@ -99,7 +99,7 @@ def measure(case: dict[str, Any]) -> dict[str, Any]:
     workload = replace(ALL[case["workload"]].changed(case["gaussians"], case["size"]), crop=case["crop"])
     steps = case["warm_up"] + _BLOCK * case["blocks"] + 1
     model = {"sleep": case["model"] != "gpu", "gpu_memory": case["cap"] * spills}
-    run = WorkloadRun(workload, case["parallel"], steps, still=not case["learn"], **model)
+    run = WorkloadRun(workload, steps, still=not case["learn"], **model)
     if device.type == "cuda":
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
@@ -139,28 +139,23 @@ def milliseconds(found: dict[str, Any]) -> float:
 
 def row(case: dict[str, Any], found: dict[str, Any] | None, first: dict[str, Any] | None) -> list[str]:
     """A row of the table. first: the first case of the same scene; found: None of a case without a result."""
-    cells = [f"{case['ranks']}", case["parallel"] if case["ranks"] > 1 else "", case["model"]]
+    cells = [f"{case['ranks']}", case["model"]]
     if found is None:
-        return [case["workload"], *cells, "failed", *[""] * (len(HEADER) - 5 + case["learn"])]
+        return [case["workload"], *cells, "failed", *[""] * (len(HEADER) - 4 + case["learn"])]
     step, every = milliseconds(found), found["by_rank"]
     spread = [ms for own in every for ms in own["ms"]]
-    images = _views(found) / step
-    cells += [f"{step:.3f}", f"{min(spread):.3f} to {max(spread):.3f}", f"{1e3 * images:.1f}"]
-    cells.append(f"{images * milliseconds(first) / _views(first):.2f}")
+    cells += [f"{step:.3f}", f"{min(spread):.3f} to {max(spread):.3f}", f"{1e3 / step:.1f}"]
+    cells.append(f"{milliseconds(first) / step:.2f}")
     cells += [" ".join(f"{own[name] / 1024:.2f}" for own in every) for name in ("peak", "last")]
     cells.append(" ".join(f"{own['far']:.0%}" for own in every))
     return [found["name"], *cells] + [" ".join(own["digest"] for own in every)] * case["learn"]
-
-
-def _views(found: dict[str, Any]) -> int:
-    return found["ranks"] if found["parallel"] == "views" else 1
 
 
 def bytes_each(results: list[dict[str, Any]]) -> list[str]:
     """Sentences on the memory of a Gaussian, from cases that differ in their number of Gaussians alone."""
     groups: dict[str, list[dict[str, Any]]] = {}
     for found in results:
-        name = " ".join([f"{found['workload']}, {found['ranks']} ranks,", *row(found, None, None)[2:4]])
+        name = f"{found['workload']}, {found['ranks']} ranks, {found['model']}"
         groups.setdefault(name, []).append(found)
     said = []
     for name, group in groups.items():
@@ -180,11 +175,10 @@ def cases(args: argparse.Namespace) -> list[dict[str, Any]]:
     """Every combination of the options."""
     same = {name: getattr(args, name) for name in ("size", "crop", "cap", "learn", "warm_up", "blocks")}
     return [
-        same | {"workload": workload, "gaussians": count, "ranks": number, "parallel": shared, "model": model}
+        same | {"workload": workload, "gaussians": count, "ranks": number, "model": model}
         for workload in args.workload
         for count in args.gaussians
         for number in args.ranks
-        for shared in (args.parallel if number > 1 else ["tiles"])
         for model in args.model
     ]
 
@@ -194,7 +188,6 @@ def options() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
     add("--ranks", type=int, nargs="+", default=[1], help="numbers of processes (default: 1)")
-    add("--parallel", nargs="+", choices=["tiles", "views"], default=["tiles", "views"], help="default: both")
     add("--workload", nargs="+", choices=list(ALL), default=list(ALL), help="default: all")
     add("--gaussians", type=int, nargs="+", default=[None], help="in place of the workload's")
     add("--size", type=int, nargs=2, metavar=("WIDTH", "HEIGHT"), help="of the image, in place of the workload's")

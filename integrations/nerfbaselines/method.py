@@ -43,7 +43,7 @@ _FIXED = dict.fromkeys(
     ("keep_best", "advise", "viewer", "viewer_exit", "viewer_host", "whole_curve", "detect_anomaly", "target_psnr",
      "start_checkpoint", "source_path", "model_path", "images", "invert_masks", "refine_lens")
     , "",
-) | {"options": "given", "parallel": "tiles", "resolution": "1", "mask_meaning": "auto"}  # fmt: skip
+) | {"options": "given", "resolution": "1", "mask_meaning": "auto"}  # fmt: skip
 _LISTS = ("test_iterations", "save_iterations", "checkpoint_iterations")
 
 

@@ -76,11 +76,6 @@ class GaussianAdam(torch.optim.Adam):
         """Take a state dict, as torch does."""
         undecorated(torch.optim.Adam.load_state_dict)(self, state_dict)
 
-    def set_betas(self, beta1: float, beta2: float) -> None:
-        """Set the decay of the averages, of all groups."""
-        for group in [self.defaults, *self.param_groups]:
-            group["betas"] = beta1, beta2
-
     def set_active_columns(self, name: str, columns: int) -> None:
         """Promise that only the first `columns` values of each row of this group ever had a gradient.
 

@@ -20,17 +20,14 @@ def observe(gaussians: GaussianParameters, viewspace_points: Tensor, radii: Tens
     """Add a view to the statistics: largest radius, gradient length and count of the Gaussians it saw.
 
     viewspace_points: (N, 3) with `.grad` per NDC unit; radii: (N,) int32 pixels, 0 where not seen. One pass updates
-    max_radii2D and does the work of add_densification_stats for radii > 0. Several views at once: (V, N, 3) and
-    (V, N).
+    max_radii2D and does the work of add_densification_stats for radii > 0.
     """
-    for gradient, pixels in _views(viewspace_points.grad, radii):
-        gaussians.statistics.observe(gradient, pixels)
+    gaussians.statistics.observe(viewspace_points.grad, radii)
 
 
 def observe_absolute(gaussians: GaussianParameters, viewspace_points: Tensor, radii: Tensor) -> None:
     """Do as observe with the lengths of absolute gradients, of a `render` with want_absolute_gradient."""
-    for gradient, pixels in _views(viewspace_points.grad, radii):
-        gaussians.statistics.observe(gradient[:, 2], pixels)
+    gaussians.statistics.observe(viewspace_points.grad[:, 2], radii)
 
 
 def add_densification_stats(
@@ -257,8 +254,3 @@ def reset_opacity(gaussians: GaussianParameters) -> None:
     else:
         lowered = gaussians.inverse_opacity_activation(gaussians.get_opacity.detach().clamp_max(rules.RESET_OPACITY))
     gaussians._take(gaussians.replace_tensor_to_optimizer(lowered, "opacity"))
-
-
-def _views(gradient: Tensor, radii: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """The gradients and radii of each view."""
-    return [(gradient, radii)] if radii.dim() == 1 else list(zip(gradient, radii, strict=True))

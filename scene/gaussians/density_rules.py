@@ -34,17 +34,16 @@ class Actions(NamedTuple):
     reset_opacity: bool
 
 
-def interval(opt: argparse.Namespace, until: int, stride: float, views: int = 1) -> int:
+def interval(opt: argparse.Namespace, until: int, stride: float) -> int:
     """Iterations from one densification to the next: densification_interval of the options, in most runs.
 
     until: the end of the window of densifications, which begins with densify_from_iter, in iterations of the schedule;
     stride: of these, how many each iteration stands for. Where they are several, there would be too few densifications.
-    views: of each iteration; densification_interval counts views.
     """
     if stride <= 1:
         return opt.densification_interval
     steps = (until - opt.densify_from_iter) / stride
-    return min(math.ceil(opt.densification_interval / views), max(1, int(steps / FEW_DENSIFICATIONS)))
+    return min(opt.densification_interval, max(1, int(steps / FEW_DENSIFICATIONS)))
 
 
 def actions(
@@ -53,13 +52,12 @@ def actions(
     white_background: bool,
     span: range | None = None,
     stride: float = 1.0,
-    views: int = 1,
 ) -> Actions:
     """Actions due in an iteration (paper, section 5.2, in the reference's windows): none from densify_until_iter on.
 
     span, stride: the iterations of the schedule that it stands for, and their mean number there; by default itself.
     The options' windows and resets are of the schedule; densifications come every `interval` iterations, as their
-    statistics need views (views: of each iteration). Resets that do not pay are left out.
+    statistics need views. Resets that do not pay are left out.
     """
     before, now = (iteration - 1, iteration) if span is None else (span.start - 1, span.stop - 1)
     active, resets = now < opt.densify_until_iter, opt.opacity_reset_interval
@@ -69,13 +67,13 @@ def actions(
         observe=active,
         densify=active
         and now > opt.densify_from_iter
-        and iteration % interval(opt, opt.densify_until_iter, stride, views) == 0,
+        and iteration % interval(opt, opt.densify_until_iter, stride) == 0,
         limit_size=now > resets,
-        reset_opacity=active and any(is_due and reset_pays(now, opt, stride, views, white) for is_due, white in kinds),
+        reset_opacity=active and any(is_due and reset_pays(now, opt, stride, white) for is_due, white in kinds),
     )
 
 
-def reset_pays(step: int, opt: argparse.Namespace, stride: float = 1.0, views: int = 1, of_white: bool = False) -> bool:
+def reset_pays(step: int, opt: argparse.Namespace, stride: float = 1.0, of_white: bool = False) -> bool:
     """Whether a model recovers from a reset at an iteration of the schedule, before the next one and before the end.
 
     With less than half an interval to go it keeps haze. of_white: the reset at densify_from_iter, where the interval
@@ -83,7 +81,7 @@ def reset_pays(step: int, opt: argparse.Namespace, stride: float = 1.0, views: i
     """
     resets = opt.opacity_reset_interval
     half = (min(resets, USUAL_RESETS) if of_white else resets) / 2
-    return opt.iterations - step >= half and (stride <= 1 or resets >= RECOVERY * stride / views)
+    return opt.iterations - step >= half and (stride <= 1 or resets >= RECOVERY * stride)
 
 
 def logit(p: float) -> float:

@@ -36,10 +36,6 @@ class Penalty(NamedTuple):
         """The weights of one opacity and of one of the three scales, among `count` Gaussians."""
         return Penalty(self.opacity / max(count, 1), self.scale / max(3 * count, 1))
 
-    def times(self, factor: float) -> "Penalty":
-        """The weights times a factor."""
-        return Penalty(factor * self.opacity, factor * self.scale)
-
 
 NO_PENALTY = Penalty()
 

@@ -17,7 +17,7 @@ from scene.gaussians.spilled import is_spilled, room_for, to_host
 from scene.gaussians.statistics import NAMES, Statistics
 from scene.gaussians.table import GaussianTable
 from splatting.distributed.ranks import Ranks
-from splatting.distributed.rows import WHOLE, Divided, Shards, own_rows
+from splatting.distributed.rows import WHOLE, Divided, Shards
 from splatting.host.machine import compute_device
 from utils.general_utils import build_scaling_rotation, inverse_sigmoid, strip_symmetric
 from utils.system_utils import UserError
@@ -128,11 +128,9 @@ class GaussianParameters:
         return self.shards.total(len(self))
 
     def divide(self, ranks: Ranks) -> None:
-        """Let ranks share the Gaussians, which all have in whole: each keeps its part, also of what is loaded later."""
+        """Let ranks share the Gaussians of a model that has none yet: each keeps its part of what is loaded."""
         if ranks.several:
-            if len(self):
-                self.table.change(lambda values: own_rows(values, ranks), self.table.row_groups())
-            self.shards = Divided(ranks, len(self))
+            self.shards = Divided(ranks, 0)
 
     def __bool__(self) -> bool:
         """True, also for a model without Gaussians: the reference's has no length."""

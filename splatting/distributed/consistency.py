@@ -3,18 +3,12 @@
 import argparse
 import hashlib
 import importlib.util
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-import torch
-from torch import Tensor
-
 from scene.cameras import Camera
-from scene.gaussian_model import GaussianModel
 from scene.scene import Scene
 from splatting.distributed.ranks import ranks, refuse_differences
-from splatting.training.restart import what_stands
 
 _ROOT = Path(__file__).resolve().parents[2]
 _ROOMS = ("arguments", "gaussian_renderer", "splatting", "scene", "utils")
@@ -31,38 +25,13 @@ def agree_on_options(args: argparse.Namespace) -> None:
 
 
 def agree_on_scene(scene: Scene, start: str | None) -> None:
-    """UserError if ranks have read another scene or checkpoint than rank 0.
-
-    From here on, a fault that cannot save the model names the checkpoint that stands (start: the one resumed).
-    """
+    """UserError if ranks have read another scene or checkpoint (start: the one resumed) than rank 0."""
     if not ranks().several:
         return
     facts = {"the training views": _digest(scene.getTrainCameras()), "the test views": _digest(scene.getTestCameras())}
     if start:
         facts[start] = hashlib.sha256(Path(start).read_bytes()).hexdigest()
     refuse_differences(ranks().everyone(facts), "give all ranks the same dataset", shown=False)
-    ranks().stands = lambda: what_stands(scene.model_path, start)
-
-
-def agree_on_model(gaussians: GaussianModel, poses: Mapping[str, np.ndarray]) -> None:
-    """UserError if ranks that each trained the whole model have other parameters or averages of Adam than rank 0.
-
-    poses: the numbers of poses that are trained, too.
-    """
-    facts = {f"poses ({name})": str(numbers.tolist()) for name, numbers in poses.items()}
-    states = gaussians.optimizer.state
-    for group in gaussians.optimizer.param_groups:
-        tensors = [tensor for param in group["params"] for tensor in (param, *states.get(param, {}).values())]
-        facts[group["name"]] = str([_sums(tensor) for tensor in tensors])
-    remedy = f"one of their GPUs computes wrongly, so find out which; {ranks().stands()}"
-    refuse_differences(ranks().everyone(facts), remedy, shown=False)
-
-
-def _sums(values: Tensor) -> list[int]:
-    """Sums of the bits of values (N, ...) of 32 bits each: by column, and by row times its number."""
-    bits = torch.atleast_2d(values.detach()).flatten(1).view(torch.int32)
-    rows = bits.sum(1) * torch.arange(len(bits), device=bits.device)
-    return [int(rows.sum()), *bits.sum(0).tolist()]
 
 
 def _code() -> dict[str, str]:

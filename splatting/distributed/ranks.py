@@ -6,7 +6,7 @@ torch is imported on first use: not every program needs it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
 from splatting.files.listing import some
@@ -29,7 +29,6 @@ class Ranks:
 
     rank = 0
     size = 1
-    prompt = False  # whether the others may expect this rank at the next collective call within seconds
     flag: Tensor | None = None  # (1,) int64, which each `agree` raises to the largest of all ranks
 
     @property
@@ -130,13 +129,6 @@ class Ranks:
     def anyone(self, fact: bool) -> bool:
         """Whether a fact holds on any rank."""
         return bool(self.numbers(int(fact)).any())
-
-    def busy(self) -> AbstractContextManager[None]:
-        """Within it, the others have to wait for this rank as long as it takes, as for a large file."""
-        return nullcontext()
-
-    def tell_notes(self) -> None:
-        """Print what only other ranks have said so far, with their names (splatting/distributed/rank_logging.py)."""
 
 
 ALONE = Ranks()

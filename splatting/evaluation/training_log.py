@@ -5,7 +5,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -33,11 +33,9 @@ class Stopwatch:
     """Seconds since its construction, without those inside `paused()` or of a stopped process, where it stands still.
 
     spent: the seconds inside, by their purpose. Of a pause in another one, they count for the inner purpose.
-    busy: what else happens in a pause, as a context.
     """
 
-    def __init__(self, busy: Callable[[], AbstractContextManager] = nullcontext) -> None:
-        self._busy = busy
+    def __init__(self) -> None:
         self._start = running_seconds()
         self._stopped: float | None = None  # when the outermost pause began
         self.spent: dict[str, float] = {}
@@ -51,8 +49,7 @@ class Stopwatch:
         before, outer, others = running_seconds(), self._stopped, sum(self.spent.values())
         self._stopped = before if outer is None else outer
         try:
-            with self._busy():
-                yield
+            yield
         finally:
             taken = running_seconds() - before
             inner = sum(self.spent.values()) - others

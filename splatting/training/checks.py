@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from arguments import OPTIONS, other_scene, read_model_json, read_training_options
+from arguments import OPTIONS, other_scene, read_training_options
 from arguments.strategies import STRATEGIES, STRATEGY_OPTIONS
 from scene.check import of_options, tell
 from scene.check.photos import hints
@@ -25,6 +25,9 @@ from splatting.files.listing import some
 from splatting.training.density import DensityControl
 from splatting.training.schedule import USUAL, DecidedSchedule
 from utils.system_utils import UserError
+
+# Milliseconds of a step on an H100: of any, and of a million Gaussians (docs/results/several_gpus.md).
+STEP_ALONE, STEP_SHARED = (0.5, 1.05), (2.8, 0.4)
 
 
 def _warn(text: str) -> None:
@@ -103,6 +106,17 @@ def check_exposures(gaussians: GaussianModel, exposes: bool, checkpoint: str) ->
         print(f"{checkpoint} has no exposures: all photos start without a correction")
 
 
+def faster_alone(ranks: int, on_gpu: bool, count: int) -> str | None:
+    """What to say if one GPU would train `count` Gaussians, as many as there may be, faster than several do."""
+    alone, shared = (base + each * count / 1e6 for base, each in (STEP_ALONE, STEP_SHARED))
+    if ranks == 1 or not on_gpu or shared < alone:
+        return None
+    return (
+        f"one GPU is faster here: a step of {count:,} Gaussians takes it about {alone:.1f} ms, and two that share it "
+        f"{shared:.1f} ms; start train.py without torchrun, unless they do not fit"
+    )
+
+
 def without_effect(opt: argparse.Namespace, strategy: str) -> str | None:
     """What to say of given options that belong to another strategy; their help begins with its name."""
     other = {*STRATEGIES} - {strategy}
@@ -122,7 +136,7 @@ def late_reset(density: DensityControl, opt: argparse.Namespace, done: int) -> s
     last = range(max(done, schedule.ends - rules.RECOVERY) + 1, schedule.ends)
     if not (due := [iteration for iteration in last if density.resets(iteration)]):
         return None
-    of_white = schedule.schedule_step(due[-1]) % opt.opacity_reset_interval >= schedule.views
+    of_white = schedule.schedule_step(due[-1]) % opt.opacity_reset_interval > 0
     remedy = "raise --opacity_reset_interval"
     if of_white:
         remedy = "lower --densify_from_iter, where a white background has a reset"
@@ -157,7 +171,7 @@ def another_number(density: DensityControl, opt: argparse.Namespace, count: int,
     done = schedule.schedule_step(first) - 1
     until = f"--densify_until_iter {done + (schedule.length - done) // 2}"
     scaled = None
-    if not done and schedule.views == 1 and opt.densify_from_iter < density.ends < USUAL:
+    if not done and opt.densify_from_iter < density.ends < USUAL:
         scaled = f"--schedule {schedule.length} in place of --iterations {schedule.length}"
     if too_late:
         window = f"--densify_from_iter {done + (schedule.length - done) // 20}"
@@ -181,7 +195,6 @@ def _start_of(count: int, opt: argparse.Namespace) -> str:
 
 
 _OF_VIEWS = {"images", "resolution", "white_background", "eval", "train_test_exp"}  # in cfg_args, for all saves alike
-VIEWS = "views_per_iteration"  # entry of model.json, where it is not 1
 
 
 def check_folder(
@@ -226,17 +239,6 @@ def check_folder(
 def lies_in(checkpoint: str | None, folder: str | os.PathLike) -> bool:
     """Whether a checkpoint, if there is one, lies in a model folder."""
     return checkpoint is not None and _same_place(Path(checkpoint).parent, folder)
-
-
-def check_views(checkpoint: str, views: int) -> None:
-    """UserError if the run that wrote a checkpoint had another number of views in each iteration than this run."""
-    then = read_model_json(str(Path(checkpoint).parent)).get(VIEWS, 1)
-    if then != views:
-        how = f"--parallel views and {then} processes" if then > 1 else "--parallel tiles"
-        raise UserError(
-            f"{checkpoint} is of a run that had {then} views in each iteration, and this one would have {views}; "
-            f"resume it with {how}"
-        )
 
 
 def report_changes(checkpoint: str, now: argparse.Namespace) -> None:

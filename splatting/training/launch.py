@@ -11,10 +11,6 @@ def add_launch_options(parser: argparse.ArgumentParser) -> None:
     """Add them to a parser. Iterations are those of the schedule (splatting/training/schedule)."""
     add = parser.add_argument
     flag, listed = {"action": "store_true"}, {"type": int, "nargs": "+", "metavar": "N"}
-    add("--parallel", choices=["tiles", "views"], default="tiles",
-        help="how processes that torchrun has started share the training, of which each has a part of the Gaussians; "
-             "tiles: each draws a part of every view, and the result is that of one process; views: each draws a view "
-             "of its own, so that an iteration shows several (default: tiles)")
     add("--ip", type=str, default="127.0.0.1", help="address to listen at for the remote viewer (default: 127.0.0.1)")
     add("--port", type=int, default=6009, help="port for the remote viewer, 0: any free one (default: 6009)")
     add("--disable_viewer", **flag, help="open no port for the remote viewer")

@@ -1,6 +1,5 @@
 """The training loop: the method, and nothing else."""
 
-import gc
 from collections.abc import Iterator, Sequence
 
 import torch
@@ -30,29 +29,28 @@ def training_steps(run: Run, observers: Sequence[Observer]) -> Iterator[tuple[It
     """
     taker, together = step_taker(run), StepAgreement(run)
     every = Announcer([together, *observers], run.look)
-    # Backward runs on this thread: waking autograd's worker costs time in every iteration.
-    with run.interrupt, every, torch.autograd.set_multithreading_enabled(False):
-        try:
-            for at in run.iterations():
-                every.begins(at)
-                taker.throttle(at)  # before the learning rates are set, which a replayed step changes
-                run.prepare(at)  # learning rates, SH degree, photos of the next views
-                taker.take(at, every)
-                at.stopping = together.stopping  # read once: a signal may come at any moment
-                if at.stopping:
-                    taker.drain()
-                every.stepped(at)
-                if at.stopping:
-                    together.wait()
-                    raise at.stopping
-                if together.divides(at):
-                    taker.drain()
-                    run.divide()
-                    taker = step_taker(run)
-                    gc.collect()  # the former has captured steps, which keep memory
-                yield at, taker
-        except BaseException:  # leave the model as it was between two steps
-            run.lost = taker.abort()
-            raise
-    together.finish()
+    at = None
+    try:
+        # Backward runs on this thread: waking autograd's worker costs time in every iteration.
+        with run.interrupt, every, torch.autograd.set_multithreading_enabled(False):
+            try:
+                for at in run.iterations():
+                    every.begins(at)
+                    taker.throttle(at)  # before the learning rates are set, which a replayed step changes
+                    run.prepare(at)  # learning rates, SH degree, photos of the next views
+                    taker.take(at, every)
+                    at.stopping = together.stopping  # read once: a signal may come at any moment
+                    if at.stopping:
+                        taker.drain()
+                    every.stepped(at)
+                    if at.stopping:
+                        raise at.stopping
+                    yield at, taker
+            except BaseException:  # leave the model as it was between two steps
+                run.lost = taker.abort()
+                raise
+    except KeyboardInterrupt:
+        if at is not None and at.stopping:
+            together.wait()
+        raise
     every.ended()  # out here a signal stops at once what is only drawn and printed

@@ -30,18 +30,23 @@ _REMEDY = "--images_to_load, or lower --resolution (-r) or --sh_degree"
 LITTLE = 0.1  # of what is free, of which nobody has to know
 
 
+def expected_count(max_splats: int, now: int) -> int:
+    """How many Gaussians there may be later. max_splats: their limit; without one (0), GROWTH times the number now."""
+    return max(max_splats, now) if max_splats else GROWTH * now
+
+
 def announce_memory(
     scene: Scene, gaussians: GaussianModel, memory: "GpuMemory", max_splats: int, absolute: bool = False, size: int = 1
 ) -> None:
     """Print the memory that photos and Gaussians need and what is free; warn, with a remedy, if they do not fit.
 
-    max_splats: limit of the number of Gaussians. Without a limit (0), the estimate is for GROWTH times the number now.
-    absolute: with absolute gradients. size: of processes that train together; each says what itself needs.
+    max_splats: as for `expected_count`. absolute: with absolute gradients. size: of processes that train together; each
+    says what itself needs.
     """
     images, device = scene.images, gaussians.get_xyz.device
     pixels = largest_view(scene)
     now = gaussians.gaussian_count
-    later = max(max_splats, now) if max_splats else GROWTH * now
+    later = expected_count(max_splats, now)
     why = "--max_num_splats" if max_splats else f"scenes often grow {GROWTH}-fold"
     per_rank = [-(-count // size) for count in (now, later)]
     spilled = [memory.spilled_bytes(count) for count in per_rank]

@@ -4,19 +4,16 @@ import argparse
 import copy
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
-from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from gaussian_renderer.rays import check_views
-from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
@@ -26,8 +23,8 @@ from scene.gaussians.morton import sort_rows
 from scene.gaussians.ppisp import Ppisp
 from scene.sleeping import MOST_SHARE, REST, Sleeping, share_seen
 from splatting.deterministic.counter_rng import Stream, uniform
-from splatting.distributed.consistency import agree_on_model, agree_on_scene
-from splatting.distributed.ranks import ALONE, ranks
+from splatting.distributed.consistency import agree_on_scene
+from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch
 from splatting.exports.in_scene import scene_with, start_from
 from splatting.exports.splats import Splats
@@ -35,10 +32,9 @@ from splatting.host.clock import seconds_since_start
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.training import checks, schedule_file
 from splatting.training.best_model import BEST, BestModel
-from splatting.training.division import begins_whole, say_whole, shared_seconds
 from splatting.training.gpu_memory import GpuMemory, limit_torch, reads_on_host
 from splatting.training.iteration import Iteration, ViewOrder
-from splatting.training.memory_estimate import announce_memory, largest_view
+from splatting.training.memory_estimate import announce_memory, expected_count, largest_view
 from splatting.training.objective import LossWatch, Objective
 from splatting.training.pose_refinement import PoseRefinement
 from splatting.training.resolution import Resolution, resolution_of, smallest
@@ -97,25 +93,23 @@ class Run:
         dataset = self.dataset = checks.with_lenses(dataset, self.start)
         if opt.strategy == AUTO and (self.start or not (opt.time_budget or opt.schedule)):
             opt.strategy = checks.strategy_of(self.start) if self.start else USUAL
-        self.lost, share = 0, partial(shared_seconds, self.group)
+        self.lost = 0
         self.interrupt, self.device = DeferredInterrupt(), compute_device()
         capture, self.first_iteration = self._read_start()
-        views = self.group.size if launch.parallel == "views" else 1
-        self.schedule = schedule_file.schedule_of(opt, self.start, self.first_iteration, views, share)
+        self.schedule = schedule_file.schedule_of(opt, self.start, self.first_iteration, self.group.shared)
         if isinstance(self.schedule, DecidedSchedule):
             end_in_time(opt)
         self.warnings: list[str] = []
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
-        sharing = self.group if views == 1 else ALONE  # all read the same images in the same order
         init_ply = None if self.start else getattr(dataset, "init_ply", None)
-        self.scene, first = scene_with(init_ply, dataset, self.gaussians, ranks=sharing)
+        self.scene, first = scene_with(init_ply, dataset, self.gaussians, ranks=self.group)
         checks.check_scene(self.scene, dataset, bool(self.start))
         checks.check_target(opt.target_psnr, len(self.scene.getTestCameras()))
         agree_on_scene(self.scene, self.start)  # before an image is shared
         points = self.scene.info.point_cloud.points if first is None else first
         count = len(points if capture is None else capture[1])
         self._share(count)
-        self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed, views, self.group.rank if views > 1 else 0)
+        self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed)
         self.resolution = self._sizes()
         self._decode_ahead(self.first_iteration + 1)
         self._begin_model(capture, first)
@@ -125,8 +119,7 @@ class Run:
             opt.strategy = self._strategy_by_the_clock()
         self.schedule.strategy = opt.strategy
         self.density = density_control(self)
-        if not self.whole:
-            self._expect(self.density.most_gaussians)
+        self._expect(self.density.most_gaussians)
         self.objective = Objective(self)
         self._depth_weight = get_expon_lr_func(
             opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
@@ -135,12 +128,13 @@ class Run:
         self.sleeping = self._may_sleep()
         if self.sleeping and capture and (asleep := further(capture, ASLEEP)):
             self.sleeping.restore(asleep)
+        expected = expected_count(self.density.most_gaussians, self.gaussians.gaussian_count)
+        self._warn(checks.faster_alone(self.group.size, self.device.type == "cuda", expected))
         self._warn(checks.late_reset(self.density, opt, self.first_iteration))
         self._warn(checks.without_effect(given, opt.strategy))
         self._warn(checks.another_number(self.density, opt, self.gaussians.gaussian_count, self.first_iteration + 1))
         if capture is None and first is None:
             self.density.started()
-        self.group.tell_notes()
 
     def _refined_poses(self, capture: tuple | None) -> PoseRefinement | None:
         """What refines the poses of the views, with the state of a checkpoint; None unless it is asked for."""
@@ -174,8 +168,7 @@ class Run:
 
     def _expect(self, count: int) -> None:
         """Let the memory be divided for a number of Gaussians, of which each rank has its part."""
-        if self.schedule.views == 1:
-            self.memory.expect(-(-count // self.gaussians.shards.ranks.size))
+        self.memory.expect(-(-count // self.group.size))
 
     def _warn(self, text: str | None) -> None:
         """Print what a check says, and keep it for the log."""
@@ -191,14 +184,8 @@ class Run:
         return strategy
 
     def _share(self, count: int) -> None:
-        """Divide the empty model among the processes, or let each train all of its `count` Gaussians on all photos.
-
-        Then decide on the limit of the GPU's memory.
-        """
-        if begins_whole(self, count):
-            self.scene.keep_all_images()
-        else:
-            self.gaussians.divide(self.group)
+        """Divide the empty model among the processes, and decide on the limit of the GPU's memory."""
+        self.gaussians.divide(self.group)
         store, pixels = self.scene.images, largest_view(self.scene)
         self.memory = GpuMemory(self.opt.gpu_memory, self.gaussians, store, pixels, self.opt.absgrad, self.device)
         self._expect(count)
@@ -245,8 +232,6 @@ class Run:
         if self.opt.filter_3d:
             self._begin_filter(capture and further(capture, FILTER))
         self.gaussians.limit_columns()
-        if (views := self.schedule.views) > 1:
-            self.gaussians.optimizer.set_betas(0.9**views, 0.999**views)
 
     def _begin_filter(self, kept: Any) -> None:
         """Compute the 3D filter, or take that of a checkpoint, if it has one."""
@@ -269,7 +254,6 @@ class Run:
         saves = [[] if self.opt.target_psnr else self.schedule.known(one) for one in planned]
         checks.check_folder(self.options, saves[0], start, self.first_iteration, saves[1])
         if start:
-            checks.check_views(start, self.schedule.views)
             checks.report_changes(start, self.options)
 
     @property
@@ -281,9 +265,8 @@ class Run:
     @property
     def entries(self) -> dict[str, Any]:
         """Entries of model.json besides the options (`write_model_json`)."""
-        views = {checks.VIEWS: self.schedule.views} if self.schedule.views > 1 else {}
         sky = {SKY: self.sky.captured()} if self.sky else {}
-        return {"world_offset": self.gaussians.world_offset} | views | sky
+        return {"world_offset": self.gaussians.world_offset} | sky
 
     def begin(self) -> None:
         """Write the inputs into the output folder, print the memory estimate, start or continue the log."""
@@ -294,14 +277,12 @@ class Run:
             schedule_file.leave_schedule(Path(folder), self.first_iteration if checks.lies_in(start, folder) else 0)
         density = self.density
         wants = density.most_gaussians, density.absolute_gradients
-        announce_memory(self.scene, self.gaussians, self.memory, *wants, self.gaussians.shards.ranks.size)
+        announce_memory(self.scene, self.gaussians, self.memory, *wants, self.group.size)
         self._tell_of_spilling()
-        if self.whole:
-            say_whole(self)
         self.memory.settle(self.gaussians)
         self.log, self.rows = checks.continue_records(folder, start, self.first_iteration)
         self.losses = LossWatch(self.log.loss)
-        self.clock = Stopwatch(self.group.busy)
+        self.clock = Stopwatch()
 
     def iterations(self) -> Iterator[Iteration]:
         """The iterations of this run."""
@@ -313,7 +294,7 @@ class Run:
                 iteration,
                 last=False,
                 camera=camera,
-                background=self._background(self.views.own(iteration)),
+                background=self._background(iteration),
                 depth_weight=self._depth_weight(schedule.schedule_step(iteration)) if camera.depth_reliable else 0.0,
                 changes=self._changes(iteration),
                 started=seconds,
@@ -339,16 +320,10 @@ class Run:
         before, now = (self.schedule.schedule_step(t) // SH_INTERVAL for t in (iteration - 1, iteration))
         return now - before
 
-    def batch(self, iteration: int) -> list[tuple[Camera, Tensor]]:
-        """All views of an iteration, of which each process shows its own, and their backgrounds (3,)."""
-        step, numbers = self.schedule.schedule_step(iteration), self.views.numbers(iteration)
-        return [(self.resolution.view(self.views.of(n), step), self._background(n)) for n in numbers]
-
-    def _background(self, view: int) -> Tensor:
-        """view: the number of a view, which is its iteration where an iteration has one."""
+    def _background(self, iteration: int) -> Tensor:
         if not self.opt.random_background:
             return self.background
-        draws = uniform(self.opt.seed, Stream.BACKGROUND, view, torch.zeros(1, dtype=torch.int64))
+        draws = uniform(self.opt.seed, Stream.BACKGROUND, iteration, torch.zeros(1, dtype=torch.int64))
         return draws[0, :3].to(self.device)
 
     def prepare(self, step: Iteration) -> None:
@@ -366,7 +341,7 @@ class Run:
         self.gaussians.exposures.held = self.density.recovers(step.iteration)
         self.gaussians.update_learning_rate(self.schedule.schedule_step(step.iteration))
         if (factor := self.schedule.rate_factor(step.iteration)) is not None:
-            sparse = self.opt.optimizer_type == "sparse_adam" and self.schedule.views == 1
+            sparse = self.opt.optimizer_type == "sparse_adam"
             self.gaussians.scale_rates(factor * (bias_correction(step.iteration) if sparse else 1.0))
 
     def _decode_ahead(self, iteration: int) -> None:
@@ -388,7 +363,7 @@ class Run:
         """What lets blocks sleep, where it saves something, and a step concerns no row that its view does not see."""
         density = self.density
         dense = type(self.gaussians.optimizer) is GaussianAdam and FusedAdam.takes(self.gaussians)
-        alone = not (self.schedule.views > 1 or density.queues or any(density.penalty) or self.opt.filter_3d)
+        alone = not (density.queues or any(density.penalty) or self.opt.filter_3d)
         if not (dense and alone and self.is_standard):
             return None
         saves = self.group.anyone(self.memory.limit > 0) or self._share_seen() < MOST_SHARE
@@ -404,7 +379,7 @@ class Run:
 
     def _tell_of_spilling(self) -> None:
         """Say what lies in the host's memory, now or once there are as many Gaussians as there may be."""
-        count = -(-max(self.gaussians.gaussian_count, self.density.most_gaussians) // self.gaussians.shards.ranks.size)
+        count = -(-max(self.gaussians.gaussian_count, self.density.most_gaussians) // self.group.size)
         if not self.memory.spilled_bytes(count):
             return
         share = self._share_seen()
@@ -412,34 +387,14 @@ class Run:
         same = self.sleeping is None or share < MOST_SHARE  # blocks would sleep in any case
         print("\n".join(self.memory.words(count, 1.0 if dense else share, same)))
 
-    @property
-    def whole(self) -> bool:
-        """Whether each of several processes trains the whole model by itself (training/division.py)."""
-        return self.group.size > self.gaussians.shards.ranks.size
-
-    def divide(self) -> None:
-        """Give each process its part of the whole model that all have, after a step in which all blocks woke."""
-        agree_on_model(self.gaussians, self.poses.arrays if self.poses else {})
-        self.gaussians.divide(self.group)
-        self._expect(self.density.most_gaussians)
-        if self.sleeping:
-            self.sleeping.reset()
-        what = f"{self.gaussians.gaussian_count:,} Gaussians"
-        tqdm.write(f"{what} are divided among {self.group.size} GPUs from here on", file=sys.stdout)
-
-    def wakes_all(self, step: Iteration) -> bool:
-        """Whether no block of Gaussians would sleep after a step."""
-        return step.changes or step.iteration % REST == 0
-
     def rests(self, step: Iteration) -> bool:
         """Whether all blocks of Gaussians wake after a step."""
         return self.sleeping is not None and step.iteration % REST == 0
 
-    def step_poses(self, step: Iteration, cameras: Sequence[Camera], gradients: Tensor) -> None:
-        """Take the steps of views' poses. gradients (views, numbers): of each image's loss by its camera's numbers."""
-        at = self.schedule.schedule_step(step.iteration)
-        for camera, gradient in zip(cameras, gradients.cpu().numpy(), strict=True):
-            self.poses.step(camera.uid, gradient, at, (camera.image_width, camera.image_height))
+    def step_pose(self, step: Iteration, gradient: Tensor) -> None:
+        """Take the step of the view's pose. gradient (numbers,): of the loss by the camera's numbers."""
+        camera, at = step.camera, self.schedule.schedule_step(step.iteration)
+        self.poses.step(camera.uid, gradient.cpu().numpy(), at, (camera.image_width, camera.image_height))
         self.poses.place()
 
     def after_step(self, step: Iteration) -> None:

@@ -2,8 +2,7 @@
 
 Options count steps of a schedule, whose last is --iterations: windows of densification, resets, learning rates, and
 when to test or save. A steady run takes each of them in one iteration. Another run is longer or shorter, and still goes
-through the whole schedule: with several views an iteration (--parallel views), by the clock (--time_budget), or as a
-file says (--schedule).
+through the whole schedule: by the clock (--time_budget), or as a file says (--schedule).
 """
 
 import math
@@ -37,12 +36,11 @@ _TOLD = 1.02  # times the budget, from which on a run says that it takes longer
 class Schedule:
     """The steady schedule: each iteration stands for itself.
 
-    length: of the schedule, in iterations. ends: the last iteration of the run, None: not known yet. views: of each
-    iteration. megapixels: of a view. sizes: the schedule of the views' sizes that is in force (--resolution_schedule);
-    levels: of that. strategy: the one in force (--strategy).
+    length: of the schedule, in iterations. ends: the last iteration of the run, None: not known yet. megapixels: of a
+    view. sizes: the schedule of the views' sizes that is in force (--resolution_schedule); levels: of that. strategy:
+    the one in force (--strategy).
     """
 
-    views = 1
     megapixels = 1.0
     sizes = "none"
     levels: Levels = ()
@@ -105,31 +103,6 @@ class SettlingSchedule(Schedule):
 
     def rate_factor(self, iteration: int) -> float:
         return longer_steps(USUAL / self.length, iteration / self.length)
-
-
-class BatchSchedule(Schedule):
-    """Each iteration stands for as many steps of the schedule as it shows views, so all show as many views together.
-
-    Rates without a schedule of their own are multiplied by the root of the number of views, and Adam's betas are raised
-    to its power, so that averages reach as far back in views (Zhao et al. 2024, Grendel: their two scaling rules).
-    """
-
-    def __init__(self, length: int, views: int) -> None:
-        super().__init__(length)
-        self.views = views
-        self.ends = math.ceil(length / views)
-
-    def schedule_step(self, iteration: int) -> int:
-        return min(iteration * self.views, self.length)
-
-    def stride(self, iteration: int) -> float:
-        return float(self.views)
-
-    def rate_factor(self, iteration: int) -> float:
-        return math.sqrt(self.views)
-
-    def known(self, planned: Sequence[int]) -> list[int]:
-        return [math.ceil(iteration / self.views) for iteration in planned if iteration <= self.length]
 
 
 def longer_steps(stride: float, progress: float) -> float:

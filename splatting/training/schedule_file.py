@@ -15,7 +15,6 @@ from arguments.strategies import STRATEGIES
 from splatting.files.json_files import read_json, write_json
 from splatting.training.schedule import (
     PYRAMID,
-    BatchSchedule,
     Block,
     Decided,
     DecidedSchedule,
@@ -115,15 +114,14 @@ def schedule_of(
     opt: argparse.Namespace,
     checkpoint: str | None,
     first_iteration: int,
-    views: int = 1,
     share: Callable[[float], float] = lambda seconds: seconds,
 ) -> Schedule:
     """The schedule of a run. UserError for one that this run cannot follow, or that leaves nothing to do.
 
-    checkpoint: a chkpntN.pth that is resumed, or None. first_iteration: its N, or 0. views: of each iteration.
+    checkpoint: a chkpntN.pth that is resumed, or None. first_iteration: its N, or 0.
     share: gives all processes the seconds of one.
     """
-    schedule = _chosen(opt, checkpoint, first_iteration, share) if views == 1 else _batched(opt, views)
+    schedule = _chosen(opt, checkpoint, first_iteration, share)
     if not schedule.is_over(first_iteration):
         return schedule
     at = f"{checkpoint} is at iteration {first_iteration}"
@@ -135,15 +133,6 @@ def schedule_of(
         f"{at}, so --iterations {opt.iterations} leaves nothing to do; --iterations counts from the start of the first "
         "run"
     )
-
-
-def _batched(opt: argparse.Namespace, views: int) -> Schedule:
-    for name in ("schedule", "time_budget"):
-        if getattr(opt, name):
-            raise UserError(f"--{name} and --parallel views both give the pace of a run; leave one out")
-    if opt.gpu_memory:
-        raise UserError("--gpu_memory takes one view in each iteration; use --parallel tiles")
-    return BatchSchedule(opt.iterations, views)
 
 
 def _chosen(

@@ -7,7 +7,6 @@ send, and once how many gradient rows.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -28,13 +27,7 @@ class Sent:
     gaussians: Tensor  # (n,), ascending for each rank, rank after rank
     sizes: list[int]  # records for each rank
     received: list[int]
-    places: Tensor | None  # (n,) int32, by Gaussian, then by rank; None: as the records lie
-
-
-def agree_on_sizes(ranks: Ranks, counts: Tensor) -> tuple[list[int], list[int]]:
-    """How many records this rank sends to each rank, and how many it receives. counts: (size, n), those to each."""
-    every = ranks.agree(counts.sum(1))
-    return every[ranks.rank], [numbers[ranks.rank] for numbers in every]
+    places: Tensor  # (n,) int32, of the records by Gaussian, then by rank
 
 
 def send_splats(ranks: Ranks, bands: Bands, splats: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], Sent]:
@@ -44,24 +37,13 @@ def send_splats(ranks: Ranks, bands: Bands, splats: tuple[Tensor, ...]) -> tuple
     """
     reach = *splats[2:], bands.limits
     counts, *lists = OPERATORS.list_records(*reach, room := int(_ROOM * len(splats[0])))
-    sizes, received = agree_on_sizes(ranks, counts[:-1])
+    every = ranks.agree(counts[:-1].sum(1))
+    sizes, received = every[ranks.rank], [numbers[ranks.rank] for numbers in every]
     if (total := sum(sizes)) > room:
         _, *lists = OPERATORS.list_records(*reach, total)
     gaussians, places = (numbers[:total] for numbers in lists)
-    rows = ranks.send(_packed([splats], gaussians, [len(gaussians)]), sizes, received)[0]
+    rows = ranks.send(_packed(splats, gaussians), sizes, received)[0]
     return _unpacked(rows, splats), Sent(gaussians, sizes, received, places)
-
-
-def send_views(ranks: Ranks, views: Sequence[tuple[Tensor, ...]]) -> tuple[tuple[Tensor, ...], Sent]:
-    """Send what has tiles in view r to rank r; receive this rank's, in the order of ranks.
-
-    views: for each, tensors as of `send_splats`.
-    """
-    reached = torch.stack([tensors[-1] for tensors in views]) > 0
-    sizes, received = agree_on_sizes(ranks, reached)
-    gaussian = torch.nonzero_static(reached, size=sum(sizes))[:, 1].contiguous()
-    rows = ranks.send(_packed(views, gaussian, sizes), sizes, received)[0]
-    return _unpacked(rows, views[0]), Sent(gaussian, sizes, received, None)
 
 
 def return_rows(
@@ -74,45 +56,24 @@ def return_rows(
     Gaussians: the rows of each in the order of ranks, which is that of its tiles; or one row, their sum, where the
     record of a Gaussian lies in one band.
     """
-    arrived = _send_back(ranks, sent, rows, counts, torch.where(inside, counts.clamp_max(1), counts))
+    kept = torch.where(inside, counts.clamp_max(1), counts)
+    arrived, arrived_counts, length = _send_back(ranks, sent, rows, counts, kept)
     runs = len(sent.places)
     ends = torch.arange(runs, runs + ranks.size, dtype=torch.int32, device=rows.device)
     places = _with_last(sent.places.split(sent.sizes), ends)
-    moved = move_runs(arrived.rows, arrived.counts, places)
+    moved = move_runs(arrived, arrived_counts, places)
     nobody = torch.full((ranks.size,), count, device=rows.device)
     own = _with_last(sent.gaussians.split(sent.sizes), nobody)
-    total = torch.zeros(count + 1, dtype=torch.int32, device=rows.device).index_add_(0, own, arrived.counts)
-    return moved[: sum(arrived.lengths)], total[:-1]
+    total = torch.zeros(count + 1, dtype=torch.int32, device=rows.device).index_add_(0, own, arrived_counts)
+    return moved[:length], total[:-1]
 
 
-def return_sums(ranks: Ranks, sent: Sent, count: int, rows: Tensor, counts: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Send back one gradient row for each record of `send_views` that has any, their sum; receive those of other ranks.
+def _send_back(ranks: Ranks, sent: Sent, rows: Tensor, counts: Tensor, kept: Tensor) -> tuple[Tensor, Tensor, int]:
+    """Send what is kept of the rows of each record (`sum_runs` of the rasterizer), and receive those of this rank.
 
-    Returns for each view the rows of the rank's own `count` Gaussians, and how many each has: one or none.
-    """
-    arrived = _send_back(ranks, sent, rows, counts, counts.clamp_max(1))
-    counts = arrived.counts.split([n + 1 for n in sent.sizes])
-    views = zip(sent.gaussians.split(sent.sizes), counts, arrived.rows.split(arrived.padded), strict=True)
-    found = []
-    for (own, of_view, part), length in zip(views, arrived.lengths, strict=True):
-        total = torch.zeros(count, dtype=torch.int32, device=rows.device)
-        found.append((part[:length], total.index_add_(0, own, of_view[:-1])))
-    return found
-
-
-class _Arrived(NamedTuple):
-    """Rows from all ranks, by rank, of each an even number, so that all begin at a multiple of 16 bytes."""
-
-    rows: Tensor
-    counts: Tensor  # int32 of each record that a rank got, and behind them one more row, of zeros, or none
-    lengths: list[int]  # without these
-    padded: list[int]  # with them
-
-
-def _send_back(ranks: Ranks, sent: Sent, rows: Tensor, counts: Tensor, kept: Tensor) -> _Arrived:
-    """Send what is kept of the rows of each record (`sum_runs` of the rasterizer).
-
-    Rows that began at other places than multiples of 16 bytes took NCCL longer (docs/results/several_gpus.md).
+    Returns the rows from all ranks, by rank; the number of each record that a rank got (int32), and behind them one
+    more, 1 or 0; and the number of rows without these. Such a row of zeros makes the rows of a rank even, so that all
+    begin at a multiple of 16 bytes: else NCCL takes longer.
     """
     odd = _sums_of_parts(kept, sent.received).remainder(2).int()
     kept = _with_last(kept.split(sent.received), odd)
@@ -126,7 +87,7 @@ def _send_back(ranks: Ranks, sent: Sent, rows: Tensor, counts: Tensor, kept: Ten
     found = numbers()
     padded, to_send, rest = (found[part * ranks.size : (part + 1) * ranks.size] for part in range(3))
     arrived = ranks.send(summed[: sum(to_send)], to_send, padded)[0]
-    return _Arrived(arrived, own, [n - one for n, one in zip(padded, rest, strict=True)], padded)
+    return arrived, own, sum(padded) - sum(rest)
 
 
 def _with_last(parts: Sequence[Tensor], last: Tensor) -> Tensor:
@@ -134,14 +95,13 @@ def _with_last(parts: Sequence[Tensor], last: Tensor) -> Tensor:
     return torch.cat([piece for pair in zip(parts, last.split(1), strict=True) for piece in pair])
 
 
-def _packed(views: Sequence[tuple[Tensor, ...]], gaussians: Tensor, sizes: Sequence[int]) -> Tensor:
-    """A row of words of 32 bits for each Gaussian, of which the first sizes[0] are of the first view, and so on."""
-    words = _words(views[0])
+def _packed(splats: Sequence[Tensor], gaussians: Tensor) -> Tensor:
+    """A row of words of 32 bits for each Gaussian."""
+    words = _words(splats)
     rows = torch.empty(len(gaussians), sum(words), dtype=torch.int32, device=gaussians.device)
-    for part, splats, own in zip(rows.split(sizes), views, gaussians.split(sizes), strict=True):
-        for columns, wide, t in zip(part.split(words, 1), words, splats, strict=True):
-            # Into a part of each row: whole rows of 16 bytes are a block of threads each for torch (2.9 ms of 3 M).
-            torch.index_select(t.view(torch.int32).view(len(t), wide), 0, own, out=columns)
+    for columns, wide, t in zip(rows.split(words, 1), words, splats, strict=True):
+        # Into a part of each row: whole rows of 16 bytes are a block of threads each for torch (2.9 ms of 3 M).
+        torch.index_select(t.view(torch.int32).view(len(t), wide), 0, gaussians, out=columns)
     return rows
 
 

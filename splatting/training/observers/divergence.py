@@ -10,8 +10,6 @@ from tqdm import tqdm
 
 from scene.gaussians.adam import StepGuard
 from scene.gaussians.checkpoint import save_checkpoint
-from splatting.distributed.ranks import Ranks
-from splatting.training.division import all_failed
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
@@ -34,6 +32,7 @@ class DivergenceWatch(Observer):
     def __init__(self, run: Run) -> None:
         self._run = run
         self._gaussians = run.gaussians
+        self._ranks = run.group
         self._losses = run.losses
         self._iteration = run.first_iteration
         self._guard = StepGuard(run.device)
@@ -91,11 +90,6 @@ class DivergenceWatch(Observer):
                 file=sys.stderr,
             )
 
-    @property
-    def _ranks(self) -> Ranks:
-        """Those that have a part of the model each: this one alone while it has the whole."""
-        return self._gaussians.shards.ranks
-
     def _value_of(self, loss: float) -> float:
         """The loss of an iteration that was not finite, in whatever process."""
         return next((value for value in self._ranks.everyone(loss) if not math.isfinite(value)), loss)
@@ -108,11 +102,9 @@ class DivergenceWatch(Observer):
         return " and ".join(parts)
 
     def _rescue(self, iteration: int) -> str:
-        """Save the model, all processes together, if it is whole on each. Return what was saved, and what to do."""
+        """Save the model, all processes together. Return what was saved, and what to do."""
         if iteration == self._run.first_iteration:
             return "no iteration was trained before it; lower the learning rates"
-        if self._run.whole and not all_failed(self._run):
-            return self._run.group.stands()
         path = Path(self._run.scene.model_path) / f"chkpnt{iteration}.pth"
         faults = self._ranks.everyone(self._fault(lambda: self._gaussians.check_finite(iteration)))
         fault = next(filter(None, faults), None)

@@ -23,6 +23,7 @@ from splatting.host.memory import is_out_of_memory
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
+from splatting.training.restart import what_stands
 from splatting.training.robust_mask import FEW, FOLDER, MASKED, MOST_PHOTOS, odd_photos, residuals_of
 from splatting.training.run import Run
 from utils.image_utils import as_float
@@ -200,9 +201,9 @@ class MemoryGuard(Observer):
 
     def _rescue(self) -> str:
         """Save the model, unless other processes have parts of it. Return what was saved, and what to do."""
-        group = self._run.group
-        if group.several:
-            return f"{group.stands()}, with a lower --resolution (-r), --max_num_splats or --images_to_load"
+        if self._run.group.several:
+            stands = what_stands(self._run.scene.model_path, self._run.start)
+            return f"{stands}, with a lower --resolution (-r), --max_num_splats or --images_to_load"
         if self._iteration == self._first and not self._changing:
             return "nothing was trained yet; lower --resolution (-r), --max_num_splats, --images_to_load or --sh_degree"
         gaussians, iteration = self._gaussians, self._iteration + self._changing

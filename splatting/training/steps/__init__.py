@@ -1,6 +1,5 @@
 """The ways to take a step of training: all give the same bytes."""
 
-from splatting.distributed.rendering.batch import ViewOfEach
 from splatting.training.run import Run
 from splatting.training.steps.captured import CapturedStep
 from splatting.training.steps.fused import FusedStep
@@ -10,10 +9,8 @@ from splatting.training.steps.plain import PlainStep
 def step_taker(run: Run) -> PlainStep:
     """The fastest way to take the steps of this run.
 
-    It is the plain one where somebody else may need gradients, and for several views at once.
+    It is the plain one where somebody else may need gradients.
     """
-    if run.schedule.views > 1:
-        return PlainStep(run, ViewOfEach(run))
     if not FusedStep.suits(run):
         return PlainStep(run)
     exchanges = run.gaussians.shards.ranks.several  # numbers, in each step

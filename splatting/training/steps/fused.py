@@ -44,7 +44,7 @@ class FusedStep(PlainStep):
                 self.advance(at, drawn, gradients)
                 del drawn, gradients  # what changes rows needs their memory
                 if self.camera_gradient is not None and not at.last:
-                    self._run.step_poses(at, [at.camera], self.camera_gradient[None])
+                    self._run.step_pose(at, self.camera_gradient)
                 return self.follow(at)
         super().take(at, observers)
 

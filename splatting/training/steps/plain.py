@@ -12,7 +12,7 @@ Package = dict[str, Tensor | None]
 
 
 class OneView:
-    """Renders the iteration's view, of the whole model; other models have a class of their own with these methods."""
+    """Renders the iteration's view."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
@@ -47,7 +47,7 @@ class RefinedView(OneView):
         if not at.last:
             color, depth = (None if plane is None else plane.grad for plane in self._planes)
             drawn = draw(at.camera, run.gaussians, run.pipe, at.background, depth is not None)
-            run.step_poses(at, [at.camera], drawn.camera_gradient(color, depth)[None])
+            run.step_pose(at, drawn.camera_gradient(color, depth))
         return package, losses
 
 
@@ -59,9 +59,9 @@ class PlainStep:
     returns their number. A plain step leaves nothing pending.
     """
 
-    def __init__(self, run: Run, views: OneView | None = None) -> None:
+    def __init__(self, run: Run) -> None:
         self._run = run
-        self._views = views or (RefinedView if run.poses else OneView)(run)
+        self._view = (RefinedView if run.poses else OneView)(run)
 
     def take(self, at: Iteration, observers: Announcer) -> None:
         """Take a step; the observers are told once the gradients are there."""
@@ -70,15 +70,15 @@ class PlainStep:
             run.poses.place(at.camera)
         if run.sleeping:
             self._wake(at)
-        package = self._views.render(at)
+        package = self._view.render(at)
         losses = run.objective(package, at)
         losses.total.backward()
         if self._reaches_sleepers():
             self._end_sleep()
             return self.take(at, observers)
-        package, losses = self._views.collect(at, package, losses)
+        package, losses = self._view.collect(at, package, losses)
         if any(run.density.penalty):
-            run.gaussians.penalise(run.density.penalty.times(run.schedule.views))
+            run.gaussians.penalise(run.density.penalty)
         observers.measured(at, losses)
         run.density.after_backward(at, package)
         if not at.last:  # as in the reference, the last iteration takes no step

@@ -55,7 +55,7 @@ class AdaptiveDensityControl(DensityControl):
         now, resets = self.schedule.schedule_step(iteration), self._opt.opacity_reset_interval
         last = now - now % resets
         recovers = resets <= last < self.ends and now % resets < rules.RECOVERY
-        pays = rules.reset_pays(last, self._opt, self.schedule.stride(iteration), self.schedule.views)
+        pays = rules.reset_pays(last, self._opt, self.schedule.stride(iteration))
         return recovers and pays and not self._ends_too_soon(last, iteration)
 
     def replaced(self, iteration: int) -> Collection[str]:
@@ -88,7 +88,7 @@ class AdaptiveDensityControl(DensityControl):
 
     def _actions(self, iteration: int) -> rules.Actions:
         schedule = self.schedule
-        place = schedule.span(iteration), schedule.stride(iteration), schedule.views
+        place = schedule.span(iteration), schedule.stride(iteration)
         return rules.actions(iteration, self._opt, self._white_background, *place)
 
     def _densify(self, iteration: int, limit_size: bool) -> None:

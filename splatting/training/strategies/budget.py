@@ -90,9 +90,7 @@ class BudgetControl(DensityControl):
         return max(math.ceil(ahead) - 1, 0)
 
     def _interval(self, iteration: int) -> int:
-        return rules.interval(
-            self._opt, self._opt.densify_until_iter, self.schedule.stride(iteration), self.schedule.views
-        )
+        return rules.interval(self._opt, self._opt.densify_until_iter, self.schedule.stride(iteration))
 
     def _chosen(self, step: Iteration, count: int) -> Tensor:
         """Indices of this process's Gaussians to split, ascending; those of all processes are at most `count`."""

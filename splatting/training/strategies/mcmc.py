@@ -53,7 +53,7 @@ class MarkovChain(DensityControl):
         opt = self._opt
         within = opt.densify_from_iter < self.schedule.schedule_step(iteration) < opt.mcmc_until_iter
         stride = self.schedule.stride(iteration)
-        return within and iteration % rules.interval(opt, opt.mcmc_until_iter, stride, self.schedule.views) == 0
+        return within and iteration % rules.interval(opt, opt.mcmc_until_iter, stride) == 0
 
     def most_after(self, count: int, first: int, last: int) -> int:
         for iteration in filter(
