@@ -1,7 +1,8 @@
 """train.py with a fault in one rank, for tests of several: `faulty_train.py FAULT RANK ITERATION OPTIONS...`.
 
 FAULT is one of `_FAULTS`, which come in that iteration; or code (other files, in the folder that OTHER_CODE names), or
-none. A restarted training has no fault. All ranks print the same lines at first, and wait five seconds for each other.
+none. A restarted training has no fault. All ranks print the same lines at first. Where one hangs, the others wait ten
+seconds.
 """
 
 import os
@@ -26,7 +27,7 @@ from splatting.training.iteration import Iteration
 from splatting.training.run import Run
 from utils.system_utils import run_cli
 
-launcher.TIMEOUT = timedelta(seconds=5)
+launcher.TIMEOUT = timedelta(seconds=10 if fault == "hang" else 60)
 prepare = Run.prepare
 
 

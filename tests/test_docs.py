@@ -1,4 +1,4 @@
-"""README and docs: lengths, copied figures, and every command and flag that a page shows."""
+"""README and docs: copied figures, and every command and flag that a page shows."""
 
 import ast
 import contextlib
@@ -21,7 +21,6 @@ PAGES = [
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-MOST_LINES, MOST_WORDS = 130, 2500
 # What benchmarks/device.sh runs by its first word.
 DEVICE = {
     "kernels": "benchmarks.kernels.rasterizer",
@@ -121,22 +120,15 @@ def test_every_flag_in_prose_is_known():
     assert {(page, flag) for page, flag in shown - removed if flag not in known} == set()
 
 
-def test_pages_are_short():
-    """`make docs` checks their links and the navigation."""
-    words = {_name(page): len(page.read_text(encoding="utf-8").split()) for page in PAGES}
-    assert {page: count for page, count in words.items() if count > MOST_WORDS} == {}
-
-
 def test_links_of_the_readme_resolve():
     """No page of the site."""
     links = re.findall(r"\]\((?!\w+:)([^()\s#]+)", _prose(ROOT / "README.md"))
     assert links and [link for link in links if not (ROOT / link).exists()] == []
 
 
-def test_the_readme_is_short_and_its_figures_stand_in_the_results():
+def test_figures_of_the_readme_stand_in_the_results():
     """README copies rows of generated tables. A table made anew must not leave the copy behind."""
     readme = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
-    assert len(readme) <= MOST_LINES
     results = (ROOT / "docs" / "results" / "training.md").read_text(encoding="utf-8").splitlines()
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in readme]
     scored = [row for row in rows if row[0] in ("CPU", "GPU")]

@@ -46,10 +46,7 @@ def run_together(main: Callable[[], object], outcome: Callable[[Callable[[], obj
         except RuntimeError as error:
             if is_out_of_memory(error) or not _is_lost(error):
                 raise
-            status, line = (
-                1,
-                "error: another rank has ended, or did not answer within the time limit; see torchrun's report",
-            )
+            status, line = 1, "error: another rank has ended, or did not answer in time; see torchrun's report"
     if rank > 0 and status == _REFUSED:
         try:
             time.sleep(_PRECEDENCE)
@@ -57,6 +54,9 @@ def run_together(main: Callable[[], object], outcome: Callable[[Callable[[], obj
             return status
     if line and (rank == 0 or status == _REFUSED):
         print(line if rank == 0 else line.replace("error:", f"error: rank {rank}:", 1), file=sys.stderr, flush=True)
+    if status and dist.is_initialized() and dist.get_backend() == "nccl":
+        sys.stdout.flush()
+        os._exit(status)  # Python's own end would wait for kernels that wait for a rank that is gone
     return status
 
 
@@ -80,6 +80,7 @@ def _join_and_run(main: Callable[[], object]) -> None:
     # torchrun's store outlives a restart of all ranks, and the notes of those before it are not for these.
     store = dist.PrefixStore(f"restart {torchrun.restarts()}", store)
     options = {"backend": "nccl", "device_id": device} if by_gpu else {"backend": "gloo"}
+    os.environ.setdefault("TORCH_NCCL_DUMP_ON_TIMEOUT", "0")  # for which it would wait a minute after the limit
     dist.init_process_group(store=store, rank=rank, world_size=size, timeout=TIMEOUT, **options)
     ranks = SeveralRanks()
     refuse_differences(ranks.everyone(_machine(device)), "start all ranks with the same installation")
