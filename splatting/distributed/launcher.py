@@ -80,7 +80,7 @@ def _join_and_run(main: Callable[[], object]) -> None:
     # torchrun's store outlives a restart of all ranks, and the notes of those before it are not for these.
     store = dist.PrefixStore(f"restart {torchrun.restarts()}", store)
     options = {"backend": "nccl", "device_id": device} if by_gpu else {"backend": "gloo"}
-    os.environ.setdefault("TORCH_NCCL_DUMP_ON_TIMEOUT", "0")  # for which it would wait a minute after the limit
+    os.environ.setdefault("TORCH_NCCL_WAIT_TIMEOUT_DUMP_MILSEC", "1000")  # else a minute more after the limit
     dist.init_process_group(store=store, rank=rank, world_size=size, timeout=TIMEOUT, **options)
     ranks = SeveralRanks()
     refuse_differences(ranks.everyone(_machine(device)), "start all ranks with the same installation")
