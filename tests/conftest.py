@@ -1,4 +1,4 @@
-"""Fixtures that several test files share."""
+"""Fixtures that several test files share, and a limit to the time of a test."""
 
 import os
 import shutil
@@ -14,6 +14,13 @@ from synthetic import make_blender_scene, make_colmap_scene
 
 from splatting.evaluation import curve_recorder
 from splatting.evaluation.error_curve import FIGURE
+
+# Tests run side by side, a process a core. Those about several threads set their number.
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # of programs that a test starts
+torch.set_num_threads(1)
+
+MOST_SECONDS = 5.0  # of processors, for a test that is not marked slow
+HAS_GPU = torch.cuda.is_available()  # whose first calls take seconds
 
 
 @pytest.fixture(scope="session")
@@ -34,6 +41,23 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
             patch.setattr(torch.cuda, "is_available", lambda: False)
             patch.setattr(torch.cuda, "_cached_device_count", 0, raising=False)  # torch remembers what it saw first
         return (yield)
+
+
+def _seconds_of_processors() -> float:
+    """Of this process and of its children that have ended: others on the machine do not add to it."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    """A test that takes long is marked, so that `-m "not slow"` stays short."""
+    start = _seconds_of_processors()
+    result = yield
+    taken = _seconds_of_processors() - start
+    if taken > MOST_SECONDS and item.get_closest_marker("slow") is None and not HAS_GPU:
+        pytest.fail(f"took {taken:.1f} s of CPU time: make it faster, or mark it with @pytest.mark.slow", pytrace=False)
+    return result
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -119,12 +143,3 @@ def dtype(request: pytest.FixtureRequest) -> Iterator[torch.dtype]:
     device, made = request.param
     with torch.device(device):
         yield made
-
-
-@pytest.fixture
-def one_thread():
-    """Use one thread: on images of a hundred pixels, more only wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)

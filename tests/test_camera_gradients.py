@@ -19,7 +19,6 @@ from gaussian_renderer import render as render_model
 from scene.cameras import MiniCam
 from scene.poses import motion, moved
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 VIEW = rigid((0.95, 0.1, -0.15, 0.05), (0.1, -0.05, 0.2))
 SHEARED = VIEW.clone()
 SHEARED[:3, :3] = torch.tensor([[-1.1, 0.1, 0.0], [0.2, 0.8, 0.15], [0.0, -0.1, 0.9]], dtype=torch.float64)
@@ -168,12 +167,12 @@ def test_other_gradients_keep_their_bytes(device, dtype):
         assert torch.equal(values, asked[name]), name
 
 
-def test_threads_give_the_same_bytes():
+def test_threads_give_the_same_bytes(threads):
     parameters, size = few(1000, 70, 33, dtype=torch.float32)
     parameters["scales"] -= 2
     found = []
-    for threads in (1, 3):
-        torch.set_num_threads(threads)
+    for count in (1, 3):
+        threads(count)
         found.append(_gradient_of_numbers(parameters, settings(**size)))
     assert torch.equal(*found)
 

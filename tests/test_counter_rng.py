@@ -84,14 +84,9 @@ def test_portable_functions_agree_with_numpy():
     assert np.abs(sin.numpy() - np.sin(angle)).max() < 2e-15
 
 
-def test_bits_do_not_depend_on_the_number_of_threads():
+def test_bits_do_not_depend_on_the_number_of_threads(threads):
     items = torch.arange(100_003)
-    threads = torch.get_num_threads()
-    try:
-        torch.set_num_threads(1)
-        one = normal(0, Stream.SPLIT, 600, items)
-        torch.set_num_threads(2)
-        two = normal(0, Stream.SPLIT, 600, items)
-    finally:
-        torch.set_num_threads(threads)
-    assert torch.equal(one, two)
+    threads(1)
+    one = normal(0, Stream.SPLIT, 600, items)
+    threads(2)
+    assert torch.equal(one, normal(0, Stream.SPLIT, 600, items))

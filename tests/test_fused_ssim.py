@@ -12,7 +12,6 @@ EPS = {torch.float32: 2**-24, torch.float64: 2**-53}
 LARGEST_SLOPE = 2 / 0.03**2  # of SSIM over a covariance; multiplies an error of the inputs or of the oracle
 both_dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 on_a_gpu = pytest.mark.parametrize("device", [pytest.param("cuda", marks=GPU_MARKS)])
-pytestmark = pytest.mark.usefixtures("one_thread")
 both_paddings = pytest.mark.parametrize("padding", allowed_padding)
 
 

@@ -104,13 +104,9 @@ def test_extremes_stay_finite():
     assert [tuple(rows.shape) for rows in empty.values()] == [(0, 3), (0, 3), (0, 1)]
 
 
-def test_any_number_of_threads_gives_the_same():
-    parents, before = _parents(40_001), torch.get_num_threads()
-    try:
-        results = []
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            results.append(long_axis_children(*parents))
-    finally:
-        torch.set_num_threads(before)
+def test_any_number_of_threads_gives_the_same(threads):
+    parents, results = _parents(40_001), []
+    for count in (1, 2, 3):
+        threads(count)
+        results.append(long_axis_children(*parents))
     assert all(torch.equal(rows, other[name]) for other in results[1:] for name, rows in results[0].items())

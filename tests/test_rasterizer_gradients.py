@@ -9,7 +9,6 @@ from rasterizer_tools import BOTH_AND_GPU, activated, few, on_device, ops, pick,
 from benchmarks.workloads.splat_scenes import settings
 from utils.sh_utils import RGB2SH
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 # With steps of 1e-6, truncation and rounding leave errors of some 1e-9; a wrong term is far above 1e-6.
 CHECK = {"eps": 1e-6, "atol": 1e-7, "rtol": 1e-6}
 VIEW = rigid((0.95, 0.1, -0.15, 0.05), (0.1, -0.05, 0.2))

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from processes import in_ranks
 from rasterizer_tools import GPU_MARKS
 from step_ways import WAYS, Rerun, fused_iterations, take_as  # noqa: F401  (a fixture)
@@ -134,18 +133,15 @@ def test_ranks(scene, tmp_path, plain):
 
 
 @pytest.mark.parametrize("strategy", ["adc", "mcmc", "budget"])
-def test_any_number_of_threads(scene, tmp_path, strategy):
+def test_any_number_of_threads(scene, tmp_path, threads, strategy):
     """With as many points and pixels as torch divides loops between threads: from 32,768 values on."""
     rng, count = np.random.default_rng(0), 40_003
     write_point_cloud(tmp_path / "cloud.ply", rng.normal(size=(count, 3)), rng.integers(0, 255, (count, 3)))
     more = "--strategy", strategy, "--init_pcd_path", tmp_path / "cloud.ply", "--densify_grad_threshold", 5e-5
     more += "--max_num_splats", 50_000, "-r", 160
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            results.append(trained(scene, tmp_path / str(threads), *more))
-    finally:
-        torch.set_num_threads(before)
+    results = []
+    for number in (1, 2):
+        threads(number)
+        results.append(trained(scene, tmp_path / str(number), *more))
     assert not differences(*results)
     assert len(results[0]["ply"]) > count * 4 * 14
