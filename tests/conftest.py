@@ -10,6 +10,7 @@ from pathlib import Path
 import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import pytest
 import torch
+from filelock import FileLock
 from synthetic import make_blender_scene, make_colmap_scene
 
 from splatting.evaluation import curve_recorder
@@ -104,17 +105,31 @@ def stdout() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def _colmap_master(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("colmap_master") / "scene"
-    make_colmap_scene(folder)
-    return folder
+def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """A function that lets make(folder) fill a folder once, and names it. Tests of all workers read it."""
+    base = tmp_path_factory.getbasetemp()
+    shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "once"
+
+    def made(name: str, make: Callable[[Path], object]) -> Path:
+        folder, done = shared / name, shared / f"{name}.done"
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(shared / f"{name}.lock"):
+            if not done.exists():
+                make(folder)
+                done.touch()
+        return folder
+
+    return made
 
 
 @pytest.fixture(scope="session")
-def _blender_master(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("blender_master") / "scene"
-    make_blender_scene(folder)
-    return folder
+def _colmap_master(once) -> Path:
+    return once("colmap_scene", make_colmap_scene)
+
+
+@pytest.fixture(scope="session")
+def _blender_master(once) -> Path:
+    return once("blender_scene", make_blender_scene)
 
 
 @pytest.fixture

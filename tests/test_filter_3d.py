@@ -9,13 +9,12 @@ import torch
 from gaussians import pipeline
 from scipy.spatial.transform import Rotation
 from synthetic import FOCAL, make_colmap_scene, options_of
-from trainings import BUDGET, differences, trained
+from trainings import ITERATIONS, OPTIONS, plain_training, shared_scene, trained, whole_result
 
 from gaussian_renderer import render
 from scene import GaussianModel, Scene
 from scene.gaussians.checkpoint import FILTER, further, load_checkpoint, save_checkpoint, with_further
 from scene.gaussians.filter_3d import filter_widths, filtered
-from splatting.training import run
 from utils.system_utils import UserError
 
 ON = "--filter_3d", "--antialiasing"
@@ -87,19 +86,15 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("options", [(), BUDGET], ids=["adc", "budget"])
-def test_all_steps_and_a_resumed_training_have_the_same_bytes(scene, tmp_path, monkeypatch, options):
-    monkeypatch.setattr(run, "FILTER_INTERVAL", 15)
-    words = *ON, *options
-    whole = trained(scene, tmp_path / "whole", *words, "--checkpoint_iterations", 34, 60)
-    assert not differences(whole, trained(scene, tmp_path / "plain", *words, "--plain_step"))
-    start = tmp_path / "whole" / "chkpnt34.pth"
-    assert not differences(whole, trained(scene, tmp_path / "resumed", *words, "--start_checkpoint", start))
-    assert trained(scene, tmp_path / "off", *ON[1:], *options)["ply"] != whole["ply"]
-    capture, iteration = load_checkpoint(start)
+def test_a_training_with_it_is_another_and_a_damaged_one_is_refused(once, tmp_path):
+    name, start = "filter and budget", tmp_path / "chkpnt33.pth"
+    scene, whole = shared_scene(once), plain_training(once, name)
+    off = trained(scene, tmp_path / "off", *OPTIONS[name][1:])
+    assert off["ply"] != whole_result(whole, ITERATIONS)["ply"]
+    capture, iteration = load_checkpoint(whole / "chkpnt33.pth")
     save_checkpoint(start, with_further(capture, {FILTER: further(capture, FILTER)[1:]}), iteration)
     with pytest.raises(UserError, match="the 3D filter of the checkpoint does not fit"):
-        trained(scene, tmp_path / "wrong", *words, "--start_checkpoint", start)
+        trained(scene, tmp_path / "wrong", *OPTIONS[name], "--start_checkpoint", start)
 
 
 def test_the_ply_looks_as_the_model_and_needs_no_filter(scene, tmp_path, monkeypatch):

@@ -12,7 +12,7 @@ import pytest
 import torch
 from diff_gaussian_rasterization.reference.lens import pixels_of
 from synthetic import BROWN, as_text, make_blender_scene, make_colmap_scene
-from trainings import differences, train_on, trained
+from trainings import plain_training, shared_scene, train_on, trained
 
 import metrics
 import render
@@ -327,29 +327,22 @@ def scene(tmp_path_factory) -> Path:
     return folder
 
 
-def test_a_resumed_training_has_the_bytes_of_a_whole_one(scene, tmp_path):
-    options = "--refine_poses", "--resolution_schedule", "pyramid", "--test_iterations", -1
-    whole = trained(scene, tmp_path / "whole", *options, "--checkpoint_iterations", 33, 60)
-    start = "--start_checkpoint", tmp_path / "whole" / "chkpnt33.pth"
-    resumed = trained(scene, tmp_path / "resumed", *options, *start)
-    assert not differences(whole, resumed)
-    tables = [(tmp_path / name / NAME).read_bytes() for name in ("whole", "resumed")]
-    assert tables[0] == tables[1]
-    loaded = Scene(_options(scene, tmp_path / "whole"), GaussianModel(1), load_iteration=60, start=False)
-    table = json.loads(tables[0])
+def test_a_model_has_the_poses_that_a_training_found(once, tmp_path):
+    scene, whole = shared_scene(once), plain_training(once, "poses")
+    loaded = Scene(_options(scene, whole), GaussianModel(1), load_iteration=60, start=False)
+    table = json.loads((whole / NAME).read_text())
     for name, cameras in (("train", loaded.getTrainCameras()), ("test", loaded.getTestCameras())):
         for camera in cameras:
             entry = table[name][camera.uid]
             assert entry["img_name"] == camera.image_name and entry["R"] == camera.R.tolist()
-    plain = Scene(_options(scene, tmp_path / "whole", refine_poses=False), GaussianModel(1), 60, start=False)
+    plain = Scene(_options(scene, whole, refine_poses=False), GaussianModel(1), 60, start=False)
     assert np.abs(_poses(plain) - _poses(loaded)).max() > 1e-5
     with pytest.raises(UserError, match="chkpnt33.pth was trained with --refine_poses; give that option"):
-        trained(scene, tmp_path / "other", *start)
-    trained(scene, tmp_path / "unrefined", "--checkpoint_iterations", 60)
-    assert not (tmp_path / "unrefined" / NAME).exists()
+        trained(scene, tmp_path / "other", "--start_checkpoint", whole / "chkpnt33.pth")
+    unrefined = plain_training(once, "default")
+    assert not (unrefined / NAME).exists()
     with pytest.raises(UserError, match="the checkpoint has no refined poses of this run's views"):
-        trained(scene, tmp_path / "more", "--refine_poses", "--iterations", 61, "--start_checkpoint",
-                tmp_path / "unrefined" / "chkpnt60.pth")  # fmt: skip
+        trained(scene, tmp_path / "more", "--refine_poses", "--start_checkpoint", unrefined / "chkpnt33.pth")
 
 
 def test_test_views_are_scored_with_given_poses_too(tmp_path, monkeypatch):

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 from scipy import ndimage
 from synthetic import make_colmap_scene
-from trainings import differences, trained
+from trainings import trained
 
 import train
 from splatting.evaluation.model_folder import MASKED_PHOTOS
@@ -106,13 +106,8 @@ def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RobustMask, "early", 0)
 
 
-def test_all_steps_and_a_resumed_training_have_the_same_bytes(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(robust_mask, "_FACTOR", 1.2)
-    monkeypatch.setattr(robust_mask, "_BESIDE", 0.4)
-    whole = trained(scene, tmp_path / "whole", *ON, "--checkpoint_iterations", 45, 60)
-    assert not differences(whole, trained(scene, tmp_path / "plain", *ON, "--plain_step"))
-    start = "--start_checkpoint", tmp_path / "whole" / "chkpnt45.pth"
-    assert not differences(whole, trained(scene, tmp_path / "resumed", *ON, *start))
+def test_a_training_shows_what_it_leaves_out(scene, tmp_path, monkeypatch):
+    whole = trained(scene, tmp_path / "whole", *ON)
     assert (off := trained(scene, tmp_path / "off", *ON[2:]))["ply"] != whole["ply"]
     lines = read_log(tmp_path / "whole" / "train_log.json")[-1]["lines"]
     (said,) = [line for line in lines if line.startswith("--robust_mask leaves out")]

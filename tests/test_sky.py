@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from synthetic import options_of
-from trainings import differences, trained
+from trainings import trained
 
 import export
 import train
@@ -113,11 +113,10 @@ def test_what_is_far_comes_back_to_the_sphere_and_what_is_near_stays():
     torch.testing.assert_close(gaussians.get_scaling[:, 0].detach(), torch.tensor([6.25, 6.25, 20.0, 20.0]))
 
 
-def test_a_training_and_a_resumed_one_keep_it_and_exports_leave_it_out(scene, tmp_path, monkeypatch):
-    """Rows change, and after a reset of opacities density control removes what is large. Plain steps give the same."""
-    whole = trained(scene, tmp_path / "whole", *ON, "--checkpoint_iterations", 33, 60)
-    start = "--start_checkpoint", tmp_path / "whole" / "chkpnt33.pth"
-    assert not differences(whole, trained(scene, tmp_path / "resumed", *ON, *start, "--plain_step"))
+@pytest.mark.slow
+def test_a_training_keeps_it_and_exports_leave_it_out(scene, tmp_path, monkeypatch):
+    """Rows change, and after a reset of opacities density control removes what is large."""
+    trained(scene, tmp_path / "whole", *ON)
     known = read_model_json(tmp_path / "whole")["sky"]
     model = read_splats(tmp_path / "whole/point_cloud/iteration_60/point_cloud.ply")
     distances = np.linalg.norm(model.means - known["center"], axis=1) / known["radius"]

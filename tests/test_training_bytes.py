@@ -1,16 +1,19 @@
-"""A training has the same bytes by every way to take its steps: each of trainings.OPTIONS, each way, any ranks."""
+"""A training has the same bytes by every way to take its steps, resumed, scored between, and on any ranks and threads.
+
+Features have no such tests of their own: an option that has a part in steps or in checkpoints is in trainings.OPTIONS.
+"""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+from diff_gaussian_rasterization import ops
 from processes import in_ranks
 from rasterizer_tools import GPU_MARKS
-from step_ways import WAYS, Rerun, fused_iterations, take_as  # noqa: F401  (a fixture)
-from trainings import ITERATIONS, OPTIONS, differences, narrow_scene, trained
+from step_ways import Rerun, fused_iterations, take_as  # noqa: F401  (a fixture)
+from trainings import ITERATIONS, OPTIONS, differences, plain_training, shared_scene, trained, whole_result
 
 from scene.readers.point_cloud import write_point_cloud
 from splatting.distributed.ranks import ranks
@@ -19,15 +22,30 @@ from splatting.training.steps.captured import Graphs
 
 Result = dict[str, bytes | list]
 EVERY = pytest.mark.parametrize("name", OPTIONS)
+# Captured steps are those of all. These have every term, every optimiser, and every way to change rows.
+COVERING = "together", "appearance", "sparse", "filter", "budget errors", "points and poses"
+RESUMED = (  # each has a state of its own
+    *("default", "sparse", "absgrad", "exposure", "appearance", "points", "poses", "points and poses", "sky"),
+    *("poses and lenses", "exposure and sizes", "mcmc sparse", "filter", "filter and adc", "filter and budget"),
+    *("budget errors", "robust mask"),
+)
 LOOKS = ("--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44, "--checkpoint_iterations", 21, ITERATIONS)
 # Whose steps are queued one call after the other.
 WITHOUT_GRAPHS = ("depth", "masks", "together", "poses, no graph", "points", "poses and lenses")
-KINDS = {"degree 0": 1, "two phases": 5, "appearance": 5, "exposure": 8, "budget errors": 7}  # half images count, too
+WITHOUT_GRAPHS += "robust mask", "points and poses"
+KINDS = {
+    "degree 0": 1,
+    "two phases": 5,
+    "appearance": 5,
+    "exposure": 8,
+    "budget errors": 7,
+    "exposure and sizes": 9,
+}  # half images count, too
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return narrow_scene(tmp_path_factory.mktemp("bytes") / "scene")
+def scene(once) -> Path:
+    return shared_scene(once)
 
 
 @contextmanager
@@ -45,22 +63,25 @@ def _awake_here() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def plain(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Result]:
-    """Trains by plain steps with the options of a name, once."""
-    folder = tmp_path_factory.mktemp("plain")
-    return cache(lambda name: trained(scene, folder / name, "--plain_step", *OPTIONS[name]))
+def plain(once) -> Callable[[str], Result]:
+    return lambda name: whole_result(plain_training(once, name), ITERATIONS)
 
 
+@pytest.mark.slow
 def test_each_training_is_another(scene, tmp_path, plain):
     results = [plain(name)["ply"] for name in OPTIONS] + [trained(scene, tmp_path, "--seed", 6)["ply"]]
     assert len(set(results)) == len(OPTIONS) + 1
 
 
-@EVERY
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(
+    ("way", "name"),
+    [*(("captured", name) for name in OPTIONS), *((way, name) for way in ("fused", "queued") for name in COVERING)],
+)
 def test_fast_steps(scene, tmp_path, monkeypatch, take_as, plain, way, name):  # noqa: F811
+    """And they write no gradient of a parameter."""
     expected = plain(name)
     take_as(way)
+    monkeypatch.setattr(ops, "gradients_of", lambda *_: pytest.fail("autograd has asked for gradients"))
     fused, find, kinds = fused_iterations(monkeypatch), Graphs._graph_for, []
     monkeypatch.setattr(Graphs, "_graph_for", lambda self, at: (find(self, at), kinds.append({*self._graphs}))[0])
     assert not differences(trained(scene, tmp_path, *OPTIONS[name]), expected)
@@ -82,11 +103,11 @@ def test_steps_of_a_gpu(scene, tmp_path, name, _):
     assert not differences(trained(scene, tmp_path / "captured", *OPTIONS[name]), expected)
 
 
-@EVERY
-def test_resumed(scene, tmp_path, plain, name):
-    trained(scene, tmp_path / "a", *OPTIONS[name], "--checkpoint_iterations", 33, ITERATIONS)
-    start = "--start_checkpoint", tmp_path / "a" / "chkpnt33.pth"
-    assert not differences(trained(scene, tmp_path / "b", *OPTIONS[name], *start), plain(name))
+@pytest.mark.parametrize("name", RESUMED)
+def test_resumed(scene, tmp_path, once, plain, name):
+    """By fast steps, from a checkpoint of plain ones."""
+    start = "--start_checkpoint", plain_training(once, name) / "chkpnt33.pth"
+    assert not differences(trained(scene, tmp_path, *OPTIONS[name], *start), plain(name))
 
 
 @pytest.mark.parametrize("name", ["together", "sparse", "mcmc idle", "budget"])
@@ -124,7 +145,8 @@ def _all(scene: Path, folder: Path, kinds: list[tuple[str, tuple[str, ...]]]) ->
 
 
 def test_ranks(scene, tmp_path, plain):
-    alone = "mcmc moves", "mcmc idle", "rays", "points"
+    alone = "mcmc moves", "mcmc idle", "rays", "points", "points and poses", "sky", "robust mask"
+    alone += "filter and adc", "filter and budget", "exposure and sizes"
     kinds = [(name, ()) for name in OPTIONS if name not in alone]
     kinds += [("exposure", ("--plain_step",)), ("poses", ("--plain_step",))]
     found = in_ranks(2, _all, scene, tmp_path, kinds)[0]

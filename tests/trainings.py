@@ -13,11 +13,13 @@ from synthetic import FOCAL, make_colmap_scene
 
 import train
 from scene.readers.point_cloud import write_point_cloud
-from splatting.training import loop, run
+from splatting.training import loop, robust_mask, run
 from splatting.training.iteration import Iteration
 from splatting.training.steps.plain import PlainStep
 
+Once = Callable[[str, Callable[[Path], object]], Path]
 ITERATIONS = 60
+LEARNT = "poses.json", "exposure.json", "appearance.json"
 MCMC = ("--strategy", "mcmc", "--mcmc_noise", 5e4, "--mcmc_gate_opacity", 0.5, "--mcmc_min_opacity", 0.45)
 BUDGET = ("--strategy", "budget", "--max_num_splats", 500, "--densify_until_iter", 50)
 OPTIONS = {
@@ -44,9 +46,15 @@ OPTIONS = {
     "mcmc idle": ("--strategy", "mcmc", "--mcmc_growth", 0, "--mcmc_min_opacity", 1e-6),
     "mcmc sparse": (*MCMC, "--optimizer_type", "sparse_adam", "--antialiasing"),
     "filter": (*MCMC, "--filter_3d", "--antialiasing"),
+    "filter and adc": ("--filter_3d", "--antialiasing"),
+    "filter and budget": ("--filter_3d", "--antialiasing", *BUDGET),
     "budget": BUDGET,
+    "sky": ("--sky", "auto", "--densify_grad_threshold", 1e-5),
+    "robust mask": ("--robust_mask", 0.3, "--opacity_reset_interval", 3000),
+    "points and poses": ("--sparse_depth", 0.5, "--refine_poses"),
     "poses": ("--refine_poses", "--resolution_schedule", "pyramid"),
     "poses, no graph": ("--refine_poses", "--train_test_exp", "-d", "depths", "--depth_l1_weight_init", 1),
+    "exposure and sizes": ("--train_test_exp", "--resolution_schedule", "pyramid", "-r", 1),
     "poses and lenses": ("--refine_poses", "--refine_lens", "--resolution_schedule", "pyramid"),
     "budget errors": (*BUDGET, "--score_power", 2, "--train_test_exp"),
 }
@@ -91,8 +99,32 @@ def trained(scene: Path, out: Path, *options: object) -> dict[str, bytes | list]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stdout", sys.stdout)  # training stamps it
         patch.setattr(run, "SH_INTERVAL", 12)  # between the iterations that change rows
+        patch.setattr(run, "FILTER_INTERVAL", 15)
+        patch.setattr(robust_mask.RobustMask, "early", 0)  # renders are far from the photos
+        patch.setattr(robust_mask, "_FACTOR", 1.2)
+        patch.setattr(robust_mask, "_BESIDE", 0.4)
         train_on(scene, out, *words, "--no_curve", "--quiet", "--disable_viewer", *options)
     return whole_result(out, ITERATIONS)
+
+
+def shared_scene(once: Once) -> Path:
+    """A scene that narrow_scene has made for all workers; see conftest.once."""
+    return once("narrow_scene", narrow_scene)
+
+
+def plain_training(once: Once, name: str) -> Path:
+    """The output folder of a training by plain steps with the options of a name, for all workers.
+
+    It has a checkpoint of iteration 33, too. No block sleeps.
+    """
+
+    def make(out: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(run, "MOST_SHARE", 0.0)
+            words = "--plain_step", "--checkpoint_iterations", 33, ITERATIONS
+            trained(shared_scene(once), out, *words, *OPTIONS[name])
+
+    return once(f"plain/{name}", make)
 
 
 def before_steps(monkeypatch: pytest.MonkeyPatch, act: Callable[[Iteration], None]) -> None:
@@ -120,14 +152,16 @@ def leaves(value: object) -> list:
 
 
 def whole_result(out: Path, iteration: int) -> dict[str, bytes | list]:
-    """The bytes of the PLY of an iteration, and the leaves of its checkpoint."""
+    """The bytes of the PLY of an iteration and of what was learnt beside it, and the leaves of its checkpoint."""
     checkpoint = torch.load(out / f"chkpnt{iteration}.pth", "cpu", weights_only=False)  # where all has room
     ply = out / f"point_cloud/iteration_{iteration}/point_cloud.ply"
-    return {"ply": ply.read_bytes(), "checkpoint": leaves(checkpoint)}
+    beside = {path.name: path.read_bytes() for name in LEARNT if (path := out / name).exists()}
+    return {"ply": ply.read_bytes(), **beside, "checkpoint": leaves(checkpoint)}
 
 
 def differences(one: dict[str, bytes | list], other: dict[str, bytes | list]) -> list[str]:
     """What differs between two results, in few words."""
     pairs = zip(one["checkpoint"], other["checkpoint"], strict=True)
     found = [f"leaf {n}: {str(a)[:60]} and {str(b)[:60]}" for n, (a, b) in enumerate(pairs) if a != b]
-    return found + (["ply"] if one["ply"] != other["ply"] else [])
+    files = sorted({*one, *other} - {"checkpoint"})
+    return found + [name for name in files if one.get(name) != other.get(name)]
