@@ -147,6 +147,7 @@ def _drawn(weights: list[float], count: int, iteration: int, seed: int = 0) -> l
     return chosen.tolist()
 
 
+@pytest.mark.slow
 def test_pairs_are_drawn_as_often_as_one_after_the_other():
     weights, draws = [1.0, 2.0, 4.0, 0.0, 1.5], 2000
     total = sum(weights)

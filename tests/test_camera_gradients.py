@@ -215,6 +215,7 @@ def test_the_module_of_the_reference_passes_them_on():
     assert view.grad.any() and torch.equal(view.grad, twin.grad)
 
 
+@pytest.mark.slow
 def test_torch_compile_gives_the_same_gradient():
     parameters, size = few()
     camera = settings(**size, view=VIEW)

@@ -40,10 +40,8 @@ NAMES = ["photo_00.png", "photo_01.png", "Ünser Bild 2.png", "deep/photo_03.png
 NAMES += ["photo_04.png", "photo_05.png", "photo_06.png", "photo_07.jpg"]
 
 
-@pytest.fixture(scope="module")
-def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def _photos(scene: Path) -> None:
     """Images of a room in `input`, with a sub-folder, blanks and an umlaut in names, and one turned by EXIF."""
-    scene = tmp_path_factory.mktemp("convert") / "my room"
     make_photos(scene / "input", VIEWS)
     (scene / "input" / "deep").mkdir()
     for number, name in enumerate(NAMES):
@@ -53,15 +51,18 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     exif[0x010F] = "maker"
     Image.open(plain).transpose(Image.Transpose.ROTATE_90).save(plain.with_suffix(".jpg"), quality=97, exif=exif)
     plain.unlink()
-    return scene
+
+
+def _convert(scene: Path) -> None:
+    _photos(scene)
+    before = folder_state(scene / "input")
+    convert.main(["-s", str(scene), "--no_gpu", "--resize"])
+    assert folder_state(scene / "input") == before
 
 
 @pytest.fixture(scope="module")
-def converted(photos: Path) -> Path:
-    before = folder_state(photos / "input")
-    convert.main(["-s", str(photos), "--no_gpu", "--resize"])
-    assert folder_state(photos / "input") == before
-    return photos
+def converted(once) -> Path:
+    return once("my room", _convert)
 
 
 @pytest.fixture
@@ -70,6 +71,7 @@ def copy(converted: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(converted, tmp_path / "copy", copy_function=shutil.copy2))
 
 
+@pytest.mark.slow
 def test_every_photo_is_placed_where_it_was_taken(converted):
     info = read_scene(converted, "images", hold_out=False)
     assert [camera.image_name for camera in info.train_cameras] == sorted(NAMES, key=os.fsencode)
@@ -238,6 +240,7 @@ def test_stages_are_redone_from_the_first_that_changed(tmp_path):
         run(a=1)
 
 
+@pytest.mark.slow
 def test_a_finished_scene_stays_until_the_next_one_is_there(copy, monkeypatch):
     def scene() -> dict:
         own = ("input", "distorted")
@@ -411,14 +414,14 @@ def test_webp_is_rewritten_since_colmap_does_not_read_it(tmp_path):
         np.testing.assert_array_equal(np.asarray(before), np.asarray(after))
 
 
-def test_masks_keep_features_away(photos, tmp_path):
+def test_masks_keep_features_away(converted, tmp_path):
     layout = Layout(tmp_path / "scene")
     masks = tmp_path / "masks"
     for folder in (layout.input, masks / "deep"):
         folder.mkdir(parents=True)
     for name in (*NAMES[:2], NAMES[3]):
         (layout.input / name).parent.mkdir(exist_ok=True)
-        shutil.copy(photos / "input" / name, layout.input / name)
+        shutil.copy(converted / "input" / name, layout.input / name)
     half = Image.new("L", SIZE)
     half.paste(255, (SIZE[0] // 2, 0, *SIZE))
     half.save(masks / "photo_00.png.png")
@@ -439,6 +442,7 @@ def test_every_lens_model_can_be_asked_for():
     assert {*LENS_MODELS, "INVALID"} == set(pycolmap.CameraModelId.__members__)
 
 
+@pytest.mark.slow
 def test_panoramas_are_placed_and_taken_as_they_are(tmp_path):
     make_photos(tmp_path / "input", 4, panoramas=True)
     words = ["-s", str(tmp_path), "--no_gpu", "--camera", "EQUIRECTANGULAR"]

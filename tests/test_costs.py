@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 from gaussians import options, pipeline
 from rasterizer_tools import CPU_AND_GPU, ops
@@ -46,6 +47,7 @@ print(json.dumps({"modules": [*set(sys.modules) - before], "binds": binds, "deco
 UNUSED = {"matplotlib", "tensorboard", "socketserver", "lpips", "torch._dynamo", "torchvision", "pycolmap", "viser"}
 
 
+@pytest.mark.slow
 def test_a_training_loads_binds_and_decodes_nothing_that_it_does_not_use(blender_scene, tmp_path):
     command = [sys.executable, "-c", PROBE, str(blender_scene), str(tmp_path / "model")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)

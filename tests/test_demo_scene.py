@@ -20,10 +20,8 @@ BOX = Box((0.9, -0.4, 0.5), (0.3, 0.4, 0.2), 0.5)
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
-    out = tmp_path_factory.mktemp("demo") / "scene"
-    make_scene(out, VIEWS, WIDTH, HEIGHT, POINTS, seed=3)
-    return out
+def scene(once) -> Path:
+    return once("demo_scene", lambda out: make_scene(out, VIEWS, WIDTH, HEIGHT, POINTS, seed=3))
 
 
 @pytest.fixture(scope="module")

@@ -316,6 +316,7 @@ def test_points_are_looked_up_where_colmap_sees_them():
     assert (scale, offset) == pytest.approx((2.0, 0.1), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_the_command_makes_a_file_that_training_takes(colmap_scene, tmp_path, monkeypatch):
     """Make maps of the points themselves: a square around each, with a scale and an offset per photo."""
     monkeypatch.setattr(sys, "stdout", sys.stdout)

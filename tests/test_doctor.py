@@ -259,6 +259,7 @@ def test_models_with_a_fault(model, change, said):
     assert not any("train longer" in text for text in found)
 
 
+@pytest.mark.slow
 def test_a_model_is_checked_against_the_scene_that_is_given(healthy, model, colmap_scene, tmp_path, capsys):
     moved = colmap_scene.rename(tmp_path / "moved")
     folder = model(source=tmp_path / "gone", cloud=moved)
@@ -328,6 +329,7 @@ def test_a_scene_too_small_to_be_drawn(model, colmap_scene):
     assert "most Gaussians are nearer than 0.2 and never drawn -> scale cameras and points" in line
 
 
+@pytest.mark.slow
 def test_models_that_have_not_converged(model, monkeypatch):
     lines = check_model(model(), -1)
     assert lines[0].text == "iteration 7, 300 Gaussians of SH degree 3"

@@ -27,21 +27,21 @@ SWAP = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, 1, 0]])
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("doctor") / "scene"
-    make_scene(folder, 24, 120, 90, 1500, seed=1)
-    return folder
+def scene(once) -> Path:
+    return once("doctor/scene", lambda folder: make_scene(folder, 24, 120, 90, 1500, seed=1))
 
 
 @pytest.fixture(scope="module")
-def trained(scene: Path) -> Path:
+def trained(scene: Path, once) -> Path:
     """A model whose Gaussians are long, so that their rotations matter."""
-    out = scene.parent / "model"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "stdout", sys.stdout)  # which the command silences
-        train_on(scene, out, "--eval", "--iterations", N, "--disable_viewer", "--quiet", "--test_iterations", -1,
-                 "--checkpoint_iterations", N)  # fmt: skip
-    return out
+
+    def train(out: Path) -> None:
+        words = "--eval", "--iterations", N, "--test_iterations", -1, "--checkpoint_iterations", N
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "stdout", sys.stdout)  # which the command silences
+            train_on(scene, out, *words, "--disable_viewer", "--quiet")
+
+    return once("doctor/model", train)
 
 
 @pytest.fixture
@@ -110,6 +110,7 @@ def test_a_photo_that_somebody_walked_into_is_named(trained, scene, tmp_path):
         assert ["most in " + name + ";" in text for text, name in zip(found, named, strict=True)] == [True] * len(named)
 
 
+@pytest.mark.slow
 def test_photos_with_each_others_names_are_found_before_and_after_a_training(folder, scene, tmp_path):
     other = Path(shutil.copytree(scene, tmp_path / "scene"))
     photos = sorted((other / "images").iterdir())

@@ -16,6 +16,7 @@ from synthetic import folder_state
 from splatting.demo.make_scene import make_scene
 
 pytest.importorskip("diff_gaussian_rasterization", reason="the extensions are not built: make test")
+pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
 ITERATIONS = 300

@@ -440,6 +440,7 @@ class TestTraining:
         assert row["gaussians"] == 300 and row["seconds"] == log[0]["seconds"]
         assert row["peak_memory_mib"] > 0 and row["wall_seconds"] > row["seconds"]
 
+    @pytest.mark.slow
     def test_peak_memory_is_that_of_all_parts(self, colmap_scene, tmp_path):
         """The peak of an earlier part that took more, from its last row or its log, whichever is larger."""
         out = tmp_path / "out"
@@ -506,6 +507,7 @@ print(clock.wall_seconds(), "matplotlib" in sys.modules, memory.peak_memory_mib(
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="this system does not tell when a process started")
 def test_what_a_process_has_used():
     start = time.perf_counter()

@@ -28,6 +28,7 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from splatting.files.image_files import read_plane
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "inside" / "extending.md"
 CODE = (

@@ -80,10 +80,8 @@ def test_widths_follow_from_the_nearest_view_that_shows_a_point(tmp_path, model,
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("filter") / "scene"
-    make_colmap_scene(folder)
-    return folder
+def scene(_colmap_master: Path) -> Path:
+    return _colmap_master
 
 
 def test_a_training_with_it_is_another_and_a_damaged_one_is_refused(once, tmp_path):

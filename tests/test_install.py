@@ -188,6 +188,7 @@ def wheel_of(folder: Path) -> tuple[str, list[str], list[str]]:
     return name, names, [line.partition(": ")[2] for line in lines if line.startswith("Requires-Dist: ")]
 
 
+@pytest.mark.slow
 def test_a_build_has_every_instruction_set_and_the_same_bytes_wherever_it_is_made(tmp_path: Path) -> None:
     """Its wheel serves every Python, and leaves torch alone: pip --force-reinstall would install requirements again."""
     folders = [tmp_path / name / "toy" for name in ("one", "another_one")]
@@ -208,6 +209,7 @@ def test_a_build_has_every_instruction_set_and_the_same_bytes_wherever_it_is_mad
         assert library[f"lanes_{isa}"]() == lanes
 
 
+@pytest.mark.slow
 def test_compile_error_ends_without_traceback(tmp_path: Path) -> None:
     write_extension(tmp_path, "int broken() { return no_such_name; }")
     done = build_extension(tmp_path)
@@ -245,6 +247,7 @@ def test_an_extension_without_torch_says_what_to_do(package: str, tmp_path: Path
     assert last_line(f"import {package}", tmp_path) == "ModuleNotFoundError: No module named 'part_of_torch'"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("statement", "package", "lacking"),
     [
@@ -294,6 +297,7 @@ def copy_repository(folder: Path) -> None:
     (folder / "train.py").touch()
 
 
+@pytest.mark.slow
 def test_the_root_wheel_has_the_extensions_alone(tmp_path: Path) -> None:
     copy_repository(tmp_path)
     name, names, requires = wheel_of(tmp_path)

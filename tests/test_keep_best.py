@@ -11,8 +11,7 @@ import torch
 from gaussians import pipeline
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
-from synthetic import make_colmap_scene
-from trainings import train_on
+from trainings import saved_plys, train_on
 
 from arguments import GroupParams, read_stored_options
 from gaussian_renderer import render
@@ -40,17 +39,15 @@ def late_resets():
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("scene")
-    make_colmap_scene(folder)
-    return folder
+def scene(_colmap_master: Path) -> Path:
+    return _colmap_master
 
 
 @pytest.fixture(scope="module")
-def kept(scene, tmp_path_factory) -> tuple[Path, dict[int, bytes]]:
+def kept(scene, once) -> tuple[Path, dict[int, bytes]]:
     """A training that a late reset of the opacities leaves worse than it was, and its PLYs."""
-    out = tmp_path_factory.mktemp("kept")
-    return out, train_on(scene, out, *WORDS, "--keep_best")
+    out = once("kept_best", lambda out: train_on(scene, out, *WORDS, "--keep_best"))
+    return out, saved_plys(out)
 
 
 def test_the_last_save_is_the_model_that_shows_the_validation_photos_best(kept, scene):

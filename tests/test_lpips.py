@@ -73,6 +73,7 @@ def pixels(image: torch.Tensor) -> np.ndarray:
     return (image[0].permute(1, 2, 0) * 255).round().byte().numpy()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("net", NETS)
 def test_values_are_the_packages(net, judges):
     x, y = images()

@@ -75,6 +75,7 @@ def test_unknown_models_are_undistorted(tmp_path):
     assert all(view.native is None and view.lens is None for view in read(tmp_path, native=True).train_cameras)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "params"), [("OPENCV", BROWN), ("OPENCV_FISHEYE", FISHEYE), PANORAMA])
 def test_a_training_and_its_renders_have_the_photos(tmp_path, monkeypatch, capsys, model, params):
     scene, out = tmp_path / "scene", tmp_path / "out"

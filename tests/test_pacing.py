@@ -340,6 +340,7 @@ def _last_record(out: Path) -> dict:
     return json.loads((out / "train_log.json").read_text())[-1]
 
 
+@pytest.mark.slow
 def test_a_budgeted_training_replays_and_resumes_to_the_byte(colmap_scene, tmp_path, monkeypatch, capsys):
     clocked, replayed, resumed, on = (tmp_path / name for name in ("clocked", "replayed", "resumed", "on"))
     every = "--random_background", "--save_iterations", 1500, "--checkpoint_iterations", 1200

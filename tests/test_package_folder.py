@@ -74,6 +74,7 @@ def test_a_package_folder_works_beside_the_plain_names(kind, tmp_path):
     assert run(SCRIPT, [package.parent, package], tmp_path).endswith("done\n")
 
 
+@pytest.mark.slow
 def test_utils_merges_with_a_folder_of_that_name(tmp_path):
     """`utils` has no __init__.py, so a project's own `utils` without one adds its modules, on either side of ours."""
     assert not (ROOT / "utils" / "__init__.py").exists()

@@ -63,6 +63,7 @@ def _loaded(scene: Path, out: Path, *more: str) -> list[str]:
     return done.stdout.splitlines()[-1].split()[1:]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="is of GNU's OpenMP")
 @pytest.mark.parametrize(("more", "wanted"), [({}, "1 True"), ({"GOMP_SPINCOUNT": "5"}, "0 False")])
 def test_a_program_that_imports_torch_first_has_more_threads_than_cores_so_that_none_spins_for_long(more, wanted):
@@ -74,6 +75,7 @@ def test_a_program_that_imports_torch_first_has_more_threads_than_cores_so_that_
     assert done.stdout.strip() == wanted, done.stderr
 
 
+@pytest.mark.slow
 def test_a_training_imports_nothing_that_it_does_not_use(blender_scene, tmp_path):
     """A checkpoint takes the optimiser's state. Another process draws the curve."""
     assert _loaded(blender_scene, tmp_path, "--eval", "--checkpoint_iterations", "6") == []

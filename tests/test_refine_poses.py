@@ -321,10 +321,8 @@ def test_a_scene_without_tracks_is_refused(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("disturbed") / "scene"
-    make_colmap_scene(folder)
-    return folder
+def scene(_colmap_master: Path) -> Path:
+    return _colmap_master
 
 
 def test_a_model_has_the_poses_that_a_training_found(once, tmp_path):

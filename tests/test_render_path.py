@@ -180,6 +180,7 @@ def _resident() -> int:
     return sum(pages) * os.sysconf("SC_PAGE_SIZE")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not list(Path("/proc/self/task").glob("*/children")), reason="/proc tells no memory of processes")
 def test_memory_does_not_grow_with_the_length(run, monkeypatch):
     drawn, sizes = render_path.render, []

@@ -42,6 +42,7 @@ def test_seconds_of_a_stopped_process_do_not_count():
     assert wall > 4.0 and counted < wall - 3.5
 
 
+@pytest.mark.slow
 def test_seconds_of_work_count_also_where_no_other_thread_may_look_at_the_clock():
     counted, wall = _counted("hold the lock")
     assert counted == pytest.approx(wall, abs=0.5)

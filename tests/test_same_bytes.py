@@ -204,6 +204,7 @@ torch.save(results(), sys.argv[1])
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("isa", ["baseline", "avx2"] if platform.machine() in ("x86_64", "AMD64") else ["baseline"])
 def test_instruction_sets_agree_to_rounding(isa, tmp_path):
     """In every instruction set, culling changes no bit. GS_ISA is read when a library loads."""

@@ -186,6 +186,7 @@ def _run(code: str, folder: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_a_package_of_options_of_their_own_does_not_matter(colmap_scene, tmp_path):
     (tmp_path / "arguments").mkdir()
     (tmp_path / "arguments" / "__init__.py").write_text("class ModelParams:\n    theirs = True\n")

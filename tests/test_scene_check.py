@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from synthetic import as_text, make_colmap_scene, options_of, read
+from synthetic import as_text, options_of, read
 
 from scene import Scene
 from scene.check import Finding, findings, tell
@@ -83,10 +83,8 @@ def test_masks_that_leave_out_everything(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def sound(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("sound") / "scene"
-    make_colmap_scene(folder)
-    return folder
+def sound(_colmap_master: Path) -> Path:
+    return _colmap_master
 
 
 def _cameras(info: SceneInfo, **fields) -> SceneInfo:

@@ -38,8 +38,8 @@ def _made(folder: Path, things: Things) -> Path:
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
-    return _made(tmp_path_factory.mktemp("sky") / "scene", with_sky)
+def scene(once) -> Path:
+    return once("sky_scene", lambda folder: _made(folder, with_sky))
 
 
 def _found(folder: Path) -> tuple[Scene, Sky, np.ndarray, np.ndarray, float]:

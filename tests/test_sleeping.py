@@ -4,7 +4,6 @@ import math
 import os
 import signal
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +16,8 @@ from diff_gaussian_rasterization.scene import Scene
 from gaussians import needs_fused_step
 from processes import in_ranks
 from rasterizer_tools import BOTH_AND_GPU, GPU_MARKS
-from step_ways import WAYS, Immediate, take_as  # noqa: F401  (a fixture)
-from trainings import ITERATIONS, OPTIONS, differences, narrow_scene, trained, with_clusters
+from step_ways import Immediate, take_as  # noqa: F401  (a fixture)
+from trainings import ITERATIONS, OPTIONS, Once, differences, narrow_scene, trained, whole_result, with_clusters
 
 import train
 from scene.gaussian_model import GaussianModel
@@ -38,8 +37,10 @@ from utils.system_utils import UserError
 BETAS, EPS = (0.9, 0.999), 1e-15
 MOST_RATIO = 0.1 / math.sqrt(0.001 * (1 - 0.81 / 0.999))  # of |m| / sqrt(v) (csrc/math/sleep.h)
 SCENES, STEPS = 6, (5, 60)  # of random blocks; 1000, or 1 and (7000, 7001), for the figures of docs/inside/sleep.md
-VIEWS = 30  # random ones of each lens; 1000 for the figures of docs/inside/sleep.md
+VIEWS = 12  # random ones of each lens; 1000 for the figures of docs/inside/sleep.md
+COVERING = "together", "poses", "budget", "absgrad"  # the steps of other names are captured alone
 NAMES = ("default", "poses", "white", "masks", "exposure", "depth", "absgrad", "together", "budget", "degree 0", "rays")
+CHECKPOINTS = 42, 33, 19, 20, 30, 59
 WITH_RAYS = "default", "depth", "together"  # or all that sleep and have rays: those of OPTIONS without MCMC and poses
 
 
@@ -263,9 +264,9 @@ def test_steps_with_sleep_are_those_of_dense_adam_in_double():
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scene(once) -> Path:
     """Of a room of clusters, of which a view sees a part."""
-    return with_clusters(narrow_scene(tmp_path_factory.mktemp("sleeping") / "scene"), 1000, 30, 200)
+    return once("sleeping/scene", lambda folder: with_clusters(narrow_scene(folder), 1000, 30, 200))
 
 
 def _trained(scene: Path, out: Path, *options: object) -> dict:
@@ -292,15 +293,33 @@ def _sleeps(patch: pytest.MonkeyPatch) -> list[float]:
     return found
 
 
+def _once(once: Once, scene: Path, name: str, *options: object) -> Path:
+    """The output folder of a training in which blocks sleep, made for all workers."""
+
+    def make(out: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            _sleeps(patch)
+            _trained(scene, out, *options)
+
+    return once(f"sleeping/{name}", make)
+
+
 @pytest.fixture(scope="module")
-def plain(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict]:
-    """Trains by plain steps with the options of a name, once."""
-    folder = tmp_path_factory.mktemp("plain")
-    return cache(lambda name: _trained(scene, folder / name, "--plain_step", *OPTIONS[name]))
+def plain(scene: Path, once) -> Callable[[str], dict]:
+    """What plain steps leave with the options of a name."""
+    return lambda name: whole_result(_once(once, scene, name, "--plain_step", *OPTIONS[name]), ITERATIONS)
 
 
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("way", WAYS)
+@pytest.fixture(scope="module")
+def cut(scene: Path, once) -> Path:
+    """The folder of a training with checkpoints: after a rest, while some sleep, and beside changes."""
+    return _once(once, scene, "cut", "--checkpoint_iterations", *CHECKPOINTS, ITERATIONS)
+
+
+@pytest.mark.parametrize(
+    ("way", "name"),
+    [*(("captured", name) for name in NAMES), *((way, name) for way in ("fused", "queued") for name in COVERING)],
+)
 def test_fast_steps(scene, tmp_path, take_as, plain, shares, way, name):  # noqa: F811
     expected = plain(name)
     shares.clear()
@@ -341,12 +360,11 @@ def _in_rank(scene: Path, folder: Path, kinds: list[tuple[str, ...]]) -> tuple[l
 
 
 @pytest.mark.parametrize("size", [2, 3])
-def test_ranks(scene, tmp_path, plain, size):
+def test_ranks(scene, tmp_path, cut, plain, size):
     kinds: list[tuple] = [("default", "--checkpoint_iterations", 33, ITERATIONS), ("white", "--plain_step")]
     if size == 2:
-        _trained(scene, tmp_path / "alone", "--checkpoint_iterations", 33, ITERATIONS)
         kinds += [("exposure",), ("absgrad",), ("budget",)]
-        kinds += [("default", "--start_checkpoint", tmp_path / "alone/chkpnt33.pth")]
+        kinds += [("default", "--start_checkpoint", cut / "chkpnt33.pth")]
     found = in_ranks(size, _in_rank, scene, tmp_path, kinds)
     assert all(share < 0.9 for _, share in found)
     for (name, *_), result in zip(kinds, found[0][0], strict=True):
@@ -364,30 +382,32 @@ def test_a_rank_without_rows(scene, tmp_path):
 
 @pytest.mark.parametrize("name", ["default", "rays"])
 @pytest.mark.parametrize("way", [(), ("--plain_step",)])
-def test_scores_and_saves_between_change_nothing(scene, tmp_path, plain, way, name):
+def test_scores_and_saves_between_change_nothing(scene, tmp_path, once, plain, way, name):
     way, looks = (*way, *OPTIONS[name]), ("--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44)
     assert not differences(_trained(scene, tmp_path, *way, *looks), plain(name))
-    _trained(scene, tmp_path / "plain", "--plain_step", *OPTIONS[name], "--save_iterations", 9, 44)
+    words = "--plain_step", *OPTIONS[name], "--save_iterations", 9, 44
+    saved = _once(once, scene, f"{name}, saved", *words)
     for iteration in (9, 44):
         ply = f"point_cloud/iteration_{iteration}/point_cloud.ply"
-        assert (tmp_path / ply).read_bytes() == (tmp_path / "plain" / ply).read_bytes()
+        assert (tmp_path / ply).read_bytes() == (saved / ply).read_bytes()
 
 
-@pytest.mark.parametrize("iteration", [42, 33, 19, 20, 30, 59])  # after a rest, some asleep, beside changes
-def test_resumed(scene, tmp_path, plain, iteration):
-    checkpoint = tmp_path / "a" / f"chkpnt{iteration}.pth"
-    planned = "--checkpoint_iterations", iteration, ITERATIONS
-    assert not differences(_trained(scene, tmp_path / "a", *planned), plain("default"))
+def test_checkpoints_between_change_nothing(cut, plain):
+    assert not differences(whole_result(cut, ITERATIONS), plain("default"))
+
+
+@pytest.mark.parametrize("iteration", CHECKPOINTS)
+def test_resumed(scene, tmp_path, cut, plain, iteration):
+    checkpoint = cut / f"chkpnt{iteration}.pth"
     assert not differences(_trained(scene, tmp_path / "b", "--start_checkpoint", checkpoint), plain("default"))
     capture, _ = load_checkpoint(checkpoint)
     asleep = further(capture, ASLEEP)
     assert (asleep is None) == (iteration in (20, 30, 42))
 
 
-def test_a_checkpoint_from_within_a_step_resumes(scene, tmp_path, plain):
+def test_a_checkpoint_from_within_a_step_resumes(scene, tmp_path, cut, plain):
     """As where memory has run out: the blocks that the step concerns are awake for it already."""
-    _trained(scene, tmp_path / "a", "--checkpoint_iterations", 33, ITERATIONS)
-    capture, iteration = load_checkpoint(tmp_path / "a/chkpnt33.pth")
+    capture, iteration = load_checkpoint(cut / "chkpnt33.pth")
     asleep = further(capture, ASLEEP)
     asleep["taken"] += asleep["awake"].int()
     save_checkpoint(tmp_path / "within.pth", capture, iteration)
@@ -408,9 +428,8 @@ def test_rays_have_the_bytes_of_a_training_in_which_nothing_sleeps(scene, tmp_pa
 
 
 @pytest.mark.parametrize("what", ["rows", "taken", "terms"])
-def test_damaged_sleep_is_refused(scene, tmp_path, what):
-    _trained(scene, tmp_path / "a", "--checkpoint_iterations", 33, ITERATIONS)
-    capture, iteration = load_checkpoint(tmp_path / "a/chkpnt33.pth")
+def test_damaged_sleep_is_refused(scene, tmp_path, cut, what):
+    capture, iteration = load_checkpoint(cut / "chkpnt33.pth")
     asleep = further(capture, ASLEEP)
     if what == "rows":
         asleep["rows"].pop()
@@ -443,6 +462,7 @@ def test_interrupted(scene, tmp_path, plain, monkeypatch):
 
 def test_captured_steps_that_are_stopped_resume_to_the_same_bytes(scene, tmp_path, plain, take_as, monkeypatch):  # noqa: F811
     """Some iterations after all blocks have rested, no Python of theirs has run."""
+    expected = plain("default")
     take_as("captured")
     launch = captured.Graphs.launch
 
@@ -457,7 +477,7 @@ def test_captured_steps_that_are_stopped_resume_to_the_same_bytes(scene, tmp_pat
     monkeypatch.setattr(captured.Graphs, "launch", launch)
     start = "--start_checkpoint", tmp_path / "cut/chkpnt37.pth"
     assert further(load_checkpoint(start[1])[0], ASLEEP)
-    assert not differences(_trained(scene, tmp_path / "whole", *start), plain("default"))
+    assert not differences(_trained(scene, tmp_path / "whole", *start), expected)
 
 
 @pytest.mark.parametrize("way", [(), ("--plain_step",)])

@@ -77,10 +77,8 @@ def test_the_gradient_is_that_of_finite_differences_and_masks_count():
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("points") / "scene"
-    make_colmap_scene(folder)
-    return folder
+def scene(_colmap_master: Path) -> Path:
+    return _colmap_master
 
 
 def _scores(scene: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:

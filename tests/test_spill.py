@@ -5,7 +5,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +15,17 @@ from diff_gaussian_rasterization.optim import adam_
 from gaussians import model, needs_59_values
 from processes import in_ranks
 from rasterizer_tools import GPU_MARKS
-from trainings import ITERATIONS, OPTIONS, before_steps, differences, narrow_scene, train_on, trained, with_clusters
+from trainings import (
+    ITERATIONS,
+    OPTIONS,
+    before_steps,
+    differences,
+    narrow_scene,
+    train_on,
+    trained,
+    whole_result,
+    with_clusters,
+)
 
 from scene.gaussians import spilled
 from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
@@ -158,8 +168,8 @@ def test_the_cpu_has_one_memory():
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return with_clusters(narrow_scene(tmp_path_factory.mktemp("spill") / "scene"), 1000, 20, 50)
+def scene(once) -> Path:
+    return once("spill/scene", lambda folder: with_clusters(narrow_scene(folder), 1000, 20, 50))
 
 
 def _trained(scene: Path, out: Path, *options: object) -> dict:
@@ -167,16 +177,15 @@ def _trained(scene: Path, out: Path, *options: object) -> dict:
 
 
 @pytest.fixture(scope="module")
-def usual(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict]:
-    """Trains with the options of a name and nothing spilled, once; blocks sleep."""
-    folder = tmp_path_factory.mktemp("usual")
+def usual(scene: Path, once) -> Callable[[str], dict]:
+    """What a training leaves with the options of a name and nothing spilled; blocks sleep."""
 
-    def train(name: str) -> dict:
+    def train(name: str, out: Path) -> None:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(run, "MOST_SHARE", 2.0)
-            return _trained(scene, folder / name, *KINDS[name])
+            _trained(scene, out, *KINDS[name])
 
-    return cache(train)
+    return lambda name: whole_result(once(f"spill/{name}", partial(train, name)), ITERATIONS)
 
 
 @contextmanager

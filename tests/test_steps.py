@@ -9,11 +9,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from diff_gaussian_rasterization import ops
 from gaussians import needs_fused_step
 from rasterizer_tools import GPU_MARKS
 from step_ways import Rerun, fused_iterations, take_as  # noqa: F401  (a fixture)
-from trainings import ITERATIONS, OPTIONS, differences, leaves, narrow_scene, trained, whole_result
+from trainings import ITERATIONS, OPTIONS, differences, leaves, shared_scene, trained, whole_result
 
 from splatting.training import run
 from splatting.training.objective import Losses, Objective
@@ -30,8 +29,8 @@ GROWING = ("--opacity_reset_interval", 1000)  # lists get longer to the end, as 
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return narrow_scene(tmp_path_factory.mktemp("steps") / "scene")
+def scene(once) -> Path:
+    return shared_scene(once)
 
 
 @pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
@@ -45,13 +44,6 @@ def test_a_host_that_runs_ahead_without_capacity_gives_the_same_bytes(scene, tmp
     monkeypatch.setattr(speculative, "_FIRST", (1, 1, 1, 1))
     assert trained(scene, tmp_path / "overflowing", *options) == plain
     assert len(overflows) > 5
-
-
-@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
-def test_no_gradient_of_a_parameter_is_written(scene, tmp_path, monkeypatch, options):
-    """In a whole training, with the iterations that change rows and the last one."""
-    monkeypatch.setattr(ops, "gradients_of", lambda *_: pytest.fail("autograd has asked for gradients"))
-    trained(scene, tmp_path, *options)
 
 
 @pytest.mark.parametrize("iteration", [20, 30, 36, ITERATIONS])  # growth, a reset, a higher degree, the last

@@ -107,6 +107,7 @@ def test_sh_degree_rises_every_interval_up_to_its_maximum(colmap_scene, tmp_path
     assert active == [min(t // 2, degree) for t in every]
 
 
+@pytest.mark.slow
 def test_a_terminated_run_leaves_whole_files(colmap_scene, tmp_path):
     """While its threads decode photos. tests.kills: one that is killed."""
     for path in (colmap_scene / "images").rglob("*.png"):

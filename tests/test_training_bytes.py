@@ -33,14 +33,8 @@ LOOKS = ("--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44, "--chec
 # Whose steps are queued one call after the other.
 WITHOUT_GRAPHS = ("depth", "masks", "together", "poses, no graph", "points", "poses and lenses")
 WITHOUT_GRAPHS += "robust mask", "points and poses"
-KINDS = {
-    "degree 0": 1,
-    "two phases": 5,
-    "appearance": 5,
-    "exposure": 8,
-    "budget errors": 7,
-    "exposure and sizes": 9,
-}  # half images count, too
+KINDS = {"degree 0": 1, "two phases": 5, "appearance": 5, "exposure": 8, "budget errors": 7}  # half images count, too
+KINDS["exposure and sizes"] = 9
 
 
 @pytest.fixture(scope="module")
@@ -154,6 +148,7 @@ def test_ranks(scene, tmp_path, plain):
         assert not differences(result, plain(name)), (name, more)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["adc", "mcmc", "budget"])
 def test_any_number_of_threads(scene, tmp_path, threads, strategy):
     """With as many points and pixels as torch divides loops between threads: from 32,768 values on."""

@@ -89,6 +89,11 @@ def with_clusters(scene: Path, near: int, clusters: int, each: int) -> Path:
 def train_on(scene: Path, out: Path, *words: object) -> dict[int, bytes]:
     """Train; the PLYs in the output folder by iteration."""
     train.main([*map(str, ("-s", scene, "-m", out, *words))])
+    return saved_plys(out)
+
+
+def saved_plys(out: Path) -> dict[int, bytes]:
+    """The PLYs in an output folder by iteration."""
     return {int(ply.parent.name[10:]): ply.read_bytes() for ply in out.glob("point_cloud/*/*.ply")}
 
 

@@ -1,7 +1,8 @@
-"""Programs written for the reference's modules run on ours: clients/*.py, each in a process of its own."""
+"""Programs written for the reference's modules run on ours: clients/*.py, in another folder than the project's."""
 
 import json
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -10,9 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cuda_is_cpu import CudaIsCpu
 from PIL import Image
 from plyfile import PlyData
 from synthetic import FOCAL, HEIGHT, WIDTH, make_colmap_scene
+from trainings import train_on
 
 pytest.importorskip("diff_gaussian_rasterization", reason="the extensions are not built: make test")
 
@@ -25,7 +28,7 @@ VIEWS, HELD_OUT = 17, 3
 
 
 def command(*words: object, cwd: Path) -> None:
-    """Run Python with these words in a folder."""
+    """Run Python with these words in a folder, in a process of its own."""
     places = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]  # packages may be installed there
     env = os.environ | {"PYTHONPATH": os.pathsep.join(places), "OMP_NUM_THREADS": "1"}
     words = [sys.executable, *map(str, words)]
@@ -49,11 +52,8 @@ def fell(losses: list[float], by: float = 0.98) -> bool:
     return sum(losses[-part:]) < by * sum(losses[:part])
 
 
-@pytest.fixture(scope="session")
-def world(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
-    """A scene with central principal point and depth maps, and the model that train.py made of it."""
-    folder = tmp_path_factory.mktemp("clients")
-    scene, model = folder / "scene", folder / "model"
+def _make_scene(scene: Path) -> None:
+    """With central principal point and depth maps."""
     model_of_colmap = make_colmap_scene(scene, params=(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
     scales = {}
     for image in model_of_colmap.images.values():
@@ -63,26 +63,40 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
         Image.fromarray(np.full((HEIGHT, WIDTH), 20000, dtype=np.uint16)).save(path)
         scales[name] = {"scale": 1.0, "offset": 0.0}
     (scene / "sparse" / "0" / "depth_params.json").write_text(json.dumps(scales))
-    train = ("train.py", "-s", scene, "-m", model, *TRAINING, "--checkpoint_iterations", ITERATIONS)
-    command(*train, "--test_iterations", ITERATIONS, cwd=ROOT)
+
+
+@pytest.fixture(scope="module")
+def world(once) -> SimpleNamespace:
+    """A scene, and the model that train.py made of it."""
+    scene = once("clients/scene", _make_scene)
+    words = *TRAINING, "--checkpoint_iterations", ITERATIONS, "--test_iterations", ITERATIONS
+    model = once("clients/model", lambda out: train_on(scene, out, *words))
     psnr = json.loads((model / "train_log.json").read_text())[-1]["test_psnr"]
     return SimpleNamespace(scene=scene, model=model, psnr=psnr)
 
 
 @pytest.fixture
-def client(world: SimpleNamespace, tmp_path: Path):
-    """Run a client in a folder that is not the project's; returns what it wrote as its result."""
+def client(world: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Run a client; returns what it wrote as its result."""
 
-    def run(name: str, *words: object, out: Path | None = None) -> Any:
+    def run(name: str, *words: object, out: Path | None = None, alone: bool = False) -> Any:
+        """alone: in a process of its own, as by hand."""
         out = out or tmp_path / "out"
         out.mkdir(exist_ok=True)
         script = HERE / "clients" / f"{name}.py"
-        command(HERE / "cuda_is_cpu.py", script, world.scene, world.model, out, *words, cwd=tmp_path)
+        if alone:
+            command(HERE / "cuda_is_cpu.py", script, world.scene, world.model, out, *words, cwd=tmp_path)
+        else:
+            monkeypatch.chdir(tmp_path)
+            monkeypatch.setattr(sys, "argv", [str(word) for word in (script, world.scene, world.model, out, *words)])
+            with CudaIsCpu():
+                runpy.run_path(str(script), run_name="__main__")
         return json.loads((out / "result.json").read_text())
 
     return run
 
 
+@pytest.mark.slow
 def test_the_loop_of_2024_trains_as_train_py_does_and_resumes(world, client, tmp_path):
     out = tmp_path / "out"
     words = (*TRAINING, "--checkpoint_iterations", 150)
@@ -94,8 +108,8 @@ def test_the_loop_of_2024_trains_as_train_py_does_and_resumes(world, client, tmp
     resumed = client("tutorial_loop", *words, "--start_checkpoint", out / "chkpnt150.pth", out=tmp_path / "resumed")
     assert len(resumed["losses"]) == 150 and abs(resumed["psnr"] - world.psnr) < 1.0
     # train.py goes on from what the loop wrote.
-    command("train.py", "-s", world.scene, "-m", tmp_path / "again", "--eval", "--iterations", 160,
-            "--start_checkpoint", out / "chkpnt150.pth", cwd=ROOT)  # fmt: skip
+    start = "--start_checkpoint", out / "chkpnt150.pth"
+    train_on(world.scene, tmp_path / "again", "--eval", "--iterations", 160, *start)
 
 
 @pytest.mark.parametrize(
@@ -119,13 +133,14 @@ def test_the_loop_of_2024_takes_the_options_of_its_release(world, client, option
         assert result["exposures"] == [VIEWS, 3, 4] and result["exposure_moved"] > 1e-3
 
 
+@pytest.mark.slow
 def test_the_loop_of_2023_with_its_own_option_classes(world, client):
-    result = client("tutorial_loop_2023", *TRAINING, "--port", 0)
+    result = client("tutorial_loop_2023", *TRAINING, "--port", 0, alone=True)
     assert fell(result["losses"], 0.8) and result["count"] > 400 and abs(result["psnr"] - world.psnr) < 1.5
 
 
 def test_distiller(world, client):
-    result = client("distiller")
+    result = client("distiller", alone=True)
     assert result["first"] == ITERATIONS and fell(result["losses"], 0.95)
     assert result["moved"]["_xyz"] == result["moved"]["_rotation"] == 0
     assert result["moved"]["_features_rest"] > 0 and result["moved"]["_scaling"] > 0
