@@ -60,8 +60,12 @@ def _discs(reconstruction, image) -> np.ndarray:
         pixel = image.project_point(point.xyz)
         if pixel is not None:
             radius = 9.0 / (from_world * point.xyz)[2]
-            inside = (columns + 0.5 - pixel[0]) ** 2 + (rows + 0.5 - pixel[1]) ** 2 < radius**2
-            picture[inside] = point.color
+            (left, right), (top, bottom) = (
+                (max(math.floor(at - radius), 0), max(math.ceil(at + radius), 0)) for at in pixel
+            )
+            near = np.s_[top:bottom, left:right]
+            inside = (columns[near] + 0.5 - pixel[0]) ** 2 + (rows[near] + 0.5 - pixel[1]) ** 2 < radius**2
+            picture[near][inside] = point.color
     return picture
 
 
