@@ -1,5 +1,6 @@
 # make demo   a scene made, trained, rendered and scored
-# make test   lint, format check, C++ tests, pytest
+# make test   lint, format check, C++ tests, pytest without the tests that are marked slow
+# make check  all of that, and the slow tests
 # make test-aarch64, test-windows, test-macos   the C++ tests, built for another platform and run under an emulator
 # make test-browser   the tests that need Chromium, which is installed first where Debian's package manager may be used
 # make test-foreign   the tests by programs of npm that read our exports; they skip without npm
@@ -30,7 +31,7 @@ CXX_SOURCES := $(shell find submodules -name build -prune -o \( -name '*.cpp' -o
 sources = $(shell find submodules/common submodules/$(1) \( -name build -o -name tests -o -name emulation \) -prune -o \
             \( -name '*.cpp' -o -name '*.cu*' -o -name '*.h' -o -name '*.py' -o -name '*.toml' \) -print)
 
-.PHONY: install demo test test-aarch64 test-windows test-macos test-browser test-foreign lint format cpp-test docs wheels gate clean
+.PHONY: install demo test check test-aarch64 test-windows test-macos test-browser test-foreign lint format cpp-test docs wheels gate clean
 .NOTPARALLEL:
 
 install: $(EXTENSIONS:%=$(VENV)/.built-%)
@@ -55,8 +56,10 @@ demo: install output/demo_scene
 output/demo_scene: | install
 	$(BIN)/python -m splatting.demo.make_scene $@
 
-test: install lint cpp-test
-	$(BIN)/python -m pytest -m 'not browser' --numprocesses $(shell expr $(CORES) + 1) --maxprocesses 5 --dist worksteal
+test: CHOSEN := not browser and not slow
+check: CHOSEN := not browser
+test check: install lint cpp-test
+	$(BIN)/python -m pytest -m '$(CHOSEN)' --numprocesses $(shell expr $(CORES) + 1) --maxprocesses 5 --dist worksteal
 
 test-aarch64 test-windows test-macos:
 	$(PYTHON) .ci/cross.py $(@:test-%=%)

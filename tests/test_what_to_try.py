@@ -35,24 +35,19 @@ OF_BUDGET = {"iteration": 8000, "strategy": "budget"}
 OF_MCMC = {"iteration": 8000, "strategy": "mcmc"}
 
 
+# What is told: numbers and options, each after the one before.
 TOLD = [
-    (FALLING, RISING, COUNTS, {}, [
-        "From iteration 4000 on only the training photos were fitted (+4.00 dB), and the test views lost 1.50 dB",
-        "try --keep_best, --strategy mcmc or budget with fewer Gaussians (--max_num_splats 4000, half as many as"]),
-    (FALLING, RISING, COUNTS, OF_MCMC, ["try --keep_best, fewer Gaussians (--max_num_splats 4000, half as many as"]),
-    (FALLING, RISING, COUNTS, OF_BUDGET | {"kept_iteration": 4000}, ["try --strategy mcmc, fewer Gaussians (--max"]),
+    (FALLING, RISING, COUNTS, {}, ["4000", "+4.00 dB", "1.50 dB", "--keep_best", "mcmc", "--max_num_splats 4000"]),
+    (FALLING, RISING, COUNTS, OF_MCMC, ["try --keep_best", "fewer", "--max_num_splats 4000"]),
+    (FALLING, RISING, COUNTS, OF_BUDGET | {"kept_iteration": 4000}, ["try --strategy mcmc", "fewer", "--max"]),
     (FALLING, RISING, CAPPED, {"max_num_splats": 4000}, ["only the training photos"]),  # a higher cap is no remedy
     (FALLING, RISING, COUNTS, {"default_budget": 3200}, ["only the training photos"]),
     (RISING, RISING, CAPPED, {"max_num_splats": 4000}, [
-        "From iteration 4000 on there was no room for more Gaussians (--max_num_splats 4000)",
-        "test views changed by +4.00 dB; try --strategy budget with the same number", "or a higher one"]),
-    (RISING, RISING, FLAT, {}, [
-        "The number of Gaussians never rose from one scoring to the next (1000 at first, 900 at",
-        "--densify_grad_threshold"]),
-    (RISING, RISING, FLAT, OF_MCMC, ["try a higher --max_num_splats", "_from_iter and --mcmc_until_iter leave"]),
-    (RISING, RISING, FLAT, OF_BUDGET, ["try a higher --max_num_splats", "and --densify_until_iter leave"]),
-    (RISING, RISING, COUNTS, {"default_budget": 3200}, [
-        "There are 8000 Gaussians, 2.5 times as many as --strategy budget takes for these photos (3200)"]),
+        "4000", "no room", "--max_num_splats 4000", "+4.00 dB", "try --strategy budget", "higher"]),
+    (RISING, RISING, FLAT, {}, ["never rose", "1000", "900", "--densify_grad_threshold"]),
+    (RISING, RISING, FLAT, OF_MCMC, ["try a higher --max_num_splats", "--mcmc_until_iter"]),
+    (RISING, RISING, FLAT, OF_BUDGET, ["try a higher --max_num_splats", "--densify_until_iter"]),
+    (RISING, RISING, COUNTS, {"default_budget": 3200}, ["8000", "2.5", "--strategy budget", "3200"]),
     ([20.0, 24.0, 23.9, 23.95], RISING, COUNTS, {}, ["The last 40.0 of 80.0 s"]),
     (LATE, RISING, COUNTS, {}, ["try --iterations 4000 --position_lr_max_steps 4000"]),
 ]  # fmt: skip
@@ -61,9 +56,7 @@ TOLD = [
 @pytest.mark.parametrize(("test", "train_views", "gaussians", "record", "parts"), TOLD)
 def test_what_is_seen_is_told_with_options_to_try(test, train_views, gaussians, record, parts):
     (said,) = what_to_try(_curve(test, train_views, gaussians), [record])
-    assert said.startswith(parts[0]) or parts[0] in said
-    for part in parts:
-        assert part in said
+    assert re.search(".*?".join(map(re.escape, parts)), said), said
 
 
 @pytest.mark.parametrize(
@@ -96,7 +89,7 @@ def test_slower_iterations_towards_the_end_are_told():
         row["seconds"] = seconds
     rows[:0] = [rows[0] | {"iteration": 100, "seconds": 0.2}, rows[0] | {"iteration": 900, "seconds": 1.8}]
     (said,) = what_to_try(rows, [])
-    assert said.startswith("The last 30.0 of 80.0 s changed the test views by +0.02 dB, at 15 ms an iteration after 2")
+    assert re.search(r"last 30\.0 of 80\.0 s .*\+0\.02 dB.* 15 ms .* 2", said), said
 
 
 def test_every_option_named_is_one_of_training():
