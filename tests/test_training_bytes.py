@@ -23,11 +23,11 @@ from splatting.training.steps.captured import Graphs
 Result = dict[str, bytes | list]
 EVERY = pytest.mark.parametrize("name", OPTIONS)
 # Captured steps are those of all. These have every term, every optimiser, and every way to change rows.
-COVERING = "together", "appearance", "sparse", "filter", "budget errors", "points and poses"
+COVERING = "together", "appearance", "sparse", "filter", "budget", "points and poses"
 RESUMED = (  # each has a state of its own
     *("default", "sparse", "absgrad", "exposure", "appearance", "points", "poses", "points and poses", "sky"),
-    *("poses and lenses", "exposure and sizes", "mcmc sparse", "filter", "filter and adc", "filter and budget"),
-    *("budget errors", "robust mask"),
+    *("exposure and sizes", "mcmc sparse", "filter", "filter and adc", "filter and budget"),
+    *("budget", "robust mask"),
 )
 LOOKS = ("--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44, "--checkpoint_iterations", 21, ITERATIONS)
 # Whose steps are queued one call after the other.
