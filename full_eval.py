@@ -15,8 +15,10 @@ if __name__ == "__main__":
 
 import os
 import sys
+import time
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 
 from arguments import OptionParser
 from splatting.evaluation import plan, stages
+from splatting.evaluation.child import Finished, Slot, run_child, share
 from splatting.evaluation.configs import check_options, read_configs, shipped
 from splatting.evaluation.error_curve import peers_of
 from splatting.evaluation.model_folder import trained_iterations
@@ -41,6 +44,7 @@ EXPOSURE = (
     "--exposure_lr_init", "0.001", "--exposure_lr_final", "0.0001", "--exposure_lr_delay_steps", "5000",
     "--exposure_lr_delay_mult", "0.001", "--train_test_exp",
 )  # fmt: skip
+Start = Callable[..., Finished]  # child.run_child, or what stands in for it
 _SHORT_FOR = {  # flags: words for train.py that they stand for, and help
     "use_depth": (("-d", "depths2/"), "supervise with inverse depth maps: train.py -d depths2/"),
     "use_expcomp": (EXPOSURE, "exposure compensation: train.py --train_test_exp and its learning rates"),
@@ -72,6 +76,9 @@ def _parser() -> OptionParser:
     add("--skip_training", **flag, help="use the models in the output folder, whatever made them")
     add("--skip_rendering", **flag, help="use the existing renders")
     add("--skip_metrics", **flag, help="use the existing scores")
+    add("--gpus", type=int, nargs="+", default=[], metavar="N",
+        help="share the runs among the GPUs with these numbers, one run on each at a time; a number given twice takes "
+        "two, whose seconds then tell little (default: one run after another, on the first)")  # fmt: skip
     add("--iterations", type=int, metavar="N", help="training steps (default: train.py's, 30000)")
     add("--seeds", type=int, nargs="+", default=[], metavar="N",
         help="train with each of these seeds and report mean and standard deviation (default: once)")  # fmt: skip
@@ -154,38 +161,75 @@ def _rehearse(runs: Sequence[Run], args: Namespace, output: Path) -> None:
     rehearse(runs, output, _parse_for_training, facts_asked(), not args.skip_training)
 
 
-def _carry_out(runs: Sequence[Run], args: Namespace, failures: dict[Run, Failure]) -> None:
+def _visible(gpus: Sequence[int]) -> list[str]:
+    """What CUDA_VISIBLE_DEVICES is for each of these GPUs. UserError if there is no such GPU."""
+    if not gpus:
+        return []
+    import torch  # here, as it takes a second
+
+    count = torch.cuda.device_count()
+    if wrong := [gpu for gpu in gpus if not 0 <= gpu < count]:
+        there = f"it has {count}, from 0 on" if count else "torch finds none here; leave --gpus out"
+        raise UserError(f"--gpus: this machine has no GPU {wrong[0]}; {there}")
+    given = os.environ.get("CUDA_VISIBLE_DEVICES")
+    return [given.split(",")[gpu] if given else str(gpu) for gpu in gpus]
+
+
+def _carry_out(
+    runs: Sequence[Run], args: Namespace, gpus: Sequence[str], failures: dict[Run, Failure], start: Start
+) -> None:
     """Carry out every run; note and print a failure, and continue with the next run."""
     facts = {} if args.skip_training else facts_asked()
     options = _SHORT_FOR["aa"][0] if args.aa else ()
     download = True
 
-    def advise(run: Run) -> None:
-        if not args.skip_training:
-            stages.advise(run, runs)
+    def child(say: str, command: Sequence[str], slot: Slot | None = None, **environment: str) -> Finished:
+        if slot is None:
+            print(f"  {say}", flush=True)
+        return start(command, slot, **environment)
 
-    def carry_out(run: Run) -> None:
+    def attempt(do: Callable[[], None], run: Run, begin: str = "  ") -> None:
+        try:
+            do()
+        except StageFailed as failed:
+            failures[run] = failed.failure
+            _say(f"{begin}FAILED ({failed.failure.stage}): {failed}")
+
+    def carry_out(run: Run, slot: Slot | None = None) -> None:
         nonlocal download
+        here = partial(child, slot=slot)
         if not args.skip_training:
-            stages.train(run, runs, facts)
+            stages.train(run, runs, facts, here)
         if not args.skip_rendering:
-            stages.render(run, (*options, *stages.fitted_like(run, runs)))
+            stages.render(run, (*options, *stages.fitted_like(run, runs)), here)
         if not args.skip_metrics:
-            download = stages.score(run, download, args.weights)
+            download = stages.score(run, here, download, args.weights)
         if args.html_models:
-            stages.page(run, args.output_path.resolve(), options)
+            stages.page(run, args.output_path.resolve(), options, here)
 
-    for do in (advise, carry_out):  # advice first, as it decides how the runs without it are rendered
-        for number, run in enumerate(runs, 1):
-            if run in failures:
-                continue
-            if do is carry_out:
-                print(f"[{number}/{len(runs)}] {run.title}", flush=True)
-            try:
-                do(run)
-            except StageFailed as failed:
-                failures[run] = failed.failure
-                print(f"  FAILED ({failed.failure.stage}): {failed}", flush=True)
+    def on_gpu(numbered: tuple[int, Run], slot: Slot) -> None:
+        number, run = numbered
+        head, begun = f"[{number}/{len(runs)}] {run.title}: ", time.perf_counter()
+        _say(f"{head}on GPU {slot.gpu}")
+        attempt(lambda: carry_out(run, slot), run, head)
+        if run not in failures:
+            _say(f"{head}finished in {time.perf_counter() - begun:.0f} s")
+
+    for run in runs if not args.skip_training else ():  # first, as it decides how the runs without it are rendered
+        attempt(partial(stages.advise, run, runs, child), run)
+    left = [(number, run) for number, run in enumerate(runs, 1) if run not in failures]
+    if gpus:
+        share(left, gpus, on_gpu)
+        return
+    for number, run in left:
+        _say(f"[{number}/{len(runs)}] {run.title}")
+        attempt(partial(carry_out, run), run)
+
+
+def _say(line: str) -> None:
+    """Print a line at once and whole, as other threads print, too."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
 
 
 def _report(
@@ -225,14 +269,14 @@ def _text(table: Table) -> str:
     return markdown_table(table.header, table.rows)
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """Run the command line."""
+def main(argv: Sequence[str] | None = None, start: Start = run_child) -> None:
+    """Run the command line. start: how a stage's command is run."""
     words = list(sys.argv[1:] if argv is None else argv)
     end = words.index("--") if "--" in words else len(words)
     args = _parser().parse_args(words[:end])
     runs = _plan(args, words[end + 1 :])
     peers = peers_of(args.peer, list(dict.fromkeys(run.scene.name for run in runs)))
-    output = args.output_path.resolve()
+    gpus, output = _visible(args.gpus), args.output_path.resolve()
     if args.dry:
         _rehearse(runs, args, output)
         return
@@ -241,7 +285,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     busy = "full_eval.py (process {process}), or a training that it started,"
     with locked(output, "full_eval.py", busy, "--output_path", inherited=True):
         try:
-            _carry_out(runs, args, failures)
+            _carry_out(runs, args, gpus, failures, start)
         finally:  # report the finished runs after Ctrl-C too
             scored = _report(["full_eval.py", *words], runs, failures, peers, output)
     if failures:

@@ -12,11 +12,14 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from stand_ins import run, run_as_programs
 from synthetic import folder_state
 from waiting import LIMIT, wait_for
 
@@ -25,17 +28,18 @@ import train
 from arguments import write_cfg_args
 from splatting.evaluation import report as report_module
 from splatting.evaluation import results_page, stages
+from splatting.evaluation.child import Finished, Slot, run_child, share
 from splatting.evaluation.configs import check_options
 from splatting.evaluation.figures import draw_curves, draw_fronts
 from splatting.evaluation.model_folder import SCHEDULE, shorter_ends_there
 from splatting.evaluation.plan import DATASETS, Run, SceneEntry, dataset_scenes, photos_of
 from splatting.evaluation.renders import GAIN, GAP, HEADER, ComparedViews
 from splatting.evaluation.results_page import BEGIN, END
+from splatting.host.interrupt import DeferredInterrupt
 from utils import lpips_utils
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]
-STAND_INS = Path(__file__).parent / "stand_ins"
 MACHINE = {
     "commit": "abc", "cpu": "some CPU", "gpu": None, "instruction_set": "avx2", "packages": {"torch": "2"},
     "python": "3.11", "threads": 2,
@@ -45,7 +49,6 @@ BASE_AND_SH1 = '{"base": [], "sh1": ["--sh_degree", 1]}'
 
 @pytest.fixture(autouse=True)
 def _stand_ins(monkeypatch):
-    monkeypatch.setattr(stages, "_ROOT", STAND_INS)
     monkeypatch.setattr(full_eval, "facts_asked", lambda: MACHINE)
     monkeypatch.setattr(report_module, "draw_curves", lambda *_: [])  # half a second each; see `figures`
     monkeypatch.setattr(report_module, "draw_fronts", lambda *_: [])
@@ -70,7 +73,7 @@ class Evaluation:
         return ["--scenes", *scenes, "--output_path", str(self.out), "--iterations", "40", *map(str, more)]
 
     def __call__(self, names: str, *more: object) -> dict:
-        full_eval.main(self.words(names, *more))
+        full_eval.main(self.words(names, *more), run)
         return self.report
 
     def fails(self, names: str, *more: object) -> None:
@@ -143,7 +146,7 @@ def test_data_sets_get_the_options_of_the_paper(evaluate, tmp_path):
         folder.mkdir(parents=True)
     words = ["-m360", mip, "-tat", tanks, "--output_path", evaluate.out, "--fast", "--use_depth", "--use_expcomp"]
     with pytest.raises(SystemExit) as status:
-        full_eval.main([str(word) for word in words])
+        full_eval.main([str(word) for word in words], run)
     assert status.value.code == 1  # "train" is missing
     log = [json.loads(line) for root in (mip, tanks) for line in (root / "calls.txt").read_text().splitlines()]
     trained = {Path(words[2]).name: words[11:] for words in log if words[0] == "train"}
@@ -222,7 +225,7 @@ def test_finished_models_without_any_data_set(evaluate):
     """With --skip_training the reference fails; metrics alone need no data set."""
     (evaluate.scenes / "attic").rename(evaluate.scenes / "garden")
     evaluate("garden")
-    full_eval.main(["--skip_training", "--skip_rendering", "--output_path", str(evaluate.out)])
+    full_eval.main(["--skip_training", "--skip_rendering", "--output_path", str(evaluate.out)], run)
     found = [(run["scene"], run["group"], run["finished"]) for run in evaluate.report["runs"]]
     assert found == [("garden", "mipnerf360", True)]
 
@@ -233,7 +236,7 @@ def test_a_failed_scene_is_told_and_the_others_go_on(evaluate, capsys):
     evaluate.fails("attic brick")
     attic, brick = evaluate.report["runs"]
     assert attic["failure"]["stage"] == "train" and attic["failure"]["command"][1].endswith("train.py")
-    assert attic["failure"]["lines"] == ["error: <b>the scene</b> is broken; fix it"]  # no progress bar
+    assert attic["failure"]["lines"] == ["error: <b>the scene</b> is broken; fix it"]
     assert brick["finished"] and [row["scene"] for row in evaluate.report["summary"]] == ["brick"]
     assert "    error: <b>the scene</b> is broken; fix it" in evaluate.text("md")
     assert "&lt;b&gt;the scene&lt;/b&gt; is broken" in evaluate.text("html")
@@ -249,10 +252,10 @@ def _start(evaluate: Evaluation, words: list[str]) -> subprocess.Popen:
     attic = evaluate.scenes / "attic"
     (attic / "slow").touch()
     program = (
-        "import pathlib, sys; from splatting.evaluation import stages;"
-        "import full_eval; from utils.system_utils import run_cli;"
-        f"stages._ROOT = pathlib.Path({str(STAND_INS)!r}); full_eval.machine = dict;"
-        "full_eval._parse_for_training = lambda words: None; run_cli(full_eval.main)"
+        f"import functools, sys; sys.path.append({str(Path(__file__).parent)!r});"
+        "import full_eval, stand_ins; from utils.system_utils import run_cli;"
+        "full_eval.facts_asked = dict; full_eval._parse_for_training = lambda words: None;"
+        "run_cli(functools.partial(full_eval.main, start=stand_ins.run_as_programs))"
     )
     process = subprocess.Popen([sys.executable, "-c", program, *words], cwd=ROOT, stderr=subprocess.PIPE, text=True,
                                start_new_session=True)  # fmt: skip
@@ -260,31 +263,36 @@ def _start(evaluate: Evaluation, words: list[str]) -> subprocess.Popen:
     return process
 
 
-def _interrupt(evaluate: Evaluation, *given: str, sent: signal.Signals = signal.SIGINT, status: int = 130) -> None:
-    """Start it, and send a signal to the whole group, as from a terminal on Ctrl-C or when it is closed."""
-    process = _start(evaluate, evaluate.words(*given))
+@pytest.mark.slow
+def test_ctrl_c_in_a_terminal_reaches_the_training_once(evaluate):
+    """It goes to the whole group of processes."""
+    process = _start(evaluate, evaluate.words("attic brick"))
     try:
-        os.killpg(process.pid, sent)
+        os.killpg(process.pid, signal.SIGINT)
         said = process.communicate(timeout=2 * LIMIT)[1]
     finally:
         process.kill()
-    assert process.returncode == status, said
-
-
-@pytest.mark.parametrize(
-    ("sent", "status", "more", "at", "end"),
-    [
-        (signal.SIGINT, 130, (), 5, 40),
-        (signal.SIGHUP, 143, (), 5, 40),
-        (signal.SIGINT, 130, ("--", "--time_budget", "20"), 41, 43),  # beyond --iterations, as the training decides
-    ],
-)
-def test_a_signal_reaches_the_training_and_the_next_call_resumes_it(evaluate, sent, status, more, at, end):
-    _interrupt(evaluate, "attic brick", *more, sent=sent, status=status)
+    assert process.returncode == 130, said
     runs = evaluate.report["runs"]
     assert [run["finished"] for run in runs] == [False, False] and not runs[0]["failure"]
     assert "Not finished: attic; brick." in evaluate.text("md") and "Nothing was scored." in evaluate.text("md")
-    assert [run["finished"] for run in evaluate("attic brick", *more)["runs"]] == [True, True]
+    _resumed(evaluate, "attic brick")
+
+
+@pytest.mark.parametrize(
+    ("more", "at", "end"),
+    [((), 5, 40), (("--", "--time_budget", "20"), 41, 43)],  # beyond --iterations, as the training decides
+)
+def test_the_call_after_an_interrupt_resumes_the_training(evaluate, more, at, end):
+    (evaluate.scenes / "attic" / "slow").touch()
+    with pytest.raises(KeyboardInterrupt):
+        evaluate("attic brick", *more)
+    assert [run["finished"] for run in evaluate.report["runs"]] == [False, False]
+    _resumed(evaluate, "attic brick", *more, at=at, end=end)
+
+
+def _resumed(evaluate: Evaluation, *given: str, at: int = 5, end: int = 40) -> None:
+    assert [run["finished"] for run in evaluate(*given)["runs"]] == [True, True]
     checkpoint = str(evaluate.out / "attic" / f"chkpnt{at}.pth")
     assert evaluate.calls("train")[1][-2:] == ["--start_checkpoint", checkpoint]
     assert not Path(checkpoint).exists() and list(evaluate.report["runs"][0]["iterations"]) == [str(end)]
@@ -292,28 +300,30 @@ def test_a_signal_reaches_the_training_and_the_next_call_resumes_it(evaluate, se
 
 def test_a_checkpoint_of_a_failure_is_not_resumed_but_that_of_an_interrupt_is(evaluate, capsys):
     """A failure leaves a checkpoint at 9; an interrupt before it, one at 5 in the same folder."""
-    full = evaluate.scenes / "attic" / "full"
+    full, slow = (evaluate.scenes / "attic" / name for name in ("full", "slow"))
     full.touch()
     evaluate.fails("attic")
     noted = evaluate.record("attic")["train_failed"]
-    assert noted["checkpoint"] == "chkpnt9.pth" and noted["wall_seconds"] > 0
+    assert noted["checkpoint"] == "chkpnt9.pth" and noted["cpu_seconds"] == 1
     full.unlink()
     assert evaluate("attic")["runs"][0]["finished"]
     assert "--start_checkpoint" not in evaluate.calls("train")[1]
     assert "training from the start (chkpnt9.pth was left by a training that failed after" in capsys.readouterr().out
 
     shutil.rmtree(evaluate.out)
-    _interrupt(evaluate, "attic")
-    before = evaluate.record("attic")["train_interrupted"]["wall_seconds"]
+    slow.touch()
+    with pytest.raises(KeyboardInterrupt):
+        evaluate("attic")
     full.touch()
     evaluate.fails("attic")
     full.unlink()
     report = evaluate("attic")
     checkpoint = str(evaluate.out / "attic" / "chkpnt5.pth")
     assert evaluate.calls("train")[-1][-2:] == ["--start_checkpoint", checkpoint]
-    assert before > 0.5 and report["runs"][0]["wall_seconds"] > before
+    assert report["runs"][0]["cpu_seconds"] == 2  # of both parts
 
 
+@pytest.mark.slow
 def test_a_second_one_is_refused_while_the_first_or_its_training_lives(evaluate):
     process = _start(evaluate, evaluate.words("attic"))
     trainer = int((evaluate.out / "attic" / "pid").read_text())
@@ -518,7 +528,9 @@ def test_seeds_and_option_sets(figures, evaluate, tmp_path, capsys, monkeypatch)
 def test_refusals(evaluate, words, sentence):
     before = folder_state(evaluate.scenes)
     with pytest.raises(UserError, match=sentence):
-        full_eval.main(["--output_path", str(evaluate.out), *words.replace("SCENES", str(evaluate.scenes)).split()])
+        full_eval.main(
+            ["--output_path", str(evaluate.out), *words.replace("SCENES", str(evaluate.scenes)).split()], run
+        )
     assert evaluate.calls() == [] and folder_state(evaluate.scenes) == before and not evaluate.out.exists()
 
 
@@ -626,7 +638,9 @@ def test_peers_are_shown_and_stay_in_the_report(figures, evaluate, tmp_path):
 @pytest.mark.parametrize("name", ["<script>alert(1)<", "[x](javascript:alert(1))", "a\nb", "# a", "caf\udce9"])
 def test_names_stay_names_in_the_report(figures, evaluate, name):
     (evaluate.scenes / name / "sparse").mkdir(parents=True)
-    full_eval.main(["--scenes", str(evaluate.scenes / name), "--output_path", str(evaluate.out), "--iterations", "40"])
+    full_eval.main(
+        ["--scenes", str(evaluate.scenes / name), "--output_path", str(evaluate.out), "--iterations", "40"], run
+    )
     assert evaluate.report["runs"][0]["finished"]
     text = evaluate.text("md")
     assert [evaluate.text(kind).count("<script") for kind in ("md", "html")] == [0, 1]
@@ -687,7 +701,8 @@ def test_each_model_becomes_a_page_that_the_report_links(evaluate):
     assert len(evaluate.calls("export")) == 3
 
 
-def test_a_rehearsal_tells_what_would_run_and_how_long_and_writes_nothing(colmap_scene, tmp_path, capsys):
+def test_a_rehearsal_tells_what_would_run_and_how_long_and_writes_nothing(colmap_scene, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(stages, "run_child", run)
     evaluate = Evaluation(tmp_path, tmp_path / "out")
     both, given = ("--seeds", 0, 1), ("--configs", "advice", "--", "-r", 2, "--keep_best")
 
@@ -717,6 +732,7 @@ def test_a_rehearsal_tells_what_would_run_and_how_long_and_writes_nothing(colmap
         told(*both, *given)
 
 
+@pytest.mark.slow
 def test_for_real(colmap_scene, tmp_path):
     """The real train.py, render.py and metrics.py accept their options, and the report has their results."""
     out = tmp_path / "out"
@@ -744,3 +760,101 @@ def test_for_real(colmap_scene, tmp_path):
 def test_options_with_which_a_training_does_not_end_by_itself_are_refused(words, said):
     with pytest.raises(UserError, match=f"^after --: {said}") if said else contextlib.nullcontext():
         check_options(words, "after --", train.parse)
+
+
+@pytest.fixture
+def two_gpus(monkeypatch):
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+
+
+def test_runs_are_shared_among_gpus(evaluate, two_gpus, capsys):
+    """Four runs on two GPUs, one on each at a time; two fail."""
+    (evaluate.scenes / "attic" / "broken").touch()
+    both, busy, given = threading.Barrier(2), [], ("attic brick", "--seeds", 0, 1)
+
+    def start(command: list[str], slot: Slot, **environment: str) -> Finished:
+        assert slot.gpu not in busy
+        busy.append(slot.gpu)
+        if "attic" in " ".join(command):  # the first two, whose trainings fail together
+            both.wait(LIMIT)
+        done = run(command, slot, **environment)
+        busy.remove(slot.gpu)
+        return done
+
+    with pytest.raises(SystemExit):
+        full_eval.main(evaluate.words(*given, "--gpus", 0, 1), start)
+    found = [(run["scene"], run["finished"], bool(run["failure"])) for run in evaluate.report["runs"]]
+    assert found == [("attic", False, True)] * 2 + [("brick", True, False)] * 2
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("[")]
+    form = r"\[[1-4]/4\] (attic|brick), seed [01]: (on GPU [01]|finished in 0 s|FAILED \(train\): error: .*; fix it)"
+    assert len(lines) == 8 and all(re.fullmatch(form, line) for line in lines)
+    (evaluate.scenes / "attic" / "broken").unlink()
+    before = len(evaluate.calls("train"))
+    assert all(run["finished"] for run in evaluate(*given, "--gpus", 1)["runs"])
+    assert len(evaluate.calls("train")) == before + 2
+
+
+def _signal_once(started: list[Path], times: int = 1) -> None:
+    """Send this process Ctrl-C once all these files are there, and perhaps again."""
+
+    def send() -> None:
+        wait_for(lambda: all(path.exists() for path in started))
+        for _ in range(times):
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.5)
+
+    threading.Thread(target=send).start()
+
+
+def test_an_interrupt_ends_the_trainings_on_all_gpus_and_the_next_call_resumes_them(evaluate, two_gpus):
+    names = ("attic", "brick", "cellar")
+    (evaluate.scenes / "cellar" / "sparse").mkdir(parents=True)
+    for name in names:
+        (evaluate.scenes / name / "slow").touch()
+    _signal_once([evaluate.scenes / name / "started" for name in names[:2]])
+    with pytest.raises(KeyboardInterrupt):
+        full_eval.main(evaluate.words(" ".join(names), "--gpus", 0, 1), run_as_programs)
+    stopped = [evaluate.record(name)["train_interrupted"]["checkpoint"] for name in names[:2]]
+    assert stopped == ["chkpnt5.pth"] * 2 and not (evaluate.out / "cellar").exists()
+    (evaluate.scenes / "cellar" / "slow").unlink()
+    assert all(run["finished"] for run in evaluate(" ".join(names), "--gpus", 0, 1)["runs"])
+    assert sum("--start_checkpoint" in words for words in evaluate.calls("train")) == 2
+
+
+def test_a_second_signal_kills_children_that_do_not_end(tmp_path):
+    deaf = (
+        "import os, pathlib, signal, sys, time; signal.signal(signal.SIGINT, signal.SIG_IGN);"
+        "pathlib.Path(sys.argv[1]).write_text(str(os.getpid())); time.sleep(600)"
+    )
+    started = [tmp_path / name for name in "ab"]
+    _signal_once(started, times=2)
+    with pytest.raises(KeyboardInterrupt):
+        share(started, "01", lambda path, slot: run_child([sys.executable, "-c", deaf, str(path)], slot))
+    for path in started:
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(path.read_text()), 0)
+
+
+def test_a_child_has_its_gpu_and_its_own_seconds(capsys):
+    """And its last lines are kept, without progress bars; they are shown where it is the only one."""
+    code = r"import os, sys; sys.stderr.write(' 50%|##  | 5/10\r\n' + os.environ['CUDA_VISIBLE_DEVICES'])"
+    for slot, shown in ((Slot("7", DeferredInterrupt()), ""), (None, " 50%|##  | 5/10\r\n4")):
+        done = run_child([sys.executable, "-c", code], slot, **({} if slot else {"CUDA_VISIBLE_DEVICES": "4"}))
+        assert (done.status, done.lines, capsys.readouterr().err) == (0, ["7" if slot else "4"], shown)
+        assert 0.01 < done.cpu_seconds < 30
+
+
+@pytest.mark.parametrize(
+    ("count", "sentence"),
+    [(2, "--gpus: this machine has no GPU 2; it has 2, from 0 on"), (0, "torch finds none here; leave --gpus out")],
+)
+def test_a_gpu_that_is_not_there_is_refused(evaluate, monkeypatch, count, sentence):
+    monkeypatch.setattr("torch.cuda.device_count", lambda: count)
+    with pytest.raises(UserError, match=sentence):
+        evaluate("attic", "--gpus", 0 if count == 0 else 1, 2)
+    assert not evaluate.out.exists()
+
+
+def test_gpus_are_those_that_are_visible(monkeypatch, two_gpus):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7")
+    assert full_eval._visible([1, 0, 1]) == ["7", "5", "7"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 import io
 import os
 import re
@@ -192,15 +193,17 @@ def run_title(run: Mapping[str, Any]) -> str:
 def render(kind: str, report: Mapping[str, Any], pictures: Pictures, folder: Path) -> str:
     """Render report.jinja as a page of a kind, "md" or "html". folder: of the page, for links."""
     scenes = comparison.grouped(report["runs"], "scene")
-    text = environment(kind, folder).get_template("report.jinja").render(
+    environment(kind).globals["folder"] = folder
+    text = environment(kind).get_template("report.jinja").render(
         facts=_facts(report), form=f"page.{kind}.jinja", gain=GAIN, pictures=pictures, report=report,
         published=comparison.published_tables(), scenes=scenes, tables=tables, title=TITLE,
     )  # fmt: skip
     return (re.sub(r"\n{2,}", "\n\n", text) if kind == "md" else text).strip() + "\n"
 
 
-def environment(kind: str, folder: Path) -> jinja2.Environment:
-    """Make what renders the templates of a kind of page, which will lie in a folder."""
+@functools.cache
+def environment(kind: str) -> jinja2.Environment:
+    """Make what renders the templates of a kind of page. Its global `folder` is that of the page."""
     made = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True, finalize=_escaped if kind == "md" else None,
@@ -208,10 +211,14 @@ def environment(kind: str, folder: Path) -> jinja2.Environment:
     made.filters |= {
         "data_uri": _data_uri, "indented": _indented, "jpeg": _uri, "markdown": markdown, "no_list": _no_list,
         "number": tables.number, "one_line": lambda text: Markup(" ".join(text.split())),
-        "relative": lambda path: os.path.relpath(path, folder), "run_title": run_title,
-        "url": lambda path: quote(os.fsencode(path)),
+        "relative": _relative, "run_title": run_title, "url": lambda path: quote(os.fsencode(path)),
     }  # fmt: skip
     return made
+
+
+@jinja2.pass_environment
+def _relative(made: jinja2.Environment, path: Path) -> str:
+    return os.path.relpath(path, made.globals["folder"])
 
 
 def _facts(report: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,7 @@
-"""The stages advise, train, render, score and page. Each is a subprocess, and is skipped silently if it is finished."""
+"""The stages advise, train, render, score and page. Each is a subprocess, and is skipped silently if it is finished.
+
+child: says what a stage does and runs its command; more arguments are variables of the environment.
+"""
 
 from __future__ import annotations
 
@@ -26,6 +29,7 @@ _ROOT = Path(__file__).resolve().parents[2]
 _APPEARANCE = ("--appearance", "ppisp")
 FINISHED, TO_SCORE = "finished", "to render and score"  # states of a run
 REST = ("render_", "metrics", "html")  # beginnings of the names of stages after training
+Child = Callable[..., Finished]
 PIECE = 200  # iterations of a timed piece
 _TO_THE_END = ("--time_budget=0", "--target_psnr=0", "--schedule=")  # without the options of plan.ENDING
 
@@ -47,7 +51,7 @@ class StageFailed(Exception):
         self.failure = failure
 
 
-def advise(run: Run, runs: Sequence[Run]) -> None:
+def advise(run: Run, runs: Sequence[Run], child: Child) -> None:
     """Note what the scene's data ask for, if the run's options are to follow it. The seeds of a set ask once."""
     if run.plain is None or run.advice is not None:
         return
@@ -57,8 +61,7 @@ def advise(run: Run, runs: Sequence[Run]) -> None:
     record.start(run.key)
     if found is None:
         command = _script("train.py", "-s", _source_of(run), "-m", str(run.model), "--advise", *run.plain)
-        _say(f"{run.title}: asking what the scene's data say")
-        done = run_child(command)
+        done = child(f"{run.title}: asking what the scene's data say", command)
         _expect_success("advise", command, done)
         found = read_json(run.model / ADVICE)
         _stop_if_asked(done)
@@ -102,7 +105,7 @@ def _copy(there: Run, run: Run) -> None:
     copied.rename(run.model)
 
 
-def train(run: Run, runs: Sequence[Run], machine: dict[str, Any]) -> None:
+def train(run: Run, runs: Sequence[Run], machine: dict[str, Any], child: Child) -> None:
     """Train, unless the training is finished. Resume only from a checkpoint that an interrupt left.
 
     A run whose advice asks for nothing becomes a copy of one of `runs` that has trained without advice.
@@ -123,8 +126,7 @@ def train(run: Run, runs: Sequence[Run], machine: dict[str, Any]) -> None:
     before = before if before.get("checkpoint") in there else {}
     command = _script("train.py", "-s", source, "-m", str(run.model), "--disable_viewer", "--quiet", "--whole_curve")
     command += [*options, *(("--start_checkpoint", str(run.model / before["checkpoint"])) if before else ())]
-    _say("training" + _from_where(before, record))
-    done = run_child(command)
+    done = child("training" + _from_where(before, record), command)
     spent = _sum(before, done)
     if done.status and (left := [name for name, stamp in _checkpoints(run).items() if stamp != there.get(name)]):
         stopped = done.interrupt and done.status in (128 + signal.SIGINT, 128 + signal.SIGTERM)
@@ -223,7 +225,7 @@ def _source(run: Run) -> tuple[str, ...]:
 
 
 def _once(
-    record: Record, name: str, say: str, command: list[str], requested: dict[str, Any],
+    child: Child, record: Record, name: str, say: str, command: list[str], requested: dict[str, Any],
     found: Callable[[], dict[str, Any] | None], also: Callable[[], dict[str, Any]] = dict, **environment: str,
 ) -> None:  # fmt: skip
     """Run a command, unless its stage is noted as done with what is requested and what is found.
@@ -233,8 +235,7 @@ def _once(
     noted, there = record.stage(name), found()
     if noted and there is not None and {key: noted.get(key) for key in requested | there} == requested | there:
         return
-    _say(say)
-    done, stage = run_child(command, **environment), name.partition("_")[0]
+    done, stage = child(say, command, **environment), name.partition("_")[0]
     _expect_success(stage, command, done)
     there = found()
     if there is None:
@@ -243,7 +244,7 @@ def _once(
     _stop_if_asked(done)
 
 
-def render(run: Run, options: Sequence[str]) -> None:
+def render(run: Run, options: Sequence[str], child: Child) -> None:
     """Render the test views of every saved iteration, except those already rendered from the same model.
 
     options: more words for render.py.
@@ -252,10 +253,8 @@ def render(run: Run, options: Sequence[str]) -> None:
         command = _script("render.py", "-m", str(run.model), *_source(run), "--iteration", str(iteration))
         command += ["--skip_train", "--eval", "--quiet", *options]
         requested = {"model": _stamp(saved_ply(run.model, iteration)), "options": list(options)}
-        say = f"rendering iteration {iteration}"
-        _once(
-            Record(run.model), f"render_{iteration}", say, command, requested, partial(_rendered, run.model, iteration)
-        )
+        say, found = f"rendering iteration {iteration}", partial(_rendered, run.model, iteration)
+        _once(child, Record(run.model), f"render_{iteration}", say, command, requested, found)
 
 
 def _stamp(file: Path) -> list[int]:
@@ -271,7 +270,7 @@ def _rendered(model: Path, iteration: int) -> dict[str, int] | None:
     return {"views": len(renders)} if renders and renders == truth else None
 
 
-def score(run: Run, download: bool = True, weights: Path | None = None) -> bool:
+def score(run: Run, child: Child, download: bool = True, weights: Path | None = None) -> bool:
     """Run metrics.py, unless the same renders are already scored, with the same folder of weights.
 
     download: whether it may try to download the weights of LPIPS; return whether another run may. A try without an
@@ -291,7 +290,7 @@ def score(run: Run, download: bool = True, weights: Path | None = None) -> bool:
     words = [f"--{name}={folder}" for name, folder in given.items()]
     command = _script("metrics.py", "-m", str(model), "--error_maps", *words)
     _once(
-        record, "metrics", "scoring", command, {"renders": renders, **given}, dict,
+        child, record, "metrics", "scoring", command, {"renders": renders, **given}, dict,
         lambda: {"ground_truth_sha256": ground_truth_digest(model / "test" / methods[-1])}, **environment,
     )  # fmt: skip
     if record.stage("metrics") is before:
@@ -304,7 +303,7 @@ def page_file(model: Path, output: Path) -> Path:
     return output / "models" / f"{model.relative_to(output)}.html"
 
 
-def page(run: Run, output: Path, options: Sequence[str]) -> None:
+def page(run: Run, output: Path, options: Sequence[str], child: Child) -> None:
     """Write the last saved iteration as one HTML file, unless it was made of the same model.
 
     options: more words for export.py.
@@ -315,7 +314,7 @@ def page(run: Run, output: Path, options: Sequence[str]) -> None:
     command += ["--to", str(file), *options]
     requested = {"model": _stamp(saved_ply(run.model, last)), "options": list(options)}
     say = "writing the model as a page"
-    _once(Record(run.model), "html", say, command, requested, lambda: {} if file.is_file() else None)
+    _once(child, Record(run.model), "html", say, command, requested, lambda: {} if file.is_file() else None)
 
 
 def _scored(model: Path, methods: Sequence[str]) -> bool:
