@@ -1,7 +1,6 @@
 """Benchmarks: every command on a tiny case, and what their tables and figures make of numbers."""
 
 import json
-import math
 import re
 import sys
 from collections import Counter
@@ -11,10 +10,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import stand_ins
 import torch
 from pycolmap import Reconstruction
 from torch.profiler import ProfilerActivity, profile
 
+import full_eval
 import train
 from benchmarks.accuracy import oracle
 from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT
@@ -22,11 +23,11 @@ from benchmarks.harness.calls import by_stage
 from benchmarks.harness.measuring import GpuTime, short_name
 from benchmarks.kernels import rasterizer
 from benchmarks.parallel import steps, workload
-from benchmarks.scenes import options, step_profile, training
-from benchmarks.strategies.figure import draw, with_peers
-from benchmarks.strategies.tables import at, joined
+from benchmarks.scenes import made, scores, step_profile
+from benchmarks.scenes.thinned import thinned
 from scene.dataset_readers import read_scene
 from splatting.demo.tracer import ring_views, trace
+from splatting.evaluation.configs import read_configs
 from splatting.files.image_files import write_plane
 from splatting.training.sparse_depth import HELD_OUT
 from utils.system_utils import UserError
@@ -88,49 +89,65 @@ def _rows(said: str, first: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
 
 
-def test_options_are_compared_with_none_on_every_third_photo(colmap_scene, tmp_path, monkeypatch, capsys):
-    given = []
-
-    def train(scene: Path, model: Path, seed: int, words: list[str], **more: object) -> dict[str, float]:
-        given.append((words, more["judged"]))
-        views = read_scene(scene, "images", hold_out=False).train_cameras
-        every = sorted(view.image_name for view in read_scene(colmap_scene, "images", hold_out=True).train_cameras)
-        assert sorted(view.image_name for view in views) == every[::3]
-        assert more["shown"][-2:] == ["--appearance", "ppisp"]
-        at_width = {f"{name}@9": 1.0 * number for number, name in enumerate(("PSNR", "SSIM"))}
-        scores = {"PSNR": 20.0 + seed + 0.5 * (len(words) > 2), "fitted": 25.0, "SSIM": 0.5, "DEPTH": None, **at_width}
-        return scores | {"seconds": 1, "Gaussians": 7}
-
-    monkeypatch.setattr(options, "train", train)
-    words = f"options {tmp_path}/out --scenes {colmap_scene} --keep 3 --with=--refine_poses --seeds 0 2 -r 4 --widths 9"
-    monkeypatch.setattr(sys, "argv", words.split())
-    options.main()
-    assert given == [(["-r", "4", *more], colmap_scene) for more in [[]] * 2 + [["--refine_poses"]] * 2]
-    rows = _rows(capsys.readouterr().out, colmap_scene.name)
-    assert rows[0][1:] == ["none", "21.00", "25.00", "0.5000", "", "", "", "", "1.0", "7", "0.00", "1.0000", ""]
-    assert rows[1][1:][:9] == ["--refine_poses", "21.50", "25.00", "0.5000", "", "", "", "", "1.0"]
-    assert rows[1][-1] == "+0.50 (0.00)"
-    points = (tmp_path / "out" / colmap_scene.name / "thinned/sparse/0/points3D.txt").read_text().splitlines()
+def test_a_thinned_scene_trains_on_every_third_photo(colmap_scene, tmp_path):
+    whole = read_scene(colmap_scene, "images", hold_out=True)
+    few = read_scene(thinned(colmap_scene, tmp_path / "few", 3), "images", hold_out=True)
+    by_name = lambda views: sorted(views, key=lambda view: view.image_name)  # noqa: E731
+    for found, given in (
+        (few.train_cameras, by_name(whole.train_cameras)[::3]),
+        (few.test_cameras, by_name(whole.test_cameras)[:1]),
+    ):
+        assert [Path(view.image_path).resolve() for view in by_name(found)] == [
+            Path(view.image_path).resolve() for view in given
+        ]
+    points = (tmp_path / "few/sparse/0/points3D.txt").read_text().splitlines()
     known = Reconstruction(str(colmap_scene / "sparse/0")).num_points3D()
     assert len(points) == known - -(-known // HELD_OUT)
 
 
+def test_models_are_scored_again_with_other_options_of_render(tmp_path, monkeypatch, capsys):
+    scene, out = tmp_path / "attic", tmp_path / "out"
+    (scene / "sparse").mkdir(parents=True)
+    sets = tmp_path / "sets.json"
+    sets.write_text('{"none": [], "deep": ["--sparse_depth", "0.5"]}')
+    words = f"--scenes {scene} --output_path {out} --iterations 40 --seeds 0 1 --configs {sets}"
+    monkeypatch.setattr(full_eval, "facts_asked", dict)
+    full_eval.main(words.split(), stand_ins.run)
+    monkeypatch.setattr(scores, "run_child", stand_ins.run)
+    capsys.readouterr()
+    monkeypatch.setattr(sys, "argv", f"scores {out} -- --depth -r 34".split())
+    scores.main()
+    calls = [json.loads(line) for line in (tmp_path / "calls.txt").read_text().splitlines()]
+    assert [words[-3:] for words in calls if words[0] == "render"][4:] == [["--depth", "-r", "34"]] * 4
+    none, deep = _rows(capsys.readouterr().out, "attic")
+    assert (none[1:3], none[-1]) == (["none", "23.05"], "+0.00 (0.00)")
+    assert (deep[1:3], deep[-1]) == (["deep", "23.80"], "+0.75 (0.35)")  # the stand-in adds more to the second seed
+    monkeypatch.setattr(sys, "argv", ["scores", str(tmp_path)])
+    with pytest.raises(UserError, match="has no report of full_eval.py"):
+        scores.main()
+
+
+@pytest.mark.parametrize("path", sorted((Path(__file__).parents[1] / "benchmarks/sets").glob("*.json")), ids=str)
+def test_sets_are_options_of_training(path):
+    assert read_configs(path, train.parse)
+
+
 def test_floaters_are_counted_where_nothing_was_traced(tmp_path, monkeypatch):
     """Half transparent planes: a quarter of the columns nearer than a quarter of the extent, all else beyond all."""
-    monkeypatch.setattr(options, "_SIZE", (32, 24))
-    monkeypatch.setattr(options, "read_scene", lambda *_, **__: SimpleNamespace(extent=4.0))
+    monkeypatch.setattr(made, "_SIZE", (32, 24))
+    monkeypatch.setattr(scores, "read_scene", lambda *_, **__: SimpleNamespace(extent=4.0))
     inverse, sky = np.full((24, 32), 0.5 / 100), []
     inverse[:, :8] = 0.5 / 0.9
     for place, view in enumerate(ring_views(48, 32, 24, np.random.default_rng(0))[::8]):
         for plane, values in (("depth", inverse), ("alpha", np.full((24, 32), 0.5))):
-            (tmp_path / "test/ours_1" / plane).mkdir(parents=True, exist_ok=True)
-            write_plane(tmp_path / f"test/ours_1/{plane}/{place:05d}.png", values)
+            (tmp_path / plane).mkdir(exist_ok=True)
+            write_plane(tmp_path / plane / f"{place:05d}.png", values)
         rows, columns = np.indices((24, 32)) + 0.5
         rays = view.rays(columns.ravel(), rows.ravel())
-        sky.append(np.isinf(trace(options.with_sky(None), np.float32(view.center)[:, None], rays)[0]).reshape(24, 32))
-    found = options.floaters("sky", tmp_path, tmp_path)
+        sky.append(np.isinf(trace(made.with_sky(None), np.float32(view.center)[:, None], rays)[0]).reshape(24, 32))
+    found = scores.floaters("sky", tmp_path, tmp_path)
     assert found["NEAR"] == 0.25 and found["SKY"] == pytest.approx(np.mean(sky, (0, 1))[:8].sum() / np.mean(sky) / 32)
-    assert 0 < found["SKY"] < 1 and options.floaters("clean", tmp_path, tmp_path) == {"NEAR": 0.25}
+    assert 0 < found["SKY"] < 1 and scores.floaters("clean", tmp_path, tmp_path) == {"NEAR": 0.25}
 
 
 def test_the_kernels_are_timed(colmap_scene, tmp_path, monkeypatch, capsys):
@@ -176,15 +193,6 @@ def test_the_profile_of_a_step_adds_up_kernels_by_name():
     assert step_profile.kernels_of(run) == 5.0  # a copy from the host runs beside the kernels
 
 
-def test_runs_of_a_seed_are_compared(capsys):
-    run = {"seconds": 1.0, "process": 2.0, "PSNR": 30.0, "SSIM": 0.9, "Gaussians": 1000, "bytes": 9}
-    runs = [run | {"seed": seed, "ranks": ranks, "hash": f"{seed}"} for seed in (0, 1) for ranks in (1, 2)]
-    training.print_runs([*runs, runs[0] | {"hash": "other"}])
-    said = capsys.readouterr().out
-    assert said.endswith("seed 0, 3 runs: the PLYs are DIFFERENT\nseed 1, 2 runs: the PLYs are the same\n")
-    assert _rows(said, "mean")[1][1:3] == ["2", "1.0 (0.0)"]
-
-
 @pytest.mark.parametrize("name", ["XL", "city"])
 def test_ranks_draw_together_what_one_process_draws(name, monkeypatch):
     monkeypatch.setattr(workload, "_PIECE", 300)
@@ -196,6 +204,7 @@ def test_ranks_draw_together_what_one_process_draws(name, monkeypatch):
         assert len(values) == 1000 and torch.equal(torch.cat([part[attribute] for part in parts]), values)
 
 
+@pytest.mark.slow
 def test_steps_of_ranks_and_of_a_spilled_model_stand_beside_those_of_one_process(monkeypatch, capsys):
     words = "--size 64 40 --rounds 1 --warm_up 2 --blocks 2 --workload city --gaussians 1000 --crop 2"
     launch = steps.launch  # one rank needs no process of its own
@@ -244,55 +253,3 @@ def test_runs_agree_with_the_oracle_and_are_reported(monkeypatch, capsys):
     for kernel, ratio in ((CPU_DOUBLE, "0.00"), (CPU_FLOAT, "1.00")):
         oracle.print_ratios(runs | {(case, CUDA_FLOAT): runs[case, kernel] for case in oracle.CASES})
         assert f"where either error exceeds 1e-06: {ratio} (at most 3 allowed)" in capsys.readouterr().out
-
-
-def _run(*points: tuple[float, float], whole: bool = True) -> dict:
-    """A training with a curve of seconds and PSNR."""
-    curve = [{"iteration": 1, "seconds": x, "gaussians": 9, "test_psnr": y, "whole": whole} for x, y in points]
-    return {"end": curve[-1], "curve": curve, "ply_bytes": 1}
-
-
-def _file(sets: dict[str, dict[str, dict | None]], scene: str = "a", **options: list[str]) -> dict:
-    return {"machine": "m", "sets": {name: [] for name in sets} | options, "scenes": {scene: sets}}
-
-
-def test_a_curve_between_its_points():
-    curve = [*_run((1, 20), (3, 24))["curve"], *_run((2, 99), whole=False)["curve"]]
-    assert [at(curve, seconds) for seconds in (0.5, 2, 9)] == [-math.inf, pytest.approx(22), 24]
-
-
-def test_files_of_trainings_are_joined():
-    ended = _file({"adc": {"0": _run((1, 20)), "1": None}})
-    failed = _file({"adc": {"0": None, "1": _run((1, 21))}})
-    for files in ([ended, failed], [failed, ended]):
-        found = joined(json.loads(json.dumps(files)))["scenes"]["a"]["adc"]
-        assert {seed: run["end"]["test_psnr"] for seed, run in found.items()} == {"0": 20, "1": 21}
-    with pytest.raises(UserError, match="set adc has other options"):
-        joined([_file({"adc": {}}), _file({"adc": {}}, adc=["--iterations", "7000"])])
-
-
-def test_a_figure_of_whatever_trainings_there_are(tmp_path, monkeypatch):
-    drawn = []
-    save = lambda figure, path, **_: drawn.append(figure) or path.touch()  # noqa: E731
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", save)
-    many = {f"set{number}": {"0": _run((1, 20), (5, 20 + number))} for number in range(11)}
-    clock = {"5s": {"0": _run((5, 30)), "1": _run((5, 31))}, "9s": {"0": None}}
-    budget = ["--strategy", "mcmc", "--time_budget", "5"]
-    files = [_file(many | clock, **dict.fromkeys(clock, budget)), _file({"set0": {"0": None}}, "nothing")]
-    files.append(
-        _file({"set0": {"0": _run((0, 9), (1, 10), (2, 11)), "1": _run((4, 10), (5, 11))}}, "c")
-    )  # at no time both
-    files.append(_file({"set0": {"0": _run((2, 18))}, "set1": {"0": _run((2, 18), whole=False)}}, "d"))
-    (tmp_path / "two.csv").write_text("seconds,test_psnr\n2,19\n4,20\n")
-    (tmp_path / "three.csv").write_text("seconds,test_psnr\n2,18\n3,20\n4,21\n")
-    peers = [("c/ends", f"{tmp_path}/two.csv"), ("c/line", *[f"{tmp_path}/three.csv"] * 2)]
-    draw(with_peers(joined(files), peers), tmp_path / "figure.png", ["set10"])
-    panels = drawn[0].axes
-    assert [panel.get_title() for panel in panels] == ["a", "c", "d", ""]
-    assert panels[0].get_legend_handles_labels()[1] == [*(f"our set{k}" for k in range(10)), "our mcmc by the clock"]
-    lengths = {line.get_label(): len(line.get_xdata()) for line in panels[1].lines if line.get_label()[0] != "_"}
-    assert lengths == {"our set0": 1, "ends": 2, "line": 1} and len(panels[1].lines) == 4  # one is a line
-    with pytest.raises(UserError, match="give SCENE/NAME, of the scenes a"):
-        with_peers(joined(files[:1]), [("ends", f"{tmp_path}/two.csv")])
-    with pytest.raises(UserError, match="no training is left"):
-        draw(joined([_file({"adc": {"0": _run((1, 20))}})]), tmp_path / "none.png", ["adc"])

@@ -25,10 +25,9 @@ FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 DEVICE = {
     "kernels": "benchmarks.kernels.rasterizer",
     "accuracy": "benchmarks.accuracy.oracle",
-    "train": "benchmarks.scenes.training",
+    "train": "full_eval.py",
 }
-SCENES = ("step_profile", "options", "street", "training")
-FORWARDING = [f"benchmarks.scenes.{name}" for name in SCENES]  # unknown words go to train.py
+FORWARDING = ["benchmarks.scenes.step_profile"]  # unknown words go to train.py
 FOREIGN = {"--eval_steps", "--save_steps", "--nnodes", "--shutdown_timeout", "--set"}  # flags of other programs
 
 

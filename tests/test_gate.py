@@ -3,8 +3,10 @@
 import json
 import math
 import re
+import sys
 
 import pytest
+import stand_ins
 
 from benchmarks.gate import __main__ as gate
 from benchmarks.gate import baseline, trainings
@@ -154,10 +156,24 @@ def test_the_stored_build_is_a_checkout_of_its_commit(monkeypatch, tmp_path):
         monkeypatch.setattr(trainings, "_same_extensions", lambda _, same=same: same)
         build = trainings.older_build(commit)
         assert (build.folder / "train.py").is_file() and build.folder == tmp_path / commit
-        assert build.environment().get("PYTHONPATH") == (None if same else str(build.folder / "site"))
+        (build.folder / "tell.py").write_text("import os, sys; sys.exit(os.environ.get('PYTHONPATH'))")
+        told = build.run([sys.executable, str(trainings.ROOT / "tell.py")], PYTHONPATH="installed").lines
+        assert told == ["installed" if same else str(build.folder / "site")]
         assert trainings.older_build(commit) == build
     with pytest.raises(UserError, match="git has no commit 0123456 here; fetch the whole history"):
         trainings.older_build("0123456")
+
+
+def test_trainings_go_through_the_stages_of_full_eval(monkeypatch, tmp_path):
+    monkeypatch.setattr(trainings, "run_child", stand_ins.run)
+    (tmp_path / "attic" / "sparse").mkdir(parents=True)
+    task = trainings.Task(tmp_path / "attic", ["--iterations", "40"])
+    found = trainings.scored(task, 1)
+    assert found == {"seed": 1, "PSNR": 23.1, "SSIM": 0.9, "seconds": 16, "Gaussians": 16000, "bytes": 36}
+    assert trainings.timed(task, 1, None) == trainings.timed(task, 1, trainings.Build(tmp_path, None)) == 16
+    (tmp_path / "attic" / "broken").touch()
+    with pytest.raises(UserError, match="attic: train failed: error: <b>the scene</b> is broken"):
+        trainings.scored(task, 1)
 
 
 def test_scenes_are_real_or_made(monkeypatch, tmp_path):
@@ -171,7 +187,10 @@ def test_scenes_are_real_or_made(monkeypatch, tmp_path):
         (tmp_path / "scenes" / name).mkdir(parents=True)
     work = trainings.tasks(30)
     assert list(work) == list(trainings.REAL)
-    assert work["nerf_lego200_tiny"] == (tmp_path / "scenes" / "nerf_lego200_tiny", ["--iterations", "30", "-w"])
+    assert work["nerf_lego200_tiny"] == (
+        tmp_path / "scenes" / "nerf_lego200_tiny",
+        ["--iterations", "30", "--no_curve", "-w"],
+    )
 
 
 def test_the_stored_file_fits_the_code():

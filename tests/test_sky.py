@@ -13,7 +13,7 @@ from trainings import trained
 import export
 import train
 from benchmarks.harness.colmap_part import part
-from benchmarks.scenes.options import with_sky
+from benchmarks.scenes.made import with_sky
 from scene.gaussian_model import GaussianModel
 from scene.readers.tracks import projected
 from scene.scene import Scene

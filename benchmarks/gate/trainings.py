@@ -6,13 +6,18 @@ import subprocess
 import sys
 import tarfile
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks.scenes.training import ROOT, run, seconds_of, train
 from splatting.demo.make_scene import make_scene
+from splatting.evaluation import stages
+from splatting.evaluation.child import Finished, run_child
+from splatting.evaluation.plan import SceneEntry, plan_runs
+from splatting.evaluation.results import MB, read_run
 from utils.system_utils import UserError
 
+ROOT = Path(__file__).resolve().parents[2]
 WORK = ROOT / "build" / "gate"
 REAL = {"fox_tiny": [], "bonsai_small": [], "nerf_lego200_tiny": ["-w"]}
 # Made where the real ones are missing. Arguments of make_scene, and options of train.py.
@@ -33,7 +38,7 @@ class Task(NamedTuple):
 def tasks(iterations: int) -> dict[str, Task]:
     """Return the real scenes below $GS_SHARED or beside the repository if all are there, else made ones, by name."""
     real = Path(os.environ.get("GS_SHARED") or ROOT.parent / "shared") / "scenes"
-    length = ["--iterations", str(iterations)]
+    length = ["--iterations", str(iterations), "--no_curve"]
     if all((real / name).is_dir() for name in REAL):
         return {name: Task(real / name, [*length, *options]) for name, options in REAL.items()}
     made = {}
@@ -51,9 +56,10 @@ class Build(NamedTuple):
     folder: Path
     site: Path | None
 
-    def environment(self) -> dict[str, str]:
-        """Return the environment for its programs."""
-        return os.environ | ({} if self.site is None else {"PYTHONPATH": str(self.site)})
+    def run(self, command: Sequence[str], **environment: str) -> Finished:
+        """Run a program of the repository, as this checkout has it."""
+        environment |= {} if self.site is None else {"PYTHONPATH": str(self.site)}
+        return run_child([command[0], str(self.folder / Path(command[1]).name), *command[2:]], **environment)
 
 
 def older_build(commit: str) -> Build:
@@ -106,13 +112,31 @@ def head() -> str:
 def scored(task: Task, seed: int) -> dict[str, float]:
     """Train by this code, render and score the test views."""
     with tempfile.TemporaryDirectory() as folder:
-        return train(task.scene, Path(folder) / "model", seed, task.options)
+        found = _trained(task, seed, Build(ROOT, None), Path(folder), scores=True)
+    return {name: found[name] for name in ("PSNR", "SSIM", "seconds")} | {
+        "seed": seed, "Gaussians": found["gaussians"], "bytes": round(MB * found["ply_mb"]),
+    }  # fmt: skip
 
 
 def timed(task: Task, seed: int, build: Build | None) -> float:
     """Return the training seconds of this code (None) or of an older build."""
-    folder, environment = (ROOT, None) if build is None else (build.folder, build.environment())
-    with tempfile.TemporaryDirectory() as model:
-        words = ["-s", str(task.scene), "-m", model, "--eval", "--seed", str(seed), "--test_iterations", "-1"]
-        run("train.py", *words, "--no_curve", *task.options, folder=folder, environment=environment)
-        return seconds_of(Path(model))
+    with tempfile.TemporaryDirectory() as folder:
+        return _trained(task, seed, build or Build(ROOT, None), Path(folder))["seconds"]
+
+
+def _trained(task: Task, seed: int, build: Build, folder: Path, scores: bool = False) -> dict[str, float]:
+    """Train as full_eval.py does; what its report tells of the last iteration."""
+    scene = SceneEntry(task.scene.name, "scenes", task.scene)
+    (run,) = plan_runs([scene], folder, task.options, {}, [seed])
+
+    def child(_: str, command: Sequence[str], **environment: str) -> Finished:
+        return build.run(command, **environment)
+
+    try:
+        stages.train(run, [run], {}, child)
+        if scores:
+            stages.render(run, (), child)
+            stages.score(run, child, download=False)
+    except stages.StageFailed as failed:
+        raise UserError(f"{task.scene.name}: {failed.failure.stage} failed: {failed}") from failed
+    return max(read_run(run, folder, None)["iterations"].items(), key=lambda one: int(one[0]))[1]
