@@ -6,7 +6,7 @@
 #   benchmarks/device.sh sanitize                  memcheck and racecheck of the GPU tests on small scenes
 #   benchmarks/device.sh kernels [OPTION...]       python3 -m benchmarks.kernels.rasterizer OPTION...
 #   benchmarks/device.sh accuracy                  python3 -m benchmarks.accuracy.oracle --times
-#   benchmarks/device.sh train SCENE [OPTION...]   python3 -m benchmarks.scenes.training SCENE OPTION...
+#   benchmarks/device.sh train SCENE [OPTION...]   python3 full_eval.py --scenes SCENE OPTION...
 #   benchmarks/device.sh ranks COUNT SCENE [PART...]
 #                                                  training over COUNT GPUs; parts: tests, scene, steps, memory
 #   benchmarks/device.sh run COMMAND...            any other command, after building the extensions
@@ -146,7 +146,7 @@ part() {
 }
 
 ranks() {
-  local count=$1 scene=$2 name status=0
+  local count=$1 scene=$2 name models ranks status=0
   local steps=(python3 -m benchmarks.parallel.steps)
   shift 2
   # One host: gloo needs no network.
@@ -160,8 +160,12 @@ ranks() {
           tests/test_ranks_gpu.py || status=1
         ;;
       scene)
-        part 150 "a scene by ranks" python3 -m benchmarks.scenes.training "$scene" \
-          "$(mktemp -d build/device/models.XXXX)/models" --seeds 0 --ranks 1 "$count" --iterations 7000 || status=1
+        models=$(mktemp -d build/device/models.XXXX)
+        for ranks in 1 "$count"; do
+          part 75 "a scene by $ranks ranks" torchrun --standalone --nproc_per_node "$ranks" train.py -s "$scene" \
+            -m "$models/$ranks" --eval --iterations 7000 --no_curve --disable_viewer --quiet || status=1
+          tail -n 20 "$models/$ranks/train_log.json" && sha256sum "$models/$ranks"/point_cloud/*/point_cloud.ply || status=1
+        done
         ;;
       steps)
         part 210 "steps by ranks" "${steps[@]}" --ranks 1 "$count" --limit 75 || status=1
@@ -197,7 +201,7 @@ build
       scene=${1:?a scene}
       shift
       say "training on $scene"
-      python3 -m benchmarks.scenes.training "$scene" "$(mktemp -d build/device/models.XXXX)/models" "$@"
+      python3 full_eval.py --scenes "$scene" --output_path "$(mktemp -d build/device/models.XXXX)" "$@"
       ;;
     ranks) ranks "${1:?a number of GPUs}" "${2:?a scene}" "${@:3}" ;;
     run) "$@" ;;
