@@ -183,47 +183,39 @@ def _carry_out(
     options = _SHORT_FOR["aa"][0] if args.aa else ()
     download = True
 
-    def child(say: str, command: Sequence[str], slot: Slot | None = None, **environment: str) -> Finished:
-        if slot is None:
-            print(f"  {say}", flush=True)
-        return start(command, slot, **environment)
-
-    def attempt(do: Callable[[], None], run: Run, begin: str = "  ") -> None:
+    def carry_out(numbered: tuple[int, Run], slot: Slot | None = None) -> None:
+        nonlocal download
+        number, run = numbered
+        begun, child = time.perf_counter(), partial(start, slot=slot)
+        head = f"[{number}/{len(runs)}] {run.title}"
+        _say(f"{head}: on GPU {slot.gpu}" if slot else head)
         try:
-            do()
+            if not args.skip_training:
+                stages.train(run, runs, facts, child)
+            if not args.skip_rendering:
+                stages.render(run, (*options, *stages.fitted_like(run, runs)), child)
+            if not args.skip_metrics:
+                download = stages.score(run, child, download, args.weights)
+            if args.html_models:
+                stages.page(run, args.output_path.resolve(), options, child)
+            end = f"finished in {time.perf_counter() - begun:.0f} s"
         except StageFailed as failed:
             failures[run] = failed.failure
-            _say(f"{begin}FAILED ({failed.failure.stage}): {failed}")
-
-    def carry_out(run: Run, slot: Slot | None = None) -> None:
-        nonlocal download
-        here = partial(child, slot=slot)
-        if not args.skip_training:
-            stages.train(run, runs, facts, here)
-        if not args.skip_rendering:
-            stages.render(run, (*options, *stages.fitted_like(run, runs)), here)
-        if not args.skip_metrics:
-            download = stages.score(run, here, download, args.weights)
-        if args.html_models:
-            stages.page(run, args.output_path.resolve(), options, here)
-
-    def on_gpu(numbered: tuple[int, Run], slot: Slot) -> None:
-        number, run = numbered
-        head, begun = f"[{number}/{len(runs)}] {run.title}: ", time.perf_counter()
-        _say(f"{head}on GPU {slot.gpu}")
-        attempt(lambda: carry_out(run, slot), run, head)
-        if run not in failures:
-            _say(f"{head}finished in {time.perf_counter() - begun:.0f} s")
+            end = f"FAILED ({failed.failure.stage}): {failed}"
+        _say(f"{head}: {end}" if slot else f"  {end}")
 
     for run in runs if not args.skip_training else ():  # first, as it decides how the runs without it are rendered
-        attempt(partial(stages.advise, run, runs, child), run)
+        try:
+            stages.advise(run, runs, start)
+        except StageFailed as failed:
+            failures[run] = failed.failure
+            _say(f"  FAILED ({failed.failure.stage}): {failed}")
     left = [(number, run) for number, run in enumerate(runs, 1) if run not in failures]
     if gpus:
-        share(left, gpus, on_gpu)
-        return
-    for number, run in left:
-        _say(f"[{number}/{len(runs)}] {run.title}")
-        attempt(partial(carry_out, run), run)
+        share(left, gpus, carry_out)
+    else:
+        for numbered in left:
+            carry_out(numbered)
 
 
 def _say(line: str) -> None:

@@ -158,9 +158,11 @@ def export(words: list[str], _: dict[str, str]) -> None:
 PROGRAMS = {"train": train, "render": render, "metrics": metrics, "export": export}
 
 
-def run(command: list[str], slot: Slot | None = None, **environment: str) -> Finished:
+def run(command: list[str], say: str = "", slot: Slot | None = None, **environment: str) -> Finished:
     """What `run_child` returns for such a program. An exit of 130 counts as an interrupt of full_eval.py, too."""
     start = time.perf_counter()
+    if say and not slot:
+        print(f"  {say}")
     try:
         PROGRAMS[Path(command[1]).stem](command[2:], environment)
     except SystemExit as ended:
@@ -170,10 +172,10 @@ def run(command: list[str], slot: Slot | None = None, **environment: str) -> Fin
     return Finished(0, [], time.perf_counter() - start, 1.0, None)
 
 
-def run_as_programs(command: list[str], slot: Slot | None = None, **environment: str) -> Finished:
+def run_as_programs(command: list[str], say: str = "", slot: Slot | None = None, **environment: str) -> Finished:
     """The same in a process of its own."""
     environment |= {"PYTHONPATH": str(Path(__file__).parents[1])}
-    return run_child([sys.executable, __file__, Path(command[1]).name, *command[2:]], slot, **environment)
+    return run_child([sys.executable, __file__, Path(command[1]).name, *command[2:]], say, slot, **environment)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from typing import NamedTuple
 from splatting.demo.make_scene import make_scene
 from splatting.evaluation import stages
 from splatting.evaluation.child import Finished, run_child
+from splatting.evaluation.model_folder import trained_iterations
 from splatting.evaluation.plan import SceneEntry, plan_runs
 from splatting.evaluation.results import MB, read_run
 from utils.system_utils import UserError
@@ -56,10 +57,13 @@ class Build(NamedTuple):
     folder: Path
     site: Path | None
 
-    def run(self, command: Sequence[str], **environment: str) -> Finished:
+    def run(self, command: Sequence[str], _: str = "", **environment: str) -> Finished:
         """Run a program of the repository, as this checkout has it."""
         environment |= {} if self.site is None else {"PYTHONPATH": str(self.site)}
         return run_child([command[0], str(self.folder / Path(command[1]).name), *command[2:]], **environment)
+
+
+HERE = Build(ROOT, None)
 
 
 def older_build(commit: str) -> Build:
@@ -111,32 +115,26 @@ def head() -> str:
 
 def scored(task: Task, seed: int) -> dict[str, float]:
     """Train by this code, render and score the test views."""
-    with tempfile.TemporaryDirectory() as folder:
-        found = _trained(task, seed, Build(ROOT, None), Path(folder), scores=True)
-    return {name: found[name] for name in ("PSNR", "SSIM", "seconds")} | {
-        "seed": seed, "Gaussians": found["gaussians"], "bytes": round(MB * found["ply_mb"]),
-    }  # fmt: skip
+    found = _trained(task, seed, HERE, scores=True)
+    counts = {"seed": seed, "Gaussians": found["gaussians"], "bytes": round(MB * found["ply_mb"])}
+    return counts | {name: found[name] for name in ("PSNR", "SSIM", "seconds")}
 
 
 def timed(task: Task, seed: int, build: Build | None) -> float:
     """Return the training seconds of this code (None) or of an older build."""
-    with tempfile.TemporaryDirectory() as folder:
-        return _trained(task, seed, build or Build(ROOT, None), Path(folder))["seconds"]
+    return _trained(task, seed, build or HERE)["seconds"]
 
 
-def _trained(task: Task, seed: int, build: Build, folder: Path, scores: bool = False) -> dict[str, float]:
+def _trained(task: Task, seed: int, build: Build, scores: bool = False) -> dict[str, float]:
     """Train as full_eval.py does; what its report tells of the last iteration."""
-    scene = SceneEntry(task.scene.name, "scenes", task.scene)
-    (run,) = plan_runs([scene], folder, task.options, {}, [seed])
-
-    def child(_: str, command: Sequence[str], **environment: str) -> Finished:
-        return build.run(command, **environment)
-
-    try:
-        stages.train(run, [run], {}, child)
-        if scores:
-            stages.render(run, (), child)
-            stages.score(run, child, download=False)
-    except stages.StageFailed as failed:
-        raise UserError(f"{task.scene.name}: {failed.failure.stage} failed: {failed}") from failed
-    return max(read_run(run, folder, None)["iterations"].items(), key=lambda one: int(one[0]))[1]
+    with tempfile.TemporaryDirectory() as folder:
+        scene = SceneEntry(task.scene.name, "scenes", task.scene)
+        (run,) = plan_runs([scene], Path(folder), task.options, {}, [seed])
+        try:
+            stages.train(run, [run], {}, build.run)
+            if scores:
+                stages.render(run, (), build.run)
+                stages.score(run, build.run, download=False)
+        except stages.StageFailed as failed:
+            raise UserError(f"{task.scene.name}: {failed.failure.stage} failed: {failed}") from failed
+        return read_run(run, Path(folder), None)["iterations"][str(trained_iterations(run.model)[-1])]

@@ -23,7 +23,7 @@ from scene.readers.info import HOLD
 from splatting.demo.objects import demo_scene
 from splatting.demo.tracer import CAMERAS, ring_views, trace
 from splatting.evaluation import stages
-from splatting.evaluation.child import Finished, run_child
+from splatting.evaluation.child import run_child
 from splatting.evaluation.comparison import FITTED, grouped
 from splatting.evaluation.model_folder import trained_iterations
 from splatting.evaluation.plan import Run
@@ -36,14 +36,10 @@ _BEYOND = 4  # extents, farther than all things but the sky
 FORMS = {"PSNR": ".2f", "fitted": ".2f", "SSIM": ".4f", "DEPTH": ".2%", "DEPTH_95": ".1%", "NEAR": ".2%", "SKY": ".1%"}
 
 
-def _child(_: str, command: Sequence[str], **environment: str) -> Finished:
-    return run_child(command, **environment)
-
-
 def scores(run: Run, options: Sequence[str]) -> dict[str, float | None]:
     """Render and score the last iteration of a model, with options of render.py."""
-    stages.render(run, options, _child)
-    stages.score(run, _child, download=False)
+    stages.render(run, options, run_child)
+    stages.score(run, run_child, download=False)
     method, found = f"ours_{trained_iterations(run.model)[-1]}", read_json(run.model / "results.json")
     fitted = found.get(f"{method}_{FITTED}", {}).get("PSNR")
     folder, traced = run.model / "test" / method, run.scene.name in MADE

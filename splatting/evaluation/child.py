@@ -43,14 +43,16 @@ class Slot:
     ended: threading.Event = field(default_factory=threading.Event)  # the child is to be killed
 
 
-def run_child(command: Sequence[str], slot: Slot | None = None, **environment: str) -> Finished:
+def run_child(command: Sequence[str], say: str = "", slot: Slot | None = None, **environment: str) -> Finished:
     """Run a command without a shell. environment: variables beside our own.
 
-    slot: None: this is the only child, and its stderr is copied to ours.
+    slot: None: this is the only child; what it does is said first, and its stderr is copied to ours.
 
     Ctrl-C or SIGTERM to this process is passed on once, SIGHUP (a closed terminal) as SIGTERM. Then this function waits
     for the child, since train.py saves a checkpoint, and sets `interrupt`. A second signal kills the child and raises.
     """
+    if say and not slot:
+        print(f"  {say}", flush=True)
     start = time.perf_counter()
     visible = {"CUDA_VISIBLE_DEVICES": slot.gpu} if slot else {}
     # The child gets its own session. Otherwise the terminal's Ctrl-C would reach it twice, directly and through us, and

@@ -1,6 +1,6 @@
 """The stages advise, train, render, score and page. Each is a subprocess, and is skipped silently if it is finished.
 
-child: says what a stage does and runs its command; more arguments are variables of the environment.
+child: `run_child`, or what stands in for it.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def advise(run: Run, runs: Sequence[Run], child: Child) -> None:
     record.start(run.key)
     if found is None:
         command = _script("train.py", "-s", _source_of(run), "-m", str(run.model), "--advise", *run.plain)
-        done = child(f"{run.title}: asking what the scene's data say", command)
+        done = child(command, f"{run.title}: asking what the scene's data say")
         _expect_success("advise", command, done)
         found = read_json(run.model / ADVICE)
         _stop_if_asked(done)
@@ -126,7 +126,7 @@ def train(run: Run, runs: Sequence[Run], machine: dict[str, Any], child: Child) 
     before = before if before.get("checkpoint") in there else {}
     command = _script("train.py", "-s", source, "-m", str(run.model), "--disable_viewer", "--quiet", "--whole_curve")
     command += [*options, *(("--start_checkpoint", str(run.model / before["checkpoint"])) if before else ())]
-    done = child("training" + _from_where(before, record), command)
+    done = child(command, "training" + _from_where(before, record))
     spent = _sum(before, done)
     if done.status and (left := [name for name, stamp in _checkpoints(run).items() if stamp != there.get(name)]):
         stopped = done.interrupt and done.status in (128 + signal.SIGINT, 128 + signal.SIGTERM)
@@ -235,7 +235,7 @@ def _once(
     noted, there = record.stage(name), found()
     if noted and there is not None and {key: noted.get(key) for key in requested | there} == requested | there:
         return
-    done, stage = child(say, command, **environment), name.partition("_")[0]
+    done, stage = child(command, say, **environment), name.partition("_")[0]
     _expect_success(stage, command, done)
     there = found()
     if there is None:
