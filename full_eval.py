@@ -1,7 +1,7 @@
 """Train, render and score a table of scenes, and write one report.
 
 python full_eval.py -m360 DIR -tat DIR -db DIR [--output_path DIR]
-python full_eval.py --scenes FOLDER ... [--iterations N] [--seeds 0 1 2] [--configs FILE] [-- more options of train.py]
+python full_eval.py --scenes FOLDER ... [--iterations N] [--seeds 0 1 2] [--configs FILE] [--gpus 0 1] [-- OPTIONS]
 
 Writes report.md, report.json, report.html, figures/ and timing.txt into the output folder, and a model folder for every
 run: <scene>[/<option set>][/seed_N]; with --html_models also models/, each model as one HTML file. After an

@@ -24,9 +24,9 @@ from splatting.demo.objects import demo_scene
 from splatting.demo.tracer import CAMERAS, ring_views, trace
 from splatting.evaluation import stages
 from splatting.evaluation.child import run_child
-from splatting.evaluation.comparison import FITTED, grouped
-from splatting.evaluation.model_folder import trained_iterations
+from splatting.evaluation.comparison import BESIDE, FITTED, grouped
 from splatting.evaluation.plan import Run
+from splatting.evaluation.renders import TIMES
 from splatting.evaluation.results import read_earlier
 from splatting.files.image_files import read_plane
 from splatting.files.json_files import read_json
@@ -39,12 +39,14 @@ FORMS = {"PSNR": ".2f", "fitted": ".2f", "SSIM": ".4f", "DEPTH": ".2%", "DEPTH_9
 def scores(run: Run, options: Sequence[str]) -> dict[str, float | None]:
     """Render and score the last iteration of a model, with options of render.py."""
     stages.render(run, options, run_child)
+    (run.model / "results.json").unlink(missing_ok=True)  # those of another scene (-s) are to be scored, too
     stages.score(run, run_child, download=False)
-    method, found = f"ours_{trained_iterations(run.model)[-1]}", read_json(run.model / "results.json")
-    fitted = found.get(f"{method}_{FITTED}", {}).get("PSNR")
-    folder, traced = run.model / "test" / method, run.scene.name in MADE
+    times = [path for path in run.model.glob(f"test/*/{TIMES}") if not path.parent.name.endswith(BESIDE)]
+    folder = max(times, key=lambda path: path.stat().st_mtime_ns).parent
+    found, traced = read_json(run.model / "results.json"), run.scene.name in MADE
+    fitted = found.get(f"{folder.name}_{FITTED}", {}).get("PSNR")
     seen = floaters(run.scene.name, run.scene.source, folder) if traced and (folder / "alpha").is_dir() else {}
-    return found[method] | {"fitted": fitted} | seen
+    return found[folder.name] | {"fitted": fitted} | seen
 
 
 def floaters(name: str, scene: Path, folder: Path) -> dict[str, float]:

@@ -7,7 +7,7 @@ what_to_try                 advice from both
 
 From runs to the report:
 plan, configs               scene folders, options, model folders and their records; sets/ has option sets to use
-stages, child               execution of the plan: each stage is a subprocess
+stages, child               execution of the plan: each stage is a subprocess, one at a time or one on each GPU
 model_folder, renders       readers of model folders, and of the sets of views rendered there
 results, comparison         a run's numbers; those of several: spread, option sets, published tables (published.json)
 advised                     runs that follow what a scene's data ask for, against those that do not
