@@ -57,7 +57,6 @@ MAY_IMPORT = {
     "benchmarks": (),
     "benchmarks.workloads": ("scene.gaussians.morton",),
     "benchmarks.harness": ("benchmarks.workloads",),
-    "benchmarks.strategies": ("benchmarks.harness", "splatting.evaluation.error_curve"),
 }
 MAY_IMPORT["splatting.training.observers"] = (
     *("splatting.training", "splatting.viewer"),
@@ -67,7 +66,7 @@ MEASURED = ("train", "render", "metrics", *(room for room in ROOMS if room != "b
 for room in ("kernels", "accuracy", "scenes", "exports", "parallel", "peers"):
     MAY_IMPORT[f"benchmarks.{room}"] = ("benchmarks.harness", "benchmarks.workloads", *MEASURED)
 MAY_IMPORT["integrations"] = ("train", *(room for room in ROOMS if room != "benchmarks"))
-MAY_IMPORT["benchmarks.gate"] = ("benchmarks.scenes.training", "benchmarks.harness", *MEASURED)
+MAY_IMPORT["benchmarks.gate"] = ("benchmarks.harness", *MEASURED)
 
 # Names that users of the reference import, and what came with them.
 UTILS = {
