@@ -171,3 +171,11 @@ def test_a_photo_in_postscript_is_never_run(colmap_scene, monkeypatch):
     monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *_, **__: pytest.fail("Ghostscript was started"))
     with pytest.raises(UserError, match="cannot read .*left/v02.png .*cannot identify image file"):
         read(colmap_scene)
+
+
+def test_photos_that_a_model_of_windows_names(tmp_path):
+    """Backslashes, and another letter case."""
+    (tmp_path / "left").mkdir()
+    (tmp_path / "left/IMG_1.JPG").touch()
+    for name in (r"left\IMG_1.JPG", r"LEFT\img_1.jpg"):
+        assert find_images(tmp_path, [name], "images.bin", "copy them") == [tmp_path / "left/IMG_1.JPG"]

@@ -36,7 +36,6 @@ def _counted(work: str, stopped: float = 0.0) -> tuple[float, float]:
         return float(said), time.monotonic() - began
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows stops no processes")
 def test_seconds_of_a_stopped_process_do_not_count():
     counted, wall = _counted("read", stopped=4.0)
     assert wall > 4.0 and counted < wall - 3.5

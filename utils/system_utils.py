@@ -5,7 +5,6 @@ import os
 import re
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -30,9 +29,6 @@ __all__ = [
 ]
 
 _ITERATION_FOLDER = re.compile(r"iteration_(\d+)")
-# Windows' errors while another program, such as a virus scanner, has a file open; Linux has no such error.
-_IN_USE = {5, 32, 33}  # access denied, sharing violation, lock violation
-_PATIENCE = 2.0  # seconds for it to close the file
 
 
 def run_cli(main: Callable[[], object], several: bool = False) -> None:
@@ -134,7 +130,7 @@ def atomic_write(path: str | os.PathLike, every_rank: bool = False) -> Iterator[
     temporary = target.with_name(f".{target.stem}.{os.getpid()}.tmp{target.suffix}")
     try:
         yield temporary
-        _replace(temporary, target)
+        os.replace(temporary, target)
     except BaseException as error:
         with contextlib.suppress(OSError):
             temporary.unlink()
@@ -144,17 +140,6 @@ def atomic_write(path: str | os.PathLike, every_rank: bool = False) -> Iterator[
                 f"cannot write {target} ({reason}); free space, fix the permissions, or choose another place"
             ) from error
         raise
-
-
-def _replace(temporary: Path, target: Path) -> None:
-    end = time.monotonic() + _PATIENCE
-    while True:
-        try:
-            return os.replace(temporary, target)
-        except OSError as error:
-            if getattr(error, "winerror", None) not in _IN_USE or time.monotonic() > end:
-                raise
-        time.sleep(0.05)
 
 
 def mkdir_p(folder_path: str | os.PathLike) -> None:

@@ -11,7 +11,6 @@ from pathlib import Path
 from scene.images.decode import picture_size
 from splatting.files.image_files import SUFFIXES
 from splatting.files.listing import some
-from splatting.files.plain_files import relative_to
 from utils.system_utils import UserError
 
 
@@ -120,7 +119,7 @@ def find_images(
             name, path = next(iter(changed.items()))
             print(
                 f"{len(changed)} of {len(paths)} {kind} are used although their file names {difference} those in "
-                f"{listed_by}; the first is {relative_to(path, folder)} for {name}",
+                f"{listed_by}; the first is {os.path.relpath(path, folder)} for {name}",
                 file=sys.stderr,
             )
     return paths

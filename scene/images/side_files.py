@@ -23,8 +23,7 @@ def names_below(names: Sequence[str], base: Path) -> list[str]:
     names = [os.path.normpath(name).replace(os.sep, "/") for name in names]
     if not any(map(_leads_out, names)):
         return names
-    # Without the drive of Windows, as there is no way from one to another.
-    paths = [os.path.splitdrive(os.path.abspath(base / name))[1] for name in names]
+    paths = [os.path.abspath(base / name) for name in names]
     common = os.path.commonpath(list(map(os.path.dirname, paths)))
     return [os.path.relpath(path, common).replace(os.sep, "/") for path in paths]
 
@@ -87,7 +86,7 @@ class SideFiles:
 
 
 def _leads_out(name: str) -> bool:
-    return os.path.isabs(name) or bool(os.path.splitdrive(name)[0]) or name.split("/")[0] == os.pardir
+    return os.path.isabs(name) or name.split("/")[0] == os.pardir
 
 
 def _stem(name: str) -> str:

@@ -25,7 +25,7 @@ from scene.readers.info import CameraInfo, SceneInfo
 from splatting.files.folders import cache_folder
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.listing import some
-from splatting.files.plain_files import plain, plain_text, relative_to
+from splatting.files.plain_files import plain, plain_text
 from splatting.host.machine import threads
 from utils.system_utils import UserError
 
@@ -176,7 +176,7 @@ def with_depth_maps(info: SceneInfo, scene: Path, depths: str) -> SceneInfo:
 def _files(cameras: Sequence[CameraInfo], scene: Path, folder: Path, is_colmap: bool) -> SideFiles:
     photos = [Path(camera.image_path) for camera in cameras]
     names = [
-        camera.image_name if is_colmap or not camera.image_path else relative_to(photo, scene).as_posix()
+        camera.image_name if is_colmap or not camera.image_path else os.path.relpath(photo, scene)
         for camera, photo in zip(cameras, photos, strict=True)
     ]
     return SideFiles(folder, names, photos, scene)

@@ -15,7 +15,6 @@ from scene.images.decode import picture_size
 from scene.images.lens import Lens
 from scene.images.masks import Mask
 from scene.images.store import Decodable, InMemory
-from splatting.files.plain_files import relative_to
 from utils.graphics_utils import BasicPointCloud, camera_center, focal2fov, fov2focal, rigid_pose
 from utils.system_utils import UserError
 
@@ -258,12 +257,9 @@ def exposure_names(cameras: Sequence[CameraInfo]) -> list[str]:
     if not shared:
         return names
     paths = [Path(getattr(camera, "image_path", None) or "") for camera in cameras]
-    try:
-        folder = os.path.commonpath([path.parent for path in paths if path.name] or [""])
-    except ValueError:  # drives of Windows
-        folder = ""
+    folder = os.path.commonpath([path.parent for path in paths if path.name] or [""])
     return [
-        relative_to(path, folder).as_posix() if name in shared and path.name else name
+        os.path.relpath(path, folder) if name in shared and path.name else name
         for name, path in zip(names, paths, strict=True)
     ]
 

@@ -19,7 +19,6 @@ from scene.readers.point_cloud import read_point_cloud
 from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, random_in_cube, random_in_frusta, scene_info
 from splatting.files.image_files import SUFFIXES
 from splatting.files.json_files import read_json
-from splatting.files.plain_files import relative_to
 from utils.graphics_utils import fov2focal
 from utils.system_utils import UserError
 
@@ -238,7 +237,7 @@ def _cameras(
     listed = [str(frame["file_path"]) for frame in frames]
     remedy = f"put them there, or take their frames out of {path.name} to go on without"
     photos = find_images(path.parent, listed, str(path), remedy, suffixes)
-    names = [relative_to(photo, path.parent).as_posix() for photo in photos]
+    names = [os.path.relpath(photo, path.parent) for photo in photos]
     found = _masks(path, frames, names, photos, masks)
     sizes, cameras = picture_sizes(photos), []
     for index, (frame, photo, mask, (R, T)) in enumerate(zip(frames, photos, found, poses, strict=True)):

@@ -10,7 +10,6 @@ from typing import IO
 
 import numpy as np
 
-from splatting.host.interrupt import own_session
 from utils.system_utils import UserError, atomic_write
 
 # Of x264, 0 to 51, smaller is better. At 16 a render keeps 35 dB and more; what is lost is colour at edges, as yuv420p
@@ -47,7 +46,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], width: int, height: in
         # In a session of its own Ctrl-C does not reach it; it is ended below.
         streams = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": said}
         try:
-            process = subprocess.Popen(command, **streams, **own_session())
+            process = subprocess.Popen(command, **streams, start_new_session=True)
         except OSError as error:
             raise UserError(
                 f"cannot start {program} ({error.strerror}); `pip install --force-reinstall imageio-ffmpeg` brings it "

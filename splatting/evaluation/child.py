@@ -30,7 +30,7 @@ class Finished:
     status: int  # exit status; negative: the signal that killed it
     lines: list[str]  # last lines of stderr; what ended it, if nothing else tells
     wall_seconds: float
-    cpu_seconds: float | None  # of all its threads; None where the system does not tell
+    cpu_seconds: float  # of all its threads
     interrupt: type[KeyboardInterrupt] | None  # the interrupt that this process got meanwhile
 
 
@@ -64,7 +64,6 @@ def run_child(command: Sequence[str], say: str = "", slot: Slot | None = None, *
         child = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True, close_fds=False,
                                  env=os.environ | visible | environment)  # fmt: skip
         tail = bytearray()
-        # Windows cannot wait for a pipe with a time limit.
         reader = threading.Thread(target=_read, args=(child, tail, slot is None), daemon=True)
         reader.start()
         try:
@@ -72,7 +71,7 @@ def run_child(command: Sequence[str], say: str = "", slot: Slot | None = None, *
             while reader.is_alive():
                 if interrupt.requested and not handed_on:
                     handed_on = True
-                    _hand_on(interrupt.requested, child)
+                    child.send_signal(signal.SIGTERM if interrupt.requested is Terminated else signal.SIGINT)
                 if slot and slot.ended.is_set():
                     child.kill()
                 reader.join(_LOOK)
@@ -129,22 +128,17 @@ def _read(child: subprocess.Popen, tail: bytearray, shown: bool) -> None:
 
 
 def _wait(child: subprocess.Popen) -> float | None:
-    """Wait for a child's end; its CPU seconds, with those of its own children, None where the system does not tell."""
-    with contextlib.suppress(ChildProcessError):  # it ended as it was told to
-        if hasattr(os, "wait4"):
-            _, status, usage = os.wait4(child.pid, 0)
-            child.returncode = os.waitstatus_to_exitcode(status)
-            return usage.ru_utime + usage.ru_stime
-    child.wait()
-    return None
+    """Wait for a child's end; its CPU seconds, with those of its own children, None if it was waited for already."""
+    try:
+        _, status, usage = os.wait4(child.pid, 0)
+    except ChildProcessError:  # it ended as it was told to
+        child.wait()
+        return None
+    child.returncode = os.waitstatus_to_exitcode(status)
+    return usage.ru_utime + usage.ru_stime
 
 
 def _lines(tail: bytearray) -> list[str]:
     """The last lines, without progress bars, which redraw their line with carriage returns."""
     lines = (line.rsplit("\r", 1)[-1] for line in tail.decode("utf-8", "replace").split("\n"))
     return [line.rstrip() for line in lines if line.strip() and not re.search(r"\d+%\|", line)][-LINES:]
-
-
-def _hand_on(interrupt: type[KeyboardInterrupt], child: subprocess.Popen) -> None:
-    if os.name != "nt":  # there Ctrl-C has reached the child as well, and no other signal can be sent
-        child.send_signal(signal.SIGTERM if interrupt is Terminated else signal.SIGINT)

@@ -17,7 +17,6 @@ from splatting.evaluation.error_curve import COLUMNS, ESTIMATED, FIGURE, NAME, S
 from splatting.evaluation.training_log import TrainingLog
 from splatting.evaluation.what_to_try import gain_since_peak, peak_advice
 from splatting.host.clock import running_seconds, wall_seconds
-from splatting.host.interrupt import own_session
 from splatting.host.machine import cores
 from utils.system_utils import UserError, writes_files
 
@@ -110,7 +109,7 @@ class CurveDrawer:
             self._process = subprocess.Popen(
                 [sys.executable, "-X", "utf8", "-m", "splatting.evaluation.figures", *words],
                 cwd=_ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8",
-                **own_session(),  # Ctrl-C is for the training, which ends this process if need be
+                start_new_session=True,  # Ctrl-C is for the training, which ends this process if need be
             )  # fmt: skip
 
     def draw(self) -> None:

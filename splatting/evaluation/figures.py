@@ -300,7 +300,7 @@ def main() -> None:
     """Draw for `CurveRecorder`."""
     gc.disable()  # for the second that this takes
     with contextlib.suppress(Exception):  # drawing reports it
-        import matplotlib.backends.backend_agg
+        import matplotlib.backends.backend_agg  # noqa: F401
         import matplotlib.figure  # noqa: F401
     if sys.stdin.readline():
         source, target, title, *views = sys.argv[1:]

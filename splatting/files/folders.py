@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import re
 from collections.abc import Iterator
@@ -11,14 +12,6 @@ from typing import TextIO
 
 from splatting.host.errors import UserError
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    import msvcrt
-
-    fcntl = None
-
-_FAR = 1 << 30  # Windows keeps other programs from reading a byte that is locked, so one behind the content is locked
 _TEMPORARY = re.compile(r"\..*\.(\d+)\.tmp(\.[^.]*)?")  # as `utils.system_utils.atomic_write` names them
 
 
@@ -29,9 +22,8 @@ def locked(folder: Path, program: str, busy: str, option: str, inherited: bool =
     program: the command, which names the file of the lock. busy: words for the message about the process that has it.
     option: with which the user names another folder. inherited: child processes that inherit open files keep the
     folder, too, until the last of them ends; then the lock's file stays.
-    The system releases the lock when its last process ends in any way, so a killed one does not block the folder. On
-    Windows child processes do not inherit it, and the lock's file stays. Without file locks (some network file systems)
-    this does nothing.
+    The system releases the lock when its last process ends in any way, so a killed one does not block the folder.
+    Without file locks (some network file systems) this does nothing.
     """
     path = folder / f".{program.removesuffix('.py')}.lock"
     with contextlib.ExitStack() as stack:
@@ -59,7 +51,7 @@ def _acquired(stack: contextlib.ExitStack, path: Path, busy: str, option: str) -
         except OSError as error:
             raise UserError(f"cannot write {path} ({error.strerror}); choose another {option}") from error
         try:
-            _lock(file)
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             file.seek(0)
             process = file.read().strip() or "not known"
@@ -72,18 +64,6 @@ def _acquired(stack: contextlib.ExitStack, path: Path, busy: str, option: str) -
         if _is_at(file, path):
             return file
         # Its owner has removed the file between our two calls, so the next one may hold another file.
-
-
-def _lock(file: TextIO) -> None:
-    """Lock a file until it is closed. BlockingIOError if another process has it."""
-    if fcntl:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    else:
-        os.lseek(file.fileno(), _FAR, os.SEEK_SET)
-        try:
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-        except PermissionError as error:
-            raise BlockingIOError(*error.args) from error
 
 
 def _is_at(file: TextIO, path: Path) -> bool:
@@ -106,8 +86,6 @@ def remove_temporary_files(folder: str | os.PathLike) -> list[Path]:
 
 
 def _runs(process: int) -> bool:
-    if os.name == "nt":  # there, asking for a process would end it
-        return True
     try:
         os.kill(process, 0)
     except ProcessLookupError:

@@ -70,11 +70,3 @@ def check_packed_rows(count: int, size: int) -> None:
     """
     if count > size + _FREE:
         raise ValueError(f"it promises {count:,} rows in {size:,} bytes, which no honest file does")
-
-
-def relative_to(path: Path, folder: str | os.PathLike) -> Path:
-    """The way from a folder to a path, through parent folders if need be; the path itself if on another drive."""
-    try:
-        return Path(os.path.relpath(path, folder))
-    except ValueError:  # there is no way from one drive to another
-        return path

@@ -3,23 +3,17 @@
 import contextlib
 import os
 import signal
-import subprocess
 import threading
 from collections.abc import Iterable
 from types import FrameType, TracebackType
-from typing import Any
-
-_HANGUP = getattr(signal, "SIGHUP", None)  # Windows has none
 
 
 class Terminated(KeyboardInterrupt):
     """SIGTERM or SIGHUP, raised like Ctrl-C's KeyboardInterrupt."""
 
 
-_ERRORS = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: Terminated}
-if _HANGUP is not None:
-    _ERRORS[_HANGUP] = Terminated
-_ENDS = tuple(signum for signum, error in _ERRORS.items() if error is Terminated)
+_ENDS = (signal.SIGTERM, signal.SIGHUP)
+_ERRORS = {signal.SIGINT: KeyboardInterrupt} | dict.fromkeys(_ENDS, Terminated)
 
 
 class DeferredInterrupt:
@@ -38,7 +32,7 @@ class DeferredInterrupt:
     def __enter__(self) -> "DeferredInterrupt":
         if threading.current_thread() is threading.main_thread():
             for signum in _ERRORS:
-                if signum != _HANGUP or signal.getsignal(signum) != signal.SIG_IGN:
+                if signum != signal.SIGHUP or signal.getsignal(signum) != signal.SIG_IGN:
                     self._previous[signum] = signal.signal(signum, self._note)
         return self
 
@@ -50,7 +44,7 @@ class DeferredInterrupt:
                 signal.signal(signum, handler)
 
     def _note(self, signum: int, frame: FrameType | None) -> None:
-        if signum == _HANGUP:
+        if signum == signal.SIGHUP:
             _leave_closed_terminal()
         elif self.requested:
             raise _ERRORS[signum]
@@ -79,7 +73,7 @@ def _pass_over(signum: int, frame: FrameType | None) -> None:
 
 def _terminate(signum: int, frame: FrameType | None) -> None:
     ignore(_ENDS)  # several senders may tell one process to end, and what follows removes half-done files
-    if signum == _HANGUP:
+    if signum == signal.SIGHUP:
         _leave_closed_terminal()
     raise Terminated
 
@@ -94,10 +88,3 @@ def _leave_closed_terminal() -> None:
                 nowhere = os.open(os.devnull, os.O_WRONLY)
                 os.dup2(nowhere, descriptor)
                 os.close(nowhere)
-
-
-def own_session() -> dict[str, Any]:
-    """Options of subprocess.Popen that give the child a session of its own, on Windows a process group."""
-    if os.name == "nt":
-        return {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
-    return {"start_new_session": True}

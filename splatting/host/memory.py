@@ -7,16 +7,12 @@ from __future__ import annotations
 
 import contextlib
 import re
+import resource
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import torch
-
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None
 
 # Words of torch on CPU and GPU, of C++ and CUDA, and of the rasterizer for more instances than it can count.
 _WORDS = ("can't allocate memory", "not enough memory", "out of memory", "bad_alloc", "more than 2^31")
@@ -108,7 +104,7 @@ def _group_limit() -> int | None:
 
 def _process_limit() -> int | None:
     """Bytes of address space left to this process; None without a limit."""
-    if resource is None or (most := resource.getrlimit(resource.RLIMIT_AS)[0]) == resource.RLIM_INFINITY:
+    if (most := resource.getrlimit(resource.RLIMIT_AS)[0]) == resource.RLIM_INFINITY:
         return None
     with contextlib.suppress(OSError, ValueError):
         return max(most - int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize(), 0)

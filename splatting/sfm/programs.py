@@ -4,6 +4,7 @@ If this process is killed, it cannot end them. worker.py notices, because its in
 working, and keep the lock on the log that they write to.
 """
 
+import fcntl
 import subprocess
 import time
 from collections.abc import Callable, Sequence
@@ -13,11 +14,6 @@ from typing import BinaryIO
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.host.progress import Bar
 from utils.system_utils import UserError
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
 
 _PATIENCE = 5.0  # seconds that a program gets to end by itself
 _ORPHAN_PATIENCE = 2.0  # seconds that a worker gets to notice that its caller was killed
@@ -55,7 +51,7 @@ def refuse_while_working(log: Path) -> None:
 def _lock(output: BinaryIO) -> None:
     """Lock a log, for this process and the programs that get it as their output, until the last of them has ended."""
     deadline = time.monotonic() + _ORPHAN_PATIENCE
-    while fcntl:
+    while True:
         try:
             fcntl.flock(output, fcntl.LOCK_EX | fcntl.LOCK_NB)
             return

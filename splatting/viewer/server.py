@@ -4,7 +4,6 @@ import argparse
 import contextlib
 import errno
 import io
-import os
 import socket
 import sys
 import warnings
@@ -109,8 +108,7 @@ def _free_port(address: Address) -> int:
         family, _, _, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         for tried in range(port, min(port + _TRIED, 65536)):
             with socket.socket(family) as probe:
-                if os.name == "posix":  # on Windows it would allow for a port that is taken
-                    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 try:
                     probe.bind((place[0], tried, *place[2:]))
                 except OSError as error:
