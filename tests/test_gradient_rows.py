@@ -111,6 +111,7 @@ def scene_of(kind: str, device: str, dtype: torch.dtype) -> tuple[dict[str, Tens
 SCENES = pytest.mark.parametrize("kind", ["empty", "one", "behind", "giants", "many", "rays"])
 DEPTH = pytest.mark.parametrize("depth", [False, True])
 ABSOLUTE = pytest.mark.parametrize("absolute", [False, True])
+BOTH = pytest.mark.parametrize(("depth", "absolute"), [(False, True), (True, False)])
 
 
 @BOTH_AND_GPU
@@ -134,8 +135,7 @@ def test_single_steps_of_the_forward_are_rasterize_to_the_bit(kind, depth, devic
 
 @BOTH_AND_GPU
 @SCENES
-@DEPTH
-@ABSOLUTE
+@BOTH
 def test_rows_give_the_gradients_of_the_lists(kind, depth, absolute, device, dtype):
     forward = Forward.of(*scene_of(kind, device, dtype), depth)
     rows = forward.rows(absolute)
@@ -208,8 +208,7 @@ def test_gradients_of_covariances_and_colors_are_added(device, dtype):
 
 @BOTH_AND_GPU
 @SCENES
-@DEPTH
-@ABSOLUTE
+@BOTH
 def test_bands_give_the_rows_of_the_image(kind, depth, absolute, device, dtype):
     forward = Forward.of(*scene_of(kind, device, dtype), depth)
     whole = forward.rows(absolute)

@@ -142,7 +142,7 @@ def test_images_and_gradients_are_the_oracles(model, antialiasing, monkeypatch):
         monkeypatch.setattr(reference.blend, "alphas", of_nearest_copies)
     of, width, height = lens(model).scaled(0.5, 0.5), WIDTH // 2, HEIGHT // 2  # for speed
     camera = settings(of, torch.float64, antialiasing=antialiasing, image_width=width, image_height=height)
-    values = everywhere(of, camera, 2000)
+    values = everywhere(of, camera, 600)
     weight = torch.randn(3, height, width, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     ours, theirs = ({name: v.clone().requires_grad_() for name, v in values.items()} for _ in range(2))
     one = draw(camera, ours, want_inverse_depth=True)

@@ -458,8 +458,7 @@ def test_coefficients_of_another_rank_are_named(shs):
         call(splats, camera, shs=shs)
 
 
-@pytest.mark.parametrize("fullgraph", [True, False])
-@pytest.mark.parametrize("backend", ["eager", "aot_eager"])
+@pytest.mark.parametrize(("backend", "fullgraph"), [("eager", False), ("aot_eager", True)])
 def test_torch_compile_gives_the_same_gradients(backend, fullgraph, recwarn):
     splats, camera = scene()
 

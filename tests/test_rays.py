@@ -155,24 +155,31 @@ def test_activated_parameters_agree_with_the_oracle(device, dtype, covariances, 
     assert max(error(got[name], wanted[name]).largest for name in wanted) < bound
 
 
+WEIGHT = torch.randn(3, 7, 18, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+
+
+@functools.cache
+def oracle_by_pixels(lens: Lens | None):
+    """The oracle's gradients of the screen means, of each pixel by itself."""
+    parameters, arguments = few()
+    view = settings(**arguments, projection="ray", sh_degree=1, lens=lens)
+    means2d = torch.zeros_like(parameters["means"]).requires_grad_()
+    image = WEIGHT * render(parameters, view, means2d, function=reference.render).color
+    gradients = [
+        torch.autograd.grad(image[(..., *at)].sum(), means2d, retain_graph=True)[0] for at in np.ndindex(7, 18)
+    ]
+    return parameters, view, gradients
+
+
 @BOTH_AND_GPU
 @pytest.mark.parametrize("lens", [None, SMALL], ids=["pinhole", "fisheye"])
 def test_lengths_of_absolute_gradients_are_those_of_the_oracles_pixels(device, dtype, lens):
-    parameters, arguments = few()
-    view = settings(**arguments, projection="ray", sh_degree=1, lens=lens)
-    inputs, camera = {name: t.to(device, dtype) for name, t in parameters.items()}, on_device(view, device)
-    weight = torch.randn(3, 7, 18, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-
-    def screen_gradient(loss, parameters, view, **options):
-        means2d = torch.zeros_like(parameters["means"]).requires_grad_()
-        loss(render(parameters, view, means2d, **options).color.cpu()).backward()
-        return means2d.grad.cpu().double()
-
-    pixels = [
-        screen_gradient(lambda c, at=at: (weight * c)[(..., *at)].sum(), parameters, view, function=reference.render)
-        for at in np.ndindex(7, 18)
-    ]
-    found = screen_gradient(lambda c: (weight * c).sum(), inputs, camera, want_absolute_gradient=True)
+    parameters, view, pixels = oracle_by_pixels(lens)
+    inputs = {name: t.to(device, dtype) for name, t in parameters.items()}
+    means2d = torch.zeros_like(inputs["means"]).requires_grad_()
+    image = render(inputs, on_device(view, device), means2d, want_absolute_gradient=True).color
+    (WEIGHT * image.cpu()).sum().backward()
+    found = means2d.grad.cpu().double()
     bounds = {} if dtype == torch.float64 else {"rtol": 1e-5, "atol": 1e-5 * found.abs().max().item()}
     torch.testing.assert_close(found[:, 2], sum(pixel.abs() for pixel in pixels)[:, :2].norm(dim=1), **bounds)
     torch.testing.assert_close(found[:, :2], sum(pixels)[:, :2], **bounds)

@@ -1,5 +1,6 @@
 """Equal results in every run and with any number of threads, and to rounding with any instruction set."""
 
+import functools
 import os
 import platform
 import subprocess
@@ -176,6 +177,7 @@ def _bytes(tensor: Tensor) -> bytes:
     return tensor.detach().cpu().contiguous().numpy().tobytes()
 
 
+@functools.cache
 def results() -> dict[str, Tensor]:
     """Outputs and gradients in both precisions with this process's instruction set: three kinds of scene, and SSIM."""
     out = {}
