@@ -44,8 +44,10 @@ def run(model, monkeypatch) -> Callable[[], None]:
 @pytest.mark.filterwarnings("error::ResourceWarning")
 def test_table_and_sheet(run, model, capsys):
     run()
-    cells = capsys.readouterr().out.splitlines()[1].split()
+    lines = capsys.readouterr().out.splitlines()
+    cells = lines[1].split()
     assert cells == ["garden", "30", "12", "s", "123", "2", "20.00", "dB", "0.5000"]
+    assert lines[-2].endswith(f" {model / 'contact_sheet.png'}") and lines[-1].endswith(f"view.py -m {model}")
     with Image.open(model / "contact_sheet.png") as sheet:
         assert sheet.width > 90
 

@@ -5,6 +5,8 @@ python -m splatting.demo.report MODEL [--views 4]
 
 from __future__ import annotations
 
+import os
+import sys
 from argparse import ArgumentParser
 from pathlib import Path
 
@@ -57,9 +59,10 @@ def main() -> None:
     widths = [max(len(cell) for cell in column) for column in table]
     for line in zip(*table, strict=True):
         print("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)))
-    print(f"contact sheet  {sheet}")
     print(f"renders        {model / 'test' / method / 'renders'}")
     print(f"model          {model / 'point_cloud' / f'iteration_{iteration}' / 'point_cloud.ply'}")
+    print(f"contact sheet  {sheet}")
+    print(f"to see it      {min(sys.executable, os.path.relpath(sys.executable), key=len)} view.py -m {model}")
 
 
 if __name__ == "__main__":

@@ -58,6 +58,7 @@ void test_against_cpu() {
   for (const gs::Image image : {gs::Image{1, 1}, gs::Image{16, 16}, gs::Image{70, 33}, gs::Image{330, 70}})
     for (int64_t count : {0, 1, 33, 300})
       for (bool antialiasing : {false, true}) {
+        if (count < 300 && (image.width == 330 || antialiasing != (count == 1))) continue;
         Parameters<float> p(count);
         if (count == 300)  // one covers all tiles: a whole warp tests them
           for (int k = 0; k < 3; ++k) p.scales[3 * 17 + k] = 1;
@@ -113,6 +114,7 @@ Parameters<float> on_rays(int64_t count) {
 void test_rays() {
   for (const auto& [count, image] : {std::pair{1, gs::Image{16, 16}}, {33, {70, 33}}, {300, {330, 70}}})
     for (bool antialiasing : {false, true}) {
+      if (count != 33 && antialiasing != (count == 1)) continue;
       Parameters<float> p = on_rays(count);
       if (count == 33) p.distort_view();
       check_scene(p, image, antialiasing, antialiasing);
@@ -174,7 +176,7 @@ void check_ahead(Parameters<float>& p, gs::Image image, bool absolute, bool reco
   const gs::Room exact = needed;
   CHECK(exact.instances == wanted.instances && exact.slots >= exact.instances && exact.rows <= exact.instances);
   CHECK(exact.rows > 0);
-  for (const int64_t more : {0, 1, 1000, 20000}) {
+  for (const int64_t more : {0, 1000}) {
     const Result<float> got = go({exact.instances + more, exact.slots + more, exact.rows + more, 0});
     CHECK(got.color == wanted.color && got.gradient == wanted.gradient && got.instances == wanted.instances);
     CHECK(got.absolute == wanted.absolute);
@@ -183,7 +185,7 @@ void check_ahead(Parameters<float>& p, gs::Image image, bool absolute, bool reco
   }
   const std::vector<float> untouched(wanted.gradient.size(), -77.0f), no_lengths(wanted.absolute.size(), -77.0f);
   for (int64_t gs::Room::* const lacking : {&gs::Room::instances, &gs::Room::slots, &gs::Room::rows})
-    for (const int64_t of : {int64_t(0), int64_t(1), exact.*lacking - 1}) {
+    for (const int64_t of : {int64_t(0), exact.*lacking - 1}) {
       gs::Room room = exact;
       room.*lacking = of;
       CHECK(go(room).gradient == untouched);
@@ -200,7 +202,7 @@ void check_ahead(Parameters<float>& p, gs::Image image, bool absolute, bool reco
 void test_ahead() {
   Parameters<float> p(300);
   for (int k = 0; k < 3; ++k) p.scales[3 * 17 + k] = 1;
-  check_ahead(p, gs::Image{330, 70}, false, false);
+  check_ahead(p, gs::Image{70, 33}, false, false);
   p = two_long_lists(900);
   check_ahead(p, kTwoTiles, true, true);
 }
@@ -236,6 +238,7 @@ void check_lists(const LongLists& lists) {
     const Blending again = emulated(order, true, true, true);
     CHECK(again.color == got.color && again.transmittance == got.transmittance && again.depth == got.depth);
     CHECK(again.last == got.last && again.moments == got.moments);
+    if (order != gs::emulation::Order::shuffled) continue;
     for (const auto& [depth, last] : {std::pair{false, true}, std::pair{true, false}, std::pair{false, false}}) {
       const Blending fewer = emulated(order, depth, last, true);
       CHECK(fewer.color == got.color && fewer.transmittance == got.transmittance);
@@ -330,7 +333,8 @@ void check_bins(Parameters<float>& p, gs::Image image) {
       for (const auto& [rects, records] : {std::pair{true, true}, std::pair{true, false}, std::pair{false, true}}) {
         if (records && !has_records(image)) continue;
         // 256 threads visit each of so many tiles, which takes long.
-        if (!has_records(image) && order != gs::emulation::Order::shuffled) continue;
+        if (!has_records(image) && (order != gs::emulation::Order::shuffled || !slots)) continue;
+        if (!slots && order != gs::emulation::Order::shuffled) continue;
         gs::emulation::order = order;
         gs::emulation::Memory memory;
         const auto got = bin_scene(memory.queue(), scene, {rects, records, slots});
@@ -345,6 +349,7 @@ void check_bins(Parameters<float>& p, gs::Image image) {
 void test_lists() {
   for (const gs::Image image : {gs::Image{330, 70}, gs::Image{264, 260}})
     for (const int64_t count : {0, 1, 150}) {
+      if (count < 150 && image.width == 264) continue;
       Parameters<float> p(count);
       for (int64_t i = 20; i < count; i += 40)
         for (int k = 0; k < 3; ++k) p.scales[3 * i + k] = 0;
@@ -555,9 +560,8 @@ void test_rows() {
   for (const Parameters<float>& p : scenes_for_rows())
     for (const bool depth : {false, true}) check(p, {40, 70}, gs::emulation::kOrders[at++ % 3], depth, !depth);
   check(scenes_for_rows()[3], {120, 70}, gs::emulation::Order::shuffled, true, true);
-  for (const bool depth : {false, true}) check(on_rays(60), {70, 33}, gs::emulation::Order::shuffled, depth, depth);
-  const Parameters<float> p = two_long_lists(900);
-  for (const bool layers : {false, true}) check(p, {25, 40}, gs::emulation::Order::shuffled, true, layers);
+  check(on_rays(60), {70, 33}, gs::emulation::Order::shuffled, true, true);
+  check(two_long_lists(900), {25, 40}, gs::emulation::Order::shuffled, true, false);
 }
 
 // Moves what changes from step to step to `now`.
@@ -576,6 +580,8 @@ void put_off(gs::GaussianStep<float>& step, gs::StepNow& now) {
 void test_gaussian_step() {
   for (const auto& [count, rays] : {std::pair{0, false}, {1, false}, {33, false}, {33, true}, {200, false}})
     for (const StepCase& how : kStepCases) {
+      if (count != 33 && (&how - kStepCases) % 3 != count % 3) continue;  // each with some scene
+      if (rays && !(how.guarded && how.sparse)) continue;
       const Stepping start{rays ? on_rays(count) : Parameters<float>(count)};
       Stepping plain = start, fused = start, stepped = start;
       for (int64_t iteration = 1; iteration <= 3; ++iteration) {
