@@ -108,8 +108,6 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, ...]:
             raise UserError(f"--{name} takes iterations from 1 on, or -1 for none, got {wrong[0]}")
     if args.keep_best:
         checks.check_keep_best(*options[:2], several=False)
-    if args.viewer_exit and args.viewer is None:
-        raise UserError("--viewer_exit closes the page of --viewer; add --viewer, or leave it out")
     return args, *options
 
 

@@ -40,14 +40,8 @@ STRATEGY_OPTIONS: tuple[Option, ...] = (
         help="mcmc: growth in every densification, as a part of the number of Gaussians"),
     Option("mcmc_min_opacity", 0.005, origin=_PAPER, check=_between,
         help="mcmc: a Gaussian of this opacity or less is moved to another one"),
-    Option("mcmc_parts", 51, origin=_PAPER, check=within(2, 51),
-        help="mcmc: largest number of parts for which opacity and scales of a divided Gaussian are corrected"),
     Option("mcmc_noise", 500_000.0, origin=_PAPER, check=within(0, 1e9),
         help="mcmc: factor of the noise that moves Gaussians in every step, times the learning rate of positions"),
-    Option("mcmc_gate_steepness", 100.0, origin=_PAPER, check=within(0, 10_000),
-        help="mcmc: k of the factor sigmoid(-k (opacity - t)) of that noise; higher: less noise of opaque Gaussians"),
-    Option("mcmc_gate_opacity", 0.005, origin=_PAPER, check=within(0, 1),
-        help="mcmc: t of that factor, the opacity with half of the noise"),
     Option("mcmc_opacity_reg", 0.01, origin=_PAPER, check=at_least(0),
         help="mcmc: weight of the mean opacity in the loss; higher: more Gaussians fade and are moved"),
     Option("mcmc_scale_reg", 0.01, origin=_PAPER, check=at_least(0),
@@ -58,14 +52,6 @@ STRATEGY_OPTIONS: tuple[Option, ...] = (
         help="mcmc: scale of the Gaussians that are made from points, as a part of the distance to their neighbours; "
              "0: 0.1, or 1 with --time_budget"),
 
-    Option("growth_power", 1.0, origin="ours; 2 in Taming 3DGS", check=above(0),
-        help="budget: how early the Gaussians multiply. The part of the densifications that is left, to this power, "
-             "is the part of the growth to --max_num_splats that is left; 1: evenly, higher: earlier"),
-    Option("score_views", 10, origin="ours", check=at_least(1),
-        help="budget: training views, drawn anew in each densification, whose error says where Gaussians are added"),
-    Option("score_power", 1.0, origin="ours", check=within(0, 100),  # beyond, most chances are 0
-        help="budget: Gaussians are drawn for splitting with a chance that grows as their score to this power; "
-             "higher: only the worst, 0: any that draws an error"),
     Option("opacity_decay", 0.98, origin="ours", check=within(0.5, 1),
         help="budget: factor of all opacities after each densification, so that useless Gaussians fade; 1: none"),
     Option("prune_opacity", 0.005, origin="ours, and adaptive density control's", check=within(0, 0.5),

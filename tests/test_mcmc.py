@@ -34,7 +34,7 @@ def test_gaussians_are_moved(colmap_scene, tmp_path, monkeypatch):
     moved, relocate = [], GaussianModel.relocate
     monkeypatch.setattr(GaussianModel, "relocate", lambda *x, **named: moved.append(relocate(*x, **named)) or moved[-1])
     _train(colmap_scene, tmp_path, *MCMC[2:])
-    assert len(moved) == 5 and moved[1] and moved[-1]
+    assert len(moved) == 5 and moved[1] and any(moved[2:])
 
 
 @pytest.mark.parametrize(("growth", "count", "grown"), [(0.05, 5, 6), (0.05, 40, 42), (0.0, 5, 5), (1.0, 30, 45)])

@@ -48,9 +48,9 @@ OTHERS = {
     *("exposure_lr_delay_mult", "percent_dense", "lambda_dssim", "densification_interval", "opacity_reset_interval"),
     *("densify_from_iter", "densify_until_iter", "densify_grad_threshold", "depth_l1_weight_init"),
     *("depth_l1_weight_final", "gpu_memory", "max_num_splats", "keep_unseen"),
-    *("absgrad", "absgrad_threshold", "split", "mcmc_until_iter", "mcmc_growth", "mcmc_min_opacity", "mcmc_parts"),
-    *("mcmc_noise", "mcmc_gate_steepness", "mcmc_gate_opacity", "mcmc_opacity_reg", "mcmc_scale_reg"),
-    *("mcmc_init_opacity", "mcmc_init_scale", "growth_power", "score_views", "score_power", "opacity_decay"),
+    *("absgrad", "absgrad_threshold", "split", "mcmc_until_iter", "mcmc_growth", "mcmc_min_opacity"),
+    *("mcmc_noise", "mcmc_opacity_reg", "mcmc_scale_reg"),
+    *("mcmc_init_opacity", "mcmc_init_scale", "opacity_decay"),
     *("prune_opacity", "time_budget", "target_psnr", "schedule"),
 }
 

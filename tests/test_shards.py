@@ -105,7 +105,7 @@ def _emptied(gaussians: GaussianModel) -> None:
 
 
 def _mcmc(gaussians: GaussianModel, **changes: object) -> None:
-    changes = {"mcmc_min_opacity": 0.3, "mcmc_noise": 1e4, "mcmc_gate_opacity": 0.5, "mcmc_growth": 0.2} | changes
+    changes = {"mcmc_min_opacity": 0.02, "mcmc_noise": 1e4, "mcmc_growth": 0.2} | changes
     density = MarkovChain(gaussians, options(strategy="mcmc", **changes))
     if "max_num_splats" not in changes:
         density.started()

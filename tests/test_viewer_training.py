@@ -66,6 +66,7 @@ class Watched:
                 super().ended(error)
 
         monkeypatch.setattr("splatting.training.observers.standard.PageObserver", Observer)
+        monkeypatch.setattr(observed, "serve", lambda page: None)  # so that the test ends
 
     def connect(self) -> None:
         """Let a browser look."""
@@ -93,10 +94,10 @@ class Watched:
         threading.Thread(target=play).start()
 
 
-def _train(scene: Path, out: Path, *options: object, viewer: bool = True, stays: bool = False) -> Path:
+def _train(scene: Path, out: Path, *options: object, viewer: bool = True) -> Path:
     words = ["-s", scene, "-m", out, "-r", 24, "--iterations", ITERATIONS, "--eval", "--densify_from_iter", 20,
              "--densification_interval", 20, "--densify_grad_threshold", 1e-6, *options]  # fmt: skip
-    train.main([*map(str, words), *(["--viewer", "0", *(["--viewer_exit"] * (not stays))] if viewer else [])])
+    train.main([*map(str, words), *(["--viewer", "0"] if viewer else [])])
     return out / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply"
 
 
@@ -231,19 +232,19 @@ def test_the_page_stays_after_its_training_and_shows_the_saved_model(colmap_scen
 
     watched = _Staying(monkeypatch, {5: lambda w: w.requests.pause() or w.requests.resume()}, visit)
     # The last iteration is one of densification, after the model is saved.
-    path = _train(colmap_scene, tmp_path / "out", "--no_curve", stays=True)
+    path = _train(colmap_scene, tmp_path / "out", "--no_curve")
     shown, picture, count = watched.seen[0]
     saved = read_model(path)
     assert len(watched.observer._run.gaussians) > len(saved) == len(shown) == int(count.replace(",", ""))
     assert torch.equal(shown.get_xyz, saved.get_xyz) and picture.std() > 5
     said = capfd.readouterr().err
-    assert f"The page stays open at {watched.page.url}" in said and "--viewer_exit" in said
+    assert f"The page stays open at {watched.page.url}" in said
 
 
 def test_a_training_that_the_page_stops_can_be_looked_at(colmap_scene, tmp_path, monkeypatch, capfd):
     watched = _Staying(monkeypatch, {33: lambda w: w.requests.stop()}, _Staying.look_and_close)
     with pytest.raises(KeyboardInterrupt, match="stopped from the page"):
-        _train(colmap_scene, tmp_path / "out", "--no_curve", stays=True)
+        _train(colmap_scene, tmp_path / "out", "--no_curve")
     assert watched.seen[0].std() > 5 and watched.page.iteration.value == "33"
     assert f"saved as {tmp_path / 'out/chkpnt33.pth'}" in watched.observer._tab.state.content
     assert load_checkpoint(str(tmp_path / "out/chkpnt33.pth"), "cpu")[1] == 33
@@ -257,14 +258,14 @@ def test_a_signal_ends_the_page_of_a_training_that_is_over(colmap_scene, tmp_pat
         wait_for(lambda: watched.ends)
 
     watched = _Staying(monkeypatch, {}, visit)
-    _train(colmap_scene, tmp_path / "out", "--no_curve", stays=True)  # and goes on as after any training
+    _train(colmap_scene, tmp_path / "out", "--no_curve")  # and goes on as after any training
     assert watched.ends == [KeyboardInterrupt]
 
 
 def test_a_signal_that_ends_the_training_ends_the_page(colmap_scene, tmp_path, monkeypatch):
     watched = _Staying(monkeypatch, {33: lambda w: os.kill(os.getpid(), signal.SIGINT)}, lambda _: None)
     with pytest.raises(KeyboardInterrupt):
-        _train(colmap_scene, tmp_path / "out", "--no_curve", stays=True)
+        _train(colmap_scene, tmp_path / "out", "--no_curve")
     assert not watched.seen
     with pytest.raises(OSError):
         Client(watched.page.url)
@@ -296,11 +297,6 @@ def test_points_of_some_test_views_are_called_so():
     scored, estimated = "2 of 4 points are scores of some test views.", "1 of 4 points are estimates from scores of"
     text = training_tab._of_some_views([rows[0], *rows])
     assert text.startswith(f"{scored} {estimated}") and training_tab._of_some_views(rows[2:]) == ""
-
-
-def test_viewer_exit_without_a_page_is_refused():
-    with pytest.raises(UserError, match="--viewer_exit closes the page of --viewer"):
-        train.parse(["-s", "scene", "--viewer_exit"])
 
 
 def test_a_wrong_address_is_refused_before_a_file_is_written(colmap_scene, tmp_path):

@@ -20,7 +20,7 @@ from splatting.training.steps.plain import PlainStep
 Once = Callable[[str, Callable[[Path], object]], Path]
 ITERATIONS = 60
 LEARNT = "poses.json", "exposure.json", "appearance.json"
-MCMC = ("--strategy", "mcmc", "--mcmc_noise", 5e4, "--mcmc_gate_opacity", 0.5, "--mcmc_min_opacity", 0.45)
+MCMC = ("--strategy", "mcmc", "--mcmc_noise", 5e4, "--mcmc_init_opacity", 0.03, "--mcmc_min_opacity", 0.024)
 BUDGET = ("--strategy", "budget", "--max_num_splats", 500, "--densify_until_iter", 50)
 OPTIONS = {
     "default": (),
@@ -56,7 +56,7 @@ OPTIONS = {
     "poses, no graph": ("--refine_poses", "--train_test_exp", "-d", "depths", "--depth_l1_weight_init", 1),
     "exposure and sizes": ("--train_test_exp", "--resolution_schedule", "pyramid", "-r", 1),
     "poses and lenses": ("--refine_poses", "--refine_lens", "--resolution_schedule", "pyramid"),
-    "budget errors": (*BUDGET, "--score_power", 2, "--train_test_exp"),
+    "budget errors": (*BUDGET, "--train_test_exp"),
 }
 
 

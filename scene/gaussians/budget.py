@@ -10,15 +10,13 @@ from splatting.deterministic.portable_math import exp, log
 from splatting.distributed.rows import changes_rows
 
 
-def count_after(now: int, budget: int, remaining: int, power: float) -> int:
+def count_after(now: int, budget: int, remaining: int) -> int:
     """The number of Gaussians after a densification that `remaining` others follow.
 
-    They approach the budget so that what is missing of it is a part (1 - p)^power of what was missing at the start, p
-    the part of the densifications that have passed (Mallick et al. 2024, Taming 3DGS, for power 2). Computed from the
-    number `now` before this one, so that it needs no state, and a run that fell behind catches up.
+    They approach the budget in equal parts. Computed from the number `now` before this one, so that it needs no state,
+    and a run that fell behind catches up.
     """
-    left = remaining / (remaining + 1)
-    return budget - round((budget - now) * left**power)
+    return budget - round((budget - now) * (remaining / (remaining + 1)))
 
 
 @torch.no_grad()

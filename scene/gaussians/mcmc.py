@@ -20,7 +20,9 @@ from splatting.deterministic.counter_rng import Stream, random_bits
 from splatting.deterministic.portable_math import exp, log
 from splatting.distributed.rows import WHOLE, Shards, changes_rows
 
-MOST_PARTS = 51  # of one Gaussian (paper): itself and 50 copies
+MOST_PARTS = 51  # for which a divided Gaussian is corrected (paper): itself and 50 copies
+GATE_STEEPNESS = 100.0  # k of the paper's factor sigmoid(-k (o - t)) of the noise
+GATE_OPACITY = 0.005  # t of that: the opacity o with half of the noise
 _UNITS = 2**24  # of opacity 1, where Gaussians are drawn in proportion to it
 _MOST_LOGIT = 40.0  # an opacity of 1 - 4e-18; beyond, the sum of `_weight` would lose its digits
 _RELOCATION, _GROWTH = range(2)  # draws of one iteration
@@ -54,43 +56,41 @@ def is_alive(gaussians: GaussianParameters, min_opacity: float) -> Tensor:
     return gaussians.opacity_logits().reshape(-1) > logit(min_opacity)
 
 
-def relocate(gaussians: GaussianParameters, min_opacity: float, most_parts: int, *, seed: int, iteration: int) -> int:
+def relocate(gaussians: GaussianParameters, min_opacity: float, *, seed: int, iteration: int) -> int:
     """Move the Gaussians of an opacity <= min_opacity to others, which are drawn in proportion to their opacity.
 
-    A Gaussian and those that have come to it are equal parts of what it was, as far as these are at most
-    `most_parts`. Adam's averages of all of them restart at zero. seed and iteration decide the random numbers.
-    Returns the number of such Gaussians; if all are, nothing changes.
+    A Gaussian and those that have come to it are equal parts of what it was, as far as these are at most MOST_PARTS.
+    Adam's averages of all of them restart at zero. seed and iteration decide the random numbers. Returns the number of
+    such Gaussians; if all are, nothing changes.
     """
     live = is_alive(gaussians, min_opacity)
     dead = (~live).nonzero().reshape(-1)
     counts = gaussians.shards.ranks.numbers(len(dead))[:, 0]
     count = int(counts.sum())
     if 0 < count < gaussians.gaussian_count:
-        draws, origins = _divide(gaussians, live, count, most_parts, seed, iteration, _RELOCATION)
+        draws, origins = _divide(gaussians, live, count, seed, iteration, _RELOCATION)
         rows = gaussians.rows_at(origins)
         gaussians.table.overwrite(dead, gaussians.shards.send_draws(rows, draws, counts))
     return count
 
 
 @changes_rows
-def grow(gaussians: GaussianParameters, count: int, most_parts: int, *, seed: int, iteration: int) -> None:
+def grow(gaussians: GaussianParameters, count: int, *, seed: int, iteration: int) -> None:
     """Append `count` Gaussians, which are parts of others as `relocate` makes them."""
     every = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians._xyz.device)
-    draws, origins = _divide(gaussians, every, count, most_parts, seed, iteration, _GROWTH)
+    draws, origins = _divide(gaussians, every, count, seed, iteration, _GROWTH)
     append_rows(gaussians, gaussians.rows_at(origins), origins)
     gaussians.shards.order(draws)
 
 
 @torch.no_grad()
-def add_noise(
-    gaussians: GaussianParameters, size: float, steepness: float, threshold: float, *, seed: int, iteration: int
-) -> None:
-    """Move every centre by size g C n: its covariance C, standard normal n, g = sigmoid(steepness (threshold - o)).
+def add_noise(gaussians: GaussianParameters, size: float, *, seed: int, iteration: int) -> None:
+    """Move every centre by size g C n: its covariance C, standard normal n, the factor g of its opacity.
 
-    o: the opacity. seed and iteration decide n. Nothing moves once a guard holds steps back.
+    seed and iteration decide n. Nothing moves once a guard holds steps back.
     """
     shapes = gaussians.log_scales(), gaussians._rotation, gaussians.opacity_logits()
-    gate = {"size": size, "steepness": steepness, "threshold": threshold}
+    gate = {"size": size, "steepness": GATE_STEEPNESS, "threshold": GATE_OPACITY}
     numbers = {"seed": seed, "stream": Stream.NOISE, "iteration": iteration}
     guard = getattr(gaussians.optimizer, "guard", None)
     where = {"stopped": guard.stopped if guard else None, "first": gaussians.shards.first}
@@ -115,7 +115,7 @@ def penalise(gaussians: GaussianParameters, penalty: Penalty) -> None:
 
 
 def _divide(
-    gaussians: GaussianParameters, live: Tensor, count: int, most: int, seed: int, iteration: int, which: int
+    gaussians: GaussianParameters, live: Tensor, count: int, seed: int, iteration: int, which: int
 ) -> tuple[Tensor, Tensor]:
     """Draw the origins of `count` new Gaussians among those of `live`, and make each a part of what it was.
 
@@ -126,7 +126,7 @@ def _divide(
     numbers = {"seed": seed, "iteration": iteration, "draw": which}
     draws, origins = draw(units, count, **numbers, shards=gaussians.shards)
     sources, copies = origins.unique(return_counts=True)
-    opacities, larger = divided(logits[sources], (copies + 1).clamp_max(most))
+    opacities, larger = divided(logits[sources], (copies + 1).clamp_max(MOST_PARTS))
     log_scales = gaussians.log_scales()[sources] + larger[:, None]
     gaussians.table.overwrite(sources, gaussians.raw_shapes(opacities[:, None].float(), log_scales.float()))
     return draws, origins

@@ -90,5 +90,5 @@ def check_options(words: Sequence[str], where: str, parse: Parse | None) -> None
     args = found[0] if isinstance(found, tuple) else None
     if getattr(args, "advise", False):
         raise UserError(f"{where}: --advise trains nothing; give --options auto to follow it, or run train.py --advise")
-    if getattr(args, "viewer", None) is not None and not args.viewer_exit:
-        raise UserError(f"{where}: --viewer waits for its page to be closed; add --viewer_exit, or leave it out")
+    if getattr(args, "viewer", None) is not None:
+        raise UserError(f"{where}: --viewer waits for its page to be closed; leave it out")

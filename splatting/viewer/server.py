@@ -40,15 +40,12 @@ def add_host_option(parser: argparse.ArgumentParser) -> None:
 
 
 def add_viewer_options(parser: argparse.ArgumentParser) -> None:
-    """--viewer, --viewer_exit and --viewer_host of train.py."""
+    """--viewer and --viewer_host of train.py."""
     parser.add_argument(
         "--viewer", type=int, nargs="?", const=PORT, default=None, metavar="PORT",
         help=f"serve a web page that shows the training and controls it, at this port or {PORT}, and stays "
         "open after it (default: no page)",
     )  # fmt: skip
-    parser.add_argument(
-        "--viewer_exit", action="store_true", help="close the page when the training ends (default: off)"
-    )
     add_host_option(parser)
 
 

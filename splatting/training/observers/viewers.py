@@ -19,7 +19,6 @@ from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
 from splatting.training.observers.saves import Checkpoints
-from splatting.training.output_folder import view_command
 from splatting.training.run import Run
 from splatting.viewer.page import Page, serve
 from splatting.viewer.server import Address
@@ -126,14 +125,12 @@ class PageObserver(Observer):
         self._tab.show(speed, run.losses.mean, run.rows)
 
     def ended(self, error: Error) -> None:
-        """Let the page stay, unless an error or a signal ended the training, or --viewer_exit closes it."""
+        """Let the page stay, unless an error or a signal ended the training."""
         run = self._run
         by_button = isinstance(error, KeyboardInterrupt) and self._requests.stopped and not run.interrupt.requested
         try:
             if error is not None and not by_button:
                 self._page.notify("The training has stopped", "Its terminal says why, and how to resume it")
-            elif run.launch.viewer_exit:
-                self._page.notify("The training is over", f"See its model by {view_command(run.scene.model_path)}")
             else:
                 saved = as_utf8(f"{run.scene.model_path}/chkpnt{self._step.iteration}.pth")
                 self._stay(f"stopped and saved as {saved}" if by_button else "complete")
@@ -150,7 +147,7 @@ class PageObserver(Observer):
         self._tab.end(f"The training is {how}. This page stays until it is closed here, or by Ctrl-C in its terminal.")
         self._page.notify("The training is over", f"It is {how}; the page stays open")
         sys.stdout.flush()  # which may be a pipe
-        line = f"The page stays open at {self._page.url} until it is closed there, or Ctrl-C (--viewer_exit closes it)"
+        line = f"The page stays open at {self._page.url} until it is closed there, or Ctrl-C"
         tqdm.write(line, file=sys.stderr)
         serve(self._page)
 

@@ -1,8 +1,8 @@
 """Growth to a given number of Gaussians, where the training views' error is.
 
 After the growth curve of Mallick et al. 2024 (Taming 3DGS), the error-driven scores of Rota Bulo et al. 2024, and the
-long-axis split of Deng et al. 2025 (Improved-GS). Of these papers it departs as follows. The curve is even by default,
-which was no worse on small scenes and trains fewer Gaussians. Scores are sums of a pixel error times blending weight
+long-axis split of Deng et al. 2025 (Improved-GS). Of these papers it departs as follows. The curve is even, which
+was no worse on small scenes and trains fewer Gaussians. Scores are sums of a pixel error times blending weight
 over several views, and nothing else counts. Gaussians are drawn by their scores without
 replacement, not the highest taken. Children keep their parent's mean and covariance. Opacities are multiplied by a
 factor, where Rota Bulo et al. subtract a constant.
@@ -19,7 +19,6 @@ from scene.gaussians import density_rules as rules
 from scene.gaussians.budget import count_after, fade, remove_useless, split_in_two
 from scene.gaussians.morton import sort_rows
 from splatting.deterministic.counter_rng import Stream, permutation
-from splatting.deterministic.portable_math import exp, log
 from splatting.training.density import DensityControl, default_budget, refuse_empty
 from splatting.training.iteration import Iteration
 from splatting.training.strategies.error_scores import error_scores
@@ -27,8 +26,8 @@ from splatting.training.strategies.error_scores import error_scores
 if TYPE_CHECKING:
     from splatting.training.run import Run
 
+SCORED_VIEWS = 10  # at most, drawn anew in each densification
 ITERATIONS_A_SCORE = 5  # at least, of a scored view
-_SMALLEST = 1e-300
 
 
 class BudgetControl(DensityControl):
@@ -76,7 +75,7 @@ class BudgetControl(DensityControl):
     def _aim(self, now: int, iteration: int) -> int:
         """How many Gaussians there are to be after the densification of an iteration, `now` before it."""
         most = self.most(iteration, now, self.most_gaussians)
-        return count_after(now, most, self._remaining(iteration), self._opt.growth_power)
+        return count_after(now, most, self._remaining(iteration))
 
     def _grows(self, iteration: int) -> bool:
         return self.schedule.schedule_step(iteration) > self._opt.densify_from_iter
@@ -94,17 +93,13 @@ class BudgetControl(DensityControl):
 
     def _chosen(self, step: Iteration, count: int) -> Tensor:
         """Indices of this process's Gaussians to split, ascending; those of all processes are at most `count`."""
-        opt, shards = self._opt, self._gaussians.shards
         scores = self._scores(self._scored_views(step.iteration), step.background)
-        # The power of a score itself may be too small a number.
-        relative = scores / shards.largest(scores).clamp_min(_SMALLEST)
-        weights = exp(opt.score_power * log(relative)) * (scores > 0)
-        numbers = {"seed": opt.seed, "stream": Stream.DENSIFY, "iteration": step.iteration}
-        return shards.choose(weights, count, **numbers)
+        numbers = {"seed": self._opt.seed, "stream": Stream.DENSIFY, "iteration": step.iteration}
+        return self._gaussians.shards.choose(scores, count, **numbers)
 
     def _scored_views(self, iteration: int) -> list[Camera]:
         order = permutation(self._opt.seed, Stream.SCORED_VIEWS, iteration, len(self._cameras))
-        count = self._opt.score_views
+        count = SCORED_VIEWS
         if self.schedule.stride(iteration) > 1:  # few iterations, of which scores shall not take the time
             count = min(count, max(self._interval(iteration) // ITERATIONS_A_SCORE, 1))
         return [self._cameras[index] for index in order[:count]]

@@ -2,8 +2,7 @@
 
 Gaussians are taken for samples of a distribution, and training for a random walk among them. What departs from the
 paper: opacities and scales are penalised by their means, as in the authors' release, where the paper writes sums;
-Adam's averages restart for the moved Gaussians as well as for those that they come to; a Gaussian that would be divided
-into more than `--mcmc_parts` is corrected for so many.
+Adam's averages restart for the moved Gaussians as well as for those that they come to.
 """
 
 import argparse
@@ -79,29 +78,27 @@ class MarkovChain(DensityControl):
 
     def after_step(self, step: Iteration) -> None:
         """Add the noise of the random walk (the paper's update by Langevin dynamics)."""
-        opt = self._opt
         if self.changes(step.iteration):
             sort_rows(self._gaussians)
-        rate = self._gaussians.position_learning_rate * opt.mcmc_noise
-        gate = opt.mcmc_gate_steepness, opt.mcmc_gate_opacity
-        self._gaussians.add_noise(rate, *gate, seed=opt.seed, iteration=step.iteration)
+        rate = self._gaussians.position_learning_rate * self._opt.mcmc_noise
+        self._gaussians.add_noise(rate, seed=self._opt.seed, iteration=step.iteration)
 
     def _relocate(self, iteration: int) -> None:
         """Move what nobody sees (the paper's relocation of dead Gaussians), or remove random points (`most`)."""
-        least, parts, seed = self._opt.mcmc_min_opacity, self._opt.mcmc_parts, self._opt.seed
+        least = self._opt.mcmc_min_opacity
         count = self._gaussians.gaussian_count
         if 0 < (most := self.most(iteration, count, 0)) < count:
             remove_useless(self._gaussians, least, most)
-        dead = self._gaussians.relocate(least, parts, seed=seed, iteration=iteration)
+        dead = self._gaussians.relocate(least, seed=self._opt.seed, iteration=iteration)
         empty = dead == self._gaussians.gaussian_count
         refuse_empty(iteration, empty, "lower --mcmc_opacity_reg", f"with an opacity above {least} in")
 
     def _grow(self, iteration: int) -> None:
         """Grow to `_grown`."""
-        count, opt = self._gaussians.gaussian_count, self._opt
+        count = self._gaussians.gaussian_count
         new = self._grown(count, iteration) - count
         if new > 0:
-            self._gaussians.grow(new, opt.mcmc_parts, seed=opt.seed, iteration=iteration)
+            self._gaussians.grow(new, seed=self._opt.seed, iteration=iteration)
 
     def _grown(self, count: int, iteration: int) -> int:
         """The number after a growth: more by a part of it (the paper's rule of adding Gaussians), at least by one."""
