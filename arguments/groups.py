@@ -82,9 +82,6 @@ class ModelParams(OptionTable):
         Option("refine_poses", False, origin="ours", stored=MODEL_JSON,
             help="train a small correction of each training camera's pose with the Gaussians. The tracks of a COLMAP "
                  "scene hold the cameras, and place the test views"),
-        Option("refine_lens", False, origin="ours", stored=MODEL_JSON,
-            help="with --refine_poses, train a small correction of each camera's focal lengths, principal point and "
-                 "distortion, too"),
         Option("appearance", "none", origin="ours", check=one_of("none", "affine", "ppisp"), stored=MODEL_JSON,
             help="how photos of different exposure train. affine: --train_test_exp; ppisp: exposure and white balance "
                  "of each photo, vignetting and response of each camera, with the test photos held out; exports and "

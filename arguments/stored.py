@@ -21,7 +21,7 @@ _IN_CFG_ARGS = {option.name: option.default for option in OPTIONS if option.stor
 _IN_MODEL_JSON = {option.name: option.default for option in OPTIONS if option.stored == MODEL_JSON}
 _OF_TRAINING = {option.name: option.default for option in OPTIONS if not option.stored and option.compared}
 # Options of a model that change no picture, or whose change of it has a name of its own.
-_UNSEEN = {"sh_degree", "source_path", "model_path", "depths", "data_device", "refine_lens", "seed", "optimizer_type"}
+_UNSEEN = {"sh_degree", "source_path", "model_path", "depths", "data_device", "seed", "optimizer_type"}
 _OF_MODEL = {option.name for option in ModelParams.options if option.stored == MODEL_JSON}
 
 

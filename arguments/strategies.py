@@ -66,9 +66,6 @@ STRATEGY_OPTIONS: tuple[Option, ...] = (
         help="smaller views at first, so that the first iterations take less time. pyramid: a quarter of the size up "
              "to 10 % of the schedule, half of it up to 25 %; auto: pyramid where --time_budget leaves no more than an "
              "iteration for 4 megapixels of the schedule's views, else none"),
-    Option("target_psnr", 0.0, origin="ours", check=at_least(0),
-        help="stop, and save, once the mean PSNR (dB) of the test views (--eval) is at least this; 0: no target. They "
-             "are scored every 100 iterations, or every 20 times their number if that is more"),
     Option("schedule", "", origin="ours",
         help="schedule.json of a run with --time_budget: train as that run did, without looking at the clock. Or a "
              "number: so many iterations, which go through the whole schedule of --iterations in equal parts"),

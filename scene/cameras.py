@@ -4,7 +4,7 @@ Matrices are transposed, so that they multiply row vectors from the right. Camer
 """
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from scene.readers.depth_maps import depth_fit
 from scene.readers.info import CameraInfo
 from splatting.compat.camera_forms import SIGNATURE, of_either_form
 from splatting.host.machine import compute_device
-from utils.graphics_utils import camera_center, focal2fov, fov2focal, projection, world_to_camera
+from utils.graphics_utils import camera_center, fov2focal, projection, world_to_camera
 
 ZNEAR = 0.01  # ZNEAR and ZFAR only shape the clip depth and cull nothing
 ZFAR = 100.0
@@ -138,25 +138,6 @@ class Camera(nn.Module):
         self._numbers = self._on_device = None
         for name in _MATRICES:
             self.__dict__.pop(name, None)
-
-    def refocus(self, shares: Sequence[float]) -> None:
-        """Give it another lens, before it is `place`d.
-
-        shares: focal lengths and principal point, in parts of width and height, then the coefficients of its `lens`.
-        """
-        size = self._size * 2
-        self.fx, self.fy, self.cx, self.cy = (share * side for share, side in zip(shares[:4], size, strict=True))
-        self.FoVx, self.FoVy = focal2fov(self.fx, size[0]), focal2fov(self.fy, size[1])
-        offset = (2 * share - 1 for share in shares[2:4])
-        self._projection = projection(ZNEAR, ZFAR, self.FoVx, self.FoVy, *offset).numpy()
-        if self.lens:
-            self.lens = self.lens.with_values((self.fx, self.fy, self.cx - 0.5, self.cy - 0.5, *shares[4:]))
-
-    @property
-    def shares(self) -> list[float]:
-        """What `refocus` takes."""
-        of_size = zip((self.fx, self.fy, self.cx, self.cy), self._size * 2, strict=True)
-        return [value / side for value, side in of_size] + list(self.lens.values[4:] if self.lens else ())
 
     @property
     def numbers(self) -> np.ndarray:

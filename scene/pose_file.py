@@ -1,6 +1,5 @@
-"""poses.json: the refined poses of a model's views (--refine_poses), and their lenses (--refine_lens)."""
+"""poses.json: the refined poses of a model's views (--refine_poses)."""
 
-import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,18 +16,12 @@ NAME = "poses.json"
 _REMEDY = "save the model again, or write refine_poses=false into model.json to render from the dataset's poses"
 
 
-def write_poses(
-    folder: str | os.PathLike, train: Sequence[Camera], test: Sequence[Camera], with_lens: bool = False
-) -> None:
-    """Write the poses of both lists of cameras, in the dataset's order: names, and R and T as `Camera` has them.
-
-    with_lens: their `shares`, too.
-    """
+def write_poses(folder: str | os.PathLike, train: Sequence[Camera], test: Sequence[Camera]) -> None:
+    """Write the poses of both lists of cameras, in the dataset's order: names, and R and T as `Camera` has them."""
     lists = {"train": train, "test": test}
     table = {
         name: [
             {"img_name": camera.image_name, "R": np.asarray(camera.R).tolist(), "T": np.asarray(camera.T).tolist()}
-            | ({"lens": camera.shares} if with_lens else {})
             for camera in sorted(cameras, key=lambda camera: camera.uid)
         ]
         for name, cameras in lists.items()
@@ -59,18 +52,6 @@ def _placed(views: Sequence[CameraInfo], entries: Any, path: Path) -> list[Camer
         raise UserError(f"{path} has no list of poses; {_REMEDY}") from error
     if any(R.shape != (3, 3) or T.shape != (3,) for R, T in poses):
         raise UserError(f"{path} has a pose that is not R (3, 3) and T (3,); {_REMEDY}")
-    placed = [view._replace(R=R, T=T) for view, (R, T) in zip(views, poses, strict=True)]
-    return [_refocused(view, entry.get("lens"), path) for view, entry in zip(placed, entries, strict=True)]
-
-
-def _refocused(view: CameraInfo, shares: Any, path: Path) -> CameraInfo:
-    """A view with a lens of the file, if it has one. shares: as of `Camera.refocus`."""
-    if shares is None:
-        return view
-    count = len(view.native.values) if view.native else 4
-    numbers = isinstance(shares, list) and all(isinstance(one, float) and math.isfinite(one) for one in shares)
-    if not (numbers and len(shares) == count and min(shares[:2]) > 0):
-        raise UserError(f"{path} has a lens that is not {count} numbers; {_REMEDY}")
-    fx, fy, cx, cy = (share * side for share, side in zip(shares[:4], (view.width, view.height) * 2, strict=True))
-    native = view.native and view.native.with_values((fx, fy, cx - 0.5, cy - 0.5, *shares[4:]))
-    return view._replace(fx=fx, fy=fy, cx=cx, cy=cy, native=native)
+    if any("lens" in entry for entry in entries):
+        raise UserError(f"{path} has refined lenses, which this version does not know; {_REMEDY}")
+    return [view._replace(R=R, T=T) for view, (R, T) in zip(views, poses, strict=True)]

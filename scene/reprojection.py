@@ -1,49 +1,32 @@
 """Poses by the tracks of structure from motion: the reprojection error of points that stay where they are."""
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from scene.lens_correction import ENDS
 from scene.readers.tracks import Track
 
 OUTLIER = 1.0  # pixels; larger errors count linearly (Huber 1964)
 BOUND = 0.05  # of a correction: rotation in radians, and translation in extents of the scene
 _STEPS = 10
 _CHANCE = 10.0  # times what noise makes the loss fall on the mean; poses of structure from motion reach 5
-_LESS = 0.9  # of the loss: a lens whose loss falls less stays
-_RANK = 1e-9  # of the largest curvature: less says nothing of a lens
 _NEAR = 1e-3  # units of depth, or of distance from a fisheye; nearer points do not count
 _BEHIND = 3.0  # radians from the axis; beyond, the smallest turn moves a fisheye's points across the image
 
 
-class Seen(NamedTuple):
-    """A photo's pose and track, the focal length of its image (pixels), and `ray_slopes` (2, 15, K) of its lens."""
-
-    pose: np.ndarray
-    track: Track
-    focal: float
-    slopes: np.ndarray
-
-    def track_after(self, change: np.ndarray) -> Track:
-        """The track, whose rays pass through a lens that has changed (scene/lens_correction.py)."""
-        return self.track._replace(rays=self.track.rays + np.einsum("cjk,j->kc", self.slopes, change))
-
-
 class Pull(NamedTuple):
-    """A sum of Huber losses (pixels squared), its gradient (6,) by a twist, or (21,) by that and a lens's change."""
+    """A sum of Huber losses (pixels squared), and its gradient (6,) by a twist."""
 
     loss: float
     gradient: np.ndarray
-    slope: np.ndarray  # (2, 6 or 21, K): of the points' pixels
+    slope: np.ndarray  # (2, 6, K): of the points' pixels
     weight: np.ndarray  # (K,)
     size: np.ndarray  # (K,): errors, in pixels
 
     @property
     def curvature(self) -> np.ndarray:
-        """The Gauss-Newton matrix (6, 6), or (21, 21)."""
+        """The Gauss-Newton matrix (6, 6)."""
         return 2 * np.einsum("cjk,clk,k->jl", self.slope, self.slope, self.weight)
 
 
@@ -97,18 +80,13 @@ def twist_gradient(pose: np.ndarray, numbers: np.ndarray, unit: float) -> np.nda
     return np.array(turn + move)
 
 
-def pull(pose: np.ndarray, track: Track, focal: float, unit: float, slopes: np.ndarray | None = None) -> Pull:
-    """What the reprojection error of a track says of a pose, by `moved_pose`'s twist at 0. focal: pixels.
-
-    slopes: as of `Seen`; then what it says of the lens, too.
-    """
+def pull(pose: np.ndarray, track: Track, focal: float, unit: float) -> Pull:
+    """What the reprojection error of a track says of a pose, by `moved_pose`'s twist at 0. focal: pixels."""
     local = np.einsum("ij,kj->ik", pose[:3, :3], track.points) + pose[:3, 3:]
     rays, rows, seen = (_angular if track.angular else _straight)(local, unit)
     shown = focal * seen
     error = shown * (rays - track.rays.T)
     slope, size = shown * rows, np.hypot(*error)
-    if slopes is not None:
-        slope = np.concatenate([slope, -shown * slopes], 1)
     weight = OUTLIER / np.maximum(size, OUTLIER)
     loss = np.where(size <= OUTLIER, size**2, OUTLIER * (2 * size - OUTLIER)).sum()
     # einsum has one order of sums, whatever the number of threads.
@@ -165,30 +143,3 @@ def nearest_pose(pose: np.ndarray, track: Track | None, focal: float, unit: floa
     before, after = (pull(place, track, focal, unit).loss for place in (pose, found))
     better = (before - after) * (2 * len(track.points) - 6) > _CHANCE * 6 * after
     return found if better and turn <= bound and apart <= bound else pose
-
-
-def nearest_change(views: Sequence[Seen], unit: float, onto: np.ndarray) -> np.ndarray:
-    """The change (15,) of the lens of views whose reprojection error is least, together with poses; 0 for little gain.
-
-    onto: as `allowed` of scene/lens_correction.py. Bundle adjustment of points that stay where they are: poses are
-    eliminated from each step (Triggs et al. 2000, section 6.1). A change beyond BOUND is none, either.
-    """
-    poses, change = [view.pose for view in views], np.zeros(len(onto))
-    losses = []
-    for _ in range(_STEPS + 1):
-        matrix, vector, solved, loss = np.zeros_like(onto), np.zeros(len(onto)), [], 0.0
-        for pose, view in zip(poses, views, strict=True):
-            at = pull(pose, view.track_after(change), view.focal, unit, view.slopes)
-            curvature = 2 * np.einsum("cjk,clk->jl", at.slope * at.weight, at.slope)
-            across, own = curvature[:6, 6:], curvature[6:, 6:]
-            by = np.linalg.solve(damped(curvature[:6, :6]), np.column_stack([at.gradient[:6], across]))
-            matrix += own - across.T @ by[:, 1:]
-            vector += at.gradient[6:] - across.T @ by[:, 0]
-            solved.append(by)
-            loss += at.loss
-        losses.append(loss)
-        step = -np.linalg.pinv(onto @ matrix @ onto, _RANK, hermitian=True) @ (onto @ vector)
-        change = change + step
-        poses = [moved_pose(pose, -by[:, 0] - by[:, 1:] @ step, unit) for pose, by in zip(poses, solved, strict=True)]
-    lengths = [np.linalg.norm(part) for part in np.split(change, ENDS[:-1])]
-    return change if losses[-1] < _LESS * losses[0] and max(lengths) <= BOUND else np.zeros(len(onto))

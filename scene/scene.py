@@ -19,7 +19,6 @@ from scene.gaussians.ppisp import UNTRAINED, Ppisp
 from scene.half_images import half, train_on_all
 from scene.images.masks import MaskOptions, check_masks
 from scene.images.store import ImageStore, Picture, image_device
-from scene.lens_correction import shares_of
 from scene.pose_file import with_poses, write_poses
 from scene.readers.depth_maps import with_depth_maps
 from scene.readers.info import CameraInfo, SceneInfo, exposure_names, photo_size, without_validation
@@ -64,7 +63,6 @@ class Scene:
         self._halves = bool(getattr(args, "train_test_exp", False))
         self._appearance = getattr(args, "appearance", "none") == Ppisp.kind
         self._refines = bool(getattr(args, "refine_poses", False)) and not getattr(args, "other_scene", "")
-        self._refines_lens = bool(getattr(args, "refine_lens", False))
         self.info = self._read(args)
         self.validation: list[CameraInfo] = []
         if getattr(args, "keep_best", False) and not getattr(args, "other_scene", ""):
@@ -138,8 +136,6 @@ class Scene:
         views = [copy.copy(camera) for camera in self.getTestCameras()] if self._refines else []
         for camera in views:
             given = self._given[camera.uid]
-            if self._refines_lens:
-                camera.refocus(shares_of(given).tolist())
             camera.place(given.R, given.T)
         return views
 
@@ -158,7 +154,7 @@ class Scene:
     def save_views(self) -> None:
         """Write `poses.json`, and `exposure.json` or `appearance.json`, if poses or the photos' look are trained."""
         if self._refines:
-            write_poses(self.model_path, self.getTrainCameras(), self.getTestCameras(), self._refines_lens)
+            write_poses(self.model_path, self.getTrainCameras(), self.getTestCameras())
         if self._appearance:
             self.gaussians.save_exposures(self.model_path)
         if self._halves:

@@ -59,7 +59,7 @@ ABSURD = {
     "mcmc_growth": "-0.1 1.1", "mcmc_min_opacity": "0 1", "mcmc_noise": "-1 inf 1e300",
     "mcmc_opacity_reg": "-0.01",
     "mcmc_scale_reg": "-0.01", "mcmc_init_opacity": "1", "mcmc_init_scale": "-0.1", "resolution_schedule": "fine",
-    "target_psnr": "-3", "time_budget": "-1 inf 1e300", "gpu_memory": "-1 nan 1e300",
+    "time_budget": "-1 inf 1e300", "gpu_memory": "-1 nan 1e300",
     "exposure_lr_init": "-0.1", "exposure_lr_delay_steps": "-1",
     "exposure_lr_delay_mult": "1.5", "depth_l1_weight_final": "-1",
 }
@@ -269,7 +269,7 @@ def test_model_json_has_what_is_stored_there_with_sorted_keys(tmp_path):
     }  # fmt: skip
     write_cfg_args(tmp_path, argparse.Namespace())
     del record["options"]
-    defaults = {"masks": "", "mask_meaning": "auto", "lenses": "auto", "refine_poses": False, "refine_lens": False,
+    defaults = {"masks": "", "mask_meaning": "auto", "lenses": "auto", "refine_poses": False,
                 "appearance": "none", "keep_best": False}  # fmt: skip
     assert read_stored_options(tmp_path) == {**MODEL, **record, **defaults}
 

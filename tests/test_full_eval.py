@@ -380,7 +380,6 @@ def test_a_training_that_ends_by_itself(evaluate):
         ("--iterations 40 --time_budget 0.5", None),
         ("--time_budget=20", None),
         ("--schedule schedule.json", None),
-        ("--target_psnr 30", None),
         ("--iterations many", None),
     ],
 )
@@ -686,7 +685,7 @@ def test_a_rehearsal_tells_what_would_run_and_how_long_and_writes_nothing(colmap
     assert first.startswith("| colmap_scene | plain | 0 | 12, 3 | 48x32 | 40 | to train | ") and "timed piece" in first
     assert remark.startswith("at least") and not evaluate.out.exists()
     (piece,) = evaluate.calls()  # the scene is the same in all four
-    assert "--seed 0 --time_budget=0 --target_psnr=0 --schedule= --iterations 200" in " ".join(piece)
+    assert "--seed 0 --time_budget=0 --schedule= --iterations 200" in " ".join(piece)
     evaluate("colmap_scene", "--seeds", 0, *given)
     before, calls = folder_state(evaluate.out), evaluate.calls()
     _, _, *rows, remark = told(*both, *given)
@@ -695,8 +694,8 @@ def test_a_rehearsal_tells_what_would_run_and_how_long_and_writes_nothing(colmap
     assert "this scene" in told(*both, "--configs", "strategies")[2]
     (tmp_path / "sets.json").write_text('{"seeded": ["--seed", "5", "-r", "2", "--keep_best"]}')
     assert "other seeds" in told("--configs", tmp_path / "sets.json")[2]
-    with pytest.raises(UserError, match="--keep_best does not go with --target_psnr"):
-        told("--configs", tmp_path / "sets.json", "--", "--target_psnr", 9)
+    with pytest.raises(UserError, match="--keep_best does not go with --train_test_exp"):
+        told("--configs", tmp_path / "sets.json", "--", "--train_test_exp")
     photo = min((colmap_scene / "images").rglob("*.png"))
     photo.unlink()
     with pytest.raises(UserError, match=f"colmap_scene, plain, seed 0: .*{photo.name}"):

@@ -120,7 +120,7 @@ def test_options_that_need_files_are_refused(method):
 
 @pytest.mark.parametrize(
     "given",
-    [("keep_best", True), ("keep_best", "true"), ("options", "auto"), ("advise", True), ("target_psnr", 20),
+    [("keep_best", True), ("keep_best", "true"), ("options", "auto"), ("advise", True),
      ("resolution", 4), ("viewer", 8080), ("checkpoint_iterations", 7), ("start_checkpoint", "chkpnt7.pth")],
 )  # fmt: skip
 def test_options_that_nothing_would_follow_are_refused(method, given):

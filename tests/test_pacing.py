@@ -14,11 +14,9 @@ from gaussians import options
 from trainings import before_steps, train_on
 
 from scene.gaussians import density_rules as rules
-from scene.gaussians.checkpoint import load_checkpoint
 from splatting.evaluation.training_log import Stopwatch
 from splatting.training.density import DensityControl
 from splatting.training.iteration import Iteration
-from splatting.training.observers import report
 from splatting.training.observers.report import ProgressBar
 from splatting.training.observers.saves import ScheduleFile
 from splatting.training.resolution import Resolution
@@ -387,31 +385,6 @@ def test_a_short_training_by_the_clock_begins_with_smaller_views_and_replays(
     assert "--resolution_schedule" not in capsys.readouterr().err  # as that is its name
 
 
-def test_training_stops_at_the_target_with_the_model_that_was_scored(colmap_scene, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(report, "EVERY", 10)
-    monkeypatch.setattr(report, "PER_VIEW", 1)
-    whole, stopped, again = (tmp_path / name for name in ("whole", "stopped", "again"))
-    more = "--iterations", 120, "--prune_sh", -1, "--keep_unseen", "--save_iterations", *range(10, 120, 10)
-    saved = _train(colmap_scene, whole, *more, "--target_psnr", 99)
-    records = json.loads((whole / "train_log.json").read_text())
-    assert any("and --target_psnr 99 was not reached" in line for line in records[-1]["lines"])
-    scores = {record["iteration"]: record["test_views_psnr"] for record in records if "test_views_psnr" in record}
-    assert list(scores) == list(range(10, 130, 10)) and scores[60] > scores[10]
-    wanted = 0.5 * (scores[30] + scores[60])
-    end = next(iteration for iteration, psnr in scores.items() if psnr >= wanted)
-    assert 30 < end < 120
-    early = _train(colmap_scene, stopped, *more, "--target_psnr", wanted)
-    assert max(early) == end and early == {t: ply for t, ply in saved.items() if t <= end}
-    assert f"{end} iterations in " in capsys.readouterr().out
-    _train(colmap_scene, whole, *more, "--target_psnr", wanted)
-    assert "and other commands take the highest" in capsys.readouterr().err
-    # With a time budget, whichever comes first; the schedule then says where the run ended.
-    _timed(monkeypatch, lambda t: 0.1)
-    early = _train(colmap_scene, again, "--time_budget", 20, "--target_psnr", wanted)
-    ended = read_schedule(again / "schedule.json").ended
-    assert ended == max(early) < 200 and ended % 10 == 0
-
-
 def test_what_contradicts_itself_is_refused(colmap_scene, tmp_path):
     path = tmp_path / "schedule.json"
 
@@ -484,17 +457,6 @@ def test_a_checkpoint_comes_with_its_schedule_and_the_last_one_is_the_end(colmap
     assert read_schedule(tmp_path / "schedule.json").ended == int(checkpoint.stem[6:])
     with pytest.raises(UserError, match="and its schedule ends with .*, so nothing is left to do"):
         _train(colmap_scene, tmp_path / "on", "--time_budget", 4, "--start_checkpoint", checkpoint)
-
-
-def test_an_iteration_that_becomes_the_last_takes_no_step(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(report, "EVERY", 7)
-    monkeypatch.setattr(report, "PER_VIEW", 1)
-    states = []
-    for name in ("fused", "plain"):
-        more = ["--plain_step"] if name == "plain" else []
-        _train(colmap_scene, tmp_path / name, "--target_psnr", 1, "--checkpoint_iterations", 100, *more)
-        states.append(load_checkpoint(tmp_path / name / "chkpnt7.pth")[0])
-    assert torch.equal(states[0][1], states[1][1]) and states[0][10]["state"][0]["step"].item() == 6
 
 
 def test_a_steady_run_leaves_the_schedule_of_a_folder_where_it_goes_on(colmap_scene, tmp_path, monkeypatch, capsys):

@@ -31,7 +31,8 @@ from splatting.demo.objects import demo_scene
 from splatting.demo.tracer import FISHEYE, ring_views
 from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.results import read_run
-from splatting.training import pose_refinement, tracked_poses
+from splatting.training import bounded_adam, pose_refinement, tracked_poses
+from splatting.training.bounded_adam import BoundedAdam
 from splatting.training.pose_refinement import PoseRefinement
 from utils.graphics_utils import camera_center, world_to_camera
 from utils.system_utils import UserError
@@ -122,7 +123,7 @@ def test_a_pose_may_stay():
     noisy, near = _track(200, 1e-3), moved_pose(POSE, 1e-3 * TURN, 1.0)
     assert nearest_pose(near, noisy, 500.0, 1.0, BOUND) is near  # by a hundredth of the errors' size
     assert nearest_pose(moved_pose(POSE, 0.05 * TURN, 1.0), noisy, 500.0, 1.0, BOUND) is not near
-    tracked = tracked_poses.TrackedPoses([near], [noisy], [500.0], [None], 1.0)
+    tracked = tracked_poses.TrackedPoses([near], [noisy], [500.0], 1.0)
     assert not tracked.pulled(0, np.zeros(6)).any()  # it is held there
     assert tracked.pulled(0, TURN).any()
 
@@ -286,6 +287,20 @@ def test_the_gradient_of_a_twist(tmp_path):
     np.testing.assert_allclose(got, unit * twist.grad, rtol=1e-5, atol=1e-5)
 
 
+def test_bounded_adam_is_torchs(monkeypatch):
+    monkeypatch.setattr(bounded_adam, "BOUND", 10.0)
+    mine, rates = BoundedAdam(2), [0.1, 0.05, 0.02]
+    value = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    theirs = torch.optim.Adam([value], betas=(0.9, 0.99), eps=1e-12)
+    for rate in rates:
+        gradient = np.random.default_rng(int(100 * rate)).normal(size=6)
+        mine.step(1, gradient, rate)
+        theirs.param_groups[0]["lr"], value.grad = rate, torch.from_numpy(gradient)
+        theirs.step()
+    np.testing.assert_allclose(mine.values[1], value.detach().numpy(), rtol=1e-12)
+    assert not mine.values[0].any()
+
+
 def test_steps_are_bounded_and_follow_the_gradient(tmp_path, monkeypatch):
     make_colmap_scene(tmp_path)
     _, poses = _refinement(tmp_path)
@@ -322,7 +337,7 @@ def test_tracks_hold_a_camera(tmp_path):
     poses._drift = np.zeros((7, poses.twists.size)), np.zeros((7, 7))
     for step in range(400):
         poses.step(0, _gradient(poses, 0, np.array([0.02, 0, 0, 0, 0, 0])), step // 4)
-    rest = np.linalg.solve(1e-3 * poses._tracked.held[0][1], [-0.02, 0, 0, 0, 0, 0])
+    rest = np.linalg.solve(1e-3 * poses._tracked.held[0], [-0.02, 0, 0, 0, 0, 0])
     np.testing.assert_allclose(poses.twists[0], rest, atol=0.1 * np.abs(rest).max())
 
 
@@ -378,6 +393,19 @@ def test_test_views_are_scored_with_given_poses_too(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["x", "-m", str(out), "--skip_train"])
     render.main()
     assert [path.name for path in (out / "test").iterdir()] == ["ours_200"]
+
+
+def test_files_with_refined_lenses_are_refused(tmp_path):
+    make_colmap_scene(tmp_path)
+    scene, poses = _refinement(tmp_path)
+    with pytest.raises(UserError, match="the checkpoint has refined lenses, .*; train from the start"):
+        poses.restore(poses.captured() | {"lenses": {}})
+    scene.save_views()
+    table = json.loads((tmp_path / "out" / NAME).read_text())
+    table["train"][0]["lens"] = [1.0, 1.0, 0.5, 0.5]
+    (tmp_path / "out" / NAME).write_text(json.dumps(table))
+    with pytest.raises(UserError, match="has refined lenses, .* write refine_poses=false into model.json"):
+        with_poses(scene.info, tmp_path / "out")
 
 
 @pytest.mark.parametrize(

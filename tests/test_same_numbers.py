@@ -28,7 +28,7 @@ SETS = {
     "ppisp": ("--appearance", "ppisp", "--sparse_depth", 0.5),
     "native": ("--lenses", "native", "--filter_3d", "--antialiasing", "--optimizer_type", "sparse_adam"),
     "undistorted": ("--lenses", "undistort", "--masks", "masks", "--keep_best"),
-    "poses": ("--refine_poses", "--refine_lens", "--resolution_schedule", "pyramid", "--init_type", "random"),
+    "poses": ("--refine_poses", "--resolution_schedule", "pyramid", "--init_type", "random"),
     "passers-by": ("--robust_mask", 0.2, "--sky", "auto", "--strategy", "budget", "--images_to_load", 5),
     "in PyTorch": ("--convert_SHs_python", "--compute_cov3D_python", "--strategy", "mcmc", "-i", "images/."),
     "RGBA": ("--random_background",),
@@ -51,7 +51,7 @@ OTHERS = {
     *("absgrad", "absgrad_threshold", "split", "mcmc_until_iter", "mcmc_growth", "mcmc_min_opacity"),
     *("mcmc_noise", "mcmc_opacity_reg", "mcmc_scale_reg"),
     *("mcmc_init_opacity", "mcmc_init_scale", "opacity_decay"),
-    *("prune_opacity", "time_budget", "target_psnr", "schedule"),
+    *("prune_opacity", "time_budget", "schedule"),
 }
 
 

@@ -12,11 +12,10 @@ import torch
 from gaussians import needs_fused_step
 from rasterizer_tools import GPU_MARKS
 from step_ways import Rerun, fused_iterations, take_as  # noqa: F401  (a fixture)
-from trainings import ITERATIONS, OPTIONS, differences, leaves, shared_scene, trained, whole_result
+from trainings import ITERATIONS, OPTIONS, differences, leaves, shared_scene, trained
 
 from splatting.training import run
 from splatting.training.objective import Losses, Objective
-from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.steps import speculative, step_taker
 from splatting.training.steps.captured import CapturedStep, Graphs, Recorder
 from splatting.training.steps.fused import FusedStep
@@ -66,25 +65,6 @@ def test_a_gradient_of_nan_ends_in_the_same_way(scene, tmp_path, monkeypatch, it
         left = {path.name: leaves(torch.load(path, weights_only=False)) for path in out.glob("*.pth")}
         ends.append((said, left))
     assert ends[0] == ends[1] and ends[0][1]
-
-
-@pytest.mark.parametrize("iteration", [20, 25])
-def test_a_training_that_ends_early_leaves_the_same_checkpoint(scene, tmp_path, monkeypatch, iteration):
-    """An observer says so when the loss is known; the view still counts in the statistics."""
-    measured = DivergenceWatch.measured
-
-    def ending(self, step, losses):
-        if step.iteration == iteration:
-            step.end(ITERATIONS)
-        measured(self, step, losses)
-
-    monkeypatch.setattr(DivergenceWatch, "measured", ending)
-    found = []
-    for way in ((), ("--plain_step",)):
-        with pytest.raises(FileNotFoundError):  # of the last iteration
-            trained(scene, tmp_path / str(len(way)), *way)
-        found.append(whole_result(tmp_path / str(len(way)), iteration))
-    assert not differences(*found)
 
 
 def test_losses_that_are_kept_keep_no_image(scene, tmp_path, monkeypatch):

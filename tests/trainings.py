@@ -55,7 +55,6 @@ OPTIONS = {
     "poses": ("--refine_poses", "--resolution_schedule", "pyramid"),
     "poses, no graph": ("--refine_poses", "--train_test_exp", "-d", "depths", "--depth_l1_weight_init", 1),
     "exposure and sizes": ("--train_test_exp", "--resolution_schedule", "pyramid", "-r", 1),
-    "poses and lenses": ("--refine_poses", "--refine_lens", "--resolution_schedule", "pyramid"),
     "budget errors": (*BUDGET, "--train_test_exp"),
 }
 

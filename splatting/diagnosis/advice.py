@@ -48,8 +48,7 @@ _AGAINST = {  # by an advised option: the options, with these values, that it do
 }
 _OFF = (False, "", "none", "off")  # values of options that do nothing; 0 is equal to False
 _NOT_OF_DATA = {  # model options that the short training of small photos has itself, or does without
-    "sh_degree", "model_path", "resolution", "depths", "keep_best", "train_test_exp", "refine_poses", "refine_lens",
-    "appearance",
+    "sh_degree", "model_path", "resolution", "depths", "keep_best", "train_test_exp", "refine_poses", "appearance",
 }  # fmt: skip
 _WIDTH = 200  # pixels of a photo
 _DARK, _LIGHT = 0.02, 0.98  # of a channel; beyond, an exposure cannot be told

@@ -104,7 +104,7 @@ def logged(model: Path, warn: bool = False) -> dict[int, dict[str, Any]]:
 def trained_iterations(model: Path) -> list[int]:
     """List the saved iterations of the training that the log tells of, ascending.
 
-    Where the clock or a score ends a training, an earlier one of the same options may have left a later iteration.
+    Where the clock ends a training, an earlier one of the same options may have left a later iteration.
     """
     saved, end = saved_iterations(model / "point_cloud"), max(logged(model), default=None)
     return saved if end not in saved else [iteration for iteration in saved if iteration <= end]

@@ -36,7 +36,7 @@ _DEFAULT_ITERATIONS = next(option.default for option in OptimizationParams.optio
 RECORD = "full_eval.json"  # in a model folder: finished stages with their inputs, machine and seconds
 ADVICE = "advice.json"  # what train.py --advise writes there: texts, and options that the scene asks for
 _AUTO = ("--options", "auto")
-ENDING = ("time_budget", "schedule", "target_psnr")  # options by which a training ends before or after --iterations
+ENDING = ("time_budget", "schedule")  # options by which a training ends before or after --iterations
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ FINISHED, TO_SCORE = "finished", "to render and score"  # states of a run
 REST = ("render_", "metrics", "html")  # beginnings of the names of stages after training
 Child = Callable[..., Finished]
 PIECE = 200  # iterations of a timed piece
-_TO_THE_END = ("--time_budget=0", "--target_psnr=0", "--schedule=")  # without the options of plan.ENDING
+_TO_THE_END = ("--time_budget=0", "--schedule=")  # without the options of plan.ENDING
 
 
 @dataclass(frozen=True)

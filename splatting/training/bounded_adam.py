@@ -1,23 +1,23 @@
-"""Small corrections that are trained on the host: bounded numbers, each row with steps of Adam of its own."""
+"""Twists of cameras that are trained on the host: bounded, each with steps of Adam of its own."""
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
+
+from scene.reprojection import BOUND
 
 _BETAS, _EPS = (0.9, 0.99), 1e-12
 
 
 class BoundedAdam:
-    """Rows of numbers (n, k) float64 that begin at 0, with Adam's averages and counts of steps (Kingma and Ba 2015).
+    """Twists (n, 6) float64 that begin at 0, with Adam's averages and counts of steps (Kingma and Ba 2015).
 
-    ends: of the parts of a row, none of which gets longer than the bound.
+    Neither the rotation nor the translation of a twist gets longer than BOUND.
     """
 
-    def __init__(self, count: int, ends: Sequence[int], bound: float) -> None:
-        self.values, self.mean, self.square = (np.zeros((count, ends[-1])) for _ in range(3))
+    def __init__(self, count: int) -> None:
+        self.values, self.mean, self.square = (np.zeros((count, 6)) for _ in range(3))
         self.counts = np.zeros(count)
-        self._parts, self._bound = [slice(*part) for part in zip((0, *ends), ends, strict=False)], bound
 
     @property
     def state(self) -> tuple[np.ndarray, ...]:
@@ -33,8 +33,8 @@ class BoundedAdam:
         square = self.square[row] = _BETAS[1] * self.square[row] + (1 - _BETAS[1]) * gradient**2
         to_mean, to_square = (1 - beta**count for beta in _BETAS)
         values = self.values[row] - rate * (mean / to_mean) / (np.sqrt(square / to_square) + _EPS)
-        for part in self._parts:
+        for part in (slice(3), slice(3, 6)):
             length = math.hypot(*values[part].tolist())
-            if length > self._bound:
-                values[part] *= self._bound / length
+            if length > BOUND:
+                values[part] *= BOUND / length
         self.values[row] = values

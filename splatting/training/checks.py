@@ -64,32 +64,24 @@ def check_one_process(option: str, several: bool) -> None:
 
 
 def check_keep_best(dataset: argparse.Namespace, opt: argparse.Namespace, several: bool) -> None:
-    """Refuse --keep_best where more than Gaussians would have to be kept, or a score ends the training (UserError)."""
+    """Refuse --keep_best where more than Gaussians would have to be kept (UserError)."""
     check_one_process("--keep_best", several)
-    apart = {"appearance": "none", "refine_poses": False, "target_psnr": 0.0, "train_test_exp": False}
+    apart = {"appearance": "none", "refine_poses": False, "train_test_exp": False}
     given = vars(dataset) | vars(opt)
     if wrong := [name for name, default in apart.items() if given.get(name, default) != default]:
         raise UserError(f"--keep_best does not go with --{wrong[0]}; leave one of them out")
 
 
 def check_poses(dataset: argparse.Namespace, projection: str = "ewa") -> None:
-    """Refuse to refine poses on rays, and lenses without poses (UserError)."""
+    """Refuse to refine poses on rays (UserError)."""
     if projection == "ray" and getattr(dataset, "refine_poses", False):
         raise UserError("--projection ray has no gradients of poses; leave --refine_poses out, or use ewa")
-    if getattr(dataset, "refine_lens", False) and not getattr(dataset, "refine_poses", False):
-        raise UserError("--refine_lens corrects lenses together with poses; give --refine_poses, too")
 
 
 def check_unrefined(poses: object, checkpoint: str) -> None:
     """Refuse a checkpoint with refined poses that this run would not use (UserError)."""
     if poses:
         raise UserError(f"{checkpoint} was trained with --refine_poses; give that option")
-
-
-def check_target(target_psnr: float, test_views: int) -> None:
-    """Refuse a target for test views that are not there (UserError)."""
-    if target_psnr and not test_views:
-        raise UserError("--target_psnr needs held-out views to score, and there are none; give --eval")
 
 
 def check_photos(appearance: str, count: int) -> None:

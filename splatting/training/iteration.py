@@ -13,10 +13,7 @@ from utils.system_utils import UserError
 
 @dataclass(slots=True)
 class Iteration:
-    """One iteration, counted from 1. Run.iterations makes it; later change only `due` to `stopping`, and its end.
-
-    An observer that is asked before those that save may end the training with this iteration (`end`), in `measured`.
-    """
+    """One iteration, counted from 1. Run.iterations makes it; later change only `due` to `stopping`."""
 
     iteration: int
     last: bool  # nothing comes after it, so it takes no step
@@ -25,7 +22,7 @@ class Iteration:
     depth_weight: float  # of the depth loss, 0 if the view has no reliable depth map
     changes: bool  # rows of the Gaussians, the SH degree, the size of views or the 3D filter change in this iteration
     started: float  # seconds of training before it
-    span: range  # steps of the schedule that it stands for (training/schedule.py)
+    span: range  # steps of the schedule that it stands for (training/schedule.py); of the last, all that are left
     points: PointDepths | None = None  # of the depth of points, None: not wanted, or the view has none
     sky: PointDepths | None = None  # the same of what is far away
     due: bool = False  # the model is read, written or changed, so every loss so far must be checked first
@@ -42,10 +39,6 @@ class Iteration:
     def takes(self, planned: Collection[int]) -> bool:
         """Whether what is planned for an iteration of the schedule is to be done in it."""
         return any(iteration in planned for iteration in self.span)
-
-    def end(self, length: int) -> None:
-        """Make it the last one; what is planned for the rest of the schedule, of a length, is done in it."""
-        self.last, self.span = True, range(self.span.start, length + 1)
 
 
 class ViewOrder:

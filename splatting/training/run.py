@@ -104,7 +104,6 @@ class Run:
         init_ply = None if self.start else getattr(dataset, "init_ply", None)
         self.scene, first = scene_with(init_ply, dataset, self.gaussians, ranks=self.group)
         checks.check_scene(self.scene, dataset, bool(self.start))
-        checks.check_target(opt.target_psnr, len(self.scene.getTestCameras()))
         agree_on_scene(self.scene, self.start)  # before an image is shared
         points = self.scene.info.point_cloud.points if first is None else first
         count = len(points if capture is None else capture[1])
@@ -143,8 +142,7 @@ class Run:
         if not getattr(self.dataset, "refine_poses", False):
             checks.check_unrefined(state, self.start)
             return None
-        with_lens = getattr(self.dataset, "refine_lens", False)
-        poses = PoseRefinement(self.scene, self.dataset.source_path, self.opt.iterations, with_lens)
+        poses = PoseRefinement(self.scene, self.dataset.source_path, self.opt.iterations)
         if capture:
             poses.restore(state)
         return poses
@@ -249,9 +247,7 @@ class Run:
     def _check_records(self) -> None:
         """Compare this run with those before it, in its folder and beside its checkpoint."""
         start = self.start
-        # A target may come before any of the iterations that are planned.
-        planned = self.launch.save_iterations, self.launch.checkpoint_iterations
-        saves = [[] if self.opt.target_psnr else self.schedule.known(one) for one in planned]
+        saves = [self.schedule.known(one) for one in (self.launch.save_iterations, self.launch.checkpoint_iterations)]
         checks.check_folder(self.options, saves[0], start, self.first_iteration, saves[1])
         if start:
             checks.report_changes(start, self.options)
@@ -290,20 +286,19 @@ class Run:
             seconds, schedule = self.clock.seconds, self.schedule
             schedule.reach(iteration, self.log.seconds_before + seconds)
             camera = self.resolution.view(self.views[iteration], schedule.schedule_step(iteration))
+            span, last = schedule.span(iteration), schedule.is_last(iteration)
             step = Iteration(
                 iteration,
-                last=False,
+                last=last,
                 camera=camera,
                 background=self._background(iteration),
                 depth_weight=self._depth_weight(schedule.schedule_step(iteration)) if camera.depth_reliable else 0.0,
                 changes=self._changes(iteration),
                 started=seconds,
-                span=schedule.span(iteration),
+                span=range(span.start, schedule.length + 1) if last else span,
                 points=self.sparse_depth and self.sparse_depth.at(camera),
                 sky=self.sky and self.sky.at(camera, self.scene),
             )
-            if schedule.is_last(iteration):
-                step.end(schedule.length)
             yield step
             if iteration == self.first_iteration + 1:
                 self.first_done = seconds_since_start()
@@ -393,8 +388,8 @@ class Run:
 
     def step_pose(self, step: Iteration, gradient: Tensor) -> None:
         """Take the step of the view's pose. gradient (numbers,): of the loss by the camera's numbers."""
-        camera, at = step.camera, self.schedule.schedule_step(step.iteration)
-        self.poses.step(camera.uid, gradient.cpu().numpy(), at, (camera.image_width, camera.image_height))
+        at = self.schedule.schedule_step(step.iteration)
+        self.poses.step(step.camera.uid, gradient.cpu().numpy(), at)
         self.poses.place()
 
     def after_step(self, step: Iteration) -> None:

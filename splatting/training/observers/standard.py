@@ -8,7 +8,7 @@ from splatting.training.observer import Observer
 from splatting.training.observers.curve import Curve
 from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.observers.guards import MaskWatch, MemoryGuard, OddPhotos, PassersBy
-from splatting.training.observers.report import ProgressBar, Records, Report, Summary, Target, training_report
+from splatting.training.observers.report import ProgressBar, Records, Report, Summary, training_report
 from splatting.training.observers.saves import Checkpoints, KeepBest, Saves, ScheduleFile
 from splatting.training.observers.viewers import NetworkViewer, PageObserver
 from splatting.training.run import Run
@@ -27,7 +27,6 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
         watch,  # first: observers that write rely on all losses so far being finite
         *([ProgressBar(run)] if run.group.first else []),  # reads the losses that the watch has checked
         MaskWatch(run.scene.getTrainCameras()),  # may refuse the scene before anything is written
-        *([Target(run)] if run.opt.target_psnr else []),  # may make this iteration the last, which others look at
         *([Curve(run)] if with_curve else []),  # the scores are those of the model saved at the same iteration
         *([KeepBest(run)] if run.best else []),
         Report(run, writer, report),

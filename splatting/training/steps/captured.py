@@ -130,8 +130,7 @@ class CapturedStep(FusedStep):
         row = self._rows[at.iteration % _ROWS]
         row.copy_(self.camera_gradient, non_blocking=True)
         copied = torch.cuda.current_stream().record_event() if row.is_pinned() else None
-        size = at.camera.image_width, at.camera.image_height
-        self._fetched[at.iteration] = _Fetched(at.camera.uid, size, row, copied)
+        self._fetched[at.iteration] = _Fetched(at.camera.uid, row, copied)
 
     def _step_poses(self, most: int) -> None:
         """Take the steps of poses that steps of the Gaussians left behind, but at most so many of the last.
@@ -144,7 +143,7 @@ class CapturedStep(FusedStep):
             if fetched.copied is not None:
                 fetched.copied.synchronize()
             step = self._run.schedule.schedule_step(iteration)
-            self._run.poses.step(fetched.uid, fetched.gradient.numpy(), step, fetched.size)
+            self._run.poses.step(fetched.uid, fetched.gradient.numpy(), step)
 
     # What speculation asks for, of steps that are done or overflowed
 
@@ -173,7 +172,6 @@ class CapturedStep(FusedStep):
 @dataclass
 class _Fetched:
     uid: int
-    size: tuple[int, int]  # of the image
     gradient: Tensor  # (CAMERA_NUMBERS,) on the host, once it is copied
     copied: torch.cuda.Event | None
     done: bool = False
@@ -203,8 +201,7 @@ class Graphs:
         self._kinds: set[Kind] = set()
         self._graphs: dict[Kind, _Graph] = {}
         self._baked: tuple = ()
-        # Whether the objective can be captured, and memory is there. Lenses lie in arguments on the host.
-        self._able = not (run.poses and run.poses.lens)
+        self._able = True  # the objective can be captured, and memory is there
         self._taken = 0
 
     def launch(self, at: Iteration) -> Losses | None:
