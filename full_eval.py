@@ -251,8 +251,7 @@ def _report(
         print(f"\nadvice by the scenes' data, and what it did\n{_text(advice_table(report['advice']))}")
     for scene, found in report["reached"].items():
         print(f"\n{scene}: seconds of training to reach a test PSNR\n{_text(reached_table(found))}")
-        if legend := reached_legend(found):
-            print(legend)
+        print(reached_legend(found))
     print(f"\nreport: {output / 'report.html'}")
     return scored
 

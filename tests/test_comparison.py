@@ -99,19 +99,33 @@ def test_seconds_and_gaussians_to_reach_a_level():
     assert table.header == ["options", "32.0 dB", "31.5 dB", "adc's end", "31.0 dB", "30.0 dB"]
     adc, fast, small = table.rows
     assert adc[:2] == ["adc", "not reached"] and adc[3] == "40.0 ± 0.0 s"
-    assert reached_legend(found) == "In brackets: the part of adc's seconds."
+    assert reached_legend(found) == "PSNR of the test views: all. In brackets: the part of adc's seconds."
     assert fast[5] == "10.0 ± 0.0 s (50 %)" and small[4] == "not reached"
     assert adc[4] == "36.4 ± 5.1 s"  # the end of one seed, and between points of the other
     runs = set_runs()
     runs[-1]["curve"][-1]["test_psnr"] = 31.1
-    runs[2]["curve"][1] |= {"subset": 3, "estimated": 1}  # a point at 10 s of the first seed of fast
-    runs[0]["curve"][1] |= {"subset": 3, "estimated": 1}  # the end of a set is no estimate
     found = reached(comparable_sets(runs, "attic"))
     table = reached_table(found)
     assert reached_legend(found).endswith(" 1 of 2 seeds: the mean of those that got there.")
     assert table.rows[0][3] == "40.0 ± 0.0 s"
     assert table.rows[2][4] == "48.8 s, 1 of 2 seeds"
-    assert [cell.startswith("~ ") for cell in table.rows[1][1:]] == [True] * 5
+
+
+def test_levels_are_reached_on_the_views_that_all_runs_score():
+    runs, parts = set_runs(), set_runs()
+    for run in parts:  # a subset that is 5 dB easier, scored at all points, and the whole at the end alone
+        easy = [row | {"test_psnr": row["test_psnr"] + 5, "subset": 3} for row in run["curve"]]
+        run |= {"curve": [*easy, run["curve"][-1]], "views": {"test": 8, "train": 7}}
+    whole, part = (reached(comparable_sets(some, "attic")) for some in (runs, parts))
+    assert (whole["subset"], part["subset"], part["views"]) == (None, 3, 8)
+    assert reached_legend(part).startswith("PSNR of the test views: 3 of 8, the same at all points. In")
+    assert [level["psnr"] - 5 for level in part["levels"]] == pytest.approx([x["psnr"] for x in whole["levels"]])
+    for name, cells in whole["sets"].items():
+        of_part = [cell["seconds"]["values"] for cell in part["sets"][name]]
+        assert of_part == [pytest.approx(cell["seconds"]["values"]) for cell in cells]
+    for row in parts[3]["curve"][:-1]:  # one seed scores others, and compares at its end alone
+        row["subset"] = 2
+    assert reached(comparable_sets(parts, "attic")) is None
 
 
 def test_no_level_repeats_the_seconds_of_the_end():

@@ -25,14 +25,15 @@ from splatting.evaluation.curve_recorder import (
     curve_points,
     drawn,
     evenly_spread,
-    whole_points,
 )
 from splatting.evaluation.error_curve import (
     COLUMNS,
     Row,
     best_test,
+    common_subset,
     continue_curve,
     read_curve,
+    rows_on,
     whole_sets,
     write_curve,
 )
@@ -48,9 +49,8 @@ ROOT = Path(__file__).parents[1]
 VIEWS = {"test": 2, "train": 2}
 HEADER = (
     "iteration,seconds,wall_seconds,gaussians,peak_memory_mib,"
-    "test_l1,test_psnr,test_ssim,train_l1,train_psnr,train_ssim,subset,estimated\n"
+    "test_l1,test_psnr,test_ssim,train_l1,train_psnr,train_ssim,subset\n"
 )
-OLD = HEADER.replace(",subset,estimated", "")  # of files without subsets
 
 
 @pytest.fixture(autouse=True)
@@ -92,7 +92,7 @@ class TestFile:
         path = tmp_path / "error_vs_time.csv"
         rows = [_row(3, 20.25, math.inf, gaussians=7), _row(5, math.nan, test_l1=0.125)]
         write_curve(path, rows)
-        lines = "3,0.3,0.3333333333333333,7,,,20.25,,,,,,", "5,0.5,0.5555555555555556,,,0.125,,,,,,,"
+        lines = "3,0.3,0.3333333333333333,7,,,20.25,,,,,", "5,0.5,0.5555555555555556,,,0.125,,,,,,"
         assert path.read_text() == HEADER + "\n".join(lines) + "\n"
         assert read_curve(path) == [_row(3, 20.25, None, gaussians=7), _row(5, None, test_l1=0.125)]
 
@@ -100,10 +100,11 @@ class TestFile:
         "content",
         [
             *("", "iteration,seconds\n1,2\n", "\xff\x00"),
-            *(f"{HEADER}{line}\n" for line in ("x,0.3,,,,,,,,,,,", "3,,,,,,,,,,,,", "3,0.3,,,,,nan,,,,,,")),
-            HEADER + "3,0.3,,,,,,,,,,1.5,\n",  # no whole number
+            *(f"{HEADER}{line}\n" for line in ("x,0.3,,,,,,,,,,", "3,,,,,,,,,,,", "3,0.3,,,,,nan,,,,,")),
+            HEADER + "3,0.3,,,,,,,,,,1.5\n",  # no whole number
             HEADER + "3,0.3,,,,,,,,,\n",  # a line of an older file
-            HEADER + "3,0.3,,,,,,,,,,,\n3,0.4,,,,,,,,,,,\n",
+            HEADER + "3,0.3,,,,,,,,,,\n3,0.4,,,,,,,,,,\n",
+            HEADER + "3,0.3,,,,,,,,,,\n3,0.3,,,,,,,,,,2\n",  # the whole before its part
         ],
     )
     def test_damage(self, tmp_path, capsys, content):
@@ -115,13 +116,30 @@ class TestFile:
         assert re.fullmatch(r"warning: .*error_vs_time.csv cannot be read .*\n", capsys.readouterr().err)
         assert not path.exists()
 
-    def test_files_without_subsets_are_read_and_continued(self, tmp_path):
+    @pytest.mark.parametrize(
+        ("columns", "lines"),
+        [
+            ("", "3,0.3,0.4,7,,,20.25,,,,\n5,0.5,0.6,7,,,21.25,,,,\n"),
+            (",subset,estimated", "2,0.2,0.3,7,,,9.5,,,,,4,1\n3,0.3,0.4,7,,,20.25,,,,,,\n5,0.5,0.6,7,,,21.25,,,,,,\n"),
+            (",subset,estimated,test_depth", "3,0.3,0.4,7,,,20.25,,,,,,,0.1\n5,0.5,0.6,7,,,21.25,,,,,,,0.1\n"),
+        ],
+    )
+    def test_older_files_are_read_and_continued_without_their_estimates(self, tmp_path, columns, lines):
         path = tmp_path / "error_vs_time.csv"
-        path.write_text(OLD + "3,0.3,0.4,7,,,20.25,,,,\n5,0.5,0.6,7,,,21.25,,,,\n")
+        path.write_text(HEADER.replace(",subset", columns) + lines)
         wanted = [_row(3, 20.25, gaussians=7, wall_seconds=0.4), _row(5, 21.25, gaussians=7, wall_seconds=0.6)]
         assert read_curve(path) == wanted and whole_sets(wanted) == wanted
         assert continue_curve(tmp_path, 4) == wanted[:1]
-        assert path.read_text() == HEADER + "3,0.3,0.4,7,,,20.25,,,,,,\n"
+        assert path.read_text() == HEADER + "3,0.3,0.4,7,,,20.25,,,,,\n"
+
+    def test_curves_compare_on_the_views_that_all_score_at_most_points(self):
+        part, whole = [_row(t, 10.0, subset=2) for t in (1, 2, 4)], [_row(t, 11.0) for t in (4, 8)]
+        other = [_row(t, 10.0, subset=4) for t in (1, 2, 4)]
+        assert common_subset([[*part, *whole], part + whole[:1]]) == 2
+        assert common_subset([[*part, *whole], [*other, *whole]]) is None  # other views
+        assert common_subset([[*part[:2], *whole]]) is common_subset([]) is common_subset([part, other]) is None
+        assert common_subset([part, [_row(1, None)], []]) == 2
+        assert rows_on(part + whole, 2) == part and rows_on(part + whole, None) == whole
 
     def test_what_a_run_goes_on_from(self, tmp_path):
         path, figure = tmp_path / "error_vs_time.csv", tmp_path / "error_vs_time.png"
@@ -156,22 +174,6 @@ class TestCosts:
         spent = sum(0.46 * 2 * pace(t) for t in points)
         assert whole + size * spent < max(0.05 * training, 1.05 * (whole + spent))
 
-    @pytest.mark.parametrize("views", [1, 7, 30])
-    def test_whole_test_sets_within_a_tenth(self, views, growth, iterations):
-        """The whole sets at the end, and a view at each point between, are taken at any cost."""
-        pace = _pace(growth, iterations)
-        points = whole_points(iterations, [-1, iterations], 2, views)
-        training = sum(pace(t) for t in range(1, iterations + 1))
-        ends = 0.46 * (2 * views * pace(iterations) + sum(map(pace, points)))
-        spent = 0.46 * sum((count - 1) * pace(t) for t, count in points.items())
-        assert ends + spent < max(0.1 * training, 1.001 * ends)
-        assert 9 <= len(points) <= 12 and min(points) > 0 and max(points) < iterations
-        if iterations >= 2000:
-            assert sorted(points.values())[-7:] == [views] * 7
-        whole = [count == views for _, count in sorted(points.items(), reverse=True)]
-        if sum(whole) > 1:  # the last ones, and the first one
-            assert whole[-1] and whole[: sum(whole) - 1] == [True] * (sum(whole) - 1)
-
 
 class TestPoints:
     def test_points_are_evenly_spaced_in_log_time(self):
@@ -180,7 +182,7 @@ class TestPoints:
             (30_000, 1, 30_000, 12, 2**0.5, 1),  # a time budget may leave too few iterations for more
             (30_000, 25, None, 12, 2**0.5, 25),
             (12_000, 200, None, 12, 2**0.5, 8),
-            (12_000, 200, 30_000, 12, 2**0.5, 45),
+            (12_000, 200, 30_000, 12, 2**0.5, 32),
         ):
             points, found = curve_points(iterations, [-1, 40_000], 2, views, taken)
             assert (len(points), found) == (count, size)
@@ -236,75 +238,54 @@ class TestScores:
         assert seen[3:] == [("scores", "a"), ("scores", "b")]  # loaded once
         assert recorder.rows[0]["test_psnr"] == recorder.rows[1]["train_psnr"] == 20.0
 
-    def test_between_a_fixed_part_of_each_set_is_scored(self, tmp_path):
-        views = {"test": list(range(25)), "train": list(range(100, 125))}
+    def test_between_the_same_part_of_each_set_is_scored_and_stays_a_line_where_all_is(self, tmp_path):
+        views = {"test": [10.0 + n for n in range(25)], "train": [50.0 + n for n in range(25)]}
         recorder, seen = _recorder(tmp_path, 2000, [500], views)
         for iteration in (250, 500, 1000, 2000):
             recorder.add(iteration, iteration / 10, 5)
-        assert [row["subset"] for row in recorder.rows] == [1, None, 1, None]
+        rows = recorder.rows
+        assert [(row["iteration"], row["subset"]) for row in rows] == [
+            (250, 1), (500, 1), (500, None), (1000, 1), (2000, 1), (2000, None)
+        ]  # fmt: skip
         scored = [view for what, view in seen if what == "scores"]
         assert len(scored) == 2 * 52 and scored[:52] == scored[52:]
-        assert scored[1] == 100 + scored[0] and scored[2:52] == [*views["test"], *views["train"]]
-        assert read_curve(tmp_path / "error_vs_time.csv") == recorder.rows
+        assert scored[1] == 40 + scored[0] and scored[2:52] == [*views["test"], *views["train"]]
+        assert {(row["test_psnr"], row["train_psnr"]) for row in rows_on(rows, 1)} == {tuple(scored[:2])}
+        assert {(row["test_psnr"], row["train_psnr"]) for row in whole_sets(rows)} == {(22.0, 62.0)}
+        assert read_curve(tmp_path / "error_vs_time.csv") == rows
 
-    def test_a_part_is_turned_into_the_whole_by_what_separates_them_where_both_are_scored(self, tmp_path):
-        """Of views from 10 to 14 dB, which improve by what `gained` says; the drawn one is off by a known number."""
-        views = {"test": [10.0, 11.0, 14.0, 13.0, 12.0], "train": [20.0] * 5}
-        off = views["test"][drawn(range(5), 1)[0]] - 12.0
-        assert off
-        recorder, _ = _recorder(tmp_path, 300, [150], views)
-        for iteration, gained in ((75, 1.0), (150, 2.0), (212, 3.0), (300, 4.0)):
-            recorder._scores = lambda view, gained=gained: {"psnr": view + gained}
+    def test_where_whole_sets_fit_every_point_has_one_row(self, tmp_path):
+        recorder, _ = _recorder(tmp_path, 30_000, [], {"test": [10.0] * 6, "train": [20.0] * 6})
+        for iteration in (15_000, 30_000):
             recorder.add(iteration, iteration / 10, 5)
-            if iteration == 75:
-                assert recorder.rows[0]["test_psnr"] == 13.0 + off  # nothing else is known yet
-        assert [row["subset"] for row in recorder.rows] == [1, None, 1, None]
-        assert [row["test_psnr"] for row in recorder.rows] == [13.0, 14.0, 15.0, 16.0]
-        assert [row["train_psnr"] for row in recorder.rows] == [21.0, 22.0, 23.0, 24.0]
-        assert read_curve(tmp_path / "error_vs_time.csv") == recorder.rows
+        assert [(row["iteration"], row["subset"]) for row in recorder.rows] == [(15_000, None), (30_000, None)]
 
-        assert [row["estimated"] for row in recorder.rows] == [1, None, 1, None]
-
-        # A resumed training: rows of an earlier part are estimated once.
-        for before in (_row(75, 13.0 + off, 21.0, subset=1), dict(recorder.rows[0])):
-            again, _ = _recorder(tmp_path, 300, [], views, (before,))
-            again.add(300, 30.0, 5)
-            first = again.rows[0]
-            assert (first["test_psnr"], first["subset"], first["estimated"]) == (13.0, 1, 1)
-
-    def test_for_full_eval_the_last_points_score_all_test_views(self, tmp_path):
-        views = {"test": [10.0, 14.0, 15.0], "train": [20.0] * 3}
-        recorder, _ = _recorder(tmp_path, 200, [], views, whole_test=True)
-        for iteration in range(1, 201):
-            if recorder.due(range(iteration, iteration + 1), 0, iteration / 10):
-                recorder.add(iteration, iteration / 10, 5)
-        rows = recorder.rows
-        assert len(rows) > 10 and [row["subset"] for row in rows[-5:]] == [None] * 5 and rows[0]["subset"] is None
-        assert {row["subset"] for row in rows} == {None, 1} and [row["test_psnr"] for row in rows] == [13.0] * len(rows)
-        assert [row["train_psnr"] for row in rows] == [None] * (len(rows) - 1) + [20.0]
-
-    @pytest.mark.parametrize("whole", [False, True])
     @pytest.mark.parametrize("taken", [60, 130, 400, 20_000])
-    def test_by_the_clock_points_fit_the_iterations_that_there_will_be(self, tmp_path, taken, whole):
-        """12 points in at most 5 % of the training, or 10 % with whole sets, from 120 iterations on."""
+    def test_by_the_clock_points_fit_the_iterations_that_there_will_be(self, tmp_path, taken):
+        """12 points in at most 5 % of the training from 120 iterations on."""
+        recorder, seen = self._by_the_clock(tmp_path, taken, lambda step: taken if step > 1 + taken // 100 else None)
+        between = sum(kind == "scores" for kind, _ in seen) - 12
+        assert 0.5 * between <= 0.05 * taken or taken < 120
+        assert len({row["iteration"] for row in recorder.rows}) >= (12 if taken >= 400 else 10 if taken == 130 else 1)
+
+    def test_by_the_clock_points_are_planned_again_and_score_the_same_views(self, tmp_path):
+        """The first iterations were slow; a resumed training has other points, too."""
+        recorder, _ = self._by_the_clock(tmp_path, 400, lambda step: 30.0 if step < 6 else 400.0)
+        assert len({row["iteration"] for row in recorder.rows}) >= 12
+        rows = (_row(1, 10.0, subset=2),)
+        recorder, _ = self._by_the_clock(tmp_path, 400, lambda _: 400.0, rows)
+        assert {row["subset"] for row in recorder.rows} == {2, None}
+
+    @staticmethod
+    def _by_the_clock(folder: Path, taken: int, expected: Callable[[int], float | None], rows: tuple[Row, ...] = ()):
+        """A recorder after `taken` iterations of a schedule of 30,000. expected: how many, as known in an iteration."""
         views = {"test": [10.0 + n for n in range(6)], "train": [20.0] * 6}
-        recorder, seen = _recorder(tmp_path, 30_000, [], views, whole_test=whole, steady=False)
+        recorder, seen = _recorder(folder, 30_000, [], views, rows, steady=False)
         for step in range(1, taken + 1):
             span = range(30_000 * (step - 1) // taken + 1, 30_000 * step // taken + 1)
-            known = step > 1 + taken // 100  # as the speed is
-            if recorder.due(span, 0, step / 10, taken if known else None):
+            if recorder.due(span, 0, step / 10, expected(step)):
                 recorder.add(recorder.point(span), step / 10, 5, step)
-        between = sum(kind == "scores" for kind, _ in seen) - 12
-        assert 0.5 * between <= (0.1 if whole else 0.05) * taken or taken < 120
-        assert len(recorder.rows) >= (12 if taken >= 400 else 10 if taken == 130 or whole else 1)
-
-    def test_points_are_planned_again_where_the_first_iterations_were_slow(self, tmp_path):
-        recorder, _ = _recorder(tmp_path, 30_000, [], {"test": [10.0] * 6, "train": [20.0] * 6}, steady=False)
-        for step in range(1, 401):
-            span = range(30_000 * (step - 1) // 400 + 1, 30_000 * step // 400 + 1)
-            if recorder.due(span, 0, step / 10, 30.0 if step < 6 else 400.0):
-                recorder.add(recorder.point(span), step / 10, 5, step)
-        assert len(recorder.rows) >= 12
+        return recorder, seen
 
     def test_views_are_drawn_by_a_seed_of_their_own_or_evenly_spread(self):
         torch.manual_seed(1)

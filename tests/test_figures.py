@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from splatting.evaluation.error_curve import COLUMNS
 from splatting.evaluation.figures import draw_curve, draw_curves, draw_fronts, draw_poses
 
-NAMES = ("seconds", "test_psnr", "test_ssim", "train_psnr", "train_ssim", "subset", "estimated")
+NAMES = ("seconds", "test_psnr", "test_ssim", "train_psnr", "train_ssim", "subset")
 
 
 @pytest.fixture
@@ -39,28 +39,26 @@ def hollow(axes) -> list:
 
 
 def test_the_curve_of_a_training(tmp_path, drawn):
-    """All points on one line for each set, the best and the end, too; estimates hollow, with their number of views.
-
-    Subsets that are not estimated are left out.
-    """
+    """Each subset of the views has a line of its own, and whole sets beside it are hollow; the best and the end."""
     rows = curve(
-        (0.3, 2.0, 0.5, 3.0, 0.5, 4), (0.5, 9.0, 0.5, 9.5, 0.5, 4, 1), (1.0, 10.0, 0.75, 11.0, 0.875),
-        (1.5, 12.0, 0.5, 13.0, 0.5, 3, 1),
-        (2.0, 15.0, 0.75, None, 0.875), (4.0, 14.0, 0.75, 20.0, 0.875),
+        (0.5, 9.0, 0.5, 9.5, 0.5, 4), (1.0, 10.0, 0.75, 11.0, 0.875, 4), (1.0, 15.0, 0.75, None, 0.875),
+        (4.0, 12.0, 0.75, 18.0, 0.875, 4), (4.0, 14.0, 0.75, 20.0, 0.875),
     )  # fmt: skip
     draw_curve(tmp_path / "error_vs_time.png", rows, "a model", {"test": 7, "train": 6})
     upper, lower = drawn[0].axes
     assert upper.get_xscale() == lower.get_xscale() == lower.get_yscale() == "log"
-    (test,) = points(upper, "7 test views; hollow: estimated from 3 to 4 of them")
-    assert test == [[0.5, 9], [1, 10], [1.5, 12], [2, 15], [4, 14]]
-    (train,) = points(upper, "6 train views; hollow: estimated from 3 to 4 of them")
-    assert train == [[0.5, 9.5], [1, 11], [1.5, 13], [4, 20]]
-    assert points(upper, "highest mean over all test views: 15.00 dB, iteration 5") == [[[2, 15]]] and [2, 15] in test
-    assert hollow(upper) == [[[0.5, 9], [1.5, 12]], [[0.5, 9.5], [1.5, 13]]]
+    assert points(upper, "4 of 7 test views") == [[[0.5, 9], [1, 10], [4, 12]]]
+    assert points(upper, "4 of 6 train views") == [[[0.5, 9.5], [1, 11], [4, 18]]]
+    assert points(upper, "all 7 test views") == [[[1, 15], [4, 14]]] and points(upper, "all 6 train views") == [
+        [[4, 20]]
+    ]
+    assert points(upper, "highest mean over all test views: 15.00 dB, iteration 3") == [[[1, 15]]]
+    assert hollow(upper) == [[[1, 15], [4, 14]], [[4, 20]]]
     legends = [text.get_text() for axes in (upper, lower) for text in axes.get_legend().get_texts()]
-    assert "gap, 6 dB at the end" in legends and "gap, 0.125 at the end" in legends
-    draw_curve(tmp_path / "error_vs_time.png", rows[4:], "a model", {"test": 7, "train": 6})
-    assert points(drawn[1].axes[0], "7 test views") == [[[2, 15], [4, 14]]] and not hollow(drawn[1].axes[0])
+    assert "gap, 6 dB at the end, 4 views of each" in legends
+    assert "gap, 0.125 at the end, 4 views of each" in legends
+    draw_curve(tmp_path / "error_vs_time.png", [rows[2], rows[4]], "a model", {"test": 7, "train": 6})
+    assert points(drawn[1].axes[0], "all 7 test views") == [[[1, 15], [4, 14]]] and not hollow(drawn[1].axes[0])
 
 
 @pytest.mark.parametrize("rows", [(), ((1,),), ((1, 5.0),), ((1, 5.0, 1.0, None, 1.0),)])
@@ -74,7 +72,7 @@ def test_the_figures_of_a_scene_can_be_read_at_half_their_size(tmp_path, drawn):
     """Each panel is a file of its own; its legend covers no point, and names the views."""
     curves = {
         "base": curve((0.3, 15.0, 0.7), (2.8, 29.0, 0.945)),
-        "fast start": curve((0.3, 21.0, 0.8, None, None, 2, 1), (3.3, 29.5, 0.95)),
+        "fast start": curve((0.3, 21.0, 0.8), (3.3, 29.5, 0.95)),
     } | {f"a longer name of set {i}": curve((0.31, 15.0, 0.7), (2.9, 28.5, 0.94)) for i in range(6)}  # fmt: skip
     files = draw_curves(tmp_path, "attic", runs_of(curves))
     assert [file.name for file in files] == ["attic_psnr.png", "attic_ssim.png"] and all(map(Path.is_file, files))
@@ -83,7 +81,7 @@ def test_the_figures_of_a_scene_can_be_read_at_half_their_size(tmp_path, drawn):
         assert not legend.get_window_extent().overlaps(axes.get_window_extent())
         assert all(figure.bbox.contains(*corner) for corner in legend.get_window_extent().get_points())
         said = legend.get_title().get_text()
-        assert said == "7 test views; hollow: estimated from 2 of them\nPareto front of all points"
+        assert said == "all 7 test views\nPareto front of the lines"
         inches = figure.get_figwidth()
         letters = 358 / inches / 72 * min(text.get_fontsize() for text in legend.get_texts())
         assert letters > 8.5  # pixels where the window is 390 wide
@@ -94,15 +92,31 @@ def test_the_figures_of_a_scene_can_be_read_at_half_their_size(tmp_path, drawn):
 
 
 def test_one_option_set_has_its_training_views(tmp_path, drawn):
-    rows = curve((0.3, 35.0, 0.9, 36.0, 0.9, 2, 1), (1.0, 36.0, 0.95, 37.0, 0.9, 2, 1), (2.0, 20.0, 0.8, 21.0, 0.8))
+    rows = curve((0.3, 35.0, 0.9, 36.0, 0.9, 2), (2.0, 36.0, 0.95, 37.0, 0.9, 2), (2.0, 20.0, 0.8, 21.0, 0.8))
     draw_curves(tmp_path, "attic", runs_of({None: rows}))
     draw_curves(tmp_path, "attic", runs_of({"a": rows, "b": rows}))
     one, two = drawn[0].axes[0], drawn[2].axes[0]
     twice = runs_of({"a": rows, "b": rows}) + runs_of({"a": rows})
     draw_curves(tmp_path, "attic", twice)
-    assert drawn[4].legends[0].get_title().get_text().endswith("\na line for each seed; Pareto front of all points")
-    assert points(one, "training views") == [[[0.3, 36.0], [1.0, 37.0], [2.0, 21.0]]] and len(hollow(one)) == 1
+    assert drawn[4].legends[0].get_title().get_text().endswith("\na line for each seed; Pareto front of the lines")
+    assert points(one, "training views") == [[[0.3, 36.0], [2.0, 37.0]]] and hollow(one) == [[[2.0, 20.0]]]
     assert not points(two, "training views") and len(hollow(two)) == 2
+
+
+def test_lines_are_of_the_views_on_which_all_runs_compare(tmp_path, drawn):
+    """The front goes through no other point, and other programs, which score all views, are told from them."""
+    whole = curve((9.0, 50.0, 0.99))
+    curves = [curve((t, p, 0.8, None, None, n), (9.0, p + 1, 0.9, None, None, n)) for t, p, n in
+              ((1.0, 20.0, 2), (2.0, 22.0, 2), (3.0, 24.0, 4))]  # fmt: skip
+    peer = {"name": "other", "curve": curve((0.5, 40.0))}
+    draw_curves(tmp_path, "attic", runs_of({name: curves[i] + whole for i, name in enumerate("ab")}), [peer])
+    draw_curves(tmp_path, "attic", runs_of({name: curves[i] + whole for i, name in enumerate("abc")}))
+    same, mixed = drawn[0].axes[0], drawn[2].axes[0]
+    assert points(same, "b") == [[[2.0, 22.0], [9.0, 23.0]]] and hollow(same) == [[[9.0, 50.0]]] * 2
+    assert points(same, "Pareto front") == [[[1.0, 20.0], [2.0, 20.0], [2.0, 22.0], [9.0, 22.0], [9.0, 23.0]]]
+    said = [figure.legends[0].get_title().get_text().splitlines()[0] for figure in drawn[::2]]
+    assert said == ["2 of 7 test views; hollow and other programs: all of them", "all 7 test views"]
+    assert [points(mixed, name) for name in "abc"] == [[[[9.0, 50.0]]]] * 3 and not hollow(mixed)
 
 
 def test_other_programs_and_sets_that_stand_apart_are_drawn_and_in_no_front(tmp_path, drawn):

@@ -118,8 +118,8 @@ def test_commands_of_a_plain_scene(figures, evaluate):
     out, scene = str(evaluate.out / "attic"), str(evaluate.scenes / "attic")
     attic, render, brick, _ = map(" ".join, evaluate.calls())
     shared, switches = "--eval --test_iterations -1", "--antialiasing --iterations 40 -r 2"
-    assert attic == f"train -s {scene} -m {out} --disable_viewer --quiet --whole_curve {shared} {switches}"
-    assert brick.endswith(f" --whole_curve {shared} -w {switches}")
+    assert attic == f"train -s {scene} -m {out} --disable_viewer --quiet {shared} {switches}"
+    assert brick.endswith(f" --quiet {shared} -w {switches}")
     assert render == f"render -m {out} -s {scene} --iteration 40 --skip_train --eval --quiet --antialiasing"
     first = report["runs"][0]
     load = {name: first["iterations"]["40"].pop(name) for name in ("process_seconds", "cpu_seconds")}
@@ -340,7 +340,7 @@ def test_advice_is_taken_and_judged(evaluate, asked, score, gains, word):
     assert row["difference"]["values"] == pytest.approx(gains) and row["seconds_with"]["mean"] == 16
     asking, *trained = evaluate.calls("train")
     assert asking[5] == "--advise" and "auto" not in sum(trained, [])
-    followed = [words[words.index("--whole_curve") + 1 :] for words in trained if "advised" in words[4]]
+    followed = [words[words.index("--quiet") + 1 :] for words in trained if "advised" in words[4]]
     shared = "--eval --test_iterations -1 --iterations 40 --seed"
     assert list(map(" ".join, followed)) == [f"{asked} {shared} {seed}" for seed in (0, 1) if asked]
     fitted = ["appearance" in " ".join(words) for words in evaluate.calls("render") if "plain" in words[2]]

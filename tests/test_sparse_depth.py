@@ -10,7 +10,7 @@ import pycolmap
 import pytest
 import torch
 from synthetic import BROWN, make_blender_scene, make_colmap_scene
-from trainings import train_on, trained
+from trainings import trained
 
 import metrics
 import render
@@ -18,7 +18,6 @@ import train
 from scene.gaussian_model import GaussianModel
 from scene.readers.tracks import read_tracks
 from scene.scene import Scene
-from splatting.evaluation.error_curve import read_curve
 from splatting.files.image_files import read_plane
 from splatting.files.json_files import read_json
 from splatting.training import checks, sparse_depth
@@ -111,7 +110,7 @@ def _by_pycolmap(scene: Path, folder: Path) -> list[list[float]]:
 
 
 def test_depth_comes_nearer_to_points_of_test_views(scene, tmp_path, monkeypatch):
-    """They are scored by training's curve, and by render.py and metrics.py, as pycolmap says."""
+    """They are scored by render.py and metrics.py, as pycolmap says."""
     found = {}
     for name, options in (("without", ()), ("with", ("--sparse_depth", 1.0))):
         trained(scene, tmp_path / name, *options, "--test_iterations", -1, "--opacity_reset_interval", 3000)
@@ -121,17 +120,6 @@ def test_depth_comes_nearer_to_points_of_test_views(scene, tmp_path, monkeypatch
     for key, share in (("DEPTH", 0.5), ("DEPTH_95", 0.95)):
         expected = np.mean([np.quantile(of_view, share) for of_view in errors])
         assert found["with"][key] == pytest.approx(expected, rel=1e-3)
-
-
-def test_the_curve_has_errors_of_depth(scene, tmp_path, monkeypatch):
-    with monkeypatch.context() as patch:
-        patch.setattr(sys, "stdout", sys.stdout)
-        words = "--eval", "-r", 48, "--iterations", 60, "--sparse_depth", 1, "--quiet", "--disable_viewer"
-        train_on(scene, tmp_path, *words)
-    (row,) = read_curve(tmp_path / "error_vs_time.csv")
-    scores = _scores(scene, tmp_path, monkeypatch)
-    assert row["test_depth"] == pytest.approx(scores["DEPTH"], rel=1e-5)
-    assert row["test_depth_95"] == pytest.approx(scores["DEPTH_95"], rel=1e-5)
 
 
 def test_off_reads_no_tracks(scene, tmp_path, monkeypatch):

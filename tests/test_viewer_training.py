@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -293,10 +294,13 @@ def test_neither_a_checkpoint_nor_a_frame_that_fails_ends_a_training(colmap_scen
 
 
 def test_points_of_some_test_views_are_called_so():
-    rows = [{"subset": 4, "estimated": None}, {"subset": 4, "estimated": 1}, {"subset": None, "estimated": None}]
-    scored, estimated = "2 of 4 points are scores of some test views.", "1 of 4 points are estimates from scores of"
-    text = training_tab._of_some_views([rows[0], *rows])
-    assert text.startswith(f"{scored} {estimated}") and training_tab._of_some_views(rows[2:]) == ""
+    tab = training_tab.TrainingTab(mock.MagicMock(), mock.MagicMock())
+    rows = [{"seconds": s, "test_psnr": p} for s, p in ((1.0, 20.0), (2.0, 25.0))]
+    tab.show(None, 0.1, rows, 4)
+    assert [values.tolist() for values in tab.curve.data] == [[1.0, 2.0], [20.0, 25.0]]
+    assert tab.note.content == "Points score 4 of the test views." and tab.note.visible
+    tab.show(None, 0.1, [*rows, {"seconds": 3.0, "test_psnr": 26.0}], None)
+    assert len(tab.curve.data[0]) == 3 and not tab.note.visible
 
 
 def test_a_wrong_address_is_refused_before_a_file_is_written(colmap_scene, tmp_path):

@@ -40,7 +40,7 @@ _ALWAYS = ("--eval", "--resolution=1", "--disable_viewer", "--no_curve", "--test
 _OF_FILES = ("appearance", "init_ply", "depths", "masks", "train_test_exp", "refine_poses", "sparse_depth")
 # Options that nothing follows here, with the value that is the case. Our other observers score, save and show.
 _FIXED = dict.fromkeys(
-    ("keep_best", "advise", "viewer", "viewer_host", "whole_curve", "detect_anomaly",
+    ("keep_best", "advise", "viewer", "viewer_host", "detect_anomaly",
      "start_checkpoint", "source_path", "model_path", "images", "invert_masks")
     , "",
 ) | {"options": "given", "resolution": "1", "mask_meaning": "auto"}  # fmt: skip

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from splatting.evaluation.error_curve import SUBSET, Row, of_whole_sets
+from splatting.evaluation.error_curve import Row, common_subset, rows_on
 from splatting.evaluation.plan import DATASETS
 from splatting.files.json_files import read_json
 
@@ -185,9 +185,10 @@ def default_set(sets: Sets) -> str:
     return next((name for name in DEFAULT if name in sets), next(iter(sets)))
 
 
-def _scored(run: Run) -> list[Row]:
-    """Return the points of a run's curve that have a PSNR of all test views, measured or estimated."""
-    return [row for row in of_whole_sets(run["curve"]) if row["test_psnr"] is not None]
+def _line(run: Run, subset: int | None) -> list[Row]:
+    """Return the points of a run's curve on a subset, None: all test views; none if the curve's end is not of them."""
+    rows = [row for row in rows_on(run["curve"], subset) if row["test_psnr"] is not None]
+    return rows if rows and rows[-1]["iteration"] == run["curve"][-1]["iteration"] else []
 
 
 def seconds_to_reach(curve: Sequence[Row], level: float) -> float | None:
@@ -220,13 +221,14 @@ def round_levels(finals: Sequence[float]) -> list[float]:
 def reached(sets: Sets) -> dict[str, Any] | None:
     """Return the table of a scene's sets; None if fewer than two have a curve to their end, of two points or more.
 
-    default: the set that others are compared with. levels: `psnr`, and `of_default`: it is the mean PSNR at the end of
-    that set. sets: by name the cells, one for each level (`_cell`), with `ratio`: its mean seconds as a part of the
-    default's.
+    default: the set that others are compared with. subset: how many of the `views` of the test set the PSNR is of,
+    null: all. levels: `psnr`, and `of_default`: it is the mean PSNR at the end of that set. sets: by name the cells,
+    one for each level (`_cell`), with `ratio`: its mean seconds as a part of the default's.
     """
-    curves = {name: [_scored(run) for run in runs] for name, runs in sets.items()}
-    ends = {name: [rows[-1]["test_psnr"] for rows in seeds if len(rows) > 1 and rows[-1][SUBSET] is None]
-            for name, seeds in curves.items()}  # fmt: skip
+    every = [run for runs in sets.values() for run in runs]
+    subset = common_subset(run["curve"] for run in every)
+    curves = {name: [_line(run, subset) for run in runs] for name, runs in sets.items()}
+    ends = {name: [rows[-1]["test_psnr"] for rows in seeds if len(rows) > 1] for name, seeds in curves.items()}
     finals = {name: statistics.fmean(values) for name, values in ends.items() if len(values) == len(curves[name])}
     if len(finals) < 2:
         return None
@@ -239,15 +241,16 @@ def reached(sets: Sets) -> dict[str, Any] | None:
         for cell, theirs in zip(cells, table[default], strict=True):
             both = cell["seconds"]["mean"], theirs["seconds"]["mean"]
             cell["ratio"] = None if None in both or not both[1] else both[0] / both[1]
-    return {"default": default, "levels": levels, "sets": table}
+    views = every[0]["views"]["test"]
+    return {"default": default, "levels": levels, "sets": table, "subset": subset, "views": views}
 
 
 def _cell(curves: Sequence[Sequence[Row]], psnr: float, of_default: bool, is_default: bool) -> dict[str, Any]:
     """Return what the seeds of a set take to reach a level: spreads of seconds and Gaussians.
 
-    Seeds that do not reach it have null, and so has the mean then. reached: the number of seeds that do; estimated:
-    whether a point that scored a part of the test views decides; at_end: whether the seconds are all those of each
-    seed. That is so only for the default's own end, unless each seed was as good before.
+    Seeds that do not reach it have null, and so has the mean then. reached: the number of seeds that do; at_end:
+    whether the seconds are all those of each seed. That is so only for the default's own end, unless each seed was as
+    good before.
     """
     places = [next((i for i, row in enumerate(curve) if row["test_psnr"] >= psnr), None) for curve in curves]
     lasts = [i in (None, len(curve) - 1) for curve, i in zip(curves, places, strict=True)]
@@ -256,11 +259,8 @@ def _cell(curves: Sequence[Sequence[Row]], psnr: float, of_default: bool, is_def
         rows = [curve[-1] for curve in curves]
     else:
         rows = [None if i is None else curve[i] for curve, i in zip(curves, places, strict=True)]
-    deciding = [row for curve, i in zip(curves, places, strict=True) if i is not None
-                for row in curve[max(i - 1, 0) : i + 1]]  # fmt: skip
     return {
         "at_end": at_end,
-        "estimated": not at_end and any(row[SUBSET] is not None for row in deciding),
         "gaussians": spread(row and row["gaussians"] for row in rows),
         "reached": sum(i is not None for i in places),
         "seconds": spread(curve[-1]["seconds"] if at_end else seconds_to_reach(curve, psnr) for curve in curves),

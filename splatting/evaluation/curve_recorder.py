@@ -9,11 +9,10 @@ from pathlib import Path
 from statistics import fmean
 from typing import TypeVar
 
-import numpy as np
 import torch
 from tqdm import tqdm
 
-from splatting.evaluation.error_curve import COLUMNS, ESTIMATED, FIGURE, NAME, SCORES, SUBSET, Row, write_curve
+from splatting.evaluation.error_curve import COLUMNS, FIGURE, NAME, SUBSET, Row, write_curve
 from splatting.evaluation.training_log import TrainingLog
 from splatting.evaluation.what_to_try import gain_since_peak, peak_advice
 from splatting.host.clock import running_seconds, wall_seconds
@@ -25,7 +24,6 @@ SHORTEST = 200  # iterations of a training that is scored between, too
 GRIDS = ((4, 32), (2, 12))  # points while the number of iterations doubles, and their number before the last iteration
 SHARE = 0.025  # of a training that scoring may take by its estimate; 0.05 is promised, and early points may be dearer
 MOST_SHARE = 0.05  # the same where one view of each set at each point takes more than SHARE
-WHOLE_SHARE = 0.075  # the same for --whole_curve, where 0.1 is promised
 REPLANNED = 1.5  # times as many iterations as were expected, or more, get points of their own
 VIEW_COST = 0.5  # of scoring a view, in iterations: it takes no gradient and no step
 _ROOT = Path(__file__).resolve().parents[2]
@@ -39,8 +37,9 @@ def curve_points(
 
     The points are evenly spaced in the logarithm of the iteration, and follow from the options alone, so that the same
     command scores the same on every machine. They score as many views as fit SHARE of the training, at least one, on
-    the coarse grid; all views on the fine one where that fits, too. sets: of `views` each. taken: the iterations of a
-    run whose schedule has `iterations`, None: the same. Then there is the coarse grid alone.
+    the coarse grid; all views on the fine one where that fits, too. A part is a power of two, so that runs of nearly as
+    many iterations score the same one. sets: of `views` each. taken: the iterations of a run whose schedule has
+    `iterations`, None: the same. Then there is the coarse grid alone.
     """
     (fine, many), coarse = GRIDS
     if iterations < SHORTEST or (taken is not None and coarse[1] * VIEW_COST > MOST_SHARE * taken):
@@ -49,29 +48,8 @@ def curve_points(
     budget = SHARE * (iterations if taken is None else taken) / VIEW_COST - len(whole) * sets * views
     density, count = (fine, many) if taken is None and budget >= sets * views * many else coarse
     places = {round(iterations * 2 ** (-place / density)) for place in range(1, count + 1)}
-    return frozenset(places - whole), max(1, min(views, int(budget / (sets * count))))
-
-
-def whole_points(
-    iterations: int, whole: Iterable[int], sets: int, views: int, taken: float | None = None
-) -> dict[int, int]:
-    """The iterations of `curve_points`' coarse grid, and how many of the `views` of the test set each scores.
-
-    As many as WHOLE_SHARE allows score all of them: the last ones, since the levels that are compared lie near the end,
-    and the first one, for the `Estimates`. The others score one view each, or if none can score all, each the same
-    number. taken: as in `curve_points`.
-    """
-    density, count = GRIDS[1]
-    whole = {t for t in whole if 0 < t < iterations} | {iterations}
-    places = {round(iterations * 2 ** (-place / density)) for place in range(1, count + 1)} - whole - {0}
-    left = (
-        WHOLE_SHARE * (iterations if taken is None else taken) / VIEW_COST - len(whole) * sets * views - len(places)
-    )  # beyond one view a point
-    full = min(len(places), max(0, int(left / max(views - 1, 1))))
-    size = 1 if full else max(1, min(views, int(left / max(len(places), 1)) + 1))
-    first, *others = sorted(places) or [0]
-    order = [*others[-1:], first, *others[-2::-1]]
-    return {t: views if place < full else size for place, t in enumerate(order) if t}
+    most = max(1, int(budget / (sets * count)))
+    return frozenset(places - whole), views if most >= views else 1 << (most.bit_length() - 1)
 
 
 def evenly_spread(views: Sequence[View], count: int) -> list[View]:
@@ -85,6 +63,12 @@ def drawn(views: Sequence[View], count: int) -> list[View]:
     indices = list(range(len(views)))
     random.Random(0).shuffle(indices)
     return [views[index] for index in sorted(indices[:count])]
+
+
+def _means(name: str, of_views: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """The mean of each score of a set's views that have it, by column."""
+    kinds = dict.fromkeys(kind for scores in of_views for kind in scores)
+    return {f"{name}_{kind}": round(fmean(x[kind] for x in of_views if kind in x), 6) for kind in kinds}
 
 
 class CurveDrawer:
@@ -140,61 +124,16 @@ class CurveDrawer:
             self._process.wait()
 
 
-class Estimates:
-    """Turns scores of a subset into those of the whole sets, in rows of a curve.
-
-    A subset's views are easier or harder than all of them. By how much is known wherever all were scored. Between two
-    such scores of the subset it is interpolated, and outside of them taken as at the nearest.
-
-    rows: those of an earlier part of the training; its subsets that are not estimated yet will be.
-    """
-
-    def __init__(self, rows: Sequence[Row], views: Mapping[str, Sequence[View]]) -> None:
-        self._sizes = {name: len(of_set) for name, of_set in views.items()}
-        self._raw: list[tuple[Row, Row]] = []  # a row of a subset, and its scores as measured
-        self._known: list[Mapping[str, Sequence[float]]] = []  # the scores of each view
-        for row in rows:
-            if row[SUBSET] is not None and not row[ESTIMATED]:
-                self.add(row, {})
-
-    def add(self, row: Row, scores: Mapping[str, Sequence[float]]) -> None:
-        """Take a scored row in. scores: by column, those of each view, in the order of the set."""
-        if row[SUBSET] is None:
-            self._known.append(scores)
-        else:
-            self._raw.append((row, {name: row[name] for name in SCORES if row[name] is not None}))
-        for old, raw in self._raw if row[SUBSET] is None else self._raw[-1:]:
-            whole = {name: self._whole(name, value, int(old[SUBSET] or 0)) for name, value in raw.items()}
-            old |= {} if None in whole.values() else whole | {ESTIMATED: 1}
-
-    def _whole(self, name: str, value: float, size: int) -> float | None:
-        """The score of all views for that of a subset of `size`; None if that is not known."""
-        count = self._sizes[name.partition("_")[0]]
-        there = drawn(range(count), size)
-        known = {}
-        for scores in self._known:
-            of_views = scores.get(name, ())
-            # Some are left out where no pixel of them counts; the PSNR of equal images is infinite.
-            if len(of_views) == count and np.isfinite(of_views).all():
-                part = fmean(of_views[i] for i in there)
-                known[part] = fmean(of_views) - part
-        if not known:
-            return None
-        parts, offsets = zip(*sorted(known.items()), strict=True)
-        return round(value + float(np.interp(value, parts, offsets)), 6)
-
-
 class CurveRecorder:
     """Scores views in the iterations of a plan, keeps the curve's file up to date, and draws it at the end.
 
     rows: those of the runs that this one resumes; `log` has their seconds. Iterations are those of the schedule, which
     are those of the run if it is `steady`. iterations: the last one; always: those that score all views, as the last
-    one does; those between score a fixed part of each set (`curve_points`, `drawn`), from which the whole is estimated
-    (`Estimates`); with whole_test, test views alone (`whole_points`), unless all fit. A run that is not steady has no
-    points between until it is known how many iterations it takes. views: those to score, by set, "test" and "train".
-    load(views) decodes their photos; scores(view) gives the scores of one by name, none if no pixel
-    counts. If the file cannot be written, one warning says so and the next point tries again: a training is worth more
-    than its curve.
+    one does. Those between score a part of each set, the same at all (`curve_points`, `drawn`). Where all views are
+    scored, that part has a row of its own, before theirs. A run that is not steady has no points between until it is
+    known how many iterations it takes. views: those to score, by set, "test" and "train". load(views) decodes their
+    photos; scores(view) gives the scores of one by name, none if no pixel counts. If the file cannot be written, one
+    warning says so and the next point tries again: a training is worth more than its curve.
     """
 
     def __init__(
@@ -209,42 +148,46 @@ class CurveRecorder:
         scores: Callable[[View], dict[str, float]],
         device: torch.device,
         steady: bool = True,
-        whole_test: bool = False,
     ) -> None:
         self.rows = rows
         self._folder = Path(model_path)
         self._log = log
         self._iterations = iterations
         self._whole = {*always, iterations}
-        self._views, self._steady, self._whole_test = views, steady, whole_test
-        self._counts: dict[str, dict[int, int]] = {}  # of views to score, by set and iteration
+        self._views, self._steady = views, steady
+        self._all = {name: range(len(of_set)) for name, of_set in views.items()}
+        self._part: dict[str, Sequence[int]] = {}  # of each set's views, what points between score
         self._planned = 0.0  # for so many iterations
-        self._points, self._size = {*self._whole}, None
+        self._points = self._whole
         if steady:
             self._plan(iterations)
-        self._estimates = Estimates(rows, views)
         self._load = load
         self._scores = scores
         self._device = device
-        self._scored = 0
+        self._scored = self._scored_in_part = 0
         self._spent = dict.fromkeys(("scoring", "writing", "drawing", "loading"), 0.0)  # seconds
         self._warned = False
         self._drawer = CurveDrawer(self._folder, {name: len(of_set) for name, of_set in views.items()})
         self._ahead = AHEAD if cores() >= MANY_CORES else 0.0
 
     def _plan(self, taken: float) -> None:
-        """Choose points, and how many views they score, for a run that takes so many iterations."""
+        """Choose points for a run that takes so many iterations, and the part of the views that they score."""
         self._planned = taken
-        views, most = self._views, max(map(len, self._views.values()))
-        given = self._iterations, self._whole, len(views)
-        between, size = curve_points(*given, most, taken if not self._steady else None)
-        self._counts = {name: dict.fromkeys(between, size) for name in views}
-        if self._whole_test and size < most:
-            self._counts = {"test": whole_points(*given, len(views["test"]), taken)}
-        elif len(views) * len(between) * VIEW_COST > MOST_SHARE * taken:
-            self._counts = {"test": dict.fromkeys(between, size)}
-        self._points = self._whole | self._counts["test"].keys()
-        self._size = min((n for n in self._counts["test"].values() if n < len(views["test"])), default=None)
+        count = len(self._all["test"])
+        between, size = curve_points(
+            self._iterations, self._whole, len(self._all), count, None if self._steady else taken
+        )
+        before = [int(row[SUBSET]) for row in self.rows if row[SUBSET] is not None]
+        if before and not self._steady:
+            size = before[-1]
+        dear = len(self._all) * len(between) * VIEW_COST > MOST_SHARE * taken  # even one view of each set
+        sets = ["test"] if dear else list(self._all) if between else []
+        self._part = {name: drawn(self._all[name], size) for name in sets}
+        self._points = self._whole | between
+
+    def _subset(self, part: Mapping[str, Sequence[int]]) -> int | None:
+        """The number of test views in a part of the sets, None for all of them."""
+        return len(part["test"]) if len(part["test"]) < len(self._all["test"]) else None
 
     def point(self, span: range) -> int | None:
         """The iteration to score of those that a step stands for; None: none of them."""
@@ -276,23 +219,22 @@ class CurveRecorder:
         """
         # The peaks of log and curve, because after a rescue the curve has rows beyond the log's last record.
         peaks = [self._log.peak_memory_mib(), *(row["peak_memory_mib"] for row in self.rows[-1:])]
-        views = self._views
-        if iteration not in self._whole:
-            views = {name: drawn(views[name], counts[iteration]) for name, counts in self._counts.items()}
-        part = len(views["test"]) < len(self._views["test"])
         row = dict.fromkeys(COLUMNS) | {
             "iteration": iteration if trained is None else trained,
             "seconds": round(self._log.seconds_before + seconds, 3),
             "wall_seconds": round(self._log.wall_seconds_before + wall_seconds(), 3),
             "gaussians": gaussians,
             "peak_memory_mib": max((peak for peak in peaks if peak is not None), default=None),
-            SUBSET: len(views["test"]) if part else None,
         }
         if not self._scored:  # photos that training mostly needs soon: no part of the cost
             self._timed("loading", lambda: self._load([view for of_set in self._views.values() for view in of_set]))
-        self._timed("scoring", lambda: self._score(row, views))
+        whole = iteration in self._whole
+        parts = [self._all] if whole else [self._part]
+        if whole and self._part and self._subset(self._part) is not None:
+            parts.insert(0, self._part)
+        self._timed("scoring", lambda: self._score(row, parts))
         self._scored += 1
-        self.rows.append(row)
+        self._scored_in_part += self.rows[-1][SUBSET] is not None
         self._timed("writing", self._write)
         if iteration == self._iterations and writes_files():
             self._drawer.draw()
@@ -302,14 +244,14 @@ class CurveRecorder:
         call()
         self._spent[part] += running_seconds() - start
 
-    def _score(self, row: Row, views: dict[str, Sequence[View]]) -> None:
-        scores: dict[str, list[float]] = {}
-        for name, of_set in views.items():
-            for view in of_set:
-                for score, value in self._scores(view).items():
-                    scores.setdefault(f"{name}_{score}", []).append(value)
-        row |= {name: round(fmean(values), 6) for name, values in scores.items()}
-        self._estimates.add(row, scores)
+    def _score(self, row: Row, parts: Sequence[Mapping[str, Sequence[int]]]) -> None:
+        """Add a row for each of the parts, of which the last has all views of the others."""
+        scores = {name: {i: self._scores(self._views[name][i]) for i in of_set} for name, of_set in parts[-1].items()}
+        for part in parts:
+            means = {SUBSET: self._subset(part)}
+            for name, indices in part.items():
+                means |= _means(name, [scores[name][i] for i in indices])
+            self.rows.append(row | means)
 
     def _write(self) -> None:
         try:
@@ -331,10 +273,8 @@ class CurveRecorder:
         costs = {f"curve_{part}_seconds": round(taken, 4) for part, taken in self._spent.items()}
         self._log.add(self.rows[-1]["iteration"], seconds, **costs)
         often = "once" if self._scored == 1 else f"{self._scored} times"
-        sizes = sorted(row[SUBSET] for row in self.rows[-self._scored :] if row[SUBSET] is not None)
-        if sizes:
-            some = f"{sizes[0]}" if sizes[0] == sizes[-1] else f"{sizes[0]} to {sizes[-1]}"
-            often += f" ({len(sizes)} of them on {some} of {len(self._views['test'])} views)"
+        if self._scored_in_part:
+            often += f" ({self._scored_in_part} of them on {len(self._part['test'])} of {len(self._all['test'])} views)"
         self._log.tell(f"Test PSNR measured {often}, {self._spent['scoring']:.1f} s: {self._folder / FIGURE}")
         if advice := peak_advice(self.rows, saved, steady):
             # Where training overfits, `what_to_try` says more, and one line is printed.

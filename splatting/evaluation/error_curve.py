@@ -5,6 +5,7 @@ import csv
 import math
 import os
 import sys
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,12 @@ from utils.system_utils import UserError, atomic_write
 NAME = "error_vs_time.csv"
 FIGURE = "error_vs_time.png"
 SUBSET = "subset"
-ESTIMATED = "estimated"
-COUNTS = ("iteration", "gaussians", SUBSET, ESTIMATED)
+COUNTS = ("iteration", "gaussians", SUBSET)
 SCORES = tuple(f"{views}_{score}" for views in ("test", "train") for score in ("l1", "psnr", "ssim"))
-DEPTHS = ("test_depth", "test_depth_95")
 COSTS = ("iteration", "seconds", "wall_seconds", "gaussians", "peak_memory_mib")
-COLUMNS = (*COSTS, *SCORES, SUBSET, ESTIMATED, *DEPTHS)
-_HEADERS = [list(COLUMNS[:end]) for end in (None, -2, -3, -4)]  # without depths; older: estimates; subsets
+_OLDEST = (*COSTS, *SCORES)
+COLUMNS = (*_OLDEST, SUBSET)
+_ESTIMATED = "estimated"  # a column of older files: rows that tell of whole sets what only a part of them says
 PEER_COLUMNS = (*COSTS, *SCORES[:3], "test_lpips", *SCORES[3:])
 PEER_REQUIRED = ("seconds", "test_psnr")
 
@@ -31,21 +31,22 @@ Row = dict[str, float | None]
 def read_curve(path: str | os.PathLike) -> list[Row]:
     """Rows of a training's curve in ascending iterations; each has all COLUMNS, None for an empty field.
 
+    An iteration has a row for each part of the test views that was scored there. Estimates in older files are left out.
+
     seconds: of training, without evaluation and saving, over all resumed parts. wall_seconds: since the start of the
     process, with those of earlier parts. peak_memory_mib: the most of all parts so far, of the GPU if it trains.
     `<views>_l1`, `<views>_psnr` (dB), `<views>_ssim`: gaussian_renderer/scored_views.py. subset: number of views of
-    each set that were scored; None: all. estimated: 1 where the scores are estimates of those of whole sets; None in a
-    row of a subset: they are those of the subset. test_depth, test_depth_95: relative errors at held-out points, median
-    and 95 %, means over the views that were scored, never estimates (training/sparse_depth.py). UserError if the file
-    is missing or damaged.
+    each set that were scored, the same ones in all rows of that number; None: all. UserError if the file is missing or
+    damaged.
     """
     try:
         header, *lines = _lines(path)
-        if header not in _HEADERS:
+        if header[: len(_OLDEST)] != list(_OLDEST):
             raise ValueError("its columns are different")
-        rows = [_row(header, line, COLUMNS, ("iteration", "seconds"), COUNTS) for line in lines]
-        iterations = [row["iteration"] for row in rows]
-        if iterations != sorted(set(iterations)):
+        measured = [line for line in lines if not dict(zip(header, line, strict=True)).get(_ESTIMATED)]
+        rows = [_row(header, line, COLUMNS, ("iteration", "seconds"), COUNTS) for line in measured]
+        places = [(row["iteration"], math.inf if row[SUBSET] is None else row[SUBSET]) for row in rows]
+        if places != sorted(set(places)):
             raise ValueError("its iterations do not ascend")
     except FileNotFoundError as error:
         raise UserError(f"no curve {path}; train.py --eval records one unless --no_curve is set") from error
@@ -81,13 +82,9 @@ def _write(path: str | os.PathLike, columns: Sequence[str], lines: Iterable[Sequ
 
 
 def write_curve(path: str | os.PathLike, rows: list[Row]) -> None:
-    """Write rows that have all COLUMNS, without DEPTHS that none has.
-
-    A value that is None or not finite (PSNR of equal images) is left empty.
-    """
-    columns = [name for name in COLUMNS if name not in DEPTHS or any(row[name] is not None for row in rows)]
-    values = ((row[name] for name in columns) for row in rows)
-    _write(path, columns, [["" if x is None or not math.isfinite(x) else x for x in line] for line in values])
+    """Write rows that have all COLUMNS. A value that is None or not finite (PSNR of equal images) is left empty."""
+    values = ((row[name] for name in COLUMNS) for row in rows)
+    _write(path, COLUMNS, [["" if x is None or not math.isfinite(x) else x for x in line] for line in values])
 
 
 def continue_curve(
@@ -116,14 +113,25 @@ def continue_curve(
     return rows
 
 
+def rows_on(rows: Iterable[Row], subset: float | None) -> list[Row]:
+    """The rows that score a subset, None: whole sets. Only rows on the same views compare."""
+    return [row for row in rows if row.get(SUBSET) == subset]
+
+
 def whole_sets(rows: Iterable[Row]) -> list[Row]:
-    """The rows that score whole sets. Only these compare with scores of other places, and with each other's best."""
-    return [row for row in rows if row.get(SUBSET) is None]
+    """The rows that score whole sets. Only these compare with scores of other places."""
+    return rows_on(rows, None)
 
 
-def of_whole_sets(rows: Iterable[Row]) -> list[Row]:
-    """The rows that score whole sets or estimate them."""
-    return [row for row in rows if row.get(SUBSET) is None or row.get(ESTIMATED)]
+def common_subset(curves: Iterable[Iterable[Row]]) -> int | None:
+    """The subset, None: whole sets, on which curves compare: of those that all have, the one with the most points.
+
+    The curve with the fewest points decides. Curves without test PSNR have no say.
+    """
+    found = [Counter(row.get(SUBSET) for row in curve if row["test_psnr"] is not None) for curve in curves]
+    counts = [count for count in found if count]
+    shared = set.intersection(*map(set, counts)) if counts else set()
+    return max(shared, key=lambda subset: (min(count[subset] for count in counts), subset is None), default=None)
 
 
 def best_test(rows: Iterable[Row]) -> Row | None:

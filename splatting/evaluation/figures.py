@@ -11,13 +11,13 @@ import contextlib
 import gc
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatting.evaluation.comparison import COSTS, pareto_front
-from splatting.evaluation.error_curve import SUBSET, Row, best_test, of_whole_sets, read_curve
+from splatting.evaluation.error_curve import SUBSET, Row, best_test, common_subset, read_curve, rows_on, whole_sets
 from splatting.files.listing import as_utf8
 from utils.system_utils import atomic_write
 
@@ -31,6 +31,7 @@ MARKERS = "osD"  # with ten colours they tell thirty sets apart
 PEER_MARKERS = "xs^vDP*"
 LABELS = {"seconds": "seconds of training", "gaussians": "Gaussians trained", "ply_mb": "megabytes of the PLY"}
 PANEL, DPI, FONT = (5.6, 4.2), 140, 12  # of a report's figure: inches, and letters to be read at half the size, too
+HOLLOW = {"linestyle": ":", "linewidth": 1, "markerfacecolor": "white", "zorder": 3}  # whole sets beside a subset
 DIFFER = 1.02  # times the lowest mean of a cost; where none has more, their points hide each other
 LEGEND = 72  # letters in a line of a legend
 
@@ -48,13 +49,9 @@ def dissimilarity(row: Row, views: str) -> float | None:
     return None if ssim is None or ssim >= 1 else 1 - ssim
 
 
-def depth_error(row: Row, views: str) -> float | None:
-    return row.get(f"{views}_depth")
-
-
-def _points(rows: Sequence[Row], value: Value, views: str) -> list[Point]:
-    """Seconds and values of the rows that have them for whole sets; the axis of the seconds is logarithmic."""
-    pairs = ((row["seconds"], value(row, views)) for row in of_whole_sets(rows))
+def _points(rows: Sequence[Row], value: Value, views: str, subset: int | None) -> list[Point]:
+    """Seconds and values of the rows on a subset that have them; the axis of the seconds is logarithmic."""
+    pairs = ((row["seconds"], value(row, views)) for row in rows_on(rows, subset))
     return [(seconds, number) for seconds, number in pairs if seconds > 0 and number is not None]
 
 
@@ -62,25 +59,11 @@ def _draw(axes: Axes, points: Sequence[Point], label: str | None, **style: Any) 
     axes.plot([x for x, _ in points], [y for _, y in points], label=label and as_utf8(label), **style)
 
 
-def _draw_rows(
-    axes: Axes, rows: Sequence[Row], value: Value, views: str, label: str | None, **style: Any
-) -> list[Point]:
-    """Draw a line whose points are hollow where they are estimates; return the points."""
-    points = _points(rows, value, views)
-    _draw(axes, points, label, **style)
-    if estimated := _points([row for row in rows if row[SUBSET] is not None], value, views):
-        _draw(axes, estimated, None, **style | {"linestyle": "", "markerfacecolor": "white", "zorder": 3})
-    return points
-
-
-def _views_text(views: int | None, rows: Iterable[Row]) -> str:
-    """How many test views the points of curves have."""
-    sizes = sorted({int(row[SUBSET]) for row in of_whole_sets(rows) if row[SUBSET] is not None})
-    count = "all" if views is None else f"{views:,}"
-    if not sizes:
-        return f"{count} test views"
-    some = f"{sizes[0]}" if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}"
-    return f"{count} test views; hollow: estimated from {some} of them"
+def _views_text(subset: int | None, count: int | None, kind: str = "test") -> str:
+    """Which views of a set of so many points score; count: None where it differs."""
+    if subset is None:
+        return " ".join(["all", *([] if count is None else [f"{count:,}"]), kind, "views"])
+    return f"{subset:,} of {'the' if count is None else f'{count:,}'} {kind} views"
 
 
 def _label(axes: Axes, x: str, y: str, log: bool = False) -> None:
@@ -118,38 +101,37 @@ def _save(figure: Figure, path: str | os.PathLike, dpi: int = 120) -> None:
 def draw_curve(path: str | os.PathLike, rows: list[Row], title: str, views: Mapping[str, int]) -> None:
     """Draw PSNR and 1 - SSIM of test and train views against seconds of training, the gap between both shaded.
 
-    views: how many each set has. Raises matplotlib's errors, ImportError if it is missing, and UserError if `path`
+    Each subset of the views has a line of its own, and whole sets beside it have one that is dotted and hollow. views:
+    how many each set has. Raises matplotlib's errors, ImportError if it is missing, and UserError if `path`
     cannot be written.
     """
-    judged = any(depth_error(row, "test") is not None for row in rows)
-    figure, (upper, lower, *further) = _figure(2 + judged, (7.5, 7.0 + 3.0 * judged), title)
+    figure, (upper, lower) = _figure(2, (7.5, 7.0), title)
+    subsets = {int(row[SUBSET]) for row in rows if row[SUBSET] is not None}
+    main = common_subset([rows])
     for axes, value, unit in ((upper, psnr, " dB"), (lower, dissimilarity, "")):
-        for name, color in COLORS.items():
-            of_set = [row for row in rows if value(row, name) is not None]
-            label = _views_text(views[name], of_set).replace("test", name)
-            _draw_rows(axes, rows, value, name, label, marker="o", markersize=4, linewidth=1.2, color=color)
+        for subset in (*sorted(subsets), None):
+            for name, color in COLORS.items():
+                style = HOLLOW if subset is None and subsets else {"linewidth": 1.2}
+                points = _points(rows, value, name, subset)
+                label = _views_text(subset, views[name], name) if points or subset is None else None
+                _draw(axes, points, label, **{"marker": "o", "markersize": 4, "color": color} | style)
         both = [
             row
-            for row in of_whole_sets(rows)
+            for row in rows_on(rows, main)
             if row["seconds"] > 0 and None not in [value(row, name) for name in COLORS]
         ]
         ends = [[value(row, name) for row in both] for name in COLORS]
-        label = f"gap, {abs(ends[1][-1] - ends[0][-1]):.3g}{unit} at the end" if len(both) > 1 else None
+        which = "" if main is None else f", {main} views of each"
+        label = f"gap, {abs(ends[1][-1] - ends[0][-1]):.3g}{unit} at the end{which}" if len(both) > 1 else None
         axes.fill_between([row["seconds"] for row in both], *ends, color="gray", alpha=0.2, linewidth=0, label=label)
-    if best := best_test(rows):
+    if len(whole_sets(rows)) > 1 and (best := best_test(rows)):
         label = f"highest mean over all test views: {best['test_psnr']:.2f} dB, iteration {best['iteration']:,}"
         _draw(
             upper, [(best["seconds"], best["test_psnr"])], label, marker="*", color="black", markersize=12, linestyle=""
         )
     _label(upper, "", "PSNR (dB)")
-    seconds = "seconds of training, without scoring and saving"
-    _label(lower, "" if judged else seconds, "1 - SSIM", log=True)
-    for axes in further:
-        _draw_rows(
-            axes, rows, depth_error, "test", "test views; hollow: some of them", marker="o", color=COLORS["test"]
-        )
-        _label(axes, seconds, "depth error at held-out points", log=True)
-    for axes in (upper, lower, *further):
+    _label(lower, "seconds of training, without scoring and saving", "1 - SSIM", log=True)
+    for axes in (upper, lower):
         axes.legend()
     _save(figure, path)
 
@@ -179,19 +161,22 @@ def draw_curves(
 ) -> list[Path]:
     """Draw a scene's test PSNR and 1 - SSIM against seconds of training; return the files, none if no run has a curve.
 
-    Each option set has a colour and each seed a line, which the legend says. With several option sets, the Pareto front
-    of all points is marked, without runs that stand apart. With one, the training views are drawn too, dashed. peers:
-    curves of other programs, in grey; they are no part of the front.
+    Each option set has a colour and each seed a line, which the legend says. Lines are of the views on which all runs
+    compare; if these are a subset, hollow points beside them score all. With several option sets, the Pareto front of
+    the lines' points is marked, without runs that stand apart. With one, the training views are drawn too, dashed.
+    peers: curves of other programs, in grey; they are no part of the front.
     """
-    runs = [run for run in runs if any(row["test_psnr"] is not None for row in of_whole_sets(run["curve"]))]
+    runs = [run for run in runs if any(row["test_psnr"] is not None for row in run["curve"])]
     several = len({run["config"] for run in runs}) > 1
     counts = {run["views"]["test"] for run in runs}
-    said = _views_text(counts.pop() if len(counts) == 1 else None, [row for run in runs for row in run["curve"]])
+    subset = common_subset(run["curve"] for run in runs)
+    said = _views_text(subset, counts.pop() if len(counts) == 1 else None)
+    said += "" if subset is None else f"; hollow{' and other programs' if peers else ''}: all of them"
     more = ["a line for each seed"] * (len(runs) > len({run["config"] for run in runs}))
-    said = "\n".join([said, "; ".join([*more, "Pareto front of all points"])] if several else [said, *more])
+    said = "\n".join([said, "; ".join([*more, "Pareto front of the lines"])] if several else [said, *more])
 
     def draw(axes: Axes, value: Value, sign: int) -> str:
-        ours = _draw_runs(axes, runs, value, several)
+        ours = _draw_runs(axes, runs, value, several, subset)
         if several and ours:
             draw_front(axes, ours, sign)
         _draw_peers(axes, peers, value)
@@ -202,8 +187,6 @@ def draw_curves(
         "psnr": (psnr, "PSNR of the test views (dB)", -1),
         "ssim": (dissimilarity, "1 - SSIM of the test views", 1),
     }
-    if any(depth_error(row, "test") is not None for run in runs for row in run["curve"]):
-        panels["depth"] = depth_error, "depth error at held-out points", 1
     return [
         _panel(folder / f"{scene}_{name}.png", scene, name != "psnr", (x, y), partial(draw, value=value, sign=sign))
         for name, (value, y, sign) in (panels.items() if runs else ())
@@ -226,7 +209,9 @@ def draw_poses(folder: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list
     return [_panel(folder / f"{scene}_poses.png", scene, False, labels, draw)] if shown else []
 
 
-def _draw_runs(axes: Axes, runs: Sequence[dict[str, Any]], value: Value, several: bool) -> list[Point]:
+def _draw_runs(
+    axes: Axes, runs: Sequence[dict[str, Any]], value: Value, several: bool, subset: int | None
+) -> list[Point]:
     """Draw a line for each run; return the points of those that do not stand apart."""
     configs = list(dict.fromkeys(run["config"] for run in runs))
     every: list[Point] = []
@@ -237,11 +222,14 @@ def _draw_runs(axes: Axes, runs: Sequence[dict[str, Any]], value: Value, several
         name += " (other ground truth)" if run["apart"] else ""
         style = {"color": f"C{index % 10}", "linestyle": STYLES[index // 10 % len(STYLES)], "linewidth": 1.2}
         style |= {"marker": "o", "markersize": 3.5, "alpha": 0.4 if run["apart"] else 1.0}
-        found = _draw_rows(axes, run["curve"], value, "test", name if first else None, **style)
+        found = _points(run["curve"], value, "test", subset)
+        _draw(axes, found, name if first else None, **style)
+        if subset is not None:
+            _draw(axes, _points(run["curve"], value, "test", None), None, **style | HOLLOW)
         every += [] if run["apart"] else found
         if not several:
             dashed = style | {"marker": "", "linestyle": "--", "alpha": 0.6}
-            of_train = _points(run["curve"], value, "train")
+            of_train = _points(run["curve"], value, "train", subset)
             if len(of_train) > 1:
                 _draw(axes, of_train, "training views" if first else None, **dashed)
     return every
@@ -249,7 +237,7 @@ def _draw_runs(axes: Axes, runs: Sequence[dict[str, Any]], value: Value, several
 
 def _draw_peers(axes: Axes, peers: Sequence[dict[str, Any]], value: Value) -> None:
     """Draw other programs' curves."""
-    found = [(peer["name"], points) for peer in peers if (points := _points(peer["curve"], value, "test"))]
+    found = [(peer["name"], points) for peer in peers if (points := _points(peer["curve"], value, "test", None))]
     for index, (name, points) in enumerate(found):
         _draw(
             axes, points, f"{name} (another program)", color="0.35", linestyle="--",

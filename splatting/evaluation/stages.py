@@ -124,7 +124,7 @@ def train(run: Run, runs: Sequence[Run], machine: dict[str, Any], child: Child) 
     there = _checkpoints(run)
     before = record.stage("train_interrupted") or {}
     before = before if before.get("checkpoint") in there else {}
-    command = _script("train.py", "-s", source, "-m", str(run.model), "--disable_viewer", "--quiet", "--whole_curve")
+    command = _script("train.py", "-s", source, "-m", str(run.model), "--disable_viewer", "--quiet")
     command += [*options, *(("--start_checkpoint", str(run.model / before["checkpoint"])) if before else ())]
     done = child(command, "training" + _from_where(before, record))
     spent = _sum(before, done)

@@ -162,22 +162,24 @@ def _cell(cell: Mapping[str, Any], is_default: bool) -> str:
         return "not reached"
     if not known:
         return "not known"
-    digits, about = 2 if known[0] < 10 else 1, "~ " if cell["estimated"] else ""
+    digits = 2 if known[0] < 10 else 1
     if seconds["mean"] is None:
-        return f"{about}{number(statistics.fmean(known), digits)} s, {len(known)} of {len(seconds['values'])} seeds"
+        return f"{number(statistics.fmean(known), digits)} s, {len(known)} of {len(seconds['values'])} seeds"
     part = "" if is_default or cell["ratio"] is None else f" ({100 * cell['ratio']:.0f} %)"
-    return f"{about}{spread_cell(seconds, digits)} s{part}"
+    return f"{spread_cell(seconds, digits)} s{part}"
 
 
 def reached_legend(found: Mapping[str, Any]) -> str:
-    """What is said below `reached_table`, in a line."""
+    """What is said below `reached_table`, in a line: which views the PSNR is of, and what marks in cells mean."""
+    subset = found["subset"]
+    some = "all" if subset is None else f"{subset} of {found['views']}, the same at all points"
     texts = [cell for row in reached_table(found).rows for cell in row[1:]]
     parts = {
         " %)": f"In brackets: the part of {found['default']}'s seconds.",
-        "~": "~: rests on an estimate from a part of the test views.",
         " seeds": "1 of 2 seeds: the mean of those that got there.",
     }
-    return " ".join(text for mark, text in parts.items() if any(mark in cell for cell in texts))
+    said = [text for mark, text in parts.items() if any(mark in cell for cell in texts)]
+    return " ".join([f"PSNR of the test views: {some}.", *said])
 
 
 def front_table(found: Mapping[str, Any]) -> Table:

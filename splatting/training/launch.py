@@ -26,9 +26,6 @@ def add_launch_options(parser: argparse.ArgumentParser) -> None:
     add("--no_curve", **flag,
         help="write no error_vs_time.csv and .png, which cost up to 5 %% of the time, more in short runs "
              "(default: write them with --eval)")
-    add("--whole_curve", **flag,
-        help="let the last points of error_vs_time.csv score all test views, as many as a tenth of the training's time "
-             "allows, as full_eval.py does (default: a part of all views at each point, 5 %% of the time)")
     add("--plain_step", **flag,
         help="take every step by autograd, slower and with the same result (default: the fast step)")
     add("--advise", **flag, help="print which options the scene's photos, poses and points ask for, and end; with -m "

@@ -82,13 +82,6 @@ class Requests:
         self._set(paused=False, stopped=False, _steps=0, _checkpoints=0)
 
 
-def _of_some_views(rows: Sequence[dict[str, float | None]]) -> str:
-    """What to say of points that not all test views were scored for."""
-    estimated = [row.get("estimated") for row in rows if row.get("subset") is not None]
-    counts = (estimated.count(None), "scores"), (len(estimated) - estimated.count(None), "estimates from scores")
-    return " ".join(f"{n} of {len(rows)} points are {what} of some test views." for n, what in counts if n)
-
-
 class TrainingTab:
     """Buttons that make requests; iterations a second, loss, and the error against time."""
 
@@ -126,8 +119,13 @@ class TrainingTab:
     def _label(self) -> None:
         self.pause.label = "Resume" if self._requests.paused else "Pause"
 
-    def show(self, speed: float | None, loss: float, rows: Sequence[dict[str, float | None]]) -> None:
-        """Show iterations a second (None: not known), the loss, and the curve's rows so far."""
+    def show(
+        self, speed: float | None, loss: float, rows: Sequence[dict[str, float | None]], subset: float | None
+    ) -> None:
+        """Show iterations a second (None: not known), the loss, and the curve's rows so far, which score a subset.
+
+        subset: how many test views these are, None for all.
+        """
         self.speed.value = "" if speed is None else f"{speed:.3g}"
         self.loss.value = f"{loss:.5f}"
         if len(rows) != self._rows:
@@ -136,8 +134,8 @@ class TrainingTab:
             points = [point for point in points if all(map(math.isfinite, point))]
             if len(points) > 1:
                 self.curve.data = tuple(np.array(values, dtype=np.float64) for values in zip(*points, strict=True))
-                self.note.content = text = _of_some_views(rows)
-                self.curve.visible, self.note.visible = True, bool(text)
+                self.note.content = "" if subset is None else f"Points score {subset} of the test views."
+                self.curve.visible, self.note.visible = True, subset is not None
 
     def end(self, text: str) -> None:
         """Show that the training is over. text: what came of it."""

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from gaussian_renderer.blending import view_planes
 from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
 from splatting.evaluation.curve_recorder import CurveRecorder, evenly_spread
@@ -12,7 +11,6 @@ from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
 from splatting.training.run import Run
 from splatting.training.schedule import DecidedSchedule
-from splatting.training.sparse_depth import held_out_points
 from utils.system_utils import saved_iterations
 
 
@@ -32,21 +30,12 @@ class Curve(Observer):
             run.launch.test_iterations,
             {"test": test, "train": evenly_spread(trained, len(test))},
             lambda cameras: self._load(cameras, views),
-            lambda camera: views.scores([camera], run.gaussians) | self._depth(camera),
+            lambda camera: views.scores([camera], run.gaussians),
             run.device,
             not isinstance(run.schedule, DecidedSchedule),
-            run.launch.whole_curve,
         )
-        self._points = held_out_points(run.scene, run.dataset.source_path) if run.sparse_depth else {}
         self._due = False
         self._seconds = 0.0
-
-    def _depth(self, camera: Camera) -> dict[str, float]:
-        """The scores of a view's depth; none of views without points."""
-        if camera.image_name not in self._points:
-            return {}
-        depth = view_planes(camera, self._run.gaussians, self._run.pipe)["depth"]
-        return self._points[camera.image_name].scores(depth, camera.counted_pixels)
 
     def _load(self, cameras: Sequence[Camera], views: ScoredViews) -> None:
         self._run.scene.prefetch(cameras)

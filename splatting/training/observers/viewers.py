@@ -14,6 +14,7 @@ from gaussian_renderer.network_transfer import ViewerLost
 from scene.gaussian_model import GaussianModel
 from scene.saved_iterations import saved_ply
 from scene.saved_model import read_model
+from splatting.evaluation.error_curve import common_subset, rows_on
 from splatting.files.listing import as_utf8
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
@@ -122,7 +123,8 @@ class PageObserver(Observer):
         took = run.clock.seconds - seconds
         speed = (iteration - before) / took if before and took > 0 else None
         self._page.show_numbers(iteration, run.gaussians.gaussian_count)
-        self._tab.show(speed, run.losses.mean, run.rows)
+        subset = common_subset([run.rows])
+        self._tab.show(speed, run.losses.mean, rows_on(run.rows, subset), subset)
 
     def ended(self, error: Error) -> None:
         """Let the page stay, unless an error or a signal ended the training."""
