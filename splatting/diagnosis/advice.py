@@ -32,7 +32,7 @@ from splatting.diagnosis.model import masks_of
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.plan import ADVICE
 from splatting.files.json_files import write_json
-from splatting.training.robust_mask import FEW, MASKED, odd_photos
+from splatting.training.robust_mask import FEW, MASKED, odd_share
 from splatting.training.sky import FEWEST as LEAST_SKY
 from splatting.training.sky import Sky, find_sky, said_of_sky
 from utils.image_utils import as_float
@@ -249,7 +249,6 @@ def _of_passers_by(dataset: argparse.Namespace) -> Iterator[Advice]:
     with tempfile.TemporaryDirectory() as folder:
         own = ["-m", folder, "-r", _WIDTH, "--iterations", _ITERATIONS, "--quiet", "--no_curve", "--disable_viewer"]
         _trained([sys.executable, str(ROOT / "train.py"), *map(str, own), *_data_words(dataset)])
-        masks = masks_of(folder)
-    share = len(odd_photos(masks)) / len(masks.cameras)
+        share = odd_share(masks_of(folder))
     text = f"{share:.0%} of the photos show what a short training does not, as if someone had passed by"
     yield _asked(text, share > FEW, f"--robust_mask {MASKED:g}")

@@ -9,6 +9,7 @@ beside it (hysteresis), as a cell at its edge shows both.
 
 import math
 from collections.abc import Sequence
+from statistics import fmean
 from typing import Any, ClassVar
 
 import torch
@@ -137,10 +138,9 @@ def residuals_of(cameras: Sequence[Camera], views: ScoredViews, gaussians: Gauss
     return masks
 
 
-def odd_photos(masks: RobustMask) -> list[str]:
-    """Names of the photos that clearly show what the model does not, those that differ most first."""
-    differences = {camera.image_name: masks.difference(camera) for camera in masks.cameras}
-    return sorted((name for name in differences if differences[name] > CLEAR), key=differences.get, reverse=True)
+def odd_share(masks: RobustMask) -> float:
+    """Share of the photos that clearly show what the model does not."""
+    return fmean(masks.difference(camera) > CLEAR for camera in masks.cameras)
 
 
 def _in_cells(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:

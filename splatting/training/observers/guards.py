@@ -1,4 +1,4 @@
-"""Guards of a training: masks that leave nothing to train on, photos with passers-by, and memory that runs out."""
+"""Guards of a training: masks that leave nothing to train on, what --robust_mask masks, and memory that runs out."""
 
 import shutil
 import sys
@@ -12,7 +12,6 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gaussian_renderer.memory_errors import situation
-from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
 from scene.gaussians.checkpoint import save_checkpoint
 from scene.images.side_files import names_below
@@ -24,12 +23,11 @@ from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.observer import Error, Observer
 from splatting.training.restart import what_stands
-from splatting.training.robust_mask import FEW, FOLDER, MASKED, MOST_PHOTOS, odd_photos, residuals_of
+from splatting.training.robust_mask import FOLDER
 from splatting.training.run import Run
 from utils.image_utils import as_float
 from utils.system_utils import UserError, atomic_write
 
-_LEARNT = 1000  # iterations, until which much is not explained; advice trains so many, and searches itself
 _ENOUGH = 100  # if so many views have no pixel that counts, and no view has one, the masks are wrong
 _ALMOST_NOTHING = 1e-3  # share of the pixels
 _INVERT = "is white masked in them (--invert_masks), or do they belong to another scene?"
@@ -134,30 +132,6 @@ class PassersBy(Observer):
             rows.append(list(zip((name, f"{shares[name]:.0%}"), images, strict=True)))
         with atomic_write(path) as temporary:
             sheet(("photo", "left out: dark"), rows, WIDEST).save(temporary)
-
-
-class OddPhotos(Observer):
-    """Names the photos that a training without --robust_mask does not explain, where these are many."""
-
-    reads_model = False  # before the end
-
-    def __init__(self, run: Run) -> None:
-        self._run = run
-
-    @staticmethod
-    def serves(run: Run) -> bool:
-        """Whether the model is trained and photos are few enough, and no budget counts the time."""
-        long, few = run.opt.iterations > _LEARNT, len(run.scene.getTrainCameras()) <= MOST_PHOTOS
-        return long and few and not (run.opt.time_budget or run.group.several or run.robust_mask or run.exposes)
-
-    def ended(self, error: Error) -> None:
-        if error is not None:
-            return
-        run, cameras = self._run, self._run.scene.getTrainCameras()
-        odd = odd_photos(residuals_of(cameras, ScoredViews(run.pipe, run.background, False), run.gaussians))
-        if len(odd) > FEW * len(cameras):
-            text = f"{len(odd)} of {len(cameras)} photos show what the model does not, as if someone had passed by"
-            run.log.tell(f"{text}: most in {some(odd)}; try --robust_mask {MASKED:g}")
 
 
 class MemoryGuard(Observer):

@@ -7,7 +7,7 @@ from gaussian_renderer import network_gui
 from splatting.training.observer import Observer
 from splatting.training.observers.curve import Curve
 from splatting.training.observers.divergence import DivergenceWatch
-from splatting.training.observers.guards import MaskWatch, MemoryGuard, OddPhotos, PassersBy
+from splatting.training.observers.guards import MaskWatch, MemoryGuard, PassersBy
 from splatting.training.observers.report import ProgressBar, Records, Report, Summary, training_report
 from splatting.training.observers.saves import Checkpoints, KeepBest, Saves, ScheduleFile
 from splatting.training.observers.viewers import NetworkViewer, PageObserver
@@ -33,7 +33,6 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
         Saves(run, test_in_memory),  # before the model changes
         Records(run),  # after all that add to the iteration's record
         *([PassersBy(run)] if run.robust_mask else []),
-        *([OddPhotos(run)] if OddPhotos.serves(run) else []),
         Summary(run),  # after all that say something at the end
         *([NetworkViewer(run)] if network_gui.listener else []),  # after all that write: it may make training wait
         MemoryGuard(run),  # from `measured` to `stepped` the model changes; otherwise it is whole
