@@ -34,7 +34,7 @@ from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.report import make_report, write_report
 from splatting.evaluation.results import read_earlier, read_run
 from splatting.evaluation.stages import Failure, StageFailed
-from splatting.evaluation.tables import MAIN, Table, advice_table, reached_legend, reached_table, result_tables
+from splatting.evaluation.tables import MAIN, Table, reached_legend, reached_table, result_tables
 from splatting.files.folders import locked
 from splatting.files.listing import markdown_table
 from splatting.host.machine import facts_asked
@@ -191,9 +191,9 @@ def _carry_out(
         _say(f"{head}: on GPU {slot.gpu}" if slot else head)
         try:
             if not args.skip_training:
-                stages.train(run, runs, facts, child)
+                stages.train(run, facts, child)
             if not args.skip_rendering:
-                stages.render(run, (*options, *stages.fitted_like(run, runs)), child)
+                stages.render(run, options, child)
             if not args.skip_metrics:
                 download = stages.score(run, child, download, args.weights)
             if args.html_models:
@@ -204,17 +204,10 @@ def _carry_out(
             end = f"FAILED ({failed.failure.stage}): {failed}"
         _say(f"{head}: {end}" if slot else f"  {end}")
 
-    for run in runs if not args.skip_training else ():  # first, as it decides how the runs without it are rendered
-        try:
-            stages.advise(run, runs, start)
-        except StageFailed as failed:
-            failures[run] = failed.failure
-            _say(f"  FAILED ({failed.failure.stage}): {failed}")
-    left = [(number, run) for number, run in enumerate(runs, 1) if run not in failures]
     if gpus:
-        share(left, gpus, carry_out)
+        share(enumerate(runs, 1), gpus, carry_out)
     else:
-        for numbered in left:
+        for numbered in enumerate(runs, 1):
             carry_out(numbered)
 
 
@@ -247,8 +240,6 @@ def _report(
     write_report(report, output)
     for table in result_tables(report["summary"], MAIN):
         print(f"\n{table.title}\n{_text(table)}" if table.title else _text(table))
-    if report["advice"]:
-        print(f"\nadvice by the scenes' data, and what it did\n{_text(advice_table(report['advice']))}")
     for scene, found in report["reached"].items():
         print(f"\n{scene}: seconds of training to reach a test PSNR\n{_text(reached_table(found))}")
         print(reached_legend(found))

@@ -20,7 +20,7 @@ def run_of(config: str | None, seed: int, *points: tuple[float, float, int], sce
         "ply_mb": gaussians / 1e4, "views": 2,
     }  # fmt: skip
     return {
-        "added_options": [], "advice": None, "apart": False, "config": config, "conventions": {}, "cpu_seconds": None,
+        "added_options": [], "apart": False, "config": config, "conventions": {}, "cpu_seconds": None,
         "curve": curve(*points), "failure": None, "final_iteration": end, "finished": True, "group": "scenes",
         "ground_truth_sha256": "a" * 64, "iterations": {str(end): values}, "lines": [], "machine": {},
         "model": f"{scene}/{config}/{seed}", "open_ended": False, "options": [], "page": None, "peak": None,

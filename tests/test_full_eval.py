@@ -149,7 +149,7 @@ def test_data_sets_get_the_options_of_the_paper(evaluate, tmp_path):
         full_eval.main([str(word) for word in words], run)
     assert status.value.code == 1  # "train" is missing
     log = [json.loads(line) for root in (mip, tanks) for line in (root / "calls.txt").read_text().splitlines()]
-    trained = {Path(words[2]).name: words[11:] for words in log if words[0] == "train"}
+    trained = {Path(words[2]).name: words[10:] for words in log if words[0] == "train"}
     switches = ["-d", "depths2/", *full_eval.EXPOSURE, "--optimizer_type", "sparse_adam"]
     assert trained["garden"] == ["-i", "images_4", *switches] and trained["room"] == ["-i", "images_2", *switches]
     assert trained["truck"] == switches
@@ -318,37 +318,6 @@ def test_a_second_one_is_refused_while_the_first_or_its_training_lives(evaluate)
 
     wait_for(released)
     assert reports[0]["runs"][0]["finished"]  # the remains of the first run do not block it
-
-
-@pytest.mark.parametrize(
-    ("asked", "score", "gains", "word"),
-    [
-        ("", "PSNR", [0, 0], "nothing asked"),
-        ("--sparse_depth 0.1", "PSNR", [0.1, 0.2], "confirmed"),
-        ("--sparse_depth -0.1", "PSNR", [-0.1, -0.2], "refuted"),
-        ("--appearance ppisp", "PSNR_fitted_appearance", [0, 0], "undecided"),
-    ],
-)
-def test_advice_is_taken_and_judged(evaluate, asked, score, gains, word):
-    said = [{"text": "12 photos train", "options": asked}, {"text": "0.2 stops", "options": ""}]
-    (evaluate.scenes / "attic" / "advice.json").write_text(json.dumps(said))
-    given = ("attic", "--seeds", 0, 1, "--configs", "advice")
-    report = evaluate(*given)
-    (row,) = report["advice"]
-    assert (row["word"], row["score"], row["seeds"], row["plain"]) == (word, score, [0, 1], "plain")
-    assert row["found"] == said and row["options"] == [asked] * bool(asked)
-    assert row["difference"]["values"] == pytest.approx(gains) and row["seconds_with"]["mean"] == 16
-    asking, *trained = evaluate.calls("train")
-    assert asking[5] == "--advise" and "auto" not in sum(trained, [])
-    followed = [words[words.index("--quiet") + 1 :] for words in trained if "advised" in words[4]]
-    shared = "--eval --test_iterations -1 --iterations 40 --seed"
-    assert list(map(" ".join, followed)) == [f"{asked} {shared} {seed}" for seed in (0, 1) if asked]
-    fitted = ["appearance" in " ".join(words) for words in evaluate.calls("render") if "plain" in words[2]]
-    assert fitted == ["appearance" in asked] * 2 and [run["finished"] for run in report["runs"]] == [True] * 4
-    text = re.sub(" +", " ", evaluate.text("md"))
-    assert f"| attic | {word} | {row['difference']['mean']:.2f} ± " in text and "attic: 12 photos train" in text
-    done = evaluate.calls()
-    assert evaluate(*given)["advice"] == [row] and evaluate.calls() == done
 
 
 def test_a_training_that_ends_by_itself(evaluate):

@@ -131,7 +131,7 @@ def _trained(task: Task, seed: int, build: Build, scores: bool = False) -> dict[
         scene = SceneEntry(task.scene.name, "scenes", task.scene)
         (run,) = plan_runs([scene], Path(folder), task.options, {}, [seed])
         try:
-            stages.train(run, [run], {}, build.run)
+            stages.train(run, {}, build.run)
             if scores:
                 stages.render(run, (), build.run)
                 stages.score(run, build.run, download=False)

@@ -30,7 +30,6 @@ from splatting.diagnosis import Line
 from splatting.diagnosis.dataset import pose_errors, poses_differ
 from splatting.diagnosis.model import masks_of
 from splatting.distributed.ranks import ranks
-from splatting.evaluation.plan import ADVICE
 from splatting.files.json_files import write_json
 from splatting.training.robust_mask import FEW, MASKED, odd_share
 from splatting.training.sky import FEWEST as LEAST_SKY
@@ -38,6 +37,7 @@ from splatting.training.sky import Sky, find_sky, said_of_sky
 from utils.image_utils import as_float
 from utils.system_utils import UserError, mkdir_p
 
+ADVICE = "advice.json"  # what train.py --advise writes: texts, and options that the scene asks for
 EXPOSURES = 0.4  # stops; photos of a usual automatic exposure differ by 0.15 to 0.35
 FEW_PHOTOS = 16  # 14 gained 0.2 dB by points that hold the depth, 20 and 21 lost as much (docs/results/photos.md)
 DISTANCES = 2.5  # the farthest photo of a point over the nearest
@@ -92,7 +92,7 @@ def asked_options(dataset: argparse.Namespace, args: argparse.Namespace, given: 
     """Print the advice on a scene, and return the options that it asks for, as words of a command line.
 
     args: the options of the training, from the words `given`. Advice on one of these words, and advice that does not go
-    with these options, is left out. With --advise their model folder gets ADVICE, a list of texts and options, as JSON.
+    with these options, is left out. With --advise their model folder gets ADVICE.
     """
     if ranks().several:
         raise UserError("--advise and --options auto need one process; run train.py --advise, and give what it says")

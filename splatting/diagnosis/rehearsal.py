@@ -38,7 +38,7 @@ def rehearse(runs: Sequence[Run], output: Path, parse: Parse, machine: dict[str,
     known, rows, total, timed = _finished(output, machine), [], 0.0, {}
     photos: dict[str, tuple[str, str]] = {}
     for run in runs:
-        _, dataset, opt, _ = parse([*(run.plain or run.options), "-s", str(run.scene.source or "")])
+        _, dataset, opt, _ = parse([*run.options, "-s", str(run.scene.source or "")])
         key = str(vars(dataset))
         photos[key] = photos.get(key) or _photos(dataset, run)
         state, about, by = stages.state(run, trains), 0.0, "-"

@@ -34,8 +34,6 @@ RESERVED = {"figures"}  # folders of the report, next to the models
 _DEFAULT_ITERATIONS = next(option.default for option in OptimizationParams.options if option.name == "iterations")
 
 RECORD = "full_eval.json"  # in a model folder: finished stages with their inputs, machine and seconds
-ADVICE = "advice.json"  # what train.py --advise writes there: texts, and options that the scene asks for
-_AUTO = ("--options", "auto")
 ENDING = ("time_budget", "schedule")  # options by which a training ends before or after --iterations
 
 
@@ -124,16 +122,6 @@ class Run:
         return {"options": list(self.options), "scene": self.scene.source and str(self.scene.source)}
 
     @property
-    def plain(self) -> tuple[str, ...] | None:
-        """The options without `--options auto`; None where they do not have it."""
-        return options_without_advice(self.options)
-
-    @property
-    def advice(self) -> list[dict[str, str]] | None:
-        """What the scene's data say, noted by `stages.advise`: texts and options. None if that is not known."""
-        return (Record(self.model).stage("advice") or {}).get("found")
-
-    @property
     def iterations(self) -> int | None:
         """The last iteration, from the options; None if the training decides it, or train.py will refuse them."""
         parser = argparse.ArgumentParser(add_help=False, exit_on_error=False)
@@ -146,12 +134,6 @@ class Run:
             return None
         # Zeros alone, as in 0.0, mean that the option is off.
         return None if any(values[name].strip("0.") for name in ENDING) else values["iterations"]
-
-
-def options_without_advice(words: Sequence[str]) -> tuple[str, ...] | None:
-    """Return words for train.py without `--options auto`; None where they do not have it."""
-    at = next((i for i in range(len(words)) if tuple(words[i : i + 2]) == _AUTO), None)
-    return None if at is None else (*words[:at], *words[at + 2 :])
 
 
 def photos_of(options: Sequence[str]) -> str:
@@ -195,11 +177,6 @@ class Record:
         if self.key != key:
             self._content = {"key": key, "stages": {}}
             self._write()
-
-    def adopt(self, key: dict[str, Any], **values: Any) -> None:
-        """Let the stages count for another key whose model is the same. values: notes of the stage `advice`."""
-        self._content["key"] = key
-        self.note("advice", **values)
 
     def note(self, name: str, **values: Any) -> None:
         """Note that a stage succeeded, or that training was interrupted or failed."""

@@ -18,7 +18,6 @@ from markupsafe import Markup
 from PIL import Image
 
 from splatting.evaluation import comparison, tables
-from splatting.evaluation.advised import advice_effects
 from splatting.evaluation.comparison import Sets
 from splatting.evaluation.figures import draw_curves, draw_fronts, draw_poses
 from splatting.evaluation.model_folder import MASKED_PHOTOS
@@ -59,7 +58,6 @@ def make_report(
     rows = sorted(comparison.summarise(runs), key=lambda row: scenes.index(row["scene"]))
     means = comparison.dataset_means(rows)
     return {
-        "advice": advice_effects(runs),
         "dataset_means": means,
         "fronts": _of_scenes(runs, comparison.fronts),
         "manifest": {

@@ -34,7 +34,6 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
     iteration at which test views were clearly better than at the end, its PSNR, and the loss since; gained: by training
     views since then, null if not clearly; shorter_ends_there: whether --iterations with that number gives that model.
     poses: seconds and the mean correction of refined poses.
-    advice: the scene's data in words, each with the options that it asks for, if the training followed it.
     """
     model, record = run.model, Record(run.model)
     trained = record.stage("train") or {}
@@ -60,7 +59,6 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
     except UserError as error:
         failure = failure or Failure("report", [], [str(error)])
     return views | {
-        "advice": run.advice,
         "added_options": list(run.added) if known == run.key else None,
         "config": run.config,
         "cpu_seconds": trained.get("cpu_seconds"),

@@ -1,4 +1,4 @@
-"""The stages advise, train, render, score and page. Each is a subprocess, and is skipped silently if it is finished.
+"""The stages train, render, score and page. Each is a subprocess, and is skipped silently if it is finished.
 
 child: `run_child`, or what stands in for it.
 """
@@ -19,14 +19,12 @@ from typing import Any
 from scene.saved_iterations import saved_ply
 from splatting.evaluation.child import Finished, run_child
 from splatting.evaluation.model_folder import load_scores, logged, trained_iterations
-from splatting.evaluation.plan import ADVICE, Record, Run
+from splatting.evaluation.plan import Record, Run
 from splatting.evaluation.renders import TIMES, ground_truth_digest, view_names
-from splatting.files.json_files import read_json
 from utils.lpips_utils import TOLD
 from utils.system_utils import UserError, mkdir_p, temporary_folder
 
 _ROOT = Path(__file__).resolve().parents[2]
-_APPEARANCE = ("--appearance", "ppisp")
 FINISHED, TO_SCORE = "finished", "to render and score"  # states of a run
 REST = ("render_", "metrics", "html")  # beginnings of the names of stages after training
 Child = Callable[..., Finished]
@@ -51,35 +49,6 @@ class StageFailed(Exception):
         self.failure = failure
 
 
-def advise(run: Run, runs: Sequence[Run], child: Child) -> None:
-    """Note what the scene's data ask for, if the run's options are to follow it. The seeds of a set ask once."""
-    if run.plain is None or run.advice is not None:
-        return
-    alike = (other for other in runs if (other.scene, other.config) == (run.scene, run.config))
-    found = next((other.advice for other in alike if other.advice is not None), None)
-    record = Record(run.model)
-    record.start(run.key)
-    if found is None:
-        command = _script("train.py", "-s", _source_of(run), "-m", str(run.model), "--advise", *run.plain)
-        done = child(command, f"{run.title}: asking what the scene's data say")
-        _expect_success("advise", command, done)
-        found = read_json(run.model / ADVICE)
-        _stop_if_asked(done)
-    record.note("advice", found=found)
-
-
-def plain_one(run: Run, runs: Sequence[Run]) -> Run | None:
-    """Return the run that differs from this one by not following advice, if there is one."""
-    return next((other for other in runs if other.scene == run.scene and other.options == run.plain), None)
-
-
-def fitted_like(run: Run, runs: Sequence[Run]) -> tuple[str, ...]:
-    """Return options of render.py with which a run gets the scores of one that trains the photos' appearance."""
-    followers = (other for other in runs if plain_one(other, runs) == run)
-    asked = any(_APPEARANCE[0] in said["options"] for other in followers for said in other.advice or ())
-    return _APPEARANCE if asked else ()
-
-
 def _source_of(run: Run) -> str:
     if (source := run.scene.source) is None or not source.is_dir():
         reason = f"no such scene folder: {source}" if source else f"no scene folder was given for {run.scene.name}"
@@ -87,45 +56,22 @@ def _source_of(run: Run) -> str:
     return str(source)
 
 
-def _options_of(run: Run) -> list[str]:
-    """Return the options of train.py, with those that advice asks for; given ones, which follow, win."""
-    if run.advice is None:
-        return list(run.options)
-    return [*" ".join(said["options"] for said in run.advice).split(), *run.plain]
-
-
-def _copy(there: Run, run: Run) -> None:
-    """Make a run of another one that has trained with the same options."""
-    _say(f"nothing is asked for, so this is {there.title}")
-    copied = run.model.with_name(f"{run.model.name}.copied")
-    shutil.rmtree(copied, ignore_errors=True)
-    shutil.copytree(there.model, copied)  # with the files' times, by which stages know them
-    Record(copied).adopt(run.key, found=run.advice)
-    shutil.rmtree(run.model)
-    copied.rename(run.model)
-
-
-def train(run: Run, runs: Sequence[Run], machine: dict[str, Any], child: Child) -> None:
+def train(run: Run, machine: dict[str, Any], child: Child) -> None:
     """Train, unless the training is finished. Resume only from a checkpoint that an interrupt left.
-
-    A run whose advice asks for nothing becomes a copy of one of `runs` that has trained without advice.
 
     A checkpoint of a training that failed may hold half a densification, and would fail again with the same options, so
     training then starts from the beginning. `plan.check_folders` has made sure that nothing in the model folder was
     made with other options.
     """
-    source, record, options = _source_of(run), Record(run.model), _options_of(run)
+    source, record = _source_of(run), Record(run.model)
     if _trained(run, record):
-        return
-    if tuple(options) == run.plain and (same := plain_one(run, runs)) and _trained(same, Record(same.model)):
-        _copy(same, run)
         return
     record.start(run.key)
     there = _checkpoints(run)
     before = record.stage("train_interrupted") or {}
     before = before if before.get("checkpoint") in there else {}
     command = _script("train.py", "-s", source, "-m", str(run.model), "--disable_viewer", "--quiet")
-    command += [*options, *(("--start_checkpoint", str(run.model / before["checkpoint"])) if before else ())]
+    command += [*run.options, *(("--start_checkpoint", str(run.model / before["checkpoint"])) if before else ())]
     done = child(command, "training" + _from_where(before, record))
     spent = _sum(before, done)
     if done.status and (left := [name for name, stamp in _checkpoints(run).items() if stamp != there.get(name)]):
@@ -167,7 +113,7 @@ def timed_piece(run: Run) -> tuple[float, float]:
     with temporary_folder() as folder:
         half = str(PIECE // 2)
         command = _script("train.py", "-s", _source_of(run), "-m", str(folder), "--disable_viewer", "--quiet")
-        command += [*(run.plain or run.options), *_TO_THE_END, "--iterations", str(PIECE), "--no_curve"]
+        command += [*run.options, *_TO_THE_END, "--iterations", str(PIECE), "--no_curve"]
         done = run_child([*command, "--save_iterations", half])
         _stop_if_asked(done)
         if done.status:

@@ -196,28 +196,6 @@ def _on_front(beaten: Mapping[str, Any] | None) -> str:
     return f"perhaps beaten by {beaten['by']}" if beaten["clearly"] is False else f"beaten by {beaten['by']}"
 
 
-def advice_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Table of report.json's `advice`."""
-
-    def seconds(row: Mapping[str, Any]) -> str:
-        return f"{spread_cell(row['seconds_without'], 1)}, {spread_cell(row['seconds_with'], 1)}"
-
-    columns = {
-        "scene": lambda row: row["scene"],
-        "result": lambda row: row["word"],
-        "difference": lambda row: spread_cell(row["difference"], 2),
-        "advised": lambda row: " ".join(row["options"]) or "nothing",
-        "without": lambda row: spread_cell(row["without"], 2),
-        "with": lambda row: spread_cell(row["with"], 2),
-        "score": lambda row: QUANTITIES[row["score"]][0],
-        "training (s): without, with": seconds,
-        "seeds": lambda row: _seeds(row["seeds"]),
-    }
-    if any(row["plain"] for row in rows):
-        columns["option sets"] = lambda row: f"{row['plain'] or '-'}, {row['config']}"
-    return table(columns, rows)
-
-
 def runs_table(runs: Sequence[Mapping[str, Any]]) -> Table:
     """Table of what each run was given."""
     columns = {
