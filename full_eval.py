@@ -72,7 +72,7 @@ def _parser() -> OptionParser:
         help="any COLMAP, Blender or nerfstudio folders; Blender scenes get train.py's -w, as in published "
         "tables")  # fmt: skip
     add("--output_path", type=Path, default=Path("./eval"), metavar="DIR", help="models and report (default: ./eval)")
-    add("--dry", **flag, help="check the scenes and options, print what would run and about how long, and end")
+    add("--dry", **flag, help="check the scenes and options, print what would run, and end")
     add("--skip_training", **flag, help="use the models in the output folder, whatever made them")
     add("--skip_rendering", **flag, help="use the existing renders")
     add("--skip_metrics", **flag, help="use the existing scores")
@@ -151,14 +151,14 @@ def _parse_for_training(words: Sequence[str]) -> tuple[Namespace, ...]:
     return train.parse(words)
 
 
-def _rehearse(runs: Sequence[Run], args: Namespace, output: Path) -> None:
+def _rehearse(runs: Sequence[Run], args: Namespace) -> None:
     """Print what would be carried out; UserError for what would fail."""
     from splatting.diagnosis.rehearsal import rehearse  # imports the extensions
 
     for run in runs:
         if args.skip_training and not trained_iterations(run.model):
             raise UserError(f"{run.model} has no saved iteration; train it first")
-    rehearse(runs, output, _parse_for_training, facts_asked(), not args.skip_training)
+    rehearse(runs, _parse_for_training, not args.skip_training)
 
 
 def _visible(gpus: Sequence[int]) -> list[str]:
@@ -260,7 +260,7 @@ def main(argv: Sequence[str] | None = None, start: Start = run_child) -> None:
     peers = peers_of(args.peer, list(dict.fromkeys(run.scene.name for run in runs)))
     gpus, output = _visible(args.gpus), args.output_path.resolve()
     if args.dry:
-        _rehearse(runs, args, output)
+        _rehearse(runs, args)
         return
     mkdir_p(output)
     failures: dict[Run, Failure] = {}

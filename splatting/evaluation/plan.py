@@ -164,10 +164,6 @@ class Record:
     def key(self) -> dict[str, Any] | None:
         return self._content.get("key")
 
-    def names(self) -> list[str]:
-        """List the names of the stages that are noted."""
-        return list(self._content.get("stages", {}))
-
     def stage(self, name: str) -> dict[str, Any] | None:
         """Return the notes of a stage that succeeded; None if it did not."""
         return self._content.get("stages", {}).get(name)

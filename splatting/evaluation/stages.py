@@ -17,19 +17,15 @@ from pathlib import Path
 from typing import Any
 
 from scene.saved_iterations import saved_ply
-from splatting.evaluation.child import Finished, run_child
+from splatting.evaluation.child import Finished
 from splatting.evaluation.model_folder import load_scores, logged, trained_iterations
 from splatting.evaluation.plan import Record, Run
 from splatting.evaluation.renders import TIMES, ground_truth_digest, view_names
 from utils.lpips_utils import TOLD
-from utils.system_utils import UserError, mkdir_p, temporary_folder
+from utils.system_utils import UserError, mkdir_p
 
 _ROOT = Path(__file__).resolve().parents[2]
-FINISHED, TO_SCORE = "finished", "to render and score"  # states of a run
-REST = ("render_", "metrics", "html")  # beginnings of the names of stages after training
 Child = Callable[..., Finished]
-PIECE = 200  # iterations of a timed piece
-_TO_THE_END = ("--time_budget=0", "--schedule=")  # without the options of plan.ENDING
 
 
 @dataclass(frozen=True)
@@ -100,28 +96,8 @@ def state(run: Run, trains: bool = True) -> str:
     """Say in a few words what is left to do for a run. trains: False if its model counts as trained."""
     record = Record(run.model)
     if not trains or _trained(run, record):
-        return FINISHED if record.stage("metrics") else TO_SCORE
+        return "finished" if record.stage("metrics") else "to render and score"
     return "to resume" if record.stage("train_interrupted") else "to train"
-
-
-def timed_piece(run: Run) -> tuple[float, float]:
-    """Train PIECE iterations elsewhere; return the seconds to start and end, and those of an iteration.
-
-    UserError with the last message of a training that fails.
-    """
-    _say(f"{run.title}: timing {PIECE} iterations")
-    with temporary_folder() as folder:
-        half = str(PIECE // 2)
-        command = _script("train.py", "-s", _source_of(run), "-m", str(folder), "--disable_viewer", "--quiet")
-        command += [*run.options, *_TO_THE_END, "--iterations", str(PIECE), "--no_curve"]
-        done = run_child([*command, "--save_iterations", half])
-        _stop_if_asked(done)
-        if done.status:
-            raise UserError(f"{run.title}: {(done.lines or ['train.py failed'])[-1].removeprefix('error: ')}")
-        log = logged(folder)
-        middle, end = log[PIECE // 2], log[PIECE]
-    spent = end["seconds"] - middle["seconds"]  # the first half has what is done once
-    return done.wall_seconds - end["seconds"], spent / (PIECE - PIECE // 2)
 
 
 def _sum(before: dict[str, Any], done: Finished) -> dict[str, float | None]:
