@@ -2,10 +2,10 @@
 
 import argparse
 import json
-import struct
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import pytest
 import torch
@@ -20,7 +20,7 @@ from splatting.evaluation import peer_curve
 from splatting.evaluation.error_curve import COLUMNS, PEER_COLUMNS, peers_of, read_peer, write_curve, write_peer
 from splatting.evaluation.peer_curve import read_scalars
 from utils.graphics_utils import focal2fov, projection
-from utils.system_utils import UserError
+from utils.system_utils import UserError, run_cli
 
 
 def written(path: Path, *lines: str) -> Path:
@@ -39,7 +39,7 @@ def test_a_curve_may_have_few_columns_in_any_order(tmp_path):
     assert read_peer(tmp_path / "b.csv") == rows
 
     ours = dict.fromkeys(COLUMNS) | {"iteration": 7, "seconds": 1.5, "test_psnr": 20.0, "gaussians": 5}
-    write_curve(tmp_path / "a.csv", [ours])  # a curve of train.py is one
+    write_curve(tmp_path / "a.csv", [ours | {"subset": 2}, ours])  # a curve of train.py is one: what scores all views
     assert read_peer(tmp_path / "a.csv") == [{name: ours.get(name) for name in PEER_COLUMNS}]
 
 
@@ -128,59 +128,76 @@ def test_console_outputs_without_what_is_needed(tmp_path, text, sentence):
         peer_curve.from_log(written(tmp_path / "log.txt", text))
 
 
-def _varint(value: int) -> bytes:
-    low, rest = value & 127, value >> 7
-    return bytes([low | 128]) + _varint(rest) if rest else bytes([low])
+READER = "tensorboard.backend.event_processing.event_accumulator"
 
 
-def _field(number: int, content: bytes) -> bytes:
-    return _varint(number << 3 | 2) + _varint(len(content)) + content
+class Scalar(NamedTuple):
+    """A scalar as TensorBoard's reader gives it."""
+
+    wall_time: float
+    step: int
+    value: float
 
 
-def _record(wall: float, step: int, tag: str, value: float) -> bytes:
-    summary = _field(1, _field(1, tag.encode()) + b"\x15" + struct.pack("<f", value))
-    event = b"\x09" + struct.pack("<d", wall) + b"\x10" + _varint(step) + _field(5, summary)
-    return struct.pack("<Q", len(event)) + bytes(4) + event + bytes(4)
+@pytest.fixture
+def tensorboard(monkeypatch) -> dict[str, list[Scalar]]:
+    """The scalars that a stand-in for TensorBoard's reader finds in any folder."""
+    found: dict[str, list[Scalar]] = {}
+
+    class Accumulator:
+        def __init__(self, folder: str, sizes: dict[str, int]) -> None:
+            assert sizes == {"scalars": 0}
+            self.Reload, self.Tags, self.Scalars = lambda: self, lambda: {"scalars": [*found]}, found.__getitem__
+
+    monkeypatch.setitem(sys.modules, READER, SimpleNamespace(EventAccumulator=Accumulator))
+    return found
 
 
-def _events(folder: Path, scored: tuple[int, ...], last: int, every: int = 1) -> Path:
+def _fill(found: dict[str, list[Scalar]], scored: tuple[int, ...], last: int, every: int = 1) -> None:
     """Iterations of 0.1 s, the first one logged at 1000.1 s; each scored one is followed by a pause of 60 s."""
-    folder.mkdir(exist_ok=True)
-    data, wall = b"", 1000.0
+    scores, points, times, wall = [], [], [], 1000.0
     for step in range(1, last + 1):
         wall += 0.1
         if step % every == 0 or step == 1:
-            data += _record(wall, step, "iter_time", 100.0)
+            times.append(Scalar(wall, step, 100.0))
         if step in scored:
-            data += _record(wall + 50, step, "test/loss_viewpoint - psnr", 20 + step / 100)
-            data += _record(wall + 50, step, "total_points", 10 * step)
+            scores.append(Scalar(wall + 50, step, 20 + step / 100))
+            points.append(Scalar(wall + 50, step, 10.0 * step))
             wall += 60
-    (folder / "events.out.tfevents.1.host").write_bytes(data)
-    return folder
+    found |= {"iter_time": times, "test/loss_viewpoint - psnr": scores, "total_points": points}
 
 
 @pytest.mark.parametrize("every", [1, 10])
-def test_the_references_tensorboard_files_give_seconds_without_pauses(tmp_path, every):
-    rows = peer_curve.from_events(_events(tmp_path / "m", (100, 200, 300), 300, every))
+def test_the_references_tensorboard_files_give_seconds_without_pauses(tmp_path, tensorboard, every):
+    _fill(tensorboard, (100, 200, 300), 300, every)
+    rows = peer_curve.from_events(tmp_path)
     assert [row["iteration"] for row in rows] == [100, 200, 300]
     assert [row["seconds"] for row in rows] == pytest.approx([10, 20, 30], abs=1e-3)
     assert [row["wall_seconds"] for row in rows] == pytest.approx([60, 130, 200], abs=1e-3)
     assert [row["test_psnr"] for row in rows] == [21, 22, 23] and rows[1]["gaussians"] == 2000
 
 
-def test_event_files_that_are_cut_or_empty(tmp_path):
-    folder = _events(tmp_path / "m", (100,), 120)
-    (file,) = folder.iterdir()
-    whole = file.read_bytes()
-    file.write_bytes(whole[:-3])
-    assert len(read_scalars(folder)["iter_time"]) == 119
-    for content, sentence in ((b"", "have no iter_time"), (whole[:12] + b"\xff" * (len(whole) - 12), "are damaged")):
-        file.write_bytes(content)
-        with pytest.raises(UserError, match=sentence):
-            peer_curve.from_events(folder)
+def test_of_several_scalars_at_a_step_the_one_written_last_counts(tmp_path, tensorboard):
+    tensorboard["a"] = [Scalar(5.0, 2, 1.0), Scalar(6.0, 4, 2.0), Scalar(1.0, 4, 7.0), Scalar(7.0, 2, 3.0)]
+    assert read_scalars(tmp_path) == {"a": [Scalar(7.0, 2, 3.0), Scalar(6.0, 4, 2.0)]}
+    with pytest.raises(UserError, match="have no iter_time"):
+        peer_curve.from_events(tmp_path)
 
 
-def test_the_command(tmp_path, monkeypatch, capsys):
+def test_without_tensorboard_one_sentence_names_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, READER, None)
+    folder = written(tmp_path / "m/events.out.tfevents.1.host", "").parent
+    monkeypatch.setattr(sys, "argv", ["peer_curve", "reference", str(folder), str(tmp_path / "out.csv")])
+    with pytest.raises(SystemExit) as ended:
+        run_cli(peer_curve.main)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert ended.value.code == 2 and "install tensorboard, or give a saved console output" in line
+
+
+def test_the_command(tmp_path, monkeypatch, capsys, tensorboard):
+    _fill(tensorboard, (5, 9), 9)
+    events = written(tmp_path / "m/events.out.tfevents.1.host", "").parent
+
     def made(*words: object) -> tuple[list[float], str]:
         monkeypatch.setattr(sys, "argv", ["peer_curve", *map(str, words), str(tmp_path / "out.csv")])
         peer_curve.main()
@@ -188,7 +205,7 @@ def test_the_command(tmp_path, monkeypatch, capsys):
 
     for words, iterations, sentence in (
         (("gsplat", _result_of_gsplat(tmp_path / "g")), [7000, 30000], "contain the scoring and saving"),
-        (("reference", _events(tmp_path / "m", (5, 9), 9)), [5, 9], "are of training, without scoring"),
+        (("reference", events), [5, 9], "are of training, without scoring"),
         (("reference", written(tmp_path / "log", LOG)), [1000, 5000], "whole seconds"),
     ):
         found, said = made(*words)

@@ -43,7 +43,7 @@ def read_curve(path: str | os.PathLike) -> list[Row]:
         header, *lines = _lines(path)
         if header[: len(_OLDEST)] != list(_OLDEST):
             raise ValueError("its columns are different")
-        measured = [line for line in lines if not dict(zip(header, line, strict=True)).get(_ESTIMATED)]
+        measured = _without(_ESTIMATED, header, lines)
         rows = [_row(header, line, COLUMNS, ("iteration", "seconds"), COUNTS) for line in measured]
         places = [(row["iteration"], math.inf if row[SUBSET] is None else row[SUBSET]) for row in rows]
         if places != sorted(set(places)):
@@ -59,6 +59,11 @@ def _lines(path: str | os.PathLike) -> list[list[str]]:
     """Lines of a CSV file, stripped fields, the header first."""
     with open(path, encoding=encoding_of(path), newline="") as file:
         return [[field.strip() for field in line] for line in csv.reader(file, strict=True) if line] or [[]]
+
+
+def _without(name: str, header: Sequence[str], lines: Iterable[Sequence[str]]) -> list[Sequence[str]]:
+    """The lines that have nothing in the column of that name."""
+    return [line for line in lines if not dict(zip(header, line, strict=True)).get(name)]
 
 
 def _row(
@@ -150,7 +155,8 @@ def read_peer(path: Path, required: Sequence[str] = PEER_REQUIRED) -> list[Row]:
         header, *lines = _lines(path)
         if missing := [name for name in required if name not in header]:
             raise ValueError(f"it has no column {missing[0]}")
-        rows = [_row(header, line, PEER_COLUMNS, required, ()) for line in lines]
+        whole = _without(SUBSET, header, lines)  # of a training's curve
+        rows = [_row(header, line, PEER_COLUMNS, required, ()) for line in whole]
         if not rows:
             raise ValueError("it has no points")
         if (least := min(row["seconds"] for row in rows)) <= 0:

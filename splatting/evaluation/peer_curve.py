@@ -9,21 +9,23 @@ Says what the seconds contain.
 
 from __future__ import annotations
 
-import io
 import json
 import re
 import statistics
-import struct
 from argparse import ArgumentParser
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from datetime import datetime, timedelta
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from splatting.evaluation.error_curve import Row, write_peer
-from splatting.files.plain_files import plain, plain_text
+from splatting.files.plain_files import plain_text
 from utils.system_utils import UserError, run_cli
+
+if TYPE_CHECKING:
+    from tensorboard.backend.event_processing.event_accumulator import ScalarEvent
 
 WITH_PAUSES = (
     "seconds run on the clock from the first iteration; from the second point on they contain the scoring and saving "
@@ -133,20 +135,20 @@ def from_events(folder: Path) -> list[Row]:
     if len(clock) < 3:
         raise UserError(f"the TensorBoard files in {folder} have no iter_time; give a saved console output instead")
     seconds = _training_seconds(clock, sorted(rows))
-    walls = {scalar.step: scalar.wall for scalar in scalars.get(_SCORED, ())}
+    walls = {scalar.step: scalar.wall_time for scalar in scalars.get(_SCORED, ())}
     for step, row in rows.items():
         row |= {"seconds": seconds[step]}
         if step in walls:
-            row["wall_seconds"] = walls[step] - clock[0].wall + clock[0].step * clock[0].value / 1000
+            row["wall_seconds"] = walls[step] - clock[0].wall_time + clock[0].step * clock[0].value / 1000
     return _scored(list(rows.values()), folder)
 
 
-def _training_seconds(clock: Sequence[Scalar], scored: Sequence[int]) -> dict[int, float]:
+def _training_seconds(clock: Sequence[ScalarEvent], scored: Sequence[int]) -> dict[int, float]:
     """Seconds until each scored iteration. clock: the times of iterations, in milliseconds, and when they were written.
 
     A score is written after the time of its iteration, so its pause lies in the gap that begins there.
     """
-    paces = [(after.wall - at.wall) / (after.step - at.step) for at, after in zip(clock, clock[1:], strict=False)]
+    paces = [(after.wall_time - at.wall_time) / (after.step - at.step) for at, after in pairwise(clock)]
     paused = {bisect_right(clock, step, key=lambda scalar: scalar.step) - 1 for step in scored}
     total = [clock[0].step * clock[0].value / 1000]
     for index, pace in enumerate(paces):
@@ -158,78 +160,25 @@ def _training_seconds(clock: Sequence[Scalar], scored: Sequence[int]) -> dict[in
     return {step: total[max(bisect_right(steps, step) - 1, 0)] for step in scored}
 
 
-class Scalar(NamedTuple):
-    """A value of TensorBoard's files at a step, and the seconds since 1970 at which it was written."""
+def read_scalars(folder: Path) -> dict[str, list[ScalarEvent]]:
+    """Read the scalars of all event files in a folder by tag, in the order of their steps.
 
-    step: int
-    wall: float
-    value: float
-
-
-def read_scalars(folder: Path) -> dict[str, list[Scalar]]:
-    """Read the scalars of all event files in a folder by tag, in the order of their steps. It needs no TensorBoard.
-
-    Of several at one step the one written last counts. A file that is cut short gives what is whole. Checksums are not
-    compared. UserError for a damaged file.
+    Of several at one step the one written last counts. What is damaged or cut short is left out. UserError without
+    TensorBoard.
     """
-    found: dict[str, dict[int, Scalar]] = {}
-    for path in sorted(folder.glob("events.out.tfevents.*")):
-        try:
-            scalars = [pair for event in _events(plain(path).read_bytes()) for pair in _scalars(event)]
-        except (LookupError, OSError, TypeError, ValueError, struct.error) as error:
-            raise UserError(f"the TensorBoard files in {folder} are damaged ({error}); train again") from error
-        for tag, scalar in sorted(scalars, key=lambda pair: pair[1].wall):
-            before = found.setdefault(tag, {}).get(scalar.step)
-            if before is None or before.wall <= scalar.wall:
-                found[tag][scalar.step] = scalar
-    return {tag: [steps[step] for step in sorted(steps)] for tag, steps in found.items()}
-
-
-def _events(data: bytes) -> Iterator[bytes]:
-    """Contents of a file's records: each is its length (8 bytes), a checksum (4), the content, a checksum (4)."""
-    at = 0
-    while at + 12 <= len(data) and (end := at + 12 + struct.unpack_from("<Q", data, at)[0]) + 4 <= len(data):
-        yield data[at + 12 : end]
-        at = end + 4
-
-
-def _scalars(event: bytes) -> Iterator[tuple[str, Scalar]]:
-    """Scalars of an `Event`, whose fields are 1 wall_time, 2 step, 5 summary.
-
-    A summary has values (field 1) of tag (1) and simple_value (2).
-    """
-    fields = dict(_fields(event))
-    for _, value in _fields(fields.get(5, b"")):
-        parts = dict(_fields(value))
-        if isinstance(parts.get(1), bytes) and isinstance(parts.get(2), bytes) and len(parts[2]) == 4:
-            wall, number = struct.unpack("<df", fields.get(1, bytes(8)) + parts[2])
-            yield parts[1].decode("utf-8", "replace"), Scalar(int(fields.get(2, 0)), wall, number)
-
-
-def _fields(message: bytes) -> Iterator[tuple[int, int | bytes]]:
-    """Number and content of each field of a protocol buffer: an integer, or bytes. ValueError if it is cut."""
-    stream = io.BytesIO(message)
-    while stream.tell() < len(message):
-        key = _varint(stream)
-        if key & 7 == 0:
-            yield key >> 3, _varint(stream)
-            continue
-        size = {1: 8, 2: None, 5: 4}[key & 7]
-        size = _varint(stream) if size is None else size
-        content = stream.read(size)
-        if len(content) < size:
-            raise ValueError("a field is cut")
-        yield key >> 3, content
-
-
-def _varint(stream: io.BytesIO) -> int:
-    value = 0
-    for shift in range(0, 64, 7):
-        (byte,) = stream.read(1) or [128]
-        value |= (byte & 127) << shift
-        if byte < 128:
-            return value
-    raise ValueError("a number is cut")
+    try:
+        from tensorboard.backend.event_processing.event_accumulator import EventAccumulator  # takes a second
+    except ImportError as error:
+        raise UserError(
+            f"{folder} has TensorBoard's files, and the package that reads them is missing; install tensorboard, or "
+            "give a saved console output"
+        ) from error
+    events = EventAccumulator(str(folder), {"scalars": 0}).Reload()  # 0: all of them
+    found = {}
+    for tag in events.Tags()["scalars"]:
+        last = {scalar.step: scalar for scalar in sorted(events.Scalars(tag), key=lambda scalar: scalar.wall_time)}
+        found[tag] = [last[step] for step in sorted(last)]
+    return found
 
 
 def _scored(rows: Sequence[Row], source: Path) -> list[Row]:
