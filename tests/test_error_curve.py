@@ -175,6 +175,18 @@ class TestCosts:
         assert whole + size * spent < max(0.05 * training, 1.05 * (whole + spent))
 
 
+@pytest.mark.parametrize(("iterations", "views"), [(200, 4), (300, 8), (600, 8), (2000, 40)])
+def test_a_short_training_scores_with_its_end_within_five_percent(tmp_path, iterations, views):
+    """Where need be, points between score no training views."""
+    recorder, seen = _recorder(tmp_path, iterations, [-1], {name: [20.0] * views for name in ("test", "train")})
+    for iteration in range(1, iterations + 1):
+        if recorder.due(range(iteration, iteration + 1), 0, iteration / 10):
+            recorder.add(iteration, iteration / 10, 5)
+    assert 0.46 * sum(kind == "scores" for kind, _ in seen) <= 0.05 * iterations
+    assert len({row["iteration"] for row in recorder.rows}) == 13
+    assert [row["train_psnr"] is None for row in recorder.rows[:-1]] == [iterations < 600] * 13
+
+
 class TestPoints:
     def test_points_are_evenly_spaced_in_log_time(self):
         for iterations, views, taken, count, ratio, size in (

@@ -55,8 +55,8 @@ def test_the_curve_of_a_training(tmp_path, drawn):
     assert points(upper, "highest mean over all test views: 15.00 dB, iteration 3") == [[[1, 15]]]
     assert hollow(upper) == [[[1, 15], [4, 14]], [[4, 20]]]
     legends = [text.get_text() for axes in (upper, lower) for text in axes.get_legend().get_texts()]
-    assert "gap, 6 dB at the end, 4 views of each" in legends
-    assert "gap, 0.125 at the end, 4 views of each" in legends
+    assert "gap, 6 dB at the end, 4 of 7 test views" in legends
+    assert "gap, 0.125 at the end, 4 of 7 test views" in legends
     draw_curve(tmp_path / "error_vs_time.png", [rows[2], rows[4]], "a model", {"test": 7, "train": 6})
     assert points(drawn[1].axes[0], "all 7 test views") == [[[1, 15], [4, 14]]] and not hollow(drawn[1].axes[0])
 

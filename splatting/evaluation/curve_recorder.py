@@ -180,9 +180,10 @@ class CurveRecorder:
         before = [int(row[SUBSET]) for row in self.rows if row[SUBSET] is not None]
         if before and not self._steady:
             size = before[-1]
-        dear = len(self._all) * len(between) * VIEW_COST > MOST_SHARE * taken  # even one view of each set
-        sets = ["test"] if dear else list(self._all) if between else []
-        self._part = {name: drawn(self._all[name], size) for name in sets}
+        ends = count * sum(0 < iteration <= self._iterations for iteration in self._whole)
+        dear = len(self._all) * (ends + size * len(between)) * VIEW_COST > MOST_SHARE * taken
+        sets = ["test"] if dear else list(self._all)
+        self._part = {name: drawn(self._all[name], size) for name in sets} if between else {}
         self._points = self._whole | between
 
     def _subset(self, part: Mapping[str, Sequence[int]]) -> int | None:

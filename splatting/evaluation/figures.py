@@ -121,7 +121,7 @@ def draw_curve(path: str | os.PathLike, rows: list[Row], title: str, views: Mapp
             if row["seconds"] > 0 and None not in [value(row, name) for name in COLORS]
         ]
         ends = [[value(row, name) for row in both] for name in COLORS]
-        which = "" if main is None else f", {main} views of each"
+        which = "" if main is None else f", {_views_text(main, views['test'])}"
         label = f"gap, {abs(ends[1][-1] - ends[0][-1]):.3g}{unit} at the end{which}" if len(both) > 1 else None
         axes.fill_between([row["seconds"] for row in both], *ends, color="gray", alpha=0.2, linewidth=0, label=label)
     if len(whole_sets(rows)) > 1 and (best := best_test(rows)):
