@@ -46,23 +46,18 @@ def _save(model: Path, iteration: int, degree: int) -> None:
 def train(words: list[str], _: dict[str, str]) -> None:
     """Numbers depend on the options.
 
-    With --advise it writes the scene's `advice.json`, or that nothing is asked for. --sparse_depth is what it adds to
-    the PSNR of seed 0, and twice that to seed 1. With --time_budget it ends three iterations later than with
-    --iterations, and three more for each seed above 0. A file `broken` in the scene folder makes it fail, `full` makes
-    it fail and leave a checkpoint, `slow` makes it wait for a signal.
+    --sparse_depth is what it adds to the PSNR of seed 0, and twice that to seed 1. With --time_budget it ends three
+    iterations later than with --iterations, and three more for each seed above 0. A file `broken` in the scene folder
+    makes it fail, `full` makes it fail and leave a checkpoint, `slow` makes it wait for a signal.
     """
     args = _parsed(words, iterations=30000, sh_degree=3, seed=0, time_budget=0.0, start_checkpoint=None,
-                   save_iterations=[7000, 30000], advise=False, appearance=None, sparse_depth=0.0,
+                   save_iterations=[7000, 30000], sparse_depth=0.0,
                    keep_best=False)  # fmt: skip
     end = args.iterations + (3 + 3 * args.seed if args.time_budget else 0)
     _note(args, "train", words)
     args.m.mkdir(parents=True, exist_ok=True)
     if (args.s / "broken").exists():
         sys.exit("error: <b>the scene</b> is broken; fix it")
-    if args.advise:
-        advice, nothing = args.s / "advice.json", json.dumps([{"text": "20 photos train", "options": ""}])
-        (args.m / "advice.json").write_text(advice.read_text() if advice.exists() else nothing)
-        return
     if (args.s / "full").exists():
         (args.m / "chkpnt9.pth").write_bytes(b"")
         sys.exit("error: training ran out of memory")
@@ -78,7 +73,7 @@ def train(words: list[str], _: dict[str, str]) -> None:
         cost = f"{t},{t * slowness / 10},{t},{100 * t * slowness},{300 + t}"
         rows.append(f"{cost},0.1,{best - 10 + 10 * progress},{0.7 + 0.2 * progress},0.1,30,0.95")
     (args.m / "error_vs_time.csv").write_text("\n".join(rows) + "\n")
-    (args.m / "stand_in.json").write_text(json.dumps({"psnr": best, "appearance": args.appearance}))
+    (args.m / "stand_in.json").write_text(json.dumps({"psnr": best}))
     (args.m / "cameras.json").write_text(json.dumps([{"img_name": f"photo_{i}.jpg"} for i in range(9)]))
     log = []
     for t in sorted({*args.save_iterations, *([end // 4] if args.keep_best else []), end}):
@@ -115,7 +110,7 @@ def _wait_for_a_signal(args: argparse.Namespace) -> None:
 
 def render(words: list[str], _: dict[str, str]) -> None:
     """Two grey test views, with a brighter stripe in the renders."""
-    args = _parsed(words, iteration="", appearance=None)
+    args = _parsed(words, iteration="")
     _note(args, "render", words)
     folder = args.m / "test" / f"ours_{args.iteration}"
     for side in ("gt", "renders"):
@@ -125,8 +120,6 @@ def render(words: list[str], _: dict[str, str]) -> None:
             if side == "renders":
                 image.paste((110, 90, 90), (0, 0, 120, 20))
             image.save(folder / side / f"{index:05d}.png")
-    if args.appearance or json.loads((args.m / "stand_in.json").read_text())["appearance"]:
-        folder.with_name(f"{folder.name}_fitted_appearance").mkdir(exist_ok=True)
     (folder / "render_times.json").write_text(json.dumps({"median_ms": 4.0, "fps": 250.0}))
 
 

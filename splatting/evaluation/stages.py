@@ -246,10 +246,6 @@ def _scored(model: Path, methods: Sequence[str]) -> bool:
         return False
 
 
-def _say(what: str) -> None:
-    print(f"  {what}", flush=True)
-
-
 def _script(name: str, *words: str) -> list[str]:
     return [sys.executable, str(_ROOT / name), *words]
 
