@@ -13,7 +13,8 @@ from splatting.files.json_files import read_json, write_json
 from utils.system_utils import UserError
 
 NAME = "poses.json"
-_REMEDY = "save the model again, or write refine_poses=false into model.json to render from the dataset's poses"
+_WITHOUT = "write refine_poses=false into model.json to render from the dataset's poses"
+_REMEDY = f"save the model again, or {_WITHOUT}"
 
 
 def write_poses(folder: str | os.PathLike, train: Sequence[Camera], test: Sequence[Camera]) -> None:
@@ -53,5 +54,5 @@ def _placed(views: Sequence[CameraInfo], entries: Any, path: Path) -> list[Camer
     if any(R.shape != (3, 3) or T.shape != (3,) for R, T in poses):
         raise UserError(f"{path} has a pose that is not R (3, 3) and T (3,); {_REMEDY}")
     if any("lens" in entry for entry in entries):
-        raise UserError(f"{path} has refined lenses, which this version does not know; {_REMEDY}")
+        raise UserError(f"{path} has refined lenses, which this version does not know; {_WITHOUT}")
     return [view._replace(R=R, T=T) for view, (R, T) in zip(views, poses, strict=True)]

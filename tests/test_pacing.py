@@ -79,7 +79,7 @@ def test_a_budget_of_few_pixels_takes_smaller_views_at_first(megapixels, name):
         return 0.02 / seen[-1]
 
     last, _ = _run(schedule, seconds)
-    recorded = schedule.recorded(last, last=True)
+    recorded = schedule.up_to(last)
     assert recorded.resolution_schedule == schedule.sizes == name and _factors(DecidedSchedule(recorded), last) == seen
     assert list(dict.fromkeys(seen)) == ([1.0, 4.0, 2.0] if name == "pyramid" else [1.0])  # at last whole again
     assert seen[0] == seen[-1] == 1.0
@@ -147,7 +147,7 @@ def test_a_resumed_run_goes_on_from_its_place_with_the_seconds_that_are_left(tmp
         whole.reach(at, seconds)
         seconds += _noisy(at, 0)
     assert at != whole.blocks[-1].last  # within a block
-    write_schedule(tmp_path / "schedule.json", whole.recorded(at, False))
+    write_schedule(tmp_path / "schedule.json", whole.up_to(at))
     before = read_schedule(tmp_path / "schedule.json")
     assert before.ended is None
     schedule = TimeBudget(before)
@@ -349,11 +349,12 @@ def test_a_budgeted_training_replays_and_resumes_to_the_byte(colmap_scene, tmp_p
     said = r"\d+ iterations in (19|20)\.\d s \(budget 20 s, [\d.]+ s with start, scores and saves\)"
     assert re.match(said, record["lines"][0])
     (checkpoint,) = clocked.glob("chkpnt*.pth")
+    (clocked / "schedule.json").rename(tmp_path / "schedule.json")  # of which a checkpoint needs nothing
     monkeypatch.undo()  # the clock of this machine has no say below
-    assert _train(colmap_scene, replayed, *every, "--schedule", clocked / "schedule.json") == saved
-    assert (replayed / "schedule.json").read_bytes() == (clocked / "schedule.json").read_bytes()
+    assert _train(colmap_scene, replayed, *every, "--schedule", tmp_path / "schedule.json") == saved
+    assert (replayed / "schedule.json").read_bytes() == (tmp_path / "schedule.json").read_bytes()
     again = _train(
-        colmap_scene, resumed, *every, "--start_checkpoint", checkpoint, "--schedule", clocked / "schedule.json"
+        colmap_scene, resumed, *every, "--start_checkpoint", checkpoint, "--schedule", tmp_path / "schedule.json"
     )
     assert again == saved | again and max(again) == max(saved)
     _timed(monkeypatch, lambda t: 0.3)
@@ -417,16 +418,16 @@ def test_a_checkpoint_finds_its_place_or_is_refused(colmap_scene, tmp_path, monk
     assert max(saved) in (79, 80, 81)
     (checkpoint,) = clocked.glob("chkpnt*.pth")
     for reason, more in (
-        ("and without one --iterations 60 leaves nothing to do; resume it with --time_budget", ("--iterations", 60)),
+        ("so --iterations 60 leaves nothing to do", ("--iterations", 60)),
         ("of a schedule of 60 iterations, not 61", ("--iterations", 61, "--time_budget", 9)),
-        ("with --resolution_schedule none; resume", ("--iterations", 60, "--time_budget", 9, "--resolution_schedule",
+        ("with --resolution_schedule none; leave", ("--iterations", 60, "--time_budget", 9, "--resolution_schedule",
                                                      "pyramid")),
     ):  # fmt: skip
         with pytest.raises(UserError, match=reason):
             _train(colmap_scene, tmp_path / "out", "--start_checkpoint", checkpoint, *more)
-    (steady / "schedule.json").write_text("{")
-    with pytest.raises(UserError, match="is no schedule .*; restore it for .*chkpnt30.pth, or move it elsewhere"):
-        _train(colmap_scene, tmp_path / "out", "--iterations", 60, *start, "--time_budget", 9)
+    for broken in ({}, {"blocks": []}, GOOD):  # the last ends before the checkpoint
+        with pytest.raises(UserError, match=r"^the schedule in a.pth is broken \(.*\); give another one$"):
+            schedule_of(options(time_budget=9.0), "a.pth", 30, before=broken)
 
 
 def test_a_decided_run_goes_through_rates_degrees_and_windows(colmap_scene, tmp_path, monkeypatch):
@@ -459,40 +460,31 @@ def test_a_checkpoint_comes_with_its_schedule_and_the_last_one_is_the_end(colmap
         _train(colmap_scene, tmp_path / "on", "--time_budget", 4, "--start_checkpoint", checkpoint)
 
 
-def test_a_steady_run_leaves_the_schedule_of_a_folder_where_it_goes_on(colmap_scene, tmp_path, monkeypatch, capsys):
-    """Earlier checkpoints keep their place in it; later ones are of no schedule."""
+def test_a_steady_run_goes_on_from_a_checkpoint_of_a_budget_and_removes_the_schedule(
+    colmap_scene, tmp_path, monkeypatch, capsys
+):
+    """Earlier checkpoints keep their place in it; its own are of no schedule."""
     out, path = tmp_path / "out", tmp_path / "out" / "schedule.json"
     _timed(monkeypatch, lambda t: 0.1)
-    plans = "--checkpoint_iterations", 20, 40
-    whole = _train(colmap_scene, out, "--iterations", 60, *plans, "--time_budget", 5)
+    whole = _train(colmap_scene, out, "--iterations", 60, "--checkpoint_iterations", 20, 40, "--time_budget", 5)
     before, (early, late) = read_schedule(path), sorted(out.glob("chkpnt*.pth"), key=lambda c: int(c.stem[6:]))
     on = int(late.stem[6:])
     assert before.ended == max(whole) > on
     more = "--iterations", on + 20, "--checkpoint_iterations", on + 10, "--start_checkpoint"
     _train(colmap_scene, out, *more, late)
-    assert "is of a run with --time_budget, and this one has none" in capsys.readouterr().err
-    left = read_schedule(path)
-    assert left == DecidedSchedule(before).up_to(on) and (left.ended, left.blocks[-1].last) == (None, on)
-    with pytest.raises(UserError, match="is of a run that did not end"):
-        _train(colmap_scene, tmp_path / "a", "--iterations", 60, "--schedule", path)
-    # A checkpoint of the steady run is of no run with a budget, and one from before still is.
+    assert f"and this one has neither: it goes on at iteration {on} of --iterations" in capsys.readouterr().err
+    assert not path.exists()
     steady = out / f"chkpnt{on + 10}.pth"
     _train(colmap_scene, out, *more, steady)
-    assert "--time_budget" not in capsys.readouterr().err and read_schedule(path) == left
-    with pytest.raises(UserError, match=f"ends before iteration {on + 10} of .*, so it is of another run"):
-        _train(colmap_scene, tmp_path / "b", "--iterations", 60, "--time_budget", 5, "--start_checkpoint", steady)
+    assert "--time_budget" not in capsys.readouterr().err
     _train(colmap_scene, out, "--iterations", 60, "--time_budget", 5, "--start_checkpoint", early)
     first = DecidedSchedule(before).up_to(int(early.stem[6:])).blocks
     assert read_schedule(path).blocks[: len(first)] == first and len(first) > 3
-
-
-def test_a_steady_run_from_elsewhere_removes_the_schedule_of_its_folder(colmap_scene, tmp_path):
-    """From the start, or from the checkpoint of another folder."""
-    for name, start in (("a", ()), ("b", ("--start_checkpoint", tmp_path / "a" / "chkpnt10.pth"))):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "schedule.json").write_text(json.dumps(GOOD))
-        _train(colmap_scene, tmp_path / name, "--iterations", 20, "--checkpoint_iterations", 10, *start)
-        assert not (tmp_path / name / "schedule.json").exists()
+    _train(colmap_scene, out, "--iterations", on + 60, "--time_budget", 5, "--start_checkpoint", steady)
+    assert f"has no pace of a time budget: its iterations count as {on + 10} of" in capsys.readouterr().err
+    assert read_schedule(path).blocks[0].last == on + 10
+    _train(colmap_scene, out, "--iterations", 20)
+    assert not path.exists()
 
 
 def test_a_time_budget_takes_the_strategy_that_is_best_in_it(colmap_scene, tmp_path, monkeypatch, capsys):
@@ -574,7 +566,7 @@ def test_a_number_of_iterations_goes_through_the_whole_schedule(tmp_path):
     steps = [schedule.schedule_step(t) for t in range(1001)]
     assert steps[::500] == [0, 15_000, 30_000] and schedule.is_last(1000)
     assert DensityControl.most(SimpleNamespace(schedule=schedule), 100, 10, 90_000) == 90_000
-    write_schedule(tmp_path / "schedule.json", schedule.recorded(1000, True))
+    write_schedule(tmp_path / "schedule.json", schedule.up_to(1000))
     assert read_schedule(tmp_path / "schedule.json").blocks == schedule.blocks
     for words, reason in (({"schedule": "0"}, "between 1 and 2147483647"), ({"time_budget": 9.0}, "leave one out")):
         with pytest.raises(UserError, match=reason):

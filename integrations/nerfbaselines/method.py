@@ -28,8 +28,6 @@ from splatting.training.observer import Observer
 from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.observers.guards import MaskWatch, MemoryGuard
 from splatting.training.run import Run
-from splatting.training.schedule import DecidedSchedule
-from splatting.training.schedule_file import NAME, write_schedule
 from train import parse
 from utils.system_utils import UserError, compute_device
 
@@ -197,8 +195,6 @@ class GaussianSplatting(Method):
         options.source_path = options.model_path = ""  # they lie in a temporary folder
         folder.mkdir(parents=True, exist_ok=True)
         with self._look():
-            if self._at and isinstance(run.schedule, DecidedSchedule):
-                write_schedule(folder / NAME, run.schedule.recorded(iteration, self._at.last))
             save_checkpoint(folder / f"chkpnt{iteration}.pth", run.captured(), iteration)
             self._gaussians.save_ply(str(saved_ply(folder, iteration)))
         run.log.add(iteration, run.clock.seconds, gaussians=self._gaussians.gaussian_count, loss=run.losses.mean)

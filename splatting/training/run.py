@@ -96,7 +96,8 @@ class Run:
         self.lost = 0
         self.interrupt, self.device = DeferredInterrupt(), compute_device()
         capture, self.first_iteration = self._read_start()
-        self.schedule = schedule_file.schedule_of(opt, self.start, self.first_iteration, self.group.shared)
+        before = capture and further(capture, schedule_file.KEY)
+        self.schedule = schedule_file.schedule_of(opt, self.start, self.first_iteration, self.group.shared, before)
         if isinstance(self.schedule, DecidedSchedule):
             end_in_time(opt)
         self.warnings: list[str] = []
@@ -270,7 +271,7 @@ class Run:
         if not start or not (Path(folder) / "cameras.json").exists():
             self.scene.write_inputs()
         if not isinstance(self.schedule, DecidedSchedule) and self.group.first:
-            schedule_file.leave_schedule(Path(folder), self.first_iteration if checks.lies_in(start, folder) else 0)
+            (Path(folder) / schedule_file.NAME).unlink(missing_ok=True)
         density = self.density
         wants = density.most_gaussians, density.absolute_gradients
         announce_memory(self.scene, self.gaussians, self.memory, *wants, self.group.size)
@@ -420,6 +421,7 @@ class Run:
     def captured(self) -> tuple:
         """The state of the model for a checkpoint, from which a training resumes. Every rank must call it."""
         state, widths = self.gaussians.capture(), self.gaussians.filter_3d
+        paced = isinstance(self.schedule, DecidedSchedule) and self.schedule.blocks
         filtered = widths is not None and len(widths) == len(self.gaussians)  # not where memory ran out on the way
         states = {
             POSES: self.poses and self.poses.captured(),
@@ -428,6 +430,7 @@ class Run:
             SKY: self.sky and self.sky.captured(),
             BEST: self.best and self.best.captured(),
             ASLEEP: self.sleeping and self.sleeping.captured(),
+            schedule_file.KEY: schedule_file.table_of(self.schedule.decided) if paced else None,
         }
         return with_further(state, {key: found for key, found in states.items() if found is not None})
 

@@ -127,7 +127,7 @@ class Block(NamedTuple):
 
 
 class Decided(NamedTuple):
-    """What a run decided, as schedule.json keeps it (splatting/training/schedule_file.py)."""
+    """What a run decided, as schedule.json and checkpoints keep it (splatting/training/schedule_file.py)."""
 
     iterations: int  # of its schedule
     blocks: list[Block]
@@ -187,16 +187,17 @@ class DecidedSchedule(Schedule):
     def known(self, planned: Sequence[int]) -> list[int]:
         return [self.ends] if self.ends is not None and self.length in planned else []
 
-    def recorded(self, iteration: int, last: bool) -> Decided:
-        """The schedule of a run that has taken an iteration. last: it ended with it."""
-        return self.up_to(iteration)._replace(ended=iteration) if last else self._decided
+    @property
+    def decided(self) -> Decided:
+        """All that is decided by now, also of iterations to come."""
+        decided = {"resolution_schedule": self.sizes, "levels": self.levels, "strategy": self.strategy}
+        return self._decided._replace(blocks=self.blocks, ended=self.ends, **decided)
 
     def up_to(self, iteration: int) -> Decided:
         """The schedule of a run that went no further than an iteration."""
         index, block = self._block(iteration)
         blocks = [*self.blocks[:index], block._replace(last=iteration)]
-        decided = {"resolution_schedule": self.sizes, "levels": self.levels, "strategy": self.strategy}
-        return self._decided._replace(blocks=blocks, ended=None, **decided)
+        return self.decided._replace(blocks=blocks, ended=iteration if self.is_last(iteration) else None)
 
     def _block(self, iteration: int) -> tuple[int, Block]:
         index = bisect_left(self.blocks, iteration, key=lambda block: block.last)
@@ -241,9 +242,6 @@ class TimeBudget(DecidedSchedule):
             if self._open and self._measured > 2 and seconds > _KNOWN * self.seconds:
                 self._choose_sizes(iteration - 1, seconds)
             self._decide(seconds)
-
-    def recorded(self, iteration: int, last: bool) -> Decided:
-        return self.up_to(iteration)._replace(ended=iteration if last else None)
 
     def _measure(self, seconds: float) -> None:
         """Take the speed of the block that is done, if this run has taken it."""

@@ -1,13 +1,13 @@
 """The schedule that a run follows, by its options, and schedule.json.
 
-schedule.json tells how a run with --time_budget went through its schedule, so that another one can do the same.
+schedule.json tells how a run with --time_budget went through its schedule, so that another one can do the same. Its
+checkpoints hold the same table, from which a resumed run goes on.
 """
 
 import argparse
 import math
 import sys
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,48 +25,34 @@ from splatting.training.schedule import (
 from utils.system_utils import UserError
 
 NAME = "schedule.json"
+KEY = "schedule"  # of the table among the state in a checkpoint
 _MOST = 2**31 - 1  # iterations, as of --iterations
+_BROKEN = ValueError, TypeError, KeyError, AttributeError, IndexError, OverflowError, RecursionError
+
+
+def table_of(decided: Decided) -> dict[str, Any]:
+    """A schedule as plain values, for a file or a checkpoint."""
+    return decided._asdict() | {"blocks": [block._asdict() for block in decided.blocks]}
 
 
 def write_schedule(path: Path, decided: Decided) -> None:
     """Write the whole file or none."""
-    write_json(path, decided._asdict() | {"blocks": [block._asdict() for block in decided.blocks]})
+    write_json(path, table_of(decided))
 
 
-def read_schedule(path: Path, remedy: str = f"name the {NAME} of a run with --time_budget") -> Decided:
-    """The schedule of a file. UserError, which ends with the remedy, if it is missing or broken."""
+def read_schedule(path: Path) -> Decided:
+    """The schedule of a file. UserError if it is missing or broken."""
+    remedy = f"name the {NAME} of a run with --time_budget"
     try:
         return _decided(read_json(path))
     except OSError as error:
         raise UserError(f"cannot read {path} ({error.strerror}); {remedy}") from error
-    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+    except _BROKEN as error:
         raise UserError(f"{path} is no schedule of a run ({_reason(error)}); {remedy}") from error
 
 
 def _reason(error: Exception) -> str:
     return f"{error} is missing" if isinstance(error, KeyError) else str(error)
-
-
-def leave_schedule(folder: Path, iteration: int) -> None:
-    """Let the schedule of a folder end with an iteration, from which a run without a time budget goes on; 0: remove it.
-
-    Checkpoints up to there keep their place in it. A broken file stays as it is.
-    """
-    path = folder / NAME
-    if not iteration:
-        return path.unlink(missing_ok=True)
-    with suppress(UserError):
-        found = read_schedule(path)
-        if found.blocks[-1].last >= iteration:
-            write_schedule(path, DecidedSchedule(found).up_to(iteration))
-
-
-def covers(path: Path, iteration: int) -> bool:
-    """Whether an iteration was one of the run of a schedule; True for a broken file, False without one."""
-    try:
-        return path.exists() and read_schedule(path).blocks[-1].last >= iteration
-    except UserError:
-        return True
 
 
 def _decided(content: Any) -> Decided:
@@ -115,13 +101,14 @@ def schedule_of(
     checkpoint: str | None,
     first_iteration: int,
     share: Callable[[float], float] = lambda seconds: seconds,
+    before: Any = None,
 ) -> Schedule:
     """The schedule of a run. UserError for one that this run cannot follow, or that leaves nothing to do.
 
-    checkpoint: a chkpntN.pth that is resumed, or None. first_iteration: its N, or 0.
-    share: gives all processes the seconds of one.
+    checkpoint: a chkpntN.pth that is resumed, or None. first_iteration: its N, or 0. share: gives all processes the
+    seconds of one. before: the table in the checkpoint, None: it has none.
     """
-    schedule = _chosen(opt, checkpoint, first_iteration, share)
+    schedule = _chosen(opt, checkpoint, first_iteration, share, before)
     if not schedule.is_over(first_iteration):
         return schedule
     at = f"{checkpoint} is at iteration {first_iteration}"
@@ -136,35 +123,20 @@ def schedule_of(
 
 
 def _chosen(
-    opt: argparse.Namespace, checkpoint: str | None, first_iteration: int, share: Callable[[float], float]
+    opt: argparse.Namespace, checkpoint: str | None, first_iteration: int, share: Callable[[float], float], before: Any
 ) -> Schedule:
     if opt.schedule.isdecimal() and not Path(opt.schedule).exists():
         return DecidedSchedule(_even(int(opt.schedule), opt))
     if opt.schedule:
         return DecidedSchedule(_recorded(Path(opt.schedule), opt))
-    path = Path(checkpoint).parent / NAME if checkpoint else None
     if not opt.time_budget:
-        if path and covers(path, first_iteration):
-            _tell_of_budget(checkpoint, first_iteration, opt.iterations)
+        if before is not None:
+            told = f"warning: {checkpoint} is of a run with --time_budget or --schedule, and this one has neither: it"
+            print(f"{told} goes on at iteration {first_iteration} of --iterations {opt.iterations}", file=sys.stderr)
         return SettlingSchedule(opt.iterations) if opt.strategy == "budget" else Schedule(opt.iterations)
-    if not path:
+    if not first_iteration:
         return TimeBudget(Decided(opt.iterations, [], None, opt.time_budget, opt.resolution_schedule), share)
-    before = _before(path, checkpoint, opt, first_iteration)
-    return TimeBudget(before._replace(time_budget=opt.time_budget), share)
-
-
-def _tell_of_budget(checkpoint: str, first_iteration: int, iterations: int) -> None:
-    """Warn that a run goes on without the time budget that it had; UserError if no iteration is left then."""
-    if first_iteration >= iterations:
-        raise UserError(
-            f"{checkpoint} is at iteration {first_iteration} of a run with --time_budget, and without one --iterations "
-            f"{iterations} leaves nothing to do; resume it with --time_budget"
-        )
-    print(
-        f"warning: {checkpoint} is of a run with --time_budget, and this one has none: it goes on at iteration "
-        f"{first_iteration} of {iterations}",
-        file=sys.stderr,
-    )
+    return TimeBudget(_resumed(before, checkpoint, opt, first_iteration)._replace(time_budget=opt.time_budget), share)
 
 
 def _even(count: int, opt: argparse.Namespace) -> Decided:
@@ -181,42 +153,36 @@ def _even(count: int, opt: argparse.Namespace) -> Decided:
 def _recorded(path: Path, opt: argparse.Namespace) -> Decided:
     if opt.time_budget:
         raise UserError("--time_budget and --schedule both give the pace of a run; leave one out")
-    found = _read(path, opt)
-    if opt.resolution_schedule not in ("auto", found.resolution_schedule):
-        raise UserError(
-            f"{path} is of a run with --resolution_schedule {found.resolution_schedule}; leave that option out, as "
-            "--schedule takes it from there"
-        )
+    found = _fitting(read_schedule(path), path, opt)
     if found.ended is None:
         raise UserError(f"{path} is of a run that did not end; resume that run, or name the {NAME} of another one")
     return found
 
 
-def _read(path: Path, opt: argparse.Namespace, *remedy: str) -> Decided:
-    found = read_schedule(path, *remedy)
+def _fitting(found: Decided, path: Path | str, opt: argparse.Namespace) -> Decided:
+    """A schedule of a file, if the options fit it (UserError)."""
     if found.iterations != opt.iterations:
         raise UserError(
             f"{path} is of a schedule of {found.iterations} iterations, not {opt.iterations}; give --iterations "
             f"{found.iterations}, as in the run that wrote it"
         )
+    if opt.resolution_schedule not in ("auto", found.resolution_schedule):
+        raise UserError(
+            f"{path} is of a run with --resolution_schedule {found.resolution_schedule}; leave that option out, as it "
+            "is taken from there"
+        )
     return found
 
 
-def _before(path: Path, checkpoint: str, opt: argparse.Namespace, first_iteration: int) -> Decided:
-    """The schedule so far of the runs that are resumed; one block if they had no budget."""
-    if not path.exists():
+def _resumed(before: Any, checkpoint: str, opt: argparse.Namespace, first_iteration: int) -> Decided:
+    """The schedule so far of the runs that are resumed; one block if their checkpoint has none."""
+    if before is None:
+        told = f"{checkpoint} has no pace of a time budget: its iterations count as {first_iteration} of the schedule"
+        print(told, file=sys.stderr)
         step = 1.0 / max(opt.iterations, first_iteration + 1)
         return Decided(opt.iterations, [Block(first_iteration, 0.0, step, 0.0)], None, 0.0, opt.resolution_schedule)
-    remedy = "move it elsewhere to resume that checkpoint as one of a run without a time budget"
-    found = _read(path, opt, f"restore it for {checkpoint}, or {remedy}")
-    if found.blocks[-1].last < first_iteration:
-        raise UserError(
-            f"{path} ends before iteration {first_iteration} of {checkpoint}, so it is of another run; {remedy}"
-        )
-    if opt.resolution_schedule not in ("auto", found.resolution_schedule):
-        raise UserError(
-            f"{checkpoint} is of a run with --resolution_schedule {found.resolution_schedule}; resume it with that"
-        )
-    if found.ended == first_iteration:
-        return found
-    return DecidedSchedule(found).up_to(first_iteration)
+    try:
+        found = DecidedSchedule(_decided(before)).up_to(first_iteration)
+    except _BROKEN as error:
+        raise UserError(f"the schedule in {checkpoint} is broken ({_reason(error)}); give another one") from error
+    return _fitting(found, checkpoint, opt)

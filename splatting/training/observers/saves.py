@@ -114,7 +114,7 @@ class Checkpoints(Observer):
             run.gaussians.check_finite(step.iteration)
             tqdm.write(f"[ITER {step.iteration}] Saving Checkpoint", file=sys.stdout)
             path = Path(run.scene.model_path) / f"chkpnt{step.iteration}.pth"
-            save_schedule(run, step)  # first: a checkpoint never lacks its place in the schedule
+            save_schedule(run, step)
             run.scene.save_views()
             save_checkpoint(path, run.captured(), step.iteration)
             run.log.add(step.iteration, seconds, gaussians=run.gaussians.gaussian_count, loss=run.losses.mean)
@@ -131,7 +131,7 @@ def save_schedule(run: Run, step: Iteration) -> None:
     """Write what the schedule has decided up to an iteration, if anything, and the sizes of views to model.json."""
     if isinstance(run.schedule, DecidedSchedule):
         folder = run.scene.model_path
-        write_schedule(Path(folder) / NAME, run.schedule.recorded(step.iteration, step.last))
+        write_schedule(Path(folder) / NAME, run.schedule.up_to(step.iteration))
         if run.opt.time_budget:
             add_to_model_json(folder, resolution_schedule=run.schedule.sizes)
 
