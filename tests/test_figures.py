@@ -111,10 +111,13 @@ def test_lines_are_of_the_views_on_which_all_runs_compare(tmp_path, drawn):
     peer = {"name": "other", "curve": curve((0.5, 40.0))}
     draw_curves(tmp_path, "attic", runs_of({name: curves[i] + whole for i, name in enumerate("ab")}), [peer])
     draw_curves(tmp_path, "attic", runs_of({name: curves[i] + whole for i, name in enumerate("abc")}))
+    apart = runs_of({"c": curves[2] + whole})[0] | {"apart": True}
+    draw_curves(tmp_path, "attic", [*runs_of({name: curves[i] for i, name in enumerate("ab")}), apart])
+    assert drawn[4].legends[0].get_title().get_text().startswith("2 of ")
     same, mixed = drawn[0].axes[0], drawn[2].axes[0]
     assert points(same, "b") == [[[2.0, 22.0], [9.0, 23.0]]] and hollow(same) == [[[9.0, 50.0]]] * 2
     assert points(same, "Pareto front") == [[[1.0, 20.0], [2.0, 20.0], [2.0, 22.0], [9.0, 22.0], [9.0, 23.0]]]
-    said = [figure.legends[0].get_title().get_text().splitlines()[0] for figure in drawn[::2]]
+    said = [figure.legends[0].get_title().get_text().splitlines()[0] for figure in drawn[:4:2]]
     assert said == ["2 of 7 test views; hollow and other programs: all of them", "all 7 test views"]
     assert [points(mixed, name) for name in "abc"] == [[[[9.0, 50.0]]]] * 3 and not hollow(mixed)
 

@@ -169,7 +169,7 @@ def draw_curves(
     runs = [run for run in runs if any(row["test_psnr"] is not None for row in run["curve"])]
     several = len({run["config"] for run in runs}) > 1
     counts = {run["views"]["test"] for run in runs}
-    subset = common_subset(run["curve"] for run in runs)
+    subset = common_subset(run["curve"] for run in runs if not run["apart"])
     said = _views_text(subset, counts.pop() if len(counts) == 1 else None)
     said += "" if subset is None else f"; hollow{' and other programs' if peers else ''}: all of them"
     more = ["a line for each seed"] * (len(runs) > len({run["config"] for run in runs}))
