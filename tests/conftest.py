@@ -24,6 +24,12 @@ MOST_SECONDS = 5.0  # of processors, for a test that is not marked slow
 HAS_GPU = torch.cuda.is_available()  # whose first calls take seconds
 
 
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """On a new machine matplotlib looks at all fonts for a dozen seconds, which is no test's own time."""
+    if not hasattr(session.config, "workerinput"):
+        import matplotlib.font_manager  # noqa: F401
+
+
 @pytest.fixture(scope="session")
 def shared_dir() -> Path:
     """Folder with real scenes and models: $GS_SHARED, or `shared` beside the repository; skips if it is missing."""
@@ -73,8 +79,7 @@ def cache_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 @pytest.fixture(scope="session", autouse=True)
 def hangups() -> None:
     """Programs under test see SIGHUP, also where the tests themselves run under nohup."""
-    if hasattr(signal, "SIGHUP"):
-        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 class Undrawn(curve_recorder.CurveDrawer):
