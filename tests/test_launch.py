@@ -15,6 +15,7 @@ from waiting import wait_for
 
 import train
 
+pytestmark = pytest.mark.slow
 SECONDS = ("seconds", "wall_seconds", "peak_memory_mib")
 
 
@@ -60,7 +61,6 @@ def _tensors(path: Path) -> list[torch.Tensor]:
     return [part for part in capture if torch.is_tensor(part)]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "said"),
     [

@@ -407,7 +407,7 @@ def test_resumed(scene, tmp_path, cut, plain, iteration):
     assert not differences(_trained(scene, tmp_path / "b", "--start_checkpoint", checkpoint), plain("default"))
     capture, _ = load_checkpoint(checkpoint)
     asleep = further(capture, ASLEEP)
-    assert (asleep is None) == (iteration != 33)
+    assert (asleep is None) == (iteration in (20, 30, 42))
 
 
 def test_a_checkpoint_from_within_a_step_resumes(scene, tmp_path, cut, plain):
