@@ -32,16 +32,16 @@ def scene(once) -> Path:
     return shared_scene(once)
 
 
-@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
+@pytest.mark.parametrize("name", [name for name in OPTIONS if name != "robust mask"])  # which no host runs ahead of
 @pytest.mark.parametrize("_", GPU)
-def test_a_host_that_runs_ahead_without_capacity_gives_the_same_bytes(scene, tmp_path, monkeypatch, options, _):
+def test_a_host_that_runs_ahead_without_capacity_gives_the_same_bytes(scene, tmp_path, monkeypatch, name, _):
     """Capacity for one instance at first, and never for more than the last visit needed: many steps overflow."""
-    plain = trained(scene, tmp_path / "plain", "--plain_step", *options)
+    plain = trained(scene, tmp_path / "plain", "--plain_step", *OPTIONS[name])
     overflows, replay = [], speculative.Speculation._replay
     monkeypatch.setattr(speculative.Speculation, "_replay", lambda *x: (overflows.append(1), replay(*x)))
     monkeypatch.setattr(speculative, "_with_spare", lambda count, *_: count)
     monkeypatch.setattr(speculative, "_FIRST", (1, 1, 1, 1))
-    assert trained(scene, tmp_path / "overflowing", *options) == plain
+    assert trained(scene, tmp_path / "overflowing", *OPTIONS[name]) == plain
     assert len(overflows) > 5
 
 
