@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
-from synthetic import FakeGaussians, folder_state, options_of, read
+from synthetic import FakeGaussians, edit_json, folder_state, options_of, read
 
 from scene import Scene
 from scene.readers.point_cloud import write_point_cloud
@@ -21,9 +21,7 @@ _read = partial(read, hold_out=True)
 
 
 def _edit(scene: Path, change, name: str = "transforms_train.json") -> None:
-    content = json.loads((scene / name).read_text())
-    change(content)
-    (scene / name).write_text(json.dumps(content))
+    edit_json(scene / name, change)
 
 
 def test_axes_of_a_hand_made_pose(blender_scene):
@@ -122,10 +120,8 @@ def test_random_cloud(blender_scene):
     np.testing.assert_array_equal(_read(blender_scene).point_cloud.points, cloud.points)
 
 
-def test_own_cloud_and_given_cloud(blender_scene, tmp_path):
+def test_a_given_cloud_comes_before_the_own(blender_scene, tmp_path):
     write_point_cloud(blender_scene / "points3d.ply", np.array([[1.0, 2.0, 3.0]]), np.array([[0, 255, 0]]))
-    info = _read(blender_scene)
-    assert info.ply_path == blender_scene / "points3d.ply" and len(info.point_cloud.points) == 1
     write_point_cloud(tmp_path / "mine.ply", np.zeros((2, 3)), np.zeros((2, 3)))
     info = _read(blender_scene, init_pcd_path=str(tmp_path / "mine.ply"))
     assert info.ply_path == tmp_path / "mine.ply" and len(info.point_cloud.points) == 2

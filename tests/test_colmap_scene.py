@@ -64,21 +64,16 @@ def test_the_three_classic_files_and_sparse_itself_suffice(colmap_scene):
     _assert_same(read(colmap_scene), whole)
 
 
-def test_broken_binary_falls_back_to_text(colmap_scene):
-    whole = read(colmap_scene)
-    sparse = colmap_scene / "sparse" / "0"
-    pycolmap.Reconstruction(str(sparse)).write_text(str(sparse))
-    (sparse / "cameras.bin").write_bytes((sparse / "cameras.bin").read_bytes()[:-5])
-    _assert_same(read(colmap_scene), whole)
-
-
-@pytest.mark.parametrize("text", [["cameras"], ["images", "points3D"], ["cameras", "images"]])
+@pytest.mark.parametrize("text", [[], ["cameras"], ["images", "points3D"], ["cameras", "images"]])
 def test_a_model_may_have_files_of_both_kinds(colmap_scene, text):
+    """A broken binary file falls back to text, too."""
     whole = read(colmap_scene)
     sparse = colmap_scene / "sparse" / "0"
     pycolmap.Reconstruction(str(sparse)).write_text(str(sparse))
-    for name in ("cameras", "images", "points3D"):
+    for name in ("cameras", "images", "points3D") if text else ():
         (sparse / f"{name}.{'bin' if name in text else 'txt'}").unlink()
+    if not text:
+        (sparse / "cameras.bin").write_bytes((sparse / "cameras.bin").read_bytes()[:-5])
     _assert_same(read(colmap_scene), whole)
 
 
@@ -165,16 +160,10 @@ def test_a_fresh_scene_writes_its_side_files_and_leaves_the_dataset_alone(colmap
     entries = json.loads((tmp_path / "out" / "cameras.json").read_text())
     assert [entry["id"] for entry in entries] == list(range(17))
     assert [entry["img_name"] for entry in entries] == [c.image_name for c in info.test_cameras + info.train_cameras]
-    assert list(entries[0]) == ["id", "img_name", "width", "height", "position", "rotation", "fy", "fx"]
 
     cloud = read_point_cloud(tmp_path / "out" / "input.ply")
     np.testing.assert_array_equal(cloud.points, gaussians.pcd.points)
     np.testing.assert_array_equal(cloud.colors, gaussians.pcd.colors)
-    header = (tmp_path / "out" / "input.ply").read_bytes().split(b"end_header")[0].decode()
-    assert [line.split()[1:] for line in header.splitlines() if line.startswith("property")] == [
-        *[["float", name] for name in ("x", "y", "z", "nx", "ny", "nz")],
-        *[["uchar", name] for name in ("red", "green", "blue")],
-    ]
 
 
 def test_order_of_views_and_numbers(colmap_scene, tmp_path):

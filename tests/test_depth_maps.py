@@ -6,6 +6,7 @@ import struct
 import subprocess
 import sys
 import zlib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,16 +16,15 @@ import pytest
 import torch
 from gaussians import pipeline
 from PIL import Image
-from synthetic import FakeGaussians
+from synthetic import FakeGaussians, options_of
 
 import train
-from arguments import ModelParams, OptionParser
 from gaussian_renderer import render
 from scene import Scene, colmap_loader
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.readers import depth_maps, depth_scale
-from scene.readers.colmap import read_model, read_model_of_kind
+from scene.readers.colmap import ColmapModel, read_model, read_model_of_kind
 from scene.readers.depth_maps import (
     DepthMap,
     Metric,
@@ -316,6 +316,16 @@ def test_points_are_looked_up_where_colmap_sees_them():
     assert (scale, offset) == pytest.approx((2.0, 0.1), abs=1e-9)
 
 
+def _squares(view: colmap_loader.Image, model: ColmapModel, value: Callable[[float], float]) -> np.ndarray:
+    """A map of eight times the photo's size: a square of value(depth) around each point that a view sees."""
+    camera = model.cameras[view.camera_id]
+    values = np.zeros((camera.height * 8, camera.width * 8))
+    pixels, depths = sightings(view, model.points, camera, "")
+    for (x, y), z in zip(pixels * 8, depths, strict=True):
+        values[max(int(y) - 1, 0) : int(y) + 2, max(int(x) - 1, 0) : int(x) + 2] = value(z)
+    return values
+
+
 @pytest.mark.slow
 def test_the_command_makes_a_file_that_training_takes(colmap_scene, tmp_path, monkeypatch):
     """Make maps of the points themselves: a square around each, with a scale and an offset per photo."""
@@ -325,11 +335,7 @@ def test_the_command_makes_a_file_that_training_takes(colmap_scene, tmp_path, mo
     model = read_model_of_kind(colmap_scene / "sparse/0", "bin", with_2d_points=True)
     for view in model.images:
         scale, offset = rng.uniform(0.5, 1.5), rng.uniform(-0.02, 0.02)
-        camera = model.cameras[view.camera_id]
-        pixels, depths = sightings(view, model.points, camera, "")
-        values = np.zeros((camera.height * 8, camera.width * 8))
-        for (x, y), z in zip(pixels * 8, depths, strict=True):
-            values[max(int(y) - 1, 0) : int(y) + 2, max(int(x) - 1, 0) : int(x) + 2] = (1 / z - offset) / scale
+        values = _squares(view, model, lambda z, scale=scale, offset=offset: (1 / z - offset) / scale)
         assert values.max() < 1
         _save((values * 65535).round().astype(np.uint16), (tmp_path / "maps" / view.name).with_suffix(".png"))
         wanted[view.name.removesuffix(".png")] = (scale, offset)
@@ -430,11 +436,7 @@ def test_one_scale_is_fitted_to_all_metric_maps(colmap_scene, kind, monkeypatch,
     """Maps of the points themselves, 2.5 units a metre, with gaps elsewhere."""
     model = read_model_of_kind(colmap_scene / "sparse/0", "bin", with_2d_points=True)
     for view in model.images:
-        camera = model.cameras[view.camera_id]
-        pixels, depths = sightings(view, model.points, camera, "")
-        values = np.zeros((camera.height * 8, camera.width * 8))
-        for (x, y), z in zip(pixels * 8, depths, strict=True):
-            values[max(int(y) - 1, 0) : int(y) + 2, max(int(x) - 1, 0) : int(x) + 2] = z / 2.5
+        values = _squares(view, model, lambda z: z / 2.5)
         _save_metric(values, (colmap_scene / "depths" / view.name).with_suffix(""), kind)
     if kind == "png":
         (colmap_scene / "depths/metric.json").write_text('{"metres_per_step": 0.001}')
@@ -527,8 +529,7 @@ def test_what_is_masked_has_no_depth_either(scene, tmp_path, monkeypatch):
 
 
 def _depth_error(scene: Path, out: Path) -> float:
-    options = ModelParams(OptionParser()).extract(OptionParser().parse_args([]))
-    options.source_path, options.model_path, options.resolution, options.depths = str(scene), str(out), 24, "depths"
+    options = options_of(scene, out, resolution=24, depths="depths")
     gaussians = GaussianModel(3)
     gaussians.load_ply(out / "point_cloud/iteration_60/point_cloud.ply")
     cameras = Scene(options, FakeGaussians(), shuffle=False, start=False).getTrainCameras()
@@ -543,8 +544,7 @@ def _depth_error(scene: Path, out: Path) -> float:
 
 
 def test_a_finished_model_needs_no_maps(scene):
-    options = ModelParams(OptionParser()).extract(OptionParser().parse_args([]))
-    options.source_path, options.model_path, options.depths = str(scene), str(scene / "model"), "nowhere"
+    options = options_of(scene, scene / "model", depths="nowhere")
     (scene / "model/point_cloud/iteration_1").mkdir(parents=True)
     (scene / "model/point_cloud/iteration_1/point_cloud.ply").write_bytes(b"ply")
     cameras = Scene(options, FakeGaussians(), load_iteration=1).getTrainCameras()

@@ -23,7 +23,6 @@ from scene import Scene
 from scene.check.photos import hints
 from scene.images.decode import decode
 from scene.images.masks import IGNORE, TRANSPARENT, Mask, MaskOptions, find_masks
-from scene.images.side_files import names_below
 from scene.readers.pinholes import _check_mask
 from splatting.training.observers.guards import MaskWatch
 from utils.image_utils import pixels_that_count
@@ -215,9 +214,8 @@ def test_masks_are_found_by_the_names_of_the_pictures(masked_scene, capsys):
 
 @pytest.mark.parametrize("way", ["{0}.mask.png", "{1}.mask.png", "{1}_mask.png", "{0}_mask.png", "{1}_mask.JPG"])
 def test_masks_have_the_names_that_tools_give_them(tmp_path, way):
-    photo = _save(tmp_path / "images" / "a" / "x.jpg", np.full((8, 8), 200, np.uint8))
-    mask = _save(tmp_path / "masks" / "a" / way.format("x.jpg", "x"), np.zeros((8, 8), np.uint8))
-    assert find_masks(tmp_path, ["a/x.jpg"], MaskOptions("masks"), [photo])[0].path == mask
+    mask = "a/" + way.format("x.jpg", "x")
+    assert _of_photos(tmp_path, ["a/x.jpg"], [mask]) == [mask]
 
 
 def _of_photos(tmp_path: Path, names: list[str], masks: list[str], folder: str = "masks") -> list[Path | None]:
@@ -269,13 +267,6 @@ def test_masks_of_several_photos_are_refused(blender_scene):
         _save(blender_scene / "masks" / f"{name}.png", np.zeros((30, 40), np.uint8))
     with pytest.raises(UserError, match="2 masks belong to several photos each, the first is .*r_0.png for .*sub-fold"):
         _views(blender_scene, masks="masks")
-
-
-def test_names_below_a_folder():
-    base = Path("/data/scene")
-    assert names_below(["a/x.png", "a/./y.png"], base) == ["a/x.png", "a/y.png"]
-    assert names_below(["../b/x.png", "a/x.png", "/data/c/y.png"], base) == ["b/x.png", "scene/a/x.png", "c/y.png"]
-    assert names_below(["/data/x.png"], base) == ["x.png"]
 
 
 def test_a_transparent_mask_is_alpha(masked_scene):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from synthetic import FakeGaussians, folder_state, make_nerfstudio_scene, options_of, read
+from synthetic import FakeGaussians, edit_json, folder_state, make_nerfstudio_scene, options_of, read
 
 from scene import Scene
 from scene.dataset_readers import read_scene
@@ -26,9 +26,7 @@ def scene(tmp_path) -> Path:
 
 
 def _edit(scene: Path, change) -> None:
-    content = json.loads((scene / "transforms.json").read_text())
-    change(content)
-    (scene / "transforms.json").write_text(json.dumps(content))
+    edit_json(scene / "transforms.json", change)
 
 
 @pytest.mark.parametrize("distorted", [False, True])
@@ -276,10 +274,11 @@ def test_frames_have_their_own_intrinsics(scene, blender_scene):
     cameras = read(scene).train_cameras
     assert sorted({(camera.fx, camera.fy, camera.cx) for camera in cameras}) == [(77, 110, 40), (110, 110, 45)]
 
-    path = blender_scene / "transforms_train.json"
-    content = json.loads(path.read_text())
-    content["frames"][1] |= {"fl_x": 33.0, "cx": 18.0}
-    path.write_text(json.dumps(content | {"fl_y": 31.0}))
+    def change(content):
+        content["frames"][1] |= {"fl_x": 33.0, "cx": 18.0}
+        content["fl_y"] = 31.0
+
+    edit_json(blender_scene / "transforms_train.json", change)
     cameras = read(blender_scene).train_cameras
     assert (cameras[1].fx, cameras[1].fy, cameras[1].cx, cameras[1].cy) == (33, 31, 18, 15)
     assert (cameras[0].FovX, cameras[0].fy) == (pytest.approx(0.7), 31)

@@ -15,7 +15,7 @@ import train
 from splatting.evaluation.model_folder import MASKED_PHOTOS
 from splatting.evaluation.renders import GAP, HEADER
 from splatting.evaluation.training_log import read_log
-from splatting.training import checks, robust_mask
+from splatting.training import robust_mask
 from splatting.training.observers import guards
 from splatting.training.robust_mask import RobustMask
 from utils.system_utils import UserError, run_cli
@@ -146,8 +146,6 @@ def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         run_cli(lambda: train.main(["-s", str(scene), "-m", str(tmp_path / "out"), "--robust_mask", "0.7"]))
     assert ended.value.code == 2 and "robust_mask" in capsys.readouterr().err
-    with pytest.raises(UserError, match="--robust_mask needs a training of one process"):
-        checks.check_one_process("--robust_mask", several=True)
     masks, others = (RobustMask(_views(n), 0.3, torch.device("cpu")) for n in (3, 4))
     with pytest.raises(UserError, match="residuals of other photos"):
         masks.restore(others.captured())

@@ -208,7 +208,6 @@ def test_random_points_of_a_blender_scene_are_the_references_cube(blender_scene)
 
 
 def test_no_points_at_all(colmap_scene, tmp_path):
-    (tmp_path / "none.ply").write_bytes(b"")
     write_point_cloud(colmap_scene / "sparse" / "0" / "points3D.ply", np.zeros((0, 3)), np.zeros((0, 3)))
     with pytest.raises(UserError, match="has no points; start from random points with --init_type random, or from a f"):
         Scene(options_of(colmap_scene, tmp_path / "out"), FakeGaussians())
