@@ -22,6 +22,7 @@ from utils.system_utils import UserError
 
 Change = Callable[[Path], object]  # changes a scene, and may return options of train.py
 SPARSE, PHOTO = "sparse/0", "images/left/v02.png"
+SMALL = (4, "0"), (5, "1"), (6, "0.25")  # a colour
 XYZ, RGB = "float x, float y, float z", "uchar red, uchar green, uchar blue"
 
 
@@ -46,37 +47,34 @@ def _given(**options: str) -> Change:
     return lambda scene: {name: value.replace("SCENE", str(scene)) for name, value in options.items()}
 
 
-def _word(file: str, *places: tuple[int, str]) -> Change:
-    """Words of the first data line of a text file are replaced; a place at the end ends the line."""
-
-    def change(scene: Path) -> None:
-        as_text(scene)
-        path = scene / SPARSE / file
-        lines = path.read_text().splitlines()
-        first = next(i for i, line in enumerate(lines) if not line.startswith("#"))
-        words = lines[first].split()
-        for place, word in places:
-            words[place] = word
-        lines[first] = " ".join(words)
-        path.write_text("\n".join(lines) + "\n")
-
-    return change
-
-
-def _twice(file: str, number: int, *places: tuple[int, str]) -> Change:
-    """A record of a text file again, with other words, behind the first `number` data lines."""
+def _lines(file: str, edit: Callable[[list[str]], list[str]]) -> Change:
+    """The lines of a text file are edited, of which comments are left out."""
 
     def change(scene: Path) -> None:
         as_text(scene)
         path = scene / SPARSE / file
         lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
-        words = lines[0].split()
-        for place, word in places:
-            words[place] = word
-        again = [" ".join(words), *lines[1:2]] if file == "images.txt" else [" ".join(words)]
-        path.write_text("\n".join([*lines[:number], *again, *lines[number:], ""]))
+        path.write_text("\n".join([*edit(lines), ""]))
 
     return change
+
+
+def _replaced(line: str, places: tuple[tuple[int, str], ...]) -> str:
+    words = line.split()
+    for place, word in places:
+        words[place] = word
+    return " ".join(words)
+
+
+def _word(file: str, *places: tuple[int, str]) -> Change:
+    """Words of the first line of a text file are replaced; a place at the end ends the line."""
+    return _lines(file, lambda lines: [_replaced(lines[0], places), *lines[1:]])
+
+
+def _twice(file: str, number: int, *places: tuple[int, str]) -> Change:
+    """A record of a text file again, with other words, behind the first `number` lines."""
+    more = slice(1, 2 if file == "images.txt" else 1)
+    return _lines(file, lambda lines: [*lines[:number], _replaced(lines[0], places), *lines[more], *lines[number:]])
 
 
 def _same_ids(file: str, length: int, width: int, at: int, each: int) -> Change:
@@ -93,13 +91,6 @@ def _same_ids(file: str, length: int, width: int, at: int, each: int) -> Change:
         path.write_bytes(content)
 
     return change
-
-
-def _small_colours(scene: Path) -> None:
-    as_text(scene)
-    path = scene / SPARSE / "points3D.txt"
-    rows = [line.split() for line in path.read_text().splitlines() if not line.startswith("#")]
-    path.write_text("".join(" ".join([*row[:4], "0", "1", "0.25", *row[7:]]) + "\n" for row in rows))
 
 
 def _cloud(name: str, properties: str, rows: str, element: str = "vertex 1", kind: str = "ascii") -> Change:
@@ -220,11 +211,10 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_no_model, "no COLMAP model.*found sparse/0;"),
         (_gone(f"{SPARSE}/images.bin"), "^SCENE/sparse/0 has no images as .bin or .txt; copy the"),
         (_cut(f"{SPARSE}/cameras.bin", 5), "0/cameras.bin ends within camera 1 of 1, or is no such file; copy the"),
-        (_written(f"{SPARSE}/cameras.bin", b""), "^SCENE/sparse/0/cameras.bin is empty; copy the file again from"),
         (_written(f"{SPARSE}/images.bin", "<!DOCTYPE html><html>404</html>"), "0/images.bin is a web page"),
         (_no_views, "COLMAP model in SCENE/sparse/0 has no registered photo"),
-        (_word("cameras.txt", (4, "wide")), r"line 4 of SCENE/sparse/0/cameras\.txt .*wide"),
-        (_word("cameras.txt", (1, "PINHOLE2")), r"line 4 of .*0/cameras\.txt .*no camera model PINHOLE2"),
+        (_word("cameras.txt", (4, "wide")), r"line 1 of SCENE/sparse/0/cameras\.txt .*wide"),
+        (_word("cameras.txt", (1, "PINHOLE2")), r"line 1 of .*0/cameras\.txt .*no camera model PINHOLE2"),
         (
             _word("cameras.txt", (1, "EQUIRECTANGULAR"), (4, "96"), (5, "64"), (6, ""), (7, "")),
             "V03.png is a panorama, which no pinhole image can show; train on it with --lenses native",
@@ -234,7 +224,7 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_word("images.txt", (5, "nan")), "pose of .*png is not finite"),
         (_word("images.txt", (5, "1e30")), "more than 1e[+]12 from the origin"),
         (_word("images.txt", (8, "77")), r"SCENE/sparse/0/images\.txt has the camera 77"),
-        (_word("points3D.txt", (2, "nan")), r"line 4 of SCENE/sparse/0/points3D\.txt .*nan"),
+        (_word("points3D.txt", (2, "nan")), r"line 1 of SCENE/sparse/0/points3D\.txt .*nan"),
         (_twice("cameras.txt", 1), "^line 1 and line 2 of .*cameras.txt both have the id 1; keep one"),
         (_twice("images.txt", 4, (9, "other.png")), r"^line 1 and line 5 of .*images\.txt both have the id \d"),
         (_twice("images.txt", 4, (0, "999")), r"^line 1 and line 5 of .*images\.txt both have the name left/v08.png"),
@@ -244,7 +234,10 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
             r"^photo 1 and photo 2 of .*images\.bin both have the id",
         ),
         (_same_ids("points3D.bin", 51, 8, 43, 8), r"^point 1 and point 2 of .*points3D\.bin both have the id"),
-        (_small_colours, r"^line 1 of .*points3D\.txt has the colour 0.0 1.0 0.25, and COLMAP's range from 0 to 255;"),
+        (
+            _lines("points3D.txt", lambda lines: [_replaced(line, SMALL) for line in lines]),
+            r"^line 1 of .*points3D\.txt has the colour 0.0 1.0 0.25, and COLMAP's range from 0 to 255;",
+        ),
         (_gone(PHOTO), "1 of 9 photos .*are missing: SCENE/images/left/v02.png"),
         (_seven_gone, r"7 of 9 photos that .* lists are missing: .*Right/V03.png, .* and 2 more \(the folder has .*-i"),
         (_converted, r"9 of 9 photos .*Right/V03.png.*the folder has Right/V03.bmp, .*go on without.*image_deleter"),

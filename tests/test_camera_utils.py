@@ -1,7 +1,6 @@
 """Cameras of records: loadCam and the lists that a scene makes with it, also when other code has replaced them."""
 
 import math
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,6 +16,7 @@ import scene as scene_package
 import train
 from scene import Scene
 from scene.cameras import Camera
+from scene.dataset_readers import CameraInfo
 from utils import camera_utils
 from utils.system_utils import UserError
 
@@ -97,7 +97,7 @@ def test_halves_by_the_record_and_the_list(record):
 def test_entries_of_plain_records(record):
     plain = SimpleNamespace(**{name: getattr(record, name) for name in ("R", "T", "FovX", "FovY")})
     plain.width, plain.height, plain.image_name = 80, 48, "b"
-    for camera in (plain, record):
+    for camera in (plain, record, CameraInfo(*record)):
         entry = camera_utils.camera_to_JSON(4, camera)
         assert list(entry) == ["id", "img_name", "width", "height", "position", "rotation", "fy", "fx"]
         assert (entry["id"], entry["width"], entry["height"]) == (4, 80, 48)
@@ -134,7 +134,6 @@ def _ply(scene: Path, out: Path, *more: str) -> bytes:
 def test_cameras_of_a_replaced_loader_train_the_same_model(tmp_path, monkeypatch):
     # The reference's arguments cannot tell a principal point.
     make_colmap_scene(tmp_path / "scene", params=(110.0, 110.0, 48.0, 32.0), views=9)
-    monkeypatch.setattr(sys, "stdout", sys.stdout)  # which training stamps
     ours = _ply(tmp_path / "scene", tmp_path / "ours")
     called = []
     monkeypatch.setattr(camera_utils, "loadCam", lambda *a: called.append(a) or _theirs(*a))

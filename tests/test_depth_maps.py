@@ -327,9 +327,8 @@ def _squares(view: colmap_loader.Image, model: ColmapModel, value: Callable[[flo
 
 
 @pytest.mark.slow
-def test_the_command_makes_a_file_that_training_takes(colmap_scene, tmp_path, monkeypatch):
+def test_the_command_makes_a_file_that_training_takes(colmap_scene, tmp_path):
     """Make maps of the points themselves: a square around each, with a scale and an offset per photo."""
-    monkeypatch.setattr(sys, "stdout", sys.stdout)
     wanted = {}
     rng = np.random.default_rng(0)
     model = read_model_of_kind(colmap_scene / "sparse/0", "bin", with_2d_points=True)
@@ -432,7 +431,7 @@ def test_metric_maps_are_distances_with_gaps(tmp_path, kind):
 
 
 @pytest.mark.parametrize("kind", ["png", "npy"])
-def test_one_scale_is_fitted_to_all_metric_maps(colmap_scene, kind, monkeypatch, capsys):
+def test_one_scale_is_fitted_to_all_metric_maps(colmap_scene, kind, capsys):
     """Maps of the points themselves, 2.5 units a metre, with gaps elsewhere."""
     model = read_model_of_kind(colmap_scene / "sparse/0", "bin", with_2d_points=True)
     for view in model.images:
@@ -450,7 +449,6 @@ def test_one_scale_is_fitted_to_all_metric_maps(colmap_scene, kind, monkeypatch,
     first = next(iter(depths.values()))
     known = first.decode((768, 512)).isfinite()
     assert 0.001 < known.float().mean() < 0.5
-    monkeypatch.setattr(sys, "stdout", sys.stdout)
     train.main(["-s", str(colmap_scene), "-m", str(colmap_scene / "out"), "-d", "depths", "--iterations", "3"])
     first.path.unlink()
     assert sum(depth is None for depth in _depths(colmap_scene).values()) == 1
@@ -497,8 +495,7 @@ def _train(scene: Path, out: Path, *more: object) -> bytes:
     return (out / "point_cloud/iteration_60/point_cloud.ply").read_bytes()
 
 
-def test_training_follows_the_maps_or_leaves_them_alone(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "stdout", sys.stdout)
+def test_training_follows_the_maps_or_leaves_them_alone(scene, tmp_path):
     for path in (scene / "depths").rglob("*.png"):
         _save(np.full((64, 96), 6554, np.uint16), path)  # 0.1: all surfaces appear far behind their true depth
     plain = _train(scene, tmp_path / "plain")
@@ -510,9 +507,8 @@ def test_training_follows_the_maps_or_leaves_them_alone(scene, tmp_path, monkeyp
     assert error["on"] < 0.8 * error["plain"], error
 
 
-def test_what_is_masked_has_no_depth_either(scene, tmp_path, monkeypatch):
+def test_what_is_masked_has_no_depth_either(scene, tmp_path):
     """With masks, the model is the same to the byte, whatever photos and depth maps show behind them."""
-    monkeypatch.setattr(sys, "stdout", sys.stdout)
     options = ("-d", "depths", "--masks", "masks", "--depth_l1_weight_init", 20)
     for path in (scene / "depths").rglob("*.png"):
         mask = np.full((64, 96), 255, np.uint8)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pycolmap
 import pytest
 from PIL import EpsImagePlugin, Image
-from synthetic import HEIGHT, WIDTH, make_colmap_scene, read
+from synthetic import HEIGHT, WIDTH, as_text, make_colmap_scene, read
 
 from scene.images.find import find_images
 from utils.system_utils import UserError
@@ -25,10 +25,9 @@ def _rename(scene: Path, new_names: dict[str, str], text: bool = False) -> None:
             (scene / "images" / new).parent.mkdir(parents=True, exist_ok=True)
             shutil.move(scene / "images" / image.name, scene / "images" / new)
             image.name = new
+    reconstruction.write_binary(str(sparse))
     if text:
-        for path in sparse.iterdir():
-            path.unlink()
-    (reconstruction.write_text if text else reconstruction.write_binary)(str(sparse))
+        as_text(scene)
 
 
 def _model(folder: Path, views: int) -> None:
@@ -129,10 +128,7 @@ def test_the_largest_of_several_models(colmap_scene, capsys):
 def test_several_cameras_and_sizes(tmp_path):
     make_colmap_scene(tmp_path, views=4)
     sparse = tmp_path / "sparse" / "0"
-    reconstruction = pycolmap.Reconstruction(str(sparse))
-    shutil.rmtree(sparse)
-    sparse.mkdir()
-    reconstruction.write_text(str(sparse))
+    as_text(tmp_path)
     for name in ("rigs.txt", "frames.txt"):  # the classic three files allow any camera for any photo
         (sparse / name).unlink()
     with open(sparse / "cameras.txt", "a") as file:

@@ -2,7 +2,6 @@
 
 import math
 import re
-import sys
 
 import numpy as np
 import pytest
@@ -51,32 +50,27 @@ def test_inverse_sigmoid():
     torch.testing.assert_close(torch.sigmoid(inverse_sigmoid(x)), x)
 
 
-def test_learning_rate_curve():
-    rate = get_expon_lr_func(1.6e-4, 1.6e-6, max_steps=30000)
-    assert rate(0) == pytest.approx(1.6e-4, rel=1e-12)
-    assert rate(1) == pytest.approx(1.6e-4 * math.exp(math.log(0.01) / 30000), rel=1e-12)
-    assert rate(15000) == pytest.approx(1.6e-5, rel=1e-12)
-    assert rate(30000) == rate(40000) == pytest.approx(1.6e-6, rel=1e-12)
-    assert rate(-1) == 0
+SECOND = 1.6e-4 * math.exp(math.log(0.01) / 30000)
+DELAYED = 0.1 * (0.2 + 0.8 * math.sin(math.pi / 4))
 
 
-def test_learning_rate_delay_and_zero_rates():
-    rate = get_expon_lr_func(0.1, 0.1, lr_delay_steps=100, lr_delay_mult=0.2, max_steps=1000)
-    assert rate(0) == pytest.approx(0.02)
-    assert rate(50) == pytest.approx(0.1 * (0.2 + 0.8 * math.sin(math.pi / 4)))
-    assert rate(100) == rate(500) == pytest.approx(0.1)
-    assert {get_expon_lr_func(0.0, 0.0, max_steps=10)(t) for t in (0, 5, 10, 20)} == {0.0}
+@pytest.mark.parametrize(
+    ("arguments", "rates"),
+    [
+        ((1.6e-4, 1.6e-6, 0, 1, 30000), {-1: 0, 0: 1.6e-4, 1: SECOND, 15000: 1.6e-5, 30000: 1.6e-6, 40000: 1.6e-6}),
+        ((0.1, 0.1, 100, 0.2, 1000), {0: 0.02, 50: DELAYED, 100: 0.1, 500: 0.1}),
+        ((0.0, 0.0, 0, 1, 10), {0: 0, 5: 0, 10: 0, 20: 0}),
+        # Linear: powers would switch a rate off that begins or ends at zero.
+        ((0.1, 0.0, 0, 1, 10), {0: 0.1, 5: 0.05, 10: 0, 20: 0}),
+        ((0.0, 0.1, 0, 1, 10), {0: 0, 5: 0.05, 10: 0.1, 20: 0.1}),
+    ],
+)
+def test_learning_rates(arguments, rates):
+    rate = get_expon_lr_func(*arguments)
+    assert {step: rate(step) for step in rates} == pytest.approx(rates, rel=1e-12, abs=0)
 
 
-@pytest.mark.parametrize(("first", "last"), [(0.1, 0.0), (0.0, 0.1)])
-def test_a_rate_that_begins_or_ends_at_zero_is_linear(first, last):
-    """Powers would switch it off from the first step on, or until the last."""
-    rate = get_expon_lr_func(first, last, max_steps=10)
-    assert [rate(t) for t in (0, 5, 10, 20)] == pytest.approx([first, 0.05, last, last])
-
-
-def test_stdout_lines_are_stamped_once_and_seeds_set(capsys, monkeypatch):
-    monkeypatch.setattr(sys, "stdout", sys.stdout)  # put back afterwards
+def test_stdout_lines_are_stamped_once_and_seeds_set(capsys):
     safe_state(False, 5)
     safe_state(False, 5)
     first = torch.rand(1), np.random.rand()

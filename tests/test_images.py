@@ -14,25 +14,28 @@ from utils.system_utils import UserError
 
 
 @pytest.mark.parametrize(
-    ("file", "r", "size"),
+    ("file", "r", "scale", "size"),
     [
-        ((1601, 901), 1, (1601, 901)),
-        ((1601, 901), 2, (800, 450)),  # 800.5 and 450.5 round to even
-        ((1603, 903), 2, (802, 452)),  # 801.5 and 451.5 as well
-        ((1601, 901), 4, (400, 225)),
-        ((1601, 901), 8, (200, 113)),
-        ((1602, 901), -1, (1600, 899)),  # 899.9 is cut off
-        ((1601, 901), -1, (1599, 900)),  # the reference's division: 1601 / (1601 / 1600) is just below 1600
-        ((1600, 901), -1, (1600, 901)),
-        ((900, 4000), -1, (900, 4000)),  # only the width counts
-        ((1601, 901), 1000, (1000, 562)),  # 562.8 is cut off
-        ((500, 333), 1000, (1000, 666)),  # a width can enlarge
-        ((501, 333), 3, (3, 1)),
-        ((3, 3), 8, (1, 1)),  # never without pixels
+        ((1601, 901), 1, 1, (1601, 901)),
+        ((1601, 901), 2, 1, (800, 450)),  # 800.5 and 450.5 round to even
+        ((1603, 903), 2, 1, (802, 452)),  # 801.5 and 451.5 as well
+        ((1601, 901), 4, 1, (400, 225)),
+        ((1601, 901), 8, 1, (200, 113)),
+        ((1602, 901), -1, 1, (1600, 899)),  # 899.9 is cut off
+        ((1601, 901), -1, 1, (1599, 900)),  # the reference's division: 1601 / (1601 / 1600) is just below 1600
+        ((1600, 901), -1, 1, (1600, 901)),
+        ((900, 4000), -1, 1, (900, 4000)),  # only the width counts
+        ((1601, 901), 1000, 1, (1000, 562)),  # 562.8 is cut off
+        ((500, 333), 1000, 1, (1000, 666)),  # a width can enlarge
+        ((501, 333), 3, 1, (3, 1)),
+        ((3, 3), 8, 1, (1, 1)),  # never without pixels
+        ((1601, 901), 2, 2.0, (400, 225)),
+        ((1000, 500), -1, 2.0, (500, 250)),
+        ((1000, 500), 400, 2.0, (200, 100)),
     ],
 )
-def test_training_size(file, r, size):
-    assert training_size(*file, r) == size
+def test_training_size(file, r, scale, size):
+    assert training_size(*file, r, scale) == size
 
 
 @pytest.mark.parametrize("r", [16385, 100_000_000, 10**400], ids=["next", "huge", "beyond float"])
@@ -57,12 +60,6 @@ def test_too_little_memory_names_the_picture_and_its_size(tmp_path, monkeypatch)
     monkeypatch.setattr(Image.Image, "resize", full)
     with pytest.raises(UserError, match="memory for .*a.png at 12 x 8 pixels"):
         decode(tmp_path / "a.png", (12, 8))
-
-
-def test_resolution_scale_divides_further():
-    assert training_size(1601, 901, 2, 2.0) == (400, 225)
-    assert training_size(1000, 500, -1, 2.0) == (500, 250)
-    assert training_size(1000, 500, 400, 2.0) == (200, 100)
 
 
 def test_the_notice_comes_once(capsys):

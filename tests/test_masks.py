@@ -358,10 +358,8 @@ def test_what_is_to_be_ignored_must_be_there(colmap_scene, masked_scene):
 
 
 def _train(scene: Path, out: Path, *options: object) -> bytes:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "stdout", sys.stdout)  # restored afterwards, since training stamps it
-        command = ["-s", scene, "-m", out, "--iterations", 40, "--test_iterations", -1, "--eval", "-r", 48, *options]
-        train.main(list(map(str, command)))
+    command = ["-s", scene, "-m", out, "--iterations", 40, "--test_iterations", -1, "--eval", "-r", 48, *options]
+    train.main(list(map(str, command)))
     return (out / "point_cloud" / "iteration_40" / "point_cloud.ply").read_bytes()
 
 
@@ -373,7 +371,6 @@ def test_training_rendering_and_scores_ignore_what_is_masked(masked_scene, tmp_p
 
     def run(module, *arguments: object) -> None:
         monkeypatch.setattr(sys, "argv", [f"{module.__name__}.py", *map(str, arguments)])
-        monkeypatch.setattr(sys, "stdout", sys.stdout)
         monkeypatch.setenv("TORCH_HOME", "/dev/null")
         monkeypatch.setenv("https_proxy", "http://127.0.0.1:9")
         module.main()

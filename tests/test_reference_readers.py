@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from plyfile import PlyData
-from synthetic import make_colmap_scene
+from synthetic import folder_state, make_colmap_scene
 
 from scene import colmap_loader
 from scene.dataset_readers import (
@@ -36,7 +36,7 @@ from scene.dataset_readers import (
 )
 from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, DepthMap
 from scene.readers.info import exposure_names, photo_size
-from utils.camera_utils import camera_to_JSON, loadCam
+from utils.camera_utils import loadCam
 from utils.system_utils import UserError
 
 FIELDS = (
@@ -53,10 +53,6 @@ def _values(**changes) -> dict:
         "is_test": True,
     }
     return {**values, **changes}
-
-
-def _files(folder: Path) -> set[tuple[str, int]]:
-    return {(str(path), path.stat().st_mtime_ns) for path in folder.rglob("*") if path.is_file()}
 
 
 # Records
@@ -169,8 +165,6 @@ def test_our_code_takes_records_of_the_references_fields():
     infos = [CameraInfo(**_values(T=np.array(T), image_name=f"{T[0]}.png")) for T in ([0.0, 0, 0], [2.0, 0, 0])]
     assert scene_extent(infos) == pytest.approx(1.1)
     assert exposure_names(infos) == ["0.0.png", "2.0.png"]
-    entry = camera_to_JSON(0, infos[1])
-    assert entry["fx"] == fov2focal(0.8, 160) and entry["position"] == [-2, 0, 0]
     plain = [SimpleNamespace(R=c.R, T=c.T, image_name=c.image_name) for c in infos]
     assert scene_extent(plain) == pytest.approx(1.1) and exposure_names(plain) == ["0.0.png", "2.0.png"]
     # Names clash only in the first two, and one of these has no path.
@@ -231,7 +225,7 @@ def _same(view: CameraInfo, other: CameraInfo) -> None:
 
 
 def test_a_colmap_scene_in_the_form_of_2024(colmap_scene, cache_folder):
-    before = _files(colmap_scene)
+    before = folder_state(colmap_scene)
     assert sceneLoadTypeCallbacks["Colmap"] is readColmapSceneInfo
     info = readColmapSceneInfo(str(colmap_scene), None, "", True, False)
     ours = read_scene(colmap_scene, "images", True)
@@ -249,7 +243,7 @@ def test_a_colmap_scene_in_the_form_of_2024(colmap_scene, cache_folder):
     np.testing.assert_array_equal(info.point_cloud.colors.astype(np.float32), ours.point_cloud.colors)
     assert type(info.ply_path) is str and Path(info.ply_path).is_relative_to(cache_folder)
     np.testing.assert_array_equal(fetchPly(info.ply_path).points, info.point_cloud.points)
-    assert _files(colmap_scene) == before
+    assert folder_state(colmap_scene) == before
     assert readColmapSceneInfo(colmap_scene, "images", "", False, False).ply_path == info.ply_path
 
 
@@ -334,7 +328,7 @@ def _model(scene: Path) -> tuple[dict, dict]:
     )
 
 
-def test_views_of_single_files(colmap_scene):
+def test_views_of_singlefolder_state(colmap_scene):
     images, cameras = _model(colmap_scene)
     ours = {view.image_name: view for view in read_scene(colmap_scene, "images", False).train_cameras}
     views = readColmapCameras(images, cameras, None, str(colmap_scene / "images"), "", [])
@@ -361,7 +355,7 @@ def test_views_of_a_lens_that_distorts_are_undistorted(tmp_path, cache_folder):
 
 
 def test_a_blender_scene_in_both_forms(blender_scene, cache_folder):
-    before = _files(blender_scene)
+    before = folder_state(blender_scene)
     assert sceneLoadTypeCallbacks["Blender"] is readNerfSyntheticInfo
     info = readNerfSyntheticInfo(str(blender_scene), True, "", True)
     ours = read_scene(blender_scene, "", True)
@@ -378,7 +372,7 @@ def test_a_blender_scene_in_both_forms(blender_scene, cache_folder):
     old = readNerfSyntheticInfo(str(blender_scene), True, True, ".png")
     assert (len(old.train_cameras), len(old.test_cameras)) == (4, 2)
     assert len(readNerfSyntheticInfo(blender_scene, white_background=True, eval=False).train_cameras) == 6
-    assert _files(blender_scene) == before
+    assert folder_state(blender_scene) == before
 
 
 def test_one_camera_file_in_both_forms(blender_scene):

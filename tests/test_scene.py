@@ -1,6 +1,5 @@
 """Scene as other people's code calls it: with their options, their readers, and their own package `arguments`."""
 
-import argparse
 import json
 import os
 import subprocess
@@ -14,11 +13,10 @@ import numpy as np
 import pytest
 import torch
 from reference_records import CameraOf2024
-from synthetic import FakeGaussians
+from synthetic import FakeGaussians, options_of
 
 import scene as scene_package
 import train
-from arguments import ModelParams
 from scene import Scene
 from scene.dataset_readers import read_scene, sceneLoadTypeCallbacks
 from scene.gaussian_model import GaussianModel
@@ -42,10 +40,7 @@ def _args(folder: Path, out: Path, values: dict[str, object] = OF_2024, **change
 def test_options_of_the_reference_suffice(colmap_scene, tmp_path, values):
     gaussians = FakeGaussians()
     made = Scene(_args(colmap_scene, tmp_path / "out", values), gaussians)
-    ours = Scene(
-        ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**vars(_args(colmap_scene, tmp_path / "o")))),
-        FakeGaussians(),
-    )
+    ours = Scene(options_of(colmap_scene, tmp_path / "o", eval=True), FakeGaussians())
     names = [camera.image_name for camera in made.getTrainCameras()]
     assert names == [camera.image_name for camera in ours.getTrainCameras()] and len(names) == 14
     assert len(made.getTestCameras()) == 3 and made.images.limit == 0
@@ -64,7 +59,7 @@ def test_lists_of_cameras_may_be_replaced(colmap_scene, tmp_path):
 
 
 def test_replaced_training_views_train(colmap_scene, tmp_path):
-    options = ModelParams(argparse.ArgumentParser()).extract(_args(colmap_scene, tmp_path / "out", resolution=24))
+    options = options_of(colmap_scene, tmp_path / "out", eval=True, resolution=24)
     made = Scene(options, GaussianModel(0), shuffle=False)
     made.train_cameras = {1.0: made.train_cameras[1.0][:3]}
     views = run.ViewOrder(made.getTrainCameras(), 0)

@@ -17,7 +17,6 @@ from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.copies import places_of
 from scene.gaussians.start import start_rows
-from scene.images.masks import Mask
 from scene.readers.info import CameraInfo, SceneInfo
 from splatting.diagnosis.dataset import check_dataset
 from splatting.training.checks import check_scene
@@ -33,11 +32,11 @@ def said(info: SceneInfo, **options) -> str:
     return "\n".join(str(one) for one in findings(info, **options))
 
 
-def _with_photos(*photos: np.ndarray, **fields) -> SceneInfo:
+def _with_photos(*photos: np.ndarray) -> SceneInfo:
     """A scene of photos in memory, with cameras in different places and no points."""
     views = [
         CameraInfo(n, np.eye(3), np.array([n, 0.0, 0]), FovX=1, FovY=1, image_name=f"v{n}", width=64, height=48,
-                   image=Image.fromarray(photo), **fields)
+                   image=Image.fromarray(photo))
         for n, photo in enumerate(photos)
     ]  # fmt: skip
     return SceneInfo(None, views, [], {"radius": 1.0}, None)
@@ -76,12 +75,6 @@ def test_sound_photos_are_passed():
     assert said(_alpha(0, 0), alpha=False) == ""
 
 
-def test_masks_that_leave_out_everything(tmp_path):
-    Image.new("L", (64, 48)).save(tmp_path / "black.png")
-    (one,) = findings(_with_photos(COLORS, COLORS, mask=Mask(tmp_path / "black.png")))
-    assert one.severe and "the masks of 2 of the 2 photos that were looked at leave out every pixel" in one.text
-
-
 @pytest.fixture(scope="module")
 def sound(_colmap_master: Path) -> Path:
     return _colmap_master
@@ -106,10 +99,8 @@ def test_a_sound_scene_is_passed(sound):
         ({"fx": 6.0, "fy": 6.0}, "these may be in millimetres"),
         ({"fx": 5000.0, "fy": 5000.0}, "17 cameras have odd opening angles"),
         ({"cx": 0.5, "cy": 0.5}, "principal point in a corner or at an edge"),
-        ({"cx": 0.0, "cy": 0.0}, "principal point in a corner or at an edge"),
         ({"cx": 192.0, "cy": 128.0}, "principal point in a corner or at an edge"),
         ({"fy": 300.0}, "focal lengths in x and y that differ more than twofold"),
-        ({"file_size": (64, 96)}, "17 of 17 photos have the sides of their camera exchanged"),
     ],
 )
 def test_cameras(sound, fields, text):

@@ -1,7 +1,5 @@
 """Depth by the points of structure from motion (--sparse_depth): where they lie, their loss, and trainings with it."""
 
-import sys
-from argparse import Namespace
 from operator import itemgetter
 from pathlib import Path
 
@@ -9,7 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from synthetic import BROWN, make_blender_scene, make_colmap_scene
+from synthetic import BROWN, make_blender_scene, make_colmap_scene, options_of
 from trainings import trained
 
 import metrics
@@ -27,10 +25,8 @@ from utils.system_utils import UserError, run_cli
 FISHEYE = (*BROWN[:4], 0.02, -0.01, 0.003, 0.001)
 
 
-def _scene(folder: Path, gaussians: GaussianModel | None = None, out: str = "out", **more) -> Scene:
-    values = {"source_path": str(folder), "model_path": str(folder / out), "images": "images", "resolution": -1}
-    values |= {"eval": True, "white_background": False, "train_test_exp": False, "data_device": "cpu"}
-    return Scene(Namespace(**values | more), gaussians or GaussianModel(1), start=False)
+def _scene(folder: Path, **more) -> Scene:
+    return Scene(options_of(folder, folder / "out", eval=True, **more), GaussianModel(1), start=False)
 
 
 @pytest.mark.parametrize("lenses", ["native", "undistort"])
@@ -83,9 +79,7 @@ def scene(_colmap_master: Path) -> Path:
 def _scores(scene: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
     """What metrics.py makes of the test views' depth."""
     monkeypatch.setattr("sys.argv", ["render.py", "-m", str(folder), "--skip_train", "--depth", "--quiet"])
-    with monkeypatch.context() as patch:
-        patch.setattr(sys, "stdout", sys.stdout)  # which rendering stamps
-        render.main()
+    render.main()
     monkeypatch.setenv("GS_DOWNLOAD", "0")
     metrics.evaluate([folder])
     return read_json(folder / "results.json")["ours_60"]
