@@ -328,7 +328,7 @@ def _model(scene: Path) -> tuple[dict, dict]:
     )
 
 
-def test_views_of_singlefolder_state(colmap_scene):
+def test_views_of_single_files(colmap_scene):
     images, cameras = _model(colmap_scene)
     ours = {view.image_name: view for view in read_scene(colmap_scene, "images", False).train_cameras}
     views = readColmapCameras(images, cameras, None, str(colmap_scene / "images"), "", [])
