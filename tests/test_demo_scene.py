@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 
@@ -26,8 +27,6 @@ def scene(once) -> Path:
 
 @pytest.fixture(scope="module")
 def model(scene):
-    import pycolmap
-
     return pycolmap.Reconstruction(scene / "sparse" / "0")
 
 
@@ -97,8 +96,6 @@ def test_samples_average_what_a_pixel_covers():
 
 @pytest.mark.parametrize(("camera", "size"), [("fisheye", (80, 60)), ("panorama", (80, 40))])
 def test_wide_cameras_are_pycolmaps(tmp_path, camera, size):
-    import pycolmap
-
     (view, *_) = ring_views(3, *size, np.random.default_rng(0), CAMERAS[camera])
     x, y = np.random.default_rng(1).uniform(0.02, 0.98, (2, 500)) * np.reshape(size, (2, 1))
     points = view.center[:, None] + 3 * view.rays(x, y).astype(np.float64)

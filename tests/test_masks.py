@@ -319,10 +319,7 @@ def test_alpha_is_background_unless_it_is_to_be_ignored(colmap_scene):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (
-            lambda masks: masks.rename(masks.parent / "elsewhere"),
-            "no folder .*/masks for --masks; name a folder in the scene",
-        ),
+        (lambda masks: masks.rename(masks.parent / "elsewhere"), "no folder .*/masks for --masks; name a folder"),
         (
             lambda masks: [path.rename(path.parent / f"mask_{path.name}") for path in masks.rglob("*.*")],
             "no mask in .*/masks .* belongs to a photo: looked for .*V03.png.png .* name masks like the photos",
@@ -347,9 +344,7 @@ def test_masks_to_invert_must_be_named(colmap_scene, blender_scene):
 
 
 def test_what_is_to_be_ignored_must_be_there(colmap_scene, masked_scene):
-    with pytest.raises(
-        UserError, match="--mask_meaning ignore has nothing to ignore: no masks are named, and no photo"
-    ):
+    with pytest.raises(UserError, match="--mask_meaning ignore has nothing to ignore: no masks .* no photo"):
         _views(colmap_scene, mask_meaning="ignore")
     assert _views(masked_scene, mask_meaning="ignore", masks="masks")
     path = next(path for path in (colmap_scene / "images").rglob("*.png"))

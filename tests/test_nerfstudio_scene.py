@@ -131,9 +131,7 @@ def test_panoramas_of_instant_ngp(panorama):
 
 @pytest.mark.parametrize("lens", [{"ftheta_p1": 0.1}, {"equirectangular": True}, {"orthographic": True}])
 def test_other_lenses_of_instant_ngp_are_refused(lens):
-    with pytest.raises(
-        UserError, match=f"a.json has {next(iter(lens))}, a lens of instant-ngp that cannot be used; convert"
-    ):
+    with pytest.raises(UserError, match=f"a.json has {next(iter(lens))}, a lens .*cannot be used; convert"):
         lens_of(lens, {"fl_x": 30.0}, (64, 32), Path("a.json"))
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 from synthetic import as_text, options_of, read
@@ -92,10 +93,7 @@ def test_a_sound_scene_is_passed(sound):
 @pytest.mark.parametrize(
     ("fields", "text"),
     [
-        (
-            {"fx": 1.2, "fy": 1.7},
-            "a focal length of 1.2 pixels); give focal lengths in pixels (these may be in parts of",
-        ),
+        ({"fx": 1.2, "fy": 1.7}, "a focal length of 1.2 pixels); give focal lengths in pixels (these may be in parts"),
         ({"fx": 6.0, "fy": 6.0}, "these may be in millimetres"),
         ({"fx": 5000.0, "fy": 5000.0}, "17 cameras have odd opening angles"),
         ({"cx": 0.5, "cy": 0.5}, "principal point in a corner or at an edge"),
@@ -163,9 +161,8 @@ def test_a_few_pairs_change_nothing(sound):
     pairs = BasicPointCloud(*(np.concatenate([values, values[:20]]) for values in info.point_cloud))
     assert not places_of(pairs.points).misleads and said(info._replace(point_cloud=pairs)) == ""
     four = BasicPointCloud(*(np.concatenate([values] * 4) for values in info.point_cloud))
-    assert f"100% of the {4 * len(points)} points share a place with others, up to 4 in one" in said(
-        info._replace(point_cloud=four)
-    )
+    lines = said(info._replace(point_cloud=four))
+    assert f"100% of the {4 * len(points)} points share a place with others, up to 4 in one" in lines
 
 
 def test_photos_that_are_there_twice(sound, tmp_path):
@@ -232,8 +229,6 @@ def _farther(model) -> None:
     ("change", "text"), [(_longer, "with focal lengths 0.769 times as long"), (_farther, "if those are scaled by 0.1")]
 )
 def test_a_geometric_cause_is_named_before_colours(sound, tmp_path, change, text, tracks):
-    import pycolmap
-
     scene = Path(shutil.copytree(sound, tmp_path / "scene"))
     model = pycolmap.Reconstruction(scene / "sparse" / "0")
     change(model)
