@@ -324,9 +324,8 @@ def test_a_copy_shares_the_photos_and_nothing_else(used, monkeypatch):
     twin = copy.deepcopy(used)
     assert twin.images is used.images and twin.undecoded == used.undecoded and type(twin) is Camera
     monkeypatch.setattr("scene.images.store.decode", lambda *_: pytest.fail("decoded again"))
-    assert torch.equal(twin.original_image, used.original_image) and torch.equal(
-        twin.counted_pixels, used.counted_pixels
-    )
+    assert torch.equal(twin.original_image, used.original_image)
+    assert torch.equal(twin.counted_pixels, used.counted_pixels)
     assert twin.original_image.data_ptr() != used.original_image.data_ptr()
     before = [copy.deepcopy(getattr(used, name)) for name in ("R", "T", *MATRICES)]
     for name in ("R", "T", *MATRICES):
@@ -343,10 +342,8 @@ def test_a_pickle_leaves_the_photos_out(used):
     assert len(content) < 8192
     loaded = pickle.loads(content)
     assert loaded.images is not used.images and len(loaded.images) == 0
-    assert torch.equal(loaded.original_image, used.original_image) and torch.equal(
-        loaded.counted_pixels, used.counted_pixels
-    )
-    assert torch.equal(loaded.full_proj_transform, used.full_proj_transform)
+    for name in ("original_image", "counted_pixels", "full_proj_transform"):
+        assert torch.equal(getattr(loaded, name), getattr(used, name))
 
 
 def test_a_shallow_copy_has_its_own_attributes(used, monkeypatch):

@@ -124,9 +124,7 @@ def _theirs(args, id, cam_info, resolution_scale, is_nerf_synthetic, is_test_dat
 
 
 def _ply(scene: Path, out: Path, *more: str) -> bytes:
-    options = (
-        "--iterations 20 --densify_from_iter 5 --densification_interval 5 -r 24 --test_iterations 10 --eval --quiet"
-    )
+    options = "--iterations 20 --densify_from_iter 5 --densification_interval 5 -r 24 --test_iterations 10 --eval"
     train.main(["-s", str(scene), "-m", str(out), *options.split(), *more])
     return (out / "point_cloud" / "iteration_20" / "point_cloud.ply").read_bytes()
 
@@ -145,9 +143,8 @@ def test_cameras_of_a_replaced_loader_train_the_same_model(tmp_path, monkeypatch
 def test_a_scene_leaves_cameras_of_another_class_as_they_are(colmap_scene, tmp_path, monkeypatch):
     foreign = SimpleNamespace(image_width=3, image_height=2)
     monkeypatch.setattr(camera_utils, "loadCam", lambda *_: foreign)
-    made = Scene(
-        options_of(colmap_scene, tmp_path / "out", eval=True, train_test_exp=True), FakeGaussians(), start=False
-    )
+    options = options_of(colmap_scene, tmp_path / "out", eval=True, train_test_exp=True)
+    made = Scene(options, FakeGaussians(), start=False)
     assert made.getTrainCameras() == [foreign] * 17 and made.getTestCameras() == [foreign] * 3
     assert vars(foreign) == {"image_width": 3, "image_height": 2}
     made.prefetch(made.getTrainCameras())

@@ -177,9 +177,8 @@ def test_order_of_views_and_numbers(colmap_scene, tmp_path):
 
 
 def test_resolution_scales_and_the_size_option(colmap_scene, tmp_path):
-    scene = Scene(
-        options_of(colmap_scene, tmp_path / "out", resolution=48), FakeGaussians(), resolution_scales=[1.0, 2.0]
-    )
+    options = options_of(colmap_scene, tmp_path / "out", resolution=48)
+    scene = Scene(options, FakeGaussians(), resolution_scales=[1.0, 2.0])
     for scale, size in ((1.0, (48, 32)), (2.0, (24, 16))):
         camera = scene.getTrainCameras(scale)[0]
         assert (camera.image_width, camera.image_height) == size

@@ -272,9 +272,7 @@ def test_maps_of_almost_no_pixels_are_refused(blender_scene, shape, suffix):
             np.save(f"{stem}.npy", np.ones(size))
         else:
             _save(np.ones(size, np.uint16), stem.with_suffix(suffix))
-    said = (
-        f"depth map .*r_2{suffix} has only {shape[1]} x {shape[0]} pixels|r_2.npy has .* and its photo has other sides"
-    )
+    said = f"map .*r_2{suffix} has only {shape[1]} x {shape[0]} pixels|r_2.npy has .* and its photo has other sides"
     with pytest.raises(UserError, match=said):
         _depths(blender_scene, hold_out=True)
 

@@ -23,6 +23,7 @@ from scene import Scene
 from scene.check.photos import hints
 from scene.images.decode import decode
 from scene.images.masks import IGNORE, TRANSPARENT, Mask, MaskOptions, find_masks
+from scene.images.side_files import names_below
 from scene.readers.pinholes import _check_mask
 from splatting.training.observers.guards import MaskWatch
 from utils.image_utils import pixels_that_count
@@ -267,6 +268,12 @@ def test_masks_of_several_photos_are_refused(blender_scene):
         _save(blender_scene / "masks" / f"{name}.png", np.zeros((30, 40), np.uint8))
     with pytest.raises(UserError, match="2 masks belong to several photos each, the first is .*r_0.png for .*sub-fold"):
         _views(blender_scene, masks="masks")
+
+
+def test_names_of_several_forms_count_from_one_folder():
+    names = names_below(["../b/x.png", "a/./x.png", "/data/c/y.png"], Path("/data/scene"))
+    assert names == ["b/x.png", "scene/a/x.png", "c/y.png"]
+    assert names_below(["/data/x.png"], Path("/data/scene")) == ["x.png"]
 
 
 def test_a_transparent_mask_is_alpha(masked_scene):
