@@ -12,18 +12,9 @@ import numpy as np
 import pytest
 import torch
 
-import splatting.diagnosis.advice
 from scene.readers.tracks import Track
-from splatting.diagnosis.advice import (
-    ADVICE,
-    Advice,
-    _of_passers_by,
-    _trained,
-    asked_options,
-    check_options,
-    distances,
-    exposures,
-)  # fmt: skip
+from splatting.diagnosis import advice
+from splatting.diagnosis.advice import Advice
 from splatting.files.json_files import write_json
 from train import parse
 from utils.system_utils import UserError
@@ -38,6 +29,11 @@ def _track(points: np.ndarray, ranks: np.ndarray) -> Track:
     return Track(points, np.zeros((len(ranks), 2)), places, ones, ones, ranks)
 
 
+def _camera(image: np.ndarray) -> SimpleNamespace:
+    pixels = torch.from_numpy(image.reshape(3, SIDE, SIDE))
+    return SimpleNamespace(device="cpu", target=lambda _: pixels)
+
+
 def test_exposures_are_those_of_the_photos_though_some_points_disagree():
     rng, given = np.random.default_rng(0), np.array([-0.7, 0.2, 0.4, 0.0, 0.1])
     albedo, cameras, tracks = rng.uniform(0.1, 0.4, (3, SIDE**2)), [], []
@@ -45,11 +41,10 @@ def test_exposures_are_those_of_the_photos_though_some_points_disagree():
         light = albedo * 2**exposure
         light[:, rng.choice(SIDE**2, 40, replace=False)] = 0.9  # highlights
         image = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-        pixels = torch.from_numpy(image.reshape(3, SIDE, SIDE))
-        cameras.append(SimpleNamespace(device="cpu", target=lambda _, pixels=pixels: pixels))
+        cameras.append(_camera(image))
         ranks = np.sort(rng.choice(SIDE**2, 300, replace=False))
         tracks.append(_track(np.zeros((300, 3)), ranks))
-    np.testing.assert_allclose(exposures(cameras, tracks), given - given.mean(), atol=0.02)
+    np.testing.assert_allclose(advice.exposures(cameras, tracks), given - given.mean(), atol=0.02)
 
 
 def test_exposures_that_drift_along_a_walk_are_found():
@@ -58,27 +53,26 @@ def test_exposures_that_drift_along_a_walk_are_found():
     albedo, cameras, tracks = np.random.default_rng(0).uniform(0.1, 0.4, SIDE**2), [], []
     for place, exposure in enumerate(given):
         image = 1.055 * (albedo * 2**exposure) ** (1 / 2.4) - 0.055
-        pixels = torch.from_numpy(np.broadcast_to(image.reshape(1, SIDE, SIDE), (3, SIDE, SIDE)).copy())
-        cameras.append(SimpleNamespace(device="cpu", target=lambda _, pixels=pixels: pixels))
+        cameras.append(_camera(np.stack([image] * 3)))
         tracks.append(_track(np.zeros((3 * window, 3)), 3 * place + np.arange(3 * window)))
-    np.testing.assert_allclose(exposures(cameras, tracks), given - given.mean(), atol=0.02)
+    np.testing.assert_allclose(advice.exposures(cameras, tracks), given - given.mean(), atol=0.02)
 
 
 def test_photos_of_a_point_from_twice_as_far_have_twice_the_depth_in_focal_lengths():
     points = np.random.default_rng(0).normal(size=(30, 3))
     views = [SimpleNamespace(R=np.eye(3), T=np.array([0, 0, z]), fx=f) for z, f in ((100.0, 50.0), (400.0, 100.0))]
     tracks = [_track(points, np.arange(30)), None, _track(points, np.arange(30))]
-    assert abs(distances([views[0], views[0], views[1]], tracks) - 2) < 0.05
+    assert abs(advice.distances([views[0], views[0], views[1]], tracks) - 2) < 0.05
 
 
 def test_advice_on_a_given_option_or_against_one_is_not_taken(tmp_path, monkeypatch, capsys):
     found = [Advice("", "--sky auto"), Advice("", "--appearance ppisp --x 1"), Advice("", "--refine_poses")]
-    monkeypatch.setattr(f"{Advice.__module__}.advise", lambda *_, **__: found)
+    monkeypatch.setattr(advice, "advise", lambda *_, **__: found)
     args = argparse.Namespace(keep_best=False, train_test_exp=False, projection="ray", strategy="adc", advise=True)
     dataset = argparse.Namespace(model_path=str(tmp_path))
-    assert asked_options(dataset, args, ["--app=none", "-r", "2"]) == ["--sky", "auto"]
+    assert advice.asked_options(dataset, args, ["--app=none", "-r", "2"]) == ["--sky", "auto"]
     assert "--refine_poses is left out, as it does not go with --projection" in capsys.readouterr().out
-    assert [one["options"] for one in json.loads((tmp_path / ADVICE).read_text())] == ["--sky auto", "", ""]
+    assert [one["options"] for one in json.loads((tmp_path / advice.ADVICE).read_text())] == ["--sky auto", "", ""]
 
 
 @pytest.mark.parametrize("more", [["--init_type", "random"], ["--init_ply=a.ply"], ["--init_pcd_path=b"], ["-i=c"]])
@@ -90,16 +84,16 @@ def test_the_short_training_reads_the_data_as_the_training_does(more, monkeypatc
         lines.append(line[2:])
         raise UserError("no scene")
 
-    monkeypatch.setattr(splatting.diagnosis.advice, "_trained", fail)
+    monkeypatch.setattr(advice, "_trained", fail)
     with pytest.raises(UserError, match="^no scene$"):
-        next(_of_passers_by(dataset))
+        next(advice._of_passers_by(dataset))
     other = {name for name, value in vars(parse(lines[0])[1]).items() if value != vars(dataset)[name]}
     assert other == {"model_path", "resolution"}
 
 
 def test_a_short_training_that_fails_says_why_and_one_that_is_interrupted_leaves_no_process(tmp_path):
     with pytest.raises(UserError, match="^no scene$"):
-        _trained([sys.executable, "-c", "import sys; sys.exit('x\\nerror: no scene')"])
+        advice._trained([sys.executable, "-c", "import sys; sys.exit('x\\nerror: no scene')"])
     number = tmp_path / "number"
     code = f"import os, time; open({str(number)!r}, 'w').write(str(os.getpid())); time.sleep(60)"
     # The handler of SIGINT, which a program in the background ignores, runs where the main thread is interrupted.
@@ -108,7 +102,7 @@ def test_a_short_training_that_fails_says_why_and_one_that_is_interrupted_leaves
     timer.start()
     try:
         with pytest.raises(KeyboardInterrupt):
-            _trained([sys.executable, "-c", code])
+            advice._trained([sys.executable, "-c", code])
     finally:
         signal.signal(signal.SIGINT, before)
     with pytest.raises(ProcessLookupError):
@@ -116,8 +110,8 @@ def test_a_short_training_that_fails_says_why_and_one_that_is_interrupted_leaves
 
 
 def test_a_model_is_not_told_to_take_what_it_was_trained_with(tmp_path, monkeypatch):
-    monkeypatch.setattr(f"{Advice.__module__}.advise", lambda *_, **__: [Advice("far", "--sky auto")])
-    assert len(check_options("scene", "images", str(tmp_path / "none"))) == 1
+    monkeypatch.setattr(advice, "advise", lambda *_, **__: [Advice("far", "--sky auto")])
+    assert len(advice.check_options("scene", "images", str(tmp_path / "none"))) == 1
     (tmp_path / "cfg_args").write_text("Namespace()")
     write_json(tmp_path / "model.json", {"options": {"sky": "auto"}})
-    assert check_options("scene", "images", str(tmp_path)) == []
+    assert advice.check_options("scene", "images", str(tmp_path)) == []

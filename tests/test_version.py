@@ -77,13 +77,11 @@ def test_release_notes_point_to_no_file_and_say_what_is_missing():
     notes = runpy.run_path(str(NOTES))["release_notes"]
     changelog = "## [1.2.3] - 2026-01-02\n\n- See [a page](docs/a.md#b) and [the web](https://a.b).\n\n## [1.2.2] - x\n"
     assert notes(changelog, "1.2.3") == "- See a page and [the web](https://a.b).\n"
+    absent, empty = "no section `## [1.2.3] - YYYY-MM-DD`", "the section of 1.2.3 in CHANGELOG.md is empty"
     for changelog, complaint in (
-        ("## [1.2.30] - 2026-01-02\n\n- a\n", "no section `## [1.2.3] - YYYY-MM-DD`"),
-        ("## [1.2.3]\n\n- a\n", "no section `## [1.2.3] - YYYY-MM-DD`"),
-        (
-            "## [1.2.3] - 2026-01-02\n\n## [1.2.2] - 2026-01-01\n\n- a\n",
-            "the section of 1.2.3 in CHANGELOG.md is empty",
-        ),
+        ("## [1.2.30] - 2026-01-02\n\n- a\n", absent),
+        ("## [1.2.3]\n\n- a\n", absent),
+        ("## [1.2.3] - 2026-01-02\n\n## [1.2.2] - 2026-01-01\n\n- a\n", empty),
     ):
         with pytest.raises(ValueError, match=re.escape(complaint)):
             notes(changelog, "1.2.3")
