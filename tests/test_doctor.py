@@ -263,7 +263,6 @@ def test_models_with_a_fault(model, change, said):
 def test_a_model_is_checked_against_the_scene_that_is_given(healthy, model, colmap_scene, tmp_path, capsys):
     moved = colmap_scene.rename(tmp_path / "moved")
     folder = model(source=tmp_path / "gone", cloud=moved)
-    assert "no scene folder" in check_model(folder, -1)[0].text
     lines = check_model(folder, -1, str(moved))
     assert lines[0].text == "iteration 7, 300 Gaussians of SH degree 3" and "renders" not in lines[0].text
     exit_status("-s", str(moved), "-m", folder)
@@ -332,7 +331,6 @@ def test_a_scene_too_small_to_be_drawn(model, colmap_scene):
 @pytest.mark.slow
 def test_models_that_have_not_converged(model, monkeypatch):
     lines = check_model(model(), -1)
-    assert lines[0].text == "iteration 7, 300 Gaussians of SH degree 3"
     assert "opacities: 0-0.01 0%, 0.01-0.05 0%, 0.05-0.2 100%" in lines[1].text
     assert any("PSNR of only" in text and "train longer, 3000 iterations" in text for text in problems(lines))
     assert "shortly after opacities were reset" in str(problems(check_model(model(iteration=6100), 6100)))
