@@ -68,8 +68,12 @@ PYTEST := $(BIN)/python -m pytest --numprocesses $(shell expr $(CORES) + 1) --ma
 test: install lint cpp-test-cpu
 	$(PYTEST) -m 'not browser and not slow'
 
-check: install lint cpp-test
-	$(PYTEST) -m 'not browser'
+# C++ tests beside pytest, whose processes also wait.
+check: install lint
+	@mkdir -p build
+	@$(MAKE) --no-print-directory cpp-test > build/cpp-test.log 2>&1 & cpp=$$!; status=0; \
+	    $(PYTEST) -m 'not browser' || status=$$?; \
+	    wait $$cpp || status=$$?; cat build/cpp-test.log; exit $$status
 
 test-aarch64 test-windows test-macos:
 	$(PYTHON) .ci/cross.py $(@:test-%=%)

@@ -65,6 +65,7 @@ def test_splat_transform_reads_what_we_wrote(tmp_path, ending, degree):
         assert _loss(some, read_back(path)) >= least
 
 
+@pytest.mark.slow
 def test_a_sog_file_has_the_same_bytes_each_time(tmp_path, monkeypatch):
     """Although the program starts from random clusters and writes the time."""
     some = splats(COUNT + 88, 3)  # clusters shared by chance
