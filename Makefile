@@ -64,7 +64,9 @@ demo-plan:
 output/demo_scene: | install
 	$(BIN)/python -m splatting.demo.make_scene $@
 
-PYTEST := $(BIN)/python -m pytest --numprocesses $(shell expr $(CORES) + 1) --maxprocesses 5 --dist worksteal
+# More processes than cores, as some wait. test-foreign has the tests that are ignored.
+PYTEST := $(BIN)/python -m pytest --numprocesses $(shell expr $(CORES) + 2) --maxprocesses 6 --dist worksteal \
+          --ignore tests/test_exports_foreign.py
 test: install lint cpp-test-cpu
 	$(PYTEST) -m 'not browser and not slow'
 

@@ -41,6 +41,7 @@ def _oracle(kind: str, antialiasing: bool) -> tuple[Tensor, Tensor]:
     return keep, torch.stack(wanted)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "antialiasing"), [(k, k != "ordinary") for k in KINDS] + [("ordinary", True)])
 @BOTH_AND_GPU
 def test_lengths_are_those_of_the_oracle(kind, antialiasing, device, dtype):

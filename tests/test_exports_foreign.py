@@ -16,6 +16,7 @@ from small_splats import cube, moved, splats, written
 from benchmarks.exports.sizes import decibels, orbit, read_back, read_by_splat_transform, renders
 from splatting.exports.splats import Splats, half_turned, with_sh_degree
 
+pytestmark = pytest.mark.slow
 FOREIGN = Path(__file__).parent / "foreign"
 FLOAT, COMPRESSED = 60, 35  # dB that a format keeps at least
 COUNT = 512  # as many as SOG has clusters for their SH bands, so that its loss does not hang on which ones it merges
@@ -65,7 +66,6 @@ def test_splat_transform_reads_what_we_wrote(tmp_path, ending, degree):
         assert _loss(some, read_back(path)) >= least
 
 
-@pytest.mark.slow
 def test_a_sog_file_has_the_same_bytes_each_time(tmp_path, monkeypatch):
     """Although the program starts from random clusters and writes the time."""
     some = splats(COUNT + 88, 3)  # clusters shared by chance

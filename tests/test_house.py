@@ -222,6 +222,7 @@ def test_one_place_knows(words):
     assert [module for module in said if not any(_within(module, place) for place in SAID_IN[words])] == []
 
 
+@pytest.mark.slow
 def test_names_of_the_reference_are_the_same_objects_everywhere():
     code = """
 import sys

@@ -63,6 +63,7 @@ def _argument(name: str, words: str) -> str:
     )
 
 
+@pytest.mark.slow
 def test_there_are_as_many_as_operators(outcomes):
     registered = {name for name in torch._C._dispatch_get_all_op_names() if "::" in name}
     ours = {name for name in registered if name.startswith(("diff_gaussian", "fused_ssim", "simple_knn"))}

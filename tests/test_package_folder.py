@@ -61,6 +61,7 @@ def run(script: str, path: list[Path], folder: Path) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["copy", "link"])
 def test_a_package_folder_works_beside_the_plain_names(kind, tmp_path):
     """As projects do that keep the code in a sub-folder and have both on the path of imports."""

@@ -100,6 +100,7 @@ def test_small_gaussians_look_as_with_ewa(lens):
         assert difference < (most if lens else 2 * size * most / 0.1), size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lens", [None, FISHEYE], ids=["pinhole", "fisheye"])
 def test_gradients_are_those_of_differences(lens):
     parameters, _ = few(2, WIDTH, HEIGHT)
