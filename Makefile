@@ -65,17 +65,13 @@ output/demo_scene: | install
 	$(BIN)/python -m splatting.demo.make_scene $@
 
 # More processes than cores, as some wait. test-foreign has the tests that are ignored.
-PYTEST := $(BIN)/python -m pytest --numprocesses $(shell expr $(CORES) + 2) --maxprocesses 6 --dist worksteal \
+PYTEST := $(BIN)/python -m pytest --numprocesses $(shell expr $(CORES) + 1) --maxprocesses 5 --dist worksteal \
           --ignore tests/test_exports_foreign.py
 test: install lint cpp-test-cpu
 	$(PYTEST) -m 'not browser and not slow'
 
-# C++ tests beside pytest, whose processes also wait.
-check: install lint
-	@mkdir -p build
-	@$(MAKE) --no-print-directory cpp-test > build/cpp-test.log 2>&1 & cpp=$$!; status=0; \
-	    $(PYTEST) -m 'not browser' || status=$$?; \
-	    wait $$cpp || status=$$?; cat build/cpp-test.log; exit $$status
+check: install lint cpp-test
+	$(PYTEST) -m 'not browser'
 
 test-aarch64 test-windows test-macos:
 	$(PYTHON) .ci/cross.py $(@:test-%=%)
