@@ -56,9 +56,8 @@ def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
     """A test that takes long is marked, so that `-m "not slow"` stays short."""
     start, began = _seconds_of_processors(), time.perf_counter()
     result = yield
-    # Seconds of a child count when it is waited for, which may be in a later test.
-    most = (time.perf_counter() - began) * (os.cpu_count() or 1)
-    taken = min(_seconds_of_processors() - start, most)
+    # Seconds of a child count when it is waited for, which may be in a later, shorter test.
+    taken = min(_seconds_of_processors() - start, time.perf_counter() - began)
     if taken > MOST_SECONDS and item.get_closest_marker("slow") is None and not HAS_GPU:
         pytest.fail(f"took {taken:.1f} s of CPU time: make it faster, or mark it with @pytest.mark.slow", pytrace=False)
     return result
