@@ -21,7 +21,7 @@ from splatting.evaluation.error_curve import FIGURE
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # of programs that a test starts
 torch.set_num_threads(1)
 
-MOST_SECONDS = 5.0  # of processors, for a test that is not marked slow
+MOST_SECONDS = 10.0  # of processors, for a test that is not marked slow: a busy machine needs three times as many
 HAS_GPU = torch.cuda.is_available()  # whose first calls take seconds
 
 

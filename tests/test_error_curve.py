@@ -344,6 +344,7 @@ class TestDrawer:
         write_curve("Füße/error_vs_time.csv", [_row(t, 10.0 + t) for t in (1, 2, 4)])
         return Path("Füße")
 
+    @pytest.mark.slow
     def test_another_process_draws_and_imports_no_torch(self, folder):
         drawer = CurveDrawer(folder, VIEWS)
         drawer.begin()
