@@ -26,14 +26,13 @@ from arguments import ModelParams, OptionParser, PipelineParams, get_combined_ar
 from gaussian_renderer.blending import blending_weights, most_important
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import change_on_views
-from scene.gaussians.checkpoint import SKY
 from scene.saved_model import find_save, load_saved, read_model
 from scene.scene import Scene
 from splatting.exports.formats import FORMATS, READABLE, Format, format_of, read_splats
 from splatting.exports.in_scene import load_file, splats_of
 from splatting.exports.splats import Splats, choose, selected, tidy, used_sh_degree, with_sh_degree
 from splatting.files.json_files import OFFSET, read_model_json
-from splatting.training.sky import Sky
+from splatting.parts import tools
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, compute_device, run_cli
 
@@ -108,8 +107,9 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     splats, scene = load(args, options, needs_views=bool(args.max_splats) or entry.of_scene)
     degree = used_sh_degree(splats) if args.typed_sh_degree is None else min(args.typed_sh_degree, splats.sh_degree)
     keep = choose(splats, args.crop, args.min_opacity)
-    if args.no_sky:
-        keep &= ~sky_of(args.model_path).rows(torch.from_numpy(splats.means)).numpy()
+    for left_out in tools("left_out"):
+        if (found := left_out(args, torch.from_numpy(splats.means))) is not None:
+            keep &= ~found.numpy()
     if scene is not None and args.max_splats:
         keep = thin_out(scene, keep, degree, args.max_splats, pipe, options, scored=args.crop is None)
     chosen = tidy(with_sh_degree(selected(splats, keep), degree))
@@ -126,14 +126,6 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     print(
         f"Wrote {args.to}: {what}, {size / 1e6:.2f} MB ({size / max(len(chosen), 1):.0f} bytes each), {seconds:.1f} s"
     )
-
-
-def sky_of(model_path: str | None) -> Sky:
-    """The sky of a model folder. UserError if it has none."""
-    state = read_model_json(model_path).get(SKY) if model_path else None
-    if state is None:
-        raise UserError("--no_sky needs -m of a model that has a sky (train.py --sky auto); leave it out")
-    return Sky.restored(state)
 
 
 def _refuse_to_replace_a_model(file: Path, source: str | None) -> None:
@@ -173,7 +165,8 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
     add("--crop", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
         help="keep the Gaussians with a centre in this box, in the frame of the model (default: keep all)")  # fmt: skip
     add("--min_opacity", type=float, default=0.0, help="leave fainter Gaussians out, 0 to 1 (default: 0)")
-    add("--no_sky", action="store_true", help="leave the sky of train.py --sky out (default: keep it)")
+    for add_options in tools("add_export_options"):
+        add_options(add)
     add("--max_splats", type=int, default=0, metavar="N",
         help="keep N Gaussians; what adds least to the training views goes first (default: 0, no limit)")  # fmt: skip
     add("--path", metavar="PATH",

@@ -37,6 +37,7 @@ from gaussian_renderer.scored_views import ScoredViews, fitted_views
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.ppisp import Ppisp
+from scene.point_depths import PointDepths, held_out_points
 from scene.saved_model import load_saved
 from scene.scene import Scene
 from splatting.camera_paths.render_path import add_path_options, path_request, render_path
@@ -46,7 +47,6 @@ from splatting.exports.in_scene import load_file
 from splatting.files.image_files import remove_leftovers, save_png, write_plane
 from splatting.files.json_files import write_json
 from splatting.host.progress import Bar
-from splatting.training.sparse_depth import PointDepths, held_out_points
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p, run_cli
 

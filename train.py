@@ -19,6 +19,7 @@ from arguments import ModelParams, OptimizationParams, OptionParser, PipelinePar
 from gaussian_renderer import network_gui
 from splatting.distributed.consistency import agree_on_options
 from splatting.evaluation.training_log import EventWriter as SummaryWriter
+from splatting.parts import check_together, chosen
 from splatting.training import checks
 from splatting.training.gpu_memory import own_limit
 from splatting.training.launch import add_launch_options, launch_options
@@ -106,8 +107,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, ...]:
     for name in ("test_iterations", "save_iterations", "checkpoint_iterations"):
         if wrong := [t for t in getattr(args, name) if t < 1 and t != -1]:
             raise UserError(f"--{name} takes iterations from 1 on, or -1 for none, got {wrong[0]}")
-    if args.keep_best:
-        checks.check_keep_best(*options[:2], several=False)
+    check_together(chosen(args), args, several=False)
     return args, *options
 
 

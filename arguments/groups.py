@@ -4,9 +4,11 @@ import argparse
 import os
 from collections.abc import Collection
 
-from arguments.param_group import CFG_ARGS, GroupParams, Option, OptionTable, above, at_least, one_of, within
+from arguments.param_group import GroupParams, OptionTable
 from arguments.strategies import STRATEGY_OPTIONS
 from splatting.files.json_files import MODEL_JSON
+from splatting.parts import options_of
+from splatting.training.option import CFG_ARGS, Option, above, at_least, one_of, within
 from utils.system_utils import UserError
 
 
@@ -36,9 +38,7 @@ class ModelParams(OptionTable):
             help="folder of the model"),
         Option("images", "images", short="i", stored=CFG_ARGS,
             help="folder of the photos inside the scene folder (COLMAP only)"),
-        Option("depths", "", short="d", stored=CFG_ARGS,
-            help="folder of depth maps inside the scene folder, with the photos' names: PNGs of inverse depth, or "
-                 "metric PNGs, .npy or .pfm; they stabilise regions that few photos show; empty: no depth supervision"),
+        *options_of("model"),
         Option("resolution", -1, short="r", check=_resolution, stored=CFG_ARGS,
             help="1, 2, 4, 8: divide the size of the photos by this; -1: keep their size, but at most 1600 pixels "
                  "wide; any other value: width in pixels"),
@@ -52,9 +52,6 @@ class ModelParams(OptionTable):
                  "use. Without a usable GPU, cuda means the CPU"),
         Option("eval", False, stored=CFG_ARGS,
             help="hold out a test set: every 8th photo by name, or Blender's test frames"),
-        Option("keep_best", False, origin="ours", stored=MODEL_JSON,
-            help="take every 16th training photo, and at least two, for validation: the last save is the model "
-                 "that showed them best, of all points scored"),
         Option("init_pcd_path", "", origin="ours",
             help="file of points to start from instead of the scene's own: PLY, npz (points, colors), or text whose "
                  "lines are x y z or x y z red green blue"),
@@ -176,19 +173,10 @@ class OptimizationParams(OptionTable):
         Option("densify_until_iter", 15_000, "densification ends before this step", "paper", check=at_least(0)),
         Option("densify_grad_threshold", 0.0002, origin="paper", check=above(0),
             help="screen-space gradient (per NDC unit) that makes a Gaussian clone or split; lower: more Gaussians"),
-        Option("depth_l1_weight_init", 1.0, "weight of the depth loss (--depths) at the start", check=at_least(0)),
-        Option("depth_l1_weight_final", 0.01, "weight of the depth loss in the last step", check=at_least(0)),
-        Option("sparse_depth", 0.0, origin="ours", check=at_least(0),
-            help="weight of the depth of the scene's own points (COLMAP only), where photos have seen them; 0: off"),
-        Option("robust_mask", 0.0, origin="ours", check=within(0, 0.5),
-            help="largest part of a photo that training may leave out because all others disagree with it, as with "
-                 "passers-by; no mask is needed. 0: off"),
         Option("filter_3d", False, origin="ours",
             help="let no Gaussian be finer than the training photos can show, so that views from other distances look "
                  "right. It is part of the PLY, so that every viewer shows it; best with --antialiasing"),
-        Option("sky", "off", origin="ours", check=one_of("off", "auto"),
-            help="auto: where directions that photos show have no points, add Gaussians on a far sphere, as a sky "
-                 "behind all; off: add none. By one process, with --strategy adc or budget"),
+        *options_of("optimisation"),
         Option("random_background", False,
             help="a new random background in every step, so that no Gaussian imitates a fixed one"),
         Option("optimizer_type", "default", check=one_of("default", "sparse_adam"), stored=MODEL_JSON,

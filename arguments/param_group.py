@@ -1,85 +1,12 @@
-"""Options as records, from which parser, defaults, checks and help are made."""
+"""Groups of options, and the parser that takes them."""
 
 import argparse
 import difflib
-import math
-from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from collections.abc import Collection
 from typing import Any, ClassVar, NoReturn
 
 from arguments.removed import REMOVED
-from utils.system_utils import UserError
-
-Value = bool | int | float | str
-CFG_ARGS = "cfg_args"  # the file of options in a model folder of the reference
-
-
-@dataclass(frozen=True)
-class Option:
-    """One command-line option.
-
-    name, short: long name (also the attribute) and one-letter form; default: its type is the option's type.
-    help: effect, may be empty. origin: source of the default; "ours..." for options that the reference does not have.
-    check: returns None for a valid value, else a description of valid values.
-    stored: the file of the model folder that keeps it; empty: none. compared: whether a resumed run warns if its value
-    is not the stored one.
-    loaded: what a command that loads a model takes if the option is not given; empty: the stored value.
-    """
-
-    name: str
-    default: Value
-    help: str
-    origin: str = "reference"
-    short: str | None = None
-    check: Callable[[Any], str | None] | None = None
-    stored: str = ""
-    compared: bool = True
-    loaded: str = ""
-
-    @property
-    def ours(self) -> bool:
-        """Whether the reference does not have this option."""
-        return self.origin.startswith("ours")
-
-    @property
-    def attribute(self) -> str:
-        """Name of the group's attribute that holds the default: with a leading underscore if there is a short form."""
-        return f"_{self.name}" if self.short else self.name
-
-    def add_to(self, group: argparse._ArgumentGroup, sentinel: bool) -> None:
-        flags = [f"--{self.name}"] + ([f"-{self.short}"] if self.short else [])
-        default = None if sentinel else self.default
-        text = f"{self.help} (default: {self._shown_default(sentinel)})" if self.help else f"default: {self._shown()}"
-        if isinstance(self.default, bool):
-            kind: dict[str, Any] = {"action": "store_true"}
-        else:
-            kind = {"type": type(self.default), "metavar": self._metavar()}
-        action = group.add_argument(*flags, **kind, default=default, help=text.replace("%", "%%"))
-        action.ours = self.ours  # type: ignore[attr-defined]  # for OptionParser
-
-    def _shown(self) -> str:
-        return "off" if self.default is False else repr(self.default) if self.default == "" else str(self.default)
-
-    def _shown_default(self, sentinel: bool) -> str:
-        """Text about what counts if the option is not given. sentinel: by a command that loads a model."""
-        if sentinel and (self.loaded or self.stored):
-            return self.loaded or "that of the model"
-        return f"{self._shown()}; {self.origin}"
-
-    def _metavar(self) -> str | None:
-        if choices := getattr(self.check, "choices", ()):
-            return f"{{{','.join(choices)}}}"
-        return {int: "N", float: "X", str: "TEXT"}.get(type(self.default))
-
-    def verify(self, value: Value) -> None:
-        """Raise UserError if the value is not finite, no boolean for a flag, or fails the option's check."""
-        if isinstance(self.default, bool) and value not in (False, True):
-            raise UserError(f"--{self.name} must be True or False, got {value!r}")
-        if isinstance(value, float) and not math.isfinite(value):
-            raise UserError(f"--{self.name} must be a finite number, got {value}")
-        valid = self.check(value) if self.check else None
-        if valid:
-            raise UserError(f"--{self.name} must be {valid}, got {value!r}")
+from splatting.training.option import Option
 
 
 class OptionParser(argparse.ArgumentParser):
@@ -189,28 +116,3 @@ class OptionTable(ParamGroup):
             if option in self.options:
                 option.verify(getattr(values, option.name))
         return values
-
-
-def at_least(low: float) -> Callable[[float], str | None]:
-    """Make a check for `Option`: value >= low."""
-    return lambda value: None if value >= low else f"at least {low}"
-
-
-def above(low: float) -> Callable[[float], str | None]:
-    """Make a check for `Option`: value > low."""
-    return lambda value: None if value > low else f"greater than {low}"
-
-
-def within(low: float, high: float) -> Callable[[float], str | None]:
-    """Make a check for `Option`: low <= value <= high."""
-    return lambda value: None if low <= value <= high else f"between {low} and {high}"
-
-
-def one_of(*choices: str) -> Callable[[str], str | None]:
-    """Make a check for `Option`: value is one of `choices`, which its help shows."""
-
-    def check(value: str) -> str | None:
-        return None if value in choices else " or ".join(choices)
-
-    check.choices = choices
-    return check

@@ -10,18 +10,19 @@ from pathlib import Path
 from typing import Any
 
 from arguments.groups import OPTIONS, ModelParams
-from arguments.param_group import CFG_ARGS, Value
 from splatting.files import json_files
 from splatting.files.json_files import MODEL_JSON, OFFSET
 from splatting.files.plain_files import plain_text
 from splatting.host.machine import VERSION
+from splatting.training.option import CFG_ARGS, Value
 from utils.system_utils import UserError, atomic_write
 
 _IN_CFG_ARGS = {option.name: option.default for option in OPTIONS if option.stored == CFG_ARGS}
 _IN_MODEL_JSON = {option.name: option.default for option in OPTIONS if option.stored == MODEL_JSON}
 _OF_TRAINING = {option.name: option.default for option in OPTIONS if not option.stored and option.compared}
 # Options of a model that change no picture, or whose change of it has a name of its own.
-_UNSEEN = {"sh_degree", "source_path", "model_path", "depths", "data_device", "seed", "optimizer_type"}
+_UNSEEN = {"sh_degree", "source_path", "model_path", "data_device", "seed", "optimizer_type"}
+_UNSEEN |= {option.name for option in OPTIONS if not option.seen}
 _OF_MODEL = {option.name for option in ModelParams.options if option.stored == MODEL_JSON}
 
 

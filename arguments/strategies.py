@@ -1,7 +1,7 @@
 """Options of the strategies: how many Gaussians there are, and where, and how a run is paced."""
 
-from arguments.param_group import Option, above, at_least, one_of, within
 from splatting.files.json_files import MODEL_JSON
+from splatting.training.option import Option, above, at_least, one_of, within
 
 _PAPER = "ours, from the MCMC paper"
 _RELEASED = "ours, from the release of the MCMC paper"

@@ -20,8 +20,7 @@ from scene.half_images import half, train_on_all
 from scene.images.masks import MaskOptions, check_masks
 from scene.images.store import ImageStore, Picture, image_device
 from scene.pose_file import with_poses, write_poses
-from scene.readers.depth_maps import with_depth_maps
-from scene.readers.info import CameraInfo, SceneInfo, exposure_names, photo_size, without_validation
+from scene.readers.info import CameraInfo, SceneInfo, exposure_names, photo_size
 from scene.readers.point_cloud import write_point_cloud
 from scene.readers.scene_folder import kind_of
 from scene.saved_iterations import find_iteration, saved_ply
@@ -30,19 +29,21 @@ from splatting.compat.readers import scene_by
 from splatting.distributed.ranks import ALONE, Ranks
 from splatting.files.json_files import OFFSET, read_model_json
 from splatting.host.machine import compute_device
+from splatting.parts import chosen
+from splatting.training.part import Part
 from utils.system_utils import UserError, atomic_write
 
 
 class Scene:
     """Views and model of one run.
 
-    args: model options, as ModelParams.extract gives them; the reference's of 2023 suffice. load_iteration:
-    None calls `create_gaussians` and `write_inputs`; -1 loads the last saved iteration, N that one. start: False leaves
-    all of this to the caller. shuffle: mix the order of the views (always the same way). resolution_scales: factors by
-    which views are made smaller, one list of cameras each. train_cameras, test_cameras: these lists by scale, which may
-    be replaced. validation_cameras: the same of views that neither train nor test, but choose what --keep_best saves.
-    info: the dataset as read, without the last. cameras_extent: E in world units, from the training views.
-    images: the store of the decoded photos. ranks: processes that divide them (ImageStore).
+    args: model options, as ModelParams.extract gives them; the reference's of 2023 suffice. load_iteration: None calls
+    `create_gaussians` and `write_inputs`; -1 loads the last saved iteration, N that one. start: False leaves all of
+    this to the caller. shuffle: mix the order of the views (always the same way). resolution_scales: factors by which
+    views are made smaller, one list of cameras each. train_cameras, test_cameras: these lists by scale, which may be
+    replaced. validation_cameras: the same of views that neither train nor test. info: the dataset as read.
+    cameras_extent: E in world units, from the training views. images: the store of the decoded photos. ranks: processes
+    that divide them (ImageStore). parts: of a training, None: those that args ask for.
     """
 
     def __init__(
@@ -54,6 +55,7 @@ class Scene:
         resolution_scales: Sequence[float] = (1.0,),
         start: bool = True,
         ranks: Ranks = ALONE,
+        parts: Sequence[Part] | None = None,
     ) -> None:
         self.model_path = args.model_path
         self.gaussians = gaussians
@@ -63,19 +65,17 @@ class Scene:
         self._halves = bool(getattr(args, "train_test_exp", False))
         self._appearance = getattr(args, "appearance", "none") == Ppisp.kind
         self._refines = bool(getattr(args, "refine_poses", False)) and not getattr(args, "other_scene", "")
+        self._parts = chosen(args) if parts is None else parts
         self.info = self._read(args)
-        self.validation: list[CameraInfo] = []
-        if getattr(args, "keep_best", False) and not getattr(args, "other_scene", ""):
-            self.info, self.validation = without_validation(self.info)
         self.cameras_extent = self.info.extent
 
         device = compute_device()
         place = image_device(args.data_device, device, warn=True)
         self.images = ImageStore(getattr(args, "images_to_load", None) or 0, place, device, ranks)
-        lists = (self.info.train_cameras, False), (self.info.test_cameras, True), (self.validation, True)
+        lists = (self.info.train_cameras, False), (self.info.test_cameras, True), (self.info.validation_cameras, True)
         self.train_cameras, self.test_cameras, self.validation_cameras = (
             {scale: self._cameras(args, scale, shuffle, *views) for scale in resolution_scales} if asked else {}
-            for asked, views in zip((True, True, self.validation), lists, strict=True)
+            for asked, views in zip((True, True, self.info.validation_cameras), lists, strict=True)
         )
         self._plan_images()
 
@@ -95,10 +95,9 @@ class Scene:
         fresh = self.loaded_iter is None
         if fresh:
             _refuse_dataset_folder(args)
-        depths = getattr(args, "depths", None) or ""
         kind = kind_of(args.source_path)
         if read := replaced_reader(kind):
-            return scene_by(read, kind, args, depths, self._halves)
+            return self._changed(scene_by(read, kind, args, self._halves), args, False)
         masks = MaskOptions(**_given(args, folder="masks", invert="invert_masks", meaning="mask_meaning"))
         info = read_scene(
             args.source_path,
@@ -119,8 +118,12 @@ class Scene:
         self._given = info.test_cameras
         if self._refines and not fresh:
             info = with_poses(info, self.model_path)
-        if depths and fresh:
-            info = with_depth_maps(info, Path(args.source_path), depths)
+        return self._changed(info, args, fresh)
+
+    def _changed(self, info: SceneInfo, args: argparse.Namespace, fresh: bool) -> SceneInfo:
+        """The dataset as the parts want it."""
+        for part in self._parts:
+            info = part.dataset(info, args, fresh)
         return info
 
     def getTrainCameras(self, scale: float = 1.0) -> list[Camera]:
@@ -179,7 +182,7 @@ class Scene:
         else:
             colors = np.round(info.point_cloud.colors * 255).astype(np.uint8)
             write_point_cloud(folder / "input.ply", info.point_cloud.points, colors)
-        views = info.test_cameras + info.train_cameras + self.validation
+        views = [*info.test_cameras, *info.train_cameras, *info.validation_cameras]
         entries = [scene.camera_to_JSON(i, camera) for i, camera in enumerate(views)]
         with atomic_write(folder / "cameras.json") as path:
             path.write_text(json.dumps(entries, allow_nan=False), encoding="utf-8")

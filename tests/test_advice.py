@@ -71,7 +71,7 @@ def test_advice_on_a_given_option_or_against_one_is_not_taken(tmp_path, monkeypa
     args = argparse.Namespace(keep_best=False, train_test_exp=False, projection="ray", strategy="adc", advise=True)
     dataset = argparse.Namespace(model_path=str(tmp_path))
     assert advice.asked_options(dataset, args, ["--app=none", "-r", "2"]) == ["--sky", "auto"]
-    assert "--refine_poses is left out, as it does not go with --projection" in capsys.readouterr().out
+    assert "--refine_poses is left out: it does not go with --projection" in capsys.readouterr().out
     assert [one["options"] for one in json.loads((tmp_path / advice.ADVICE).read_text())] == ["--sky auto", "", ""]
 
 
@@ -86,7 +86,7 @@ def test_the_short_training_reads_the_data_as_the_training_does(more, monkeypatc
 
     monkeypatch.setattr(advice, "_trained", fail)
     with pytest.raises(UserError, match="^no scene$"):
-        next(advice._of_passers_by(dataset))
+        next(advice._of_short_training(dataset))
     other = {name for name, value in vars(parse(lines[0])[1]).items() if value != vars(dataset)[name]}
     assert other == {"model_path", "resolution"}
 

@@ -26,10 +26,10 @@ from benchmarks.parallel import steps, workload
 from benchmarks.scenes import made, scores, step_profile
 from benchmarks.scenes.thinned import thinned
 from scene.dataset_readers import read_scene
+from scene.point_depths import HELD_OUT
 from splatting.demo.tracer import ring_views, trace
 from splatting.evaluation.configs import read_configs
 from splatting.files.image_files import write_plane
-from splatting.training.sparse_depth import HELD_OUT
 from utils.system_utils import UserError
 
 

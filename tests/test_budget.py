@@ -279,8 +279,8 @@ def counts(monkeypatch) -> list[tuple[int, int]]:
 def test_the_loss_sees_what_is_brighter_than_white(strategy, clamped):
     """Unlike the reference's. Else Gaussians brighter than a white background float before it, and hide test views."""
     bright = torch.full((3, HEIGHT, WIDTH), 1.5, requires_grad=True)
-    step = SimpleNamespace(camera=View(), background=GREY, depth_weight=0.0, points=None, sky=None)
-    run = SimpleNamespace(opt=options(), density=strategy, robust_mask=None, gaussians=model(1))
+    step = SimpleNamespace(camera=View(), background=GREY, terms={})
+    run = SimpleNamespace(opt=options(), density=strategy, counts=None, gaussians=model(1))
     Objective(run)({"render": bright}, step).total.backward()
     assert bool(bright.grad.any()) != clamped
 

@@ -657,7 +657,7 @@ def test_a_rehearsal_tells_what_would_run_and_writes_nothing(colmap_scene, tmp_p
     assert [row.split(" | ")[-1] for row in told(*both, *given)] == ["finished |", "to train |"] * 2
     assert folder_state(evaluate.out) == before and evaluate.calls() == calls
     (tmp_path / "sets.json").write_text('{"seeded": ["--seed", "5", "-r", "2", "--keep_best"]}')
-    with pytest.raises(UserError, match="--keep_best does not go with --train_test_exp"):
+    with pytest.raises(UserError, match="--keep_best does not work with --train_test_exp"):
         told("--configs", tmp_path / "sets.json", "--", "--train_test_exp")
     photo = min((colmap_scene / "images").rglob("*.png"))
     photo.unlink()

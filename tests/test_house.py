@@ -23,7 +23,10 @@ MAY_IMPORT = {
     **dict.fromkeys(BASE, ()),
     "utils.camera_utils": ("scene", "splatting.compat"),
     "utils.make_depth_scale": ("scene.readers.depth_scale", "scene.readers.depth_maps"),  # a command of the reference
-    "arguments": (),
+    "arguments": ("splatting.training.option", "splatting.parts"),
+    "splatting.training.option": (),
+    "splatting.training.part": ("splatting.training", "scene.readers.info"),
+    "splatting.parts": ("arguments", "splatting.training", "splatting.evaluation", "gaussian_renderer", "scene"),
     "lpipsPyTorch": (),  # a name of the reference
     "scene.images": (),
     "scene.colmap_loader": (),
@@ -33,7 +36,7 @@ MAY_IMPORT = {
     "scene.gaussian_model": ("scene.gaussians", "scene.readers.info"),
     "scene.dataset_readers": ("scene.readers", "scene.images", "splatting.compat"),
     "scene.cameras": ("scene.readers", "scene.images", "splatting.compat"),
-    "scene.scene": ("scene", "splatting.compat"),
+    "scene.scene": ("scene", "splatting.compat", "splatting.parts", "splatting.training.part"),
     "scene": (),  # not arguments: a client's own package of that name may be found first
     "gaussian_renderer": ("scene",),
     "splatting.compat": ("scene",),
@@ -41,15 +44,15 @@ MAY_IMPORT = {
     "splatting.distributed.rendering": ("gaussian_renderer", "scene"),
     "splatting.camera_paths": ("gaussian_renderer", "scene"),
     "splatting.exports": ("splatting.camera_paths", "scene"),
-    "splatting.evaluation": ("arguments", "scene.saved_iterations", "scene.readers.info"),
+    "splatting.evaluation": ("arguments", "scene.saved_iterations", "scene.readers.info", "splatting.parts"),
     "splatting.training": (
-        *("splatting.evaluation", "splatting.exports", "splatting.viewer.server"),
+        *("splatting.evaluation", "splatting.exports", "splatting.parts", "splatting.viewer.server"),
         *("arguments", "gaussian_renderer", "scene"),
     ),
     "splatting.viewer": ("splatting.camera_paths", "splatting.exports", "gaussian_renderer", "scene"),
     "splatting.diagnosis": (
         *("arguments", "gaussian_renderer", "splatting.evaluation", "scene"),
-        *("splatting.training.robust_mask", "splatting.training.sky"),
+        "splatting.parts",
     ),
     "splatting.sfm": ("scene.readers", "scene.images"),
     "splatting.demo": ("arguments", "splatting.evaluation"),

@@ -12,15 +12,16 @@ import torch
 
 import train
 from splatting.evaluation.training_log import TrainingLog
+from splatting.training.announcer import Announcer
 from splatting.training.density import DensityControl
-from splatting.training.observer import Announcer, Observer
 from splatting.training.observers.standard import standard_observers
+from splatting.training.part import Part
 from splatting.training.strategies import adc
 
 ITERATIONS = 24
 
 
-class Recorder(Observer):
+class Recorder(Part):
     """Notes every hook with its iteration."""
 
     def __init__(self, told: list[tuple[str, int]], name: str = "", writes: tuple[int, ...] = ()) -> None:
@@ -70,12 +71,12 @@ def test_every_hook_is_called_once_an_iteration_and_in_order(colmap_scene, tmp_p
 def test_observers_are_told_in_the_order_of_the_list_and_of_the_error(colmap_scene, tmp_path, monkeypatch):
     told = []
 
-    class Broken(Observer):
+    class Broken(Part):
         def stepped(self, step) -> None:
             if step.iteration == 2:
                 raise RuntimeError("broken")
 
-    def observers(*_) -> list[Observer]:
+    def observers(*_) -> list[Part]:
         return [Recorder(told, "a "), Broken(), Recorder(told, "b ")]
 
     with pytest.raises(RuntimeError, match="broken"):
@@ -88,9 +89,9 @@ def test_observers_are_told_in_the_order_of_the_list_and_of_the_error(colmap_sce
 
 def test_a_hook_that_is_not_overridden_costs_nothing(monkeypatch):
     for hook in ("due", "begins", "measured", "stepped", "ended"):
-        monkeypatch.setattr(Observer, hook, lambda *_: pytest.fail("called"))
+        monkeypatch.setattr(Part, hook, lambda *_: pytest.fail("called"))
     step = SimpleNamespace(changes=False, due=True, stopping=None)
-    with Announcer([Observer()]) as tell:
+    with Announcer([Part()]) as tell:
         tell.begins(step)
         tell.measured(step, None)
         tell.stepped(step)
@@ -101,7 +102,7 @@ def test_the_guards_stand_where_they_must(colmap_scene, tmp_path, monkeypatch):
     """The list's order is meant: checks first, writers next, then the guard of a changing model, checkpoints last."""
     names = []
 
-    def observers(*given) -> list[Observer]:
+    def observers(*given) -> list[Part]:
         listed = standard_observers(*given)
         names.extend(type(one).__name__ for one in listed)
         return listed
@@ -144,7 +145,7 @@ def test_another_strategy_is_another_object(colmap_scene, tmp_path, monkeypatch)
 def test_backward_runs_on_the_callers_thread(colmap_scene, tmp_path, monkeypatch):
     found = []
 
-    class Threads(Observer):
+    class Threads(Part):
         def measured(self, step, losses) -> None:
             found.append(torch.autograd.is_multithreading_enabled())
 

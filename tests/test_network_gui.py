@@ -25,8 +25,8 @@ import train
 from gaussian_renderer import network_gui, network_transfer, render
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
-from splatting.training.observer import Observer
 from splatting.training.observers.viewers import NetworkViewer
+from splatting.training.part import Part
 from utils.system_utils import UserError
 
 ITERATIONS = 60
@@ -65,7 +65,7 @@ def answered(viewer: Viewer) -> str:
     return viewer.path()
 
 
-class Watched(Observer):
+class Watched(Part):
     """A training that a viewer has paused in its first iteration. script: called with that in a thread of its own.
 
     stops: iterations in which training waits for `go`, so that the script does not have to hurry.
@@ -77,7 +77,7 @@ class Watched(Observer):
         self._go = threading.Event()
         self._started, self._connected, self._run_training = threading.Event(), threading.Event(), train.run_training
 
-    def _train(self, run: object, observers: list[Observer]) -> None:
+    def _train(self, run: object, observers: list[Part]) -> None:
         self.run = run
         self._started.set()
         assert self._connected.wait(LIMIT)

@@ -35,11 +35,11 @@ def test_a_log_gets_a_line_in_ten_seconds_and_a_last_one(monkeypatch, seconds):
 
 def test_the_number_of_gaussians_is_exact(capsys):
     run = SimpleNamespace(
-        losses=LossWatch(), dataset=SimpleNamespace(depths=""), first_iteration=0,
+        losses=LossWatch(), parts=[], first_iteration=0,
         schedule=Schedule(20), gaussians=SimpleNamespace(gaussian_count=123_456), clock=SimpleNamespace(seconds=1.0),
         opt=SimpleNamespace(time_budget=0.0),
     )  # fmt: skip
     bar = ProgressBar(run)
-    bar.measured(SimpleNamespace(iteration=10, due=True, span=range(10, 11)), SimpleNamespace(depth=None))
+    bar.measured(SimpleNamespace(iteration=10, due=True, span=range(10, 11)), SimpleNamespace(terms={}))
     bar.ended(None)
     assert "Gaussians=123,456" in capsys.readouterr().err

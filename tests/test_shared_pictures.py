@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from parts.test_depth_maps import scene  # noqa: F401  (a fixture)
 from PIL import Image
 from processes import in_ranks
-from test_depth_maps import scene  # noqa: F401  (a fixture)
 
 import train
 from scene.images.store import ImageStore

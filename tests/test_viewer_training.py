@@ -42,7 +42,7 @@ class Watched:
         self.clients: list[Client] = []
         watched = self
 
-        class Observer(observed.PageObserver):
+        class Part(observed.PageObserver):
             def __init__(self, *given: object) -> None:
                 super().__init__(*given)
                 watched.observer, watched.page, watched.requests = self, self._page, self._requests
@@ -66,7 +66,7 @@ class Watched:
                     client.__exit__()
                 super().ended(error)
 
-        monkeypatch.setattr("splatting.training.observers.standard.PageObserver", Observer)
+        monkeypatch.setattr("splatting.training.observers.standard.PageObserver", Part)
         monkeypatch.setattr(observed, "serve", lambda page: None)  # so that the test ends
 
     def connect(self) -> None:

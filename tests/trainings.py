@@ -13,7 +13,8 @@ from synthetic import FOCAL, make_colmap_scene
 
 import train
 from scene.readers.point_cloud import write_point_cloud
-from splatting.training import loop, robust_mask, run
+from splatting.parts.robust_mask import residuals
+from splatting.training import loop, run
 from splatting.training.iteration import Iteration
 from splatting.training.steps.plain import PlainStep
 
@@ -104,9 +105,9 @@ def trained(scene: Path, out: Path, *options: object) -> dict[str, bytes | list]
         patch.setattr(sys, "stdout", sys.stdout)  # training stamps it
         patch.setattr(run, "SH_INTERVAL", 12)  # between the iterations that change rows
         patch.setattr(run, "FILTER_INTERVAL", 15)
-        patch.setattr(robust_mask.RobustMask, "early", 0)  # renders are far from the photos
-        patch.setattr(robust_mask, "_FACTOR", 1.2)
-        patch.setattr(robust_mask, "_BESIDE", 0.4)
+        patch.setattr(residuals.Residuals, "early", 0)  # renders are far from the photos
+        patch.setattr(residuals, "_FACTOR", 1.2)
+        patch.setattr(residuals, "_BESIDE", 0.4)
         train_on(scene, out, *words, "--no_curve", "--quiet", "--disable_viewer", *options)
     return whole_result(out, ITERATIONS)
 

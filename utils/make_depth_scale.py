@@ -1,4 +1,4 @@
-"""Fit a scene's depth maps to its COLMAP points, for train.py --depths.
+"""Fit a scene's depth maps to its COLMAP points.
 
 Maps of inverse depth get scale and offset each, in depth_params.json beside the model. Metric maps get one scale, in
 metric.json beside them.

@@ -19,7 +19,6 @@ from splatting.training.resolution import Resolution
 from splatting.training.run import Run
 from splatting.training.schedule_file import schedule_of
 from splatting.training.strategies import density_control
-from utils.general_utils import get_expon_lr_func
 from utils.system_utils import compute_device
 
 _EXTENT = 5.0  # world units
@@ -63,7 +62,6 @@ class WorkloadRun(Run):
         if sleep:
             sort_rows(self.gaussians)
             self.sleeping = Sleeping(self.gaussians)
-        self._depth_weight = get_expon_lr_func(0.0, 0.0)
 
     def _begin(self, workload: Workload) -> None:
         gaussians, here = self.gaussians, self.group

@@ -40,8 +40,8 @@ from splatting.distributed.ranks import ranks
 from splatting.host.memory import peak_memory_mib
 from splatting.training.iteration import Iteration
 from splatting.training.loop import run_training
-from splatting.training.observer import Observer
 from splatting.training.observers.divergence import DivergenceWatch
+from splatting.training.part import Part
 from utils.system_utils import UserError, compute_device, run_cli
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -52,7 +52,7 @@ _PIECE = 1 << 20  # Gaussians that are copied to the host at a time
 _USABLE = 0.92  # of a GPU
 
 
-class Timing(Observer):
+class Timing(Part):
     """Times blocks of steps after a warm-up."""
 
     def __init__(self, device: torch.device, warm_up: int) -> None:

@@ -10,8 +10,8 @@ import argparse
 from pathlib import Path
 
 from benchmarks.harness.colmap_part import but_every, part
+from scene.point_depths import HELD_OUT
 from scene.readers.info import HOLD
-from splatting.training.sparse_depth import HELD_OUT
 from utils.system_utils import UserError, run_cli
 
 

@@ -22,11 +22,12 @@ from scene.saved_iterations import saved_ply
 from scene.saved_model import find_save, read_model
 from splatting.evaluation import training_log
 from splatting.files.json_files import read_json, write_json
+from splatting.parts import PARTS, part_class
 from splatting.training.iteration import Iteration
 from splatting.training.loop import training_steps
-from splatting.training.observer import Observer
 from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.observers.guards import MaskWatch, MemoryGuard
+from splatting.training.part import Part
 from splatting.training.run import Run
 from train import parse
 from utils.system_utils import UserError, compute_device
@@ -35,11 +36,14 @@ RECORD = "nerfbaselines.json"  # in a checkpoint: its step, and the options that
 INTERVAL = 100  # iterations between losses that are told: reading one waits for the GPU
 # Test views are held out by NerfBaselines. Full-size photos, no viewer, and nothing written but by `save`.
 _ALWAYS = ("--eval", "--resolution=1", "--disable_viewer", "--no_curve", "--test_iterations=-1", "--save_iterations=-1")
-_OF_FILES = ("appearance", "init_ply", "depths", "masks", "train_test_exp", "refine_poses", "sparse_depth")
+_PARTS = [part_class(name) for name in PARTS]
+_OF_FILES = ("appearance", "init_ply", "masks", "train_test_exp", "refine_poses")
+_OF_FILES += tuple(part.switch or part.name for part in _PARTS if part.needs.files)
 # Options that nothing follows here, with the value that is the case. Our other observers score, save and show.
 _FIXED = dict.fromkeys(
-    ("keep_best", "advise", "viewer", "viewer_host", "detect_anomaly",
-     "start_checkpoint", "source_path", "model_path", "images", "invert_masks")
+    ("advise", "viewer", "viewer_host", "detect_anomaly",
+     "start_checkpoint", "source_path", "model_path", "images", "invert_masks",
+     *(part.switch or part.name for part in _PARTS if part.final is not Part.final))
     , "",
 ) | {"options": "given", "resolution": "1", "mask_meaning": "auto"}  # fmt: skip
 _LISTS = ("test_iterations", "save_iterations", "checkpoint_iterations")
@@ -63,7 +67,7 @@ def words_of(options: Mapping[str, Any]) -> list[str]:
     return words
 
 
-class _Losses(Observer):
+class _Losses(Part):
     """Lets the losses be read at intervals."""
 
     reads_model = False

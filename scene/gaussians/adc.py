@@ -57,10 +57,10 @@ def densify_and_prune(
     """Clone small and split large Gaussians with a mean gradient >= max_grad, then remove useless ones.
 
     min_opacity: a Gaussian below it is removed. extent: of the scene, world units. max_screen_size: pixels; unless
-    None, Gaussians wider than that or than a tenth of the extent are removed, but none of a sky for its width. radii:
-    (N,) pixels of this view, `tmp_radii` until the end. seed and iteration decide the positions of split children;
-    without a seed, torch's generator draws one. max_splats > 0 bounds the number of Gaussians. long_axis: split along
-    the longest axis (scene/gaussians/long_axis.py) instead, without random numbers.
+    None, Gaussians wider than that or than a tenth of the extent are removed; none that is pinned is so for its width.
+    radii: (N,) pixels of this view, `tmp_radii` until the end. seed and iteration decide the positions of split
+    children; without a seed, torch's generator draws one. max_splats > 0 bounds the number of Gaussians. long_axis:
+    split along the longest axis (scene/gaussians/long_axis.py) instead, without random numbers.
     """
     if radii is not None:
         gaussians.tmp_radii = radii
@@ -87,7 +87,7 @@ def densify_and_prune(
         # Appending has just zeroed max_radii2D, so the first test never fires, as in the reference.
         remove |= gaussians.max_radii2D > max_screen_size
         large = ~rules.is_small(gaussians.log_scales(), rules.PRUNE_EXTENT * extent)
-        remove |= large if gaussians.far is None else large & ~gaussians.far(gaussians.raw("xyz"))
+        remove |= large if gaussians.pinned is None else large & ~gaussians.pinned(gaussians.raw("xyz"))
     gaussians.prune_points(remove)
     if radii is not None:
         gaussians.tmp_radii = None

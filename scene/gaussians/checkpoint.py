@@ -26,8 +26,7 @@ _LARGEST = 1e15  # extent; learning rates are multiples of it
 _OPTIMIZER = 10  # which entry its state dict is
 _ENTRIES = 12  # the reference's; the values of further attributes may follow
 EXPOSURES, WRITTEN_BY = "exposures", "version"  # keys in the optimiser's state dict
-POSES, RESIDUALS, FILTER, ASLEEP = "poses", "residuals", "filter_3d", "asleep"  # those of further state of a training
-SKY = "sky"  # the same, and an entry of model.json
+POSES, FILTER, ASLEEP = "poses", "filter_3d", "asleep"  # those of further state of a training
 
 
 class State(NamedTuple):
@@ -133,6 +132,12 @@ def pack(state: State) -> tuple:
 def with_further(entries: tuple, states: dict[str, Any]) -> tuple:
     """The entries with further state of a training in the optimiser's state dict, by its key."""
     return (*entries[:_OPTIMIZER], entries[_OPTIMIZER] | states, *entries[_OPTIMIZER + 1 :])
+
+
+def states_of(entries: Sequence[Any]) -> dict[str, Any]:
+    """All further state, by its key."""
+    optimizer = entries[_OPTIMIZER]
+    return optimizer if isinstance(optimizer, dict) else {}
 
 
 def further(entries: Sequence[Any], key: str) -> Any:

@@ -49,7 +49,7 @@ class GaussianParameters:
     The tensors become parameters when rows are taken; an empty model has plain ones, as in the reference. shards: where
     these rows are among those of all ranks, if several have a part of the model each. spill: makes room for so many
     rows like those of a tensor, a part of them in the host's memory, or returns None (scene/gaussians/spilled.py).
-    far: tells which of means (N,3) are of a sky, and of any size, (N,) bool; None: there is no sky.
+    pinned: tells which of means (N,3) density control leaves, of any size, (N,) bool; None: it may remove all.
     max_radii2D, xyz_gradient_accum, denom: observations since the last densification (Statistics has shapes and units).
     optimizer: any of torch's, with `name` in its groups; None until training is set up. tmp_radii: (N,) pixels of the
     present view, or None; density control keeps it in step with the rows. filter_3d: (N, 1) standard deviation of the
@@ -62,7 +62,7 @@ class GaussianParameters:
     world_offset = (0.0, 0.0, 0.0)
     shards: Shards = WHOLE
     spill: Callable[[Tensor, int], Tensor | None] | None = None
-    far: Callable[[Tensor], Tensor] | None = None
+    pinned: Callable[[Tensor], Tensor] | None = None
     optimizer: torch.optim.Optimizer | None = None
     tmp_radii: Tensor | None = None
     filter_3d: Tensor | None = None

@@ -1,4 +1,4 @@
-"""Depth maps that supervise training (--depths): their files, units and decoding.
+"""Depth maps that supervise training: their files, units and decoding.
 
 Maps of inverse depth are grey images. Metric maps, of distances along the axis of the view, or from the camera for
 fisheyes and panoramas, are .npy and .pfm files of metres, and 16-bit PNGs beside a file METRIC, which tells metres.

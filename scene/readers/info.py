@@ -19,8 +19,6 @@ from utils.graphics_utils import BasicPointCloud, camera_center, focal2fov, fov2
 from utils.system_utils import UserError
 
 HOLD = 8  # every 8th photo by name is a test view (Mip-NeRF 360's split)
-VALIDATION = 16  # with --keep_best, every 16th training view by order does not train, and at least two do not
-FEWEST = 8  # training views to take these from
 NEAREST = 0.2  # depth from which Gaussians are drawn (the rasterizer's rule)
 APART = 10.0  # median distances from the cameras' median, beyond which a camera stands apart
 NARROW = 1e-2  # of the depth; with a smaller E, removing Gaussians wider than 0.1 E would leave only pixel-sized ones
@@ -162,7 +160,7 @@ class SceneInfo(_LikeNamedTuple):
 
     nerf_normalization: "radius", the extent E in world units, and "translate" (3,), minus the cameras' centre.
     is_nerf_synthetic: a Blender scene. offset (3,) float64: the world's coordinates of the frame's origin
-    (scene/readers/world_offset.py); zero by default.
+    (scene/readers/world_offset.py); zero by default. validation_cameras: views that neither train nor test.
     """
 
     point_cloud: BasicPointCloud | None
@@ -173,6 +171,7 @@ class SceneInfo(_LikeNamedTuple):
     is_nerf_synthetic: bool = False
     _: KW_ONLY
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    validation_cameras: Sequence[CameraInfo] = ()
 
     def _replace(self, **changes: Any) -> "SceneInfo":
         """A copy with some fields changed."""
@@ -198,19 +197,6 @@ def split_by_order(
     if not train:
         raise UserError(f"{folder} has too few photos for --eval, which holds out every {HOLD}th; leave --eval out")
     return train, test
-
-
-def without_validation(info: SceneInfo) -> tuple[SceneInfo, list[CameraInfo]]:
-    """The dataset with fewer training views, and those that were taken away, to choose a model by (--keep_best)."""
-    views = info.train_cameras
-    if len(views) < FEWEST:
-        raise UserError(
-            f"--keep_best takes photos away from training and needs {FEWEST}, and only {len(views)} train; leave it out"
-        )
-    step = min(VALIDATION, len(views) // 2)
-    chosen = range(step // 2, len(views), step)
-    left = [view for index, view in enumerate(views) if index not in chosen]
-    return info._replace(train_cameras=left), held_out([replace(views[n], depth=None, depth_path="") for n in chosen])
 
 
 def held_out(cameras: Sequence[CameraInfo]) -> list[CameraInfo]:

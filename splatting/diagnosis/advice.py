@@ -28,33 +28,29 @@ from scene.readers.tracks import Track, read_tracks
 from scene.scene import Scene
 from splatting.diagnosis import Line
 from splatting.diagnosis.dataset import pose_errors, poses_differ
-from splatting.diagnosis.model import masks_of
+from splatting.diagnosis.model import load_scored
 from splatting.distributed.ranks import ranks
 from splatting.files.json_files import write_json
-from splatting.training.robust_mask import FEW, MASKED, odd_share
-from splatting.training.sky import FEWEST as LEAST_SKY
-from splatting.training.sky import Sky, find_sky, said_of_sky
+from splatting.parts import check_together, chosen, options_of, tools
 from utils.image_utils import as_float
 from utils.system_utils import UserError, mkdir_p
 
 ADVICE = "advice.json"  # what train.py --advise writes: texts, and options that the scene asks for
 EXPOSURES = 0.4  # stops; photos of a usual automatic exposure differ by 0.15 to 0.35
-FEW_PHOTOS = 16  # 14 gained 0.2 dB by points that hold the depth, 20 and 21 lost as much (docs/results/photos.md)
 DISTANCES = 2.5  # the farthest photo of a point over the nearest
-_AGAINST = {  # by an advised option: the options, with these values, that it does not go with
-    "--appearance": {"keep_best": True, "train_test_exp": True},
-    "--refine_poses": {"keep_best": True, "projection": "ray"},
-    "--sky": {"strategy": "mcmc"},
+_AGAINST = {  # by an advised option: the options, with these values, that it does not go with, besides those of parts
+    "--appearance": {"train_test_exp": True},
+    "--refine_poses": {"projection": "ray"},
 }
 _OFF = (False, "", "none", "off")  # values of options that do nothing; 0 is equal to False
 _NOT_OF_DATA = {  # model options that the short training of small photos has itself, or does without
-    "sh_degree", "model_path", "resolution", "depths", "keep_best", "train_test_exp", "refine_poses", "appearance",
-}  # fmt: skip
+    "sh_degree", "model_path", "resolution", "train_test_exp", "refine_poses", "appearance",
+} | {option.name for option in options_of("model")}  # fmt: skip
 _WIDTH = 200  # pixels of a photo
 _DARK, _LIGHT = 0.02, 0.98  # of a channel; beyond, an exposure cannot be told
 _OUTLIER = 0.6  # stops; a larger difference is no exposure (Tukey's biweight: Beaton and Tukey 1974)
 _ROUNDS = 10
-_ITERATIONS = 1000  # of the short training that passers-by are searched in
+_ITERATIONS = 1000  # of the short training
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear sRGB
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -70,22 +66,21 @@ class Advice(NamedTuple):
 
 
 def advise(dataset: argparse.Namespace, trains: bool = True, warns: bool = False) -> list[Advice]:
-    """Advice on a scene. dataset: the model options. trains: look for passers-by by a short training, too.
+    """Advice on a scene. dataset: the model options. trains: ask by a short training, too.
 
     warns: print what the check of the scene finds, too. UserError as from Scene, and where the scene cannot be trained.
     """
     small = copy.copy(dataset)
-    small.resolution, small.model_path, small.depths = _WIDTH, "", ""
+    small.resolution, small.model_path = _WIDTH, ""
+    vars(small).update({option.name: option.default for option in options_of("model")})
     with contextlib.redirect_stdout(io.StringIO()):  # from the readers
         scene = Scene(small, GaussianModel(0), shuffle=False, start=False)
     if trains:
         tell(of_options(scene.info, dataset), dataset.source_path, quiet=not warns)
     tracks = read_tracks(dataset.source_path, scene.info.train_cameras, scene.info.offset)
     found = [*_of_tracks(scene, tracks)] if any(tracks) else []
-    if len(scene.info.point_cloud.points):
-        _, share = find_sky(scene, Sky.around(scene.info))
-        found.append(_asked(said_of_sky(share), share >= LEAST_SKY, "--sky auto"))
-    return [*found, *_of_passers_by(dataset)] if trains else found
+    found += [Advice(*one) for advise_part in tools("advise") for one in advise_part(scene, tracks)]
+    return [*found, *_of_short_training(dataset)] if trains else found
 
 
 def asked_options(dataset: argparse.Namespace, args: argparse.Namespace, given: Sequence[str]) -> list[str]:
@@ -110,10 +105,19 @@ def asked_options(dataset: argparse.Namespace, args: argparse.Namespace, given: 
 
 def _taken(advice: Advice, args: argparse.Namespace, given: Sequence[str]) -> Advice:
     """The advice, without its options where one of them is given, or where they do not go with given ones."""
-    unfit = _AGAINST.get(advice.options.partition(" ")[0], {}).items()
-    against = next((name for name, value in unfit if getattr(args, name) == value), None)
+    words = advice.options.split()
+    unfit = _AGAINST.get(words[0], {}) if words else {}
+    against = next(
+        (f"it does not go with --{name}" for name, value in unfit.items() if getattr(args, name) == value), None
+    )
+    if words and not against:
+        taken = argparse.Namespace(**vars(args) | {words[0][2:]: words[1] if len(words) > 1 else True})
+        try:
+            check_together(chosen(taken), taken, several=False)
+        except UserError as error:
+            against = str(error)
     if against:
-        print(f"{advice.options} is left out, as it does not go with --{against}")
+        print(f"{advice.options} is left out: {against}")
     names = tuple(word.partition("=")[0] for word in given if word.startswith("--") and word != "--")
     return advice._replace(options="") if against or advice.options.startswith(names) else advice
 
@@ -151,7 +155,6 @@ def _of_tracks(scene: Scene, tracks: list[Track | None]) -> Iterator[Advice]:
     ratio = distances(views, tracks)
     text = f"the farthest photo of a point is {ratio:.1f} times as far away as the nearest (median)"
     yield _asked(text, ratio > DISTANCES, "--antialiasing")
-    yield _asked(f"{len(views)} photos train", len(views) < FEW_PHOTOS, "--sparse_depth 0.1")
     given, best = pose_errors(views, tracks, scene.cameras_extent)
     text = f"points lie {given:.2g} pixels from where photos show them (median), and {best:.2g} with better poses"
     yield _asked(text, poses_differ(given, best), "--refine_poses")
@@ -244,11 +247,10 @@ def _trained(line: list[str]) -> None:
         raise UserError(said.strip().rpartition("\n")[2].removeprefix("error: ") or "the short training failed")
 
 
-def _of_passers_by(dataset: argparse.Namespace) -> Iterator[Advice]:
+def _of_short_training(dataset: argparse.Namespace) -> Iterator[Advice]:
     """What a short training of small photos leaves over."""
     with tempfile.TemporaryDirectory() as folder:
         own = ["-m", folder, "-r", _WIDTH, "--iterations", _ITERATIONS, "--quiet", "--no_curve", "--disable_viewer"]
         _trained([sys.executable, str(ROOT / "train.py"), *map(str, own), *_data_words(dataset)])
-        share = odd_share(masks_of(folder))
-    text = f"{share:.0%} of the photos show what a short training does not, as if someone had passed by"
-    yield _asked(text, share > FEW, f"--robust_mask {MASKED:g}")
+        scene, views = load_scored(folder)
+        yield from (Advice(*one) for advise_part in tools("advise_trained") for one in advise_part(scene, views))

@@ -14,7 +14,6 @@ from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import Rows
-from scene.gaussians.checkpoint import SKY
 from scene.readers.point_cloud import read_point_cloud
 from scene.scene import Scene
 from splatting.diagnosis import Line
@@ -22,7 +21,7 @@ from splatting.diagnosis.photos import CLEARLY, FITS, other_focal_length, others
 from splatting.evaluation.model_folder import curve_of
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
-from splatting.training.sky import Sky
+from splatting.parts import tools
 from utils.general_utils import build_rotation
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.system_utils import UserError
@@ -41,11 +40,15 @@ class Change(NamedTuple):
     undo: Callable[[Rows], Rows]
 
 
-def without_sky(scene: Scene) -> GaussianModel:
-    """The Gaussians but those of a sky, which is far away, large and opaque by intent."""
-    gaussians, state = scene.gaussians, read_model_json(scene.model_path).get(SKY)
-    near = ~Sky.restored(state).rows(gaussians.get_xyz.detach()) if state else None
-    return gaussians.part(near, gaussians.max_sh_degree) if near is not None and near.any() else gaussians
+def of_scene(scene: Scene) -> GaussianModel:
+    """The Gaussians of a model but those that a part of its training has put beside the scene."""
+    gaussians, facts = scene.gaussians, read_model_json(scene.model_path)
+    means = gaussians.get_xyz.detach()
+    own = torch.ones(len(means), dtype=torch.bool, device=means.device)
+    for beside in tools("beside"):
+        if (found := beside(facts, means)) is not None:
+            own &= ~found
+    return gaussians if own.all() or not own.any() else gaussians.part(own, gaussians.max_sh_degree)
 
 
 def recorded_psnr(model: Path, iteration: int) -> float | None:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from arguments import ModelParams, PipelineParams, read_model_json, read_stored_options, read_training_options
+from arguments import ModelParams, PipelineParams, read_model_json, read_stored_options
 from gaussian_renderer import render
 from gaussian_renderer.scored_views import ScoredViews
 from scene import Scene
@@ -19,15 +19,14 @@ from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
 from splatting.diagnosis import Line, from_error
 from splatting.diagnosis.changes import FITS as BAD_PSNR
-from splatting.diagnosis.changes import LOST, NEAR, recorded_psnr, what_changed, without_sky
+from splatting.diagnosis.changes import LOST, NEAR, of_scene, recorded_psnr, what_changed
 from splatting.diagnosis.dataset import check_dataset
 from splatting.diagnosis.photos import others_photos
 from splatting.evaluation.model_folder import closing_lines, curve_of
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
 from splatting.evaluation.what_to_try import what_to_try
-from splatting.files.listing import some
-from splatting.training.robust_mask import MASKED, MOST_PHOTOS, RobustMask, residuals_of
+from splatting.parts import options_of, tools
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.system_utils import UserError, compute_device
 
@@ -70,7 +69,7 @@ def check_model(model_path: str, iteration: int, source: str | None = None, imag
     if not len(gaussians):
         return [Line(f"{name} has no Gaussians, so renders show the background", "train it again")]
     lines = [Line(f"{name}, {len(gaussians)} Gaussians of SH degree {gaussians.max_sh_degree}")]
-    own_rows = without_sky(scene)
+    own_rows = of_scene(scene)
     if wrong := [*_not_finite(gaussians)] or [*_wrong_sizes(own_rows, extent)]:
         return [*lines, *wrong]
     shapes, (renders, changed) = [_opacities(own_rows), _sizes(scene)], _renders(scene, options, stored)
@@ -83,7 +82,7 @@ def check_model(model_path: str, iteration: int, source: str | None = None, imag
     if changed:  # which explains all else, and the training has no say in it
         return [*lines, *(line for line in shapes if not line.finding), renders]
     reset = [] if renders.finding else _late_reset(scene)
-    odd = [] if renders.finding else _passers_by(scene, options)
+    odd = [] if renders.finding else _notes(scene, options)
     return [*lines, *shapes, renders, *odd, *reset, *check_training(Path(model_path))]
 
 
@@ -108,7 +107,7 @@ def check_training(model: Path) -> list[Line]:
 def _load(model_path: str, stored: dict[str, Any], iteration: int) -> tuple[argparse.Namespace, Scene]:
     # Small images are enough to tell black renders from bad ones.
     given = {**stored, "model_path": model_path, "resolution": _WIDTH, "images_to_load": 1}
-    given.pop("depths", None)
+    given |= {option.name: option.default for option in options_of("model")}
     options = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**given))
     with contextlib.redirect_stdout(io.StringIO()):  # from the readers
         return options, load_saved(options, iteration)
@@ -156,29 +155,21 @@ def _wrong_values(gaussians: GaussianModel, extent: float) -> Iterator[Line]:
         yield Line(text, remedy)
 
 
-def _passers_by(scene: Scene, options: argparse.Namespace) -> Iterator[Line]:
-    """A note on photos that show what the model does not."""
-    cameras = scene.getTrainCameras()
-    taken = bool(read_training_options(scene.model_path).get("robust_mask"))
-    if len(cameras) > MOST_PHOTOS or options.train_test_exp or taken:
-        return
-    masks = residuals_of(cameras, _scored(scene, options), scene.gaussians)
-    found = {camera.image_name: masks.counted(camera) for camera in cameras}
-    shares = {name: 1 - float(counts.float().mean()) for name, counts in found.items() if counts is not None}
-    if worst := sorted(shares, key=shares.get, reverse=True):
-        text = f"{len(worst)} of {len(cameras)} photos show what the model does not, as if someone had passed by"
-        yield Line(f"{text}: most in {some(worst)}; try --robust_mask {MASKED:g}", note=True)
+def _notes(scene: Scene, options: argparse.Namespace) -> Iterator[Line]:
+    """What parts of a training say of a trained model."""
+    for examine in tools("examine"):
+        yield from (Line(text, note=True) for text in examine(scene, _scored(scene, options), options))
 
 
-def masks_of(model_path: str) -> RobustMask:
-    """Masks of what training photos show and the model in a folder does not."""
+def load_scored(model_path: str) -> tuple[Scene, ScoredViews]:
+    """The newest model of a folder in its scene, and what scores its views."""
     options, scene = _load(model_path, read_stored_options(model_path), -1)
-    return residuals_of(scene.getTrainCameras(), _scored(scene, options), scene.gaussians)
+    return scene, _scored(scene, options)
 
 
 def _late_reset(scene: Scene) -> Iterator[Line]:
     """What training said at its start of a reset, if the opacities have not recovered from it."""
-    faint = float(without_sky(scene).get_opacity.detach().median()) < UNRECOVERED
+    faint = float(of_scene(scene).get_opacity.detach().median()) < UNRECOVERED
     said = closing_lines(Path(scene.model_path)) if faint else []
     yield from (from_error(UserError(line.partition(": ")[2])) for line in said if line.startswith(_RESET_SAID))
 
@@ -191,9 +182,9 @@ def _opacities(gaussians: GaussianModel) -> Line:
 
 
 def _sizes(scene: Scene) -> Line:
-    """Sizes against the extent of the cameras, but of a sky."""
+    """Sizes against the extent of the cameras, but of what a part has put beside the scene."""
     extent = scene.cameras_extent
-    largest = without_sky(scene).get_scaling.detach().max(dim=1).values.cpu().numpy()
+    largest = of_scene(scene).get_scaling.detach().max(dim=1).values.cpu().numpy()
     huge = float((largest > HUGE * extent).mean())
     if huge <= HUGE_SHARE:
         return Line(f"sizes: median {np.median(largest) / extent:.2g}, largest {largest.max() / extent:.2g} extents")
@@ -225,7 +216,7 @@ def _renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) 
     text = "renders of the training views are black"
     text = text if black else f"training views have a PSNR of only {means.psnr:.1f} dB"
     wrong = _other_background(scene, options, stored, means.psnr)
-    wrong = wrong or changed or next(_wrong_values(without_sky(scene), scene.cameras_extent), None)
+    wrong = wrong or changed or next(_wrong_values(of_scene(scene), scene.cameras_extent), None)
     wrong = wrong or next(_late_reset(scene), None)
     wrong = wrong or (_why_black(scene, views, means) if black else Line("", _why_bad(scene, stored, means)))
     return wrong._replace(text=f"{text}: {wrong.text}" if wrong.text else text), wrong is changed
@@ -298,7 +289,7 @@ def _measure(camera: Camera, scene: Scene, options: argparse.Namespace) -> tuple
 
 
 def _why_black(scene: Scene, cameras: list[Camera], means: Means) -> Line:
-    gaussians = without_sky(scene)
+    gaussians = of_scene(scene)
     if means.drawn < 0.01:
         depths = torch.cat([_depths(camera, gaussians.get_xyz) for camera in cameras])
         if float(((depths > 0) & (depths < NEAREST)).float().mean()) > 0.5:
@@ -319,7 +310,7 @@ def _depths(camera: Camera, points: torch.Tensor) -> torch.Tensor:
 
 def _why_bad(scene: Scene, stored: dict[str, Any], means: Means) -> str:
     iteration = scene.loaded_iter
-    faint = float(without_sky(scene).get_opacity.detach().median()) < UNRECOVERED
+    faint = float(of_scene(scene).get_opacity.detach().median()) < UNRECOVERED
     if faint and RESET_INTERVAL <= iteration < 15_000 and iteration % RESET_INTERVAL < 500:
         return "this iteration is shortly after opacities were reset; check a later one"
     if (sizes := _sizes(scene)).finding:

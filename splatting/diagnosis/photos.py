@@ -10,9 +10,9 @@ from scene.readers.info import CameraInfo
 from scene.scene import Scene
 from splatting.diagnosis import Line
 from splatting.files.listing import some
-from splatting.training.robust_mask import MOST_PHOTOS
 from utils.image_utils import as_float, psnr
 
+MOST_PHOTOS = 300  # that are compared with each other
 FITS = 18.0  # dB of training views; models that converge reach 22 and more
 CLEARLY = 3.0  # dB that undoing a change has to gain, unless it comes to what was recorded
 _SUSPECTS = 12  # views whose photos are looked for among all, those that fit worst

@@ -1,7 +1,6 @@
 """Readers of a model folder: number of Gaussians, curve, log, scores."""
 
-from __future__ import annotations
-
+import argparse
 import re
 import sys
 from pathlib import Path
@@ -15,10 +14,10 @@ from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
 from splatting.files.json_files import read_json
 from splatting.files.plain_files import plain
+from splatting.parts import chosen
 from utils.system_utils import UserError, saved_iterations
 
 SCHEDULE = "schedule.json"  # of a training whose iterations followed the clock
-MASKED_PHOTOS = "robust_masks.png"  # photos of which --robust_mask leaves out most
 
 
 def json_or_none(path: Path) -> Any | None:
@@ -62,10 +61,12 @@ def shorter_ends_there(model: Path) -> bool:
         options = read_stored_options(model)
     except UserError:
         return False
-    # These schedules follow --iterations: the depth loss's weight, the exposures' learning rate, the views' sizes.
+    if any(part.follows_length for part in chosen(argparse.Namespace(**options))):
+        return False
+    # These schedules follow --iterations, too: the exposures' learning rate, the views' sizes.
     pyramid = options.get("resolution_schedule", "none") != "none"
     exposed = options.get("train_test_exp") or options.get("appearance", "none") != "none"
-    return not (options.get("depths") or exposed or pyramid)
+    return not (exposed or pyramid)
 
 
 def load_scores(model: Path, method: str) -> tuple[dict[str, float | None], dict[str, dict[str, float | None]]]:

@@ -20,11 +20,11 @@ from PIL import Image
 from splatting.evaluation import comparison, tables
 from splatting.evaluation.comparison import Sets
 from splatting.evaluation.figures import draw_curves, draw_fronts, draw_poses
-from splatting.evaluation.model_folder import MASKED_PHOTOS
 from splatting.evaluation.renders import GAIN, ComparedViews
 from splatting.files.json_files import write_json
 from splatting.files.listing import markdown_table
 from splatting.host.machine import one_line
+from splatting.parts import tools
 from utils.system_utils import UserError, atomic_write
 
 TITLE = "3D Gaussian Splatting: evaluation"
@@ -37,9 +37,7 @@ _MEANT = re.compile(r"[\\`*\[\]<>&]")  # characters that begin or end Markdown's
 _ENTITIES = {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
 
 Run = dict[str, Any]
-Pictures = Mapping[
-    str, Mapping[str, Any]
-]  # by scene: paths of `curves`, `poses`, `masked`, `fronts`; `views`, by `_views`
+Pictures = Mapping[str, Mapping[str, Any]]  # by scene: paths of `curves`, `poses`, `masked`, `fronts`; `views`
 
 
 def make_report(
@@ -129,7 +127,13 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
         pictures[scene] = {
             "curves": _figures(draw_curves, folder, scene, members, peers),
             "poses": _figures(draw_poses, folder, scene, members),
-            "masked": [path for run in members if (path := output / run["model"] / MASKED_PHOTOS).is_file()],
+            "masked": [
+                path
+                for run in members
+                for of in tools("pictures")
+                for path in of(output / run["model"])
+                if path.is_file()
+            ],
             "fronts": _figures(draw_fronts, folder, scene, found, names) if found else [],
             "views": _views(output, scene, members, each),
         }
@@ -140,6 +144,11 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
         with atomic_write(output / name) as temporary:
             # Names that are not UTF-8 have surrogates, which appear as numbers.
             temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+
+
+def _of_parts(model: Path) -> list[Path]:
+    """Pictures of a model folder that parts of its training have drawn."""
+    return [path for pictures in tools("pictures") for path in pictures(model) if path.is_file()]
 
 
 def _figures(draw: Callable[..., list[Path]], *content: Any) -> list[Path]:
@@ -228,7 +237,7 @@ def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
 
     return {
         "cpu_known": known("cpu_seconds"),
-        "kept": {run["model"]: x for run in runs for x in run["lines"] or () if x.startswith("--keep_best")},
+        "kept": {run["model"]: x for run in runs for of in tools("remarks") for x in of(run["lines"] or ())},
         "left_out": any(row["gaussians"]["mean"] != row["gaussians_saved"]["mean"] for row in rows),
         "machines": sorted({one_line(run["machine"]) for run in runs if run["machine"]}),
         "mipnerf360": any(run["group"] == "mipnerf360" for run in runs),

@@ -63,15 +63,6 @@ def check_one_process(option: str, several: bool) -> None:
         raise UserError(f"{option} needs a training of one process; leave it out, or start train.py without torchrun")
 
 
-def check_keep_best(dataset: argparse.Namespace, opt: argparse.Namespace, several: bool) -> None:
-    """Refuse --keep_best where more than Gaussians would have to be kept (UserError)."""
-    check_one_process("--keep_best", several)
-    apart = {"appearance": "none", "refine_poses": False, "train_test_exp": False}
-    given = vars(dataset) | vars(opt)
-    if wrong := [name for name, default in apart.items() if given.get(name, default) != default]:
-        raise UserError(f"--keep_best does not go with --{wrong[0]}; leave one of them out")
-
-
 def check_poses(dataset: argparse.Namespace, projection: str = "ewa") -> None:
     """Refuse to refine poses on rays (UserError)."""
     if projection == "ray" and getattr(dataset, "refine_poses", False):

@@ -1,13 +1,13 @@
 """One iteration of training, as the loop, the losses, density control and the observers know it, and its view."""
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from torch import Tensor
 
 from scene.cameras import Camera
 from splatting.deterministic.counter_rng import Stream, permutation
-from splatting.training.sparse_depth import PointDepths
+from splatting.training.part import Term
 from utils.system_utils import UserError
 
 
@@ -19,22 +19,16 @@ class Iteration:
     last: bool  # nothing comes after it, so it takes no step
     camera: Camera
     background: Tensor  # (3,), random or that of the scene
-    depth_weight: float  # of the depth loss, 0 if the view has no reliable depth map
     changes: bool  # rows of the Gaussians, the SH degree, the size of views or the 3D filter change in this iteration
     started: float  # seconds of training before it
     span: range  # steps of the schedule that it stands for (training/schedule.py); of the last, all that are left
-    points: PointDepths | None = None  # of the depth of points, None: not wanted, or the view has none
-    sky: PointDepths | None = None  # the same of what is far away
+    terms: dict[str, Term] = field(default_factory=dict)  # that parts add to the loss, weights included
+    wants_depth: bool = False  # its loss needs the rendered depth
     due: bool = False  # the model is read, written or changed, so every loss so far must be checked first
     read: bool = False  # an observer reads the model
     record: dict[str, float] | None = None  # what train_log.json gets of this iteration; None: no record
     scored_at: float | None = None  # seconds of training when the curve scored it, for all records of the same score
     stopping: type[KeyboardInterrupt] | KeyboardInterrupt | None = None  # raised once the step is complete
-
-    @property
-    def wants_depth(self) -> bool:
-        """Whether its loss needs the rendered depth."""
-        return self.depth_weight > 0 or self.points is not None or self.sky is not None
 
     def takes(self, planned: Collection[int]) -> bool:
         """Whether what is planned for an iteration of the schedule is to be done in it."""

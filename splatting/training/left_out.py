@@ -108,7 +108,7 @@ def save_last(run: Run, scored: bool, iteration: int) -> LeftOut:
     """
     scene, opt, halves = run.scene, run.opt, run.dataset.train_test_exp
     scene.gaussians.optimizer.zero_grad(set_to_none=True)  # room for the trimmed copy
-    trained = run.best.model(scene.gaussians, iteration) if run.best else scene.gaussians
+    trained, run.final_iteration = run.final(iteration)
     final, search = trim(trained, scene.getTrainCameras(), run.pipe, opt.keep_unseen, opt.prune_sh, iteration)
     change, test = {}, scene.getTestCameras()
     if test and (search.unseen > search.faint or search.cut_bounds[final.max_sh_degree] > 0):
@@ -134,5 +134,5 @@ def save_last(run: Run, scored: bool, iteration: int) -> LeftOut:
         picture_bytes_in_files=3 * file_pixels,
         test_change={name: value for name, value in change.items() if math.isfinite(value)},
     )
-    add_to_model_json(scene.model_path, left_out=dataclasses.asdict(left_out))
+    add_to_model_json(scene.model_path, left_out=dataclasses.asdict(left_out), **run.facts)
     return left_out

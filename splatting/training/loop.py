@@ -4,15 +4,16 @@ from collections.abc import Iterator, Sequence
 
 import torch
 
+from splatting.training.announcer import Announcer
 from splatting.training.iteration import Iteration
-from splatting.training.observer import Announcer, Observer
+from splatting.training.part import Part
 from splatting.training.run import Run
 from splatting.training.step_agreement import StepAgreement
 from splatting.training.steps import step_taker
 from splatting.training.steps.plain import PlainStep
 
 
-def run_training(run: Run, observers: Sequence[Observer]) -> None:
+def run_training(run: Run, observers: Sequence[Part]) -> None:
     """Take the steps (training/steps): render a view, follow the gradient of its loss, control density.
 
     Whatever else happens is an observer's business, in the order of the list (training/observers/standard.py).
@@ -22,7 +23,7 @@ def run_training(run: Run, observers: Sequence[Observer]) -> None:
         pass
 
 
-def training_steps(run: Run, observers: Sequence[Observer]) -> Iterator[tuple[Iteration, PlainStep]]:
+def training_steps(run: Run, observers: Sequence[Part]) -> Iterator[tuple[Iteration, PlainStep]]:
     """`run_training` by iterations. Yields each, and its step's taker.
 
     Once that is drained, and within `run.look()`, others may read the model.

@@ -1,6 +1,5 @@
-"""The loss of a render: photometric, and inverse depth where a map or points supervise. Further terms belong here."""
+"""The loss of a render: photometric, and what parts add to it."""
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import torch
@@ -10,15 +9,11 @@ from torch import Tensor
 from gaussian_renderer import photo_name
 from scene.gaussians.ppisp import Ppisp
 from splatting.training.iteration import Iteration
-from utils.loss_utils import inverse_depth_loss, photometric_loss
+from splatting.training.part import Term
+from utils.loss_utils import photometric_loss
 
 if TYPE_CHECKING:
-    from scene.cameras import Camera
     from splatting.training.run import Run
-
-
-# Of a render's package and the mask of the pixels that count, (1, H, W) bool or None.
-Term = Callable[[dict[str, Any], Tensor | None], Tensor]
 
 
 class Losses(NamedTuple):
@@ -26,12 +21,22 @@ class Losses(NamedTuple):
 
     total: Tensor  # what is differentiated
     l1: Tensor  # of the colours
-    depth: Tensor | None  # weighted, part of the total; None without a depth map
+    terms: dict[str, Tensor]  # parts of the total that were added to the photometric loss, weighted, by name
     mask: Tensor | None  # (1, H, W) bool, pixels that count; None if all do
+
+    @property
+    def values(self) -> list[Tensor]:
+        """All scalars, in one order."""
+        return [self.total, self.l1, *self.terms.values()]
+
+    def detached(self) -> "Losses":
+        """The values alone, which keep neither an image nor its gradient."""
+        terms = {name: value.detach() for name, value in self.terms.items()}
+        return Losses(self.total.detach(), self.l1.detach(), terms, self.mask)
 
 
 class Objective:
-    """`(1 - lambda_dssim) L1 + lambda_dssim (1 - SSIM)` (Kerbl et al. 2023, Eq. 7), and the weighted depth loss.
+    """`(1 - lambda_dssim) L1 + lambda_dssim (1 - SSIM)` (Kerbl et al. 2023, Eq. 7), and what parts add.
 
     Strategies say whether renders are compared clamped to [0, 1] (DensityControl.clamps). fusable: as that of
     DensityControl.
@@ -48,15 +53,9 @@ class Objective:
 
     def terms(self, step: Iteration) -> dict[str, Term]:
         """What a step adds to the photometric loss, weights included, by name."""
-        camera, terms = step.camera, {}
-        if step.depth_weight > 0:
-            terms["depth"] = lambda package, mask: step.depth_weight * _depth_loss(package["depth"], camera, mask)
-        if step.sky is not None:
-            terms["sky"] = lambda package, mask: step.sky.loss(package["depth"], mask)
-        if step.points is not None:
-            terms["points"] = lambda package, mask: step.points.loss(package["depth"], mask)
+        terms = dict(step.terms)
         if isinstance(exposures := self._run.gaussians.exposures, Ppisp):
-            terms["appearance"] = lambda *_: exposures.pull(photo_name(camera))
+            terms["appearance"] = lambda *_: exposures.pull(photo_name(step.camera))
         return terms
 
     def __call__(self, package: dict[str, Any], step: Iteration) -> Losses:
@@ -69,20 +68,12 @@ class Objective:
         image, weight, clamp = package["render"], self._run.opt.lambda_dssim, self._run.density.clamps
         if (band := package.get("band")) is not None:
             total, l1 = photometric_loss_by_bands(image, target, weight, *band, clamp)
-            return Losses(total, l1, depth=None, mask=None)
-        if (robust := self._run.robust_mask) is not None:
-            learns = not self._run.density.recovers(step.iteration)
-            mask = robust.mask(camera, image.detach(), target, mask, learns)
+            return Losses(total, l1, terms={}, mask=None)
+        if (counts := self._run.counts) is not None:
+            mask = counts.mask(step, image.detach(), target, mask)
         total, l1 = photometric_loss(image, target, weight, mask, camera.columns, clamp)
         further = {name: term(package, mask) for name, term in self.terms(step).items()}
-        return Losses(sum(further.values(), start=total), l1, further.get("depth"), mask)
-
-
-def _depth_loss(inverse_depth: Tensor, camera: "Camera", mask: Tensor | None) -> Tensor:
-    target = camera.target_inverse_depth
-    if camera.depth_has_gaps:
-        mask = target > 0 if mask is None else mask & (target > 0)
-    return inverse_depth_loss(inverse_depth, target, camera.columns, mask)
+        return Losses(sum(further.values(), start=total), l1, further, mask)
 
 
 NEWEST = 0.4  # weight of the newest loss in the running mean, as in the reference

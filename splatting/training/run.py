@@ -4,8 +4,9 @@ import argparse
 import copy
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import cached_property
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from gaussian_renderer.rays import check_views
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
-from scene.gaussians.checkpoint import ASLEEP, FILTER, POSES, RESIDUALS, SKY, further, load_checkpoint, with_further
+from scene.gaussians.checkpoint import ASLEEP, FILTER, POSES, further, load_checkpoint, states_of, with_further
 from scene.gaussians.filter_3d import check_widths, filter_widths
 from scene.gaussians.morton import sort_rows
 from scene.gaussians.ppisp import Ppisp
@@ -30,21 +31,18 @@ from splatting.exports.in_scene import scene_with, start_from
 from splatting.exports.splats import Splats
 from splatting.host.clock import seconds_since_start
 from splatting.host.interrupt import DeferredInterrupt
+from splatting.parts import check_together, chosen, states_in
 from splatting.training import checks, schedule_file
-from splatting.training.best_model import BEST, BestModel
 from splatting.training.gpu_memory import GpuMemory, limit_torch, reads_on_host
 from splatting.training.iteration import Iteration, ViewOrder
 from splatting.training.memory_estimate import announce_memory, expected_count, largest_view
 from splatting.training.objective import LossWatch, Objective
+from splatting.training.part import Part, overrides
 from splatting.training.pose_refinement import PoseRefinement
 from splatting.training.resolution import Resolution, resolution_of, smallest
 from splatting.training.restart import resumed
-from splatting.training.robust_mask import RobustMask
 from splatting.training.schedule import DecidedSchedule
-from splatting.training.sky import Sky, resumed_sky, with_sky
-from splatting.training.sparse_depth import SparseDepth
 from splatting.training.strategies import AUTO, USUAL, density_control, end_in_time, of_clock
-from utils.general_utils import get_expon_lr_func
 from utils.system_utils import compute_device
 
 
@@ -72,11 +70,10 @@ class Run:
     """
 
     first_done: float | None = None
+    parts: Sequence[Part] = ()
     sleeping: Sleeping | None = None
-    sparse_depth: SparseDepth | None = None
-    robust_mask: RobustMask | None = None
-    sky: Sky | None = None
-    best: BestModel | None = None
+    counts: Any = None
+    final_iteration: int | None = None
 
     def __init__(
         self, dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, launch: argparse.Namespace
@@ -96,6 +93,7 @@ class Run:
         self.lost = 0
         self.interrupt, self.device = DeferredInterrupt(), compute_device()
         capture, self.first_iteration = self._read_start()
+        self._choose_parts(capture)
         before = capture and further(capture, schedule_file.KEY)
         self.schedule = schedule_file.schedule_of(opt, self.start, self.first_iteration, self.group.shared, before)
         if isinstance(self.schedule, DecidedSchedule):
@@ -103,7 +101,7 @@ class Run:
         self.warnings: list[str] = []
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
         init_ply = None if self.start else getattr(dataset, "init_ply", None)
-        self.scene, first = scene_with(init_ply, dataset, self.gaussians, ranks=self.group)
+        self.scene, first = scene_with(init_ply, dataset, self.gaussians, ranks=self.group, parts=self.parts)
         checks.check_scene(self.scene, dataset, bool(self.start))
         agree_on_scene(self.scene, self.start)  # before an image is shared
         points = self.scene.info.point_cloud.points if first is None else first
@@ -112,18 +110,16 @@ class Run:
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed)
         self.resolution = self._sizes()
         self._decode_ahead(self.first_iteration + 1)
+        self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
         self._begin_model(capture, first)
         self._check_records()
-        self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
         if opt.strategy == AUTO:
             opt.strategy = self._strategy_by_the_clock()
+            check_together(self.parts, self._all_options, self.group.several)
         self.schedule.strategy = opt.strategy
         self.density = density_control(self)
         self._expect(self.density.most_gaussians)
         self.objective = Objective(self)
-        self._depth_weight = get_expon_lr_func(
-            opt.depth_l1_weight_init, opt.depth_l1_weight_final, max_steps=opt.iterations
-        )
         self.density.schedule = self.schedule
         self.sleeping = self._may_sleep()
         if self.sleeping and capture and (asleep := further(capture, ASLEEP)):
@@ -135,6 +131,24 @@ class Run:
         self._warn(checks.another_number(self.density, opt, self.gaussians.gaussian_count, self.first_iteration + 1))
         if capture is None and first is None:
             self.density.started()
+
+    def _choose_parts(self, capture: tuple | None) -> None:
+        """Choose the parts by the options and by the state of a checkpoint, and let them check both."""
+        given = self._all_options
+        self.parts = chosen(given, states_in(states_of(capture)) if capture else ())
+        check_together(self.parts, given, self.group.several)
+        for check in self._each("check"):
+            check(self)
+
+    @cached_property
+    def _hooks(self) -> dict[str, list[Callable]]:
+        return {}
+
+    def _each(self, hook: str) -> list[Callable]:
+        """That hook of the parts that have it."""
+        if hook not in self._hooks:
+            self._hooks[hook] = overrides(self.parts, hook)
+        return self._hooks[hook]
 
     def _refined_poses(self, capture: tuple | None) -> PoseRefinement | None:
         """What refines the poses of the views, with the state of a checkpoint; None unless it is asked for."""
@@ -178,7 +192,8 @@ class Run:
     def _strategy_by_the_clock(self) -> str:
         if self.opt.schedule:
             return self.schedule.strategy or USUAL
-        strategy = "budget" if self.sky else of_clock(self.opt.time_budget, self.scene.getTrainCameras(), self.device)
+        views = self.scene.getTrainCameras()  # mcmc would move Gaussians that are pinned
+        strategy = "budget" if self.gaussians.pinned else of_clock(self.opt.time_budget, views, self.device)
         print(f"--time_budget takes --strategy {strategy}, which is best here; name another one to compare")
         return strategy
 
@@ -194,40 +209,22 @@ class Run:
         self.gaussians.appearance = getattr(self.dataset, "appearance", "none")
         checks.check_photos(self.gaussians.appearance, len(self.scene.getTrainCameras()))
         self.poses = self._refined_poses(capture)
-        if weight := self.opt.sparse_depth:
-            checks.check_one_process("--sparse_depth", self.group.several)
-            self.sparse_depth = SparseDepth(self.scene, self.dataset.source_path, weight)
-        if share := self.opt.robust_mask:
-            checks.check_one_process("--robust_mask", self.group.several)
-            self.robust_mask = RobustMask(self.scene.getTrainCameras(), share, self.device)
-            if capture and (state := further(capture, RESIDUALS)):
-                self.robust_mask.restore(state)
-        if self.opt.sky != "off":
-            checks.check_one_process("--sky", self.group.several)
         if capture is not None:
-            if state := further(capture, SKY):
-                self.sky = resumed_sky(state, self.scene)
-            elif self.opt.sky != "off":
-                print("--sky auto: the checkpoint has no sky, and a sky is added only when a training starts")
             self.gaussians.start_exposures(self.scene.info.train_cameras)
             self.gaussians.restore(capture, self.opt)
             checks.check_exposures(self.gaussians, self.exposes, self.start)
+            states = states_in(states_of(capture))
+            for begin in self._each("begin"):
+                begin(self, states.get(begin.__self__.name))
         else:
             if first is None:
                 self.scene.create_gaussians()
             else:
                 start_from(first, self.scene, self.gaussians)
-            if self.opt.sky != "off":
-                self.sky = with_sky(self.scene, self.gaussians)
+            for begin in self._each("begin"):
+                begin(self, None)
             self.gaussians.training_setup(self.opt)
             sort_rows(self.gaussians)
-        if self.sky:
-            self.gaussians.far = self.sky.rows
-        if validation := self.scene.validation_cameras.get(1.0):
-            checks.check_keep_best(self.dataset, self.opt, self.group.several)
-            self.best = BestModel(validation)
-            if capture:
-                self.best.restore(further(capture, BEST), self.gaussians)
         if self.opt.filter_3d:
             self._begin_filter(capture and further(capture, FILTER))
         self.gaussians.limit_columns()
@@ -254,6 +251,11 @@ class Run:
             checks.report_changes(start, self.options)
 
     @property
+    def _all_options(self) -> argparse.Namespace:
+        """Those of all groups and of the launch."""
+        return argparse.Namespace(**vars(self.dataset) | vars(self.opt) | vars(self.pipe) | vars(self.launch))
+
+    @property
     def options(self) -> argparse.Namespace:
         """All options of the three groups; resolution_schedule is the one in force."""
         groups = vars(self.dataset) | vars(self.opt) | vars(self.pipe)
@@ -262,8 +264,12 @@ class Run:
     @property
     def entries(self) -> dict[str, Any]:
         """Entries of model.json besides the options (`write_model_json`)."""
-        sky = {SKY: self.sky.captured()} if self.sky else {}
-        return {"world_offset": self.gaussians.world_offset} | sky
+        return {"world_offset": self.gaussians.world_offset} | self.facts
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What parts keep in model.json."""
+        return {name: fact for facts in self._each("facts") for name, fact in facts().items()}
 
     def begin(self) -> None:
         """Write the inputs into the output folder, print the memory estimate, start or continue the log."""
@@ -293,18 +299,22 @@ class Run:
                 last=last,
                 camera=camera,
                 background=self._background(iteration),
-                depth_weight=self._depth_weight(schedule.schedule_step(iteration)) if camera.depth_reliable else 0.0,
                 changes=self._changes(iteration),
                 started=seconds,
                 span=range(span.start, schedule.length + 1) if last else span,
-                points=self.sparse_depth and self.sparse_depth.at(camera),
-                sky=self.sky and self.sky.at(camera, self.scene),
             )
+            self._add_terms(step)
             yield step
             if iteration == self.first_iteration + 1:
                 self.first_done = seconds_since_start()
             if step.last:
                 return
+
+    def _add_terms(self, step: Iteration) -> None:
+        for terms in self._each("terms"):
+            found = terms(step)
+            step.terms |= found
+            step.wants_depth |= bool(found) and terms.__self__.needs.depth
 
     def _changes(self, iteration: int) -> bool:
         resizes = self.resolution.changes(*map(self.schedule.schedule_step, (iteration - 1, iteration)))
@@ -396,11 +406,11 @@ class Run:
     def after_step(self, step: Iteration) -> None:
         """What follows the optimiser's step."""
         self.density.after_step(step)
-        if self.robust_mask:
-            self.robust_mask.keep()
+        for after_step in self._each("after_step"):
+            after_step(step)
         if step.changes:
-            if self.sky:
-                self.sky.hold(self.gaussians)
+            for after_change in self._each("after_change"):
+                after_change(step)
             if self.opt.filter_3d:
                 self._update_filter()
             self.memory.settle(self.gaussians)
@@ -425,14 +435,19 @@ class Run:
         filtered = widths is not None and len(widths) == len(self.gaussians)  # not where memory ran out on the way
         states = {
             POSES: self.poses and self.poses.captured(),
-            RESIDUALS: self.robust_mask and self.robust_mask.captured(),
             FILTER: self.gaussians.shards.whole(widths) if filtered else None,
-            SKY: self.sky and self.sky.captured(),
-            BEST: self.best and self.best.captured(),
             ASLEEP: self.sleeping and self.sleeping.captured(),
             schedule_file.KEY: schedule_file.table_of(self.schedule.decided) if paced else None,
         }
+        states |= {part.name: part.state() for part in self.parts}
         return with_further(state, {key: found for key, found in states.items() if found is not None})
+
+    def final(self, iteration: int) -> tuple[GaussianModel, int]:
+        """The model of the last save, and its iteration."""
+        model = self.gaussians, iteration
+        for final in self._each("final"):
+            model = final(*model)
+        return model
 
     def end_sleep(self, guarded: bool = True) -> None:
         """Let all blocks take the steps that they have missed, and sleep no more. guarded: of `Sleeping.rest`."""

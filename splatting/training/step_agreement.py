@@ -3,13 +3,13 @@
 from splatting.host.interrupt import Terminated
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
-from splatting.training.observer import Observer
+from splatting.training.part import Part
 from splatting.training.run import Run
 
 _SIGNALS = (None, KeyboardInterrupt, Terminated)
 
 
-class StepAgreement(Observer):
+class StepAgreement(Part):
     """Shares whether an iteration is due, which signal asks to stop, and where the guard has stopped the optimisers.
 
     These go with the numbers that they exchange to render the iteration's view (`agree`), and are known when its

@@ -8,13 +8,13 @@ from scene.cameras import Camera
 from splatting.evaluation.curve_recorder import CurveRecorder, evenly_spread
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
-from splatting.training.observer import Error, Observer
+from splatting.training.part import Error, Part
 from splatting.training.run import Run
 from splatting.training.schedule import DecidedSchedule
 from utils.system_utils import saved_iterations
 
 
-class Curve(Observer):
+class Curve(Part):
     """Scores test views, and as many training views, in planned iterations; draws the curve at the end."""
 
     def __init__(self, run: Run) -> None:

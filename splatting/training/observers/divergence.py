@@ -12,7 +12,7 @@ from scene.gaussians.adam import StepGuard
 from scene.gaussians.checkpoint import save_checkpoint
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
-from splatting.training.observer import Error, Observer
+from splatting.training.part import Error, Part
 from splatting.training.run import Run
 from utils.system_utils import UserError
 
@@ -22,7 +22,7 @@ _NEVER = 1 << 62  # an iteration
 _WORSE_AFTER = 100  # iterations after which a loss should have fallen
 
 
-class DivergenceWatch(Observer):
+class DivergenceWatch(Part):
     """Checks, when something is due, that all losses and all steps of the optimisers were finite.
 
     After the first one that was not, the optimisers change nothing (StepGuard), so even a late check finds the

@@ -1,32 +1,25 @@
-"""Guards of a training: masks that leave nothing to train on, what --robust_mask masks, and memory that runs out."""
+"""Guards of a training: masks that leave nothing to train on, and memory that runs out."""
 
-import shutil
 import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
 
 from gaussian_renderer.memory_errors import situation
 from scene.cameras import Camera
 from scene.gaussians.checkpoint import save_checkpoint
-from scene.images.side_files import names_below
-from splatting.evaluation.model_folder import MASKED_PHOTOS
-from splatting.files.image_files import dimmed, to_bytes
 from splatting.files.listing import some
 from splatting.host.memory import is_out_of_memory
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
-from splatting.training.observer import Error, Observer
+from splatting.training.part import Error, Part
 from splatting.training.restart import what_stands
-from splatting.training.robust_mask import FOLDER
 from splatting.training.run import Run
-from utils.image_utils import as_float
-from utils.system_utils import UserError, atomic_write
+from utils.system_utils import UserError
 
 _ENOUGH = 100  # if so many views have no pixel that counts, and no view has one, the masks are wrong
 _ALMOST_NOTHING = 1e-3  # share of the pixels
@@ -34,7 +27,7 @@ _INVERT = "is white masked in them (--invert_masks), or do they belong to anothe
 _BLACK = "white must be where photos count; make the masks again, or leave them out"
 
 
-class MaskWatch(Observer):
+class MaskWatch(Part):
     """Adds up, without waiting for a GPU, how much of each view counts. Only `look` waits for it, while views are new.
 
     views: those that train. This check decodes no mask ahead, so training on thousands of photos starts in seconds.
@@ -90,51 +83,7 @@ class MaskWatch(Observer):
             self._scanty.clear()
 
 
-class PassersBy(Observer):
-    """Writes what --robust_mask masks at the end as mask files, names the photos, and draws the worst."""
-
-    def __init__(self, run: Run) -> None:
-        self._run = run
-
-    def ended(self, error: Error) -> None:
-        if error is not None:
-            return
-        run, model, shares = self._run, Path(self._run.scene.model_path), {}
-        folder, picture = model / FOLDER, model / MASKED_PHOTOS
-        shutil.rmtree(folder, ignore_errors=True)  # of an earlier training
-        picture.unlink(missing_ok=True)
-        given = [camera.image_name for camera in run.robust_mask.cameras]
-        names = dict(zip(given, names_below(given, Path(run.dataset.source_path)), strict=True))
-        for camera in run.robust_mask.cameras:
-            if (counts := run.robust_mask.counted(camera)) is None:
-                continue
-            shares[camera.image_name] = 1 - float(counts.float().mean())
-            with atomic_write(folder / f"{names[camera.image_name]}.png") as temporary:
-                Image.fromarray(counts[0].to(torch.uint8).mul(255).cpu().numpy()).save(temporary)
-        views = len(run.robust_mask.cameras)
-        shares = dict(sorted(shares.items(), key=lambda named: -named[1]))
-        if shares:
-            self._draw(shares, picture)
-        most = [f"{name} ({share:.0%})" for name, share in shares.items()]
-        text = f"--robust_mask leaves out {sum(shares.values()) / views:.1%} of the pixels"
-        text += f", in {len(shares)} of {views} photos"
-        run.log.tell(text + (f", most in {some(most)}; {folder} shows them" if most else ""))
-
-    def _draw(self, shares: dict[str, float], path: Path) -> None:
-        """Draw photos beside themselves with darker masked parts. shares: of what is masked, the largest first."""
-        from splatting.evaluation.renders import WIDEST, WORST, sheet  # here, as few trainings need it
-
-        rows, cameras = [], {camera.image_name: camera for camera in self._run.robust_mask.cameras}
-        for name in list(shares)[:WORST]:
-            photo = as_float(cameras[name].target(self._run.background))
-            both = photo, dimmed(photo, self._run.robust_mask.counted(cameras[name]))
-            images = [Image.fromarray(to_bytes(image).numpy()) for image in both]
-            rows.append(list(zip((name, f"{shares[name]:.0%}"), images, strict=True)))
-        with atomic_write(path) as temporary:
-            sheet(("photo", "left out: dark"), rows, WIDEST).save(temporary)
-
-
-class MemoryGuard(Observer):
+class MemoryGuard(Part):
     """Saves the model when memory runs out, and turns the error into a UserError.
 
     Until an iteration is `measured`, the saved state is that after the iteration before: a resumed run then equals one

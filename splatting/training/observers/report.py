@@ -24,8 +24,8 @@ from splatting.host.progress import Bar
 from splatting.training.density import default_budget
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses, LossWatch
-from splatting.training.observer import Error, Observer
 from splatting.training.output_folder import view_command
+from splatting.training.part import Error, Part
 from splatting.training.run import Run
 from utils.image_utils import as_float, mean_psnr, mse, pixels_that_count, psnr
 from utils.loss_utils import l1_loss
@@ -36,15 +36,16 @@ BAR_INTERVAL = 10  # iterations between updates, at least
 BAR_SECONDS = 0.2  # between updates, at least: each reads the losses, and so waits for the GPU
 
 
-class ProgressBar(Observer):
+class ProgressBar(Part):
     """Shows running means. At the end of a training it says how long that took."""
 
     reads_model = False
 
     def __init__(self, run: Run) -> None:
         self._run = run
-        self._depth = LossWatch()
-        self._shown = {"Loss": run.losses} | ({"Depth Loss": self._depth} if run.dataset.depths else {})
+        self._terms = {name: LossWatch() for part in run.parts for name in part.shown}
+        titles = {title: self._terms[name] for part in run.parts for name, title in part.shown.items()}
+        self._shown = {"Loss": run.losses} | titles
         self._updated, self._done = -math.inf, run.first_iteration
         first = run.schedule.schedule_step(run.first_iteration)
         form = {"bar_format": BY_CLOCK} if run.opt.time_budget else {}
@@ -55,8 +56,8 @@ class ProgressBar(Observer):
         return step.last or shown
 
     def measured(self, step: Iteration, losses: Losses) -> None:
-        if losses.depth is not None:
-            self._depth.add(step.iteration, losses.depth)
+        for name in self._terms.keys() & losses.terms.keys():
+            self._terms[name].add(step.iteration, losses.terms[name])
         if not step.due:
             return
         for loss in self._shown.values():
@@ -92,7 +93,7 @@ LOG_INTERVAL = 10  # iterations between TensorBoard's losses: reading one waits 
 SHOWN = 5  # views of a set whose images TensorBoard gets
 
 
-class Report(Observer):
+class Report(Part):
     """Scores in testing iterations. writer: TensorBoard's, or None. report: `training_report` or what replaces it."""
 
     def __init__(self, run: Run, writer: Any | None, report: Callable[..., dict[str, float]]) -> None:
@@ -147,7 +148,7 @@ class Report(Observer):
         log.advise(*what_to_try(self._run.rows, log.records))
 
 
-class Summary(Observer):
+class Summary(Part):
     """Says at the end what the model is worth, and how to look at it."""
 
     def __init__(self, run: Run) -> None:
@@ -158,7 +159,7 @@ class Summary(Observer):
     def measured(self, step: Iteration, losses: Losses) -> None:
         self._iteration = step.iteration
         if step.last:
-            saved = (self._run.best and self._run.best.iteration) or step.iteration
+            saved = self._run.final_iteration or step.iteration
             scored = [row["test_psnr"] for row in whole_sets(self._run.rows) if row["iteration"] == saved]
             self._psnr = scored[0] if scored else None
 
@@ -266,7 +267,7 @@ def _means(
     return {name: value for name, value in means.items() if value is not None}
 
 
-class Records(Observer):
+class Records(Part):
     """Writes what other observers have put into the step's record, once all of it is there.
 
     Where poses are refined, it has how far they have moved, at points of the curve, too.

@@ -6,23 +6,20 @@ from pathlib import Path
 from tqdm import tqdm
 
 from arguments import add_to_model_json
-from gaussian_renderer.scored_views import ScoredViews
 from scene.gaussians.checkpoint import save_checkpoint
 from scene.saved_iterations import saved_ply
-from splatting.evaluation.curve_recorder import curve_points
-from splatting.evaluation.what_to_try import KEPT
 from splatting.training.iteration import Iteration
 from splatting.training.left_out import LeftOut, lines, save_last, saved_line
 from splatting.training.objective import Losses
-from splatting.training.observer import Error, Observer
 from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.output_folder import view_command
+from splatting.training.part import Error, Part
 from splatting.training.run import Run
 from splatting.training.schedule import DecidedSchedule
 from splatting.training.schedule_file import NAME, write_schedule
 
 
-class Saves(Observer):
+class Saves(Part):
     """Saves the PLY when planned; the last save leaves out what the model does not need.
 
     test_in_memory: the test photos are decoded by the last iteration, so that scoring them once more costs little.
@@ -59,39 +56,7 @@ class Saves(Observer):
             run.log.keep(*lines(self._left_out))
 
 
-class KeepBest(Observer):
-    """Scores the validation views, and notes the model that shows them best, which `Saves` writes at the end."""
-
-    def __init__(self, run: Run) -> None:
-        self._run, self._cameras = run, run.best.cameras
-        self._views = ScoredViews(run.pipe, run.background, False)
-        whole, length = run.launch.test_iterations, run.opt.iterations
-        self._points = curve_points(length, whole, 1, len(self._cameras))[0] | {*whole, length}
-        self._psnr: float | None = None
-
-    def due(self, step: Iteration) -> bool:
-        return step.takes(self._points)
-
-    def measured(self, step: Iteration, losses: Losses) -> None:
-        if not step.takes(self._points):
-            return
-        run = self._run
-        with run.clock.paused("scoring"):
-            run.scene.prefetch(self._cameras)
-            self._psnr = self._views.scores(self._cameras, run.gaussians).get("psnr")
-            if self._psnr is not None:  # masks may leave no pixel of the views, or all are shown exactly
-                run.best.offer(run.gaussians, step.iteration, self._psnr)
-                step.record = (step.record or {}) | {"validation_psnr": self._psnr}
-        if step.last:
-            add_to_model_json(run.scene.model_path, kept_best=run.best.facts())
-
-    def ended(self, error: Error) -> None:
-        if error is None:
-            self._run.log.note(**{KEPT: self._run.best.iteration})
-            self._run.log.tell(self._run.best.line(self._psnr))
-
-
-class Checkpoints(Observer):
+class Checkpoints(Part):
     """Writes chkpntN.pth when planned, and when a signal stops the training, which also saves the PLY."""
 
     def __init__(self, run: Run, watch: DivergenceWatch) -> None:
@@ -136,7 +101,7 @@ def save_schedule(run: Run, step: Iteration) -> None:
             add_to_model_json(folder, resolution_schedule=run.schedule.sizes)
 
 
-class ScheduleFile(Observer):
+class ScheduleFile(Part):
     """Writes schedule.json when the training ends, also by an error whose rescue has saved a checkpoint."""
 
     def __init__(self, run: Run) -> None:

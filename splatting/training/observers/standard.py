@@ -4,18 +4,18 @@ from collections.abc import Callable
 from typing import Any
 
 from gaussian_renderer import network_gui
-from splatting.training.observer import Observer
 from splatting.training.observers.curve import Curve
 from splatting.training.observers.divergence import DivergenceWatch
-from splatting.training.observers.guards import MaskWatch, MemoryGuard, PassersBy
+from splatting.training.observers.guards import MaskWatch, MemoryGuard
 from splatting.training.observers.report import ProgressBar, Records, Report, Summary, training_report
-from splatting.training.observers.saves import Checkpoints, KeepBest, Saves, ScheduleFile
+from splatting.training.observers.saves import Checkpoints, Saves, ScheduleFile
 from splatting.training.observers.viewers import NetworkViewer, PageObserver
+from splatting.training.part import Part
 from splatting.training.run import Run
 from splatting.training.schedule import DecidedSchedule
 
 
-def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[str, float]]) -> list[Observer]:
+def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[str, float]]) -> list[Part]:
     """The observers of every training. writer: TensorBoard's, or None. report: `training_report`."""
     with_curve = not run.launch.no_curve and bool(run.scene.getTestCameras())
     test_in_memory = with_curve or run.opt.iterations in run.launch.test_iterations
@@ -28,11 +28,10 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
         *([ProgressBar(run)] if run.group.first else []),  # reads the losses that the watch has checked
         MaskWatch(run.scene.getTrainCameras()),  # may refuse the scene before anything is written
         *([Curve(run)] if with_curve else []),  # the scores are those of the model saved at the same iteration
-        *([KeepBest(run)] if run.best else []),
+        *run.parts,
         Report(run, writer, report),
         Saves(run, test_in_memory),  # before the model changes
         Records(run),  # after all that add to the iteration's record
-        *([PassersBy(run)] if run.robust_mask else []),
         Summary(run),  # after all that say something at the end
         *([NetworkViewer(run)] if network_gui.listener else []),  # after all that write: it may make training wait
         MemoryGuard(run),  # from `measured` to `stepped` the model changes; otherwise it is whole

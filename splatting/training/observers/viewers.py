@@ -18,8 +18,8 @@ from splatting.evaluation.error_curve import common_subset, rows_on
 from splatting.files.listing import as_utf8
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
-from splatting.training.observer import Error, Observer
 from splatting.training.observers.saves import Checkpoints
+from splatting.training.part import Error, Part
 from splatting.training.run import Run
 from splatting.viewer.page import Page, serve
 from splatting.viewer.server import Address
@@ -31,7 +31,7 @@ _NUMBERS_EVERY = 0.5  # seconds
 _WAIT = 0.2  # seconds until a paused training notices a signal
 
 
-class PageObserver(Observer):
+class PageObserver(Part):
     """Draws frames for the page between two iterations, and does what its buttons ask for.
 
     While nobody watches it asks one variable in each iteration. The time it takes is not that of training. It comes
@@ -44,8 +44,8 @@ class PageObserver(Observer):
         address = Address(run.launch.viewer_host, run.launch.viewer)
         self._page = Page(address, run.scene, run.pipe, run.dataset.white_background, run.dataset.train_test_exp)
         self._requests = self._page.requests
-        if run.robust_mask:
-            self._page.frames.masks = run.robust_mask.counted
+        if run.counts:
+            self._page.frames.masks = run.counts.counted
         with self._page.tabs.add_tab("Training"):
             self._tab = TrainingTab(self._page.server, self._requests)
         self.budget = Budget()
@@ -166,7 +166,7 @@ _TICK = 0.1  # seconds between looks whether a signal asks to stop
 _LAST = 1.0  # seconds that a finished training waits for one more request
 
 
-class NetworkViewer(Observer):
+class NetworkViewer(Part):
     """Serves the viewer of gaussian_renderer/network_gui.py.
 
     Training waits only while the viewer says so. Otherwise a request is answered when it is there, one an iteration.

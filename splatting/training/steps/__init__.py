@@ -14,6 +14,5 @@ def step_taker(run: Run) -> PlainStep:
     if not FusedStep.suits(run):
         return PlainStep(run)
     exchanges = run.gaussians.shards.ranks.several  # numbers, in each step
-    # A step that is queued may be repeated, and would find the residuals of its first time.
-    runs_ahead = run.device.type == "cuda" and not exchanges and run.robust_mask is None
+    runs_ahead = run.device.type == "cuda" and not exchanges and all(part.needs.replay for part in run.parts)
     return CapturedStep(run) if runs_ahead else FusedStep(run)

@@ -23,9 +23,9 @@ from torch import Tensor
 from gaussian_renderer import photo_name
 from scene.cameras import Camera
 from scene.fused_adam import CAMERA_NUMBERS, NOW_WORDS, FusedAdam
+from splatting.training.announcer import Announcer
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
-from splatting.training.observer import Announcer
 from splatting.training.run import Run
 from splatting.training.steps.fused import FusedStep
 from splatting.training.steps.plain import PlainStep
@@ -157,9 +157,8 @@ class CapturedStep(FusedStep):
         self._run.set_rates(at)
         losses = self._queue(at)
         with torch.no_grad():
-            for new, old in zip(losses[:3], first[:3], strict=True):
-                if old is not None:
-                    old.detach().copy_(new)
+            for new, old in zip(losses.values, first.values, strict=True):
+                old.detach().copy_(new)
 
     def rewind(self, steps: int) -> None:
         """Take back what the host has counted for steps that will be replayed, or that an error has ended."""
@@ -231,7 +230,7 @@ class Graphs:
         if exposes:
             exposures.keep_gradients()
             self._run.gaussians.guard_loss(at.iteration, total)
-        return Losses(total, l1, None, None)
+        return Losses(total, l1, {}, None)
 
     def clear(self) -> None:
         """Forget the graphs: their capacity was too small."""
@@ -258,8 +257,8 @@ class Graphs:
         self._recorder.release()
 
     def _is_usual(self, at: Iteration) -> bool:
-        """Whether the photo has no mask, and the loss needs no depth."""
-        return self._able and not at.wants_depth and at.camera.counts_all_pixels
+        """Whether the photo has no mask, and no part adds to the loss."""
+        return self._able and not at.terms and at.camera.counts_all_pixels
 
     def _graph_for(self, at: Iteration) -> _Graph | None:
         """The graph for a step, made if it is worth it. The first step of a kind is not, as it may load kernels."""
@@ -318,9 +317,7 @@ class Graphs:
         placeholder = SimpleNamespace(
             camera=any_camera,
             background=self._background,
-            depth_weight=0.0,
-            points=None,
-            sky=None,
+            terms={},
             wants_depth=False,
             changes=False,
             last=False,

@@ -5,9 +5,9 @@ from torch import Tensor
 
 from gaussian_renderer import Drawn, KnownBands, draw, exposed
 from scene.fused_adam import CAMERA_NUMBERS, FusedAdam
+from splatting.training.announcer import Announcer
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
-from splatting.training.observer import Announcer
 from splatting.training.run import Run
 from splatting.training.steps.plain import PlainStep
 
@@ -84,8 +84,7 @@ class FusedStep(PlainStep):
             losses = objective({"render": color, "depth": depth, "band": drawn.band}, at)
             losses.total.backward()
         # Observers keep losses for a while, which must not keep the image and its gradient.
-        losses = losses._make(None if value is None else value.detach() for value in losses)
-        return drawn, losses, (image.grad, None if depth is None else depth.grad)
+        return drawn, losses.detached(), (image.grad, None if depth is None else depth.grad)
 
     def drop_further_terms(self) -> bool:
         """Whether the loss of the last `measure` depends on a parameter by another way than the image.

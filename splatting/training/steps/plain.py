@@ -3,9 +3,9 @@
 from torch import Tensor
 
 from gaussian_renderer import draw, exposed, render, wake
+from splatting.training.announcer import Announcer
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
-from splatting.training.observer import Announcer
 from splatting.training.run import Run
 
 Package = dict[str, Tensor | None]

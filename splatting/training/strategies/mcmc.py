@@ -18,7 +18,6 @@ from splatting.training.density import DensityControl, default_budget, refuse_em
 from splatting.training.iteration import Iteration
 from splatting.training.schedule import DecidedSchedule
 from splatting.training.strategies import of_clock
-from utils.system_utils import UserError
 
 if TYPE_CHECKING:
     from splatting.training.run import Run
@@ -108,9 +107,7 @@ class MarkovChain(DensityControl):
 
 
 def of_run(run: "Run") -> MarkovChain:
-    """The control of a run. UserError for one with a sky, which would not stay where it is."""
-    if run.sky:
-        raise UserError("--sky needs --strategy adc or budget, as mcmc throws large Gaussians about; name one of them")
+    """The control of a run."""
     if not isinstance(run.schedule, DecidedSchedule):
         return MarkovChain(run.gaussians, run.opt)
     # Penalties need time; with little of it they only darken (fox_tiny, 1,243 iterations: -1.7 dB), except where they

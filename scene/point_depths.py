@@ -1,7 +1,6 @@
-"""Depth by the points of structure from motion (--sparse_depth): each view's own, where its photo has seen them.
+"""Inverse depth at places of a view, from points: as supervision (Deng et al. 2022, DS-NeRF, section 3), and as scores.
 
-Sparse points as supervision of depth: Deng et al. 2022 (DS-NeRF), section 3. No network is asked. Points that are never
-trained on score the depth of test views.
+Points of structure from motion that are never trained on score the depth of test views.
 """
 
 import numpy as np
@@ -12,7 +11,6 @@ from scene.cameras import Camera
 from scene.readers.info import CameraInfo
 from scene.readers.tracks import Track, read_tracks
 from scene.scene import Scene
-from utils.system_utils import UserError
 
 HELD_OUT = 8  # every so many points, by the rank of their ids, are never trained on, and score
 _NEAR = 0.01  # depth, as the camera's
@@ -45,29 +43,6 @@ class PointDepths:
         if not len(errors):
             return {}
         return dict(zip(("depth", "depth_95"), np.quantile(errors, (0.5, 0.95)).tolist(), strict=True))
-
-
-class SparseDepth:
-    """The points of all training views. `at` has those of a view at its size."""
-
-    def __init__(self, scene: Scene, source_path: str, weight: float) -> None:
-        """UserError for a scene without tracks."""
-        self._views, self._weight = scene.info.train_cameras, weight
-        self._tracks = read_tracks(source_path, self._views, scene.info.offset)
-        self._known: dict[tuple[int, int, int], PointDepths | None] = {}
-        if not any(self._tracks):
-            raise UserError(
-                "--sparse_depth needs the tracks of a COLMAP model, the places of its points in photos that are no "
-                f"panoramas, and {source_path} has none; leave it out"
-            )
-
-    def at(self, camera: Camera) -> PointDepths | None:
-        """The points that train a view; None if there are none."""
-        key = camera.uid, camera.image_width, camera.image_height
-        if key not in self._known:
-            track = self._tracks[camera.uid]
-            self._known[key] = track and points_of(camera, self._views[camera.uid], track, self._weight)
-        return self._known[key]
 
 
 def held_out_points(scene: Scene, source_path: str) -> dict[str, PointDepths]:

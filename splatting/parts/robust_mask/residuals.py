@@ -22,7 +22,6 @@ from scene.gaussian_model import GaussianModel
 from utils.image_utils import as_float
 from utils.system_utils import UserError
 
-FOLDER = "robust_masks"  # of a model folder: mask files of what was masked at the end
 CELLS = 32  # of a photo, across and down
 _NEWEST = 0.5  # weight of the newest residuals in a photo's
 _FACTOR = 13.0  # times the level of all photos is what detail and highlights rarely reach
@@ -38,7 +37,7 @@ CLEAR = 0.11  # mean difference of a passer-by; what is not learnt yet rarely di
 FEW = 0.2  # of the photos, which a bare wall or a sky may reach after a short training
 
 
-class RobustMask:
+class Residuals:
     """The residuals of all training photos so far, and the masks that follow from them.
 
     share: of a photo, at most, that is masked. residuals (n, CELLS, CELLS), by the cameras' uid; levels (n,): what the
@@ -128,9 +127,9 @@ class RobustMask:
 
 
 @torch.no_grad()
-def residuals_of(cameras: Sequence[Camera], views: ScoredViews, gaussians: GaussianModel) -> RobustMask:
+def residuals_of(cameras: Sequence[Camera], views: ScoredViews, gaussians: GaussianModel) -> Residuals:
     """The residuals and masks of photos after a training that did not keep them."""
-    masks = RobustMask(cameras, MASKED, gaussians.get_xyz.device)
+    masks = Residuals(cameras, MASKED, gaussians.get_xyz.device)
     masks.least, masks.early = 1, 0  # it is trained
     for camera in cameras:
         masks.mask(camera, *views.compared(camera, gaussians), learns=True)
@@ -138,7 +137,7 @@ def residuals_of(cameras: Sequence[Camera], views: ScoredViews, gaussians: Gauss
     return masks
 
 
-def odd_share(masks: RobustMask) -> float:
+def odd_share(masks: Residuals) -> float:
     """Share of the photos that clearly show what the model does not."""
     return fmean(masks.difference(camera) > CLEAR for camera in masks.cameras)
 

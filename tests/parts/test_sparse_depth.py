@@ -14,12 +14,12 @@ import metrics
 import render
 import train
 from scene.gaussian_model import GaussianModel
+from scene.point_depths import HELD_OUT, PointDepths, points_of
 from scene.readers.tracks import read_tracks
 from scene.scene import Scene
 from splatting.files.image_files import read_plane
 from splatting.files.json_files import read_json
-from splatting.training import sparse_depth
-from splatting.training.sparse_depth import HELD_OUT, PointDepths, points_of
+from splatting.parts.sparse_depth import points
 from utils.system_utils import UserError, run_cli
 
 FISHEYE = (*BROWN[:4], 0.02, -0.01, 0.003, 0.001)
@@ -117,7 +117,7 @@ def test_depth_comes_nearer_to_points_of_test_views(scene, tmp_path, monkeypatch
 
 
 def test_off_reads_no_tracks(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(sparse_depth, "read_tracks", lambda *_: pytest.fail("tracks are read"))
+    monkeypatch.setattr(points, "read_tracks", lambda *_: pytest.fail("tracks are read"))
     trained(scene, tmp_path / "off", "--test_iterations", -1)
 
 

@@ -12,12 +12,10 @@ from synthetic import make_colmap_scene
 from trainings import trained
 
 import train
-from splatting.evaluation.model_folder import MASKED_PHOTOS
 from splatting.evaluation.renders import GAP, HEADER
 from splatting.evaluation.training_log import read_log
-from splatting.training import robust_mask
-from splatting.training.observers import guards
-from splatting.training.robust_mask import RobustMask
+from splatting.parts.robust_mask import residuals, written
+from splatting.parts.robust_mask.residuals import Residuals
 from utils.system_utils import UserError, run_cli
 
 ON = "--robust_mask", 0.3, "--test_iterations", -1, "--opacity_reset_interval", 3000
@@ -34,7 +32,7 @@ def _photo(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.from_numpy(detail).to(torch.uint8), torch.from_numpy(blurred / 255).float()
 
 
-def _visit(masks: RobustMask, views: list, photos: list, times: int) -> list[torch.Tensor | None]:
+def _visit(masks: Residuals, views: list, photos: list, times: int) -> list[torch.Tensor | None]:
     found = []
     for _ in range(times):
         found = []
@@ -46,19 +44,19 @@ def _visit(masks: RobustMask, views: list, photos: list, times: int) -> list[tor
 
 def test_a_passer_by_is_masked_and_detail_is_not(monkeypatch):
     """Detail has large residuals, too, pixel by pixel; only their means over cells are small."""
-    monkeypatch.setattr(RobustMask, "early", 3)  # the edge does not reach so high a limit
+    monkeypatch.setattr(Residuals, "early", 3)  # the edge does not reach so high a limit
     views, photos = _views(10), [_photo(seed) for seed in range(10)]
     there = np.hypot(*(np.mgrid[:64, :96] - np.array([30, 40])[:, None, None])) < 12
     photos[3][0][:, there] = 20
-    masks = RobustMask(views, 0.3, torch.device("cpu"))
-    assert _visit(masks, views, photos, RobustMask.least) == [None] * 10
+    masks = Residuals(views, 0.3, torch.device("cpu"))
+    assert _visit(masks, views, photos, Residuals.least) == [None] * 10
     found = _visit(masks, views, photos, 1)
     assert [mask is not None for mask in found] == [k == 3 for k in range(10)]
-    assert robust_mask.odd_share(masks) == 0.1
+    assert residuals.odd_share(masks) == 0.1
     masked = ~found[3][0].numpy()
     assert masked[there].all() and not masked[~ndimage.binary_dilation(there, iterations=6)].any()
     assert masks.mask(views[3], photos[3][1], photos[3][0], None, learns=False) is not None
-    assert _visit(masks, views, photos, robust_mask._UNMASKED - 3) == [None] * 10  # or a floater would stay, too
+    assert _visit(masks, views, photos, residuals._UNMASKED - 3) == [None] * 10  # or a floater would stay, too
     now = [masks.counted(view) for view in views]
     assert not now.pop(3)[~found[3]].any() and now == [None] * 9 and masks.counted(_views(1)[0]) is None
 
@@ -68,15 +66,15 @@ def test_no_more_is_masked_than_the_share(share):
     views, photos = _views(10), [_photo(seed) for seed in range(10)]
     photos[3][0][:] = 255
     photos[4][0][:, :, :60] = 0
-    masks = RobustMask(views, share, torch.device("cpu"))
-    found = _visit(masks, views, photos, RobustMask.least + 1)
+    masks = Residuals(views, share, torch.device("cpu"))
+    found = _visit(masks, views, photos, Residuals.least + 1)
     assert all(0 < (~found[k]).float().mean() <= share + 0.05 for k in (3, 4))  # cells of a pixel more or less
 
 
 def test_masks_of_files_stay_and_resets_teach_nothing():
     views, photos = _views(3), [_photo(seed) for seed in range(3)]
-    masks = RobustMask(views, 0.3, torch.device("cpu"))
-    _visit(masks, views, photos, RobustMask.least)
+    masks = Residuals(views, 0.3, torch.device("cpu"))
+    _visit(masks, views, photos, Residuals.least)
     before = masks.captured()
     given = torch.ones(1, 64, 96, dtype=torch.bool)
     given[:, :20] = False
@@ -104,7 +102,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """In trainings of 60 iterations, whose renders are far from the photos."""
-    monkeypatch.setattr(RobustMask, "early", 0)
+    monkeypatch.setattr(Residuals, "early", 0)
 
 
 def test_a_training_shows_what_it_leaves_out(scene, tmp_path, monkeypatch):
@@ -112,40 +110,34 @@ def test_a_training_shows_what_it_leaves_out(scene, tmp_path, monkeypatch):
     assert (off := trained(scene, tmp_path / "off", *ON[2:]))["ply"] != whole["ply"]
     lines = read_log(tmp_path / "whole" / "train_log.json")[-1]["lines"]
     (said,) = [line for line in lines if line.startswith("--robust_mask leaves out")]
-    written = [path for path in (tmp_path / "whole" / robust_mask.FOLDER).rglob("*.png")]
-    assert f"in {len(written)} of 14 photos" in said and written
-    with Image.open(tmp_path / "whole" / MASKED_PHOTOS) as picture:
+    files = [path for path in (tmp_path / "whole" / written.FOLDER).rglob("*.png")]
+    assert f"in {len(files)} of 14 photos" in said and files
+    with Image.open(tmp_path / "whole" / written.PICTURE) as picture:
         pixels = np.asarray(picture, int)
     wide = (picture.width - 3 * GAP) // 2
     left, right = pixels[HEADER:, GAP : GAP + wide], pixels[HEADER:, -GAP - wide : -GAP]
     assert 0.01 < (right < left - 20).any(2).mean() < 0.4  # the same photos, darker where pixels are left out
-    again = trained(scene, tmp_path / "again", "--masks", tmp_path / "whole" / robust_mask.FOLDER, *ON[2:])
+    again = trained(scene, tmp_path / "again", "--masks", tmp_path / "whole" / written.FOLDER, *ON[2:])
     assert again["ply"] != off["ply"]  # they are mask files
 
 
 @pytest.mark.parametrize("above", ["../", "{}/images/"])
-def test_masks_are_written_below_the_model_folder(tmp_path, above):
+def test_masks_are_written_below_the_model_folder(tmp_path, above, monkeypatch):
     """Wherever the dataset says that its photos are."""
     names = [above.format(tmp_path) + f"{side}/1.png" for side in ("left", "right")]
     cameras = [SimpleNamespace(image_name=name) for name in names]
     masks = SimpleNamespace(cameras=cameras, counted=lambda camera: torch.ones(1, 4, 4))
-    run = SimpleNamespace(
-        scene=SimpleNamespace(model_path=tmp_path / "model" / "of" / "it"),
-        dataset=SimpleNamespace(source_path=str(tmp_path / "scene")),
-        robust_mask=masks,
-        log=SimpleNamespace(tell=lambda text: None),
-    )
-    observer = guards.PassersBy(run)
-    observer._draw = lambda *_: None
-    observer.ended(None)
-    written = [path.relative_to(run.scene.model_path).as_posix() for path in tmp_path.rglob("*.png")]
-    assert sorted(written) == ["robust_masks/left/1.png.png", "robust_masks/right/1.png.png"]
+    model = tmp_path / "model" / "of" / "it"
+    monkeypatch.setattr(written, "_draw", lambda *_: None)
+    written.write_masks(masks, model, str(tmp_path / "scene"), torch.zeros(3))
+    found = [path.relative_to(model).as_posix() for path in tmp_path.rglob("*.png")]
+    assert sorted(found) == ["robust_masks/left/1.png.png", "robust_masks/right/1.png.png"]
 
 
 def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         run_cli(lambda: train.main(["-s", str(scene), "-m", str(tmp_path / "out"), "--robust_mask", "0.7"]))
     assert ended.value.code == 2 and "robust_mask" in capsys.readouterr().err
-    masks, others = (RobustMask(_views(n), 0.3, torch.device("cpu")) for n in (3, 4))
+    masks, others = (Residuals(_views(n), 0.3, torch.device("cpu")) for n in (3, 4))
     with pytest.raises(UserError, match="residuals of other photos"):
         masks.restore(others.captured())

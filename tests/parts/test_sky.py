@@ -1,5 +1,6 @@
 """A sky (--sky): where it is found, that it stays there, and trainings with it."""
 
+import argparse
 import math
 import sys
 from pathlib import Path
@@ -23,8 +24,9 @@ from splatting.demo.tracer import ring_views, shade, trace
 from splatting.diagnosis.model import check_model
 from splatting.exports.formats import read_splats
 from splatting.files.json_files import read_model_json
-from splatting.training.sky import Sky, find_sky
-from splatting.training.sky_directions import FEWEST
+from splatting.parts.sky.directions import FEWEST
+from splatting.parts.sky.shell import Shell, find_sky
+from splatting.parts.sky.tools import left_out
 from utils.system_utils import UserError
 
 ON = "--sky", "auto", "--densify_grad_threshold", 1e-5
@@ -41,9 +43,9 @@ def scene(once) -> Path:
     return once("sky_scene", lambda folder: _made(folder, with_sky))
 
 
-def _found(folder: Path) -> tuple[Scene, Sky, np.ndarray, np.ndarray, float]:
+def _found(folder: Path) -> tuple[Scene, Shell, np.ndarray, np.ndarray, float]:
     scene = Scene(options_of(folder, folder / "out"), GaussianModel(0), start=False)
-    sky = Sky.around(scene.info)
+    sky = Shell.around(scene.info)
     cloud, share = find_sky(scene, sky)
     return scene, sky, cloud.points, cloud.colors, share
 
@@ -102,7 +104,7 @@ def _model(means: torch.Tensor, log_scale: float) -> GaussianModel:
 
 
 def test_what_is_far_comes_back_to_the_sphere_and_what_is_near_stays():
-    sky = Sky([1.0, 2.0, 3.0], 100.0)
+    sky = Shell([1.0, 2.0, 3.0], 100.0)
     means = torch.tensor([[1.0, 2.0, 73.0], [1.0, 2.0, -147.0], [41.0, 2.0, 3.0], [0.0, 0.0, 0.0]])
     gaussians = _model(means, math.log(20.0))
     sky.hold(gaussians)
@@ -138,10 +140,10 @@ def test_none_begins_in_a_resumed_training(scene, tmp_path, capsys):
 
 
 def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path):
-    with pytest.raises(UserError, match="--sky needs --strategy adc or budget"):
+    with pytest.raises(UserError, match="--sky does not work with --strategy mcmc, which relocates large Gaussians"):
         train.main(["-s", str(scene), "-m", str(tmp_path), "--sky", "auto", "--strategy", "mcmc"])
     with pytest.raises(UserError, match="--no_sky needs -m of a model that has a sky"):
-        export.sky_of(tmp_path)
+        left_out(argparse.Namespace(no_sky=True, model_path=str(tmp_path)), torch.zeros(1, 3))
     for broken in (None, {"center": [0, 1], "radius": 2}, {"center": [0, 1, 2], "radius": math.nan}):
         with pytest.raises(UserError, match="the sky has no center and radius"):
-            Sky.restored(broken)
+            Shell.restored(broken)

@@ -20,7 +20,9 @@ from scene.gaussians import density_rules
 from scene.readers import info
 from scene.saved_model import load_saved
 from splatting.evaluation.training_log import read_log
-from splatting.training import checks
+from splatting.parts import check_together
+from splatting.parts.keep_best.part import KeepBest
+from splatting.parts.keep_best.validation import without_validation
 from utils.system_utils import UserError
 
 POINTS = 60, 85, 120, 170, 240
@@ -98,7 +100,7 @@ def test_a_resumed_training_knows_the_best_so_far(kept, scene, tmp_path):
         train_on(scene, tmp_path / "no", *WORDS, "--keep_best", start[0], tmp_path / "plain" / "chkpnt200.pth")
     for wrong, words in ((torch.zeros(2, 2), "xyz of the checkpoint has the shape"), (torch.zeros(2, 3), "is damaged")):
         state = torch.load(start[1], weights_only=False)
-        state[0][10]["best"]["rows"]["xyz"] = wrong
+        state[0][10]["keep_best"]["rows"]["xyz"] = wrong
         torch.save(state, tmp_path / "chkpnt200.pth")
         with pytest.raises(UserError, match=words):
             train_on(scene, tmp_path / "no", *WORDS, "--keep_best", start[0], tmp_path / "chkpnt200.pth")
@@ -118,7 +120,8 @@ def test_a_validation_photo_that_is_shown_exactly_has_no_say(scene, tmp_path, mo
 @pytest.mark.parametrize(("count", "places"), [(8, (2, 6)), (31, (7, 22)), (43, (8, 24, 40))])
 def test_every_sixteenth_view_validates_and_two_at_least(count, places):
     views = load_views(count)
-    left, chosen = info.without_validation(views)
+    left = without_validation(views)
+    chosen = left.validation_cameras
     assert [view.uid for view in chosen] == list(places) and all(v.is_test and not v.depth_path for v in chosen)
     assert [view.uid for view in left.train_cameras] == [n for n in range(count) if n not in places]
 
@@ -130,9 +133,9 @@ def load_views(count: int) -> info.SceneInfo:
 
 def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path):
     with pytest.raises(UserError, match="takes photos away from training and needs 8, and only 7 train; leave it out"):
-        info.without_validation(load_views(7))
+        without_validation(load_views(7))
     for words in (("--refine_poses",), ("--appearance", "ppisp"), ("--train_test_exp",)):
-        with pytest.raises(UserError, match=f"--keep_best does not go with {words[0]}"):
+        with pytest.raises(UserError, match=f"--keep_best does not work with {words[0]}"):
             train_on(scene, tmp_path, *WORDS, "--keep_best", *words)
     with pytest.raises(UserError, match="--keep_best needs a training of one process"):
-        checks.check_keep_best(SimpleNamespace(keep_best=True), SimpleNamespace(), several=True)
+        check_together([KeepBest()], SimpleNamespace(keep_best=True), several=True)

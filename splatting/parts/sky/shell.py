@@ -15,11 +15,11 @@ from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.density_rules import logit
 from scene.gaussians.start import start_rows
+from scene.point_depths import PointDepths
 from scene.readers.info import CameraInfo, SceneInfo
 from scene.readers.tracks import projected
 from scene.scene import Scene
-from splatting.training.sky_directions import ACROSS, FEWEST, cell_at, find_directions
-from splatting.training.sparse_depth import PointDepths
+from splatting.parts.sky.directions import ACROSS, FEWEST, cell_at, find_directions
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 
@@ -30,7 +30,7 @@ _WEIGHT = 0.1  # of the inverse depth, in 1 / extents, of the sky's pixels in th
 _OPACITY = 0.9  # at first: what lets the background through asks for Gaussians in front of it
 
 
-class Sky:
+class Shell:
     """The sphere of the sky's Gaussians. center (3,), radius: world units.
 
     points (N, 3): where they began; None: not known.
@@ -62,7 +62,7 @@ class Sky:
         return PointDepths(torch.from_numpy(pixels).to(camera.device), inverse, weights)
 
     @classmethod
-    def around(cls, info: SceneInfo) -> "Sky":
+    def around(cls, info: SceneInfo) -> "Shell":
         """The sphere around a scene's cameras and points."""
         center = -info.nerf_normalization["translate"]
         distances = np.linalg.norm(info.point_cloud.points - center, axis=1)
@@ -70,7 +70,7 @@ class Sky:
         return cls(center.tolist(), radius)
 
     @classmethod
-    def restored(cls, state: Any) -> "Sky":
+    def restored(cls, state: Any) -> "Shell":
         """The sphere of `captured()`, without points. UserError for anything else."""
         try:
             center, radius = [float(value) for value in state["center"]], float(state["radius"])
@@ -103,9 +103,9 @@ class Sky:
         scales.copy_(torch.where(far, gaussians.raw_scaling(gaussians.log_scales().clamp_max(largest)), scales))
 
 
-def with_sky(scene: Scene, gaussians: GaussianModel) -> Sky | None:
+def with_shell(scene: Scene, gaussians: GaussianModel) -> Shell | None:
     """Add a sky to a model that is to be trained, and say so; None, where points lie in nearly all directions."""
-    sky = Sky.around(scene.info)
+    sky = Shell.around(scene.info)
     cloud, share = find_sky(scene, sky)
     text = f"--sky auto: {said_of_sky(share)}"
     if share < FEWEST:
@@ -119,9 +119,9 @@ def with_sky(scene: Scene, gaussians: GaussianModel) -> Sky | None:
     return sky
 
 
-def resumed_sky(state: Any, scene: Scene) -> Sky:
+def resumed_shell(state: Any, scene: Scene) -> Shell:
     """The sky of a checkpoint, from `captured()`."""
-    sky = Sky.restored(state)
+    sky = Shell.restored(state)
     sky.points = find_sky(scene, sky)[0].points
     return sky
 
@@ -131,6 +131,6 @@ def said_of_sky(share: float) -> str:
     return f"{share:.1%} of the directions that several photos show look like a far sky: one colour and no points"
 
 
-def find_sky(scene: Scene, sky: Sky) -> tuple[BasicPointCloud, float]:
+def find_sky(scene: Scene, sky: Shell) -> tuple[BasicPointCloud, float]:
     """Points of a sky, and their share of the directions that photos show, as `find_directions`."""
     return find_directions(scene, sky.center, sky.radius)

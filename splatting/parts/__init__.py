@@ -1,0 +1,79 @@
+"""The registry of the parts of a training (splatting/training/part.py is their manual): their one order."""
+
+import argparse
+from collections.abc import Callable, Collection, Mapping
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+from splatting.training.option import Option
+from splatting.training.part import Part
+from utils.system_utils import UserError
+
+# Names of folders, with the reason for the place, where there is one.
+PARTS = (
+    "depth_maps",
+    "keep_best",  # after maps are found: its views have none
+    "robust_mask",
+    "sky",
+    "sparse_depth",  # the order of the terms of the loss is in the bytes of the model
+)
+
+
+@cache
+def part_class(name: str) -> type[Part]:
+    """The class of the folder `name`: its name in capital words."""
+    return getattr(import_module(f"{__name__}.{name}.part"), "".join(map(str.capitalize, name.split("_"))))
+
+
+def options_of(group: str) -> list[Option]:
+    """What the parts declare of a group of options: model, pipeline or optimisation."""
+    return [option for name in PARTS for option in getattr(part_class(name).options, group)]
+
+
+_OLD_KEYS = {"residuals": "robust_mask", "best": "keep_best"}  # of states in checkpoints of version 0.2 and before
+
+
+def states_in(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
+    """The states of parts by their names, from what a checkpoint keeps besides the model."""
+    named = {_OLD_KEYS.get(key, key): state for key, state in checkpoint.items()}
+    return {name: named[name] for name in PARTS if named.get(name) is not None}
+
+
+def chosen(given: argparse.Namespace, states: Collection[str] = ()) -> list[Part]:
+    """The parts that options ask for, and those that resume by a state, in their order.
+
+    given: options of all groups. states: names of parts that a checkpoint has states of.
+    """
+    kinds = map(part_class, PARTS)
+    return [kind() for kind in kinds if kind.wanted(given) or (kind.resumes and kind.name in states)]
+
+
+def check_together(parts: Collection[Part], given: argparse.Namespace, several: bool) -> None:
+    """Refuse a part that does not work with other options, or with several processes (UserError)."""
+    for part in parts:
+        option = part.switch or part.name
+        if several and not part.needs.ranks:
+            raise UserError(
+                f"--{option} needs a training of one process; leave it out, or start train.py without torchrun"
+            )
+        for other, reason in part.against.items():
+            name, _, value = other.partition("=")
+            if str(getattr(given, name, "")) == value if value else getattr(given, name, None):
+                raise UserError(f"--{option} does not work with --{name}{value and ' '}{value}, {reason}")
+
+
+def tools(name: str) -> list[Callable]:
+    """The functions of a name that parts have for other commands than train.py, in their tools.py.
+
+    advise(scene, tracks): texts on a scene, and options of train.py that they speak for.
+    beside(facts, means): which Gaussians of a model are not of the scene itself. facts: of model.json.
+    add_export_options(add), left_out(args, means): options of export.py, and which Gaussians these leave out.
+    advise_trained(scene, views): as advise, by a short training. examine(scene, views, options): notes of doctor.py.
+    remarks(lines): lines of a training that reports show. against_overfitting(record): an option to try, or None.
+    pictures(model): files in a model folder that reports show, where they are there.
+    """
+    modules = [f"{__name__}.{part}.tools" for part in PARTS]
+    found = [import_module(module) for module in modules if find_spec(module)]
+    return [getattr(module, name) for module in found if hasattr(module, name)]

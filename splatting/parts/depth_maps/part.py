@@ -1,0 +1,59 @@
+"""Depth maps as supervision (--depths), as in the newest reference: a loss of inverse depth with a falling weight."""
+
+from typing import TYPE_CHECKING, Any
+
+from splatting.training.option import CFG_ARGS, Option, at_least
+from splatting.training.part import Needs, Options, Part, Term
+
+if TYPE_CHECKING:
+    import argparse
+
+    from scene.readers.info import SceneInfo
+    from splatting.training.iteration import Iteration
+
+
+class DepthMaps(Part):
+    """Finds the maps of the training photos, and adds their loss for views whose map is reliable."""
+
+    name = "depth_maps"
+    switch = "depths"
+    # fmt: off
+    options = Options(
+        model=(
+            Option("depths", "", short="d", stored=CFG_ARGS, seen=False,
+                help="folder of depth maps inside the scene folder, with the photos' names: PNGs of inverse depth, or "
+                     "metric PNGs, .npy or .pfm; they stabilise regions that few photos show; empty: no depth "
+                     "supervision"),
+        ),
+        optimisation=(
+            Option("depth_l1_weight_init", 1.0, "weight of the depth loss (--depths) at the start", check=at_least(0)),
+            Option("depth_l1_weight_final", 0.01, "weight of the depth loss in the last step", check=at_least(0)),
+        ),
+    )
+    # fmt: on
+    needs = Needs(depth=True, files=True)
+    follows_length = True
+    shown = {"depth": "Depth Loss"}
+
+    def dataset(self, info: "SceneInfo", args: "argparse.Namespace", fresh: bool) -> "SceneInfo":
+        if not fresh:
+            return info
+        from pathlib import Path
+
+        from scene.readers.depth_maps import with_depth_maps
+
+        return with_depth_maps(info, Path(args.source_path), args.depths)
+
+    def begin(self, run: Any, state: Any) -> None:
+        from splatting.parts.depth_maps.loss import depth_loss
+        from utils.general_utils import get_expon_lr_func
+
+        self._schedule, self._loss, opt = run.schedule, depth_loss, run.opt
+        ends = opt.depth_l1_weight_init, opt.depth_l1_weight_final
+        self._weight = get_expon_lr_func(*ends, max_steps=opt.iterations)
+
+    def terms(self, at: "Iteration") -> dict[str, Term]:
+        weight = self._weight(self._schedule.schedule_step(at.iteration)) if at.camera.depth_reliable else 0.0
+        if not weight > 0:
+            return {}
+        return {"depth": lambda package, mask: weight * self._loss(package["depth"], at.camera, mask)}

@@ -1,0 +1,53 @@
+"""A sky behind all points (--sky): Gaussians on a far sphere that stay there."""
+
+from typing import TYPE_CHECKING, Any
+
+from splatting.training.option import Option, one_of
+from splatting.training.part import Needs, Options, Part, Term, fill
+
+if TYPE_CHECKING:
+    from splatting.training.iteration import Iteration
+
+
+class Sky(Part):
+    """Adds the sky's Gaussians at the start, holds them on their sphere, and asks that nothing stays before them."""
+
+    name = "sky"
+    # fmt: off
+    options = Options(optimisation=(
+        Option("sky", "off", origin="ours", check=one_of("off", "auto"),
+            help="auto: where directions that photos show have no points, add Gaussians on a far sphere, as a sky "
+                 "behind all; off: add none. By one process, with --strategy adc or budget"),
+    ))
+    # fmt: on
+    resumes = True
+    needs = Needs(depth=True, ranks=False)
+    against = {"strategy=mcmc": "which relocates large Gaussians; use adc or budget"}
+    shell = None
+
+    def begin(self, run: Any, state: Any) -> None:
+        from splatting.parts.sky import shell
+
+        self._run = run
+        if state is not None:
+            self.shell = shell.resumed_shell(state, run.scene)
+        elif run.start:
+            print("--sky auto: the checkpoint has no sky, and a sky is added only when a training starts")
+        else:
+            self.shell = shell.with_shell(run.scene, run.gaussians)
+        if self.shell:
+            fill(run.gaussians, "pinned", self.shell.rows, self)
+
+    def terms(self, at: "Iteration") -> dict[str, Term]:
+        points = self.shell and self.shell.at(at.camera, self._run.scene)
+        return {"sky": lambda package, mask: points.loss(package["depth"], mask)} if points else {}
+
+    def after_change(self, at: "Iteration") -> None:
+        if self.shell:
+            self.shell.hold(self._run.gaussians)
+
+    def state(self) -> dict[str, Any] | None:
+        return self.shell and self.shell.captured()
+
+    def facts(self) -> dict[str, Any]:
+        return {self.name: self.shell.captured()} if self.shell else {}

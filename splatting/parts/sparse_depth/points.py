@@ -1,0 +1,30 @@
+"""The points of structure from motion that training photos have seen, as depths of their views."""
+
+from scene.cameras import Camera
+from scene.point_depths import PointDepths, points_of
+from scene.readers.tracks import read_tracks
+from scene.scene import Scene
+from utils.system_utils import UserError
+
+
+class SeenPoints:
+    """The points of all training views. `at` has those of a view at its size."""
+
+    def __init__(self, scene: Scene, source_path: str, weight: float) -> None:
+        """UserError for a scene without tracks."""
+        self._views, self._weight = scene.info.train_cameras, weight
+        self._tracks = read_tracks(source_path, self._views, scene.info.offset)
+        self._known: dict[tuple[int, int, int], PointDepths | None] = {}
+        if not any(self._tracks):
+            raise UserError(
+                "--sparse_depth needs the tracks of a COLMAP model, the places of its points in photos that are no "
+                f"panoramas, and {source_path} has none; leave it out"
+            )
+
+    def at(self, camera: Camera) -> PointDepths | None:
+        """The points that train a view; None if there are none."""
+        key = camera.uid, camera.image_width, camera.image_height
+        if key not in self._known:
+            track = self._tracks[camera.uid]
+            self._known[key] = track and points_of(camera, self._views[camera.uid], track, self._weight)
+        return self._known[key]

@@ -1,0 +1,167 @@
+"""The manual of parts: what a feature adds to a training, in one class, which lies in one folder.
+
+A part is a subclass of `Part` in splatting/parts/NAME/part.py, and a line in splatting/parts/__init__.py. The place of
+that line is the part's in the one order of all hooks. Outside of its folder nobody names it. Hooks are optional; those
+that a
+class does not override cost nothing. This module and every part.py import nothing heavy, as `train.py --help` reads
+them: the method itself lies in further modules of the folder, which hooks import.
+
+A run (splatting/training/run.py), in the order in which it calls the hooks:
+
+check        The options and the checkpoint are read. Refuse here what can be refused.
+dataset      The photos, cameras and points are found. Scenes that are made without a run call it, too.
+begin        The Gaussians exist. In a new training they have no optimiser yet, so rows may be added.
+terms        In each iteration, before its step: what it adds to the loss.
+begins, due, measured, stepped, ended
+             What observers see. The core's own (splatting/training/observers) are parts without a name.
+after_step   The optimiser has taken its step.
+after_change The same, where rows, the SH degree or sizes have changed.
+state        A checkpoint is written. It keeps the state by the part's name, and gives it back to `begin`.
+facts        model.json is written, when the training begins and with the last save.
+final        The last save is written: it may be of another model.
+
+What only one part can give is a slot of the run or of the model, with a neutral default that the part replaces in
+`begin`; a second one that does so is refused by `fill`:
+
+model.pinned which Gaussians density control leaves where they are, and as large as they are
+run.counts   which pixels of a view count in its loss
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
+
+from splatting.training.option import Option
+from utils.system_utils import UserError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from scene.readers.info import SceneInfo
+    from splatting.training.iteration import Iteration
+    from splatting.training.objective import Losses
+
+Error: TypeAlias = BaseException | None
+# Scalar of a render's package and of the mask of the pixels that count, (1, H, W) bool or None.
+Term: TypeAlias = "Callable[[dict[str, Any], Tensor | None], Tensor]"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of a part, by the group that they belong to."""
+
+    model: tuple[Option, ...] = ()
+    pipeline: tuple[Option, ...] = ()
+    optimisation: tuple[Option, ...] = ()
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a part asks of the steps. It is data, because a captured step cannot ask anybody while it replays.
+
+    depth: steps that have terms of the part render depth. replay: a step that is taken twice gives the same; if not,
+    the host does not run ahead of a GPU. ranks: it works with several processes. files: it reads files of the scene
+    besides photos.
+    """
+
+    depth: bool = False
+    replay: bool = True
+    ranks: bool = True
+    files: bool = False
+
+
+class Part:
+    """Base of all parts.
+
+    name: of its folder, and the key of its state. options: that it declares. switch: the one of them that brings the
+    part in where it is given another value than its default; empty: the one that is named like the part. resumes:
+    whether the state in a checkpoint brings the part in as well. against: what it does not work with, as `option` or
+    `option=value`, and the rest of a sentence that says why, and what to do. reads_model: whether it reads the model in
+    iterations that are due for it; blocks that sleep are brought up to date for that. shown: names of terms whose
+    running mean the progress bar shows, with what it calls them. follows_length: whether its steps depend on
+    --iterations, so that a shorter training is not the beginning of a longer one.
+    """
+
+    name: ClassVar[str] = ""
+    options: ClassVar[Options] = Options()
+    switch: ClassVar[str] = ""
+    resumes: ClassVar[bool] = False
+    needs: ClassVar[Needs] = Needs()
+    against: ClassVar[dict[str, str]] = {}
+    reads_model: ClassVar[bool] = True
+    shown: ClassVar[dict[str, str]] = {}
+    follows_length: ClassVar[bool] = False
+
+    @classmethod
+    def wanted(cls, given: argparse.Namespace) -> bool:
+        """Whether the options ask for the part."""
+        groups = cls.options
+        every = {option.name: option for option in (*groups.model, *groups.pipeline, *groups.optimisation)}
+        option = every[cls.switch or cls.name]
+        return getattr(given, option.name, option.default) != option.default
+
+    def check(self, run: Any) -> None:
+        """Refuse what cannot be trained (UserError). Nothing is written yet."""
+
+    def dataset(self, info: "SceneInfo", args: argparse.Namespace, fresh: bool) -> "SceneInfo":
+        """The dataset with other views or points. args: the model options. fresh: it is read for a new training."""
+        return info
+
+    def begin(self, run: Any, state: Any) -> None:
+        """Take part in a training. state: its entry of the checkpoint; None: a new training, or one that had none."""
+
+    def terms(self, at: "Iteration") -> "dict[str, Term]":
+        """What the iteration adds to the loss, weights included, by names for logs."""
+        return {}
+
+    def after_step(self, at: "Iteration") -> None:
+        """The optimiser has taken the iteration's step."""
+
+    def after_change(self, at: "Iteration") -> None:
+        """Rows, the SH degree or sizes of views have changed, after `after_step`."""
+
+    def state(self) -> Any:
+        """What a checkpoint keeps, as tensors and plain values; None: nothing."""
+
+    def facts(self) -> dict[str, Any]:
+        """Entries of model.json."""
+        return {}
+
+    def final(self, model: Any, iteration: int) -> tuple[Any, int]:
+        """The model of the last save and its iteration, in place of the trained one."""
+        return model, iteration
+
+    def due(self, at: "Iteration") -> bool:
+        """Whether this iteration reads the model or a loss, or writes something. Asked once, when it begins.
+
+        If so, all steps before it are done by then, and every loss so far is checked first in `measured`. Otherwise the
+        GPU may be some steps behind in `measured` and `stepped`, so what these get must not be read, only noted.
+        """
+        raise NotImplementedError
+
+    def begins(self, at: "Iteration") -> None:
+        """The iteration begins, with its view."""
+
+    def measured(self, at: "Iteration", losses: "Losses") -> None:
+        """The losses are computed. If the iteration is due, the model is still the one that was rendered."""
+
+    def stepped(self, at: "Iteration") -> None:
+        """Density control and optimiser are done; the model is that of the next iteration."""
+
+    def ended(self, error: Error) -> None:
+        """Training is over: after its last iteration (None), or by an error, which may be replaced by raising."""
+
+
+def overrides(parts: Sequence[Part], hook: str) -> list[Callable]:
+    """The bound hooks of the parts whose class overrides it."""
+    plain = getattr(Part, hook)
+    return [getattr(part, hook) for part in parts if getattr(type(part), hook) is not plain]
+
+
+def fill(owner: Any, slot: str, value: Any, part: Part) -> None:
+    """Let a part provide a slot. UserError if another part does already."""
+    providers = owner.__dict__.setdefault("_providers", {})
+    if (other := providers.setdefault(slot, part.name)) != part.name:
+        raise UserError(f"--{part.name} does not work with --{other}: both decide on {slot}; leave one of them out")
+    setattr(owner, slot, value)

@@ -1,0 +1,166 @@
+"""Rules of parts (splatting/training/part.py): nobody names one outside of its folder, and each can be deleted."""
+
+import argparse
+import ast
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+from synthetic import make_colmap_scene
+
+from splatting.parts import PARTS, part_class
+from splatting.training.part import Options, Part, fill, overrides
+from utils.system_utils import UserError
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / "splatting" / "parts"
+ROOMS = ("arguments", "gaussian_renderer", "integrations", "splatting", "scene", "utils")
+COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "export", "view")
+
+
+def _options(name: str) -> set[str]:
+    groups = part_class(name).options
+    return {option.name for option in (*groups.model, *groups.pipeline, *groups.optimisation)}
+
+
+def _files(name: str) -> Iterator[Path]:
+    """All Python files of the project that may not know a part: those outside of its folder, but the registry.
+
+    splatting/compat has the reference's functions, whose parameters have names of its options.
+    """
+    found = [*(path for room in ROOMS for path in (ROOT / room).rglob("*.py")), *(ROOT / f"{c}.py" for c in COMMANDS)]
+    known = FOLDER / name, ROOT / "splatting" / "compat"
+    yield from (path for path in found if not {*known} & {*path.parents} and path != FOLDER / "__init__.py")
+
+
+@cache
+def _nodes(path: Path) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+
+
+def _names_of(name: str, path: Path) -> Iterator[str]:
+    """Lines of a file that import a part, or say the name of one of its options."""
+    options = _options(name)
+    typed = re.compile(rf"--({'|'.join(map(re.escape, sorted(options)))})\b")
+    for node in _nodes(path):
+        if isinstance(node, ast.ImportFrom):
+            found = f"splatting.parts.{name}" in f"{node.module}." or any(
+                f"{node.module}.{alias.name}" == f"splatting.parts.{name}" for alias in node.names
+            )
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            found = node.value in options or typed.search(node.value)
+        elif isinstance(node, ast.Attribute):
+            found = node.attr in options and not (isinstance(node.value, ast.Name) and node.value.id == "self")
+        else:
+            continue
+        if found:
+            yield f"{path.relative_to(ROOT)}:{node.lineno}"
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_nobody_names_a_part_outside_of_its_folder(name):
+    assert [line for path in _files(name) for line in _names_of(name, path)] == []
+
+
+def test_what_declares_parts_imports_nothing_heavy():
+    """As every command reads it for its options."""
+    code = (
+        "import sys; from splatting.parts import PARTS, part_class; list(map(part_class, PARTS)); print(*sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert not {"torch", "numpy", "scene", "arguments"} & {*done.stdout.split()}
+
+
+# A program in which a part is not there: neither its line of the registry nor its folder.
+WITHOUT = """
+import sys
+import splatting.parts as registry
+name, *words = sys.argv[1:]
+registry.PARTS = tuple(other for other in registry.PARTS if other != name)
+sys.modules[f"splatting.parts.{name}"] = None
+"""
+IMPORTED = """
+from importlib import import_module
+from pathlib import Path
+for room in words:
+    paths = Path(room).rglob("*.py") if Path(room).is_dir() else [Path(room)]
+    for path in sorted(paths):
+        module = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
+        if not module.startswith((f"splatting.parts.{name}", "integrations")) and not module.endswith("__main__"):
+            import_module(module)
+from arguments import OPTIONS
+print(*(option.name for option in OPTIONS))
+"""
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_without_a_part_all_else_imports_and_lacks_its_options_alone(name):
+    words = [name, *ROOMS, *(f"{command}.py" for command in COMMANDS)]
+    command = [sys.executable, "-c", WITHOUT + IMPORTED, *words]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    every = {option for other in PARTS for option in _options(other)}
+    there = {*done.stdout.split()}
+    assert not there & _options(name) and every - _options(name) <= there
+
+
+TRAINED = """
+import doctor, export, render, train
+scene, out = words
+short = ["--iterations", "20", "--test_iterations", "20", "--eval", "-r", "48", "--disable_viewer"]
+train.main(["-s", scene, "-m", out, *short])
+for command, line in ((render, ["-m", out]), (doctor, ["-m", out]), (export, ["-m", out, "--to", out + "/a.ply"])):
+    sys.argv = [command.__name__, *line]
+    try:
+        command.main()
+    except SystemExit as ended:
+        assert not ended.code or command is doctor
+"""
+
+
+@pytest.fixture(scope="module")
+def scene(once) -> Path:
+    return once("scene_of_parts", make_colmap_scene)
+
+
+def _trained(scene: Path, out: Path, name: str) -> bytes:
+    command = [sys.executable, "-c", WITHOUT + TRAINED, name, str(scene), str(out)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return (out / "point_cloud/iteration_20/point_cloud.ply").read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PARTS)
+def test_without_a_part_a_training_has_the_bytes_of_one_with_the_part_off(name, scene, tmp_path, once):
+    once("of_all_parts", lambda folder: _trained(scene, folder, "none"))
+    whole = once("of_all_parts", None) / "point_cloud/iteration_20/point_cloud.ply"
+    assert _trained(scene, tmp_path / "out", name) == whole.read_bytes()
+
+
+def test_hooks_that_are_not_overridden_are_not_called():
+    class Counting(Part):
+        def stepped(self, at: object) -> None: ...
+
+    parts = [Part(), Counting()]
+    assert [hook.__self__ for hook in overrides(parts, "stepped")] == parts[1:] and not overrides(parts, "ended")
+
+
+def test_a_second_provider_of_a_slot_is_refused_with_both_names():
+    class One(Part):
+        name = "one"
+
+    class Other(Part):
+        name = "other"
+
+    run = argparse.Namespace()
+    fill(run, "counts", 1, One())
+    fill(run, "counts", 2, One())
+    assert run.counts == 2
+    with pytest.raises(UserError, match="--other does not work with --one: both decide on counts"):
+        fill(run, "counts", 3, Other())
+    assert run.counts == 2 and Options() == Options()
