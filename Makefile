@@ -59,7 +59,7 @@ demo: demo-plan install output/demo_scene
 
 demo-plan:
 	@echo 'The demo makes a ray-traced scene, trains 1,500 iterations, renders and scores the test views:'
-	@echo 'about 3 minutes on two cores, of which setting up .venv takes one if it is missing.'
+	@echo 'one to three minutes on two cores, and one to four more to set up .venv if it is missing.'
 
 output/demo_scene: | install
 	$(BIN)/python -m splatting.demo.make_scene $@

@@ -76,9 +76,6 @@ class ModelParams(OptionTable):
                  "the rasterizer knows the camera model; undistort: resample them to pinhole images when they are "
                  "loaded; auto: native, but as before in a resumed training, and undistort in code that does not "
                  "train by train.py"),
-        Option("refine_poses", False, origin="ours", stored=MODEL_JSON,
-            help="train a small correction of each training camera's pose with the Gaussians. The tracks of a COLMAP "
-                 "scene hold the cameras, and place the test views"),
         Option("appearance", "none", origin="ours", check=one_of("none", "affine", "ppisp"), stored=MODEL_JSON,
             help="how photos of different exposure train. affine: --train_test_exp; ppisp: exposure and white balance "
                  "of each photo, vignetting and response of each camera, with the test photos held out; exports and "
@@ -173,9 +170,6 @@ class OptimizationParams(OptionTable):
         Option("densify_until_iter", 15_000, "densification ends before this step", "paper", check=at_least(0)),
         Option("densify_grad_threshold", 0.0002, origin="paper", check=above(0),
             help="screen-space gradient (per NDC unit) that makes a Gaussian clone or split; lower: more Gaussians"),
-        Option("filter_3d", False, origin="ours",
-            help="let no Gaussian be finer than the training photos can show, so that views from other distances look "
-                 "right. It is part of the PLY, so that every viewer shows it; best with --antialiasing"),
         *options_of("optimisation"),
         Option("random_background", False,
             help="a new random background in every step, so that no Gaussian imitates a fixed one"),

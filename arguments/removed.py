@@ -4,7 +4,7 @@ _CONSTANT = "its default is now the only value; leave it out"
 
 REMOVED: dict[str, str] = {
     "target_psnr": "bound the time instead by --time_budget, and read what is reached from error_vs_time.csv",
-    "refine_lens": "let the program that placed the photos refine their lenses; --refine_poses corrects poses",
+    "refine_lens": "let the program that placed the photos refine their lenses",
     "parallel": "leave it out, as processes of torchrun always share each view by tiles",
     "whole_curve": "leave it out, as the last point of the curve scores all test views",
     "viewer_exit": "leave it out; the page ends by its button or by Ctrl-C",

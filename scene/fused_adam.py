@@ -10,7 +10,6 @@ from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam, SparseGaussianAdam
-from scene.gaussians.filter_3d import chain_of
 from scene.gaussians.mcmc import NO_PENALTY, Penalty
 
 # In the operator's order (gs::Stepped).
@@ -89,9 +88,9 @@ class FusedAdam:
         """
         gaussians, view, *options = scene.lists
         model = self._gaussians
-        if model.filter_3d is not None:
+        if model.drawn is not None:
             raw = model.raw("opacity").detach(), model.raw("scaling").detach()
-            gaussians += [*raw, chain_of(*raw, scene.opacities, scene.scales)]
+            gaussians += [*raw, model.drawn.chain(*raw, scene.opacities, scene.scales)]
         view = view if awake is None else (*view, awake)
         # By place: names would cost the operator microseconds.
         arguments = source, planes, [], radii, *self.arguments(observe, camera), now, absolute
@@ -110,7 +109,7 @@ class FusedAdam:
     def places(self) -> tuple[int, ...]:
         """Number of Gaussians, and where all tensors of a step lie, to see whether one was replaced."""
         tensors = [t for one in self._stepping() for t in (one.param, one.state["exp_avg"], one.state["exp_avg_sq"])]
-        tensors += [*self._statistics(), *([] if (it := self._gaussians.filter_3d) is None else [it])]
+        tensors += [*self._statistics(), *self._gaussians.columns.values()]
         return len(self._gaussians), *[tensor.data_ptr() for tensor in tensors]
 
     @property

@@ -7,18 +7,17 @@ import argparse
 import os
 import re
 from pathlib import Path
-from typing import Any
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import Rows
-from scene.gaussians.checkpoint import FILTER, further, load_checkpoint, unpack
-from scene.gaussians.filter_3d import check_widths, filtered
+from scene.gaussians.checkpoint import load_checkpoint, states_of, unpack
 from scene.gaussians.finite import warn_of_undrawn
 from scene.gaussians.ply import read_ply
 from scene.gaussians.ppisp import Ppisp
 from scene.saved_iterations import saved_ply
 from scene.scene import Scene
 from splatting.files.json_files import read_model_json
+from splatting.parts import states_in, tools
 from utils.system_utils import UserError, saved_iterations
 
 APPEARANCE = "appearance"  # entry of model.json, of a training that has one
@@ -55,7 +54,7 @@ def read_model(path: Path, sh_degree: int | None = None) -> GaussianModel:
         capture, _ = load_checkpoint(path)
         degree = _degree(capture[3].shape[1])  # of f_rest
         gaussians = GaussianModel(degree if sh_degree is None else sh_degree)
-        rows = _drawn(unpack(capture, gaussians._attributes, gaussians.max_sh_degree).rows, further(capture, FILTER))
+        rows = _drawn(unpack(capture, gaussians._attributes, gaussians.max_sh_degree).rows, capture)
     else:
         rows = read_ply(path, sh_degree)
         gaussians = GaussianModel(_degree(rows["f_rest"].shape[1]))
@@ -65,13 +64,12 @@ def read_model(path: Path, sh_degree: int | None = None) -> GaussianModel:
     return gaussians
 
 
-def _drawn(rows: Rows, widths: Any) -> Rows:
-    """A checkpoint's rows behind its 3D filter, as its PLY would have them. widths: of the filter (N, 1), or None."""
-    if widths is None:
-        return rows
-    check_widths(widths, len(rows["xyz"]))
-    opacity, scaling = filtered(rows["opacity"], rows["scaling"], widths.to(rows["xyz"].device))
-    return rows | {"opacity": opacity, "scaling": scaling}
+def _drawn(rows: Rows, capture: tuple) -> Rows:
+    """A checkpoint's rows as its PLY would have them."""
+    states = states_in(states_of(capture))
+    for drawn in tools("drawn"):
+        rows = drawn(rows, states)
+    return rows
 
 
 def _degree(coefficients: int) -> int:

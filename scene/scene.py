@@ -19,7 +19,6 @@ from scene.gaussians.ppisp import UNTRAINED, Ppisp
 from scene.half_images import half, train_on_all
 from scene.images.masks import MaskOptions, check_masks
 from scene.images.store import ImageStore, Picture, image_device
-from scene.pose_file import with_poses, write_poses
 from scene.readers.info import CameraInfo, SceneInfo, exposure_names, photo_size
 from scene.readers.point_cloud import write_point_cloud
 from scene.readers.scene_folder import kind_of
@@ -64,8 +63,8 @@ class Scene:
             self.loaded_iter = find_iteration(self.model_path, load_iteration)
         self._halves = bool(getattr(args, "train_test_exp", False))
         self._appearance = getattr(args, "appearance", "none") == Ppisp.kind
-        self._refines = bool(getattr(args, "refine_poses", False)) and not getattr(args, "other_scene", "")
         self._parts = chosen(args) if parts is None else parts
+        self._moved = any(part.needs.camera_gradient for part in self._parts) and not getattr(args, "other_scene", "")
         self.info = self._read(args)
         self.cameras_extent = self.info.extent
 
@@ -116,8 +115,6 @@ class Scene:
         if self._halves:
             info = train_on_all(info)
         self._given = info.test_cameras
-        if self._refines and not fresh:
-            info = with_poses(info, self.model_path)
         return self._changed(info, args, fresh)
 
     def _changed(self, info: SceneInfo, args: argparse.Namespace, fresh: bool) -> SceneInfo:
@@ -135,8 +132,8 @@ class Scene:
         return self.test_cameras[scale]
 
     def given_test_views(self) -> list[Camera]:
-        """Copies of the held-out views as the dataset has them, where poses are refined; none elsewhere."""
-        views = [copy.copy(camera) for camera in self.getTestCameras()] if self._refines else []
+        """Copies of the held-out views as the dataset has them, where training moves views; none elsewhere."""
+        views = [copy.copy(camera) for camera in self.getTestCameras()] if self._moved else []
         for camera in views:
             given = self._given[camera.uid]
             camera.place(given.R, given.T)
@@ -147,7 +144,7 @@ class Scene:
         self.images.prefetch(self._pictures(cameras))
 
     def save(self, iteration: int, gaussians: SceneGaussians | None = None) -> None:
-        """Write `point_cloud/iteration_N/point_cloud.ply`, and exposures and poses if they are trained.
+        """Write `point_cloud/iteration_N/point_cloud.ply`, exposures if they are trained, and what parts write.
 
         gaussians: written in place of the scene's own; the exposures are always the scene's.
         """
@@ -155,9 +152,9 @@ class Scene:
         (self.gaussians if gaussians is None else gaussians).save_ply(str(saved_ply(self.model_path, iteration)))
 
     def save_views(self) -> None:
-        """Write `poses.json`, and `exposure.json` or `appearance.json`, if poses or the photos' look are trained."""
-        if self._refines:
-            write_poses(self.model_path, self.getTrainCameras(), self.getTestCameras())
+        """Write `exposure.json` or `appearance.json` if the photos' look is trained, and what parts write."""
+        for part in self._parts:
+            part.save(self)
         if self._appearance:
             self.gaussians.save_exposures(self.model_path)
         if self._halves:

@@ -19,8 +19,8 @@ from torch import Tensor
 from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.filter_3d import sampling_rate
 from scene.gaussians.spilled import is_spilled, to_host
+from scene.sampling_rate import sampling_rate
 from splatting.distributed.rows import BLOCK, PIECE
 from utils.system_utils import UserError
 

@@ -13,6 +13,7 @@ from synthetic import FOCAL, make_colmap_scene
 
 import train
 from scene.readers.point_cloud import write_point_cloud
+from splatting.parts.filter_3d import part as filter_3d
 from splatting.parts.robust_mask import residuals
 from splatting.training import loop, run
 from splatting.training.iteration import Iteration
@@ -104,7 +105,7 @@ def trained(scene: Path, out: Path, *options: object) -> dict[str, bytes | list]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stdout", sys.stdout)  # training stamps it
         patch.setattr(run, "SH_INTERVAL", 12)  # between the iterations that change rows
-        patch.setattr(run, "FILTER_INTERVAL", 15)
+        patch.setattr(filter_3d, "INTERVAL", 15)
         patch.setattr(residuals.Residuals, "early", 0)  # renders are far from the photos
         patch.setattr(residuals, "_FACTOR", 1.2)
         patch.setattr(residuals, "_BESIDE", 0.4)

@@ -40,7 +40,6 @@ class WorkloadRun(Run):
         words += ["--strategy", "adc", "--gpu_memory", str(gpu_memory)]
         self.launch, self.dataset, self.opt, self.pipe = train.parse(words)
         self.lost = self.first_iteration = 0
-        self.poses = None
         self.interrupt, self.device = DeferredInterrupt(), compute_device()
         self.schedule = schedule_of(self.opt, None, 0)
         images = SimpleNamespace(ahead=0, keep_on=torch.device("cpu"), planned_bytes=0)

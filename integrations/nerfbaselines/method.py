@@ -37,7 +37,7 @@ INTERVAL = 100  # iterations between losses that are told: reading one waits for
 # Test views are held out by NerfBaselines. Full-size photos, no viewer, and nothing written but by `save`.
 _ALWAYS = ("--eval", "--resolution=1", "--disable_viewer", "--no_curve", "--test_iterations=-1", "--save_iterations=-1")
 _PARTS = [part_class(name) for name in PARTS]
-_OF_FILES = ("appearance", "init_ply", "masks", "train_test_exp", "refine_poses")
+_OF_FILES = ("appearance", "init_ply", "masks", "train_test_exp")
 _OF_FILES += tuple(part.switch or part.name for part in _PARTS if part.needs.files)
 # Options that nothing follows here, with the value that is the case. Our other observers score, save and show.
 _FIXED = dict.fromkeys(

@@ -245,6 +245,8 @@ def prune_points(gaussians: GaussianParameters, mask: Tensor) -> None:
         values = getattr(gaussians, name, None)  # users delete those that they do not need
         if values is not None:
             setattr(gaussians, name, values.index_select(0, keep))
+    for name, values in gaussians.columns.items():
+        gaussians.columns[name] = values.index_select(0, keep)
 
 
 def reset_opacity(gaussians: GaussianParameters) -> None:

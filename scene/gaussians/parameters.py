@@ -5,12 +5,12 @@ import math
 import os
 from collections.abc import Callable
 from operator import attrgetter
+from types import MappingProxyType
 
 import torch
 from torch import Tensor, nn
 
 from scene.gaussians.attributes import Attribute, Rows, attributes
-from scene.gaussians.filter_3d import filtered
 from scene.gaussians.finite import warn_of_undrawn
 from scene.gaussians.ply import FLAT, column_names, read_ply, row_bytes, write_ply
 from scene.gaussians.spilled import is_spilled, room_for, to_host
@@ -52,8 +52,9 @@ class GaussianParameters:
     pinned: tells which of means (N,3) density control leaves, of any size, (N,) bool; None: it may remove all.
     max_radii2D, xyz_gradient_accum, denom: observations since the last densification (Statistics has shapes and units).
     optimizer: any of torch's, with `name` in its groups; None until training is set up. tmp_radii: (N,) pixels of the
-    present view, or None; density control keeps it in step with the rows. filter_3d: (N, 1) standard deviation of the
-    3D filter (scene/gaussians/filter_3d.py), world units, or None; what is drawn or written as a PLY is behind it.
+    present view, or None; density control keeps it in step with the rows. columns: further values
+    (N, ...) by name that move with the rows, zero in new ones. drawn: from raw opacities and scales to those that are
+    drawn or written as a PLY, and by `chain` the derivatives (scene/fused_adam.py); None: the same.
     """
 
     # What a subclass need not set whose __init__ sets the reference's attributes and does not call this one.
@@ -65,7 +66,8 @@ class GaussianParameters:
     pinned: Callable[[Tensor], Tensor] | None = None
     optimizer: torch.optim.Optimizer | None = None
     tmp_radii: Tensor | None = None
-    filter_3d: Tensor | None = None
+    columns: dict[str, Tensor] = MappingProxyType({})
+    drawn: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]] | None = None
 
     _xyz: Tensor
     _features_dc: Tensor
@@ -176,9 +178,9 @@ class GaussianParameters:
         return self.covariance_activation(self.get_scaling, scaling_modifier, self._rotation)
 
     def _drawn_shapes(self) -> tuple[Tensor, Tensor]:
-        """Raw opacities and scales behind the 3D filter, if there is one."""
+        """Raw opacities and scales as they are drawn."""
         raw = self._opacity, self._scaling
-        return raw if self.filter_3d is None else filtered(*raw, self.filter_3d)
+        return raw if self.drawn is None else self.drawn(*raw)
 
     def raw_geometry(self) -> dict[str, Tensor]:
         """Raw shapes by the rasterizer's names: opacities (N, 1) logit, scales (N, 3) log, rotations (N, 4) wxyz."""
@@ -267,11 +269,11 @@ class GaussianParameters:
         self.active_sh_degree = self.max_sh_degree
 
     def save_ply(self, path: str | os.PathLike) -> None:
-        """Write the raw parameters, behind the 3D filter, as a PLY in the reference's layout."""
+        """Write the raw parameters, as they are drawn, as a PLY in the reference's layout."""
         write_ply(path, self.drawn_rows(), self._degree_of_tensors(), self.world_offset, shards=self.shards)
 
     def drawn_rows(self) -> Rows:
-        """Raw values by optimiser group, behind the 3D filter."""
+        """Raw values by optimiser group, as they are drawn."""
         opacity, scaling = (values.detach() for values in self._drawn_shapes())
         return raw_rows(self) | {"opacity": opacity, "scaling": scaling}
 
@@ -283,7 +285,7 @@ class GaussianParameters:
     def part(self, keep: Tensor | slice, sh_degree: int) -> "GaussianParameters":
         """A copy of the Gaussians `keep`, (N,) bool or a slice, with the SH bands up to sh_degree; no optimiser.
 
-        It looks the same without a 3D filter.
+        It looks the same.
         """
         rows = self.drawn_rows()
         rest = rows.pop("f_rest")[:, : (sh_degree + 1) ** 2 - 1]
@@ -304,7 +306,7 @@ class GaussianParameters:
         return {name: values.index_select(0, indices) for name, values in raw_rows(self).items()}
 
     def set_rows(self, rows: Rows) -> None:
-        """Take raw values of any number of Gaussians by optimiser group, with new statistics and no 3D filter.
+        """Take raw values of any number of Gaussians by optimiser group, with new statistics, and no further columns.
 
         They move to the device that computes.
         """
@@ -315,7 +317,7 @@ class GaussianParameters:
             room = room_for(self, name, like, len(rows[name]))
             params[name] = nn.Parameter(rows[name].to(device) if room is None else room.copy_(rows[name].detach()))
         self._take(params)
-        self.filter_3d = None
+        self.columns, self.drawn = {}, None
         self.shards = self.shards.of(len(self))
         self._zero_statistics()
 

@@ -57,4 +57,4 @@ class Statistics:
 
 
 NAMES = tuple(field.name for field in fields(Statistics))
-PER_ROW = *NAMES, "tmp_radii", "filter_3d"  # attributes of a model with a row per Gaussian, unless they are None
+PER_ROW = *NAMES, "tmp_radii"  # attributes of a model with a row per Gaussian, unless they are None

@@ -83,8 +83,8 @@ class GaussianTable:
 
         try:
             params = self._map(groups, grow)
-            if (widths := getattr(self._model, "filter_3d", None)) is not None:  # of new rows it is yet to be computed
-                self._model.filter_3d = torch.cat((widths, widths.new_zeros(len(rows["xyz"]), 1)))
+            for name, values in self._columns.items():
+                self._columns[name] = torch.cat((values, values.new_zeros(len(rows["xyz"]), *values.shape[1:])))
             return params
         except (MemoryError, RuntimeError) as error:
             if is_out_of_memory(error):
@@ -103,6 +103,13 @@ class GaussianTable:
             values = getattr(model, name, None)  # users delete those that they do not need
             if values is not None:
                 setattr(model, name, change(values))
+        for name, values in self._columns.items():
+            self._columns[name] = change(values)
+
+    @property
+    def _columns(self) -> dict[str, Tensor]:
+        """Further columns of a model, which one of other code may lack."""
+        return getattr(self._model, "columns", {})
 
     def replace(self, name: str, value: Tensor) -> dict[str, nn.Parameter]:
         """Give a parameter other values, and averages of zero. Returns it by name; {} for a name that is not there."""

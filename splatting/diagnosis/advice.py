@@ -27,7 +27,6 @@ from scene.readers.info import CameraInfo
 from scene.readers.tracks import Track, read_tracks
 from scene.scene import Scene
 from splatting.diagnosis import Line
-from splatting.diagnosis.dataset import pose_errors, poses_differ
 from splatting.diagnosis.model import load_scored
 from splatting.distributed.ranks import ranks
 from splatting.files.json_files import write_json
@@ -40,11 +39,10 @@ EXPOSURES = 0.4  # stops; photos of a usual automatic exposure differ by 0.15 to
 DISTANCES = 2.5  # the farthest photo of a point over the nearest
 _AGAINST = {  # by an advised option: the options, with these values, that it does not go with, besides those of parts
     "--appearance": {"train_test_exp": True},
-    "--refine_poses": {"projection": "ray"},
 }
 _OFF = (False, "", "none", "off")  # values of options that do nothing; 0 is equal to False
 _NOT_OF_DATA = {  # model options that the short training of small photos has itself, or does without
-    "sh_degree", "model_path", "resolution", "train_test_exp", "refine_poses", "appearance",
+    "sh_degree", "model_path", "resolution", "train_test_exp", "appearance",
 } | {option.name for option in options_of("model")}  # fmt: skip
 _WIDTH = 200  # pixels of a photo
 _DARK, _LIGHT = 0.02, 0.98  # of a channel; beyond, an exposure cannot be told
@@ -155,9 +153,6 @@ def _of_tracks(scene: Scene, tracks: list[Track | None]) -> Iterator[Advice]:
     ratio = distances(views, tracks)
     text = f"the farthest photo of a point is {ratio:.1f} times as far away as the nearest (median)"
     yield _asked(text, ratio > DISTANCES, "--antialiasing")
-    given, best = pose_errors(views, tracks, scene.cameras_extent)
-    text = f"points lie {given:.2g} pixels from where photos show them (median), and {best:.2g} with better poses"
-    yield _asked(text, poses_differ(given, best), "--refine_poses")
 
 
 def _asked(text: str, asks: bool, options: str) -> Advice:

@@ -11,13 +11,13 @@ import numpy as np
 
 from scene.check import findings
 from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
+from scene.pose_errors import ADJUSTED, COMPARED, pose_errors, poses_differ
 from scene.readers.info import NEAREST
 from scene.readers.tracks import Track, read_tracks
-from scene.reprojection import BOUND, nearest_pose, pull
 from splatting.diagnosis import Line, from_error
 from splatting.diagnosis.colors import UNITS, check_colors
 from splatting.files.json_files import read_json
-from utils.graphics_utils import world_to_camera
+from splatting.parts import tools
 from utils.system_utils import UserError
 
 # Learning rates and size limits are fractions of the extent, but depths below 0.2 are culled and float32 is used.
@@ -27,11 +27,9 @@ FEWEST_POINTS = 1000
 REGISTERED = 0.9  # share of the photos
 MOST_PHOTOS = 100  # that are decoded
 _WIDE = 1600
-_COMPARED = 16  # views whose tracks are looked at
 _MOST = 0.75  # share of the views that another cause makes better
 _LONGER = 0.03  # difference of a focal length that counts; tracks tell a hundredth of it
-_ADJUSTED = 0.5  # median error of points with better poses, as a part of that with the given ones,
-_SEEN = 0.2  # if that is more pixels
+_ADJUST = "adjust the model again (COLMAP: bundle_adjuster)"
 _WRONG = 5.0  # pixels, beyond which poses are wrong even if no better ones are near
 
 
@@ -98,7 +96,7 @@ def check_geometry(source: str, info: SceneInfo) -> Iterator[Line]:
 
 def check_focal(views: Sequence[CameraInfo], tracks: Sequence[Track | None]) -> Iterator[Line]:
     """Another focal length, or another unit of the points, with which the tracks fit far better."""
-    step = max(1, len(views) // _COMPARED)
+    step = max(1, len(views) // COMPARED)
     pairs = [pair for pair in zip(views[::step], tracks[::step], strict=True) if pair[1] is not None]
     if not pairs:
         return
@@ -109,7 +107,7 @@ def check_focal(views: Sequence[CameraInfo], tracks: Sequence[Track | None]) -> 
     factor = float(np.median([_longer(*pair) for pair in pairs]))
     longer = np.array([_missed(*pair, factor=factor) for pair in pairs])
     best = units[unit] if np.median(units[unit]) < np.median(longer) else longer
-    if (best < _ADJUSTED * given).mean() < _MOST:
+    if (best < ADJUSTED * given).mean() < _MOST:
         return
     if best is longer and abs(factor - 1) > _LONGER:
         text = f"points fit the photos with focal lengths {factor:.3g} times as long as the given ones"
@@ -144,32 +142,10 @@ def check_poses(views: Sequence[CameraInfo], tracks: Sequence[Track | None], ext
     given, best = found
     text = f"points lie {given:.2g} pixels from where photos show them (median)"
     if poses_differ(given, best):
-        better = "train with --refine_poses, or adjust the model again (COLMAP: bundle_adjuster)"
-        yield Line(f"{text}, and {best:.2g} with better poses", better)
+        remedies = [*(remedy(True) for remedy in tools("for_wrong_poses")), _ADJUST]
+        yield Line(f"{text}, and {best:.2g} with better poses", ", or ".join(remedies))
     elif given > _WRONG:
-        yield Line(text, "adjust the model again (COLMAP: bundle_adjuster); --refine_poses corrects 3 degrees at most")
-
-
-def pose_errors(
-    views: Sequence[CameraInfo], tracks: Sequence[Track | None], extent: float
-) -> tuple[float, float] | None:
-    """Pixels from points to where photos show them (median), with their poses and with the best ones; None: no tracks.
-
-    Of _COMPARED views.
-    """
-    errors, step = [], max(1, len(views) // _COMPARED)
-    for view, track in zip(views[::step], tracks[::step], strict=True):
-        if track is None:
-            continue
-        given = world_to_camera(view.R, view.T)
-        best = nearest_pose(given, track, view.fx, extent, BOUND)
-        errors.append([np.median(pull(pose, track, view.fx, extent).size) for pose in (given, best)])
-    return tuple(np.median(errors, axis=0).tolist()) if errors else None
-
-
-def poses_differ(given: float, best: float) -> bool:
-    """Whether better poses fit the tracks far better (`pose_errors`)."""
-    return given > _SEEN and best < _ADJUSTED * given
+        yield Line(text, "; ".join([_ADJUST, *(remedy(False) for remedy in tools("for_wrong_poses"))]))
 
 
 def _check_registered(path: Path) -> Iterator[Line]:

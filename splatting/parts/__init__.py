@@ -13,11 +13,13 @@ from utils.system_utils import UserError
 
 # Names of folders, with the reason for the place, where there is one.
 PARTS = (
+    "refine_poses",  # its cameras stand right before anything asks where they are
     "depth_maps",
     "keep_best",  # after maps are found: its views have none
     "robust_mask",
     "sky",
     "sparse_depth",  # the order of the terms of the loss is in the bytes of the model
+    "filter_3d",  # after all that moves rows
 )
 
 
@@ -32,7 +34,8 @@ def options_of(group: str) -> list[Option]:
     return [option for name in PARTS for option in getattr(part_class(name).options, group)]
 
 
-_OLD_KEYS = {"residuals": "robust_mask", "best": "keep_best"}  # of states in checkpoints of version 0.2 and before
+# Of states in checkpoints of version 0.2 and before.
+_OLD_KEYS = {"residuals": "robust_mask", "best": "keep_best", "poses": "refine_poses"}
 
 
 def states_in(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
@@ -42,12 +45,17 @@ def states_in(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def chosen(given: argparse.Namespace, states: Collection[str] = ()) -> list[Part]:
-    """The parts that options ask for, and those that resume by a state, in their order.
+    """The parts that options ask for, in their order. UserError for a state that none of them takes, but should.
 
     given: options of all groups. states: names of parts that a checkpoint has states of.
     """
-    kinds = map(part_class, PARTS)
-    return [kind() for kind in kinds if kind.wanted(given) or (kind.resumes and kind.name in states)]
+    parts = []
+    for kind in map(part_class, PARTS):
+        if kind.wanted(given) or (kind.unasked == "joins" and kind.name in states):
+            parts.append(kind())
+        elif kind.unasked == "refused" and kind.name in states:
+            raise UserError(f"{given.start_checkpoint} was trained with --{kind.switch or kind.name}; give that option")
+    return parts
 
 
 def check_together(parts: Collection[Part], given: argparse.Namespace, several: bool) -> None:
@@ -60,8 +68,14 @@ def check_together(parts: Collection[Part], given: argparse.Namespace, several: 
             )
         for other, reason in part.against.items():
             name, _, value = other.partition("=")
-            if str(getattr(given, name, "")) == value if value else getattr(given, name, None):
-                raise UserError(f"--{option} does not work with --{name}{value and ' '}{value}, {reason}")
+            _, _, need = name.partition(".")
+            if need:
+                found = [f"--{one.switch or one.name}" for one in parts if one is not part and getattr(one.needs, need)]
+            else:
+                there = getattr(given, name, None)
+                found = [f"--{name}{value and ' '}{value}"] if (str(there) == value if value else there) else []
+            if found:
+                raise UserError(f"--{option} does not work with {found[0]}, {reason}")
 
 
 def tools(name: str) -> list[Callable]:
@@ -71,6 +85,7 @@ def tools(name: str) -> list[Callable]:
     beside(facts, means): which Gaussians of a model are not of the scene itself. facts: of model.json.
     add_export_options(add), left_out(args, means): options of export.py, and which Gaussians these leave out.
     advise_trained(scene, views): as advise, by a short training. examine(scene, views, options): notes of doctor.py.
+    drawn(rows, states): rows of a checkpoint as its PLY would have them. for_wrong_poses(best): a remedy.
     remarks(lines): lines of a training that reports show. against_overfitting(record): an option to try, or None.
     pictures(model): files in a model folder that reports show, where they are there.
     """

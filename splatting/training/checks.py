@@ -63,18 +63,6 @@ def check_one_process(option: str, several: bool) -> None:
         raise UserError(f"{option} needs a training of one process; leave it out, or start train.py without torchrun")
 
 
-def check_poses(dataset: argparse.Namespace, projection: str = "ewa") -> None:
-    """Refuse to refine poses on rays (UserError)."""
-    if projection == "ray" and getattr(dataset, "refine_poses", False):
-        raise UserError("--projection ray has no gradients of poses; leave --refine_poses out, or use ewa")
-
-
-def check_unrefined(poses: object, checkpoint: str) -> None:
-    """Refuse a checkpoint with refined poses that this run would not use (UserError)."""
-    if poses:
-        raise UserError(f"{checkpoint} was trained with --refine_poses; give that option")
-
-
 def check_photos(appearance: str, count: int) -> None:
     """Refuse an appearance that one photo cannot tell from the scene's (UserError)."""
     if appearance == Ppisp.kind and count < 2:

@@ -11,20 +11,26 @@ A run (splatting/training/run.py), in the order in which it calls the hooks:
 check        The options and the checkpoint are read. Refuse here what can be refused.
 dataset      The photos, cameras and points are found. Scenes that are made without a run call it, too.
 begin        The Gaussians exist. In a new training they have no optimiser yet, so rows may be added.
+ready        Model and optimiser exist.
 terms        In each iteration, before its step: what it adds to the loss.
 begins, due, measured, stepped, ended
              What observers see. The core's own (splatting/training/observers) are parts without a name.
+changes      Asked in each iteration: whether rows, sizes or what is drawn will change in it.
 after_step   The optimiser has taken its step.
 after_change The same, where rows, the SH degree or sizes have changed.
+records      A record of the log is written, or a point of the curve.
 state        A checkpoint is written. It keeps the state by the part's name, and gives it back to `begin`.
 facts        model.json is written, when the training begins and with the last save.
+save         A PLY or a checkpoint is written: own files beside it. Scenes that are made without a run call it, too.
 final        The last save is written: it may be of another model.
 
 What only one part can give is a slot of the run or of the model, with a neutral default that the part replaces in
 `begin`; a second one that does so is refused by `fill`:
 
+model.drawn  what raw opacities and scales are drawn as, and its chain backward; model.columns keeps values per row
 model.pinned which Gaussians density control leaves where they are, and as large as they are
 run.counts   which pixels of a view count in its loss
+run.on_host  takes the steps of cameras, by the gradients of their numbers, on the host: `place`, `step`, `independent`
 """
 
 import argparse
@@ -60,12 +66,17 @@ class Options:
 class Needs:
     """What a part asks of the steps. It is data, because a captured step cannot ask anybody while it replays.
 
-    depth: steps that have terms of the part render depth. replay: a step that is taken twice gives the same; if not,
-    the host does not run ahead of a GPU. ranks: it works with several processes. files: it reads files of the scene
-    besides photos.
+    depth: steps that have terms of the part render depth.
+    camera_gradient: steps compute the gradient of the camera's numbers, for the slot run.on_host.
+    all_rows: every step concerns all rows, so that none may sleep.
+    replay: a step that is taken twice gives the same; if not, the host does not run ahead of a GPU.
+    ranks: it works with several processes.
+    files: it reads files of the scene besides photos.
     """
 
     depth: bool = False
+    camera_gradient: bool = False
+    all_rows: bool = False
     replay: bool = True
     ranks: bool = True
     files: bool = False
@@ -74,19 +85,24 @@ class Needs:
 class Part:
     """Base of all parts.
 
-    name: of its folder, and the key of its state. options: that it declares. switch: the one of them that brings the
-    part in where it is given another value than its default; empty: the one that is named like the part. resumes:
-    whether the state in a checkpoint brings the part in as well. against: what it does not work with, as `option` or
-    `option=value`, and the rest of a sentence that says why, and what to do. reads_model: whether it reads the model in
-    iterations that are due for it; blocks that sleep are brought up to date for that. shown: names of terms whose
-    running mean the progress bar shows, with what it calls them. follows_length: whether its steps depend on
-    --iterations, so that a shorter training is not the beginning of a longer one.
+    name: of its folder, and the key of its state.
+    options: that it declares.
+    switch: the option that brings the part in where it has another value than its default; empty: that named `name`.
+    unasked: what becomes of its state in a checkpoint where no option asks for it: it is "dropped" or "refused", or the
+        part "joins".
+    needs: what it asks of the steps.
+    against: what it does not work with, and the rest of a sentence: why, and what to do. It is `option`,
+        `option=value`, or `needs.NAME`: other parts that need that.
+    reads_model: whether it reads the model in iterations that are due for it; sleeping blocks then catch up first.
+    shown: terms whose running mean the progress bar shows, and what it calls them.
+    follows_length: whether its steps depend on --iterations, so that a shorter training is not the beginning of a
+        longer one.
     """
 
     name: ClassVar[str] = ""
     options: ClassVar[Options] = Options()
     switch: ClassVar[str] = ""
-    resumes: ClassVar[bool] = False
+    unasked: ClassVar[str] = "dropped"
     needs: ClassVar[Needs] = Needs()
     against: ClassVar[dict[str, str]] = {}
     reads_model: ClassVar[bool] = True
@@ -111,15 +127,29 @@ class Part:
     def begin(self, run: Any, state: Any) -> None:
         """Take part in a training. state: its entry of the checkpoint; None: a new training, or one that had none."""
 
+    def ready(self, run: Any) -> None:
+        """The model has its rows and its optimiser."""
+
     def terms(self, at: "Iteration") -> "dict[str, Term]":
         """What the iteration adds to the loss, weights included, by names for logs."""
         return {}
+
+    def changes(self, iteration: int) -> bool:
+        """Whether something changes in an iteration besides its step, so that every loss so far is checked first."""
+        return False
 
     def after_step(self, at: "Iteration") -> None:
         """The optimiser has taken the iteration's step."""
 
     def after_change(self, at: "Iteration") -> None:
         """Rows, the SH degree or sizes of views have changed, after `after_step`."""
+
+    def records(self) -> dict[str, float]:
+        """Numbers for a record of the log."""
+        return {}
+
+    def save(self, scene: Any) -> None:
+        """Write own files into the model folder of a scene, beside a PLY or a checkpoint."""
 
     def state(self) -> Any:
         """What a checkpoint keeps, as tensors and plain values; None: nothing."""

@@ -18,8 +18,7 @@ from gaussian_renderer.rays import check_views
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
-from scene.gaussians.checkpoint import ASLEEP, FILTER, POSES, further, load_checkpoint, states_of, with_further
-from scene.gaussians.filter_3d import check_widths, filter_widths
+from scene.gaussians.checkpoint import ASLEEP, further, load_checkpoint, states_of, with_further
 from scene.gaussians.morton import sort_rows
 from scene.gaussians.ppisp import Ppisp
 from scene.sleeping import MOST_SHARE, REST, Sleeping, share_seen
@@ -38,7 +37,6 @@ from splatting.training.iteration import Iteration, ViewOrder
 from splatting.training.memory_estimate import announce_memory, expected_count, largest_view
 from splatting.training.objective import LossWatch, Objective
 from splatting.training.part import Part, overrides
-from splatting.training.pose_refinement import PoseRefinement
 from splatting.training.resolution import Resolution, resolution_of, smallest
 from splatting.training.restart import resumed
 from splatting.training.schedule import DecidedSchedule
@@ -55,7 +53,6 @@ def bias_correction(step: int, beta1: float = 0.9, beta2: float = 0.999) -> floa
 
 
 SH_INTERVAL = 1000  # iterations between raises of the active SH degree
-FILTER_INTERVAL = 500  # iterations, at most, between updates of the 3D filter: positions hardly move in as many
 
 
 class Run:
@@ -73,6 +70,7 @@ class Run:
     parts: Sequence[Part] = ()
     sleeping: Sleeping | None = None
     counts: Any = None
+    on_host: Any = None
     final_iteration: int | None = None
 
     def __init__(
@@ -129,6 +127,8 @@ class Run:
         self._warn(checks.late_reset(self.density, opt, self.first_iteration))
         self._warn(checks.without_effect(given, opt.strategy))
         self._warn(checks.another_number(self.density, opt, self.gaussians.gaussian_count, self.first_iteration + 1))
+        for ready in self._each("ready"):
+            ready(self)
         if capture is None and first is None:
             self.density.started()
 
@@ -149,18 +149,6 @@ class Run:
         if hook not in self._hooks:
             self._hooks[hook] = overrides(self.parts, hook)
         return self._hooks[hook]
-
-    def _refined_poses(self, capture: tuple | None) -> PoseRefinement | None:
-        """What refines the poses of the views, with the state of a checkpoint; None unless it is asked for."""
-        checks.check_poses(self.dataset, getattr(self.pipe, "projection", "ewa"))
-        state = capture and further(capture, POSES)
-        if not getattr(self.dataset, "refine_poses", False):
-            checks.check_unrefined(state, self.start)
-            return None
-        poses = PoseRefinement(self.scene, self.dataset.source_path, self.opt.iterations)
-        if capture:
-            poses.restore(state)
-        return poses
 
     def _read_start(self) -> tuple[tuple | None, int]:
         """The state of the checkpoint that is resumed, and its iteration. A limit of the GPU's memory begins before."""
@@ -208,7 +196,6 @@ class Run:
         """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""
         self.gaussians.appearance = getattr(self.dataset, "appearance", "none")
         checks.check_photos(self.gaussians.appearance, len(self.scene.getTrainCameras()))
-        self.poses = self._refined_poses(capture)
         if capture is not None:
             self.gaussians.start_exposures(self.scene.info.train_cameras)
             self.gaussians.restore(capture, self.opt)
@@ -225,22 +212,7 @@ class Run:
                 begin(self, None)
             self.gaussians.training_setup(self.opt)
             sort_rows(self.gaussians)
-        if self.opt.filter_3d:
-            self._begin_filter(capture and further(capture, FILTER))
         self.gaussians.limit_columns()
-
-    def _begin_filter(self, kept: Any) -> None:
-        """Compute the 3D filter, or take that of a checkpoint, if it has one."""
-        self._update_filter()
-        if kept is None:
-            return
-        gaussians = self.gaussians
-        check_widths(kept, gaussians.gaussian_count)
-        gaussians.filter_3d = gaussians.shards.own(kept).to(gaussians.filter_3d)
-
-    def _update_filter(self) -> None:
-        views = self.scene.getTrainCameras()
-        self.gaussians.filter_3d = filter_widths(self.gaussians.get_xyz.detach(), views)
 
     def _check_records(self) -> None:
         """Compare this run with those before it, in its folder and beside its checkpoint."""
@@ -318,8 +290,8 @@ class Run:
 
     def _changes(self, iteration: int) -> bool:
         resizes = self.resolution.changes(*map(self.schedule.schedule_step, (iteration - 1, iteration)))
-        filters = self.opt.filter_3d and iteration % FILTER_INTERVAL == 0
-        return self.density.changes(iteration) or self._raises_degree(iteration) > 0 or resizes or filters
+        changes = any([changes(iteration) for changes in self._each("changes")])
+        return self.density.changes(iteration) or self._raises_degree(iteration) > 0 or resizes or changes
 
     def _raises_degree(self, iteration: int) -> int:
         """How often the SH degree is raised in an iteration."""
@@ -369,7 +341,7 @@ class Run:
         """What lets blocks sleep, where it saves something, and a step concerns no row that its view does not see."""
         density = self.density
         dense = type(self.gaussians.optimizer) is GaussianAdam and FusedAdam.takes(self.gaussians)
-        alone = not (density.queues or any(density.penalty) or self.opt.filter_3d)
+        alone = not (density.queues or any(density.penalty) or any(part.needs.all_rows for part in self.parts))
         if not (dense and alone and self.is_standard):
             return None
         saves = self.group.anyone(self.memory.limit > 0) or self._share_seen() < MOST_SHARE
@@ -397,11 +369,11 @@ class Run:
         """Whether all blocks of Gaussians wake after a step."""
         return self.sleeping is not None and step.iteration % REST == 0
 
-    def step_pose(self, step: Iteration, gradient: Tensor) -> None:
-        """Take the step of the view's pose. gradient (numbers,): of the loss by the camera's numbers."""
+    def step_on_host(self, step: Iteration, gradient: Tensor) -> None:
+        """Take the step of the view's camera. gradient (numbers,): of the loss by the camera's numbers."""
         at = self.schedule.schedule_step(step.iteration)
-        self.poses.step(step.camera.uid, gradient.cpu().numpy(), at)
-        self.poses.place()
+        self.on_host.step(step.camera.uid, gradient.cpu().numpy(), at)
+        self.on_host.place()
 
     def after_step(self, step: Iteration) -> None:
         """What follows the optimiser's step."""
@@ -411,8 +383,6 @@ class Run:
         if step.changes:
             for after_change in self._each("after_change"):
                 after_change(step)
-            if self.opt.filter_3d:
-                self._update_filter()
             self.memory.settle(self.gaussians)
         if self.sleeping is None:
             return
@@ -430,12 +400,9 @@ class Run:
 
     def captured(self) -> tuple:
         """The state of the model for a checkpoint, from which a training resumes. Every rank must call it."""
-        state, widths = self.gaussians.capture(), self.gaussians.filter_3d
+        state = self.gaussians.capture()
         paced = isinstance(self.schedule, DecidedSchedule) and self.schedule.blocks
-        filtered = widths is not None and len(widths) == len(self.gaussians)  # not where memory ran out on the way
         states = {
-            POSES: self.poses and self.poses.captured(),
-            FILTER: self.gaussians.shards.whole(widths) if filtered else None,
             ASLEEP: self.sleeping and self.sleeping.captured(),
             schedule_file.KEY: schedule_file.table_of(self.schedule.decided) if paced else None,
         }

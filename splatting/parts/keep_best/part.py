@@ -32,7 +32,7 @@ class KeepBest(Part):
         "appearance=affine": _ALONE,
         "appearance=ppisp": _ALONE,
         "train_test_exp": _ALONE,
-        "refine_poses": _ALONE,
+        "needs.camera_gradient": _ALONE,
     }
 
     def dataset(self, info: "SceneInfo", args: "argparse.Namespace", fresh: bool) -> "SceneInfo":

@@ -25,7 +25,7 @@ from splatting.training.density import default_budget
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses, LossWatch
 from splatting.training.output_folder import view_command
-from splatting.training.part import Error, Part
+from splatting.training.part import Error, Part, overrides
 from splatting.training.run import Run
 from utils.image_utils import as_float, mean_psnr, mse, pixels_that_count, psnr
 from utils.loss_utils import l1_loss
@@ -270,7 +270,7 @@ def _means(
 class Records(Part):
     """Writes what other observers have put into the step's record, once all of it is there.
 
-    Where poses are refined, it has how far they have moved, at points of the curve, too.
+    What parts add is also recorded at points of the curve.
     """
 
     def __init__(self, run: Run) -> None:
@@ -279,11 +279,12 @@ class Records(Part):
 
     def measured(self, step: Iteration, losses: Losses) -> None:
         run = self._run
-        if step.record is None and (run.poses is None or step.scored_at is None):
+        adds = overrides(run.parts, "records")
+        if step.record is None and not (adds and step.scored_at is not None):
             return
         self._seconds = seconds = run.clock.seconds if step.scored_at is None else step.scored_at
         with run.clock.paused("saving"):
-            values = (step.record or {}) | (run.poses.corrections() if run.poses else {})
+            values = (step.record or {}) | {name: number for add in adds for name, number in add().items()}
             run.log.add(step.iteration, seconds, gaussians=run.gaussians.gaussian_count, loss=run.losses.mean, **values)
 
     def ended(self, error: Error) -> None:

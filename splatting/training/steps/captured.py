@@ -49,7 +49,7 @@ class CapturedStep(FusedStep):
         self._ahead = Speculation(run.device, self)
         self._graphs = Graphs(run, self, self._adam, self._ahead.capacity)
         pinned = run.device.type == "cuda"
-        self._rows = torch.zeros(_ROWS, CAMERA_NUMBERS, dtype=torch.float64, pin_memory=pinned) if run.poses else None
+        self._rows = torch.zeros(_ROWS, CAMERA_NUMBERS, dtype=torch.float64, pin_memory=pinned) if run.on_host else None
         self._fetched: dict[int, _Fetched] = {}  # by iteration: of poses that have yet to step
 
     def take(self, at: Iteration, observers: Announcer) -> None:
@@ -71,7 +71,7 @@ class CapturedStep(FusedStep):
     def throttle(self, at: Iteration) -> None:
         if self._is_queued(at):
             self._ahead.throttle()
-            if poses := self._run.poses:
+            if poses := self._run.on_host:
                 most = poses.independent(at.camera.uid, [one.uid for one in self._fetched.values()])
                 self._ahead.wait(most)
                 self._step_poses(min(most, AHEAD))
@@ -82,15 +82,15 @@ class CapturedStep(FusedStep):
     def drain(self) -> None:
         self._ahead.drain()
         self._step_poses(0)
-        if self._run.poses:
-            self._run.poses.place()
+        if self._run.on_host:
+            self._run.on_host.place()
 
     def abort(self) -> int:
         lost = self._ahead.abort()
         self._step_poses(sum(not one.done for one in self._fetched.values()))
         self._fetched.clear()
-        if self._run.poses:
-            self._run.poses.place()
+        if self._run.on_host:
+            self._run.on_host.place()
         return lost
 
     def _is_queued(self, at: Iteration) -> bool:
@@ -143,7 +143,7 @@ class CapturedStep(FusedStep):
             if fetched.copied is not None:
                 fetched.copied.synchronize()
             step = self._run.schedule.schedule_step(iteration)
-            self._run.poses.step(fetched.uid, fetched.gradient.numpy(), step)
+            self._run.on_host.step(fetched.uid, fetched.gradient.numpy(), step)
 
     # What speculation asks for, of steps that are done or overflowed
 
@@ -345,7 +345,7 @@ class Graphs:
 
     def _numbers_of(self, camera: Camera) -> np.ndarray:
         """The camera's numbers (35,) on the host, read from the GPU once; those of a trained pose never lie there."""
-        if poses := self._run.poses:
+        if poses := self._run.on_host:
             poses.place(camera)
             return camera.numbers[:_CAMERA]
         tensors = camera.world_view_transform, camera.full_proj_transform, camera.camera_center

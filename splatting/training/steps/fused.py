@@ -23,7 +23,7 @@ class FusedStep(PlainStep):
 
     def __init__(self, run: Run) -> None:
         super().__init__(run)
-        pose = torch.zeros(CAMERA_NUMBERS, dtype=torch.float64, device=run.device) if run.poses else None
+        pose = torch.zeros(CAMERA_NUMBERS, dtype=torch.float64, device=run.device) if run.on_host else None
         self.camera_gradient = pose  # of the last step
         self._adam = FusedAdam(run.gaussians, run.density.penalty)
         self._bands = KnownBands()
@@ -44,7 +44,7 @@ class FusedStep(PlainStep):
                 self.advance(at, drawn, gradients)
                 del drawn, gradients  # what changes rows needs their memory
                 if self.camera_gradient is not None and not at.last:
-                    self._run.step_pose(at, self.camera_gradient)
+                    self._run.step_on_host(at, self.camera_gradient)
                 return self.follow(at)
         super().take(at, observers)
 
@@ -66,8 +66,8 @@ class FusedStep(PlainStep):
     def measure(self, at: Iteration, now: Tensor | None = None) -> Measured:
         """Render: what was drawn, the losses, and their gradients of image and depth. now: as for `Drawn.step`."""
         run = self._run
-        if run.poses and now is None:
-            run.poses.place(at.camera)
+        if run.on_host and now is None:
+            run.on_host.place(at.camera)
         whole = at.changes or at.last  # all blocks wake, as in a plain step
         if whole and run.sleeping:
             run.sleeping.rest()

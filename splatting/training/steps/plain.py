@@ -47,7 +47,7 @@ class RefinedView(OneView):
         if not at.last:
             color, depth = (None if plane is None else plane.grad for plane in self._planes)
             drawn = draw(at.camera, run.gaussians, run.pipe, at.background, depth is not None)
-            run.step_pose(at, drawn.camera_gradient(color, depth))
+            run.step_on_host(at, drawn.camera_gradient(color, depth))
         return package, losses
 
 
@@ -61,13 +61,13 @@ class PlainStep:
 
     def __init__(self, run: Run) -> None:
         self._run = run
-        self._view = (RefinedView if run.poses else OneView)(run)
+        self._view = (RefinedView if run.on_host else OneView)(run)
 
     def take(self, at: Iteration, observers: Announcer) -> None:
         """Take a step; the observers are told once the gradients are there."""
         run = self._run
-        if run.poses:
-            run.poses.place(at.camera)
+        if run.on_host:
+            run.on_host.place(at.camera)
         if run.sleeping:
             self._wake(at)
         package = self._view.render(at)

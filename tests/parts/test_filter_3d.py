@@ -13,8 +13,8 @@ from trainings import ITERATIONS, OPTIONS, plain_training, shared_scene, trained
 
 from gaussian_renderer import render
 from scene import GaussianModel, Scene
-from scene.gaussians.checkpoint import FILTER, further, load_checkpoint, save_checkpoint, with_further
-from scene.gaussians.filter_3d import filter_widths, filtered
+from scene.gaussians.checkpoint import further, load_checkpoint, save_checkpoint, with_further
+from splatting.parts.filter_3d.smoothing import filter_widths, filtered
 from utils.system_utils import UserError
 
 ON = "--filter_3d", "--antialiasing"
@@ -90,7 +90,7 @@ def test_a_training_with_it_is_another_and_a_damaged_one_is_refused(once, tmp_pa
     off = trained(scene, tmp_path / "off", *OPTIONS[name][1:])
     assert off["ply"] != whole_result(whole, ITERATIONS)["ply"]
     capture, iteration = load_checkpoint(whole / "chkpnt33.pth")
-    save_checkpoint(start, with_further(capture, {FILTER: further(capture, FILTER)[1:]}), iteration)
+    save_checkpoint(start, with_further(capture, {"filter_3d": further(capture, "filter_3d")[1:]}), iteration)
     with pytest.raises(UserError, match="the 3D filter of the checkpoint does not fit"):
         trained(scene, tmp_path / "wrong", *OPTIONS[name], "--start_checkpoint", start)
 
@@ -103,13 +103,13 @@ def test_the_ply_looks_as_the_model_and_needs_no_filter(scene, tmp_path, monkeyp
         images.append(render(view, self, pipe, black)["render"].detach())
         by_getters = render(view, self, pipeline(antialiasing=True, compute_cov3D_python=True), black)["render"]
         torch.testing.assert_close(by_getters, images[0], rtol=1e-3, atol=1e-3)
-        assert (self.filter_3d > 0).any()
+        assert (self.columns["filter_3d"] > 0).any()
         save(self, path)
         read = GaussianModel(3)
         read.load_ply(path)
         read.active_sh_degree = self.active_sh_degree
         images.append(render(view, read, pipe, black)["render"].detach())
-        assert read.filter_3d is None and (read.get_opacity < torch.sigmoid(self.raw("opacity"))).any()
+        assert read.drawn is None and (read.get_opacity < torch.sigmoid(self.raw("opacity"))).any()
 
     monkeypatch.setattr(GaussianModel, "save_ply", saved)
     trained(scene, tmp_path / "out", *ON, "--keep_unseen")

@@ -13,39 +13,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from scene.gaussians.parameters import GaussianParameters
+from scene.sampling_rate import sampling_rate
 from splatting.deterministic import portable_math
 from utils.system_utils import UserError
 
 # In squared pixels. The paper's 0.2 goes with renders that add 0.1. Ours, and those of all viewers, add 0.3 already.
 VARIANCE = 0.05
-NEAREST = 0.2  # depth, below which no Gaussian is drawn
+
+NAME = "filter_3d"  # of the column
 
 Function = Callable[[Tensor], Tensor]
-
-
-def sampling_rate(points: Tensor, view: Any) -> Tensor:
-    """Pixels of a view by unit of length at points (N, 3); (N,), 0 at points that it does not show.
-
-    A lens counts by its focal length on the axis; in a fisheye or a panorama, pixels are proportional to angles.
-    """
-    lens = getattr(view, "lens", None)
-    if lens and lens.chart != "perspective":
-        x, y, z, _ = _transformed(points, view.world_view_transform)
-        depth = (x * x + y * y + z * z).sqrt()
-        field = min(lens.field(view.image_width, view.image_height), math.pi)
-        seen, focal = z >= math.cos(field) * depth, max(lens.focal)
-    else:
-        x, y, _, depth = _transformed(points, view.full_proj_transform)
-        seen = (x.abs() < depth) & (y.abs() < depth)
-        sides = (view.image_width, view.FoVx), (view.image_height, view.FoVy)
-        focal = max(side / (2 * math.tan(angle / 2)) for side, angle in sides)
-    return torch.where(seen & (depth > NEAREST), focal / depth, 0.0)
-
-
-def _transformed(points: Tensor, matrix: Tensor) -> list[Tensor]:
-    """Homogeneous coordinates (N,) behind a transposed matrix (4, 4), each product and sum rounded by itself."""
-    x, y, z = points.unbind(1)
-    return [x * a + y * b + z * c + d for a, b, c, d in matrix.T.tolist()]
 
 
 def filter_widths(points: Tensor, views: Sequence[Any]) -> Tensor:
@@ -60,6 +38,19 @@ def check_widths(widths: Any, count: int) -> None:
     """UserError for what a checkpoint has as its filter, if it does not fit so many Gaussians."""
     if not torch.is_tensor(widths) or widths.shape != (count, 1) or widths.dtype != torch.float32:
         raise UserError("the 3D filter of the checkpoint does not fit its Gaussians; give another one")
+
+
+class Smoothing:
+    """Raw opacities and scales of a model behind its filter: the slot `model.drawn`."""
+
+    def __init__(self, model: GaussianParameters) -> None:
+        """The widths (N, 1) of the filter are the model's column of this name."""
+        self._model = model
+
+    def __call__(self, logits: Tensor, log_scales: Tensor) -> tuple[Tensor, Tensor]:
+        return filtered(logits, log_scales, self._model.columns[NAME])
+
+    chain = staticmethod(lambda *values: chain_of(*values))
 
 
 def filtered(logits: Tensor, log_scales: Tensor, widths: Tensor) -> tuple[Tensor, Tensor]:

@@ -20,7 +20,6 @@ from benchmarks.scenes.poses import disturbed
 from scene.dataset_readers import SceneInfo
 from scene.gaussian_model import GaussianModel
 from scene.images.lens import Lens, rays_of
-from scene.pose_file import NAME, with_poses
 from scene.poses import moved
 from scene.readers.colmap import read_colmap
 from scene.readers.tracks import Track, read_tracks
@@ -31,9 +30,10 @@ from splatting.demo.objects import demo_scene
 from splatting.demo.tracer import FISHEYE, ring_views
 from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.results import read_run
-from splatting.training import bounded_adam, pose_refinement, tracked_poses
-from splatting.training.bounded_adam import BoundedAdam
-from splatting.training.pose_refinement import PoseRefinement
+from splatting.parts.refine_poses import bounded_adam, refinement, tracked_poses
+from splatting.parts.refine_poses.bounded_adam import BoundedAdam
+from splatting.parts.refine_poses.pose_file import NAME, with_poses
+from splatting.parts.refine_poses.refinement import PoseRefinement
 from utils.graphics_utils import camera_center, world_to_camera
 from utils.system_utils import UserError
 
@@ -242,7 +242,7 @@ def test_what_all_cameras_could_do_together_is_taken_out(tmp_path, monkeypatch):
     scene, poses = _refinement(tmp_path)
     cameras, before = scene.getTrainCameras(), _poses(scene)
     monkeypatch.setattr(tracked_poses, "_ANCHOR", 0.0)
-    monkeypatch.setattr(pose_refinement, "_PASSES", 1)
+    monkeypatch.setattr(refinement, "_PASSES", 1)
     rng = np.random.default_rng(3)
     own = rng.normal(size=poses.twists.shape) * 1e-3
     basis, inverse = poses._drift
@@ -305,7 +305,7 @@ def test_steps_are_bounded_and_follow_the_gradient(tmp_path, monkeypatch):
     make_colmap_scene(tmp_path)
     _, poses = _refinement(tmp_path)
     monkeypatch.setattr(tracked_poses, "_ANCHOR", 0.0)
-    monkeypatch.setattr(pose_refinement, "_PASSES", 1)
+    monkeypatch.setattr(refinement, "_PASSES", 1)
     poses.step(2, _gradient(poses, 2, np.array([1.0, -1, 1, -1, 1, -1])), 0)
     assert np.array_equal(np.sign(poses.twists[2]), [-1, 1, -1, 1, -1, 1]) and not poses.twists[[0, 1, 3]].any()
     poses.twists[2, :3] = 3.0
@@ -323,7 +323,7 @@ def test_a_pose_depends_on_its_own_steps_and_on_whole_passes(tmp_path):
     _, poses = _refinement(tmp_path)
     count = len(poses.twists)
     assert poses.independent(2, [0, 1]) == 2 and poses.independent(1, [0, 1, 1, 0, 2]) == 2
-    whole = [0] * (pose_refinement._PASSES * count)
+    whole = [0] * (refinement._PASSES * count)
     assert poses.independent(2, whole) == 0 and poses.independent(2, [*whole, 0, 1]) == 2
     assert poses.independent(2, whole[1:]) == len(whole) - 1
     poses.step(0, np.zeros(34), 0)

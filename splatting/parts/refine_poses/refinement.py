@@ -16,8 +16,8 @@ from scene.reprojection import moved_pose, twist_gradient
 from scene.scene import Scene
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import DEGREES, PERCENT
-from splatting.training.bounded_adam import BoundedAdam
-from splatting.training.tracked_poses import TrackedPoses
+from splatting.parts.refine_poses.bounded_adam import BoundedAdam
+from splatting.parts.refine_poses.tracked_poses import TrackedPoses
 from utils.general_utils import get_expon_lr_func
 from utils.graphics_utils import world_to_camera
 from utils.system_utils import UserError

@@ -1,0 +1,53 @@
+"""Poses that are trained with the Gaussians (--refine_poses): a small correction of each training camera's."""
+
+from typing import TYPE_CHECKING, Any
+
+from splatting.files.json_files import MODEL_JSON
+from splatting.training.option import Option
+from splatting.training.part import Needs, Options, Part, fill
+
+if TYPE_CHECKING:
+    import argparse
+
+    from scene.readers.info import SceneInfo
+    from scene.scene import Scene
+
+
+class RefinePoses(Part):
+    """Gives the cameras their poses, which take steps on the host, and keeps them in poses.json."""
+
+    name = "refine_poses"
+    # fmt: off
+    options = Options(model=(
+        Option("refine_poses", False, origin="ours", stored=MODEL_JSON,
+            help="train a small correction of each training camera's pose with the Gaussians. The tracks of a COLMAP "
+                 "scene hold the cameras, and place the test views"),
+    ))
+    # fmt: on
+    unasked = "refused"
+    needs = Needs(camera_gradient=True, files=True)
+    against = {"projection=ray": "which has no gradients of poses; leave one of them out"}
+
+    def dataset(self, info: "SceneInfo", args: "argparse.Namespace", fresh: bool) -> "SceneInfo":
+        from splatting.parts.refine_poses.pose_file import with_poses
+
+        return info if fresh or getattr(args, "other_scene", "") else with_poses(info, args.model_path)
+
+    def begin(self, run: Any, state: Any) -> None:
+        from splatting.parts.refine_poses.refinement import PoseRefinement
+
+        self.poses = PoseRefinement(run.scene, run.dataset.source_path, run.opt.iterations)
+        if run.start:
+            self.poses.restore(state)
+        fill(run, "on_host", self.poses, self)
+
+    def records(self) -> dict[str, float]:
+        return self.poses.corrections()
+
+    def state(self) -> dict[str, Any]:
+        return self.poses.captured()
+
+    def save(self, scene: "Scene") -> None:
+        from splatting.parts.refine_poses.pose_file import write_poses
+
+        write_poses(scene.model_path, scene.getTrainCameras(), scene.getTestCameras())

@@ -1,0 +1,21 @@
+"""Whether tracks of a scene ask for other poses."""
+
+from collections.abc import Iterator, Sequence
+
+from scene.pose_errors import pose_errors, poses_differ
+from scene.readers.tracks import Track
+from scene.scene import Scene
+
+
+def advise(scene: Scene, tracks: Sequence[Track | None]) -> Iterator[tuple[str, str]]:
+    """Texts, and the options that they speak for, or none."""
+    found = pose_errors(scene.info.train_cameras, tracks, scene.cameras_extent) if any(tracks) else None
+    if found is not None:
+        given, best = found
+        text = f"points lie {given:.2g} pixels from where photos show them (median), and {best:.2g} with better poses"
+        yield text, "--refine_poses" if poses_differ(given, best) else ""
+
+
+def for_wrong_poses(best: bool) -> str:
+    """What to do where points are not where photos show them. best: other poses would fit far better."""
+    return "train with --refine_poses" if best else "--refine_poses corrects 3 degrees at most"
