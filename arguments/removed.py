@@ -3,7 +3,7 @@
 _CONSTANT = "its default is now the only value; leave it out"
 
 REMOVED: dict[str, str] = {
-    "target_psnr": "bound the time instead by --time_budget, and read what is reached from error_vs_time.csv",
+    "target_psnr": "bound the seconds instead, and read what is reached from error_vs_time.csv",
     "refine_lens": "let the program that placed the photos refine their lenses",
     "parallel": "leave it out, as processes of torchrun always share each view by tiles",
     "whole_curve": "leave it out, as the last point of the curve scores all test views",

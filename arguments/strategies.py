@@ -1,4 +1,4 @@
-"""Options of the strategies: how many Gaussians there are, and where, and how a run is paced."""
+"""Options of the strategies: how many Gaussians there are, and where."""
 
 from splatting.files.json_files import MODEL_JSON
 from splatting.training.option import Option, above, at_least, one_of, within
@@ -17,12 +17,12 @@ def _between(value: float) -> str | None:
 # fmt: off
 STRATEGY_OPTIONS: tuple[Option, ...] = (
     Option("strategy", "auto", origin="ours", check=one_of("auto", *STRATEGIES), stored=MODEL_JSON,
-        help="how many Gaussians there are, and where. auto: adc; with --time_budget budget, or on a GPU mcmc for at "
-             "most 50 photos and 0.25 seconds or more for each; a resumed run keeps its own. adc: adaptive density "
+        help="how many Gaussians there are, and where. auto: adc, or what is best in the time that is given; "
+             "a resumed run keeps its own. adc: adaptive density "
              "control, the method's own; mcmc: Gaussians that nobody sees are moved to others, and positions get "
              "noise; budget: growth to --max_num_splats Gaussians, where the error is; 0: one for 64 training pixels, "
              "100,000 to 1,000,000. budget has larger learning rates of colour, opacity, scale and rotation, the fewer "
-             "--iterations there are. With --time_budget all grow to at most 25 Gaussians for each iteration"),
+             "--iterations there are"),
 
     Option("absgrad", False, origin="ours",
         help="adc: densify by the sum of the pixels' absolute gradients (AbsGS), which do not cancel out where a "
@@ -50,24 +50,11 @@ STRATEGY_OPTIONS: tuple[Option, ...] = (
         help="mcmc: opacity of the Gaussians that are made from points"),
     Option("mcmc_init_scale", 0.0, origin=_RELEASED, check=at_least(0),
         help="mcmc: scale of the Gaussians that are made from points, as a part of the distance to their neighbours; "
-             "0: 0.1, or 1 with --time_budget"),
+             "0: 0.1, or 1 in a given time"),
 
     Option("opacity_decay", 0.98, origin="ours", check=within(0.5, 1),
         help="budget: factor of all opacities after each densification, so that useless Gaussians fade; 1: none"),
     Option("prune_opacity", 0.005, origin="ours, and adaptive density control's", check=within(0, 0.5),
         help="budget: Gaussians of a lower opacity are removed, every densification_interval steps"),
-
-    Option("time_budget", 0.0, origin="ours", check=within(0, 31_536_000),  # a year
-        help="seconds of training that the run takes, without scoring and saving, to 3 %; 0: no budget. It goes "
-             "through the whole schedule of --iterations in them, in fewer or more iterations, with learning rates "
-             "that follow their number, and writes schedule.json"),
-    Option("resolution_schedule", "auto", origin="ours", check=one_of("auto", "none", "pyramid"),
-        stored=MODEL_JSON,
-        help="smaller views at first, so that the first iterations take less time. pyramid: a quarter of the size up "
-             "to 10 % of the schedule, half of it up to 25 %; auto: pyramid where --time_budget leaves no more than an "
-             "iteration for 4 megapixels of the schedule's views, else none"),
-    Option("schedule", "", origin="ours",
-        help="schedule.json of a run with --time_budget: train as that run did, without looking at the clock. Or a "
-             "number: so many iterations, which go through the whole schedule of --iterations in equal parts"),
 )
 # fmt: on

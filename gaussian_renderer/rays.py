@@ -28,5 +28,5 @@ def check_views(
         except ValueError as error:
             raise UserError(
                 f"{view.image_name} cannot be drawn at {width} x {height} pixels, as {error}; draw it larger, by "
-                "--resolution (-r) or --resolution_schedule none, or give --projection ewa"
+                "--resolution (-r) and with no smaller views at first, or give --projection ewa"
             ) from error

@@ -24,10 +24,11 @@ from scene.gaussians.long_axis import long_axis_children
 from scene.saved_model import read_model
 from splatting.deterministic.counter_rng import Stream
 from splatting.distributed.rows import WHOLE
+from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
 from splatting.training.checks import another_number
 from splatting.training.density import default_budget
 from splatting.training.objective import Objective
-from splatting.training.schedule import STEADY, Block, Decided, DecidedSchedule, Schedule
+from splatting.training.schedule import STEADY, Schedule
 from splatting.training.strategies import budget
 from splatting.training.strategies.adc import AdaptiveDensityControl
 from splatting.training.strategies.error_scores import error_map, error_scores

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.gaussians.long_axis import long_axis_children
+from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
 from splatting.training.checks import late_reset
-from splatting.training.schedule import Block, Decided, DecidedSchedule, Schedule
+from splatting.training.schedule import Schedule
 from splatting.training.strategies import adc
 from splatting.training.strategies.adc import AdaptiveDensityControl
 from utils.general_utils import build_rotation

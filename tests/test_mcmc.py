@@ -10,7 +10,7 @@ from trainings import MCMC, train_on
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.saved_model import read_model
-from splatting.training.schedule import Block, Decided, DecidedSchedule
+from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
 from splatting.training.strategies.mcmc import MarkovChain
 from utils.system_utils import UserError
 

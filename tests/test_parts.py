@@ -19,6 +19,12 @@ from utils.system_utils import UserError
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "splatting" / "parts"
 ROOMS = ("arguments", "gaussian_renderer", "integrations", "splatting", "scene", "utils")
+NAMESPACES = ("args", "opt", "options", "dataset", "given", "launch", "pipe")  # what options are read from
+KNOWN = {  # files that say the name of an option and mean something else, or have to keep it
+    "splatting/parts/time_budget/schedule_file.py",  # a key of schedule.json
+    "integrations/nerfbaselines/spec.py",  # sets of options, as a user gives them
+    "scene/gaussian_model.py",  # the schedule of exposures' learning rate
+}
 COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "export", "view")
 
 
@@ -34,6 +40,7 @@ def _files(name: str) -> Iterator[Path]:
     """
     found = [*(path for room in ROOMS for path in (ROOT / room).rglob("*.py")), *(ROOT / f"{c}.py" for c in COMMANDS)]
     known = FOLDER / name, ROOT / "splatting" / "compat"
+    found = [path for path in found if path.relative_to(ROOT).as_posix() not in KNOWN]
     yield from (path for path in found if not {*known} & {*path.parents} and path != FOLDER / "__init__.py")
 
 
@@ -54,7 +61,8 @@ def _names_of(name: str, path: Path) -> Iterator[str]:
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             found = node.value in options or typed.search(node.value)
         elif isinstance(node, ast.Attribute):
-            found = node.attr in options and not (isinstance(node.value, ast.Name) and node.value.id == "self")
+            of = getattr(node.value, "attr", getattr(node.value, "id", ""))
+            found = node.attr in options and of.strip("_") in NAMESPACES
         else:
             continue
         if found:

@@ -21,7 +21,7 @@ from splatting.evaluation.error_curve import read_curve, read_peer
 from splatting.evaluation.training_log import read_log
 from splatting.files.image_files import read_plane
 from splatting.files.plain_files import MOST
-from splatting.training.schedule_file import read_schedule
+from splatting.parts.time_budget.schedule_file import read_schedule
 from utils.lpips_utils import _load_state
 from utils.system_utils import UserError
 

@@ -15,9 +15,8 @@ from splatting.host.interrupt import DeferredInterrupt
 from splatting.training.gpu_memory import GpuMemory
 from splatting.training.iteration import ViewOrder
 from splatting.training.objective import LossWatch, Objective
-from splatting.training.resolution import Resolution
 from splatting.training.run import Run
-from splatting.training.schedule_file import schedule_of
+from splatting.training.schedule import Schedule
 from splatting.training.strategies import density_control
 from utils.system_utils import compute_device
 
@@ -41,7 +40,7 @@ class WorkloadRun(Run):
         self.launch, self.dataset, self.opt, self.pipe = train.parse(words)
         self.lost = self.first_iteration = 0
         self.interrupt, self.device = DeferredInterrupt(), compute_device()
-        self.schedule = schedule_of(self.opt, None, 0)
+        self.schedule = Schedule(self.opt.iterations)
         images = SimpleNamespace(ahead=0, keep_on=torch.device("cpu"), planned_bytes=0)
         self.gaussians = GaussianModel(3)
         pixels = (workload.width // workload.crop) * (workload.height // workload.crop)
@@ -53,7 +52,6 @@ class WorkloadRun(Run):
             cameras_extent=_EXTENT, images=images, prefetch=lambda _: None, model_path=".", info=info
         )
         self.views = ViewOrder(cameras, self.opt.seed)
-        self.resolution = Resolution(self.schedule, images)
         self.background = torch.zeros(3, device=self.device)
         self.objective = Objective(self)
         self.density = density_control(self)

@@ -79,8 +79,8 @@ class _Losses(Part):
 class GaussianSplatting(Method):
     """A training that NerfBaselines steps, or a model that it has loaded from a checkpoint.
 
-    A step is one of the schedule of --iterations. With --time_budget an iteration stands for several steps, or a step
-    for several iterations, as the clock has it; seconds between steps do not count.
+    A step is one of the schedule of --iterations. Where seconds are given, an iteration stands for several steps, or a
+    step for several iterations, as the clock has it; seconds between steps do not count.
     checkpoint: a folder that `save` has written. config_overrides: options of train.py.
     """
 

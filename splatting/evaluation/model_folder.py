@@ -14,7 +14,7 @@ from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
 from splatting.files.json_files import read_json
 from splatting.files.plain_files import plain
-from splatting.parts import chosen
+from splatting.parts import PARTS, part_class
 from utils.system_utils import UserError, saved_iterations
 
 SCHEDULE = "schedule.json"  # of a training whose iterations followed the clock
@@ -61,12 +61,10 @@ def shorter_ends_there(model: Path) -> bool:
         options = read_stored_options(model)
     except UserError:
         return False
-    if any(part.follows_length for part in chosen(argparse.Namespace(**options))):
+    if any(part_class(name).follows_length(argparse.Namespace(**options)) for name in PARTS):
         return False
-    # These schedules follow --iterations, too: the exposures' learning rate, the views' sizes.
-    pyramid = options.get("resolution_schedule", "none") != "none"
     exposed = options.get("train_test_exp") or options.get("appearance", "none") != "none"
-    return not (exposed or pyramid)
+    return not exposed  # whose learning rate follows --iterations, too
 
 
 def load_scores(model: Path, method: str) -> tuple[dict[str, float | None], dict[str, dict[str, float | None]]]:

@@ -14,6 +14,7 @@ from typing import Any
 
 from arguments import OptimizationParams
 from splatting.files.json_files import read_json, write_json
+from splatting.parts import PARTS, part_class
 from utils.system_utils import UserError
 
 _OUTDOOR = ("-i", "images_4")
@@ -34,7 +35,10 @@ RESERVED = {"figures"}  # folders of the report, next to the models
 _DEFAULT_ITERATIONS = next(option.default for option in OptimizationParams.options if option.name == "iterations")
 
 RECORD = "full_eval.json"  # in a model folder: finished stages with their inputs, machine and seconds
-ENDING = ("time_budget", "schedule")  # options by which a training ends before or after --iterations
+_OF_PARTS = [part_class(name) for name in PARTS if part_class(name).own_end]
+ENDING = [
+    option.name for part in _OF_PARTS for option in part.options.optimisation
+]  # they end a training by themselves
 
 
 @dataclass(frozen=True)

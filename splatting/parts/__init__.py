@@ -1,10 +1,13 @@
 """The registry of the parts of a training (splatting/training/part.py is their manual): their one order."""
 
 import argparse
+import os
+import shutil
 from collections.abc import Callable, Collection, Mapping
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 from splatting.training.option import Option
@@ -13,6 +16,8 @@ from utils.system_utils import UserError
 
 # Names of folders, with the reason for the place, where there is one.
 PARTS = (
+    "coarse_to_fine",  # says which sizes of views are asked for
+    "time_budget",  # decides on them
     "refine_poses",  # its cameras stand right before anything asks where they are
     "depth_maps",
     "keep_best",  # after maps are found: its views have none
@@ -35,7 +40,7 @@ def options_of(group: str) -> list[Option]:
 
 
 # Of states in checkpoints of version 0.2 and before.
-_OLD_KEYS = {"residuals": "robust_mask", "best": "keep_best", "poses": "refine_poses"}
+_OLD_KEYS = {"residuals": "robust_mask", "best": "keep_best", "poses": "refine_poses", "schedule": "time_budget"}
 
 
 def states_in(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
@@ -45,17 +50,12 @@ def states_in(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def chosen(given: argparse.Namespace, states: Collection[str] = ()) -> list[Part]:
-    """The parts that options ask for, in their order. UserError for a state that none of them takes, but should.
+    """The parts that options ask for, and those that join where a checkpoint has their state, in their order.
 
     given: options of all groups. states: names of parts that a checkpoint has states of.
     """
-    parts = []
-    for kind in map(part_class, PARTS):
-        if kind.wanted(given) or (kind.unasked == "joins" and kind.name in states):
-            parts.append(kind())
-        elif kind.unasked == "refused" and kind.name in states:
-            raise UserError(f"{given.start_checkpoint} was trained with --{kind.switch or kind.name}; give that option")
-    return parts
+    kinds = map(part_class, PARTS)
+    return [kind() for kind in kinds if kind.wanted(given) or (kind.joins and kind.name in states)]
 
 
 def check_together(parts: Collection[Part], given: argparse.Namespace, several: bool) -> None:
@@ -78,6 +78,14 @@ def check_together(parts: Collection[Part], given: argparse.Namespace, several: 
                 raise UserError(f"--{option} does not work with {found[0]}, {reason}")
 
 
+def remove_traces(folder: str | os.PathLike, parts: Collection[Part]) -> None:
+    """Remove what an earlier training has left in a model folder by parts that this one does not have."""
+    for name in {*PARTS} - {part.name for part in parts}:
+        for trace in part_class(name).traces:
+            path = Path(folder) / trace
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+
+
 def tools(name: str) -> list[Callable]:
     """The functions of a name that parts have for other commands than train.py, in their tools.py.
 
@@ -85,7 +93,8 @@ def tools(name: str) -> list[Callable]:
     beside(facts, means): which Gaussians of a model are not of the scene itself. facts: of model.json.
     add_export_options(add), left_out(args, means): options of export.py, and which Gaussians these leave out.
     advise_trained(scene, views): as advise, by a short training. examine(scene, views, options): notes of doctor.py.
-    drawn(rows, states): rows of a checkpoint as its PLY would have them. for_wrong_poses(best): a remedy.
+    drawn(rows, states): rows of a checkpoint as its PLY would have them. for_wrong_poses(best),
+    for_few_iterations(count): remedies.
     remarks(lines): lines of a training that reports show. against_overfitting(record): an option to try, or None.
     pictures(model): files in a model folder that reports show, where they are there.
     """

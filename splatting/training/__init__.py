@@ -6,8 +6,7 @@ steps/                     the step of an iteration: plain, fused or captured
 objective                  the loss
 part, option               what a feature adds to a training, in one class; the features lie in splatting/parts
 density, strategies/       density control; another strategy is another class with the same hooks
-schedule, schedule_file    the steps of the schedule that an iteration stands for, and how that is chosen and kept
-resolution                 smaller views at first
+schedule                   the steps of the schedule that an iteration stands for
 announcer, observers/      everything that watches: checks, progress, curve, report, saves, checkpoints, viewers
 checks, memory_estimate    before: what is refused or warned of, and an estimate of the memory that a training needs
 gpu_memory                 the limit of a GPU's memory, and what lies in the host's to keep it

@@ -22,8 +22,9 @@ from splatting.evaluation.error_curve import NAME as CURVE
 from splatting.evaluation.error_curve import Row, continue_curve
 from splatting.evaluation.training_log import TrainingLog
 from splatting.files.listing import some
+from splatting.parts import tools
 from splatting.training.density import DensityControl
-from splatting.training.schedule import USUAL, DecidedSchedule
+from splatting.training.schedule import USUAL
 from utils.system_utils import UserError
 
 # Milliseconds of a step at 1600x1060 on an H100: of any, and of a million Gaussians (docs/results/several_gpus.md).
@@ -102,7 +103,7 @@ def late_reset(density: DensityControl, opt: argparse.Namespace, done: int) -> s
     done: iterations before this run, which may have been the reset. A run with a time budget leaves such resets out.
     """
     schedule = density.schedule
-    if isinstance(schedule, DecidedSchedule):
+    if schedule.paced:
         return None
     last = range(max(done, schedule.ends - rules.RECOVERY) + 1, schedule.ends)
     if not (due := [iteration for iteration in last if density.resets(iteration)]):
@@ -123,7 +124,7 @@ def another_number(density: DensityControl, opt: argparse.Namespace, count: int,
     count: of Gaussians, now; first: the next iteration. Not known of a run with a time budget.
     """
     schedule, aim = density.schedule, density.most_gaussians
-    if opt.schedule or schedule.ends is None or schedule.schedule_step(first) >= density.ends > 0:
+    if schedule.paced or schedule.schedule_step(first) >= density.ends > 0:
         return None  # what is repeated or resumed has no say in it any more
     if 0 < density.ends <= opt.densify_from_iter < schedule.length:
         until = "mcmc_until_iter" if opt.strategy == "mcmc" else "densify_until_iter"
@@ -143,7 +144,7 @@ def another_number(density: DensityControl, opt: argparse.Namespace, count: int,
     until = f"--densify_until_iter {done + (schedule.length - done) // 2}"
     scaled = None
     if not done and opt.densify_from_iter < density.ends < USUAL:
-        scaled = f"--schedule {schedule.length} in place of --iterations {schedule.length}"
+        scaled = next((remedy(schedule.length) for remedy in tools("for_few_iterations")), None)
     if too_late:
         window = f"--densify_from_iter {done + (schedule.length - done) // 20}"
         if opt.strategy != "mcmc":

@@ -1,22 +1,19 @@
 """The hooks by which a strategy of density control acts on a training (strategies: training/strategies)."""
 
 import math
-import sys
 from collections.abc import Collection, Sequence
 from typing import ClassVar
 
 from torch import Tensor
-from tqdm import tqdm
 
 from scene.cameras import Camera
 from scene.gaussians.mcmc import NO_PENALTY
 from splatting.training.iteration import Iteration
-from splatting.training.schedule import STEADY, DecidedSchedule, Schedule
+from splatting.training.schedule import STEADY, Schedule
 from utils.system_utils import UserError
 
 PIXELS = 64  # training pixels of all views for each Gaussian of the default budget
 FEWEST, MOST = 100_000, 1_000_000  # Gaussians of the default budget
-AN_ITERATION = 25  # Gaussians for each iteration, at most, where the clock sets the number of iterations
 
 
 class DensityControl:
@@ -45,7 +42,6 @@ class DensityControl:
     ends = math.inf
     schedule: Schedule = STEADY
     random = False
-    _told = False
 
     def started(self) -> None:
         """Called before the first iteration of a model that was made from points, not read from a file."""
@@ -89,28 +85,11 @@ class DensityControl:
         With a time budget not more than so few iterations can train, but the `count` that are there all stay, except of
         a random start.
         """
-        schedule = self.schedule
-        if not isinstance(schedule, DecidedSchedule) or not schedule.seconds:
-            return limit
-        if (possible := schedule.possible(iteration)) >= schedule.length:
-            return limit
-        trained = max(int(AN_ITERATION * possible), 1)
-        if limit and trained >= limit:
-            return limit
-        self._tell(int(possible), trained)
-        most = trained if self.random else max(trained, count)
-        return min(limit, most) if limit else most
+        return self.schedule.most(iteration, count, limit, self.random, self.most_gaussians)
 
-    def _tell(self, iterations: int, trained: int) -> None:
-        """Say once how many Gaussians a time budget trains."""
-        if not self._told:
-            self._told = True
-            given = f", not the {self.most_gaussians:,} of --max_num_splats" if self.most_gaussians else ""
-            tqdm.write(
-                f"--time_budget {self.schedule.seconds:g} is time for some {iterations:,} iterations, which train at "
-                f"most about {trained:,} Gaussians, {AN_ITERATION} for each{given}",
-                file=sys.stderr,
-            )
+    def rate_factor(self, iteration: int) -> float | None:
+        """Factor of the learning rates that have no schedule, where the run's schedule has none. None: 1."""
+        return None
 
     def after_backward(self, step: Iteration, package: dict[str, Tensor]) -> None:
         """Called with the gradients computed, before the optimiser's step. package: the result of `render`."""

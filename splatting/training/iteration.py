@@ -35,6 +35,24 @@ class Iteration:
         return any(iteration in planned for iteration in self.span)
 
 
+class OwnSize:
+    """Views in their own size, in all iterations: what the slot run.sizes has where no part fills it."""
+
+    factor = 1.0  # by which the last view was made smaller
+
+    def view(self, camera: Camera, schedule_step: int) -> Camera:
+        """A view as it is trained at an iteration of the schedule."""
+        return camera
+
+    def needs(self, camera: Camera) -> bool:
+        """Whether the pictures of a view will be needed in their own size."""
+        return True
+
+    def smallest(self, camera: Camera) -> tuple[int, int]:
+        """The smallest size (width, height) in which a view may train."""
+        return camera.image_width, camera.image_height
+
+
 class ViewOrder:
     """Training cameras by iteration, counted from 1: each once per epoch, in an order drawn from seed and epoch."""
 

@@ -29,6 +29,8 @@ What only one part can give is a slot of the run or of the model, with a neutral
 
 model.drawn  what raw opacities and scales are drawn as, and its chain backward; model.columns keeps values per row
 model.pinned which Gaussians density control leaves where they are, and as large as they are
+run.schedule which steps of the schedule an iteration stands for
+run.sizes    the size of a view in an iteration
 run.counts   which pixels of a view count in its loss
 run.on_host  takes the steps of cameras, by the gradients of their numbers, on the host: `place`, `step`, `independent`
 """
@@ -88,26 +90,26 @@ class Part:
     name: of its folder, and the key of its state.
     options: that it declares.
     switch: the option that brings the part in where it has another value than its default; empty: that named `name`.
-    unasked: what becomes of its state in a checkpoint where no option asks for it: it is "dropped" or "refused", or the
-        part "joins".
+    joins: whether its state in a checkpoint brings the part in where no option asks for it.
     needs: what it asks of the steps.
     against: what it does not work with, and the rest of a sentence: why, and what to do. It is `option`,
         `option=value`, or `needs.NAME`: other parts that need that.
     reads_model: whether it reads the model in iterations that are due for it; sleeping blocks then catch up first.
     shown: terms whose running mean the progress bar shows, and what it calls them.
-    follows_length: whether its steps depend on --iterations, so that a shorter training is not the beginning of a
-        longer one.
+    own_end: whether its options let a training end before or after --iterations.
+    traces: files and folders in a model folder that a training without the part removes.
     """
 
     name: ClassVar[str] = ""
     options: ClassVar[Options] = Options()
     switch: ClassVar[str] = ""
-    unasked: ClassVar[str] = "dropped"
+    joins: ClassVar[bool] = False
     needs: ClassVar[Needs] = Needs()
     against: ClassVar[dict[str, str]] = {}
     reads_model: ClassVar[bool] = True
     shown: ClassVar[dict[str, str]] = {}
-    follows_length: ClassVar[bool] = False
+    own_end: ClassVar[bool] = False
+    traces: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def wanted(cls, given: argparse.Namespace) -> bool:
@@ -117,8 +119,21 @@ class Part:
         option = every[cls.switch or cls.name]
         return getattr(given, option.name, option.default) != option.default
 
-    def check(self, run: Any) -> None:
-        """Refuse what cannot be trained (UserError). Nothing is written yet."""
+    @classmethod
+    def dropped(cls, given: argparse.Namespace, iteration: int) -> str | None:
+        """What to warn of where a checkpoint has a state of the part, and no option asks for it. UserError refuses it.
+
+        given: options of all groups. iteration: of the checkpoint.
+        """
+        return None
+
+    @classmethod
+    def follows_length(cls, given: argparse.Namespace) -> bool:
+        """Whether, by these options, steps depend on --iterations: a shorter training does not begin a longer one."""
+        return False
+
+    def check(self, run: Any, state: Any) -> None:
+        """Refuse what cannot be trained (UserError). Nothing is written yet. state: as for `begin`."""
 
     def dataset(self, info: "SceneInfo", args: argparse.Namespace, fresh: bool) -> "SceneInfo":
         """The dataset with other views or points. args: the model options. fresh: it is read for a new training."""

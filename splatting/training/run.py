@@ -30,18 +30,17 @@ from splatting.exports.in_scene import scene_with, start_from
 from splatting.exports.splats import Splats
 from splatting.host.clock import seconds_since_start
 from splatting.host.interrupt import DeferredInterrupt
-from splatting.parts import check_together, chosen, states_in
-from splatting.training import checks, schedule_file
+from splatting.parts import check_together, chosen, part_class, remove_traces, states_in
+from splatting.training import checks
 from splatting.training.gpu_memory import GpuMemory, limit_torch, reads_on_host
-from splatting.training.iteration import Iteration, ViewOrder
+from splatting.training.iteration import Iteration, OwnSize, ViewOrder
 from splatting.training.memory_estimate import announce_memory, expected_count, largest_view
 from splatting.training.objective import LossWatch, Objective
 from splatting.training.part import Part, overrides
-from splatting.training.resolution import Resolution, resolution_of, smallest
 from splatting.training.restart import resumed
-from splatting.training.schedule import DecidedSchedule
-from splatting.training.strategies import AUTO, USUAL, density_control, end_in_time, of_clock
-from utils.system_utils import compute_device
+from splatting.training.schedule import Schedule
+from splatting.training.strategies import AUTO, density_control
+from utils.system_utils import UserError, compute_device
 
 
 def bias_correction(step: int, beta1: float = 0.9, beta2: float = 0.999) -> float:
@@ -69,6 +68,8 @@ class Run:
     first_done: float | None = None
     parts: Sequence[Part] = ()
     sleeping: Sleeping | None = None
+    asked_sizes = "none"
+    sizes: Any = OwnSize()
     counts: Any = None
     on_host: Any = None
     final_iteration: int | None = None
@@ -86,16 +87,15 @@ class Run:
         checks.check_alone(launch.viewer, getattr(pipe, "projection", "ewa"), self.group.several)
         self.start = self.group.shared(resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
         dataset = self.dataset = checks.with_lenses(dataset, self.start)
-        if opt.strategy == AUTO and (self.start or not (opt.time_budget or opt.schedule)):
-            opt.strategy = checks.strategy_of(self.start) if self.start else USUAL
+        if opt.strategy == AUTO and self.start:
+            opt.strategy = checks.strategy_of(self.start)
         self.lost = 0
         self.interrupt, self.device = DeferredInterrupt(), compute_device()
         capture, self.first_iteration = self._read_start()
-        self._choose_parts(capture)
-        before = capture and further(capture, schedule_file.KEY)
-        self.schedule = schedule_file.schedule_of(opt, self.start, self.first_iteration, self.group.shared, before)
-        if isinstance(self.schedule, DecidedSchedule):
-            end_in_time(opt)
+        self.schedule = Schedule(opt.iterations)
+        states = self._choose_parts(capture)
+        if self.schedule.is_over(self.first_iteration):
+            raise UserError(self.schedule.nothing_left(self.start, self.first_iteration))
         self.warnings: list[str] = []
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
         init_ply = None if self.start else getattr(dataset, "init_ply", None)
@@ -106,13 +106,14 @@ class Run:
         count = len(points if capture is None else capture[1])
         self._share(count)
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed)
-        self.resolution = self._sizes()
         self._decode_ahead(self.first_iteration + 1)
         self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
-        self._begin_model(capture, first)
+        self._begin_model(capture, first, states)
+        check_views(self.pipe, self.scene.getTrainCameras(), self.sizes.smallest)
+        check_views(self.pipe, [*self.scene.getTestCameras(), *self.scene.validation_cameras.get(1.0, ())])
         self._check_records()
         if opt.strategy == AUTO:
-            opt.strategy = self._strategy_by_the_clock()
+            opt.strategy = self.schedule.best_strategy(self)
             check_together(self.parts, self._all_options, self.group.several)
         self.schedule.strategy = opt.strategy
         self.density = density_control(self)
@@ -132,13 +133,17 @@ class Run:
         if capture is None and first is None:
             self.density.started()
 
-    def _choose_parts(self, capture: tuple | None) -> None:
-        """Choose the parts by the options and by the state of a checkpoint, and let them check both."""
-        given = self._all_options
-        self.parts = chosen(given, states_in(states_of(capture)) if capture else ())
+    def _choose_parts(self, capture: tuple | None) -> dict[str, Any]:
+        """Choose the parts by the options and by a checkpoint, and let them check both. Returns the states by name."""
+        given, states = self._all_options, states_in(states_of(capture)) if capture else {}
+        self.parts = chosen(given, states)
         check_together(self.parts, given, self.group.several)
+        for name in states.keys() - {part.name for part in self.parts}:
+            if text := part_class(name).dropped(given, self.first_iteration):
+                print(f"warning: {text}", file=sys.stderr)
         for check in self._each("check"):
-            check(self)
+            check(self, states.get(check.__self__.name))
+        return states
 
     @cached_property
     def _hooks(self) -> dict[str, list[Callable]]:
@@ -160,13 +165,6 @@ class Run:
         on_host = self.group.several or reads_on_host(self.start, self.opt.gpu_memory, self.device)
         return load_checkpoint(self.start, "cpu" if on_host else self.device, self.group.several)
 
-    def _sizes(self) -> Resolution:
-        """The sizes of the views, in all of which they can be drawn."""
-        found = resolution_of(self.opt, self.schedule, self.scene)
-        check_views(self.pipe, self.scene.getTrainCameras(), smallest(self.opt, self.schedule))
-        check_views(self.pipe, [*self.scene.getTestCameras(), *self.scene.validation_cameras.get(1.0, ())])
-        return found
-
     def _expect(self, count: int) -> None:
         """Let the memory be divided for a number of Gaussians, of which each rank has its part."""
         self.memory.expect(-(-count // self.group.size))
@@ -177,14 +175,6 @@ class Run:
             self.warnings.append(f"warning: {text}")
             print(self.warnings[-1], file=sys.stderr)
 
-    def _strategy_by_the_clock(self) -> str:
-        if self.opt.schedule:
-            return self.schedule.strategy or USUAL
-        views = self.scene.getTrainCameras()  # mcmc would move Gaussians that are pinned
-        strategy = "budget" if self.gaussians.pinned else of_clock(self.opt.time_budget, views, self.device)
-        print(f"--time_budget takes --strategy {strategy}, which is best here; name another one to compare")
-        return strategy
-
     def _share(self, count: int) -> None:
         """Divide the empty model among the processes, and decide on the limit of the GPU's memory."""
         self.gaussians.divide(self.group)
@@ -192,7 +182,7 @@ class Run:
         self.memory = GpuMemory(self.opt.gpu_memory, self.gaussians, store, pixels, self.opt.absgrad, self.device)
         self._expect(count)
 
-    def _begin_model(self, capture: tuple | None, first: Splats | None) -> None:
+    def _begin_model(self, capture: tuple | None, first: Splats | None, states: dict[str, Any]) -> None:
         """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""
         self.gaussians.appearance = getattr(self.dataset, "appearance", "none")
         checks.check_photos(self.gaussians.appearance, len(self.scene.getTrainCameras()))
@@ -200,7 +190,6 @@ class Run:
             self.gaussians.start_exposures(self.scene.info.train_cameras)
             self.gaussians.restore(capture, self.opt)
             checks.check_exposures(self.gaussians, self.exposes, self.start)
-            states = states_in(states_of(capture))
             for begin in self._each("begin"):
                 begin(self, states.get(begin.__self__.name))
         else:
@@ -229,9 +218,8 @@ class Run:
 
     @property
     def options(self) -> argparse.Namespace:
-        """All options of the three groups; resolution_schedule is the one in force."""
-        groups = vars(self.dataset) | vars(self.opt) | vars(self.pipe)
-        return argparse.Namespace(**groups | {"resolution_schedule": self.schedule.sizes})
+        """All options of the three groups, as they are in force."""
+        return argparse.Namespace(**vars(self.dataset) | vars(self.opt) | vars(self.pipe))
 
     @property
     def entries(self) -> dict[str, Any]:
@@ -248,8 +236,8 @@ class Run:
         folder, start = self.scene.model_path, self.start
         if not start or not (Path(folder) / "cameras.json").exists():
             self.scene.write_inputs()
-        if not isinstance(self.schedule, DecidedSchedule) and self.group.first:
-            (Path(folder) / schedule_file.NAME).unlink(missing_ok=True)
+        if self.group.first:
+            remove_traces(folder, self.parts)
         density = self.density
         wants = density.most_gaussians, density.absolute_gradients
         announce_memory(self.scene, self.gaussians, self.memory, *wants, self.group.size)
@@ -264,7 +252,7 @@ class Run:
         for iteration in count(self.first_iteration + 1):
             seconds, schedule = self.clock.seconds, self.schedule
             schedule.reach(iteration, self.log.seconds_before + seconds)
-            camera = self.resolution.view(self.views[iteration], schedule.schedule_step(iteration))
+            camera = self.sizes.view(self.views[iteration], schedule.schedule_step(iteration))
             span, last = schedule.span(iteration), schedule.is_last(iteration)
             step = Iteration(
                 iteration,
@@ -289,9 +277,8 @@ class Run:
             step.wants_depth |= bool(found) and terms.__self__.needs.depth
 
     def _changes(self, iteration: int) -> bool:
-        resizes = self.resolution.changes(*map(self.schedule.schedule_step, (iteration - 1, iteration)))
         changes = any([changes(iteration) for changes in self._each("changes")])
-        return self.density.changes(iteration) or self._raises_degree(iteration) > 0 or resizes or changes
+        return self.density.changes(iteration) or self._raises_degree(iteration) > 0 or changes
 
     def _raises_degree(self, iteration: int) -> int:
         """How often the SH degree is raised in an iteration."""
@@ -318,7 +305,10 @@ class Run:
         """Set the learning rates of a step, which may be one that is repeated."""
         self.gaussians.exposures.held = self.density.recovers(step.iteration)
         self.gaussians.update_learning_rate(self.schedule.schedule_step(step.iteration))
-        if (factor := self.schedule.rate_factor(step.iteration)) is not None:
+        factor = self.schedule.rate_factor(step.iteration)
+        if factor is None:
+            factor = self.density.rate_factor(step.iteration)
+        if factor is not None:
             sparse = self.opt.optimizer_type == "sparse_adam"
             self.gaussians.scale_rates(factor * (bias_correction(step.iteration) if sparse else 1.0))
 
@@ -326,7 +316,7 @@ class Run:
         ahead = self.scene.images.ahead
         if (last := self.schedule.ends) is not None:
             ahead = min(ahead, last - iteration + 1)
-        self.scene.prefetch(list(filter(self.resolution.needs, self.views.coming(iteration, ahead))))
+        self.scene.prefetch(list(filter(self.sizes.needs, self.views.coming(iteration, ahead))))
 
     @property
     def is_standard(self) -> bool:
@@ -401,10 +391,8 @@ class Run:
     def captured(self) -> tuple:
         """The state of the model for a checkpoint, from which a training resumes. Every rank must call it."""
         state = self.gaussians.capture()
-        paced = isinstance(self.schedule, DecidedSchedule) and self.schedule.blocks
         states = {
             ASLEEP: self.sleeping and self.sleeping.captured(),
-            schedule_file.KEY: schedule_file.table_of(self.schedule.decided) if paced else None,
         }
         states |= {part.name: part.state() for part in self.parts}
         return with_further(state, {key: found for key, found in states.items() if found is not None})

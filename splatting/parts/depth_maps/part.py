@@ -32,8 +32,11 @@ class DepthMaps(Part):
     )
     # fmt: on
     needs = Needs(depth=True, files=True)
-    follows_length = True
     shown = {"depth": "Depth Loss"}
+
+    @classmethod
+    def follows_length(cls, given: "argparse.Namespace") -> bool:
+        return cls.wanted(given)
 
     def dataset(self, info: "SceneInfo", args: "argparse.Namespace", fresh: bool) -> "SceneInfo":
         if not fresh:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 from splatting.files.json_files import MODEL_JSON
 from splatting.training.option import Option
 from splatting.training.part import Needs, Options, Part, fill
+from utils.system_utils import UserError
 
 if TYPE_CHECKING:
     import argparse
@@ -24,9 +25,12 @@ class RefinePoses(Part):
                  "scene hold the cameras, and place the test views"),
     ))
     # fmt: on
-    unasked = "refused"
     needs = Needs(camera_gradient=True, files=True)
     against = {"projection=ray": "which has no gradients of poses; leave one of them out"}
+
+    @classmethod
+    def dropped(cls, given: "argparse.Namespace", iteration: int) -> str | None:
+        raise UserError(f"{given.start_checkpoint} was trained with --{cls.name}; give that option")
 
     def dataset(self, info: "SceneInfo", args: "argparse.Namespace", fresh: bool) -> "SceneInfo":
         from splatting.parts.refine_poses.pose_file import with_poses

@@ -20,7 +20,7 @@ class Sky(Part):
                  "behind all; off: add none. By one process, with --strategy adc or budget"),
     ))
     # fmt: on
-    unasked = "joins"
+    joins = True
     needs = Needs(depth=True, ranks=False)
     against = {"strategy=mcmc": "which relocates large Gaussians; use adc or budget"}
     shell = None

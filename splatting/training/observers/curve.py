@@ -10,7 +10,6 @@ from splatting.training.iteration import Iteration
 from splatting.training.objective import Losses
 from splatting.training.part import Error, Part
 from splatting.training.run import Run
-from splatting.training.schedule import DecidedSchedule
 from utils.system_utils import saved_iterations
 
 
@@ -32,7 +31,7 @@ class Curve(Part):
             lambda cameras: self._load(cameras, views),
             lambda camera: views.scores([camera], run.gaussians),
             run.device,
-            not isinstance(run.schedule, DecidedSchedule),
+            not run.schedule.paced,
         )
         self._due = False
         self._seconds = 0.0
@@ -61,4 +60,4 @@ class Curve(Part):
         run = self._run
         there = saved_iterations(Path(run.scene.model_path) / "point_cloud")
         saved = {*run.schedule.known(run.launch.save_iterations)} & {*there}
-        self._recorder.finish(self._seconds, saved, not isinstance(run.schedule, DecidedSchedule))
+        self._recorder.finish(self._seconds, saved, not run.schedule.paced)

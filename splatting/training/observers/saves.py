@@ -1,11 +1,10 @@
-"""Saves of the model as PLY, checkpoints that a training can be resumed from, and schedule.json."""
+"""Saves of the model as PLY, and checkpoints that a training can be resumed from."""
 
 import sys
 from pathlib import Path
 
 from tqdm import tqdm
 
-from arguments import add_to_model_json
 from scene.gaussians.checkpoint import save_checkpoint
 from scene.saved_iterations import saved_ply
 from splatting.training.iteration import Iteration
@@ -15,8 +14,6 @@ from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.output_folder import view_command
 from splatting.training.part import Error, Part
 from splatting.training.run import Run
-from splatting.training.schedule import DecidedSchedule
-from splatting.training.schedule_file import NAME, write_schedule
 
 
 class Saves(Part):
@@ -79,7 +76,6 @@ class Checkpoints(Part):
             run.gaussians.check_finite(step.iteration)
             tqdm.write(f"[ITER {step.iteration}] Saving Checkpoint", file=sys.stdout)
             path = Path(run.scene.model_path) / f"chkpnt{step.iteration}.pth"
-            save_schedule(run, step)
             run.scene.save_views()
             save_checkpoint(path, run.captured(), step.iteration)
             run.log.add(step.iteration, seconds, gaussians=run.gaussians.gaussian_count, loss=run.losses.mean)
@@ -87,32 +83,6 @@ class Checkpoints(Part):
                 run.scene.save(step.iteration)
         if step.stopping:
             look = f"Look at the model: {view_command(run.scene.model_path, step.iteration)}"
-            early = ", before its learning rates fell" if run.opt.time_budget else ""
+            early = ", before its learning rates fell" if run.schedule.seconds else ""
             resume = f"Resume by the same command with --start_checkpoint {path}"
             tqdm.write(f"Stopped at iteration {step.iteration}{early}\n{look}\n{resume}", file=sys.stderr)
-
-
-def save_schedule(run: Run, step: Iteration) -> None:
-    """Write what the schedule has decided up to an iteration, if anything, and the sizes of views to model.json."""
-    if isinstance(run.schedule, DecidedSchedule):
-        folder = run.scene.model_path
-        write_schedule(Path(folder) / NAME, run.schedule.up_to(step.iteration))
-        if run.opt.time_budget:
-            add_to_model_json(folder, resolution_schedule=run.schedule.sizes)
-
-
-class ScheduleFile(Part):
-    """Writes schedule.json when the training ends, also by an error whose rescue has saved a checkpoint."""
-
-    def __init__(self, run: Run) -> None:
-        self._run = run
-        self._step: Iteration | None = None
-
-    def stepped(self, step: Iteration) -> None:
-        self._step = step
-
-    def ended(self, error: Error) -> None:
-        run = self._run
-        if self._step is None:
-            return
-        save_schedule(run, self._step)

@@ -8,11 +8,10 @@ from splatting.training.observers.curve import Curve
 from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.observers.guards import MaskWatch, MemoryGuard
 from splatting.training.observers.report import ProgressBar, Records, Report, Summary, training_report
-from splatting.training.observers.saves import Checkpoints, Saves, ScheduleFile
+from splatting.training.observers.saves import Checkpoints, Saves
 from splatting.training.observers.viewers import NetworkViewer, PageObserver
 from splatting.training.part import Part
 from splatting.training.run import Run
-from splatting.training.schedule import DecidedSchedule
 
 
 def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[str, float]]) -> list[Part]:
@@ -36,6 +35,5 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
         *([NetworkViewer(run)] if network_gui.listener else []),  # after all that write: it may make training wait
         MemoryGuard(run),  # from `measured` to `stepped` the model changes; otherwise it is whole
         checkpoints,  # writes the whole state after the step
-        *([ScheduleFile(run)] if isinstance(run.schedule, DecidedSchedule) else []),
         *([PageObserver(run, checkpoints)] if run.launch.viewer is not None else []),  # last: may let the training wait
     ]

@@ -241,7 +241,7 @@ class Graphs:
         run, optimizer = self._run, self._run.gaussians.optimizer
         columns = optimizer.active_columns("f_rest")
         used = run.objective, run.density, run.pipe.antialiasing, type(optimizer), optimizer.guard, columns
-        used = *used, run.resolution.factor, run.sleeping and run.sleeping.awake.data_ptr()
+        used = *used, run.sizes.factor, run.sleeping and run.sleeping.awake.data_ptr()
         baked = self._adam.places(), used
         if baked != self._baked:
             self._graphs.clear()

@@ -1,6 +1,5 @@
 """Strategies: how many Gaussians there are, and where. Each is a file, whose name is that of --strategy."""
 
-import argparse
 from collections.abc import Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING
@@ -24,7 +23,7 @@ FEW, SECONDS = 50, 0.25  # training photos; seconds for each
 
 
 def of_clock(seconds: float, cameras: Sequence[Camera], device: torch.device) -> str:
-    """The strategy that is best in so many seconds, which --strategy auto takes for a new run with --time_budget."""
+    """The strategy that is best in so many seconds, which --strategy auto takes for a new run that has them."""
     few = len(cameras) <= FEW and seconds >= SECONDS * len(cameras)
     return "mcmc" if few and device.type == "cuda" else "budget"
 
@@ -35,16 +34,6 @@ def is_random(scene: Scene) -> bool:
     if cloud is None or scene.info.ply_path is not None or len(cloud.points) != RANDOM_POINTS:
         return False
     return bool((cloud.colors == cloud.colors[0]).all())
-
-
-def end_in_time(opt: argparse.Namespace) -> None:
-    """Let rows change no longer than by default, 1/2 or 5/6 of the schedule, where that is to go on to its end.
-
-    A run by the clock has few iterations, and needs the last ones for what it has.
-    """
-    for name, part in (("densify_until_iter", 1 / 2), ("mcmc_until_iter", 5 / 6)):
-        if getattr(opt, name) >= opt.iterations:
-            setattr(opt, name, int(part * opt.iterations))
 
 
 def density_control(run: "Run") -> DensityControl:

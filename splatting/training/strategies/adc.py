@@ -18,7 +18,6 @@ from scene.gaussians.morton import sort_rows
 from scene.gaussians.ppisp import Ppisp
 from splatting.training.density import DensityControl, refuse_empty
 from splatting.training.iteration import Iteration
-from splatting.training.schedule import DecidedSchedule
 
 if TYPE_CHECKING:
     from splatting.training.run import Run
@@ -84,7 +83,7 @@ class AdaptiveDensityControl(DensityControl):
         """Whether a run by the clock, at the pace of an iteration, could not recover from a reset at a step."""
         schedule = self.schedule
         left = (schedule.length - step) / schedule.stride(iteration)
-        return isinstance(schedule, DecidedSchedule) and left < rules.RECOVERY
+        return schedule.paced and left < rules.RECOVERY
 
     def _actions(self, iteration: int) -> rules.Actions:
         schedule = self.schedule

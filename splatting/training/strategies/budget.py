@@ -21,6 +21,7 @@ from scene.gaussians.morton import sort_rows
 from splatting.deterministic.counter_rng import Stream, permutation
 from splatting.training.density import DensityControl, default_budget, refuse_empty
 from splatting.training.iteration import Iteration
+from splatting.training.schedule import USUAL, longer_steps
 from splatting.training.strategies.error_scores import error_scores
 
 if TYPE_CHECKING:
@@ -45,6 +46,11 @@ class BudgetControl(DensityControl):
         self.ends = run.opt.densify_until_iter
         self._scores = partial(error_scores, run.gaussians, run.pipe, run.exposes)
         self.most_gaussians = run.opt.max_num_splats or default_budget(self._cameras)
+
+    def rate_factor(self, iteration: int) -> float:
+        """Learning rates follow the number of iterations, and fall at the end."""
+        length = self.schedule.length
+        return longer_steps(USUAL / length, iteration / length)
 
     def changes(self, iteration: int) -> bool:
         in_time = self.schedule.schedule_step(iteration) < self._opt.densify_until_iter

@@ -16,7 +16,6 @@ from scene.gaussians.mcmc import NO_PENALTY, Penalty, is_alive
 from scene.gaussians.morton import sort_rows
 from splatting.training.density import DensityControl, default_budget, refuse_empty
 from splatting.training.iteration import Iteration
-from splatting.training.schedule import DecidedSchedule
 from splatting.training.strategies import of_clock
 
 if TYPE_CHECKING:
@@ -44,7 +43,7 @@ class MarkovChain(DensityControl):
 
     def started(self) -> None:
         """Make Gaussians more opaque and smaller than those of adaptive density control (as the authors' release)."""
-        scale = self._opt.mcmc_init_scale or INIT_SCALES[isinstance(self.schedule, DecidedSchedule)]
+        scale = self._opt.mcmc_init_scale or INIT_SCALES[self.schedule.paced]
         self._gaussians.start_as(self._opt.mcmc_init_opacity, scale)
 
     def changes(self, iteration: int) -> bool:
@@ -108,7 +107,7 @@ class MarkovChain(DensityControl):
 
 def of_run(run: "Run") -> MarkovChain:
     """The control of a run."""
-    if not isinstance(run.schedule, DecidedSchedule):
+    if not run.schedule.paced:
         return MarkovChain(run.gaussians, run.opt)
     # Penalties need time; with little of it they only darken (fox_tiny, 1,243 iterations: -1.7 dB), except where they
     # clear away random points (nerf_lego200_tiny, 346 iterations: +17 dB).

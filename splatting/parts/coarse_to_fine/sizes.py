@@ -1,20 +1,16 @@
 """Coarse to fine: views that are smaller at first, by how far the schedule is (--resolution_schedule)."""
 
-import argparse
-from collections.abc import Callable
-
 import torch
 
 from scene.cameras import Camera
 from scene.images.store import GPU_SHARE, ImageStore
-from scene.scene import Scene
 from splatting.host.memory import free_memory
-from splatting.training.schedule import PYRAMID, DecidedSchedule, Schedule
+from splatting.training.schedule import Schedule
 
 LEAST = 32  # pixels of the shorter side; a picture is not made smaller than that
 
 
-class Resolution:
+class Sizes:
     """Gives the views of training in the size that their place in the schedule asks for.
 
     A smaller view is made when it is first needed, and kept while its level lasts. The smaller photos take 1 /
@@ -34,9 +30,9 @@ class Resolution:
         """The factor at an iteration of the schedule."""
         return self._schedule.factor_at(schedule_step)
 
-    def changes(self, before: int, now: int) -> bool:
-        """Whether the factor differs between two iterations of the schedule."""
-        return self.factor_at(before) != self.factor_at(now)
+    def smallest(self, camera: Camera) -> tuple[int, int]:
+        """The smallest size (width, height) in which a view may train."""
+        return smaller(camera, max((factor for _, factor in self._schedule.possible_levels), default=1.0))
 
     def view(self, camera: Camera, schedule_step: int) -> Camera:
         """A view as it is trained at an iteration of the schedule. Ask in ascending order."""
@@ -75,19 +71,3 @@ def smaller(camera: Camera, factor: float) -> tuple[int, int]:
     sides = camera.image_width, camera.image_height
     factor = max(1.0, min(factor, min(sides) / LEAST))
     return tuple(max(1, round(side / factor)) for side in sides)
-
-
-def smallest(opt: argparse.Namespace, schedule: Schedule) -> Callable[[Camera], tuple[int, int]]:
-    """A function that gives the smallest size (width, height) in which a view may train. A clock may choose PYRAMID."""
-    by_clock = isinstance(schedule, DecidedSchedule) and opt.resolution_schedule == "auto"
-    factors = [factor for _, factor in schedule.levels or (PYRAMID if by_clock else ())]
-    return lambda camera: smaller(camera, max(factors, default=1.0))
-
-
-def resolution_of(opt: argparse.Namespace, schedule: Schedule, scene: Scene) -> Resolution:
-    """The sizes of the training views by the options, or by the schedule that a run repeats or resumes."""
-    schedule.megapixels = scene.training_pixels()[0] / len(scene.getTrainCameras()) / 1e6
-    if not isinstance(schedule, DecidedSchedule):
-        schedule.sizes = "none" if opt.resolution_schedule == "auto" else opt.resolution_schedule
-        schedule.levels = PYRAMID if schedule.sizes == "pyramid" else ()
-    return Resolution(schedule, scene.images)

@@ -13,26 +13,20 @@ from typing import Any
 
 from arguments.strategies import STRATEGIES
 from splatting.files.json_files import read_json, write_json
-from splatting.training.schedule import (
-    PYRAMID,
-    Block,
-    Decided,
-    DecidedSchedule,
-    Schedule,
-    SettlingSchedule,
-    TimeBudget,
-)
+from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule, TimeBudget
+from splatting.training.schedule import PYRAMID
 from utils.system_utils import UserError
 
 NAME = "schedule.json"
-KEY = "schedule"  # of the table among the state in a checkpoint
+_SIZES = "resolution_schedule"  # key of the sizes of views
 _MOST = 2**31 - 1  # iterations, as of --iterations
 _BROKEN = ValueError, TypeError, KeyError, AttributeError, IndexError, OverflowError, RecursionError
 
 
 def table_of(decided: Decided) -> dict[str, Any]:
     """A schedule as plain values, for a file or a checkpoint."""
-    return decided._asdict() | {"blocks": [block._asdict() for block in decided.blocks]}
+    table = decided._asdict() | {"blocks": [block._asdict() for block in decided.blocks]}
+    return {_SIZES if name == "sizes" else name: value for name, value in table.items()}
 
 
 def write_schedule(path: Path, decided: Decided) -> None:
@@ -72,7 +66,7 @@ def _decided(content: Any) -> Decided:
         raise ValueError("its levels do not ascend")
     if (strategy := content.get("strategy", "")) not in ("", *STRATEGIES):
         raise ValueError(f"{strategy!r} is no strategy")
-    named = str(content["resolution_schedule"]), levels, strategy
+    named = str(content[_SIZES]), levels, strategy
     decided = Decided(length, blocks, ended, _number(content["time_budget"], 0.0), *named)
     if max(map(DecidedSchedule(decided).progress, lasts)) > 1 + 1e-6:
         raise ValueError("its progress goes beyond its end")
@@ -98,64 +92,42 @@ def _number(value: Any, least: float) -> float:
 
 def schedule_of(
     opt: argparse.Namespace,
+    sizes: str,
     checkpoint: str | None,
     first_iteration: int,
     share: Callable[[float], float] = lambda seconds: seconds,
     before: Any = None,
-) -> Schedule:
-    """The schedule of a run. UserError for one that this run cannot follow, or that leaves nothing to do.
+) -> DecidedSchedule:
+    """The schedule of a run. UserError for one that this run cannot follow.
 
-    checkpoint: a chkpntN.pth that is resumed, or None. first_iteration: its N, or 0. share: gives all processes the
-    seconds of one. before: the table in the checkpoint, None: it has none.
+    sizes: of views that are asked for. checkpoint: a chkpntN.pth that is resumed, or None. first_iteration: its N, or
+    0. share: gives all processes the seconds of one. before: the table in the checkpoint, None: it has none.
     """
-    schedule = _chosen(opt, checkpoint, first_iteration, share, before)
-    if not schedule.is_over(first_iteration):
-        return schedule
-    at = f"{checkpoint} is at iteration {first_iteration}"
-    if isinstance(schedule, DecidedSchedule):
-        raise UserError(
-            f"{at}, and its schedule ends with {schedule.ends}, so nothing is left to do; leave it as it is"
-        )
-    raise UserError(
-        f"{at}, so --iterations {opt.iterations} leaves nothing to do; --iterations counts from the start of the first "
-        "run"
-    )
-
-
-def _chosen(
-    opt: argparse.Namespace, checkpoint: str | None, first_iteration: int, share: Callable[[float], float], before: Any
-) -> Schedule:
+    if opt.schedule and opt.time_budget:
+        raise UserError("--time_budget and --schedule both give the pace of a run; leave one out")
     if opt.schedule.isdecimal() and not Path(opt.schedule).exists():
-        return DecidedSchedule(_even(int(opt.schedule), opt))
+        return DecidedSchedule(_even(int(opt.schedule), opt, sizes))
     if opt.schedule:
         return DecidedSchedule(_recorded(Path(opt.schedule), opt))
-    if not opt.time_budget:
-        if before is not None:
-            told = f"warning: {checkpoint} is of a run with --time_budget or --schedule, and this one has neither: it"
-            print(f"{told} goes on at iteration {first_iteration} of --iterations {opt.iterations}", file=sys.stderr)
-        return SettlingSchedule(opt.iterations) if opt.strategy == "budget" else Schedule(opt.iterations)
     if not first_iteration:
-        return TimeBudget(Decided(opt.iterations, [], None, opt.time_budget, opt.resolution_schedule), share)
-    return TimeBudget(_resumed(before, checkpoint, opt, first_iteration)._replace(time_budget=opt.time_budget), share)
+        return TimeBudget(Decided(opt.iterations, [], None, opt.time_budget, sizes), share)
+    found = _resumed(before, checkpoint, opt, sizes, first_iteration)
+    return TimeBudget(found._replace(time_budget=opt.time_budget), share)
 
 
-def _even(count: int, opt: argparse.Namespace) -> Decided:
+def _even(count: int, opt: argparse.Namespace, sizes: str) -> Decided:
     """The schedule that so many iterations go through in equal parts, with no budget of seconds."""
-    if opt.time_budget:
-        raise UserError("--time_budget and --schedule both give the pace of a run; leave one out")
     if not 1 <= count <= _MOST:
         raise UserError(f"--schedule must name iterations between 1 and {_MOST}, or a file, got {count}")
-    sizes = "none" if opt.resolution_schedule == "auto" else opt.resolution_schedule
+    sizes = "none" if sizes == "auto" else sizes
     levels = PYRAMID if sizes == "pyramid" else ()
     return Decided(opt.iterations, [Block(count, 0.0, 1 / count, 0.0)], count, 0.0, sizes, levels)
 
 
 def _recorded(path: Path, opt: argparse.Namespace) -> Decided:
-    if opt.time_budget:
-        raise UserError("--time_budget and --schedule both give the pace of a run; leave one out")
     found = _fitting(read_schedule(path), path, opt)
     if found.ended is None:
-        raise UserError(f"{path} is of a run that did not end; resume that run, or name the {NAME} of another one")
+        raise UserError(f"{path}: run not finished; resume it, or give the {NAME} of a finished run")
     return found
 
 
@@ -166,21 +138,16 @@ def _fitting(found: Decided, path: Path | str, opt: argparse.Namespace) -> Decid
             f"{path} is of a schedule of {found.iterations} iterations, not {opt.iterations}; give --iterations "
             f"{found.iterations}, as in the run that wrote it"
         )
-    if opt.resolution_schedule not in ("auto", found.resolution_schedule):
-        raise UserError(
-            f"{path} is of a run with --resolution_schedule {found.resolution_schedule}; leave that option out, as it "
-            "is taken from there"
-        )
     return found
 
 
-def _resumed(before: Any, checkpoint: str, opt: argparse.Namespace, first_iteration: int) -> Decided:
+def _resumed(before: Any, checkpoint: str, opt: argparse.Namespace, sizes: str, first_iteration: int) -> Decided:
     """The schedule so far of the runs that are resumed; one block if their checkpoint has none."""
     if before is None:
         told = f"{checkpoint} has no pace of a time budget: its iterations count as {first_iteration} of the schedule"
         print(told, file=sys.stderr)
         step = 1.0 / max(opt.iterations, first_iteration + 1)
-        return Decided(opt.iterations, [Block(first_iteration, 0.0, step, 0.0)], None, 0.0, opt.resolution_schedule)
+        return Decided(opt.iterations, [Block(first_iteration, 0.0, step, 0.0)], None, 0.0, sizes)
     try:
         found = DecidedSchedule(_decided(before)).up_to(first_iteration)
     except _BROKEN as error:

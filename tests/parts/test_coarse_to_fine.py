@@ -18,7 +18,7 @@ from scene.gaussian_model import GaussianModel
 from scene.images.sizes import shrink_mask, shrink_photo, shrink_values
 from scene.images.store import InMemory
 from scene.readers.info import CameraInfo
-from splatting.training.resolution import Resolution, smaller
+from splatting.parts.coarse_to_fine.sizes import Sizes, smaller
 from splatting.training.schedule import PYRAMID, Schedule
 
 
@@ -119,10 +119,10 @@ def test_masks_depth_maps_and_columns_are_smaller_too(colmap_scene, tmp_path):
 def test_levels_are_of_the_schedule_and_small_views_stay():
     levels = ((0.0, 4.0), (0.1, 2.0), (0.25, 1.0))
     assert levels == PYRAMID
-    sizes = Resolution(_schedule(1000), None)
+    sizes = Sizes(_schedule(1000), None)
     factors = [sizes.factor_at(t) for t in range(1, 1001)]
     assert [factors.index(f) + 1 for f in (4.0, 2.0, 1.0)] == [1, 100, 250] and factors == sorted(factors)[::-1]
-    assert [t for t in range(2, 1001) if sizes.changes(t - 1, t)] == [100, 250]
+    assert [t for t in range(2, 1001) if sizes.factor_at(t - 1) != sizes.factor_at(t)] == [100, 250]
     view = argparse.Namespace(image_width=200, image_height=100)
     assert smaller(view, 4.0) == (64, 32) and smaller(view, 2.0) == (100, 50)
     assert smaller(argparse.Namespace(image_width=20, image_height=10), 4.0) == (20, 10)
@@ -131,14 +131,14 @@ def test_levels_are_of_the_schedule_and_small_views_stay():
 def test_views_are_made_once_a_level_and_assigned_pictures_are_left_alone(colmap_scene, tmp_path):
     scene, _ = _scene(colmap_scene, tmp_path, resolution=1)
     first, second, third = scene.getTrainCameras()[:3]
-    sizes = Resolution(_schedule(1000), scene.images)
+    sizes = Sizes(_schedule(1000), scene.images)
     third.original_image = torch.zeros(3, 64, 96)
     small = sizes.view(first, 1)
     assert small._size == (48, 32) and small is sizes.view(first, 2) and sizes.view(third, 2) is third
     assert not sizes.needs(first) and sizes.needs(second)
     assert sizes.view(first, 250) is first and sizes.needs(first)
     limited, _ = _scene(colmap_scene, tmp_path / "limited", resolution=1, images_to_load=3)
-    sizes, view = Resolution(_schedule(1000), limited.images), limited.getTrainCameras()[0]
+    sizes, view = Sizes(_schedule(1000), limited.images), limited.getTrainCameras()[0]
     assert sizes.view(view, 1) is not sizes.view(view, 1) and sizes.needs(view)
 
 
@@ -154,7 +154,7 @@ def test_a_factor_beyond_all_sizes_makes_the_smallest_views(colmap_scene, tmp_pa
     scene, _ = _scene(colmap_scene, tmp_path, resolution=1)
     schedule = _schedule(10)
     schedule.levels = ((0.0, 1e300),)
-    assert Resolution(schedule, scene.images).view(scene.getTrainCameras()[0], 1)._size == (48, 32)
+    assert Sizes(schedule, scene.images).view(scene.getTrainCameras()[0], 1)._size == (48, 32)
 
 
 OPTIONS = ["--eval", "--no_curve", "--test_iterations", -1, "--iterations", 60, "--densify_from_iter", 5,

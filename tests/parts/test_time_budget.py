@@ -15,14 +15,15 @@ from trainings import before_steps, train_on
 
 from scene.gaussians import density_rules as rules
 from splatting.evaluation.training_log import Stopwatch
+from splatting.parts import part_class
+from splatting.parts.coarse_to_fine.sizes import Sizes
+from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule, TimeBudget
+from splatting.parts.time_budget.schedule_file import read_schedule, schedule_of, write_schedule
 from splatting.training.density import DensityControl
 from splatting.training.iteration import Iteration
 from splatting.training.observers.report import ProgressBar
-from splatting.training.observers.saves import ScheduleFile
-from splatting.training.resolution import Resolution
 from splatting.training.run import Run
-from splatting.training.schedule import Block, Decided, DecidedSchedule, Schedule, SettlingSchedule, TimeBudget
-from splatting.training.schedule_file import read_schedule, schedule_of, write_schedule
+from splatting.training.schedule import Schedule, longer_steps
 from splatting.training.strategies import density_control, of_clock
 from utils.system_utils import UserError
 
@@ -63,7 +64,7 @@ COSTS = {
 
 
 def _factors(schedule: Schedule, last: int) -> list[float]:
-    sizes = Resolution(schedule, None)
+    sizes = Sizes(schedule, None)
     return [sizes.factor_at(schedule.schedule_step(t)) for t in range(1, last + 1)]
 
 
@@ -75,12 +76,12 @@ def test_a_budget_of_few_pixels_takes_smaller_views_at_first(megapixels, name):
     seen: list[float] = []
 
     def seconds(iteration: int, step: int) -> float:
-        seen.append(Resolution(schedule, None).factor_at(step))
+        seen.append(Sizes(schedule, None).factor_at(step))
         return 0.02 / seen[-1]
 
     last, _ = _run(schedule, seconds)
     recorded = schedule.up_to(last)
-    assert recorded.resolution_schedule == schedule.sizes == name and _factors(DecidedSchedule(recorded), last) == seen
+    assert recorded.sizes == schedule.sizes == name and _factors(DecidedSchedule(recorded), last) == seen
     assert list(dict.fromkeys(seen)) == ([1.0, 4.0, 2.0] if name == "pyramid" else [1.0])  # at last whole again
     assert seen[0] == seen[-1] == 1.0
     resumed = TimeBudget(DecidedSchedule(recorded).up_to(last // 2)._replace(time_budget=30.0))
@@ -306,7 +307,7 @@ def test_rates_fall_to_a_tenth_at_the_end(length, steps, factor):
     falling = factors[held:]
     assert falling == sorted(falling, reverse=True) and falling[0] > 0.98 * factor
     assert schedule.rate_factor(int(0.85 * steps)) == pytest.approx(0.55 * factor, abs=0.01 * factor)
-    assert factors == pytest.approx([SettlingSchedule(steps).rate_factor(iteration) for iteration in percents])
+    assert factors == pytest.approx([longer_steps(30_000 / steps, iteration / steps) for iteration in percents])
 
 
 def _timed(monkeypatch: pytest.MonkeyPatch, cost: Callable[[int], float]) -> None:
@@ -400,7 +401,7 @@ def test_what_contradicts_itself_is_refused(colmap_scene, tmp_path):
     refused("--time_budget and --schedule both give the pace", *more, "--time_budget", 3)
     refused("is of a run with --resolution_schedule none; leave that", *more, "--resolution_schedule", "pyramid")
     path.write_text(json.dumps(GOOD | {"ended": None}))
-    refused("is of a run that did not end", *more)
+    refused("run not finished; resume it", *more)
     path.write_text("{}")
     refused("'iterations' is missing", *more)
     assert not (tmp_path / "out").exists()
@@ -427,7 +428,7 @@ def test_a_checkpoint_finds_its_place_or_is_refused(colmap_scene, tmp_path, monk
             _train(colmap_scene, tmp_path / "out", "--start_checkpoint", checkpoint, *more)
     for broken in ({}, {"blocks": []}, GOOD):  # the last ends before the checkpoint
         with pytest.raises(UserError, match=r"^the schedule in a.pth is broken \(.*\); give another one$"):
-            schedule_of(options(time_budget=9.0), "a.pth", 30, before=broken)
+            schedule_of(options(time_budget=9.0), "auto", "a.pth", 30, before=broken)
 
 
 def test_a_decided_run_goes_through_rates_degrees_and_windows(colmap_scene, tmp_path, monkeypatch):
@@ -452,7 +453,7 @@ def test_a_decided_run_goes_through_rates_degrees_and_windows(colmap_scene, tmp_
 def test_a_checkpoint_comes_with_its_schedule_and_the_last_one_is_the_end(colmap_scene, tmp_path, monkeypatch):
     _timed(monkeypatch, lambda t: 0.1)
     with monkeypatch.context() as killed:
-        killed.setattr(ScheduleFile, "ended", lambda *_: None)  # as if the process were killed before
+        killed.setattr(part_class("time_budget"), "ended", lambda *_: None)  # as if the process were killed before
         _train(colmap_scene, tmp_path, "--time_budget", 4, "--checkpoint_iterations", 3000)
     (checkpoint,) = tmp_path.glob("chkpnt*.pth")
     assert read_schedule(tmp_path / "schedule.json").ended == int(checkpoint.stem[6:])
@@ -540,7 +541,7 @@ def test_the_clock_ends_growth_at_the_pace_of_whole_views_and_removes_nothing(si
         if step // 1000 > schedule.schedule_step(iteration - 1) // 1000 and step < 15_000:
             counts.append(max(counts[-1], min(int(1.05 * counts[-1]) + 1, control.most(iteration, counts[-1], 50_000))))
             assert control.most(iteration, counts[-1], 50_000) >= counts[-1]
-        pixels = Resolution(schedule, None).factor_at(step) ** -2
+        pixels = Sizes(schedule, None).factor_at(step) ** -2
         return (0.005 + counts[-1] * 1e-6) * (0.2 + 0.8 * pixels) * (3 if step > 13_000 else 1)
 
     _run(schedule, cost)
@@ -562,12 +563,15 @@ def test_a_strategy_of_a_damaged_file_is_none():
 def test_a_number_of_iterations_goes_through_the_whole_schedule(tmp_path):
     """In equal parts, and with no limit of Gaussians, as no clock sets their number."""
     opt = options(schedule="1000", strategy="budget", iterations=30_000)
-    schedule = schedule_of(opt, None, 0)
+    schedule = schedule_of(opt, "auto", None, 0)
     steps = [schedule.schedule_step(t) for t in range(1001)]
     assert steps[::500] == [0, 15_000, 30_000] and schedule.is_last(1000)
-    assert DensityControl.most(SimpleNamespace(schedule=schedule), 100, 10, 90_000) == 90_000
+    assert (
+        DensityControl.most(SimpleNamespace(schedule=schedule, random=False, most_gaussians=0), 100, 10, 90_000)
+        == 90_000
+    )
     write_schedule(tmp_path / "schedule.json", schedule.up_to(1000))
     assert read_schedule(tmp_path / "schedule.json").blocks == schedule.blocks
     for words, reason in (({"schedule": "0"}, "between 1 and 2147483647"), ({"time_budget": 9.0}, "leave one out")):
         with pytest.raises(UserError, match=reason):
-            schedule_of(options(**{"schedule": "7"} | words), None, 0)
+            schedule_of(options(**{"schedule": "7"} | words), "auto", None, 0)

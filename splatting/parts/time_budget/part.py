@@ -1,0 +1,84 @@
+"""Trainings that end with their seconds (--time_budget), or in as many iterations as another one (--schedule)."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatting.training.option import Option, within
+from splatting.training.part import Error, Options, Part, fill
+
+if TYPE_CHECKING:
+    import argparse
+
+    from scene.scene import Scene
+    from splatting.training.iteration import Iteration
+
+_FILE = "schedule.json"
+
+
+class TimeBudget(Part):
+    """Lets each iteration stand for a part of the schedule, and keeps in schedule.json for which."""
+
+    name = "time_budget"
+    # fmt: off
+    options = Options(optimisation=(
+        Option("time_budget", 0.0, origin="ours", check=within(0, 31_536_000),  # a year
+            help="seconds of training that the run takes, without scoring and saving, to 3 %; 0: no budget. It goes "
+                 "through the whole schedule of --iterations in them, in fewer or more iterations, with learning rates "
+                 "that follow their number, and writes schedule.json. --strategy auto takes budget, or on a GPU mcmc "
+                 "for at most 50 photos and 0.25 seconds or more for each; all grow to at most 25 Gaussians for each "
+                 "iteration"),
+        Option("schedule", "", origin="ours",
+            help="schedule.json of a run with --time_budget: train as that run did, without looking at the clock. Or a "
+                 "number: so many iterations, which go through the whole schedule of --iterations in equal parts"),
+    ))
+    # fmt: on
+    traces = (_FILE,)
+    own_end = True
+
+    @classmethod
+    def wanted(cls, given: "argparse.Namespace") -> bool:
+        return bool(getattr(given, "time_budget", 0) or getattr(given, "schedule", ""))
+
+    @classmethod
+    def dropped(cls, given: "argparse.Namespace", iteration: int) -> str | None:
+        return (
+            f"{given.start_checkpoint} is of a run with --time_budget or --schedule, and this one has neither: it goes "
+            f"on at iteration {iteration} of --iterations {given.iterations}"
+        )
+
+    def check(self, run: Any, state: Any) -> None:
+        from splatting.parts.time_budget.schedule_file import schedule_of
+
+        self._run, self._iteration = run, 0
+        schedule = schedule_of(run.opt, run.asked_sizes, run.start, run.first_iteration, run.group.shared, state)
+        fill(run, "schedule", schedule, self)
+        self._end_in_time(run.opt)
+
+    @staticmethod
+    def _end_in_time(opt: "argparse.Namespace") -> None:
+        """Let rows change no longer than by default, 1/2 or 5/6 of the schedule, where that is to go on to its end.
+
+        A run by the clock has few iterations, and needs the last ones for what it has.
+        """
+        for name, part in (("densify_until_iter", 1 / 2), ("mcmc_until_iter", 5 / 6)):
+            if getattr(opt, name) >= opt.iterations:
+                setattr(opt, name, int(part * opt.iterations))
+
+    def measured(self, at: "Iteration", losses: object) -> None:
+        self._iteration = at.iteration
+
+    def state(self) -> dict[str, Any] | None:
+        from splatting.parts.time_budget.schedule_file import table_of
+
+        schedule = self._run.schedule
+        return table_of(schedule.decided) if schedule.blocks else None
+
+    def save(self, scene: "Scene") -> None:
+        from splatting.parts.time_budget.schedule_file import write_schedule
+
+        if self._iteration:
+            write_schedule(Path(scene.model_path) / _FILE, self._run.schedule.up_to(self._iteration))
+
+    def ended(self, error: Error) -> None:
+        """Also by an error whose rescue has saved a checkpoint."""
+        self.save(self._run.scene)
