@@ -5,9 +5,8 @@ import os
 from collections.abc import Collection
 
 from arguments.param_group import GroupParams, OptionTable
-from arguments.strategies import STRATEGY_OPTIONS
 from splatting.files.json_files import MODEL_JSON
-from splatting.parts import options_of
+from splatting.parts import options_of, part_class, strategies
 from splatting.training.option import CFG_ARGS, Option, above, at_least, one_of, within
 from utils.system_utils import UserError
 
@@ -192,7 +191,9 @@ class OptimizationParams(OptionTable):
                  "drop bands that are zero throughout, -1: drop none. The sh_degree in cfg_args follows"),
         Option("seed", 0, origin="ours, and the reference's fixed seed", check=within(0, 2**63 - 1), stored=MODEL_JSON,
             help="seed of every random choice; the same seed gives the same bytes"),
-        *STRATEGY_OPTIONS,
+        Option("strategy", "auto", origin="ours", check=one_of("auto", *strategies()), stored=MODEL_JSON,
+            help="how many Gaussians there are, and where. auto: adc, or what is best in the time that is given; a "
+                 "resumed run keeps its own. " + "; ".join(f"{n}: {part_class(n).summary}" for n in strategies())),
     )
     # fmt: on
 

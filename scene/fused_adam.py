@@ -10,7 +10,7 @@ from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam, SparseGaussianAdam
-from scene.gaussians.mcmc import NO_PENALTY, Penalty
+from scene.gaussians.penalty import NO_PENALTY, Penalty
 
 # In the operator's order (gs::Stepped).
 _STEPPED = ("xyz", "opacity", "scaling", "rotation", "f_dc", "f_rest")

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from scene.gaussians import adc, checkpoint, mcmc
+from scene.gaussians import adc, checkpoint, penalty
 from scene.gaussians.adam import GaussianAdam, SparseGaussianAdam, StepGuard
 from scene.gaussians.attributes import INITIAL_OPACITY, Rows
 from scene.gaussians.exposure import Exposures, read_exposures, read_pretrained
@@ -86,7 +86,7 @@ class GaussianModel(GaussianParameters):
         if use_train_test_exp:
             self.pretrained_exposures = read_pretrained((Path(path).absolute().parent / "../..").resolve())
 
-    # Density control: the reference's (scene/gaussians/adc.py), and that of MCMC (scene/gaussians/mcmc.py)
+    # Density control: the reference's (scene/gaussians/adc.py)
 
     observe, observe_absolute = adc.observe, adc.observe_absolute
     add_densification_stats = adc.add_densification_stats
@@ -94,8 +94,7 @@ class GaussianModel(GaussianParameters):
     densify_and_clone, densify_and_split = adc.densify_and_clone, adc.densify_and_split
     densification_postfix, prune_points = adc.densification_postfix, adc.prune_points
     reset_opacity = adc.reset_opacity
-    start_as, relocate, grow = mcmc.start_as, mcmc.relocate, mcmc.grow
-    add_noise, penalise = mcmc.add_noise, mcmc.penalise
+    penalise = penalty.penalise
 
     def drop_broken_statistics(self) -> None:
         """Restart the statistics of Gaussians whose sum of gradients is not finite."""

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.gaussians.long_axis import long_axis_children
+from splatting.parts import part_class
+from splatting.parts.adc.control import AdaptiveDensityControl
 from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
 from splatting.training.checks import late_reset
 from splatting.training.schedule import Schedule
-from splatting.training.strategies import adc
-from splatting.training.strategies.adc import AdaptiveDensityControl
 from utils.general_utils import build_rotation
 
 EXTENT = 2.0
@@ -299,7 +299,7 @@ def test_an_appearance_wants_no_resets(appearance, interval, resets):
     gaussians.appearance = appearance
     run = SimpleNamespace(gaussians=gaussians, opt=options(opacity_reset_interval=interval))
     run.dataset, run.scene = SimpleNamespace(white_background=True), SimpleNamespace(cameras_extent=1.0)
-    control = adc.of_run(run)
+    control = part_class("adc")().control(run)
     control.schedule = Schedule(30_000)
     assert sum(control.resets(t) for t in range(1, 30_000)) == resets
     assert run.opt.opacity_reset_interval == interval

@@ -12,11 +12,11 @@ import torch
 
 import train
 from splatting.evaluation.training_log import TrainingLog
+from splatting.parts.adc import control as adc
 from splatting.training.announcer import Announcer
 from splatting.training.density import DensityControl
 from splatting.training.observers.standard import standard_observers
 from splatting.training.part import Part
-from splatting.training.strategies import adc
 
 ITERATIONS = 24
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from synthetic import make_colmap_scene
 
-from splatting.parts import PARTS, part_class
+from splatting.parts import PARTS, part_class, strategies
 from splatting.training.part import Options, Part, fill, overrides
 from utils.system_utils import UserError
 
@@ -20,10 +20,12 @@ ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "splatting" / "parts"
 ROOMS = ("arguments", "gaussian_renderer", "integrations", "splatting", "scene", "utils")
 NAMESPACES = ("args", "opt", "options", "dataset", "given", "launch", "pipe")  # what options are read from
-KNOWN = {  # files that say the name of an option and mean something else, or have to keep it
-    "splatting/parts/time_budget/schedule_file.py",  # a key of schedule.json
-    "integrations/nerfbaselines/spec.py",  # sets of options, as a user gives them
-    "scene/gaussian_model.py",  # the schedule of exposures' learning rate
+KNOWN = {  # words in files that are options of a part, and mean something else there or have to stay
+    ("resolution_schedule", "splatting/parts/time_budget/schedule_file.py"),  # a key of schedule.json
+    ("time_budget", "integrations/nerfbaselines/spec.py"),  # a set of options, as a user gives it
+    ("schedule", "scene/gaussian_model.py"),  # that of exposures' learning rate
+    ("split", "splatting/evaluation/tables.py"),  # of photos into training and test views
+    ("split", "splatting/evaluation/results.py"),
 }
 COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "export", "view")
 
@@ -40,7 +42,6 @@ def _files(name: str) -> Iterator[Path]:
     """
     found = [*(path for room in ROOMS for path in (ROOT / room).rglob("*.py")), *(ROOT / f"{c}.py" for c in COMMANDS)]
     known = FOLDER / name, ROOT / "splatting" / "compat"
-    found = [path for path in found if path.relative_to(ROOT).as_posix() not in KNOWN]
     yield from (path for path in found if not {*known} & {*path.parents} and path != FOLDER / "__init__.py")
 
 
@@ -51,7 +52,9 @@ def _nodes(path: Path) -> list[ast.AST]:
 
 def _names_of(name: str, path: Path) -> Iterator[str]:
     """Lines of a file that import a part, or say the name of one of its options."""
-    options = _options(name)
+    file = path.relative_to(ROOT).as_posix()
+    options = {option for option in _options(name) if (option, file) not in KNOWN} or {"no option"}
+    called = [node.func for node in _nodes(path) if isinstance(node, ast.Call)]
     typed = re.compile(rf"--({'|'.join(map(re.escape, sorted(options)))})\b")
     for node in _nodes(path):
         if isinstance(node, ast.ImportFrom):
@@ -62,11 +65,11 @@ def _names_of(name: str, path: Path) -> Iterator[str]:
             found = node.value in options or typed.search(node.value)
         elif isinstance(node, ast.Attribute):
             of = getattr(node.value, "attr", getattr(node.value, "id", ""))
-            found = node.attr in options and of.strip("_") in NAMESPACES
+            found = node.attr in options and of.strip("_") in NAMESPACES and node not in called
         else:
             continue
         if found:
-            yield f"{path.relative_to(ROOT)}:{node.lineno}"
+            yield f"{file}:{node.lineno}"
 
 
 @pytest.mark.parametrize("name", PARTS)
@@ -118,9 +121,9 @@ def test_without_a_part_all_else_imports_and_lacks_its_options_alone(name):
 
 TRAINED = """
 import doctor, export, render, train
-scene, out = words
-short = ["--iterations", "20", "--test_iterations", "20", "--eval", "-r", "48", "--disable_viewer"]
-train.main(["-s", scene, "-m", out, *short])
+scene, out, strategy = words
+short = ["--strategy", strategy, "--iterations", "20", "--test_iterations", "20", "--eval", "-r", "48"]
+train.main(["-s", scene, "-m", out, "--disable_viewer", *short])
 for command, line in ((render, ["-m", out]), (doctor, ["-m", out]), (export, ["-m", out, "--to", out + "/a.ply"])):
     sys.argv = [command.__name__, *line]
     try:
@@ -135,8 +138,10 @@ def scene(once) -> Path:
     return once("scene_of_parts", make_colmap_scene)
 
 
-def _trained(scene: Path, out: Path, name: str) -> bytes:
-    command = [sys.executable, "-c", WITHOUT + TRAINED, name, str(scene), str(out)]
+def _trained(scene: Path, out: Path, name: str, hidden: str) -> bytes:
+    """Train without the part `hidden`, by the first strategy that is not `name`."""
+    other = next(strategy for strategy in strategies() if strategy != name)
+    command = [sys.executable, "-c", WITHOUT + TRAINED, hidden, str(scene), str(out), other]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return (out / "point_cloud/iteration_20/point_cloud.ply").read_bytes()
@@ -145,9 +150,10 @@ def _trained(scene: Path, out: Path, name: str) -> bytes:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PARTS)
 def test_without_a_part_a_training_has_the_bytes_of_one_with_the_part_off(name, scene, tmp_path, once):
-    once("of_all_parts", lambda folder: _trained(scene, folder, "none"))
-    whole = once("of_all_parts", None) / "point_cloud/iteration_20/point_cloud.ply"
-    assert _trained(scene, tmp_path / "out", name) == whole.read_bytes()
+    other = next(strategy for strategy in strategies() if strategy != name)
+    whole = once(f"of_all_parts_by_{other}", lambda folder: _trained(scene, folder, name, "none"))
+    ply = whole / "point_cloud/iteration_20/point_cloud.ply"
+    assert _trained(scene, tmp_path / "out", name, name) == ply.read_bytes()
 
 
 def test_hooks_that_are_not_overridden_are_not_called():

@@ -7,7 +7,7 @@ from gaussians import model
 from rasterizer_tools import BOTH_AND_GPU
 from torch import Tensor
 
-from scene.gaussians.mcmc import NO_PENALTY, Penalty
+from scene.gaussians.penalty import NO_PENALTY, Penalty
 
 WEIGHTS = {"opacity": 0.3, "scale": 0.7}
 

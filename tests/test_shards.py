@@ -19,9 +19,9 @@ from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
 from scene.gaussians.density_rules import logit
 from scene.gaussians.sh_bands import cut_bounds
 from splatting.distributed.ranks import ranks
-from splatting.training.strategies.adc import AdaptiveDensityControl
-from splatting.training.strategies.budget import BudgetControl
-from splatting.training.strategies.mcmc import MarkovChain
+from splatting.parts.adc.control import AdaptiveDensityControl
+from splatting.parts.budget.control import BudgetControl
+from splatting.parts.mcmc.control import MarkovChain
 from utils.system_utils import UserError
 
 EXTENT, THRESHOLD = 2.0, 2e-4

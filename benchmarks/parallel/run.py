@@ -12,12 +12,12 @@ from scene.sleeping import Sleeping, share_seen
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch
 from splatting.host.interrupt import DeferredInterrupt
+from splatting.training.density import density_control
 from splatting.training.gpu_memory import GpuMemory
 from splatting.training.iteration import ViewOrder
 from splatting.training.objective import LossWatch, Objective
 from splatting.training.run import Run
 from splatting.training.schedule import Schedule
-from splatting.training.strategies import density_control
 from utils.system_utils import compute_device
 
 _EXTENT = 5.0  # world units

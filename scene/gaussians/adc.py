@@ -249,6 +249,17 @@ def prune_points(gaussians: GaussianParameters, mask: Tensor) -> None:
         gaussians.columns[name] = values.index_select(0, keep)
 
 
+@changes_rows
+def remove_useless(gaussians: GaussianParameters, min_opacity: float, most: int) -> None:
+    """Remove Gaussians of an opacity below min_opacity; then those of the lowest, until there are at most `most`."""
+    opacity = gaussians.opacity_logits().reshape(-1)
+    remove = rules.is_useless(opacity, min_opacity)
+    over = gaussians.gaussian_count - most
+    if over > 0:
+        remove[gaussians.shards.lowest(opacity, over)] = True
+    gaussians.prune_points(remove)
+
+
 def reset_opacity(gaussians: GaussianParameters) -> None:
     """Lower every opacity to at most 0.01; Adam's averages of it restart at zero."""
     if gaussians.keeps_logits:

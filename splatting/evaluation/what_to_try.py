@@ -5,7 +5,7 @@ from itertools import pairwise
 from typing import Any
 
 from splatting.evaluation.error_curve import Row, best_test, whole_sets
-from splatting.parts import tools
+from splatting.parts import part_class, tools
 
 # Entries of the log's last record: options of the training.
 CAP, PLANNED, STRATEGY = "max_num_splats", "iterations_planned", "strategy"
@@ -101,7 +101,7 @@ def _never_grew(rows: Sequence[Row], strategy: str) -> str | None:
     if len(counts) < 2 or rows[-1]["iteration"] < SETTLED or grew:
         return None
     remedy = "a lower --densify_grad_threshold" if strategy == "adc" else "a higher --max_num_splats"
-    end = "--mcmc_until_iter" if strategy == "mcmc" else "--densify_until_iter"
+    end = f"--{part_class(strategy).until[0]}"
     return _NEVER_GREW.format(first=counts[0], last=counts[-1], remedy=remedy, end=end)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from splatting.training.option import Option
-from splatting.training.part import Part
+from splatting.training.part import Part, Strategy
 from utils.system_utils import UserError
 
 # Names of folders, with the reason for the place, where there is one.
@@ -22,6 +22,9 @@ PARTS = (
     "depth_maps",
     "keep_best",  # after maps are found: its views have none
     "robust_mask",
+    "adc",  # the first strategy is the default
+    "mcmc",  # before budget: where a time is given, the first that is best in it is taken
+    "budget",
     "sky",
     "sparse_depth",  # the order of the terms of the loss is in the bytes of the model
     "filter_3d",  # after all that moves rows
@@ -32,6 +35,11 @@ PARTS = (
 def part_class(name: str) -> type[Part]:
     """The class of the folder `name`: its name in capital words."""
     return getattr(import_module(f"{__name__}.{name}.part"), "".join(map(str.capitalize, name.split("_"))))
+
+
+def strategies() -> list[str]:
+    """Names of the strategies of density control."""
+    return [name for name in PARTS if issubclass(part_class(name), Strategy)]
 
 
 def options_of(group: str) -> list[Option]:

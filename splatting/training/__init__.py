@@ -5,7 +5,7 @@ run, iteration             the loop's inputs: a run made from the options, one i
 steps/                     the step of an iteration: plain, fused or captured
 objective                  the loss
 part, option               what a feature adds to a training, in one class; the features lie in splatting/parts
-density, strategies/       density control; another strategy is another class with the same hooks
+density                    the hooks of density control; the strategies lie in splatting/parts
 schedule                   the steps of the schedule that an iteration stands for
 announcer, observers/      everything that watches: checks, progress, curve, report, saves, checkpoints, viewers
 checks, memory_estimate    before: what is refused or warned of, and an estimate of the memory that a training needs

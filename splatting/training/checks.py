@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from arguments import OPTIONS, other_scene, read_training_options
-from arguments.strategies import STRATEGIES, STRATEGY_OPTIONS
 from scene.check import of_options, tell
 from scene.check.photos import hints
 from scene.gaussian_model import GaussianModel
@@ -22,7 +21,7 @@ from splatting.evaluation.error_curve import NAME as CURVE
 from splatting.evaluation.error_curve import Row, continue_curve
 from splatting.evaluation.training_log import TrainingLog
 from splatting.files.listing import some
-from splatting.parts import tools
+from splatting.parts import part_class, strategies, tools
 from splatting.training.density import DensityControl
 from splatting.training.schedule import USUAL
 from utils.system_utils import UserError
@@ -90,10 +89,9 @@ def faster_alone(ranks: int, on_gpu: bool, count: int) -> str | None:
 
 
 def without_effect(opt: argparse.Namespace, strategy: str) -> str | None:
-    """What to say of given options that belong to another strategy; their help begins with its name."""
-    other = {*STRATEGIES} - {strategy}
-    given = [f"--{o.name}" for o in STRATEGY_OPTIONS
-             if o.help.partition(":")[0] in other and getattr(opt, o.name) != o.default]  # fmt: skip
+    """What to say of given options that belong to another strategy."""
+    others = [option for name in strategies() if name != strategy for option in part_class(name).options.optimisation]
+    given = [f"--{option.name}" for option in others if getattr(opt, option.name) != option.default]
     return f"--strategy {strategy} has no use for {some(given)}" if given else None
 
 
@@ -123,42 +121,37 @@ def another_number(density: DensityControl, opt: argparse.Namespace, count: int,
 
     count: of Gaussians, now; first: the next iteration. Not known of a run with a time budget.
     """
-    schedule, aim = density.schedule, density.most_gaussians
+    schedule, aim, strategy = density.schedule, density.most_gaussians, part_class(opt.strategy)
     if schedule.paced or schedule.schedule_step(first) >= density.ends > 0:
         return None  # what is repeated or resumed has no say in it any more
+    ending, start = strategy.until[0], f"--densify_from_iter {opt.densify_from_iter} is not before"
     if 0 < density.ends <= opt.densify_from_iter < schedule.length:
-        until = "mcmc_until_iter" if opt.strategy == "mcmc" else "densify_until_iter"
-        what = f"--densify_from_iter {opt.densify_from_iter} is not before --{until} {density.ends}"
-        return f"{what}, so no Gaussians are added; lower --densify_from_iter"
+        return f"{start} --{ending} {density.ends}, so no Gaussians are added; lower --densify_from_iter"
     reached = density.most_after(count, first, schedule.ends)
     too_many, too_late = 0 < opt.max_num_splats < count, opt.densify_from_iter >= schedule.length
-    if opt.strategy == "adc":
-        if too_many:
-            remedy = "" if too_late else "; --strategy budget gets down to it"
-            return f"{_start_of(count, opt)}; adc adds none, and removes only faint ones{remedy}"
-        return None
-    # The number that mcmc takes where none is given is a limit, nothing to reach.
-    if reached == aim or ((reached > aim or opt.strategy == "mcmc") and not opt.max_num_splats):
+    remover = next((name for name in strategies() if part_class(name).removes), None)
+    if not density.grows_to:
+        remedy = f"; --strategy {remover} gets down to it" if remover and not too_late else ""
+        adds = f"{opt.strategy} adds none, and removes only faint ones"
+        return f"{_start_of(count, opt)}; {adds}{remedy}" if too_many else None
+    if reached == aim or ((reached > aim or density.default_is_limit) and not opt.max_num_splats):
         return None
     done = schedule.schedule_step(first) - 1
-    until = f"--densify_until_iter {done + (schedule.length - done) // 2}"
+    ends = {"densify_until_iter": f"--densify_until_iter {done + (schedule.length - done) // 2}"}.get(ending, "")
     scaled = None
     if not done and opt.densify_from_iter < density.ends < USUAL:
         scaled = next((remedy(schedule.length) for remedy in tools("for_few_iterations")), None)
     if too_late:
-        window = f"--densify_from_iter {done + (schedule.length - done) // 20}"
-        if opt.strategy != "mcmc":
-            window += f" {until}"
-        why = f"--densify_from_iter {opt.densify_from_iter} is not before the end; give {scaled or window}"
-        if too_many and opt.strategy == "budget":
+        window = f"--densify_from_iter {done + (schedule.length - done) // 20} {ends}".rstrip()
+        why = f"{start} the end; give {scaled or window}"
+        if too_many and strategy.removes:
             return f"{_start_of(count, opt)}; only faint ones are removed, as {why}"
-    elif opt.strategy == "mcmc":
-        why = f"--mcmc_growth {opt.mcmc_growth:g} adds too few each time; raise it"
-        why = "it removes none; --strategy budget does" if too_many else why
-    elif schedule.length < density.ends:
-        why = f"--densify_until_iter {opt.densify_until_iter} is not before the end; give {scaled or until}"
+    elif too_many and not strategy.removes:
+        why = f"it removes none; --strategy {remover} does"
+    elif ends and schedule.length < density.ends:
+        why = f"--{ending} {density.ends} is not before the end; give {scaled or ends}"
     else:
-        why = "they at most double each time; lower --densification_interval"
+        why = density.too_slow()
     return f"--strategy {opt.strategy} gets to {reached:,} Gaussians, not to {aim:,}, as {why}"
 
 

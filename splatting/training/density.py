@@ -1,13 +1,16 @@
-"""The hooks by which a strategy of density control acts on a training (strategies: training/strategies)."""
+"""The hooks by which a strategy of density control acts on a training (strategies: splatting/parts)."""
 
 import math
 from collections.abc import Collection, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from torch import Tensor
 
 from scene.cameras import Camera
-from scene.gaussians.mcmc import NO_PENALTY
+from scene.gaussians.penalty import NO_PENALTY
+from scene.readers.start_cloud import RANDOM_POINTS
+from scene.scene import Scene
+from splatting.parts import part_class, strategies
 from splatting.training.iteration import Iteration
 from splatting.training.schedule import STEADY, Schedule
 from utils.system_utils import UserError
@@ -30,7 +33,8 @@ class DensityControl:
     white cost nothing before a white background. ends: the iteration of the schedule from which it changes no rows.
     schedule: tells how far it is in an iteration (training/schedule.py). Rules that are windows of the schedule ask it;
     rules that count steps take the iteration itself. random: whether the model began as random points, of which the
-    clock may remove those that it cannot train.
+    clock may remove those that it cannot train. grows_to: whether it is meant to reach most_gaussians; not where nobody
+    has given a number, with default_is_limit.
     """
 
     fusable: ClassVar[bool] = False
@@ -42,6 +46,8 @@ class DensityControl:
     ends = math.inf
     schedule: Schedule = STEADY
     random = False
+    grows_to: ClassVar[bool] = True
+    default_is_limit: ClassVar[bool] = False
 
     def started(self) -> None:
         """Called before the first iteration of a model that was made from points, not read from a file."""
@@ -87,6 +93,10 @@ class DensityControl:
         """
         return self.schedule.most(iteration, count, limit, self.random, self.most_gaussians)
 
+    def too_slow(self) -> str:
+        """Why it may not reach its number of Gaussians in time, and what to do."""
+        return "they at most double each time; lower --densification_interval"
+
     def rate_factor(self, iteration: int) -> float | None:
         """Factor of the learning rates that have no schedule, where the run's schedule has none. None: 1."""
         return None
@@ -100,6 +110,26 @@ class DensityControl:
 
     def after_step(self, step: Iteration) -> None:
         """Called after the optimiser's step, so not in the last iteration, which takes none."""
+
+
+def density_control(run: Any) -> DensityControl:
+    """The control of the strategy that --strategy names, for the model and the scene of a run.
+
+    UserError for a name that is none of a strategy: a file of another run may say anything.
+    """
+    if (name := run.opt.strategy) not in strategies():
+        raise UserError(f"there is no strategy {name!r}; give --strategy {' or '.join(strategies())}")
+    control = part_class(name)().control(run)
+    control.random = is_random(run.scene)
+    return control
+
+
+def is_random(scene: Scene) -> bool:
+    """Whether a scene has no points but random ones."""
+    cloud = scene.info.point_cloud
+    if cloud is None or scene.info.ply_path is not None or len(cloud.points) != RANDOM_POINTS:
+        return False
+    return bool((cloud.colors == cloud.colors[0]).all())
 
 
 def default_budget(cameras: Sequence[Camera]) -> int:

@@ -198,6 +198,36 @@ class Part:
         """Training is over: after its last iteration (None), or by an error, which may be replaced by raising."""
 
 
+class Strategy(Part):
+    """A part of which each training has one: how many Gaussians there are, and where (--strategy NAME).
+
+    summary: of what it does, for the help. until: the option of the step at which it ends, and the part of the schedule
+    that this is by default. removes: whether it removes Gaussians down to a given number.
+    """
+
+    summary: ClassVar[str] = ""
+    until: ClassVar[tuple[str, float]] = "densify_until_iter", 1 / 2
+    removes: ClassVar[bool] = False
+
+    @classmethod
+    def wanted(cls, given: argparse.Namespace) -> bool:
+        return False  # what names it may be decided late
+
+    @classmethod
+    def best_in(cls, seconds: float, run: Any) -> bool:
+        """Whether it is the best one for a run that takes so many seconds. The first that says so is taken."""
+        return False
+
+    @classmethod
+    def absolute_gradients(cls, opt: argparse.Namespace) -> bool:
+        """Whether, by these options, its statistics take the lengths of absolute gradients, which need memory."""
+        return False
+
+    def control(self, run: Any) -> Any:
+        """The hooks by which it acts on a run (splatting.training.density.DensityControl)."""
+        raise NotImplementedError
+
+
 def overrides(parts: Sequence[Part], hook: str) -> list[Callable]:
     """The bound hooks of the parts whose class overrides it."""
     plain = getattr(Part, hook)

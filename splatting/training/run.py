@@ -30,8 +30,9 @@ from splatting.exports.in_scene import scene_with, start_from
 from splatting.exports.splats import Splats
 from splatting.host.clock import seconds_since_start
 from splatting.host.interrupt import DeferredInterrupt
-from splatting.parts import check_together, chosen, part_class, remove_traces, states_in
+from splatting.parts import check_together, chosen, part_class, remove_traces, states_in, strategies
 from splatting.training import checks
+from splatting.training.density import density_control
 from splatting.training.gpu_memory import GpuMemory, limit_torch, reads_on_host
 from splatting.training.iteration import Iteration, OwnSize, ViewOrder
 from splatting.training.memory_estimate import announce_memory, expected_count, largest_view
@@ -39,7 +40,6 @@ from splatting.training.objective import LossWatch, Objective
 from splatting.training.part import Part, overrides
 from splatting.training.restart import resumed
 from splatting.training.schedule import Schedule
-from splatting.training.strategies import AUTO, density_control
 from utils.system_utils import UserError, compute_device
 
 
@@ -87,7 +87,7 @@ class Run:
         checks.check_alone(launch.viewer, getattr(pipe, "projection", "ewa"), self.group.several)
         self.start = self.group.shared(resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
         dataset = self.dataset = checks.with_lenses(dataset, self.start)
-        if opt.strategy == AUTO and self.start:
+        if opt.strategy == "auto" and self.start:
             opt.strategy = checks.strategy_of(self.start)
         self.lost = 0
         self.interrupt, self.device = DeferredInterrupt(), compute_device()
@@ -112,7 +112,7 @@ class Run:
         check_views(self.pipe, self.scene.getTrainCameras(), self.sizes.smallest)
         check_views(self.pipe, [*self.scene.getTestCameras(), *self.scene.validation_cameras.get(1.0, ())])
         self._check_records()
-        if opt.strategy == AUTO:
+        if opt.strategy == "auto":
             opt.strategy = self.schedule.best_strategy(self)
             check_together(self.parts, self._all_options, self.group.several)
         self.schedule.strategy = opt.strategy
@@ -179,7 +179,8 @@ class Run:
         """Divide the empty model among the processes, and decide on the limit of the GPU's memory."""
         self.gaussians.divide(self.group)
         store, pixels = self.scene.images, largest_view(self.scene)
-        self.memory = GpuMemory(self.opt.gpu_memory, self.gaussians, store, pixels, self.opt.absgrad, self.device)
+        absolute = any(part_class(name).absolute_gradients(self.opt) for name in strategies())
+        self.memory = GpuMemory(self.opt.gpu_memory, self.gaussians, store, pixels, absolute, self.device)
         self._expect(count)
 
     def _begin_model(self, capture: tuple | None, first: Splats | None, states: dict[str, Any]) -> None:

@@ -10,6 +10,8 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from typing import Any
 
+from splatting.parts import strategies
+
 USUAL = 30_000  # iterations that the default learning rates are for
 LONGER = 2.0  # times the root of the stride
 MOST_RATE = 8.0  # about the best for 1,300 iterations in place of 30,000 (docs/results/tried.md)
@@ -90,8 +92,8 @@ class Schedule:
         return limit
 
     def best_strategy(self, run: Any) -> str:
-        """The strategy of a new run that names none."""
-        return "adc"
+        """The strategy of a new run that names none: the first in the registry."""
+        return strategies()[0]
 
     def nothing_left(self, checkpoint: str, iteration: int) -> str:
         """Why a run that would resume a checkpoint has nothing to do."""

@@ -19,12 +19,11 @@ from splatting.parts import part_class
 from splatting.parts.coarse_to_fine.sizes import Sizes
 from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule, TimeBudget
 from splatting.parts.time_budget.schedule_file import read_schedule, schedule_of, write_schedule
-from splatting.training.density import DensityControl
+from splatting.training.density import DensityControl, density_control
 from splatting.training.iteration import Iteration
 from splatting.training.observers.report import ProgressBar
 from splatting.training.run import Run
 from splatting.training.schedule import Schedule, longer_steps
-from splatting.training.strategies import density_control, of_clock
 from utils.system_utils import UserError
 
 OPTIONS = ["-r", 24, "--eval", "--no_curve", "--test_iterations", -1, "--densify_grad_threshold", 1e-4,
@@ -512,7 +511,10 @@ def test_a_time_budget_takes_the_strategy_that_is_best_in_it(colmap_scene, tmp_p
     [(43, 10, "cpu", "budget"), (43, 10, "cuda", "budget"), (43, 11, "cuda", "mcmc"), (60, 90, "cuda", "budget")],
 )
 def test_few_photos_and_much_time_on_a_gpu_take_mcmc(views, seconds, device, strategy):
-    assert of_clock(seconds, [None] * views, torch.device(device)) == strategy
+    scene = SimpleNamespace(getTrainCameras=lambda: [None] * views)
+    run = SimpleNamespace(scene=scene, device=torch.device(device), parts=[])
+    schedule = TimeBudget(Decided(30_000, [], None, seconds))
+    assert schedule.best_strategy(run) == strategy
 
 
 @pytest.mark.parametrize("strategy", ["adc", "mcmc"])

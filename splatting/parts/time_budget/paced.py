@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
+from splatting.parts import part_class, strategies
 from splatting.training.schedule import PYRAMID, USUAL, Levels, Schedule, longer_steps
-from splatting.training.strategies import of_clock
 
 _PACE = 5  # blocks that tell the pace of a run
 _ROUNDING = 1e-6  # iterations of the schedule; progress is a float, and just below a whole number counts as that
@@ -180,9 +180,11 @@ class TimeBudget(DecidedSchedule):
         return self.levels or (PYRAMID if self._open else ())
 
     def best_strategy(self, run: Any) -> str:
-        """The one that is best in the seconds; mcmc would move Gaussians that are pinned."""
-        views = run.scene.getTrainCameras()
-        strategy = "budget" if run.gaussians.pinned else of_clock(self.seconds, views, run.device)
+        """The one that is best in the seconds, of those that the run's parts work with."""
+        against = {conflict for part in run.parts for conflict in part.against}
+        fit = [name for name in strategies() if f"strategy={name}" not in against]
+        best = (name for name in fit if part_class(name).best_in(self.seconds, run))
+        strategy = next(best, super().best_strategy(run))
         print(f"--time_budget takes --strategy {strategy}, which is best here; name another one to compare")
         return strategy
 

@@ -60,7 +60,9 @@ class TimeBudget(Part):
 
         A run by the clock has few iterations, and needs the last ones for what it has.
         """
-        for name, part in (("densify_until_iter", 1 / 2), ("mcmc_until_iter", 5 / 6)):
+        from splatting.parts import part_class, strategies
+
+        for name, part in {part_class(strategy).until for strategy in strategies()}:
             if getattr(opt, name) >= opt.iterations:
                 setattr(opt, name, int(part * opt.iterations))
 

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from arguments.strategies import STRATEGIES
 from splatting.files.json_files import read_json, write_json
+from splatting.parts import strategies
 from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule, TimeBudget
 from splatting.training.schedule import PYRAMID
 from utils.system_utils import UserError
@@ -64,7 +64,7 @@ def _decided(content: Any) -> Decided:
     levels = [(_number(part, 0.0), _number(factor, 1.0)) for part, factor in content["levels"]]
     if levels != sorted(levels):
         raise ValueError("its levels do not ascend")
-    if (strategy := content.get("strategy", "")) not in ("", *STRATEGIES):
+    if (strategy := content.get("strategy", "")) not in ("", *strategies()):
         raise ValueError(f"{strategy!r} is no strategy")
     named = str(content[_SIZES]), levels, strategy
     decided = Decided(length, blocks, ended, _number(content["time_budget"], 0.0), *named)

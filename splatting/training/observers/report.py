@@ -140,7 +140,7 @@ class Report(Part):
             return
         log, opt = self._run.log, self._run.opt
         options = {PLANNED: opt.iterations, STRATEGY: opt.strategy}
-        if opt.strategy == "adc":  # the others are meant to reach their number
+        if not self._run.density.grows_to:
             budget = default_budget(self._run.scene.getTrainCameras())
             options |= {CAP: opt.max_num_splats} if opt.max_num_splats else {BUDGET: budget}
         log.note(**options)

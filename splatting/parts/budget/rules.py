@@ -1,9 +1,8 @@
-"""Changes of a model's Gaussians on their way to a given number: split in two, remove, fade."""
+"""Changes of a model's Gaussians on their way to a given number: split in two, fade."""
 
 import torch
 from torch import Tensor
 
-from scene.gaussians import density_rules as rules
 from scene.gaussians.long_axis import long_axis_children
 from scene.gaussians.parameters import GaussianParameters
 from splatting.deterministic.portable_math import exp, log
@@ -43,17 +42,6 @@ def split_in_two(gaussians: GaussianParameters, parents: Tensor) -> None:
     for name, values in children.items():
         gaussians.raw(name)[parents] = values[:count]
     gaussians.table.restart(parents)
-
-
-@changes_rows
-def remove_useless(gaussians: GaussianParameters, min_opacity: float, most: int) -> None:
-    """Remove Gaussians of an opacity below min_opacity; then those of the lowest, until there are at most `most`."""
-    opacity = gaussians.opacity_logits().reshape(-1)
-    remove = rules.is_useless(opacity, min_opacity)
-    over = gaussians.gaussian_count - most
-    if over > 0:
-        remove[gaussians.shards.lowest(opacity, over)] = True
-    gaussians.prune_points(remove)
 
 
 @torch.no_grad()

@@ -9,8 +9,9 @@ from gaussians import GROUPS, model, take_steps
 from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.budget import fade, remove_useless, split_in_two
-from scene.gaussians.mcmc import MOST_PARTS, divided, draw, opacity_units
+from scene.gaussians.adc import remove_useless
+from splatting.parts.budget.rules import fade, split_in_two
+from splatting.parts.mcmc.rules import MOST_PARTS, divided, draw, grow, opacity_units, relocate, start_as
 
 LOGITS = torch.tensor([-5.2, -2.0, 0.0, 1.5, 4.0, 9.0, 15.0])
 WHERE = {"seed": 3, "iteration": 600}
@@ -106,7 +107,7 @@ def _assert_parts(gaussians: GaussianModel, live: int, before: dict[str, Tensor]
 def test_dead_gaussians_become_parts_of_live_ones():
     gaussians = _trained()
     before, averages = _values(gaussians), _averages(gaussians)
-    assert gaussians.relocate(LEAST, **WHERE) == 12
+    assert relocate(gaussians, LEAST, **WHERE) == 12
     _assert_parts(gaussians, 28, before, averages)
     assert all(getattr(gaussians, field).grad is None for field in GROUPS.values())
 
@@ -114,7 +115,7 @@ def test_dead_gaussians_become_parts_of_live_ones():
 def test_more_copies_than_parts_are_corrected_for_as_many():
     gaussians = _trained(count=80, dead=79)
     before = _values(gaussians)
-    gaussians.relocate(LEAST, **WHERE)
+    relocate(gaussians, LEAST, **WHERE)
     logits, _ = divided(before["opacity"][0], torch.tensor([MOST_PARTS]))
     torch.testing.assert_close(_values(gaussians)["opacity"], logits.float().expand(80, 1))
 
@@ -124,7 +125,7 @@ def test_without_dead_or_without_live_gaussians_nothing_changes(dead):
     gaussians = _trained(dead=dead)
     before, averages = _values(gaussians), _averages(gaussians)
     params = [getattr(gaussians, field) for field in GROUPS.values()]
-    assert gaussians.relocate(LEAST, **WHERE) == dead
+    assert relocate(gaussians, LEAST, **WHERE) == dead
     assert all(torch.equal(value, before[name]) for name, value in _values(gaussians).items())
     assert all(torch.equal(old, new) for old, new in zip(averages, _averages(gaussians), strict=True))
     assert all(getattr(gaussians, f) is p and p.grad is not None for f, p in zip(GROUPS.values(), params, strict=True))
@@ -135,13 +136,13 @@ def test_an_opacity_at_the_limit_is_dead():
     with torch.no_grad():
         gaussians._opacity[0] = math.log(0.005 / 0.995)
         gaussians._opacity[1] = torch.nextafter(gaussians._opacity[0], torch.zeros(1))
-    assert gaussians.relocate(LEAST, **WHERE) == 1
+    assert relocate(gaussians, LEAST, **WHERE) == 1
 
 
 def test_growth_appends_parts():
     gaussians = _trained(dead=0)
     before, averages = _values(gaussians), _averages(gaussians)
-    gaussians.grow(7, **WHERE)
+    grow(gaussians, 7, **WHERE)
     assert len(gaussians) == 47
     _assert_parts(gaussians, 40, before, averages)
 
@@ -155,7 +156,7 @@ def test_other_activations_are_followed():
     own.opacity_activation = own.inverse_opacity_activation = own.scaling_activation = torch.abs
     own.scaling_inverse_activation = torch.abs
     for gaussians in (plain, own):
-        gaussians.relocate(LEAST, **WHERE)
+        relocate(gaussians, LEAST, **WHERE)
         split_in_two(gaussians, torch.tensor([1, 4]))
     least = float(plain.get_opacity.detach().sort(dim=0).values[2:4].mean())
     for gaussians in (plain, own):
@@ -165,6 +166,6 @@ def test_other_activations_are_followed():
     for name in ("get_opacity", "get_scaling", "get_xyz"):
         torch.testing.assert_close(getattr(own, name), getattr(plain, name))
     for gaussians in (plain, own):
-        gaussians.start_as(0.5, 0.1)
+        start_as(gaussians, 0.5, 0.1)
         torch.testing.assert_close(gaussians.get_opacity, torch.full_like(own._opacity, 0.5))
     torch.testing.assert_close(own.get_scaling, plain.get_scaling)

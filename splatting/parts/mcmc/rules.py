@@ -1,16 +1,15 @@
 """Density control by relocation (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo").
 
 Gaussians that nobody sees move to others, which are divided into equal parts that lie in the same place and together
-look as the one did. Functions of a GaussianModel, which has them as its methods. What decides rows is computed in
+look as the one did. What decides rows is computed in
 float64 by operations that every device and number of threads rounds in the same way, and sums are of integers.
 """
 
 import math
-from typing import NamedTuple
 
 import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
-from diff_gaussian_rasterization.density import add_noise_, penalise_
+from diff_gaussian_rasterization.density import add_noise_
 from torch import Tensor
 
 from scene.gaussians.adc import append_rows
@@ -28,24 +27,10 @@ _MOST_LOGIT = 40.0  # an opacity of 1 - 4e-18; beyond, the sum of `_weight` woul
 _RELOCATION, _GROWTH = range(2)  # draws of one iteration
 
 
-class Penalty(NamedTuple):
-    """Weights of the mean opacity and of the mean scale (world units) of all Gaussians in the loss."""
-
-    opacity: float = 0.0
-    scale: float = 0.0
-
-    def of_each(self, count: int) -> "Penalty":
-        """The weights of one opacity and of one of the three scales, among `count` Gaussians."""
-        return Penalty(self.opacity / max(count, 1), self.scale / max(3 * count, 1))
-
-
-NO_PENALTY = Penalty()
-
-
 def start_as(gaussians: GaussianParameters, opacity: float, scale: float) -> None:
     """Give all Gaussians an opacity, and multiply their scales; call it before the first step."""
     with torch.no_grad():
-        logits = torch.full_like(gaussians._opacity, logit(opacity))
+        logits = torch.full_like(gaussians.raw("opacity"), logit(opacity))
         log_scales = gaussians.log_scales() + math.log(scale)
         for name, values in gaussians.raw_shapes(logits, log_scales).items():
             gaussians.raw(name).copy_(values)
@@ -77,7 +62,7 @@ def relocate(gaussians: GaussianParameters, min_opacity: float, *, seed: int, it
 @changes_rows
 def grow(gaussians: GaussianParameters, count: int, *, seed: int, iteration: int) -> None:
     """Append `count` Gaussians, which are parts of others as `relocate` makes them."""
-    every = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians._xyz.device)
+    every = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.raw("xyz").device)
     draws, origins = _divide(gaussians, every, count, seed, iteration, _GROWTH)
     append_rows(gaussians, gaussians.rows_at(origins), origins)
     gaussians.shards.order(draws)
@@ -89,29 +74,12 @@ def add_noise(gaussians: GaussianParameters, size: float, *, seed: int, iteratio
 
     seed and iteration decide n. Nothing moves once a guard holds steps back.
     """
-    shapes = gaussians.log_scales(), gaussians._rotation, gaussians.opacity_logits()
+    shapes = gaussians.log_scales(), gaussians.raw("rotation"), gaussians.opacity_logits()
     gate = {"size": size, "steepness": GATE_STEEPNESS, "threshold": GATE_OPACITY}
     numbers = {"seed": seed, "stream": Stream.NOISE, "iteration": iteration}
     guard = getattr(gaussians.optimizer, "guard", None)
     where = {"stopped": guard.stopped if guard else None, "first": gaussians.shards.first}
-    add_noise_(gaussians._xyz, *shapes, **gate, **numbers, **where)
-
-
-def penalise(gaussians: GaussianParameters, penalty: Penalty) -> None:
-    """Add a penalty's gradients to those of the parameters, with the bits of the step that adds them itself."""
-    if not gaussians.kernels_activate:
-        total = gaussians.gaussian_count
-        opacity, scale = gaussians.get_opacity.sum() / total, gaussians.get_scaling.sum() / (3 * total)
-        return (penalty.opacity * opacity + penalty.scale * scale).backward()
-    params = gaussians._opacity, gaussians._scaling
-    for param in params:
-        if param.grad is None:
-            param.grad = torch.zeros_like(param)
-    each = penalty.of_each(gaussians.gaussian_count)
-    gradients = [param.grad.contiguous() for param in params]
-    penalise_(*(param.detach() for param in params), *gradients, opacity=each.opacity, scale=each.scale)
-    for param, gradient in zip(params, gradients, strict=True):
-        param.grad = gradient
+    add_noise_(gaussians.raw("xyz"), *shapes, **gate, **numbers, **where)
 
 
 def _divide(

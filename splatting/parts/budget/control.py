@@ -10,22 +10,20 @@ factor, where Rota Bulo et al. subtract a constant.
 
 import math
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import Any
 
 from torch import Tensor
 
 from scene.cameras import Camera
 from scene.gaussians import density_rules as rules
-from scene.gaussians.budget import count_after, fade, remove_useless, split_in_two
+from scene.gaussians.adc import remove_useless
 from scene.gaussians.morton import sort_rows
 from splatting.deterministic.counter_rng import Stream, permutation
+from splatting.parts.budget.error_scores import error_scores
+from splatting.parts.budget.rules import count_after, fade, split_in_two
 from splatting.training.density import DensityControl, default_budget, refuse_empty
 from splatting.training.iteration import Iteration
 from splatting.training.schedule import USUAL, longer_steps
-from splatting.training.strategies.error_scores import error_scores
-
-if TYPE_CHECKING:
-    from splatting.training.run import Run
 
 SCORED_VIEWS = 10  # at most, drawn anew in each densification
 ITERATIONS_A_SCORE = 5  # at least, of a scored view
@@ -40,7 +38,7 @@ class BudgetControl(DensityControl):
     fusable = True
     clamps = False
 
-    def __init__(self, run: "Run") -> None:
+    def __init__(self, run: Any) -> None:
         self._gaussians, self._opt = run.gaussians, run.opt
         self._cameras = run.scene.getTrainCameras()
         self.ends = run.opt.densify_until_iter
@@ -109,8 +107,3 @@ class BudgetControl(DensityControl):
         if self.schedule.stride(iteration) > 1:  # few iterations, of which scores shall not take the time
             count = min(count, max(self._interval(iteration) // ITERATIONS_A_SCORE, 1))
         return [self._cameras[index] for index in order[:count]]
-
-
-def of_run(run: "Run") -> BudgetControl:
-    """The control of a run."""
-    return BudgetControl(run)

@@ -7,29 +7,26 @@ Adam's averages restart for the moved Gaussians as well as for those that they c
 
 import argparse
 from collections.abc import Collection
-from typing import TYPE_CHECKING
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
-from scene.gaussians.budget import remove_useless
-from scene.gaussians.mcmc import NO_PENALTY, Penalty, is_alive
+from scene.gaussians.adc import remove_useless
 from scene.gaussians.morton import sort_rows
-from splatting.training.density import DensityControl, default_budget, refuse_empty
+from scene.gaussians.penalty import NO_PENALTY, Penalty
+from splatting.parts.mcmc.rules import add_noise, grow, is_alive, relocate, start_as
+from splatting.training.density import DensityControl, refuse_empty
 from splatting.training.iteration import Iteration
-from splatting.training.strategies import of_clock
-
-if TYPE_CHECKING:
-    from splatting.training.run import Run
 
 MOST_GAUSSIANS = 1_000_000  # where --max_num_splats is 0
 INIT_SCALES = (0.1, 1.0)  # of the paper's long trainings, and of those by the clock, which are too short for it
 
 
 class MarkovChain(DensityControl):
-    """The strategy of the MCMC paper, with the rules of scene/gaussians/mcmc.py. It resets no opacities."""
+    """The strategy of the MCMC paper, with the rules beside it. It resets no opacities."""
 
     fusable = True
     clamps = False
+    default_is_limit = True
     queues = True
 
     def __init__(
@@ -41,10 +38,13 @@ class MarkovChain(DensityControl):
         self.penalty = Penalty(opt.mcmc_opacity_reg, opt.mcmc_scale_reg) if penalised else NO_PENALTY
         self.ends = opt.mcmc_until_iter
 
+    def too_slow(self) -> str:
+        return f"--mcmc_growth {self._opt.mcmc_growth:g} adds too few each time; raise it"
+
     def started(self) -> None:
         """Make Gaussians more opaque and smaller than those of adaptive density control (as the authors' release)."""
         scale = self._opt.mcmc_init_scale or INIT_SCALES[self.schedule.paced]
-        self._gaussians.start_as(self._opt.mcmc_init_opacity, scale)
+        start_as(self._gaussians, self._opt.mcmc_init_opacity, scale)
 
     def changes(self, iteration: int) -> bool:
         opt = self._opt
@@ -79,7 +79,7 @@ class MarkovChain(DensityControl):
         if self.changes(step.iteration):
             sort_rows(self._gaussians)
         rate = self._gaussians.position_learning_rate * self._opt.mcmc_noise
-        self._gaussians.add_noise(rate, seed=self._opt.seed, iteration=step.iteration)
+        add_noise(self._gaussians, rate, seed=self._opt.seed, iteration=step.iteration)
 
     def _relocate(self, iteration: int) -> None:
         """Move what nobody sees (the paper's relocation of dead Gaussians), or remove random points (`most`)."""
@@ -87,7 +87,7 @@ class MarkovChain(DensityControl):
         count = self._gaussians.gaussian_count
         if 0 < (most := self.most(iteration, count, 0)) < count:
             remove_useless(self._gaussians, least, most)
-        dead = self._gaussians.relocate(least, seed=self._opt.seed, iteration=iteration)
+        dead = relocate(self._gaussians, least, seed=self._opt.seed, iteration=iteration)
         empty = dead == self._gaussians.gaussian_count
         refuse_empty(iteration, empty, "lower --mcmc_opacity_reg", f"with an opacity above {least} in")
 
@@ -96,21 +96,10 @@ class MarkovChain(DensityControl):
         count = self._gaussians.gaussian_count
         new = self._grown(count, iteration) - count
         if new > 0:
-            self._gaussians.grow(new, seed=self._opt.seed, iteration=iteration)
+            grow(self._gaussians, new, seed=self._opt.seed, iteration=iteration)
 
     def _grown(self, count: int, iteration: int) -> int:
         """The number after a growth: more by a part of it (the paper's rule of adding Gaussians), at least by one."""
         growth = self._opt.mcmc_growth
         most = self.most(iteration, count, self.most_gaussians)
         return min(max(int((1 + growth) * count), count + (growth > 0)), most)
-
-
-def of_run(run: "Run") -> MarkovChain:
-    """The control of a run."""
-    if not run.schedule.paced:
-        return MarkovChain(run.gaussians, run.opt)
-    # Penalties need time; with little of it they only darken (fox_tiny, 1,243 iterations: -1.7 dB), except where they
-    # clear away random points (nerf_lego200_tiny, 346 iterations: +17 dB).
-    views = run.scene.getTrainCameras()
-    useful = of_clock(run.schedule.seconds, views, run.device) == "mcmc" or run.scene.info.ply_path is None
-    return MarkovChain(run.gaussians, run.opt, default_budget(views), penalised=useful)

@@ -19,20 +19,21 @@ import train
 from gaussian_renderer import model_inputs, rasterizer_settings
 from scene.cameras import MiniCam
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.budget import fade, remove_useless, split_in_two
+from scene.gaussians.adc import remove_useless
 from scene.gaussians.long_axis import long_axis_children
 from scene.saved_model import read_model
 from splatting.deterministic.counter_rng import Stream
 from splatting.distributed.rows import WHOLE
+from splatting.parts.adc.control import AdaptiveDensityControl
+from splatting.parts.budget import control as budget
+from splatting.parts.budget.error_scores import error_map, error_scores
+from splatting.parts.budget.rules import fade, split_in_two
+from splatting.parts.mcmc.control import MarkovChain
 from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
 from splatting.training.checks import another_number
 from splatting.training.density import default_budget
 from splatting.training.objective import Objective
 from splatting.training.schedule import STEADY, Schedule
-from splatting.training.strategies import budget
-from splatting.training.strategies.adc import AdaptiveDensityControl
-from splatting.training.strategies.error_scores import error_map, error_scores
-from splatting.training.strategies.mcmc import MarkovChain
 from utils.graphics_utils import getProjectionMatrix
 from utils.loss_utils import photometric_loss
 from utils.system_utils import UserError
@@ -380,7 +381,9 @@ def test_a_number_out_of_reach_is_told(strategy, number, changes, first, said):
     control = _control(Schedule(160), strategy=strategy, max_num_splats=number, **changes)
     if strategy == "mcmc":
         control = MarkovChain(None, control._opt)
-        control.schedule = Schedule(160)
+    if strategy == "adc":
+        control = AdaptiveDensityControl(None, control._opt, False, 1.0)
+    control.schedule = Schedule(160)
     told = another_number(control, control._opt, 300, first)
     assert told is None if said is None else said in told
 

@@ -5,22 +5,15 @@ splits and for clones. --split long_axis splits along the longest axis (scene/ga
 """
 
 import argparse
-import copy
-import sys
 from collections.abc import Collection
-from typing import TYPE_CHECKING
 
 from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.gaussians.morton import sort_rows
-from scene.gaussians.ppisp import Ppisp
 from splatting.training.density import DensityControl, refuse_empty
 from splatting.training.iteration import Iteration
-
-if TYPE_CHECKING:
-    from splatting.training.run import Run
 
 
 class AdaptiveDensityControl(DensityControl):
@@ -30,6 +23,7 @@ class AdaptiveDensityControl(DensityControl):
     """
 
     fusable = True
+    grows_to = False
 
     def __init__(
         self, gaussians: GaussianModel, opt: argparse.Namespace, white_background: bool, extent: float
@@ -103,15 +97,3 @@ class AdaptiveDensityControl(DensityControl):
         )
         refuse_empty(iteration, self._gaussians.gaussian_count == 0, "raise --opacity_reset_interval")
         sort_rows(self._gaussians)
-
-
-def of_run(run: "Run") -> AdaptiveDensityControl:
-    """The control of a run. With --appearance ppisp it resets no opacities, unless an interval is given for it.
-
-    Haze can grow before the cameras after a reset, and cameras would learn from it.
-    """
-    opt, white = run.opt, run.dataset.white_background
-    if run.gaussians.appearance == Ppisp.kind and opt.opacity_reset_interval == rules.USUAL_RESETS:
-        opt, white = copy.copy(opt), False
-        opt.opacity_reset_interval = sys.maxsize
-    return AdaptiveDensityControl(run.gaussians, opt, white, run.scene.cameras_extent)

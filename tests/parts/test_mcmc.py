@@ -10,8 +10,9 @@ from trainings import MCMC, train_on
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.saved_model import read_model
+from splatting.parts.mcmc import control
+from splatting.parts.mcmc.control import MarkovChain
 from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
-from splatting.training.strategies.mcmc import MarkovChain
 from utils.system_utils import UserError
 
 
@@ -31,8 +32,8 @@ def test_every_part_has_an_effect(colmap_scene, tmp_path, name):
 
 
 def test_gaussians_are_moved(colmap_scene, tmp_path, monkeypatch):
-    moved, relocate = [], GaussianModel.relocate
-    monkeypatch.setattr(GaussianModel, "relocate", lambda *x, **named: moved.append(relocate(*x, **named)) or moved[-1])
+    moved, relocate = [], control.relocate
+    monkeypatch.setattr(control, "relocate", lambda *x, **named: moved.append(relocate(*x, **named)) or moved[-1])
     _train(colmap_scene, tmp_path, *MCMC[2:])
     assert len(moved) == 5 and moved[1] and any(moved[2:])
 

@@ -1,0 +1,35 @@
+"""Growth to a given number of Gaussians, where the training views' error is."""
+
+from typing import Any
+
+from splatting.training.option import Option, within
+from splatting.training.part import Options, Strategy
+
+
+class Budget(Strategy):
+    """Removes useless Gaussians and adds others, up to a number. In a given time it is best in most cases."""
+
+    name = "budget"
+    summary = (
+        "growth to --max_num_splats Gaussians, where the error is; 0: one for 64 training pixels, 100,000 to "
+        "1,000,000. budget has larger learning rates of colour, opacity, scale and rotation, the fewer --iterations "
+        "there are"
+    )
+    removes = True
+    # fmt: off
+    options = Options(optimisation=(
+        Option("opacity_decay", 0.98, origin="ours", check=within(0.5, 1),
+            help="budget: factor of all opacities after each densification, so that useless Gaussians fade; 1: none"),
+        Option("prune_opacity", 0.005, origin="ours, and adaptive density control's", check=within(0, 0.5),
+            help="budget: Gaussians of a lower opacity are removed, every densification_interval steps"),
+    ))
+    # fmt: on
+
+    @classmethod
+    def best_in(cls, seconds: float, run: Any) -> bool:
+        return True
+
+    def control(self, run: Any) -> Any:
+        from splatting.parts.budget.control import BudgetControl
+
+        return BudgetControl(run)
