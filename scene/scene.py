@@ -5,6 +5,7 @@ import copy
 import json
 import random
 import shutil
+import sys
 from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
@@ -12,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-import scene
 from scene.cameras import Camera
 from scene.dataset_readers import read_scene, replaced_reader
 from scene.gaussians.ppisp import UNTRAINED, Ppisp
@@ -180,7 +180,7 @@ class Scene:
             colors = np.round(info.point_cloud.colors * 255).astype(np.uint8)
             write_point_cloud(folder / "input.ply", info.point_cloud.points, colors)
         views = [*info.test_cameras, *info.train_cameras, *info.validation_cameras]
-        entries = [scene.camera_to_JSON(i, camera) for i, camera in enumerate(views)]
+        entries = [_named("camera_to_JSON")(i, camera) for i, camera in enumerate(views)]
         with atomic_write(folder / "cameras.json") as path:
             path.write_text(json.dumps(entries, allow_nan=False), encoding="utf-8")
 
@@ -188,8 +188,7 @@ class Scene:
         self, args: argparse.Namespace, scale: float, shuffle: bool, views: Sequence[CameraInfo], test: bool
     ) -> list[Camera]:
         """Cameras of views, which are held out (test) or train, in the same order at every scale."""
-        # By names of the package, because code of others may replace them there or in utils.camera_utils.
-        cameras = list(scene.cameraList_from_camInfos(views, scale, args, self.info.is_nerf_synthetic, test))
+        cameras = list(_named("cameraList_from_camInfos")(views, scale, args, self.info.is_nerf_synthetic, test))
         ours = [(camera, view) for camera, view in zip(cameras, views, strict=False) if isinstance(camera, Camera)]
         for camera, _ in ours:
             camera.images = self.images
@@ -219,6 +218,11 @@ class Scene:
     def _pictures(self, cameras: Iterable[Camera]) -> list[Picture]:
         """Those of our cameras; cameras of other classes have none."""
         return [p for camera in cameras if getattr(camera, "images", None) is self.images for p in camera.undecoded]
+
+
+def _named(name: str) -> Any:
+    """A name of the package, as code of others may replace it there or in utils.camera_utils."""
+    return getattr(sys.modules[__package__], name)
 
 
 def _given(args: argparse.Namespace, **names: str) -> dict[str, Any]:

@@ -14,8 +14,7 @@ import train
 from splatting.diagnosis import environment
 from splatting.evaluation.peer_curve import read_scalars
 from splatting.evaluation.training_log import EventWriter
-from splatting.training.iteration import Iteration
-from splatting.training.objective import Losses
+from splatting.training.iteration import Iteration, Losses
 from splatting.training.observers import report
 from splatting.training.observers.report import Report
 

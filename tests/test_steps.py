@@ -15,7 +15,8 @@ from step_ways import Rerun, fused_iterations, take_as  # noqa: F401  (a fixture
 from trainings import ITERATIONS, OPTIONS, differences, leaves, shared_scene, trained
 
 from splatting.training import run
-from splatting.training.objective import Losses, Objective
+from splatting.training.iteration import Losses
+from splatting.training.objective import Objective
 from splatting.training.steps import speculative, step_taker
 from splatting.training.steps.captured import CapturedStep, Graphs, Recorder
 from splatting.training.steps.fused import FusedStep

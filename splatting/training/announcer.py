@@ -4,8 +4,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from types import TracebackType
 
-from splatting.training.iteration import Iteration
-from splatting.training.objective import Losses
+from splatting.training.iteration import Iteration, Losses
 from splatting.training.part import Error, Part, overrides
 
 

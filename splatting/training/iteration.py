@@ -1,14 +1,36 @@
-"""One iteration of training, as the loop, the losses, density control and the observers know it, and its view."""
+"""One iteration of training, as the loop, the losses, density control and parts know it, its view and its losses."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
 from scene.cameras import Camera
 from splatting.deterministic.counter_rng import Stream, permutation
-from splatting.training.part import Term
 from utils.system_utils import UserError
+
+# Scalar of a render's package and of the mask of the pixels that count, (1, H, W) bool or None.
+Term = Callable[[dict[str, Any], Tensor | None], Tensor]
+
+
+class Losses(NamedTuple):
+    """Scalars of one iteration, and the mask that they were computed with."""
+
+    total: Tensor  # what is differentiated
+    l1: Tensor  # of the colours
+    terms: dict[str, Tensor]  # parts of the total that were added to the photometric loss, weighted, by name
+    mask: Tensor | None  # (1, H, W) bool, pixels that count; None if all do
+
+    @property
+    def values(self) -> list[Tensor]:
+        """All scalars, in one order."""
+        return [self.total, self.l1, *self.terms.values()]
+
+    def detached(self) -> "Losses":
+        """The values alone, which keep neither an image nor its gradient."""
+        terms = {name: value.detach() for name, value in self.terms.items()}
+        return Losses(self.total.detach(), self.l1.detach(), terms, self.mask)
 
 
 @dataclass(slots=True)

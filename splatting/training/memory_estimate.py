@@ -2,7 +2,7 @@
 
 import math
 import sys
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 
@@ -11,9 +11,6 @@ from scene.gaussian_model import GaussianModel
 from scene.images.store import ImageStore
 from splatting.host.memory import free_memory, gib
 from splatting.host.torchrun import local_size
-
-if TYPE_CHECKING:
-    from splatting.training.gpu_memory import GpuMemory
 
 # Bytes besides the parameters and Adam's two averages. 106 and 57 were fitted to the peak memory of
 # forward and backward in docs/results/kernels.md (100 thousand to 6 million Gaussians, within 4 %). The rest are the
@@ -36,12 +33,12 @@ def expected_count(max_splats: int, now: int) -> int:
 
 
 def announce_memory(
-    scene: Scene, gaussians: GaussianModel, memory: "GpuMemory", max_splats: int, absolute: bool = False, size: int = 1
+    scene: Scene, gaussians: GaussianModel, memory: Any, max_splats: int, absolute: bool = False, size: int = 1
 ) -> None:
     """Print the memory that photos and Gaussians need and what is free; warn, with a remedy, if they do not fit.
 
-    max_splats: as for `expected_count`. absolute: with absolute gradients. size: of processes that train together; each
-    says what itself needs.
+    memory: the limit (gpu_memory.GpuMemory). max_splats: as for `expected_count`. absolute: with absolute gradients.
+    size: of processes that train together; each says what itself needs.
     """
     images, device = scene.images, gaussians.get_xyz.device
     pixels = largest_view(scene)

@@ -1,6 +1,6 @@
 """The loss of a render: photometric, and what parts add to it."""
 
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from fused_ssim import photometric_loss_by_bands
@@ -8,31 +8,8 @@ from torch import Tensor
 
 from gaussian_renderer import photo_name
 from scene.gaussians.ppisp import Ppisp
-from splatting.training.iteration import Iteration
-from splatting.training.part import Term
+from splatting.training.iteration import Iteration, Losses, Term
 from utils.loss_utils import photometric_loss
-
-if TYPE_CHECKING:
-    from splatting.training.run import Run
-
-
-class Losses(NamedTuple):
-    """Scalars of one iteration, and the mask that they were computed with."""
-
-    total: Tensor  # what is differentiated
-    l1: Tensor  # of the colours
-    terms: dict[str, Tensor]  # parts of the total that were added to the photometric loss, weighted, by name
-    mask: Tensor | None  # (1, H, W) bool, pixels that count; None if all do
-
-    @property
-    def values(self) -> list[Tensor]:
-        """All scalars, in one order."""
-        return [self.total, self.l1, *self.terms.values()]
-
-    def detached(self) -> "Losses":
-        """The values alone, which keep neither an image nor its gradient."""
-        terms = {name: value.detach() for name, value in self.terms.items()}
-        return Losses(self.total.detach(), self.l1.detach(), terms, self.mask)
 
 
 class Objective:
@@ -44,7 +21,8 @@ class Objective:
 
     fusable: ClassVar[bool] = True
 
-    def __init__(self, run: "Run") -> None:
+    def __init__(self, run: Any) -> None:
+        """run: of splatting/training/run.py."""
         self._run = run
 
     def takes_bands(self, step: Iteration) -> bool:

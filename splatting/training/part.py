@@ -44,15 +44,10 @@ from splatting.training.option import Option
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from scene.readers.info import SceneInfo
-    from splatting.training.iteration import Iteration
-    from splatting.training.objective import Losses
+    from splatting.training.iteration import Iteration, Losses, Term
 
 Error: TypeAlias = BaseException | None
-# Scalar of a render's package and of the mask of the pixels that count, (1, H, W) bool or None.
-Term: TypeAlias = "Callable[[dict[str, Any], Tensor | None], Tensor]"
 
 
 @dataclass(frozen=True)

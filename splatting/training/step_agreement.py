@@ -1,8 +1,7 @@
 """Agreement of the processes of a training in each iteration, without an exchange of its own."""
 
 from splatting.host.interrupt import Terminated
-from splatting.training.iteration import Iteration
-from splatting.training.objective import Losses
+from splatting.training.iteration import Iteration, Losses
 from splatting.training.part import Part
 from splatting.training.run import Run
 

@@ -3,13 +3,13 @@
 from typing import TYPE_CHECKING, Any
 
 from splatting.training.option import CFG_ARGS, Option, at_least
-from splatting.training.part import Needs, Options, Part, Term
+from splatting.training.part import Needs, Options, Part
 
 if TYPE_CHECKING:
     import argparse
 
     from scene.readers.info import SceneInfo
-    from splatting.training.iteration import Iteration
+    from splatting.training.iteration import Iteration, Term
 
 
 class DepthMaps(Part):
@@ -55,7 +55,7 @@ class DepthMaps(Part):
         ends = opt.depth_l1_weight_init, opt.depth_l1_weight_final
         self._weight = get_expon_lr_func(*ends, max_steps=opt.iterations)
 
-    def terms(self, at: "Iteration") -> dict[str, Term]:
+    def terms(self, at: "Iteration") -> "dict[str, Term]":
         weight = self._weight(self._schedule.schedule_step(at.iteration)) if at.camera.depth_reliable else 0.0
         if not weight > 0:
             return {}

@@ -10,8 +10,7 @@ if TYPE_CHECKING:
     import argparse
 
     from scene.readers.info import SceneInfo
-    from splatting.training.iteration import Iteration
-    from splatting.training.objective import Losses
+    from splatting.training.iteration import Iteration, Losses
 
 _ALONE = "as it keeps Gaussians alone; leave one of them out"
 

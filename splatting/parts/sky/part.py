@@ -3,10 +3,10 @@
 from typing import TYPE_CHECKING, Any
 
 from splatting.training.option import Option, one_of
-from splatting.training.part import Needs, Options, Part, Term, fill
+from splatting.training.part import Needs, Options, Part, fill
 
 if TYPE_CHECKING:
-    from splatting.training.iteration import Iteration
+    from splatting.training.iteration import Iteration, Term
 
 
 class Sky(Part):
@@ -38,7 +38,7 @@ class Sky(Part):
         if self.shell:
             fill(run.gaussians, "pinned", self.shell.rows, self)
 
-    def terms(self, at: "Iteration") -> dict[str, Term]:
+    def terms(self, at: "Iteration") -> "dict[str, Term]":
         points = self.shell and self.shell.at(at.camera, self._run.scene)
         return {"sky": lambda package, mask: points.loss(package["depth"], mask)} if points else {}
 

@@ -6,10 +6,10 @@ Sparse points as supervision of depth: Deng et al. 2022 (DS-NeRF), section 3. No
 from typing import TYPE_CHECKING, Any
 
 from splatting.training.option import Option, at_least
-from splatting.training.part import Needs, Options, Part, Term
+from splatting.training.part import Needs, Options, Part
 
 if TYPE_CHECKING:
-    from splatting.training.iteration import Iteration
+    from splatting.training.iteration import Iteration, Term
 
 
 class SparseDepth(Part):
@@ -29,6 +29,6 @@ class SparseDepth(Part):
 
         self._points = SeenPoints(run.scene, run.dataset.source_path, run.opt.sparse_depth)
 
-    def terms(self, at: "Iteration") -> dict[str, Term]:
+    def terms(self, at: "Iteration") -> "dict[str, Term]":
         points = self._points.at(at.camera)
         return {"points": lambda package, mask: points.loss(package["depth"], mask)} if points else {}

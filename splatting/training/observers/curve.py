@@ -6,8 +6,7 @@ from pathlib import Path
 from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
 from splatting.evaluation.curve_recorder import CurveRecorder, evenly_spread
-from splatting.training.iteration import Iteration
-from splatting.training.objective import Losses
+from splatting.training.iteration import Iteration, Losses
 from splatting.training.part import Error, Part
 from splatting.training.run import Run
 from utils.system_utils import saved_iterations

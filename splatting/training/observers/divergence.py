@@ -10,8 +10,7 @@ from tqdm import tqdm
 
 from scene.gaussians.adam import StepGuard
 from scene.gaussians.checkpoint import save_checkpoint
-from splatting.training.iteration import Iteration
-from splatting.training.objective import Losses
+from splatting.training.iteration import Iteration, Losses
 from splatting.training.part import Error, Part
 from splatting.training.run import Run
 from utils.system_utils import UserError

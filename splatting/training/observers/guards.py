@@ -14,8 +14,7 @@ from scene.cameras import Camera
 from scene.gaussians.checkpoint import save_checkpoint
 from splatting.files.listing import some
 from splatting.host.memory import is_out_of_memory
-from splatting.training.iteration import Iteration
-from splatting.training.objective import Losses
+from splatting.training.iteration import Iteration, Losses
 from splatting.training.part import Error, Part
 from splatting.training.restart import what_stands
 from splatting.training.run import Run

@@ -22,8 +22,8 @@ from splatting.evaluation.what_to_try import BUDGET, CAP, PLANNED, STRATEGY, wha
 from splatting.host.clock import wall_seconds
 from splatting.host.progress import Bar
 from splatting.training.density import default_budget
-from splatting.training.iteration import Iteration
-from splatting.training.objective import Losses, LossWatch
+from splatting.training.iteration import Iteration, Losses
+from splatting.training.objective import LossWatch
 from splatting.training.output_folder import view_command
 from splatting.training.part import Error, Part, overrides
 from splatting.training.run import Run

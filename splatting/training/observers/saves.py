@@ -7,9 +7,8 @@ from tqdm import tqdm
 
 from scene.gaussians.checkpoint import save_checkpoint
 from scene.saved_iterations import saved_ply
-from splatting.training.iteration import Iteration
+from splatting.training.iteration import Iteration, Losses
 from splatting.training.left_out import LeftOut, lines, save_last, saved_line
-from splatting.training.objective import Losses
 from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.output_folder import view_command
 from splatting.training.part import Error, Part

@@ -16,8 +16,7 @@ from scene.saved_iterations import saved_ply
 from scene.saved_model import read_model
 from splatting.evaluation.error_curve import common_subset, rows_on
 from splatting.files.listing import as_utf8
-from splatting.training.iteration import Iteration
-from splatting.training.objective import Losses
+from splatting.training.iteration import Iteration, Losses
 from splatting.training.observers.saves import Checkpoints
 from splatting.training.part import Error, Part
 from splatting.training.run import Run

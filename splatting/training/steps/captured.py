@@ -24,8 +24,7 @@ from gaussian_renderer import photo_name
 from scene.cameras import Camera
 from scene.fused_adam import CAMERA_NUMBERS, NOW_WORDS, FusedAdam
 from splatting.training.announcer import Announcer
-from splatting.training.iteration import Iteration
-from splatting.training.objective import Losses
+from splatting.training.iteration import Iteration, Losses
 from splatting.training.run import Run
 from splatting.training.steps.fused import FusedStep
 from splatting.training.steps.plain import PlainStep

@@ -6,8 +6,7 @@ from torch import Tensor
 from gaussian_renderer import Drawn, KnownBands, draw, exposed
 from scene.fused_adam import CAMERA_NUMBERS, FusedAdam
 from splatting.training.announcer import Announcer
-from splatting.training.iteration import Iteration
-from splatting.training.objective import Losses
+from splatting.training.iteration import Iteration, Losses
 from splatting.training.run import Run
 from splatting.training.steps.plain import PlainStep
 

@@ -4,8 +4,7 @@ from torch import Tensor
 
 from gaussian_renderer import draw, exposed, render, wake
 from splatting.training.announcer import Announcer
-from splatting.training.iteration import Iteration
-from splatting.training.objective import Losses
+from splatting.training.iteration import Iteration, Losses
 from splatting.training.run import Run
 
 Package = dict[str, Tensor | None]

@@ -19,18 +19,29 @@ from collections import deque
 from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from diff_gaussian_rasterization.backend import OPERATORS
 
-from splatting.training.iteration import Iteration
-from splatting.training.objective import Losses
-
-if TYPE_CHECKING:
-    from splatting.training.steps.captured import CapturedStep
+from splatting.training.iteration import Iteration, Losses
 
 AHEAD = 8  # steps; enough to hide a pause of the host, and few to replay
+
+
+class Replayed(Protocol):
+    """What speculation asks of the taker of the steps (splatting/training/steps/captured.py)."""
+
+    def finished(self, at: Iteration) -> None:
+        """The GPU has taken a step for good."""
+
+    def replay(self, at: Iteration, first: Losses) -> None:
+        """Take a step once more; its losses go into `first`."""
+
+    def rewind(self, steps: int) -> None:
+        """Take back what the host has counted for so many steps."""
+
+
 _REPORTS = 2 * AHEAD
 _SPARE = 1.25  # times what a view needed before: Gaussians move and multiply until its next visit
 _LEAST = 1024
@@ -52,7 +63,7 @@ class _Pending:
 class Speculation:
     """The steps that a GPU has yet to do. steps: queues and replays them."""
 
-    def __init__(self, device: torch.device, steps: "CapturedStep") -> None:
+    def __init__(self, device: torch.device, steps: "Replayed") -> None:
         self._words = torch.zeros(6, dtype=torch.int64, device=device)
         self._reports = torch.zeros(_REPORTS, 6, dtype=torch.int64, pin_memory=True)
         self._numbers = list(self._reports.numpy())  # the same memory
