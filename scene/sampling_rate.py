@@ -1,10 +1,14 @@
-"""At which rate a view samples points."""
+"""At which rate a view samples points, and how many of them it sees."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
+
+from scene.cameras import Camera
+from scene.scene import Scene
 
 NEAREST = 0.2  # depth, below which no Gaussian is drawn
 
@@ -32,3 +36,18 @@ def _transformed(points: Tensor, matrix: Tensor) -> list[Tensor]:
     """Homogeneous coordinates (N,) behind a transposed matrix (4, 4), each product and sum rounded by itself."""
     x, y, z = points.unbind(1)
     return [x * a + y * b + z * c + d for a, b, c, d in matrix.T.tolist()]
+
+
+def share_seen(points: Tensor, cameras: Sequence[Camera]) -> float:
+    """The share of points (N, 3) that a camera sees, on the mean of up to 32 cameras. Distortion is left out."""
+    views = cameras[:: -(-len(cameras) // 32)]
+    return sum(float((sampling_rate(points, view) > 0).float().mean()) for view in views) / len(views)
+
+
+def share_of(scene: Scene, device: torch.device) -> float:
+    """The share of a scene's points that a training view sees; 1 where there are none."""
+    cloud = scene.info.point_cloud
+    if cloud is None or not len(cloud.points):
+        return 1.0
+    points = torch.as_tensor(cloud.points, dtype=torch.float32, device=device)
+    return share_seen(points, scene.getTrainCameras())

@@ -6,7 +6,7 @@ has missed when a view may show it. Rows lie along a Morton curve, so most block
 iterations all blocks wake, so that what is saved then is whole.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -16,11 +16,9 @@ from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.scene import Scene
 from torch import Tensor
 
-from scene.cameras import Camera
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.spilled import is_spilled, to_host
-from scene.sampling_rate import sampling_rate
 from splatting.distributed.rows import BLOCK, PIECE
 from utils.system_utils import UserError
 
@@ -67,6 +65,10 @@ class Sleeping:
     def stepped(self) -> None:
         """A step was taken, or taken back: from now on, the blocks that sleep are behind."""
         self._is_whole = False
+
+    def rests(self, iteration: int) -> bool:
+        """Whether all blocks wake after a step."""
+        return iteration % REST == 0
 
     def rest(self, guarded: bool = True) -> None:
         """Let all blocks take the steps that they have missed. The next step may leave them asleep.
@@ -168,9 +170,3 @@ class Sleeping:
         sleep = [self.awake, self._taken, self._terms]
         step = averages, steps, guard if guarded else [], attributes, rates, constants, columns, iteration, now
         return OPERATORS.wake_(*scene.lists, sleep, every, *step)
-
-
-def share_seen(points: Tensor, cameras: Sequence[Camera]) -> float:
-    """The share of points (N, 3) that a camera sees, on the mean of up to 32 cameras. Distortion is left out."""
-    views = cameras[:: -(-len(cameras) // 32)]
-    return sum(float((sampling_rate(points, view) > 0).float().mean()) for view in views) / len(views)

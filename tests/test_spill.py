@@ -27,6 +27,7 @@ from trainings import (
     with_clusters,
 )
 
+from scene import sleeping
 from scene.gaussians import spilled
 from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
 from splatting.distributed.ranks import ranks
@@ -182,7 +183,7 @@ def usual(scene: Path, once) -> Callable[[str], dict]:
 
     def train(name: str, out: Path) -> None:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(run, "MOST_SHARE", 2.0)
+            patch.setattr(sleeping, "MOST_SHARE", 2.0)
             _trained(scene, out, *KINDS[name])
 
     return lambda name: whole_result(once(f"spill/{name}", partial(train, name)), ITERATIONS)
@@ -246,7 +247,7 @@ def test_spilled_rows_are_trained_as_any_others(scene, tmp_path, monkeypatch, us
 @pytest.mark.parametrize(("first", "then"), [((), SPILL), (SPILL, ())])
 def test_resumed(scene, tmp_path, monkeypatch, usual, first, then):
     expected = usual("default")
-    monkeypatch.setattr(run, "MOST_SHARE", 2.0)
+    monkeypatch.setattr(sleeping, "MOST_SHARE", 2.0)
     _trained(scene, tmp_path / "a", *first, "--checkpoint_iterations", 33, ITERATIONS)
     start = "--start_checkpoint", tmp_path / "a" / "chkpnt33.pth"
     assert not differences(_trained(scene, tmp_path / "b", *then, *start), expected)
@@ -269,7 +270,7 @@ def test_ranks(scene, tmp_path, usual):
 
 @pytest.mark.parametrize(("options", "sleeps"), [((), False), (SPILL, True), ((*SPILL, *KINDS["mcmc"]), False)])
 def test_blocks_sleep_wherever_they_can(scene, tmp_path, monkeypatch, options, sleeps):
-    monkeypatch.setattr(run, "MOST_SHARE", 0.0)
+    monkeypatch.setattr(sleeping, "MOST_SHARE", 0.0)
     found, begin = [], run.Run.begin
     monkeypatch.setattr(run.Run, "begin", lambda self: (found.append(self.sleeping is not None), begin(self)))
     _trained(scene, tmp_path, *options)
@@ -346,7 +347,7 @@ def test_both_memories_give_the_bytes_of_one(tmp_path, monkeypatch, name, _):
     """With as many rows as pages need, more of them by density control, and half of them on the host."""
     scene = with_clusters(narrow_scene(tmp_path / "scene"), 40_000, 20, 2000)
     more = ("--max_num_splats", 90_000) if name in ("budget", "mcmc") else ()
-    monkeypatch.setattr(run, "MOST_SHARE", 2.0)
+    monkeypatch.setattr(sleeping, "MOST_SHARE", 2.0)
     expected = _trained(scene, tmp_path / "usual", *KINDS[name], *more)
     gc.collect()
     before = bytes_of()

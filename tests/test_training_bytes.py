@@ -15,9 +15,9 @@ from rasterizer_tools import GPU_MARKS
 from step_ways import Rerun, fused_iterations, take_as  # noqa: F401  (a fixture)
 from trainings import ITERATIONS, OPTIONS, differences, plain_training, shared_scene, trained, whole_result
 
+from scene import sleeping
 from scene.readers.point_cloud import write_point_cloud
 from splatting.distributed.ranks import ranks
-from splatting.training import run
 from splatting.training.steps.captured import Graphs
 
 Result = dict[str, bytes | list]
@@ -44,9 +44,9 @@ def scene(once) -> Path:
 
 @contextmanager
 def _awake() -> Iterator[None]:
-    """No block sleeps; tests/test_sleeping.py has those that do."""
+    """No block sleeps; tests/parts/test_sleep.py has those that do."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run, "MOST_SHARE", 0.0)
+        patch.setattr(sleeping, "MOST_SHARE", 0.0)
         yield
 
 

@@ -12,6 +12,7 @@ from PIL import Image
 from synthetic import FOCAL, make_colmap_scene
 
 import train
+from scene import sleeping
 from scene.readers.point_cloud import write_point_cloud
 from splatting.parts.filter_3d import part as filter_3d
 from splatting.parts.robust_mask import residuals
@@ -126,7 +127,7 @@ def plain_training(once: Once, name: str) -> Path:
 
     def make(out: Path) -> None:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(run, "MOST_SHARE", 0.0)
+            patch.setattr(sleeping, "MOST_SHARE", 0.0)
             words = "--plain_step", "--checkpoint_iterations", 33, ITERATIONS
             trained(shared_scene(once), out, *words, *OPTIONS[name])
 

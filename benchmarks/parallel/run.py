@@ -8,7 +8,8 @@ import train
 from benchmarks.parallel.workload import Workload
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.morton import sort_rows
-from scene.sleeping import Sleeping, share_seen
+from scene.sampling_rate import share_seen
+from scene.sleeping import Sleeping
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch
 from splatting.host.interrupt import DeferredInterrupt

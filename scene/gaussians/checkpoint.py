@@ -26,7 +26,6 @@ _LARGEST = 1e15  # extent; learning rates are multiples of it
 _OPTIMIZER = 10  # which entry its state dict is
 _ENTRIES = 12  # the reference's; the values of further attributes may follow
 EXPOSURES, WRITTEN_BY = "exposures", "version"  # keys in the optimiser's state dict
-ASLEEP = "asleep"  # the same of further state of a training
 
 
 class State(NamedTuple):

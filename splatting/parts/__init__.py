@@ -28,6 +28,7 @@ PARTS = (
     "sky",
     "sparse_depth",  # the order of the terms of the loss is in the bytes of the model
     "filter_3d",  # after all that moves rows
+    "sleep",  # after all that decides whether every step concerns all rows
 )
 
 
@@ -48,7 +49,13 @@ def options_of(group: str) -> list[Option]:
 
 
 # Of states in checkpoints of version 0.2 and before.
-_OLD_KEYS = {"residuals": "robust_mask", "best": "keep_best", "poses": "refine_poses", "schedule": "time_budget"}
+_OLD_KEYS = {
+    "asleep": "sleep",
+    "best": "keep_best",
+    "poses": "refine_poses",
+    "residuals": "robust_mask",
+    "schedule": "time_budget",
+}
 
 
 def states_in(checkpoint: Mapping[str, Any]) -> dict[str, Any]:

@@ -31,6 +31,7 @@ model.drawn  what raw opacities and scales are drawn as, and its chain backward;
 model.pinned which Gaussians density control leaves where they are, and as large as they are
 run.schedule which steps of the schedule an iteration stands for
 run.sizes    the size of a view in an iteration
+run.sleeping which blocks of rows take a step (scene/sleeping.py)
 run.counts   which pixels of a view count in its loss
 run.on_host  takes the steps of cameras, by the gradients of their numbers, on the host: `place`, `step`, `independent`
 """

@@ -15,13 +15,12 @@ import torch
 from torch import Tensor
 
 from gaussian_renderer.rays import check_views
-from scene.fused_adam import FusedAdam
+from scene import sleeping
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.adam import GaussianAdam
-from scene.gaussians.checkpoint import ASLEEP, further, load_checkpoint, states_of, with_further
+from scene.gaussians.checkpoint import load_checkpoint, states_of, with_further
 from scene.gaussians.morton import sort_rows
 from scene.gaussians.ppisp import Ppisp
-from scene.sleeping import MOST_SHARE, REST, Sleeping, share_seen
+from scene.sampling_rate import share_of
 from splatting.deterministic.counter_rng import Stream, uniform
 from splatting.distributed.consistency import agree_on_scene
 from splatting.distributed.ranks import ranks
@@ -67,7 +66,7 @@ class Run:
 
     first_done: float | None = None
     parts: Sequence[Part] = ()
-    sleeping: Sleeping | None = None
+    sleeping: Any = None
     asked_sizes = "none"
     sizes: Any = OwnSize()
     counts: Any = None
@@ -120,9 +119,6 @@ class Run:
         self._expect(self.density.most_gaussians)
         self.objective = Objective(self)
         self.density.schedule = self.schedule
-        self.sleeping = self._may_sleep()
-        if self.sleeping and capture and (asleep := further(capture, ASLEEP)):
-            self.sleeping.restore(asleep)
         expected = expected_count(self.density.most_gaussians, self.gaussians.gaussian_count)
         self._warn(checks.faster_alone(self.group.size, self.device.type == "cuda", expected))
         self._warn(checks.late_reset(self.density, opt, self.first_iteration))
@@ -328,37 +324,15 @@ class Run:
         own = all(vars(type(one)).get("fusable", False) for one in (self.objective, self.density))
         return own and not (self.pipe.compute_cov3D_python or self.pipe.convert_SHs_python)
 
-    def _may_sleep(self) -> Sleeping | None:
-        """What lets blocks sleep, where it saves something, and a step concerns no row that its view does not see."""
-        density = self.density
-        dense = type(self.gaussians.optimizer) is GaussianAdam and FusedAdam.takes(self.gaussians)
-        alone = not (density.queues or any(density.penalty) or any(part.needs.all_rows for part in self.parts))
-        if not (dense and alone and self.is_standard):
-            return None
-        saves = self.group.anyone(self.memory.limit > 0) or self._share_seen() < MOST_SHARE
-        return Sleeping(self.gaussians) if saves else None
-
-    def _share_seen(self) -> float:
-        """The share of the scene's points that a view sees; 1 where there are none."""
-        cloud = self.scene.info.point_cloud
-        if cloud is None or not len(cloud.points):
-            return 1.0
-        points = torch.as_tensor(cloud.points, dtype=torch.float32, device=self.device)
-        return share_seen(points, self.scene.getTrainCameras())
-
     def _tell_of_spilling(self) -> None:
         """Say what lies in the host's memory, now or once there are as many Gaussians as there may be."""
         count = -(-max(self.gaussians.gaussian_count, self.density.most_gaussians) // self.group.size)
         if not self.memory.spilled_bytes(count):
             return
-        share = self._share_seen()
+        share = share_of(self.scene, self.device)
         dense = self.sleeping is None and self.opt.optimizer_type == "default"
-        same = self.sleeping is None or share < MOST_SHARE  # blocks would sleep in any case
+        same = self.sleeping is None or share < sleeping.MOST_SHARE  # blocks would sleep in any case
         print("\n".join(self.memory.words(count, 1.0 if dense else share, same)))
-
-    def rests(self, step: Iteration) -> bool:
-        """Whether all blocks of Gaussians wake after a step."""
-        return self.sleeping is not None and step.iteration % REST == 0
 
     def step_on_host(self, step: Iteration, gradient: Tensor) -> None:
         """Take the step of the view's camera. gradient (numbers,): of the loss by the camera's numbers."""
@@ -375,15 +349,6 @@ class Run:
             for after_change in self._each("after_change"):
                 after_change(step)
             self.memory.settle(self.gaussians)
-        if self.sleeping is None:
-            return
-        self.gaussians.optimizer.rows = None
-        if step.changes:
-            self.sleeping.reset()
-        elif self.rests(step):
-            self.sleeping.rest()
-        else:
-            self.sleeping.stepped()
 
     def look(self) -> AbstractContextManager:
         """Within it, others may read the model."""
@@ -392,10 +357,7 @@ class Run:
     def captured(self) -> tuple:
         """The state of the model for a checkpoint, from which a training resumes. Every rank must call it."""
         state = self.gaussians.capture()
-        states = {
-            ASLEEP: self.sleeping and self.sleeping.captured(),
-        }
-        states |= {part.name: part.state() for part in self.parts}
+        states = {part.name: part.state() for part in self.parts}
         return with_further(state, {key: found for key, found in states.items() if found is not None})
 
     def final(self, iteration: int) -> tuple[GaussianModel, int]:

@@ -107,7 +107,7 @@ class CapturedStep(FusedStep):
         losses = self._graphs.launch(at)
         if losses is not None:
             self._fetch(at)
-            queues = density.queues or run.exposes or run.rests(at)
+            queues = density.queues or run.exposes or (run.sleeping is not None and run.sleeping.rests(at.iteration))
             with self._ahead.capacity(at) if queues else nullcontext():
                 run.gaussians.exposures.step()
                 run.after_step(at)

@@ -20,8 +20,9 @@ from step_ways import Immediate, take_as  # noqa: F401  (a fixture)
 from trainings import ITERATIONS, OPTIONS, Once, differences, narrow_scene, trained, whole_result, with_clusters
 
 import train
+from scene import sleeping
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.checkpoint import ASLEEP, further, load_checkpoint, save_checkpoint
+from scene.gaussians.checkpoint import further, load_checkpoint, save_checkpoint
 from scene.gaussians.table import GaussianTable
 from scene.readers.point_cloud import write_point_cloud
 from scene.saved_model import read_model
@@ -292,8 +293,8 @@ def _sleeps(patch: pytest.MonkeyPatch) -> list[float]:
         found.append(float(self.awake.float().mean()))
         return awake
 
-    patch.setattr(runs, "REST", 7)  # also between changes of rows
-    patch.setattr(runs, "MOST_SHARE", 2.0)
+    patch.setattr(sleeping, "REST", 7)  # also between changes of rows
+    patch.setattr(sleeping, "MOST_SHARE", 2.0)
     patch.setattr(Sleeping, "wake", noted)
     return found
 
@@ -406,14 +407,14 @@ def test_resumed(scene, tmp_path, cut, plain, iteration):
     checkpoint = cut / f"chkpnt{iteration}.pth"
     assert not differences(_trained(scene, tmp_path / "b", "--start_checkpoint", checkpoint), plain("default"))
     capture, _ = load_checkpoint(checkpoint)
-    asleep = further(capture, ASLEEP)
+    asleep = further(capture, "sleep")
     assert (asleep is None) == (iteration in (20, 30, 42))
 
 
 def test_a_checkpoint_from_within_a_step_resumes(scene, tmp_path, cut, plain):
     """As where memory has run out: the blocks that the step concerns are awake for it already."""
     capture, iteration = load_checkpoint(cut / "chkpnt33.pth")
-    asleep = further(capture, ASLEEP)
+    asleep = further(capture, "sleep")
     asleep["taken"] += asleep["awake"].int()
     save_checkpoint(tmp_path / "within.pth", capture, iteration)
     start = "--start_checkpoint", tmp_path / "within.pth"
@@ -426,7 +427,7 @@ def test_rays_have_the_bytes_of_a_training_in_which_nothing_sleeps(scene, tmp_pa
     looks = "--test_iterations", 3, 17, 31, "--save_iterations", 9, "--checkpoint_iterations", 33, ITERATIONS
     looked = _trained(scene, tmp_path / "a", *words, *looks)
     resumed = _trained(scene, tmp_path / "b", *words, "--start_checkpoint", tmp_path / "a/chkpnt33.pth")
-    monkeypatch.setattr(runs, "MOST_SHARE", 0.0)
+    monkeypatch.setattr(sleeping, "MOST_SHARE", 0.0)
     awake = _trained(scene, tmp_path / "awake", *words)
     assert looked["ply"] == resumed["ply"] == awake["ply"]
 
@@ -434,7 +435,7 @@ def test_rays_have_the_bytes_of_a_training_in_which_nothing_sleeps(scene, tmp_pa
 @pytest.mark.parametrize("what", ["rows", "taken", "terms"])
 def test_damaged_sleep_is_refused(scene, tmp_path, cut, what):
     capture, iteration = load_checkpoint(cut / "chkpnt33.pth")
-    asleep = further(capture, ASLEEP)
+    asleep = further(capture, "sleep")
     if what == "rows":
         asleep["rows"].pop()
     elif what == "taken":
@@ -460,7 +461,7 @@ def test_interrupted(scene, tmp_path, plain, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         _trained(scene, tmp_path / "cut")
     (checkpoint,) = (tmp_path / "cut").glob("chkpnt*.pth")
-    assert further(load_checkpoint(checkpoint)[0], ASLEEP)
+    assert further(load_checkpoint(checkpoint)[0], "sleep")
     assert not differences(_trained(scene, tmp_path / "whole", "--start_checkpoint", checkpoint), plain("default"))
 
 
@@ -480,7 +481,7 @@ def test_captured_steps_that_are_stopped_resume_to_the_same_bytes(scene, tmp_pat
         _trained(scene, tmp_path / "cut")
     monkeypatch.setattr(captured.Graphs, "launch", launch)
     start = "--start_checkpoint", tmp_path / "cut/chkpnt37.pth"
-    assert further(load_checkpoint(start[1])[0], ASLEEP)
+    assert further(load_checkpoint(start[1])[0], "sleep")
     assert not differences(_trained(scene, tmp_path / "whole", *start), expected)
 
 
@@ -513,7 +514,7 @@ def test_a_term_that_somebody_adds_to_the_loss_reaches_all_rows(scene, tmp_path,
 
     monkeypatch.setattr(Objective, "__call__", more)
     asleep = _trained(scene, tmp_path / "asleep", *way)
-    monkeypatch.setattr(runs, "MOST_SHARE", 0.0)
+    monkeypatch.setattr(sleeping, "MOST_SHARE", 0.0)
     assert not differences(asleep, _trained(scene, tmp_path / "awake", *way))
 
 
@@ -583,7 +584,7 @@ def test_memory_that_runs_out_while_rows_change_ends_in_one_sentence(scene, tmp_
 
 
 def test_where_views_see_most_points_no_block_sleeps(scene, tmp_path, monkeypatch, shares):
-    monkeypatch.setattr(runs, "MOST_SHARE", 0.0)
+    monkeypatch.setattr(sleeping, "MOST_SHARE", 0.0)
     _trained(scene, tmp_path)
     assert not shares
 
@@ -592,13 +593,13 @@ def test_a_model_that_is_saved_between_is_as_if_no_block_had_slept(scene, tmp_pa
     """Up to rounding, which a training magnifies: in few steps, from the same points."""
     words = "--save_iterations", 9, "--checkpoint_iterations", 9, ITERATIONS
     _trained(scene, tmp_path / "asleep", *words)
-    monkeypatch.setattr(runs, "MOST_SHARE", 0.0)
+    monkeypatch.setattr(sleeping, "MOST_SHARE", 0.0)
     _trained(scene, tmp_path / "awake", *words)
     one, other = (read_model(tmp_path / out / "point_cloud/iteration_9/point_cloud.ply") for out in ("asleep", "awake"))
     torch.testing.assert_close(one.get_xyz, other.get_xyz, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(one.get_opacity, other.get_opacity, rtol=1e-4, atol=1e-4)
     one, other = (load_checkpoint(tmp_path / out / "chkpnt9.pth")[0] for out in ("asleep", "awake"))
-    assert further(one, ASLEEP) and not further(other, ASLEEP)
+    assert further(one, "sleep") and not further(other, "sleep")
     torch.testing.assert_close(one[1], other[1], rtol=1e-5, atol=1e-5)
     averages, dense = (capture[10]["state"][0]["exp_avg"] for capture in (one, other))
     assert (averages - dense).abs().max() < 1e-3 * dense.abs().max()

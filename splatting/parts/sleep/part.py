@@ -1,0 +1,59 @@
+"""Blocks of Gaussians that sleep while no view shows them, and catch up when one may, with the same bytes."""
+
+from typing import TYPE_CHECKING, Any
+
+from splatting.training.part import Part, fill
+
+if TYPE_CHECKING:
+    import argparse
+
+    from splatting.training.iteration import Iteration
+
+
+class Sleep(Part):
+    """Lets blocks sleep where that saves something, and a step concerns no row that its view does not see."""
+
+    name = "sleep"
+
+    @classmethod
+    def wanted(cls, given: "argparse.Namespace") -> bool:
+        return True
+
+    def begin(self, run: Any, state: Any) -> None:
+        self._run, self._state = run, state
+
+    def ready(self, run: Any) -> None:
+        from scene.sleeping import Sleeping
+
+        if self._saves():
+            sleeping = Sleeping(run.gaussians)
+            fill(run, "sleeping", sleeping, self)
+            if self._state is not None:
+                sleeping.restore(self._state)
+
+    def _saves(self) -> bool:
+        from scene import sleeping
+        from scene.fused_adam import FusedAdam
+        from scene.gaussians.adam import GaussianAdam
+        from scene.sampling_rate import share_of
+
+        run, density = self._run, self._run.density
+        dense = type(run.gaussians.optimizer) is GaussianAdam and FusedAdam.takes(run.gaussians)
+        alone = not (density.queues or any(density.penalty) or any(part.needs.all_rows for part in run.parts))
+        if not (dense and alone and run.is_standard):
+            return False
+        return run.group.anyone(run.memory.limit > 0) or share_of(run.scene, run.device) < sleeping.MOST_SHARE
+
+    def after_step(self, at: "Iteration") -> None:
+        if (sleeping := self._run.sleeping) is None:
+            return
+        self._run.gaussians.optimizer.rows = None
+        if at.changes:
+            sleeping.reset()
+        elif sleeping.rests(at.iteration):
+            sleeping.rest()
+        else:
+            sleeping.stepped()
+
+    def state(self) -> Any:
+        return self._run.sleeping and self._run.sleeping.captured()
