@@ -15,10 +15,6 @@ def _resolution(value: int) -> str | None:
     return None if value == -1 or value > 0 else "-1, 1, 2, 4, 8 or a width in pixels"
 
 
-def _tolerance(value: float) -> str | None:
-    return None if value == -1 or value >= 0 else "at least 0, or -1"
-
-
 class ModelParams(OptionTable):
     """Options of the data, the output folder and the SH degree. Those of CFG_ARGS make up that file."""
 
@@ -182,13 +178,6 @@ class OptimizationParams(OptionTable):
             help="largest number of Gaussians, 0: no limit, 1,000,000 with mcmc, or with budget what --strategy says; "
                  "near it, adc densifies only those with the largest gradients. adc and mcmc keep a start with more, "
                  "budget removes what is too many"),
-        Option("keep_unseen", False, origin="ours",
-            help="also save the Gaussians that nobody sees. Without this the last save leaves out those that no "
-                 "training view and no view between neighbouring ones depends on: training views at their training "
-                 "size stay the same, views from elsewhere may change"),
-        Option("prune_sh", -1.0, origin="ours", check=_tolerance,
-            help="in the last save, drop the highest SH bands that change no colour (0 to 1) by more than this; 0: "
-                 "drop bands that are zero throughout, -1: drop none. The sh_degree in cfg_args follows"),
         Option("seed", 0, origin="ours, and the reference's fixed seed", check=within(0, 2**63 - 1), stored=MODEL_JSON,
             help="seed of every random choice; the same seed gives the same bytes"),
         Option("strategy", "auto", origin="ours", check=one_of("auto", *strategies()), stored=MODEL_JSON,

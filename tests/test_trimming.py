@@ -30,7 +30,7 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.readers.point_cloud import write_point_cloud
 from splatting.diagnosis.model import check_model
-from splatting.training.left_out import LeftOut, lines, saved_line
+from splatting.parts.last_save.trim_report import TrimReport, lines, saved_line
 from utils.system_utils import UserError
 
 ITERATIONS = 12
@@ -306,7 +306,7 @@ def test_a_view_between_is_interpolated():
         assert (clip[1] / clip[3]).item() * view.image_height / 2 == pytest.approx(-1 + fraction, abs=1e-3)
 
 
-LEFT_OUT = LeftOut(
+LEFT_OUT = TrimReport(
     gaussians=1000, unseen=50, faint=0, keep_unseen=False, search=DONE, views=99, iterations=7000, max_sh_degree=3,
     sh_degree=3, cut_bounds=[0.3, 0.2, 0.1, 0.0], ply_bytes=248_000, ply_bytes_saved=12_400, seconds=1.25,
     picture_bytes=3_000_000, picture_bytes_in_files=12_000_000,
@@ -343,7 +343,7 @@ def test_a_training_ends_with_at_most_six_lines(colmap_scene, tmp_path, capfd):
     train.main(["-s", str(colmap_scene), "-m", str(tmp_path), "-r", "24", "--iterations", "210", "--eval"])
     said = re.sub(r" \[\d\d/\d\d \d\d:\d\d:\d\d\]$", "", capfd.readouterr().out, flags=re.MULTILINE).splitlines()
     end = said[next(n for n, line in enumerate(said) if line.startswith("210 iterations in ")) :]
-    left_out = LeftOut(**json.loads((tmp_path / "model.json").read_text())["left_out"])
+    left_out = TrimReport(**json.loads((tmp_path / "model.json").read_text())["left_out"])
     assert saved_line(left_out, tmp_path / "point_cloud" / "iteration_210") in end
     assert re.fullmatch(
         r"Test PSNR measured 13 times \(12 of them on 1 of 3 views\), [\d.]+ s: .*error_vs_time.png", end[1]

@@ -28,6 +28,7 @@ PARTS = (
     "sky",
     "sparse_depth",  # the order of the terms of the loss is in the bytes of the model
     "filter_3d",  # after all that moves rows
+    "last_save",  # after keep_best, which may choose another model
     "sleep",  # after all that decides whether every step concerns all rows
 )
 

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from arguments import add_to_model_json, write_cfg_args
 from gaussian_renderer.rays import check_views
 from scene import sleeping
 from scene.gaussian_model import GaussianModel
@@ -72,6 +73,7 @@ class Run:
     counts: Any = None
     on_host: Any = None
     final_iteration: int | None = None
+    last_iteration: int | None = None
 
     def __init__(
         self, dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, launch: argparse.Namespace
@@ -360,12 +362,15 @@ class Run:
         states = {part.name: part.state() for part in self.parts}
         return with_further(state, {key: found for key, found in states.items() if found is not None})
 
-    def final(self, iteration: int) -> tuple[GaussianModel, int]:
-        """The model of the last save, and its iteration."""
-        model = self.gaussians, iteration
+    def save_last(self, iteration: int) -> None:
+        """Save the model that parts make of the trained one, and what they keep in model.json."""
+        model, self.final_iteration, self.last_iteration = self.gaussians, iteration, iteration
         for final in self._each("final"):
-            model = final(*model)
-        return model
+            model, self.final_iteration = final(model, self.final_iteration)
+        scene = self.scene
+        scene.save(iteration, model)
+        write_cfg_args(scene.model_path, argparse.Namespace(**vars(self.dataset) | {"sh_degree": model.max_sh_degree}))
+        add_to_model_json(scene.model_path, **self.facts)
 
     def end_sleep(self, guarded: bool = True) -> None:
         """Let all blocks take the steps that they have missed, and sleep no more. guarded: of `Sleeping.rest`."""

@@ -279,12 +279,14 @@ class Records(Part):
 
     def measured(self, step: Iteration, losses: Losses) -> None:
         run = self._run
-        adds = overrides(run.parts, "records")
-        if step.record is None and not (adds and step.scored_at is not None):
+        if step.record is None and step.scored_at is None:
+            return
+        added = {name: number for add in overrides(run.parts, "records") for name, number in add().items()}
+        if step.record is None and not added:
             return
         self._seconds = seconds = run.clock.seconds if step.scored_at is None else step.scored_at
         with run.clock.paused("saving"):
-            values = (step.record or {}) | {name: number for add in adds for name, number in add().items()}
+            values = (step.record or {}) | added
             run.log.add(step.iteration, seconds, gaussians=run.gaussians.gaussian_count, loss=run.losses.mean, **values)
 
     def ended(self, error: Error) -> None:

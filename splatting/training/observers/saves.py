@@ -6,26 +6,18 @@ from pathlib import Path
 from tqdm import tqdm
 
 from scene.gaussians.checkpoint import save_checkpoint
-from scene.saved_iterations import saved_ply
 from splatting.training.iteration import Iteration, Losses
-from splatting.training.left_out import LeftOut, lines, save_last, saved_line
 from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.output_folder import view_command
-from splatting.training.part import Error, Part
+from splatting.training.part import Part
 from splatting.training.run import Run
 
 
 class Saves(Part):
-    """Saves the PLY when planned; the last save leaves out what the model does not need.
+    """Saves the PLY when planned. The last save is of the model that parts make of the trained one (`final`)."""
 
-    test_in_memory: the test photos are decoded by the last iteration, so that scoring them once more costs little.
-    """
-
-    def __init__(self, run: Run, test_in_memory: bool) -> None:
+    def __init__(self, run: Run) -> None:
         self._run = run
-        self._test_in_memory = test_in_memory
-        self._left_out: LeftOut | None = None
-        self._iteration = 0
 
     def due(self, step: Iteration) -> bool:
         return step.takes(self._run.launch.save_iterations)
@@ -39,17 +31,9 @@ class Saves(Part):
             run.gaussians.check_finite(step.iteration)
             tqdm.write(f"[ITER {step.iteration}] Saving Gaussians", file=sys.stdout)
             if step.last:
-                self._left_out = save_last(run, self._test_in_memory, step.iteration)
-                self._iteration = step.iteration
-                step.record["gaussians_left_out"] = self._left_out.unseen
+                run.save_last(step.iteration)
             else:
                 run.scene.save(step.iteration)
-
-    def ended(self, error: Error) -> None:
-        if error is None and self._left_out is not None:
-            run, folder = self._run, saved_ply(self._run.scene.model_path, self._iteration).parent
-            run.log.tell(saved_line(self._left_out, folder))
-            run.log.keep(*lines(self._left_out))
 
 
 class Checkpoints(Part):

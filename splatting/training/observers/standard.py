@@ -17,7 +17,6 @@ from splatting.training.run import Run
 def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[str, float]]) -> list[Part]:
     """The observers of every training. writer: TensorBoard's, or None. report: `training_report`."""
     with_curve = not run.launch.no_curve and bool(run.scene.getTestCameras())
-    test_in_memory = with_curve or run.opt.iterations in run.launch.test_iterations
     if report is not training_report:
         run.end_sleep()  # it may read or change the model in every iteration
     watch = DivergenceWatch(run)
@@ -29,7 +28,7 @@ def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[
         *([Curve(run)] if with_curve else []),  # the scores are those of the model saved at the same iteration
         *run.parts,
         Report(run, writer, report),
-        Saves(run, test_in_memory),  # before the model changes
+        Saves(run),  # before the model changes
         Records(run),  # after all that add to the iteration's record
         Summary(run),  # after all that say something at the end
         *([NetworkViewer(run)] if network_gui.listener else []),  # after all that write: it may make training wait

@@ -1,22 +1,20 @@
-"""The last save of a training: the model without what it does not need, and lines about what that saves."""
+"""A model without what it does not need, and lines about what that saves."""
 
-import argparse
-import dataclasses
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from arguments import add_to_model_json, write_cfg_args
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import FEW, ITERATIONS_PER_VIEW, TOO_LONG, WORTH, change_on_views, trim
-from splatting.training.run import Run
+from scene.gaussian_model import GaussianModel
 
 MB = 1e6
 
 
 @dataclass
-class LeftOut:
-    """Facts that `lines` reports and `model.json` keeps."""
+class TrimReport:
+    """Facts that `lines` reports and model.json keeps."""
 
     gaussians: int  # trained
     unseen: int  # of these, not saved, because nobody sees them
@@ -36,7 +34,7 @@ class LeftOut:
     test_change: dict[str, float] = field(default_factory=dict)  # `trimming.change_on_views`; {} without test views
 
 
-def saved_line(it: LeftOut, folder: Path) -> str:
+def saved_line(it: TrimReport, folder: Path) -> str:
     """What was saved, where, and what the file lacks, as training says it."""
     size = f"{(it.ply_bytes - it.ply_bytes_saved) / MB:.2f} MB"
     if it.sh_degree < it.max_sh_degree:
@@ -48,12 +46,12 @@ def saved_line(it: LeftOut, folder: Path) -> str:
     return f"{line}. Left out {it.unseen:,} invisible Gaussians {why}{_change(it.test_change)}"
 
 
-def lines(it: LeftOut) -> list[str]:
+def lines(it: TrimReport) -> list[str]:
     """Lines about Gaussians, SH bands and photos, for reports."""
     return [_gaussians(it), _bands(it), _pictures(it)]
 
 
-def _gaussians(it: LeftOut) -> str:
+def _gaussians(it: TrimReport) -> str:
     if it.keep_unseen:
         return "No Gaussian was left out (--keep_unseen)"
     found = f"Of {it.gaussians:,} Gaussians, {it.unseen:,} invisible ones were left out{_share(it, it.unseen)}"
@@ -66,7 +64,7 @@ def _gaussians(it: LeftOut) -> str:
     return f"{found}; {how.get(it.search, searched)}{_change(it.test_change)}"
 
 
-def _share(it: LeftOut, count: int) -> str:
+def _share(it: TrimReport, count: int) -> str:
     part = count / it.gaussians
     return f" ({100 * part:.1f} %, {it.ply_bytes * part / MB:.2f} MB of the PLY)"
 
@@ -80,7 +78,7 @@ def _change(change: dict[str, float]) -> str:
     return text
 
 
-def _bands(it: LeftOut) -> str:
+def _bands(it: TrimReport) -> str:
     if it.sh_degree < it.max_sh_degree:
         rows = it.gaussians - it.unseen
         saved = 12 * ((it.max_sh_degree + 1) ** 2 - (it.sh_degree + 1) ** 2) * rows / MB
@@ -93,7 +91,7 @@ def _bands(it: LeftOut) -> str:
     return f"All SH bands were kept. Cutting them (--prune_sh) moves colours (values 0 to 1) by at most {moved}"
 
 
-def _pictures(it: LeftOut) -> str:
+def _pictures(it: TrimReport) -> str:
     saved = 4 * it.picture_bytes_in_files - it.picture_bytes
     return (
         f"Colours of the training photos are kept as bytes and at training size: {it.picture_bytes / MB:.1f} MB, "
@@ -101,22 +99,19 @@ def _pictures(it: LeftOut) -> str:
     )
 
 
-def save_last(run: Run, scored: bool, iteration: int) -> LeftOut:
-    """Save the finished model without what it does not need, and record in model.json what was left out.
+def trimmed(run: Any, trained: GaussianModel, scored: bool, iteration: int) -> tuple[GaussianModel, TrimReport]:
+    """A finished model without what it does not need, and the facts.
 
     scored: whether to compute the change in PSNR, which is cheap if the test photos are in memory. iteration: the last.
     """
     scene, opt, halves = run.scene, run.opt, run.dataset.train_test_exp
     scene.gaussians.optimizer.zero_grad(set_to_none=True)  # room for the trimmed copy
-    trained, run.final_iteration = run.final(iteration)
     final, search = trim(trained, scene.getTrainCameras(), run.pipe, opt.keep_unseen, opt.prune_sh, iteration)
     change, test = {}, scene.getTestCameras()
     if test and (search.unseen > search.faint or search.cut_bounds[final.max_sh_degree] > 0):
         change = change_on_views(trained, final, test, ScoredViews(run.pipe, run.background, halves), scored)
-    scene.save(iteration, final)
-    write_cfg_args(scene.model_path, argparse.Namespace(**vars(run.dataset) | {"sh_degree": final.max_sh_degree}))
     kept_pixels, file_pixels = scene.training_pixels()
-    left_out = LeftOut(
+    return final, TrimReport(
         gaussians=trained.gaussian_count,
         unseen=search.unseen,
         faint=search.faint,
@@ -134,5 +129,3 @@ def save_last(run: Run, scored: bool, iteration: int) -> LeftOut:
         picture_bytes_in_files=3 * file_pixels,
         test_change={name: value for name, value in change.items() if math.isfinite(value)},
     )
-    add_to_model_json(scene.model_path, left_out=dataclasses.asdict(left_out), **run.facts)
-    return left_out
