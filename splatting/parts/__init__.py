@@ -2,7 +2,6 @@
 
 import argparse
 import os
-import shutil
 from collections.abc import Callable, Collection, Mapping
 from functools import cache
 from importlib import import_module
@@ -95,11 +94,10 @@ def check_together(parts: Collection[Part], given: argparse.Namespace, several: 
 
 
 def remove_traces(folder: str | os.PathLike, parts: Collection[Part]) -> None:
-    """Remove what an earlier training has left in a model folder by parts that this one does not have."""
+    """Remove files that parts of an earlier training wrote into a model folder, and this one does not have."""
     for name in {*PARTS} - {part.name for part in parts}:
         for trace in part_class(name).traces:
-            path = Path(folder) / trace
-            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+            (Path(folder) / trace).unlink(missing_ok=True)
 
 
 def tools(name: str) -> list[Callable]:

@@ -2,9 +2,8 @@
 
 A part is a subclass of `Part` in splatting/parts/NAME/part.py, and a line in splatting/parts/__init__.py. The place of
 that line is the part's in the one order of all hooks. Outside of its folder nobody names it. Hooks are optional; those
-that a
-class does not override cost nothing. This module and every part.py import nothing heavy, as `train.py --help` reads
-them: the method itself lies in further modules of the folder, which hooks import.
+that a class does not override cost nothing. This module and every part.py import nothing heavy, as `train.py --help`
+reads them: the method itself lies in further modules of the folder, which hooks import.
 
 A run (splatting/training/run.py), in the order in which it calls the hooks:
 
@@ -93,7 +92,7 @@ class Part:
     reads_model: whether it reads the model in iterations that are due for it; sleeping blocks then catch up first.
     shown: terms whose running mean the progress bar shows, and what it calls them.
     own_end: whether its options let a training end before or after --iterations.
-    traces: files and folders in a model folder that a training without the part removes.
+    traces: files that the part writes into a model folder, and a training without it removes; never what may be input.
     """
 
     name: ClassVar[str] = ""

@@ -36,6 +36,7 @@ class Filter3d(Part):
         if self._state is not None:
             check_widths(self._state, model.gaussian_count)
             model.columns[self.name] = model.shards.own(self._state).to(model.columns[self.name])
+        self._state = None  # it is as large as the model
 
     def _update(self) -> None:
         from splatting.parts.filter_3d.smoothing import filter_widths

@@ -26,7 +26,6 @@ class RobustMask(Part):
                  "passers-by; no mask is needed. 0: off"),
     ))
     # fmt: on
-    traces = ("robust_masks", "robust_masks.png")  # written.FOLDER and PICTURE
     needs = Needs(replay=False, ranks=False)
 
     def begin(self, run: Any, state: Any) -> None:

@@ -30,6 +30,7 @@ class Sleep(Part):
             fill(run, "sleeping", sleeping, self)
             if self._state is not None:
                 sleeping.restore(self._state)
+        self._state = None  # it has rows of the model
 
     def _saves(self) -> bool:
         from scene import sleeping

@@ -33,6 +33,7 @@ class TimeBudget(Part):
     ))
     # fmt: on
     traces = (_FILE,)
+    _iteration = 0  # of a run; a scene without one saves no schedule
     own_end = True
 
     @classmethod
@@ -49,7 +50,7 @@ class TimeBudget(Part):
     def check(self, run: Any, state: Any) -> None:
         from splatting.parts.time_budget.schedule_file import schedule_of
 
-        self._run, self._iteration = run, 0
+        self._run = run
         schedule = schedule_of(run.opt, run.asked_sizes, run.start, run.first_iteration, run.group.shared, state)
         fill(run, "schedule", schedule, self)
         self._end_in_time(run.opt)
