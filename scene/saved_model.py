@@ -10,7 +10,7 @@ from pathlib import Path
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import Rows
-from scene.gaussians.checkpoint import load_checkpoint, states_of, unpack
+from scene.gaussians.checkpoint import extra_state, load_checkpoint, unpack
 from scene.gaussians.finite import warn_of_undrawn
 from scene.gaussians.ply import read_ply
 from scene.gaussians.ppisp import Ppisp
@@ -66,7 +66,7 @@ def read_model(path: Path, sh_degree: int | None = None) -> GaussianModel:
 
 def _drawn(rows: Rows, capture: tuple) -> Rows:
     """A checkpoint's rows as its PLY would have them."""
-    states = states_in(states_of(capture))
+    states = states_in(extra_state(capture))
     for drawn in tools("drawn"):
         rows = drawn(rows, states)
     return rows

@@ -96,7 +96,7 @@ class Scene:
             _refuse_dataset_folder(args)
         kind = kind_of(args.source_path)
         if read := replaced_reader(kind):
-            return self._changed(scene_by(read, kind, args, self._halves), args, False)
+            return self._changed(scene_by(read, kind, args, self._halves), args, fresh)
         masks = MaskOptions(**_given(args, folder="masks", invert="invert_masks", meaning="mask_meaning"))
         info = read_scene(
             args.source_path,

@@ -66,11 +66,11 @@ class Sleeping:
         """A step was taken, or taken back: from now on, the blocks that sleep are behind."""
         self._is_whole = False
 
-    def rests(self, iteration: int) -> bool:
+    def flushes(self, iteration: int) -> bool:
         """Whether all blocks wake after a step."""
         return iteration % REST == 0
 
-    def rest(self, guarded: bool = True) -> None:
+    def flush(self, guarded: bool = True) -> None:
         """Let all blocks take the steps that they have missed. The next step may leave them asleep.
 
         guarded: unless the optimiser's guard has stopped its steps.
@@ -86,7 +86,7 @@ class Sleeping:
         return self.awake.bool().repeat_interleave(BLOCK)[: len(self._gaussians._xyz)]
 
     @contextmanager
-    def look(self) -> Iterator[None]:
+    def flushed_view(self) -> Iterator[None]:
         """Within it, the model is what it would be had no block slept; then it is as before, to the bit."""
         if self._is_whole:
             yield
@@ -102,7 +102,7 @@ class Sleeping:
                 self._asleep = None
 
     def captured(self) -> State | None:
-        """Within `look`, what a checkpoint of the model lacks; None: nothing. Every rank must call it."""
+        """Within `flushed_view`, what a checkpoint of the model lacks; None: nothing. Every rank must call it."""
         if self._asleep is None:
             return None
         whole = self._gaussians.shards.whole

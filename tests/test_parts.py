@@ -23,6 +23,8 @@ NAMESPACES = ("args", "opt", "options", "dataset", "given", "launch", "pipe")  #
 KNOWN = {  # words in files that are options of a part, and mean something else there or have to stay
     ("resolution_schedule", "splatting/parts/time_budget/schedule_file.py"),  # a key of schedule.json
     ("time_budget", "integrations/nerfbaselines/spec.py"),  # a set of options, as a user gives it
+    ("no_curve", "integrations/nerfbaselines/method.py"),
+    ("no_curve", "splatting/diagnosis/advice.py"),  # of a short training
     ("schedule", "scene/gaussian_model.py"),  # that of exposures' learning rate
     ("split", "splatting/evaluation/tables.py"),  # of photos into training and test views
     ("split", "splatting/evaluation/results.py"),
@@ -31,8 +33,7 @@ COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "exp
 
 
 def _options(name: str) -> set[str]:
-    groups = part_class(name).options
-    return {option.name for option in (*groups.model, *groups.pipeline, *groups.optimisation)}
+    return {*part_class(name).options.by_name}
 
 
 def _files(name: str) -> Iterator[Path]:
@@ -104,7 +105,8 @@ for room in words:
         if not module.startswith((f"splatting.parts.{name}", "integrations")) and not module.endswith("__main__"):
             import_module(module)
 from arguments import OPTIONS
-print(*(option.name for option in OPTIONS))
+from splatting.training.launch import launch_options
+print(*(option.name for option in OPTIONS), *vars(launch_options()))
 """
 
 

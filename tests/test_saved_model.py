@@ -16,7 +16,7 @@ import export
 import render
 from arguments import ModelParams
 from scene.gaussians import ply
-from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint, with_further
+from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint, with_extra_state
 from scene.saved_model import find_save, load_saved, read_model
 from splatting.evaluation.training_log import read_log
 from splatting.host.start import typed_command
@@ -66,14 +66,14 @@ def test_both_kinds_have_the_same_gaussians(tmp_path):
 def test_a_checkpoint_is_shown_behind_its_3d_filter(tmp_path):
     gaussians = model(5, degree=2)
     gaussians.columns["filter_3d"], gaussians.drawn = torch.rand(5, 1), Smoothing(gaussians)
-    capture = with_further(gaussians.capture(), {"filter_3d": gaussians.columns["filter_3d"]})
+    capture = with_extra_state(gaussians.capture(), {"filter_3d": gaussians.columns["filter_3d"]})
     save_checkpoint(tmp_path / "chkpnt7.pth", capture, 7)
     gaussians.save_ply(tmp_path / "point_cloud.ply")
     of_ply, of_checkpoint = (parameters(read_model(tmp_path / name)) for name in ("point_cloud.ply", "chkpnt7.pth"))
     for name, values in of_ply.items():
         assert torch.equal(values, of_checkpoint[name]), name
     assert not torch.equal(of_checkpoint["scaling"], capture[4])
-    save_checkpoint(tmp_path / "chkpnt7.pth", with_further(capture, {"filter_3d": torch.rand(4, 1)}), 7)
+    save_checkpoint(tmp_path / "chkpnt7.pth", with_extra_state(capture, {"filter_3d": torch.rand(4, 1)}), 7)
     with pytest.raises(UserError, match="the 3D filter of the checkpoint does not fit"):
         read_model(tmp_path / "chkpnt7.pth")
 

@@ -11,13 +11,13 @@ import pytest
 import torch
 from gaussians import needs_fused_step
 from rasterizer_tools import GPU_MARKS
-from step_ways import Rerun, fused_iterations, take_as  # noqa: F401  (a fixture)
+from step_ways import Immediate, Rerun, fused_iterations, take_as  # noqa: F401  (a fixture)
 from trainings import ITERATIONS, OPTIONS, differences, leaves, shared_scene, trained
 
 from splatting.training import run
-from splatting.training.iteration import Losses
+from splatting.training.iteration import Iteration, Losses
 from splatting.training.objective import Objective
-from splatting.training.steps import speculative, step_taker
+from splatting.training.steps import captured, speculative, step_taker
 from splatting.training.steps.captured import CapturedStep, Graphs, Recorder
 from splatting.training.steps.fused import FusedStep
 from splatting.training.steps.plain import PlainStep
@@ -74,7 +74,8 @@ def test_losses_that_are_kept_keep_no_image(scene, tmp_path, monkeypatch):
 
     def noted(self, step):
         measured = measure(self, step)
-        told.extend(measured[1].values)
+        total, l1, terms, _ = measured[1]
+        told.extend([total, l1, *terms.values()])
         return measured
 
     monkeypatch.setattr(FusedStep, "measure", noted)
@@ -305,3 +306,26 @@ test_steps.trained(Path(sys.argv[1]), Path(sys.argv[2]), *test_steps.GROWING, "-
     assert done.returncode == -signal.SIGKILL, done.stderr
     start = "--start_checkpoint", tmp_path / "out/chkpnt25.pth"
     assert not differences(trained(scene, tmp_path / "out", *GROWING, *start), wanted)
+
+
+@needs_fused_step
+def test_a_graph_may_replay_a_step_that_was_taken_without_one(scene, tmp_path, monkeypatch, take_as):  # noqa: F811
+    """The first step of a kind has no graph, and its losses tell of terms; a graph's do not."""
+
+    class Replaying(Immediate):
+        def __init__(self, device: torch.device, steps: CapturedStep) -> None:
+            super().__init__(device, steps)
+            self._held = []
+            self.add = self._add
+
+        def _add(self, at: Iteration, losses: Losses) -> None:
+            self._pending.append(at)
+            self._held.append((at, losses))
+            if len(self._held) == 2:
+                self._steps.rewind(2)
+                for step, first in self._held:
+                    self._steps.replay(step, first)
+
+    take_as("captured")
+    monkeypatch.setattr(captured, "Speculation", Replaying)
+    assert trained(scene, tmp_path / "a", *OPTIONS["appearance"])["ply"]

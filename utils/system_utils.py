@@ -11,7 +11,7 @@ from pathlib import Path
 from splatting.distributed.ranks import ranks
 from splatting.host import start, torchrun
 from splatting.host.errors import UserError, first_line
-from splatting.host.interrupt import Terminated
+from splatting.host.interrupt import Terminated, let_signals_end
 from splatting.host.machine import compute_device
 from splatting.host.memory import is_out_of_memory, shortage
 
@@ -54,6 +54,8 @@ def run_cli(main: Callable[[], object], several: bool = False) -> None:
             print(f"error: {reason}; free space there, or send the output elsewhere", file=sys.stderr)
         _discard_output()
         status = 2
+    finally:
+        let_signals_end()  # else one that comes now would print a traceback from Python's own end
     if status:
         sys.exit(status)
 

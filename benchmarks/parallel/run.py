@@ -13,6 +13,7 @@ from scene.sleeping import Sleeping
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch
 from splatting.host.interrupt import DeferredInterrupt
+from splatting.parts import part_class
 from splatting.training.density import density_control
 from splatting.training.gpu_memory import GpuMemory
 from splatting.training.iteration import ViewOrder
@@ -60,6 +61,9 @@ class WorkloadRun(Run):
         if sleep:
             sort_rows(self.gaussians)
             self.sleeping = Sleeping(self.gaussians)
+            keeps = part_class("sleep")()
+            keeps.begin(self, None)
+            self.parts = [keeps]
 
     def _begin(self, workload: Workload) -> None:
         gaussians, here = self.gaussians, self.group

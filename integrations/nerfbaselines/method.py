@@ -43,7 +43,7 @@ _OF_FILES += tuple(part.switch or part.name for part in _PARTS if part.needs.fil
 _FIXED = dict.fromkeys(
     ("advise", "viewer", "viewer_host", "detect_anomaly",
      "start_checkpoint", "source_path", "model_path", "images", "invert_masks",
-     *(part.switch or part.name for part in _PARTS if part.final is not Part.final))
+     *(name for part in _PARTS if part.final is not Part.final for name in part.options.by_name))
     , "",
 ) | {"options": "given", "resolution": "1", "mask_meaning": "auto"}  # fmt: skip
 _LISTS = ("test_iterations", "save_iterations", "checkpoint_iterations")
@@ -178,7 +178,7 @@ class GaussianSplatting(Method):
         if self._at is not None:
             self._taker.drain()
             self._watch.look(self._at.iteration, stepped=not self._at.last)
-        return self._run.look()
+        return self._run.flushed_view()
 
     @torch.no_grad()
     def render(self, camera: Any, *, options: Mapping[str, Any] | None = None) -> dict[str, np.ndarray]:
@@ -199,7 +199,7 @@ class GaussianSplatting(Method):
         options.source_path = options.model_path = ""  # they lie in a temporary folder
         folder.mkdir(parents=True, exist_ok=True)
         with self._look():
-            save_checkpoint(folder / f"chkpnt{iteration}.pth", run.captured(), iteration)
+            save_checkpoint(folder / f"chkpnt{iteration}.pth", run.checkpoint_state(), iteration)
             self._gaussians.save_ply(str(saved_ply(folder, iteration)))
         run.log.add(iteration, run.clock.seconds, gaussians=self._gaussians.gaussian_count, loss=run.losses.mean)
         shutil.copyfile(Path(run.scene.model_path) / training_log.NAME, folder / training_log.NAME)

@@ -128,21 +128,15 @@ def pack(state: State) -> tuple:
     )
 
 
-def with_further(entries: tuple, states: dict[str, Any]) -> tuple:
-    """The entries with further state of a training in the optimiser's state dict, by its key."""
+def with_extra_state(entries: tuple, states: dict[str, Any]) -> tuple:
+    """The entries with extra state of a training in the optimiser's state dict, by its key."""
     return (*entries[:_OPTIMIZER], entries[_OPTIMIZER] | states, *entries[_OPTIMIZER + 1 :])
 
 
-def states_of(entries: Sequence[Any]) -> dict[str, Any]:
-    """All further state, by its key."""
+def extra_state(entries: Sequence[Any]) -> dict[str, Any]:
+    """What `with_extra_state` has added, among the optimiser's own entries."""
     optimizer = entries[_OPTIMIZER]
     return optimizer if isinstance(optimizer, dict) else {}
-
-
-def further(entries: Sequence[Any], key: str) -> Any:
-    """What stands there, or None."""
-    optimizer = entries[_OPTIMIZER]
-    return optimizer.get(key) if isinstance(optimizer, dict) else None
 
 
 def unpack(entries: Sequence[Any], table: dict[str, Attribute], max_sh_degree: int) -> State:

@@ -107,7 +107,7 @@ def check_training(model: Path) -> list[Line]:
 def _load(model_path: str, stored: dict[str, Any], iteration: int) -> tuple[argparse.Namespace, Scene]:
     # Small images are enough to tell black renders from bad ones.
     given = {**stored, "model_path": model_path, "resolution": _WIDTH, "images_to_load": 1}
-    given |= {option.name: option.default for option in options_of("model")}
+    given |= {option.name: option.default for option in options_of("model") if not option.seen}
     options = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**given))
     with contextlib.redirect_stdout(io.StringIO()):  # from the readers
         return options, load_saved(options, iteration)

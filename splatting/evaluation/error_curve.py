@@ -49,7 +49,7 @@ def read_curve(path: str | os.PathLike) -> list[Row]:
         if places != sorted(set(places)):
             raise ValueError("its iterations do not ascend")
     except FileNotFoundError as error:
-        raise UserError(f"no curve {path}; train.py --eval records one unless --no_curve is set") from error
+        raise UserError(f"no curve {path}; train.py --eval records one") from error
     except (OSError, ValueError, csv.Error) as error:
         raise UserError(f"{path} cannot be read as a curve ({error}); train again to record one") from error
     return rows

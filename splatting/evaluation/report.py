@@ -127,13 +127,7 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
         pictures[scene] = {
             "curves": _figures(draw_curves, folder, scene, members, peers),
             "poses": _figures(draw_poses, folder, scene, members),
-            "masked": [
-                path
-                for run in members
-                for of in tools("pictures")
-                for path in of(output / run["model"])
-                if path.is_file()
-            ],
+            "masked": [path for run in members for path in _of_parts(output / run["model"])],
             "fronts": _figures(draw_fronts, folder, scene, found, names) if found else [],
             "views": _views(output, scene, members, each),
         }

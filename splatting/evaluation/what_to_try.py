@@ -5,7 +5,7 @@ from itertools import pairwise
 from typing import Any
 
 from splatting.evaluation.error_curve import Row, best_test, whole_sets
-from splatting.parts import part_class, tools
+from splatting.parts import part_class, strategies, tools
 
 # Entries of the log's last record: options of the training.
 CAP, PLANNED, STRATEGY = "max_num_splats", "iterations_planned", "strategy"
@@ -101,8 +101,8 @@ def _never_grew(rows: Sequence[Row], strategy: str) -> str | None:
     if len(counts) < 2 or rows[-1]["iteration"] < SETTLED or grew:
         return None
     remedy = "a lower --densify_grad_threshold" if strategy == "adc" else "a higher --max_num_splats"
-    end = f"--{part_class(strategy).until[0]}"
-    return _NEVER_GREW.format(first=counts[0], last=counts[-1], remedy=remedy, end=end)
+    end = part_class(strategy).until[0] if strategy in strategies() else "densify_until_iter"
+    return _NEVER_GREW.format(first=counts[0], last=counts[-1], remedy=remedy, end=f"--{end}")
 
 
 def _late(rows: Sequence[Row], scored: Sequence[Row]) -> str | None:

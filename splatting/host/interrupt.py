@@ -61,6 +61,13 @@ def raise_on_signals() -> None:
             signal.signal(signum, _terminate)
 
 
+def let_signals_end() -> None:
+    """Let SIGTERM and SIGHUP end the process again, as nothing half-done is left that Python's own end would leave."""
+    for signum in _ENDS:
+        if signal.getsignal(signum) == _terminate:
+            signal.signal(signum, signal.SIG_DFL)
+
+
 def ignore(signals: Iterable[int] = tuple(_ERRORS)) -> None:
     """Ignore these signals from now on."""
     for signum in signals:

@@ -19,6 +19,7 @@ PARTS = (
     "time_budget",  # decides on them
     "refine_poses",  # its cameras stand right before anything asks where they are
     "depth_maps",
+    "curve",  # its scores are those of the model that is saved in the same iteration
     "keep_best",  # after maps are found: its views have none
     "robust_mask",
     "adc",  # the first strategy is the default
@@ -44,7 +45,7 @@ def strategies() -> list[str]:
 
 
 def options_of(group: str) -> list[Option]:
-    """What the parts declare of a group of options: model, pipeline or optimisation."""
+    """What the parts declare of a group of options: model, pipeline, optimisation or launch."""
     return [option for name in PARTS for option in getattr(part_class(name).options, group)]
 
 
@@ -78,9 +79,10 @@ def check_together(parts: Collection[Part], given: argparse.Namespace, several: 
     for part in parts:
         option = part.switch or part.name
         if several and not part.needs.ranks:
-            raise UserError(
-                f"--{option} needs a training of one process; leave it out, or start train.py without torchrun"
-            )
+            remedy = "leave it out, or start train.py without torchrun"
+            if not part.wanted(given):
+                remedy = f"it is in {given.start_checkpoint}, so start train.py without torchrun"
+            raise UserError(f"--{option} needs a training of one process; {remedy}")
         for other, reason in part.against.items():
             name, _, value = other.partition("=")
             _, _, need = name.partition(".")

@@ -22,11 +22,6 @@ class Losses(NamedTuple):
     terms: dict[str, Tensor]  # parts of the total that were added to the photometric loss, weighted, by name
     mask: Tensor | None  # (1, H, W) bool, pixels that count; None if all do
 
-    @property
-    def values(self) -> list[Tensor]:
-        """All scalars, in one order."""
-        return [self.total, self.l1, *self.terms.values()]
-
     def detached(self) -> "Losses":
         """The values alone, which keep neither an image nor its gradient."""
         terms = {name: value.detach() for name, value in self.terms.items()}

@@ -3,6 +3,7 @@
 import argparse
 from typing import Any
 
+from splatting.parts import options_of
 from splatting.viewer.server import add_viewer_options
 
 
@@ -23,9 +24,8 @@ def add_launch_options(parser: argparse.ArgumentParser) -> None:
         help="iterations that save the model besides the last, -1: none (default: 7000 30000, reference)")
     add("--checkpoint_iterations", **listed, default=[], help="iterations that save a checkpoint (default: none)")
     add("--start_checkpoint", type=str, metavar="FILE", help="chkpntN.pth to resume (default: none)")
-    add("--no_curve", **flag,
-        help="write no error_vs_time.csv and .png, which cost up to 5 %% of the time, more in short runs "
-             "(default: write them with --eval)")
+    for option in options_of("launch"):
+        option.add_to(parser, sentinel=False)
     add("--plain_step", **flag,
         help="take every step by autograd, slower and with the same result (default: the fast step)")
     add("--advise", **flag, help="print which options the scene's photos, poses and points ask for, and end; with -m "

@@ -24,34 +24,34 @@ def run_training(run: Run, observers: Sequence[Part]) -> None:
 
 
 def training_steps(run: Run, observers: Sequence[Part]) -> Iterator[tuple[Iteration, PlainStep]]:
-    """`run_training` by iterations. Yields each, and its step's taker.
+    """`run_training` by iterations. Yields each, and the taker of its step.
 
-    Once that is drained, and within `run.look()`, others may read the model.
+    Once that is drained, and within `run.flushed_view()`, others may read the model.
     """
-    taker, together = step_taker(run), StepAgreement(run)
-    every = Announcer([together, *observers], run.look)
+    step, barrier = step_taker(run), StepAgreement(run)
+    announcer = Announcer([barrier, *observers], run.flushed_view)
     at = None
     try:
         # Backward runs on this thread: waking autograd's worker costs time in every iteration.
-        with run.interrupt, every, torch.autograd.set_multithreading_enabled(False):
+        with run.interrupt, announcer, torch.autograd.set_multithreading_enabled(False):
             try:
                 for at in run.iterations():
-                    every.begins(at)
-                    taker.throttle(at)  # before the learning rates are set, which a replayed step changes
+                    announcer.begins(at)
+                    step.throttle(at)  # before the learning rates are set, which a replayed step changes
                     run.prepare(at)  # learning rates, SH degree, photos of the next views
-                    taker.take(at, every)
-                    at.stopping = together.stopping  # read once: a signal may come at any moment
+                    step.take(at, announcer)
+                    at.stopping = barrier.stopping  # read once: a signal may come at any moment
                     if at.stopping:
-                        taker.drain()
-                    every.stepped(at)
+                        step.drain()
+                    announcer.stepped(at)
                     if at.stopping:
                         raise at.stopping
-                    yield at, taker
+                    yield at, step
             except BaseException:  # leave the model as it was between two steps
-                run.lost = taker.abort()
+                run.lost = step.abort()
                 raise
     except KeyboardInterrupt:
         if at is not None and at.stopping:
-            together.wait()
+            barrier.wait()
         raise
-    every.ended()  # out here a signal stops at once what is only drawn and printed
+    announcer.ended()  # out here a signal stops at once what is only drawn and printed

@@ -46,7 +46,7 @@ class Option:
         """Name of the group's attribute that holds the default: with a leading underscore if there is a short form."""
         return f"_{self.name}" if self.short else self.name
 
-    def add_to(self, group: argparse._ArgumentGroup, sentinel: bool) -> None:
+    def add_to(self, group: argparse._ActionsContainer, sentinel: bool) -> None:
         flags = [f"--{self.name}"] + ([f"-{self.short}"] if self.short else [])
         default = None if sentinel else self.default
         text = f"{self.help} (default: {self._shown_default(sentinel)})" if self.help else f"default: {self._shown()}"

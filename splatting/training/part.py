@@ -11,6 +11,7 @@ check        The options and the checkpoint are read. Refuse here what can be re
 dataset      The photos, cameras and points are found. Scenes that are made without a run call it, too.
 begin        The Gaussians exist. In a new training they have no optimiser yet, so rows may be added.
 ready        Model and optimiser exist.
+opened       The log is open, and files may be written.
 terms        In each iteration, before its step: what it adds to the loss.
 begins, due, measured, stepped, ended
              What observers see. The core's own (splatting/training/observers) are parts without a name.
@@ -57,6 +58,12 @@ class Options:
     model: tuple[Option, ...] = ()
     pipeline: tuple[Option, ...] = ()
     optimisation: tuple[Option, ...] = ()
+    launch: tuple[Option, ...] = ()
+
+    @property
+    def by_name(self) -> dict[str, Option]:
+        """All of them."""
+        return {option.name: option for group in vars(self).values() for option in group}
 
 
 @dataclass(frozen=True)
@@ -85,6 +92,7 @@ class Part:
     name: of its folder, and the key of its state.
     options: that it declares.
     switch: the option that brings the part in where it has another value than its default; empty: that named `name`.
+    active: whether it takes part; `begin` may clear it where a scene has no use for the part, which then has no hooks.
     joins: whether its state in a checkpoint brings the part in where no option asks for it.
     needs: what it asks of the steps.
     against: what it does not work with, and the rest of a sentence: why, and what to do. It is `option`,
@@ -98,6 +106,7 @@ class Part:
     name: ClassVar[str] = ""
     options: ClassVar[Options] = Options()
     switch: ClassVar[str] = ""
+    active = True
     joins: ClassVar[bool] = False
     needs: ClassVar[Needs] = Needs()
     against: ClassVar[dict[str, str]] = {}
@@ -109,9 +118,7 @@ class Part:
     @classmethod
     def wanted(cls, given: argparse.Namespace) -> bool:
         """Whether the options ask for the part."""
-        groups = cls.options
-        every = {option.name: option for option in (*groups.model, *groups.pipeline, *groups.optimisation)}
-        option = every[cls.switch or cls.name]
+        option = cls.options.by_name[cls.switch or cls.name]
         return getattr(given, option.name, option.default) != option.default
 
     @classmethod
@@ -139,6 +146,9 @@ class Part:
 
     def ready(self, run: Any) -> None:
         """The model has its rows and its optimiser."""
+
+    def opened(self, run: Any) -> None:
+        """The log is open, and files may be written."""
 
     def terms(self, at: "Iteration") -> "dict[str, Term]":
         """What the iteration adds to the loss, weights included, by names for logs."""

@@ -18,7 +18,7 @@ from arguments import add_to_model_json, write_cfg_args
 from gaussian_renderer.rays import check_views
 from scene import sleeping
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.checkpoint import load_checkpoint, states_of, with_further
+from scene.gaussians.checkpoint import extra_state, load_checkpoint, with_extra_state
 from scene.gaussians.morton import sort_rows
 from scene.gaussians.ppisp import Ppisp
 from scene.sampling_rate import share_of
@@ -133,7 +133,7 @@ class Run:
 
     def _choose_parts(self, capture: tuple | None) -> dict[str, Any]:
         """Choose the parts by the options and by a checkpoint, and let them check both. Returns the states by name."""
-        given, states = self._all_options, states_in(states_of(capture)) if capture else {}
+        given, states = self._all_options, states_in(extra_state(capture)) if capture else {}
         self.parts = chosen(given, states)
         check_together(self.parts, given, self.group.several)
         for name in states.keys() - {part.name for part in self.parts}:
@@ -200,6 +200,8 @@ class Run:
                 begin(self, None)
             self.gaussians.training_setup(self.opt)
             sort_rows(self.gaussians)
+        self.parts = [part for part in self.parts if part.active]
+        self._hooks.clear()
         self.gaussians.limit_columns()
 
     def _check_records(self) -> None:
@@ -212,8 +214,8 @@ class Run:
 
     @property
     def _all_options(self) -> argparse.Namespace:
-        """Those of all groups and of the launch."""
-        return argparse.Namespace(**vars(self.dataset) | vars(self.opt) | vars(self.pipe) | vars(self.launch))
+        """Those of all groups, as they are in force, and of the launch, which may have all as they were given."""
+        return argparse.Namespace(**vars(self.launch) | vars(self.options))
 
     @property
     def options(self) -> argparse.Namespace:
@@ -245,6 +247,8 @@ class Run:
         self.log, self.rows = checks.continue_records(folder, start, self.first_iteration)
         self.losses = LossWatch(self.log.loss)
         self.clock = Stopwatch()
+        for opened in self._each("opened"):
+            opened(self)
 
     def iterations(self) -> Iterator[Iteration]:
         """The iterations of this run."""
@@ -352,15 +356,15 @@ class Run:
                 after_change(step)
             self.memory.settle(self.gaussians)
 
-    def look(self) -> AbstractContextManager:
+    def flushed_view(self) -> AbstractContextManager:
         """Within it, others may read the model."""
-        return nullcontext() if self.sleeping is None else self.sleeping.look()
+        return nullcontext() if self.sleeping is None else self.sleeping.flushed_view()
 
-    def captured(self) -> tuple:
+    def checkpoint_state(self) -> tuple:
         """The state of the model for a checkpoint, from which a training resumes. Every rank must call it."""
         state = self.gaussians.capture()
         states = {part.name: part.state() for part in self.parts}
-        return with_further(state, {key: found for key, found in states.items() if found is not None})
+        return with_extra_state(state, {key: found for key, found in states.items() if found is not None})
 
     def save_last(self, iteration: int) -> None:
         """Save the model that parts make of the trained one, and what they keep in model.json."""
@@ -372,10 +376,10 @@ class Run:
         write_cfg_args(scene.model_path, argparse.Namespace(**vars(self.dataset) | {"sh_degree": model.max_sh_degree}))
         add_to_model_json(scene.model_path, **self.facts)
 
-    def end_sleep(self, guarded: bool = True) -> None:
-        """Let all blocks take the steps that they have missed, and sleep no more. guarded: of `Sleeping.rest`."""
+    def stop_skipping(self, guarded: bool = True) -> None:
+        """Let all blocks take the steps that they have missed, and sleep no more. guarded: of `Sleeping.flush`."""
         if self.sleeping is not None:
-            self.sleeping.rest(guarded)
+            self.sleeping.flush(guarded)
         self.sleeping = None
 
     @property

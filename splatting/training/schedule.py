@@ -27,8 +27,8 @@ class Schedule:
 
     length: of the schedule, in iterations. ends: the last iteration of the run, None: not known yet. megapixels: of a
     view. sizes: the schedule of the views' sizes that is in force; levels: of that. strategy: the one in force
-    (--strategy). paced: whether iterations stand for more or fewer than themselves. seconds: that the run may take, 0:
-    any number.
+    (--strategy). paced: whether iterations stand for more or fewer than themselves. by_clock: whether that follows the
+    seconds that pass. seconds: that the run may take, 0: any number.
     """
 
     megapixels = 1.0
@@ -36,6 +36,7 @@ class Schedule:
     levels: Levels = ()
     strategy = ""
     paced = False
+    by_clock = False
     seconds = 0.0
 
     def __init__(self, length: int) -> None:

@@ -13,7 +13,7 @@ from trainings import ITERATIONS, OPTIONS, plain_training, shared_scene, trained
 
 from gaussian_renderer import render
 from scene import GaussianModel, Scene
-from scene.gaussians.checkpoint import further, load_checkpoint, save_checkpoint, with_further
+from scene.gaussians.checkpoint import extra_state, load_checkpoint, save_checkpoint, with_extra_state
 from splatting.parts.filter_3d.smoothing import filter_widths, filtered
 from utils.system_utils import UserError
 
@@ -90,7 +90,9 @@ def test_a_training_with_it_is_another_and_a_damaged_one_is_refused(once, tmp_pa
     off = trained(scene, tmp_path / "off", *OPTIONS[name][1:])
     assert off["ply"] != whole_result(whole, ITERATIONS)["ply"]
     capture, iteration = load_checkpoint(whole / "chkpnt33.pth")
-    save_checkpoint(start, with_further(capture, {"filter_3d": further(capture, "filter_3d")[1:]}), iteration)
+    save_checkpoint(
+        start, with_extra_state(capture, {"filter_3d": extra_state(capture).get("filter_3d")[1:]}), iteration
+    )
     with pytest.raises(UserError, match="the 3D filter of the checkpoint does not fit"):
         trained(scene, tmp_path / "wrong", *OPTIONS[name], "--start_checkpoint", start)
 

@@ -17,6 +17,7 @@ from trainings import plain_training, shared_scene, train_on, trained
 import metrics
 import render
 from benchmarks.scenes.poses import disturbed
+from scene import dataset_readers
 from scene.dataset_readers import SceneInfo
 from scene.gaussian_model import GaussianModel
 from scene.images.lens import Lens, rays_of
@@ -28,6 +29,7 @@ from scene.scene import Scene
 from splatting.demo.make_scene import write_scene
 from splatting.demo.objects import demo_scene
 from splatting.demo.tracer import FISHEYE, ring_views
+from splatting.diagnosis.model import load_scored
 from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.results import read_run
 from splatting.parts.refine_poses import bounded_adam, refinement, tracked_poses
@@ -423,3 +425,19 @@ def test_a_broken_file_is_named(content, said, scene, tmp_path):
         (tmp_path / NAME).write_text(content)
     with pytest.raises(UserError, match=said):
         with_poses(read_colmap(scene, "images", True), tmp_path)
+
+
+def test_checks_of_a_model_take_its_refined_poses(once):
+    """As they are in poses.json, not in the dataset."""
+    model = plain_training(once, "poses")
+    scene, _ = load_scored(str(model))
+    known = json.loads((model / NAME).read_text())["train"]
+    assert [view.T.tolist() for view in scene.info.train_cameras] == [entry["T"] for entry in known]
+
+
+def test_a_reader_of_other_code_reads_no_poses_of_a_new_training(tmp_path, monkeypatch):
+    make_colmap_scene(tmp_path / "scene")
+    own = dataset_readers.sceneLoadTypeCallbacks["Colmap"]
+    monkeypatch.setitem(dataset_readers.sceneLoadTypeCallbacks, "Colmap", lambda *given: own(*given))
+    train_on(tmp_path / "scene", tmp_path / "out", "--refine_poses", "--iterations", 2, "--no_curve", "-r", 48)
+    assert (tmp_path / "out" / NAME).is_file()

@@ -27,6 +27,8 @@ from splatting.files.json_files import read_model_json
 from splatting.parts.sky.directions import FEWEST
 from splatting.parts.sky.shell import Shell, find_sky
 from splatting.parts.sky.tools import left_out
+from splatting.parts.time_budget.paced import Block, Decided
+from splatting.parts.time_budget.schedule_file import write_schedule
 from utils.system_utils import UserError
 
 ON = "--sky", "auto", "--densify_grad_threshold", 1e-5
@@ -144,6 +146,11 @@ def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path):
         train.main(["-s", str(scene), "-m", str(tmp_path), "--sky", "auto", "--strategy", "mcmc"])
     with pytest.raises(UserError, match="--no_sky needs -m of a model that has a sky"):
         left_out(argparse.Namespace(no_sky=True, model_path=str(tmp_path)), torch.zeros(1, 3))
+    file = tmp_path / "schedule.json"
+    write_schedule(file, Decided(100, [Block(9, 0.0, 1 / 9, 0.0)], 9, 9.0, strategy="mcmc"))
+    words = ["-s", str(scene), "-m", str(tmp_path), "--iterations", "100", "--schedule", str(file)]
+    with pytest.raises(UserError, match="--sky does not work with --strategy mcmc"):  # which is known late
+        train.main([*words, "--sky", "auto"])
     for broken in (None, {"center": [0, 1], "radius": 2}, {"center": [0, 1, 2], "radius": math.nan}):
         with pytest.raises(UserError, match="the sky has no center and radius"):
             Shell.restored(broken)

@@ -22,7 +22,7 @@ from trainings import ITERATIONS, OPTIONS, Once, differences, narrow_scene, trai
 import train
 from scene import sleeping
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.checkpoint import further, load_checkpoint, save_checkpoint
+from scene.gaussians.checkpoint import extra_state, load_checkpoint, save_checkpoint
 from scene.gaussians.table import GaussianTable
 from scene.readers.point_cloud import write_point_cloud
 from scene.saved_model import read_model
@@ -407,14 +407,14 @@ def test_resumed(scene, tmp_path, cut, plain, iteration):
     checkpoint = cut / f"chkpnt{iteration}.pth"
     assert not differences(_trained(scene, tmp_path / "b", "--start_checkpoint", checkpoint), plain("default"))
     capture, _ = load_checkpoint(checkpoint)
-    asleep = further(capture, "sleep")
+    asleep = extra_state(capture).get("sleep")
     assert (asleep is None) == (iteration in (20, 30, 42))
 
 
 def test_a_checkpoint_from_within_a_step_resumes(scene, tmp_path, cut, plain):
     """As where memory has run out: the blocks that the step concerns are awake for it already."""
     capture, iteration = load_checkpoint(cut / "chkpnt33.pth")
-    asleep = further(capture, "sleep")
+    asleep = extra_state(capture).get("sleep")
     asleep["taken"] += asleep["awake"].int()
     save_checkpoint(tmp_path / "within.pth", capture, iteration)
     start = "--start_checkpoint", tmp_path / "within.pth"
@@ -435,7 +435,7 @@ def test_rays_have_the_bytes_of_a_training_in_which_nothing_sleeps(scene, tmp_pa
 @pytest.mark.parametrize("what", ["rows", "taken", "terms"])
 def test_damaged_sleep_is_refused(scene, tmp_path, cut, what):
     capture, iteration = load_checkpoint(cut / "chkpnt33.pth")
-    asleep = further(capture, "sleep")
+    asleep = extra_state(capture).get("sleep")
     if what == "rows":
         asleep["rows"].pop()
     elif what == "taken":
@@ -461,7 +461,7 @@ def test_interrupted(scene, tmp_path, plain, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         _trained(scene, tmp_path / "cut")
     (checkpoint,) = (tmp_path / "cut").glob("chkpnt*.pth")
-    assert further(load_checkpoint(checkpoint)[0], "sleep")
+    assert extra_state(load_checkpoint(checkpoint)[0]).get("sleep")
     assert not differences(_trained(scene, tmp_path / "whole", "--start_checkpoint", checkpoint), plain("default"))
 
 
@@ -481,7 +481,7 @@ def test_captured_steps_that_are_stopped_resume_to_the_same_bytes(scene, tmp_pat
         _trained(scene, tmp_path / "cut")
     monkeypatch.setattr(captured.Graphs, "launch", launch)
     start = "--start_checkpoint", tmp_path / "cut/chkpnt37.pth"
-    assert further(load_checkpoint(start[1])[0], "sleep")
+    assert extra_state(load_checkpoint(start[1])[0]).get("sleep")
     assert not differences(_trained(scene, tmp_path / "whole", *start), expected)
 
 
@@ -523,7 +523,7 @@ def test_a_term_that_somebody_adds_to_the_loss_reaches_all_rows(scene, tmp_path,
 def test_a_term_ends_no_sleep_before_the_queued_steps_are_done(scene, tmp_path, monkeypatch, take_as, way):  # noqa: F811
     """Once a step has halted for lack of room, a rest would do nothing, and what blocks have missed would be lost."""
     made, calls, done, ends = [], [], [], []
-    make, call, end = Objective.__init__, Objective.__call__, runs.Run.end_sleep
+    make, call, end = Objective.__init__, Objective.__call__, runs.Run.stop_skipping
     monkeypatch.setattr(Objective, "__init__", lambda self, run: (made.append(run), make(self, run))[1])
 
     def more(self: Objective, package: dict, at: Iteration) -> object:
@@ -537,7 +537,7 @@ def test_a_term_ends_no_sleep_before_the_queued_steps_are_done(scene, tmp_path, 
             self.discard = lambda: done.append(1)
 
     monkeypatch.setattr(Objective, "__call__", more)
-    monkeypatch.setattr(runs.Run, "end_sleep", lambda self, *x: (ends.append(len(done)), end(self, *x))[1])
+    monkeypatch.setattr(runs.Run, "stop_skipping", lambda self, *x: (ends.append(len(done)), end(self, *x))[1])
     take_as(way)
     monkeypatch.setattr(captured, "Speculation", Queue)
     _trained(scene, tmp_path)
@@ -563,8 +563,8 @@ def test_a_model_with_activations_of_its_own_does_not_sleep(scene, tmp_path, mon
 
 
 def test_the_progress_bar_does_not_wake_blocks(scene, tmp_path, monkeypatch):
-    looks, look = [], Sleeping.look
-    monkeypatch.setattr(Sleeping, "look", lambda self: (looks.append(1), look(self))[1])
+    looks, look = [], Sleeping.flushed_view
+    monkeypatch.setattr(Sleeping, "flushed_view", lambda self: (looks.append(1), look(self))[1])
     monkeypatch.setattr(ProgressBar, "due", lambda self, step: True)
     _trained(scene, tmp_path)
     assert len(looks) < 4
@@ -599,7 +599,7 @@ def test_a_model_that_is_saved_between_is_as_if_no_block_had_slept(scene, tmp_pa
     torch.testing.assert_close(one.get_xyz, other.get_xyz, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(one.get_opacity, other.get_opacity, rtol=1e-4, atol=1e-4)
     one, other = (load_checkpoint(tmp_path / out / "chkpnt9.pth")[0] for out in ("asleep", "awake"))
-    assert further(one, "sleep") and not further(other, "sleep")
+    assert extra_state(one).get("sleep") and not extra_state(other).get("sleep")
     torch.testing.assert_close(one[1], other[1], rtol=1e-5, atol=1e-5)
     averages, dense = (capture[10]["state"][0]["exp_avg"] for capture in (one, other))
     assert (averages - dense).abs().max() < 1e-3 * dense.abs().max()

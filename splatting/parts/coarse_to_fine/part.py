@@ -4,11 +4,13 @@ from typing import TYPE_CHECKING, Any
 
 from splatting.files.json_files import MODEL_JSON
 from splatting.training.option import Option, one_of
-from splatting.training.part import Options, Part, fill
+from splatting.training.part import Error, Options, Part, fill
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
     import argparse
+
+    from scene.scene import Scene
 
 
 class CoarseToFine(Part):
@@ -25,6 +27,7 @@ class CoarseToFine(Part):
                  "than an iteration for 4 megapixels of the schedule's views, else none"),
     ))
     # fmt: on
+    _run = None
 
     @classmethod
     def wanted(cls, given: "argparse.Namespace") -> bool:
@@ -58,6 +61,16 @@ class CoarseToFine(Part):
     def changes(self, iteration: int) -> bool:
         step = self._run.schedule.schedule_step
         return self._run.sizes.factor_at(step(iteration - 1)) != self._run.sizes.factor_at(step(iteration))
+
+    def save(self, scene: "Scene") -> None:
+        """Keep the sizes that a clock has chosen by now."""
+        if self._run and self._run.schedule.by_clock:
+            from arguments import add_to_model_json
+
+            add_to_model_json(scene.model_path, **self.facts())
+
+    def ended(self, error: Error) -> None:
+        self.save(self._run.scene)
 
     def facts(self) -> dict[str, Any]:
         return {self.switch: self._run.schedule.sizes}

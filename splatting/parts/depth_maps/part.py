@@ -39,12 +39,14 @@ class DepthMaps(Part):
         return cls.wanted(given)
 
     def dataset(self, info: "SceneInfo", args: "argparse.Namespace", fresh: bool) -> "SceneInfo":
-        if not fresh:
-            return info
         from pathlib import Path
 
+        from scene.dataset_readers import replaced_reader
         from scene.readers.depth_maps import with_depth_maps
+        from scene.readers.scene_folder import kind_of
 
+        if not fresh or replaced_reader(kind_of(args.source_path)):  # which finds the maps itself
+            return info
         return with_depth_maps(info, Path(args.source_path), args.depths)
 
     def begin(self, run: Any, state: Any) -> None:

@@ -15,8 +15,6 @@ from scene.gaussians.checkpoint import check_rows
 from splatting.files.listing import some
 from utils.system_utils import UserError
 
-BEST = "best"  # key of its state in a checkpoint
-
 
 class BestModel:
     """The best model so far. cameras: the validation views; iteration: 0 before the first score; psnr: their mean, dB.

@@ -35,19 +35,19 @@ class Sky(Part):
             print("--sky auto: the checkpoint has no sky, and a sky is added only when a training starts")
         else:
             self.shell = shell.with_shell(run.scene, run.gaussians)
-        if self.shell:
+        self.active = self.shell is not None
+        if self.active:
             fill(run.gaussians, "pinned", self.shell.rows, self)
 
     def terms(self, at: "Iteration") -> "dict[str, Term]":
-        points = self.shell and self.shell.at(at.camera, self._run.scene)
+        points = self.shell.at(at.camera, self._run.scene)
         return {"sky": lambda package, mask: points.loss(package["depth"], mask)} if points else {}
 
     def after_change(self, at: "Iteration") -> None:
-        if self.shell:
-            self.shell.hold(self._run.gaussians)
+        self.shell.hold(self._run.gaussians)
 
-    def state(self) -> dict[str, Any] | None:
-        return self.shell and self.shell.captured()
+    def state(self) -> dict[str, Any]:
+        return self.shell.captured()
 
     def facts(self) -> dict[str, Any]:
-        return {self.name: self.shell.captured()} if self.shell else {}
+        return {self.name: self.shell.captured()}

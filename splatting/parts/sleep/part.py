@@ -51,8 +51,8 @@ class Sleep(Part):
         self._run.gaussians.optimizer.rows = None
         if at.changes:
             sleeping.reset()
-        elif sleeping.rests(at.iteration):
-            sleeping.rest()
+        elif sleeping.flushes(at.iteration):
+            sleeping.flush()
         else:
             sleeping.stepped()
 

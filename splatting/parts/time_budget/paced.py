@@ -162,6 +162,8 @@ class TimeBudget(DecidedSchedule):
     one resumes, whose blocks are in the schedule. share: gives all processes the seconds of one.
     """
 
+    by_clock = True
+
     def __init__(self, decided: Decided, share: Callable[[float], float] = lambda seconds: seconds) -> None:
         super().__init__(decided)
         self._share = share
@@ -181,7 +183,7 @@ class TimeBudget(DecidedSchedule):
 
     def best_strategy(self, run: Any) -> str:
         """The one that is best in the seconds, of those that the run's parts work with."""
-        against = {conflict for part in run.parts for conflict in part.against}
+        against = {conflict for part in run.parts for conflict in part.against}  # such as a sky that was found
         fit = [name for name in strategies() if f"strategy={name}" not in against]
         best = (name for name in fit if part_class(name).best_in(self.seconds, run))
         strategy = next(best, super().best_strategy(run))

@@ -68,7 +68,7 @@ class DivergenceWatch(Part):
         else:
             good, what = first, f"{self._unstepped()} had no finite step"
         self._gaussians.rewind(iteration - good if stepped else iteration - 1 - good)
-        self._run.end_sleep(guarded=False)
+        self._run.stop_skipping(guarded=False)
         if good < iteration:
             self._gaussians.active_sh_degree = self._sh_degrees[0]
         view = self._run.views[first].image_name

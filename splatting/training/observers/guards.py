@@ -140,10 +140,10 @@ class MemoryGuard(Part):
                 gaussians.active_sh_degree = self._sh_degree
                 anew = "--max_num_splats or --sh_degree"  # a resumed run with as many Gaussians would end here again
             path = self._folder / f"chkpnt{iteration}.pth"
-            with self._run.look():
+            with self._run.flushed_view():
                 gaussians.check_finite(iteration)
                 gaussians.check_steps()
-                save_checkpoint(path, self._run.captured(), iteration)
+                save_checkpoint(path, self._run.checkpoint_state(), iteration)
         except (UserError, MemoryError, RuntimeError) as error:
             return f"and the model could not be saved ({error}); resume an earlier checkpoint"
         return (

@@ -48,7 +48,7 @@ class ProgressBar(Part):
         self._shown = {"Loss": run.losses} | titles
         self._updated, self._done = -math.inf, run.first_iteration
         first = run.schedule.schedule_step(run.first_iteration)
-        form = {"bar_format": BY_CLOCK} if run.schedule.seconds else {}
+        form = {"bar_format": BY_CLOCK} if run.schedule.by_clock else {}
         self._bar = Bar(initial=first, total=run.schedule.length, desc="Training progress", dynamic_ncols=True, **form)
 
     def due(self, step: Iteration) -> bool:
@@ -75,7 +75,7 @@ class ProgressBar(Part):
         if error is not None:
             return
         run, seconds = self._run, self._run.clock.seconds
-        if not run.schedule.seconds:
+        if not run.schedule.by_clock:
             before = f", {run.log.seconds_before + seconds:.1f} s with those before" if run.first_iteration else ""
             print(f"{_iterations(self._done - run.first_iteration)} in {seconds:.1f} s{before}")
             return

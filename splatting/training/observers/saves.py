@@ -60,12 +60,12 @@ class Checkpoints(Part):
             tqdm.write(f"[ITER {step.iteration}] Saving Checkpoint", file=sys.stdout)
             path = Path(run.scene.model_path) / f"chkpnt{step.iteration}.pth"
             run.scene.save_views()
-            save_checkpoint(path, run.captured(), step.iteration)
+            save_checkpoint(path, run.checkpoint_state(), step.iteration)
             run.log.add(step.iteration, seconds, gaussians=run.gaussians.gaussian_count, loss=run.losses.mean)
             if step.stopping:
                 run.scene.save(step.iteration)
         if step.stopping:
             look = f"Look at the model: {view_command(run.scene.model_path, step.iteration)}"
-            early = ", before its learning rates fell" if run.schedule.seconds else ""
+            early = ", before its learning rates fell" if run.schedule.by_clock else ""
             resume = f"Resume by the same command with --start_checkpoint {path}"
             tqdm.write(f"Stopped at iteration {step.iteration}{early}\n{look}\n{resume}", file=sys.stderr)

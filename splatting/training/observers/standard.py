@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any
 
 from gaussian_renderer import network_gui
-from splatting.training.observers.curve import Curve
 from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.observers.guards import MaskWatch, MemoryGuard
 from splatting.training.observers.report import ProgressBar, Records, Report, Summary, training_report
@@ -16,16 +15,14 @@ from splatting.training.run import Run
 
 def standard_observers(run: Run, writer: Any | None, report: Callable[..., dict[str, float]]) -> list[Part]:
     """The observers of every training. writer: TensorBoard's, or None. report: `training_report`."""
-    with_curve = not run.launch.no_curve and bool(run.scene.getTestCameras())
     if report is not training_report:
-        run.end_sleep()  # it may read or change the model in every iteration
+        run.stop_skipping()  # it may read or change the model in every iteration
     watch = DivergenceWatch(run)
     checkpoints = Checkpoints(run, watch)
     return [
         watch,  # first: observers that write rely on all losses so far being finite
         *([ProgressBar(run)] if run.group.first else []),  # reads the losses that the watch has checked
         MaskWatch(run.scene.getTrainCameras()),  # may refuse the scene before anything is written
-        *([Curve(run)] if with_curve else []),  # the scores are those of the model saved at the same iteration
         *run.parts,
         Report(run, writer, report),
         Saves(run),  # before the model changes

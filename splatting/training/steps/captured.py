@@ -49,7 +49,7 @@ class CapturedStep(FusedStep):
         self._graphs = Graphs(run, self, self._adam, self._ahead.capacity)
         pinned = run.device.type == "cuda"
         self._rows = torch.zeros(_ROWS, CAMERA_NUMBERS, dtype=torch.float64, pin_memory=pinned) if run.on_host else None
-        self._fetched: dict[int, _Fetched] = {}  # by iteration: of poses that have yet to step
+        self._fetched: dict[int, _Fetched] = {}  # by iteration: of cameras that have yet to step
 
     def take(self, at: Iteration, observers: Announcer) -> None:
         """Queue a step, unless something is due in it."""
@@ -61,7 +61,7 @@ class CapturedStep(FusedStep):
         losses = self._queue(at)
         if losses is None:
             self._ahead.discard()
-            self._step_poses(0)
+            self._step_on_host(0)
             run.set_rates(at)
             return PlainStep.take(self, at, observers)
         self._ahead.add(at, losses)
@@ -70,23 +70,23 @@ class CapturedStep(FusedStep):
     def throttle(self, at: Iteration) -> None:
         if self._is_queued(at):
             self._ahead.throttle()
-            if poses := self._run.on_host:
-                most = poses.independent(at.camera.uid, [one.uid for one in self._fetched.values()])
+            if host := self._run.on_host:
+                most = host.independent(at.camera.uid, [one.uid for one in self._fetched.values()])
                 self._ahead.wait(most)
-                self._step_poses(min(most, AHEAD))
+                self._step_on_host(min(most, AHEAD))
         else:
             self.drain()
             self._graphs.save_memory()
 
     def drain(self) -> None:
         self._ahead.drain()
-        self._step_poses(0)
+        self._step_on_host(0)
         if self._run.on_host:
             self._run.on_host.place()
 
     def abort(self) -> int:
         lost = self._ahead.abort()
-        self._step_poses(sum(not one.done for one in self._fetched.values()))
+        self._step_on_host(sum(not one.done for one in self._fetched.values()))
         self._fetched.clear()
         if self._run.on_host:
             self._run.on_host.place()
@@ -107,7 +107,7 @@ class CapturedStep(FusedStep):
         losses = self._graphs.launch(at)
         if losses is not None:
             self._fetch(at)
-            queues = density.queues or run.exposes or (run.sleeping is not None and run.sleeping.rests(at.iteration))
+            queues = density.queues or run.exposes or (run.sleeping is not None and run.sleeping.flushes(at.iteration))
             with self._ahead.capacity(at) if queues else nullcontext():
                 run.gaussians.exposures.step()
                 run.after_step(at)
@@ -123,7 +123,7 @@ class CapturedStep(FusedStep):
         return losses
 
     def _fetch(self, at: Iteration) -> None:
-        """Queue a copy to the host of the gradient of the view's pose."""
+        """Queue a copy to the host of the gradient of the view's camera."""
         if self._rows is None:
             return
         row = self._rows[at.iteration % _ROWS]
@@ -131,8 +131,8 @@ class CapturedStep(FusedStep):
         copied = torch.cuda.current_stream().record_event() if row.is_pinned() else None
         self._fetched[at.iteration] = _Fetched(at.camera.uid, row, copied)
 
-    def _step_poses(self, most: int) -> None:
-        """Take the steps of poses that steps of the Gaussians left behind, but at most so many of the last.
+    def _step_on_host(self, most: int) -> None:
+        """Take the steps of cameras that steps of the Gaussians left behind, but at most so many of the last.
 
         They wait as long as they may: to wait for a step's end here would let the GPU run out of work.
         """
@@ -156,7 +156,10 @@ class CapturedStep(FusedStep):
         self._run.set_rates(at)
         losses = self._queue(at)
         with torch.no_grad():
-            for new, old in zip(losses.values, first.values, strict=True):
+            # One of them may be of a graph, which tells of no terms.
+            terms = losses.terms.keys() & first.terms.keys()
+            pairs = [(losses.total, first.total), (losses.l1, first.l1)]
+            for new, old in pairs + [(losses.terms[name], first.terms[name]) for name in terms]:
                 old.detach().copy_(new)
 
     def rewind(self, steps: int) -> None:
@@ -344,8 +347,8 @@ class Graphs:
 
     def _numbers_of(self, camera: Camera) -> np.ndarray:
         """The camera's numbers (35,) on the host, read from the GPU once; those of a trained pose never lie there."""
-        if poses := self._run.on_host:
-            poses.place(camera)
+        if host := self._run.on_host:
+            host.place(camera)
             return camera.numbers[:_CAMERA]
         tensors = camera.world_view_transform, camera.full_proj_transform, camera.camera_center
         state = [(id(tensor), tensor._version) for tensor in tensors]

@@ -69,7 +69,7 @@ class FusedStep(PlainStep):
             run.on_host.place(at.camera)
         whole = at.changes or at.last  # all blocks wake, as in a plain step
         if whole and run.sleeping:
-            run.sleeping.rest()
+            run.sleeping.flush()
         exposures, objective = run.exposes, run.objective
         by_bands = run.group.several and not exposures and objective.takes_bands(at)
         wants = {"want_depth": at.wants_depth, "by_bands": by_bands, "bands": self._bands}

@@ -73,7 +73,7 @@ class PlainStep:
         losses = run.objective(package, at)
         losses.total.backward()
         if self._reaches_sleepers():
-            self._end_sleep()
+            self._stop_skipping()
             return self.take(at, observers)
         package, losses = self._view.collect(at, package, losses)
         if any(run.density.penalty):
@@ -88,7 +88,7 @@ class PlainStep:
         """Wake the blocks that the step concerns: all, where rows change or nothing follows."""
         run = self._run
         if at.changes or at.last:
-            run.sleeping.rest()
+            run.sleeping.flush()
         else:
             wake(run.sleeping, at.camera, run.gaussians, run.pipe, at.background)
             run.gaussians.optimizer.rows = run.sleeping.rows()
@@ -102,11 +102,11 @@ class PlainStep:
         gradients = [gaussians.raw(name).grad for name in gaussians._attributes]
         return any(bool(gradient[asleep].any()) for gradient in gradients if gradient is not None)
 
-    def _end_sleep(self) -> None:
+    def _stop_skipping(self) -> None:
         """Let all blocks wake for good, and drop the gradients of a step that will be taken again."""
         self._drop_gradients()
         self._run.gaussians.optimizer.rows = None
-        self._run.end_sleep()
+        self._run.stop_skipping()
 
     def _drop_gradients(self) -> None:
         gaussians = self._run.gaussians

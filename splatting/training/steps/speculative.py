@@ -32,6 +32,9 @@ AHEAD = 8  # steps; enough to hide a pause of the host, and few to replay
 class Replayed(Protocol):
     """What speculation asks of the taker of the steps (splatting/training/steps/captured.py)."""
 
+    def measure(self, at: Iteration) -> object:
+        """Render a view, and compute the losses and their gradients."""
+
     def finished(self, at: Iteration) -> None:
         """The GPU has taken a step for good."""
 

@@ -1,6 +1,6 @@
 #pragma once
 // The chain rule of a step whose opacities and scales in the Scene are functions of the parameters that it changes, as
-// the 3D smoothing filter's are (scene/gaussians/filter_3d.py).
+// the 3D smoothing filter's are (splatting/parts/filter_3d/smoothing.py).
 #include <cstdint>
 
 #include "gs/rounded.h"
