@@ -1,5 +1,5 @@
 # make demo   a scene made, trained, rendered and scored
-# make test   lint, format check, C++ tests of the CPU, pytest but for slow tests: some five minutes
+# make test   lint, format check, C++ tests of the CPU, pytest but for slow tests: three to five minutes
 # make check  make test, CUDA kernels emulated, and slow tests; what CI runs
 # make test-aarch64, test-windows, test-macos   the C++ tests, built for another platform and run under an emulator
 # make test-browser   the tests that need Chromium, which is installed first where Debian's package manager may be used

@@ -41,5 +41,10 @@ def test_an_option_a_term_a_state_and_a_line(colmap_scene, tmp_path):
     again = _train(colmap_scene, "-m", resumed, "--grey", 5, "--start_checkpoint", checkpoint)
     assert _ply(resumed) == _ply(whole)
     assert said in again.stdout
+    without = subprocess.run(
+        [sys.executable, "train.py", "-s", colmap_scene, "-m", tmp_path / "no", "--start_checkpoint", checkpoint],
+        cwd=ROOT, capture_output=True, text=True,
+    )  # fmt: skip
+    assert without.returncode == 2 and "the checkpoint has a state of grey, which this code does not" in without.stderr
     refused = _train(colmap_scene, "-m", tmp_path / "no", "--grey", -1)
     assert "--grey must be at least 0" in refused.stderr

@@ -26,6 +26,7 @@ _LARGEST = 1e15  # extent; learning rates are multiples of it
 _OPTIMIZER = 10  # which entry its state dict is
 _ENTRIES = 12  # the reference's; the values of further attributes may follow
 EXPOSURES, WRITTEN_BY = "exposures", "version"  # keys in the optimiser's state dict
+_NO_EXTRA = {EXPOSURES, WRITTEN_BY, "state", "param_groups"}
 
 
 class State(NamedTuple):
@@ -134,9 +135,11 @@ def with_extra_state(entries: tuple, states: dict[str, Any]) -> tuple:
 
 
 def extra_state(entries: Sequence[Any]) -> dict[str, Any]:
-    """What `with_extra_state` has added, among the optimiser's own entries."""
+    """What `with_extra_state` has added; nothing in a checkpoint of other code."""
     optimizer = entries[_OPTIMIZER]
-    return optimizer if isinstance(optimizer, dict) else {}
+    if not isinstance(optimizer, dict) or WRITTEN_BY not in optimizer:
+        return {}
+    return {key: state for key, state in optimizer.items() if key not in _NO_EXTRA}
 
 
 def unpack(entries: Sequence[Any], table: dict[str, Attribute], max_sh_degree: int) -> State:

@@ -60,9 +60,14 @@ _OLD_KEYS = {
 
 
 def states_in(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
-    """The states of parts by their names, from what a checkpoint keeps besides the model."""
+    """The states of parts by their names, from the extra state of a checkpoint. UserError for one of no part."""
     named = {_OLD_KEYS.get(key, key): state for key, state in checkpoint.items()}
-    return {name: named[name] for name in PARTS if named.get(name) is not None}
+    if unknown := sorted(map(str, named.keys() - {*PARTS})):
+        raise UserError(
+            f"the checkpoint has a state of {unknown[0]}, which this code does not have; use the code that wrote it, "
+            "or start a new training from its PLY by --init_ply"
+        )
+    return {name: state for name, state in named.items() if state is not None}
 
 
 def chosen(given: argparse.Namespace, states: Collection[str] = ()) -> list[Part]:

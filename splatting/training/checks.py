@@ -137,7 +137,8 @@ def another_number(density: DensityControl, opt: argparse.Namespace, count: int,
     if reached == aim or ((reached > aim or density.default_is_limit) and not opt.max_num_splats):
         return None
     done = schedule.schedule_step(first) - 1
-    ends = {"densify_until_iter": f"--densify_until_iter {done + (schedule.length - done) // 2}"}.get(ending, "")
+    # Half of what is left suits rules that need the rest to settle, as those that end late by default do not.
+    ends = f"--{ending} {done + (schedule.length - done) // 2}" if strategy.until[1] == 1 / 2 else ""
     scaled = None
     if not done and opt.densify_from_iter < density.ends < USUAL:
         scaled = next((remedy(schedule.length) for remedy in tools("for_few_iterations")), None)

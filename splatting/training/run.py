@@ -280,7 +280,7 @@ class Run:
             step.wants_depth |= bool(found) and terms.__self__.needs.depth
 
     def _changes(self, iteration: int) -> bool:
-        changes = any([changes(iteration) for changes in self._each("changes")])
+        changes = any(changes(iteration) for changes in self._each("changes"))
         return self.density.changes(iteration) or self._raises_degree(iteration) > 0 or changes
 
     def _raises_degree(self, iteration: int) -> int:

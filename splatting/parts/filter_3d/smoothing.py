@@ -40,19 +40,6 @@ def check_widths(widths: Any, count: int) -> None:
         raise UserError("the 3D filter of the checkpoint does not fit its Gaussians; give another one")
 
 
-class Smoothing:
-    """Raw opacities and scales of a model behind its filter: the slot `model.drawn`."""
-
-    def __init__(self, model: GaussianParameters) -> None:
-        """The widths (N, 1) of the filter are the model's column of this name."""
-        self._model = model
-
-    def __call__(self, logits: Tensor, log_scales: Tensor) -> tuple[Tensor, Tensor]:
-        return filtered(logits, log_scales, self._model.columns[NAME])
-
-    chain = staticmethod(lambda *values: chain_of(*values))
-
-
 def filtered(logits: Tensor, log_scales: Tensor, widths: Tensor) -> tuple[Tensor, Tensor]:
     """Logits (N, 1) and log scales (N, 3) with the filter of `widths` (N, 1), differentiable by both."""
     return _Filtered.apply(logits, log_scales, widths)
@@ -92,3 +79,16 @@ class _Filtered(torch.autograd.Function):
         chain = chain_of(*ctx.saved_tensors)
         # As chain_rule of csrc/math/chain.h, so that all kinds of steps have the same bits.
         return chain[:, :1] * of_logits, chain[:, 1:4] * of_scales + chain[:, 4:] * of_logits, None
+
+
+class Smoothing:
+    """Raw opacities and scales of a model behind its filter: the slot `model.drawn`."""
+
+    def __init__(self, model: GaussianParameters) -> None:
+        """The widths (N, 1) of the filter are the model's column of this name."""
+        self._model = model
+
+    def __call__(self, logits: Tensor, log_scales: Tensor) -> tuple[Tensor, Tensor]:
+        return filtered(logits, log_scales, self._model.columns[NAME])
+
+    chain = staticmethod(chain_of)
