@@ -87,7 +87,7 @@ def thin_out(
         weights = blending_weights(before, cameras, pipe)
     chosen = most_important(weights, count)
     background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
-    views = ScoredViews(pipe, background, options.train_test_exp)
+    views = ScoredViews(pipe, background, scene.halves)
     loss = "no score, as photos show more than the crop"
     if scored:
         change = change_on_views(before, before.part(chosen, sh_degree), cameras, views, scored=True)

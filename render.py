@@ -33,15 +33,14 @@ from arguments import ModelParams, OptionParser, PipelineParams, get_combined_ar
 from gaussian_renderer.blending import PLANES, view_planes
 from gaussian_renderer.memory_errors import memory_errors_explained
 from gaussian_renderer.rays import check_views
-from gaussian_renderer.scored_views import ScoredViews, fitted_views
+from gaussian_renderer.scored_views import ScoredViews, beside_test
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.ppisp import Ppisp
 from scene.point_depths import PointDepths, held_out_points
 from scene.saved_model import load_saved
 from scene.scene import Scene
 from splatting.camera_paths.render_path import add_path_options, path_request, render_path
-from splatting.evaluation.comparison import FITTED, GIVEN_POSES
+from splatting.evaluation.comparison import BESIDE
 from splatting.evaluation.renders import DEPTHS, ERRORS, INCOMPLETE, TIMES, model_digest, summarise_times
 from splatting.exports.in_scene import load_file
 from splatting.files.image_files import remove_leftovers, save_png, write_plane
@@ -163,24 +162,21 @@ def render_sets(
     """Render the views of a saved iteration, -1: the last one, by `render_set`.
 
     Folders of pictures that options draw or compare in another way than the model's have names that say so, as in
-    ours_30000_r2. Test views of a model with refined poses are also rendered with the dataset's, as
-    ours_N_given_poses, and those of a model whose photos' appearance is trained with their own (`fitted_views`), as
-    ours_N_fitted_appearance.
+    ours_30000_r2. Test views are also rendered as parts score them besides, as ours_N_fitted_appearance.
     dataset: the model options. sh_degree: degree that the PLY must have, None: any. planes: those of PLANES to write,
     too. ply: model of any tool to render instead, into folders that have its name. UserError if nothing can be loaded.
     """
     scene, background = _loaded(dataset, iteration, sh_degree, ply, pipeline)
-    halves = getattr(dataset, "train_test_exp", False)  # options of 2023 lack it
-    drawn = scene.gaussians, pipeline, background, halves, separate_sh
+    drawn = scene.gaussians, pipeline, background, scene.halves, separate_sh
     if not skip_train:
         render_set(scene.model_path, "train", scene.loaded_iter, scene.getTrainCameras(), *drawn, planes=planes)
     if not skip_test:
         views = scene.getTestCameras()
         points = held_out_points(scene, dataset.source_path) if "depth" in planes else None
         render_set(scene.model_path, "test", scene.loaded_iter, views, *drawn, planes=planes, points=points)
-        own = views if isinstance(scene.gaussians.exposures, Ppisp) else []
-        beside = {GIVEN_POSES: (scene.given_test_views(), None), FITTED: (own, fitted_views(pipeline, background))}
-        for name, (shown, scored) in beside.items():
+        beside = beside_test(scene, pipeline, background)
+        for name in BESIDE:
+            scored, shown = beside.get(name, (None, []))
             method = f"{scene.loaded_iter}_{name}"
             if shown:
                 render_set(scene.model_path, "test", method, shown, *drawn, planes=planes, scored=scored)

@@ -34,7 +34,7 @@ def main() -> None:
     scene = load_saved(options, args.iteration, args.typed_sh_degree)
     if len(scene.gaussians) == 0:
         raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
-    page = Page(place, scene, pipeline, options.white_background, options.train_test_exp)
+    page = Page(place, scene, pipeline, options.white_background, scene.halves)
     try:
         raise serve(page)
     finally:

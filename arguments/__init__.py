@@ -4,6 +4,7 @@ from arguments.groups import OPTIONS, ModelParams, OptimizationParams, PipelineP
 from arguments.param_group import GroupParams, OptionParser, ParamGroup
 from arguments.stored import (
     VERSION,
+    VIEW_OPTIONS,
     add_to_model_json,
     get_combined_args,
     other_scene,
@@ -19,6 +20,7 @@ from arguments.stored import (
 __all__ = [
     "OPTIONS",
     "VERSION",
+    "VIEW_OPTIONS",
     "GroupParams",
     "ModelParams",
     "OptimizationParams",

@@ -6,8 +6,8 @@ from collections.abc import Collection
 
 from arguments.param_group import GroupParams, OptionTable
 from splatting.files.json_files import MODEL_JSON
-from splatting.parts import options_of, part_class, strategies
-from splatting.training.option import CFG_ARGS, Option, above, at_least, one_of, within
+from splatting.parts import appearances, options_of, part_class, strategies
+from splatting.training.option import CFG_ARGS, Option, above, at_least, in_places, one_of, within
 from utils.system_utils import UserError
 
 
@@ -20,7 +20,7 @@ class ModelParams(OptionTable):
 
     title = "model"
     # fmt: off
-    options = (
+    options = in_places((
         Option("sh_degree", 3, origin="paper", check=within(0, 3), stored=CFG_ARGS, compared=False,
             loaded="that of the saved PLY",
             help="highest degree, 0 to 3, of the spherical harmonics that make colour depend on the view; higher: "
@@ -38,9 +38,6 @@ class ModelParams(OptionTable):
             help="1, 2, 4, 8: divide the size of the photos by this; -1: keep their size, but at most 1600 pixels "
                  "wide; any other value: width in pixels"),
         Option("white_background", False, "white background instead of black", short="w", stored=CFG_ARGS),
-        Option("train_test_exp", False, stored=CFG_ARGS, compared=False,
-            help="train a colour correction of each photo, for photos of different exposure; this trains on the left "
-                 "halves of the test photos too, and only right halves are scored and rendered"),
         Option("data_device", "cuda", stored=CFG_ARGS, compared=False,
             help="device that holds the images, as 8-bit values. With cpu, or if they would take more than a quarter "
                  "of the GPU's free memory, pinned memory of the CPU holds them and they are copied ahead of their "
@@ -71,15 +68,15 @@ class ModelParams(OptionTable):
                  "the rasterizer knows the camera model; undistort: resample them to pinhole images when they are "
                  "loaded; auto: native, but as before in a resumed training, and undistort in code that does not "
                  "train by train.py"),
-        Option("appearance", "none", origin="ours", check=one_of("none", "affine", "ppisp"), stored=MODEL_JSON,
-            help="how photos of different exposure train. affine: --train_test_exp; ppisp: exposure and white balance "
-                 "of each photo, vignetting and response of each camera, with the test photos held out; exports and "
-                 "viewers show none of it"),
+        Option("appearance", "none", origin="ours", check=one_of("none", *(one.kind for one in appearances())),
+            stored=MODEL_JSON,
+            help="how photos of different exposure train. " + "; ".join(f"{a.kind}: {a.summary}" for a in appearances())
+                 + "; exports and viewers show none of it"),
         Option("images_to_load", 0, origin="ours", check=at_least(0),
             help="largest number of decoded images (photos, masks and depth maps) kept in memory, 0: all. The one "
                  "unused for longest goes. Every photo still trains, with the same result; up to 32 that come next "
                  "are decoded ahead"),
-    )
+    ))
     # fmt: on
 
     def __init__(self, parser: argparse.ArgumentParser, sentinel: bool = False, without: Collection[str] = ()) -> None:
@@ -92,10 +89,12 @@ class ModelParams(OptionTable):
         starts = [f"--{name} {value}" for name, value in given.items() if value not in ("", "sfm")]
         if len(starts) > 1:
             raise UserError(f"{' and '.join(starts[:2])} both name the points to start from; leave one out")
-        if getattr(values, "appearance", "") == "affine":
-            values.train_test_exp = True
-        elif getattr(values, "appearance", "") == "ppisp" and getattr(values, "train_test_exp", False):
-            raise UserError("--train_test_exp is --appearance affine; leave it out, or --appearance ppisp")
+        for appearance in filter(lambda one: one.flag, appearances()):
+            kind, flag, named = appearance.kind, appearance.flag, getattr(values, "appearance", "none")
+            if named == kind:
+                setattr(values, flag, True)
+            elif named != "none" and getattr(values, flag, False):
+                raise UserError(f"--{flag} is --appearance {kind}; leave it out, or --appearance {named}")
         if getattr(values, "source_path", ""):
             values.source_path = os.path.abspath(values.source_path)
         return values
@@ -134,7 +133,7 @@ class OptimizationParams(OptionTable):
             help="learning rate of positions at the start, times the scene extent"),
         Option("position_lr_final", 0.0000016, origin="paper", check=at_least(0),
             help="learning rate of positions at position_lr_max_steps, times the scene extent. Between both it falls "
-                 "evenly in its logarithm; linearly where one is 0, as do exposure_lr and depth_l1_weight"),
+                 "evenly in its logarithm; linearly where one is 0, as other rates and weights with two ends do"),
         Option("position_lr_delay_mult", 0.01, check=at_least(0),
             help="no effect, there are no delay steps; kept for old commands"),
         Option("position_lr_max_steps", 30_000, check=at_least(1),
@@ -145,13 +144,6 @@ class OptimizationParams(OptionTable):
             help="learning rate of the opacity logits; higher: Gaussians fade in and out faster"),
         Option("scaling_lr", 0.005, "learning rate of the logarithms of the scales", check=at_least(0)),
         Option("rotation_lr", 0.001, "learning rate of the quaternions", check=at_least(0)),
-        Option("exposure_lr_init", 0.01, check=at_least(0),
-            help="learning rate of exposures (--train_test_exp) at the start"),
-        Option("exposure_lr_final", 0.001, "learning rate of exposures in the last step", check=at_least(0)),
-        Option("exposure_lr_delay_steps", 0, check=at_least(0),
-            help="steps at the start over which the learning rate of exposures rises to its normal value"),
-        Option("exposure_lr_delay_mult", 0.0, check=within(0, 1),
-            help="factor of the learning rate of exposures at step 0, where that rise begins"),
         Option("percent_dense", 0.01, check=at_least(0),
             help="size that decides densification, as a fraction of the scene extent: smaller Gaussians are cloned, "
                  "larger ones split"),
@@ -160,7 +152,7 @@ class OptimizationParams(OptionTable):
         Option("densification_interval", 100, "steps between densifications", "paper", check=at_least(1)),
         Option("opacity_reset_interval", 3000, origin="paper", check=at_least(1),
             help="steps between resets of all opacities to at most 0.01; one with less than half of them to go is left "
-                 "out, and all at the default with --appearance ppisp"),
+                 "out"),
         Option("densify_from_iter", 500, "densification starts after this step", check=at_least(0)),
         Option("densify_until_iter", 15_000, "densification ends before this step", "paper", check=at_least(0)),
         Option("densify_grad_threshold", 0.0002, origin="paper", check=above(0),

@@ -18,7 +18,6 @@ from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.exposure import apply_exposure
 from scene.gaussians.parameters import GaussianParameters
-from scene.gaussians.ppisp import Ppisp
 from scene.sleeping import Sleeping
 from splatting.distributed.rendering.sharded import (
     DividedDrawn,
@@ -238,8 +237,8 @@ def rasterizer_settings(
 def exposed(color: Tensor, camera: Camera | MiniCam, pc: GaussianModel) -> Tensor:
     """The image (3, H, W) with the trained exposure of the view's photo; a view without a photo has none."""
     name = photo_name(camera)
-    if name is not None and isinstance(exposures := getattr(pc, "exposures", None), Ppisp):
-        return exposures.shown(color, name)
+    if name is not None and (shown := getattr(getattr(pc, "exposures", None), "shown", None)):
+        return shown(color, name)
     return color if name is None else apply_exposure(color, pc.get_exposure_from_name(name))
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -9,17 +10,15 @@ from torch import Tensor
 from gaussian_renderer import photo_name, render
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.ppisp import Ppisp
-from scene.half_images import half
-from utils.image_utils import as_float, mean_psnr, pixels_that_count
+from utils.image_utils import as_float, half, mean_psnr, pixels_that_count
 from utils.loss_utils import l1_and_ssim
 
 
 class ScoredViews:
     """Renders of views and their targets, as they are scored.
 
-    By the half-image protocol (train_test_exp), only right halves count, and they are rendered with exposures. Photos
-    whose appearance has trained are rendered with that, too.
+    halves: only right halves count, and they are rendered with exposures (the half-image protocol). Photos that the
+    model's exposures cover are rendered as these show them, too.
     draw: renders a camera and a model to (3, H, W) in [0, 1]; None: `render` does. whole: the same, the render before
     `part` cuts it.
     """
@@ -28,22 +27,22 @@ class ScoredViews:
         self,
         pipe: argparse.Namespace,
         background: Tensor,
-        train_test_exp: bool,
+        halves: bool,
         draw: Callable[[Camera, GaussianModel], Tensor] | None = None,
     ) -> None:
         self._pipe = pipe
         self._background = background
-        self._halves = train_test_exp
+        self.halves = halves
         self.whole = draw or self._render
 
     def _render(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
-        exposed = self._halves or shown_as_trained(camera, gaussians)
+        exposed = self.halves or shown_as_trained(camera, gaussians)
         options = {"use_trained_exp": exposed, "want_depth": False, "want_visibility": False}
         return render(camera, gaussians, self._pipe, self._background, **options)["render"]
 
     def part(self, image: Tensor) -> Tensor:
         """The scored part of an image (C, H, W): all of it, or its right half."""
-        return image[..., half(image.shape[-1], of_test_view=True)].contiguous() if self._halves else image
+        return image[..., half(image.shape[-1], of_test_view=True)].contiguous() if self.halves else image
 
     def image(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
         """The scored part of the render, (3, H, W) float32 in [0, 1]."""
@@ -73,27 +72,20 @@ class ScoredViews:
 
 
 def shown_as_trained(camera: Camera, gaussians: GaussianModel) -> bool:
-    """Whether a view is one of a photo whose appearance has trained (scene/gaussians/ppisp.py)."""
-    return isinstance(it := getattr(gaussians, "exposures", None), Ppisp) and photo_name(camera) in it.mapping
+    """Whether a view is one of a photo that the model's exposures cover."""
+    exposures = getattr(gaussians, "exposures", None)
+    return exposures is not None and exposures.covers(photo_name(camera))
 
 
-def fitted_views(pipe: argparse.Namespace, background: Tensor) -> ScoredViews:
-    """Right halves of held-out views, with their photos' exposure and balance from the left ones.
+def beside_test(
+    scene: Any, pipe: argparse.Namespace, background: Tensor
+) -> dict[str, tuple[ScoredViews | None, list[Camera]]]:
+    """Test views as parts score them besides, by the end of the set's name: how, None: as all others; and the views.
 
-    Of models whose photos' appearance has trained, which stay as they are (the protocol of Martin-Brualla et al. 2021,
-    NeRF in the Wild).
+    A scene of other code has none.
     """
-
-    def draw(camera: Camera, gaussians: GaussianModel) -> Tensor:
-        options = {"want_depth": False, "want_visibility": False, "clamp": False}
-        image = render(camera, gaussians, pipe, background, **options)["render"]
-        target, mask = camera.ground_truth(background)
-        counts = torch.zeros_like(image[:1], dtype=torch.bool)
-        counts[..., half(image.shape[-1], of_test_view=False)] = True
-        counts = counts if mask is None else counts & mask
-        return gaussians.exposures.fitted(image, as_float(target), counts, camera.colmap_id)
-
-    return ScoredViews(pipe, background, True, draw)
+    parts = getattr(scene, "parts", ())
+    return {name: views for part in parts for name, views in part.scored(scene, pipe, background).items()}
 
 
 def mean_scores(compared: Iterable[tuple[Tensor, Tensor, Tensor | None]]) -> dict[str, float]:

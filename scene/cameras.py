@@ -67,9 +67,9 @@ class Camera(nn.Module):
     integer pixel coordinates are half a pixel less). lens: of a photo that is taken as it is, at that size; None: a
     pinhole. world_view_transform, projection_matrix, full_proj_transform: (4,4) float32, transposed; camera_center (3,)
     float32; all on `device`, made when they are first read. trans, scale: moved the camera's centre c to
-    (c + trans) * scale in these. columns: the columns that count in loss and scores, None: all (scene/half_images.py).
-    exposure_name: the photo's name among the trained exposures where it is not image_name (scene/half_images.py), else
-    None. data_device: where photos in memory lie, and the images and masks below that other code reads.
+    (c + trans) * scale in these. columns: the columns that count in loss and scores, None: all.
+    exposure_name: the photo's name among the trained exposures where it is not image_name, else None. data_device:
+    where photos in memory lie, and the images and masks below that other code reads.
     All may be assigned, and other attributes added; nothing is computed again from an assigned one. `del` of an
     original_image, alpha_mask, depth_reliable, invdepthmap or depth_mask brings the photo's back.
     depth_has_gaps: whether an inverse depth of 0 is unknown, and not far away.

@@ -15,10 +15,9 @@ from scene.gaussians.attributes import INITIAL_OPACITY, Rows
 from scene.gaussians.exposure import Exposures, read_exposures, read_pretrained
 from scene.gaussians.finite import check_finite
 from scene.gaussians.parameters import GaussianParameters, raw_rows
-from scene.gaussians.ppisp import Ppisp, read_appearance
 from scene.gaussians.start import start_rows
 from scene.gaussians.table import trainable
-from scene.readers.info import exposure_names
+from scene.readers.info import photo_names
 from splatting.host.machine import compute_device
 from utils.general_utils import get_expon_lr_func, inverse_sigmoid
 from utils.graphics_utils import BasicPointCloud
@@ -38,13 +37,11 @@ class GaussianModel(GaussianParameters):
     """Gaussians as they are trained, with the reference's names.
 
     GaussianParameters has the tensors and their activated forms. optimizer_type: "default" or "sparse_adam", whose step
-    takes a mask of the visible Gaussians. appearance: kind of the exposures that it starts or loads; `none` and affine
-    are one. spatial_lr_scale: extent of the scene, world units. percent_dense: largest
+    takes a mask of the visible Gaussians. spatial_lr_scale: extent of the scene, world units. percent_dense: largest
     scale, as a part of the scene's extent, of a Gaussian that is cloned; a larger one is split.
     """
 
     optimizer_type = "default"
-    appearance = "none"
     spatial_lr_scale = 0.0
     percent_dense = 0.0
 
@@ -144,16 +141,12 @@ class GaussianModel(GaussianParameters):
 
     def start_exposures(self, cam_infos: Sequence) -> None:
         """Give each training camera an exposure that changes nothing."""
-        names = _photo_names(cam_infos)
-        self.exposures = Ppisp(names, _cameras(cam_infos)) if self.appearance == Ppisp.kind else Exposures(names)
+        self.exposures = Exposures(photo_names(cam_infos))
 
     def load_exposures(self, folder: str | os.PathLike, cam_infos: Sequence) -> None:
         """Take the exposures of the training cameras from a model folder."""
-        if self.appearance == Ppisp.kind:
-            self.exposures = read_appearance(folder, _photo_names(cam_infos), _cameras(cam_infos))
-            return
         image_names = [camera.image_name for camera in cam_infos]
-        self.exposures = read_exposures(folder, _photo_names(cam_infos), image_names)
+        self.exposures = read_exposures(folder, photo_names(cam_infos), image_names)
 
     def save_exposures(self, folder: str | os.PathLike) -> None:
         """Write the exposures into a model folder."""
@@ -265,15 +258,3 @@ class GaussianModel(GaussianParameters):
         remedy = "nothing of this iteration was saved; lower the learning rates, or resume from an earlier checkpoint"
         check_finite(raw_rows(self), f"iteration {iteration}", remedy, self.shards)
         self.exposures.check_finite(f"iteration {iteration}", remedy)
-
-
-def _photo_names(cam_infos: Sequence) -> list[str]:
-    """A name for each camera's exposure. Cameras of one name need an `image_path`, or they share an exposure."""
-    names = [camera.image_name for camera in cam_infos]
-    if len(set(names)) == len(names):
-        return names
-    return exposure_names(cam_infos) if all(hasattr(c, "image_path") for c in cam_infos) else list(dict.fromkeys(names))
-
-
-def _cameras(cam_infos: Sequence) -> list[object]:
-    return [getattr(camera, "uid", 0) for camera in cam_infos]

@@ -13,14 +13,11 @@ from scene.gaussians.attributes import Rows
 from scene.gaussians.checkpoint import extra_state, load_checkpoint, unpack
 from scene.gaussians.finite import warn_of_undrawn
 from scene.gaussians.ply import read_ply
-from scene.gaussians.ppisp import Ppisp
 from scene.saved_iterations import saved_ply
 from scene.scene import Scene
-from splatting.files.json_files import read_model_json
 from splatting.parts import states_in, tools
 from utils.system_utils import UserError, saved_iterations
 
-APPEARANCE = "appearance"  # entry of model.json, of a training that has one
 _CHECKPOINT = re.compile(r"chkpnt(\d+)\.pth")
 
 
@@ -80,16 +77,11 @@ def _degree(coefficients: int) -> int:
 def load_saved(options: argparse.Namespace, iteration: int, sh_degree: int | None = None) -> Scene:
     """Scene of the model options, whose `gaussians` are those of a saved iteration, -1: the newest one.
 
-    sh_degree: degree that the file must have, None: any. With --appearance ppisp, photos of another scene, and of a
-    model that was trained without, have nothing trained. UserError as from Scene and the functions above.
+    sh_degree: degree that the file must have, None: any. UserError as from Scene and the functions above.
     """
     iteration, path = find_save(options.model_path, iteration)
     gaussians = read_model(path, sh_degree)
     scene = Scene(options, gaussians, load_iteration=iteration, shuffle=False, start=False)
     print(f"Loading trained model at iteration {iteration}" + (f" from {path}" if path.suffix == ".pth" else ""))
-    if getattr(options, "appearance", "none") == Ppisp.kind:
-        own = not getattr(options, "other_scene", "") and APPEARANCE in read_model_json(options.model_path)
-        gaussians.appearance, gaussians.exposures = Ppisp.kind if own else "none", Ppisp()
-    if gaussians.appearance == Ppisp.kind or getattr(options, "train_test_exp", False):
-        gaussians.load_exposures(options.model_path, scene.info.train_cameras)
+    scene.load_beside(options)
     return scene

@@ -1,7 +1,6 @@
 """Views of a dataset, together with the Gaussians that are trained on them or loaded for them."""
 
 import argparse
-import copy
 import json
 import random
 import shutil
@@ -15,15 +14,13 @@ import numpy as np
 
 from scene.cameras import Camera
 from scene.dataset_readers import read_scene, replaced_reader
-from scene.gaussians.ppisp import UNTRAINED, Ppisp
-from scene.half_images import half, train_on_all
 from scene.images.masks import MaskOptions, check_masks
 from scene.images.store import ImageStore, Picture, image_device
-from scene.readers.info import CameraInfo, SceneInfo, exposure_names, photo_size
+from scene.readers.info import CameraInfo, SceneInfo, photo_size
 from scene.readers.point_cloud import write_point_cloud
 from scene.readers.scene_folder import kind_of
 from scene.saved_iterations import find_iteration, saved_ply
-from splatting.compat.models import SceneGaussians, call_of_either_form, load_model, save_exposures
+from splatting.compat.models import SceneGaussians, call_of_either_form
 from splatting.compat.readers import scene_by
 from splatting.distributed.ranks import ALONE, Ranks
 from splatting.files.json_files import OFFSET, read_model_json
@@ -42,7 +39,8 @@ class Scene:
     views are made smaller, one list of cameras each. train_cameras, test_cameras: these lists by scale, which may be
     replaced. validation_cameras: the same of views that neither train nor test. info: the dataset as read.
     cameras_extent: E in world units, from the training views. images: the store of the decoded photos. ranks: processes
-    that divide them (ImageStore). parts: of a training, None: those that args ask for.
+    that divide them (ImageStore). parts: of a training, None: those that args ask for. halves: only right halves of
+    views are scored, as by ScoredViews. given_test_views: the held-out views as read, before parts changed the dataset.
     """
 
     def __init__(
@@ -61,10 +59,8 @@ class Scene:
         self.loaded_iter = load_iteration
         if load_iteration is not None and start:
             self.loaded_iter = find_iteration(self.model_path, load_iteration)
-        self._halves = bool(getattr(args, "train_test_exp", False))
-        self._appearance = getattr(args, "appearance", "none") == Ppisp.kind
-        self._parts = chosen(args) if parts is None else parts
-        self._moved = any(part.needs.camera_gradient for part in self._parts) and not getattr(args, "other_scene", "")
+        self.parts = chosen(args) if parts is None else parts
+        self.halves = False
         self.info = self._read(args)
         self.cameras_extent = self.info.extent
 
@@ -83,20 +79,20 @@ class Scene:
             return
         if self.loaded_iter is not None:
             print(f"Loading trained model at iteration {self.loaded_iter}")
-            exposed = self.info.train_cameras if self._halves else None
-            load_model(gaussians, self.model_path, saved_ply(self.model_path, self.loaded_iter), exposed)
+            gaussians.load_ply(str(saved_ply(self.model_path, self.loaded_iter)))
+            self.load_beside(args)
         else:
             self.create_gaussians()
             self.write_inputs()
 
     def _read(self, args: argparse.Namespace) -> SceneInfo:
-        """The dataset as the options want it: masks, halves, depth maps."""
+        """The dataset as the options want it."""
         fresh = self.loaded_iter is None
         if fresh:
             _refuse_dataset_folder(args)
         kind = kind_of(args.source_path)
         if read := replaced_reader(kind):
-            return self._changed(scene_by(read, kind, args, self._halves), args, fresh)
+            return self._changed(scene_by(read, kind, args), args, fresh)
         masks = MaskOptions(**_given(args, folder="masks", invert="invert_masks", meaning="mask_meaning"))
         info = read_scene(
             args.source_path,
@@ -112,14 +108,12 @@ class Scene:
         if fresh:
             views = info.train_cameras + info.test_cameras
             check_masks([(view.image_path, view.mask) for view in views], masks)
-        if self._halves:
-            info = train_on_all(info)
-        self._given = info.test_cameras
         return self._changed(info, args, fresh)
 
     def _changed(self, info: SceneInfo, args: argparse.Namespace, fresh: bool) -> SceneInfo:
         """The dataset as the parts want it."""
-        for part in self._parts:
+        self.given_test_views = info.test_cameras
+        for part in self.parts:
             info = part.dataset(info, args, fresh)
         return info
 
@@ -131,34 +125,27 @@ class Scene:
         """Held-out views at a resolution scale that the scene was made with."""
         return self.test_cameras[scale]
 
-    def given_test_views(self) -> list[Camera]:
-        """Copies of the held-out views as the dataset has them, where training moves views; none elsewhere."""
-        views = [copy.copy(camera) for camera in self.getTestCameras()] if self._moved else []
-        for camera in views:
-            given = self._given[camera.uid]
-            camera.place(given.R, given.T)
-        return views
-
     def prefetch(self, cameras: Sequence[Camera]) -> None:
         """Start to prepare the images of the views that come next, in that order (`images.ahead` of them)."""
         self.images.prefetch(self._pictures(cameras))
 
     def save(self, iteration: int, gaussians: SceneGaussians | None = None) -> None:
-        """Write `point_cloud/iteration_N/point_cloud.ply`, exposures if they are trained, and what parts write.
+        """Write `point_cloud/iteration_N/point_cloud.ply`, and what parts write beside it.
 
-        gaussians: written in place of the scene's own; the exposures are always the scene's.
+        gaussians: written in place of the scene's own; what parts write is always of the scene.
         """
-        self.save_views()
+        self.save_beside()
         (self.gaussians if gaussians is None else gaussians).save_ply(str(saved_ply(self.model_path, iteration)))
 
-    def save_views(self) -> None:
-        """Write `exposure.json` or `appearance.json` if the photos' look is trained, and what parts write."""
-        for part in self._parts:
+    def save_beside(self) -> None:
+        """Write the files of parts into the model folder."""
+        for part in self.parts:
             part.save(self)
-        if self._appearance:
-            self.gaussians.save_exposures(self.model_path)
-        if self._halves:
-            save_exposures(self.gaussians, self.model_path)
+
+    def load_beside(self, args: argparse.Namespace) -> None:
+        """Read the files of parts in the model folder. args: the model options."""
+        for part in self.parts:
+            part.load(self, args)
 
     def training_pixels(self) -> tuple[int, int]:
         """Pixels of all training views: at training size, and in the photos."""
@@ -192,24 +179,12 @@ class Scene:
         ours = [(camera, view) for camera, view in zip(cameras, views, strict=False) if isinstance(camera, Camera)]
         for camera, _ in ours:
             camera.images = self.images
-        if self._halves or self._appearance:
-            self._name_exposures(ours, test)
+        for part in self.parts:
+            part.cameras(self, ours, test)
         if shuffle:
             # A generator of its own: a resumed run must get the same order, whatever drew random numbers before.
             random.Random(0).shuffle(cameras)
         return cameras
-
-    def _name_exposures(self, cameras: Sequence[tuple[Camera, CameraInfo]], in_test_list: bool) -> None:
-        """Set exposure names of cameras where the views' names clash, and the columns that count by halves."""
-        training, tested = self.info.train_cameras, {view.image_path for view in self.info.test_cameras}
-        names = dict(zip([view.image_path for view in training], exposure_names(training), strict=True))
-        for camera, view in cameras:
-            if (name := names.get(view.image_path, view.image_name)) != view.image_name:
-                camera.exposure_name = name
-            if not self._halves:
-                camera.exposure_name = UNTRAINED if in_test_list else camera.exposure_name
-            elif view.image_path in tested:
-                camera.columns = half(camera.image_width, in_test_list)
 
     def _plan_images(self) -> None:
         others = chain(*self.test_cameras.values(), *self.validation_cameras.values())

@@ -10,7 +10,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 
 from scene.readers.tracks import Track
 from splatting.diagnosis import advice
@@ -27,35 +26,6 @@ def _track(points: np.ndarray, ranks: np.ndarray) -> Track:
     places = (np.stack([ranks % SIDE, ranks // SIDE], axis=1) + 0.5) / SIDE
     ones = np.ones(len(ranks))
     return Track(points, np.zeros((len(ranks), 2)), places, ones, ones, ranks)
-
-
-def _camera(image: np.ndarray) -> SimpleNamespace:
-    pixels = torch.from_numpy(image.reshape(3, SIDE, SIDE))
-    return SimpleNamespace(device="cpu", target=lambda _: pixels)
-
-
-def test_exposures_are_those_of_the_photos_though_some_points_disagree():
-    rng, given = np.random.default_rng(0), np.array([-0.7, 0.2, 0.4, 0.0, 0.1])
-    albedo, cameras, tracks = rng.uniform(0.1, 0.4, (3, SIDE**2)), [], []
-    for exposure in given:
-        light = albedo * 2**exposure
-        light[:, rng.choice(SIDE**2, 40, replace=False)] = 0.9  # highlights
-        image = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-        cameras.append(_camera(image))
-        ranks = np.sort(rng.choice(SIDE**2, 300, replace=False))
-        tracks.append(_track(np.zeros((300, 3)), ranks))
-    np.testing.assert_allclose(advice.exposures(cameras, tracks), given - given.mean(), atol=0.02)
-
-
-def test_exposures_that_drift_along_a_walk_are_found():
-    """Each point is seen in eight photos that follow each other."""
-    given, window = 0.7 * np.sin(np.linspace(0, 2 * np.pi, 120)), 8
-    albedo, cameras, tracks = np.random.default_rng(0).uniform(0.1, 0.4, SIDE**2), [], []
-    for place, exposure in enumerate(given):
-        image = 1.055 * (albedo * 2**exposure) ** (1 / 2.4) - 0.055
-        cameras.append(_camera(np.stack([image] * 3)))
-        tracks.append(_track(np.zeros((3 * window, 3)), 3 * place + np.arange(3 * window)))
-    np.testing.assert_allclose(advice.exposures(cameras, tracks), given - given.mean(), atol=0.02)
 
 
 def test_photos_of_a_point_from_twice_as_far_have_twice_the_depth_in_focal_lengths():

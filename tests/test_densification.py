@@ -17,6 +17,7 @@ from splatting.parts import part_class
 from splatting.parts.adc.control import AdaptiveDensityControl
 from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
 from splatting.training.checks import late_reset
+from splatting.training.part import Needs
 from splatting.training.schedule import Schedule
 from utils.general_utils import build_rotation
 
@@ -291,13 +292,10 @@ def test_a_run_by_the_clock_recovers_from_no_reset_that_it_leaves_out():
     assert not any(control.resets(t) or control.recovers(t) for t in range(1, 3000))
 
 
-@pytest.mark.parametrize(
-    ("appearance", "interval", "resets"), [("none", 3000, 5), ("ppisp", 3000, 0), ("ppisp", 2500, 6)]
-)
-def test_an_appearance_wants_no_resets(appearance, interval, resets):
-    gaussians = model(4)
-    gaussians.appearance = appearance
-    run = SimpleNamespace(gaussians=gaussians, opt=options(opacity_reset_interval=interval))
+@pytest.mark.parametrize(("bright", "interval", "resets"), [(False, 3000, 5), (True, 3000, 0), (True, 2500, 6)])
+def test_a_part_may_want_no_resets(bright, interval, resets):
+    parts = [SimpleNamespace(needs=Needs(bright=bright))]
+    run = SimpleNamespace(gaussians=model(4), parts=parts, opt=options(opacity_reset_interval=interval))
     run.dataset, run.scene = SimpleNamespace(white_background=True), SimpleNamespace(cameras_extent=1.0)
     control = part_class("adc")().control(run)
     control.schedule = Schedule(30_000)

@@ -25,8 +25,11 @@ MAY_IMPORT = {
     "utils.make_depth_scale": ("scene.readers.depth_scale", "scene.readers.depth_maps"),  # a command of the reference
     "arguments": ("splatting.training.option", "splatting.parts"),
     "splatting.training.option": (),
-    "splatting.training.part": ("splatting.training", "scene.readers.info"),
-    "splatting.parts": ("arguments", "splatting.training", "splatting.evaluation", "gaussian_renderer", "scene"),
+    "splatting.training.part": ("splatting.training", "gaussian_renderer.scored_views", "scene"),
+    "splatting.parts": (
+        *("splatting.compat", "splatting.training", "splatting.evaluation"),
+        *("arguments", "gaussian_renderer", "scene"),
+    ),
     "lpipsPyTorch": (),  # a name of the reference
     "scene.images": (),
     "scene.colmap_loader": (),
@@ -213,7 +216,6 @@ def test_tensors_are_seen_in_one_folder():
 
 # Words, and the modules and rooms that may say them.
 SAID_IN = {
-    "import half": ("gaussian_renderer.scored_views", "scene.scene", "splatting.compat", "utils.camera_utils"),
     "torch.ops.diff_gaussian_rasterization": ("submodules", "benchmarks"),
     # Commands run as modules, but for setup.py, whose builder is in no package, and what the reference runs as a file.
     "sys.path": ("submodules", "setup", "utils.make_depth_scale"),

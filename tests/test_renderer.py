@@ -66,7 +66,7 @@ def _report(camera, draw, *more: object, halves: bool = False) -> dict[str, floa
     """Scores of a training report whose views are this camera's, five of training and one of test."""
     camera.target, camera.counted_pixels, camera.image_name = lambda _: torch.ones(3, HEIGHT, WIDTH), None, "a"
     views = dict.fromkeys(("getTrainCameras", "getTestCameras"), lambda: [camera])
-    scene = argparse.Namespace(gaussians=model(5), given_test_views=list, **views)
+    scene = argparse.Namespace(gaussians=model(5), **views)
     zero, arguments = torch.zeros(()), (pipeline(), BLACK, *more)
     return report.training_report(None, 1, zero, zero, l1_loss, 0.0, [1], scene, draw, arguments, halves)
 

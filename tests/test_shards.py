@@ -126,7 +126,7 @@ def _mcmc_at_one_end(gaussians: GaussianModel) -> None:
 def _budget(gaussians: GaussianModel) -> None:
     opt = options(strategy="budget", max_num_splats=2 * gaussians.gaussian_count, opacity_decay=0.9, prune_opacity=0.05)
     scene = SimpleNamespace(getTrainCameras=list)
-    density = BudgetControl(SimpleNamespace(gaussians=gaussians, opt=opt, scene=scene, pipe=None, exposes=False))
+    density = BudgetControl(SimpleNamespace(gaussians=gaussians, opt=opt, scene=scene, pipe=None))
     scores = "scores"
     density._scores = lambda *_: _random(gaussians, scores).double().clamp_min(0.0)
     _train(gaussians, density)

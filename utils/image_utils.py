@@ -40,3 +40,8 @@ def pixels_that_count(image: Tensor, mask: Tensor | None) -> Tensor:
     if mask is None:
         return image
     return image[:, mask[0]] if mask.any() else image.new_zeros(image.shape[0], 1)
+
+
+def half(width: int, of_test_view: bool) -> slice:
+    """Columns of the half that counts where test photos train, too: the right one of their views, else the left one."""
+    return slice(width // 2, width) if of_test_view else slice(0, width // 2)

@@ -22,7 +22,7 @@ from scene.saved_iterations import saved_ply
 from scene.saved_model import find_save, read_model
 from splatting.evaluation import training_log
 from splatting.files.json_files import read_json, write_json
-from splatting.parts import PARTS, part_class
+from splatting.parts import PARTS, appearances, part_class
 from splatting.training.iteration import Iteration
 from splatting.training.loop import training_steps
 from splatting.training.observers.divergence import DivergenceWatch
@@ -37,7 +37,7 @@ INTERVAL = 100  # iterations between losses that are told: reading one waits for
 # Test views are held out by NerfBaselines. Full-size photos, no viewer, and nothing written but by `save`.
 _ALWAYS = ("--eval", "--resolution=1", "--disable_viewer", "--no_curve", "--test_iterations=-1", "--save_iterations=-1")
 _PARTS = [part_class(name) for name in PARTS]
-_OF_FILES = ("appearance", "init_ply", "masks", "train_test_exp")
+_OF_FILES = ("appearance", "init_ply", "masks", *(kind.flag for kind in appearances() if kind.flag))
 _OF_FILES += tuple(part.switch or part.name for part in _PARTS if part.needs.files)
 # Options that nothing follows here, with the value that is the case. Our other observers score, save and show.
 _FIXED = dict.fromkeys(

@@ -22,7 +22,7 @@ _LINES = 5  # most findings that a training prints
 def findings(info: SceneInfo, most: int = LOOKED_AT, halves: bool = False, alpha: bool = True) -> list[Finding]:
     """Faults of the records that readers return, the severe ones first; none if nothing is wrong.
 
-    most: photos that are decoded. halves: test views train, too, with their left halves (--train_test_exp).
+    most: photos that are decoded. halves: test views train, too, with their left halves.
     alpha: that of photos counts (--mask_meaning).
     """
     train, test = ([*map(_ours, views)] for views in (info.train_cameras, info.test_cameras))
@@ -38,10 +38,10 @@ def _ours(view: Any) -> CameraInfo:
     return CameraInfo(**{one.name: getattr(view, one.name) for one in fields(CameraInfo) if hasattr(view, one.name)})
 
 
-def of_options(info: SceneInfo, options: argparse.Namespace) -> list[Finding]:
+def of_options(info: SceneInfo, options: argparse.Namespace, halves: bool) -> list[Finding]:
     """`findings` with the model options of a training; code written for the reference lacks those that we added."""
     alpha = getattr(options, "mask_meaning", "") != "none"
-    return findings(info, halves=bool(getattr(options, "train_test_exp", False)), alpha=alpha)
+    return findings(info, halves=halves, alpha=alpha)
 
 
 def tell(found: list[Finding], source: str | os.PathLike, quiet: bool = False) -> None:

@@ -14,9 +14,9 @@ from torch import Tensor, nn
 
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.attributes import IN_CHECKPOINT, Attribute, Rows
+from scene.gaussians.exposure import Exposures
 from scene.gaussians.finite import check_finite, with_scales
 from scene.gaussians.parameters import GaussianParameters
-from scene.gaussians.ppisp import exposures_of
 from scene.gaussians.statistics import NAMES, Statistics
 from splatting.files.tensor_files import read_tensors
 from splatting.host.machine import VERSION
@@ -26,7 +26,7 @@ _LARGEST = 1e15  # extent; learning rates are multiples of it
 _OPTIMIZER = 10  # which entry its state dict is
 _ENTRIES = 12  # the reference's; the values of further attributes may follow
 EXPOSURES, WRITTEN_BY = "exposures", "version"  # keys in the optimiser's state dict
-_NO_EXTRA = {EXPOSURES, WRITTEN_BY, "state", "param_groups"}
+_NO_EXTRA = {WRITTEN_BY, "state", "param_groups"}
 
 
 class State(NamedTuple):
@@ -90,8 +90,13 @@ def restore(gaussians: GaussianParameters, model_args: Sequence[Any], training_a
     gaussians.active_sh_degree = state.active_sh_degree
     gaussians.spatial_lr_scale = state.spatial_lr_scale
     gaussians.set_rows(state.rows)
-    if state.exposures is not None and not gaussians.exposures.mapping:  # a model without a scene
-        gaussians.exposures = exposures_of(state.exposures)
+    exposures = state.exposures
+    if exposures is not None and exposures.get("kind", Exposures.kind) != gaussians.exposures.kind:
+        exposures = None  # a part takes them
+    elif exposures is not None and not gaussians.exposures.mapping:  # a model without a scene
+        names = exposures.get("names")
+        if isinstance(names, list) and all(isinstance(name, str) for name in names):  # else `restore` refuses them
+            gaussians.exposures = Exposures(names)
     gaussians.training_setup(training_args)
     try:
         if isinstance(gaussians.optimizer, GaussianAdam):
@@ -104,8 +109,8 @@ def restore(gaussians: GaussianParameters, model_args: Sequence[Any], training_a
     if "xyz" in lacking:  # f_rest may lack it, as Gaussians without active bands have no steps
         names = ", ".join(map(str, lacking))
         print(f"warning: the checkpoint has no averages of Adam for {names}; they begin at zero", file=sys.stderr)
-    if state.exposures is not None:
-        gaussians.exposures.restore(state.exposures)
+    if exposures is not None:
+        gaussians.exposures.restore(exposures)
     gaussians.statistics = state.statistics.to(gaussians._xyz.device)
 
 
@@ -135,21 +140,26 @@ def with_extra_state(entries: tuple, states: dict[str, Any]) -> tuple:
 
 
 def extra_state(entries: Sequence[Any]) -> dict[str, Any]:
-    """What `with_extra_state` has added; nothing in a checkpoint of other code."""
-    optimizer = entries[_OPTIMIZER]
+    """What `with_extra_state` has added, and exposures; nothing more in a checkpoint of other code."""
+    optimizer, found = entries[_OPTIMIZER], _exposures_in(entries)
+    extra = {} if found is None else {EXPOSURES: found}
     if not isinstance(optimizer, dict) or WRITTEN_BY not in optimizer:
-        return {}
-    return {key: state for key, state in optimizer.items() if key not in _NO_EXTRA}
+        return extra
+    return {key: state for key, state in optimizer.items() if key not in _NO_EXTRA} | extra
+
+
+def _exposures_in(entries: Sequence[Any]) -> dict[str, Any] | None:
+    """The state of trained exposures; until 0.1.0, it was the last entry."""
+    found = next((entry for entry in entries[_ENTRIES:] if isinstance(entry, dict)), None)
+    optimizer = entries[_OPTIMIZER]
+    found = optimizer.get(EXPOSURES, found) if isinstance(optimizer, dict) else found
+    return found if isinstance(found, dict) else None
 
 
 def unpack(entries: Sequence[Any], table: dict[str, Attribute], max_sh_degree: int) -> State:
     """The state from the entries that `pack` made. UserError if its attributes are not those of the table."""
     active_sh_degree, *tensors = entries[:7]
     max_radii2D, xyz_gradient_accum, denom, optimizer, spatial_lr_scale, *others = entries[7:]
-    # Until 0.1.0, the exposures were the last entry.
-    exposures = next((entry for entry in others if isinstance(entry, dict)), None)
-    if isinstance(optimizer, dict):
-        exposures = optimizer.get(EXPOSURES, exposures)
     names = (*IN_CHECKPOINT, *(name for name in table if name not in IN_CHECKPOINT))
     tensors += [entry for entry in others if not isinstance(entry, dict)]
     if len(tensors) != len(names):
@@ -166,7 +176,7 @@ def unpack(entries: Sequence[Any], table: dict[str, Attribute], max_sh_degree: i
             "give the --sh_degree it was trained with"
         )
     statistics = Statistics(max_radii2D, xyz_gradient_accum, denom)
-    return State(int(active_sh_degree), rows, statistics, optimizer, float(spatial_lr_scale), exposures)
+    return State(int(active_sh_degree), rows, statistics, optimizer, float(spatial_lr_scale), _exposures_in(entries))
 
 
 def check_rows(rows: Rows, table: dict[str, Attribute], max_sh_degree: int) -> None:

@@ -1,4 +1,4 @@
-"""Colour maps of the training photos, trained with the Gaussians (--train_test_exp), and exposure.json."""
+"""Colour maps of the training photos, trained with the Gaussians (--appearance affine), and exposure.json."""
 
 import argparse
 import json
@@ -29,10 +29,17 @@ class Exposures:
     A pixel c, a row vector, becomes c A[:, :3] + A[:, 3] (`apply_exposure`). mapping: index by the photo's name.
     pretrained: None, or maps (3, 4) by name that are used in place of the values. optimizer: of the values, None before
     training_setup. schedule: the learning rate by iteration. kind: of --appearance.
+
+    A part may put a subclass in their place. applied: whether a training compares renders as photos show them. held:
+    whether strategies have turned renders dark, so that nothing of photos should be learnt; these learn in any case, as
+    the reference's. shown: in place of `apply_exposure`, a render (3, H, W), not clamped, as the photo of a name shows
+    it.
     """
 
     kind: ClassVar[str] = "affine"
-    held = False  # of Ppisp; these learn in any case, as the reference's
+    shown: ClassVar[Callable[..., Tensor] | None] = None
+    applied = False
+    held = False
 
     def __init__(self, names: Sequence[str] = ()) -> None:
         self.start(names)
@@ -62,6 +69,10 @@ class Exposures:
     def names(self) -> list[str]:
         """Names of the photos, in the order of the values."""
         return sorted(self.mapping, key=self.mapping.__getitem__)
+
+    def covers(self, name: str | None) -> bool:
+        """Whether every render of the view of that photo is as the photo shows it, without an option that asks."""
+        return False
 
     @property
     def trained(self) -> bool:
@@ -110,12 +121,10 @@ class Exposures:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Take the state of `capture()`, after training_setup. UserError for a state that does not fit."""
-        if (kind := state.get("kind", "affine")) != self.kind:
-            raise UserError(f"the checkpoint was trained with --appearance {kind}; give that option")
         if state.get("names") != self.names:
             raise UserError(
                 "the checkpoint's exposures are of other photos than this run's; give the scene and the options "
-                "--eval and --train_test_exp that it was trained with"
+                "--eval and --appearance that it was trained with"
             )
         self.take_values(state)
         self.check_finite("the checkpoint", "use another checkpoint")

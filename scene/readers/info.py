@@ -250,6 +250,19 @@ def exposure_names(cameras: Sequence[CameraInfo]) -> list[str]:
     ]
 
 
+def photo_names(cam_infos: Sequence[Any]) -> list[str]:
+    """A name for each camera's exposure. Cameras of one name need an `image_path`, or they share an exposure."""
+    names = [camera.image_name for camera in cam_infos]
+    if len(set(names)) == len(names):
+        return names
+    return exposure_names(cam_infos) if all(hasattr(c, "image_path") for c in cam_infos) else list(dict.fromkeys(names))
+
+
+def names_of_photos(info: SceneInfo) -> dict[str, str]:
+    """`exposure_names` of the training views by the paths of their photos."""
+    return dict(zip([view.image_path for view in info.train_cameras], exposure_names(info.train_cameras), strict=True))
+
+
 def normalization(cameras: Sequence[CameraInfo], points: np.ndarray | None = None) -> dict[str, Any]:
     """`SceneInfo.nerf_normalization` of the training views: the radius is `scene_extent`."""
     centers = camera_centers(cameras)

@@ -11,13 +11,13 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from scene.half_images import half
 from scene.images.decode import picture_size, pixels_of
 from scene.images.masks import TRANSPARENT, Mask, add_alpha
 from scene.images.store import InMemory, Size
 from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, DepthMap, depth_fit, fitted
 from scene.readers.info import CameraInfo
 from utils.general_utils import check_flags
+from utils.image_utils import half
 
 _NOT_MOVED = np.array([0.0, 0.0, 0.0])
 Arguments = tuple[tuple[CameraInfo, Size, int], dict[str, Any]]  # of a Camera made of a CameraInfo

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from scene.readers.info import CameraInfo
+from scene.saved_iterations import saved_ply
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import atomic_write
 
@@ -38,17 +39,12 @@ def call_of_either_form(function: Callable, newer: tuple, older: tuple) -> Any:
     return function(*newer)
 
 
-def load_model(
-    gaussians: SceneGaussians, folder: str | os.PathLike, ply: Path, exposed: Sequence[CameraInfo] | None
-) -> None:
-    """Load a PLY of a model folder. exposed: the views whose exposures are loaded, too; None: none are."""
-    load_exposures = getattr(gaussians, "load_exposures", None)
-    if exposed is not None and load_exposures is None:
-        gaussians.load_ply(str(ply), True)
-        return
-    gaussians.load_ply(str(ply))
-    if exposed is not None:
-        load_exposures(folder, exposed)
+def load_exposures(scene: Any) -> None:
+    """Load the exposures of a scene's training views, whose PLY is loaded; the reference's model reads both at once."""
+    if load := getattr(scene.gaussians, "load_exposures", None):
+        load(scene.model_path, scene.info.train_cameras)
+    else:
+        scene.gaussians.load_ply(str(saved_ply(scene.model_path, scene.loaded_iter)), True)
 
 
 def save_exposures(gaussians: SceneGaussians, folder: str | os.PathLike) -> None:

@@ -206,14 +206,14 @@ def _published_scene(
     return with_depth_maps(info, folder, depths) if depths else info
 
 
-def scene_by(read: Callable[..., Any], kind: str, args: argparse.Namespace, train_test_exp: bool) -> SceneInfo:
+def scene_by(read: Callable[..., Any], kind: str, args: argparse.Namespace) -> SceneInfo:
     """The scene by a reader of other code, which is called with the reference's arguments.
 
     It may return any record with the fields that a release of the reference has. kind: of the scene folder.
     """
     depths = getattr(args, "depths", None) or ""
     if kind == COLMAP:
-        info = read(str(args.source_path), args.images, depths, args.eval, train_test_exp)
+        info = read(str(args.source_path), args.images, depths, args.eval, getattr(args, "train_test_exp", False))
     else:
         info = read(str(args.source_path), args.white_background, depths, args.eval)
     if isinstance(info, SceneInfo):

@@ -15,12 +15,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from scipy import sparse
-from scipy.sparse.linalg import spsolve
 
 from arguments import ModelParams, read_training_options
-from scene.cameras import Camera
 from scene.check import of_options, tell
 from scene.gaussian_model import GaussianModel
 from scene.readers.info import CameraInfo
@@ -31,25 +27,16 @@ from splatting.diagnosis.model import load_scored
 from splatting.distributed.ranks import ranks
 from splatting.files.json_files import write_json
 from splatting.parts import check_together, chosen, options_of, tools
-from utils.image_utils import as_float
 from utils.system_utils import UserError, mkdir_p
 
 ADVICE = "advice.json"  # what train.py --advise writes: texts, and options that the scene asks for
-EXPOSURES = 0.4  # stops; photos of a usual automatic exposure differ by 0.15 to 0.35
 DISTANCES = 2.5  # the farthest photo of a point over the nearest
-_AGAINST = {  # by an advised option: the options, with these values, that it does not go with, besides those of parts
-    "--appearance": {"train_test_exp": True},
-}
 _OFF = (False, "", "none", "off")  # values of options that do nothing; 0 is equal to False
 _NOT_OF_DATA = {  # model options that the short training of small photos has itself, or does without
-    "sh_degree", "model_path", "resolution", "train_test_exp", "appearance",
+    "sh_degree", "model_path", "resolution", "appearance",
 } | {option.name for option in options_of("model")}  # fmt: skip
 _WIDTH = 200  # pixels of a photo
-_DARK, _LIGHT = 0.02, 0.98  # of a channel; beyond, an exposure cannot be told
-_OUTLIER = 0.6  # stops; a larger difference is no exposure (Tukey's biweight: Beaton and Tukey 1974)
-_ROUNDS = 10
 _ITERATIONS = 1000  # of the short training
-_LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear sRGB
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -74,7 +61,7 @@ def advise(dataset: argparse.Namespace, trains: bool = True, warns: bool = False
     with contextlib.redirect_stdout(io.StringIO()):  # from the readers
         scene = Scene(small, GaussianModel(0), shuffle=False, start=False)
     if trains:
-        tell(of_options(scene.info, dataset), dataset.source_path, quiet=not warns)
+        tell(of_options(scene.info, dataset, scene.halves), dataset.source_path, quiet=not warns)
     tracks = read_tracks(dataset.source_path, scene.info.train_cameras, scene.info.offset)
     found = [*_of_tracks(scene, tracks)] if any(tracks) else []
     found += [Advice(*one) for advise_part in tools("advise") for one in advise_part(scene, tracks)]
@@ -104,11 +91,8 @@ def asked_options(dataset: argparse.Namespace, args: argparse.Namespace, given: 
 def _taken(advice: Advice, args: argparse.Namespace, given: Sequence[str]) -> Advice:
     """The advice, without its options where one of them is given, or where they do not go with given ones."""
     words = advice.options.split()
-    unfit = _AGAINST.get(words[0], {}) if words else {}
-    against = next(
-        (f"it does not go with --{name}" for name, value in unfit.items() if getattr(args, name) == value), None
-    )
-    if words and not against:
+    against = None
+    if words:
         taken = argparse.Namespace(**vars(args) | {words[0][2:]: words[1] if len(words) > 1 else True})
         try:
             check_together(chosen(taken), taken, several=False)
@@ -146,65 +130,9 @@ def _trained_with(model: str) -> list[str]:
 
 def _of_tracks(scene: Scene, tracks: list[Track | None]) -> Iterator[Advice]:
     """What the tracks of structure from motion say."""
-    views = scene.info.train_cameras
-    cameras = sorted(scene.getTrainCameras(), key=lambda camera: camera.uid)
-    spread = float(np.std(exposures(cameras, tracks)))
-    yield _asked(f"exposures of the photos differ by {spread:.2f} stops", spread > EXPOSURES, "--appearance ppisp")
-    ratio = distances(views, tracks)
+    ratio = distances(scene.info.train_cameras, tracks)
     text = f"the farthest photo of a point is {ratio:.1f} times as far away as the nearest (median)"
-    yield _asked(text, ratio > DISTANCES, "--antialiasing")
-
-
-def _asked(text: str, asks: bool, options: str) -> Advice:
-    return Advice(text, options if asks else "")
-
-
-def exposures(cameras: list[Camera], tracks: list[Track | None]) -> np.ndarray:
-    """Exposures (K,) in stops around their mean, of the photos that have a track.
-
-    A robust fit: log2 of a luminance is the exposure of its photo and the albedo of its point.
-    """
-    logs, points, photos = [], [], []
-    for track, camera in zip(tracks, cameras, strict=True):
-        if track is None:
-            continue
-        image = as_float(camera.target(torch.zeros(3, device=camera.device))).cpu().numpy()
-        column, row = (track.places * image.shape[:0:-1]).astype(int).T
-        inside = (column >= 0) & (column < image.shape[2]) & (row >= 0) & (row < image.shape[1])
-        colors = image[:, row[inside], column[inside]]
-        usable = (colors.max(0) < _LIGHT) & (colors.min(0) > _DARK)
-        logs.append(np.log2(np.tensordot(_LUMINANCE, _linear(colors[:, usable]), 1)))
-        points.append(track.ranks[inside][usable])
-        photos.append(np.full(len(points[-1]), len(photos)))
-    log, point, photo = map(np.concatenate, (logs, points, photos))
-    weight = np.ones(len(log))
-    for _ in range(_ROUNDS):
-        exposure, albedo = _fitted(log, weight, photo, point, len(logs))
-        away = log - exposure[photo] - albedo[point]
-        weight = np.maximum(1 - (away / _OUTLIER) ** 2, 1e-3) ** 2
-    return exposure - exposure.mean()
-
-
-def _fitted(
-    values: np.ndarray, weight: np.ndarray, photo: np.ndarray, point: np.ndarray, photos: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Exposures (photos,) and albedos whose sums are nearest to values (K,), by weighted least squares.
-
-    Albedos are eliminated (Triggs et al. 2000, section 6.1). To fit both by turns would take as many rounds as a walk
-    has photos.
-    """
-    seen = sparse.coo_array((weight, (photo, point)), (photos, point.max(initial=0) + 1)).tocsr()
-    of_point, of_photo = (np.maximum(seen.sum(axis), 1e-9) for axis in (0, 1))
-    matrix = sparse.diags_array((1 + 1e-9) * of_photo) - seen / of_point @ seen.T  # singular else: their sum is free
-    mean = np.bincount(point, weight * values) / of_point
-    vector = np.bincount(photo, weight * (values - mean[point]), photos)
-    exposure = spsolve(matrix.tocsc(), vector)
-    return exposure, np.bincount(point, weight * (values - exposure[photo])) / of_point
-
-
-def _linear(values: np.ndarray) -> np.ndarray:
-    """sRGB to light (IEC 61966-2-1)."""
-    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    yield Advice(text, "--antialiasing" if ratio > DISTANCES else "")
 
 
 def distances(views: list[CameraInfo], tracks: list[Track | None]) -> float:

@@ -268,7 +268,7 @@ def _pipe(scene: Scene) -> argparse.Namespace:
 
 def _scored(scene: Scene, options: argparse.Namespace) -> ScoredViews:
     background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
-    return ScoredViews(_pipe(scene), background, options.train_test_exp)
+    return ScoredViews(_pipe(scene), background, scene.halves)
 
 
 def _measure(camera: Camera, scene: Scene, options: argparse.Namespace) -> tuple[float, ...] | None:

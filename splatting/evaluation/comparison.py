@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from arguments import OPTIONS, VIEW_OPTIONS
 from splatting.evaluation.error_curve import Row, common_subset, rows_on
 from splatting.evaluation.plan import DATASETS
 from splatting.files.json_files import read_json
@@ -35,8 +36,10 @@ SHORTEST = 10.0  # seconds of a process whose share of the processors says somet
 EVEN = 0.8  # share of the best that trainings get on a machine of their own
 WIDEST_STEP = 2.0  # largest ratio of the seconds of two points to interpolate between; a wider gap tells too little
 DECIDING = {  # options of train.py that decide what test views show, and which of their pixels count
-    *("--resolution", "-r", "--images", "-i", "--white_background", "-w", "--train_test_exp"),
-    *("--masks", "--invert_masks", "--mask_meaning", "--lenses"),
+    word
+    for option in OPTIONS
+    if option.name in VIEW_OPTIONS - {"eval"} | {"masks", "invert_masks", "mask_meaning", "lenses"}
+    for word in (f"--{option.name}", f"-{option.short}")
 }
 
 Run = Mapping[str, Any]

@@ -61,10 +61,7 @@ def shorter_ends_there(model: Path) -> bool:
         options = read_stored_options(model)
     except UserError:
         return False
-    if any(part_class(name).follows_length(argparse.Namespace(**options)) for name in PARTS):
-        return False
-    exposed = options.get("train_test_exp") or options.get("appearance", "none") != "none"
-    return not exposed  # whose learning rate follows --iterations, too
+    return not any(part_class(name).follows_length(argparse.Namespace(**options)) for name in PARTS)
 
 
 def load_scores(model: Path, method: str) -> tuple[dict[str, float | None], dict[str, dict[str, float | None]]]:

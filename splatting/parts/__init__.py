@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from splatting.training.option import Option
-from splatting.training.part import Part, Strategy
+from splatting.training.part import Appearance, Part, Strategy
 from utils.system_utils import UserError
 
 # Names of folders, with the reason for the place, where there is one.
 PARTS = (
     "coarse_to_fine",  # says which sizes of views are asked for
     "time_budget",  # decides on them
+    "exposure",  # adds training views before anything moves them
     "refine_poses",  # its cameras stand right before anything asks where they are
     "depth_maps",
     "curve",  # its scores are those of the model that is saved in the same iteration
@@ -27,6 +28,7 @@ PARTS = (
     "budget",
     "sky",
     "sparse_depth",  # the order of the terms of the loss is in the bytes of the model
+    "ppisp",
     "filter_3d",  # after all that moves rows
     "last_save",  # after keep_best, which may choose another model
     "sleep",  # after all that decides whether every step concerns all rows
@@ -44,11 +46,17 @@ def strategies() -> list[str]:
     return [name for name in PARTS if issubclass(part_class(name), Strategy)]
 
 
+def appearances() -> list[type[Appearance]]:
+    """The parts that train how photos show renders (--appearance)."""
+    return [kind for kind in map(part_class, PARTS) if issubclass(kind, Appearance)]
+
+
 def options_of(group: str) -> list[Option]:
     """What the parts declare of a group of options: model, pipeline, optimisation or launch."""
     return [option for name in PARTS for option in getattr(part_class(name).options, group)]
 
 
+EXPOSURES = "exposures"  # the model's own key of what an appearance has trained
 # Of states in checkpoints of version 0.2 and before.
 _OLD_KEYS = {
     "asleep": "sleep",
@@ -61,7 +69,9 @@ _OLD_KEYS = {
 
 def states_in(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     """The states of parts by their names, from the extra state of a checkpoint. UserError for one of no part."""
-    named = {_OLD_KEYS.get(key, key): state for key, state in checkpoint.items()}
+    kinds = {kind.kind: kind.name for kind in appearances()}
+    renamed = _OLD_KEYS | {EXPOSURES: kinds.get(checkpoint.get(EXPOSURES, {}).get("kind", "affine"), EXPOSURES)}
+    named = {renamed.get(key, key): state for key, state in checkpoint.items()}
     if unknown := sorted(map(str, named.keys() - {*PARTS})):
         raise UserError(
             f"the checkpoint has a state of {unknown[0]}, which this code does not have; use the code that wrote it, "
@@ -82,22 +92,22 @@ def chosen(given: argparse.Namespace, states: Collection[str] = ()) -> list[Part
 def check_together(parts: Collection[Part], given: argparse.Namespace, several: bool) -> None:
     """Refuse a part that does not work with other options, or with several processes (UserError)."""
     for part in parts:
-        option = part.switch or part.name
+        option = part.asked_by(given)
         if several and not part.needs.ranks:
             remedy = "leave it out, or start train.py without torchrun"
             if not part.wanted(given):
                 remedy = f"it is in {given.start_checkpoint}, so start train.py without torchrun"
-            raise UserError(f"--{option} needs a training of one process; {remedy}")
+            raise UserError(f"{option} needs a training of one process; {remedy}")
         for other, reason in part.against.items():
             name, _, value = other.partition("=")
             _, _, need = name.partition(".")
             if need:
-                found = [f"--{one.switch or one.name}" for one in parts if one is not part and getattr(one.needs, need)]
+                found = [one.asked_by(given) for one in parts if one is not part and getattr(one.needs, need)]
             else:
                 there = getattr(given, name, None)
                 found = [f"--{name}{value and ' '}{value}"] if (str(there) == value if value else there) else []
             if found:
-                raise UserError(f"--{option} does not work with {found[0]}, {reason}")
+                raise UserError(f"{option} does not work with {found[0]}, {reason}")
 
 
 def remove_traces(folder: str | os.PathLike, parts: Collection[Part]) -> None:

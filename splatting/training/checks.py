@@ -8,12 +8,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from arguments import OPTIONS, other_scene, read_training_options
+from arguments import OPTIONS, VIEW_OPTIONS, other_scene, read_training_options
 from scene.check import of_options, tell
 from scene.check.photos import hints
-from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
-from scene.gaussians.ppisp import Ppisp
 from scene.saved_model import saves_in
 from scene.scene import Scene
 from splatting.evaluation import training_log
@@ -42,7 +40,7 @@ def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> Non
     info, views = scene.info, scene.getTrainCameras()
     if not resumed:
         smallest = min((view.image_width, view.image_height) for view in views)
-        found = [*of_options(info, options), *hints(info, smallest, options.white_background)]
+        found = [*of_options(info, options, scene.halves), *hints(info, smallest, options.white_background)]
         tell(found, options.source_path)
     if info.offset.any():
         print(
@@ -61,20 +59,6 @@ def check_one_process(option: str, several: bool) -> None:
     """Refuse an option in a training of several processes (UserError)."""
     if several:
         raise UserError(f"{option} needs a training of one process; leave it out, or start train.py without torchrun")
-
-
-def check_photos(appearance: str, count: int) -> None:
-    """Refuse an appearance that one photo cannot tell from the scene's (UserError)."""
-    if appearance == Ppisp.kind and count < 2:
-        raise UserError("--appearance ppisp compares photos, and there is only one to train on; leave it out")
-
-
-def check_exposures(gaussians: GaussianModel, exposes: bool, checkpoint: str) -> None:
-    """Refuse a checkpoint with exposures that this run would not use (UserError); report the opposite case."""
-    if gaussians.exposures.trained and not exposes:
-        raise UserError(f"{checkpoint} was trained with --train_test_exp; give that option")
-    if exposes and not gaussians.exposures.trained:
-        print(f"{checkpoint} has no exposures: all photos start without a correction")
 
 
 def faster_alone(ranks: int, on_gpu: bool, count: int) -> str | None:
@@ -160,9 +144,6 @@ def _start_of(count: int, opt: argparse.Namespace) -> str:
     return f"the start has {count:,} Gaussians, more than --max_num_splats {opt.max_num_splats}"
 
 
-_OF_VIEWS = {"images", "resolution", "white_background", "eval", "train_test_exp"}  # in cfg_args, for all saves alike
-
-
 def check_folder(
     now: argparse.Namespace,
     saving_iterations: Sequence[int],
@@ -187,7 +168,7 @@ def check_folder(
     if not stay:
         return
     kept = f"{folder} keeps iteration {', '.join(map(str, sorted(stay)))} of an earlier training"
-    changed = [name for name in _changed(then, now) if name in _OF_VIEWS]
+    changed = [name for name in _changed(then, now) if name in VIEW_OPTIONS]
     if changed and max(stay) > max(saving_iterations, default=0):
         before, after = (" ".join(_typed(n, of[n]) for n in changed) for of in (then, vars(now)))
         raise UserError(
@@ -229,7 +210,7 @@ def report_changes(checkpoint: str, now: argparse.Namespace) -> None:
         )
     if changed:
         before, after = (" ".join(_typed(n, of[n]) for n in changed) for of in (then, vars(now)))
-        mixed = _OF_VIEWS.intersection(changed) and (folder / CURVE).exists()
+        mixed = VIEW_OPTIONS.intersection(changed) and (folder / CURVE).exists()
         of_curve = "; the earlier points of its curve are of those other views" if mixed else ""
         _warn(f"{folder} was trained with {before}, this run has {after}{of_curve}")
 

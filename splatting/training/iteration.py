@@ -40,6 +40,7 @@ class Iteration:
     started: float  # seconds of training before it
     span: range  # steps of the schedule that it stands for (training/schedule.py); of the last, all that are left
     terms: dict[str, Term] = field(default_factory=dict)  # that parts add to the loss, weights included
+    captured: bool = True  # a captured step may record the terms
     wants_depth: bool = False  # its loss needs the rendered depth
     due: bool = False  # the model is read, written or changed, so every loss so far must be checked first
     read: bool = False  # an observer reads the model

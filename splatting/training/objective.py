@@ -6,8 +6,6 @@ import torch
 from fused_ssim import photometric_loss_by_bands
 from torch import Tensor
 
-from gaussian_renderer import photo_name
-from scene.gaussians.ppisp import Ppisp
 from splatting.training.iteration import Iteration, Losses, Term
 from utils.loss_utils import photometric_loss
 
@@ -31,10 +29,7 @@ class Objective:
 
     def terms(self, step: Iteration) -> dict[str, Term]:
         """What a step adds to the photometric loss, weights included, by name."""
-        terms = dict(step.terms)
-        if isinstance(exposures := self._run.gaussians.exposures, Ppisp):
-            terms["appearance"] = lambda *_: exposures.pull(photo_name(step.camera))
-        return terms
+        return step.terms
 
     def __call__(self, package: dict[str, Any], step: Iteration) -> Losses:
         """package: of `render`, with `depth` where the step wants it.

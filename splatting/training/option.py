@@ -2,7 +2,7 @@
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +21,7 @@ class Option:
     check: returns None for a valid value, else a description of valid values.
     stored: the file of the model folder that keeps it; empty: none. compared: whether a resumed run warns if its value
     is not the stored one.
+    after: the option of its group that it follows; empty: where its part has its place.
     seen: whether renders of a model differ with its value, if no name of them tells it.
     loaded: what a command that loads a model takes if the option is not given; empty: the stored value.
     """
@@ -35,6 +36,7 @@ class Option:
     compared: bool = True
     loaded: str = ""
     seen: bool = True
+    after: str = ""
 
     @property
     def ours(self) -> bool:
@@ -80,6 +82,12 @@ class Option:
         valid = self.check(value) if self.check else None
         if valid:
             raise UserError(f"--{self.name} must be {valid}, got {value!r}")
+
+
+def in_places(options: Sequence[Option]) -> tuple[Option, ...]:
+    """The options, each that names another in `after` behind it."""
+    places = {option.name: (index, 0) for index, option in enumerate(options)}
+    return tuple(sorted(options, key=lambda one: (*places[one.after][:1], 1) if one.after else places[one.name]))
 
 
 def at_least(low: float) -> Callable[[float], str | None]:

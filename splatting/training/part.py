@@ -8,7 +8,8 @@ reads them: the method itself lies in further modules of the folder, which hooks
 A run (splatting/training/run.py), in the order in which it calls the hooks:
 
 check        The options and the checkpoint are read. Refuse here what can be refused.
-dataset      The photos, cameras and points are found. Scenes that are made without a run call it, too.
+dataset      The photos, cameras and points are found. Scenes that are made without a run call it, too, and the next.
+cameras      The cameras of a list are made.
 begin        The Gaussians exist. In a new training they have no optimiser yet, so rows may be added.
 ready        Model and optimiser exist.
 opened       The log is open, and files may be written.
@@ -23,11 +24,13 @@ state        A checkpoint is written. It keeps the state by the part's name, and
 facts        model.json is written, when the training begins and with the last save.
 save         A PLY or a checkpoint is written: own files beside it. Scenes that are made without a run call it, too.
 final        The last save is written: it may be of another model.
+load, scored A saved model is loaded, and its test views are to be scored or rendered, in a training or without one.
 
 What only one part can give is a slot of the run or of the model, with a neutral default that the part replaces in
 `begin`; a second one that does so is refused by `fill`:
 
 model.drawn  what raw opacities and scales are drawn as, and its chain backward; model.columns keeps values per row
+model.exposures what photos make of renders, trained with the Gaussians (scene/gaussians/exposure.py)
 model.pinned which Gaussians density control leaves where they are, and as large as they are
 run.schedule which steps of the schedule an iteration stands for
 run.sizes    the size of a view in an iteration
@@ -45,10 +48,13 @@ from splatting.training.option import Option
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
-    from scene.readers.info import SceneInfo
+    from gaussian_renderer.scored_views import ScoredViews
+    from scene.cameras import Camera
+    from scene.readers.info import CameraInfo, SceneInfo
     from splatting.training.iteration import Iteration, Losses, Term
 
 Error: TypeAlias = BaseException | None
+Scored: TypeAlias = "tuple[ScoredViews | None, Sequence[Camera]]"  # how, None: as all others; and which views
 
 
 @dataclass(frozen=True)
@@ -71,19 +77,25 @@ class Needs:
     """What a part asks of the steps. It is data, because a captured step cannot ask anybody while it replays.
 
     depth: steps that have terms of the part render depth.
+    captured: a captured step may record its terms, which depend on the render and on the view's photo alone.
     camera_gradient: steps compute the gradient of the camera's numbers, for the slot run.on_host.
     all_rows: every step concerns all rows, so that none may sleep.
     replay: a step that is taken twice gives the same; if not, the host does not run ahead of a GPU.
     ranks: it works with several processes.
     files: it reads files of the scene besides photos.
+    photos: it trains something of the photos, which a copy of the Gaussians alone would not have.
+    bright: renders must not turn dark, so strategies reset no opacities unless they are told how often.
     """
 
     depth: bool = False
+    captured: bool = False
     camera_gradient: bool = False
     all_rows: bool = False
     replay: bool = True
     ranks: bool = True
     files: bool = False
+    photos: bool = False
+    bright: bool = False
 
 
 class Part:
@@ -122,6 +134,11 @@ class Part:
         return getattr(given, option.name, option.default) != option.default
 
     @classmethod
+    def asked_by(cls, given: argparse.Namespace) -> str:
+        """The option that asks for the part, as it is typed."""
+        return f"--{cls.switch or cls.name}"
+
+    @classmethod
     def dropped(cls, given: argparse.Namespace, iteration: int) -> str | None:
         """What to warn of where a checkpoint has a state of the part, and no option asks for it. UserError refuses it.
 
@@ -140,6 +157,9 @@ class Part:
     def dataset(self, info: "SceneInfo", args: argparse.Namespace, fresh: bool) -> "SceneInfo":
         """The dataset with other views or points. args: the model options. fresh: it is read for a new training."""
         return info
+
+    def cameras(self, scene: Any, cameras: "Sequence[tuple[Camera, CameraInfo]]", held_out: bool) -> None:
+        """Cameras of the scene's training views, or of those that are held out, with the records they are made of."""
 
     def begin(self, run: Any, state: Any) -> None:
         """Take part in a training. state: its entry of the checkpoint; None: a new training, or one that had none."""
@@ -170,6 +190,13 @@ class Part:
 
     def save(self, scene: Any) -> None:
         """Write own files into the model folder of a scene, beside a PLY or a checkpoint."""
+
+    def load(self, scene: Any, args: argparse.Namespace) -> None:
+        """Read own files of the model folder, once its Gaussians are loaded. args: the model options."""
+
+    def scored(self, scene: Any, pipe: argparse.Namespace, background: Any) -> "dict[str, Scored]":
+        """Further sets of test views, by what is put behind the name of the set."""
+        return {}
 
     def state(self) -> Any:
         """What a checkpoint keeps, as tensors and plain values; None: nothing."""
@@ -231,6 +258,36 @@ class Strategy(Part):
     def control(self, run: Any) -> Any:
         """The hooks by which it acts on a run (splatting.training.density.DensityControl)."""
         raise NotImplementedError
+
+
+class Appearance(Part):
+    """A part that trains how photos show renders (--appearance KIND), of which a training has one at most.
+
+    kind, summary: the value of the option, and what it does, for the help. flag: a further option that asks for it.
+    """
+
+    needs = Needs(photos=True)
+    kind: ClassVar[str] = ""
+    summary: ClassVar[str] = ""
+    flag: ClassVar[str] = ""
+
+    @classmethod
+    def wanted(cls, given: argparse.Namespace) -> bool:
+        return getattr(given, "appearance", "none") == cls.kind or bool(cls.flag and getattr(given, cls.flag, False))
+
+    @classmethod
+    def asked_by(cls, given: argparse.Namespace) -> str:
+        named = getattr(given, "appearance", "none") == cls.kind or not cls.flag
+        return f"--appearance {cls.kind}" if named else f"--{cls.flag}"
+
+    @classmethod
+    def dropped(cls, given: argparse.Namespace, iteration: int) -> str | None:
+        option = f"--{cls.flag}" if cls.flag else f"--appearance {cls.kind}"
+        raise UserError(f"{given.start_checkpoint} was trained with {option}; give that option")
+
+    @classmethod
+    def follows_length(cls, given: argparse.Namespace) -> bool:
+        return cls.wanted(given)  # by its learning rate
 
 
 def overrides(parts: Sequence[Part], hook: str) -> list[Callable]:

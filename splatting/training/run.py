@@ -20,7 +20,6 @@ from scene import sleeping
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import extra_state, load_checkpoint, with_extra_state
 from scene.gaussians.morton import sort_rows
-from scene.gaussians.ppisp import Ppisp
 from scene.sampling_rate import share_of
 from splatting.deterministic.counter_rng import Stream, uniform
 from splatting.distributed.consistency import agree_on_scene
@@ -183,12 +182,9 @@ class Run:
 
     def _begin_model(self, capture: tuple | None, first: Splats | None, states: dict[str, Any]) -> None:
         """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""
-        self.gaussians.appearance = getattr(self.dataset, "appearance", "none")
-        checks.check_photos(self.gaussians.appearance, len(self.scene.getTrainCameras()))
         if capture is not None:
             self.gaussians.start_exposures(self.scene.info.train_cameras)
             self.gaussians.restore(capture, self.opt)
-            checks.check_exposures(self.gaussians, self.exposes, self.start)
             for begin in self._each("begin"):
                 begin(self, states.get(begin.__self__.name))
         else:
@@ -266,18 +262,20 @@ class Run:
                 started=seconds,
                 span=range(span.start, schedule.length + 1) if last else span,
             )
-            self._add_terms(step)
+            self.add_terms(step)
             yield step
             if iteration == self.first_iteration + 1:
                 self.first_done = seconds_since_start()
             if step.last:
                 return
 
-    def _add_terms(self, step: Iteration) -> None:
+    def add_terms(self, step: Iteration) -> None:
+        """Add what parts add to the loss of a step."""
         for terms in self._each("terms"):
-            found = terms(step)
-            step.terms |= found
-            step.wants_depth |= bool(found) and terms.__self__.needs.depth
+            if found := terms(step):
+                step.terms |= found
+                step.wants_depth |= terms.__self__.needs.depth
+                step.captured &= terms.__self__.needs.captured
 
     def _changes(self, iteration: int) -> bool:
         changes = any(changes(iteration) for changes in self._each("changes"))
@@ -382,15 +380,10 @@ class Run:
             self.sleeping.flush(guarded)
         self.sleeping = None
 
-    @property
-    def exposes(self) -> bool:
-        """Whether renders are compared with photos as their trained exposures show them."""
-        return self.dataset.train_test_exp or self.gaussians.appearance == Ppisp.kind
-
     def render_options(self, step: Iteration) -> dict[str, bool]:
         """Options of `render` that make it compute what this step's loss needs, and no more."""
         return {
-            "use_trained_exp": self.exposes,
+            "use_trained_exp": self.gaussians.exposures.applied,
             "want_depth": step.wants_depth,
             "want_visibility": False,
             "want_inactive_bands": False,

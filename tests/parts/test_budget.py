@@ -20,6 +20,7 @@ from gaussian_renderer import model_inputs, rasterizer_settings
 from scene.cameras import MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adc import remove_useless
+from scene.gaussians.exposure import Exposures
 from scene.gaussians.long_axis import long_axis_children
 from scene.saved_model import read_model
 from splatting.deterministic.counter_rng import Stream
@@ -168,9 +169,8 @@ def test_pairs_are_drawn_as_often_as_one_after_the_other():
 
 def _control(schedule: Schedule = STEADY, **changes: object) -> budget.BudgetControl:
     """The control of a run with four large views."""
-    run = SimpleNamespace(opt=options(), pipe=None, gaussians=SimpleNamespace(shards=WHOLE))
+    run = SimpleNamespace(opt=options(), pipe=None, gaussians=SimpleNamespace(shards=WHOLE, exposures=Exposures()))
     vars(run.opt).update(changes)
-    run.exposes = False
     run.scene = SimpleNamespace(getTrainCameras=lambda: [SimpleNamespace(image_width=6400, image_height=1000)] * 4)
     control = budget.BudgetControl(run)
     control.schedule = schedule

@@ -10,10 +10,7 @@ from splatting.training.part import Options, Strategy
 
 
 class Adc(Strategy):
-    """Clones, splits, prunes and resets. With --appearance ppisp it resets no opacities, unless an interval is given.
-
-    Haze can grow before the cameras after a reset, and cameras would learn from it.
-    """
+    """Clones, splits, prunes and resets; where a part needs bright renders, it resets at a given interval alone."""
 
     name = "adc"
     summary = "adaptive density control, the method's own"
@@ -37,11 +34,10 @@ class Adc(Strategy):
 
     def control(self, run: Any) -> Any:
         from scene.gaussians.density_rules import USUAL_RESETS
-        from scene.gaussians.ppisp import Ppisp
         from splatting.parts.adc.control import AdaptiveDensityControl
 
         opt, white = run.opt, run.dataset.white_background
-        if run.gaussians.appearance == Ppisp.kind and opt.opacity_reset_interval == USUAL_RESETS:
+        if any(part.needs.bright for part in run.parts) and opt.opacity_reset_interval == USUAL_RESETS:
             opt, white = copy.copy(opt), False
             opt.opacity_reset_interval = sys.maxsize
         return AdaptiveDensityControl(run.gaussians, opt, white, run.scene.cameras_extent)

@@ -42,7 +42,7 @@ class BudgetControl(DensityControl):
         self._gaussians, self._opt = run.gaussians, run.opt
         self._cameras = run.scene.getTrainCameras()
         self.ends = run.opt.densify_until_iter
-        self._scores = partial(error_scores, run.gaussians, run.pipe, run.exposes)
+        self._scores = partial(error_scores, run.gaussians, run.pipe, run.gaussians.exposures.applied)
         self.most_gaussians = run.opt.max_num_splats or default_budget(self._cameras)
 
     def rate_factor(self, iteration: int) -> float:

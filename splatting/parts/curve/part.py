@@ -41,7 +41,7 @@ class Curve(Part):
         if not test:
             return
         trained = [camera for camera in run.scene.getTrainCameras() if camera.columns is None]  # in whole
-        views = ScoredViews(run.pipe, run.background, run.dataset.train_test_exp)
+        views = ScoredViews(run.pipe, run.background, run.scene.halves)
         self._recorder = CurveRecorder(
             run.scene.model_path,
             run.rows,

@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from scene.readers.info import SceneInfo
     from splatting.training.iteration import Iteration, Losses
 
-_ALONE = "as it keeps Gaussians alone; leave one of them out"
-
 
 class KeepBest(Part):
     """Takes views away from training, scores them in the curve's iterations, and keeps the best model so far."""
@@ -27,12 +25,7 @@ class KeepBest(Part):
     ))
     # fmt: on
     needs = Needs(ranks=False)
-    against = {
-        "appearance=affine": _ALONE,
-        "appearance=ppisp": _ALONE,
-        "train_test_exp": _ALONE,
-        "needs.camera_gradient": _ALONE,
-    }
+    against = {"needs.photos": "as it keeps Gaussians alone; leave one of them out"}
 
     def dataset(self, info: "SceneInfo", args: "argparse.Namespace", fresh: bool) -> "SceneInfo":
         from splatting.parts.keep_best.validation import without_validation

@@ -104,7 +104,7 @@ def trimmed(run: Any, trained: GaussianModel, scored: bool, iteration: int) -> t
 
     scored: whether to compute the change in PSNR, which is cheap if the test photos are in memory. iteration: the last.
     """
-    scene, opt, halves = run.scene, run.opt, run.dataset.train_test_exp
+    scene, opt, halves = run.scene, run.opt, run.scene.halves
     scene.gaussians.optimizer.zero_grad(set_to_none=True)  # room for the trimmed copy
     final, search = trim(trained, scene.getTrainCameras(), run.pipe, opt.keep_unseen, opt.prune_sh, iteration)
     change, test = {}, scene.getTestCameras()

@@ -1,10 +1,11 @@
 """Poses that are trained with the Gaussians (--refine_poses): a small correction of each training camera's."""
 
+import copy
 from typing import TYPE_CHECKING, Any
 
 from splatting.files.json_files import MODEL_JSON
 from splatting.training.option import Option
-from splatting.training.part import Needs, Options, Part, fill
+from splatting.training.part import Needs, Options, Part, Scored, fill
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ class RefinePoses(Part):
                  "scene hold the cameras, and place the test views"),
     ))
     # fmt: on
-    needs = Needs(camera_gradient=True, files=True)
+    needs = Needs(camera_gradient=True, files=True, photos=True)
     against = {"projection=ray": "which has no gradients of poses; leave one of them out"}
 
     @classmethod
@@ -35,7 +36,8 @@ class RefinePoses(Part):
     def dataset(self, info: "SceneInfo", args: "argparse.Namespace", fresh: bool) -> "SceneInfo":
         from splatting.parts.refine_poses.pose_file import with_poses
 
-        return info if fresh or getattr(args, "other_scene", "") else with_poses(info, args.model_path)
+        self._elsewhere = bool(getattr(args, "other_scene", ""))
+        return info if fresh or self._elsewhere else with_poses(info, args.model_path)
 
     def begin(self, run: Any, state: Any) -> None:
         from splatting.parts.refine_poses.refinement import PoseRefinement
@@ -50,6 +52,16 @@ class RefinePoses(Part):
 
     def state(self) -> dict[str, Any]:
         return self.poses.captured()
+
+    def scored(self, scene: "Scene", pipe: "argparse.Namespace", background: Any) -> dict[str, Scored]:
+        """Test views as the dataset has them."""
+        from splatting.evaluation.comparison import GIVEN_POSES
+
+        views = [] if self._elsewhere else [copy.copy(camera) for camera in scene.getTestCameras()]
+        for camera in views:
+            given = scene.given_test_views[camera.uid]
+            camera.place(given.R, given.T)
+        return {GIVEN_POSES: (None, views)} if views else {}
 
     def save(self, scene: "Scene") -> None:
         from splatting.parts.refine_poses.pose_file import write_poses

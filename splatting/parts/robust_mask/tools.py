@@ -23,7 +23,7 @@ def examine(scene: Scene, views: ScoredViews, options: argparse.Namespace) -> It
     """Notes on a trained model."""
     cameras = scene.getTrainCameras()
     taken = bool(read_training_options(scene.model_path).get("robust_mask"))
-    if len(cameras) > MOST_PHOTOS or options.train_test_exp or taken:
+    if len(cameras) > MOST_PHOTOS or scene.halves or taken:
         return
     masks = residuals_of(cameras, views, scene.gaussians)
     found = {camera.image_name: masks.counted(camera) for camera in cameras}

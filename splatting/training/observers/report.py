@@ -11,12 +11,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gaussian_renderer import render
-from gaussian_renderer.scored_views import ScoredViews, fitted_views, shown_as_trained
+from gaussian_renderer.scored_views import ScoredViews, beside_test, shown_as_trained
 from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.ppisp import Ppisp
-from splatting.evaluation.comparison import FITTED, GIVEN_POSES
 from splatting.evaluation.error_curve import whole_sets
 from splatting.evaluation.what_to_try import BUDGET, CAP, PLANNED, STRATEGY, what_to_try
 from splatting.host.clock import wall_seconds
@@ -128,7 +126,7 @@ class Report(Part):
         tested = [step.iteration if t in step.span else -1 for t in run.launch.test_iterations]
         scores = self._report(
             self._writer, step.iteration, l1, total, l1_loss, seconds, tested,
-            run.scene, render, (run.pipe, run.background), run.dataset.train_test_exp,
+            run.scene, render, (run.pipe, run.background), run.scene.halves,
         )  # fmt: skip
         if scores:
             step.record = (step.record or {}) | scores
@@ -188,8 +186,7 @@ def training_report(
 
     elapsed: seconds of this iteration; renderArgs: what follows camera and model in renderFunc, (pipe, background) or
     more. train_test_exp: render with exposures (a sixth of renderArgs says so, too), and score right halves only.
-    Returns `<set>_l1` and `<set>_psnr` (dB, mean over views and channels) of the sets scored, {} otherwise. Where poses
-    are refined, test views are scored with the dataset's, too, and where appearance is trained, by `fitted_views`.
+    Returns `<set>_l1` and `<set>_psnr` (dB, mean over views and channels) of the sets scored, `beside_test` included.
     """
     if tb_writer and iteration % LOG_INTERVAL == 0:
         tb_writer.add_scalar("train_loss_patches/l1_loss", l1.item(), iteration)
@@ -207,10 +204,11 @@ def training_report(
 
     views = ScoredViews(*renderArgs[:2], train_test_exp, draw)
     train, test = scene.getTrainCameras(), scene.getTestCameras()
-    sets = {"test": (views, test), f"test_{GIVEN_POSES}": (views, scene.given_test_views())}
-    if isinstance(getattr(scene.gaussians, "exposures", None), Ppisp):
-        halves = ScoredViews(*renderArgs[:2], True, draw)  # what the fitted ones compare with
-        sets |= {"test_right_halves": (halves, test), f"test_{FITTED}": (fitted_views(*renderArgs[:2]), test)}
+    sets = {"test": (views, test)}
+    for name, (how, cameras) in beside_test(scene, *renderArgs[:2]).items():
+        if how and how.halves:  # what they compare with
+            sets["test_right_halves"] = ScoredViews(*renderArgs[:2], True, draw), cameras
+        sets[f"test_{name}"] = how or views, cameras
     sets |= {"train": (views, [train[i % len(train)] for i in range(5, 30, 5)])}
     scores = {}
     for name, (scored, cameras) in sets.items():

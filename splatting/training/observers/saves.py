@@ -59,7 +59,7 @@ class Checkpoints(Part):
             run.gaussians.check_finite(step.iteration)
             tqdm.write(f"[ITER {step.iteration}] Saving Checkpoint", file=sys.stdout)
             path = Path(run.scene.model_path) / f"chkpnt{step.iteration}.pth"
-            run.scene.save_views()
+            run.scene.save_beside()
             save_checkpoint(path, run.checkpoint_state(), step.iteration)
             run.log.add(step.iteration, seconds, gaussians=run.gaussians.gaussian_count, loss=run.losses.mean)
             if step.stopping:

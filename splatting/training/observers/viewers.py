@@ -41,7 +41,7 @@ class PageObserver(Part):
         """Start the page at the address of --viewer. UserError as from `Page`."""
         self._run, self._checkpoints = run, checkpoints
         address = Address(run.launch.viewer_host, run.launch.viewer)
-        self._page = Page(address, run.scene, run.pipe, run.dataset.white_background, run.dataset.train_test_exp)
+        self._page = Page(address, run.scene, run.pipe, run.dataset.white_background, run.scene.halves)
         self._requests = self._page.requests
         if run.counts:
             self._page.frames.masks = run.counts.counted
@@ -155,7 +155,7 @@ class PageObserver(Part):
     def _show_saved(self, iteration: int) -> None:
         run, path = self._run, saved_ply(self._run.scene.model_path, iteration)
         gaussians = read_model(path)
-        if run.dataset.train_test_exp:
+        if run.scene.halves:
             gaussians.load_exposures(run.scene.model_path, run.scene.info.train_cameras)
         gaussians.world_offset = run.gaussians.world_offset
         self._page.show_model(gaussians, iteration)

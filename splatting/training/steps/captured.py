@@ -107,7 +107,8 @@ class CapturedStep(FusedStep):
         losses = self._graphs.launch(at)
         if losses is not None:
             self._fetch(at)
-            queues = density.queues or run.exposes or (run.sleeping is not None and run.sleeping.flushes(at.iteration))
+            flushes = run.sleeping is not None and run.sleeping.flushes(at.iteration)
+            queues = density.queues or run.gaussians.exposures.applied or flushes
             with self._ahead.capacity(at) if queues else nullcontext():
                 run.gaussians.exposures.step()
                 run.after_step(at)
@@ -223,13 +224,13 @@ class Graphs:
         self._taken += 1
         self._host_cameras[row][:] = numbers
         self._adam.write_now(self._host[row, :NOW_WORDS], at.iteration)
-        exposures, exposes = self._run.gaussians.exposures, self._run.exposes
-        if exposes:
+        exposures = self._run.gaussians.exposures
+        if exposures.applied:
             self._host[row, -1] = exposures.mapping[photo_name(at.camera)]
         self._inputs.copy_(self._host[row], non_blocking=True)
         graph.launch()
         total, l1 = losses.copy_(graph.losses).unbind()
-        if exposes:
+        if exposures.applied:
             exposures.keep_gradients()
             self._run.gaussians.guard_loss(at.iteration, total)
         return Losses(total, l1, {}, None)
@@ -259,16 +260,16 @@ class Graphs:
         self._recorder.release()
 
     def _is_usual(self, at: Iteration) -> bool:
-        """Whether the photo has no mask, and no part adds to the loss."""
-        return self._able and not at.terms and at.camera.counts_all_pixels
+        """Whether the photo has no mask, and what parts add to the loss can be captured."""
+        return self._able and at.captured and at.camera.counts_all_pixels
 
     def _graph_for(self, at: Iteration) -> _Graph | None:
         """The graph for a step, made if it is worth it. The first step of a kind is not, as it may load kernels."""
         camera, run = at.camera, self._run
-        held = run.exposes and run.gaussians.exposures.held
+        held = run.gaussians.exposures.applied and run.gaussians.exposures.held
         phase = run.density.observes(at.iteration), run.gaussians.active_sh_degree, held
         size = camera.image_height, camera.image_width, camera.FoVx, camera.FoVy
-        kind = (*size, camera.lens, str(camera.columns), *phase)
+        kind = (*size, camera.lens, str(camera.columns), *at.terms, *phase)
         graph = self._graphs.get(kind)
         if graph is not None:
             return graph
@@ -320,10 +321,12 @@ class Graphs:
             camera=any_camera,
             background=self._background,
             terms={},
+            captured=True,
             wants_depth=False,
             changes=False,
             last=False,
         )
+        self._run.add_terms(placeholder)
         with self._capacity(None):
             launch, losses = self._recorder.capture(lambda: self._body(at.iteration, placeholder))
         if self._fused.drop_further_terms():
@@ -335,7 +338,7 @@ class Graphs:
     def _body(self, iteration: int, placeholder: Any) -> Tensor:
         run = self._run
         now = self._inputs[:NOW_WORDS]
-        if run.exposes:
+        if run.gaussians.exposures.applied:
             run.gaussians.exposures.keep_gradients()
             run.gaussians.exposures.optimizer.zero_grad(set_to_none=False)
         drawn, losses, gradients = self._fused.measure(placeholder, now)

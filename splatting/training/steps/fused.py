@@ -70,8 +70,8 @@ class FusedStep(PlainStep):
         whole = at.changes or at.last  # all blocks wake, as in a plain step
         if whole and run.sleeping:
             run.sleeping.flush()
-        exposures, objective = run.exposes, run.objective
-        by_bands = run.group.several and not exposures and objective.takes_bands(at)
+        applied, objective = run.gaussians.exposures.applied, run.objective
+        by_bands = run.group.several and not applied and objective.takes_bands(at)
         wants = {"want_depth": at.wants_depth, "by_bands": by_bands, "bands": self._bands}
         wants |= {"sleeping": None if whole else run.sleeping, "now": now}
         drawn = draw(at.camera, run.gaussians, run.pipe, at.background, **wants)
@@ -79,7 +79,7 @@ class FusedStep(PlainStep):
             image, depth = drawn.image.requires_grad_(), drawn.depth
             if depth is not None:
                 depth.requires_grad_()
-            color = exposed(image, at.camera, run.gaussians) if exposures else image
+            color = exposed(image, at.camera, run.gaussians) if applied else image
             losses = objective({"render": color, "depth": depth, "band": drawn.band}, at)
             losses.total.backward()
         # Observers keep losses for a while, which must not keep the image and its gradient.

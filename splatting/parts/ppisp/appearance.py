@@ -1,4 +1,4 @@
-"""Photos as cameras make them (--appearance ppisp), trained with the Gaussians, and appearance.json.
+"""Photos as cameras make them, and appearance.json.
 
 A colour c of a render, channel by channel, r half diagonals of the image from the middle of the vignetting:
 
@@ -36,6 +36,7 @@ from torch import Tensor
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.exposure import Exposures
 from scene.gaussians.table import trainable
+from scene.readers.info import CameraInfo, photo_names
 from splatting.files.json_files import read_json, write_json
 from splatting.host.machine import compute_device
 from utils.general_utils import get_expon_lr_func
@@ -61,7 +62,7 @@ _FARTHEST = 5.0  # stops
 _LN2 = math.log(2)
 
 
-class Ppisp(Exposures):
+class PhotoAppearance(Exposures):
     """The numbers of training photos and of their cameras; in the place of `Exposures`.
 
     values: (n, 3) of the photos. numbers: all tensors by name. mapping: index by the photo's name. held: nothing is
@@ -69,6 +70,7 @@ class Ppisp(Exposures):
     """
 
     kind: ClassVar[str] = "ppisp"
+    applied = True
 
     def __init__(self, names: Sequence[str] = (), cameras: Sequence[object] = ()) -> None:
         """cameras: the number of each photo's camera."""
@@ -115,6 +117,9 @@ class Ppisp(Exposures):
         """Logarithms of the rises of a camera's response (3, 3), from their mean over all photos."""
         responses = self._read("response")
         return _row(responses, row) - responses.detach()[self._row_of].mean(0)
+
+    def covers(self, name: str | None) -> bool:
+        return name in self.mapping
 
     def shown(self, image: Tensor, name: str | Tensor) -> Tensor:
         """A render (3, H, W), not clamped, as the photo of this name shows it. Differentiable in the image, too."""
@@ -223,13 +228,18 @@ class Ppisp(Exposures):
         write_json(Path(folder) / NAME, {"photos": photos, "cameras": cameras})
 
 
-def read_appearance(folder: str | os.PathLike, names: Sequence[str], cameras: Sequence[object]) -> Ppisp:
+def appearance_of(views: Sequence[CameraInfo]) -> PhotoAppearance:
+    """That of training photos which changes nothing."""
+    return PhotoAppearance(photo_names(views), [view.uid for view in views])
+
+
+def read_appearance(folder: str | os.PathLike, views: Sequence[CameraInfo]) -> PhotoAppearance:
     """The appearance of photos and their cameras from a model folder. UserError for a file that does not fit them."""
-    path, appearance = Path(folder) / NAME, Ppisp(names, cameras)
+    path, appearance = Path(folder) / NAME, appearance_of(views)
     try:
         table = read_json(path)
         photos, of_cameras = dict(table["photos"]), dict(table["cameras"])
-        rows = {"photos": [photos[name] for name in names]}
+        rows = {"photos": [photos[name] for name in appearance.mapping]}
         rows |= {kind: [of_cameras[camera][kind] for camera in appearance.rows] for kind in _CAMERA}
         found = {kind: torch.tensor(values, dtype=torch.float32) for kind, values in rows.items()}
     except OSError as error:
@@ -243,14 +253,6 @@ def read_appearance(folder: str | os.PathLike, names: Sequence[str], cameras: Se
             raise UserError(f"{kind} in {path} are not {_ALL[kind][0]} finite numbers each; {_REMEDY}")
         values.copy_(found[kind])
     return appearance
-
-
-def exposures_of(state: dict[str, Any]) -> Exposures:
-    """Those of a state of `capture()`, of the same photos; `restore` refuses what is no state."""
-    names, cameras = state.get("names"), state.get("cameras")
-    if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
-        return Exposures()
-    return Ppisp(names, cameras) if isinstance(cameras, list) else Exposures(names)
 
 
 def _row(values: Tensor, index: Tensor) -> Tensor:

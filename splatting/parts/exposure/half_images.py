@@ -1,17 +1,9 @@
-"""The half-image protocol (--train_test_exp): test photos train with their left half, and their right half is scored.
-
-So the exposures of test photos are known without training on the pixels that are scored.
-"""
+"""The training views of the half-image protocol."""
 
 import os
 from dataclasses import replace
 
 from scene.readers.info import SceneInfo, normalization
-
-
-def half(width: int, of_test_view: bool) -> slice:
-    """Columns of the half that counts: the right one of views in the test list, else the left one."""
-    return slice(width // 2, width) if of_test_view else slice(0, width // 2)
 
 
 def train_on_all(info: SceneInfo) -> SceneInfo:

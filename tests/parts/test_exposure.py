@@ -19,9 +19,9 @@ from scene.dataset_readers import CameraInfo, read_scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import EXPOSURES, load_checkpoint, save_checkpoint
 from scene.gaussians.exposure import Exposures, apply_exposure, read_exposures
-from scene.half_images import train_on_all
 from scene.readers.info import exposure_names
 from splatting.evaluation.error_curve import read_curve
+from splatting.parts.exposure.half_images import train_on_all
 from utils.general_utils import get_expon_lr_func
 from utils.loss_utils import inverse_depth_loss, l1_loss, photometric_loss, ssim
 from utils.system_utils import UserError

@@ -3,6 +3,7 @@
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,25 +19,29 @@ import metrics
 import render
 from gaussian_renderer.scored_views import shown_as_trained
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.ppisp import NAME, Ppisp, read_appearance
+from scene.readers.tracks import Track
 from scene.saved_model import load_saved
 from scene.scene import Scene
 from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.results import read_run
+from splatting.parts.ppisp.appearance import NAME, PhotoAppearance, appearance_of, read_appearance
+from splatting.parts.ppisp.tools import exposures
 from utils.system_utils import UserError
 
+SIDE = 20
 NAMES, CAMERAS = ["b.png", "a.png", "c.png"], [4, 7, 4]
+VIEWS = [SimpleNamespace(image_name=name, uid=camera) for name, camera in zip(NAMES, CAMERAS, strict=True)]
 
 
-def _random(seed: int = 0, size: float = 0.5) -> Ppisp:
-    appearance, generator = Ppisp(NAMES, CAMERAS), torch.Generator().manual_seed(seed)
+def _random(seed: int = 0, size: float = 0.5) -> PhotoAppearance:
+    appearance, generator = PhotoAppearance(NAMES, CAMERAS), torch.Generator().manual_seed(seed)
     for values in appearance.numbers.values():
         values.copy_(size * torch.randn(values.shape, generator=generator))
     return appearance
 
 
 def _by_definition(image: np.ndarray, photo: np.ndarray, camera: dict[str, np.ndarray]) -> np.ndarray:
-    """The formulas of scene/gaussians/ppisp.py by channel and pixel, with the curve as a Bernstein polynomial."""
+    """The formulas of PhotoAppearance by channel and pixel, with the curve as a Bernstein polynomial."""
     exposure, red, others = photo
     gains, (_, height, width) = (exposure + red + others, exposure - 2 * others, exposure - red + others), image.shape
     seen = np.empty_like(image)
@@ -92,7 +97,7 @@ def test_gradients_are_those_of_differences():
 
 def test_the_neutral_appearance_changes_nothing_and_a_response_rises_between_its_ends():
     image = torch.rand(3, 6, 9, generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(Ppisp(NAMES, CAMERAS).shown(image, "a.png"), image, rtol=0, atol=1e-7)
+    torch.testing.assert_close(PhotoAppearance(NAMES, CAMERAS).shown(image, "a.png"), image, rtol=0, atol=1e-7)
     steep, levels = _random(size=4.0), torch.linspace(0, 1, 500).expand(3, 1, -1)
     for name in ("photos", "vignetting"):
         steep.numbers[name].zero_()
@@ -152,7 +157,7 @@ def test_a_fit_finds_the_least_squares():
     found = minimize(error, np.zeros(3), method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-12})
     least = appearance._seen(image, torch.tensor(found.x, dtype=torch.float32)[:, None, None], row).clamp(0, 1)
     torch.testing.assert_close(fitted, least, rtol=0, atol=2e-3)
-    assert torch.equal(Ppisp().fitted(image, image, counts, 4), image)  # nothing has trained
+    assert torch.equal(PhotoAppearance().fitted(image, image, counts, 4), image)  # nothing has trained
 
 
 # appearance.json
@@ -161,11 +166,11 @@ def test_a_fit_finds_the_least_squares():
 def test_the_file_comes_back(tmp_path):
     appearance = _random()
     appearance.write(tmp_path)
-    again, image = read_appearance(tmp_path, NAMES, CAMERAS), torch.rand(3, 4, 5)
+    again, image = read_appearance(tmp_path, VIEWS), torch.rand(3, 4, 5)
     for name in NAMES:
         torch.testing.assert_close(again.shown(image, name), appearance.shown(image, name))
     assert list(json.loads((tmp_path / NAME).read_text())["cameras"]) == ["4", "7"]
-    assert Ppisp(NAMES, [0, 1, 2]).rows == {"all": 0}  # frames that are numbered
+    assert PhotoAppearance(NAMES, [0, 1, 2]).rows == {"all": 0}  # frames that are numbered
 
 
 @pytest.mark.parametrize(
@@ -185,7 +190,7 @@ def test_a_broken_file_is_named(tmp_path, change, words):
     table = change(json.loads((tmp_path / NAME).read_text()))
     (tmp_path / NAME).unlink() if table is None else (tmp_path / NAME).write_text(json.dumps(table))
     with pytest.raises(UserError, match=f"{words}.*; save the model again, or give --appearance none"):
-        read_appearance(tmp_path, NAMES, CAMERAS)
+        read_appearance(tmp_path, VIEWS)
 
 
 # Trainings
@@ -261,9 +266,44 @@ def test_test_views_may_have_the_names_of_training_photos(tmp_path):
     make_blender_scene(tmp_path / "scene")
     found = Scene(options_of(tmp_path / "scene", tmp_path / "out", eval=True, appearance="ppisp"), GaussianModel(0),
                   start=False)  # fmt: skip
-    found.gaussians.appearance = "ppisp"
-    found.gaussians.start_exposures(found.info.train_cameras)
+    found.gaussians.exposures = appearance_of(found.info.train_cameras)
     assert list(found.gaussians.exposures.mapping) == [f"r_{k}" for k in range(4)]
     seen = {name: [shown_as_trained(view, found.gaussians) for view in views]
             for name, views in (("train", found.getTrainCameras()), ("test", found.getTestCameras()))}  # fmt: skip
     assert seen == {"train": [True] * 4, "test": [False] * 2}
+
+
+def _track(points: np.ndarray, ranks: np.ndarray) -> Track:
+    """A track of points that lie at the pixel of their rank."""
+    places = (np.stack([ranks % SIDE, ranks // SIDE], axis=1) + 0.5) / SIDE
+    ones = np.ones(len(ranks))
+    return Track(points, np.zeros((len(ranks), 2)), places, ones, ones, ranks)
+
+
+def _camera(image: np.ndarray) -> SimpleNamespace:
+    pixels = torch.from_numpy(image.reshape(3, SIDE, SIDE))
+    return SimpleNamespace(device="cpu", target=lambda _: pixels)
+
+
+def test_exposures_are_those_of_the_photos_though_some_points_disagree():
+    rng, given = np.random.default_rng(0), np.array([-0.7, 0.2, 0.4, 0.0, 0.1])
+    albedo, cameras, tracks = rng.uniform(0.1, 0.4, (3, SIDE**2)), [], []
+    for exposure in given:
+        light = albedo * 2**exposure
+        light[:, rng.choice(SIDE**2, 40, replace=False)] = 0.9  # highlights
+        image = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+        cameras.append(_camera(image))
+        ranks = np.sort(rng.choice(SIDE**2, 300, replace=False))
+        tracks.append(_track(np.zeros((300, 3)), ranks))
+    np.testing.assert_allclose(exposures(cameras, tracks), given - given.mean(), atol=0.02)
+
+
+def test_exposures_that_drift_along_a_walk_are_found():
+    """Each point is seen in eight photos that follow each other."""
+    given, window = 0.7 * np.sin(np.linspace(0, 2 * np.pi, 120)), 8
+    albedo, cameras, tracks = np.random.default_rng(0).uniform(0.1, 0.4, SIDE**2), [], []
+    for place, exposure in enumerate(given):
+        image = 1.055 * (albedo * 2**exposure) ** (1 / 2.4) - 0.055
+        cameras.append(_camera(np.stack([image] * 3)))
+        tracks.append(_track(np.zeros((3 * window, 3)), 3 * place + np.arange(3 * window)))
+    np.testing.assert_allclose(exposures(cameras, tracks), given - given.mean(), atol=0.02)
