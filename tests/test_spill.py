@@ -32,7 +32,7 @@ from scene.gaussians import spilled
 from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
 from splatting.distributed.ranks import ranks
 from splatting.training import gpu_memory, memory_estimate, run
-from splatting.training.gpu_memory import GpuMemory, reads_on_host
+from splatting.training.gpu_memory import GpuMemory
 from splatting.training.memory_estimate import near_rows, spillable_bytes, training_bytes
 from utils.system_utils import UserError
 
@@ -145,16 +145,6 @@ def test_a_training_leaves_torch_what_it_had(monkeypatch):
         share.append(0.1)
         raise UserError("full")
     assert share == [0.4, 0.1, 0.4]
-
-
-def test_a_large_checkpoint_is_read_on_the_host(tmp_path, monkeypatch):
-    (tmp_path / "start").write_bytes(bytes(1000))
-    start, gpu = str(tmp_path / "start"), torch.device("cuda")
-    monkeypatch.setattr(gpu_memory, "free_memory", lambda device: 4001)
-    assert not reads_on_host(start, 0, gpu) and not reads_on_host(None, 0, gpu)
-    assert reads_on_host(start, 1, gpu) and not reads_on_host(start, 0, torch.device("cpu"))
-    monkeypatch.setattr(gpu_memory, "free_memory", lambda device: 3999)
-    assert reads_on_host(start, 0, gpu)
 
 
 def test_the_cpu_has_one_memory():

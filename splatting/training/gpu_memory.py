@@ -1,7 +1,6 @@
 """The limit of what a training takes of a GPU, and the SH bands above 0 that lie in the host's memory to keep it."""
 
 import math
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -18,19 +17,11 @@ from utils.system_utils import compute_device
 _USABLE = 0.95  # of a GPU's free memory, where nobody has given a limit; torch cannot fill what it holds
 _BUS = 40e9  # bytes a second that kernels read or write in the host's memory
 _SLOW = 10.0  # milliseconds a step, from which on the bus is named
-_MUCH = 0.25  # of a GPU's free memory
 _PAGE = 2 << 20  # bytes; a spilled tensor has whole pages in each memory
 _CAN_SPILL = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 11)  # csrc/torch/spilled.cpp
 _SPARE = 0.03  # of a limit, what torch cannot fill of its blocks; and at least
 _LEAST_SPARE = 1 << 27  # bytes, for the lists of the first step
 _WHOLE_STEP = 20  # bytes of a Gaussian besides the estimate, in steps for which all blocks wake
-
-
-def reads_on_host(checkpoint: str | None, limit: float, device: torch.device) -> bool:
-    """Whether a checkpoint is read into the host's memory first, as its rows may be spilled. limit: in GiB."""
-    if limit or checkpoint is None or device.type != "cuda":
-        return limit > 0
-    return os.path.getsize(checkpoint) > _MUCH * free_memory(device)
 
 
 @contextmanager

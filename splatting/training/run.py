@@ -33,7 +33,7 @@ from splatting.host.interrupt import DeferredInterrupt
 from splatting.parts import check_together, chosen, part_class, remove_traces, states_in, strategies
 from splatting.training import checks
 from splatting.training.density import density_control
-from splatting.training.gpu_memory import GpuMemory, limit_torch, reads_on_host
+from splatting.training.gpu_memory import GpuMemory, limit_torch
 from splatting.training.iteration import Iteration, OwnSize, ViewOrder
 from splatting.training.memory_estimate import announce_memory, expected_count, largest_view
 from splatting.training.objective import LossWatch, Objective
@@ -159,9 +159,8 @@ class Run:
             limit_torch(self.opt.gpu_memory * 2**30, self.device)
         if not self.start:
             return None, 0
-        # Of several processes, each keeps a part of it on its device, and of a large model only a part fits there.
-        on_host = self.group.several or reads_on_host(self.start, self.opt.gpu_memory, self.device)
-        return load_checkpoint(self.start, "cpu" if on_host else self.device, self.group.several)
+        # A large model fits on the device only once, or in part; of several processes, each keeps its part there.
+        return load_checkpoint(self.start, mapped=self.group.several)
 
     def _expect(self, count: int) -> None:
         """Let the memory be divided for a number of Gaussians, of which each rank has its part."""
