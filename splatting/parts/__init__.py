@@ -29,6 +29,7 @@ PARTS = (
     "sparse_depth",  # the order of the terms of the loss is in the bytes of the model
     "filter_3d",  # after all that moves rows
     "last_save",  # after keep_best, which may choose another model
+    "spill",  # after all that moves rows, and before sleep, which pays where rows lie on the host
     "sleep",  # after all that decides whether every step concerns all rows
 )
 

@@ -1,96 +1,73 @@
-"""The limit of what a training takes of a GPU, and the SH bands above 0 that lie in the host's memory to keep it."""
+"""How much of a GPU's memory a training takes, and which rows of the SH bands above 0 lie on the host to keep to it."""
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import torch
 from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.room import Room
 from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
-from scene.images.store import ImageStore
-from splatting.host.memory import free_memory, gib
-from splatting.training.memory_estimate import near_rows, photo_bytes, spillable_bytes, training_bytes
-from utils.system_utils import compute_device
+from scene.scene import Scene
+from splatting.host.memory import free_memory
+from splatting.parts.spill.torch_limit import CAN_SPILL, limit_torch
+from splatting.training.memory_estimate import PER_PIXEL, largest_view, photo_bytes, training_bytes
 
 _USABLE = 0.95  # of a GPU's free memory, where nobody has given a limit; torch cannot fill what it holds
-_BUS = 40e9  # bytes a second that kernels read or write in the host's memory
-_SLOW = 10.0  # milliseconds a step, from which on the bus is named
 _PAGE = 2 << 20  # bytes; a spilled tensor has whole pages in each memory
-_CAN_SPILL = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 11)  # csrc/torch/spilled.cpp
 _SPARE = 0.03  # of a limit, what torch cannot fill of its blocks; and at least
 _LEAST_SPARE = 1 << 27  # bytes, for the lists of the first step
 _WHOLE_STEP = 20  # bytes of a Gaussian besides the estimate, in steps for which all blocks wake
 
 
-@contextmanager
-def own_limit() -> Iterator[None]:
-    """Within it a training may limit torch; afterwards, torch may take what it might before."""
-    before = torch.cuda.get_per_process_memory_fraction() if compute_device().type == "cuda" else 0
-    try:
-        yield
-    finally:
-        if before:
-            torch.cuda.set_per_process_memory_fraction(before)
+def spillable_bytes(gaussians: GaussianModel, count: int) -> int:
+    """Bytes of what of `count` Gaussians may lie in the host's memory: SH bands above 0 and their two averages."""
+    return count * 4 * 3 * math.prod(gaussians._attributes["f_rest"].shape)
 
 
-def limit_torch(limit: float, device: torch.device) -> None:
-    """Leave torch so many bytes of the GPU; `free_memory` then counts no others.
+def resident_rows(limit: float, count: int, others: float, spillable: float) -> int:
+    """How many rows of what may lie in the host's memory stay on a GPU, of which `limit` bytes may be taken.
 
-    Its segments then grow and shrink, as lists that change their size would leave holes of a fifth of the limit.
+    others, spillable: bytes of all else, and of these rows.
     """
-    if _CAN_SPILL:
-        torch._C._accelerator_setAllocatorSettings("expandable_segments:True")
-    if torch.cuda.memory_reserved(device) > limit:
-        torch.cuda.empty_cache()
-    total = torch.cuda.get_device_properties(device).total_memory
-    torch.cuda.set_per_process_memory_fraction(min(max(limit / total, 0.0), 1.0))
+    return max(min(int(count * (limit - others) / spillable), count), 0) if spillable else count
 
 
-class GpuMemory:
-    """Decides how many rows of f_rest and its averages stay on the GPU; `spill` of the model, which it makes room for.
+class GpuMemory(Room):
+    """Decides how many rows of f_rest and its averages stay on the GPU.
 
     While rows change, new tensors find the GPU's memory taken by the old ones. What lacks room lies on the host until
     `settle` brings it back. limit: bytes for torch and spilled tensors together, 0: no limit, so that nothing is
-    spilled.
+    spilled. It spills nothing before `expect` knows the scene.
     """
 
-    def __init__(
-        self,
-        limit: float,
-        gaussians: GaussianModel,
-        images: ImageStore,
-        pixels: int,
-        absolute: bool,
-        device: torch.device,
-    ) -> None:
-        """Take a limit in GiB, 0 for none. pixels: of the largest view. absolute: with absolute gradients."""
+    def __init__(self, limit: float, gaussians: GaussianModel, absolute: bool, device: torch.device) -> None:
+        """Take a limit in GiB, 0 for none. absolute: with absolute gradients."""
         self.limit, self._device = int(limit * 2**30), device
         self._each = training_bytes(gaussians, 1, 0, absolute) + _WHOLE_STEP
         self._spillable = spillable_bytes(gaussians, 1)
-        self._fixed = training_bytes(gaussians, 0, pixels) + photo_bytes(images, device)
+        self._fixed = 0
         if self.limit and device.type == "cuda":  # other programs may have a part of what was given
             there = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device)
             self.limit = min(self.limit, int(_USABLE * there))
-        gaussians.spill = self.room
         self._limit_torch(0)
 
-    def expect(self, count: int) -> None:
+    def expect(self, count: int, scene: Scene) -> None:
         """Take note of a number of this process's Gaussians that will come: a limit begins where they do not fit."""
-        if self.limit or self._device.type != "cuda" or not _CAN_SPILL:
+        self._fixed = PER_PIXEL * largest_view(scene) + photo_bytes(scene.images, self._device)
+        if self.limit or self._device.type != "cuda" or not CAN_SPILL:
             return
         limit = int(_USABLE * (free_memory(self._device) + torch.cuda.memory_allocated(self._device)))
         if self._needed(count, limit) > limit:
             self.limit = limit
             self._limit_torch(0)
 
-    def room(self, like: Tensor, rows: int) -> Tensor | None:
+    def empty_rows(self, like: Tensor, rows: int) -> Tensor | None:
         """An uninitialised tensor for so many rows of f_rest; None: all may stay on the GPU."""
         if not self._spills(rows):
             self._limit_torch(0)
             return None
-        each = self._near_bytes(like, rows)
+        each = self._resident_bytes(like, rows)
         size = max(min(each, 3 * each - bytes_of()[0]), 0) if is_spilled(like) else 0
         self._limit_torch(max(3 * each, bytes_of()[0] + size))
         return empty_rows(like, rows, size)
@@ -107,14 +84,14 @@ class GpuMemory:
                 state[name] = self._settled(state[name])
 
     def _settled(self, values: Tensor) -> Tensor:
-        wanted = self._near_bytes(values, len(values))
+        wanted = self._resident_bytes(values, len(values))
         if not is_spilled(values) or bytes_of(values)[0] > wanted - _PAGE:
             return values
         return empty_rows(values, len(values), wanted).copy_(values)
 
-    def _near_bytes(self, like: Tensor, rows: int) -> int:
+    def _resident_bytes(self, like: Tensor, rows: int) -> int:
         """Bytes of so many rows of one tensor that may stay on the GPU."""
-        return self.near_rows(rows) * math.prod(like.shape[1:]) * like.element_size()
+        return self.resident_rows(rows) * math.prod(like.shape[1:]) * like.element_size()
 
     def _spills(self, count: int) -> bool:
         """Whether so many rows do not fit with all that a change of them needs."""
@@ -123,37 +100,22 @@ class GpuMemory:
     def _needed(self, count: int, limit: int) -> int:
         return self._fixed + max(int(_SPARE * limit), _LEAST_SPARE) + count * self._each
 
-    def near_rows(self, count: int) -> int:
+    def resident_rows(self, count: int) -> int:
         """How many of so many rows stay on the GPU."""
         if not self._spills(count):
             return count
         # The estimate has room for the copy of one of three tensors while rows change, which here lies on the host.
         others = self._needed(count, self.limit) - count * self._spillable * 4 / 3
-        return near_rows(self.limit, count, others, count * self._spillable)
+        return resident_rows(self.limit, count, others, count * self._spillable)
 
-    def spilled_bytes(self, count: int) -> int:
+    def host_bytes(self, count: int) -> int:
         """Bytes of so many Gaussians in the host's memory."""
-        return self._spillable * (count - self.near_rows(count)) if self._device.type == "cuda" else 0
+        return self._spillable * (count - self.resident_rows(count)) if self._device.type == "cuda" else 0
 
-    def words(self, count: int, seen: float, same: bool) -> list[str]:
-        """What to say before a training of so many Gaussians, if some of it is spilled.
-
-        seen: the part of them that a step concerns. same: whether the files do not depend on that.
-        """
-        spilled = self.spilled_bytes(count)
-        if not spilled:
-            return []
-        said = [
-            f"{gib(spilled)} of {count:,} Gaussians go to the memory of the host, as all of them need more than "
-            f"{gib(self.limit)} of the GPU; the files stay the same" + ("" if same else " up to rounding")
-        ]
-        milliseconds = 1e3 * 2 * spilled * seen / _BUS
-        if milliseconds > _SLOW:
-            said.append(
-                f"the bus to that memory will set the pace: about {milliseconds:.0f} ms a step, which concerns "
-                f"{seen:.0%} of the Gaussians"
-            )
-        return said
+    def remedy(self, count: int, lacking: float) -> str:
+        """The option, where nobody has set it and what it lets spill of so many Gaussians is what is lacking."""
+        helps = self._device.type == "cuda" and not self.limit and lacking <= count * self._spillable
+        return "set --gpu_memory, or " if helps else ""
 
     def _limit_torch(self, near: int) -> None:
         """Leave torch the limit less so many bytes, or those that spilled tensors have now."""
