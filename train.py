@@ -21,7 +21,6 @@ from splatting.distributed.consistency import agree_on_options
 from splatting.evaluation.training_log import EventWriter as SummaryWriter
 from splatting.parts import check_together, chosen
 from splatting.training import checks
-from splatting.training.gpu_memory import own_limit
 from splatting.training.launch import add_launch_options, launch_options
 from splatting.training.loop import run_training
 from splatting.training.observers.report import training_report
@@ -35,7 +34,6 @@ from utils.system_utils import UserError, mkdir_p, run_cli
 __all__ = ["main", "parse", "prepare_output_and_logger", "train", "training", "training_report"]
 
 
-@own_limit()
 def train(
     dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, launch: argparse.Namespace
 ) -> None:

@@ -163,9 +163,6 @@ class OptimizationParams(OptionTable):
         Option("optimizer_type", "default", check=one_of("default", "sparse_adam"), stored=MODEL_JSON,
             help="default: Adam on all Gaussians; sparse_adam: Adam without bias correction, only on the Gaussians "
                  "that the view sees, which is faster if views see little of the scene"),
-        Option("gpu_memory", 0.0, origin="ours", check=within(0, 1_000_000),
-            help="GiB of the GPU that training may take, 0: all. What then does not fit of the SH bands above 0 and "
-                 "their averages of Adam lies in the memory of the host: slower, with the same result"),
         Option("max_num_splats", 0, origin="ours", check=at_least(0),
             help="largest number of Gaussians, 0: no limit, 1,000,000 with mcmc, or with budget what --strategy says; "
                  "near it, adc densifies only those with the largest gradients. adc and mcmc keep a start with more, "

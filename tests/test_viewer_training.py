@@ -248,7 +248,7 @@ def test_a_training_that_the_page_stops_can_be_looked_at(colmap_scene, tmp_path,
         _train(colmap_scene, tmp_path / "out", "--no_curve")
     assert watched.seen[0].std() > 5 and watched.page.iteration.value == "33"
     assert f"saved as {tmp_path / 'out/chkpnt33.pth'}" in watched.observer._tab.state.content
-    assert load_checkpoint(str(tmp_path / "out/chkpnt33.pth"), "cpu")[1] == 33
+    assert load_checkpoint(str(tmp_path / "out/chkpnt33.pth"))[1] == 33
     assert "with --start_checkpoint" in capfd.readouterr().err
 
 

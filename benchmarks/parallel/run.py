@@ -14,8 +14,8 @@ from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.parts import part_class
+from splatting.parts.spill.announcement import sentences
 from splatting.training.density import density_control
-from splatting.training.gpu_memory import GpuMemory
 from splatting.training.iteration import ViewOrder
 from splatting.training.objective import LossWatch, Objective
 from splatting.training.run import Run
@@ -45,14 +45,17 @@ class WorkloadRun(Run):
         self.schedule = Schedule(self.opt.iterations)
         images = SimpleNamespace(ahead=0, keep_on=torch.device("cpu"), planned_bytes=0)
         self.gaussians = GaussianModel(3)
-        pixels = (workload.width // workload.crop) * (workload.height // workload.crop)
-        self.memory = GpuMemory(gpu_memory, self.gaussians, images, pixels, False, self.device)
-        self._begin(workload)
         self._cameras = cameras = workload.cameras()
         info = SimpleNamespace(point_cloud=None)
         self.scene = SimpleNamespace(
             cameras_extent=_EXTENT, images=images, prefetch=lambda _: None, model_path=".", info=info
         )
+        self.scene.getTrainCameras = lambda: cameras
+        if gpu_memory:
+            self.parts = [part_class("spill")()]
+            self.parts[0].check(self, None)
+            self.gaussians.room.expect(-(-workload.gaussians // self.group.size), self.scene)
+        self._begin(workload)
         self.views = ViewOrder(cameras, self.opt.seed)
         self.background = torch.zeros(3, device=self.device)
         self.objective = Objective(self)
@@ -63,12 +66,12 @@ class WorkloadRun(Run):
             self.sleeping = Sleeping(self.gaussians)
             keeps = part_class("sleep")()
             keeps.begin(self, None)
-            self.parts = [keeps]
+            self.parts = [*self.parts, keeps]
 
     def _begin(self, workload: Workload) -> None:
         gaussians, here = self.gaussians, self.group
         gaussians.divide(here)
-        keep = torch.device("cpu") if self.memory.limit else self.device
+        keep = torch.device("cpu") if gaussians.room.limit else self.device
         gaussians.set_rows(workload.rows(here.rank, here.size, self.device, keep))
         gaussians.active_sh_degree, gaussians.spatial_lr_scale = 3, _EXTENT
         gaussians.start_exposures(())
@@ -77,8 +80,10 @@ class WorkloadRun(Run):
 
     def begin(self) -> None:
         """Say what is spilled, and start the clocks; nothing is written."""
-        self.memory.settle(self.gaussians)
-        seen = share_seen(self.gaussians.get_xyz.detach(), self._cameras)
-        print("".join(f"{sentence}\n" for sentence in self.memory.words(len(self.gaussians), seen, True)), end="")
+        room = self.gaussians.room
+        if room.host_bytes(len(self.gaussians)):
+            room.settle(self.gaussians)
+            seen = share_seen(self.gaussians.get_xyz.detach(), self._cameras)
+            print("".join(f"{said}\n" for said in sentences(room, len(self.gaussians), seen, True)), end="")
         self.log, self.rows = SimpleNamespace(seconds_before=0.0), []
         self.losses, self.clock = LossWatch(), Stopwatch()

@@ -223,16 +223,14 @@ def _reason(temporary: Path) -> OSError:
     return OSError("no space is left, or the file is larger than allowed")
 
 
-def load_checkpoint(
-    path: str | os.PathLike, device: torch.device | str = "cpu", mapped: bool = False
-) -> tuple[tuple, int]:
-    """Read (capture, iteration), ours or the reference's. UserError for any other file.
+def load_checkpoint(path: str | os.PathLike, mapped: bool = False) -> tuple[tuple, int]:
+    """Read (capture, iteration), ours or the reference's, on the CPU. UserError for any other file.
 
-    mapped: tensors on the CPU stay in the file until somebody reads a part of them.
+    mapped: tensors stay in the file until somebody reads a part of them.
     """
     _refuse_other_kinds(path)
     try:
-        content = read_tensors(path, device, mapped=mapped)
+        content = read_tensors(path, mapped=mapped)
     except ValueError as error:
         raise UserError(f"{path} is not a checkpoint of train.py: {error}; give a chkpntN.pth") from error
     try:

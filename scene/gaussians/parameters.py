@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from scene.gaussians.attributes import Attribute, Rows, attributes
 from scene.gaussians.finite import warn_of_undrawn
 from scene.gaussians.ply import FLAT, column_names, read_ply, row_bytes, write_ply
+from scene.gaussians.room import Room
 from scene.gaussians.spilled import is_spilled, room_for, to_host
 from scene.gaussians.statistics import NAMES, Statistics
 from scene.gaussians.table import GaussianTable
@@ -47,8 +48,7 @@ class GaussianParameters:
     `_rotation` (N,4) wxyz, any length; `_opacity` (N,1) logit. world_offset: the world's coordinates of the origin
     (scene/readers/world_offset.py), kept in the PLY. Activations are attributes, which `setup_functions` sets.
     The tensors become parameters when rows are taken; an empty model has plain ones, as in the reference. shards: where
-    these rows are among those of all ranks, if several have a part of the model each. spill: makes room for so many
-    rows like those of a tensor, a part of them in the host's memory, or returns None (scene/gaussians/spilled.py).
+    these rows are among those of all ranks, if several have a part of the model each. room: where rows lie.
     pinned: tells which of means (N,3) density control leaves, of any size, (N,) bool; None: it may remove all.
     max_radii2D, xyz_gradient_accum, denom: observations since the last densification (Statistics has shapes and units).
     optimizer: any of torch's, with `name` in its groups; None until training is set up. tmp_radii: (N,) pixels of the
@@ -62,7 +62,7 @@ class GaussianParameters:
     max_sh_degree = 3
     world_offset = (0.0, 0.0, 0.0)
     shards: Shards = WHOLE
-    spill: Callable[[Tensor, int], Tensor | None] | None = None
+    room: Room = Room()
     pinned: Callable[[Tensor], Tensor] | None = None
     optimizer: torch.optim.Optimizer | None = None
     tmp_radii: Tensor | None = None

@@ -17,10 +17,10 @@ from splatting.distributed.rows import PIECE
 def room_for(model: Any, name: str | None, like: Tensor, rows: int) -> Tensor | None:
     """An uninitialised tensor for so many rows of a model's attribute; None: wherever torch puts it.
 
-    like: (..., *shape of a row) on the device that computes. The model's `spill` decides, if it has one.
+    like: (..., *shape of a row) on the device that computes. The model's `room` decides, if it has one.
     """
-    spill = getattr(model, "spill", None)
-    return spill(like, rows) if spill is not None and name == "f_rest" else None
+    room = getattr(model, "room", None)
+    return room.empty_rows(like, rows) if room is not None and name == "f_rest" else None
 
 
 def placed(model: Any, name: str | None, values: Tensor) -> Tensor:

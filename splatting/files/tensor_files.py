@@ -43,20 +43,18 @@ class _Format:
         self.code = code
 
 
-def read_tensors(
-    path: str | os.PathLike, device: torch.device | str = "cpu", *, mapped: bool = False, legacy: bool = False
-) -> Any:
-    """The content of a file: plain values, Tensors and Parameters, onto `device`.
+def read_tensors(path: str | os.PathLike, *, mapped: bool = False, legacy: bool = False) -> Any:
+    """The content of a file: plain values, Tensors and Parameters, on the CPU.
 
-    mapped: tensors on the CPU stay in the file until somebody reads a part of them. legacy: also take the format
-    before torch 1.6, onto the CPU. OSError for a file that cannot be opened, UserError for one that does not have its
-    checksums, and ValueError for anything else that torch.save has not written, or that holds other objects. No words
-    of the file are part of a message.
+    mapped: tensors stay in the file until somebody reads a part of them. legacy: also take the format before torch
+    1.6. OSError for a file that cannot be opened, UserError for one that does not have its checksums, and ValueError
+    for anything else that torch.save has not written, or that holds other objects. No words of the file are part of a
+    message.
     """
     with open(plain(path), "rb") as file:
         try:
             if file.read(len(_ZIP)) == _ZIP:
-                return _read_archive(file, torch.device(device), mapped)
+                return _read_archive(file, mapped)
             if not legacy:
                 raise ValueError("another kind of file")
             return _read_legacy(file)
@@ -68,7 +66,7 @@ def read_tensors(
             ) from error
 
 
-def _read_archive(file: BinaryIO, device: torch.device, mapped: bool) -> Any:
+def _read_archive(file: BinaryIO, mapped: bool) -> Any:
     size = os.fstat(file.fileno()).st_size
     with zipfile.ZipFile(file) as archive:
         parts = archive.infolist()
@@ -94,9 +92,9 @@ def _read_archive(file: BinaryIO, device: torch.device, mapped: bool) -> Any:
             file.seek(part.header_offset)
             start = part.header_offset + 30 + sum(struct.unpack("<26xHH", file.read(30)))  # name and padding
             if whole is not None and start % _ALIGNMENT == 0:
-                return whole[start : start + nbytes].to(device=device)
+                return whole[start : start + nbytes]
             file.seek(start)
-            return _filled(torch.UntypedStorage(nbytes), file).to(device=device)
+            return _filled(torch.UntypedStorage(nbytes), file)
 
         pickle = archive.getinfo(f"{folder}/data.pkl")
         if pickle.file_size > MOST_BYTES:

@@ -31,6 +31,7 @@ PARTS = (
     "ppisp",
     "filter_3d",  # after all that moves rows
     "last_save",  # after keep_best, which may choose another model
+    "spill",  # after all that moves rows, and before sleep, which pays where rows lie on the host
     "sleep",  # after all that decides whether every step concerns all rows
 )
 

@@ -9,7 +9,6 @@ density                    the hooks of density control; the strategies lie in s
 schedule                   the steps of the schedule that an iteration stands for
 announcer, observers/      everything that watches: checks, progress, curve, report, saves, checkpoints, viewers
 checks, memory_estimate    before: what is refused or warned of, and an estimate of the memory that a training needs
-gpu_memory                 the limit of a GPU's memory, and what lies in the host's to keep it
 launch                     options of train.py besides the three groups
 agreement, output_folder   several processes: what has to be the same on all before the start, and one output folder
 together, restart          several processes: what they share in each iteration, and where a restarted training goes on

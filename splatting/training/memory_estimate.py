@@ -2,7 +2,6 @@
 
 import math
 import sys
-from typing import Any
 
 import torch
 
@@ -21,7 +20,7 @@ PER_PIXEL = 57 + 72
 # the 106 bytes are the most part.
 PER_ABSOLUTE = 4 + 106 // 5
 GROWTH = 20  # photo scenes grow 10- to 100-fold in 7,000 iterations (docs/results/training.md), random points 2-fold
-_REMEDY = "--images_to_load, or lower --resolution (-r) or --sh_degree"
+REMEDY = "--images_to_load, or lower --resolution (-r) or --sh_degree"
 
 
 LITTLE = 0.1  # of what is free, of which nobody has to know
@@ -33,22 +32,21 @@ def expected_count(max_splats: int, now: int) -> int:
 
 
 def announce_memory(
-    scene: Scene, gaussians: GaussianModel, memory: Any, max_splats: int, absolute: bool = False, size: int = 1
+    scene: Scene, gaussians: GaussianModel, max_splats: int, absolute: bool = False, size: int = 1
 ) -> None:
     """Print the memory that photos and Gaussians need and what is free; warn, with a remedy, if they do not fit.
 
-    memory: the limit (gpu_memory.GpuMemory). max_splats: as for `expected_count`. absolute: with absolute gradients.
-    size: of processes that train together; each says what itself needs.
+    max_splats: as for `expected_count`. absolute: with absolute gradients. size: of processes that train together; each
+    says what itself needs.
     """
-    images, device = scene.images, gaussians.get_xyz.device
+    images, device, space = scene.images, gaussians.get_xyz.device, gaussians.room
     pixels = largest_view(scene)
     now = gaussians.gaussian_count
     later = expected_count(max_splats, now)
     why = "--max_num_splats" if max_splats else f"scenes often grow {GROWTH}-fold"
     per_rank = [-(-count // size) for count in (now, later)]
-    spilled = [memory.spilled_bytes(count) for count in per_rank]
     at_start, at_end = (
-        training_bytes(gaussians, count, pixels, absolute) - far for count, far in zip(per_rank, spilled, strict=True)
+        training_bytes(gaussians, count, pixels, absolute) - space.host_bytes(count) for count in per_rank
     )
     training = f"{later:,} Gaussians ({why}) {gib(at_end)}"
     each = f" for each of {size} processes" if size > 1 else ""
@@ -56,37 +54,24 @@ def announce_memory(
     photos = f"photos {gib(pictures)}"
     if images.limit:
         photos += f" (--images_to_load keeps {images.limit:,} of {images.planned:,} decoded images)"
-    if spilled[1]:
-        _announce_host(images, spilled[1], f"{later:,} Gaussians", each)
     together = _keeps(images, device)
     if not together:
-        room = _announce(images.keep_on, photos + each, pictures, pictures)
+        room = announce_device(images.keep_on, photos + each, pictures, pictures)
         if room < 0:
-            _warn(images.keep_on, "all photos", "set --images_to_load, or lower --resolution (-r)")
+            warn_of(images.keep_on, "all photos", "set --images_to_load, or lower --resolution (-r)")
         pictures = 0
     content = (f"{photos}, {training}" if together else training) + each
-    room = _announce(device, content, pictures, pictures + at_end, memory.limit)
+    room = announce_device(device, content, pictures, pictures + at_end, space.limit)
     for count, own, needed, first in (
         (now, per_rank[0], at_start, "set "),
         (later, per_rank[1], at_end, "set a lower --max_num_splats, or "),
     ):
         if room < needed:
-            helps = device.type == "cuda" and not memory.limit and needed - spillable_bytes(gaussians, own) <= room
-            spill = "set --gpu_memory, or " if helps else ""
-            _warn(device, f"{count:,} Gaussians", f"{spill}{first}{_REMEDY}")
+            warn_of(device, f"{count:,} Gaussians", f"{space.remedy(own, needed - room)}{first}{REMEDY}")
             break
 
 
-def _announce_host(images: ImageStore, needed: int, what: str, each: str) -> None:
-    """Print what is spilled into the host's memory, besides photos there; warn if it does not fit."""
-    host = torch.device("cpu")
-    pictures = images.planned_bytes if images.keep_on == host else 0
-    room = _announce(host, f"{gib(needed)} of {what}{each}", pictures, pictures + needed)
-    if room < needed:
-        _warn(host, what, f"set a lower --max_num_splats, or {_REMEDY}")
-
-
-def _announce(device: torch.device, content: str, pictures: int, needed: int, limit: int = 0) -> float:
+def announce_device(device: torch.device, content: str, pictures: int, needed: int, limit: int = 0) -> float:
     """Print what one device needs, unless it is little of what is free, or of what may be taken of a GPU.
 
     Return the bytes that are free besides the photos, infinity if that is not known.
@@ -101,7 +86,8 @@ def _announce(device: torch.device, content: str, pictures: int, needed: int, li
     return math.inf if free is None else free - pictures
 
 
-def _warn(device: torch.device, what: str, remedy: str) -> None:
+def warn_of(device: torch.device, what: str, remedy: str) -> None:
+    """Warn that a device has too little memory for something. remedy: what to set."""
     print(f"warning: the memory of the {_name(device)} seems too small for {what}; {remedy}", file=sys.stderr)
 
 
@@ -117,19 +103,6 @@ def training_bytes(gaussians: GaussianModel, count: int, pixels: int, absolute: 
     sizes = [math.prod(attribute.shape) for attribute in gaussians._attributes.values()]
     each = 4 * (3 * sum(sizes) + max(sizes))  # no step writes gradients; rows change in one tensor after the other
     return count * (each + PER_GAUSSIAN + absolute * PER_ABSOLUTE) + pixels * PER_PIXEL
-
-
-def spillable_bytes(gaussians: GaussianModel, count: int) -> int:
-    """Bytes of what of `count` Gaussians may lie in the host's memory: SH bands above 0 and their two averages."""
-    return count * 4 * 3 * math.prod(gaussians._attributes["f_rest"].shape)
-
-
-def near_rows(limit: float, count: int, others: float, spillable: float) -> int:
-    """How many rows of what may lie in the host's memory stay on a GPU, of which `limit` bytes may be taken.
-
-    others, spillable: bytes of all else, and of these rows.
-    """
-    return max(min(int(count * (limit - others) / spillable), count), 0) if spillable else count
 
 
 def photo_bytes(images: ImageStore, device: torch.device) -> int:

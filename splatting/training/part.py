@@ -7,7 +7,7 @@ reads them: the method itself lies in further modules of the folder, which hooks
 
 A run (splatting/training/run.py), in the order in which it calls the hooks:
 
-check        The options and the checkpoint are read. Refuse here what can be refused.
+check        The options and the checkpoint are read, and the model is empty. Refuse here what can be refused.
 dataset      The photos, cameras and points are found. Scenes that are made without a run call it, too, and the next.
 cameras      The cameras of a list are made.
 begin        The Gaussians exist. In a new training they have no optimiser yet, so rows may be added.
@@ -27,11 +27,12 @@ final        The last save is written: it may be of another model.
 load, scored A saved model is loaded, and its test views are to be scored or rendered, in a training or without one.
 
 What only one part can give is a slot of the run or of the model, with a neutral default that the part replaces in
-`begin`; a second one that does so is refused by `fill`:
+`begin`, or earlier; a second one that does so is refused by `fill`:
 
 model.drawn  what raw opacities and scales are drawn as, and its chain backward; model.columns keeps values per row
 model.exposures what photos make of renders, trained with the Gaussians (scene/gaussians/exposure.py)
 model.pinned which Gaussians density control leaves where they are, and as large as they are
+model.room   where rows lie: on the device, or a part of them on the host (scene/gaussians/room.py)
 run.schedule which steps of the schedule an iteration stands for
 run.sizes    the size of a view in an iteration
 run.sleeping which blocks of rows take a step (scene/sleeping.py)

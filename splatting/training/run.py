@@ -16,11 +16,9 @@ from torch import Tensor
 
 from arguments import add_to_model_json, write_cfg_args
 from gaussian_renderer.rays import check_views
-from scene import sleeping
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import extra_state, load_checkpoint, with_extra_state
 from scene.gaussians.morton import sort_rows
-from scene.sampling_rate import share_of
 from splatting.deterministic.counter_rng import Stream, uniform
 from splatting.distributed.consistency import agree_on_scene
 from splatting.distributed.ranks import ranks
@@ -29,12 +27,11 @@ from splatting.exports.in_scene import scene_with, start_from
 from splatting.exports.splats import Splats
 from splatting.host.clock import seconds_since_start
 from splatting.host.interrupt import DeferredInterrupt
-from splatting.parts import check_together, chosen, part_class, remove_traces, states_in, strategies
+from splatting.parts import check_together, chosen, part_class, remove_traces, states_in
 from splatting.training import checks
 from splatting.training.density import density_control
-from splatting.training.gpu_memory import GpuMemory, limit_torch, reads_on_host
 from splatting.training.iteration import Iteration, OwnSize, ViewOrder
-from splatting.training.memory_estimate import announce_memory, expected_count, largest_view
+from splatting.training.memory_estimate import announce_memory, expected_count
 from splatting.training.objective import LossWatch, Objective
 from splatting.training.part import Part, overrides
 from splatting.training.restart import resumed
@@ -91,20 +88,21 @@ class Run:
             opt.strategy = checks.strategy_of(self.start)
         self.lost = 0
         self.interrupt, self.device = DeferredInterrupt(), compute_device()
+        self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
         capture, self.first_iteration = self._read_start()
         self.schedule = Schedule(opt.iterations)
         states = self._choose_parts(capture)
         if self.schedule.is_over(self.first_iteration):
             raise UserError(self.schedule.nothing_left(self.start, self.first_iteration))
         self.warnings: list[str] = []
-        self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
         init_ply = None if self.start else getattr(dataset, "init_ply", None)
         self.scene, first = scene_with(init_ply, dataset, self.gaussians, ranks=self.group, parts=self.parts)
         checks.check_scene(self.scene, dataset, bool(self.start))
         agree_on_scene(self.scene, self.start)  # before an image is shared
         points = self.scene.info.point_cloud.points if first is None else first
         count = len(points if capture is None else capture[1])
-        self._share(count)
+        self.gaussians.divide(self.group)
+        self.gaussians.room.expect(-(-count // self.group.size), self.scene)
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed)
         self._decode_ahead(self.first_iteration + 1)
         self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
@@ -117,7 +115,6 @@ class Run:
             check_together(self.parts, self._all_options, self.group.several)
         self.schedule.strategy = opt.strategy
         self.density = density_control(self)
-        self._expect(self.density.most_gaussians)
         self.objective = Objective(self)
         self.density.schedule = self.schedule
         expected = expected_count(self.density.most_gaussians, self.gaussians.gaussian_count)
@@ -153,32 +150,15 @@ class Run:
         return self._hooks[hook]
 
     def _read_start(self) -> tuple[tuple | None, int]:
-        """The state of the checkpoint that is resumed, and its iteration. A limit of the GPU's memory begins before."""
-        if self.opt.gpu_memory and self.device.type == "cuda":
-            limit_torch(self.opt.gpu_memory * 2**30, self.device)
-        if not self.start:
-            return None, 0
-        # Of several processes, each keeps a part of it on its device, and of a large model only a part fits there.
-        on_host = self.group.several or reads_on_host(self.start, self.opt.gpu_memory, self.device)
-        return load_checkpoint(self.start, "cpu" if on_host else self.device, self.group.several)
-
-    def _expect(self, count: int) -> None:
-        """Let the memory be divided for a number of Gaussians, of which each rank has its part."""
-        self.memory.expect(-(-count // self.group.size))
+        """The state of the checkpoint that is resumed, on the host, and its iteration."""
+        # A large model fits on the device only once, or in part; of several processes, each keeps its part there.
+        return load_checkpoint(self.start, mapped=self.group.several) if self.start else (None, 0)
 
     def _warn(self, text: str | None) -> None:
         """Print what a check says, and keep it for the log."""
         if text is not None:
             self.warnings.append(f"warning: {text}")
             print(self.warnings[-1], file=sys.stderr)
-
-    def _share(self, count: int) -> None:
-        """Divide the empty model among the processes, and decide on the limit of the GPU's memory."""
-        self.gaussians.divide(self.group)
-        store, pixels = self.scene.images, largest_view(self.scene)
-        absolute = any(part_class(name).absolute_gradients(self.opt) for name in strategies())
-        self.memory = GpuMemory(self.opt.gpu_memory, self.gaussians, store, pixels, absolute, self.device)
-        self._expect(count)
 
     def _begin_model(self, capture: tuple | None, first: Splats | None, states: dict[str, Any]) -> None:
         """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""
@@ -237,9 +217,7 @@ class Run:
             remove_traces(folder, self.parts)
         density = self.density
         wants = density.most_gaussians, density.absolute_gradients
-        announce_memory(self.scene, self.gaussians, self.memory, *wants, self.group.size)
-        self._tell_of_spilling()
-        self.memory.settle(self.gaussians)
+        announce_memory(self.scene, self.gaussians, *wants, self.group.size)
         self.log, self.rows = checks.continue_records(folder, start, self.first_iteration)
         self.losses = LossWatch(self.log.loss)
         self.clock = Stopwatch()
@@ -328,16 +306,6 @@ class Run:
         own = all(vars(type(one)).get("fusable", False) for one in (self.objective, self.density))
         return own and not (self.pipe.compute_cov3D_python or self.pipe.convert_SHs_python)
 
-    def _tell_of_spilling(self) -> None:
-        """Say what lies in the host's memory, now or once there are as many Gaussians as there may be."""
-        count = -(-max(self.gaussians.gaussian_count, self.density.most_gaussians) // self.group.size)
-        if not self.memory.spilled_bytes(count):
-            return
-        share = share_of(self.scene, self.device)
-        dense = self.sleeping is None and self.opt.optimizer_type == "default"
-        same = self.sleeping is None or share < sleeping.MOST_SHARE  # blocks would sleep in any case
-        print("\n".join(self.memory.words(count, 1.0 if dense else share, same)))
-
     def step_on_host(self, step: Iteration, gradient: Tensor) -> None:
         """Take the step of the view's camera. gradient (numbers,): of the loss by the camera's numbers."""
         at = self.schedule.schedule_step(step.iteration)
@@ -352,7 +320,6 @@ class Run:
         if step.changes:
             for after_change in self._each("after_change"):
                 after_change(step)
-            self.memory.settle(self.gaussians)
 
     def flushed_view(self) -> AbstractContextManager:
         """Within it, others may read the model."""

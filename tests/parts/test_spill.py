@@ -31,9 +31,12 @@ from scene import sleeping
 from scene.gaussians import spilled
 from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
 from splatting.distributed.ranks import ranks
-from splatting.training import gpu_memory, memory_estimate, run
-from splatting.training.gpu_memory import GpuMemory, reads_on_host
-from splatting.training.memory_estimate import near_rows, spillable_bytes, training_bytes
+from splatting.parts import part_class
+from splatting.parts.spill import gpu_memory, torch_limit
+from splatting.parts.spill.announcement import sentences
+from splatting.parts.spill.gpu_memory import GpuMemory, resident_rows, spillable_bytes
+from splatting.training import memory_estimate, run
+from splatting.training.memory_estimate import training_bytes
 from utils.system_utils import UserError
 
 SPILL = ("--gpu_memory", 1)
@@ -48,21 +51,28 @@ KINDS["mcmc"] = "--strategy", "mcmc"
 
 @pytest.mark.parametrize("limit", [0, 10_000, 530_000, 700_000, 1_300_000, 10**9])
 def test_what_stays_near_fits_beside_all_else(limit):
-    near = near_rows(limit, 1000, 530_000, 540_000)
+    near = resident_rows(limit, 1000, 530_000, 540_000)
     assert near == (0 if limit <= 530_000 else 1000 if limit >= 1_070_000 else near)
     if 0 < near < 1000:
         assert 530_000 + 540 * near <= limit < 530_000 + 540 * (near + 1)
-    assert near_rows(limit, 1000, 530_000, 0) == 1000  # degree 0 has nothing to spill
+    assert resident_rows(limit, 1000, 530_000, 0) == 1000  # degree 0 has nothing to spill
+
+
+VIEW = SimpleNamespace(image_width=50, image_height=20)
+SCENE = SimpleNamespace(images=None, getTrainCameras=lambda: [VIEW])
 
 
 def _memory(monkeypatch: pytest.MonkeyPatch, limit: float, photos: int = 0) -> GpuMemory:
     """That of a GPU, which need not be there; 50 Gaussians are there."""
     monkeypatch.setattr(GpuMemory, "_limit_torch", lambda self, each: None)
     monkeypatch.setattr(gpu_memory, "photo_bytes", lambda images, device: photos)
+    monkeypatch.setattr(gpu_memory, "free_memory", lambda device: 2**30)
     monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 0)
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 0)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (2**31, 2**32))
-    return GpuMemory(limit, model(50), None, 1000, False, torch.device("cuda"))
+    memory = GpuMemory(limit, model(50), False, torch.device("cuda"))
+    memory.expect(50, SCENE)
+    return memory
 
 
 @needs_59_values
@@ -71,40 +81,40 @@ def test_the_share_follows_the_number_of_gaussians(monkeypatch):
     assert training_bytes(gaussians, count, 0) == count * (12 * 59 + 4 * 45 + memory_estimate.PER_GAUSSIAN)
     assert spillable_bytes(gaussians, count) == count * 12 * 45
     memory = _memory(monkeypatch, 1, photos=2**27)
-    shares = [memory.near_rows(count) / count for count in range(10**5, 4 * 10**6, 10**5)]
+    shares = [memory.resident_rows(count) / count for count in range(10**5, 4 * 10**6, 10**5)]
     assert shares[0] == 1 and shares[-1] == 0 and shares == sorted(shares, reverse=True)
     count = 1_200_000
-    near = memory.near_rows(count)
+    near = memory.resident_rows(count)
     fixed = pixels * memory_estimate.PER_PIXEL + 2**27 + gpu_memory._LEAST_SPARE
     others = count * (12 * 14 + memory_estimate.PER_GAUSSIAN + gpu_memory._WHOLE_STEP) + fixed
-    assert abs(near - near_rows(2**30, count, others, count * 540)) <= 1 and 0 < near < count
+    assert abs(near - resident_rows(2**30, count, others, count * 540)) <= 1 and 0 < near < count
     # Where the copy that a change needs does not fit, all rows may stay, but as spilled ones.
     whole = next(count for count in range(10**5, 10**7, 10**4) if memory._spills(count))
-    assert memory.near_rows(whole) == whole
+    assert memory.resident_rows(whole) == whole
     fit = [
         training_bytes(gaussians, n, 0) + n * gpu_memory._WHOLE_STEP + fixed <= 2**30 for n in (whole, whole - 10**4)
     ]
     assert fit == [False, True]
-    assert memory.spilled_bytes(count) == 540 * (count - near)
-    assert _memory(monkeypatch, 0).near_rows(10**9) == 10**9
+    assert memory.host_bytes(count) == 540 * (count - near)
+    assert _memory(monkeypatch, 0).resident_rows(10**9) == 10**9
 
 
 @needs_59_values
 def test_a_limit_begins_where_the_gpu_has_too_little(monkeypatch):
     memory = _memory(monkeypatch, 0)
-    monkeypatch.setattr(gpu_memory, "free_memory", lambda device: 2**30)
-    memory.expect(500_000)
-    assert memory.limit == 0 and memory.words(500_000, 1.0, True) == []
-    memory.expect(1_300_000)
+    memory.expect(500_000, SCENE)
+    assert memory.limit == 0 == memory.host_bytes(500_000)
+    assert memory.remedy(1000, 540_000) == "set --gpu_memory, or " and memory.remedy(1000, 540_001) == ""
+    memory.expect(1_300_000, SCENE)
     assert memory.limit == int(gpu_memory._USABLE * 2**30)
-    said = memory.words(1_300_000, 0.02, True)
+    said = sentences(memory, 1_300_000, 0.02, True)
     assert len(said) == 1 and "GiB of 1,300,000 Gaussians go to the memory of the host" in said[0]
     assert said[0].endswith("the files stay the same")
-    memory.expect(10**9)  # no other limit
-    assert memory.limit == int(gpu_memory._USABLE * 2**30)
-    there = GpuMemory(0.0, model(50), None, 1000, False, torch.device("cpu"))
-    there.expect(10**12)
-    assert there.limit == 0
+    memory.expect(10**9, SCENE)  # no other limit
+    assert memory.limit == int(gpu_memory._USABLE * 2**30) and memory.remedy(1000, 1) == ""
+    there = GpuMemory(0.0, model(50), False, torch.device("cpu"))
+    there.expect(10**12, SCENE)
+    assert there.limit == 0 and there.remedy(1000, 1) == ""
 
 
 def test_a_limit_is_at_most_what_is_free(monkeypatch):
@@ -114,8 +124,8 @@ def test_a_limit_is_at_most_what_is_free(monkeypatch):
 
 def test_a_slow_bus_is_told_of_before(monkeypatch):
     memory = _memory(monkeypatch, 1)
-    spilled = memory.spilled_bytes(2_000_000)
-    first, second = memory.words(2_000_000, 0.8, False)
+    spilled = memory.host_bytes(2_000_000)
+    first, second = sentences(memory, 2_000_000, 0.8, False)
     assert first.endswith("the files stay the same up to rounding")
     assert f"about {2e3 * 0.8 * spilled / 40e9:.0f} ms a step, which concerns 80% of" in second
 
@@ -127,9 +137,10 @@ def test_torch_gets_the_limit_without_the_near_parts(monkeypatch):
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 2**30 - 1000)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (total, total))
     monkeypatch.setattr(torch.cuda, "empty_cache", lambda: freed.append(found[-1:]))
+    monkeypatch.setattr(torch.cuda, "get_per_process_memory_fraction", lambda: 1.0)
+    monkeypatch.setattr(torch_limit, "_before", [])
     monkeypatch.setattr(gpu_memory, "bytes_of", lambda: (living, 0))
-    monkeypatch.setattr(gpu_memory, "photo_bytes", lambda images, device: 0)
-    memory = GpuMemory(1.0, model(50), None, 0, False, torch.device("cuda"))
+    memory = GpuMemory(1.0, model(50), False, torch.device("cuda"))
     memory._limit_torch(800)
     living = 1100
     memory._limit_torch(200)
@@ -137,24 +148,24 @@ def test_torch_gets_the_limit_without_the_near_parts(monkeypatch):
 
 
 def test_a_training_leaves_torch_what_it_had(monkeypatch):
-    share = [0.4]
-    monkeypatch.setattr(gpu_memory, "compute_device", lambda: torch.device("cuda"))
+    """At its end; of one that was refused before it began, when the next one begins."""
+    share, total = [0.4], 1000
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: SimpleNamespace(total_memory=total))
     monkeypatch.setattr(torch.cuda, "get_per_process_memory_fraction", lambda: share[-1])
     monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", share.append)
-    with pytest.raises(UserError), gpu_memory.own_limit():
-        share.append(0.1)
-        raise UserError("full")
-    assert share == [0.4, 0.1, 0.4]
-
-
-def test_a_large_checkpoint_is_read_on_the_host(tmp_path, monkeypatch):
-    (tmp_path / "start").write_bytes(bytes(1000))
-    start, gpu = str(tmp_path / "start"), torch.device("cuda")
-    monkeypatch.setattr(gpu_memory, "free_memory", lambda device: 4001)
-    assert not reads_on_host(start, 0, gpu) and not reads_on_host(None, 0, gpu)
-    assert reads_on_host(start, 1, gpu) and not reads_on_host(start, 0, torch.device("cpu"))
-    monkeypatch.setattr(gpu_memory, "free_memory", lambda device: 3999)
-    assert reads_on_host(start, 0, gpu)
+    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 0)
+    monkeypatch.setattr(torch_limit, "_before", [])
+    part = part_class("spill")()
+    part.ended(None)
+    assert share == [0.4]
+    for limit in (100, 200):
+        torch_limit.limit_torch(limit, torch.device("cuda"))
+    part.ended(UserError("full"))
+    assert share == [0.4, 0.1, 0.2, 0.4]
+    torch_limit.limit_torch(300, torch.device("cuda"))
+    opt = SimpleNamespace(gpu_memory=0.0, absgrad=False)
+    part.check(SimpleNamespace(gaussians=model(50), opt=opt, device=torch.device("cpu")), None)
+    assert share == [0.4, 0.1, 0.2, 0.4, 0.3, 0.4]
 
 
 def test_the_cpu_has_one_memory():
@@ -212,7 +223,7 @@ def _half_spilled(patch: pytest.MonkeyPatch) -> Iterator[list[int]]:
 
     patch.setattr(spilled.OPERATORS, "spilled", stand_in)
     patch.setattr(spilled.OPERATORS, "spilled_bytes", found)
-    patch.setattr(GpuMemory, "near_rows", lambda self, count: count // 2)
+    patch.setattr(GpuMemory, "resident_rows", lambda self, count: count // 2)
     patch.setattr(GpuMemory, "_spills", lambda self, count: self.limit > 0)
     patch.setattr(gpu_memory, "_PAGE", PAGE if torch.cuda.is_available() else 1)
     yield made
@@ -278,7 +289,7 @@ def test_blocks_sleep_wherever_they_can(scene, tmp_path, monkeypatch, options, s
 
 
 def test_it_is_told_before_what_the_host_has_to_hold(scene, tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(GpuMemory, "spilled_bytes", lambda self, count: count * 10**6)
+    monkeypatch.setattr(GpuMemory, "host_bytes", lambda self, count: count * 10**6)
     monkeypatch.setattr(memory_estimate, "free_memory", lambda device: 10**10)
     monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
     train_on(scene, tmp_path, "--iterations", 2, "--disable_viewer", "--init_pcd_path", scene / "points.ply", *SPILL)
@@ -365,14 +376,14 @@ def test_a_tight_limit_is_kept(tmp_path, monkeypatch, _):
     before_steps(monkeypatch, lambda step: shares.append(bytes_of()))
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()
-    room = GpuMemory.room
+    empty_rows = GpuMemory.empty_rows
 
     def noted(self: GpuMemory, like: torch.Tensor, rows: int) -> torch.Tensor | None:
-        made = room(self, like, rows)
+        made = empty_rows(self, like, rows)
         peaks.append(torch.cuda.memory_reserved() + bytes_of()[0])
         return made
 
-    monkeypatch.setattr(GpuMemory, "room", noted)
+    monkeypatch.setattr(GpuMemory, "empty_rows", noted)
     _trained(scene, tmp_path / "out", "--gpu_memory", 0.7)
     assert all(near > 0 and far > 0 for near, far in shares)
     assert max(peaks) <= 0.7 * 2**30 and torch.cuda.max_memory_reserved() <= 0.7 * 2**30
