@@ -8,11 +8,12 @@ dataset_readers, readers/    a folder's dataset as CameraInfos: COLMAP, Blender,
 colmap_loader                COLMAP's files as records
 images/                      image files: finding, lenses, masks, decoding, keeping
 saved_iterations, saved_model  the saves in a model folder, and loading one with its scene
+splats/, with_splats         Gaussians of any tool's file, with a scene: a start of a training (--init_ply), or shown
 export_world                 a command: a model in the world's coordinates
 
-gaussians/ and images/ import nothing else from here, readers/ only images/ and colmap_loader, and nothing here imports
-`arguments`, because other people's code may have its own package of that name. The names below are imported on first
-use, so that `import scene.gaussian_model` loads no reader of datasets.
+gaussians/ and images/ import nothing else from here, readers/ only images/ and colmap_loader, splats/ only gaussians/
+and readers/, and nothing here imports `arguments`, because other people's code may have its own package of that name.
+The names below are imported on first use, so that `import scene.gaussian_model` loads no reader of datasets.
 """
 
 from importlib import import_module

@@ -22,12 +22,12 @@ from scene.gaussians.checkpoint import extra_state, load_checkpoint, with_extra_
 from scene.gaussians.morton import sort_rows
 from scene.gaussians.ppisp import Ppisp
 from scene.sampling_rate import share_of
+from scene.splats.splats import Splats
+from scene.with_splats import scene_with, start_from
 from splatting.deterministic.counter_rng import Stream, uniform
 from splatting.distributed.consistency import agree_on_scene
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch
-from splatting.exports.in_scene import scene_with, start_from
-from splatting.exports.splats import Splats
 from splatting.host.clock import seconds_since_start
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.parts import check_together, chosen, part_class, remove_traces, states_in, strategies

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import attributes
-from splatting.exports.formats import is_point_cloud, read_splats
-from splatting.exports.ply import columns_of
-from splatting.exports.splats import Splats, base_colors, drawable, selected
+from scene.scene import Scene
+from scene.splats.ply import columns_of
+from scene.splats.reading import is_point_cloud, read_splats
+from scene.splats.splats import Splats, base_colors, drawable, selected
 from utils.general_utils import inverse_sigmoid
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
