@@ -1,7 +1,8 @@
 """Datasets and models.
 
 scene                        Scene: the views of a dataset and the Gaussians that belong to them
-cameras, half_images         Camera: a view with its matrices and photo; which half of it trains (--train_test_exp)
+view, half_images            View: matrices and photo of a view; which half of it trains (--train_test_exp)
+cameras                      the reference's names for views: Camera, a View that may be changed, and MiniCam
 gaussian_model               GaussianModel, built of the modules in gaussians/
 gaussians/                   parameters of the Gaussians: start, optimiser, density control, exposures, PLY, checkpoint
 dataset_readers, readers/    a folder's dataset as CameraInfos: COLMAP, Blender, nerfstudio; points, depth maps

@@ -36,7 +36,7 @@ MAY_IMPORT = {
     "scene.check": ("scene.readers", "scene.images", "scene.gaussians.copies"),
     "scene.gaussian_model": ("scene.gaussians", "scene.readers.info"),
     "scene.dataset_readers": ("scene.readers", "scene.images", "splatting.compat"),
-    "scene.cameras": ("scene.readers", "scene.images", "splatting.compat"),
+    "scene.cameras": ("scene.view", "splatting.compat.camera"),
     "scene.saved_model": ("scene", "splatting.parts"),
     "scene.scene": ("scene", "splatting.compat", "splatting.parts", "splatting.training.part"),
     "scene": (),  # not arguments: a client's own package of that name may be found first

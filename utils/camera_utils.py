@@ -5,10 +5,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from scene.cameras import Camera
 from scene.half_images import half
 from scene.images.sizes import training_size
 from scene.readers.info import CameraInfo, photo_size
+from splatting.compat.camera import Camera
 from splatting.compat.camera_forms import of_record
 from splatting.compat.models import call_of_either_form
 from utils.graphics_utils import camera_center, fov2focal, rigid_pose

@@ -19,7 +19,7 @@ from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, DepthMap, depth_
 from scene.readers.info import CameraInfo
 from utils.general_utils import check_flags
 
-_NOT_MOVED = np.array([0.0, 0.0, 0.0])
+NOT_MOVED = np.array([0.0, 0.0, 0.0])
 Arguments = tuple[tuple[CameraInfo, Size, int], dict[str, Any]]  # of a Camera made of a CameraInfo
 
 
@@ -44,7 +44,7 @@ def _of_2024(
     invdepthmap: np.ndarray | None,
     image_name: str,
     uid: int,
-    trans: np.ndarray = _NOT_MOVED,
+    trans: np.ndarray = NOT_MOVED,
     scale: float = 1.0,
     data_device: str = "cuda",
     train_test_exp: bool = False,
@@ -82,7 +82,7 @@ def _of_2023(
     gt_alpha_mask: Tensor | None,
     image_name: str,
     uid: int,
-    trans: np.ndarray = _NOT_MOVED,
+    trans: np.ndarray = NOT_MOVED,
     scale: float = 1.0,
     data_device: str = "cuda",
 ) -> Arguments:
