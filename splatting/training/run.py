@@ -22,6 +22,7 @@ from scene.gaussians.checkpoint import extra_state, load_checkpoint, with_extra_
 from scene.gaussians.morton import sort_rows
 from scene.gaussians.ppisp import Ppisp
 from scene.sampling_rate import share_of
+from scene.scene import Scene
 from scene.splats.splats import Splats
 from scene.with_splats import scene_with, start_from
 from splatting.deterministic.counter_rng import Stream, uniform
@@ -99,8 +100,7 @@ class Run:
             raise UserError(self.schedule.nothing_left(self.start, self.first_iteration))
         self.warnings: list[str] = []
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
-        init_ply = None if self.start else getattr(dataset, "init_ply", None)
-        self.scene, first = scene_with(init_ply, dataset, self.gaussians, ranks=self.group, parts=self.parts)
+        self.scene, first = self._read_scene()
         checks.check_scene(self.scene, dataset, bool(self.start))
         agree_on_scene(self.scene, self.start)  # before an image is shared
         points = self.scene.info.point_cloud.points if first is None else first
@@ -162,6 +162,14 @@ class Run:
         # Of several processes, each keeps a part of it on its device, and of a large model only a part fits there.
         on_host = self.group.several or reads_on_host(self.start, self.opt.gpu_memory, self.device)
         return load_checkpoint(self.start, "cpu" if on_host else self.device, self.group.several)
+
+    def _read_scene(self) -> tuple[Scene, Splats | None]:
+        """The scene of the empty model, and the splats of --init_ply in its frame, None without them."""
+        init_ply = None if self.start else getattr(self.dataset, "init_ply", None)
+        options = {"ranks": self.group, "parts": self.parts}
+        if init_ply:
+            return scene_with(init_ply, self.dataset, self.gaussians, **options)
+        return Scene(self.dataset, self.gaussians, shuffle=False, start=False, **options), None
 
     def _expect(self, count: int) -> None:
         """Let the memory be divided for a number of Gaussians, of which each rank has its part."""
