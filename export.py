@@ -28,9 +28,10 @@ from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import change_on_views
 from scene.saved_model import find_save, load_saved, read_model
 from scene.scene import Scene
-from splatting.exports.formats import FORMATS, READABLE, Format, format_of, read_splats
-from splatting.exports.in_scene import load_file, splats_of
-from splatting.exports.splats import Splats, choose, selected, tidy, used_sh_degree, with_sh_degree
+from scene.splats.reading import READABLE, read_splats
+from scene.splats.splats import Splats, choose, selected, tidy, used_sh_degree, with_sh_degree
+from scene.with_splats import load_file, splats_of
+from splatting.exports.formats import FORMATS, Format, format_of
 from splatting.files.json_files import OFFSET, read_model_json
 from splatting.parts import tools
 from utils.general_utils import safe_state

@@ -39,10 +39,10 @@ from scene.gaussian_model import GaussianModel
 from scene.point_depths import PointDepths, held_out_points
 from scene.saved_model import load_saved
 from scene.scene import Scene
+from scene.with_splats import load_file
 from splatting.camera_paths.render_path import add_path_options, path_request, render_path
 from splatting.evaluation.comparison import BESIDE
 from splatting.evaluation.renders import DEPTHS, ERRORS, INCOMPLETE, TIMES, model_digest, summarise_times
-from splatting.exports.in_scene import load_file
 from splatting.files.image_files import remove_leftovers, save_png, write_plane
 from splatting.files.json_files import write_json
 from splatting.host.progress import Bar

@@ -1,18 +1,20 @@
 """Datasets and models.
 
 scene                        Scene: the views of a dataset and the Gaussians that belong to them
-cameras                      Camera: a view with its matrices and photo
+view                         View: matrices and photo of a view
+cameras                      the reference's names for views: Camera, a View that may be changed, and MiniCam
 gaussian_model               GaussianModel, built of the modules in gaussians/
 gaussians/                   parameters of the Gaussians: start, optimiser, density control, exposures, PLY, checkpoint
 dataset_readers, readers/    a folder's dataset as CameraInfos: COLMAP, Blender, nerfstudio; points, depth maps
 colmap_loader                COLMAP's files as records
 images/                      image files: finding, lenses, masks, decoding, keeping
 saved_iterations, saved_model  the saves in a model folder, and loading one with its scene
+splats/, with_splats         Gaussians of any tool's file, with a scene: a start of a training (--init_ply), or shown
 export_world                 a command: a model in the world's coordinates
 
-gaussians/ and images/ import nothing else from here, readers/ only images/ and colmap_loader, and nothing here imports
-`arguments`, because other people's code may have its own package of that name. The names below are imported on first
-use, so that `import scene.gaussian_model` loads no reader of datasets.
+gaussians/ and images/ import nothing else from here, readers/ only images/ and colmap_loader, splats/ only gaussians/
+and readers/, and nothing here imports `arguments`, because other people's code may have its own package of that name.
+The names below are imported on first use, so that `import scene.gaussian_model` loads no reader of datasets.
 """
 
 from importlib import import_module

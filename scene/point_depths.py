@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scene.cameras import Camera
 from scene.readers.info import CameraInfo
 from scene.readers.tracks import Track, read_tracks
 from scene.scene import Scene
+from scene.view import View
 
 HELD_OUT = 8  # every so many points, by the rank of their ids, are never trained on, and score
 _NEAR = 0.01  # depth, as the camera's
@@ -54,7 +54,7 @@ def held_out_points(scene: Scene, source_path: str) -> dict[str, PointDepths]:
 
 
 def points_of(
-    camera: Camera, view: CameraInfo, track: Track, weight: float = 1.0, held_out: bool = False
+    camera: View, view: CameraInfo, track: Track, weight: float = 1.0, held_out: bool = False
 ) -> PointDepths | None:
     """What a track says of a view's depth, with weights of that sum; of points in one pixel, that of most weight.
 

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from scene.cameras import Camera
 from scene.scene import Scene
+from scene.view import View
 
 NEAREST = 0.2  # depth, below which no Gaussian is drawn
 
@@ -38,7 +38,7 @@ def _transformed(points: Tensor, matrix: Tensor) -> list[Tensor]:
     return [x * a + y * b + z * c + d for a, b, c, d in matrix.T.tolist()]
 
 
-def share_seen(points: Tensor, cameras: Sequence[Camera]) -> float:
+def share_seen(points: Tensor, cameras: Sequence[View]) -> float:
     """The share of points (N, 3) that a camera sees, on the mean of up to 32 cameras. Distortion is left out."""
     views = cameras[:: -(-len(cameras) // 32)]
     return sum(float((sampling_rate(points, view) > 0).float().mean()) for view in views) / len(views)

@@ -14,6 +14,7 @@ from synthetic import FOCAL, make_colmap_scene
 from scene.cameras import Camera, MiniCam
 from scene.dataset_readers import CameraInfo
 from scene.readers.colmap import read_colmap
+from scene.view import View
 from utils.graphics_utils import (
     focal2fov,
     fov2focal,
@@ -183,6 +184,20 @@ def test_target_with_alpha_lies_on_the_background(tmp_path):
     assert torch.equal(target[:, 1], camera.original_image[:, 1])
     np.testing.assert_allclose(camera.alpha_mask[0].numpy(), alpha[..., 0], atol=6e-8)
     assert torch.equal(camera.target(background), target)  # the stored image is not changed
+
+
+def test_a_plain_view_is_what_a_camera_is_without_changes(tmp_path):
+    Image.fromarray(np.full((60, 80, 3), 50, np.uint8)).save(tmp_path / "a.png")
+    info, black = _info(tmp_path / "a.png"), torch.zeros(3)
+    for view, camera in (
+        (View(info, (80, 60), 3), _camera(info, (80, 60))),
+        (View(info, (80, 60), 3).at_size((40, 30)), _camera(info, (80, 60)).at_size((40, 30))),
+    ):
+        np.testing.assert_array_equal(view.numbers, camera.numbers)
+        assert torch.equal(view.target(black), camera.target(black)) and view.ground_truth(black)[1] is None
+        assert isinstance(camera, View) and view.has_dataset_pictures and camera.has_dataset_pictures
+        assert (view.depth_reliable, view.target_inverse_depth) == (False, None)
+    assert not hasattr(view, "original_image") and view.undecoded == []
 
 
 def test_mini_camera_finds_its_centre():

@@ -23,12 +23,9 @@ from gaussian_renderer import render
 from gaussian_renderer.blending import blending_weights, most_important
 from gaussian_renderer.free_view import free_view, rotation_matrix
 from scene.export_world import export_world
-from splatting.exports import scene_formats
-from splatting.exports.formats import FORMATS, format_of, read_splats
-from splatting.exports.html import turned
-from splatting.exports.in_scene import model_of, splats_of
-from splatting.exports.ply import CHUNK
-from splatting.exports.splats import (
+from scene.splats.ply import CHUNK
+from scene.splats.reading import read_splats
+from scene.splats.splats import (
     Splats,
     drawable,
     half_turned,
@@ -40,6 +37,10 @@ from splatting.exports.splats import (
     with_sh_degree,
     within_box,
 )
+from scene.with_splats import model_of, splats_of
+from splatting.exports import scene_formats
+from splatting.exports.formats import FORMATS, format_of
+from splatting.exports.html import turned
 from utils.sh_utils import C0
 from utils.system_utils import UserError
 

@@ -14,7 +14,7 @@ import pytest
 from small_splats import cube, moved, splats, written
 
 from benchmarks.exports.sizes import decibels, orbit, read_back, read_by_splat_transform, renders
-from splatting.exports.splats import Splats, half_turned, with_sh_degree
+from scene.splats.splats import Splats, half_turned, with_sh_degree
 
 pytestmark = pytest.mark.slow
 FOREIGN = Path(__file__).parent / "foreign"

@@ -20,10 +20,11 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.ply import read_ply
 from scene.readers.point_cloud import read_point_cloud
 from scene.saved_model import find_save, load_saved, read_model
+from scene.splats.reading import is_point_cloud, read_splats
+from scene.splats.splats import Splats, selected
+from scene.with_splats import model_of, splats_of
 from splatting.camera_paths.keyframes import CameraPath, Keyframe
-from splatting.exports.formats import format_of, is_point_cloud, read_splats
-from splatting.exports.in_scene import model_of, splats_of
-from splatting.exports.splats import Splats, selected
+from splatting.exports.formats import format_of
 from utils.system_utils import UserError
 
 

@@ -14,8 +14,8 @@ from scene.gaussians.attributes import attributes
 from scene.gaussians.checkpoint import save_checkpoint
 from scene.readers.point_cloud import read_point_cloud
 from scene.saved_model import read_model
-from splatting.exports.formats import is_point_cloud, read_splats
-from splatting.exports.splats import drawable
+from scene.splats.reading import is_point_cloud, read_splats
+from scene.splats.splats import drawable
 from utils.system_utils import UserError
 
 ORDER = (

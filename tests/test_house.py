@@ -35,10 +35,11 @@ MAY_IMPORT = {
     "scene.colmap_loader": (),
     "scene.readers": ("scene.images", "scene.colmap_loader"),
     "scene.gaussians": (),
+    "scene.splats": ("scene.gaussians", "scene.readers.world_offset"),
     "scene.check": ("scene.readers", "scene.images", "scene.gaussians.copies"),
     "scene.gaussian_model": ("scene.gaussians", "scene.readers.info"),
     "scene.dataset_readers": ("scene.readers", "scene.images", "splatting.compat"),
-    "scene.cameras": ("scene.readers", "scene.images", "splatting.compat"),
+    "scene.cameras": ("scene.view", "splatting.compat.camera"),
     "scene.saved_model": ("scene", "splatting.parts"),
     "scene.scene": ("scene", "splatting.compat", "splatting.parts", "splatting.training.part"),
     "scene": (),  # not arguments: a client's own package of that name may be found first
@@ -50,10 +51,10 @@ MAY_IMPORT = {
     "splatting.exports": ("splatting.camera_paths", "scene"),
     "splatting.evaluation": ("arguments", "scene.saved_iterations", "scene.readers.info", "splatting.parts"),
     "splatting.training": (
-        *("splatting.evaluation", "splatting.exports", "splatting.parts", "splatting.viewer.server"),
+        *("splatting.evaluation", "splatting.parts", "splatting.viewer.server"),
         *("arguments", "gaussian_renderer", "scene"),
     ),
-    "splatting.viewer": ("splatting.camera_paths", "splatting.exports", "gaussian_renderer", "scene"),
+    "splatting.viewer": ("splatting.camera_paths", "gaussian_renderer", "scene"),
     "splatting.diagnosis": (
         *("arguments", "gaussian_renderer", "splatting.evaluation", "scene"),
         "splatting.parts",
@@ -149,6 +150,18 @@ def test_no_modules_import_each_other():
         for module in free:
             del graph[module]
     assert not graph, "these import each other, or import such modules"
+
+
+def test_a_training_imports_nothing_that_uses_models_alone():
+    """Exports, viewers and their like use the core. The exceptions serve --viewer, and name its options."""
+    users = [f"splatting.{name}" for name in ("exports", "camera_paths", "sfm", "viewer", "diagnosis")]
+    core = [
+        *("scene", "gaussian_renderer", "arguments", "utils"),
+        *(f"splatting.{name}" for name in ("training", "parts", "distributed", "compat")),
+    ]
+    modules = [path for path in _python() if any(_within(_module(path), room) for room in core)]
+    found = {_module(path) for path in modules for name in _imports(path) if any(_within(name, user) for user in users)}
+    assert found == {"splatting.training.launch", "splatting.training.observers.viewers"}
 
 
 def test_extensions_import_nothing_of_the_project():

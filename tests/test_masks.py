@@ -292,7 +292,7 @@ def test_a_transparent_mask_is_alpha(masked_scene):
     assert torch.equal(view.target(torch.ones(3))[:, :, 32:], (plain / 255)[:, :, 32:])
     # Also at half the size: masked pixels do not bleed into the edge.
     half = _views(masked_scene, masks="masks", mask_meaning="transparent", resolution=48)[0]
-    edge = half._pixels()[:, :, 16].int()
+    edge = (255 * torch.cat([half.original_image, half.alpha_mask])[:, :, 16]).round().int()
     assert (edge[3] > 200).all() and (edge[:3] - smooth[:, :, 16].int()).abs().float().mean() < 4
 
 

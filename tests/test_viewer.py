@@ -18,8 +18,8 @@ from gaussian_renderer.blending import blend_depth
 from gaussian_renderer.free_view import free_view
 from scene import Scene
 from scene.gaussian_model import GaussianModel
+from scene.splats.reading import read_splats
 from splatting.camera_paths.keyframes import read_camera_path
-from splatting.exports.formats import read_splats
 from splatting.viewer import frusta, legend, path_tab, views
 from splatting.viewer.frames import LONGEST, Frame, Frames, inside, shown_part
 from splatting.viewer.page import used_degree, write_crop

@@ -2,13 +2,19 @@
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from scene.cameras import Camera
+from scene.images.decode import picture_size, pixels_of
+from scene.images.masks import TRANSPARENT, Mask, add_alpha
 from scene.images.sizes import training_size
+from scene.images.store import InMemory, Size
+from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, DepthMap, depth_fit
 from scene.readers.info import CameraInfo, photo_size
-from splatting.compat.camera_forms import of_record
+from splatting.compat.camera import Camera
 from splatting.compat.models import call_of_either_form
 from utils.graphics_utils import camera_center, fov2focal, rigid_pose
 from utils.image_utils import half
@@ -33,7 +39,33 @@ def loadCam(
     size = training_size(*photo_size(cam_info), args.resolution, resolution_scale)
     halved = getattr(args, "train_test_exp", False) and getattr(cam_info, "is_test", False)
     columns = half(size[0], is_test_dataset) if halved else None
-    return Camera(of_record(cam_info, size, is_nerf_synthetic), size, id, columns, data_device=args.data_device)
+    return Camera(_of_record(cam_info, size, is_nerf_synthetic), size, id, columns, data_device=args.data_device)
+
+
+def _of_record(record: Any, size: Size, is_nerf_synthetic: bool) -> CameraInfo:
+    """CameraInfo of any record with the reference's fields, whose photo and depth map are ready for training at a size.
+
+    A PIL image that it holds is resized. A file that `depth_path` names is a depth map with Blender's unit if the scene
+    is_nerf_synthetic, else with COLMAP's. UserError if that file is missing.
+    """
+    if type(record) is not CameraInfo:
+        names = {field.name for field in fields(CameraInfo)} - {"fx", "fy", "lens"}
+        values = {name: getattr(record, name) for name in names if hasattr(record, name)}
+        values |= {name: float(values[name]) for name in ("cx", "cy") if values.get(name) is not None}
+        if not isinstance(values.get("mask"), Mask):
+            values["mask"] = None  # an attribute of other code by that name
+        record = CameraInfo(**values)
+    if record.image is not None:
+        pixels, mask = pixels_of(record.image, size), record.mask
+        if mask and mask.meaning == TRANSPARENT:
+            pixels, mask = add_alpha(pixels, mask.decode(size)), None
+        record = replace(record, image=InMemory(pixels), mask=mask)
+    if record.depth_path and record.depth is None:
+        path, fit = Path(record.depth_path), depth_fit(record.depth_params)
+        picture_size(path)  # so that a missing file is named now
+        unit = BLENDER_UNIT if is_nerf_synthetic else COLMAP_UNIT
+        record = replace(record, depth=DepthMap(path, unit, fit.scale, fit.offset))
+    return record
 
 
 def cameraList_from_camInfos(

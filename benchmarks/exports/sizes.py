@@ -24,12 +24,13 @@ from benchmarks.harness.measuring import describe, print_table
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
+from scene.splats.reading import read_splats
+from scene.splats.splats import Splats, drawable, logits, selected
+from scene.with_splats import model_of
 from splatting.camera_paths.poses import facing, keyframe
-from splatting.exports.formats import FORMATS, read_splats
-from splatting.exports.in_scene import model_of
+from splatting.exports.formats import FORMATS
 from splatting.exports.scene_formats import PRIM
-from splatting.exports.splats import Splats, drawable, logits, selected
-from splatting.exports.web import PROGRAM
+from splatting.exports.sog import PROGRAM
 from utils.system_utils import UserError, compute_device, run_cli
 
 

@@ -103,7 +103,10 @@ class ImageStore:
         """
         training = dict.fromkeys(_key(source, size) for source, size in training)
         keys = dict.fromkeys([*training, *(_key(source, size) for source, size in others)])
-        self._planned, self._shared = divided({key: _bytes(*key) for key in keys}, self._own, self.device, self.ranks)
+        self._planned = set(keys)
+        if self.ranks.several:
+            sizes = {key: _bytes(*key) for key in keys}
+            self._planned, self._shared = divided(sizes, self._own, self.device, self.ranks)
         self._awaited = self._planned & training.keys()
         if self.limit >= len(self._planned):
             self.limit = 0

@@ -81,9 +81,9 @@ def finished(cameras: Sequence[CameraInfo], opaque: bool = False) -> list[Camera
     for camera in cameras:
         if camera.mask is not None:
             _check_mask(camera.mask.path, camera.file_size)
-    distorted = [index for index, camera in enumerate(cameras) if camera.lens]
-    for index, camera in zip(distorted, undistort([cameras[index] for index in distorted]), strict=True):
-        cameras[index] = camera
+    if distorted := [index for index, camera in enumerate(cameras) if camera.lens]:
+        for index, camera in zip(distorted, undistort([cameras[index] for index in distorted]), strict=True):
+            cameras[index] = camera
     return cameras
 
 

@@ -40,8 +40,6 @@ def undistort(photos: Sequence[CameraInfo]) -> list[CameraInfo]:
     Bilinear, as in COLMAP. Alpha is undistorted, too, and weights the colours. UserError for a broken photo or a cache
     that cannot be written.
     """
-    if not photos:
-        return []
     folder = cache_folder() / "undistorted"
     try:
         mkdir_p(folder)

@@ -14,13 +14,11 @@ from utils.system_utils import UserError
 def divided(
     sizes: Mapping[Hashable, int], own: Callable[[Hashable], Tensor], device: torch.device, ranks: Ranks
 ) -> tuple[set[Hashable], dict[Hashable, "SharedImage"]]:
-    """Of images, given with their bytes, those that this rank decodes, and all as shared ones; by itself it has none.
+    """Of images, given with their bytes, those that this rank decodes, and all as shared ones.
 
     own: the image of a key, on `device`. A shared image has the attributes of InMemory; all ranks read its pixels
     together.
     """
-    if not ranks.several:
-        return set(sizes), {}
     chosen = dict(zip(sizes, holders(sizes.values(), ranks.size), strict=True))
     shared = {key: SharedImage(ranks, chosen[key], partial(own, key), device) for key in sizes}
     return {key for key in sizes if chosen[key] == ranks.rank}, shared

@@ -1,23 +1,16 @@
-"""The formats of files: those that export.py writes, by the ending of a name, and those that are read, by content."""
+"""The formats of files that export.py writes, by the ending of a name."""
 
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from splatting.exports.ply import read_compressed_ply, read_plain_ply, write_compressed_ply, write_plain_ply
+from scene.splats.dot_splat import write_splat
+from scene.splats.ply import write_compressed_ply, write_plain_ply
+from scene.splats.spz import find_zstandard, write_spz
 from splatting.exports.scene_formats import find_pxr, write_glb, write_usdz
-from splatting.exports.splats import Splats, tidy
-from splatting.exports.spz import find_zstandard, read_spz, write_spz
-from splatting.exports.web import find_program, read_splat, write_sog, write_splat
-from splatting.files.ply_header import header_lines
+from splatting.exports.sog import find_program, write_sog
 from utils.system_utils import UserError
-
-READABLE = "PLY, compressed PLY, SPZ or .splat"
-_SPZ = (b"NGSP", b"\x1f\x8b")  # how its files begin
 
 
 @dataclass(frozen=True)
@@ -64,42 +57,3 @@ def format_of(path: str | os.PathLike) -> Format:
             return entry
     endings = ", ".join(entry.ending for entry in FORMATS)
     raise UserError(f"the format of {path} is unknown; end its name with one of {endings}")
-
-
-def is_point_cloud(path: str | os.PathLike) -> bool:
-    """Whether a file has points instead of splats: a PLY without their properties, or a file of another kind."""
-    if not os.path.isfile(path) or Path(path).suffix.lower() in (".splat", ".spz"):
-        return False
-    names = _properties(path)
-    if names is None:
-        with open(path, "rb") as file:
-            return not file.read(4).startswith(_SPZ)
-    return not names & {"f_dc_0", "opacity", "scale_0", "rot_0", "packed_position"}
-
-
-def _properties(path: str | os.PathLike) -> set[str] | None:
-    """The names of a PLY's properties, without CloudCompare's prefix; None for another file."""
-    lines = [line.split() for line in header_lines(path)]
-    names = (words[-1] for words in lines if words[:1] == ["property"])
-    return {name.removeprefix("scalar_") for name in names} if lines else None
-
-
-@np.errstate(over="ignore", invalid="ignore")  # what float32 cannot hold becomes Inf or NaN, which is not drawn
-def read_splats(path: str | os.PathLike) -> Splats:
-    """The Gaussians of a file. UserError if it is missing, damaged, or of another format."""
-    if not os.path.isfile(path):
-        raise UserError(f"no file {path}; give a model as {READABLE}")
-    try:
-        with open(path, "rb") as file:
-            begin = file.read(4)
-    except OSError as error:
-        raise UserError(f"cannot read {path} ({error.strerror}); fix its permissions") from error
-    if (properties := _properties(path)) is not None:
-        read = read_compressed_ply if "packed_position" in properties else read_plain_ply
-    elif begin.startswith(_SPZ):
-        read = read_spz
-    elif Path(path).suffix.lower() == ".splat":  # it has no sign of its own
-        read = read_splat
-    else:
-        raise UserError(f"{path} is no model that this program reads; give {READABLE}")
-    return tidy(read(path))

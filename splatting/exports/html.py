@@ -20,10 +20,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from scene.cameras import Camera
+from scene.splats.ply import packed_ply
+from scene.splats.splats import Splats
 from splatting.camera_paths.keyframes import TimedPath
 from splatting.camera_paths.poses import Poses, focus_point, poses_of
-from splatting.exports.ply import packed_ply
-from splatting.exports.splats import Splats
 from splatting.exports.vendor import FOLDER, RECORD, VIEWER
 from splatting.files.json_files import read_json
 from utils.sh_utils import sh_basis

@@ -17,8 +17,8 @@ from types import ModuleType
 
 import numpy as np
 
-from splatting.exports.packing import rgba_bytes
-from splatting.exports.splats import Splats, opacities
+from scene.splats.packing import rgba_bytes
+from scene.splats.splats import Splats, opacities
 from utils.system_utils import UserError, atomic_write, temporary_folder
 
 EXTENSION = "KHR_gaussian_splatting"

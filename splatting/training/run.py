@@ -19,12 +19,13 @@ from gaussian_renderer.rays import check_views
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import extra_state, load_checkpoint, with_extra_state
 from scene.gaussians.morton import sort_rows
+from scene.scene import Scene
+from scene.splats.splats import Splats
+from scene.with_splats import scene_with, start_from
 from splatting.deterministic.counter_rng import Stream, uniform
 from splatting.distributed.consistency import agree_on_scene
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch
-from splatting.exports.in_scene import scene_with, start_from
-from splatting.exports.splats import Splats
 from splatting.host.clock import seconds_since_start
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.parts import check_together, chosen, part_class, remove_traces, states_in
@@ -95,8 +96,7 @@ class Run:
         if self.schedule.is_over(self.first_iteration):
             raise UserError(self.schedule.nothing_left(self.start, self.first_iteration))
         self.warnings: list[str] = []
-        init_ply = None if self.start else getattr(dataset, "init_ply", None)
-        self.scene, first = scene_with(init_ply, dataset, self.gaussians, ranks=self.group, parts=self.parts)
+        self.scene, first = self._read_scene()
         checks.check_scene(self.scene, dataset, bool(self.start))
         agree_on_scene(self.scene, self.start)  # before an image is shared
         points = self.scene.info.point_cloud.points if first is None else first
@@ -153,6 +153,14 @@ class Run:
         """The state of the checkpoint that is resumed, on the host, and its iteration."""
         # A large model fits on the device only once, or in part; of several processes, each keeps its part there.
         return load_checkpoint(self.start, mapped=self.group.several) if self.start else (None, 0)
+
+    def _read_scene(self) -> tuple[Scene, Splats | None]:
+        """The scene of the empty model, and the splats of --init_ply in its frame, None without them."""
+        init_ply = None if self.start else getattr(self.dataset, "init_ply", None)
+        options = {"ranks": self.group, "parts": self.parts}
+        if init_ply:
+            return scene_with(init_ply, self.dataset, self.gaussians, **options)
+        return Scene(self.dataset, self.gaussians, shuffle=False, start=False, **options), None
 
     def _warn(self, text: str | None) -> None:
         """Print what a check says, and keep it for the log."""

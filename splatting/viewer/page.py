@@ -12,9 +12,9 @@ from tqdm import tqdm
 
 from scene.gaussian_model import GaussianModel
 from scene.scene import Scene
-from splatting.exports.in_scene import splats_of
-from splatting.exports.ply import write_plain_ply
-from splatting.exports.splats import drawable, selected, tidy
+from scene.splats.ply import write_plain_ply
+from scene.splats.splats import drawable, selected, tidy
+from scene.with_splats import splats_of
 from splatting.files.listing import as_utf8
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.host.start import typed_command

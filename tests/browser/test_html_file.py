@@ -14,10 +14,10 @@ from html_scene import SIZE, balls, cameras
 from PIL import Image
 
 from gaussian_renderer import render
+from scene.with_splats import model_of
 from splatting.camera_paths.generated import Ellipse
 from splatting.camera_paths.poses import poses_of
 from splatting.exports.html import write_html
-from splatting.exports.in_scene import model_of
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

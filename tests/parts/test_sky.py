@@ -18,11 +18,11 @@ from benchmarks.scenes.made import with_sky
 from scene.gaussian_model import GaussianModel
 from scene.readers.tracks import projected
 from scene.scene import Scene
+from scene.splats.reading import read_splats
 from splatting.demo.make_scene import Things, write_scene
 from splatting.demo.objects import Box, Thing, demo_scene
 from splatting.demo.tracer import ring_views, shade, trace
 from splatting.diagnosis.model import check_model
-from splatting.exports.formats import read_splats
 from splatting.files.json_files import read_model_json
 from splatting.parts.sky.directions import FEWEST
 from splatting.parts.sky.shell import Shell, find_sky

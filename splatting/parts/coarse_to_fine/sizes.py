@@ -2,8 +2,8 @@
 
 import torch
 
-from scene.cameras import Camera
 from scene.images.store import GPU_SHARE, ImageStore
+from scene.view import View
 from splatting.host.memory import free_memory
 from splatting.training.schedule import Schedule
 
@@ -23,18 +23,18 @@ class Sizes:
         self.factor = 1.0
         self._schedule = schedule
         self._images = images
-        self._made: dict[Camera, Camera] = {}
+        self._made: dict[View, View] = {}
         self._keeps = True
 
     def factor_at(self, schedule_step: int) -> float:
         """The factor at an iteration of the schedule."""
         return self._schedule.factor_at(schedule_step)
 
-    def smallest(self, camera: Camera) -> tuple[int, int]:
+    def smallest(self, camera: View) -> tuple[int, int]:
         """The smallest size (width, height) in which a view may train."""
         return smaller(camera, max((factor for _, factor in self._schedule.possible_levels), default=1.0))
 
-    def view(self, camera: Camera, schedule_step: int) -> Camera:
+    def view(self, camera: View, schedule_step: int) -> View:
         """A view as it is trained at an iteration of the schedule. Ask in ascending order."""
         factor = self.factor_at(schedule_step)
         if factor != self.factor:
@@ -48,12 +48,12 @@ class Sizes:
                 self._made[camera] = found
         return found
 
-    def needs(self, camera: Camera) -> bool:
+    def needs(self, camera: View) -> bool:
         """Whether the pictures of a view will be needed in their own size."""
         return camera not in self._made
 
-    def _shrinks(self, camera: Camera) -> bool:
-        if self.factor == 1 or not isinstance(camera, Camera) or not camera.has_dataset_pictures:
+    def _shrinks(self, camera: View) -> bool:
+        if self.factor == 1 or not isinstance(camera, View) or not camera.has_dataset_pictures:
             return False
         return smaller(camera, self.factor) != (camera.image_width, camera.image_height)
 
@@ -66,7 +66,7 @@ class Sizes:
         self._keeps = not self._images.ranks.anyone(self._images.limit > 0 or not room)
 
 
-def smaller(camera: Camera, factor: float) -> tuple[int, int]:
+def smaller(camera: View, factor: float) -> tuple[int, int]:
     """Size (width, height) of a view whose sides are divided by a factor, or by less if it is small."""
     sides = camera.image_width, camera.image_height
     factor = max(1.0, min(factor, min(sides) / LEAST))

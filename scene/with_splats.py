@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import attributes
-from splatting.exports.formats import is_point_cloud, read_splats
-from splatting.exports.ply import columns_of
-from splatting.exports.splats import Splats, base_colors, drawable, selected
+from scene.scene import Scene
+from scene.splats.ply import columns_of
+from scene.splats.reading import is_point_cloud, read_splats
+from scene.splats.splats import Splats, base_colors, drawable, selected
 from utils.general_utils import inverse_sigmoid
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
@@ -65,17 +65,17 @@ def fill_model(gaussians: GaussianModel, splats: Splats) -> None:
 
 
 def scene_with(
-    path: str | None, options: argparse.Namespace, gaussians: GaussianModel, **of_scene: Any
+    path: str, options: argparse.Namespace, gaussians: GaussianModel, **of_scene: Any
 ) -> tuple[Scene, Splats | None]:
     """A scene whose points are a file's, and the file's splats in the scene's frame; None for a point cloud.
 
-    The model stays empty. path: None or empty: the points are the dataset's own. options: the model options. Positions
-    in the file are those of the world, unless our comment world_offset tells their origin. of_scene: further
-    arguments of Scene. UserError for a file without splats that are drawn, and as from Scene.
+    The model stays empty. options: the model options. Positions in the file are those of the world, unless our comment
+    world_offset tells their origin. of_scene: further arguments of Scene. UserError for a file without splats that are
+    drawn, and as from Scene.
     """
     options = copy.copy(options)
-    if not path or is_point_cloud(path):
-        options.init_pcd_path = path or getattr(options, "init_pcd_path", "")
+    if is_point_cloud(path):
+        options.init_pcd_path = path
         return Scene(options, gaussians, shuffle=False, start=False, **of_scene), None
     splats = read_splats(path)
     splats = selected(splats, drawable(splats))

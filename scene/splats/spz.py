@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from splatting.exports.packing import morton_order, smallest_three, spread, to_bytes, whole_quaternions
-from splatting.exports.splats import Splats, half_turned, logits, opacities, selected
+from scene.splats.packing import morton_order, smallest_three, spread, to_bytes, whole_quaternions
+from scene.splats.splats import Splats, half_turned, logits, opacities, selected
 from splatting.files.plain_files import check_packed_rows
 from utils.system_utils import UserError, atomic_write
 

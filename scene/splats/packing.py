@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from scene.gaussians.morton import morton_codes
-from splatting.exports.splats import Splats, base_colors, opacities
+from scene.splats.splats import Splats, base_colors, opacities
 
 
 def pack(parts: np.ndarray, *bits: int) -> np.ndarray:

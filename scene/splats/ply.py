@@ -24,8 +24,8 @@ from torch import Tensor
 
 from scene.gaussians.ply import offset_comments, read_ply, read_vertices, write_ply
 from scene.readers.world_offset import origin_near
-from splatting.exports.packing import morton_order, pack, smallest_three, spread, unpack, whole_quaternions
-from splatting.exports.splats import Splats, base_colors, logits, opacities, selected
+from scene.splats.packing import morton_order, pack, smallest_three, spread, unpack, whole_quaternions
+from scene.splats.splats import Splats, base_colors, logits, opacities, selected
 from splatting.files.json_files import LARGEST_OFFSET
 from splatting.files.ply_header import header_lines, read_elements
 from utils.sh_utils import C0
