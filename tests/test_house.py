@@ -27,6 +27,7 @@ MAY_IMPORT = {
     "splatting.training.option": (),
     "splatting.training.part": ("splatting.training", "scene.readers.info"),
     "splatting.parts": ("arguments", "splatting.training", "splatting.evaluation", "gaussian_renderer", "scene"),
+    "splatting.parts.viewer": ("splatting.training", "splatting.evaluation", "splatting.viewer", "scene"),
     "lpipsPyTorch": (),  # a name of the reference
     "scene.images": (),
     "scene.colmap_loader": (),
@@ -47,10 +48,13 @@ MAY_IMPORT = {
     "splatting.exports": ("splatting.camera_paths", "scene"),
     "splatting.evaluation": ("arguments", "scene.saved_iterations", "scene.readers.info", "splatting.parts"),
     "splatting.training": (
-        *("splatting.evaluation", "splatting.exports", "splatting.parts", "splatting.viewer.server"),
+        *("splatting.evaluation", "splatting.exports", "splatting.parts"),
         *("arguments", "gaussian_renderer", "scene"),
     ),
-    "splatting.viewer": ("splatting.camera_paths", "splatting.exports", "gaussian_renderer", "scene"),
+    "splatting.viewer": (
+        *("splatting.camera_paths", "splatting.exports", "splatting.training.option"),
+        *("gaussian_renderer", "scene"),
+    ),
     "splatting.diagnosis": (
         *("arguments", "gaussian_renderer", "splatting.evaluation", "scene"),
         "splatting.parts",
@@ -62,10 +66,6 @@ MAY_IMPORT = {
     "benchmarks.workloads": ("scene.gaussians.morton",),
     "benchmarks.harness": ("benchmarks.workloads",),
 }
-MAY_IMPORT["splatting.training.observers"] = (
-    *("splatting.training", "splatting.viewer"),
-    *MAY_IMPORT["splatting.training"],
-)
 MEASURED = ("train", "render", "metrics", *(room for room in ROOMS if room != "benchmarks"))
 for room in ("kernels", "accuracy", "scenes", "exports", "parallel", "peers"):
     MAY_IMPORT[f"benchmarks.{room}"] = ("benchmarks.harness", "benchmarks.workloads", *MEASURED)

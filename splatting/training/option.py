@@ -23,6 +23,7 @@ class Option:
     is not the stored one.
     seen: whether renders of a model differ with its value, if no name of them tells it.
     loaded: what a command that loads a model takes if the option is not given; empty: the stored value.
+    called: the default where a program calls `train.training`, if it is another one there.
     """
 
     name: str
@@ -34,6 +35,7 @@ class Option:
     stored: str = ""
     compared: bool = True
     loaded: str = ""
+    called: Value | None = None
     seen: bool = True
 
     @property
