@@ -16,10 +16,8 @@ import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
 
 from arguments import ModelParams, OptimizationParams, OptionParser, PipelineParams, write_cfg_args, write_model_json
-from gaussian_renderer import network_gui
 from splatting.distributed.consistency import agree_on_options
-from splatting.evaluation.training_log import EventWriter as SummaryWriter
-from splatting.parts import check_together, chosen
+from splatting.parts import check_together, chosen, tools
 from splatting.training import checks
 from splatting.training.launch import add_launch_options, launch_options
 from splatting.training.loop import run_training
@@ -27,7 +25,6 @@ from splatting.training.observers.report import training_report
 from splatting.training.observers.standard import standard_observers
 from splatting.training.output_folder import folder_of, new_folder, own_folder, records_kept
 from splatting.training.run import Run
-from splatting.viewer.server import checked_address
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, mkdir_p, run_cli
 
@@ -47,13 +44,12 @@ def train(
         print(f"Optimizing {dataset.model_path}")
     else:
         print(f"Resuming {dataset.model_path} at iteration {run.first_iteration}")
-    # No process of several can draw a view for the remote viewer by itself.
-    address = None if launch.disable_viewer or run.group.several else (launch.ip, launch.port)
     # Write nothing before every input check has passed: a mistyped option must not overwrite a finished model.
-    with own_folder(folder := dataset.model_path), records_kept(folder), network_gui.listening(address):
-        writer = prepare_output_and_logger(run.options, **run.entries) if run.group.first else None
+    with own_folder(folder := dataset.model_path), records_kept(folder), run.resources:
+        run.writer = prepare_output_and_logger(run.options, **run.entries) if run.group.first else None
+        run.report = training_report
         run.begin()
-        run_training(run, standard_observers(run, writer, training_report))
+        run_training(run, standard_observers(run))
 
 
 def training(
@@ -69,10 +65,10 @@ def training(
 ) -> None:
     """`train`, with the parameters of the reference's function of this name.
 
-    launch: other options of training/launch.py. Without any, a remote viewer is served only if network_gui listens.
+    launch: other options of the launch. Without any, a remote viewer is served only if network_gui listens.
     """
     named = {"test_iterations": testing_iterations, "save_iterations": saving_iterations, "debug_from": debug_from}
-    named |= {"checkpoint_iterations": checkpoint_iterations, "start_checkpoint": checkpoint, "disable_viewer": True}
+    named |= {"checkpoint_iterations": checkpoint_iterations, "start_checkpoint": checkpoint}
     train(dataset, opt, pipe, launch_options(**named | launch))
 
 
@@ -86,10 +82,7 @@ def prepare_output_and_logger(args: argparse.Namespace, **entries: Any) -> Any |
     mkdir_p(args.model_path)
     write_cfg_args(args.model_path, args)
     write_model_json(args.model_path, args, **entries)
-    try:
-        return SummaryWriter(args.model_path)
-    except ImportError:
-        return None  # doctor.py says so
+    return next((writer(args.model_path) for writer in tools("summary_writer")), None)
 
 
 def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, ...]:
@@ -123,7 +116,6 @@ def main(argv: Sequence[str] | None = None) -> None:
     safe_state(args.quiet, opt.seed)
     agree_on_options(args)
     torch.autograd.set_detect_anomaly(args.detect_anomaly)
-    checked_address(args.viewer_host, args.viewer)
     args.save_iterations = [*args.save_iterations, opt.iterations]
     train(dataset, opt, pipe, args)
     print("Training complete.")

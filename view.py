@@ -13,7 +13,7 @@ import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
 from scene.saved_model import load_saved
 from splatting.viewer.page import Page, serve
-from splatting.viewer.server import PORT, add_host_option, checked_address
+from splatting.viewer.server import HOST_OPTION, PORT, checked_address
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, run_cli
 
@@ -24,7 +24,7 @@ def main() -> None:
     pipeline_params = PipelineParams(parser, sentinel=True)
     parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to show (default: -1, the last)")
     parser.add_argument("--port", type=int, default=PORT, help=f"port of the page, 0: any (default: {PORT})")
-    add_host_option(parser)
+    HOST_OPTION.add_to(parser, sentinel=False)
     parser.add_argument("--quiet", action="store_true", help="print nothing to stdout (default: off)")
     args = get_combined_args(parser)
     options, pipeline = model_params.extract(args), pipeline_params.extract(args)

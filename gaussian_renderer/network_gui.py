@@ -79,12 +79,9 @@ def close() -> None:
 
 
 @contextlib.contextmanager
-def listening(address: tuple[str, int] | None) -> Iterator[None]:
-    """Within it, listen at an address (`init`); None: leave things as they are."""
-    if address is None:
-        yield
-        return
-    init(*address)
+def listening(wish_host: str, wish_port: int) -> Iterator[None]:
+    """Within it, listen at an address (`init`)."""
+    init(wish_host, wish_port)
     try:
         yield
     finally:

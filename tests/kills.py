@@ -31,6 +31,7 @@ import torch
 import train
 import utils.system_utils
 from scene.readers.point_cloud import write_point_cloud
+from splatting.parts.tensorboard import tools as tensorboard
 
 sys.path.insert(0, str(Path(__file__).parent))
 from synthetic import make_blender_scene  # noqa: E402
@@ -119,7 +120,7 @@ def _start(scene: Path, out: Path, prepare: Callable[[], Any]) -> int:
         words = ["-s", str(scene), "-m", str(out), *OPTIONS]
         if newest := min(_newest(out), 50):  # the last one leaves nothing to train
             words += ["--start_checkpoint", str(out / f"chkpnt{newest}.pth")]
-        train.SummaryWriter = lambda folder: None
+        tensorboard.summary_writer = lambda folder: None
         torch.set_num_threads(1)
         train.main(words)
         status = 0

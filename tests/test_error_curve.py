@@ -41,7 +41,7 @@ from splatting.evaluation.training_log import TrainingLog
 from splatting.evaluation.what_to_try import peak_advice
 from splatting.host import clock, memory
 from splatting.training import objective
-from splatting.training.observers.report import Report
+from splatting.training.observers.report import Scores
 from utils.loss_utils import ssim
 from utils.system_utils import UserError
 
@@ -414,8 +414,8 @@ class TestTraining:
         assert costs["curve_loading_seconds"] >= 0  # for a few tiny photos it may round to 0
 
     def test_a_row_tells_of_the_model_saved_at_its_iteration(self, colmap_scene, tmp_path, monkeypatch):
-        out, measured = tmp_path / "out", Report.measured
-        monkeypatch.setattr(Report, "measured", lambda *words: (time.sleep(0.005), measured(*words)))  # after the curve
+        out, measured = tmp_path / "out", Scores.measured
+        monkeypatch.setattr(Scores, "measured", lambda *words: (time.sleep(0.005), measured(*words)))  # after the curve
         _train(colmap_scene, out, "--save_iterations", 30, "--test_iterations", 30, iterations=60)
         row = next(row for row in read_curve(out / "error_vs_time.csv") if row["iteration"] == 30)
         monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(out), "--iteration", "30", "--quiet"])

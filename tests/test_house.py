@@ -30,6 +30,7 @@ MAY_IMPORT = {
         *("splatting.compat", "splatting.training", "splatting.evaluation"),
         *("arguments", "gaussian_renderer", "scene"),
     ),
+    "splatting.parts.viewer": ("splatting.training", "splatting.evaluation", "splatting.viewer", "scene"),
     "lpipsPyTorch": (),  # a name of the reference
     "scene.images": (),
     "scene.colmap_loader": (),
@@ -51,10 +52,13 @@ MAY_IMPORT = {
     "splatting.exports": ("splatting.camera_paths", "scene"),
     "splatting.evaluation": ("arguments", "scene.saved_iterations", "scene.readers.info", "splatting.parts"),
     "splatting.training": (
-        *("splatting.evaluation", "splatting.parts", "splatting.viewer.server"),
+        *("splatting.evaluation", "splatting.parts"),
         *("arguments", "gaussian_renderer", "scene"),
     ),
-    "splatting.viewer": ("splatting.camera_paths", "gaussian_renderer", "scene"),
+    "splatting.viewer": (
+        *("splatting.camera_paths", "splatting.training.option"),
+        *("gaussian_renderer", "scene"),
+    ),
     "splatting.diagnosis": (
         *("arguments", "gaussian_renderer", "splatting.evaluation", "scene"),
         "splatting.parts",
@@ -66,10 +70,6 @@ MAY_IMPORT = {
     "benchmarks.workloads": ("scene.gaussians.morton",),
     "benchmarks.harness": ("benchmarks.workloads",),
 }
-MAY_IMPORT["splatting.training.observers"] = (
-    *("splatting.training", "splatting.viewer"),
-    *MAY_IMPORT["splatting.training"],
-)
 MEASURED = ("train", "render", "metrics", *(room for room in ROOMS if room != "benchmarks"))
 for room in ("kernels", "accuracy", "scenes", "exports", "parallel", "peers"):
     MAY_IMPORT[f"benchmarks.{room}"] = ("benchmarks.harness", "benchmarks.workloads", *MEASURED)

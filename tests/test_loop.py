@@ -99,7 +99,7 @@ def test_a_hook_that_is_not_overridden_costs_nothing(monkeypatch):
 
 
 def test_the_guards_stand_where_they_must(colmap_scene, tmp_path, monkeypatch):
-    """The list's order is meant: checks first, writers next, then the guard of a changing model, checkpoints last."""
+    """The order is meant: checks, writers, the guard of a changing model, checkpoints, and last what may wait."""
     names = []
 
     def observers(*given) -> list[Part]:
@@ -108,8 +108,8 @@ def test_the_guards_stand_where_they_must(colmap_scene, tmp_path, monkeypatch):
         return listed
 
     _train(colmap_scene, tmp_path, monkeypatch, observers, "--eval")
-    assert names[0] == "DivergenceWatch" and names[-2:] == ["MemoryGuard", "Checkpoints"]
-    between = ["Curve", "Report", "Saves", "Records", "MemoryGuard"]
+    assert names[0] == "DivergenceWatch" and names[-3:] == ["MemoryGuard", "Checkpoints", "RemoteViewer"]
+    between = ["Curve", "Tensorboard", "Scores", "Saves", "Records", "MemoryGuard"]
     assert [name for name in names if name in between] == between
 
 

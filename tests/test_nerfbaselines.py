@@ -130,7 +130,7 @@ def test_options_that_nothing_would_follow_are_refused(method, given):
 
 
 def test_every_launch_option_is_known_to_work_or_refused(method):
-    works = {"debug_from", "plain_step", "disable_viewer", "no_curve", "quiet", "ip", "port"}
+    works = {"debug_from", "plain_step", "no_curve", "quiet"}
     assert vars(launch_options()).keys() == works | {*vars(launch_options())} & {*method._FIXED, *method._LISTS}
 
 

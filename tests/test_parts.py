@@ -32,6 +32,14 @@ KNOWN = {  # words in files that are options of a part, and mean something else 
     *((f"exposure_lr_{end}", "scene/gaussians/exposure.py") for end in ("init", "final", "delay_steps", "delay_mult")),
     *((f"exposure_lr_{end}", "full_eval.py") for end in ("init", "final", "delay_steps", "delay_mult")),  # commands
     ("train_test_exp", "full_eval.py"),
+    ("viewer", "splatting/evaluation/configs.py"),  # nobody would close its page
+    ("viewer", "splatting/exports/vendor.py"),  # a folder
+    ("viewer_host", "view.py"),  # which serves the same page
+    ("viewer_host", "splatting/viewer/server.py"),
+    ("port", "view.py"),
+    *((option, "gaussian_renderer/network_gui.py") for option in ("port", "disable_viewer", "viewer")),  # its sentence
+    *(("disable_viewer", f"splatting/{of}.py") for of in ("evaluation/stages", "diagnosis/advice")),  # of own trainings
+    ("disable_viewer", "integrations/nerfbaselines/method.py"),
 }
 COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "export", "view")
 
@@ -129,7 +137,7 @@ TRAINED = """
 import doctor, export, render, train
 scene, out, strategy = words
 short = ["--strategy", strategy, "--iterations", "20", "--test_iterations", "20", "--eval", "-r", "48"]
-train.main(["-s", scene, "-m", out, "--disable_viewer", *short])
+train.main(["-s", scene, "-m", out, *([] if name == "remote_viewer" else ["--disable_viewer"]), *short])
 for command, line in ((render, ["-m", out]), (doctor, ["-m", out]), (export, ["-m", out, "--to", out + "/a.ply"])):
     sys.argv = [command.__name__, *line]
     try:

@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from splatting.host.progress import Bar
 from splatting.training.objective import LossWatch
-from splatting.training.observers.report import ProgressBar
+from splatting.training.observers.progress import ProgressBar
 from splatting.training.schedule import Schedule
 
 

@@ -41,11 +41,11 @@ _OF_FILES = ("appearance", "init_ply", "masks", *(kind.flag for kind in appearan
 _OF_FILES += tuple(part.switch or part.name for part in _PARTS if part.needs.files)
 # Options that nothing follows here, with the value that is the case. Our other observers score, save and show.
 _FIXED = dict.fromkeys(
-    ("advise", "viewer", "viewer_host", "detect_anomaly",
+    ("advise", "detect_anomaly",
      "start_checkpoint", "source_path", "model_path", "images", "invert_masks",
-     *(name for part in _PARTS if part.final is not Part.final for name in part.options.by_name))
+     *(name for part in _PARTS if part.waits or part.final is not Part.final for name in part.options.by_name))
     , "",
-) | {"options": "given", "resolution": "1", "mask_meaning": "auto"}  # fmt: skip
+) | {"options": "given", "resolution": "1", "mask_meaning": "auto", "disable_viewer": "true"}  # fmt: skip
 _LISTS = ("test_iterations", "save_iterations", "checkpoint_iterations")
 
 

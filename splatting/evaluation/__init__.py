@@ -1,7 +1,7 @@
 """Measurements of trainings, and full_eval.py, which trains, renders and scores a table of scenes.
 
 Within a training:
-training_log, error_curve   its records and its events for TensorBoard; its curve, and curves of other programs
+training_log, error_curve   its records; its curve, and curves of other programs
 curve_recorder, figures     scoring of the curve's points; drawings of it, which the report uses, too
 what_to_try                 advice from both
 

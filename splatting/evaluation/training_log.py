@@ -1,21 +1,12 @@
-"""Records of a training: train_log.json, one for each tested or saved iteration and checkpoint, by a clock of training;
-and events for TensorBoard."""
+"""Records of a training: train_log.json, by a clock of training; one for each tested or saved iteration."""
 
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
-from io import BytesIO
 from pathlib import Path
-from typing import Any
 
-from PIL import Image
-from torch import Tensor
-from tqdm import tqdm
-
-from splatting.files.image_files import to_bytes
 from splatting.files.json_files import read_json, write_json
 from splatting.host.clock import running_seconds, wall_seconds
 from splatting.host.memory import peak_memory_mib
@@ -24,7 +15,6 @@ from utils.system_utils import UserError, compute_device
 NAME = "train_log.json"
 SHORT = 2000  # iterations; after trainings up to this length, what training says at its end is short
 DEGREES, PERCENT = "pose_degrees", "pose_percent"  # mean correction of refined poses: turn, and part of the extent
-_FLUSHED = 10  # seconds until events are in the file at the latest
 _OTHERS = "loss", "peak_memory_mib", "wall_seconds", "max_num_splats", "default_budget"
 _FINITE = (DEGREES, PERCENT, *_OTHERS)  # if present
 
@@ -171,45 +161,3 @@ def _read(path: Path) -> list[dict]:
     except UserError as error:
         print(f"warning: {str(error).partition('; ')[0]}; a new one is started", file=sys.stderr)
         return []
-
-
-class EventWriter:
-    """A SummaryWriter of torch, all of whose methods can be called. ImportError without TensorBoard.
-
-    If one fails, as on a full disk, one warning says so, and nothing more is written.
-    """
-
-    def __init__(self, log_dir: str) -> None:
-        from torch.utils.tensorboard import SummaryWriter  # takes 0.3 s to import
-
-        self._folder, self._failed = log_dir, False
-        self._writer = self._guarded(SummaryWriter, log_dir, flush_secs=_FLUSHED)
-
-    def __getattr__(self, name: str) -> Callable[..., Any]:
-        if name.startswith("_"):
-            raise AttributeError(name)
-        return partial(self._guarded, getattr(self._writer, name, None))
-
-    def add_image(self, tag: str, image: Tensor, global_step: int) -> None:
-        """Add an image (3, H, W), from 0 to 1, as a JPEG: a training took 8 s for PNGs and their checksums."""
-        self._guarded(self._add_jpeg, tag, image, global_step)
-
-    def _add_jpeg(self, tag: str, image: Tensor, step: int) -> None:
-        from tensorboard.compat.proto.summary_pb2 import Summary
-
-        jpeg, pixels = BytesIO(), to_bytes(image).numpy()
-        Image.fromarray(pixels).save(jpeg, "JPEG", quality=90)
-        height, width, _ = pixels.shape
-        picture = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=jpeg.getvalue())
-        self._writer.file_writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=picture)]), step)
-
-    def _guarded(self, method: Callable[..., Any], *given: Any, **named: Any) -> Any:
-        if self._failed:
-            return None
-        try:
-            return method(*given, **named)
-        except Exception as error:  # whatever it is, the training goes on
-            self._failed = True
-            fault = f"cannot write TensorBoard's events into {self._folder} ({error})"
-            tqdm.write(f"warning: {fault}; training continues without them", file=sys.stderr)
-            return None

@@ -33,6 +33,9 @@ PARTS = (
     "last_save",  # after keep_best, which may choose another model
     "spill",  # after all that moves rows, and before sleep, which pays where rows lie on the host
     "sleep",  # after all that decides whether every step concerns all rows
+    "tensorboard",  # from here on, those that only watch
+    "remote_viewer",
+    "viewer",  # last: its pause is of all else
 )
 
 
@@ -129,6 +132,8 @@ def tools(name: str) -> list[Callable]:
     for_few_iterations(count): remedies.
     remarks(lines): lines of a training that reports show. against_overfitting(record): an option to try, or None.
     pictures(model): files in a model folder that reports show, where they are there.
+    summary_writer(folder): TensorBoard's, as `train.prepare_output_and_logger` returns it, or None.
+    report_to(writer, iteration): what writes losses, images, scores and the model of a training report by one.
     """
     modules = [f"{__name__}.{part}.tools" for part in PARTS]
     found = [import_module(module) for module in modules if find_spec(module)]

@@ -49,16 +49,12 @@ def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> Non
         )
 
 
-def check_alone(port: int | None, projection: str, several: bool) -> None:
-    """Refuse a page, or rays, of a training of several processes (UserError)."""
-    for name, needs in (("--viewer", port is not None), ("--projection ray", projection == "ray")):
-        check_one_process(name, needs and several)
-
-
-def check_one_process(option: str, several: bool) -> None:
-    """Refuse an option in a training of several processes (UserError)."""
-    if several:
-        raise UserError(f"{option} needs a training of one process; leave it out, or start train.py without torchrun")
+def check_alone(projection: str, several: bool) -> None:
+    """Refuse rays of a training of several processes (UserError)."""
+    if several and projection == "ray":
+        raise UserError(
+            "--projection ray needs a training of one process; leave it out, or start train.py without torchrun"
+        )
 
 
 def faster_alone(ranks: int, on_gpu: bool, count: int) -> str | None:

@@ -1,10 +1,9 @@
-"""Options of train.py besides the three groups: when to score and save, where to begin, several processes, viewers."""
+"""Options of train.py besides the three groups: when to score and save, where to begin."""
 
 import argparse
 from typing import Any
 
 from splatting.parts import options_of
-from splatting.viewer.server import add_viewer_options
 
 
 # fmt: off
@@ -12,10 +11,6 @@ def add_launch_options(parser: argparse.ArgumentParser) -> None:
     """Add them to a parser. Iterations are those of the schedule (splatting/training/schedule)."""
     add = parser.add_argument
     flag, listed = {"action": "store_true"}, {"type": int, "nargs": "+", "metavar": "N"}
-    add("--ip", type=str, default="127.0.0.1", help="address to listen at for the remote viewer (default: 127.0.0.1)")
-    add("--port", type=int, default=6009, help="port for the remote viewer, 0: any free one (default: 6009)")
-    add("--disable_viewer", **flag, help="open no port for the remote viewer")
-    add_viewer_options(parser)
     add("--debug_from", type=int, default=-1, metavar="N", help="switch --debug on after iteration N (default: never)")
     add("--detect_anomaly", **flag, help="let autograd name the operation that produced a NaN; slow")
     add("--test_iterations", **listed, default=[7_000, 30_000],
@@ -43,7 +38,8 @@ def launch_options(**given: Any) -> argparse.Namespace:
     """
     parser = argparse.ArgumentParser()
     add_launch_options(parser)
-    defaults = vars(parser.parse_args([]))
+    called = {option.name: option.called for option in options_of("launch") if option.called is not None}
+    defaults = vars(parser.parse_args([])) | called
     if unknown := sorted(given.keys() - defaults.keys()):
         raise TypeError(f"train.py has no option --{unknown[0]}")
     return argparse.Namespace(**defaults | given)

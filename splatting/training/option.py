@@ -24,6 +24,7 @@ class Option:
     after: the option of its group that it follows; empty: where its part has its place.
     seen: whether renders of a model differ with its value, if no name of them tells it.
     loaded: what a command that loads a model takes if the option is not given; empty: the stored value.
+    called: the default where a program calls `train.training`, if it is another one there.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Option:
     stored: str = ""
     compared: bool = True
     loaded: str = ""
+    called: Value | None = None
     seen: bool = True
     after: str = ""
 

@@ -12,7 +12,7 @@ dataset      The photos, cameras and points are found. Scenes that are made with
 cameras      The cameras of a list are made.
 begin        The Gaussians exist. In a new training they have no optimiser yet, so rows may be added.
 ready        Model and optimiser exist.
-opened       The log is open, and files may be written.
+opened       The log is open, and files may be written. What must be closed goes into run.resources, an ExitStack.
 terms        In each iteration, before its step: what it adds to the loss.
 begins, due, measured, stepped, ended
              What observers see. The core's own (splatting/training/observers) are parts without a name.
@@ -112,6 +112,7 @@ class Part:
         `option=value`, or `needs.NAME`: other parts that need that.
     reads_model: whether it reads the model in iterations that are due for it; sleeping blocks then catch up first.
     shown: terms whose running mean the progress bar shows, and what it calls them.
+    waits: whether it may let the training wait. It is told last, when all else of an iteration is done and written.
     own_end: whether its options let a training end before or after --iterations.
     traces: files that the part writes into a model folder, and a training without it removes; never what may be input.
     """
@@ -125,6 +126,7 @@ class Part:
     against: ClassVar[dict[str, str]] = {}
     reads_model: ClassVar[bool] = True
     shown: ClassVar[dict[str, str]] = {}
+    waits: ClassVar[bool] = False
     own_end: ClassVar[bool] = False
     traces: ClassVar[tuple[str, ...]] = ()
 

@@ -5,7 +5,7 @@ import copy
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from functools import cached_property
 from itertools import count
 from pathlib import Path
@@ -59,7 +59,9 @@ class Run:
     scene; first_iteration: done before this run. From `begin` on: log, rows (of the curve so far), losses (running mean
     of the total) and clock (seconds of training). lost: steps that an error has taken back. first_done: seconds from
     the process's start to the end of its first iteration, None if the system does not say. interrupt: a signal that
-    asks the loop to stop; an observer that waits has to look at it.
+    asks the loop to stop; an observer that waits has to look at it. resources: what parts have open, closed when the
+    training is over, however it ends. report: `training_report`, or what replaces it; writer: its first argument.
+    checkpoints: writes them, while the loop runs.
     """
 
     first_done: float | None = None
@@ -69,6 +71,9 @@ class Run:
     sizes: Any = OwnSize()
     counts: Any = None
     on_host: Any = None
+    writer: Any = None
+    report: Any = None
+    checkpoints: Any = None
     final_iteration: int | None = None
     last_iteration: int | None = None
 
@@ -82,12 +87,12 @@ class Run:
         given, opt = opt, copy.copy(opt)  # of which the strategy, and windows by the clock, are decided here
         self.opt, self.pipe, self.launch = opt, pipe, launch
         self.group = ranks()
-        checks.check_alone(launch.viewer, getattr(pipe, "projection", "ewa"), self.group.several)
+        checks.check_alone(getattr(pipe, "projection", "ewa"), self.group.several)
         self.start = self.group.shared(resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
         dataset = self.dataset = checks.with_lenses(dataset, self.start)
         if opt.strategy == "auto" and self.start:
             opt.strategy = checks.strategy_of(self.start)
-        self.lost = 0
+        self.lost, self.resources = 0, ExitStack()
         self.interrupt, self.device = DeferredInterrupt(), compute_device()
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
         capture, self.first_iteration = self._read_start()

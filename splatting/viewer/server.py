@@ -1,6 +1,5 @@
 """Address of the page, and the start of a viser server behind the authorization, without its own messages."""
 
-import argparse
 import contextlib
 import errno
 import io
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from tqdm import tqdm
 
+from splatting.training.option import Option
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
@@ -19,6 +19,11 @@ if TYPE_CHECKING:
 
 VISER = "viser==1.1.1"  # as setup.py names it
 HOST, PORT = "127.0.0.1", 8080
+HOST_OPTION = Option(
+    "viewer_host", HOST, origin="ours",
+    help=f"address at which the page listens; others than {HOST} can be reached from outside, and then the page needs "
+    "the token that is printed",
+)  # fmt: skip
 _TRIED = 100  # ports, from the requested one on
 _TAKEN = errno.EADDRINUSE
 
@@ -28,25 +33,6 @@ class Address(NamedTuple):
 
     host: str = HOST
     port: int = PORT
-
-
-def add_host_option(parser: argparse.ArgumentParser) -> None:
-    """--viewer_host."""
-    parser.add_argument(
-        "--viewer_host", type=str, default=HOST, metavar="HOST",
-        help=f"address at which the page listens; others than {HOST} can be reached from outside, and then the page "
-        f"needs the token that is printed (default: {HOST})",
-    )  # fmt: skip
-
-
-def add_viewer_options(parser: argparse.ArgumentParser) -> None:
-    """--viewer and --viewer_host of train.py."""
-    parser.add_argument(
-        "--viewer", type=int, nargs="?", const=PORT, default=None, metavar="PORT",
-        help=f"serve a web page that shows the training and controls it, at this port or {PORT}, and stays "
-        "open after it (default: no page)",
-    )  # fmt: skip
-    add_host_option(parser)
 
 
 def checked_address(host: str, port: int | None) -> Address | None:

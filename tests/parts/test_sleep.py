@@ -31,7 +31,7 @@ from splatting.distributed.ranks import ranks
 from splatting.training import run as runs
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Objective
-from splatting.training.observers.report import ProgressBar
+from splatting.training.observers.progress import ProgressBar
 from splatting.training.steps import captured, fused
 from utils.system_utils import UserError
 

@@ -21,7 +21,7 @@ from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule, T
 from splatting.parts.time_budget.schedule_file import read_schedule, schedule_of, write_schedule
 from splatting.training.density import DensityControl, density_control
 from splatting.training.iteration import Iteration
-from splatting.training.observers.report import ProgressBar
+from splatting.training.observers.progress import ProgressBar
 from splatting.training.run import Run
 from splatting.training.schedule import Schedule, longer_steps
 from utils.system_utils import UserError

@@ -25,7 +25,8 @@ import train
 from gaussian_renderer import network_gui, network_transfer, render
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
-from splatting.training.observers.viewers import NetworkViewer
+from splatting.parts.remote_viewer.serving import Serving
+from splatting.training.launch import launch_options
 from splatting.training.part import Part
 from utils.system_utils import UserError
 
@@ -240,7 +241,7 @@ class Endless:
         self._thread = threading.Thread(target=self._serve)
 
     def _serve(self) -> None:
-        viewer, step = NetworkViewer(self.run), SimpleNamespace(last=False)
+        viewer, step = Serving(self.run), SimpleNamespace(last=False)
         while not self._over.wait(0.0005):
             self.due += viewer.due(step)
             viewer.measured(step, None)
@@ -329,7 +330,7 @@ def test_a_frame_that_cannot_be_rendered_ends_the_connection(monkeypatch, capfd)
     def fail(*arguments: object) -> None:
         raise MemoryError("no room for\nthis")
 
-    monkeypatch.setattr("splatting.training.observers.viewers.frame_bytes", fail)
+    monkeypatch.setattr("splatting.parts.remote_viewer.serving.frame_bytes", fail)
     with Endless():
         viewer = Viewer(network_gui.port)
         viewer.say(valid())
@@ -412,6 +413,7 @@ def test_disable_viewer_opens_nothing_and_the_default_address_is_the_reference_s
     train_on(colmap_scene, tmp_path / "out", "--iterations", 1, "--disable_viewer", "-r", 48)
     args = train.parse(["-s", "."])[0]
     assert opened == [] and (args.ip, args.port, args.disable_viewer) == ("127.0.0.1", 6009, False)
+    assert launch_options().disable_viewer  # as a call of the reference's `training` opens nothing
 
 
 # Loops that call the names of the reference themselves

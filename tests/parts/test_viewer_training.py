@@ -22,7 +22,7 @@ from waiting import wait_for  # noqa: E402
 import train  # noqa: E402
 from scene.gaussians.checkpoint import load_checkpoint  # noqa: E402
 from scene.saved_model import read_model  # noqa: E402
-from splatting.training.observers import viewers as observed  # noqa: E402
+from splatting.parts.viewer import training_page as observed  # noqa: E402
 from splatting.viewer import training_tab  # noqa: E402
 from splatting.viewer.page import serve  # noqa: E402
 from utils.system_utils import UserError  # noqa: E402
@@ -42,7 +42,7 @@ class Watched:
         self.clients: list[Client] = []
         watched = self
 
-        class Part(observed.PageObserver):
+        class Page(observed.TrainingPage):
             def __init__(self, *given: object) -> None:
                 super().__init__(*given)
                 watched.observer, watched.page, watched.requests = self, self._page, self._requests
@@ -66,7 +66,7 @@ class Watched:
                     client.__exit__()
                 super().ended(error)
 
-        monkeypatch.setattr("splatting.training.observers.standard.PageObserver", Part)
+        monkeypatch.setattr(observed, "TrainingPage", Page)
         monkeypatch.setattr(observed, "serve", lambda page: None)  # so that the test ends
 
     def connect(self) -> None:

@@ -13,10 +13,11 @@ from PIL import Image
 import train
 from splatting.diagnosis import environment
 from splatting.evaluation.peer_curve import read_scalars
-from splatting.evaluation.training_log import EventWriter
+from splatting.parts.tensorboard import events
+from splatting.parts.tensorboard.event_writer import EventWriter
+from splatting.parts.tensorboard.part import Tensorboard
 from splatting.training.iteration import Iteration, Losses
-from splatting.training.observers import report
-from splatting.training.observers.report import Report
+from splatting.training.observers import progress
 
 
 def _train(scene: Path, out: Path, *more: str) -> None:
@@ -60,7 +61,7 @@ def writer(monkeypatch: pytest.MonkeyPatch) -> type[_Writer]:
 
 
 def test_tags_are_the_references(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(report, "LOG_INTERVAL", 2)
+    monkeypatch.setattr(events, "INTERVAL", 2)
     _train(colmap_scene, tmp_path, "--iterations", "3", "--test_iterations", "2", "3")
     scalars, shown = _Writer.last.scalars, _Writer.last.shown
     every = {tag: list(values) for tag, values in scalars.items()}
@@ -102,14 +103,14 @@ def test_a_writer_that_cannot_be_made_is_one_warning(monkeypatch, capsys):
 
 def test_every_tenth_iteration_has_its_own_losses(colmap_scene, tmp_path, monkeypatch):
     """They are kept until something is due, and read together."""
-    measured, plain = {}, Report.measured
+    measured, plain = {}, Tensorboard.measured
 
-    def measure(self: Report, step: Iteration, losses: Losses) -> None:
+    def measure(self: Tensorboard, step: Iteration, losses: Losses) -> None:
         measured[step.iteration] = losses.l1.item(), losses.total.item()
         plain(self, step, losses)
 
-    monkeypatch.setattr(Report, "measured", measure)
-    monkeypatch.setattr(report, "BAR_SECONDS", math.inf)  # nothing but the tests is due
+    monkeypatch.setattr(Tensorboard, "measured", measure)
+    monkeypatch.setattr(progress, "BAR_SECONDS", math.inf)  # nothing but the tests is due
     _train(colmap_scene, tmp_path, "--iterations", "40", "--test_iterations", "30")
     scalars = _Writer.last.scalars
     for place, name in enumerate(("l1_loss", "total_loss")):
@@ -119,7 +120,7 @@ def test_every_tenth_iteration_has_its_own_losses(colmap_scene, tmp_path, monkey
 
 
 def test_an_interrupted_training_ends_its_events(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(Report, "measured", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(Tensorboard, "measured", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         _train(colmap_scene, tmp_path, "--iterations", "3")
     assert "closed" in _Writer.last.scalars

@@ -1,46 +1,36 @@
-"""Viewers of a training: the web page that shows and controls it, and the remote viewer of the reference."""
+"""The web page that shows and controls a training."""
 
-import argparse
 import sys
 import time
 
-import torch
-from torch import Tensor
 from tqdm import tqdm
 
-from gaussian_renderer import network_gui, render
-from gaussian_renderer.network_message import Request
-from gaussian_renderer.network_transfer import ViewerLost
-from scene.gaussian_model import GaussianModel
 from scene.saved_iterations import saved_ply
 from scene.saved_model import read_model
 from splatting.evaluation.error_curve import common_subset, rows_on
 from splatting.files.listing import as_utf8
-from splatting.training.iteration import Iteration, Losses
-from splatting.training.observers.saves import Checkpoints
-from splatting.training.part import Error, Part
+from splatting.training.iteration import Iteration
+from splatting.training.part import Error
 from splatting.training.run import Run
 from splatting.viewer.page import Page, serve
 from splatting.viewer.server import Address
 from splatting.viewer.training_tab import TrainingTab
 from splatting.viewer.watchers import MOVING, STILL, Budget, Wish
-from utils.system_utils import UserError, first_line
+from utils.system_utils import UserError
 
 _NUMBERS_EVERY = 0.5  # seconds
 _WAIT = 0.2  # seconds until a paused training notices a signal
 
 
-class PageObserver(Part):
+class TrainingPage:
     """Draws frames for the page between two iterations, and does what its buttons ask for.
 
-    While nobody watches it asks one variable in each iteration. The time it takes is not that of training. It comes
-    last, so that a paused training has done all else that belongs to its iteration.
+    While nobody watches it asks one variable in each iteration. The time it takes is not that of training.
     """
 
-    def __init__(self, run: Run, checkpoints: Checkpoints) -> None:
-        """Start the page at the address of --viewer. UserError as from `Page`."""
-        self._run, self._checkpoints = run, checkpoints
-        address = Address(run.launch.viewer_host, run.launch.viewer)
+    def __init__(self, run: Run, address: Address) -> None:
+        """Start the page. UserError as from `Page`."""
+        self._run = run
         self._page = Page(address, run.scene, run.pipe, run.dataset.white_background, run.scene.halves)
         self._requests = self._page.requests
         if run.counts:
@@ -87,7 +77,7 @@ class PageObserver(Part):
         while True:
             if requests.stopped or run.interrupt.requested:
                 step.stopping = run.interrupt.requested or KeyboardInterrupt("stopped from the page")
-                self._checkpoints.save(step)
+                self._run.checkpoints.save(step)
                 return
             if requests.take_checkpoint():
                 self._save(step)
@@ -104,7 +94,7 @@ class PageObserver(Part):
     def _save(self, step: Iteration) -> None:
         """Save a checkpoint. A disk that is full is told, and ends nothing."""
         try:
-            self._checkpoints.save(step)
+            self._run.checkpoints.save(step)
         except UserError as error:
             if not isinstance(error.__cause__, OSError):  # such as a loss that is not finite
                 raise
@@ -129,14 +119,15 @@ class PageObserver(Part):
         """Let the page stay, unless an error or a signal ended the training."""
         run = self._run
         by_button = isinstance(error, KeyboardInterrupt) and self._requests.stopped and not run.interrupt.requested
-        try:
-            if error is not None and not by_button:
-                self._page.notify("The training has stopped", "Its terminal says why, and how to resume it")
-            else:
-                saved = as_utf8(f"{run.scene.model_path}/chkpnt{self._step.iteration}.pth")
-                self._stay(f"stopped and saved as {saved}" if by_button else "complete")
-        finally:
-            self._page.stop()
+        if error is not None and not by_button:
+            self._page.notify("The training has stopped", "Its terminal says why, and how to resume it")
+        else:
+            saved = as_utf8(f"{run.scene.model_path}/chkpnt{self._step.iteration}.pth")
+            self._stay(f"stopped and saved as {saved}" if by_button else "complete")
+
+    def close(self) -> None:
+        """Stop to listen."""
+        self._page.stop()
 
     def _stay(self, how: str) -> None:
         """Serve the page until it is closed or a signal comes; all of the training is written by now."""
@@ -159,90 +150,3 @@ class PageObserver(Part):
             gaussians.load_exposures(run.scene.model_path, run.scene.info.train_cameras)
         gaussians.world_offset = run.gaussians.world_offset
         self._page.show_model(gaussians, iteration)
-
-
-_TICK = 0.1  # seconds between looks whether a signal asks to stop
-_LAST = 1.0  # seconds that a finished training waits for one more request
-
-
-class NetworkViewer(Part):
-    """Serves the viewer of gaussian_renderer/network_gui.py.
-
-    Training waits only while the viewer says so. Otherwise a request is answered when it is there, one an iteration.
-    The last iteration's are answered after everything is written, and keep_alive holds the process there.
-    """
-
-    def __init__(self, run: Run) -> None:
-        self._run = run
-        self._asked = False
-
-    def due(self, step: Iteration) -> bool:
-        if network_gui.conn is None:
-            network_gui.try_connect()
-        self._asked = network_gui.is_asked() and not step.last
-        return self._asked
-
-    def measured(self, step: Iteration, losses: Losses) -> None:
-        if self._asked:
-            with self._run.clock.paused("viewing"):
-                self._serve(last=False)
-
-    def ended(self, error: Error) -> None:
-        if error is None:
-            if network_gui.conn is None:
-                network_gui.try_connect()
-            if network_gui.holds(last=True):
-                print("The model is saved; the viewer keeps this process until it leaves, or Ctrl-C")
-            self._serve(last=True)
-        network_gui.disconnect()
-
-    def _serve(self, last: bool) -> None:
-        """Answer until the viewer lets training go on, leaves, or a signal asks to stop."""
-        while self._waits(last) and self._answer():
-            if not network_gui.holds(last):
-                return
-
-    def _waits(self, last: bool) -> bool:
-        """Whether a request is there, after waiting for it if the viewer wants that."""
-        while network_gui.holds(last) and not self._run.interrupt.requested:
-            if network_gui.is_asked(_TICK):
-                return True
-        return network_gui.is_asked(_LAST if last else 0.0) and not self._run.interrupt.requested
-
-    def _answer(self) -> bool:
-        """Answer one request; whether the viewer is still there."""
-        try:
-            request = network_gui.receive_request()
-            frame = None if request is None else self._frame(request)
-            network_gui.send(frame, self._run.dataset.source_path)
-        except ViewerLost:
-            return False
-        return True
-
-    def _frame(self, request: Request) -> memoryview:
-        run = self._run
-        try:
-            return frame_bytes(request, run.gaussians, run.pipe, run.background)
-        except Exception as error:  # such as a frame that memory does not suffice for: no reason to end a training
-            fault = f"its frame cannot be rendered ({first_line(error)})"
-            network_gui.disconnect(fault)
-            raise ViewerLost(fault) from error
-
-
-@torch.no_grad()
-def frame_bytes(request: Request, gaussians: GaussianModel, pipe: argparse.Namespace, background: Tensor) -> memoryview:
-    """RGB bytes (H, W, 3) of the model as `render` shows it: 255 times the colour, truncated.
-
-    pipe: options of the training, which stay as they are; for the frame, the request's two switches count instead.
-    """
-    switches = {"convert_SHs_python": request.shs_python, "compute_cov3D_python": request.rot_scale_python}
-    image = render(
-        request.camera(background.device),
-        gaussians,
-        argparse.Namespace(**vars(pipe) | switches),
-        background,
-        request.scaling_modifier,
-        want_depth=False,
-        want_visibility=False,
-    )["render"]
-    return memoryview((image * 255).byte().permute(1, 2, 0).contiguous().cpu().numpy())

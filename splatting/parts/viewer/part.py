@@ -1,0 +1,54 @@
+"""A web page that shows the training and controls it (--viewer)."""
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from splatting.training.option import Option
+from splatting.training.part import Error, Needs, Options, Part
+from splatting.viewer.server import HOST_OPTION, PORT
+
+if TYPE_CHECKING:
+    from splatting.training.iteration import Iteration
+
+
+class _Port(Option):
+    """An option whose value may be left out."""
+
+    def add_to(self, group: argparse._ActionsContainer, sentinel: bool) -> None:
+        group.add_argument(f"--{self.name}", type=int, nargs="?", const=PORT, metavar="PORT", help=self.help)
+
+
+class Viewer(Part):
+    """Serves the page. It comes last, so that a paused training has done all else that belongs to its iteration."""
+
+    name = "viewer"
+    # fmt: off
+    options = Options(launch=(
+        _Port("viewer", None, origin="ours",
+            help=f"serve a web page that shows the training and controls it, at this port or {PORT}, and stays open "
+                 "after it (default: no page)"),
+        HOST_OPTION,
+    ))
+    # fmt: on
+    needs = Needs(ranks=False)
+    waits = True
+
+    def check(self, run: Any, state: Any) -> None:
+        from splatting.viewer.server import checked_address
+
+        self._address = checked_address(run.launch.viewer_host, run.launch.viewer)
+
+    def opened(self, run: Any) -> None:
+        from splatting.parts.viewer.training_page import TrainingPage
+
+        self._page = TrainingPage(run, self._address)
+        run.resources.callback(self._page.close)
+
+    def due(self, at: "Iteration") -> bool:
+        return self._page.due(at)
+
+    def stepped(self, at: "Iteration") -> None:
+        self._page.stepped(at)
+
+    def ended(self, error: Error) -> None:
+        self._page.ended(error)

@@ -1,0 +1,94 @@
+"""What a user reads while a training runs, and at its end."""
+
+import math
+import time
+
+from splatting.evaluation.error_curve import whole_sets
+from splatting.host.clock import wall_seconds
+from splatting.host.progress import Bar
+from splatting.training.iteration import Iteration, Losses
+from splatting.training.objective import LossWatch
+from splatting.training.output_folder import view_command
+from splatting.training.part import Error, Part
+from splatting.training.run import Run
+
+# Without a rate: that of the schedule is not that of iterations.
+BY_CLOCK = "{l_bar}{bar}| [{elapsed}<{remaining}{postfix}]"
+BAR_INTERVAL = 10  # iterations between updates, at least
+BAR_SECONDS = 0.2  # between updates, at least: each reads the losses, and so waits for the GPU
+
+
+class ProgressBar(Part):
+    """Shows running means. At the end of a training it says how long that took."""
+
+    reads_model = False
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._terms = {name: LossWatch() for part in run.parts for name in part.shown}
+        titles = {title: self._terms[name] for part in run.parts for name, title in part.shown.items()}
+        self._shown = {"Loss": run.losses} | titles
+        self._updated, self._done = -math.inf, run.first_iteration
+        first = run.schedule.schedule_step(run.first_iteration)
+        form = {"bar_format": BY_CLOCK} if run.schedule.by_clock else {}
+        self._bar = Bar(initial=first, total=run.schedule.length, desc="Training progress", dynamic_ncols=True, **form)
+
+    def due(self, step: Iteration) -> bool:
+        shown = step.iteration % BAR_INTERVAL == 0 and time.monotonic() - self._updated >= BAR_SECONDS
+        return step.last or shown
+
+    def measured(self, step: Iteration, losses: Losses) -> None:
+        for name in self._terms.keys() & losses.terms.keys():
+            self._terms[name].add(step.iteration, losses.terms[name])
+        if not step.due:
+            return
+        for loss in self._shown.values():
+            loss.read()
+        means = {name: f"{loss.mean:.7f}" for name, loss in self._shown.items()}
+        if step.span.stop - 1 != step.iteration:  # the bar counts iterations of the schedule
+            means["Iterations"] = f"{step.iteration:,}"
+        # As text: tqdm would round the number to three digits.
+        self._bar.set_postfix(means, Gaussians=f"{self._run.gaussians.gaussian_count:,}", refresh=False)
+        self._bar.update(step.span.stop - 1 - self._bar.n)
+        self._updated, self._done = time.monotonic(), step.iteration
+
+    def ended(self, error: Error) -> None:
+        self._bar.close()
+        if error is not None:
+            return
+        run, seconds = self._run, self._run.clock.seconds
+        if not run.schedule.by_clock:
+            before = f", {run.log.seconds_before + seconds:.1f} s with those before" if run.first_iteration else ""
+            print(f"{_iterations(self._done - run.first_iteration)} in {seconds:.1f} s{before}")
+            return
+        # With those before a resume, as the budget.
+        seconds, whole = run.log.seconds_before + seconds, run.log.wall_seconds_before + wall_seconds()
+        budget = f"budget {run.schedule.seconds:g} s, {whole:.1f} s with start, scores and saves"
+        run.log.tell(f"{_iterations(self._done)} in {seconds:.1f} s ({budget})")
+
+
+def _iterations(count: int) -> str:
+    return f"{count:,} iteration{'s' if count != 1 else ''}"
+
+
+class Summary(Part):
+    """Says at the end what the model is worth, and how to look at it."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._psnr: float | None = None
+        self._iteration = run.first_iteration
+
+    def measured(self, step: Iteration, losses: Losses) -> None:
+        self._iteration = step.iteration
+        if step.last:
+            saved = self._run.final_iteration or step.iteration
+            scored = [row["test_psnr"] for row in whole_sets(self._run.rows) if row["iteration"] == saved]
+            self._psnr = scored[0] if scored else None
+
+    def ended(self, error: Error) -> None:
+        if error is not None:
+            return
+        run = self._run
+        scored = "" if self._psnr is None else f"Test PSNR {self._psnr:.2f} dB (as metrics.py). "
+        print(f"{scored}Look at the model: {view_command(run.scene.model_path, self._iteration)}")
