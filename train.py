@@ -18,7 +18,7 @@ import torch
 from arguments import ModelParams, OptimizationParams, OptionParser, PipelineParams, write_cfg_args, write_model_json
 from splatting.distributed.consistency import agree_on_options
 from splatting.parts import check_together, chosen, tools
-from splatting.training import checks
+from splatting.training.earlier_runs import resolve_lenses
 from splatting.training.launch import add_launch_options, launch_options
 from splatting.training.loop import run_training
 from splatting.training.observers.report import training_report
@@ -109,7 +109,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         from splatting.diagnosis.advice import asked_options  # which no other training needs
 
         given = sys.argv[1:] if argv is None else argv
-        words = asked_options(checks.with_lenses(dataset, None), args, given)
+        words = asked_options(resolve_lenses(dataset, None), args, given)
         if args.advise:
             return
         args, dataset, opt, pipe = parse([*words, *given])

@@ -9,9 +9,10 @@ import torch
 
 from gaussian_renderer import Drawn
 from scene.sleeping import Sleeping
-from splatting.training.steps import captured
-from splatting.training.steps.captured import CapturedStep, Graphs
+from splatting.training.steps import captured, graphs
+from splatting.training.steps.captured import CapturedStep
 from splatting.training.steps.fused import FusedStep
+from splatting.training.steps.graphs import Graphs
 from splatting.training.steps.plain import PlainStep
 from splatting.training.steps.speculative import AHEAD
 
@@ -91,7 +92,7 @@ def take_as(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     """Lets steps be taken in a way of WAYS, as on a GPU, or plainly."""
     Rerun.made.clear()
     monkeypatch.setattr(captured, "Speculation", Immediate)
-    monkeypatch.setattr(captured, "Recorder", Rerun)
+    monkeypatch.setattr(graphs, "Recorder", Rerun)
 
     def choose(way: str) -> None:
         monkeypatch.setattr("splatting.training.loop.step_taker", WAYS.get(way, PlainStep))

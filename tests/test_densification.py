@@ -16,9 +16,9 @@ from scene.gaussians.long_axis import long_axis_children
 from splatting.parts import part_class
 from splatting.parts.adc.control import AdaptiveDensityControl
 from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
-from splatting.training.checks import late_reset
 from splatting.training.part import Needs
 from splatting.training.schedule import Schedule
+from splatting.training.strategy_warnings import late_reset
 from utils.general_utils import build_rotation
 
 EXTENT = 2.0

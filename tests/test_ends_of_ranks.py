@@ -16,8 +16,8 @@ from scene.gaussian_model import GaussianModel
 from splatting.distributed.consistency import agree_on_options, agree_on_scene
 from splatting.distributed.ranks import Ranks, refuse_differences, using
 from splatting.host import machine, torchrun
-from splatting.training import checks
 from splatting.training.restart import newest_checkpoint, what_stands
+from splatting.training.strategy_warnings import faster_alone
 from utils.system_utils import UserError, atomic_write, run_cli
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -137,9 +137,9 @@ def test_a_training_of_one_process_loads_nothing_of_several(colmap_scene, tmp_pa
 
 
 def test_a_scene_that_one_gpu_trains_faster_gets_a_sentence_with_the_estimate():
-    said = checks.faster_alone(2, True, 1_000_000)
+    said = faster_alone(2, True, 1_000_000)
     assert (
         "1,000,000 Gaussians takes it about 2.1 ms, and two that share it 3.7 ms" in said and "without torchrun" in said
     )
     for alone in ((1, True, 1_000_000), (2, False, 1_000_000), (2, True, 20_000_000)):
-        assert checks.faster_alone(*alone) is None
+        assert faster_alone(*alone) is None

@@ -21,7 +21,7 @@ from splatting.host.memory import free_memory, gib, is_out_of_memory, shortage
 from splatting.training import memory_estimate
 from splatting.training.memory_estimate import training_bytes
 from splatting.training.steps import fused
-from splatting.training.steps.captured import Graphs
+from splatting.training.steps.graphs import Graphs
 from utils.system_utils import UserError, run_cli
 
 ROOT = Path(__file__).parents[1]

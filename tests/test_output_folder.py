@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from splatting.files.folders import locked, remove_temporary_files
-from splatting.training.checks import check_folder
+from splatting.training.earlier_runs import check_folder
 from splatting.training.output_folder import folder_of, own_folder, records_kept
 from utils.system_utils import UserError, atomic_write
 

@@ -18,9 +18,11 @@ from splatting.training import run
 from splatting.training.iteration import Iteration, Losses
 from splatting.training.objective import Objective
 from splatting.training.steps import captured, speculative, step_taker
-from splatting.training.steps.captured import CapturedStep, Graphs, Recorder
+from splatting.training.steps.captured import CapturedStep
 from splatting.training.steps.fused import FusedStep
+from splatting.training.steps.graphs import Graphs
 from splatting.training.steps.plain import PlainStep
+from splatting.training.steps.recorder import Recorder
 from utils.system_utils import UserError
 
 pytestmark = needs_fused_step
@@ -191,7 +193,7 @@ def test_a_graph_without_any_memory_is_an_error_and_no_abort(_):
     """Torch allocates as a capture begins; in a process of its own, as the abort would end this one."""
     code = """
 import torch
-from splatting.training.steps.captured import Recorder
+from splatting.training.steps.recorder import Recorder
 recorder, word = Recorder(torch.device("cuda")), torch.zeros(1, device="cuda")
 recorder.capture(word.zero_)
 recorder.release()

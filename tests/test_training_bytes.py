@@ -18,7 +18,7 @@ from trainings import ITERATIONS, OPTIONS, differences, plain_training, shared_s
 from scene import sleeping
 from scene.readers.point_cloud import write_point_cloud
 from splatting.distributed.ranks import ranks
-from splatting.training.steps.captured import Graphs
+from splatting.training.steps.graphs import Graphs
 
 Result = dict[str, bytes | list]
 EVERY = pytest.mark.parametrize("name", OPTIONS)

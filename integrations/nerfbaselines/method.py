@@ -26,7 +26,8 @@ from splatting.parts import PARTS, appearances, part_class
 from splatting.training.iteration import Iteration
 from splatting.training.loop import training_steps
 from splatting.training.observers.divergence import DivergenceWatch
-from splatting.training.observers.guards import MaskWatch, MemoryGuard
+from splatting.training.observers.mask_watch import MaskWatch
+from splatting.training.observers.memory_guard import MemoryGuard
 from splatting.training.part import Part
 from splatting.training.run import Run
 from train import parse

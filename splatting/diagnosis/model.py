@@ -49,7 +49,7 @@ FEW_GAUSSIANS = 2000
 _CLEARLY = 3.0  # dB
 _VIEWS = 4
 _WIDTH = 200
-_RESET_SAID = "warning: opacities are reset"  # the beginning of what training/checks.py:late_reset says
+_RESET_SAID = "warning: opacities are reset"  # the beginning of what training/strategy_warnings.py:late_reset says
 
 
 def check_model(model_path: str, iteration: int, source: str | None = None, images: str | None = None) -> list[Line]:

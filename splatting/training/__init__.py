@@ -1,15 +1,17 @@
 """The training loop and its parts; `train.py` is its command line.
 
 loop                       the method, on one page
-run, iteration             the loop's inputs: a run made from the options, one iteration and its view
+run, stepping, iteration   what the loop gets: a run made from the options, what each iteration needs, one iteration
 steps/                     the step of an iteration: plain, fused or captured
 objective                  the loss
 part, option               what a feature adds to a training, in one class; the features lie in splatting/parts
 density                    the hooks of density control; the strategies lie in splatting/parts
 schedule                   the steps of the schedule that an iteration stands for
 announcer, observers/      what watches every training: checks, progress, scores, records, saves, checkpoints
-checks, memory_estimate    before: what is refused or warned of, and an estimate of the memory that a training needs
+checks, earlier_runs       before: what is refused, by the scene and by what earlier runs have left
+strategy_warnings, memory_estimate
+                           before: what is warned of, and how much memory a training needs
 launch                     options of train.py besides the three groups
-agreement, output_folder   several processes: what has to be the same on all before the start, and one output folder
-together, restart          several processes: what they share in each iteration, and where a restarted training goes on
+output_folder, restart     the folder that a training writes into, and where one that starts anew goes on
+step_agreement             several processes: what they share in each iteration
 """

@@ -2,17 +2,12 @@
 
 import argparse
 import copy
-import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext
-from functools import cached_property
-from itertools import count
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from arguments import add_to_model_json, write_cfg_args
 from gaussian_renderer.rays import check_views
@@ -22,55 +17,34 @@ from scene.gaussians.morton import sort_rows
 from scene.scene import Scene
 from scene.splats.splats import Splats
 from scene.with_splats import scene_with, start_from
-from splatting.deterministic.counter_rng import Stream, uniform
 from splatting.distributed.consistency import agree_on_scene
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch
-from splatting.host.clock import seconds_since_start
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.parts import check_together, chosen, part_class, remove_traces, states_in
-from splatting.training import checks
+from splatting.training import checks, earlier_runs
 from splatting.training.density import density_control
-from splatting.training.iteration import Iteration, OwnSize, ViewOrder
-from splatting.training.memory_estimate import announce_memory, expected_count
+from splatting.training.iteration import ViewOrder
+from splatting.training.memory_estimate import announce_memory
 from splatting.training.objective import LossWatch, Objective
-from splatting.training.part import Part, overrides
 from splatting.training.restart import resumed
 from splatting.training.schedule import Schedule
+from splatting.training.stepping import Stepping
+from splatting.training.strategy_warnings import warnings_of
 from utils.system_utils import UserError, compute_device
 
 
-def bias_correction(step: int, beta1: float = 0.9, beta2: float = 0.999) -> float:
-    """Factor of a step of Adam whose averages began at zero (Kingma and Ba 2015, Section 2), from 1/6 up to 1.
+class Run(Stepping):
+    """The objects that the loop and its observers share, besides those of `Stepping`.
 
-    Sparse Adam leaves it out, as the reference's. Steps that are long already would then be six times as long.
-    """
-    return math.sqrt(1 - beta2**step) / (1 - beta1**step)
-
-
-SH_INTERVAL = 1000  # iterations between raises of the active SH degree
-
-
-class Run:
-    """The objects that the loop and its observers share.
-
-    scene, gaussians, views (by iteration), objective, density, schedule; dataset, opt, pipe, launch: the options;
-    group: the processes that train together; start: a chkpntN.pth that is resumed, or None; background: (3,) of the
-    scene; first_iteration: done before this run. From `begin` on: log, rows (of the curve so far), losses (running mean
-    of the total) and clock (seconds of training). lost: steps that an error has taken back. first_done: seconds from
-    the process's start to the end of its first iteration, None if the system does not say. interrupt: a signal that
-    asks the loop to stop; an observer that waits has to look at it. resources: what parts have open, closed when the
-    training is over, however it ends. report: `training_report`, or what replaces it; writer: its first argument.
-    checkpoints: writes them, while the loop runs.
+    dataset, opt, pipe, launch: the options; group: the processes that train together; start: a chkpntN.pth that is
+    resumed, or None. From `begin` on: log, rows (of the curve so far), losses (running mean of the total) and clock
+    (seconds of training). lost: steps that an error has taken back. interrupt: a signal that asks the loop to stop; an
+    observer that waits has to look at it. resources: what parts have open, closed when the training is over, however it
+    ends. report: `training_report`, or what replaces it; writer: its first argument. checkpoints: writes them, while
+    the loop runs. final_iteration: that of the model of the last save.
     """
 
-    first_done: float | None = None
-    parts: Sequence[Part] = ()
-    sleeping: Any = None
-    asked_sizes = "none"
-    sizes: Any = OwnSize()
-    counts: Any = None
-    on_host: Any = None
     writer: Any = None
     report: Any = None
     checkpoints: Any = None
@@ -89,9 +63,9 @@ class Run:
         self.group = ranks()
         checks.check_alone(getattr(pipe, "projection", "ewa"), self.group.several)
         self.start = self.group.shared(resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
-        dataset = self.dataset = checks.with_lenses(dataset, self.start)
+        dataset = self.dataset = earlier_runs.resolve_lenses(dataset, self.start)
         if opt.strategy == "auto" and self.start:
-            opt.strategy = checks.strategy_of(self.start)
+            opt.strategy = earlier_runs.strategy_of(self.start)
         self.lost, self.resources = 0, ExitStack()
         self.interrupt, self.device = DeferredInterrupt(), compute_device()
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
@@ -100,7 +74,6 @@ class Run:
         states = self._choose_parts(capture)
         if self.schedule.is_over(self.first_iteration):
             raise UserError(self.schedule.nothing_left(self.start, self.first_iteration))
-        self.warnings: list[str] = []
         self.scene, first = self._read_scene()
         checks.check_scene(self.scene, dataset, bool(self.start))
         agree_on_scene(self.scene, self.start)  # before an image is shared
@@ -109,7 +82,7 @@ class Run:
         self.gaussians.divide(self.group)
         self.gaussians.room.expect(-(-count // self.group.size), self.scene)
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed)
-        self._decode_ahead(self.first_iteration + 1)
+        self.decode_ahead(self.first_iteration + 1)
         self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
         self._begin_model(capture, first, states)
         check_views(self.pipe, self.scene.getTrainCameras(), self.sizes.smallest)
@@ -122,12 +95,10 @@ class Run:
         self.density = density_control(self)
         self.objective = Objective(self)
         self.density.schedule = self.schedule
-        expected = expected_count(self.density.most_gaussians, self.gaussians.gaussian_count)
-        self._warn(checks.faster_alone(self.group.size, self.device.type == "cuda", expected))
-        self._warn(checks.late_reset(self.density, opt, self.first_iteration))
-        self._warn(checks.without_effect(given, opt.strategy))
-        self._warn(checks.another_number(self.density, opt, self.gaussians.gaussian_count, self.first_iteration + 1))
-        for ready in self._each("ready"):
+        self.warnings = [f"warning: {text}" for text in warnings_of(self, given)]
+        for text in self.warnings:
+            print(text, file=sys.stderr)
+        for ready in self.each("ready"):
             ready(self)
         if capture is None and first is None:
             self.density.started()
@@ -140,19 +111,9 @@ class Run:
         for name in states.keys() - {part.name for part in self.parts}:
             if text := part_class(name).dropped(given, self.first_iteration):
                 print(f"warning: {text}", file=sys.stderr)
-        for check in self._each("check"):
+        for check in self.each("check"):
             check(self, states.get(check.__self__.name))
         return states
-
-    @cached_property
-    def _hooks(self) -> dict[str, list[Callable]]:
-        return {}
-
-    def _each(self, hook: str) -> list[Callable]:
-        """That hook of the parts that have it."""
-        if hook not in self._hooks:
-            self._hooks[hook] = overrides(self.parts, hook)
-        return self._hooks[hook]
 
     def _read_start(self) -> tuple[tuple | None, int]:
         """The state of the checkpoint that is resumed, on the host, and its iteration."""
@@ -167,25 +128,19 @@ class Run:
             return scene_with(init_ply, self.dataset, self.gaussians, **options)
         return Scene(self.dataset, self.gaussians, shuffle=False, start=False, **options), None
 
-    def _warn(self, text: str | None) -> None:
-        """Print what a check says, and keep it for the log."""
-        if text is not None:
-            self.warnings.append(f"warning: {text}")
-            print(self.warnings[-1], file=sys.stderr)
-
     def _begin_model(self, capture: tuple | None, first: Splats | None, states: dict[str, Any]) -> None:
         """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""
         if capture is not None:
             self.gaussians.start_exposures(self.scene.info.train_cameras)
             self.gaussians.restore(capture, self.opt)
-            for begin in self._each("begin"):
+            for begin in self.each("begin"):
                 begin(self, states.get(begin.__self__.name))
         else:
             if first is None:
                 self.scene.create_gaussians()
             else:
                 start_from(first, self.scene, self.gaussians)
-            for begin in self._each("begin"):
+            for begin in self.each("begin"):
                 begin(self, None)
             self.gaussians.training_setup(self.opt)
             sort_rows(self.gaussians)
@@ -197,9 +152,9 @@ class Run:
         """Compare this run with those before it, in its folder and beside its checkpoint."""
         start = self.start
         saves = [self.schedule.known(one) for one in (self.launch.save_iterations, self.launch.checkpoint_iterations)]
-        checks.check_folder(self.options, saves[0], start, self.first_iteration, saves[1])
+        earlier_runs.check_folder(self.options, saves[0], start, self.first_iteration, saves[1])
         if start:
-            checks.report_changes(start, self.options)
+            earlier_runs.report_changes(start, self.options)
 
     @property
     def _all_options(self) -> argparse.Namespace:
@@ -219,7 +174,7 @@ class Run:
     @property
     def facts(self) -> dict[str, Any]:
         """What parts keep in model.json."""
-        return {name: fact for facts in self._each("facts") for name, fact in facts().items()}
+        return {name: fact for facts in self.each("facts") for name, fact in facts().items()}
 
     def begin(self) -> None:
         """Write the inputs into the output folder, print the memory estimate, start or continue the log."""
@@ -231,112 +186,11 @@ class Run:
         density = self.density
         wants = density.most_gaussians, density.absolute_gradients
         announce_memory(self.scene, self.gaussians, *wants, self.group.size)
-        self.log, self.rows = checks.continue_records(folder, start, self.first_iteration)
+        self.log, self.rows = earlier_runs.continue_records(folder, start, self.first_iteration)
         self.losses = LossWatch(self.log.loss)
         self.clock = Stopwatch()
-        for opened in self._each("opened"):
+        for opened in self.each("opened"):
             opened(self)
-
-    def iterations(self) -> Iterator[Iteration]:
-        """The iterations of this run."""
-        for iteration in count(self.first_iteration + 1):
-            seconds, schedule = self.clock.seconds, self.schedule
-            schedule.reach(iteration, self.log.seconds_before + seconds)
-            camera = self.sizes.view(self.views[iteration], schedule.schedule_step(iteration))
-            span, last = schedule.span(iteration), schedule.is_last(iteration)
-            step = Iteration(
-                iteration,
-                last=last,
-                camera=camera,
-                background=self._background(iteration),
-                changes=self._changes(iteration),
-                started=seconds,
-                span=range(span.start, schedule.length + 1) if last else span,
-            )
-            self.add_terms(step)
-            yield step
-            if iteration == self.first_iteration + 1:
-                self.first_done = seconds_since_start()
-            if step.last:
-                return
-
-    def add_terms(self, step: Iteration) -> None:
-        """Add what parts add to the loss of a step."""
-        for terms in self._each("terms"):
-            if found := terms(step):
-                step.terms |= found
-                step.wants_depth |= terms.__self__.needs.depth
-                step.captured &= terms.__self__.needs.captured
-
-    def _changes(self, iteration: int) -> bool:
-        changes = any(changes(iteration) for changes in self._each("changes"))
-        return self.density.changes(iteration) or self._raises_degree(iteration) > 0 or changes
-
-    def _raises_degree(self, iteration: int) -> int:
-        """How often the SH degree is raised in an iteration."""
-        before, now = (self.schedule.schedule_step(t) // SH_INTERVAL for t in (iteration - 1, iteration))
-        return now - before
-
-    def _background(self, iteration: int) -> Tensor:
-        if not self.opt.random_background:
-            return self.background
-        draws = uniform(self.opt.seed, Stream.BACKGROUND, iteration, torch.zeros(1, dtype=torch.int64))
-        return draws[0, :3].to(self.device)
-
-    def prepare(self, step: Iteration) -> None:
-        """Set learning rates and SH degree, and begin to decode the photos of the next views."""
-        self.set_rates(step)
-        for _ in range(self._raises_degree(step.iteration)):
-            self.gaussians.oneupSHdegree()
-            self.gaussians.limit_columns()
-        if step.iteration - 1 == self.launch.debug_from:
-            self.pipe.debug = True
-        self._decode_ahead(step.iteration)
-
-    def set_rates(self, step: Iteration) -> None:
-        """Set the learning rates of a step, which may be one that is repeated."""
-        self.gaussians.exposures.held = self.density.recovers(step.iteration)
-        self.gaussians.update_learning_rate(self.schedule.schedule_step(step.iteration))
-        factor = self.schedule.rate_factor(step.iteration)
-        if factor is None:
-            factor = self.density.rate_factor(step.iteration)
-        if factor is not None:
-            sparse = self.opt.optimizer_type == "sparse_adam"
-            self.gaussians.scale_rates(factor * (bias_correction(step.iteration) if sparse else 1.0))
-
-    def _decode_ahead(self, iteration: int) -> None:
-        ahead = self.scene.images.ahead
-        if (last := self.schedule.ends) is not None:
-            ahead = min(ahead, last - iteration + 1)
-        self.scene.prefetch(list(filter(self.sizes.needs, self.views.coming(iteration, ahead))))
-
-    @property
-    def is_standard(self) -> bool:
-        """Whether loss and density control need gradients of the image alone, and the kernels compute all the rest.
-
-        What an objective or a strategy says of itself is not inherited; subclasses opt in.
-        """
-        own = all(vars(type(one)).get("fusable", False) for one in (self.objective, self.density))
-        return own and not (self.pipe.compute_cov3D_python or self.pipe.convert_SHs_python)
-
-    def step_on_host(self, step: Iteration, gradient: Tensor) -> None:
-        """Take the step of the view's camera. gradient (numbers,): of the loss by the camera's numbers."""
-        at = self.schedule.schedule_step(step.iteration)
-        self.on_host.step(step.camera.uid, gradient.cpu().numpy(), at)
-        self.on_host.place()
-
-    def after_step(self, step: Iteration) -> None:
-        """What follows the optimiser's step."""
-        self.density.after_step(step)
-        for after_step in self._each("after_step"):
-            after_step(step)
-        if step.changes:
-            for after_change in self._each("after_change"):
-                after_change(step)
-
-    def flushed_view(self) -> AbstractContextManager:
-        """Within it, others may read the model."""
-        return nullcontext() if self.sleeping is None else self.sleeping.flushed_view()
 
     def checkpoint_state(self) -> tuple:
         """The state of the model for a checkpoint, from which a training resumes. Every rank must call it."""
@@ -347,26 +201,9 @@ class Run:
     def save_last(self, iteration: int) -> None:
         """Save the model that parts make of the trained one, and what they keep in model.json."""
         model, self.final_iteration, self.last_iteration = self.gaussians, iteration, iteration
-        for final in self._each("final"):
+        for final in self.each("final"):
             model, self.final_iteration = final(model, self.final_iteration)
         scene = self.scene
         scene.save(iteration, model)
         write_cfg_args(scene.model_path, argparse.Namespace(**vars(self.dataset) | {"sh_degree": model.max_sh_degree}))
         add_to_model_json(scene.model_path, **self.facts)
-
-    def stop_skipping(self, guarded: bool = True) -> None:
-        """Let all blocks take the steps that they have missed, and sleep no more. guarded: of `Sleeping.flush`."""
-        if self.sleeping is not None:
-            self.sleeping.flush(guarded)
-        self.sleeping = None
-
-    def render_options(self, step: Iteration) -> dict[str, bool]:
-        """Options of `render` that make it compute what this step's loss needs, and no more."""
-        return {
-            "use_trained_exp": self.gaussians.exposures.applied,
-            "want_depth": step.wants_depth,
-            "want_visibility": False,
-            "want_inactive_bands": False,
-            "want_absolute_gradient": self.density.absolute_gradients and self.density.observes(step.iteration),
-            "clamp": False,
-        }

@@ -31,10 +31,10 @@ from splatting.parts.budget.error_scores import error_map, error_scores
 from splatting.parts.budget.rules import fade, split_in_two
 from splatting.parts.mcmc.control import MarkovChain
 from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
-from splatting.training.checks import another_number
 from splatting.training.density import default_budget
 from splatting.training.objective import Objective
 from splatting.training.schedule import STEADY, Schedule
+from splatting.training.strategy_warnings import another_number
 from utils.graphics_utils import getProjectionMatrix
 from utils.loss_utils import photometric_loss
 from utils.system_utils import UserError

@@ -32,7 +32,7 @@ from splatting.training import run as runs
 from splatting.training.iteration import Iteration
 from splatting.training.objective import Objective
 from splatting.training.observers.progress import ProgressBar
-from splatting.training.steps import captured, fused
+from splatting.training.steps import captured, fused, graphs
 from utils.system_utils import UserError
 
 BETAS, EPS = (0.9, 0.999), 1e-15
@@ -469,17 +469,17 @@ def test_captured_steps_that_are_stopped_resume_to_the_same_bytes(scene, tmp_pat
     """Some iterations after all blocks have rested, no Python of theirs has run."""
     expected = plain("default")
     take_as("captured")
-    launch = captured.Graphs.launch
+    launch = graphs.Graphs.launch
 
-    def interrupted(self: captured.Graphs, at: Iteration) -> object:
+    def interrupted(self: graphs.Graphs, at: Iteration) -> object:
         if at.iteration == 37:
             os.kill(os.getpid(), signal.SIGINT)
         return launch(self, at)
 
-    monkeypatch.setattr(captured.Graphs, "launch", interrupted)
+    monkeypatch.setattr(graphs.Graphs, "launch", interrupted)
     with pytest.raises(KeyboardInterrupt):
         _trained(scene, tmp_path / "cut")
-    monkeypatch.setattr(captured.Graphs, "launch", launch)
+    monkeypatch.setattr(graphs.Graphs, "launch", launch)
     start = "--start_checkpoint", tmp_path / "cut/chkpnt37.pth"
     assert extra_state(load_checkpoint(start[1])[0]).get("sleep")
     assert not differences(_trained(scene, tmp_path / "whole", *start), expected)

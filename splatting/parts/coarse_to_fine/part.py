@@ -38,13 +38,13 @@ class CoarseToFine(Part):
         return getattr(given, cls.switch, "none") != "none"
 
     def check(self, run: Any, state: Any) -> None:
-        run.asked_sizes = run.opt.resolution_schedule
+        run.schedule.sizes = run.opt.resolution_schedule
 
     def begin(self, run: Any, state: Any) -> None:
         from splatting.parts.coarse_to_fine.sizes import Sizes
         from splatting.training.schedule import PYRAMID
 
-        schedule, asked = run.schedule, run.asked_sizes
+        schedule, asked = run.schedule, run.opt.resolution_schedule
         schedule.megapixels = run.scene.training_pixels()[0] / len(run.scene.getTrainCameras()) / 1e6
         if not schedule.paced:
             schedule.sizes = "none" if asked == "auto" else asked

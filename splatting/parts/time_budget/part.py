@@ -51,7 +51,7 @@ class TimeBudget(Part):
         from splatting.parts.time_budget.schedule_file import schedule_of
 
         self._run = run
-        schedule = schedule_of(run.opt, run.asked_sizes, run.start, run.first_iteration, run.group.shared, state)
+        schedule = schedule_of(run.opt, run.schedule.sizes, run.start, run.first_iteration, run.group.shared, state)
         fill(run, "schedule", schedule, self)
         self._end_in_time(run.opt)
 

@@ -1,7 +1,8 @@
 """The observers of a training, in their order."""
 
 from splatting.training.observers.divergence import DivergenceWatch
-from splatting.training.observers.guards import MaskWatch, MemoryGuard
+from splatting.training.observers.mask_watch import MaskWatch
+from splatting.training.observers.memory_guard import MemoryGuard
 from splatting.training.observers.progress import ProgressBar, Summary
 from splatting.training.observers.records import Records
 from splatting.training.observers.report import Scores, training_report

@@ -1,0 +1,163 @@
+"""Traces of earlier runs, in the folder of a training and beside its checkpoint: what they allow, and what goes on."""
+
+import argparse
+import contextlib
+import copy
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from arguments import OPTIONS, VIEW_OPTIONS, other_scene, read_training_options
+from scene.saved_model import saves_in
+from splatting.evaluation import training_log
+from splatting.evaluation.error_curve import NAME as CURVE
+from splatting.evaluation.error_curve import Row, continue_curve
+from splatting.evaluation.training_log import TrainingLog
+from utils.system_utils import UserError
+
+
+def check_folder(
+    now: argparse.Namespace,
+    saving_iterations: Sequence[int],
+    checkpoint: str | None,
+    first_iteration: int,
+    checkpoint_iterations: Sequence[int] = (),
+) -> None:
+    """Refuse a folder with a model of another scene (UserError), or with one that this training's options do not fit.
+
+    now: all options. Warn of iterations that an earlier training has saved and this one does not overwrite. Programs
+    that read them take the folder's options, which are those of the last training.
+    """
+    folder = Path(now.model_path)
+    saved, then = saves_in(folder), _options_of(folder)
+    trained_on = str(then.get("source_path", ""))
+    if not lies_in(checkpoint, folder) and saved and other_scene(trained_on, now.source_path):
+        raise UserError(
+            f"{folder} holds a model of another scene, {trained_on}; name another folder with -m, or remove that one"
+        )
+    new = {".ply": saving_iterations, ".pth": (*saving_iterations, *checkpoint_iterations)}
+    stay = [n for n, path in saved.items() if n > first_iteration and n not in new[path.suffix]]
+    if not stay:
+        return
+    kept = f"{folder} keeps iteration {', '.join(map(str, sorted(stay)))} of an earlier training"
+    changed = [name for name in _changed(then, now) if name in VIEW_OPTIONS]
+    if changed and max(stay) > max(saving_iterations, default=0):
+        before, after = (" ".join(_typed(n, of[n]) for n in changed) for of in (then, vars(now)))
+        raise UserError(
+            f"{kept} with {before}, which {after} would not fit; name another folder by -m, or remove the old one"
+        )
+    over = "" if lies_in(checkpoint, folder) else "; this one starts over"
+    if over and (replaced := sorted(saved.keys() - {*stay})):
+        over += f" and replaces iteration {', '.join(map(str, replaced))}"
+    _warn(
+        f"{kept}{over}, and other commands take the highest unless --iteration is given; remove the old ones, or "
+        "name another folder by -m"
+    )
+
+
+def lies_in(checkpoint: str | None, folder: str | os.PathLike) -> bool:
+    """Whether a checkpoint, if there is one, lies in a model folder."""
+    return checkpoint is not None and _same_place(Path(checkpoint).parent, folder)
+
+
+def report_changes(checkpoint: str, now: argparse.Namespace) -> None:
+    """Warn if the run that wrote a checkpoint had other options than this run, `now`.
+
+    now: all options. Those that the checkpoint's folder does not record are not compared. UserError for another scene,
+    and for --eval after a training on all photos.
+    """
+    folder = Path(checkpoint).parent
+    then = _options_of(folder)
+    trained_on = str(then.get("source_path", ""))
+    if other_scene(trained_on, now.source_path):
+        raise UserError(
+            f"{checkpoint} is of another scene, {trained_on}; resume it with that one, or start from its model with "
+            "--init_ply"
+        )
+    changed = _changed(then, now)
+    if "eval" in changed and now.eval:
+        raise UserError(
+            f"{checkpoint} was trained on all photos, so --eval can hold out none that it has not seen; leave --eval "
+            "out, or start a new training"
+        )
+    if changed:
+        before, after = (" ".join(_typed(n, of[n]) for n in changed) for of in (then, vars(now)))
+        mixed = VIEW_OPTIONS.intersection(changed) and (folder / CURVE).exists()
+        of_curve = "; the earlier points of its curve are of those other views" if mixed else ""
+        _warn(f"{folder} was trained with {before}, this run has {after}{of_curve}")
+
+
+def continue_records(model_path: str, checkpoint: str | None, first_iteration: int) -> tuple[TrainingLog, list[Row]]:
+    """The log of a training and the rows of its curve up to `first_iteration`; none for a training from the start.
+
+    Both are read from the checkpoint's folder if that has a log, else from model_path. This run continues them
+    in model_path.
+    """
+    before = Path(model_path)
+    if checkpoint and (Path(checkpoint).parent / training_log.NAME).is_file():
+        before = Path(checkpoint).parent
+    log, rows = TrainingLog(model_path, first_iteration, before), continue_curve(model_path, first_iteration, before)
+    if rows:  # after a rescue the curve has rows beyond the log's last record
+        log.not_before(rows[-1])
+    elif checkpoint and not log.records:
+        print(
+            f"{training_log.NAME} beside {checkpoint} is missing, or has nothing up to iteration {first_iteration}: "
+            "seconds count from there, in the curve too",
+            file=sys.stderr,
+        )
+    return log, rows
+
+
+def strategy_of(checkpoint: str) -> str:
+    """The strategy of the run that wrote a checkpoint; adc if its folder does not say."""
+    return str(_options_of(Path(checkpoint).parent).get("strategy", "adc"))
+
+
+def resolve_lenses(dataset: argparse.Namespace, checkpoint: str | None) -> argparse.Namespace:
+    """Model options whose --lenses auto is decided: native, or that of the run that wrote a checkpoint to resume.
+
+    A folder that does not say was written when photos were undistorted, as they are where auto stays. UserError for
+    other photos than those of that run.
+    """
+    given, then = getattr(dataset, "lenses", None), _options_of(Path(checkpoint).parent) if checkpoint else {}
+    before = then.get("lenses", "auto") if checkpoint else "native"
+    if given == "auto":
+        dataset = copy.copy(dataset)
+        dataset.lenses = before
+    elif given and then and given != before and "native" in (given, before):
+        photos = "the photos as they are" if before == "native" else "undistorted photos"
+        raise UserError(f"{checkpoint} was trained on {photos}; leave --lenses {given} out")
+    return dataset
+
+
+def _options_of(folder: Path) -> dict[str, object]:
+    """Training options that a folder records; none if they cannot be read, as in a folder without a model."""
+    with contextlib.suppress(UserError, OSError):
+        return read_training_options(folder)
+    return {}
+
+
+def _changed(then: dict[str, object], now: argparse.Namespace) -> list[str]:
+    """Names of options that differ from those of an earlier training, as far as that recorded them."""
+    names = [option.name for option in OPTIONS if option.compared and option.name in then]
+    return [name for name in names if not _equal(name, then[name], getattr(now, name))]
+
+
+def _equal(name: str, then: object, now: object) -> bool:
+    return _same_place(then, now) if name == "source_path" else then == now
+
+
+def _same_place(one: str | os.PathLike, other: str | os.PathLike) -> bool:
+    return os.path.realpath(one) == os.path.realpath(other)
+
+
+def _typed(name: str, value: object) -> str:
+    """Format an option as it is typed on a command line."""
+    if isinstance(value, bool):
+        return f"--{name}" if value else f"no --{name}"
+    return f"--{name} {value if value != '' else repr(value)}"
+
+
+def _warn(text: str) -> None:
+    print(f"warning: {text}", file=sys.stderr)

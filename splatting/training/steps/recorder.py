@@ -1,0 +1,82 @@
+"""Capture of what a function queues on a GPU as a CUDA graph, with what torch needs for it."""
+
+import gc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+
+import torch
+from torch import Tensor
+
+
+class Recorder:
+    """Captures on a stream of its own, on which nothing ever runs. All graphs share one pool of memory."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device, self._stream = device, torch.cuda.Stream(device)
+        self._keeper: torch.cuda.CUDAGraph | None = None
+
+    def capture(self, body: Callable[[], Tensor]) -> tuple[Callable[[], None], Tensor]:
+        """Capture what a function queues: a function that queues it, and the result, which each launch overwrites.
+
+        RuntimeError, torch.OutOfMemoryError among them, if it cannot be captured.
+        """
+        if self._keeper is None:
+            self._pool, self._word = torch.cuda.graph_pool_handle(), torch.zeros(1, device=self._device)
+            # Torch gives the pool's memory back once no graph uses it; the next capture would wait for it.
+            self._keeper, _ = self._graph_of(self._word.zero_)
+        graph, result = self._graph_of(body)
+        return graph.replay, result
+
+    def release(self) -> None:
+        """Give back the memory of graphs that nobody has any more, and what torch keeps for later."""
+        self._keeper = None
+        torch.cuda.empty_cache()
+
+    def is_tight(self) -> bool:
+        """Whether most of what torch may take is taken, so that what is kept for later should be given back."""
+        free, total = torch.cuda.mem_get_info(self._device)
+        most = torch.cuda.get_per_process_memory_fraction() * total
+        return min(free, most - torch.cuda.memory_reserved(self._device)) < most / 4
+
+    def _graph_of(self, body: Callable[[], Tensor]) -> tuple[torch.cuda.CUDAGraph, Tensor]:
+        self._stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(self._stream), _no_collection():
+            # capture_begin allocates two words for the random generator. Where that fails, torch's destructor of the
+            # graph throws, which aborts the process. Here it fails before there is a graph.
+            words = [torch.empty(1, dtype=torch.int64, device=self._device) for _ in range(2)]
+            del words  # to the cache of this stream, which the next allocations take
+            graph = torch.cuda.CUDAGraph()
+            graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
+            try:
+                result = body()
+                graph.capture_end()
+            except BaseException:
+                self._end(graph)
+                raise
+        return graph, result
+
+    def _end(self, graph: torch.cuda.CUDAGraph) -> None:
+        """End a capture that has failed, so that torch's allocator and generator take part in it no longer."""
+        index = torch.cuda.current_device()
+        try:
+            graph.capture_end()
+        except RuntimeError:  # which tells of the capture, not of its cause, and ends nothing else
+            with suppress(RuntimeError):
+                # Within a capture, torch gives no memory back to the driver.
+                torch._C._cuda_endAllocateToPool(index, self._pool)
+                torch._C._cuda_releasePool(index, self._pool)
+        # Where the body has ended the capture, torch's generator would go on as in one, and fail.
+        generator = torch.cuda.default_generators[index]
+        generator.graphsafe_set_state(generator.clone_state())
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Within it Python collects no garbage: to destroy the graph of an earlier training would invalidate a capture."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
