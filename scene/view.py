@@ -39,6 +39,7 @@ class View:
     pinhole. world_view_transform, projection_matrix, full_proj_transform: (4,4) float32, transposed; camera_center (3,)
     float32; all on `device`, made when they are first read. columns: the columns that count in loss and scores, None:
     all. exposure_name: the photo's name among the trained exposures where it is not image_name, else None.
+    pictures: paths of further ones, by names of parts, which are decoded at training size (`picture`).
     depth_has_gaps: whether an inverse depth of 0 is unknown, and not far away.
     """
 
@@ -72,6 +73,7 @@ class View:
         self.depth_has_gaps = getattr(info.depth, "metric", False)
         self._depth = self._placed(info.depth)
         self._reliable = self._depth is not None and depth_fit(info.depth_params).reliable
+        self.pictures: dict[str, Source | InMemory] = {}
         self._projection = projection(ZNEAR, ZFAR, self.FoVx, self.FoVy, *offset).numpy()
         self.place(info.R, info.T)
 
@@ -136,6 +138,10 @@ class View:
         twin._source = self._changed(self._source, lambda photo: shrink_photo(photo, size, self._ignore_alpha))
         twin._mask = self._changed(self._mask, lambda mask: shrink_mask(mask, size))
         twin._depth = self._changed(self._depth, lambda depth: shrink_values(depth, size))
+        twin.pictures = {
+            name: self._changed(source, lambda values: shrink_photo(values, size, ignore_alpha=True))
+            for name, source in self.pictures.items()
+        }
         return twin
 
     def _changed(self, source: Source | InMemory | None, change: Callable[[Tensor], Tensor]) -> InMemory | None:
@@ -159,11 +165,11 @@ class View:
 
     @property
     def undecoded(self) -> list[Picture]:
-        """Sources of photo, mask and depth map, each with the size (width, height) to decode it at.
+        """Sources of photo, mask, depth map and further pictures, each with the size (width, height) to decode it at.
 
         Empty if they were given as pixels.
         """
-        sources = (self._source, self._mask, self._depth)
+        sources = (self._source, self._mask, self._depth, *self.pictures.values())
         return [(s, self._size) for s in sources if s is not None and not at_hand(s)]
 
     def _stored(self, source: Source | InMemory) -> Tensor:
@@ -171,6 +177,11 @@ class View:
 
     def _decoded(self, source: Source | InMemory) -> Tensor:
         return self._stored(source).to(self.device, non_blocking=True)
+
+    def picture(self, name: str) -> Tensor | None:
+        """The further picture of a name, (C,H,W) uint8 on `device`; None for a view without one."""
+        source = self.pictures.get(name)
+        return None if source is None else self._decoded(source)
 
     def ground_truth(self, background: Tensor) -> tuple[Tensor, Tensor | None]:
         """`target` and `counted_pixels`, with one copy of the image to the device for both."""

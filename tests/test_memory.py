@@ -106,7 +106,7 @@ def _failing(function, call: int, error: Exception):
 
 @needs_fused_step
 def test_the_state_before_is_saved_and_goes_on_to_the_same_end(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("splatting.training.run.SH_INTERVAL", 5)  # the failing iteration raises the degree
+    monkeypatch.setattr("splatting.training.stepping.SH_INTERVAL", 5)  # the failing iteration raises the degree
     with monkeypatch.context() as patch:
         patch.setattr(fused, "draw", _failing(fused.draw, 5, ON_A_GPU))
         with pytest.raises(UserError, match="training ran out of memory in iteration 5") as caught:

@@ -7,12 +7,13 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 from synthetic import make_colmap_scene
 
-from splatting.parts import PARTS, part_class, strategies
+from splatting.parts import PARTS, part_class, strategies, tools
 from splatting.training.part import Part, fill, overrides
 from utils.system_utils import UserError
 
@@ -97,6 +98,14 @@ def test_what_declares_parts_imports_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert not {"torch", "numpy", "scene", "arguments"} & {*done.stdout.split()}
+
+
+def test_parts_declare_their_tools():
+    known = {*re.findall(r"\b(\w+)\(", tools.__doc__)}
+    for name in PARTS:
+        path = FOLDER / name / "tools.py"
+        there = known & {*vars(import_module(f"splatting.parts.{name}.tools"))} if path.is_file() else set()
+        assert there == {*part_class(name).tools}, name
 
 
 # A program in which a part is not there: neither its line of the registry nor its folder.

@@ -16,7 +16,7 @@ from scene import sleeping
 from scene.readers.point_cloud import write_point_cloud
 from splatting.parts.filter_3d import part as filter_3d
 from splatting.parts.robust_mask import residuals
-from splatting.training import loop, run
+from splatting.training import loop, run, stepping
 from splatting.training.iteration import Iteration
 from splatting.training.steps.plain import PlainStep
 
@@ -105,7 +105,7 @@ def trained(scene: Path, out: Path, *options: object) -> dict[str, bytes | list]
     words += ["--opacity_reset_interval", 30, "--test_iterations", -1, "--checkpoint_iterations", ITERATIONS]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stdout", sys.stdout)  # training stamps it
-        patch.setattr(run, "SH_INTERVAL", 12)  # between the iterations that change rows
+        patch.setattr(stepping, "SH_INTERVAL", 12)  # between the iterations that change rows
         patch.setattr(filter_3d, "INTERVAL", 15)
         patch.setattr(residuals.Residuals, "early", 0)  # renders are far from the photos
         patch.setattr(residuals, "_FACTOR", 1.2)

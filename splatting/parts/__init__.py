@@ -5,7 +5,6 @@ import os
 from collections.abc import Callable, Collection, Mapping
 from functools import cache
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -122,7 +121,7 @@ def remove_traces(folder: str | os.PathLike, parts: Collection[Part]) -> None:
 
 
 def tools(name: str) -> list[Callable]:
-    """The functions of a name that parts have for other commands than train.py, in their tools.py.
+    """The functions of a name that parts have for other commands than train.py, in their tools.py (`Part.tools`).
 
     advise(scene, tracks): texts on a scene, and options of train.py that they speak for.
     beside(facts, means): which Gaussians of a model are not of the scene itself. facts: of model.json.
@@ -135,6 +134,5 @@ def tools(name: str) -> list[Callable]:
     summary_writer(folder): TensorBoard's, as `train.prepare_output_and_logger` returns it, or None.
     report_to(writer, iteration): what writes losses, images, scores and the model of a training report by one.
     """
-    modules = [f"{__name__}.{part}.tools" for part in PARTS]
-    found = [import_module(module) for module in modules if find_spec(module)]
-    return [getattr(module, name) for module in found if hasattr(module, name)]
+    having = [part for part in PARTS if name in part_class(part).tools]
+    return [getattr(import_module(f"{__name__}.{part}.tools"), name) for part in having]

@@ -114,6 +114,7 @@ class Part:
     shown: terms whose running mean the progress bar shows, and what it calls them.
     waits: whether it may let the training wait. It is told last, when all else of an iteration is done and written.
     own_end: whether its options let a training end before or after --iterations.
+    tools: functions that it has for other commands, in tools.py of its folder (`tools` of splatting/parts/__init__.py).
     traces: files that the part writes into a model folder, and a training without it removes; never what may be input.
     """
 
@@ -128,6 +129,7 @@ class Part:
     shown: ClassVar[dict[str, str]] = {}
     waits: ClassVar[bool] = False
     own_end: ClassVar[bool] = False
+    tools: ClassVar[tuple[str, ...]] = ()
     traces: ClassVar[tuple[str, ...]] = ()
 
     @classmethod

@@ -15,6 +15,7 @@ class Filter3d(Part):
     """Keeps the width of each Gaussian's filter, and lets the model be drawn and saved behind it."""
 
     name = "filter_3d"
+    tools = ("drawn",)
     # fmt: off
     options = Options(optimisation=(
         Option("filter_3d", False, origin="ours",

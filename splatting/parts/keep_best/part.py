@@ -17,6 +17,7 @@ class KeepBest(Part):
     """Takes views away from training, scores them in the curve's iterations, and keeps the best model so far."""
 
     name = "keep_best"
+    tools = "remarks", "against_overfitting"
     # fmt: off
     options = Options(model=(
         Option("keep_best", False, origin="ours", stored=MODEL_JSON,

@@ -20,6 +20,7 @@ class Ppisp(Appearance):
     """Trains the numbers of photos and of their cameras. Haze can grow before cameras after a reset of opacities."""
 
     name = kind = "ppisp"
+    tools = ("advise",)
     summary = (
         "exposure and white balance of each photo, vignetting and response of each camera, with the test photos held "
         "out, and without resets of opacities at their usual interval"

@@ -19,6 +19,7 @@ class RefinePoses(Part):
     """Gives the cameras their poses, which take steps on the host, and keeps them in poses.json."""
 
     name = "refine_poses"
+    tools = "advise", "for_wrong_poses"
     # fmt: off
     options = Options(model=(
         Option("refine_poses", False, origin="ours", stored=MODEL_JSON,

@@ -19,6 +19,7 @@ class RobustMask(Part):
     """
 
     name = "robust_mask"
+    tools = "advise_trained", "examine", "pictures"
     # fmt: off
     options = Options(optimisation=(
         Option("robust_mask", 0.0, origin="ours", check=within(0, 0.5),

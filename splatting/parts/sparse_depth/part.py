@@ -16,6 +16,7 @@ class SparseDepth(Part):
     """Adds the depth of a view's points to its loss."""
 
     name = "sparse_depth"
+    tools = ("advise",)
     # fmt: off
     options = Options(optimisation=(
         Option("sparse_depth", 0.0, origin="ours", check=at_least(0),

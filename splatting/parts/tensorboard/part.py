@@ -15,6 +15,7 @@ class Tensorboard(Part):
     """Writes the losses of every tenth iteration, but for testing ones: there `training_report` writes all."""
 
     name = "tensorboard"
+    tools = "summary_writer", "report_to"
 
     @classmethod
     def wanted(cls, given: "argparse.Namespace") -> bool:

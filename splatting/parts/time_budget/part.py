@@ -19,6 +19,7 @@ class TimeBudget(Part):
     """Lets each iteration stand for a part of the schedule, and keeps in schedule.json for which."""
 
     name = "time_budget"
+    tools = ("for_few_iterations",)
     # fmt: off
     options = Options(optimisation=(
         Option("time_budget", 0.0, origin="ours", check=within(0, 31_536_000),  # a year
