@@ -7,17 +7,18 @@ from functools import cached_property
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from scene.gaussians import adc, checkpoint, penalty
 from scene.gaussians.adam import GaussianAdam, SparseGaussianAdam, StepGuard
-from scene.gaussians.attributes import INITIAL_OPACITY, Rows
+from scene.gaussians.attributes import INITIAL_OPACITY
 from scene.gaussians.exposure import Exposures, read_exposures, read_pretrained
 from scene.gaussians.finite import check_finite
 from scene.gaussians.parameters import GaussianParameters, raw_rows
 from scene.gaussians.start import start_rows
 from scene.gaussians.table import trainable
 from scene.readers.info import photo_names
+from splatting.compat.model_names import ReferenceNames
 from splatting.host.machine import compute_device
 from utils.general_utils import get_expon_lr_func, inverse_sigmoid
 from utils.graphics_utils import BasicPointCloud
@@ -26,15 +27,8 @@ from utils.system_utils import UserError
 _OPTIMIZERS = {"default": GaussianAdam, "sparse_adam": SparseGaussianAdam}
 
 
-def _of_exposures(name: str, doc: str) -> property:
-    """A part of a model's exposures, by the reference's name."""
-    return property(
-        lambda self: getattr(self.exposures, name), lambda self, value: setattr(self.exposures, name, value), doc=doc
-    )
-
-
-class GaussianModel(GaussianParameters):
-    """Gaussians as they are trained, with the reference's names.
+class GaussianModel(ReferenceNames, GaussianParameters):
+    """Gaussians as they are trained. ReferenceNames has further names of the reference.
 
     GaussianParameters has the tensors and their activated forms. optimizer_type: "default" or "sparse_adam", whose step
     takes a mask of the visible Gaussians. spatial_lr_scale: extent of the scene, world units. percent_dense: largest
@@ -97,20 +91,6 @@ class GaussianModel(GaussianParameters):
         """Restart the statistics of Gaussians whose sum of gradients is not finite."""
         self.statistics.drop_broken()
 
-    # The reference's names for changes of the optimiser's parameters; the model's own attributes stay as they are.
-
-    def replace_tensor_to_optimizer(self, tensor: Tensor, name: str) -> dict[str, nn.Parameter]:
-        """Give a parameter a new value and averages of zero (GaussianTable.replace)."""
-        return self.table.replace(name, tensor)
-
-    def cat_tensors_to_optimizer(self, tensors_dict: Rows) -> dict[str, nn.Parameter]:
-        """Append rows (n, ...) by group name, with averages of zero (GaussianTable.append)."""
-        return self.table.append(tensors_dict)
-
-    def _prune_optimizer(self, mask: Tensor) -> dict[str, nn.Parameter]:
-        """Keep the rows of a mask (N,) bool (GaussianTable.select)."""
-        return self.table.select(mask.reshape(-1).nonzero().reshape(-1), mask.numel())
-
     def take_from_optimizer(self) -> None:
         """Adopt the rows that densification had reached when memory ran out, so that they can be saved."""
         self._take({group.get("name"): group["params"][0] for group in self.optimizer.param_groups})
@@ -119,25 +99,10 @@ class GaussianModel(GaussianParameters):
 
     # Exposures
 
-    _exposure = _of_exposures("values", "Maps of colours (n, 3, 4) of the n training photos.")
-    exposure_mapping = _of_exposures("mapping", "Index in `get_exposure` by the photo's name.")
-    pretrained_exposures = _of_exposures("pretrained", "Maps (3, 4) by name that replace the trained ones, or None.")
-    exposure_optimizer = _of_exposures("optimizer", "The optimiser of the exposures; None before training is set up.")
-    exposure_scheduler_args = _of_exposures("schedule", "Learning rate by iteration; None before training is set up.")
-
     @cached_property
     def exposures(self) -> Exposures:
         """Maps of colours of the training photos, identities unless trained."""
         return Exposures()
-
-    @property
-    def get_exposure(self) -> Tensor:
-        """Maps of colours (n, 3, 4) of the n training photos."""
-        return self._exposure
-
-    def get_exposure_from_name(self, image_name: str) -> Tensor:
-        """Map of colours (3, 4) of a training photo, by its name in exposure.json."""
-        return self.exposures[image_name]
 
     def start_exposures(self, cam_infos: Sequence) -> None:
         """Give each training camera an exposure that changes nothing."""

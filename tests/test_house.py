@@ -38,7 +38,7 @@ MAY_IMPORT = {
     "scene.gaussians": (),
     "scene.splats": ("scene.gaussians", "scene.readers.world_offset"),
     "scene.check": ("scene.readers", "scene.images", "scene.gaussians.copies"),
-    "scene.gaussian_model": ("scene.gaussians", "scene.readers.info"),
+    "scene.gaussian_model": ("scene.gaussians", "scene.readers.info", "splatting.compat.model_names"),
     "scene.dataset_readers": ("scene.readers", "scene.images", "splatting.compat"),
     "scene.cameras": ("scene.view", "splatting.compat.camera"),
     "scene.saved_model": ("scene", "splatting.parts"),

@@ -130,11 +130,11 @@ def _budget(gaussians: GaussianModel) -> None:
     scores = "scores"
     density._scores = lambda *_: _random(gaussians, scores).double().clamp_min(0.0)
     _train(gaussians, density)
-    density.most_gaussians = gaussians.gaussian_count - 10
+    density.max_gaussians = gaussians.gaussian_count - 10
     _train(gaussians, density, (14900,))
     with torch.no_grad():
         gaussians.raw("opacity")[_random(gaussians, "same") > 0] = logit(0.5)
-    density.most_gaussians = gaussians.gaussian_count - 40
+    density.max_gaussians = gaussians.gaussian_count - 40
     _train(gaussians, density, (14900,))
 
 

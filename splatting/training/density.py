@@ -26,20 +26,20 @@ class DensityControl:
     does not call `after_backward`. It asks `observes`, and in iterations that `changes` names it asks `replaced` and
     calls `before_step`. It counts only where the class itself says so: a subclass may want more. queues: whether
     `after_step` queues operators that change the model; it queues nothing else, unless the iteration is one that
-    `changes` names. most_gaussians: how many it lets there be, 0: any number. penalty: a part of the loss besides the
+    `changes` names. max_gaussians: how many it lets there be, 0: any number. penalty: a part of the loss besides the
     objective, of which steps add the gradients; no loss that is told has it.
     absolute_gradients: whether the statistics take the lengths of absolute gradients (Ye et al. 2024); for the whole
     run. clamps: whether the loss takes renders clamped to [0, 1], as the reference's does; then Gaussians brighter than
     white cost nothing before a white background. ends: the iteration of the schedule from which it changes no rows.
     schedule: tells how far it is in an iteration (training/schedule.py). Rules that are windows of the schedule ask it;
     rules that count steps take the iteration itself. random: whether the model began as random points, of which the
-    clock may remove those that it cannot train. grows_to: whether it is meant to reach most_gaussians; not where nobody
+    clock may remove those that it cannot train. grows_to: whether it is meant to reach max_gaussians; not where nobody
     has given a number, with default_is_limit.
     """
 
     fusable: ClassVar[bool] = False
     queues: ClassVar[bool] = False
-    most_gaussians = 0
+    max_gaussians = 0
     penalty = NO_PENALTY
     absolute_gradients = False
     clamps: ClassVar[bool] = True
@@ -78,20 +78,20 @@ class DensityControl:
         """
         return ()
 
-    def most_after(self, count: int, first: int, last: int) -> int:
+    def projected_count(self, count: int, first: int, last: int) -> int:
         """The most that `count` Gaussians can become from iteration `first` to `last`, both known to the schedule.
 
-        `most_gaussians` where the strategy has no number to reach.
+        `max_gaussians` where the strategy has no number to reach.
         """
-        return self.most_gaussians
+        return self.max_gaussians
 
-    def most(self, iteration: int, count: int, limit: int) -> int:
+    def count_limit(self, iteration: int, count: int, limit: int) -> int:
         """How many Gaussians there may be after an iteration, 0: any number. limit: as an option has it, 0: none.
 
         With a time budget not more than so few iterations can train, but the `count` that are there all stay, except of
         a random start.
         """
-        return self.schedule.most(iteration, count, limit, self.random, self.most_gaussians)
+        return self.schedule.count_limit(iteration, count, limit, self.random, self.max_gaussians)
 
     def too_slow(self) -> str:
         """Why it may not reach its number of Gaussians in time, and what to do."""

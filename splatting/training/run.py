@@ -184,7 +184,7 @@ class Run(Stepping):
         if self.group.first:
             remove_traces(folder, self.parts)
         density = self.density
-        wants = density.most_gaussians, density.absolute_gradients
+        wants = density.max_gaussians, density.absolute_gradients
         announce_memory(self.scene, self.gaussians, *wants, self.group.size)
         self.log, self.rows = earlier_runs.continue_records(folder, start, self.first_iteration)
         self.losses = LossWatch(self.log.loss)

@@ -88,8 +88,8 @@ class Schedule:
         """Whether nothing is left to do after an iteration."""
         return self.ends is not None and iteration >= self.ends
 
-    def most(self, iteration: int, count: int, limit: int, random: bool, aim: int) -> int:
-        """How many Gaussians there may be after an iteration (DensityControl.most)."""
+    def count_limit(self, iteration: int, count: int, limit: int, random: bool, aim: int) -> int:
+        """How many Gaussians there may be after an iteration (DensityControl.count_limit)."""
         return limit
 
     def best_strategy(self, run: Any) -> str:

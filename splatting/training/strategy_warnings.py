@@ -18,7 +18,7 @@ STEP_ALONE, STEP_SHARED = (0.9, 1.25), (2.8, 0.87)
 def warnings_of(run: Any, given: argparse.Namespace) -> Iterator[str]:
     """Warnings before a run (splatting/training/run.py). given: the optimisation options as they were given."""
     density, opt, count, done = run.density, run.opt, run.gaussians.gaussian_count, run.first_iteration
-    expected = expected_count(density.most_gaussians, count)
+    expected = expected_count(density.max_gaussians, count)
     found = (
         faster_alone(run.group.size, run.device.type == "cuda", expected),
         late_reset(density, opt, done),
@@ -72,13 +72,13 @@ def another_number(density: DensityControl, opt: argparse.Namespace, count: int,
 
     count: of Gaussians, now; first: the next iteration. Not known of a run with a time budget.
     """
-    schedule, aim, strategy = density.schedule, density.most_gaussians, part_class(opt.strategy)
+    schedule, aim, strategy = density.schedule, density.max_gaussians, part_class(opt.strategy)
     if schedule.paced or schedule.schedule_step(first) >= density.ends > 0:
         return None  # what is repeated or resumed has no say in it any more
     ending, start = strategy.until[0], f"--densify_from_iter {opt.densify_from_iter} is not before"
     if 0 < density.ends <= opt.densify_from_iter < schedule.length:
         return f"{start} --{ending} {density.ends}, so no Gaussians are added; lower --densify_from_iter"
-    reached = density.most_after(count, first, schedule.ends)
+    reached = density.projected_count(count, first, schedule.ends)
     too_many, too_late = 0 < opt.max_num_splats < count, opt.densify_from_iter >= schedule.length
     remover = next((name for name in strategies() if part_class(name).removes), None)
     if not density.grows_to:

@@ -194,7 +194,7 @@ def test_a_pace_that_quickens_before_the_last_densification_leaves_none_missing(
     window = {"densification_interval": 10, "densify_from_iter": -1700, "densify_until_iter": 1000}
     control = _control(DecidedSchedule(Decided(2000, blocks, None, 9.0)), **window, max_num_splats=1000)
     # At the pace of the 80th, the 90th comes just in time.
-    assert max(filter(control.changes, range(1, 160))) == 80 and control.most_after(100, 1, 160) == 1000
+    assert max(filter(control.changes, range(1, 160))) == 80 and control.projected_count(100, 1, 160) == 1000
 
 
 def test_a_split_leaves_other_rows_alone_and_restarts_averages():

@@ -40,7 +40,7 @@ def test_gaussians_are_moved(colmap_scene, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("growth", "count", "grown"), [(0.05, 5, 6), (0.05, 40, 42), (0.0, 5, 5), (1.0, 30, 45)])
 def test_a_few_gaussians_grow_at_least_by_one(growth, count, grown):
-    assert MarkovChain(None, options(max_num_splats=45, mcmc_growth=growth)).most_after(count, 600, 601) == grown
+    assert MarkovChain(None, options(max_num_splats=45, mcmc_growth=growth)).projected_count(count, 600, 601) == grown
 
 
 def test_growth_ends_at_the_limit(colmap_scene, tmp_path):

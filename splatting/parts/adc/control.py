@@ -34,7 +34,7 @@ class AdaptiveDensityControl(DensityControl):
         self._extent = extent
         self.absolute_gradients = opt.absgrad
         self.ends = opt.densify_until_iter
-        self.most_gaussians = opt.max_num_splats
+        self.max_gaussians = opt.max_num_splats
 
     def changes(self, iteration: int) -> bool:
         todo = self._actions(iteration)
@@ -92,7 +92,7 @@ class AdaptiveDensityControl(DensityControl):
             rules.MAX_SCREEN_SIZE if limit_size else None,
             seed=self._opt.seed,
             iteration=iteration,
-            max_splats=self.most(iteration, self._gaussians.gaussian_count, self.most_gaussians),
+            max_splats=self.count_limit(iteration, self._gaussians.gaussian_count, self.max_gaussians),
             long_axis=self._opt.split == "long_axis",
         )
         refuse_empty(iteration, self._gaussians.gaussian_count == 0, "raise --opacity_reset_interval")

@@ -32,7 +32,7 @@ ITERATIONS_A_SCORE = 5  # at least, of a scored view
 class BudgetControl(DensityControl):
     """Removes useless Gaussians and adds others, every densification_interval steps before densify_until_iter.
 
-    most_gaussians: their number at the end of that.
+    max_gaussians: their number at the end of that.
     """
 
     fusable = True
@@ -43,7 +43,7 @@ class BudgetControl(DensityControl):
         self._cameras = run.scene.getTrainCameras()
         self.ends = run.opt.densify_until_iter
         self._scores = partial(error_scores, run.gaussians, run.pipe, run.gaussians.exposures.applied)
-        self.most_gaussians = run.opt.max_num_splats or default_budget(self._cameras)
+        self.max_gaussians = run.opt.max_num_splats or default_budget(self._cameras)
 
     def rate_factor(self, iteration: int) -> float:
         """Learning rates follow the number of iterations, and fall at the end."""
@@ -70,7 +70,7 @@ class BudgetControl(DensityControl):
             fade(self._gaussians, self._opt.opacity_decay)
         sort_rows(self._gaussians)
 
-    def most_after(self, count: int, first: int, last: int) -> int:
+    def projected_count(self, count: int, first: int, last: int) -> int:
         for iteration in filter(self.changes, range(first, min(last, self.ends))):  # the last iteration takes no step
             if self._grows(iteration):
                 count = min(self._aim(count, iteration), 2 * count)
@@ -78,7 +78,7 @@ class BudgetControl(DensityControl):
 
     def _aim(self, now: int, iteration: int) -> int:
         """How many Gaussians there are to be after the densification of an iteration, `now` before it."""
-        most = self.most(iteration, now, self.most_gaussians)
+        most = self.count_limit(iteration, now, self.max_gaussians)
         return count_after(now, most, self._remaining(iteration))
 
     def _grows(self, iteration: int) -> bool:

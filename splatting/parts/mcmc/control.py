@@ -34,7 +34,7 @@ class MarkovChain(DensityControl):
     ) -> None:
         self._gaussians = gaussians
         self._opt = opt
-        self.most_gaussians = opt.max_num_splats or most
+        self.max_gaussians = opt.max_num_splats or most
         self.penalty = Penalty(opt.mcmc_opacity_reg, opt.mcmc_scale_reg) if penalised else NO_PENALTY
         self.ends = opt.mcmc_until_iter
 
@@ -52,7 +52,7 @@ class MarkovChain(DensityControl):
         stride = self.schedule.stride(iteration)
         return within and iteration % rules.interval(opt, opt.mcmc_until_iter, stride) == 0
 
-    def most_after(self, count: int, first: int, last: int) -> int:
+    def projected_count(self, count: int, first: int, last: int) -> int:
         for iteration in filter(
             self.changes, range(first, min(last, self.ends))
         ):  # the last is saved before its change
@@ -65,7 +65,7 @@ class MarkovChain(DensityControl):
         if not self.changes(iteration):
             return ()
         count = gaussians.gaussian_count
-        moves = 0 < self.most(iteration, count, 0) < count or self._grown(count, iteration) > count
+        moves = 0 < self.count_limit(iteration, count, 0) < count or self._grown(count, iteration) > count
         moves = moves or gaussians.shards.ranks.anyone(not is_alive(gaussians, least).all())
         return gaussians._attributes if moves else ()
 
@@ -82,10 +82,10 @@ class MarkovChain(DensityControl):
         add_noise(self._gaussians, rate, seed=self._opt.seed, iteration=step.iteration)
 
     def _relocate(self, iteration: int) -> None:
-        """Move what nobody sees (the paper's relocation of dead Gaussians), or remove random points (`most`)."""
+        """Move what nobody sees (the paper's relocation of dead Gaussians), or remove random points (`count_limit`)."""
         least = self._opt.mcmc_min_opacity
         count = self._gaussians.gaussian_count
-        if 0 < (most := self.most(iteration, count, 0)) < count:
+        if 0 < (most := self.count_limit(iteration, count, 0)) < count:
             remove_useless(self._gaussians, least, most)
         dead = relocate(self._gaussians, least, seed=self._opt.seed, iteration=iteration)
         empty = dead == self._gaussians.gaussian_count
@@ -101,5 +101,5 @@ class MarkovChain(DensityControl):
     def _grown(self, count: int, iteration: int) -> int:
         """The number after a growth: more by a part of it (the paper's rule of adding Gaussians), at least by one."""
         growth = self._opt.mcmc_growth
-        most = self.most(iteration, count, self.most_gaussians)
+        most = self.count_limit(iteration, count, self.max_gaussians)
         return min(max(int((1 + growth) * count), count + (growth > 0)), most)

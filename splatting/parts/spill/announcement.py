@@ -19,7 +19,7 @@ def announce(run: Any, memory: GpuMemory) -> None:
 
     Warn if the host has too little for what is expected.
     """
-    now, most, size = run.gaussians.gaussian_count, run.density.most_gaussians, run.group.size
+    now, most, size = run.gaussians.gaussian_count, run.density.max_gaussians, run.group.size
     later = expected_count(most, now)
     if far := memory.host_bytes(-(-later // size)):
         _announce_host(run.scene.images, far, f"{later:,} Gaussians", size)

@@ -46,7 +46,7 @@ class Spill(Part):
         fill(self._model, "room", GpuMemory(run.opt.gpu_memory, self._model, absolute, run.device), self)
 
     def ready(self, run: Any) -> None:
-        self._model.room.expect(-(-run.density.most_gaussians // run.group.size), run.scene)
+        self._model.room.expect(-(-run.density.max_gaussians // run.group.size), run.scene)
 
     def opened(self, run: Any) -> None:
         from splatting.parts.spill.announcement import announce

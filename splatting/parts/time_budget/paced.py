@@ -91,7 +91,7 @@ class DecidedSchedule(Schedule):
         speed = statistics.median(speeds[-_PACE:]) if speeds else 0.0
         return self.seconds / speed if speed > 0 else 1 / present.step
 
-    def most(self, iteration: int, count: int, limit: int, random: bool, aim: int) -> int:
+    def count_limit(self, iteration: int, count: int, limit: int, random: bool, aim: int) -> int:
         """Not more than so few iterations can train, but the `count` that are there all stay, except of a random start.
 
         aim: what the strategy is to reach.

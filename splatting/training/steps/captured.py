@@ -99,7 +99,7 @@ class CapturedStep(FusedStep):
             return losses
         with self._ahead.capacity(at):
             drawn, losses, gradients = self.measure(at)
-            if self.drop_further_terms():
+            if self.drops_parameter_terms():
                 return None
             run.gaussians.guard_loss(at.iteration, losses.total)
             self.advance(at, drawn, gradients)

@@ -15,9 +15,9 @@ Measured = tuple[Drawn, Losses, Gradients]
 
 
 class FusedStep(PlainStep):
-    """Takes steps whose gradients only the optimiser needs, with the bytes of `PlainStep`, and that where others do.
+    """Fused backward and optimiser, byte-equal to `PlainStep`; falls back to it if anything else reads gradients.
 
-    Autograd differentiates the loss by the image only, so any loss of image and depth will do, and exposures.
+    Autograd differentiates the loss by the image alone, so any loss of image and depth will do, and exposures.
     """
 
     def __init__(self, run: Run) -> None:
@@ -27,7 +27,7 @@ class FusedStep(PlainStep):
         self._adam = FusedAdam(run.gaussians, run.density.penalty)
         self._bands = KnownBands()
         self._is_known = False  # whether the model is one that the operator steps
-        self._has_further_terms = False
+        self._has_parameter_terms = False
 
     @staticmethod
     def suits(run: Run) -> bool:
@@ -38,7 +38,7 @@ class FusedStep(PlainStep):
         """Take a step; the observers are told once the loss is known."""
         if self._fuses(at):
             drawn, losses, gradients = self.measure(at)
-            if not self.drop_further_terms():
+            if not self.drops_parameter_terms():
                 observers.measured(at, losses)
                 self.advance(at, drawn, gradients)
                 del drawn, gradients  # what changes rows needs their memory
@@ -49,7 +49,7 @@ class FusedStep(PlainStep):
 
     def _fuses(self, at: Iteration) -> bool:
         """Whether the step of this iteration can be fused."""
-        if self._run.pipe.debug or self._has_further_terms:
+        if self._run.pipe.debug or self._has_parameter_terms:
             self._is_known = False
             return False
         if at.due or not self._is_known:
@@ -85,7 +85,7 @@ class FusedStep(PlainStep):
         # Observers keep losses for a while, which must not keep the image and its gradient.
         return drawn, losses.detached(), (image.grad, None if depth is None else depth.grad)
 
-    def drop_further_terms(self) -> bool:
+    def drops_parameter_terms(self) -> bool:
         """Whether the loss of the last `measure` depends on a parameter by another way than the image.
 
         Somebody has added a term to it. Its gradients are dropped, and from now on all steps are plain. Blocks go on
@@ -93,10 +93,10 @@ class FusedStep(PlainStep):
         """
         gaussians = self._run.gaussians
         params = [gaussians.raw(name) for name in gaussians._attributes]
-        self._has_further_terms = any([param.grad is not None for param in params])
-        if self._has_further_terms:
+        self._has_parameter_terms = any([param.grad is not None for param in params])
+        if self._has_parameter_terms:
             self._drop_gradients()
-        return self._has_further_terms
+        return self._has_parameter_terms
 
     def advance(self, at: Iteration, drawn: Drawn, gradients: Gradients) -> None:
         """Take the step of the Gaussians, as far as they take one, and add the view to the statistics."""

@@ -180,7 +180,7 @@ class Graphs:
         self._run.add_terms(placeholder)
         with self._capacity(None):
             launch, losses = self._recorder.capture(lambda: self._body(at.iteration, placeholder))
-        if self._fused.drop_further_terms():
+        if self._fused.drops_parameter_terms():
             self._able = False
             return None
         return _Graph(launch, target, losses)
