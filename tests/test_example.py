@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -28,6 +29,7 @@ def _ply(out: Path) -> bytes:
     return (out / "point_cloud/iteration_40/point_cloud.ply").read_bytes()
 
 
+@pytest.mark.slow
 def test_an_option_a_term_a_state_and_a_line(colmap_scene, tmp_path):
     plain, whole, resumed = (tmp_path / name for name in ("plain", "whole", "resumed"))
     assert _train(colmap_scene, "-m", plain).returncode == 0
