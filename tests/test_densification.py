@@ -14,8 +14,8 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from scene.gaussians.long_axis import long_axis_children
 from splatting.parts import part_class
-from splatting.parts.adc.control import AdaptiveDensityControl
 from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
+from splatting.training.adaptive_density import AdaptiveDensityControl
 from splatting.training.part import Needs
 from splatting.training.schedule import Schedule
 from splatting.training.strategy_warnings import late_reset

@@ -6,6 +6,7 @@ import functools
 import io
 import re
 import runpy
+import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
@@ -134,3 +135,11 @@ def test_figures_of_the_readme_stand_in_the_results():
     assert len(scored) == 6
     for _, *cells in scored:
         assert any(set(cells) <= {cell.strip() for cell in line.split("|")} for line in results), cells
+
+
+def test_the_worked_example_applies_to_the_code():
+    """tests/test_extending.py, which is slow, also runs what it makes."""
+    page = (ROOT / "docs/inside/extending.md").read_text(encoding="utf-8")
+    diffs = "".join(re.findall(r"^```diff\n(.*?)^```$", page, re.MULTILINE | re.DOTALL))
+    done = subprocess.run(["git", "apply", "--check", "-"], input=diffs, cwd=ROOT, capture_output=True, text=True)
+    assert diffs and done.returncode == 0, f"bring the diffs of the page up to date: {done.stderr}"

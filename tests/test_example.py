@@ -1,5 +1,6 @@
-"""The worked example of a part (tests/parts/example/grey): it is one folder and one line, and resumes to the byte."""
+"""The worked examples of parts (tests/parts/example): each is one folder and one line, and resumes to the byte."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ WITH_EXAMPLE = """
 import sys
 import splatting.parts as registry
 registry.__path__.append("tests/parts/example")
-registry.PARTS = (*registry.PARTS, "grey")
+registry.PARTS = (*registry.PARTS, "patient", "grey")
 import train
 scene, *words = sys.argv[1:]
 options = ["-s", scene, "-r", "48", "--iterations", "40", "--disable_viewer", "--no_curve", "--test_iterations", "-1"]
@@ -36,10 +37,10 @@ def test_an_option_a_term_a_state_and_a_line(colmap_scene, tmp_path):
     done = _train(colmap_scene, "-m", whole, "--grey", 5, "--checkpoint_iterations", 20)
     assert done.returncode == 0 and "Grey=" in done.stderr and _ply(whole) != _ply(plain), done.stderr
     (said,) = [line.partition(" [")[0] for line in done.stdout.splitlines() if line.startswith("--grey: ")]
-    first, last = (float(word) for word in said.split() if word.startswith("0."))
-    assert 0 < last < 0.8 * first
+    last = float(said.split()[-4])
     checkpoint = whole / "chkpnt20.pth"
-    assert torch.load(checkpoint, weights_only=False)[0][10]["grey"]["first"] > 0
+    assert 0 < last < 0.8 * torch.load(checkpoint, weights_only=False)[0][10]["grey"]["mean"]
+    assert json.loads((whole / "train_log.json").read_text())[-1]["grey"] == pytest.approx(last, abs=1e-4)
     again = _train(colmap_scene, "-m", resumed, "--grey", 5, "--start_checkpoint", checkpoint)
     assert _ply(resumed) == _ply(whole)
     assert said in again.stdout
@@ -50,3 +51,21 @@ def test_an_option_a_term_a_state_and_a_line(colmap_scene, tmp_path):
     assert without.returncode == 2 and "the checkpoint has a state of grey, which this code does not" in without.stderr
     refused = _train(colmap_scene, "-m", tmp_path / "no", "--grey", -1)
     assert "--grey must be at least 0" in refused.stderr
+
+
+@pytest.mark.slow
+def test_a_strategy_with_a_value_for_each_gaussian(colmap_scene, tmp_path):
+    often = ["--densify_from_iter", 2, "--densification_interval", 4, "--densify_grad_threshold", 1e-5]
+    counts = {}
+    for name, words in {"adc": [], "one": ["--strategy", "patient", "--patience", 1]}.items():
+        assert _train(colmap_scene, "-m", tmp_path / name, *often, *words).returncode == 0
+        counts[name] = _ply(tmp_path / name)
+    assert counts["one"] == counts["adc"]  # who waits for one is adaptive density control
+    two, checkpoint = ["--strategy", "patient", *often], tmp_path / "two" / "chkpnt20.pth"
+    done = _train(colmap_scene, "-m", tmp_path / "two", "--checkpoint_iterations", 20, *two)
+    assert done.returncode == 0, done.stderr
+    streaks = torch.load(checkpoint, weights_only=False)[0][10]["patient"]
+    assert {0, 1} <= {*streaks.tolist()} and _ply(tmp_path / "two") != counts["adc"]
+    # Its name is in model.json, so the strategy joins late.
+    again = _train(colmap_scene, "-m", tmp_path / "resumed", "--start_checkpoint", checkpoint, *often)
+    assert again.returncode == 0 and _ply(tmp_path / "resumed") == _ply(tmp_path / "two"), again.stderr

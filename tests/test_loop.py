@@ -4,7 +4,6 @@ import json
 import os
 import signal
 import time
-from argparse import Namespace
 from types import SimpleNamespace
 
 import pytest
@@ -12,7 +11,7 @@ import torch
 
 import train
 from splatting.evaluation.training_log import TrainingLog
-from splatting.parts.adc import control as adc
+from splatting.training import adaptive_density as adc
 from splatting.training.announcer import Announcer
 from splatting.training.density import DensityControl
 from splatting.training.observers.standard import standard_observers
@@ -117,9 +116,11 @@ def test_another_strategy_is_another_object(colmap_scene, tmp_path, monkeypatch)
     calls = []
 
     class Strategy(DensityControl):
-        def __init__(self, gaussians, opt: Namespace, white_background: bool, extent: float) -> None:
-            assert not white_background and extent > 0
-            self._gaussians = gaussians
+        @classmethod
+        def of_run(cls, run, *_, **__) -> "Strategy":
+            control = cls()
+            control._gaussians = run.gaussians
+            return control
 
         def changes(self, iteration: int) -> bool:
             return iteration == 3

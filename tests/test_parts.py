@@ -83,7 +83,8 @@ def _names_of(name: str, path: Path) -> Iterator[str]:
         else:
             continue
         if found:
-            yield f"{file}:{node.lineno}"
+            said = getattr(node, "value", "") if isinstance(node, ast.Constant) else getattr(node, "attr", "an import")
+            yield f"{file}:{node.lineno} says {said!r}; nobody names {name} outside of its folder"
 
 
 @pytest.mark.parametrize("name", PARTS)

@@ -19,9 +19,9 @@ from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
 from scene.gaussians.density_rules import logit
 from scene.gaussians.sh_bands import cut_bounds
 from splatting.distributed.ranks import ranks
-from splatting.parts.adc.control import AdaptiveDensityControl
 from splatting.parts.budget.control import BudgetControl
 from splatting.parts.mcmc.control import MarkovChain
+from splatting.training.adaptive_density import AdaptiveDensityControl
 from utils.system_utils import UserError
 
 EXTENT, THRESHOLD = 2.0, 2e-4
@@ -73,13 +73,14 @@ def _train(gaussians: GaussianModel, density: object, iterations: tuple[int, ...
         density.after_step(step)
 
 
-def _adc(gaussians: GaussianModel, *further: int, **changes: object) -> None:
-    _train(gaussians, AdaptiveDensityControl(gaussians, options(**changes), False, EXTENT), further or ITERATIONS)
+def _adc(gaussians: GaussianModel, *further: int, rule: tuple = (), **changes: object) -> None:
+    density = AdaptiveDensityControl(gaussians, options(**changes), False, EXTENT, *rule)
+    _train(gaussians, density, further or ITERATIONS)
 
 
 def _limited(gaussians: GaussianModel) -> None:
     _adc(gaussians, max_num_splats=gaussians.gaussian_count + 7)
-    _adc(gaussians, 900, max_num_splats=gaussians.gaussian_count + 5, split="long_axis", absgrad=True)
+    _adc(gaussians, 900, max_num_splats=gaussians.gaussian_count + 5, rule=(options().absgrad_threshold, True))
 
 
 def _by_hand(gaussians: GaussianModel) -> None:

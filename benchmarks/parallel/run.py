@@ -13,7 +13,7 @@ from scene.sleeping import Sleeping
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch
 from splatting.host.interrupt import DeferredInterrupt
-from splatting.parts import part_class
+from splatting.parts import part_class, strategy_part
 from splatting.parts.spill.announcement import sentences
 from splatting.training.density import density_control
 from splatting.training.iteration import ViewOrder
@@ -59,8 +59,7 @@ class WorkloadRun(Run):
         self.views = ViewOrder(cameras, self.opt.seed)
         self.background = torch.zeros(3, device=self.device)
         self.objective = Objective(self)
-        self.density = density_control(self)
-        self.density.schedule = self.schedule
+        self.density = density_control(self, strategy_part("adc"))
         if sleep:
             sort_rows(self.gaussians)
             self.sleeping = Sleeping(self.gaussians)

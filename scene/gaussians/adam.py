@@ -69,8 +69,9 @@ class GaussianAdam(torch.optim.Adam):
         undecorated(torch.optim.Adam.add_param_group)(self, param_group)
 
     def state_dict(self) -> dict[str, Any]:
-        """The state in torch's form."""
-        return undecorated(torch.optim.Adam.state_dict)(self)
+        """The state in torch's form, sorted: a resumed training writes the same file as one that never ended."""
+        found = undecorated(torch.optim.Adam.state_dict)(self)
+        return found | {"state": dict(sorted(found["state"].items()))}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Take a state dict, as torch does."""

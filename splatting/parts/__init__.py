@@ -2,7 +2,7 @@
 
 import argparse
 import os
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -47,6 +47,18 @@ def part_class(name: str) -> type[Part]:
 def strategies() -> list[str]:
     """Names of the strategies of density control."""
     return [name for name in PARTS if issubclass(part_class(name), Strategy)]
+
+
+def strategy_part(name: str) -> Strategy:
+    """The part of a strategy. UserError for a name that is none of one: a file of another run may say anything."""
+    if name not in strategies():
+        raise UserError(f"there is no strategy {name!r}; give --strategy {' or '.join(strategies())}")
+    return part_class(name)()
+
+
+def in_order(parts: Iterable[Part]) -> list[Part]:
+    """The parts in the order of the registry."""
+    return sorted(parts, key=lambda part: PARTS.index(part.name))
 
 
 def appearances() -> list[type[Appearance]]:

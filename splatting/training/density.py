@@ -10,8 +10,8 @@ from scene.cameras import Camera
 from scene.gaussians.penalty import NO_PENALTY
 from scene.readers.start_cloud import RANDOM_POINTS
 from scene.scene import Scene
-from splatting.parts import part_class, strategies
 from splatting.training.iteration import Iteration
+from splatting.training.part import Strategy
 from splatting.training.schedule import STEADY, Schedule
 from utils.system_utils import UserError
 
@@ -112,15 +112,10 @@ class DensityControl:
         """Called after the optimiser's step, so not in the last iteration, which takes none."""
 
 
-def density_control(run: Any) -> DensityControl:
-    """The control of the strategy that --strategy names, for the model and the scene of a run.
-
-    UserError for a name that is none of a strategy: a file of another run may say anything.
-    """
-    if (name := run.opt.strategy) not in strategies():
-        raise UserError(f"there is no strategy {name!r}; give --strategy {' or '.join(strategies())}")
-    control = part_class(name)().control(run)
-    control.random = is_random(run.scene)
+def density_control(run: Any, strategy: Strategy) -> DensityControl:
+    """The control of a strategy, for the model, the scene and the schedule of a run."""
+    control = strategy.control(run)
+    control.random, control.schedule = is_random(run.scene), run.schedule
     return control
 
 

@@ -78,7 +78,8 @@ class Needs:
     """What a part asks of the steps. It is data, because a captured step cannot ask anybody while it replays.
 
     depth: steps that have terms of the part render depth.
-    captured: a captured step may record its terms, which depend on the render and on the view's photo alone.
+    captured: a captured step may record its terms, which depend on the render and on the view's photo alone. It tells
+        of no terms then, so `measured` finds none in `losses.terms`.
     camera_gradient: steps compute the gradient of the camera's numbers, for the slot run.on_host.
     all_rows: every step concerns all rows, so that none may sleep.
     replay: a step that is taken twice gives the same; if not, the host does not run ahead of a GPU.
@@ -176,7 +177,11 @@ class Part:
         """The log is open, and files may be written."""
 
     def terms(self, at: "Iteration") -> "dict[str, Term]":
-        """What the iteration adds to the loss, weights included, by names for logs."""
+        """What the iteration adds to the loss, weights included, by names for logs.
+
+        A term gets the result of `render`, not clamped, and the mask of the pixels that count; at.camera.columns are
+        the columns that count. `photometric_loss` of utils/loss_utils.py takes all of these.
+        """
         return {}
 
     def changes(self, iteration: int) -> bool:
@@ -190,7 +195,7 @@ class Part:
         """Rows, the SH degree or sizes of views have changed, after `after_step`."""
 
     def records(self) -> dict[str, float]:
-        """Numbers for a record of the log."""
+        """Numbers for a record of the log, asked once all parts are told of the iteration's losses."""
         return {}
 
     def save(self, scene: Any) -> None:
@@ -238,6 +243,8 @@ class Part:
 class Strategy(Part):
     """A part of which each training has one: how many Gaussians there are, and where (--strategy NAME).
 
+    It joins a run once it is chosen, which may be late: `check` and `begin` are called then, when the model has its
+    optimiser, and all hooks after them.
     summary: of what it does, for the help. until: the option of the step at which it ends, and the part of the schedule
     that this is by default. removes: whether it removes Gaussians down to a given number.
     """
@@ -248,7 +255,11 @@ class Strategy(Part):
 
     @classmethod
     def wanted(cls, given: argparse.Namespace) -> bool:
-        return False  # what names it may be decided late
+        return False  # the run lets it join
+
+    @classmethod
+    def asked_by(cls, given: argparse.Namespace) -> str:
+        return f"--strategy {cls.name}"
 
     @classmethod
     def best_in(cls, seconds: float, run: Any) -> bool:

@@ -21,12 +21,13 @@ from splatting.distributed.consistency import agree_on_scene
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch
 from splatting.host.interrupt import DeferredInterrupt
-from splatting.parts import check_together, chosen, part_class, remove_traces, states_in
+from splatting.parts import check_together, chosen, in_order, part_class, remove_traces, states_in, strategy_part
 from splatting.training import checks, earlier_runs
 from splatting.training.density import density_control
 from splatting.training.iteration import ViewOrder
 from splatting.training.memory_estimate import announce_memory
 from splatting.training.objective import LossWatch, Objective
+from splatting.training.part import Strategy
 from splatting.training.restart import resumed
 from splatting.training.schedule import Schedule
 from splatting.training.stepping import Stepping
@@ -88,13 +89,8 @@ class Run(Stepping):
         check_views(self.pipe, self.scene.getTrainCameras(), self.sizes.smallest)
         check_views(self.pipe, [*self.scene.getTestCameras(), *self.scene.validation_cameras.get(1.0, ())])
         self._check_records()
-        if opt.strategy == "auto":
-            opt.strategy = self.schedule.best_strategy(self)
-            check_together(self.parts, self._all_options, self.group.several)
-        self.schedule.strategy = opt.strategy
-        self.density = density_control(self)
+        self.density = density_control(self, self._choose_strategy(states))
         self.objective = Objective(self)
-        self.density.schedule = self.schedule
         self.warnings = [f"warning: {text}" for text in warnings_of(self, given)]
         for text in self.warnings:
             print(text, file=sys.stderr)
@@ -147,6 +143,20 @@ class Run(Stepping):
         self.parts = [part for part in self.parts if part.active]
         self._hooks.clear()
         self.gaussians.limit_columns()
+
+    def _choose_strategy(self, states: dict[str, Any]) -> Strategy:
+        """Let the strategy join, now that the schedule and the model may say which it is."""
+        opt = self.opt
+        if opt.strategy == "auto":
+            opt.strategy = self.schedule.best_strategy(self)
+        self.schedule.strategy = opt.strategy
+        strategy = strategy_part(opt.strategy)
+        self.parts = in_order([*self.parts, strategy])
+        self._hooks.clear()
+        check_together(self.parts, self._all_options, self.group.several)
+        for hook in (strategy.check, strategy.begin):
+            hook(self, states.get(strategy.name))
+        return strategy
 
     def _check_records(self) -> None:
         """Compare this run with those before it, in its folder and beside its checkpoint."""

@@ -25,12 +25,12 @@ from scene.gaussians.long_axis import long_axis_children
 from scene.saved_model import read_model
 from splatting.deterministic.counter_rng import Stream
 from splatting.distributed.rows import WHOLE
-from splatting.parts.adc.control import AdaptiveDensityControl
 from splatting.parts.budget import control as budget
 from splatting.parts.budget.error_scores import error_map, error_scores
 from splatting.parts.budget.rules import fade, split_in_two
 from splatting.parts.mcmc.control import MarkovChain
 from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
+from splatting.training.adaptive_density import AdaptiveDensityControl
 from splatting.training.density import default_budget
 from splatting.training.objective import Objective
 from splatting.training.schedule import STEADY, Schedule

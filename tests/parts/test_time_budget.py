@@ -15,11 +15,11 @@ from trainings import before_steps, train_on
 
 from scene.gaussians import density_rules as rules
 from splatting.evaluation.training_log import Stopwatch
-from splatting.parts import part_class
+from splatting.parts import part_class, strategy_part
 from splatting.parts.coarse_to_fine.sizes import Sizes
 from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule, TimeBudget
 from splatting.parts.time_budget.schedule_file import read_schedule, schedule_of, write_schedule
-from splatting.training.density import DensityControl, density_control
+from splatting.training.density import DensityControl
 from splatting.training.iteration import Iteration
 from splatting.training.observers.progress import ProgressBar
 from splatting.training.run import Run
@@ -561,7 +561,7 @@ def test_the_clock_ends_growth_at_the_pace_of_whole_views_and_removes_nothing(si
 def test_a_strategy_of_a_damaged_file_is_none():
     """model.json of a resumed run, whose words nobody has checked."""
     with pytest.raises(UserError, match="^there is no strategy 'error_scores'; give --strategy adc or mcmc or budget$"):
-        density_control(SimpleNamespace(opt=SimpleNamespace(strategy="error_scores")))
+        strategy_part("error_scores")
 
 
 def test_a_number_of_iterations_goes_through_the_whole_schedule(tmp_path):

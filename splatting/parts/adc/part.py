@@ -1,8 +1,6 @@
 """Adaptive density control, the method's own strategy (Kerbl et al. 2023, Section 5.2)."""
 
 import argparse
-import copy
-import sys
 from typing import Any
 
 from splatting.training.option import Option, above, one_of
@@ -10,7 +8,7 @@ from splatting.training.part import Options, Strategy
 
 
 class Adc(Strategy):
-    """Clones, splits, prunes and resets; where a part needs bright renders, it resets at a given interval alone."""
+    """Clones, splits, prunes and resets."""
 
     name = "adc"
     summary = "adaptive density control, the method's own"
@@ -33,11 +31,7 @@ class Adc(Strategy):
         return opt.absgrad
 
     def control(self, run: Any) -> Any:
-        from scene.gaussians.density_rules import USUAL_RESETS
-        from splatting.parts.adc.control import AdaptiveDensityControl
+        from splatting.training.adaptive_density import AdaptiveDensityControl
 
-        opt, white = run.opt, run.dataset.white_background
-        if any(part.needs.bright for part in run.parts) and opt.opacity_reset_interval == USUAL_RESETS:
-            opt, white = copy.copy(opt), False
-            opt.opacity_reset_interval = sys.maxsize
-        return AdaptiveDensityControl(run.gaussians, opt, white, run.scene.cameras_extent)
+        threshold = run.opt.absgrad_threshold if run.opt.absgrad else None
+        return AdaptiveDensityControl.of_run(run, threshold, long_axis=run.opt.split == "long_axis")

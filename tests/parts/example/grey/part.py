@@ -1,4 +1,4 @@
-"""A worked example of a part: a loss term with an option, a state, and a line in the report (tests/test_example.py)."""
+"""A worked example of a part: a loss term with an option, a state, and numbers in the log (tests/test_example.py)."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -22,22 +22,30 @@ class Grey(Part):
     shown = {"grey": "Grey"}  # in the progress bar
 
     def begin(self, run: Any, state: Any) -> None:
+        from splatting.training.objective import LossWatch
+
         self._run = run
-        self._first = None if state is None else state["first"]  # of the whole training, also where this one resumes
-        self._last = None
+        self._mean = LossWatch(0.0 if state is None else state["mean"])  # a running mean, of the whole training
 
     def terms(self, at: "Iteration") -> "dict[str, Term]":
-        weight = self._run.opt.grey
-        return {"grey": lambda package, mask: weight * package["render"].std(0).mean()}
+        weight, columns = self._run.opt.grey, at.camera.columns or slice(None)
+
+        def term(package: dict[str, Any], mask: Any) -> Any:
+            spread = package["render"].std(0, keepdim=True)[..., columns]
+            return weight * (spread if mask is None else spread * mask[..., columns]).mean()
+
+        return {"grey": term}
 
     def measured(self, at: "Iteration", losses: "Losses") -> None:
-        # Noted, not read: the GPU may be some steps behind.
-        self._last = losses.terms["grey"]
-        self._first = self._last if self._first is None else self._first
+        self._mean.add(at.iteration, losses.terms["grey"])  # noted, not read: the GPU may be some steps behind
+
+    def records(self) -> dict[str, float]:
+        self._mean.read()
+        return {"grey": self._mean.mean}
 
     def state(self) -> dict[str, float]:
-        return {"first": float(self._first)}
+        return {"mean": self.records()["grey"]}
 
     def ended(self, error: Error) -> None:
         if error is None:
-            self._run.log.tell(f"--grey: {float(self._first):.4f} at first, {float(self._last):.4f} at the end")
+            self._run.log.tell(f"--grey: the running mean of the term is {self.records()['grey']:.4f} at the end")

@@ -1,11 +1,13 @@
-"""Adaptive density control, the method's own strategy (Kerbl et al. 2023, Section 5.2): clone, split, prune, reset.
+"""Adaptive density control, the method's own (Kerbl et al. 2023, Section 5.2): clone, split, prune, reset.
 
---absgrad judges a Gaussian by its pixels' absolute gradients (Ye et al. 2024, AbsGS) with a threshold of its own, for
-splits and for clones. --split long_axis splits along the longest axis (scene/gaussians/long_axis.py).
+A base for strategies that are like it. They may override `densify`.
 """
 
 import argparse
+import copy
+import sys
 from collections.abc import Collection
+from typing import Any
 
 from torch import Tensor
 
@@ -19,22 +21,44 @@ from splatting.training.iteration import Iteration
 class AdaptiveDensityControl(DensityControl):
     """Adaptive density control (Kerbl et al. 2023, Section 5.2), with the rules of scene/gaussians/density_rules.py.
 
-    extent: of the scene, world units; sizes are judged by it.
+    extent: of the scene, world units; sizes are judged by it. threshold: of a Gaussian's mean screen-space gradient,
+    per NDC unit, from which on it is cloned or split; with absolute_threshold, of its pixels' absolute gradients (Ye et
+    al. 2024, AbsGS). long_axis: splits are along the longest axis (scene/gaussians/long_axis.py).
     """
 
     fusable = True
     grows_to = False
 
     def __init__(
-        self, gaussians: GaussianModel, opt: argparse.Namespace, white_background: bool, extent: float
+        self,
+        gaussians: GaussianModel,
+        opt: argparse.Namespace,
+        white_background: bool,
+        extent: float,
+        absolute_threshold: float | None = None,
+        long_axis: bool = False,
     ) -> None:
         self._gaussians = gaussians
         self._opt = opt
         self._white_background = white_background
         self._extent = extent
-        self.absolute_gradients = opt.absgrad
+        self.absolute_gradients = absolute_threshold is not None
+        self.threshold = absolute_threshold if self.absolute_gradients else opt.densify_grad_threshold
+        self._long_axis = long_axis
         self.ends = opt.densify_until_iter
         self.max_gaussians = opt.max_num_splats
+
+    @classmethod
+    def of_run(cls, run: Any, *more: Any, **options: Any) -> "AdaptiveDensityControl":
+        """For a run; more, options: as for the class.
+
+        Where a part needs bright renders, opacities are reset at an interval that is given, or never.
+        """
+        opt, white = run.opt, run.dataset.white_background
+        if any(part.needs.bright for part in run.parts) and opt.opacity_reset_interval == rules.USUAL_RESETS:
+            opt, white = copy.copy(opt), False
+            opt.opacity_reset_interval = sys.maxsize
+        return cls(run.gaussians, opt, white, run.scene.cameras_extent, *more, **options)
 
     def changes(self, iteration: int) -> bool:
         todo = self._actions(iteration)
@@ -65,7 +89,7 @@ class AdaptiveDensityControl(DensityControl):
     def before_step(self, step: Iteration) -> None:
         todo = self._actions(step.iteration)
         if todo.densify:
-            self._densify(step.iteration, todo.limit_size)
+            self.densify(step.iteration, todo.limit_size)
         if self.resets(step.iteration):
             self._gaussians.reset_opacity()
 
@@ -84,16 +108,17 @@ class AdaptiveDensityControl(DensityControl):
         place = schedule.span(iteration), schedule.stride(iteration)
         return rules.actions(iteration, self._opt, self._white_background, *place)
 
-    def _densify(self, iteration: int, limit_size: bool) -> None:
+    def densify(self, iteration: int, limit_size: bool) -> None:
+        """Clone, split and prune by the statistics, which start anew. limit_size: prune what is large on screen."""
         self._gaussians.densify_and_prune(
-            self._opt.absgrad_threshold if self.absolute_gradients else self._opt.densify_grad_threshold,
+            self.threshold,
             rules.MIN_OPACITY,
             self._extent,
             rules.MAX_SCREEN_SIZE if limit_size else None,
             seed=self._opt.seed,
             iteration=iteration,
             max_splats=self.count_limit(iteration, self._gaussians.gaussian_count, self.max_gaussians),
-            long_axis=self._opt.split == "long_axis",
+            long_axis=self._long_axis,
         )
         refuse_empty(iteration, self._gaussians.gaussian_count == 0, "raise --opacity_reset_interval")
         sort_rows(self._gaussians)
