@@ -185,7 +185,7 @@ def metashape(model: pycolmap.Reconstruction, images: Path, folder: Path) -> np.
     kind, size = "fisheye" if fisheye else "frame", {"width": str(camera.width), "height": str(camera.height)}
     sensor = ElementTree.SubElement(_under(chunk, "sensors"), "sensor", id="0", label="unknown", type=kind)
     ElementTree.SubElement(sensor, "resolution", size)
-    for state, numbers in (("initial", {"f": 50.0}), ("adjusted", values)):
+    for state, numbers in (("adjusted", values), ("initial", {"f": 50.0})):
         calibration = ElementTree.SubElement(sensor, "calibration", {"type": kind, "class": state})
         ElementTree.SubElement(calibration, "resolution", size)
         for name, value in numbers.items():

@@ -14,6 +14,7 @@ from PIL import Image
 from synthetic import BROWN, FakeGaussians, edit_json, make_colmap_scene, options_of, read
 
 from scene import Scene
+from scene.dataset_readers import read_scene
 from scene.readers.info import CameraInfo
 from utils.system_utils import UserError
 
@@ -153,6 +154,14 @@ def test_what_is_left_out_is_said(make, capsys):
     assert "1 photos or cameras of" in capsys.readouterr().err
 
 
+def test_each_photo_of_record3d_has_its_lens(make):
+    folder, _, _ = make("record3d_r3d")
+    edit_json(folder / "metadata", lambda content: content["perFrameIntrinsicCoeffs"].__setitem__(3, [99, 98, 44, 33]))
+    views = read(folder, init_type="random").train_cameras
+    lenses = {Path(view.image_path).name: (view.fx, view.fy, view.cx, view.cy) for view in views}
+    assert lenses["3.jpg"] == (99, 98, 44, 33) and lenses["2.jpg"] == (110, 112, 45, 34.5)
+
+
 def test_depth_maps_of_polycam(make, tmp_path):
     """As the docs say: 1,250 millimetres are 1.25 metres."""
     folder, _, _ = make("polycam")
@@ -168,10 +177,8 @@ def test_photos_of_metashape_may_lie_elsewhere(make):
     assert len(read(folder).train_cameras) == VIEWS  # anywhere below
     (folder / "copies").mkdir()
     shutil.copy(folder / "photos" / "left" / "V00.JPG", folder / "copies" / "v00.jpg")
-    with pytest.raises(UserError, match="the photo V00 of .*cameras.xml may be any of .*give the photos different"):
+    with pytest.raises(UserError, match="the photo V00 of .* may be any of .*; name the folder .* with -i"):
         read(folder)
-    from scene.dataset_readers import read_scene
-
     assert len(read_scene(folder, "photos", False).train_cameras) == VIEWS
 
 
@@ -223,7 +230,7 @@ def test_broken_exports_are_refused(make, layout, change, message):
 
 def test_without_points_the_message_names_the_ways_out(make):
     folder, _, points = make("record3d")
-    with pytest.raises(UserError, match="no points3D.ply .* beside it; start .*--init_type random, or"):
+    with pytest.raises(UserError, match="is an export without points, and no points3D.ply .*--init_type random"):
         read(folder)
     programs.write_point_cloud(folder / "points3D.ply", points, np.full(points.shape, 90))
     assert len(read(folder).point_cloud.points) == len(points)

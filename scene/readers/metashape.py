@@ -149,7 +149,7 @@ def _photo(index: FileIndex, label: str, path: Path) -> Path | None:
     below = [] if photo else [file for name in names for file in index.named(name)]
     if len(below) > 1:
         raise UserError(
-            f"the photo {label} of {path} may be any of {some(list(map(str, below)))}; give the photos different "
-            f"names and export again, or {_AS_COLMAP}"
+            f"the photo {label} of {path} may be any of {some(list(map(str, below)))}; name the folder of the "
+            f"photos with -i, give them different names and export again, or {_AS_COLMAP}"
         )
     return photo or (below[0] if below else None)

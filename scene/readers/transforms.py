@@ -164,7 +164,8 @@ def read_nerfstudio(
         ply = (FileIndex(folder).find(str(name)) or folder / str(name)) if name else _ply_in(folder)
         return StartCloud(read_point_cloud(ply), ply) if ply else None
 
-    lacking = f"{path} names no points (ply_file_path), and no points3D.ply lies beside it"
+    nothing = "names no points (ply_file_path)" if path.name == "transforms.json" else "is an export without points"
+    lacking = f"{path} {nothing}, and no points3D.ply lies beside it"
     return scene_info(views, start, own, lambda: random_in_frusta(views[0]), lacking)
 
 
