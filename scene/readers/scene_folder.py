@@ -4,12 +4,16 @@ import os
 import shlex
 from pathlib import Path
 
+from scene.readers.metashape import cameras_xml
+from scene.readers.phone_scans import polycam_capture, record3d_capture
 from splatting.files.listing import some
 from splatting.host.start import typed_command
 from utils.system_utils import UserError
 
 COLMAP, BLENDER, NERFSTUDIO = "Colmap", "Blender", "Nerfstudio"
 _PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
+_PACKED = (".zip", ".r3d")  # as apps export them
+_ZIP = " (.r3d is ZIP by another name)"
 _MODEL = ("cameras.bin", "cameras.txt")
 
 
@@ -20,14 +24,19 @@ def kind_of(source_path: str | os.PathLike) -> str:
     folder = Path(source_path)
     if not folder.exists():
         raise UserError(f"no scene folder {folder}; name an existing one with -s")
+    if folder.suffix.lower() in _PACKED and folder.is_file():
+        raise UserError(
+            f"{folder} is an archive (a .r3d is a ZIP, too); unpack it, and give -s the folder that comes out"
+        )
     if not folder.is_dir():
         raise UserError(f"{folder} is a file; give -s the folder of the scene{_or_rather(_above(folder.parent))}")
     kind = _kind(folder)
     if kind is None:
         found = sorted(path.name for path in folder.iterdir())
         raise UserError(
-            f"{folder} is not a scene: looked for the folder sparse (COLMAP) and the files transforms_train.json "
-            f"(Blender) and transforms.json (nerfstudio), found {some(found)}; {_remedy(folder)}"
+            f"{folder} is not a scene: looked for the folder sparse (COLMAP), the files transforms_train.json "
+            "(Blender) and transforms.json (nerfstudio), and exports of Metashape, Polycam and Record3D, found "
+            f"{some(found)}; {_remedy(folder)}"
         )
     return kind
 
@@ -37,7 +46,15 @@ def _kind(folder: Path) -> str | None:
         return COLMAP
     if (folder / "transforms_train.json").is_file():
         return BLENDER
-    return NERFSTUDIO if (folder / "transforms.json").is_file() else None
+    return NERFSTUDIO if camera_file(folder) else None
+
+
+def camera_file(folder: Path) -> Path | None:
+    """transforms.json of a folder, else what another program has exported in its place; None where there is neither."""
+    path = folder / "transforms.json"
+    if path.is_file():
+        return path
+    return polycam_capture(folder) or record3d_capture(folder) or cameras_xml(folder)
 
 
 def _remedy(folder: Path) -> str:
@@ -50,6 +67,8 @@ def _remedy(folder: Path) -> str:
         return f"give -s {above}, which is a scene"
     if any((folder / name).is_file() for name in _MODEL):
         return "the files of a COLMAP model belong in a folder sparse/0 of the scene, beside the folder images"
+    if packed := sorted(path.name for path in folder.iterdir() if path.suffix.lower() in _PACKED):
+        return f"unpack {some(packed)}{_ZIP}, and give -s the folder that comes out"
     inner = [path for path in (folder / "input", folder / "images", folder) if path.is_dir() and _has_pictures(path)]
     if inner and inner[0].name == "input":
         return f"photos need camera poses: run {typed_command('convert.py')} -s {shlex.quote(str(folder))} first"

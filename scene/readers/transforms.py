@@ -1,8 +1,11 @@
-"""Scenes whose camera file has poses in OpenGL axes: Blender's transforms_train.json, nerfstudio's transforms.json."""
+"""Scenes whose camera file has poses in OpenGL axes: Blender's transforms_train.json, nerfstudio's transforms.json.
+
+Exports of other programs are read as the transforms.json that they stand for.
+"""
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,8 +17,11 @@ from scene.images.find import FileIndex, find_images
 from scene.images.lens import PANORAMA, Lens
 from scene.images.masks import NO_MASKS, Mask, MaskOptions, find_masks
 from scene.readers.info import CameraInfo, SceneInfo, held_out, split_by_order
+from scene.readers.metashape import read_metashape
+from scene.readers.phone_scans import read_polycam, read_record3d
 from scene.readers.pinholes import camera_info, finished
 from scene.readers.point_cloud import read_point_cloud
+from scene.readers.scene_folder import camera_file
 from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, random_in_cube, random_in_frusta, scene_info
 from splatting.files.image_files import SUFFIXES
 from splatting.files.json_files import read_json
@@ -126,15 +132,16 @@ def read_nerfstudio(
     masks: MaskOptions = NO_MASKS,
     native: bool = False,
 ) -> SceneInfo:
-    """Read a nerfstudio or instant-ngp scene (transforms.json), views sorted by name (bytes).
+    """Read a nerfstudio or instant-ngp scene (transforms.json), or what stands for it (`camera_file`), views sorted by
+    name (bytes).
 
     hold_out: the file's own split if it has one (test_frames, and test_filenames, else val_filenames, are the test
     views), else every 8th view. Frames may name masks, which --masks replaces. Points come from the file's
     ply_file_path, else from a points3D.ply beside it. Arguments and errors as for `scene.dataset_readers.read_scene`;
-    images has no effect.
+    images has an effect for Metashape alone.
     """
-    path = folder / "transforms.json"
-    content = _read(path)
+    path = camera_file(folder) or folder / "transforms.json"
+    content = _read(path, partial(_content, images=images))
     read = partial(_cameras, path, masks=masks, suffixes=SUFFIXES, by_stem=False, native=native)
     try:
         cameras = read(content)
@@ -157,16 +164,27 @@ def read_nerfstudio(
         ply = (FileIndex(folder).find(str(name)) or folder / str(name)) if name else _ply_in(folder)
         return StartCloud(read_point_cloud(ply), ply) if ply else None
 
-    return scene_info(views, start, own, lambda: random_in_frusta(views[0]), f"{path} names no points (ply_file_path)")
+    nothing = "names no points (ply_file_path)" if path.name == "transforms.json" else "is an export without points"
+    lacking = f"{path} {nothing}, and no points3D.ply lies beside it"
+    return scene_info(views, start, own, lambda: random_in_frusta(views[0]), lacking)
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _content(path: Path, images: str) -> dict[str, Any]:
+    """What a camera file has, or what the export of another program would have in one."""
+    if path.is_dir():
+        return read_polycam(path)
+    if path.suffix.lower() == ".xml":
+        return read_metashape(path, images)
+    return read_json(path) if path.name == "transforms.json" else read_record3d(path)
+
+
+def _read(path: Path, load: Callable[[Path], Any] = read_json) -> dict[str, Any]:
     """A camera file's content, with a list of frames that have a file_path and a transform_matrix.
 
     Those of test_frames are the last of them. A message names fields that are not used.
     """
     try:
-        content = read_json(path)
+        content = load(path)
         frames = list(content["frames"])
         content["test_frames"] = list(content.get("test_frames") or ())
         content["frames"] = frames + content["test_frames"]

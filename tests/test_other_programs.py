@@ -1,0 +1,257 @@
+"""Exports of other programs: each made from one scene, whose points must fall where pycolmap projects them."""
+
+import json
+import shutil
+from functools import partial
+from pathlib import Path
+from xml.etree import ElementTree
+
+import exports_of_programs as programs
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from synthetic import BROWN, FakeGaussians, edit_json, make_colmap_scene, options_of, read
+
+from scene import Scene
+from scene.dataset_readers import read_scene
+from scene.readers.info import CameraInfo
+from utils.system_utils import UserError
+
+VIEWS = 9
+FISHEYE = (60.0, 60.5, 45.0, 34.5, 0.05, -0.01, 0.003, -0.001)
+FULL = (*BROWN[:2], 45.0, 34.5, -0.2, 0.03, 0.004, -0.003, 0.01, 0.0, 0.0, 0.0)
+LENSES = {"PINHOLE": (110.0, 112.0, 45.0, 34.5), "OPENCV": BROWN, "FULL_OPENCV": FULL, "OPENCV_FISHEYE": FISHEYE}
+LAYOUTS = {
+    "realityscan": (programs.realityscan, "PINHOLE"),
+    "opf2colmap": (programs.opf2colmap, "FULL_OPENCV"),
+    "nerfstudio": (programs.nerfstudio, "OPENCV"),
+    "nerfcapture": (programs.nerfcapture, "PINHOLE"),
+    "polycam": (programs.polycam, "PINHOLE"),
+    "polycam_arkit": (partial(programs.polycam, corrected=False), "PINHOLE"),
+    "record3d": (programs.record3d, "PINHOLE"),
+    "record3d_r3d": (partial(programs.record3d, r3d=True), "PINHOLE"),
+    "metashape": (programs.metashape, "OPENCV"),
+    "metashape_fisheye": (programs.metashape, "OPENCV_FISHEYE"),
+}
+
+
+@pytest.fixture
+def make(tmp_path, once):
+    """A function that makes a layout of LAYOUTS: its folder, the model before, the points in the export's world."""
+
+    def made(layout: str) -> tuple[Path, pycolmap.Reconstruction, np.ndarray]:
+        write, lens = LAYOUTS[layout]
+        master = once(f"scene_{lens}", partial(make_colmap_scene, model=lens, params=LENSES[lens], views=VIEWS))
+        folder = tmp_path / layout
+        folder.mkdir()
+        sparse = str(master / "sparse" / "0")
+        points = write(pycolmap.Reconstruction(sparse), master / "images", folder)
+        return folder, pycolmap.Reconstruction(sparse), points
+
+    return made
+
+
+def _pixels(view: CameraInfo, points: np.ndarray) -> np.ndarray:
+    """Where a view shows points (N,3), by the formulas of OpenCV: pixels (N,2), centres at .5."""
+    local = points @ view.R + view.T
+    across = local[:, :2] / local[:, 2:]
+    lens = view.native
+    if lens is None:
+        return across * (view.fx, view.fy) + (view.cx, view.cy)
+    radius = np.linalg.norm(across, axis=1, keepdims=True)
+    if lens.chart == "equidistant":
+        across, radius = across * np.arctan(radius) / radius, np.arctan(radius)
+    over, under = (
+        sum(term * radius ** (2 * power) for power, term in enumerate((1.0, *terms)))
+        for terms in (lens.radial, lens.divisor)
+    )
+    p1, p2 = lens.tangential
+    x, y = across.T
+    aside = [
+        2 * p1 * x * y + p2 * (radius[:, 0] ** 2 + 2 * x * x),
+        p1 * (radius[:, 0] ** 2 + 2 * y * y) + 2 * p2 * x * y,
+    ]
+    return (across * over / under + np.column_stack(aside)) * lens.focal + np.array(lens.center) + 0.5
+
+
+def _by_photo(info, images: Path, model: pycolmap.Reconstruction) -> list[tuple[CameraInfo, pycolmap.Image]]:
+    """Views with the image of the model that has their photo, by its pixels."""
+    small = {image.image_id: np.asarray(Image.open(images / image.name), float) for image in model.images.values()}
+    found = []
+    for view in info.train_cameras:
+        pixels = np.asarray(Image.open(view.image_path), float)
+        errors = {number: np.abs(pixels - other).mean() for number, other in small.items()}
+        best = min(errors, key=errors.get)
+        assert errors[best] < sorted(errors.values())[1] / 4  # of the same photo as JPEG, and of the next one
+        found.append((view, model.images[best]))
+    return found
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_points_fall_where_pycolmap_projects_them(make, once, layout):
+    folder, model, points = make(layout)
+    has_points = layout in ("realityscan", "opf2colmap", "nerfstudio", "metashape", "metashape_fisheye")
+    info = read(folder, native=True, init_type="sfm" if has_points else "random")
+    lens = LAYOUTS[layout][1]
+    pairs = _by_photo(info, once(f"scene_{lens}", lambda _: None) / "images", model)
+    assert len({image.image_id for _, image in pairs}) == VIEWS
+    errors = []
+    for view, image in pairs:
+        expected = [image.project_point(point) for point in programs.points_of(model)]
+        seen = np.array([pixel is not None for pixel in expected])
+        errors.extend(np.linalg.norm(_pixels(view, points[seen]) - np.array(expected)[seen], axis=1))
+    assert len(errors) > 1000
+    assert np.mean(errors) < 1e-3 and np.max(errors) < 1e-2
+    if has_points:
+        np.testing.assert_allclose(np.sort(info.point_cloud.points, axis=0), np.sort(points, axis=0), atol=1e-5)
+
+
+@pytest.mark.parametrize("layout", ["metashape", "metashape_fisheye"])
+def test_cameras_of_metashape_follow_its_manual(make, layout):
+    """The file, by the formulas of the appendix on camera models, shows the points where pycolmap does."""
+    folder, model, _ = make(layout)
+    chunk = ElementTree.parse(folder / "cameras.xml").getroot()[0]
+    numbers = {child.tag: float(child.text) for child in chunk.find(".//calibration[@class='adjusted']") if child.text}
+    k1, k2, k3, k4, p1, p2, b1 = (numbers.get(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2", "b1"))
+    for camera in chunk.find("cameras"):
+        if (place := camera.find("transform")) is None:
+            continue
+        pose = np.array(place.text.split(), float).reshape(4, 4)
+        image = next(i for i in model.images.values() if programs.stem_of(i) == camera.get("label").lower())
+        X, Y, Z, _ = np.linalg.inv(pose) @ np.column_stack([programs.points_of(model), np.ones(300)]).T
+        x, y = X / Z, Y / Z
+        if layout == "metashape_fisheye":
+            r0 = np.hypot(x, y)
+            x, y = x * np.arctan(r0) / r0, y * np.arctan(r0) / r0
+        r2 = x * x + y * y
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
+        u = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
+        v = y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
+        mine = np.column_stack([48 + numbers["cx"] + u * (numbers["f"] + b1), 32 + numbers["cy"] + v * numbers["f"]])
+        theirs = [image.project_point(point) for point in programs.points_of(model)]
+        seen = np.array([pixel is not None for pixel in theirs])
+        assert seen.sum() > 100
+        np.testing.assert_allclose(mine[seen], np.array(theirs)[seen], atol=1e-6)
+
+
+def test_what_is_left_out_is_said(make, capsys):
+    folder, _, _ = make("metashape")
+    read(folder)
+    assert "1 cameras of" in (said := capsys.readouterr().err) and "not aligned or not enabled: unaligned" in said
+    folder, _, _ = make("polycam")
+    read(folder, init_type="random")
+    assert capsys.readouterr().err == ""
+    next((folder / "keyframes" / "corrected_images").iterdir()).unlink()
+    assert len(read(folder, init_type="random").train_cameras) == VIEWS - 1
+    assert "1 photos or cameras of" in capsys.readouterr().err
+    folder, _, _ = make("polycam_arkit")
+    read(folder, init_type="random")
+    assert "has no corrected_cameras: photos are distorted and poses drift" in capsys.readouterr().err
+    folder, _, _ = make("record3d")
+    edit_json(folder / "metadata.json", lambda content: content["poses"].pop())
+    assert len(read(folder, init_type="random").train_cameras) == VIEWS - 1
+    assert "1 photos or cameras of" in capsys.readouterr().err
+
+
+def test_each_photo_of_record3d_has_its_lens(make):
+    folder, _, _ = make("record3d_r3d")
+    edit_json(folder / "metadata", lambda content: content["perFrameIntrinsicCoeffs"].__setitem__(3, [99, 98, 44, 33]))
+    views = read(folder, init_type="random").train_cameras
+    lenses = {Path(view.image_path).name: (view.fx, view.fy, view.cx, view.cy) for view in views}
+    assert lenses["3.jpg"] == (99, 98, 44, 33) and lenses["2.jpg"] == (110, 112, 45, 34.5)
+
+
+def test_depth_maps_of_polycam(make, tmp_path):
+    """As the docs say: 1,250 millimetres are 1.25 metres."""
+    folder, _, _ = make("polycam")
+    (folder / "keyframes" / "depth" / "metric.json").write_text(json.dumps({"metres_per_step": 0.001}))
+    options = options_of(folder, tmp_path / "out", depths="keyframes/depth", init_type="random")
+    camera = Scene(options, FakeGaussians()).getTrainCameras()[0]
+    assert camera.depth_reliable and float(camera.invdepthmap.mean()) == pytest.approx(1 / 1.25, rel=1e-3)
+
+
+def test_photos_of_metashape_may_lie_elsewhere(make):
+    folder, _, _ = make("metashape")
+    (folder / "images").rename(folder / "photos")
+    assert len(read(folder).train_cameras) == VIEWS  # anywhere below
+    (folder / "copies").mkdir()
+    shutil.copy(folder / "photos" / "left" / "V00.JPG", folder / "copies" / "v00.jpg")
+    with pytest.raises(UserError, match="the photo V00 of .* may be any of .*; name the folder .* with -i"):
+        read(folder)
+    assert len(read_scene(folder, "photos", False).train_cameras) == VIEWS
+
+
+def _replaced(name: str, old: str, new: str):
+    def change(folder: Path) -> None:
+        path = next(folder.glob(name))
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new))
+
+    return change
+
+
+_XML, _JSON, _META = "cameras.xml", "keyframes/corrected_cameras/*.json", "metadata.json"
+
+
+@pytest.mark.parametrize(
+    ("layout", "change", "message"),
+    [
+        ("metashape", _replaced(_XML, "<k1>", "<k4>0.1</k4><k1>"), "has k4 for a camera of the type frame.* or export"),
+        ("metashape", _replaced(_XML, "<k1>", "<b2>0.1</b2><k1>"), "has b2 for .*leave them out in Optimize Cameras"),
+        ("metashape", _replaced(_XML, "<k1>", "<corrections /><k1>"), "has corrections for"),
+        ("metashape_fisheye", _replaced(_XML, "<k1>", "<p1>1e-3</p1><k1>"), "has p1 for a camera of the type fisheye"),
+        ("metashape", _replaced(_XML, 'type="frame"', 'type="rpc"'), "type rpc, which cannot be used; export .*Colmap"),
+        ("metashape", _replaced(_XML, "<calibration", "<other"), "is not readable XML"),
+        ("metashape", _replaced(_XML, "calibration", "other"), "has no calibration; align its photos"),
+        ("metashape", _replaced(_XML, "<f>", "<f>a "), "cannot be read .*export them again"),
+        ("metashape", _replaced(_XML, 'sensor_id="0"', 'sensor_id="7"'), "cannot be read .KeyError: '7'.; export them"),
+        ("metashape", _replaced(_XML, "0.0 1.0</transform>", "0.0 1.0 2.0</transform>"), "has 17 numbers and needs 16"),
+        ("metashape", _replaced(_XML, "chunk", "chunks"), "has 0 chunks and needs one; choose Export Cameras"),
+        ("metashape", _replaced(_XML, "component_id", 'enabled="false" component_id'), "has no aligned camera; align"),
+        ("metashape", lambda folder: shutil.copy(folder / _XML, folder / "b.xml"), "several files .*b.xml, came"),
+        ("metashape", lambda folder: shutil.rmtree(folder / "images/left"), "5 of 9 .*missing: .*/images/V00.png, "),
+        ("polycam", _replaced(_JSON, '"fx"', '"f"'), r"cameras/\d+.json is not a camera file .*'fx'.; export"),
+        ("polycam", _replaced(_JSON, '"fx": ', f'"fx": 1{"0" * 400}, "was": '), "OverflowError.*; export the capture"),
+        ("polycam", _replaced(_JSON, '"t_00": ', '"t_00": 1e400, "was": '), "frame . .*keyframes has no usable pose"),
+        ("polycam", _replaced(_JSON, '"fx": 1', '"fx": -1'), "has no usable size or focal length"),
+        ("record3d", _replaced(_META, '"K"', '"k"'), "metadata.json is not a camera file of an .*export the cap"),
+        ("record3d", _replaced(_META, '"poses"', '"perFrameIntrinsicCoeffs": [[1, 1, 1]], "poses"'), "of the shape"),
+    ],
+)
+def test_broken_exports_are_refused(make, layout, change, message):
+    folder, _, _ = make(layout)
+    change(folder)
+    with pytest.raises(UserError, match=message) as refused:
+        read(folder, init_type="random")
+    assert "\n" not in str(refused.value)
+
+
+def test_without_points_the_message_names_the_ways_out(make):
+    folder, _, points = make("record3d")
+    with pytest.raises(UserError, match="is an export without points, and no points3D.ply .*--init_type random"):
+        read(folder)
+    programs.write_point_cloud(folder / "points3D.ply", points, np.full(points.shape, 90))
+    assert len(read(folder).point_cloud.points) == len(points)
+
+
+def test_archives_are_to_be_unpacked(make, tmp_path):
+    folder, _, _ = make("record3d_r3d")
+    shutil.make_archive(str(tmp_path / "capture"), "zip", folder)
+    (tmp_path / "phone").mkdir()
+    archive = (tmp_path / "capture.zip").rename(tmp_path / "phone" / "capture.r3d")
+    with pytest.raises(UserError, match="capture.r3d is an archive .*unpack it"):
+        read(archive)
+    with pytest.raises(UserError, match="unpack capture.r3d .*give -s the folder that comes out"):
+        read(archive.parent)
+    shutil.unpack_archive(archive, tmp_path / "phone" / "out", "zip")
+    assert len(read(tmp_path / "phone" / "out", init_type="random").train_cameras) == VIEWS
+
+
+def test_a_camera_file_of_nerfstudio_comes_first(make):
+    """As of a capture that ns-process-data or polyform has converted in place."""
+    folder, _, _ = make("polycam")
+    nerfstudio, _, _ = make("nerfstudio")
+    shutil.copytree(nerfstudio, folder, dirs_exist_ok=True)
+    assert read(folder).train_cameras[0].image_name.startswith("images/")
