@@ -32,13 +32,14 @@ _PAIR = 2147483647  # COLMAP: pair_id = smaller image_id * this + larger image_i
 
 @dataclass(frozen=True)
 class Settings:
-    """The user's choices. camera: COLMAP's name of the lens model to fit."""
+    """The user's choices. camera: COLMAP's name of the lens model to fit. cameras: what shares one (cameras.MODES)."""
 
     camera: str
     max_num_features: int
     matcher: str
     mapper: str
     no_gpu: bool
+    cameras: str = "per_lens"
 
 
 def worker_command(layout: Layout, step: str, **job: Any) -> Command:
