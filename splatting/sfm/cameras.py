@@ -12,7 +12,7 @@ from splatting.files.listing import some
 from splatting.host.machine import threads
 
 MODES = ("per_lens", "per_folder", "per_photo", "shared")
-OTHER_LENS = 0.02  # difference of a photo's own focal length from its camera's; photos of one lens are below 0.01
+OTHER_LENS = 0.02  # difference of a photo's own focal length from its camera's; those of one lens have 0.017 at most
 BETTER = 0.9  # of its error, that a photo of another lens falls below with a focal length of its own
 _MANY = 0.05  # share of a camera's photos: a few may be wrong for other reasons
 _FEWEST = 3
@@ -29,7 +29,9 @@ class Group(NamedTuple):
 
     def __str__(self) -> str:
         said = f"{len(self.names)} {'photo' if len(self.names) == 1 else 'photos'}, {self.size[0]} x {self.size[1]}"
-        return f"{said}: {' and '.join(map(str, self.lenses))}"
+        folders = {str(PurePosixPath(name).parent) for name in self.names}
+        place = f" in {folders.pop()}" if len(folders) == 1 and folders != {"."} else ""
+        return f"{said}{place}: {' and '.join(map(str, self.lenses))}"
 
 
 def lenses(folder: Path, names: Sequence[str]) -> dict[str, Lens]:
@@ -87,10 +89,11 @@ def advice(cameras: Sequence[dict[str, Any]], known: dict[str, Lens], mode: str)
         other = [name for name, fit in fits.items() if _is_other(*fit)]
         if len(other) >= max(_FEWEST, _MANY * len(fits)):
             factors = sorted(fits[name][0] for name in other)
+            several = len({known.get(name) for name in camera["photos"]}) > 1
             lines.append(
                 f"{len(other)} of {len(camera['photos'])} photos that share a camera ({some(other)}) fit better with "
                 f"{factors[0]:.2f} to {factors[-1]:.2f} times its focal length, as photos through several lenses, or "
-                f"zoomed or cropped ones do; convert again with {_BY_HAND}"
+                f"zoomed or cropped ones do; convert again with " + ("--cameras per_lens" if several else _BY_HAND)
             )
     silent = [name for name, lens in known.items() if not lens.known]
     if mode == "per_lens" and 0 < len(silent) < len(known):

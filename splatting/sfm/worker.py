@@ -18,6 +18,7 @@ import pycolmap
 
 SEED = 0
 FEWEST_SEEN = 50  # points of a photo that tell its focal length
+MOST_SEEN = 400  # that are asked: more take longer and tell no more
 
 
 def features(job: dict[str, Any]) -> None:
@@ -102,10 +103,10 @@ def _refit(model: pycolmap.Reconstruction, image: pycolmap.Image) -> list[float]
 
     Return the factor of the focal length, and the median error (pixels) before and after; nothing if it has few points.
     """
-    seen = [point for point in image.points2D if point.has_point3D()]
-    camera = pycolmap.Camera(image.camera.todict())
-    if len(seen) < FEWEST_SEEN or not camera.focal_length_idxs():
+    numbers, camera = image.get_observation_point2D_idxs(), pycolmap.Camera(image.camera.todict())
+    if len(numbers) < FEWEST_SEEN or not camera.focal_length_idxs():
         return []
+    seen = [image.point2D(number) for number in numbers[:: -(-len(numbers) // MOST_SEEN)]]
     places = np.array([point.xy for point in seen])
     points = np.array([model.points3D[point.point3D_id].xyz for point in seen])
     options = pycolmap.AbsolutePoseRefinementOptions()
