@@ -20,6 +20,7 @@ from pathlib import Path
 from arguments import OptionParser
 from splatting.host.start import typed_command
 from splatting.sfm import stages
+from splatting.sfm.cameras import MODES
 from splatting.sfm.colmap import LENS_MODELS, Program, Pycolmap, Settings
 from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder
 from splatting.sfm.programs import refuse_while_working
@@ -49,7 +50,7 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
         planned = [stages.image_stage(layout, names, masks)]
         planned += stages.reconstruction_stages(backend, masks is not None)
     made = {"camera": settings.camera, "mapper": settings.mapper, "matcher": settings.matcher, "program": program}
-    planned.append(stages.undistortion_stage(layout, settings, made_from, **made))
+    planned.append(stages.undistortion_stage(layout, settings, made_from, **made, shared_by=settings.cameras))
     if args.resize:
         planned.append(stages.resize_stage(layout))
     kept += record.run(planned)
@@ -91,6 +92,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         help="scene folder; its sub-folder input has the photos; --video makes a missing one")  # fmt: skip
     add("--camera", default="OPENCV", help="lens model to fit; for a fisheye lens OPENCV_FISHEYE, for panoramas "
         "EQUIRECTANGULAR (default: OPENCV)")  # fmt: skip
+    add("--cameras", choices=MODES, default="per_lens",
+        help="which photos of one size share a camera: those that EXIF data give one lens and focal length (where they "
+        "name none, those of one sub-folder), those of a sub-folder, none, or all (default: per_lens)")  # fmt: skip
     add("--no_gpu", action="store_true", help="compute features and matches on the CPU even if there is a GPU")
     add("--skip_matching", action="store_true", help="only undistort the largest model in SCENE/distorted/sparse")
     add("--colmap_executable", default="", metavar="FILE",
@@ -124,7 +128,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     if args.camera not in LENS_MODELS:
         raise UserError(f"--camera {args.camera} is not a supported lens model; choose one of {', '.join(LENS_MODELS)}")
     matcher = args.matcher or ("sequential" if args.video else "exhaustive")
-    convert(layout, Settings(args.camera, args.max_num_features, matcher, args.mapper, args.no_gpu), args)
+    convert(layout, Settings(args.camera, args.max_num_features, matcher, args.mapper, args.no_gpu, args.cameras), args)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Photos of a room's corner from known places; its three walls have textures on which features can be found."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +17,22 @@ def camera_centers(count: int) -> np.ndarray:
     return np.stack([4 * np.cos(angles), 4 * np.sin(angles), 1.4 + 0.5 * np.sin(5 * angles)], axis=1)
 
 
-def make_photos(folder: Path, count: int, suffix: str = ".png", panoramas: bool = False, **save: object) -> None:
-    """Write photo_00, photo_01, ... of SIZE, taken with focal length FOCAL (pixels), into a folder.
+def make_photos(
+    folder: Path,
+    count: int,
+    suffix: str = ".png",
+    panoramas: bool = False,
+    focals: Sequence[float] = (FOCAL,),
+    **save: object,
+) -> None:
+    """Write photo_00, photo_01, ... of SIZE, taken with focal lengths (pixels) by turns, into a folder.
 
     panoramas: of PANORAMA, which show nothing where there is no wall.
     """
     folder.mkdir(parents=True, exist_ok=True)
     textures = [_texture(seed) for seed in range(3)]
     for number, center in enumerate(camera_centers(count)):
-        picture = Image.fromarray(_photo(center, textures, panoramas))
+        picture = Image.fromarray(_photo(center, textures, None if panoramas else focals[number % len(focals)]))
         picture.save(folder / f"photo_{number:02d}{suffix}", **save)
 
 
@@ -35,7 +43,8 @@ def _texture(seed: int) -> np.ndarray:
     return np.clip(sum(layers) / 3 * 1.6 - 0.3, 0, 1)
 
 
-def _photo(center: np.ndarray, textures: list[np.ndarray], panorama: bool) -> np.ndarray:
+def _photo(center: np.ndarray, textures: list[np.ndarray], length: float | None) -> np.ndarray:
+    panorama = length is None
     width, height = PANORAMA if panorama else SIZE
     forward = np.array([0.0, 0.0, 0.6]) - center
     forward /= np.linalg.norm(forward)
@@ -44,7 +53,7 @@ def _photo(center: np.ndarray, textures: list[np.ndarray], panorama: bool) -> np
     down = np.cross(forward, right)
     # Four rays per pixel give sharp edges without aliasing.
     y, x = (np.mgrid[: 2 * height, : 2 * width] + 0.5) / 2
-    focal = width / (2 * np.pi) if panorama else FOCAL
+    focal = width / (2 * np.pi) if panorama else length
     across, below, ahead = (x - width / 2) / focal, (y - height / 2) / focal, np.ones_like(x)
     if panorama:
         across, below, ahead = np.sin(across) * np.cos(below), np.sin(below), np.cos(across) * np.cos(below)

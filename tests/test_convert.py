@@ -371,6 +371,10 @@ def test_gpu_options_have_the_names_of_the_colmap_that_is_there(tmp_path, prefix
     assert first[-2:] == second[-2:] == [f"--{prefix}Extraction.use_gpu", "0"]
     assert Path(second[second.index("--image_list_path") + 1]).read_text() == "c.png\nd.png\n"
     assert first[first.index("--ImageReader.mask_path") + 1] == str(layout.masks)
+    assert "--ImageReader.single_camera" in first
+    (each,) = program.features([["a b.png"], ["c.png"]], masks=False)
+    assert "--ImageReader.single_camera_per_image" in each and "--ImageReader.single_camera" not in each
+    assert Path(each[each.index("--image_list_path") + 1]).read_text() == "a b.png\nc.png\n"
     ((_, *match),) = program.matching()
     database = ["--database_path", str(layout.database)]
     assert match == ["exhaustive_matcher", *database, f"--{prefix}Matching.use_gpu", "0"]

@@ -11,12 +11,14 @@ import numpy as np
 
 from scene.check import findings
 from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
+from scene.images.exif import read_lens
 from scene.pose_errors import ADJUSTED, COMPARED, pose_errors, poses_differ
 from scene.readers.info import NEAREST
 from scene.readers.tracks import Track, read_tracks
 from splatting.diagnosis import Line, from_error
 from splatting.diagnosis.colors import UNITS, check_colors
 from splatting.files.json_files import read_json
+from splatting.files.listing import some
 from splatting.parts import tools
 from utils.system_utils import UserError
 
@@ -43,7 +45,13 @@ def check_dataset(source: str, images: str) -> list[Line]:
         return [*_warnings(said.getvalue()), from_error(error)]
     views = info.train_cameras
     found = findings(info, MOST_PHOTOS)
-    checks = [check_views(views), check_extent(info), check_cloud(info), [Line(*one[:2]) for one in found]]
+    checks = [
+        check_views(views),
+        check_lenses(source, views),
+        check_extent(info),
+        check_cloud(info),
+        [Line(*one[:2]) for one in found],
+    ]
     if not any(one.of_lens for one in found):  # else poses and colours have that cause
         checks.append(check_geometry(source, info))
     return [*_warnings(said.getvalue()), *chain(*checks, _check_registered(Path(source) / "convert_report.json"))]
@@ -59,6 +67,26 @@ def check_views(cameras: list[CameraInfo]) -> Iterator[Line]:
         yield Line(f"only {len(cameras)} photos", f"take {FEWEST_VIEWS} or more; new views will look bad with fewer")
     if wide := sum(n for (width, _), n in sizes.items() if width > _WIDE):
         yield Line(f"{wide} photos are wider than {_WIDE} pixels and train at that width unless -r 1 is given")
+
+
+def check_lenses(source: str, views: Sequence[CameraInfo]) -> Iterator[Line]:
+    """Photos that share a camera although their EXIF data tell different focal lengths."""
+    shared: dict[tuple, Counter[float]] = {}
+    for view in views:
+        # Programs that undistort photos keep few EXIF data: convert.py has the photos themselves in `input`.
+        lens = read_lens(view.image_path)
+        lens = lens if lens.length else read_lens(Path(source, "input", view.image_name))
+        key = view.width, view.height, view.fx, view.fy, view.cx, view.cy
+        shared.setdefault(key, Counter())[lens.length] += 1
+    for lengths in shared.values():
+        found = sorted(length for length in lengths if length)
+        if found and found[-1] > (1 + _LONGER) * found[0]:
+            listed = some([f"{length:g} mm ({lengths[length]})" for length in found])
+            yield Line(
+                f"{lengths.total()} photos share one camera, but their EXIF data tell several focal lengths: {listed}",
+                "convert them again with convert.py --cameras per_lens, or let the program that made the cameras "
+                "give each lens its own",
+            )
 
 
 def check_extent(info: SceneInfo) -> Iterator[Line]:

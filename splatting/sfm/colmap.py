@@ -32,13 +32,14 @@ _PAIR = 2147483647  # COLMAP: pair_id = smaller image_id * this + larger image_i
 
 @dataclass(frozen=True)
 class Settings:
-    """The user's choices. camera: COLMAP's name of the lens model to fit."""
+    """The user's choices. camera: COLMAP's name of the lens model to fit. cameras: what shares one (cameras.MODES)."""
 
     camera: str
     max_num_features: int
     matcher: str
     mapper: str
     no_gpu: bool
+    cameras: str = "per_lens"
 
 
 def worker_command(layout: Layout, step: str, **job: Any) -> Command:
@@ -115,6 +116,9 @@ class Program(Backend):
 
     def features(self, groups: list[list[str]], masks: bool) -> list[Command]:
         commands = []
+        mode = "single_camera"
+        if all(len(names) == 1 for names in groups):  # one command does, instead of one for each photo
+            groups, mode = [[name for names in groups for name in names]], "single_camera_per_image"
         for number, names in enumerate(groups):
             listed = self.layout.work / "jobs" / f"photos_{number}.txt"
             with atomic_write(listed) as temporary:
@@ -124,7 +128,7 @@ class Program(Backend):
                 *("--image_path", str(self.layout.prepared)),
                 *("--image_list_path", str(listed)),
                 *("--ImageReader.camera_model", self.settings.camera),
-                *("--ImageReader.single_camera", "1"),
+                *(f"--ImageReader.{mode}", "1"),
                 *("--SiftExtraction.max_num_features", str(self.settings.max_num_features)),
             ]
             command += ["--ImageReader.mask_path", str(self.layout.masks)] if masks else []

@@ -14,7 +14,10 @@ LARGE_ERROR = 1.5  # pixels; a good model of sharp photos has 0.3 to 1
 
 
 class Model(NamedTuple):
-    """One model of the mapper. registered: names of photos; track_length: mean views per point; error: mean, pixels."""
+    """One model of the mapper. registered: names of photos; track_length: mean views per point; error: mean, pixels.
+
+    cameras: id, model, size, params, and photos, by name what worker.py's _refit finds.
+    """
 
     folder: str
     registered: list[str]
@@ -69,7 +72,8 @@ def advice(
         sizes = ", ".join(map(str, others))
         lines.append(
             f"the photos form {len(others) + 1} unconnected parts ({len(chosen.registered)} photos are used, "
-            f"the other parts have {sizes}); take photos that lead from one part to the next, or try --mapper global"
+            f"the other parts have {sizes}); take photos that lead from one part to the next, or try --mapper global, "
+            "and --cameras per_photo if they came through several lenses"
         )
     if chosen.points < FEWEST_POINTS:
         text = f"only {chosen.points} points; a good start needs {FEWEST_POINTS}; use larger or more photos"
@@ -82,8 +86,8 @@ def advice(
     if chosen.error > LARGE_ERROR:
         lines.append(
             f"the mean reprojection error is {chosen.error:.1f} pixels; if objects moved, mask them (--mask_path); if "
-            "the photos come from several lenses, convert those of each lens separately; for a fisheye lens use "
-            "--camera OPENCV_FISHEYE"
+            "the photos come from several lenses, try --cameras per_photo; for a fisheye lens use --camera "
+            "OPENCV_FISHEYE"
         )
     return lines
 
@@ -97,14 +101,12 @@ def summary(report: dict[str, Any]) -> str:
 
 
 def write_report(
-    path: Path, models: Sequence[Model], images: Sequence[str], partners: dict[str, int], lines: list[str], **made: Any
+    path: Path, models: Sequence[Model], images: Sequence[str], partners: dict[str, int], **made: Any
 ) -> None:
-    """Write convert_report.json: photos placed and left out, models, cameras, settings (`made`), advice (`lines`)."""
+    """Write convert_report.json: photos placed and left out, models, and `made`: settings, cameras, advice."""
     chosen = models[0]
     content = {
         **made,
-        "advice": lines,
-        "cameras": chosen.cameras,
         "left_out": {name: {"partners": partners.get(name, 0)} for name in set(images) - set(chosen.registered)},
         "mean_error_px": round(chosen.error, 4),
         "mean_track_length": round(chosen.track_length, 4),

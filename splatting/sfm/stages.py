@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from splatting.files.json_files import read_json, write_json
-from splatting.sfm import colmap, images, report
+from splatting.sfm import cameras, colmap, images, report
 from splatting.sfm.colmap import Backend, Settings, worker_command
 from splatting.sfm.layout import Layout, image_names
 from splatting.sfm.programs import run_programs
@@ -132,12 +132,10 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
     run = partial(run_programs, layout.log)
 
     def features() -> None:
-        groups = images.sizes(layout)
-        if len(groups) > 1:
-            listed = ", ".join(f"{w} x {h} ({len(names)})" for (w, h), names in groups.items())
-            print(f"photos have {len(groups)} sizes; each size gets its own camera: {listed}")
-        total = sum(map(len, groups.values()))
-        run(backend.features(list(groups.values()), masks), "Features", total, partial(rows, "keypoints"), hint)
+        groups = cameras.group(layout.prepared, image_names(layout.prepared), settings.cameras)
+        print(cameras.listing(groups))
+        names = [group.names for group in groups]
+        run(backend.features(names, masks), "Features", sum(map(len, names)), partial(rows, "keypoints"), hint)
 
     def matching() -> None:
         count = rows("images")
@@ -160,7 +158,7 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
             )
 
     files = [layout.database.with_name(layout.database.name + end) for end in ("", "-wal", "-shm", "-journal")]
-    features_from = [backend.identity, settings.camera, settings.max_num_features, settings.no_gpu]
+    features_from = [backend.identity, settings.camera, settings.cameras, settings.max_num_features, settings.no_gpu]
     return [
         Stage("features", features_from, lambda: _remove(*files), features, check=check_sizes),
         Stage("matching", [settings.matcher], lambda: colmap.forget_matches(layout.database), matching, resumable=True),
@@ -202,8 +200,11 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
         _remove(layout.undistorted)
         limit = settings.max_num_features
         at_limit = limit if colmap.most_features(layout.database) >= limit else 0
+        lenses = cameras.lenses(root, names)
         lines = report.advice(models, names, matches, settings.matcher, at_limit)
-        report.write_report(layout.report, models, names, matches, lines, **made)
+        lines += cameras.advice(chosen.cameras, lenses, settings.cameras)
+        shared = cameras.described(chosen.cameras, lenses)
+        report.write_report(layout.report, models, names, matches, advice=lines, cameras=shared, **made)
 
     return Stage("undistortion", made_from, lambda: _remove(layout.undistorted), work)
 

@@ -13,9 +13,12 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pycolmap
 
 SEED = 0
+FEWEST_SEEN = 50  # points of a photo that tell its focal length
+MOST_SEEN = 400  # that are asked: more take longer and tell no more
 
 
 def features(job: dict[str, Any]) -> None:
@@ -27,12 +30,14 @@ def features(job: dict[str, Any]) -> None:
     options = pycolmap.FeatureExtractionOptions()
     options.sift.max_num_features = job["max_num_features"]
     pycolmap.Database.open(job["database"]).close()
+    # Import the photos first, in order: threads would number them in the order in which they happen to finish. The
+    # camera of a group begins with the focal length that the EXIF data of its first photo tell, if they do.
     for names in job["groups"]:
-        # Import the photos first, in order: threads would number them in the order in which they happen to finish.
         pycolmap.import_images(job["database"], job["images"], pycolmap.CameraMode.SINGLE, names, reader)
-        pycolmap.extract_features(
-            job["database"], job["images"], names, pycolmap.CameraMode.SINGLE, reader, options, _device(job)
-        )
+    names = [name for group in job["groups"] for name in group]
+    pycolmap.extract_features(
+        job["database"], job["images"], names, pycolmap.CameraMode.AUTO, reader, options, _device(job)
+    )
 
 
 def matching(job: dict[str, Any]) -> None:
@@ -75,13 +80,45 @@ def survey(job: dict[str, Any]) -> None:
                 "points": model.num_points3D(),
                 "track_length": model.compute_mean_track_length(),
                 "error": model.compute_mean_reprojection_error(),
-                "cameras": [
-                    {"id": i, "model": c.model_name, "size": [c.width, c.height], "params": c.params.tolist()}
-                    for i, c in sorted(model.cameras.items())
-                ],
+                "cameras": [_camera(model, camera) for _, camera in sorted(model.cameras.items())],
             }
         )
     Path(job["out"]).write_text(json.dumps(models), encoding="utf-8")
+
+
+def _camera(model: pycolmap.Reconstruction, camera: pycolmap.Camera) -> dict[str, Any]:
+    """Describe a camera of a model. photos: by name, what `_refit` finds."""
+    images = [model.images[i] for i in model.reg_image_ids() if model.images[i].camera_id == camera.camera_id]
+    return {
+        "id": camera.camera_id,
+        "model": camera.model_name,
+        "size": [camera.width, camera.height],
+        "params": camera.params.tolist(),
+        "photos": {image.name: _refit(model, image) for image in sorted(images, key=lambda one: one.name)},
+    }
+
+
+def _refit(model: pycolmap.Reconstruction, image: pycolmap.Image) -> list[float]:
+    """Fit pose and focal length of one photo to its points, which stay where they are.
+
+    Return the factor of the focal length, and the median error (pixels) before and after; nothing if it has few points.
+    """
+    numbers, camera = image.get_observation_point2D_idxs(), pycolmap.Camera(image.camera.todict())
+    if len(numbers) < FEWEST_SEEN or not camera.focal_length_idxs():
+        return []
+    seen = [image.point2D(number) for number in numbers[:: -(-len(numbers) // MOST_SEEN)]]
+    places = np.array([point.xy for point in seen])
+    points = np.array([model.points3D[point.point3D_id].xyz for point in seen])
+    options = pycolmap.AbsolutePoseRefinementOptions()
+    options.refine_focal_length = True
+    pose = image.cam_from_world()
+    found = pycolmap.refine_absolute_pose(pose, places, points, np.ones(len(seen), bool), camera, options)
+    if found is None:
+        return []
+    pairs = (image.camera, pose), (camera, found["cam_from_world"])
+    errors = [np.linalg.norm(lens.img_from_cam(placed * points) - places, axis=1) for lens, placed in pairs]
+    factor = camera.mean_focal_length() / image.camera.mean_focal_length()
+    return [factor, *(float(np.nanmedian(error)) for error in errors)]
 
 
 def undistort(job: dict[str, Any]) -> None:

@@ -1,0 +1,292 @@
+"""convert.py's cameras: which photos share one, by EXIF, folders or choice; what it says of them; the doctor's word."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from photo_room import FOCAL, SIZE, camera_centers, make_photos
+from PIL import ExifTags, Image
+
+import convert
+import train
+from scene.dataset_readers import read_scene
+from scene.images.exif import Lens, read_lens
+from splatting.diagnosis.dataset import check_lenses
+from splatting.sfm import cameras
+from splatting.sfm.layout import Layout
+
+TAGS = ExifTags.Base
+VIEWS = 10
+TELE = 1.6  # its focal length by that of the other lens
+FILM = 36.0 * FOCAL / SIZE[0]  # mm that frame as FOCAL does, were film as high as the photos
+DEVICE = {TAGS.Make: "Maker", TAGS.Model: "Phone 3"}
+CAM = {TAGS.Make: "Cam", TAGS.Model: "Cam 5"}
+NAMES = [f"photo_{number:02d}.jpg" for number in range(VIEWS)]
+
+
+def exif(device: dict | None = None, **more: object) -> Image.Exif:
+    """EXIF data by names of tags."""
+    made = Image.Exif()
+    made.update(DEVICE if device is None else device)
+    made.get_ifd(ExifTags.IFD.Exif).update({TAGS[tag]: value for tag, value in more.items()})
+    return made
+
+
+def small(path: Path, made: Image.Exif | None = None, size: tuple[int, int] = (8, 6)) -> str:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", size).save(path, exif=Image.Exif() if made is None else made)
+    return path.name
+
+
+@pytest.mark.parametrize(
+    ("made", "found", "said"),
+    [
+        (exif({}), Lens(), "a lens that EXIF does not name"),
+        (exif(), Lens("Maker", "Phone 3"), "Maker Phone 3"),
+        (
+            exif(FocalLength=6.86, FocalLengthIn35mmFilm=48, LensModel="back \x00"),
+            Lens("Maker", "Phone 3", "back", 6.86, 48),
+            "Maker Phone 3, back, 6.86 mm (as 48 mm on 35 mm film)",
+        ),
+        (exif(CAM, FocalLengthIn35mmFilm=35), Lens("Cam", "Cam 5", film=35), "Cam 5, as 35 mm on 35 mm film"),
+        (
+            exif(CAM, FocalLength=4.0, DigitalZoomRatio=2.0),
+            Lens("Cam", "Cam 5", focal=4, zoom=2),
+            "Cam 5, 4 mm, digital zoom 2",
+        ),
+        (exif(CAM, FocalLength=4.0, DigitalZoomRatio=1.0), Lens("Cam", "Cam 5", focal=4), "Cam 5, 4 mm"),
+        (exif(CAM, FocalLength=4.0, DigitalZoomRatio=0.0), Lens("Cam", "Cam 5", focal=4), "Cam 5, 4 mm"),
+    ],
+)
+def test_lenses_are_read_and_named(tmp_path, made, found, said):
+    for suffix in ("jpg", "png", "webp"):
+        small(tmp_path / f"a.{suffix}", made)
+        assert read_lens(tmp_path / f"a.{suffix}") == found
+    assert str(found) == said
+
+
+def test_damaged_exif_names_no_lens(tmp_path):
+    made = exif(FocalLength=float("nan"), FocalLengthIn35mmFilm=(1, 2), LensModel=b"\xff\xfe")
+    assert read_lens(tmp_path / small(tmp_path / "a.jpg", made)).length == 0
+    whole = (tmp_path / "a.jpg").read_bytes()
+    (tmp_path / "b.jpg").write_bytes(whole.replace(b"Exif\0\0MM\0*", b"Exif\0\0XX\0*"))
+    (tmp_path / "c.jpg").write_bytes(b"<html>")
+    assert {read_lens(tmp_path / name) for name in ("b.jpg", "c.jpg", "missing.jpg")} == {Lens()}
+
+
+LENS = {"LensModel": "back", "FocalLength": 4.0, "FocalLengthIn35mmFilm": 26}
+SHOTS = {
+    "a.jpg": exif(**LENS),
+    "b.jpg": exif(**LENS | {"FocalLengthIn35mmFilm": 52}),  # the same lens, of which the device shows the middle
+    "c.jpg": exif(**LENS | {"DigitalZoomRatio": 2.0}),
+    "d.jpg": exif(**LENS | {"FocalLength": 6.0}),
+    "e.jpg": exif({TAGS.Make: "Maker", TAGS.Model: "Phone 4"}, **LENS),
+    "f.jpg": exif(**LENS | {"LensModel": "front"}),
+    "x/g.jpg": exif(**LENS),
+    "x/h.jpg": exif({}),
+    "x/i.png": exif({}),
+    "y/j.jpg": exif({}),
+    "y/k.jpg": exif(),
+    "y/l.jpg": exif(**LENS),
+}
+
+
+@pytest.mark.parametrize(
+    ("mode", "found"),
+    [
+        ("per_lens", ["ag", "b", "c", "d", "e", "f", "hi", "j", "k", "l"]),
+        ("per_folder", ["abcdef", "ghi", "jk", "l"]),
+        ("per_photo", [*"abcdefghijkl"]),
+        ("shared", ["abcdefghijk", "l"]),
+    ],
+)
+def test_who_shares_a_camera(tmp_path, mode, found):
+    for name, made in SHOTS.items():
+        small(tmp_path / name, made, (8, 6) if "l" not in Path(name).stem else (6, 8))
+    groups = cameras.group(tmp_path, [*SHOTS], mode)
+    assert ["".join(Path(name).stem for name in one.names) for one in groups] == found
+    said = cameras.listing(groups)
+    if mode == "per_folder":
+        assert said.splitlines()[
+            2
+        ] == "  3 photos, 8 x 6 in x: Maker Phone 3, back, 4 mm (as 26 mm on 35 mm film) and " + str(Lens())
+    if mode == "per_lens":
+        assert said.splitlines()[:2] == [
+            "10 cameras:",
+            "  2 photos, 8 x 6: Maker Phone 3, back, 4 mm (as 26 mm on 35 mm film)",
+        ]
+    assert len(said.splitlines()) == (1 if mode == "per_photo" else len(found) + 1)
+
+
+def photos(scene: Path, told: bool) -> None:
+    """Photos of a room, every second one through another lens; told: EXIF says so."""
+    make_photos(scene / "input", VIEWS, focals=(FOCAL, TELE * FOCAL))
+    for number, path in enumerate(sorted((scene / "input").iterdir())):
+        film = round(FILM * TELE ** (number % 2))
+        made = exif(FocalLengthIn35mmFilm=film, LensModel=("wide", "tele")[number % 2]) if told else Image.Exif()
+        Image.open(path).save(path.with_suffix(".jpg"), quality=97, subsampling=0, exif=made)
+        path.unlink()
+
+
+def strayed(scene: Path) -> np.ndarray:
+    """Distances of the cameras' places from where photos were taken, after a similarity, in units of the room."""
+    model = pycolmap.Reconstruction(scene / "sparse" / "0")
+    names = [name for name in NAMES if model.find_image_with_name(name)]
+    found = np.array([model.find_image_with_name(name).projection_center() for name in names])
+    true = camera_centers(VIEWS)[[NAMES.index(name) for name in names]]
+    fit = pycolmap.estimate_sim3d(found, true)
+    return np.linalg.norm(fit * found - true, axis=1)
+
+
+@pytest.mark.slow
+def test_each_lens_gets_its_camera(tmp_path, capsys):
+    """Without EXIF data the same photos lose a part of them, or stand elsewhere (the next test)."""
+    photos(tmp_path, told=True)
+    convert.main(["-s", str(tmp_path), "--no_gpu"])
+    assert strayed(tmp_path).max() < 0.02  # of 4 to the corner
+    wide, tele = (f"Maker Phone 3, {lens}, as {film} mm on 35 mm film" for lens, film in (("wide", 33), ("tele", 53)))
+    assert f"2 cameras:\n  5 photos, 240 x 180: {wide}\n  5 photos, 240 x 180: {tele}\n" in capsys.readouterr().out
+    report = json.loads((tmp_path / "convert_report.json").read_text())
+    assert (report["registered"], report["shared_by"], report["advice"]) == (VIEWS, "per_lens", [])
+    said = {camera["lenses"][0]: (camera["registered"], camera["photos"]) for camera in report["cameras"]}
+    assert said == {wide: (5, NAMES[::2]), tele: (5, NAMES[1::2])}
+    for camera in read_scene(tmp_path, "images", hold_out=False).train_cameras:
+        assert camera.fx == pytest.approx(FOCAL * TELE ** (NAMES.index(camera.image_name) % 2), rel=0.02)
+    assert not [*check_lenses(str(tmp_path), read_scene(tmp_path, "images", hold_out=False).train_cameras)]
+    database = pycolmap.Database.open(str(Layout(tmp_path).database))
+    first = [camera.params[0] for camera in database.read_all_cameras() if camera.has_prior_focal_length]
+    database.close()
+    # As wide as on film means here: as much of the diagonal, 43.27 mm.
+    assert first == pytest.approx([film * np.hypot(*SIZE) / np.hypot(36, 24) for film in (33, 53)], rel=1e-3)
+
+
+@pytest.mark.slow
+def test_without_exif_each_photo_may_have_its_camera(tmp_path, capsys):
+    photos(tmp_path, told=False)
+    convert.main(["-s", str(tmp_path), "--no_gpu"])
+    one = strayed(tmp_path)
+    said = capsys.readouterr()
+    assert f"one camera for 10 photos, 240 x 180: {Lens()}" in said.out
+    assert np.median(one) > 0.2 and "--cameras per_photo if they came through several lenses" in said.err
+    convert.main(["-s", str(tmp_path), "--no_gpu", "--cameras", "per_photo"])
+    assert strayed(tmp_path).max() < 0.1 and len(strayed(tmp_path)) == VIEWS
+    assert "10 cameras, one for each photo\n" in capsys.readouterr().out
+
+
+def survey(*factors: float, gain: float = 0.5) -> list[dict]:
+    """One camera, whose photos have a focal length of their own with which their error is `gain` times as large."""
+    return [{"photos": {f"{number}.jpg": [factor, 0.8, 0.8 * gain] for number, factor in enumerate(factors)}}]
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (survey(*[1.005] * 9), None),
+        (survey(1.2, 0.9, *[1.0] * 7), None),  # two may be wrong for other reasons
+        (survey(1.2, 0.9, 1.1, *[1.0] * 77), None),
+        (survey(1.2, 0.9, 1.1, *[1.0] * 7, gain=0.95), None),
+        (
+            survey(1.2, 0.9, 1.1, *[1.0] * 7),
+            r"3 of 10 photos .* \(0.jpg, 1.jpg, 2.jpg\) .* 0.90 to 1.20 times .*--cameras",
+        ),
+    ],
+)
+def test_photos_of_another_focal_length_are_named(found, said):
+    found[0]["photos"]["few points.jpg"] = []
+    lines = cameras.advice(found, {}, "shared")
+    if said:
+        (line,) = cameras.advice(found, {"0.jpg": Lens(film=26), "1.jpg": Lens(film=52)}, "shared")
+        assert line.endswith("convert again with --cameras per_lens")
+    assert len(lines) == (said is not None) and (not said or re.search(said.replace("of 10", "of 11"), lines[0]))
+
+
+@pytest.mark.parametrize(
+    ("mode", "known", "count"), [("per_lens", 2, 1), ("per_lens", 3, 0), ("per_lens", 0, 0), ("shared", 2, 0)]
+)
+def test_photos_without_exif_among_others_are_named(mode, known, count):
+    lines = cameras.advice([], {f"{number}.jpg": Lens(film=26.0 * (number < known)) for number in range(3)}, mode)
+    assert [line.startswith("the EXIF data of 1 of 3 photos name no lens (2.jpg), and") for line in lines] == [
+        True
+    ] * count
+
+
+def test_the_doctor_compares_cameras_with_exif(colmap_scene):
+    """Also where the program that made the scene kept no EXIF data, but the photos that convert.py read are there."""
+    views = read_scene(colmap_scene, "images", hold_out=False).train_cameras
+    assert not [*check_lenses(str(colmap_scene), views)]
+    for number, view in enumerate(views):
+        made = exif(FocalLength=4.0 + 2 * (number >= 12))
+        path = view.image_path if number % 2 else colmap_scene / "input" / view.image_name
+        small(path, made, (view.width, view.height))
+    (line,) = check_lenses(str(colmap_scene), views)
+    said = "17 photos share one camera, but their EXIF data tell several focal lengths: 4 mm (12), 6 mm (5)"
+    assert line.finding and line.text == said and "--cameras per_lens" in line.remedy
+    halves = [view._replace(fx=view.fx * (1 + (number >= 12))) for number, view in enumerate(views)]
+    assert not [*check_lenses(str(colmap_scene), halves)]
+
+
+def is_tele(number: int) -> bool:
+    """Every second one, but so that both lenses are among every eighth, the test views."""
+    return (number + number // 8) % 2 == 1
+
+
+def through_two_lenses(shots: Path, scene: Path, told: bool) -> list[str]:
+    """24 photos of a folder, 400 pixels high, half of them cut to their middle; return the names of their sources."""
+    files = sorted(shots.iterdir())
+    chosen = [files[number * len(files) // 24] for number in range(24)]
+    (scene / "input").mkdir(parents=True)
+    for number, path in enumerate(chosen):
+        part = 1 / TELE if is_tele(number) else 1.0
+        with Image.open(path) as whole:
+            wide, high = whole.size
+            box = (wide * (1 - part) / 2, high * (1 - part) / 2, wide * (1 + part) / 2, high * (1 + part) / 2)
+            image = whole.resize((round(400 * wide / high), 400), Image.Resampling.LANCZOS, box)
+        made = exif(FocalLengthIn35mmFilm=42 if is_tele(number) else 26) if told else Image.Exif()
+        image.save(scene / "input" / f"{number:02d}.jpg", quality=95, exif=made)
+    return [path.name for path in chosen]
+
+
+def orbit_strayed(scene: Path, truth: pycolmap.Reconstruction, sources: list[str]) -> np.ndarray:
+    """Distances of places from those of the true model, after a similarity, in parts of the mean distance to them."""
+    model = pycolmap.Reconstruction(scene / "sparse" / "0")
+    images = [model.images[i] for i in model.reg_image_ids()]
+    found = np.array([image.projection_center() for image in images])
+    true = np.array([truth.find_image_with_name(sources[int(image.name[:2])]).projection_center() for image in images])
+    away = np.linalg.norm(pycolmap.estimate_sim3d(found, true) * found - true, axis=1)
+    return away / np.linalg.norm(true - true.mean(axis=0), axis=1).mean()
+
+
+@pytest.mark.slow
+def test_real_photos_through_two_lenses(shared_dir, tmp_path, monkeypatch, capsys):
+    """As good as with the cameras that a hand gave the same photos without EXIF data, and far better than with one."""
+    source, quality = shared_dir / "scenes" / "fox_full", {}
+    truth = pycolmap.Reconstruction(source / "sparse" / "0")
+
+    def by_hand(_: Path, names: list[str], mode: str) -> list[cameras.Group]:
+        lists = [[name for name in names if is_tele(int(name[:2])) == tele] for tele in (False, True)]
+        return [cameras.Group((224, 400), [Lens()], one) for one in lists]
+
+    for kind in ("by exif", "by hand", "one"):
+        with monkeypatch.context() as patch:
+            if kind == "by hand":
+                patch.setattr(cameras, "group", by_hand)
+            sources = through_two_lenses(source / "images", tmp_path / kind, told=kind == "by exif")
+            convert.main(["-s", str(tmp_path / kind), "--no_gpu"])
+        words = [
+            *("-r", "2", "--iterations", "600", "--test_iterations", "600"),
+            "--eval",
+            "--quiet",
+            "--disable_viewer",
+        ]
+        train.main(["-s", str(tmp_path / kind), "-m", str(tmp_path / f"{kind} model"), *words])
+        log = json.loads((tmp_path / f"{kind} model" / "train_log.json").read_text())
+        quality[kind] = log[-1]["test_psnr"], orbit_strayed(tmp_path / kind, truth, sources)
+        said = capsys.readouterr().err
+        assert ("photos that share a camera" in said) == (kind == "one")
+    for kind in ("by exif", "by hand"):
+        assert len(quality[kind][1]) == 24 and quality[kind][1].max() < 0.02
+    assert np.median(quality["one"][1]) > 0.2
+    assert quality["by exif"][0] > quality["by hand"][0] - 0.1 and quality["by exif"][0] > quality["one"][0] + 1
