@@ -11,7 +11,6 @@ if __name__ == "__main__":
     import splatting.host.early  # noqa: F401  (before the other imports, which take a second)
 
 import argparse
-import json
 import shlex
 import sys
 from collections.abc import Sequence
@@ -21,23 +20,27 @@ from arguments import OptionParser
 from splatting.host.start import typed_command
 from splatting.sfm import stages
 from splatting.sfm.colmap import LENS_MODELS, Program, Pycolmap, Settings
+from splatting.sfm.inputs import Inputs, unused_lines
 from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder
 from splatting.sfm.programs import refuse_while_working
-from splatting.sfm.report import summary
+from splatting.sfm.report import report_inputs, summary
 from utils.system_utils import UserError, run_cli
 
 
 def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> None:
     """Run the stages that are not done; print how many photos were placed, and advice about the others."""
     masks = _masks(args.mask_path)
-    names = [] if args.video else find_images(layout)
+    found = Inputs([], {}) if args.video else find_images(layout, args.skip_unreadable)
     refuse_while_working(layout.log)
     record = stages.StageRecord(layout.stages)
     refuse_foreign_results(layout, record.begun("undistortion"), record.begun("photos"), args.skip_matching)
     kept = []
     if args.video:
         kept = record.run([_video(layout, record, args)])
-        names = find_images(layout)
+        found = find_images(layout, args.skip_unreadable)
+    names = found.photos
+    for line in unused_lines(found.unused):
+        print(line)
     if args.skip_matching:
         planned = []
         program = "--skip_matching: the model that was in distorted/sparse"
@@ -55,8 +58,10 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     kept += record.run(planned)
     if kept:
         print(f"done before: {', '.join(kept)} (to start from the beginning, remove {layout.work})")
-    report = json.loads(layout.report.read_text(encoding="utf-8"))
+    report = report_inputs(layout.report, unused=found.unused)
     print(summary(report))
+    if found.unused:
+        print(f"{len(found.unused)} files in {layout.input.name} were not used; {layout.report.name} has the reasons")
     for line in report["advice"]:
         print(f"warning: {line}", file=sys.stderr)
     print(f"train it with: {typed_command('train.py')} -s {shlex.quote(str(layout.scene))}")
@@ -95,6 +100,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--skip_matching", action="store_true", help="only undistort the largest model in SCENE/distorted/sparse")
     add("--colmap_executable", default="", metavar="FILE",
         help="COLMAP program for features, matching and mapping (default: pycolmap does them)")  # fmt: skip
+    add("--skip_unreadable", action="store_true", help="leave out photos that cannot be read, and name them")
     add("--magick_executable", default="", metavar="FILE", help="no effect (Pillow resizes the photos)")
     add(
         "--resize", action="store_true", help="also write images_2, images_4, images_8, whose sides are divided by that"
