@@ -161,9 +161,9 @@ def test_without_the_reader_of_heic_the_message_has_the_line_that_installs_it(tm
 
 @pytest.mark.slow
 def test_a_folder_of_all_kinds_is_converted(tmp_path, heif, capsys):
-    make_photos(tmp_path / "plain", 8)
-    formats = ["JPEG", "HEIF", "AVIF", "JPEG2000", "TGA", "JPEG", "PNG", "WEBP"]
-    names = ["a.jfif", "b.HEIC", "c.avif", "d.jp2", "e.tga", "f", "g.png", "h.webp"]
+    make_photos(tmp_path / "plain", 6)
+    formats = ["JPEG", "HEIF", "AVIF", "JPEG2000", "TGA", "JPEG"]
+    names = ["a.jfif", "b.HEIC", "c.avif", "d.jp2", "e.tga", "f"]
     (tmp_path / "input").mkdir()
     for path, name, file_format in zip(sorted((tmp_path / "plain").iterdir()), names, formats, strict=True):
         with Image.open(path) as image:
@@ -172,9 +172,9 @@ def test_a_folder_of_all_kinds_is_converted(tmp_path, heif, capsys):
     (tmp_path / "input" / "b.AAE").write_text("<plist/>")
     convert.main(["-s", str(tmp_path), "--no_gpu"])
     said = capsys.readouterr().out
-    assert "8 of 8 photos placed" in said and "not used: b.AAE (no picture)" in said
+    assert "6 of 6 photos placed" in said and "not used: b.AAE (no picture)" in said
     report = json.loads((tmp_path / "convert_report.json").read_text())
     assert report["unused"] == {"b.AAE": "no picture"}
-    assert len(image_names(tmp_path / "images")) == 8
+    assert len(image_names(tmp_path / "images")) == 6
     assert all(abs(np.subtract(Image.open(tmp_path / "images" / name).size, SIZE)).max() < 12
                for name in image_names(tmp_path / "images"))  # fmt: skip

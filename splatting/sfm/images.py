@@ -1,13 +1,10 @@
-"""Photos for COLMAP: upright, in a readable format, with their masks; and frames of a video as photos."""
+"""Photos for COLMAP: upright, in a readable format, with their masks."""
 
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterator, Sequence
-from itertools import groupby
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from PIL import Image, ImageOps
 from tqdm.contrib.concurrent import thread_map
 
@@ -16,13 +13,10 @@ from scene.images.masks import Mask, mask_names
 from scene.images.side_files import SideFiles
 from splatting.files.image_files import SUFFIXES, UNREADABLE, open_image
 from splatting.host.machine import threads
-from splatting.host.progress import Bar
 from splatting.sfm.layout import Layout, image_names
 from utils.system_utils import UserError
 
 JPEG_QUALITY = 95
-PATTERN = "frame_[0-9][0-9][0-9][0-9][0-9].jpg"  # of a video's frames
-_STEP = 4  # sharpness is computed on every 4th row and column
 _ORIENTATION = 0x0112  # EXIF tag; 1 or absent: upright
 _LYING = (5, 6, 7, 8)  # values of the tag that exchange width and height
 _MOST_NAMED = 20
@@ -198,54 +192,3 @@ def _in_threads(work: Callable[[str], None], names: Sequence[str], title: str) -
         listed = "; ".join(str(fault).partition("; ")[0] for fault in faults[:_MOST_NAMED])
         more = f"; and {len(faults) - _MOST_NAMED} more" if len(faults) > _MOST_NAMED else ""
         raise UserError(f"{len(faults)} of {len(names)} photos cannot be used: {listed}{more}; replace or remove them")
-
-
-def extract_frames(video: Path, folder: Path, count: int) -> None:
-    """Write at most `count` upright frames into `folder` as frame_00001.jpg, ...; UserError if that fails.
-
-    Reads every frame, and keeps the one in each of `count` equal spans of time whose neighbouring pixels differ most,
-    since parts of hand-held videos are blurred.
-    """
-    decoder = find_decoder()
-    try:
-        total, _ = decoder.count_frames_and_secs(str(video))
-        total = max(total, 1)
-        spans = min(count, total)
-        frames = enumerate(Bar(_frames(decoder, video), total=total, desc="Reading video", unit="frame"))
-        by_span = groupby(frames, lambda entry: min(entry[0] * spans // total, spans - 1))
-        for number, (_, entries) in enumerate(by_span, 1):
-            sharpest = max((frame for _, frame in entries), key=sharpness)
-            path = folder / f"frame_{number:05d}.jpg"
-            Image.fromarray(sharpest).save(path, quality=JPEG_QUALITY, subsampling=0)
-    except (OSError, RuntimeError) as error:
-        reason = str(error).strip().splitlines()
-        raise UserError(
-            f"cannot read the video {video} ({reason[-1] if reason else type(error).__name__}); pass another file as "
-            f"--video, or put frames of it as JPEG into {folder}"
-        ) from error
-
-
-def sharpness(frame: np.ndarray) -> float:
-    """Return the mean squared difference of neighbouring green values along both axes of a frame (H, W, 3) uint8."""
-    rows, columns = frame[::_STEP, :, 1].astype(np.int16), frame[:, ::_STEP, 1].astype(np.int16)
-    changes = np.diff(rows, axis=1), np.diff(columns, axis=0)
-    return sum(float(np.square(change, dtype=np.float64).mean()) for change in changes)
-
-
-def _frames(decoder: Any, video: Path) -> Iterator[np.ndarray]:
-    frames = decoder.read_frames(str(video))
-    width, height = next(frames)["size"]
-    for data in frames:
-        yield np.frombuffer(data, np.uint8).reshape(height, width, 3)
-
-
-def find_decoder() -> Any:
-    """Return the package that reads videos. UserError if it is not installed."""
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise UserError(
-            "--video needs the package imageio-ffmpeg; `pip install imageio-ffmpeg`, or put frames of the video into "
-            "the folder input yourself"
-        ) from error
-    return imageio_ffmpeg

@@ -24,6 +24,7 @@ class Layout:
         self.models = work / "sparse"  # one sub-folder per model of the mapper: 0, 1, ...
         self.database = work / "database.db"
         self.calibrated = work / "calibrated.db"  # a copy, into which global mapping writes its focal lengths
+        self.frames = work / "frames.json"  # which of `input` are frames of videos
         self.log, self.stages = work / "colmap.log", work / "stages.json"
 
     def resized(self, factor: int) -> Path:
@@ -99,7 +100,7 @@ def refuse_foreign_results(layout: Layout, scene_made: bool, work_made: bool, sk
         work_made
         or skip_matching
         or not layout.work.exists()
-        or {path.name for path in layout.work.iterdir()} <= {layout.stages.name}
+        or {path.name for path in layout.work.iterdir()} <= {layout.stages.name, layout.frames.name}
     )
     if not owned:
         there.append(layout.work.name)
