@@ -89,7 +89,7 @@ def _videos(given: Sequence[str]) -> list[Path]:
     videos = [Path(name) for name in given]
     for path in videos:
         if not path.is_file():
-            raise UserError(f"no video {path}; pass existing files as --video")
+            raise UserError(f"no video {path}; pass existing files as --video, in quotes if their names have spaces")
     return videos
 
 

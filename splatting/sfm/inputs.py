@@ -16,7 +16,7 @@ from splatting.files.listing import some
 from splatting.files.plain_files import plain
 from utils.system_utils import UserError
 
-_HEAD = 1 << 16  # bytes that hold the headers looked at here
+_HEAD = 1 << 16  # bytes that hold the colours of a HEIC or AVIF file
 _HEIF = (
     b"heic",
     b"heix",
@@ -101,10 +101,11 @@ def _kind(path: Path, thorough: bool) -> _Kind:
     suffix = path.suffix.lower()
     try:
         with open(plain(path), "rb") as file:
-            head = file.read(_HEAD)
+            head = file.read(16)
+            brand = head[8:12] if head[4:8] == b"ftyp" else b""
+            head += file.read(_HEAD) if brand in _HEIF else b""
     except OSError as error:
         return _Kind("unknown", f"{error.strerror}: make it readable")
-    brand = head[8:12] if head[4:8] == b"ftyp" else b""
     if suffix in _RAW_SUFFIXES or brand == b"crx ":
         return _Kind("RAW", _DEVELOP)
     if brand in _HEIF:
