@@ -11,10 +11,10 @@ if __name__ == "__main__":
     import splatting.host.early  # noqa: F401  (before the other imports, which take a second)
 
 import argparse
-import json
 import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from arguments import OptionParser
@@ -22,23 +22,32 @@ from splatting.host.start import typed_command
 from splatting.sfm import stages
 from splatting.sfm.cameras import MODES
 from splatting.sfm.colmap import LENS_MODELS, Program, Pycolmap, Settings
+from splatting.sfm.inputs import sort_inputs, unused_lines
 from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder
 from splatting.sfm.programs import refuse_while_working
-from splatting.sfm.report import summary
+from splatting.sfm.report import report_inputs, summary
+from splatting.sfm.video import NOTE, refuse_foreign_frames, report_entries, taken_frames, video_lines
 from utils.system_utils import UserError, run_cli
 
 
 def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> None:
     """Run the stages that are not done; print how many photos were placed, and advice about the others."""
     masks = _masks(args.mask_path)
-    names = [] if args.video else find_images(layout)
+    videos = _videos(args.video)
+    found = None if videos else find_images(layout, args.skip_unreadable)
     refuse_while_working(layout.log)
     record = stages.StageRecord(layout.stages)
     refuse_foreign_results(layout, record.begun("undistortion"), record.begun("photos"), args.skip_matching)
     kept = []
-    if args.video:
-        kept = record.run([_video(layout, record, args)])
-        names = find_images(layout)
+    if videos:
+        kept = record.run([_video_stage(layout, record, videos, args)])
+        print("\n".join(video_lines(layout)))
+        found = find_images(layout, args.skip_unreadable, but=videos)
+    for line in unused_lines(found.unused):
+        print(line)
+    names = found.photos
+    alone = len(videos) == 1 and taken_frames(layout) >= set(names)
+    settings = replace(settings, matcher=args.matcher or ("sequential" if alone else "exhaustive"))
     if args.skip_matching:
         planned = []
         program = "--skip_matching: the model that was in distorted/sparse"
@@ -56,8 +65,13 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     kept += record.run(planned)
     if kept:
         print(f"done before: {', '.join(kept)} (to start from the beginning, remove {layout.work})")
-    report = json.loads(layout.report.read_text(encoding="utf-8"))
+    notes = [NOTE] if taken_frames(layout) else []
+    report = report_inputs(layout.report, notes=notes, unused=found.unused, videos=report_entries(layout))
     print(summary(report))
+    if found.unused:
+        print(f"{len(found.unused)} files in {layout.input.name} were not used; {layout.report.name} has the reasons")
+    for line in notes:
+        print(f"note: {line}")
     for line in report["advice"]:
         print(f"warning: {line}", file=sys.stderr)
     print(f"train it with: {typed_command('train.py')} -s {shlex.quote(str(layout.scene))}")
@@ -72,16 +86,23 @@ def _masks(given: str | None) -> Path | None:
     return Path(given)
 
 
-def _video(layout: Layout, record: stages.StageRecord, args: argparse.Namespace) -> stages.Stage:
-    video = Path(args.video)
-    if not video.is_file():
-        raise UserError(f"no video {video}; pass an existing file as --video")
-    if layout.input.is_dir() and not record.begun("video") and any(layout.input.iterdir()):
-        raise UserError(
-            f"{layout.input} already has files, and the frames would be mixed with them; omit --video, or convert the "
-            "video in another folder"
-        )
-    return stages.video_stage(layout, video, args.video_frames)
+def _videos(given: Sequence[str]) -> list[Path]:
+    videos = [Path(name) for name in given]
+    for path in videos:
+        if not path.is_file():
+            raise UserError(f"no video {path}; pass existing files as --video, in quotes if their names have spaces")
+    return videos
+
+
+def _video_stage(
+    layout: Layout, record: stages.StageRecord, videos: Sequence[Path], args: argparse.Namespace
+) -> stages.Stage:
+    """Make the stage of the videos. UserError for photos beside them that cannot be used, before minutes of work."""
+    begun = record.begun("video")
+    refuse_foreign_frames(layout, videos, begun)
+    if layout.input.is_dir():
+        sort_inputs(layout.input, args.skip_unreadable, but=videos)
+    return stages.video_stage(layout, videos, args.video_frames, begun)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -99,15 +120,18 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--skip_matching", action="store_true", help="only undistort the largest model in SCENE/distorted/sparse")
     add("--colmap_executable", default="", metavar="FILE",
         help="COLMAP program for features, matching and mapping (default: pycolmap does them)")  # fmt: skip
+    add("--skip_unreadable", action="store_true", help="leave out photos that cannot be read, and name them")
     add("--magick_executable", default="", metavar="FILE", help="no effect (Pillow resizes the photos)")
     add(
         "--resize", action="store_true", help="also write images_2, images_4, images_8, whose sides are divided by that"
     )
-    add("--video", default="", metavar="FILE", help="take frames of this video as photos; needs imageio-ffmpeg")
+    add("--video", nargs="+", action="extend", default=[], metavar="FILE",
+        help="take frames of these videos as photos, besides those in input; needs imageio-ffmpeg")  # fmt: skip
     add("--video_frames", type=int, default=150, metavar="N",
-        help="number of frames, the sharpest of each of N equal spans of time (default: 150)")  # fmt: skip
+        help="largest number of frames of each video, the sharpest of each of N equal parts of its motion "
+        "(default: 150)")  # fmt: skip
     add("--matcher", choices=("exhaustive", "sequential"), default=None,
-        help="match every pair, or neighbours by name (default: exhaustive; with --video sequential)")  # fmt: skip
+        help="match every pair, or neighbours by name (default: exhaustive; of one video sequential)")  # fmt: skip
     add("--mapper", choices=("incremental", "global"), default="incremental",
         help="place one photo after another, or all at once, which is faster for hundreds of photos "
         "(default: incremental)")  # fmt: skip
@@ -127,7 +151,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     layout = Layout(scene_folder(args.source_path, made=bool(args.video)))
     if args.camera not in LENS_MODELS:
         raise UserError(f"--camera {args.camera} is not a supported lens model; choose one of {', '.join(LENS_MODELS)}")
-    matcher = args.matcher or ("sequential" if args.video else "exhaustive")
+    matcher = args.matcher or "exhaustive"
     convert(layout, Settings(args.camera, args.max_num_features, matcher, args.mapper, args.no_gpu, args.cameras), args)
 
 

@@ -52,6 +52,7 @@ setup(
             'usd-core==26.11; python_version >= "3.11"',
             "zstandard==0.25.0",
         ],
+        "heic": ["pillow-heif==1.8.1"],  # photos of convert.py
         "video": ["imageio-ffmpeg==0.8.1"],  # convert.py --video, render.py --path
         "viewer": ["viser==1.1.1"],  # view.py, train.py --viewer
     },

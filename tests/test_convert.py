@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -27,7 +26,7 @@ import convert
 from scene.dataset_readers import read_scene
 from splatting.sfm import colmap, programs, report
 from splatting.sfm.colmap import LENS_MODELS, Program, Pycolmap, Settings
-from splatting.sfm.images import check_images, extract_frames, find_masks, prepare_images, sharpness
+from splatting.sfm.images import check_images, find_masks, prepare_images
 from splatting.sfm.layout import Layout
 from splatting.sfm.programs import refuse_while_working, run_programs
 from splatting.sfm.stages import Stage, StageRecord, reconstruction_stages
@@ -180,8 +179,12 @@ def _renamed(name: str) -> Callable[[Path], object]:
         ("-s {}", _renamed("images"), r"rename its folder images to input"),
         ("-s {}", _renamed("else"), r"make it and put the photos there, or pass"),
         ("-s {}", lambda scene: (scene / "images").mkdir(), r"already has images, which convert.py did not make"),
-        ("-s {}", _few, r"^1 photos .* in .*input; at least 3 are needed.*move walk.mp4 elsewhere and pass it as"),
-        ("-s {}", lambda scene: (scene / "input" / "1.HEIC").touch(), r"1 files in .* cannot be read, .* is 1.HEIC"),
+        ("-s {}", _few, r"^1 photos .* in .*input; at least 3 are needed.*walk.mp4 \(video: pass it as --video"),
+        (
+            "-s {}",
+            lambda scene: (scene / "input" / "1.HEIC").touch(),
+            r"cannot be read: 1.HEIC \(damaged",
+        ),
         ("-s {}/input", None, r"room/input is the folder of the photos itself; pass its parent folder as -s: .*room$"),
         ("-s {}/nowhere", None, r"no folder .*nowhere; make it, put the photos into a folder input"),
         ("-s '{}'", None, r"contains quotes: '.*room'; pass /.*room, quoted only once for the shell"),
@@ -192,7 +195,6 @@ def _renamed(name: str) -> Callable[[Path], object]:
         ("-s {} --mask_path {}", None, r"none of 3 photos has a mask .*photo_00.png.png"),
         ("-s {} --max_num_features 0", None, r"--max_num_features must be at least 100, got 0"),
         ("-s {} --skip_matching", None, r"--skip_matching needs a COLMAP model in .*distorted/sparse"),
-        (f"-s {{}} --video {__file__}", None, r"input already has files, and the frames would be mixed"),
         ("-s {} --colmap_executable /no/colmap", None, r"cannot run --colmap_executable /no/colmap"),
     ],
 )
@@ -509,65 +511,3 @@ def test_advice(models, said):
     photos = [f"{i:03d}" for i in range(40)]
     lines = report.advice(models, photos, dict.fromkeys(photos[:39], 3), "sequential", 8192)
     assert [bool(re.search(expected, line)) for line, expected in zip(lines, said, strict=True)] == [True] * len(said)
-
-
-class _Decoder(SimpleNamespace):
-    """A stand-in for imageio_ffmpeg with frames of noise, of which every third is sharp."""
-
-    @staticmethod
-    def count_frames_and_secs(path: str) -> tuple[int, float]:
-        return 9, 0.3
-
-    @staticmethod
-    def read_frames(path: str):
-        yield {"size": (40, 30)}
-        for number in range(9):
-            noise = np.random.default_rng(number).integers(0, 256, (30, 40, 3), dtype=np.uint8)
-            picture = Image.fromarray(noise)
-            yield (picture if number % 3 == 1 else picture.reduce(4).resize((40, 30))).tobytes()
-
-
-def test_the_sharpest_frame_of_each_span_is_taken(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", _Decoder())
-    extract_frames(Path("any.mp4"), tmp_path, 3)
-    assert sorted(path.name for path in tmp_path.iterdir()) == [f"frame_0000{i}.jpg" for i in (1, 2, 3)]
-    for index, path in enumerate(sorted(tmp_path.iterdir())):
-        noise = np.random.default_rng(3 * index + 1).integers(0, 256, (30, 40, 3), dtype=np.uint8)
-        assert sharpness(np.asarray(Image.open(path))) == pytest.approx(sharpness(noise), rel=0.1)
-    extract_frames(Path("any.mp4"), tmp_path, 100)
-    assert len(list(tmp_path.iterdir())) == 9
-
-
-def test_a_video_makes_its_scene_folder(tmp_path, monkeypatch):
-    video, scene = tmp_path / "walk.mp4", tmp_path / "deep" / "new"
-    words = ["-s", str(scene), "--video", str(video), "--video_frames", "3", "--mask_path", str(tmp_path)]
-    with pytest.raises(UserError, match="no video"):
-        convert.main(words)
-    video.touch()
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(UserError, match="--video needs the package"):
-        convert.main(words)
-    assert not scene.parent.exists()
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", _Decoder())
-    with pytest.raises(UserError, match="none of 3 photos has a mask"):  # the stage after the frames
-        convert.main(words)
-    assert len(list((scene / "input").glob("frame_*.jpg"))) == 3
-    with pytest.raises(UserError, match="no folder .*other; make it"):
-        convert.main(["-s", str(tmp_path / "other")])
-
-
-def test_a_real_video(tmp_path):
-    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="the extra imageio-ffmpeg is not installed")
-    make_photos(tmp_path / "photos", 6)
-    writer = ffmpeg.write_frames(str(tmp_path / "walk.mp4"), (SIZE[0], SIZE[1]), macro_block_size=1)
-    writer.send(None)
-    for path in sorted((tmp_path / "photos").iterdir()):
-        writer.send(np.asarray(Image.open(path)).tobytes())
-    writer.close()
-    folder = tmp_path / "input"
-    folder.mkdir()
-    extract_frames(tmp_path / "walk.mp4", folder, 3)
-    assert [Image.open(path).size for path in sorted(folder.iterdir())] == [SIZE] * 3
-    (tmp_path / "no.mp4").write_bytes(b"no video")
-    with pytest.raises(UserError, match="cannot read the video .*no.mp4"):
-        extract_frames(tmp_path / "no.mp4", folder, 3)

@@ -29,15 +29,18 @@ UNREADABLE = (
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 # What photos come in. Pillow knows more formats, and hands some of them, as PostScript, to other programs, whatever the
 # file's name is.
-FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "JPEG2000", "TGA")
+FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "JPEG2000", "AVIF", "HEIF", "TGA")
 SCALE = "scale"  # key of a plane's text chunk: value = pixel * scale
 _STEPS = 65535
 _DIM = 0.3  # brightness of what a mask leaves out
 
 
 def open_image(path: Path) -> Image.Image:
-    """Open an image file of one of FORMATS; its pixels are read later. Raises one of UNREADABLE if that fails."""
-    return Image.open(plain(path), formats=FORMATS)
+    """Open an image file of one of FORMATS; its pixels are read later. Raises one of UNREADABLE if that fails.
+
+    HEIF only where a reader of it was added to Pillow.
+    """
+    return Image.open(plain(path), formats=[name for name in FORMATS if name != "HEIF" or name in Image.OPEN])
 
 
 def open_render(path: Path) -> Image.Image:

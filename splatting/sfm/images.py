@@ -1,44 +1,44 @@
-"""Photos for COLMAP: upright, in a readable format, with their masks; and frames of a video as photos."""
+"""Photos for COLMAP: upright, in a readable format, with their masks."""
 
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from itertools import groupby
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from PIL import Image, ImageOps
 from tqdm.contrib.concurrent import thread_map
 
 from scene.images.decode import picture_size
 from scene.images.masks import Mask, mask_names
 from scene.images.side_files import SideFiles
-from splatting.files.image_files import UNREADABLE, open_image
+from splatting.files.image_files import SUFFIXES, UNREADABLE, open_image
 from splatting.host.machine import threads
-from splatting.host.progress import Bar
 from splatting.sfm.layout import Layout, image_names
 from utils.system_utils import UserError
 
 JPEG_QUALITY = 95
-PATTERN = "frame_[0-9][0-9][0-9][0-9][0-9].jpg"  # of a video's frames
-_STEP = 4  # sharpness is computed on every 4th row and column
 _ORIENTATION = 0x0112  # EXIF tag; 1 or absent: upright
 _LYING = (5, 6, 7, 8)  # values of the tag that exchange width and height
 _MOST_NAMED = 20
+# Formats that COLMAP reads, or in which photos of other formats are written for it: HEIC and AVIF lose little as JPEG.
+_WRITTEN = {"JPEG": "JPEG", "MPO": "JPEG", "PNG": "PNG", "TIFF": "TIFF", "BMP": "BMP", "HEIF": "JPEG", "AVIF": "JPEG"}
+_ENDS = {"JPEG": ".jpg", "PNG": ".png", "TIFF": ".tif", "BMP": ".bmp"}
+_LINKED = ("JPEG", "MPO", "PNG", "TIFF", "BMP")
 
 
 def prepare_images(layout: Layout, names: Sequence[str], masks: Path | None) -> None:
     """Fill `layout.prepared`, and `layout.masks` if a folder of masks is given.
 
     A photo is linked, or copied if links are impossible. A photo that its EXIF orientation turns, or whose format
-    COLMAP cannot read, is rewritten, with upright pixels and the other EXIF data kept. Masks: see `_prepare_mask`.
+    COLMAP cannot read, is rewritten, with upright pixels and the other EXIF data kept. A name without the suffix of
+    its format gets one appended. Masks: see `_prepare_mask`.
     `check_images` must have passed before; UserError for files whose pixels turn out to be broken.
     """
     with_mask = find_masks(names, masks, layout.input) if masks else {}
+    taken = {layout.prepared / name for name in names}
 
     def prepare(name: str) -> None:
-        prepared = _prepare_image(layout.input / name, layout.prepared / name)
+        prepared = _prepare_image(layout.input / name, layout.prepared / name, taken)
         if masks:
             mask = layout.masks / prepared.relative_to(layout.prepared)
             _prepare_mask(with_mask.get(name), mask.with_name(f"{mask.name}.png"), prepared)
@@ -93,21 +93,34 @@ def resize_images(layout: Layout, factor: int) -> None:
     _in_threads(resize, image_names(layout.images), f"Resizing to 1/{factor}")
 
 
-def _prepare_image(source: Path, target: Path) -> Path:
-    """Write the prepared photo and return its path: `target`, with .png appended if the format had to change."""
+def _prepare_image(source: Path, target: Path, taken: Collection[Path]) -> Path:
+    """Write the prepared photo and return its path: `target`, with the suffix of its format appended if it has none.
+
+    taken: paths of other photos.
+    """
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         with open_image(source) as image:
-            webp = image.format == "WEBP"
-            if image.getexif().get(_ORIENTATION, 1) in (0, 1) and not webp:
+            written = _written(image)
+            linked = image.format in _LINKED
+            if target.suffix.lower() not in (set(SUFFIXES) - {".webp"} if linked else {_ENDS[written]}):
+                target = target.with_name(target.name + _ENDS[written])
+                while target in taken:
+                    target = target.with_name(target.name + _ENDS[written])
+            if linked and image.getexif().get(_ORIENTATION, 1) in (0, 1):
                 _link(source, target)
                 return target
             upright = ImageOps.exif_transpose(image)
-            target = target.with_name(f"{target.name}.png") if webp else target
             _save(upright, target, image, exif=upright.getexif())
             return target
     except UNREADABLE as error:
-        raise UserError(f"cannot turn the photo {source} upright ({error}); replace or remove it") from error
+        raise UserError(f"cannot rewrite the photo {source} for COLMAP ({error}); replace or remove it") from error
+
+
+def _written(image: Image.Image) -> str:
+    """The format in which a photo is written."""
+    written = _WRITTEN.get(image.format, "PNG")
+    return "PNG" if written == "JPEG" and image.has_transparency_data else written
 
 
 def _upright_size(photo: Path) -> tuple[int, int]:
@@ -147,10 +160,10 @@ def _save(image: Image.Image, target: Path, like: Image.Image, **options: object
     target.parent.mkdir(parents=True, exist_ok=True)
     if profile := like.info.get("icc_profile"):
         options["icc_profile"] = profile
-    if like.format in ("JPEG", "MPO"):
-        image.save(target, "JPEG", quality=JPEG_QUALITY, subsampling=0, **options)
-    else:
-        image.save(target, "PNG" if like.format == "WEBP" else like.format, **options)
+    written = _written(like)
+    if written == "JPEG":
+        options |= {"quality": JPEG_QUALITY, "subsampling": 0}
+    image.save(target, written, **options)
 
 
 def _link(source: Path, target: Path) -> None:
@@ -179,54 +192,3 @@ def _in_threads(work: Callable[[str], None], names: Sequence[str], title: str) -
         listed = "; ".join(str(fault).partition("; ")[0] for fault in faults[:_MOST_NAMED])
         more = f"; and {len(faults) - _MOST_NAMED} more" if len(faults) > _MOST_NAMED else ""
         raise UserError(f"{len(faults)} of {len(names)} photos cannot be used: {listed}{more}; replace or remove them")
-
-
-def extract_frames(video: Path, folder: Path, count: int) -> None:
-    """Write at most `count` upright frames into `folder` as frame_00001.jpg, ...; UserError if that fails.
-
-    Reads every frame, and keeps the one in each of `count` equal spans of time whose neighbouring pixels differ most,
-    since parts of hand-held videos are blurred.
-    """
-    decoder = find_decoder()
-    try:
-        total, _ = decoder.count_frames_and_secs(str(video))
-        total = max(total, 1)
-        spans = min(count, total)
-        frames = enumerate(Bar(_frames(decoder, video), total=total, desc="Reading video", unit="frame"))
-        by_span = groupby(frames, lambda entry: min(entry[0] * spans // total, spans - 1))
-        for number, (_, entries) in enumerate(by_span, 1):
-            sharpest = max((frame for _, frame in entries), key=sharpness)
-            path = folder / f"frame_{number:05d}.jpg"
-            Image.fromarray(sharpest).save(path, quality=JPEG_QUALITY, subsampling=0)
-    except (OSError, RuntimeError) as error:
-        reason = str(error).strip().splitlines()
-        raise UserError(
-            f"cannot read the video {video} ({reason[-1] if reason else type(error).__name__}); pass another file as "
-            f"--video, or put frames of it as JPEG into {folder}"
-        ) from error
-
-
-def sharpness(frame: np.ndarray) -> float:
-    """Return the mean squared difference of neighbouring green values along both axes of a frame (H, W, 3) uint8."""
-    rows, columns = frame[::_STEP, :, 1].astype(np.int16), frame[:, ::_STEP, 1].astype(np.int16)
-    changes = np.diff(rows, axis=1), np.diff(columns, axis=0)
-    return sum(float(np.square(change, dtype=np.float64).mean()) for change in changes)
-
-
-def _frames(decoder: Any, video: Path) -> Iterator[np.ndarray]:
-    frames = decoder.read_frames(str(video))
-    width, height = next(frames)["size"]
-    for data in frames:
-        yield np.frombuffer(data, np.uint8).reshape(height, width, 3)
-
-
-def find_decoder() -> Any:
-    """Return the package that reads videos. UserError if it is not installed."""
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise UserError(
-            "--video needs the package imageio-ffmpeg; `pip install imageio-ffmpeg`, or put frames of the video into "
-            "the folder input yourself"
-        ) from error
-    return imageio_ffmpeg

@@ -1,12 +1,12 @@
 """Paths of a conversion, and checks of the folder that is given, with messages that name the fix."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from splatting.files.image_files import SUFFIXES
+from splatting.sfm.inputs import Inputs, sort_inputs, unused_lines
 from utils.system_utils import UserError
 
-# Frequent formats of photos that neither Pillow alone nor COLMAP can read.
-_FOREIGN = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".gif")
 _VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts")
 FEWEST = 3
 
@@ -24,6 +24,7 @@ class Layout:
         self.models = work / "sparse"  # one sub-folder per model of the mapper: 0, 1, ...
         self.database = work / "database.db"
         self.calibrated = work / "calibrated.db"  # a copy, into which global mapping writes its focal lengths
+        self.frames = work / "frames.json"  # which of `input` are frames of videos
         self.log, self.stages = work / "colmap.log", work / "stages.json"
 
     def resized(self, factor: int) -> Path:
@@ -49,29 +50,20 @@ def scene_folder(given: str, made: bool = False) -> Path:
     return folder.absolute()
 
 
-def find_images(layout: Layout) -> list[str]:
-    """List the photos below `input`, with its sub-folders, sorted.
+def find_images(layout: Layout, skip_unreadable: bool = False, but: Iterable[Path] = ()) -> Inputs:
+    """Sort the files below `input`, with its sub-folders, as `sort_inputs` does.
 
-    UserError if there are too few, if some have a format that cannot be read, or if they are in another folder.
+    UserError if there are too few photos, if some cannot be read, or if they are in another folder.
     """
     if not layout.input.is_dir():
         raise UserError(_no_input(layout))
-    files = [path for path in sorted(layout.input.rglob("*")) if path.is_file()]
-    names = image_names(layout.input)
-    foreign = [path for path in files if path.suffix.lower() in _FOREIGN]
-    if foreign:
+    found = sort_inputs(layout.input, skip_unreadable, but)
+    if len(found.photos) < FEWEST:
         raise UserError(
-            f"{len(foreign)} files in {layout.input} have a format that cannot be read, the first is "
-            f"{foreign[0].name}; convert them to JPEG or PNG, or remove them"
+            f"{len(found.photos)} photos that can be read in {layout.input}; at least {FEWEST} are needed, and 20 to "
+            f"200 with much overlap are usual; {'; '.join(['add more', *unused_lines(found.unused)])}"
         )
-    if len(names) < FEWEST:
-        videos = [path.name for path in files if path.suffix.lower() in _VIDEOS]
-        hint = f"; move {videos[0]} elsewhere and pass it as --video" if videos else ""
-        raise UserError(
-            f"{len(names)} photos ({', '.join(SUFFIXES)}) in {layout.input}; at least {FEWEST} are needed, and 20 to "
-            f"200 with much overlap are usual; add more{hint}"
-        )
-    return names
+    return found
 
 
 def image_names(folder: Path) -> list[str]:
@@ -108,7 +100,7 @@ def refuse_foreign_results(layout: Layout, scene_made: bool, work_made: bool, sk
         work_made
         or skip_matching
         or not layout.work.exists()
-        or {path.name for path in layout.work.iterdir()} <= {layout.stages.name}
+        or {path.name for path in layout.work.iterdir()} <= {layout.stages.name, layout.frames.name}
     )
     if not owned:
         there.append(layout.work.name)

@@ -117,3 +117,11 @@ def write_report(
         "registered": len(chosen.registered),
     }
     write_json(path, content)
+
+
+def report_inputs(path: Path, **inputs: Any) -> dict[str, Any]:
+    """Return the contents of convert_report.json with entries about `input`, which may change without a new model."""
+    content = read_json(path)
+    if content != (whole := {**content, **inputs}):
+        write_json(path, whole)
+    return whole

@@ -8,13 +8,13 @@ import hashlib
 import json
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from splatting.files.json_files import read_json, write_json
-from splatting.sfm import cameras, colmap, images, report
+from splatting.sfm import cameras, colmap, images, report, video
 from splatting.sfm.colmap import Backend, Settings, worker_command
 from splatting.sfm.layout import Layout, image_names
 from splatting.sfm.programs import run_programs
@@ -94,18 +94,15 @@ class StageRecord:
         write_json(self._path, self._record)
 
 
-def video_stage(layout: Layout, video: Path, count: int) -> Stage:
-    """Make the stage that writes frames of a video into `input`."""
-
-    def reset() -> None:
-        for frame in layout.input.glob(images.PATTERN):
-            frame.unlink()
-
-    def work() -> None:
-        mkdir_p(layout.input)
-        images.extract_frames(video, layout.input, count)
-
-    return Stage("video", [_state(video), count], reset, work, check=images.find_decoder)
+def video_stage(layout: Layout, videos: Sequence[Path], count: int, begun: bool) -> Stage:
+    """Make the stage that writes frames of videos into `input`. begun: an earlier run did so."""
+    return Stage(
+        "video",
+        [[_state(path) for path in videos], count],
+        reset=partial(video.remove_frames, layout, begun),
+        work=partial(video.extract_videos, layout, videos, count),
+        check=video.find_decoder,
+    )
 
 
 def image_stage(layout: Layout, names: list[str], masks: Path | None) -> Stage:

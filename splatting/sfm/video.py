@@ -1,0 +1,234 @@
+"""Frames of videos as photos: chosen by motion and sharpness, and brought from HDR to the range of a display.
+
+ffmpeg reads each video twice: first as grey pictures, which tell motion and sharpness, then the frames that are taken.
+"""
+
+import subprocess
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from splatting.files.json_files import read_json, write_json
+from splatting.host.progress import Bar
+from splatting.sfm.images import JPEG_QUALITY
+from splatting.sfm.layout import Layout
+from utils.system_utils import UserError, atomic_write, mkdir_p
+
+PATTERN = "frame_[0-9][0-9][0-9][0-9][0-9].jpg"  # of a video's frames
+# Difference, as of `_differ`, between frames that follow each other: photos of fox_raw, monstree_raw and bonsai_full
+# reach it when they move by 0.3 to 0.6 % of their width; strong noise (6 of 255 levels) reaches 0.03.
+LEAST = 0.1
+_SIDE = 48  # of the small pictures that are compared
+_STEP = 4  # sharpness is computed on every 4th row and column
+_EVERY_FRAME = ["-fps_mode", "passthrough"]  # else frames are doubled or dropped where their times are uneven
+_HDR = {"arib-std-b67": "HLG", "smpte2084": "PQ"}  # ffmpeg's names of the transfer functions of ITU-R BT.2100
+# agamma=0: zscale's approximation of HLG leaves out that its gamma is that of the luminance, and saturates colours.
+# BT.2408: white of an SDR picture is shown at 203 cd/m2, and both functions reach 1000, which is 4.93 times that. Up to
+# nine tenths of white nothing changes; what is brighter is compressed into the last tenth.
+_LINEAR = "zscale=t=linear:npl=203:agamma=0:f=bicubic,format=gbrpf32le,zscale=p=bt709"
+_COMPRESSED = "tonemap=mobius:param=0.9:peak=4.93:desat=0"
+_DISPLAY = "zscale=t=bt709:m=gbr:r=pc,format=gbrp"
+# What the scores of frames do not tell.
+NOTE = "test views of --eval lie between frames of the same video that train; other places may score lower"
+
+
+def find_decoder() -> Any:
+    """Return the package that reads videos. UserError if it is not installed."""
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise UserError(
+            "--video needs the package imageio-ffmpeg; `pip install imageio-ffmpeg`, or put frames of the video into "
+            "the folder input yourself"
+        ) from error
+    return imageio_ffmpeg
+
+
+def frame_folders(layout: Layout, videos: Sequence[Path]) -> list[Path]:
+    """The folder of each video's frames: `input` of one alone, of several a sub-folder each, named by the video."""
+    if len(videos) == 1:
+        return [layout.input]
+    stems = [video.stem for video in videos]
+    return [
+        layout.input / (stem if stems.index(stem) == place else f"{stem}_{place + 1}")
+        for place, stem in enumerate(stems)
+    ]
+
+
+def taken_frames(layout: Layout) -> set[str]:
+    """Names, below `input`, of the frames that an earlier run wrote or was about to write."""
+    return {name for entry in _record(layout) for name in entry["names"]}
+
+
+def refuse_foreign_frames(layout: Layout, videos: Sequence[Path], begun: bool) -> None:
+    """Raise UserError if a file that is no frame of an earlier run has a name that frames may get."""
+    ours = taken_frames(layout)
+    if begun and not ours:
+        return  # frames of a version that kept no record
+    for folder, video in zip(frame_folders(layout, videos), videos, strict=True):
+        foreign = [
+            path for path in sorted(folder.glob(PATTERN)) if path.relative_to(layout.input).as_posix() not in ours
+        ]
+        if foreign:
+            raise UserError(
+                f"{foreign[0]} has a name that frames of {video.name} will get; rename it, or convert the video in "
+                "another folder"
+            )
+
+
+def remove_frames(layout: Layout, begun: bool) -> None:
+    """Remove the frames of an earlier run. begun: there was one."""
+    names = taken_frames(layout)
+    frames = [layout.input / name for name in names]
+    for path in frames or (layout.input.glob(PATTERN) if begun else []):
+        path.unlink(missing_ok=True)
+    layout.frames.unlink(missing_ok=True)
+
+
+def extract_videos(layout: Layout, videos: Sequence[Path], count: int) -> None:
+    """Write at most `count` frames of each video below `input`, and `frames.json`, which says what they are."""
+    for video, folder in zip(videos, frame_folders(layout, videos), strict=True):
+        mkdir_p(folder)
+        extract_frames(layout, video, folder, count)
+
+
+def report_entries(layout: Layout) -> list[dict[str, Any]]:
+    """For each video of `frames.json` its name, how many frames it has, were asked for and taken, and its HDR."""
+    kept = ("video", "frames", "asked", "hdr")
+    return [{"taken": len(entry["names"]), **{key: entry[key] for key in kept}} for entry in _record(layout)]
+
+
+def video_lines(layout: Layout) -> list[str]:
+    """What a user should know about the frames: how many were taken, why fewer than asked, and what scores tell."""
+    lines = []
+    for entry in _record(layout):
+        taken, text = len(entry["names"]), f"{entry['video']}: {len(entry['names'])} of {entry['frames']} frames taken"
+        if taken < entry["asked"]:
+            all_taken = taken == entry["frames"]
+            text += f", not {entry['asked']}, since " + ("it has no more" if all_taken else "the others hardly differ")
+        lines.append(text + (f"; {entry['hdr']} was brought to SDR" if entry["hdr"] else ""))
+    return lines
+
+
+def _record(layout: Layout) -> list[dict[str, Any]]:
+    try:
+        return read_json(layout.frames) if layout.frames.is_file() else []
+    except (OSError, ValueError, RecursionError) as error:
+        raise UserError(f"{layout.frames} is damaged; remove {layout.work} to convert from the beginning") from error
+
+
+def extract_frames(layout: Layout, video: Path, folder: Path, count: int) -> None:
+    """Write at most `count` upright frames of a video into `folder` as frame_00001.jpg, ...; add it to frames.json.
+
+    The frames are those of `choose_frames`. UserError if the video cannot be read.
+    """
+    decoder = find_decoder()
+    try:
+        sharp, small = [], []
+        reader = decoder.read_frames(str(video), pix_fmt="gray", bits_per_pixel=8, output_params=_EVERY_FRAME)
+        header = next(reader)
+        colours, (width, height) = header["pix_fmt"], header["size"]
+        expected = round(header["duration"] * header["fps"]) or None
+        for data in Bar(reader, total=expected, desc=f"Reading {video.name}", unit="frame"):
+            frame = np.frombuffer(data, np.uint8).reshape(height, width)
+            sharp.append(sharpness(frame))
+            small.append(small_picture(frame))
+        if not small:
+            raise RuntimeError("it has no frames")
+        chosen = choose_frames(sharp, np.stack(small), count)
+        hdr = next((name for tag, name in _HDR.items() if tag in colours), "")
+        filters = _filters(decoder, video, colours, bool(hdr))
+        paths = [folder / f"frame_{number + 1:05d}.jpg" for number in range(len(chosen))]
+        names = [path.relative_to(layout.input).as_posix() for path in paths]
+        entry = {"video": video.name, "frames": len(small), "asked": count, "names": names, "hdr": hdr}
+        write_json(layout.frames, [*_record(layout), entry])
+        for path, frame in zip(paths, _read(decoder, video, chosen, filters), strict=True):
+            with atomic_write(path) as temporary:
+                Image.fromarray(frame).save(temporary, "JPEG", quality=JPEG_QUALITY, subsampling=0)
+    except (OSError, RuntimeError, ValueError, StopIteration) as error:
+        reason = str(error).strip().splitlines()
+        raise UserError(
+            f"cannot read the video {video} ({reason[-1] if reason else type(error).__name__}); pass another file as "
+            f"--video, or put frames of it as JPEG into {folder}"
+        ) from error
+
+
+def choose_frames(sharp: Sequence[float], small: np.ndarray, count: int) -> list[int]:
+    """Return the numbers of at most `count` frames, ascending, each of which differs by LEAST from the one before it.
+
+    The motion of the video is divided into equal parts; of each the sharpest frame is taken that differs from the last
+    one. Motion is counted in steps: one step ends where the picture differs by LEAST from the step's beginning. So a
+    camera that stands still adds nothing, however long, and slow motion counts.
+
+    sharp: of `sharpness`; small: (F, P) of `small_picture`.
+    """
+    steps, first = np.zeros(len(small), dtype=np.int64), small[0]
+    for number, picture in enumerate(small[1:], 1):
+        moved = _differ(picture, first)
+        steps[number] = steps[number - 1] + moved
+        first = picture if moved else first
+    total = int(steps[-1]) + 1
+    parts = steps * min(count, total) // total
+    chosen: list[int] = []
+    for part in range(min(count, total)):
+        there = np.flatnonzero(parts == part)
+        new = [number for number in there if not chosen or _differ(small[number], small[chosen[-1]])]
+        if new:
+            chosen.append(int(max(new, key=lambda number: sharp[number])))
+    return chosen
+
+
+def sharpness(frame: np.ndarray) -> float:
+    """Return the mean squared difference of neighbouring values along both axes of a grey frame (H, W) uint8."""
+    rows, columns = frame[::_STEP].astype(np.int16), frame[:, ::_STEP].astype(np.int16)
+    changes = np.diff(rows, axis=1), np.diff(columns, axis=0)
+    return sum(float(np.square(change, dtype=np.float64).mean()) for change in changes)
+
+
+def small_picture(frame: np.ndarray) -> np.ndarray:
+    """A grey frame (H, W) as (P,) float16 of mean 0 and deviation 1, so that neither exposure nor contrast counts."""
+    picture = np.asarray(Image.fromarray(frame).resize((_SIDE, _SIDE), Image.Resampling.BOX), dtype=np.float32).ravel()
+    return ((picture - picture.mean()) / max(float(picture.std()), 1.0)).astype(np.float16)
+
+
+def _differ(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether the root mean square of the difference of two small pictures is LEAST or more."""
+    return float(np.sqrt(np.square(one.astype(np.float32) - other.astype(np.float32)).mean())) >= LEAST
+
+
+def _filters(decoder: Any, video: Path, colours: str, hdr: bool) -> list[str]:
+    """ffmpeg's filters from the colours of a stream, as its header has them, to BT.709; none if it has those already.
+
+    UserError if this ffmpeg lacks the filters, or if the stream does not name its transfer function.
+    """
+    if not hdr and "bt2020" not in colours:
+        return []
+    # The header has matrix/primaries/transfer.
+    if not hdr and colours.rpartition("/")[2].startswith("unknown"):
+        raise UserError(
+            f"{video} has the colours of HDR (BT.2020), but does not say which transfer function it has (HLG or PQ); "
+            "export the video as SDR"
+        )
+    program = decoder.get_ffmpeg_exe()
+    done = subprocess.run([program, "-hide_banner", "-filters"], capture_output=True, text=True, errors="replace")
+    if not {"zscale", "tonemap"} <= set(done.stdout.split()):
+        raise UserError(
+            f"{video} has the colours of HDR (BT.2020), and {program} lacks the filters zscale and tonemap to convert "
+            "them; unset IMAGEIO_FFMPEG_EXE to use the ffmpeg of imageio-ffmpeg, or export the video as SDR"
+        )
+    # Streams may leave out the others.
+    known = ["setparams=color_primaries=bt2020:colorspace=bt2020nc"] if "unknown" in colours else []
+    return [*known, _LINEAR, *([_COMPRESSED] if hdr else []), _DISPLAY]
+
+
+def _read(decoder: Any, video: Path, numbers: Sequence[int], filters: Sequence[str]) -> Iterator[np.ndarray]:
+    """Yield the frames (H, W, 3) uint8 of these numbers."""
+    select = "select=" + "+".join(rf"eq(n\,{number})" for number in numbers)
+    options = ["-vf", ",".join([select, *filters]), *_EVERY_FRAME, "-frames:v", str(len(numbers))]
+    reader = decoder.read_frames(str(video), output_params=options)
+    width, height = next(reader)["size"]
+    for data in reader:
+        yield np.frombuffer(data, np.uint8).reshape(height, width, 3)

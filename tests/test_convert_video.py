@@ -1,0 +1,284 @@
+"""convert.py --video: frames chosen by motion and sharpness, HDR brought to SDR, several videos, videos with photos."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pycolmap
+import pytest
+from photo_room import make_photos
+from PIL import Image, ImageFilter
+from skimage.metrics import structural_similarity
+
+import convert
+from splatting.sfm import video as video_module
+from splatting.sfm.layout import Layout
+from splatting.sfm.video import choose_frames, extract_videos, sharpness, small_picture
+from utils.system_utils import UserError
+
+
+@pytest.fixture(scope="module")
+def ffmpeg():
+    return pytest.importorskip("imageio_ffmpeg", reason="no imageio-ffmpeg: pip install '.[video]'")
+
+
+class _Decoder(SimpleNamespace):
+    """A stand-in for imageio_ffmpeg with frames of noise, of which every third is sharp."""
+
+    @staticmethod
+    def frame(number: int) -> Image.Image:
+        noise = Image.fromarray(np.random.default_rng(number).integers(0, 256, (30, 40, 3), dtype=np.uint8))
+        return noise if number % 3 == 1 else noise.reduce(4).resize((40, 30))
+
+    @classmethod
+    def read_frames(cls, path: str, pix_fmt: str = "rgb24", output_params: list[str] = (), **_: object):
+        yield {"size": (40, 30), "pix_fmt": "yuv420p(tv, bt709)", "duration": 0.3, "fps": 30.0}
+        select = next((word for word in output_params if word.startswith("select=")), "")
+        for number in range(9):
+            if not select or rf"eq(n\,{number})" in select:
+                yield cls.frame(number).convert("L" if pix_fmt == "gray" else "RGB").tobytes()
+
+
+def _frames(layout: Layout) -> list[Path]:
+    return sorted(layout.input.rglob("*.jpg"))
+
+
+def _extract(scene: Path, video: Path, count: int) -> Layout:
+    layout = Layout(scene)
+    layout.work.mkdir(parents=True)
+    extract_videos(layout, [video], count)
+    return layout
+
+
+def test_the_sharpest_frame_of_each_part_is_taken(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", _Decoder())
+    layout = _extract(tmp_path / "few", Path("any.mp4"), 3)
+    assert [path.name for path in _frames(layout)] == [f"frame_0000{i}.jpg" for i in (1, 2, 3)]
+    for index, path in enumerate(_frames(layout)):
+        expected = sharpness(np.asarray(_Decoder.frame(3 * index + 1).convert("L")))
+        assert sharpness(np.asarray(Image.open(path).convert("L"))) == pytest.approx(expected, rel=0.1)
+    assert len(_frames(_extract(tmp_path / "all", Path("any.mp4"), 100))) == 9
+
+
+def test_a_video_makes_its_scene_folder(tmp_path, monkeypatch):
+    video, scene = tmp_path / "walk.mp4", tmp_path / "deep" / "new"
+    words = ["-s", str(scene), "--video", str(video), "--video_frames", "3", "--mask_path", str(tmp_path)]
+    with pytest.raises(UserError, match="no video"):
+        convert.main(words)
+    video.touch()
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(UserError, match="--video needs the package"):
+        convert.main(words)
+    assert not scene.parent.exists()
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", _Decoder())
+    with pytest.raises(UserError, match="none of 3 photos has a mask"):  # the stage after the frames
+        convert.main(words)
+    assert len(_frames(Layout(scene))) == 3
+    with pytest.raises(UserError, match="no folder .*other; make it"):
+        convert.main(["-s", str(tmp_path / "other")])
+
+
+def test_frames_replace_frames_and_nothing_else(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", _Decoder())
+    one, two, layout = tmp_path / "a.mp4", tmp_path / "b.mp4", Layout(tmp_path / "scene")
+    for path in (one, two):
+        path.touch()
+    words = ["-s", str(layout.scene), "--mask_path", str(tmp_path), "--video_frames", "4", "--video"]
+
+    def names(*videos: Path) -> set[str]:
+        with pytest.raises(UserError, match="has a mask"):
+            convert.main([*words, *map(str, videos)])
+        return {path.relative_to(layout.input).as_posix() for path in layout.input.rglob("*") if path.is_file()}
+
+    flat = {f"frame_0000{i}.jpg" for i in (1, 2, 3, 4)}
+    layout.input.mkdir(parents=True)
+    Image.new("RGB", (40, 30)).save(layout.input / "mine.jpg")
+    assert names(one) == flat | {"mine.jpg"}
+    assert names(one, two) == {f"{stem}/{name}" for stem in "ab" for name in flat} | {"mine.jpg"}
+    assert names(two) == flat | {"mine.jpg"}
+    # A photo of the user with the name of a frame is never removed.
+    other = Layout(tmp_path / "other")
+    other.input.mkdir(parents=True)
+    Image.new("RGB", (40, 30)).save(other.input / "frame_00002.jpg")
+    with pytest.raises(UserError, match="frame_00002.jpg has a name that frames of a.mp4 will get; rename it"):
+        convert.main(["-s", str(other.scene), "--video", str(one)])
+    assert [path.name for path in _frames(other)] == ["frame_00002.jpg"]
+
+
+@pytest.fixture(scope="module")
+def room(once) -> np.ndarray:
+    """Frames (16, 180, 240, 3) of a camera that moves around the corner of a room."""
+    folder = once("room of a video", lambda folder: make_photos(folder, 16))
+    return np.stack([np.asarray(Image.open(path)) for path in sorted(folder.iterdir())])
+
+
+def _write(ffmpeg, path: Path, frames: np.ndarray, *options: str, pixels: str = "rgb24") -> None:
+    height, width = frames.shape[1:3]
+    given = ["-f", "rawvideo", "-pix_fmt", pixels, "-s", f"{width}x{height}", "-r", "30", "-i", "-"]
+    command = [ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", *given, *options, str(path)]
+    subprocess.run(command, input=frames.tobytes(), check=True)
+
+
+def _places(room: np.ndarray, frames: list[np.ndarray]) -> list[int]:
+    """The place in the room that each frame shows."""
+    return [int(np.abs(room.astype(np.int16) - frame).mean(axis=(1, 2, 3)).argmin()) for frame in frames]
+
+
+def test_frames_follow_the_motion(ffmpeg, room, tmp_path):
+    """A camera that stands, moves, stands for long, and moves at half the speed, with the noise of a sensor."""
+    order = [*[0] * 30, *range(8), *[7] * 90, *np.repeat(np.arange(8, 16), 2)]
+    noise = np.random.default_rng(0).normal(0, 4, (20, *room.shape[1:])).astype(np.float32)
+    frames = [np.clip(room[place] + noise[number % 20], 0, 255) for number, place in enumerate(order)]
+    _write(ffmpeg, tmp_path / "walk.mp4", np.stack(frames).astype(np.uint8), "-crf", "18", "-pix_fmt", "yuv420p")
+    layout = _extract(tmp_path / "scene", tmp_path / "walk.mp4", 40)
+    taken = [np.asarray(Image.open(path)) for path in _frames(layout)]
+    pairs = zip(taken[:-1], taken[1:], strict=True)
+    assert max(structural_similarity(one, other, channel_axis=2) for one, other in pairs) < 0.9
+    assert _places(room, taken) == list(range(16))
+    (line,) = video_module.video_lines(layout)
+    assert line == "walk.mp4: 16 of 144 frames taken, not 40, since the others hardly differ"
+    # Fewer than there are places: each of equal parts of the motion, not of the time, has one.
+    layout = _extract(tmp_path / "few", tmp_path / "walk.mp4", 4)
+    assert [place // 4 for place in _places(room, [np.asarray(Image.open(p)) for p in _frames(layout)])] == [0, 1, 2, 3]
+
+
+def test_a_change_of_exposure_is_no_motion(room):
+    frame = room[0].mean(axis=2)
+    brighter = [small_picture((frame * factor).astype(np.uint8)) for factor in np.linspace(0.5, 1, 20)]
+    assert choose_frames([1.0] * 20, np.stack(brighter), 20) == [0]
+
+
+def _pq(light: np.ndarray) -> np.ndarray:
+    """The signal of PQ for light in cd/m2: ITU-R BT.2100-2, table 4."""
+    power = (light / 10000) ** (2610 / 16384)
+    return ((3424 / 4096 + 2413 / 128 * power) / (1 + 2392 / 128 * power)) ** (2523 / 32)
+
+
+def _hlg(light: np.ndarray) -> np.ndarray:
+    """The signal of HLG for light (..., 3) in cd/m2 of a display of 1000 cd/m2: ITU-R BT.2100-2, table 5."""
+    luminance = np.maximum(light @ [0.2627, 0.6780, 0.0593], 1e-6) / 1000
+    scene = light / 1000 * (luminance ** (1 / 1.2 - 1))[..., None]
+    high = 0.17883277 * np.log(np.maximum(12 * scene - 0.28466892, 1e-9)) + 0.55991073
+    return np.where(scene <= 1 / 12, np.sqrt(3 * scene), high)
+
+
+SIGNALS = {"arib-std-b67": _hlg, "smpte2084": _pq}
+TO_2020 = np.array([[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]])  # ITU-R BT.2087
+WHITE = 203  # cd/m2, ITU-R BT.2408
+
+
+ALL_TAGS = "color_primaries=bt2020:colorspace=bt2020nc:range=tv"
+
+
+def _write_hdr(ffmpeg, path: Path, light: np.ndarray, transfer: str, tagged: str = ALL_TAGS) -> None:
+    """Write light (F, H, W, 3) of BT.2020 in cd/m2 as a phone does: 10 bits, H.265, with the transfer in its tags."""
+    signal = np.round(np.clip(SIGNALS[transfer](light), 0, 1) * 65535).astype("<u2")
+    to_yuv = f"setparams=color_primaries=bt2020:color_trc={transfer},zscale=min=gbr:rin=pc:m=bt2020nc:r=tv:f=bicubic"
+    tags = f"format=yuv420p10le,setparams=color_trc={transfer}:{tagged}"
+    coded = ["-c:v", "libx265", "-x265-params", "log-level=error:crf=10:pools=1"]
+    _write(ffmpeg, path, signal, "-vf", f"{to_yuv},{tags}", *coded, pixels="rgb48le")
+
+
+def _light(frames: np.ndarray) -> np.ndarray:
+    """Light of BT.2020 that an SDR display shows for frames of BT.709 (BT.1886: a power of 2.4)."""
+    return (frames / 255.0) ** 2.4 * WHITE @ TO_2020.T
+
+
+@pytest.mark.parametrize(("transfer", "name"), [("arib-std-b67", "HLG"), ("smpte2084", "PQ")])
+def test_hdr_frames_look_like_those_of_the_sdr_video(ffmpeg, room, tmp_path, transfer, name):
+    # Blurred, since videos have colours at half the size.
+    source = np.stack([np.asarray(Image.fromarray(frame).filter(ImageFilter.GaussianBlur(1.5))) for frame in room[::5]])
+    # BT.2408 gives white these signals.
+    assert SIGNALS[transfer](np.full((1, 3), 203.0)) == pytest.approx({"HLG": 0.75, "PQ": 0.58}[name], abs=0.001)
+    _write_hdr(ffmpeg, tmp_path / "hdr.mov", _light(source), transfer)
+    bt709 = (
+        "scale=out_color_matrix=bt709,format=yuv420p,setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709"
+    )
+    _write(ffmpeg, tmp_path / "sdr.mp4", source, "-crf", "10", "-vf", bt709)
+    for kind in ("hdr.mov", "sdr.mp4"):
+        layout = _extract(tmp_path / kind[:3], tmp_path / kind, 9)
+        taken = np.stack([np.asarray(Image.open(path)) for path in _frames(layout)]).astype(float)
+        assert taken.shape == source.shape
+        for got, expected in zip(taken.reshape(len(source), -1, 3), source.reshape(len(source), -1, 3), strict=True):
+            assert got.mean(axis=0) == pytest.approx(expected.mean(axis=0), rel=0.03)
+            assert got.std(axis=0) == pytest.approx(expected.std(axis=0), rel=0.03)
+        (line,) = video_module.video_lines(layout)
+        assert (f"; {name} was brought to SDR" in line) == (kind == "hdr.mov")
+
+
+def test_lights_brighter_than_white_keep_their_order(ffmpeg, tmp_path):
+    steps = np.array([20, 100, 203, 400, 800], dtype=float)
+    frames = np.broadcast_to(np.repeat(steps, 32)[None, None, :, None], (2, 64, 160, 3))
+    _write_hdr(ffmpeg, tmp_path / "lamp.mov", frames, "smpte2084")
+    (path,) = _frames(_extract(tmp_path / "scene", tmp_path / "lamp.mov", 3))
+    shown = np.asarray(Image.open(path))[32, 16::32, 1].astype(int)
+    assert (np.diff(shown) > 0).all()
+    # Below nine tenths of white nothing is compressed. JPEG and 10 bits change a level or two.
+    assert shown[:2] == pytest.approx(255 * (steps[:2] / WHITE) ** (1 / 2.4), abs=2)
+
+
+def test_tags_that_are_missing(ffmpeg, room, tmp_path):
+    _write_hdr(
+        ffmpeg, tmp_path / "few.mov", _light(room[:1]), "smpte2084", "color_primaries=unknown:colorspace=unknown"
+    )
+    (path,) = _frames(_extract(tmp_path / "few", tmp_path / "few.mov", 3))
+    assert np.asarray(Image.open(path)).mean() == pytest.approx(room[0].mean(), rel=0.03)
+    _write_hdr(ffmpeg, tmp_path / "none.mov", _light(room[:1]), "smpte2084", f"{ALL_TAGS}:color_trc=unknown")
+    with pytest.raises(UserError, match="none.mov has the colours of HDR .* does not say which transfer function"):
+        _extract(tmp_path / "none", tmp_path / "none.mov", 3)
+
+
+def test_an_ffmpeg_that_can_not_convert_hdr_is_refused(ffmpeg, room, tmp_path, monkeypatch):
+    _write_hdr(ffmpeg, tmp_path / "hdr.mov", _light(room[:3]), "arib-std-b67")
+    program = tmp_path / "ffmpeg"
+    real = ffmpeg.get_ffmpeg_exe()
+    program.write_text(f'#!/bin/sh\ncase "$*" in *-filters*) echo ".. scale V->V";; *) exec {real} "$@";; esac\n')
+    program.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+    with pytest.raises(UserError, match="lacks the filters zscale and tonemap.*or export the video as SDR$"):
+        _extract(tmp_path / "scene", tmp_path / "hdr.mov", 3)
+    assert not list((tmp_path / "scene" / "input").iterdir())
+
+
+def test_a_turned_video_gives_upright_frames(ffmpeg, room, tmp_path):
+    _write(ffmpeg, tmp_path / "flat.mp4", room[:3], "-crf", "10", "-pix_fmt", "yuv420p")
+    command = [ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-display_rotation", "90", "-i", tmp_path / "flat.mp4"]
+    subprocess.run([*command, "-c", "copy", tmp_path / "turned.mp4"], check=True)
+    layout = _extract(tmp_path / "scene", tmp_path / "turned.mp4", 3)
+    taken = np.asarray(Image.open(_frames(layout)[0]).convert("L")).astype(float)
+    expected = np.rot90(np.asarray(Image.fromarray(room[0]).convert("L")))
+    assert np.abs(taken - expected).mean() < 4 < 20 < np.abs(taken - expected[::-1, ::-1]).mean()  # of 0 to 255
+
+
+def test_a_file_that_is_no_video(ffmpeg, tmp_path):
+    (tmp_path / "no.mp4").write_bytes(b"no video")
+    with pytest.raises(UserError, match="cannot read the video .*no.mp4"):
+        _extract(tmp_path / "scene", tmp_path / "no.mp4", 3)
+
+
+@pytest.mark.slow
+def test_two_videos_and_photos_make_one_scene(ffmpeg, room, tmp_path, capsys):
+    layout = Layout(tmp_path / "scene")
+    layout.input.mkdir(parents=True)
+    for number in (1, 8, 13):
+        Image.fromarray(room[number]).save(layout.input / f"photo_{number}.png")
+    for name, frames in (("left.mp4", room[2:7]), ("right.mp4", room[9:13])):
+        _write(ffmpeg, tmp_path / name, np.repeat(frames, 3, axis=0), "-crf", "12", "-pix_fmt", "yuv420p")
+    videos = ["--video", str(tmp_path / "left.mp4"), str(tmp_path / "right.mp4")]
+    convert.main(["-s", str(layout.scene), "--no_gpu", *videos])
+    said = capsys.readouterr().out
+    assert "left.mp4: 5 of 15 frames taken, not 150, since the others hardly differ" in said
+    assert "12 of 12 photos placed" in said and f"note: {video_module.NOTE}" in said
+    content = json.loads(layout.report.read_text())
+    assert content["notes"] == [video_module.NOTE] and content["matcher"] == "exhaustive"
+    assert content["videos"] == [
+        {"video": "left.mp4", "frames": 15, "taken": 5, "asked": 150, "hdr": ""},
+        {"video": "right.mp4", "frames": 12, "taken": 4, "asked": 150, "hdr": ""},
+    ]
+    model = pycolmap.Reconstruction(layout.sparse / "0")
+    assert {image.name for image in model.images.values()} >= {"left/frame_00005.jpg", "right/frame_00004.jpg"}
+    convert.main(["-s", str(layout.scene), "--no_gpu", *videos])
+    assert "done before: video, photos, features, matching, mapping, undistortion" in capsys.readouterr().out
