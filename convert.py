@@ -21,6 +21,8 @@ from arguments import OptionParser
 from splatting.host.start import typed_command
 from splatting.sfm import stages
 from splatting.sfm.cameras import MODES
+from splatting.sfm.capture import lines_of, too_few
+from splatting.sfm.capture_page import capture_stage
 from splatting.sfm.colmap import LENS_MODELS, Program, Pycolmap, Settings
 from splatting.sfm.inputs import sort_inputs, unused_lines
 from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder
@@ -60,6 +62,7 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
         planned += stages.reconstruction_stages(backend, masks is not None)
     made = {"camera": settings.camera, "mapper": settings.mapper, "matcher": settings.matcher, "program": program}
     planned.append(stages.undistortion_stage(layout, settings, made_from, **made, shared_by=settings.cameras))
+    planned.append(capture_stage(layout, names))
     if args.resize:
         planned.append(stages.resize_stage(layout))
     kept += record.run(planned)
@@ -67,7 +70,7 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
         print(f"done before: {', '.join(kept)} (to start from the beginning, remove {layout.work})")
     notes = [NOTE] if taken_frames(layout) else []
     report = report_inputs(layout.report, notes=notes, unused=found.unused, videos=report_entries(layout))
-    print(summary(report))
+    print("\n".join((summary(report), *lines_of(report), f"all of it: {layout.page}")))
     if found.unused:
         print(f"{len(found.unused)} files in {layout.input.name} were not used; {layout.report.name} has the reasons")
     for line in notes:
@@ -75,6 +78,9 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     for line in report["advice"]:
         print(f"warning: {line}", file=sys.stderr)
     print(f"train it with: {typed_command('train.py')} -s {shlex.quote(str(layout.scene))}")
+    if text := too_few(report):
+        print(f"warning: {text}", file=sys.stderr)
+        sys.exit(3)
 
 
 def _masks(given: str | None) -> Path | None:

@@ -1,5 +1,6 @@
 """Faults of photos: invisible ones, nearly one value, a part of the range, masks that leave out everything."""
 
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +13,7 @@ from scene.images.decode import picture_size
 from scene.images.masks import Mask
 from scene.readers.info import SceneInfo
 from splatting.files.image_files import UNREADABLE, open_image
+from splatting.files.json_files import read_json
 from splatting.files.listing import some
 from utils.system_utils import UserError
 
@@ -237,3 +239,14 @@ def _narrow(low: float, high: float, sixteen: bool) -> Finding:
         return Finding(text, f"multiply their values by {factor:g}")
     factor = 0.9 / max(high - low, 1 / scale)
     return Finding(text, f"stretch these values over the whole range, about {factor:.3g}-fold")
+
+
+def left_out(source: str | os.PathLike) -> str | None:
+    """What convert.py could not place of the photos of a scene that it made; None: nothing, or another made it."""
+    try:
+        report = read_json(Path(source) / "convert_report.json")
+        placed, count = int(report["registered"]), int(report["photos"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    share = f"{placed} of {count} photos ({placed / max(count, 1):.0%})"
+    return f"this scene has {share} of its capture; capture.html in it says what is missing" if placed < count else None

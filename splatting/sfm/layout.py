@@ -17,7 +17,7 @@ class Layout:
     def __init__(self, scene: Path) -> None:
         self.scene = scene
         self.input, self.images, self.sparse = scene / "input", scene / "images", scene / "sparse"
-        self.report = scene / "convert_report.json"
+        self.report, self.page = scene / "convert_report.json", scene / "capture.html"
         self.work = work = scene / "distorted"
         self.prepared = work / "photos"  # for COLMAP: upright, in formats that it reads
         self.masks, self.undistorted = work / "masks", work / "undistorted"

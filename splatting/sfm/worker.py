@@ -10,6 +10,7 @@ import os
 import shutil
 import sys
 import threading
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import pycolmap
 SEED = 0
 FEWEST_SEEN = 50  # points of a photo that tell its focal length
 MOST_SEEN = 400  # that are asked: more take longer and tell no more
+_NEIGHBOURS, _SHOWN = 30, 5000  # other photos of a photo, and points, in capture.json
 
 
 def features(job: dict[str, Any]) -> None:
@@ -121,6 +123,34 @@ def _refit(model: pycolmap.Reconstruction, image: pycolmap.Image) -> list[float]
     return [factor, *(float(np.nanmedian(error)) for error in errors)]
 
 
+def capture(job: dict[str, Any]) -> None:
+    """Write where the photos of a model stand, and which points they share, to the JSON file `out`."""
+    model = pycolmap.Reconstruction(job["model"])
+    images = {i: model.images[i] for i in model.reg_image_ids()}
+    shared: dict[int, Counter] = {i: Counter() for i in images}
+    for point in model.points3D.values():
+        seen = {element.image_id for element in point.track.elements}
+        for i in seen:
+            shared[i].update(seen - {i})
+    photos = {}
+    for i, image in sorted(images.items(), key=lambda one: one[1].name):
+        turn = image.cam_from_world().rotation.matrix()
+        photos[image.name] = {
+            "place": image.projection_center().tolist(),
+            "view": turn[2].tolist(),
+            "up": (-turn[1]).tolist(),
+            "points": image.num_points3D,
+            "shared": {images[other].name: count for other, count in shared[i].most_common(_NEIGHBOURS)},
+        }
+    chosen = sorted(model.points3D)[:: max(len(model.points3D) // _SHOWN, 1)]
+    content = {
+        "photos": photos,
+        "points": [model.points3D[i].xyz.tolist() for i in chosen],
+        "colors": [model.points3D[i].color.tolist() for i in chosen],
+    }
+    Path(job["out"]).write_text(json.dumps(content), encoding="utf-8")
+
+
 def undistort(job: dict[str, Any]) -> None:
     """Write photos and model without lens distortion, in COLMAP's layout, into the folder `out`.
 
@@ -148,7 +178,7 @@ def _end_with_input() -> None:
     os._exit(1)
 
 
-STEPS = {step.__name__: step for step in (features, matching, mapping, survey, undistort)}
+STEPS = {step.__name__: step for step in (features, matching, mapping, survey, undistort, capture)}
 
 
 def main(path: str) -> None:

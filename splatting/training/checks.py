@@ -3,7 +3,7 @@
 import argparse
 
 from scene.check import of_options, tell
-from scene.check.photos import hints
+from scene.check.photos import hints, left_out
 from scene.scene import Scene
 from utils.system_utils import UserError
 
@@ -14,6 +14,8 @@ def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> Non
     A resumed training goes on with what its start was told of.
     """
     info, views = scene.info, scene.getTrainCameras()
+    if text := left_out(options.source_path):
+        print(text)
     if not resumed:
         smallest = min((view.image_width, view.image_height) for view in views)
         found = [*of_options(info, options, scene.halves), *hints(info, smallest, options.white_background)]

@@ -1,0 +1,87 @@
+"""The report of a capture: what it finds, its page, and what train.py says of it."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image, ImageFilter
+
+from scene.check.photos import left_out
+from splatting.sfm.capture import findings, lines_of, looks_of, neighbours_of, too_few
+from splatting.sfm.capture_page import from_above, write_page
+
+NAMES = ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
+
+
+def _report(placed: int, photos: int, *left: str) -> dict:
+    counted = {"registered": placed, "photos": photos, "points": 90, "mean_track_length": 3.0, "mean_error_px": 0.5}
+    return {**counted, "left_out": {name: {"partners": 0} for name in left}, "advice": []}
+
+
+def _survey() -> dict:
+    """Photos a, b and c see much of each other; d shares little with a alone."""
+    near = {name: {other: 80 for other in NAMES[:3] if other != name} for name in NAMES[:3]}
+    shared = near | {"d.jpg": {"a.jpg": 12}}
+    place = {name: {"place": [i, 0, 0], "view": [0, 0, 1], "up": [0, -1, 0]} for i, name in enumerate(NAMES)}
+    photos = {name: place[name] | {"points": 90, "shared": shared[name]} for name in NAMES}
+    return {"photos": photos, "points": [[0, 0, 5], [1, 0, 6]], "colors": [[255, 0, 0], [0, 0, 255]]}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Four photos of noise: b is out of focus, and d two stops darker."""
+    noise = np.random.default_rng(0).uniform(40, 200, (60, 80, 3)).astype(np.uint8)
+    for name in NAMES:
+        image = Image.fromarray(noise)
+        image = image.filter(ImageFilter.GaussianBlur(3)) if name == "b.jpg" else image
+        image = image.point(lambda value: value * 0.25 ** (1 / 2.2)) if name == "d.jpg" else image
+        image.save(tmp_path / name, quality=95)
+    return tmp_path
+
+
+def test_what_is_weak_blurred_and_darker_is_named(folder):
+    looks = looks_of(folder, NAMES)
+    assert looks["a.jpg"].brightness - looks["d.jpg"].brightness == pytest.approx(2.0, abs=0.1)
+    assert neighbours_of(_survey()["photos"])["d.jpg"] == []
+    found = findings(_report(4, 5, "e.jpg"), _survey()["photos"], looks)
+    assert (found["weakly_connected"], found["blurred"]) == (["d.jpg"], ["b.jpg"])
+    assert found["brightness_spread_stops"] == pytest.approx(np.std([0, 0, 0, 2]), abs=0.05)
+    assert [line.split(":")[0] for line in found["again"]] == [
+        "what e.jpg show", "around d.jpg", "b.jpg", "with a fixed exposure, if you can",
+    ]  # fmt: skip
+    page = folder / "capture.html"
+    report = _report(4, 5, "e.jpg") | found
+    write_page(page, report, _survey(), looks, [*NAMES, "e.jpg"])
+    text = page.read_text(encoding="utf-8")
+    assert "data:image/png;base64," in text and "not placed, matches 0 photos" in text and "2 neighbours" in text
+    assert any("d.jpg" in line for line in lines_of(report))
+
+
+def test_a_sound_capture_has_nothing_to_photograph_again(folder):
+    looks = {name: looks_of(folder, ["a.jpg"])["a.jpg"] for name in NAMES[:3]}
+    photos = {name: photo for name, photo in _survey()["photos"].items() if name in looks}
+    found = findings(_report(3, 3), photos, looks)
+    assert found == {"weakly_connected": [], "blurred": [], "brightness_spread_stops": 0.0, "again": []}
+
+
+def test_the_picture_is_from_above_and_not_mirrored():
+    up = np.array([[0.0, -1.0, 0.1], [0.0, -1.0, -0.1]])
+    across, forth = from_above(up)
+    np.testing.assert_allclose(np.cross(across, forth), [0, -1, 0], atol=1e-12)  # towards who looks down
+
+
+@pytest.mark.parametrize(("placed", "said"), [(5, True), (6, False), (10, False)])
+def test_too_few_photos_are_said(placed, said):
+    text = too_few(_report(placed, 10))
+    assert (text is not None) == said and (not said or "only 5 of 10 photos" in text)
+
+
+def test_a_training_says_what_its_scene_lacks(tmp_path):
+    assert left_out(tmp_path) is None
+    path = tmp_path / "convert_report.json"
+    path.write_text(json.dumps(_report(14, 30)))
+    assert left_out(tmp_path).startswith("this scene has 14 of 30 photos (47%) of its capture")
+    path.write_text(json.dumps(_report(30, 30)))
+    assert left_out(tmp_path) is None
+    path.write_text("[]")
+    assert left_out(tmp_path) is None
