@@ -154,8 +154,8 @@ class Run(Stepping):
         self.parts = in_order([*self.parts, strategy])
         self._hooks.clear()
         check_together(self.parts, self._all_options, self.group.several)
-        for hook in (strategy.check, strategy.begin):
-            hook(self, states.get(strategy.name))
+        strategy.check(self, states.get(strategy.name))
+        strategy.begin(self, states.get(strategy.name))
         return strategy
 
     def _check_records(self) -> None:
@@ -193,8 +193,7 @@ class Run(Stepping):
             self.scene.write_inputs()
         if self.group.first:
             remove_traces(folder, self.parts)
-        density = self.density
-        wants = density.max_gaussians, density.absolute_gradients
+        wants = self.density.max_gaussians, self.density.absolute_gradients
         announce_memory(self.scene, self.gaussians, *wants, self.group.size)
         self.log, self.rows = earlier_runs.continue_records(folder, start, self.first_iteration)
         self.losses = LossWatch(self.log.loss)
