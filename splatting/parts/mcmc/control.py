@@ -35,7 +35,9 @@ class MarkovChain(DensityControl):
         self._gaussians = gaussians
         self._opt = opt
         self.max_gaussians = opt.max_num_splats or most
-        self.penalty = Penalty(opt.mcmc_opacity_reg, opt.mcmc_scale_reg) if penalised else NO_PENALTY
+        self.penalty = (
+            Penalty(opt.mcmc_opacity_reg, opt.mcmc_scale_reg * gaussians.enlargement) if penalised else NO_PENALTY
+        )
         self.ends = opt.mcmc_until_iter
 
     def too_slow(self) -> str:
@@ -78,7 +80,8 @@ class MarkovChain(DensityControl):
         """Add the noise of the random walk (the paper's update by Langevin dynamics)."""
         if self.changes(step.iteration):
             sort_rows(self._gaussians)
-        rate = self._gaussians.position_learning_rate * self._opt.mcmc_noise
+        factor = self._gaussians.enlargement  # covariances have the square of the unit, and so is the noise where drawn
+        rate = self._gaussians.position_learning_rate * self._opt.mcmc_noise * factor**2
         add_noise(self._gaussians, rate, seed=self._opt.seed, iteration=step.iteration)
 
     def _relocate(self, iteration: int) -> None:
