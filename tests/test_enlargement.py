@@ -4,6 +4,7 @@ import argparse
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from synthetic import make_colmap_scene
 
 import render
 import train
-from arguments import ModelParams, PipelineParams
+from arguments import ModelParams, OptimizationParams, PipelineParams
 from gaussian_renderer import draw
 from gaussian_renderer import render as render_view
 from scene import Scene
@@ -29,6 +30,8 @@ from scene.splats.reading import read_splats
 from scene.with_splats import load_file, splats_of
 from splatting.diagnosis.dataset import check_dataset
 from splatting.diagnosis.model import check_model
+from splatting.parts.mcmc.control import MarkovChain
+from splatting.training.schedule import Schedule
 from utils.graphics_utils import world_to_camera
 
 FACTOR = 2.0**-10  # exact in float32, so that all differences come from constants of the unit
@@ -99,6 +102,43 @@ def test_a_small_unit_changes_no_training(scenes, tmp_path, options, capsys):
     assert far < 0.01 * np.abs(_positions(usual)).max()
     scales = [np.median(rows["scale_0"]) for rows in (usual, small)]
     assert scales[1] - np.log(FACTOR) == pytest.approx(scales[0], abs=0.01)
+
+
+def test_noise_and_penalty_of_mcmc(scenes, tmp_path):
+    """Both are those of the scene in a unit of which the enlarged one is a part."""
+    opt = OptimizationParams(argparse.ArgumentParser()).extract(argparse.Namespace())
+    moves, penalties, sizes = [], [], []
+    for scene in scenes:
+        gaussians = Scene(_options(scene, tmp_path), GaussianModel(0), shuffle=False, start=False).gaussians
+        cloud = read_scene(scene, "images", hold_out=False)
+        gaussians.create_from_pcd(cloud.point_cloud, cloud.train_cameras, cloud.extent)
+        gaussians.training_setup(opt)
+        gaussians._opacity.data.fill_(-5)
+        before, control = gaussians._xyz.detach().clone(), MarkovChain(gaussians, opt)
+        control.schedule = Schedule(opt.iterations)
+        control.after_step(SimpleNamespace(iteration=1, changes=False))
+        moves.append((gaussians._xyz.detach() - before) / cloud.extent)
+        penalties.append(control.penalty.scale * gaussians.get_scaling.mean().item())
+        sizes.append(gaussians.enlargement * cloud.extent)
+    larger = sizes[1] / sizes[0]
+    assert moves[0].abs().max() > 1e-9
+    torch.testing.assert_close(moves[1], moves[0] * larger**2, rtol=0.01, atol=1e-3 * float(moves[0].abs().max()))
+    assert penalties[1] == pytest.approx(larger * penalties[0], rel=1e-3)
+
+
+def test_refined_poses_are_in_the_scenes_own_unit(scenes, tmp_path):
+    """The image pulls as strongly against the tracks."""
+    for scene in scenes:
+        _train(scene, tmp_path / scene.name, "--refine_poses", iterations=120)
+    given = np.array([view.T for view in read_scene(scenes[0], "images", hold_out=True).train_cameras])
+    usual, small = ([np.array(pose["T"]) for pose in _poses(tmp_path / scene.name)] for scene in scenes)
+    change = np.abs(np.array(usual) - given).max()
+    assert change > 1e-5
+    assert np.abs(np.array(small) / FACTOR - np.array(usual)).max() < 0.05 * change
+
+
+def _poses(out: Path) -> list:
+    return json.loads((out / "poses.json").read_text())["train"]
 
 
 def test_files_have_the_scenes_own_unit(scenes, tmp_path, monkeypatch):
