@@ -32,7 +32,7 @@ from scene.splats.reading import READABLE, read_splats
 from scene.splats.splats import Splats, choose, selected, tidy, used_sh_degree, with_sh_degree
 from scene.with_splats import load_file, splats_of
 from splatting.exports.formats import FORMATS, Format, format_of
-from splatting.files.json_files import OFFSET, read_model_json
+from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json
 from splatting.parts import tools
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, compute_device, run_cli
@@ -61,7 +61,9 @@ def load(args: argparse.Namespace, options: argparse.Namespace, needs_views: boo
         return replace(splats, antialiasing=splats.antialiasing or bool(args.antialiasing)), None
     _, path = find_save(options.model_path, args.iteration)
     gaussians = read_model(path)
-    gaussians.world_offset = tuple(read_model_json(options.model_path).get(OFFSET, (0.0, 0.0, 0.0)))
+    record = read_model_json(options.model_path)
+    gaussians.world_offset = tuple(record.get(OFFSET, (0.0, 0.0, 0.0)))
+    gaussians.enlargement = record.get(ENLARGEMENT, 1.0)
     return splats_of(gaussians, args.antialiasing), None
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from arguments.groups import OPTIONS, ModelParams
 from splatting.files import json_files
-from splatting.files.json_files import MODEL_JSON, OFFSET
+from splatting.files.json_files import ENLARGEMENT, MODEL_JSON, OFFSET
 from splatting.files.plain_files import plain_text
 from splatting.host.machine import VERSION
 from splatting.training.option import CFG_ARGS, Value
@@ -76,14 +76,15 @@ def write_model_json(
     args: argparse.Namespace | None = None,
     *,
     world_offset: Sequence[float] = (0.0, 0.0, 0.0),
+    enlargement: float = 1.0,
     **more: Value,
 ) -> None:
     """Write `model.json`, what cfg_args has no place for, with sorted keys.
 
     args: options; of those that belong here all are written that it has, but model options only where they differ from
     their default. The entry `options` has all others that differ from theirs. world_offset: world coordinates of
-    the origin of the model's frame (scene/readers/world_offset.py); zero writes no entry. more: further entries, which
-    win.
+    the origin of the model's frame (scene/readers/world_offset.py); zero writes no entry. enlargement: of the model
+    where it is drawn (scene/readers/enlargement.py); 1 writes no entry. more: further entries, which win.
     """
     record: dict[str, Any] = {"version": VERSION}
     for name, default in _IN_MODEL_JSON.items():
@@ -94,6 +95,8 @@ def write_model_json(
     record["options"] = {name: value for name, value in others.items() if value != _OF_TRAINING[name]}
     if any(world_offset):
         record[OFFSET] = list(world_offset)
+    if enlargement != 1:
+        record[ENLARGEMENT] = enlargement
     json_files.write_model_json(model_path, record | more)
 
 

@@ -60,7 +60,7 @@ def render(
     `viewspace_points` (N, 3), whose gradient is that of the screen means, per NDC unit; its third column is 0, or with
     want_absolute_gradient the length that `rasterize` tells of; `visibility_filter` (n, 1) int64 indices of the
     Gaussians with radius > 0, or None without want_visibility, which saves waiting for a GPU; `radii` (N,) int32
-    pixels; `depth` inverse depth (1, H, W), or None unless want_depth.
+    pixels; `depth` inverse depth (1, H, W) by the world's unit, or None unless want_depth.
     Without want_inactive_bands, get_features_rest gets no gradient at the active degree 0, instead of zeros.
     Raises TypeError for a flag that is neither True nor False, such as the text "no".
     """
@@ -85,7 +85,7 @@ def render(
         "viewspace_points": viewspace_points,
         "visibility_filter": (result.radii > 0).nonzero() if want_visibility else None,
         "radii": result.radii,
-        "depth": result.inverse_depth,
+        "depth": in_world_units(result.inverse_depth, pc),
     }
 
 
@@ -105,8 +105,9 @@ def _zero(device: torch.device, dtype: torch.dtype) -> Tensor:
 class Drawn:
     """A view's image (3, H, W), its inverse depth (1, H, W) if requested, and the way back from their gradients.
 
-    Both may be given `requires_grad`. blend_depth: (H, W) int32, how far down its tile's list a pixel goes. What ranks
-    draw together has the same attributes and methods. band: None where the whole image is right.
+    The inverse depth is the rasterizer's (`in_world_units`). Both may be given `requires_grad`. blend_depth: (H, W)
+    int32, how far down its tile's list a pixel goes. What ranks draw together has the same attributes and methods.
+    band: None where the whole image is right.
     """
 
     band = None
@@ -215,6 +216,7 @@ def rasterizer_settings(
     camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace, background: Tensor, scaling: float = 1.0
 ) -> GaussianRasterizationSettings:
     """The rasterizer's settings for a view of a model; arguments as for `render`."""
+    view, full = _enlarged(camera, pc)
     return GaussianRasterizationSettings(
         image_height=int(camera.image_height),
         image_width=int(camera.image_width),
@@ -222,8 +224,8 @@ def rasterizer_settings(
         tanfovy=math.tan(camera.FoVy / 2),
         bg=background,
         scale_modifier=scaling,
-        viewmatrix=camera.world_view_transform,
-        projmatrix=camera.full_proj_transform,
+        viewmatrix=view,
+        projmatrix=full,
         sh_degree=pc.active_sh_degree,
         campos=camera.camera_center,
         prefiltered=False,
@@ -232,6 +234,28 @@ def rasterizer_settings(
         lens=getattr(camera, "lens", None),  # new in ours, as is the next
         projection=getattr(pipe, "projection", "ewa"),
     )
+
+
+def _enlarged(camera: Camera | MiniCam, pc: GaussianModel) -> tuple[Tensor, Tensor]:
+    """The camera's matrices, of a frame that is larger than the world's by a model's enlargement.
+
+    Only the nearest depth that is drawn then is another.
+    """
+    view, full, factor = camera.world_view_transform, camera.full_proj_transform, enlargement_of(pc)
+    if factor == 1:
+        return view, full
+    return torch.cat((factor * view[:, :3], view[:, 3:]), dim=1), factor * full
+
+
+def in_world_units(inverse_depth: Tensor | None, pc: GaussianModel) -> Tensor | None:
+    """Inverse depth by the world's unit, from the rasterizer's. By autograd, gradients go the other way."""
+    factor = enlargement_of(pc)
+    return inverse_depth if inverse_depth is None or factor == 1 else factor * inverse_depth
+
+
+def enlargement_of(pc: GaussianModel) -> float:
+    """Of a model, which may be of other code."""
+    return getattr(pc, "enlargement", 1.0)
 
 
 def exposed(color: Tensor, camera: Camera | MiniCam, pc: GaussianModel) -> Tensor:

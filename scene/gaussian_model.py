@@ -57,7 +57,7 @@ class GaussianModel(ReferenceNames, GaussianParameters):
         """
         if not hasattr(cam_infos, "__iter__"):
             cam_infos, spatial_lr_scale = (), cam_infos
-        rows = start_rows(pcd, float(spatial_lr_scale or 0), self.max_sh_degree)
+        rows = start_rows(pcd, float(spatial_lr_scale or 0), self.max_sh_degree, self.enlargement)
         if self.inverse_opacity_activation is not inverse_sigmoid:
             opacity = torch.full_like(rows["opacity"], INITIAL_OPACITY, device=compute_device())
             rows["opacity"] = self.inverse_opacity_activation(opacity)

@@ -13,7 +13,7 @@ from scene.scene import Scene
 from scene.view import View
 
 HELD_OUT = 8  # every so many points, by the rank of their ids, are never trained on, and score
-_NEAR = 0.01  # depth, as the camera's
+_NEAR = 0.01  # depth where it is drawn, as the camera's
 
 
 class PointDepths:
@@ -49,17 +49,18 @@ def held_out_points(scene: Scene, source_path: str) -> dict[str, PointDepths]:
     """The points that score the depth of test views, by image name; of views that have some."""
     views, cameras = scene.info.test_cameras, {camera.image_name: camera for camera in scene.getTestCameras()}
     tracks = zip(views, read_tracks(source_path, views, scene.info.offset), strict=True)
-    found = {v.image_name: t and points_of(cameras[v.image_name], v, t, held_out=True) for v, t in tracks}
+    options = {"held_out": True, "enlargement": scene.gaussians.enlargement}
+    found = {v.image_name: t and points_of(cameras[v.image_name], v, t, **options) for v, t in tracks}
     return {name: points for name, points in found.items() if points is not None}
 
 
 def points_of(
-    camera: View, view: CameraInfo, track: Track, weight: float = 1.0, held_out: bool = False
+    camera: View, view: CameraInfo, track: Track, weight: float = 1.0, held_out: bool = False, enlargement: float = 1.0
 ) -> PointDepths | None:
     """What a track says of a view's depth, with weights of that sum; of points in one pixel, that of most weight.
 
     view: has the dataset's pose and lens, so that a resumed training, where they may have moved, has the same points.
-    held_out: those that are never trained on, in place of the others.
+    held_out: those that are never trained on, in place of the others. enlargement: of the model where it is drawn.
     """
     seen = track.points @ view.R + view.T
     if camera.lens is None:
@@ -72,7 +73,7 @@ def points_of(
     columns = range(camera.image_width)[camera.columns or slice(None)]
     x, y = np.floor(places).T
     trust = (track.lengths - 1) / (1 + track.errors**2)
-    counts = (depths > _NEAR) & (trust > 0) & ((track.ranks % HELD_OUT == 0) == held_out)
+    counts = (depths > _NEAR / enlargement) & (trust > 0) & ((track.ranks % HELD_OUT == 0) == held_out)
     counts &= (x >= columns.start) & (x < columns.stop) & (y >= 0) & (y < camera.image_height)
     if not counts.any():
         return None

@@ -7,16 +7,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from scene.readers.info import NEAREST
 from scene.scene import Scene
 from scene.view import View
 
-NEAREST = 0.2  # depth, below which no Gaussian is drawn
 
-
-def sampling_rate(points: Tensor, view: Any) -> Tensor:
+def sampling_rate(points: Tensor, view: Any, enlargement: float = 1.0) -> Tensor:
     """Pixels of a view by unit of length at points (N, 3); (N,), 0 at points that it does not show.
+    enlargement: of the model where
+       it is drawn.
 
-    A lens counts by its focal length on the axis; in a fisheye or a panorama, pixels are proportional to angles.
+       A lens counts by its focal length on the axis; in a fisheye or a panorama, pixels are proportional to angles.
     """
     lens = getattr(view, "lens", None)
     if lens and lens.chart != "perspective":
@@ -29,7 +30,7 @@ def sampling_rate(points: Tensor, view: Any) -> Tensor:
         seen = (x.abs() < depth) & (y.abs() < depth)
         sides = (view.image_width, view.FoVx), (view.image_height, view.FoVy)
         focal = max(side / (2 * math.tan(angle / 2)) for side, angle in sides)
-    return torch.where(seen & (depth > NEAREST), focal / depth, 0.0)
+    return torch.where(seen & (depth > NEAREST / enlargement), focal / depth, 0.0)
 
 
 def _transformed(points: Tensor, matrix: Tensor) -> list[Tensor]:
@@ -38,10 +39,10 @@ def _transformed(points: Tensor, matrix: Tensor) -> list[Tensor]:
     return [x * a + y * b + z * c + d for a, b, c, d in matrix.T.tolist()]
 
 
-def share_seen(points: Tensor, cameras: Sequence[View]) -> float:
+def share_seen(points: Tensor, cameras: Sequence[View], enlargement: float = 1.0) -> float:
     """The share of points (N, 3) that a camera sees, on the mean of up to 32 cameras. Distortion is left out."""
     views = cameras[:: -(-len(cameras) // 32)]
-    return sum(float((sampling_rate(points, view) > 0).float().mean()) for view in views) / len(views)
+    return sum(float((sampling_rate(points, view, enlargement) > 0).float().mean()) for view in views) / len(views)
 
 
 def share_of(scene: Scene, device: torch.device) -> float:
@@ -50,4 +51,4 @@ def share_of(scene: Scene, device: torch.device) -> float:
     if cloud is None or not len(cloud.points):
         return 1.0
     points = torch.as_tensor(cloud.points, dtype=torch.float32, device=device)
-    return share_seen(points, scene.getTrainCameras())
+    return share_seen(points, scene.getTrainCameras(), scene.gaussians.enlargement)

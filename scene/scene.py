@@ -16,6 +16,7 @@ from scene.cameras import Camera
 from scene.dataset_readers import read_scene, replaced_reader
 from scene.images.masks import MaskOptions, check_masks
 from scene.images.store import ImageStore, Picture, image_device
+from scene.readers.enlargement import enlargement
 from scene.readers.info import CameraInfo, SceneInfo, photo_size
 from scene.readers.point_cloud import write_point_cloud
 from scene.readers.scene_folder import kind_of
@@ -23,7 +24,7 @@ from scene.saved_iterations import find_iteration, saved_ply
 from splatting.compat.models import SceneGaussians, call_of_either_form
 from splatting.compat.readers import scene_by
 from splatting.distributed.ranks import ALONE, Ranks
-from splatting.files.json_files import OFFSET, read_model_json
+from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json
 from splatting.host.machine import compute_device
 from splatting.parts import chosen
 from splatting.training.part import Part
@@ -75,6 +76,7 @@ class Scene:
         self._plan_images()
 
         gaussians.world_offset = tuple(self.info.offset.tolist())
+        gaussians.enlargement = self._enlargement()
         if not start:
             return
         if self.loaded_iter is not None:
@@ -109,6 +111,12 @@ class Scene:
             views = info.train_cameras + info.test_cameras
             check_masks([(view.image_path, view.mask) for view in views], masks)
         return self._changed(info, args, fresh)
+
+    def _enlargement(self) -> float:
+        """Of the dataset, or of the model that exists already."""
+        if self.loaded_iter is None:
+            return enlargement(self.info)
+        return read_model_json(self.model_path).get(ENLARGEMENT, 1.0)
 
     def _changed(self, info: SceneInfo, args: argparse.Namespace, fresh: bool) -> SceneInfo:
         """The dataset as the parts want it."""

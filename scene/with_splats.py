@@ -33,7 +33,7 @@ def splats_of(gaussians: GaussianModel, antialiasing: bool = False) -> Splats:
         scales, logits = gaussians.get_scaling.log(), inverse_sigmoid(gaussians.get_opacity)
     values = (gaussians.get_xyz, scales, gaussians.get_rotation, logits[:, 0], gaussians.get_features)
     means, scales, rotations, logits, sh = (x.detach().float().cpu().contiguous().numpy() for x in values)
-    return Splats(means, scales, rotations, logits, sh, antialiasing, gaussians.world_offset)
+    return Splats(means, scales, rotations, logits, sh, antialiasing, gaussians.world_offset, gaussians.enlargement)
 
 
 def model_of(splats: Splats, sh_degree: int | None = None) -> GaussianModel:
@@ -43,6 +43,7 @@ def model_of(splats: Splats, sh_degree: int | None = None) -> GaussianModel:
     """
     degree = splats.sh_degree if sh_degree is None else sh_degree
     gaussians = GaussianModel(degree)
+    gaussians.world_offset, gaussians.enlargement = splats.world_offset, splats.enlargement
     fill_model(gaussians, splats)
     return gaussians
 
@@ -86,8 +87,11 @@ def scene_with(
     # The scene moves them into its frame, as it does any points.
     options.init_pcd_path = BasicPointCloud(points, colors, np.zeros_like(colors))
     scene = Scene(options, gaussians, shuffle=False, start=False, **of_scene)
+    if splats.enlargement != 1:  # as the file says, which is that of its training
+        gaussians.enlargement = splats.enlargement
     means = np.ascontiguousarray(scene.info.point_cloud.points, dtype=np.float32)
-    return scene, replace(splats, means=means, world_offset=tuple(scene.info.offset.tolist()))
+    frame = {"world_offset": gaussians.world_offset, "enlargement": gaussians.enlargement}
+    return scene, replace(splats, means=means, **frame)
 
 
 def load_file(options: argparse.Namespace, path: str, pipeline: argparse.Namespace) -> Scene:

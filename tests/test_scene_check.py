@@ -124,22 +124,6 @@ def test_photos_turned_against_their_camera_are_refused(sound, tmp_path, exif):
     assert "sides of their camera exchanged" in line.text
 
 
-def test_points_that_are_too_near(sound):
-    info = read(sound)
-
-    def scaled(factor: float) -> SceneInfo:
-        smaller = info._replace(point_cloud=info.point_cloud._replace(points=info.point_cloud.points * factor))
-        views = [replace(view, T=view.T * factor) for view in info.train_cameras]
-        return smaller._replace(train_cameras=views, nerf_normalization={"radius": info.extent * factor})
-
-    near = next(factor for factor in np.geomspace(1, 0.01, 40) if "is nearer than 0.2 units" in said(scaled(factor)))
-    (one,) = findings(scaled(near))
-    assert one.remedy.startswith("scale cameras and points of the scene by ") and not one.severe
-    assert said(scaled(near * float(one.remedy.rpartition(" ")[2]))) == ""
-    (one,) = findings(scaled(1e-3))
-    assert one.severe and "nothing nearer than 0.2 is drawn" in one.text
-
-
 @pytest.mark.parametrize("apart", [0.0, 1e-6])
 @pytest.mark.parametrize("size", [0.1, 1.0, 1000.0])
 def test_points_that_are_there_several_times(apart, size):

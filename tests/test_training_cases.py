@@ -185,17 +185,6 @@ def test_a_huge_world_trains_as_well(colmap_scene, tmp_path):
     assert _loss(tmp_path / "huge") == pytest.approx(_loss(tmp_path / "usual"), rel=0.2)
 
 
-def test_a_world_nearer_than_anything_is_drawn_is_refused(colmap_scene, tmp_path):
-    _change(colmap_scene, _transform(1e-3))
-    with pytest.raises(
-        UserError, match=r"points lie 0.005 units from the cameras.*scale cameras and points .* by 1000"
-    ):
-        _train(colmap_scene, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-    _change(colmap_scene, _transform(1000))
-    assert len(_start(colmap_scene)) == 300
-
-
 @pytest.mark.parametrize("value", [0, 255])
 def test_pictures_of_one_colour(colmap_scene, tmp_path, value):
     """It is learnt if the background has another colour; if it has the same one, no Gaussian remains in the end."""

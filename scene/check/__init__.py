@@ -3,15 +3,13 @@
 import argparse
 import os
 import sys
-from dataclasses import fields
-from typing import Any
 
 from scene.check.cameras import of_cameras
 from scene.check.duplicates import of_duplicates
 from scene.check.findings import Finding
 from scene.check.photos import of_photos
 from scene.check.points import of_points
-from scene.readers.info import CameraInfo, SceneInfo
+from scene.readers.info import SceneInfo, as_camera_info
 from utils.system_utils import UserError
 
 __all__ = ["Finding", "findings", "of_options", "tell"]
@@ -25,17 +23,10 @@ def findings(info: SceneInfo, most: int = LOOKED_AT, halves: bool = False, alpha
     most: photos that are decoded. halves: test views train, too, with their left halves.
     alpha: that of photos counts (--mask_meaning).
     """
-    train, test = ([*map(_ours, views)] for views in (info.train_cameras, info.test_cameras))
+    train, test = ([*map(as_camera_info, views)] for views in (info.train_cameras, info.test_cameras))
     info = info._replace(train_cameras=train, test_cameras=test)
     found = [*of_cameras(info), *of_photos(info, most, alpha), *of_points(info), *of_duplicates(info, halves)]
     return sorted(found, key=lambda one: not one.severe)
-
-
-def _ours(view: Any) -> CameraInfo:
-    """A record of a reader of other code, with what follows from its fields."""
-    if isinstance(view, CameraInfo):
-        return view
-    return CameraInfo(**{one.name: getattr(view, one.name) for one in fields(CameraInfo) if hasattr(view, one.name)})
 
 
 def of_options(info: SceneInfo, options: argparse.Namespace, halves: bool) -> list[Finding]:

@@ -1,4 +1,4 @@
-"""Faults of the points that a training starts from: too near, in no photo, far away, several in one place."""
+"""Faults of the points that a training starts from: in no photo, far away, several in one place."""
 
 from collections.abc import Iterator
 
@@ -6,19 +6,16 @@ import numpy as np
 
 from scene.check.findings import Finding
 from scene.gaussians.copies import places_of
-from scene.readers.info import NEAREST, SceneInfo, camera_centers
+from scene.readers.info import SceneInfo, camera_centers
 from scene.readers.tracks import projected
 from splatting.files.listing import some
 
 FAR_POINT = 100.0  # extents from the cameras; a sky is some tens away
 FAR_SHARE = 0.01
 FEWEST_IN_VIEW = 10  # points of the cloud in a photo
-NEAR_SHARE = 0.01  # of the points in view; six scenes of usual units have none, and one with 0.026 lost 2.5 dB
 _UNSEEN = 0.5
-_CAMERAS = 16  # whose depths are looked at
 _SAMPLE = 5000  # most points tested against the views,
 _TESTS = 1_000_000  # and most tests
-_FEWEST_BEYOND = 0.01  # share of the points in front of them that must lie beyond the nearest depth
 
 
 def of_points(info: SceneInfo) -> Iterator[Finding]:
@@ -28,10 +25,6 @@ def of_points(info: SceneInfo) -> Iterator[Finding]:
     points = np.asarray(info.point_cloud.points, dtype=np.float64)
     if not np.isfinite(points).all():
         return  # which is refused with the model's start
-    nothing_drawn = [*_scale(points, info)]
-    yield from nothing_drawn
-    if not nothing_drawn:
-        yield from _near(points, info)
     yield from _far(points, info)
     yield from _unseen(points, info)
     places = places_of(points)
@@ -39,44 +32,6 @@ def of_points(info: SceneInfo) -> Iterator[Finding]:
         text = f"{places.shared:.0%} of the {len(points)} points share a place with others"
         text += f", up to {places.counts.max()} in one"
         yield Finding(text, "remove the copies from the cloud, as a program that merges clouds may have left them")
-
-
-def _some(info: SceneInfo) -> list:
-    return info.train_cameras[:: -(-len(info.train_cameras) // _CAMERAS)]
-
-
-def _scale(points: np.ndarray, info: SceneInfo) -> Iterator[Finding]:
-    """A scene of which hardly any point lies beyond the nearest depth that is drawn."""
-    depths = np.concatenate([(points @ camera.R + camera.T)[:, 2] for camera in _some(info)])
-    depths = depths[depths > 0]
-    if len(depths) and (depths > NEAREST).mean() < _FEWEST_BEYOND:
-        middle = float(np.median(depths))
-        text = f"the points lie {middle:.2g} units from the cameras, and nothing nearer than {NEAREST} is drawn"
-        factor = 10.0 ** np.ceil(np.log10(5 / middle))
-        yield Finding(text, f"scale cameras and points of the scene by {factor:g}", severe=True)
-
-
-def _near(points: np.ndarray, info: SceneInfo) -> Iterator[Finding]:
-    """A scene of which a part is nearer to its cameras than the nearest depth."""
-    sample, depths = points[:: max(1, len(points) // _SAMPLE)], []
-    for camera in _some(info):
-        local = sample @ camera.R + camera.T
-        away = np.linalg.norm(local, axis=1) if getattr(camera, "native", None) else local[:, 2]
-        depths.append(away[projected(camera, sample)[2]])
-    depths = np.concatenate(depths)
-    share = float((depths < NEAREST).mean()) if len(depths) else 0.0
-    if share >= NEAR_SHARE:
-        factor = NEAREST / max(float(np.quantile(depths, NEAR_SHARE / 10)), 1e-9)
-        factor = next(x for x in _round_numbers() if x >= factor)
-        text = f"{share:.0%} of what the cameras see is nearer than {NEAREST} units, where nothing is drawn"
-        yield Finding(text, f"scale cameras and points of the scene by {factor:g}")
-
-
-def _round_numbers() -> Iterator[float]:
-    power = 1.0
-    while True:
-        yield from (2 * power, 5 * power, 10 * power)
-        power *= 10
 
 
 def _far(points: np.ndarray, info: SceneInfo) -> Iterator[Finding]:

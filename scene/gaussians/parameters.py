@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from scene.gaussians.attributes import Attribute, Rows, attributes
 from scene.gaussians.finite import warn_of_undrawn
-from scene.gaussians.ply import FLAT, column_names, read_ply, row_bytes, write_ply
+from scene.gaussians.ply import FLAT, column_names, frame_comments, read_ply, row_bytes, write_ply
 from scene.gaussians.room import Room
 from scene.gaussians.spilled import is_spilled, room_for, to_host
 from scene.gaussians.statistics import NAMES, Statistics
@@ -46,7 +46,9 @@ class GaussianParameters:
 
     `_xyz` (N,3) world; `_features_dc` (N,1,3), `_features_rest` (N,K,3), K = (D+1)^2 - 1; `_scaling` (N,3) log;
     `_rotation` (N,4) wxyz, any length; `_opacity` (N,1) logit. world_offset: the world's coordinates of the origin
-    (scene/readers/world_offset.py), kept in the PLY. Activations are attributes, which `setup_functions` sets.
+    (scene/readers/world_offset.py), kept in the PLY, as is enlargement: the factor by which
+    the model and its cameras are enlarged where they are drawn (scene/readers/enlargement.py). Activations are
+    attributes, which `setup_functions` sets.
     The tensors become parameters when rows are taken; an empty model has plain ones, as in the reference. shards: where
     these rows are among those of all ranks, if several have a part of the model each. room: where rows lie.
     pinned: tells which of means (N,3) density control leaves, of any size, (N,) bool; None: it may remove all.
@@ -61,6 +63,7 @@ class GaussianParameters:
     active_sh_degree = 0
     max_sh_degree = 3
     world_offset = (0.0, 0.0, 0.0)
+    enlargement = 1.0
     shards: Shards = WHOLE
     room: Room = Room()
     pinned: Callable[[Tensor], Tensor] | None = None
@@ -270,7 +273,8 @@ class GaussianParameters:
 
     def save_ply(self, path: str | os.PathLike) -> None:
         """Write the raw parameters, as they are drawn, as a PLY in the reference's layout."""
-        write_ply(path, self.drawn_rows(), self._degree_of_tensors(), self.world_offset, shards=self.shards)
+        comments = frame_comments(self.world_offset, self.enlargement)
+        write_ply(path, self.drawn_rows(), self._degree_of_tensors(), comments, shards=self.shards)
 
     def drawn_rows(self) -> Rows:
         """Raw values by optimiser group, as they are drawn."""

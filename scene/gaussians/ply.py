@@ -27,20 +27,19 @@ def write_ply(
     path: str | os.PathLike,
     rows: Rows,
     sh_degree: int,
-    world_offset: Sequence[float] = (0.0, 0.0, 0.0),
     comments: Sequence[str] = (),
     shards: Shards = WHOLE,
 ) -> None:
     """Write a binary little-endian PLY, float32, SH bands channel by channel; the whole file or none.
 
-    world_offset: world coordinates of the origin, written as a comment unless they are zero. comments: further ones.
-    shards: the place of the rows among those that together make the file. Every rank must call it; the first writes.
+    comments: of the header. shards: the place of the rows among those that together make the file. Every rank must call
+    it; the first writes.
     """
     if shards is WHOLE and not writes_files():
         return
     count = len(rows["xyz"])
     header = ["ply", "format binary_little_endian 1.0"]
-    header += [f"comment {comment}" for comment in (*offset_comments(world_offset), *comments)]
+    header += [f"comment {comment}" for comment in comments]
     header += [f"element vertex {shards.total(count)}"]
     names = column_names(sh_degree, rows["scaling"].shape[1], _has_further(rows))
     header += [f"property float {name}" for name in names]
@@ -78,9 +77,10 @@ def row_bytes(sh_degree: int) -> int:
     return 4 * len(column_names(sh_degree))
 
 
-def offset_comments(world_offset: Sequence[float]) -> list[str]:
-    """The comment that keeps the world coordinates (3,) of a PLY's origin, [] for zero."""
-    return [f"world_offset {' '.join(map(repr, world_offset))}"] if any(world_offset) else []
+def frame_comments(world_offset: Sequence[float], enlargement: float) -> list[str]:
+    """The comments that keep the world coordinates (3,) of a PLY's origin, unless zero, and an enlargement but 1."""
+    kept = [f"world_offset {' '.join(map(repr, world_offset))}"] if any(world_offset) else []
+    return kept + ([f"enlargement {enlargement!r}"] if enlargement != 1 else [])
 
 
 def _degree(names: Iterable[str]) -> int | None:

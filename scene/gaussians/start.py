@@ -12,16 +12,19 @@ from utils.graphics_utils import BasicPointCloud
 from utils.sh_utils import RGB2SH
 from utils.system_utils import UserError
 
-MIN_DISTANCE2 = 1e-7  # floor of the squared distance to the neighbours, square world units: duplicates get a size
+MIN_DISTANCE2 = (
+    1e-7  # floor of the squared distance to the neighbours, square units where they are drawn: duplicates get a size
+)
 LONE_POINT_SCALE = 0.01  # initial scale as a part of the extent, for clouds too small to have neighbours
 OUTLIER_SCALE = 100.0  # extents: a larger initial scale is that of a stray point; real scenes have up to 20 or so
 LARGEST_OUTLIER = 0.1  # extents: scale of a stray point, as large as density control lets a Gaussian be
 
 
-def start_rows(cloud: BasicPointCloud, extent: float, sh_degree: int) -> Rows:
+def start_rows(cloud: BasicPointCloud, extent: float, sh_degree: int, enlargement: float = 1.0) -> Rows:
     """Raw rows of round Gaussians as wide as the distance to their neighbours, of opacity 0.1, coloured as the points.
 
-    extent: of the scene, world units. UserError for a cloud that is empty or holds points that are not finite.
+    extent: of the scene, world units. enlargement: of the model where it is drawn. UserError for a cloud that is empty
+    or holds points that are not finite.
     """
     points = np.asarray(cloud.points, dtype=np.float32)
     count = len(points)
@@ -32,7 +35,7 @@ def start_rows(cloud: BasicPointCloud, extent: float, sh_degree: int) -> Rows:
             "the point cloud has points that are not finite; remove them, or give another by --init_pcd_path"
         )
     # NumPy's log: one thread, so the same bits for any number of torch's threads.
-    log_scale = torch.from_numpy(np.log(_initial_scales(points, extent)))
+    log_scale = torch.from_numpy(np.log(_initial_scales(points, extent, enlargement)))
     colors = torch.from_numpy(np.asarray(cloud.colors, dtype=np.float32))
     rows = {name: torch.full((count, *a.shape), a.start) for name, a in attributes(sh_degree).items()}
     return rows | {
@@ -43,17 +46,17 @@ def start_rows(cloud: BasicPointCloud, extent: float, sh_degree: int) -> Rows:
     }
 
 
-def _initial_scales(points: np.ndarray, extent: float) -> np.ndarray:
+def _initial_scales(points: np.ndarray, extent: float, enlargement: float) -> np.ndarray:
     """Scales (N,) float32, world units: the root mean squared distance to the three nearest neighbours.
 
     Neighbours are in other places, where so many points share one that their distances would say nothing.
     """
     if len(points) < 4:
-        return np.full(len(points), LONE_POINT_SCALE * max(extent, 1e-3), dtype=np.float32)
+        return np.full(len(points), LONE_POINT_SCALE * max(extent, 1e-3 / enlargement), dtype=np.float32)
     places = places_of(points)
     if places.misleads:
-        return _initial_scales(points[places.points], extent)[places.of_point]
-    scale = np.sqrt(np.maximum(distCUDA2(torch.from_numpy(points)).numpy(), np.float32(MIN_DISTANCE2)))
+        return _initial_scales(points[places.points], extent, enlargement)[places.of_point]
+    scale = np.sqrt(np.maximum(distCUDA2(torch.from_numpy(points)).numpy(), np.float32(MIN_DISTANCE2 / enlargement**2)))
     return _without_outliers(scale, extent)
 
 

@@ -150,6 +150,13 @@ class CameraInfo(_LikeNamedTuple):
         return camera_center(self.R, self.T)
 
 
+def as_camera_info(view: Any) -> CameraInfo:
+    """A record of a reader of other code, with what follows from its fields."""
+    if isinstance(view, CameraInfo):
+        return view
+    return CameraInfo(**{one.name: getattr(view, one.name) for one in fields(CameraInfo) if hasattr(view, one.name)})
+
+
 _SAME_ANGLE = 1e-9  # relative; FovX, turned into fx and back, differs by rounding
 _AXES = (("FovX", "fx", "cx", "width"), ("FovY", "fy", "cy", "height"))
 

@@ -22,7 +22,7 @@ from numpy.lib.recfunctions import unstructured_to_structured
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
-from scene.gaussians.ply import offset_comments, read_ply, read_vertices, write_ply
+from scene.gaussians.ply import frame_comments, read_ply, read_vertices, write_ply
 from scene.readers.world_offset import origin_near
 from scene.splats.packing import morton_order, pack, smallest_three, spread, unpack, whole_quaternions
 from scene.splats.splats import Splats, base_colors, logits, opacities, selected
@@ -52,7 +52,7 @@ def comments(splats: Splats) -> list[str]:
         AXES,
         f"SplatRenderMode: {'mip' if splats.antialiasing else 'default'}",
         f"antialiased {splats.antialiasing:d}",
-        *offset_comments(splats.world_offset),
+        *frame_comments(splats.world_offset, splats.enlargement),
     ]
 
 
@@ -79,6 +79,17 @@ def stored_offset(path: str | os.PathLike) -> tuple[float, float, float]:
                 if all(map(math.isfinite, offset)):
                     return _checked(offset, path)
     return 0.0, 0.0, 0.0
+
+
+def stored_enlargement(path: str | os.PathLike) -> float:
+    """The number above 0 of our comment enlargement, 1 without one."""
+    for line in header_lines(path):
+        words = line.split()
+        if words[:2] == ["comment", "enlargement"] and len(words) == 3:
+            with contextlib.suppress(ValueError):
+                if 0 < (factor := float(words[2])) < math.inf:
+                    return factor
+    return 1.0
 
 
 def _checked(offset: tuple[float, float, float], path: str | os.PathLike) -> tuple[float, float, float]:
@@ -121,7 +132,7 @@ def read_plain_ply(path: str | os.PathLike) -> Splats:
         offset = _checked(tuple((origin + offset).tolist()), path)
     sh = np.concatenate([columns["f_dc"], columns["f_rest"]], axis=1)
     values = (columns["xyz"], columns["scaling"], columns["rotation"], columns["opacity"][:, 0], sh)
-    return Splats(*values, antialiasing=says_antialiasing(path), world_offset=offset)
+    return Splats(*values, says_antialiasing(path), offset, stored_enlargement(path))
 
 
 def _near_origin(path: str | os.PathLike, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -239,7 +250,7 @@ def read_compressed_ply(path: str | os.PathLike) -> Splats:
     rotations = whole_quaternions((rotation >> np.uint32(30)).astype(np.int64), three)
     sh = np.concatenate([((rgb - 0.5) / C0).astype(np.float32)[:, None], rest], axis=1)
     values = (x.astype(np.float32) for x in (means, log_scales, rotations, logits(rgba[:, 3], 1 / 255), sh))
-    whole = Splats(*values, antialiasing=says_antialiasing(path), world_offset=stored_offset(path))
+    whole = Splats(*values, says_antialiasing(path), stored_offset(path), stored_enlargement(path))
     shown = np.any([vertex[name] for name in _VISIBLE], axis=0)
     return whole if shown.all() else selected(whole, shown)
 

@@ -28,7 +28,8 @@ class Splats:
     means (N,3); log_scales (N,3), natural logarithms; rotations (N,4), wxyz, of length 1; opacity_logits (N,);
     sh (N,K,3), the bands in the reference's order, K = (degree + 1)^2. Axes are those of COLMAP's world: of a usual
     capture x is right, y down, z forward. antialiasing: whether they were trained with --antialiasing. world_offset:
-    the world's coordinates of the origin of the means.
+    the world's coordinates of the origin of the means. enlargement: of the model where it is drawn, 1 where a file does
+    not say (scene/readers/enlargement.py).
     """
 
     means: np.ndarray
@@ -38,6 +39,7 @@ class Splats:
     sh: np.ndarray
     antialiasing: bool = False
     world_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    enlargement: float = 1.0
 
     def __len__(self) -> int:
         return len(self.means)

@@ -16,9 +16,9 @@ from utils.system_utils import atomic_write
 class SceneGaussians(Protocol):
     """The part of GaussianModel that a scene needs, or the reference's class of that name.
 
-    A scene sets `world_offset`, and calls `load_exposures(folder, cam_infos)` and `save_exposures(folder)` with
-    train_test_exp if there are such methods. Else it calls `load_ply(path, True)`, and writes exposure.json from
-    `exposure_mapping` and `get_exposure_from_name(name)`, as the reference does.
+    A scene sets `world_offset` and `enlargement`, and calls `load_exposures(folder, cam_infos)` and
+    `save_exposures(folder)` with train_test_exp if there are such methods. Else it calls `load_ply(path, True)`, and
+    writes exposure.json from `exposure_mapping` and `get_exposure_from_name(name)`, as the reference does.
     """
 
     def create_from_pcd(

@@ -13,6 +13,7 @@ from scene.check import findings
 from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
 from scene.images.exif import read_lens
 from scene.pose_errors import ADJUSTED, COMPARED, pose_errors, poses_differ
+from scene.readers.enlargement import enlargement
 from scene.readers.info import NEAREST
 from scene.readers.tracks import Track, read_tracks
 from splatting.diagnosis import Line, from_error
@@ -23,7 +24,7 @@ from splatting.parts import tools
 from utils.system_utils import UserError
 
 # Learning rates and size limits are fractions of the extent, but depths below 0.2 are culled and float32 is used.
-EXTENT = (0.1, 100.0)
+EXTENT = (1e-5, 1e5)  # at whose ends trainings still gave what they give in a usual unit
 FEWEST_VIEWS = 20
 FEWEST_POINTS = 1000
 REGISTERED = 0.9  # share of the photos
@@ -93,11 +94,12 @@ def check_extent(info: SceneInfo) -> Iterator[Line]:
     """Scale of the scene."""
     low, high = EXTENT
     if low <= info.extent <= high:
-        yield Line(f"extent {info.extent:.3g}")
+        factor = enlargement(info)
+        near = f", so depths from {NEAREST / factor:.2g} on are drawn" if factor != 1 else ""
+        yield Line(f"extent {info.extent:.3g}{near}")
     else:
         remedy = f"scale cameras and points by {10.0 ** round(np.log10(5 / info.extent)):g}"
-        text = f"the extent is {info.extent:.3g}, outside {low:g} to {high:g}"
-        yield Line(text, f"{remedy}; depths below {NEAREST} are never drawn")
+        yield Line(f"the extent is {info.extent:.3g}, outside {low:g} to {high:g}", remedy)
 
 
 def check_cloud(info: SceneInfo) -> Iterator[Line]:

@@ -16,6 +16,7 @@ from gaussian_renderer.scored_views import ScoredViews
 from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
+from scene.readers.info import NEAREST
 from scene.saved_model import load_saved
 from splatting.diagnosis import Line, from_error
 from splatting.diagnosis.changes import FITS as BAD_PSNR
@@ -44,7 +45,6 @@ BLACK = 0.02  # mean of an image in [0, 1]
 FEW_ITERATIONS = 3000
 BEGUN = 200  # iterations, from which on a model is better than one colour
 RESET_INTERVAL = 3000  # the default of --opacity_reset_interval
-NEAREST = 0.2  # depth below which nothing is drawn
 FEW_GAUSSIANS = 2000
 _CLEARLY = 3.0  # dB
 _VIEWS = 4
@@ -292,8 +292,9 @@ def _why_black(scene: Scene, cameras: list[Camera], means: Means) -> Line:
     gaussians = of_scene(scene)
     if means.drawn < 0.01:
         depths = torch.cat([_depths(camera, gaussians.get_xyz) for camera in cameras])
-        if float(((depths > 0) & (depths < NEAREST)).float().mean()) > 0.5:
-            text = f"most Gaussians are nearer than {NEAREST} and never drawn"
+        nearest = NEAREST / gaussians.enlargement
+        if float(((depths > 0) & (depths < nearest)).float().mean()) > 0.5:
+            text = f"most Gaussians are nearer than {nearest:g} and never drawn"
             return Line(text, "scale cameras and points of the scene by 10 or more and train again")
         remedy = "check the poses (x right, y down, z forward) and whether the model belongs to this dataset"
         return Line("no Gaussian is in view, because the cameras face away", remedy)

@@ -4,6 +4,7 @@ arguments/stored.py says which options are in it.
 """
 
 import json
+import math
 import os
 import re
 from pathlib import Path
@@ -15,6 +16,7 @@ from utils.system_utils import UserError, atomic_write
 _BACKSLASH = re.compile(r'\\(?:[\\"/]|u[0-9a-fA-F]{4})?')  # with what it escapes in a text that has lone ones
 MODEL_JSON = "model.json"
 OFFSET = "world_offset"  # (3,) world coordinates of the origin of the model's frame (scene/readers/world_offset.py)
+ENLARGEMENT = "enlargement"  # of the model where it is drawn (scene/readers/enlargement.py)
 LARGEST_OFFSET = 1e15  # beyond, the steps of doubles are larger than 0.1
 
 
@@ -43,7 +45,7 @@ def write_json(path: Path, content: Any, sort_keys: bool = True) -> None:
 def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
     """Read `model.json`; {} if there is none, as in a model of another program.
 
-    UserError if it is no JSON object, or if its antialiasing or world_offset is broken.
+    UserError if it is no JSON object, or if its antialiasing, world_offset or enlargement is broken.
     """
     path = Path(model_path) / MODEL_JSON
     if not path.is_file():
@@ -59,6 +61,9 @@ def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
         raise UserError(
             f"{path}: {OFFSET} must be three numbers to {LARGEST_OFFSET:g}, got {offset!r:.40}; restore the file"
         )
+    factor = record.get(ENLARGEMENT, 1.0)
+    if not (type(factor) in (int, float) and 0 < factor < math.inf):
+        raise UserError(f"{path}: {ENLARGEMENT} must be a number above 0, got {factor!r:.40}; restore the file")
     return record
 
 

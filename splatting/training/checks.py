@@ -4,12 +4,13 @@ import argparse
 
 from scene.check import of_options, tell
 from scene.check.photos import hints, left_out
+from scene.readers.info import NEAREST
 from scene.scene import Scene
 from utils.system_utils import UserError
 
 
 def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> None:
-    """Refuse a scene that cannot be trained (UserError), warn of its faults, and say where its frame is moved.
+    """Refuse a scene that cannot be trained (UserError), warn of its faults, and say where its frame is another.
 
     A resumed training goes on with what its start was told of.
     """
@@ -24,6 +25,12 @@ def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> Non
         print(
             f"the scene's coordinates are large against its extent: training subtracts {tuple(info.offset.tolist())}, "
             "which model.json keeps; python -m scene.export_world writes the model in the scene's own coordinates"
+        )
+
+    if (factor := scene.gaussians.enlargement) != 1:
+        print(
+            f"much of the scene is nearer than {NEAREST} units: depths from {NEAREST / factor:.2g} on are drawn, and "
+            "all files have the scene's own unit"
         )
 
 

@@ -14,6 +14,7 @@ from splatting.evaluation import training_log
 from splatting.evaluation.error_curve import NAME as CURVE
 from splatting.evaluation.error_curve import Row, continue_curve
 from splatting.evaluation.training_log import TrainingLog
+from splatting.files.json_files import ENLARGEMENT, read_model_json
 from utils.system_utils import UserError
 
 
@@ -129,6 +130,12 @@ def resolve_lenses(dataset: argparse.Namespace, checkpoint: str | None) -> argpa
         photos = "the photos as they are" if before == "native" else "undistorted photos"
         raise UserError(f"{checkpoint} was trained on {photos}; leave --lenses {given} out")
     return dataset
+
+
+def enlargement_of(checkpoint: str, otherwise: float) -> float:
+    """That of the run that wrote a checkpoint; `otherwise` if its folder has no model.json."""
+    record = read_model_json(Path(checkpoint).parent)
+    return record.get(ENLARGEMENT, 1.0) if record else otherwise
 
 
 def _options_of(folder: Path) -> dict[str, object]:

@@ -122,7 +122,10 @@ class Run(Stepping):
         options = {"ranks": self.group, "parts": self.parts}
         if init_ply:
             return scene_with(init_ply, self.dataset, self.gaussians, **options)
-        return Scene(self.dataset, self.gaussians, shuffle=False, start=False, **options), None
+        scene = Scene(self.dataset, self.gaussians, shuffle=False, start=False, **options)
+        if self.start:
+            self.gaussians.enlargement = earlier_runs.enlargement_of(self.start, self.gaussians.enlargement)
+        return scene, None
 
     def _begin_model(self, capture: tuple | None, first: Splats | None, states: dict[str, Any]) -> None:
         """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""
@@ -179,7 +182,8 @@ class Run(Stepping):
     @property
     def entries(self) -> dict[str, Any]:
         """Entries of model.json besides the options (`write_model_json`)."""
-        return {"world_offset": self.gaussians.world_offset} | self.facts
+        model = self.gaussians
+        return {"world_offset": model.world_offset, "enlargement": model.enlargement} | self.facts
 
     @property
     def facts(self) -> dict[str, Any]:

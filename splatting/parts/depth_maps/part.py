@@ -54,6 +54,7 @@ class DepthMaps(Part):
         from utils.general_utils import get_expon_lr_func
 
         self._schedule, self._loss, opt = run.schedule, depth_loss, run.opt
+        self._unit = 1 / run.gaussians.enlargement  # of inverse depths where they are drawn, in the world's
         ends = opt.depth_l1_weight_init, opt.depth_l1_weight_final
         self._weight = get_expon_lr_func(*ends, max_steps=opt.iterations)
 
@@ -61,4 +62,4 @@ class DepthMaps(Part):
         weight = self._weight(self._schedule.schedule_step(at.iteration)) if at.camera.depth_reliable else 0.0
         if not weight > 0:
             return {}
-        return {"depth": lambda package, mask: weight * self._loss(package["depth"], at.camera, mask)}
+        return {"depth": lambda package, mask: weight * self._unit * self._loss(package["depth"], at.camera, mask)}

@@ -43,7 +43,7 @@ class Filter3d(Part):
         from splatting.parts.filter_3d.smoothing import filter_widths
 
         model, views = self._run.gaussians, self._run.scene.getTrainCameras()
-        model.columns[self.name] = filter_widths(model.get_xyz.detach(), views)
+        model.columns[self.name] = filter_widths(model.get_xyz.detach(), views, model.enlargement)
 
     def changes(self, iteration: int) -> bool:
         return iteration % INTERVAL == 0

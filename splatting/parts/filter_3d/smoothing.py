@@ -26,11 +26,14 @@ NAME = "filter_3d"  # of the column
 Function = Callable[[Tensor], Tensor]
 
 
-def filter_widths(points: Tensor, views: Sequence[Any]) -> Tensor:
-    """Standard deviations (N, 1) of the filter at points (N, 3), in units of length; 0 where no view shows a point."""
+def filter_widths(points: Tensor, views: Sequence[Any], enlargement: float = 1.0) -> Tensor:
+    """Standard deviations (N, 1) of the filter at points (N, 3), in units of length; 0 where no view shows a point.
+
+    enlargement: of the model where it is drawn.
+    """
     rates = torch.zeros_like(points[:, 0])
     for view in views:
-        rates = torch.maximum(rates, sampling_rate(points, view))
+        rates = torch.maximum(rates, sampling_rate(points, view, enlargement))
     return torch.where(rates > 0, math.sqrt(VARIANCE) / rates, 0.0)[:, None]
 
 

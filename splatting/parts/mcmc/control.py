@@ -35,8 +35,15 @@ class MarkovChain(DensityControl):
         self._gaussians = gaussians
         self._opt = opt
         self.max_gaussians = opt.max_num_splats or most
-        self.penalty = Penalty(opt.mcmc_opacity_reg, opt.mcmc_scale_reg) if penalised else NO_PENALTY
+        self._penalised = penalised
         self.ends = opt.mcmc_until_iter
+
+    @property
+    def penalty(self) -> Penalty:
+        """Of scales as they are drawn, so that it does not depend on the unit."""
+        if not self._penalised:
+            return NO_PENALTY
+        return Penalty(self._opt.mcmc_opacity_reg, self._opt.mcmc_scale_reg * self._gaussians.enlargement)
 
     def too_slow(self) -> str:
         return f"--mcmc_growth {self._opt.mcmc_growth:g} adds too few each time; raise it"
@@ -78,7 +85,8 @@ class MarkovChain(DensityControl):
         """Add the noise of the random walk (the paper's update by Langevin dynamics)."""
         if self.changes(step.iteration):
             sort_rows(self._gaussians)
-        rate = self._gaussians.position_learning_rate * self._opt.mcmc_noise
+        factor = self._gaussians.enlargement**2  # as covariances have the square of the unit
+        rate = self._gaussians.position_learning_rate * self._opt.mcmc_noise * factor
         add_noise(self._gaussians, rate, seed=self._opt.seed, iteration=step.iteration)
 
     def _relocate(self, iteration: int) -> None:

@@ -52,6 +52,8 @@ class PoseRefinement:
         # Another kind of processor may round their solutions in another way.
         self._tracked, self._drift = ranks().shared((tracked, drift))
         self._given, self._unit = given[:count], unit
+        # Rows and translation are those of the enlarged frame, the centre is the world's.
+        self._where_drawn = np.repeat((scene.gaussians.enlargement, 1.0), (12, 3))
         self._rate = get_expon_lr_func(*_RATES, max_steps=steps)
         self._adam = BoundedAdam(count)
         self.twists, self._counts = self._adam.values, self._adam.counts
@@ -95,7 +97,7 @@ class PoseRefinement:
         """
         found = np.zeros(6)
         if (pulled := self._tracked.pulled(uid, self.twists[uid])) is not None:
-            found = twist_gradient(self._pose(uid), gradient, self._unit) + pulled
+            found = twist_gradient(self._pose(uid), gradient[:15] * self._where_drawn, self._unit) + pulled
         self._adam.step(uid, found, self._rate(step))
         self._move([uid])
         if self._counts.sum() % (_PASSES * len(self.twists)):

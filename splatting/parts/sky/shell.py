@@ -112,7 +112,7 @@ def with_shell(scene: Scene, gaussians: GaussianModel) -> Shell | None:
         print(f"{text}, so there is no sky")
         return None
     print(f"{text}; {len(cloud.points):,} Gaussians of a sky begin there, {sky.radius:.3g} units away")
-    new = start_rows(cloud, scene.cameras_extent, gaussians.max_sh_degree)
+    new = start_rows(cloud, scene.cameras_extent, gaussians.max_sh_degree, gaussians.enlargement)
     new["opacity"] = gaussians.raw_opacity(torch.full_like(new["opacity"], logit(_OPACITY)))
     gaussians.set_rows({name: torch.cat((own, new[name].to(own))) for name, own in gaussians.rows().items()})
     sky.points = cloud.points

@@ -12,7 +12,7 @@ class SeenPoints:
 
     def __init__(self, scene: Scene, source_path: str, weight: float) -> None:
         """UserError for a scene without tracks."""
-        self._views, self._weight = scene.info.train_cameras, weight
+        self._views, self._weight, self._enlargement = scene.info.train_cameras, weight, scene.gaussians.enlargement
         self._tracks = read_tracks(source_path, self._views, scene.info.offset)
         self._known: dict[tuple[int, int, int], PointDepths | None] = {}
         if not any(self._tracks):
@@ -26,5 +26,6 @@ class SeenPoints:
         key = camera.uid, camera.image_width, camera.image_height
         if key not in self._known:
             track = self._tracks[camera.uid]
-            self._known[key] = track and points_of(camera, self._views[camera.uid], track, self._weight)
+            options = {"weight": self._weight, "enlargement": self._enlargement}
+            self._known[key] = track and points_of(camera, self._views[camera.uid], track, **options)
         return self._known[key]

@@ -148,5 +148,5 @@ class TrainingPage:
         gaussians = read_model(path)
         if run.scene.halves:
             gaussians.load_exposures(run.scene.model_path, run.scene.info.train_cameras)
-        gaussians.world_offset = run.gaussians.world_offset
+        gaussians.world_offset, gaussians.enlargement = run.gaussians.world_offset, run.gaussians.enlargement
         self._page.show_model(gaussians, iteration)

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from gaussian_renderer import Drawn, KnownBands, draw, exposed
+from gaussian_renderer import Drawn, KnownBands, draw, exposed, in_world_units
 from scene.fused_adam import CAMERA_NUMBERS, FusedAdam
 from splatting.training.announcer import Announcer
 from splatting.training.iteration import Iteration, Losses
@@ -80,7 +80,8 @@ class FusedStep(PlainStep):
             if depth is not None:
                 depth.requires_grad_()
             color = exposed(image, at.camera, run.gaussians) if applied else image
-            losses = objective({"render": color, "depth": depth, "band": drawn.band}, at)
+            package = {"render": color, "depth": in_world_units(depth, run.gaussians), "band": drawn.band}
+            losses = objective(package, at)
             losses.total.backward()
         # Observers keep losses for a while, which must not keep the image and its gradient.
         return drawn, losses.detached(), (image.grad, None if depth is None else depth.grad)

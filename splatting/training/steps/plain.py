@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from gaussian_renderer import draw, exposed, render, wake
+from gaussian_renderer import draw, exposed, in_world_units, render, wake
 from splatting.training.announcer import Announcer
 from splatting.training.iteration import Iteration, Losses
 from splatting.training.run import Run
@@ -46,7 +46,7 @@ class RefinedView(OneView):
         if not at.last:
             color, depth = (None if plane is None else plane.grad for plane in self._planes)
             drawn = draw(at.camera, run.gaussians, run.pipe, at.background, depth is not None)
-            run.step_on_host(at, drawn.camera_gradient(color, depth))
+            run.step_on_host(at, drawn.camera_gradient(color, in_world_units(depth, run.gaussians)))
         return package, losses
 
 
