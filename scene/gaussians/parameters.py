@@ -46,9 +46,9 @@ class GaussianParameters:
 
     `_xyz` (N,3) world; `_features_dc` (N,1,3), `_features_rest` (N,K,3), K = (D+1)^2 - 1; `_scaling` (N,3) log;
     `_rotation` (N,4) wxyz, any length; `_opacity` (N,1) logit. world_offset: the world's coordinates of the origin
-    (scene/readers/world_offset.py), kept in the PLY, as is enlargement: the factor by which
-    the model and its cameras are enlarged where they are drawn (scene/readers/enlargement.py). Activations are
-    attributes, which `setup_functions` sets.
+    (scene/readers/world_offset.py), kept in the PLY, as is enlargement: the factor by which the model and its cameras
+    are enlarged where they are drawn (scene/readers/enlargement.py). Activations are attributes, which
+    `setup_functions` sets.
     The tensors become parameters when rows are taken; an empty model has plain ones, as in the reference. shards: where
     these rows are among those of all ranks, if several have a part of the model each. room: where rows lie.
     pinned: tells which of means (N,3) density control leaves, of any size, (N,) bool; None: it may remove all.
@@ -270,6 +270,11 @@ class GaussianParameters:
         warn_of_undrawn(rows, path)
         self.take_whole(rows)
         self.active_sh_degree = self.max_sh_degree
+
+    @property
+    def frame(self) -> dict[str, Any]:
+        """What model.json keeps of the frame of the coordinates."""
+        return {"world_offset": self.world_offset, "enlargement": self.enlargement}
 
     def save_ply(self, path: str | os.PathLike) -> None:
         """Write the raw parameters, as they are drawn, as a PLY in the reference's layout."""

@@ -12,9 +12,8 @@ from utils.graphics_utils import BasicPointCloud
 from utils.sh_utils import RGB2SH
 from utils.system_utils import UserError
 
-MIN_DISTANCE2 = (
-    1e-7  # floor of the squared distance to the neighbours, square units where they are drawn: duplicates get a size
-)
+# Floor of the squared distance to the neighbours, square units where they are drawn, so that duplicates get a size.
+MIN_DISTANCE2 = 1e-7
 LONE_POINT_SCALE = 0.01  # initial scale as a part of the extent, for clouds too small to have neighbours
 OUTLIER_SCALE = 100.0  # extents: a larger initial scale is that of a stray point; real scenes have up to 20 or so
 LARGEST_OUTLIER = 0.1  # extents: scale of a stray point, as large as density control lets a Gaussian be

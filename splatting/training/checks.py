@@ -26,7 +26,6 @@ def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> Non
             f"the scene's coordinates are large against its extent: training subtracts {tuple(info.offset.tolist())}, "
             "which model.json keeps; python -m scene.export_world writes the model in the scene's own coordinates"
         )
-
     if (factor := scene.gaussians.enlargement) != 1:
         print(
             f"much of the scene is nearer than {NEAREST} units: depths from {NEAREST / factor:.2g} on are drawn, and "

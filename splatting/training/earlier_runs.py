@@ -132,9 +132,9 @@ def resolve_lenses(dataset: argparse.Namespace, checkpoint: str | None) -> argpa
     return dataset
 
 
-def enlargement_of(checkpoint: str, otherwise: float) -> float:
-    """That of the run that wrote a checkpoint; `otherwise` if its folder has no model.json."""
-    record = read_model_json(Path(checkpoint).parent)
+def enlargement_of(checkpoint: str | None, otherwise: float) -> float:
+    """That of the run that wrote a checkpoint; `otherwise` without one, or if its folder has no model.json."""
+    record = read_model_json(Path(checkpoint).parent) if checkpoint else {}
     return record.get(ENLARGEMENT, 1.0) if record else otherwise
 
 

@@ -76,10 +76,10 @@ class Run(Stepping):
         if self.schedule.is_over(self.first_iteration):
             raise UserError(self.schedule.nothing_left(self.start, self.first_iteration))
         self.scene, first = self._read_scene()
+        self.gaussians.enlargement = earlier_runs.enlargement_of(self.start, self.gaussians.enlargement)
         checks.check_scene(self.scene, dataset, bool(self.start))
         agree_on_scene(self.scene, self.start)  # before an image is shared
-        points = self.scene.info.point_cloud.points if first is None else first
-        count = len(points if capture is None else capture[1])
+        count = len(capture[1] if capture else self.scene.info.point_cloud.points if first is None else first)
         self.gaussians.divide(self.group)
         self.gaussians.room.expect(-(-count // self.group.size), self.scene)
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed)
@@ -122,10 +122,7 @@ class Run(Stepping):
         options = {"ranks": self.group, "parts": self.parts}
         if init_ply:
             return scene_with(init_ply, self.dataset, self.gaussians, **options)
-        scene = Scene(self.dataset, self.gaussians, shuffle=False, start=False, **options)
-        if self.start:
-            self.gaussians.enlargement = earlier_runs.enlargement_of(self.start, self.gaussians.enlargement)
-        return scene, None
+        return Scene(self.dataset, self.gaussians, shuffle=False, start=False, **options), None
 
     def _begin_model(self, capture: tuple | None, first: Splats | None, states: dict[str, Any]) -> None:
         """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""
@@ -182,8 +179,7 @@ class Run(Stepping):
     @property
     def entries(self) -> dict[str, Any]:
         """Entries of model.json besides the options (`write_model_json`)."""
-        model = self.gaussians
-        return {"world_offset": model.world_offset, "enlargement": model.enlargement} | self.facts
+        return self.gaussians.frame | self.facts
 
     @property
     def facts(self) -> dict[str, Any]:
