@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from operator import attrgetter
 from types import MappingProxyType
+from typing import Any
 
 import torch
 from torch import Tensor, nn
