@@ -1,4 +1,4 @@
-"""Convert photos or a video to a scene for train.py: camera poses, points, undistorted photos.
+"""Convert photos or a video to a scene for train.py: camera poses, points, photos that it can show.
 
 python convert.py -s SCENE                 photos in SCENE/input
 python convert.py -s SCENE --video FILE    frames of a video, written to SCENE/input
@@ -20,10 +20,10 @@ from pathlib import Path
 from arguments import OptionParser
 from splatting.host.start import typed_command
 from splatting.sfm import stages
-from splatting.sfm.colmap import LENS_MODELS, Program, Pycolmap, Settings
+from splatting.sfm.colmap import LENS_MODELS, Program, Pycolmap, Settings, is_native
 from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder
 from splatting.sfm.programs import refuse_while_working
-from splatting.sfm.report import summary
+from splatting.sfm.report import lens_words, summary
 from utils.system_utils import UserError, run_cli
 
 
@@ -57,6 +57,7 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
         print(f"done before: {', '.join(kept)} (to start from the beginning, remove {layout.work})")
     report = json.loads(layout.report.read_text(encoding="utf-8"))
     print(summary(report))
+    print(lens_words(report))
     for line in report["advice"]:
         print(f"warning: {line}", file=sys.stderr)
     print(f"train it with: {typed_command('train.py')} -s {shlex.quote(str(layout.scene))}")
@@ -91,6 +92,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         help="scene folder; its sub-folder input has the photos; --video makes a missing one")  # fmt: skip
     add("--camera", default="OPENCV", help="lens model to fit; for a fisheye lens OPENCV_FISHEYE, for panoramas "
         "EQUIRECTANGULAR (default: OPENCV)")  # fmt: skip
+    add("--lenses", choices=("auto", "native", "undistort"), default="auto",
+        help="native: keep the photos as they are, with their lenses; undistort: resample them to pinhole images; "
+        "auto: native for fisheyes and panoramas, undistort for others (default: auto)")  # fmt: skip
     add("--no_gpu", action="store_true", help="compute features and matches on the CPU even if there is a GPU")
     add("--skip_matching", action="store_true", help="only undistort the largest model in SCENE/distorted/sparse")
     add("--colmap_executable", default="", metavar="FILE",
@@ -123,8 +127,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     layout = Layout(scene_folder(args.source_path, made=bool(args.video)))
     if args.camera not in LENS_MODELS:
         raise UserError(f"--camera {args.camera} is not a supported lens model; choose one of {', '.join(LENS_MODELS)}")
+    is_native(args.lenses, [args.camera])  # refuses what does not fit together
     matcher = args.matcher or ("sequential" if args.video else "exhaustive")
-    convert(layout, Settings(args.camera, args.max_num_features, matcher, args.mapper, args.no_gpu), args)
+    convert(layout, Settings(args.camera, args.max_num_features, matcher, args.mapper, args.no_gpu, args.lenses), args)
 
 
 if __name__ == "__main__":

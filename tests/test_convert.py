@@ -18,7 +18,7 @@ from types import SimpleNamespace
 import numpy as np
 import pycolmap
 import pytest
-from photo_room import FOCAL, SIZE, camera_centers, make_photos
+from photo_room import FISHEYE, FOCAL, SIZE, camera_centers, make_photos
 from PIL import Image
 from synthetic import folder_state
 from waiting import LIMIT, wait_for
@@ -188,6 +188,11 @@ def _renamed(name: str) -> Callable[[Path], object]:
         ("-s {} of mine", None, r"unexpected argument of; quote paths.*room of mine'"),
         ("-s {}/input/photo_00.png", None, r"photo_00.png is a file; pass the folder that contains"),
         ("-s {} --camera PINHOLEY", None, r"--camera PINHOLEY is not a supported lens model.*OPENCV_FISHEYE"),
+        (
+            "-s {} --camera EQUIRECTANGULAR --lenses undistort",
+            None,
+            r"no pinhole image shows a panorama; omit --lenses",
+        ),
         ("-s {} --mask_path no", None, r"no folder of masks 'no'; pass an existing folder"),
         ("-s {} --mask_path {}", None, r"none of 3 photos has a mask .*photo_00.png.png"),
         ("-s {} --max_num_features 0", None, r"--max_num_features must be at least 100, got 0"),
@@ -455,6 +460,38 @@ def test_panoramas_are_placed_and_taken_as_they_are(tmp_path):
     Image.new("RGB", (60, 40)).save(tmp_path / "input" / "small.png")
     with pytest.raises(UserError, match="small.png is not twice as wide as high, as panoramas of 360 by 180 degrees"):
         convert.main(words)
+
+
+@pytest.mark.slow
+def test_fisheyes_are_placed_and_stay_as_they_are(tmp_path, capsys):
+    make_photos(tmp_path / "input", VIEWS, lens=FISHEYE)
+    shots = sorted((tmp_path / "input").iterdir())
+    words = ["-s", str(tmp_path), "--no_gpu", "--camera", FISHEYE.model]
+
+    def converted(*options: str) -> tuple[str, list]:
+        convert.main([*words, *options])
+        report = json.loads((tmp_path / "convert_report.json").read_text())
+        return report["lenses"], read_scene(tmp_path, "images", hold_out=False, native=True).train_cameras
+
+    lenses, views = converted()
+    assert lenses == "native" and "the photos as they are, with the cameras that were fitted (OPENCV_FISHEYE)" in (
+        capsys.readouterr().out
+    )
+    assert [path.read_bytes() for path in shots] == [view.image_path.read_bytes() for view in views]
+    # The photos tell no focal length, and where the fit begins is 6 % off.
+    assert all(view.native.focal == pytest.approx(FISHEYE.params[:2], rel=0.01) for view in views)
+    _check_places(pycolmap.Reconstruction(tmp_path / "sparse" / "0"), [path.name for path in shots], FISHEYE.model)
+    lenses, views = converted("--lenses", "undistort")
+    out = capsys.readouterr().out
+    assert "done before: photos, features, matching, mapping (" in out and "undistorted photos, with pinhole" in out
+    assert lenses == "undistort" and all(view.native is None for view in views)
+    assert shots[0].read_bytes() != views[0].image_path.read_bytes()
+
+
+def test_which_photos_stay_as_they_are():
+    stay = {model.removesuffix("_FISHEYE") for model in LENS_MODELS if colmap.is_native("auto", {"OPENCV", model})}
+    assert stay == {"EQUIRECTANGULAR", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "THIN_PRISM"}
+    assert colmap.is_native("native", {"OPENCV"}) and not colmap.is_native("undistort", {"OPENCV_FISHEYE"})
 
 
 @pytest.mark.parametrize("mask", ["a.jpg.png", "a.jpg", "a.png"])

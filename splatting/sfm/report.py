@@ -96,6 +96,14 @@ def summary(report: dict[str, Any]) -> str:
     )
 
 
+def lens_words(report: dict[str, Any]) -> str:
+    """Say in one line which photos convert_report.json is about: those of the lenses, or undistorted ones."""
+    if report["lenses"] == "undistort":
+        return "the scene has undistorted photos, with pinhole cameras"
+    models = ", ".join(sorted({camera["model"] for camera in report["cameras"]}))
+    return f"the scene has the photos as they are, with the cameras that were fitted ({models})"
+
+
 def write_report(
     path: Path, models: Sequence[Model], images: Sequence[str], partners: dict[str, int], lines: list[str], **made: Any
 ) -> None:

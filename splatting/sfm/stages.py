@@ -169,7 +169,7 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
 
 
 def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **made: Any) -> Stage:
-    """Make the stage that undistorts the largest model to `images` and `sparse/0`, and writes the report.
+    """Make the stage that writes the largest model and its photos to `images` and `sparse/0`, and the report.
 
     made: settings to report. The scene of an earlier run stays until the new one is complete.
     """
@@ -184,11 +184,13 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
         matches = colmap.partners(layout.database)
         report.refuse_nothing(models, names, matches, settings.matcher)
         chosen = models[0]
+        native = colmap.is_native(settings.lenses, {camera["model"] for camera in chosen.cameras})
         job = {"model": str(layout.models / chosen.folder), "images": str(root), "out": str(layout.undistorted)}
-        command = worker_command(layout, "undistort", **job, jpeg_quality=images.JPEG_QUALITY)
+        command = worker_command(layout, "undistort", **job, native=native, jpeg_quality=images.JPEG_QUALITY)
         written = layout.undistorted / "images"
         total = len(chosen.registered)
-        run_programs(layout.log, [command], "Undistorting", total, lambda: sum(p.is_file() for p in written.rglob("*")))
+        title = "Copying photos" if native else "Undistorting"
+        run_programs(layout.log, [command], title, total, lambda: sum(p.is_file() for p in written.rglob("*")))
         missing = [name for name in chosen.registered if not (written / name).is_file()]
         if missing:
             raise UserError(
@@ -203,9 +205,11 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
         limit = settings.max_num_features
         at_limit = limit if colmap.most_features(layout.database) >= limit else 0
         lines = report.advice(models, names, matches, settings.matcher, at_limit)
-        report.write_report(layout.report, models, names, matches, lines, **made)
+        report.write_report(
+            layout.report, models, names, matches, lines, lenses="native" if native else "undistort", **made
+        )
 
-    return Stage("undistortion", made_from, lambda: _remove(layout.undistorted), work)
+    return Stage("undistortion", [made_from, settings.lenses], lambda: _remove(layout.undistorted), work)
 
 
 def resize_stage(layout: Layout) -> Stage:

@@ -16,6 +16,7 @@ from typing import Any
 import pycolmap
 
 SEED = 0
+FISHEYE_ANGLE = 2.6  # radians along the longer side, 150 degrees: first guess for a fisheye
 
 
 def features(job: dict[str, Any]) -> None:
@@ -37,10 +38,23 @@ def features(job: dict[str, Any]) -> None:
 
 def matching(job: dict[str, Any]) -> None:
     """Match and verify pairs of photos; skip pairs that the database already has."""
+    _assume_focal_lengths(job["database"])
     match = {"exhaustive": pycolmap.match_exhaustive, "sequential": pycolmap.match_sequential}[job["matcher"]]
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
     match(job["database"], verification_options=verification, device=_device(job))
+
+
+def _assume_focal_lengths(path: str) -> None:
+    """Give fisheyes whose photos tell no focal length one to begin with: pycolmap verifies no pair without."""
+    database = pycolmap.Database.open(path)
+    for camera in database.read_all_cameras():
+        if camera.is_perspective_fisheye() and not camera.has_prior_focal_length:
+            params = camera.params
+            params[camera.focal_length_idxs()] = max(camera.width, camera.height) / FISHEYE_ANGLE
+            camera.params, camera.has_prior_focal_length = params, True
+            database.update_camera(camera)
+    database.close()
 
 
 def mapping(job: dict[str, Any]) -> None:
@@ -85,12 +99,9 @@ def survey(job: dict[str, Any]) -> None:
 
 
 def undistort(job: dict[str, Any]) -> None:
-    """Write photos and model without lens distortion, in COLMAP's layout, into the folder `out`.
-
-    Panoramas are taken as they are.
-    """
-    model, out = pycolmap.Reconstruction(job["model"]), Path(job["out"])
-    if any(camera.model_name == "EQUIRECTANGULAR" for camera in model.cameras.values()):
+    """Write photos and model in COLMAP's layout into the folder `out`: as they are if `native`, else undistorted."""
+    if job["native"]:
+        model, out = pycolmap.Reconstruction(job["model"]), Path(job["out"])
         for name in [model.images[i].name for i in model.reg_image_ids()]:
             (out / "images" / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(Path(job["images"], name), out / "images" / name)
