@@ -2,6 +2,7 @@
 
 python convert.py -s SCENE                 photos in SCENE/input
 python convert.py -s SCENE --video FILE    frames of a video, written to SCENE/input
+python convert.py -s SCENE --poses FILE    points at the poses of a transforms.json, or of a COLMAP model
 
 Writes SCENE/images, SCENE/sparse/0, SCENE/convert_report.json, and intermediate results in SCENE/distorted. A second
 run resumes after the last finished stage, and repeats the stages that changed options or photos affect.
@@ -20,7 +21,7 @@ from pathlib import Path
 from arguments import OptionParser
 from splatting.host.start import typed_command
 from splatting.sfm import stages
-from splatting.sfm.colmap import LENS_MODELS, Program, Pycolmap, Settings, is_native
+from splatting.sfm.colmap import GIVEN, LENS_MODELS, Program, Pycolmap, Settings, is_native
 from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder
 from splatting.sfm.programs import refuse_while_working
 from splatting.sfm.report import lens_words, summary
@@ -47,6 +48,8 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
         backend = Program(program, layout, settings) if program else Pycolmap(layout, settings)
         program, made_from = backend.identity, None
         planned = [stages.image_stage(layout, names, masks)]
+        if args.poses:
+            planned.append(stages.poses_stage(layout, Path(args.poses)))
         planned += stages.reconstruction_stages(backend, masks is not None)
     made = {"camera": settings.camera, "mapper": settings.mapper, "matcher": settings.matcher, "program": program}
     planned.append(stages.undistortion_stage(layout, settings, made_from, **made))
@@ -84,13 +87,23 @@ def _video(layout: Layout, record: stages.StageRecord, args: argparse.Namespace)
     return stages.video_stage(layout, video, args.video_frames)
 
 
+def _refuse_beside_poses(args: argparse.Namespace) -> None:
+    """Raise UserError for an option that says what --poses says, or that needs what it leaves out."""
+    for option in ("camera", "mapper", "video", "skip_matching", "colmap_executable"):
+        if getattr(args, option):
+            raise UserError(f"--{option} does not go with --poses, which gives poses and lenses to pycolmap; omit one")
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line."""
     parser = OptionParser(description="Convert the photos in SCENE/input, or a video, to a scene for train.py.")
     add = parser.add_argument
     add("-s", "--source_path", required=True, metavar="SCENE",
         help="scene folder; its sub-folder input has the photos; --video makes a missing one")  # fmt: skip
-    add("--camera", default="OPENCV", help="lens model to fit; for a fisheye lens OPENCV_FISHEYE, for panoramas "
+    add("--poses", default="", metavar="FILE",
+        help="poses and lenses that are given, by a transforms.json or the folder of a COLMAP model; only points are "
+        "computed (default: all are computed)")  # fmt: skip
+    add("--camera", default=None, help="lens model to fit; for a fisheye lens OPENCV_FISHEYE, for panoramas "
         "EQUIRECTANGULAR (default: OPENCV)")  # fmt: skip
     add("--lenses", choices=("auto", "native", "undistort"), default="auto",
         help="native: keep the photos as they are, with their lenses; undistort: resample them to pinhole images; "
@@ -108,7 +121,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         help="number of frames, the sharpest of each of N equal spans of time (default: 150)")  # fmt: skip
     add("--matcher", choices=("exhaustive", "sequential"), default=None,
         help="match every pair, or neighbours by name (default: exhaustive; with --video sequential)")  # fmt: skip
-    add("--mapper", choices=("incremental", "global"), default="incremental",
+    add("--mapper", choices=("incremental", "global"), default=None,
         help="place one photo after another, or all at once, which is faster for hundreds of photos "
         "(default: incremental)")  # fmt: skip
     add("--max_num_features", type=int, default=8192, metavar="N",
@@ -125,11 +138,16 @@ def main(argv: Sequence[str] | None = None) -> None:
         if getattr(args, option) < least:
             raise UserError(f"--{option} must be at least {least}, got {getattr(args, option)}")
     layout = Layout(scene_folder(args.source_path, made=bool(args.video)))
-    if args.camera not in LENS_MODELS:
-        raise UserError(f"--camera {args.camera} is not a supported lens model; choose one of {', '.join(LENS_MODELS)}")
-    is_native(args.lenses, [args.camera])  # refuses what does not fit together
+    if args.poses:
+        _refuse_beside_poses(args)
+        camera, mapper = "given", GIVEN
+    else:
+        camera, mapper = args.camera or "OPENCV", args.mapper or "incremental"
+        if camera not in LENS_MODELS:
+            raise UserError(f"--camera {camera} is not a supported lens model; choose one of {', '.join(LENS_MODELS)}")
+    is_native(args.lenses, [camera])  # refuses what does not fit together
     matcher = args.matcher or ("sequential" if args.video else "exhaustive")
-    convert(layout, Settings(args.camera, args.max_num_features, matcher, args.mapper, args.no_gpu, args.lenses), args)
+    convert(layout, Settings(camera, args.max_num_features, matcher, mapper, args.no_gpu, args.lenses), args)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from utils.system_utils import UserError, atomic_write
 
 Command = list[str]
 TOLERANCE = 1e-6  # of the cost in global bundle adjustment, as in the reference: much faster, hardly worse
+GIVEN = "triangulation"  # the mapper where poses are given
 PANORAMA = "EQUIRECTANGULAR"  # photos of all directions, twice as wide as high; no pinhole image shows them
 LENS_MODELS = (
     PANORAMA,
@@ -89,10 +90,12 @@ class Pycolmap(Backend):
         return self._command("matching")
 
     def mapping(self) -> list[Command]:
-        return self._command("mapping", database=str(self.mapped), tolerance=TOLERANCE)
+        step = "triangulation" if self.settings.mapper == GIVEN else "mapping"
+        return self._command(step, database=str(self.mapped), tolerance=TOLERANCE)
 
     def _command(self, step: str, **job: Any) -> list[Command]:
         places = {"database": self.layout.database, "images": self.layout.prepared, "models": self.layout.models}
+        places["given"] = self.layout.given
         common = {**asdict(self.settings), **{name: str(path) for name, path in places.items()}}
         return [worker_command(self.layout, step, **{**common, **job})]
 

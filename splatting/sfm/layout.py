@@ -24,6 +24,7 @@ class Layout:
         self.models = work / "sparse"  # one sub-folder per model of the mapper: 0, 1, ...
         self.database = work / "database.db"
         self.calibrated = work / "calibrated.db"  # a copy, into which global mapping writes its focal lengths
+        self.given = work / "given.json"  # poses and cameras of --poses, for the photos that are here
         self.log, self.stages = work / "colmap.log", work / "stages.json"
 
     def resized(self, factor: int) -> Path:

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from splatting.files.json_files import read_json, write_json
 from splatting.sfm import colmap, images, report
 from splatting.sfm.colmap import Backend, Settings, worker_command
+from splatting.sfm.given_poses import files_of, given_names, posed_photos, write_given
 from splatting.sfm.layout import Layout, image_names
 from splatting.sfm.programs import run_programs
 from utils.system_utils import UserError, mkdir_p
@@ -123,6 +124,17 @@ def image_stage(layout: Layout, names: list[str], masks: Path | None) -> Stage:
     )
 
 
+def poses_stage(layout: Layout, source: Path) -> Stage:
+    """Make the stage that finds the given poses and cameras of the photos."""
+    return Stage(
+        "poses",
+        [[str(path), _state(path)] for path in files_of(source)],
+        reset=lambda: _remove(layout.given),
+        work=lambda: write_given(layout, source),
+        check=lambda: posed_photos(layout, source) and None,
+    )
+
+
 def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
     """Make the stages features, matching and mapping."""
     layout, settings = backend.layout, backend.settings
@@ -132,7 +144,9 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
     run = partial(run_programs, layout.log)
 
     def features() -> None:
-        groups = images.sizes(layout)
+        # Given cameras need no groups.
+        given = settings.mapper == colmap.GIVEN
+        groups = {(0, 0): given_names(layout)} if given else images.sizes(layout)
         if len(groups) > 1:
             listed = ", ".join(f"{w} x {h} ({len(names)})" for (w, h), names in groups.items())
             print(f"photos have {len(groups)} sizes; each size gets its own camera: {listed}")
@@ -183,7 +197,12 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
         names = image_names(root)
         matches = colmap.partners(layout.database)
         report.refuse_nothing(models, names, matches, settings.matcher)
-        chosen = models[0]
+        chosen, limit = models[0], settings.max_num_features
+        at_limit = limit if colmap.most_features(layout.database) >= limit else 0
+        if settings.mapper == colmap.GIVEN:
+            lines = report.advice_at_poses(chosen, names)
+        else:
+            lines = report.advice(models, names, matches, settings.matcher, at_limit)
         native = colmap.is_native(settings.lenses, {camera["model"] for camera in chosen.cameras})
         job = {"model": str(layout.models / chosen.folder), "images": str(root), "out": str(layout.undistorted)}
         command = worker_command(layout, "undistort", **job, native=native, jpeg_quality=images.JPEG_QUALITY)
@@ -202,9 +221,6 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
         (layout.undistorted / "sparse").rename(layout.sparse / "0")
         written.rename(layout.images)
         _remove(layout.undistorted)
-        limit = settings.max_num_features
-        at_limit = limit if colmap.most_features(layout.database) >= limit else 0
-        lines = report.advice(models, names, matches, settings.matcher, at_limit)
         report.write_report(
             layout.report, models, names, matches, lines, lenses="native" if native else "undistort", **made
         )

@@ -13,6 +13,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pycolmap
 
 SEED = 0
@@ -20,20 +21,24 @@ FISHEYE_ANGLE = 2.6  # radians along the longer side, 150 degrees: first guess f
 
 
 def features(job: dict[str, Any]) -> None:
-    """Write SIFT features of groups of photos into a new database, with one camera per group."""
+    """Write SIFT features of groups of photos into a new database, with one camera per group, or with given cameras."""
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = job["camera"]
     if job["masks"]:
         reader.mask_path = job["masks"]
     options = pycolmap.FeatureExtractionOptions()
     options.sift.max_num_features = job["max_num_features"]
     pycolmap.Database.open(job["database"]).close()
+    given = job["mapper"] == "triangulation"
+    mode = pycolmap.CameraMode.AUTO if given else pycolmap.CameraMode.SINGLE
+    if given:
+        _enter_given(job)
+    else:
+        reader.camera_model = job["camera"]
     for names in job["groups"]:
         # Import the photos first, in order: threads would number them in the order in which they happen to finish.
-        pycolmap.import_images(job["database"], job["images"], pycolmap.CameraMode.SINGLE, names, reader)
-        pycolmap.extract_features(
-            job["database"], job["images"], names, pycolmap.CameraMode.SINGLE, reader, options, _device(job)
-        )
+        if not given:
+            pycolmap.import_images(job["database"], job["images"], mode, names, reader)
+        pycolmap.extract_features(job["database"], job["images"], names, mode, reader, options, _device(job))
 
 
 def matching(job: dict[str, Any]) -> None:
@@ -72,6 +77,44 @@ def mapping(job: dict[str, Any]) -> None:
     options.ba_global_function_tolerance = job["tolerance"]
     options.min_model_size = 3  # a small model is better than none; the report shows its size
     pycolmap.incremental_mapping(job["database"], job["images"], job["models"], options)
+
+
+def triangulation(job: dict[str, Any]) -> None:
+    """Compute points, with their tracks, at the poses and with the lenses that are given, which stay as they are."""
+    folder = Path(job["models"], "0")
+    folder.mkdir(parents=True)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = SEED
+    pycolmap.triangulate_points(
+        _given(job["given"]), job["database"], job["images"], str(folder), True, options, refine_intrinsics=False
+    )
+
+
+def _given(path: str) -> pycolmap.Reconstruction:
+    """The cameras and photos of given.json as a model without points, with ids in the order of the file."""
+    content, model = json.loads(Path(path).read_text(encoding="utf-8")), pycolmap.Reconstruction()
+    for number, entry in enumerate(content["cameras"], start=1):
+        size = {"width": entry["width"], "height": entry["height"]}
+        camera = pycolmap.Camera(model=entry["model"], params=entry["params"], camera_id=number, **size)
+        camera.rescale(*entry["size"])
+        camera.has_prior_focal_length = True
+        model.add_camera_with_trivial_rig(camera)
+    for number, entry in enumerate(content["images"], start=1):
+        image = pycolmap.Image(name=entry["name"], camera_id=entry["camera"], image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.array(entry["pose"])))
+    return model
+
+
+def _enter_given(job: dict[str, Any]) -> None:
+    """Write the cameras and photos of given.json into the database, with the same ids."""
+    model, database = _given(job["given"]), pycolmap.Database.open(job["database"])
+    for number, camera in model.cameras.items():
+        database.write_camera(camera, use_camera_id=True)
+        database.write_rig(model.rigs[number], use_rig_id=True)
+    for number, image in sorted(model.images.items()):
+        database.write_frame(model.frames[number], use_frame_id=True)
+        database.write_image(image, use_image_id=True)
+    database.close()
 
 
 def survey(job: dict[str, Any]) -> None:
@@ -122,7 +165,7 @@ def _end_with_input() -> None:
     os._exit(1)
 
 
-STEPS = {step.__name__: step for step in (features, matching, mapping, survey, undistort)}
+STEPS = {step.__name__: step for step in (features, matching, mapping, triangulation, survey, undistort)}
 
 
 def main(path: str) -> None:
