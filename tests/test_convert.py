@@ -129,6 +129,22 @@ def test_a_second_run_does_only_what_changed(copy, capsys):
     assert len(read_scene(copy, "images", False).train_cameras) == VIEWS
 
 
+@pytest.mark.slow
+def test_the_same_command_gives_the_same_scene(copy, tmp_path, monkeypatch):
+    again = tmp_path / "again"
+    _photos(again)
+
+    def bytes_of(scene: Path) -> dict[str, bytes]:
+        files = [path for part in ("sparse", "images") for path in (scene / part).rglob("*") if path.is_file()]
+        return {str(path.relative_to(scene)): path.read_bytes() for path in files}
+
+    for mapper in ("incremental", "global"):
+        for threads, scene in enumerate((copy, again), start=1):
+            monkeypatch.setenv("OMP_NUM_THREADS", str(threads))
+            convert.main(["-s", str(scene), "--no_gpu", "--mapper", mapper])
+        assert bytes_of(copy) == bytes_of(again)
+
+
 def test_a_model_made_elsewhere_is_undistorted(copy, capsys):
     other = copy.parent / "other"
     shutil.copytree(copy / "distorted" / "photos", other / "input")

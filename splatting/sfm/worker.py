@@ -17,6 +17,7 @@ import numpy as np
 import pycolmap
 
 SEED = 0
+THREADS = 1  # of mapping: several add numbers in the order in which they happen to finish
 FISHEYE_ANGLE = 2.6  # radians along the longer side, 150 degrees: first guess for a fisheye
 
 
@@ -67,13 +68,15 @@ def mapping(job: dict[str, Any]) -> None:
     os.makedirs(job["models"])
     if job["mapper"] == "global":
         # Global mapping needs initial focal lengths; this estimates them from the pairs.
-        pycolmap.calibrate_view_graph(job["database"])
+        calibration = pycolmap.ViewGraphCalibrationOptions()
+        calibration.random_seed = SEED
+        pycolmap.calibrate_view_graph(job["database"], calibration)
         options = pycolmap.GlobalPipelineOptions()
-        options.random_seed = SEED
+        options.random_seed, options.num_threads = SEED, THREADS
         pycolmap.global_mapping(job["database"], job["images"], job["models"], options)
         return
     options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = SEED
+    options.random_seed, options.num_threads = SEED, THREADS
     options.ba_global_function_tolerance = job["tolerance"]
     options.min_model_size = 3  # a small model is better than none; the report shows its size
     pycolmap.incremental_mapping(job["database"], job["images"], job["models"], options)
@@ -84,7 +87,7 @@ def triangulation(job: dict[str, Any]) -> None:
     folder = Path(job["models"], "0")
     folder.mkdir(parents=True)
     options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = SEED
+    options.random_seed, options.num_threads = SEED, THREADS
     pycolmap.triangulate_points(
         _given(job["given"]), job["database"], job["images"], str(folder), True, options, refine_intrinsics=False
     )
