@@ -1,7 +1,8 @@
-"""Convert photos or a video to a scene for train.py: camera poses, points, undistorted photos.
+"""Convert photos or a video to a scene for train.py: camera poses, points, photos that it can show.
 
 python convert.py -s SCENE                 photos in SCENE/input
 python convert.py -s SCENE --video FILE    frames of a video, written to SCENE/input
+python convert.py -s SCENE --poses FILE    points at the poses of a transforms.json, or of a COLMAP model
 
 Writes SCENE/images, SCENE/sparse/0, SCENE/convert_report.json, and intermediate results in SCENE/distorted. A second
 run resumes after the last finished stage, and repeats the stages that changed options or photos affect.
@@ -23,11 +24,11 @@ from splatting.sfm import stages
 from splatting.sfm.cameras import MODES
 from splatting.sfm.capture import lines_of, too_few
 from splatting.sfm.capture_page import capture_stage
-from splatting.sfm.colmap import LENS_MODELS, Program, Pycolmap, Settings
+from splatting.sfm.colmap import GIVEN, LENS_MODELS, Program, Pycolmap, Settings, is_native
 from splatting.sfm.inputs import sort_inputs, unused_lines
 from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder
 from splatting.sfm.programs import refuse_while_working
-from splatting.sfm.report import report_inputs, summary
+from splatting.sfm.report import lens_words, report_inputs, summary
 from splatting.sfm.video import NOTE, refuse_foreign_frames, report_entries, taken_frames, video_lines
 from utils.system_utils import UserError, run_cli
 
@@ -59,6 +60,8 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
         backend = Program(program, layout, settings) if program else Pycolmap(layout, settings)
         program, made_from = backend.identity, None
         planned = [stages.image_stage(layout, names, masks)]
+        if args.poses:
+            planned.append(stages.poses_stage(layout, Path(args.poses)))
         planned += stages.reconstruction_stages(backend, masks is not None)
     made = {"camera": settings.camera, "mapper": settings.mapper, "matcher": settings.matcher, "program": program}
     planned.append(stages.undistortion_stage(layout, settings, made_from, **made, shared_by=settings.cameras))
@@ -70,7 +73,7 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
         print(f"done before: {', '.join(kept)} (to start from the beginning, remove {layout.work})")
     notes = [NOTE] if taken_frames(layout) else []
     report = report_inputs(layout.report, notes=notes, unused=found.unused, videos=report_entries(layout))
-    print("\n".join((summary(report), *lines_of(report), f"all of it: {layout.page}")))
+    print("\n".join((summary(report), lens_words(report), *lines_of(report), f"all of it: {layout.page}")))
     if found.unused:
         print(f"{len(found.unused)} files in {layout.input.name} were not used; {layout.report.name} has the reasons")
     for line in notes:
@@ -111,17 +114,30 @@ def _video_stage(
     return stages.video_stage(layout, videos, args.video_frames, begun)
 
 
+def _refuse_beside_poses(args: argparse.Namespace) -> None:
+    """Raise UserError for an option that says what --poses says, or that needs what it leaves out."""
+    for option in ("camera", "mapper", "video", "skip_matching", "colmap_executable"):
+        if getattr(args, option):
+            raise UserError(f"--{option} does not go with --poses, which gives poses and lenses to pycolmap; omit one")
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line."""
     parser = OptionParser(description="Convert the photos in SCENE/input, or a video, to a scene for train.py.")
     add = parser.add_argument
     add("-s", "--source_path", required=True, metavar="SCENE",
         help="scene folder; its sub-folder input has the photos; --video makes a missing one")  # fmt: skip
-    add("--camera", default="OPENCV", help="lens model to fit; for a fisheye lens OPENCV_FISHEYE, for panoramas "
+    add("--poses", default="", metavar="FILE",
+        help="poses and lenses that are given, by a transforms.json or the folder of a COLMAP model; only points are "
+        "computed (default: all are computed)")  # fmt: skip
+    add("--camera", default=None, help="lens model to fit; for a fisheye lens OPENCV_FISHEYE, for panoramas "
         "EQUIRECTANGULAR (default: OPENCV)")  # fmt: skip
     add("--cameras", choices=MODES, default="per_lens",
         help="which photos of one size share a camera: those that EXIF data give one lens and focal length (where they "
         "name none, those of one sub-folder), those of a sub-folder, none, or all (default: per_lens)")  # fmt: skip
+    add("--lenses", choices=("auto", "native", "undistort"), default="auto",
+        help="native: keep the photos as they are, with their lenses; undistort: resample them to pinhole images; "
+        "auto: native for fisheyes and panoramas, undistort for others (default: auto)")  # fmt: skip
     add("--no_gpu", action="store_true", help="compute features and matches on the CPU even if there is a GPU")
     add("--skip_matching", action="store_true", help="only undistort the largest model in SCENE/distorted/sparse")
     add("--colmap_executable", default="", metavar="FILE",
@@ -138,7 +154,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         "(default: 150)")  # fmt: skip
     add("--matcher", choices=("exhaustive", "sequential"), default=None,
         help="match every pair, or neighbours by name (default: exhaustive; of one video sequential)")  # fmt: skip
-    add("--mapper", choices=("incremental", "global"), default="incremental",
+    add("--mapper", choices=("incremental", "global"), default=None,
         help="place one photo after another, or all at once, which is faster for hundreds of photos "
         "(default: incremental)")  # fmt: skip
     add("--max_num_features", type=int, default=8192, metavar="N",
@@ -155,10 +171,17 @@ def main(argv: Sequence[str] | None = None) -> None:
         if getattr(args, option) < least:
             raise UserError(f"--{option} must be at least {least}, got {getattr(args, option)}")
     layout = Layout(scene_folder(args.source_path, made=bool(args.video)))
-    if args.camera not in LENS_MODELS:
-        raise UserError(f"--camera {args.camera} is not a supported lens model; choose one of {', '.join(LENS_MODELS)}")
+    if args.poses:
+        _refuse_beside_poses(args)
+        camera, mapper = "given", GIVEN
+    else:
+        camera, mapper = args.camera or "OPENCV", args.mapper or "incremental"
+        if camera not in LENS_MODELS:
+            raise UserError(f"--camera {camera} is not a supported lens model; choose one of {', '.join(LENS_MODELS)}")
+    is_native(args.lenses, [camera])  # refuses what does not fit together
     matcher = args.matcher or "exhaustive"
-    convert(layout, Settings(args.camera, args.max_num_features, matcher, args.mapper, args.no_gpu, args.cameras), args)
+    settings = Settings(camera, args.max_num_features, matcher, mapper, args.no_gpu, args.cameras, args.lenses)
+    convert(layout, settings, args)
 
 
 if __name__ == "__main__":

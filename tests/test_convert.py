@@ -17,13 +17,14 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from photo_room import FOCAL, SIZE, camera_centers, make_photos
+from photo_room import FISHEYE, FOCAL, SIZE, cam_to_world, camera_centers, make_photos
 from PIL import Image
 from synthetic import folder_state
 from waiting import LIMIT, wait_for
 
 import convert
 from scene.dataset_readers import read_scene
+from scene.readers.tracks import read_tracks
 from splatting.sfm import colmap, programs, report
 from splatting.sfm.colmap import LENS_MODELS, Program, Pycolmap, Settings
 from splatting.sfm.images import check_images, find_masks, prepare_images
@@ -127,6 +128,22 @@ def test_a_second_run_does_only_what_changed(copy, capsys):
     assert len(read_scene(copy, "images", False).train_cameras) == VIEWS
 
 
+@pytest.mark.slow
+def test_the_same_command_gives_the_same_scene(copy, tmp_path, monkeypatch):
+    again = tmp_path / "again"
+    _photos(again)
+
+    def bytes_of(scene: Path) -> dict[str, bytes]:
+        files = [path for part in ("sparse", "images") for path in (scene / part).rglob("*") if path.is_file()]
+        return {str(path.relative_to(scene)): path.read_bytes() for path in files}
+
+    for mapper in ("incremental", "global"):
+        for threads, scene in enumerate((copy, again), start=1):
+            monkeypatch.setenv("OMP_NUM_THREADS", str(threads))
+            convert.main(["-s", str(scene), "--no_gpu", "--mapper", mapper])
+        assert bytes_of(copy) == bytes_of(again)
+
+
 def test_a_model_made_elsewhere_is_undistorted(copy, capsys):
     other = copy.parent / "other"
     shutil.copytree(copy / "distorted" / "photos", other / "input")
@@ -191,6 +208,13 @@ def _renamed(name: str) -> Callable[[Path], object]:
         ("-s {} of mine", None, r"unexpected argument of; quote paths.*room of mine'"),
         ("-s {}/input/photo_00.png", None, r"photo_00.png is a file; pass the folder that contains"),
         ("-s {} --camera PINHOLEY", None, r"--camera PINHOLEY is not a supported lens model.*OPENCV_FISHEYE"),
+        (
+            "-s {} --camera EQUIRECTANGULAR --lenses undistort",
+            None,
+            r"no pinhole image shows a panorama; omit --lenses",
+        ),
+        ("-s {} --poses no", None, r"no poses in no; pass a transforms.json, or the folder of cameras.txt"),
+        ("-s {} --poses x --mapper global", None, r"--mapper does not go with --poses, which gives poses and lenses"),
         ("-s {} --mask_path no", None, r"no folder of masks 'no'; pass an existing folder"),
         ("-s {} --mask_path {}", None, r"none of 3 photos has a mask .*photo_00.png.png"),
         ("-s {} --max_num_features 0", None, r"--max_num_features must be at least 100, got 0"),
@@ -461,6 +485,118 @@ def test_panoramas_are_placed_and_taken_as_they_are(tmp_path):
     Image.new("RGB", (60, 40)).save(tmp_path / "input" / "small.png")
     with pytest.raises(UserError, match="small.png is not twice as wide as high, as panoramas of 360 by 180 degrees"):
         convert.main(words)
+
+
+@pytest.mark.slow
+def test_fisheyes_are_placed_and_stay_as_they_are(tmp_path, capsys):
+    make_photos(tmp_path / "input", VIEWS, lens=FISHEYE)
+    shots = sorted((tmp_path / "input").iterdir())
+    words = ["-s", str(tmp_path), "--no_gpu", "--camera", FISHEYE.model]
+
+    def converted(*options: str) -> tuple[str, list]:
+        convert.main([*words, *options])
+        report = json.loads((tmp_path / "convert_report.json").read_text())
+        return report["lenses"], read_scene(tmp_path, "images", hold_out=False, native=True).train_cameras
+
+    lenses, views = converted()
+    assert lenses == "native" and "the photos as they are, with the cameras that were fitted (OPENCV_FISHEYE)" in (
+        capsys.readouterr().out
+    )
+    assert [path.read_bytes() for path in shots] == [view.image_path.read_bytes() for view in views]
+    # The photos tell no focal length, and where the fit begins is 6 % off.
+    assert all(view.native.focal == pytest.approx(FISHEYE.params[:2], rel=0.01) for view in views)
+    _check_places(pycolmap.Reconstruction(tmp_path / "sparse" / "0"), [path.name for path in shots], FISHEYE.model)
+    lenses, views = converted("--lenses", "undistort")
+    out = capsys.readouterr().out
+    assert "done before: photos, features, matching, mapping (" in out and "undistorted photos, with pinhole" in out
+    assert lenses == "undistort" and all(view.native is None for view in views)
+    assert shots[0].read_bytes() != views[0].image_path.read_bytes()
+
+
+def _given(folder: Path, count: int) -> Path:
+    """Write transforms.json with the poses of make_photos's photos, of cameras twice as large; return its path."""
+    frames = []
+    for number, center in enumerate(camera_centers(count)):
+        pose = np.eye(4)
+        pose[:3] = np.column_stack([cam_to_world(center) * (1, -1, -1), center])  # y up, z backward
+        frames.append({"file_path": f"./images/photo_{number:02d}", "transform_matrix": pose.tolist()})
+    (width, height), path = SIZE, folder / "transforms.json"
+    content = {"w": 2 * width, "h": 2 * height, "fl_x": 2 * FOCAL, "frames": frames}
+    folder.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content))
+    return path
+
+
+@pytest.mark.slow
+def test_points_are_computed_at_given_poses(tmp_path, capsys):
+    make_photos(tmp_path / "input", VIEWS + 1)
+    poses, names = _given(tmp_path / "phone", VIEWS + 1), [f"photo_{k:02d}.png" for k in range(VIEWS)]
+    content = json.loads(poses.read_text())
+    content["frames"] = [*content["frames"][:-1], {**content["frames"][0], "file_path": "images/gone.png"}]
+    poses.write_text(json.dumps(content))
+    words = ["-s", str(tmp_path), "--no_gpu", "--poses"]
+    convert.main([*words, str(poses)])
+    out, err = capsys.readouterr()
+    assert "1 poses of" in err and "1 of 9 photos have no pose in the file and were left out (photo_08.png)" in err
+    assert f"{VIEWS} of 9 photos placed" in out
+
+    def judge() -> None:
+        model = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
+        found = np.array([model.find_image_with_name(name).projection_center() for name in names])
+        np.testing.assert_allclose(found, camera_centers(VIEWS + 1)[:VIEWS], atol=1e-12)
+        assert model.cameras[1].params == pytest.approx((FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2))
+        # The walls are the planes x = 0, y = 0 and z = 0, some 4 units away, where a pixel is 0.02 units.
+        off = np.abs([point.xyz for point in model.points3D.values()]).min(axis=1)
+        assert len(off) > 1000 and np.median(off) < 0.005 and np.percentile(off, 95) < 0.04
+        views = read_scene(tmp_path, "images", hold_out=False).train_cameras
+        assert all(read_tracks(tmp_path, views, np.zeros(3)))
+
+    judge()
+    # The same poses as a text model without points, which other programs write.
+    model = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
+    model.delete_all_points2D_and_points3D()
+    (tmp_path / "model").mkdir()
+    model.write_text(str(tmp_path / "model"))
+    (tmp_path / "model" / "points3D.txt").unlink()
+    convert.main([*words, str(tmp_path / "model")])
+    judge()
+    # Axes of another convention: no pose is where the photo shows it to be.
+    for frame in content["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) * (1, -1, -1, 1)).tolist()
+    poses.write_text(json.dumps(content))
+    before = folder_state(tmp_path / "sparse")
+    with pytest.raises(UserError, match=r"the photos do not fit the given poses \(\d points.*or omit --poses"):
+        convert.main([*words, str(poses)])
+    assert folder_state(tmp_path / "sparse") == before
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda text: text.replace('"w": 480', '"w": 360'), "photo_00.png has 240 x 180 pixels .* 360 x 360; use the"),
+        (
+            lambda text: text.replace("photo_0", "frame_"),
+            "0 photos of .*input have a pose in .*lists ./images/frame",
+        ),
+        (
+            lambda text: text.replace("photo_01", "left/photo_02"),
+            "photo_02 and .*photo_02 in .* of the photo photo_02",
+        ),
+        (lambda text: text.replace("transform_matrix", "pose"), "frame 1 .* has no transform_matrix"),
+    ],
+)
+def test_poses_that_can_not_be_used(tmp_path, change, said):
+    make_photos(tmp_path / "input", 3)
+    poses = _given(tmp_path, 3)
+    poses.write_text(change(poses.read_text()))
+    with pytest.raises(UserError, match=said):
+        convert.main(["-s", str(tmp_path), "--poses", str(poses)])
+
+
+def test_which_photos_stay_as_they_are():
+    stay = {model.removesuffix("_FISHEYE") for model in LENS_MODELS if colmap.is_native("auto", {"OPENCV", model})}
+    assert stay == {"EQUIRECTANGULAR", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "THIN_PRISM"}
+    assert colmap.is_native("native", {"OPENCV"}) and not colmap.is_native("undistort", {"OPENCV_FISHEYE"})
 
 
 @pytest.mark.parametrize("mask", ["a.jpg.png", "a.jpg", "a.png"])

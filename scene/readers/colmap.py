@@ -15,7 +15,7 @@ from scene.colmap_loader import Camera, Image, Points, qvec2rotmat, read_cameras
 from scene.images.find import find_images
 from scene.images.lens import Lens
 from scene.images.masks import NO_MASKS, Mask, MaskOptions, find_masks
-from scene.readers.info import CameraInfo, SceneInfo, split_by_order
+from scene.readers.info import CameraInfo, Posed, SceneInfo, split_by_order
 from scene.readers.pinholes import camera_info, finished
 from scene.readers.point_cloud import check_finite, read_point_cloud
 from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, random_in_frusta, scene_info
@@ -78,9 +78,20 @@ def colmap_camera(
     photo: Image, camera: Camera, path: Path, mask: Mask | None = None, ignore_alpha: bool = False, native: bool = False
 ) -> CameraInfo:
     """The view of a photo that COLMAP registered. native: as for `camera_info`."""
+    _, R, T, lens = _posed(photo, camera)
+    return camera_info(camera.id, photo.name, path, lens((0, 0)), R, T, mask, ignore_alpha, native)
+
+
+def read_poses(folder: Path) -> list[Posed]:
+    """The poses and lenses of a model's photos, whose points may be missing. UserError where it cannot be read."""
+    model = read_model(folder)
+    return [_posed(photo, model.cameras[photo.camera_id]) for photo in model.images]
+
+
+def _posed(photo: Image, camera: Camera) -> Posed:
     lens = Lens(camera.model, tuple(map(float, camera.params)), camera.width, camera.height)
     rotation, translation = qvec2rotmat(photo.qvec).T.copy(), np.asarray(photo.tvec, dtype=np.float64)
-    return camera_info(camera.id, photo.name, path, lens, rotation, translation, mask, ignore_alpha, native)
+    return Posed(photo.name, rotation, translation, lambda _: lens)
 
 
 def _own_cloud(model_folder: Path, model: ColmapModel) -> StartCloud | None:

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, FrozenInstanceError, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from diff_gaussian_rasterization.lens import Lens as NativeLens
@@ -64,6 +64,17 @@ class _LikeNamedTuple:
 
     def __getitem__(self, index: int | slice) -> Any:
         return tuple(self)[index]
+
+
+class Posed(NamedTuple):
+    """A photo with a pose. file: as it is listed. R (3,3): camera-to-world rotation; T (3,): world-to-camera
+    translation; y down and z forward. lens: of a photo of a size (width, height).
+    """
+
+    file: str
+    R: np.ndarray
+    T: np.ndarray
+    lens: Callable[[tuple[int, int]], Lens]
 
 
 @dataclass(eq=False)

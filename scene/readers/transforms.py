@@ -16,7 +16,7 @@ from scene.images.decode import picture_sizes
 from scene.images.find import FileIndex, find_images
 from scene.images.lens import PANORAMA, Lens
 from scene.images.masks import NO_MASKS, Mask, MaskOptions, find_masks
-from scene.readers.info import CameraInfo, SceneInfo, held_out, split_by_order
+from scene.readers.info import CameraInfo, Posed, SceneInfo, held_out, split_by_order
 from scene.readers.metashape import read_metashape
 from scene.readers.phone_scans import read_polycam, read_record3d
 from scene.readers.pinholes import camera_info, finished
@@ -70,6 +70,16 @@ def read_blender(
     _say_if_unused(images, files[0], train)
     lacking = f"{folder / 'points3d.ply'} has no points"
     return scene_info((train, test), start, own, random_in_cube, lacking, is_nerf_synthetic=True)
+
+
+def read_poses(path: Path) -> list[Posed]:
+    """The poses and lenses of a camera file, without a look at its photos. UserError for what cannot be used."""
+    content = _read(path)
+    frames = enumerate(content["frames"], start=1)
+    return [
+        Posed(str(frame["file_path"]), *_pose(path, number, frame), partial(_lens, path, content, frame))
+        for number, frame in frames
+    ]
 
 
 def read_frames(path: Path, masks: MaskOptions = NO_MASKS, suffixes: Sequence[str] = SUFFIXES) -> list[CameraInfo]:
@@ -259,13 +269,17 @@ def _cameras(
     found = _masks(path, frames, names, photos, masks)
     sizes, cameras = picture_sizes(photos), []
     for index, (frame, photo, mask, (R, T)) in enumerate(zip(frames, photos, found, poses, strict=True)):
-        try:
-            lens = lens_of(frame, content, sizes[index], path)
-        except (ValueError, TypeError, OverflowError) as error:
-            raise _no_camera_file(path, error) from error
+        lens = _lens(path, content, frame, sizes[index])
         name = photo.stem if by_stem else names[index]
         cameras.append(camera_info(index, name, photo, lens, R, T, mask, masks.ignore_alpha, native))
     return finished(cameras, masks.drop_alpha)
+
+
+def _lens(path: Path, content: dict[str, Any], frame: dict[str, Any], size: tuple[int, int]) -> Lens:
+    try:
+        return lens_of(frame, content, size, path)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise _no_camera_file(path, error) from error
 
 
 def _pose(path: Path, number: int, frame: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:

@@ -9,16 +9,20 @@ import sqlite3
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
+from diff_gaussian_rasterization.lens import MODELS
 
 from splatting.sfm.layout import Layout
 from utils.system_utils import UserError, atomic_write
 
 Command = list[str]
 TOLERANCE = 1e-6  # of the cost in global bundle adjustment, as in the reference: much faster, hardly worse
+GIVEN = "triangulation"  # the mapper where poses are given
 PANORAMA = "EQUIRECTANGULAR"  # photos of all directions, twice as wide as high; no pinhole image shows them
 LENS_MODELS = (
     PANORAMA,
@@ -26,13 +30,19 @@ LENS_MODELS = (
     *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
     *("OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "EUCM"),
 )
+# Fisheyes and panoramas, which see too much for a pinhole image, and through which train.py shows Gaussians.
+_WIDE = {model for model, (chart, *_) in MODELS.items() if chart != "perspective"}
 _WORKER = Path(__file__).with_name("worker.py")
 _PAIR = 2147483647  # COLMAP: pair_id = smaller image_id * this + larger image_id
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The user's choices. camera: COLMAP's name of the lens model to fit. cameras: what shares one (cameras.MODES)."""
+    """The user's choices.
+
+    camera: COLMAP's name of the lens model to fit. cameras: what shares one (cameras.MODES). lenses: native, undistort
+    or auto.
+    """
 
     camera: str
     max_num_features: int
@@ -40,6 +50,7 @@ class Settings:
     mapper: str
     no_gpu: bool
     cameras: str = "per_lens"
+    lenses: str = "auto"
 
 
 def worker_command(layout: Layout, step: str, **job: Any) -> Command:
@@ -48,6 +59,13 @@ def worker_command(layout: Layout, step: str, **job: Any) -> Command:
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps({"step": step, **job}), encoding="utf-8")
     return [sys.executable, str(_WORKER), str(path)]
+
+
+def is_native(lenses: str, models: Collection[str]) -> bool:
+    """Whether photos stay as they are, by --lenses and the camera models. UserError for panoramas to undistort."""
+    if lenses == "undistort" and PANORAMA in models:
+        raise UserError("no pinhole image shows a panorama; omit --lenses undistort")
+    return lenses == "native" or (lenses == "auto" and not _WIDE.isdisjoint(models))
 
 
 class Backend:
@@ -77,10 +95,12 @@ class Pycolmap(Backend):
         return self._command("matching")
 
     def mapping(self) -> list[Command]:
-        return self._command("mapping", database=str(self.mapped), tolerance=TOLERANCE)
+        step = "triangulation" if self.settings.mapper == GIVEN else "mapping"
+        return self._command(step, database=str(self.mapped), tolerance=TOLERANCE)
 
     def _command(self, step: str, **job: Any) -> list[Command]:
         places = {"database": self.layout.database, "images": self.layout.prepared, "models": self.layout.models}
+        places["given"] = self.layout.given
         common = {**asdict(self.settings), **{name: str(path) for name, path in places.items()}}
         return [worker_command(self.layout, step, **{**common, **job})]
 

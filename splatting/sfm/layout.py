@@ -25,6 +25,7 @@ class Layout:
         self.database = work / "database.db"
         self.calibrated = work / "calibrated.db"  # a copy, into which global mapping writes its focal lengths
         self.frames = work / "frames.json"  # which of `input` are frames of videos
+        self.given = work / "given.json"  # poses and cameras of --poses, for the photos that are here
         self.log, self.stages = work / "colmap.log", work / "stages.json"
 
     def resized(self, factor: int) -> Path:

@@ -92,12 +92,36 @@ def advice(
     return lines
 
 
+def advice_at_poses(model: Model, images: Sequence[str]) -> list[str]:
+    """Return one line for each weakness of a model at given poses. UserError if the photos contradict the poses."""
+    fit = f"{model.points} points, mean error {model.error:.1f} pixels"
+    remedy = "check that the poses and lenses are of these photos"
+    if model.points < len(model.registered):
+        raise UserError(f"the photos do not fit the given poses ({fit}); {remedy}, or omit --poses")
+    out, lines = sorted(set(images) - set(model.registered)), []
+    if out:
+        text = f"{len(out)} of {len(images)} photos have no pose in the file and were left out ({some(out)})"
+        lines.append(f"{text}; add their poses, or omit --poses")
+    if model.points < FEWEST_POINTS or model.error > LARGE_ERROR:
+        remedy += "; train.py --refine_poses corrects small errors of poses"
+        lines.append(f"the photos fit the given poses badly ({fit}); {remedy}")
+    return lines
+
+
 def summary(report: dict[str, Any]) -> str:
     """Summarise the contents of convert_report.json in one line."""
     return (
         f"{report['registered']} of {report['photos']} photos placed; {report['points']} points, each in "
         f"{report['mean_track_length']:.1f} photos, mean error {report['mean_error_px']:.2f} pixels"
     )
+
+
+def lens_words(report: dict[str, Any]) -> str:
+    """Say in one line which photos convert_report.json is about: those of the lenses, or undistorted ones."""
+    if report["lenses"] == "undistort":
+        return "the scene has undistorted photos, with pinhole cameras"
+    models = ", ".join(sorted({camera["model"] for camera in report["cameras"]}))
+    return f"the scene has the photos as they are, with the cameras that were fitted ({models})"
 
 
 def write_report(

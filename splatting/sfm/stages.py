@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from splatting.files.json_files import read_json, write_json
 from splatting.sfm import cameras, colmap, images, report, video
 from splatting.sfm.colmap import Backend, Settings, worker_command
+from splatting.sfm.given_poses import files_of, given_names, posed_photos, write_given
 from splatting.sfm.layout import Layout, image_names
 from splatting.sfm.programs import run_programs
 from utils.system_utils import UserError, mkdir_p
@@ -120,6 +121,17 @@ def image_stage(layout: Layout, names: list[str], masks: Path | None) -> Stage:
     )
 
 
+def poses_stage(layout: Layout, source: Path) -> Stage:
+    """Make the stage that finds the given poses and cameras of the photos."""
+    return Stage(
+        "poses",
+        [[str(path), _state(path)] for path in files_of(source)],
+        reset=lambda: _remove(layout.given),
+        work=lambda: write_given(layout, source),
+        check=lambda: posed_photos(layout, source) and None,
+    )
+
+
 def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
     """Make the stages features, matching and mapping."""
     layout, settings = backend.layout, backend.settings
@@ -129,9 +141,12 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
     run = partial(run_programs, layout.log)
 
     def features() -> None:
-        groups = cameras.group(layout.prepared, image_names(layout.prepared), settings.cameras)
-        print(cameras.listing(groups))
-        names = [group.names for group in groups]
+        if settings.mapper == colmap.GIVEN:
+            names = [given_names(layout)]
+        else:
+            groups = cameras.group(layout.prepared, image_names(layout.prepared), settings.cameras)
+            print(cameras.listing(groups))
+            names = [group.names for group in groups]
         run(backend.features(names, masks), "Features", sum(map(len, names)), partial(rows, "keypoints"), hint)
 
     def matching() -> None:
@@ -164,7 +179,7 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
 
 
 def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **made: Any) -> Stage:
-    """Make the stage that undistorts the largest model to `images` and `sparse/0`, and writes the report.
+    """Make the stage that writes the largest model and its photos to `images` and `sparse/0`, and the report.
 
     made: settings to report. The scene of an earlier run stays until the new one is complete.
     """
@@ -178,12 +193,21 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
         names = image_names(root)
         matches = colmap.partners(layout.database)
         report.refuse_nothing(models, names, matches, settings.matcher)
-        chosen = models[0]
+        chosen, limit = models[0], settings.max_num_features
+        at_limit = limit if colmap.most_features(layout.database) >= limit else 0
+        lenses = cameras.lenses(root, names)
+        if settings.mapper == colmap.GIVEN:
+            lines = report.advice_at_poses(chosen, names)
+        else:
+            lines = report.advice(models, names, matches, settings.matcher, at_limit)
+            lines += cameras.advice(chosen.cameras, lenses, settings.cameras)
+        native = colmap.is_native(settings.lenses, {camera["model"] for camera in chosen.cameras})
         job = {"model": str(layout.models / chosen.folder), "images": str(root), "out": str(layout.undistorted)}
-        command = worker_command(layout, "undistort", **job, jpeg_quality=images.JPEG_QUALITY)
+        command = worker_command(layout, "undistort", **job, native=native, jpeg_quality=images.JPEG_QUALITY)
         written = layout.undistorted / "images"
         total = len(chosen.registered)
-        run_programs(layout.log, [command], "Undistorting", total, lambda: sum(p.is_file() for p in written.rglob("*")))
+        title = "Copying photos" if native else "Undistorting"
+        run_programs(layout.log, [command], title, total, lambda: sum(p.is_file() for p in written.rglob("*")))
         missing = [name for name in chosen.registered if not (written / name).is_file()]
         if missing:
             raise UserError(
@@ -195,15 +219,12 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
         (layout.undistorted / "sparse").rename(layout.sparse / "0")
         written.rename(layout.images)
         _remove(layout.undistorted)
-        limit = settings.max_num_features
-        at_limit = limit if colmap.most_features(layout.database) >= limit else 0
-        lenses = cameras.lenses(root, names)
-        lines = report.advice(models, names, matches, settings.matcher, at_limit)
-        lines += cameras.advice(chosen.cameras, lenses, settings.cameras)
-        shared = cameras.described(chosen.cameras, lenses)
-        report.write_report(layout.report, models, names, matches, advice=lines, cameras=shared, **made)
+        kept = "native" if native else "undistort"
+        described = cameras.described(chosen.cameras, lenses)
+        made_of = {**made, "advice": lines, "cameras": described, "lenses": kept}
+        report.write_report(layout.report, models, names, matches, **made_of)
 
-    return Stage("undistortion", made_from, lambda: _remove(layout.undistorted), work)
+    return Stage("undistortion", [made_from, settings.lenses], lambda: _remove(layout.undistorted), work)
 
 
 def resize_stage(layout: Layout) -> Stage:
