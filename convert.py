@@ -114,6 +114,20 @@ def _video_stage(
     return stages.video_stage(layout, videos, args.video_frames, begun)
 
 
+def _settings(args: argparse.Namespace) -> Settings:
+    """The choices of the command line. UserError for those that do not fit together."""
+    if args.poses:
+        _refuse_beside_poses(args)
+        camera, mapper = "given", GIVEN
+    else:
+        camera, mapper = args.camera or "OPENCV", args.mapper or "incremental"
+        if camera not in LENS_MODELS:
+            raise UserError(f"--camera {camera} is not a supported lens model; choose one of {', '.join(LENS_MODELS)}")
+    is_native(args.lenses, [camera])  # refuses what does not fit together
+    matcher = args.matcher or "exhaustive"
+    return Settings(camera, args.max_num_features, matcher, mapper, args.no_gpu, args.cameras, args.lenses)
+
+
 def _refuse_beside_poses(args: argparse.Namespace) -> None:
     """Raise UserError for an option that says what --poses says, or that needs what it leaves out."""
     for option in ("camera", "mapper", "video", "skip_matching", "colmap_executable"):
@@ -171,17 +185,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         if getattr(args, option) < least:
             raise UserError(f"--{option} must be at least {least}, got {getattr(args, option)}")
     layout = Layout(scene_folder(args.source_path, made=bool(args.video)))
-    if args.poses:
-        _refuse_beside_poses(args)
-        camera, mapper = "given", GIVEN
-    else:
-        camera, mapper = args.camera or "OPENCV", args.mapper or "incremental"
-        if camera not in LENS_MODELS:
-            raise UserError(f"--camera {camera} is not a supported lens model; choose one of {', '.join(LENS_MODELS)}")
-    is_native(args.lenses, [camera])  # refuses what does not fit together
-    matcher = args.matcher or "exhaustive"
-    settings = Settings(camera, args.max_num_features, matcher, mapper, args.no_gpu, args.cameras, args.lenses)
-    convert(layout, settings, args)
+    convert(layout, _settings(args), args)
 
 
 if __name__ == "__main__":

@@ -99,7 +99,8 @@ def _check_places(model: pycolmap.Reconstruction, names: list[str], camera: str)
 
 def test_what_is_written(converted):
     assert sorted(path.name for path in converted.iterdir()) == [
-        *("convert_report.json", "distorted", "images", "images_2", "images_4", "images_8", "input", "sparse")
+        *("capture.html", "convert_report.json", "distorted"),
+        *("images", "images_2", "images_4", "images_8", "input", "sparse"),
     ]
     content = json.loads((converted / "convert_report.json").read_text())
     assert list(content) == sorted(content)
@@ -115,7 +116,7 @@ def test_what_is_written(converted):
 def test_a_second_run_does_only_what_changed(copy, capsys):
     scene = folder_state(copy)
     convert.main(["-s", str(copy), "--no_gpu", "--resize"])
-    assert "done before: photos, features, matching, mapping, undistortion, resize" in capsys.readouterr().out
+    assert "done before: photos, features, matching, mapping, undistortion, capture, resize" in capsys.readouterr().out
     assert folder_state(copy) == scene
     features = Layout(copy).database.read_bytes()
     # Resized copies of the old photos must not stay beside new ones.
