@@ -19,7 +19,7 @@ from splatting.sfm.video import sharpness
 
 LEAST = 0.6  # share of the photos, below which too few are placed
 _SHARED = 30  # points that a photo shares with another one that is near
-_FEW = 2  # such neighbours, with which a photo is weakly connected
+FEW = 2  # such neighbours, with which a photo is weakly connected
 _BLURRED = 0.3  # of the median sharpness
 _SPREAD = 0.5  # stops; photos of one exposure differ by less
 _WIDTH = 640  # pixels at which photos are compared, as sharpness depends on it
@@ -65,7 +65,7 @@ def findings(
     and `blurred`, names of photos; `brightness_spread_stops`; and `again`, a line for each thing to photograph again.
     """
     neighbours = neighbours_of(photos)
-    weak = sorted(name for name, others in neighbours.items() if len(others) < min(_FEW, len(photos) - 1))
+    weak = sorted(name for name, others in neighbours.items() if len(others) < min(FEW, len(photos) - 1))
     middle = float(np.median([look.sharpness for look in looks.values()])) if looks else 0.0
     blurred = sorted(name for name, look in looks.items() if look.sharpness < _BLURRED * middle)
     spread = float(np.std([look.brightness for look in looks.values()])) if looks else 0.0
@@ -85,7 +85,7 @@ def _again(left_out: list[str], weak: list[str], blurred: list[str], spread: flo
             "with 60 to 80 % of the one before"
         )
     if weak:
-        lines.append(f"around {some(weak)}: they share points with fewer than {_FEW} other photos; take more there")
+        lines.append(f"around {some(weak)}: they share points with fewer than {FEW} other photos; take more there")
     if blurred:
         lines.append(f"{some(blurred)}: they are blurred; hold still, or take more light")
     if spread > _SPREAD:

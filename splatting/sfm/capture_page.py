@@ -11,16 +11,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image, ImageDraw
 
 from splatting.files.json_files import read_json, write_json
-from splatting.sfm.capture import Look, findings, lines_of, looks_of, neighbours_of
-from splatting.sfm.colmap import worker_command
+from splatting.sfm.capture import FEW, Look, findings, lines_of, looks_of, neighbours_of
 from splatting.sfm.layout import Layout, image_names
-from splatting.sfm.programs import run_programs
 from splatting.sfm.report import summary
 from splatting.sfm.stages import Stage
 from utils.system_utils import atomic_write
 
+_SIDE, _MARGIN, _ARROW = 900, 60, 24  # pixels of the picture
 _STYLE = "body{font:15px sans-serif;max-width:60em;margin:2em auto}td,th{padding:2px 12px;text-align:left}"
 
 
@@ -28,10 +28,7 @@ def capture_stage(layout: Layout, names: Sequence[str]) -> Stage:
     """Make the stage that looks at the finished scene, adds what it is worth to the report, and writes the page."""
 
     def work() -> None:
-        out = layout.work / "capture.json"
-        command = worker_command(layout, "capture", model=str(layout.sparse / "0"), out=str(out))
-        run_programs(layout.log, [command], "Reading the scene", 1, out.exists)
-        survey, root = read_json(out), layout.prepared if layout.prepared.is_dir() else layout.input
+        survey, root = read_json(layout.capture), layout.prepared if layout.prepared.is_dir() else layout.input
         looks = looks_of(root, image_names(root))
         report = read_json(layout.report)
         report |= findings(report, survey["photos"], looks)
@@ -81,23 +78,33 @@ def from_above(directions: np.ndarray) -> np.ndarray:
 
 def _from_above(survey: Mapping[str, Any]) -> bytes:
     """A PNG: points in their colours, and each camera as an arrow along its view, the weakly connected ones red."""
-    from matplotlib.figure import Figure
-
     photos = survey["photos"]
     places, views, ups = (np.array([photo[key] for photo in photos.values()]) for key in ("place", "view", "up"))
     axes = from_above(ups)
-    points, colors = np.array(survey["points"]).reshape(-1, 3), np.array(survey["colors"]).reshape(-1, 3)
-    figure = Figure(figsize=(9, 7), layout="constrained")
-    plot = figure.subplots()
-    weak = np.array([len(others) < 2 for others in neighbours_of(photos).values()])
-    flat, seen = places @ axes.T, points @ axes.T
-    plot.scatter(*seen.T, s=2, c=colors / 255, linewidths=0)
-    plot.quiver(*flat.T, *(views @ axes.T).T, color=np.where(weak, "tab:red", "tab:blue"), width=0.003)
-    # Far points would leave the cameras a spot.
-    low, high = (np.quantile(np.concatenate([flat, seen]), q, axis=0) for q in (0.02, 0.98))
+    points, colors = np.array(survey["points"]).reshape(-1, 3), np.array(survey["colors"], np.uint8).reshape(-1, 3)
+    weak = [len(others) < FEW for others in neighbours_of(photos).values()]
+    flat, seen, along = places @ axes.T, points @ axes.T, views @ axes.T
+    # Without the farthest points, which would leave the cameras a spot.
+    low, high = (np.quantile(np.concatenate([flat, seen]), part, axis=0) for part in (0.02, 0.98))
     low, high = np.minimum(low, flat.min(0)), np.maximum(high, flat.max(0))
-    margin = 0.05 * (high - low).max() + 1e-9
-    plot.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
+    scale = (_SIDE - 2 * _MARGIN) / max(float((high - low).max()), 1e-9)
+
+    def pixels(flat: np.ndarray) -> np.ndarray:
+        return _SIDE / 2 + (flat - (low + high) / 2) * [scale, -scale]
+
+    canvas = np.full((_SIDE, _SIDE, 3), 255, np.uint8)
+    x, y = pixels(seen).astype(int).T
+    inside = (x >= 0) & (x < _SIDE - 1) & (y >= 0) & (y < _SIDE - 1)
+    for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        canvas[y[inside] + down, x[inside] + right] = colors[inside]
+    picture = Image.fromarray(canvas)
+    draw = ImageDraw.Draw(picture)
+    for start, way, is_weak in zip(pixels(flat), along * [1, -1], weak, strict=True):
+        color, across = "red" if is_weak else "blue", np.array([-way[1], way[0]])
+        end = start + _ARROW * way
+        draw.line([tuple(start), tuple(end)], fill=color, width=2)
+        head = (end, end - 0.4 * _ARROW * way + 0.2 * _ARROW * across, end - 0.4 * _ARROW * way - 0.2 * _ARROW * across)
+        draw.polygon([tuple(corner) for corner in head], fill=color)
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=120, metadata={"Software": None})
+    picture.save(buffer, "PNG")
     return buffer.getvalue()

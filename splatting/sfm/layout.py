@@ -26,6 +26,7 @@ class Layout:
         self.calibrated = work / "calibrated.db"  # a copy, into which global mapping writes its focal lengths
         self.frames = work / "frames.json"  # which of `input` are frames of videos
         self.given = work / "given.json"  # poses and cameras of --poses, for the photos that are here
+        self.capture = work / "capture.json"  # of worker.py, for the report of the capture
         self.log, self.stages = work / "colmap.log", work / "stages.json"
 
     def resized(self, factor: int) -> Path:

@@ -202,7 +202,8 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
             lines = report.advice(models, names, matches, settings.matcher, at_limit)
             lines += cameras.advice(chosen.cameras, lenses, settings.cameras)
         native = colmap.is_native(settings.lenses, {camera["model"] for camera in chosen.cameras})
-        job = {"model": str(layout.models / chosen.folder), "images": str(root), "out": str(layout.undistorted)}
+        paths = {"model": layout.models / chosen.folder, "images": root, "out": layout.undistorted}
+        job = {name: str(path) for name, path in (paths | {"capture": layout.capture}).items()}
         command = worker_command(layout, "undistort", **job, native=native, jpeg_quality=images.JPEG_QUALITY)
         written = layout.undistorted / "images"
         total = len(chosen.registered)

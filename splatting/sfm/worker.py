@@ -181,9 +181,8 @@ def _refit(model: pycolmap.Reconstruction, image: pycolmap.Image) -> list[float]
     return [factor, *(float(np.nanmedian(error)) for error in errors)]
 
 
-def capture(job: dict[str, Any]) -> None:
-    """Write where the photos of a model stand, and which points they share, to the JSON file `out`."""
-    model = pycolmap.Reconstruction(job["model"])
+def _write_capture(model: pycolmap.Reconstruction, path: str) -> None:
+    """Write where the photos of a model stand, and which points they share, to a JSON file."""
     images = {i: model.images[i] for i in model.reg_image_ids()}
     shared: dict[int, Counter] = {i: Counter() for i in images}
     for point in model.points3D.values():
@@ -206,13 +205,17 @@ def capture(job: dict[str, Any]) -> None:
         "points": [model.points3D[i].xyz.tolist() for i in chosen],
         "colors": [model.points3D[i].color.tolist() for i in chosen],
     }
-    Path(job["out"]).write_text(json.dumps(content), encoding="utf-8")
+    Path(path).write_text(json.dumps(content), encoding="utf-8")
 
 
 def undistort(job: dict[str, Any]) -> None:
-    """Write photos and model in COLMAP's layout into the folder `out`: as they are if `native`, else undistorted."""
+    """Write photos and model in COLMAP's layout into the folder `out`: as they are if `native`, else undistorted.
+
+    capture: of _write_capture.
+    """
+    model, out = pycolmap.Reconstruction(job["model"]), Path(job["out"])
+    _write_capture(model, job["capture"])
     if job["native"]:
-        model, out = pycolmap.Reconstruction(job["model"]), Path(job["out"])
         for name in [model.images[i].name for i in model.reg_image_ids()]:
             (out / "images" / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(Path(job["images"], name), out / "images" / name)
@@ -233,7 +236,7 @@ def _end_with_input() -> None:
     os._exit(1)
 
 
-STEPS = {step.__name__: step for step in (features, matching, mapping, triangulation, survey, undistort, capture)}
+STEPS = {step.__name__: step for step in (features, matching, mapping, triangulation, survey, undistort)}
 
 
 def main(path: str) -> None:
