@@ -103,8 +103,11 @@ def advice_at_poses(model: Model, images: Sequence[str]) -> list[str]:
         text = f"{len(out)} of {len(images)} photos have no pose in the file and were left out ({some(out)})"
         lines.append(f"{text}; add their poses, or omit --poses")
     if model.points < FEWEST_POINTS or model.error > LARGE_ERROR:
-        remedy += "; train.py --refine_poses corrects small errors of poses"
-        lines.append(f"the photos fit the given poses badly ({fit}); {remedy}")
+        # Imported here: it loads torch, which no other conversion needs.
+        from splatting.parts import tools
+
+        remedies = "; ".join((remedy, *(remedy_of(True) for remedy_of in tools("for_wrong_poses"))))
+        lines.append(f"the photos fit the given poses badly ({fit}); {remedies}")
     return lines
 
 
