@@ -4,6 +4,7 @@ import ast
 import contextlib
 import functools
 import io
+import pkgutil
 import re
 import runpy
 import subprocess
@@ -143,3 +144,11 @@ def test_the_worked_example_applies_to_the_code():
     diffs = "".join(re.findall(r"^```diff\n(.*?)^```$", page, re.MULTILINE | re.DOTALL))
     done = subprocess.run(["git", "apply", "--check", "-"], input=diffs, cwd=ROOT, capture_output=True, text=True)
     assert diffs and done.returncode == 0, f"bring the diffs of the page up to date: {done.stderr}"
+
+
+def test_the_pages_of_the_code_name_what_is_there():
+    """`make docs` fails else, which needs packages of its own."""
+    names = [
+        name for page in (ROOT / "docs/api").glob("*.md") for name in re.findall(r"^::: (\S+)", page.read_text(), re.M)
+    ]
+    assert len(names) > 50 and all(pkgutil.resolve_name(name) for name in names)
