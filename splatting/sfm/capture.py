@@ -114,6 +114,6 @@ def too_few(report: Mapping[str, Any]) -> str | None:
     if placed >= LEAST * count:
         return None
     return (
-        f"only {placed} of {count} photos are placed, so the scene shows a part of what was photographed; see `again` "
-        "above before you train it"
+        f"only {placed} of {count} photos are placed, so the scene shows a part of what was photographed; the lines "
+        "above say what to photograph again"
     )
