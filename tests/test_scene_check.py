@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+import torch
 from PIL import Image
 from synthetic import as_text, options_of, read
 
@@ -18,6 +19,7 @@ from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.copies import places_of
 from scene.gaussians.start import start_rows
+from scene.images.decode import decode
 from scene.readers.info import CameraInfo, SceneInfo
 from splatting.diagnosis.dataset import check_dataset
 from splatting.training.checks import check_scene
@@ -110,18 +112,47 @@ def test_a_part_of_a_large_photo_is_passed(sound):
     assert "principal" not in said(_cameras(read(sound), cx=-900.0))
 
 
-@pytest.mark.parametrize("exif", [False, True])
-def test_photos_turned_against_their_camera_are_refused(sound, tmp_path, exif):
-    scene = Path(shutil.copytree(sound, tmp_path / "scene"))
+TURNS = {
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}  # what a device with this orientation did to the upright picture
+
+
+def lie_down(scene: Path, orientation: int, turn: Image.Transpose) -> None:
     for path in (scene / "images").rglob("*.png"):
-        turned = Image.open(path).transpose(Image.Transpose.ROTATE_90)
-        orientation = turned.getexif()
-        orientation.update({0x0112: 6} if exif else {})
-        turned.save(path, exif=orientation)
+        turned = Image.open(path).transpose(turn)
+        exif = turned.getexif()
+        exif[0x0112] = orientation
+        turned.save(path, exif=exif)
+
+
+@pytest.mark.parametrize("orientation", [1, 3])
+def test_photos_turned_against_their_camera_are_refused(sound, tmp_path, orientation):
+    scene = Path(shutil.copytree(sound, tmp_path / "scene"))
+    lie_down(scene, orientation, Image.Transpose.ROTATE_90)
     with pytest.raises(UserError, match=r"17 of 17 photos have the sides .* \(64 x 96, camera 96 x 64\); turn"):
         read(scene)
     (line,) = check_dataset(str(scene), "images")
     assert "sides of their camera exchanged" in line.text
+
+
+@pytest.mark.parametrize("orientation", TURNS)
+def test_photos_that_exif_turns_are_made_upright(sound, tmp_path, monkeypatch, capsys, orientation):
+    """Also the second time, where a copy in the cache was cut short."""
+    monkeypatch.setenv("GS_CACHE", str(tmp_path / "cache"))
+    scene = Path(shutil.copytree(sound, tmp_path / "scene"))
+    lie_down(scene, orientation, TURNS[orientation])
+    for _ in range(2):
+        for view, upright in zip(read(scene).train_cameras, read(sound).train_cameras, strict=True):
+            assert view.file_size == upright.file_size == (96, 64)
+            assert torch.equal(decode(view.image_path, (96, 64)), decode(upright.image_path, (96, 64)))
+        said = capsys.readouterr().err
+        assert "17 of 17 photos are turned as their EXIF orientation says" in said and str(tmp_path / "cache") in said
+        cut = next((tmp_path / "cache" / "turned").iterdir())
+        cut.write_bytes(cut.read_bytes()[:-40])
+    assert not [line for line in check_dataset(str(scene), "images") if "exchanged" in line.text]
 
 
 @pytest.mark.parametrize("apart", [0.0, 1e-6])

@@ -247,8 +247,8 @@ def turned(names: Sequence[str], count: int, photo: tuple[int, int], camera: tup
     return (
         f"{len(names)} of {count} photos have the sides of their camera exchanged, the first {names[0]} ({size}, "
         f"camera {other})",
-        "turn the photos as their EXIF orientation says (mogrify -auto-orient), or exchange width and height of the "
-        "camera" + (", or restore the names of these photos" if len(names) < count else ""),
+        "turn the photos, or exchange width and height of the camera"
+        + (", or restore the names of these photos" if len(names) < count else ""),
     )
 
 

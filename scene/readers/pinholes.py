@@ -11,7 +11,8 @@ from diff_gaussian_rasterization.lens import MODELS, lens_of
 from scene.images.decode import picture_size, picture_sizes
 from scene.images.lens import PANORAMA, Lens, Pinhole, pinhole_of, undistortion
 from scene.images.masks import Mask
-from scene.readers.info import CameraInfo, are_exchanged, turned
+from scene.readers.info import CameraInfo, turned
+from scene.readers.turned import exchanged, turned_by_exif
 from scene.readers.undistortion import undistort
 from utils.system_utils import UserError
 
@@ -71,11 +72,13 @@ def finished(cameras: Sequence[CameraInfo], opaque: bool = False) -> list[Camera
 
     opaque: alpha of the photos is dropped, before undistortion mixes it with colours.
 
-    A message says which photos have another shape than their camera. UserError for photos that cannot be read or are
-    turned against their camera, and for a mask that cannot be used.
+    Photos that lie on their side against their camera are turned, if their EXIF orientation says so. A message says
+    which photos have another shape than their camera. UserError for photos that cannot be read or stay on their side,
+    and for a mask that cannot be used.
     """
     sizes = picture_sizes([camera.image_path for camera in cameras])
     cameras = [replace(camera, file_size=size, opaque=opaque) for camera, size in zip(cameras, sizes, strict=True)]
+    cameras = turned_by_exif(cameras)
     _refuse_turned(cameras)
     _warn_of_other_shapes(cameras)
     for camera in cameras:
@@ -99,14 +102,10 @@ def _check_mask(mask: Path, size: tuple[int, int]) -> None:
 
 def _refuse_turned(cameras: Sequence[CameraInfo]) -> None:
     """UserError if photos would be stretched from upright to lying, or the other way round."""
-    wrong = []
-    for camera in cameras:
-        lens = camera.lens or camera
-        if are_exchanged(camera.file_size, (lens.width, lens.height)):
-            wrong.append((camera, (lens.width, lens.height)))
+    wrong = [camera for camera in cameras if exchanged(camera)]
     if wrong:
-        (camera, size), names = wrong[0], [camera.image_name for camera, _ in wrong]
-        raise UserError("; ".join(turned(names, len(cameras), camera.file_size, size)))
+        lens, names = wrong[0].lens or wrong[0], [camera.image_name for camera in wrong]
+        raise UserError("; ".join(turned(names, len(cameras), wrong[0].file_size, (lens.width, lens.height))))
 
 
 def _warn_of_other_shapes(cameras: Sequence[CameraInfo]) -> None:
