@@ -21,7 +21,8 @@ SEED = 0
 FEWEST_SEEN = 50  # points of a photo that tell its focal length
 MOST_SEEN = 400  # that are asked: more take longer and tell no more
 _NEIGHBOURS, _SHOWN = 30, 5000  # other photos of a photo, and points, in capture.json
-THREADS = 1  # of mapping: several add numbers in the order in which they happen to finish
+# Of mapping, -1: all cores. Several add numbers in the order in which they happen to finish, so one repeats bytes.
+THREADS = 1 if os.environ.get("OMP_NUM_THREADS") == "1" else -1
 FISHEYE_ANGLE = 2.6  # radians along the longer side, 150 degrees: first guess for a fisheye
 
 
