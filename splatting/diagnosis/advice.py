@@ -30,6 +30,7 @@ from splatting.parts import check_together, chosen, options_of, tools
 from utils.system_utils import UserError, mkdir_p
 
 ADVICE = "advice.json"  # what train.py --advise writes: texts, and options that the scene asks for
+GUIDE = "docs/guide/scene_options.md"  # what these options do, gain and cost
 DISTANCES = 2.5  # the farthest photo of a point over the nearest
 _OFF = (False, "", "none", "off")  # values of options that do nothing; 0 is equal to False
 _NOT_OF_DATA = {  # model options that the short training of small photos has itself, or does without
@@ -84,6 +85,7 @@ def asked_options(dataset: argparse.Namespace, args: argparse.Namespace, given: 
     if written:
         write_json(Path(dataset.model_path) / ADVICE, [advice._asdict() for advice in found])
     words = " ".join(advice.options for advice in found).split()
+    print(f"{GUIDE} says what each option does, gains and costs")
     print(f"options that this scene asks for, besides those given: {' '.join(words) or 'none'}")
     return words
 

@@ -12,7 +12,7 @@ CAP, PLANNED, STRATEGY = "max_num_splats", "iterations_planned", "strategy"
 BUDGET = "default_budget"  # Gaussians that --strategy budget takes for the scene where no number is given
 FITTED = 18.0  # dB of training views; below, nothing is called overfitting
 CLEAR = 0.1  # dB between two points; those of a settled training differed by up to 0.07
-MANY = 2  # times as many are more than the scene needs (docs/guide/strategies.md: better with a fifth)
+MANY = 2  # times as many are more than the scene needs (docs/results/training.md: better with a fifth)
 FULL = 0.99  # of the cap: a densification that removes some Gaussians ends a little below it
 SETTLED = 1000  # iterations; the default densification begins after 500, so that a shorter training says little
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from scene.readers.tracks import Track
 from scene.scene import Scene
 
-FEW_PHOTOS = 16  # 14 gained 0.2 dB by points that hold the depth, 20 and 21 lost as much (docs/results/photos.md)
+FEW_PHOTOS = 16  # 14 gained 0.2 dB by points that hold the depth, 20 and 21 lost as much (docs/results/options.md)
 
 
 def advise(scene: Scene, tracks: Sequence[Track | None]) -> Iterator[tuple[str, str]]:
