@@ -77,7 +77,7 @@ def keep_freed_memory() -> None:
     """Keep freed memory for the next allocation; by default glibc returns it to the system.
 
     A step on the CPU frees as much memory as the next one takes, which the system would have to clear again: up to a
-    tenth of a training (docs/results/tried.md). Nothing changes without glibc, or where the environment sets limits.
+    tenth of a training (docs/inside/notebook.md). Nothing changes without glibc, or where the environment sets limits.
     """
     if any(name.startswith("MALLOC_") or name == "GLIBC_TUNABLES" for name in os.environ):
         return

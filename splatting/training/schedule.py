@@ -14,7 +14,7 @@ from splatting.parts import strategies
 
 USUAL = 30_000  # iterations that the default learning rates are for
 LONGER = 2.0  # times the root of the stride
-MOST_RATE = 8.0  # about the best for 1,300 iterations in place of 30,000 (docs/results/tried.md)
+MOST_RATE = 8.0  # about the best for 1,300 iterations in place of 30,000 (docs/inside/notebook.md)
 SETTLING = 0.7  # part of the schedule from which on steps get shorter
 LEAST_RATE = 0.1  # part of a rate that is left at the end
 Levels = Sequence[tuple[float, float]]  # part of the schedule that is done (0 to 1), and factor of sizes from then on
