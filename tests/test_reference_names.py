@@ -1,4 +1,4 @@
-"""The names of docs/inside/reference_names.md: each is there, and takes the arguments of both releases."""
+"""The names of the reference: each is here, takes the arguments of both releases, and stands on the page."""
 
 import argparse
 import ast
@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import pytest
 
+CONTRACT = Path(__file__).with_name("reference_names.txt")
 PAGE = Path(__file__).parents[1] / "docs" / "inside" / "reference_names.md"
 SHORT = {
     "GaussianModel": "scene.gaussian_model.GaussianModel",
@@ -17,11 +18,10 @@ SHORT = {
     "Camera": "scene.cameras.Camera",
 }
 ABSENT, VALUE, SAME = "–", "yes", "="
-LISTS = {"Values of both releases": (VALUE, VALUE), "Values of 2024 alone": (ABSENT, VALUE)}
 
 
 class Name(NamedTuple):
-    """A row of the page, or a name of a block or list on it."""
+    """A line of the contract."""
 
     name: str
     release2023: str
@@ -29,16 +29,9 @@ class Name(NamedTuple):
 
 
 def _rows() -> list[Name]:
-    page = PAGE.read_text(encoding="utf-8")
-    found = []
-    for name, first, second in re.findall(r"^\| `([\w.]+)` \| (.+?) \| (.+?) \|", page, re.MULTILINE):
-        found.append(Name(name, first.strip("`"), (first if second == SAME else second).strip("`")))
-    for block in re.findall(r"^```text\n(.*?)^```$", page, re.MULTILINE | re.DOTALL):
-        found += [Name(name, cell, cell) for name, cell in re.findall(r"^([\w.]+)(\(.*\))$", block, re.MULTILINE)]
-    for title, cells in LISTS.items():
-        for names in re.findall(rf"^{title}: (.+?)\.$", page, re.MULTILINE | re.DOTALL):
-            found += [Name(name, *cells) for name in re.findall(r"`([\w.]+)`", names)]
-    return found
+    lines = CONTRACT.read_text(encoding="utf-8").splitlines()
+    cells = [line.split(" | ") for line in lines if line and not line.startswith("#")]
+    return [Name(name, first, first if second == SAME else second) for name, first, second in cells]
 
 
 def _resolve(dotted: str) -> object:
@@ -105,4 +98,7 @@ def test_a_name_of_the_reference_is_here(row, instances):
 
 
 def test_the_page_lists_the_names_of_the_contract():
+    lists = re.findall(r"^- `([\w.]+)`: ((?:`\w+`†?,?\s+)*`\w+`†?)\.$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    names = [(f"{home}.{name}", late) for home, group in lists for name, late in re.findall(r"`(\w+)`(†?)", group)]
+    assert sorted(names) == sorted((row.name, "†" * (row.release2023 == ABSENT)) for row in ROWS)
     assert len(ROWS) > 150

@@ -37,8 +37,8 @@ from utils.system_utils import UserError
 
 BETAS, EPS = (0.9, 0.999), 1e-15
 MOST_RATIO = 0.1 / math.sqrt(0.001 * (1 - 0.81 / 0.999))  # of |m| / sqrt(v) (csrc/math/sleep.h)
-SCENES, STEPS = 6, (5, 60)  # of random blocks; 1000, or 1 and (7000, 7001), for the figures of docs/inside/sleep.md
-VIEWS = 12  # random ones of each lens; 1000 for the figures of docs/inside/sleep.md
+SCENES, STEPS = 6, (5, 60)  # of random blocks; 1000, or 1 and (7000, 7001), to measure the rounding
+VIEWS = 12  # random ones of each lens; 1000 for a thorough test
 COVERING = "together", "poses", "budget", "absgrad"  # the steps of other names are captured alone
 NAMES = ("default", "poses", "white", "masks", "exposure", "depth", "absgrad", "together", "budget", "degree 0", "rays")
 CHECKPOINTS = 42, 33, 19, 20, 30, 59
