@@ -124,7 +124,7 @@ def lie_down(scene: Path, orientation: int, turn: Image.Transpose) -> None:
     for path in (scene / "images").rglob("*.png"):
         turned = Image.open(path).transpose(turn)
         exif = turned.getexif()
-        exif[0x0112] = orientation
+        exif.update({0x0112: orientation, 0x010F: "maker"})
         turned.save(path, exif=exif)
 
 
@@ -148,6 +148,7 @@ def test_photos_that_exif_turns_are_made_upright(sound, tmp_path, monkeypatch, c
         for view, upright in zip(read(scene).train_cameras, read(sound).train_cameras, strict=True):
             assert view.file_size == upright.file_size == (96, 64)
             assert torch.equal(decode(view.image_path, (96, 64)), decode(upright.image_path, (96, 64)))
+            assert dict(Image.open(view.image_path).getexif()) == {0x010F: "maker"}
         said = capsys.readouterr().err
         assert "17 of 17 photos are turned as their EXIF orientation says" in said and str(tmp_path / "cache") in said
         cut = next((tmp_path / "cache" / "turned").iterdir())

@@ -22,7 +22,7 @@ from scene.images.decode import picture_size
 from scene.images.side_files import SideFiles
 from scene.readers.colmap import find_model
 from scene.readers.info import CameraInfo, SceneInfo
-from splatting.files.folders import cache_folder
+from scene.readers.undistortion import undistorted_folder
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.listing import some
 from splatting.files.plain_files import plain, plain_text
@@ -146,7 +146,7 @@ def with_depth_maps(info: SceneInfo, scene: Path, depths: str) -> SceneInfo:
         raise UserError(
             f"no folder of depth maps {folder}; name it with -d relative to the scene folder, or leave -d out"
         )
-    undistorted = [c.image_name for c in info.train_cameras if Path(c.image_path).is_relative_to(cache_folder())]
+    undistorted = [c.image_name for c in info.train_cameras if Path(c.image_path).is_relative_to(undistorted_folder())]
     if undistorted:
         raise UserError(
             f"-d needs photos without distortion: {len(undistorted)} photos are undistorted on load, while their depth "

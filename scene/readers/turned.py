@@ -85,7 +85,10 @@ def _copy(photo: Path, turn: int, size: tuple[int, int], folder: Path) -> Path:
             return path
     except UserError:
         pass  # not made yet, or cut short
+    with open_image(photo) as image:
+        exif = image.getexif()  # of the lens, for instance
+    del exif[ExifTags.Base.Orientation]
     pixels = decode(photo, size).permute(1, 2, 0).numpy()
     with atomic_write(path, every_rank=True) as temporary:
-        Image.fromarray(pixels).transpose(_TURNS[turn]).save(temporary, compress_level=1)
+        Image.fromarray(pixels).transpose(_TURNS[turn]).save(temporary, compress_level=1, exif=exif)
     return path

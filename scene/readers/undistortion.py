@@ -34,13 +34,18 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 
+def undistorted_folder() -> Path:
+    """Folder of the undistorted photos in the user's cache."""
+    return cache_folder() / "undistorted"
+
+
 def undistort(photos: Sequence[CameraInfo]) -> list[CameraInfo]:
     """The views with their undistorted photos, made now or found in the cache, with a progress bar on stderr.
 
     Bilinear, as in COLMAP. Alpha is undistorted, too, and weights the colours. UserError for a broken photo or a cache
     that cannot be written.
     """
-    folder = cache_folder() / "undistorted"
+    folder = undistorted_folder()
     try:
         mkdir_p(folder)
     except UserError as error:
