@@ -77,9 +77,17 @@ PROGRAMS = sorted({program for _, program, _ in COMMANDS})
 
 @functools.cache
 def _flags(program: str) -> frozenset[str]:
-    """Every option that `-h` lists. In this process, as importing torch takes seconds."""
+    """Every option that the program's help lists."""
+    said = _help(program, "-h")
+    if "--help-all" in said:
+        said = _help(program, "--help-all")
+    return frozenset(re.findall(r"(?<![\w-])--?[A-Za-z][\w-]*", said))
+
+
+def _help(program: str, word: str) -> str:
+    """What the program prints with one word. In this process, as importing torch takes seconds."""
     said, argv, path = io.StringIO(), sys.argv, sys.path.copy()
-    sys.argv = [program, "-h"]
+    sys.argv = [program, word]
     try:
         with contextlib.redirect_stdout(said), warnings.catch_warnings(), pytest.raises(SystemExit) as ended:
             warnings.simplefilter("ignore")  # a module may be loaded already
@@ -90,7 +98,7 @@ def _flags(program: str) -> frozenset[str]:
     finally:
         sys.argv, sys.path[:] = argv, path
     assert not ended.value.code, said.getvalue()
-    return frozenset(re.findall(r"(?<![\w-])--?[A-Za-z][\w-]*", said.getvalue()))
+    return said.getvalue()
 
 
 def test_every_benchmark_is_shown_and_shows_how_it_is_run():

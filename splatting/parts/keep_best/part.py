@@ -20,9 +20,9 @@ class KeepBest(Part):
     tools = "remarks", "against_overfitting"
     # fmt: off
     options = Options(model=(
-        Option("keep_best", False, origin="ours", stored=MODEL_JSON,
-            help="take every 16th training photo, and at least two, for validation: the last save is the model "
-                 "that showed them best, of all points scored"),
+        Option("keep_best", False, origin="ours", stored=MODEL_JSON, topic="quality and speed",
+            help="hold out every 16th training photo, and at least two, for validation; the last save is the model "
+                 "with the best scores on them"),
     ))
     # fmt: on
     needs = Needs(ranks=False)
