@@ -94,7 +94,7 @@ class ModelParams(OptionTable):
             if named == kind:
                 setattr(values, flag, True)
             elif named != "none" and getattr(values, flag, False):
-                raise UserError(f"--{flag} is --appearance {kind}; leave it out, or --appearance {named}")
+                raise UserError(f"--{flag} means --appearance {kind}; leave out --{flag} or --appearance {named}")
         if getattr(values, "source_path", ""):
             values.source_path = os.path.abspath(values.source_path)
         return values

@@ -41,7 +41,7 @@ def test_advice_on_a_given_option_or_against_one_is_not_taken(tmp_path, monkeypa
     args = argparse.Namespace(keep_best=False, train_test_exp=False, projection="ray", strategy="adc", advise=True)
     dataset = argparse.Namespace(model_path=str(tmp_path))
     assert advice.asked_options(dataset, args, ["--app=none", "-r", "2"]) == ["--sky", "auto"]
-    assert "--refine_poses is left out: --refine_poses does not work with --projection ray" in capsys.readouterr().out
+    assert "not recommended here: --refine_poses (--refine_poses does not work with" in capsys.readouterr().out
     assert [one["options"] for one in json.loads((tmp_path / advice.ADVICE).read_text())] == ["--sky auto", "", ""]
 
 

@@ -51,8 +51,7 @@ class CoarseToFine(Part):
             schedule.levels = PYRAMID if schedule.sizes == "pyramid" else ()
         elif asked not in ("auto", schedule.sizes):
             raise UserError(
-                f"the schedule that this run follows is of a run with --resolution_schedule {schedule.sizes}; leave "
-                "that option out, as it is taken from there"
+                f"the schedule of this run already sets --resolution_schedule {schedule.sizes}; leave that option out"
             )
         self._run = run
         run.opt.resolution_schedule = schedule.sizes

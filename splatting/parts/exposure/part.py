@@ -68,7 +68,7 @@ class Exposure(Appearance):
     def begin(self, run: Any, state: Any) -> None:
         run.gaussians.exposures.applied = True
         if run.start and state is None:
-            print(f"{run.start} has no exposures: all photos start without a correction")
+            print(f"{run.start} has no exposures; all photos start without a correction")
 
     def save(self, scene: "Scene") -> None:
         from splatting.compat.models import save_exposures

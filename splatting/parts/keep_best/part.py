@@ -26,7 +26,7 @@ class KeepBest(Part):
     ))
     # fmt: on
     needs = Needs(ranks=False)
-    against = {"needs.photos": "as it keeps Gaussians alone; leave one of them out"}
+    against = {"needs.photos": "which trains more than Gaussians; leave one of them out"}
 
     def dataset(self, info: "SceneInfo", args: "argparse.Namespace", fresh: bool) -> "SceneInfo":
         from splatting.parts.keep_best.validation import without_validation

@@ -33,7 +33,7 @@ class Sky(Part):
         if state is not None:
             self.shell = shell.resumed_shell(state, run.scene)
         elif run.start:
-            print("--sky auto: the checkpoint has no sky, and a sky is added only when a training starts")
+            print("--sky auto has no effect: the checkpoint has no sky, and only new trainings add one")
         else:
             self.shell = shell.with_shell(run.scene, run.gaussians)
         self.active = self.shell is not None

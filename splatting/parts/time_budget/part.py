@@ -42,8 +42,8 @@ class TimeBudget(Part):
     @classmethod
     def dropped(cls, given: "argparse.Namespace", iteration: int) -> str | None:
         return (
-            f"{given.start_checkpoint} is of a run with --time_budget or --schedule, and this one has neither: it goes "
-            f"on at iteration {iteration} of --iterations {given.iterations}"
+            f"{given.start_checkpoint} was trained with --time_budget or --schedule; this run has neither and "
+            f"continues at iteration {iteration} of --iterations {given.iterations}"
         )
 
     def check(self, run: Any, state: Any) -> None:
