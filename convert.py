@@ -70,7 +70,7 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
         planned.append(stages.resize_stage(layout))
     kept += record.run(planned)
     if kept:
-        print(f"done before: {', '.join(kept)} (to start from the beginning, remove {layout.work})")
+        print(f"reused from an earlier run: {', '.join(kept)}; remove {layout.work} to start from the beginning")
     notes = [NOTE] if taken_frames(layout) else []
     report = report_inputs(layout.report, notes=notes, unused=found.unused, videos=report_entries(layout))
     print("\n".join((summary(report), lens_words(report), *lines_of(report), f"all of it: {layout.page}")))

@@ -31,7 +31,7 @@ def diagnose(source: str | None, images: str | None, model: str | None, iteratio
         complete = environment.extensions_load()
     problems = _show("environment", lines)
     if not complete:
-        print("dataset and model were not checked, since that needs the packages")
+        print("dataset and model were not checked, because packages are missing")
         return problems
     from utils.system_utils import UserError
 

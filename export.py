@@ -50,7 +50,8 @@ def load(args: argparse.Namespace, options: argparse.Namespace, needs_views: boo
     if needs_views:
         if not args.model_path:
             raise UserError(
-                f"--max_splats and pages need training views; give -m of their model beside --ply {args.ply}"
+                "--max_splats and HTML pages need training views; give their model folder with -m beside "
+                f"--ply {args.ply}"
             )
         options.images_to_load = 1  # each image is used once or twice
         smooth = argparse.Namespace(antialiasing=bool(args.antialiasing))
@@ -117,7 +118,7 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
         keep = thin_out(scene, keep, degree, args.max_splats, pipe, options, scored=args.crop is None)
     chosen = tidy(with_sh_degree(selected(splats, keep), degree))
     if getattr(pipe, "projection", "ewa") == "ray":
-        print("The model was trained with --projection ray; other programs show large Gaussians off the axis otherwise")
+        print("The model was trained with --projection ray; other programs draw large Gaussians off axis differently")
     start = time.perf_counter()
     background = (1.0, 1.0, 1.0) if options.white_background else (0.0, 0.0, 0.0)
     entry.write(args.to, chosen, *((scene.getTrainCameras(), make_path, background) if entry.of_scene else ()))
@@ -134,7 +135,7 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
 def _refuse_to_replace_a_model(file: Path, source: str | None) -> None:
     saved = file.absolute().parent.parent.name == "point_cloud" or (file.parent / "cfg_args").is_file()
     if saved and file.exists() or (source and file.exists() and file.samefile(source)):
-        raise UserError(f"{file} is a trained model or what it began from; name another file by --to")
+        raise UserError(f"--to {file} would overwrite a trained model or its input; choose another file")
 
 
 def _path_maker(path: str | None, entry: Format) -> Callable[[Poses], TimedPath] | None:
@@ -142,7 +143,7 @@ def _path_maker(path: str | None, entry: Format) -> Callable[[Poses], TimedPath]
     if path is None:
         return None
     if not entry.of_scene:
-        raise UserError(f"--path is the animation of a page; leave it out for {entry.ending}, or end --to with .html")
+        raise UserError(f"--path animates an HTML page; leave it out for {entry.ending}, or end --to with .html")
     from splatting.camera_paths.render_path import path_maker
 
     return path_maker(path)

@@ -105,7 +105,7 @@ def _scenes(args: Namespace) -> list[SceneEntry]:
     roots = [(group, root) for group in groups if (root := getattr(args, group))]
     scenes = [entry for group, root in roots for entry in plan.dataset_scenes(group, root, args.resize)]
     if args.resize and not args.mipnerf360:
-        raise UserError("--resize is of Mip-NeRF 360; give -m360, or leave it out and pass -r to train.py after --")
+        raise UserError("--resize works with -m360 only; give -m360, or pass -r to train.py after --")
     scenes += plan.folder_scenes(args.scenes)
     if not scenes and args.skip_training and args.skip_rendering:
         scenes = plan.finished_scenes(args.output_path)

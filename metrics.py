@@ -193,7 +193,7 @@ def make_metrics(lpips_net: str, weights: Path | None, smallest_side: int) -> di
             network = load_network(net, weights, device)
             metrics.update({key: _lpips_metric(network, key == "LPIPS", device) for key in mine})
         except LpipsUnavailable as reason:
-            print(f"{', '.join(mine)} are null unless scored before: {reason}")
+            print(f"{', '.join(mine)} cannot be computed and are null unless scored before: {reason}")
     if weights:
         try:
             metrics["DISTS"] = _dists_metric(load_dists(weights, device), device)
@@ -327,7 +327,7 @@ def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str,
         shown = "  ".join(f"{key} {'null' if value is None else f'{value:.4f}'}" for key, value in means.items())
         print(f"{model} {name} ({len(methods[name])} views): {shown}")
         if equal := sum(value is None for value in per_view[name]["PSNR"].values()):
-            print(f"{equal} of these views are shown exactly; their PSNR is infinite and not part of the mean")
+            print(f"{equal} renders equal their photos; their PSNR is infinite, and the mean leaves them out")
         if worst := renders.worst_views(model, per_view[name]["PSNR"]):
             print("worst views:", ", ".join(f"{it['picture']} {it['PSNR']:.2f} dB" for it in worst))
     info = {

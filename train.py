@@ -15,11 +15,11 @@ from typing import Any
 import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
 
-from arguments import ModelParams, OptimizationParams, OptionParser, PipelineParams, write_cfg_args, write_model_json
+from arguments import write_cfg_args, write_model_json
 from splatting.distributed.consistency import agree_on_options
 from splatting.parts import check_together, chosen, tools
 from splatting.training.earlier_runs import resolve_lenses
-from splatting.training.launch import add_launch_options, launch_options
+from splatting.training.launch import launch_options, training_parser
 from splatting.training.loop import run_training
 from splatting.training.observers.report import training_report
 from splatting.training.observers.standard import standard_observers
@@ -90,9 +90,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, ...]:
 
     UserError for a value out of range; argparse ends the program at a word that it does not know.
     """
-    parser = OptionParser(description="Train a Gaussian model from photos with known cameras.")
-    groups = ModelParams(parser), OptimizationParams(parser), PipelineParams(parser)
-    add_launch_options(parser)
+    parser, groups = training_parser()
     args = parser.parse_args(argv)
     options = [group.extract(args) for group in groups]
     for name in ("test_iterations", "save_iterations", "checkpoint_iterations"):

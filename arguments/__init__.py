@@ -16,6 +16,7 @@ from arguments.stored import (
     write_cfg_args,
     write_model_json,
 )
+from arguments.topics import TopicParser
 
 __all__ = [
     "OPTIONS",
@@ -27,6 +28,7 @@ __all__ = [
     "OptionParser",
     "ParamGroup",
     "PipelineParams",
+    "TopicParser",
     "add_to_model_json",
     "get_combined_args",
     "read_cfg_args",

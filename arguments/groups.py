@@ -7,7 +7,7 @@ from collections.abc import Collection
 from arguments.param_group import GroupParams, OptionTable
 from splatting.files.json_files import MODEL_JSON
 from splatting.parts import appearances, options_of, part_class, strategies
-from splatting.training.option import CFG_ARGS, Option, above, at_least, in_places, one_of, within
+from splatting.training.option import CFG_ARGS, MOST_NEEDED, Option, above, at_least, in_places, one_of, within
 from utils.system_utils import UserError
 
 
@@ -22,60 +22,60 @@ class ModelParams(OptionTable):
     # fmt: off
     options = in_places((
         Option("sh_degree", 3, origin="paper", check=within(0, 3), stored=CFG_ARGS, compared=False,
-            loaded="that of the saved PLY",
+            loaded="that of the saved PLY", topic="quality and speed",
             help="highest degree, 0 to 3, of the spherical harmonics that make colour depend on the view; higher: "
                  "more view-dependent detail, more memory"),
-        Option("source_path", "", origin="none, must be given", short="s", stored=CFG_ARGS,
-            help="scene folder (COLMAP, Blender or nerfstudio)"),
-        Option("model_path", "",
-            origin="a new one under ./output, named after OAR_JOB_ID or at random, as in the reference", short="m",
-            stored=CFG_ARGS, compared=False, loaded="none, must be given",
-            help="folder of the model"),
-        Option("images", "images", short="i", stored=CFG_ARGS,
+        Option("source_path", "", short="s", stored=CFG_ARGS, topic=MOST_NEEDED, unset="none, must be given",
+            help="scene folder: COLMAP, Blender, nerfstudio, or an export of Metashape, Polycam or Record3D"),
+        Option("model_path", "", short="m", stored=CFG_ARGS, compared=False, loaded="none, must be given",
+            topic=MOST_NEEDED, unset="a new folder under ./output, named after OAR_JOB_ID or at random",
+            help="model folder"),
+        Option("images", "images", short="i", stored=CFG_ARGS, topic="data",
             help="folder of the photos inside the scene folder (COLMAP only)"),
         *options_of("model"),
-        Option("resolution", -1, short="r", check=_resolution, stored=CFG_ARGS,
+        Option("resolution", -1, short="r", check=_resolution, stored=CFG_ARGS, topic=MOST_NEEDED,
             help="1, 2, 4, 8: divide the size of the photos by this; -1: keep their size, but at most 1600 pixels "
-                 "wide; any other value: width in pixels"),
-        Option("white_background", False, "white background instead of black", short="w", stored=CFG_ARGS),
-        Option("data_device", "cuda", stored=CFG_ARGS, compared=False,
-            help="device that holds the images, as 8-bit values. With cpu, or if they would take more than a quarter "
-                 "of the GPU's free memory, pinned memory of the CPU holds them and they are copied ahead of their "
-                 "use. Without a usable GPU, cuda means the CPU"),
-        Option("eval", False, stored=CFG_ARGS,
-            help="hold out a test set: every 8th photo by name, or Blender's test frames"),
-        Option("init_pcd_path", "", origin="ours",
-            help="file of points to start from instead of the scene's own: PLY, npz (points, colors), or text whose "
-                 "lines are x y z or x y z red green blue"),
-        Option("init_ply", "", origin="ours",
-            help="model to start from, with its Gaussians' shapes and colours: PLY or compressed PLY of any tool, SPZ "
-                 "or .splat; a point cloud is taken as by --init_pcd_path"),
-        Option("init_type", "sfm", origin="ours", check=one_of("sfm", "random"),
+                 "wide; other values: width in pixels"),
+        Option("white_background", False, short="w", stored=CFG_ARGS, topic="data",
+            help="white background instead of black"),
+        Option("data_device", "cuda", stored=CFG_ARGS, compared=False, topic="memory",
+            help="device that holds the images. With cpu, or if they would take more than a quarter of the GPU's free "
+                 "memory, the host's memory holds them, and each is copied to the GPU before it is used. Without a "
+                 "usable GPU, cuda means cpu"),
+        Option("eval", False, stored=CFG_ARGS, topic=MOST_NEEDED,
+            help="hold out a test set, which training does not use: every 8th photo by name, or Blender's test frames"),
+        Option("init_pcd_path", "", origin="ours", topic="data",
+            help="file of points to start from instead of the scene's own: PLY, npz (points, colors), or text with "
+                 "x y z or x y z red green blue in each line"),
+        Option("init_ply", "", origin="ours", topic="data",
+            help="model whose Gaussians training starts from: PLY or compressed PLY of any program, SPZ or .splat; "
+                 "a point cloud is read as by --init_pcd_path"),
+        Option("init_type", "sfm", origin="ours", check=one_of("sfm", "random"), topic="data",
             help="points to start from without --init_pcd_path and --init_ply. sfm: the scene's own; random: grey "
                  "points in the cameras' frusta, or in the reference's cube for Blender scenes"),
-        Option("masks", "", origin="ours", stored=MODEL_JSON,
+        Option("masks", "", origin="ours", stored=MODEL_JSON, topic="data",
             help="folder of mask files inside the scene folder, or an absolute path; black is masked. A mask has its "
                  "photo's name, with .png, .mask.png or _mask.png appended or with another suffix. Empty: the masks "
                  "that a nerfstudio scene names"),
-        Option("invert_masks", False, "white is masked instead of black", "ours", stored=MODEL_JSON),
+        Option("invert_masks", False, "white is masked instead of black", "ours", stored=MODEL_JSON, topic="data"),
         Option("mask_meaning", "auto", origin="ours", check=one_of("auto", "ignore", "transparent", "none"),
-            stored=MODEL_JSON,
+            stored=MODEL_JSON, topic="data",
             help="meaning of pixels masked by mask files or by the photos' alpha. ignore: leave them out of loss and "
                  "scores; transparent: they show the background; auto: ignore for mask files, transparent for alpha; "
-                 "none: ignore for mask files, and photos count as opaque"),
+                 "none: ignore for mask files, and photos are opaque"),
         Option("lenses", "auto", origin="ours", check=one_of("auto", "undistort", "native"), stored=MODEL_JSON,
-            help="photos of distorting lenses. native: train on the photos as they are, through their lenses, where "
-                 "the rasterizer knows the camera model; undistort: resample them to pinhole images when they are "
-                 "loaded; auto: native, but as before in a resumed training, and undistort in code that does not "
-                 "train by train.py"),
+            topic="cameras",
+            help="photos of distorting lenses. native: train on the photos as they are, if the rasterizer knows the "
+                 "camera model; undistort: resample them to pinhole images when they are loaded; auto: native; a "
+                 "resumed training keeps what it began with, and code that does not use train.py undistorts"),
         Option("appearance", "none", origin="ours", check=one_of("none", *(one.kind for one in appearances())),
-            stored=MODEL_JSON,
-            help="how photos of different exposure train. " + "; ".join(f"{a.kind}: {a.summary}" for a in appearances())
-                 + "; exports and viewers show none of it"),
-        Option("images_to_load", 0, origin="ours", check=at_least(0),
-            help="largest number of decoded images (photos, masks and depth maps) kept in memory, 0: all. The one "
-                 "unused for longest goes. Every photo still trains, with the same result; up to 32 that come next "
-                 "are decoded ahead"),
+            stored=MODEL_JSON, topic="photos that vary",
+            help="model of exposure, for photos that differ in brightness or colour. "
+                 + "; ".join(f"{a.kind}: {a.summary}" for a in appearances())
+                 + "; exports and viewers do not show it"),
+        Option("images_to_load", 0, origin="ours", check=at_least(0), topic="memory",
+            help="largest number of decoded images (photos, masks and depth maps) in memory, 0: all. The others are "
+                 "read again when they are needed; the result is the same"),
     ))
     # fmt: on
 
@@ -94,7 +94,7 @@ class ModelParams(OptionTable):
             if named == kind:
                 setattr(values, flag, True)
             elif named != "none" and getattr(values, flag, False):
-                raise UserError(f"--{flag} is --appearance {kind}; leave it out, or --appearance {named}")
+                raise UserError(f"--{flag} means --appearance {kind}; leave out --{flag} or --appearance {named}")
         if getattr(values, "source_path", ""):
             values.source_path = os.path.abspath(values.source_path)
         return values
@@ -106,14 +106,17 @@ class PipelineParams(OptionTable):
     title = "pipeline"
     # fmt: off
     options = (
-        Option("convert_SHs_python", False, "evaluate spherical harmonics in PyTorch; slower, for experiments"),
-        Option("compute_cov3D_python", False, "compute 3D covariances in PyTorch; slower, for experiments"),
-        Option("debug", False, "check the inputs and outputs of every kernel; slower"),
-        Option("antialiasing", False, stored=MODEL_JSON,
-            help="keep the total weight of splats smaller than a pixel, so that views from other distances look right"),
-        Option("projection", "ewa", origin="ours", check=one_of("ewa", "ray"), stored=MODEL_JSON,
-            help="how a pixel sees a Gaussian. ewa: by an ellipse on the image (Zwicker et al. 2001); ray: on the "
-                 "pixel's own ray, exact for any size and angle, in training by one process"),
+        Option("convert_SHs_python", False, topic="debugging",
+            help="evaluate spherical harmonics in PyTorch; slower, for experiments"),
+        Option("compute_cov3D_python", False, topic="debugging",
+            help="compute 3D covariances in PyTorch; slower, for experiments"),
+        Option("debug", False, "check the inputs and outputs of every kernel; slower", topic="debugging"),
+        Option("antialiasing", False, stored=MODEL_JSON, topic="quality and speed",
+            help="keep the total weight of splats that are smaller than a pixel, so that views from other distances "
+                 "look right"),
+        Option("projection", "ewa", origin="ours", check=one_of("ewa", "ray"), stored=MODEL_JSON, topic="cameras",
+            help="how Gaussians are projected. ewa: to ellipses on the image (Zwicker et al. 2001); ray: evaluated "
+                 "on the ray of each pixel, exact for any size and angle; trains in one process only"),
     )
     # fmt: on
 
@@ -127,8 +130,8 @@ class OptimizationParams(OptionTable):
     title = "optimisation"
     # fmt: off
     options = (
-        Option("iterations", 30_000, "training steps, one photo each", "paper", check=within(1, 2**31 - 1),
-               compared=False),
+        Option("iterations", 30_000, origin="paper", check=within(1, 2**31 - 1), compared=False, topic=MOST_NEEDED,
+            help="training steps, one photo each"),
         Option("position_lr_init", 0.00016, origin="paper", check=at_least(0),
             help="learning rate of positions at the start, times the scene extent"),
         Option("position_lr_final", 0.0000016, origin="paper", check=at_least(0),
@@ -158,19 +161,21 @@ class OptimizationParams(OptionTable):
         Option("densify_grad_threshold", 0.0002, origin="paper", check=above(0),
             help="screen-space gradient (per NDC unit) that makes a Gaussian clone or split; lower: more Gaussians"),
         *options_of("optimisation"),
-        Option("random_background", False,
+        Option("random_background", False, topic="data",
             help="a new random background in every step, so that no Gaussian imitates a fixed one"),
         Option("optimizer_type", "default", check=one_of("default", "sparse_adam"), stored=MODEL_JSON,
+            topic="quality and speed",
             help="default: Adam on all Gaussians; sparse_adam: Adam without bias correction, only on the Gaussians "
                  "that the view sees, which is faster if views see little of the scene"),
-        Option("max_num_splats", 0, origin="ours", check=at_least(0),
-            help="largest number of Gaussians, 0: no limit, 1,000,000 with mcmc, or with budget what --strategy says; "
-                 "near it, adc densifies only those with the largest gradients. adc and mcmc keep a start with more, "
-                 "budget removes what is too many"),
+        Option("max_num_splats", 0, origin="ours", check=at_least(0), topic=MOST_NEEDED,
+            help="largest number of Gaussians; 0: no limit with adc, 1,000,000 with mcmc, and with budget as "
+                 "--strategy says. If a training starts with more, only budget removes the surplus"),
         Option("seed", 0, origin="ours, and the reference's fixed seed", check=within(0, 2**63 - 1), stored=MODEL_JSON,
+            topic="quality and speed",
             help="seed of every random choice; the same seed gives the same bytes"),
         Option("strategy", "auto", origin="ours", check=one_of("auto", *strategies()), stored=MODEL_JSON,
-            help="how many Gaussians there are, and where. auto: adc, or what is best in the time that is given; a "
+            topic=MOST_NEEDED,
+            help="how Gaussians are added, moved and removed. auto: adc, or the best strategy for a given time; a "
                  "resumed run keeps its own. " + "; ".join(f"{n}: {part_class(n).summary}" for n in strategies())),
     )
     # fmt: on

@@ -13,7 +13,10 @@ class OptionParser(argparse.ArgumentParser):
     """A parser in which options that we added never make an abbreviation of a reference option ambiguous.
 
     An error is one line, without the usage of all options, and names the option that a mistyped one may stand for.
+    lists_all: the option that lists all options.
     """
+
+    lists_all = "-h"
 
     def parse_args(self, *words: Any, **more: Any) -> argparse.Namespace:
         args, unknown = self.parse_known_args(*words, **more)
@@ -33,7 +36,7 @@ class OptionParser(argparse.ArgumentParser):
         return f"there is no option {word}" + (f"; did you mean {near[0]}?" if near else "")
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"error: {message} ({self.prog} -h lists all options)\n")
+        self.exit(2, f"error: {message} ({self.prog} {self.lists_all} lists all options)\n")
 
     def _get_option_tuples(self, option_string: str) -> list[Any]:
         matches = super()._get_option_tuples(option_string)

@@ -3,9 +3,9 @@
 _CONSTANT = "its default is now the only value; leave it out"
 
 REMOVED: dict[str, str] = {
-    "target_psnr": "bound the seconds instead, and read what is reached from error_vs_time.csv",
-    "refine_lens": "let the program that placed the photos refine their lenses",
-    "parallel": "leave it out, as processes of torchrun always share each view by tiles",
+    "target_psnr": "limit the seconds of training instead, and read the PSNR from error_vs_time.csv",
+    "refine_lens": "refine lenses in the program that estimates the poses",
+    "parallel": "leave it out; processes of torchrun always divide each view into tiles",
     "whole_curve": "leave it out, as the last point of the curve scores all test views",
     "viewer_exit": "leave it out; the page ends by its button or by Ctrl-C",
     "mcmc_gate_steepness": _CONSTANT,

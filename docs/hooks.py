@@ -1,4 +1,4 @@
-"""Hooks of the site: pages from outside of docs/, and a check that nothing is loaded from other hosts.
+"""Hooks of the site: pages from outside of docs/, train.py's options, search from a folder, a check for other hosts.
 
 MkDocs calls the functions named `on_...` (mkdocs.yml, `hooks`).
 """
@@ -6,9 +6,11 @@ MkDocs calls the functions named `on_...` (mkdocs.yml, `hooks`).
 import logging
 import posixpath
 import re
+import sys
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
@@ -19,8 +21,11 @@ PAGES = {
     "SECURITY.md": "security.md",
     "benchmarks/README.md": "benchmarks.md",
 }
+OPTIONS = "reference/options.md"
 SOURCES = {page: source for source, page in PAGES.items()}
 LINK = re.compile(r"(?<=\]\()([^()\s#:]+\.md)")
+HELP = re.compile(r"(.*?)(?: \(default: (.*)\))?")  # of an option: its effect and its default
+FLAG = re.compile(r"(?<![\w-])--?[a-z][\w-]*")
 # What a browser loads by itself. A link (<a href>) is followed only when clicked.
 LOADED = re.compile(r"<(?:script|img|iframe|source)\b[^>]*\bsrc=[\"']?(?:https?:)?//[^\"'> ]+", re.IGNORECASE)
 STYLE = re.compile(r"<link\b[^>]*\bhref=[\"']?(?:https?:)?//[^>]*>", re.IGNORECASE)
@@ -29,11 +34,31 @@ log = logging.getLogger("mkdocs.hooks")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that lie outside of docs/."""
+    """Add the pages that lie outside of docs/, and the page of train.py's options."""
     root = Path(config.config_file_path).parent
     for source, page in PAGES.items():
         files.append(File.generated(config, page, content=(root / source).read_text(encoding="utf-8")))
+    files.append(File.generated(config, OPTIONS, content=options_page(root)))
     return files
+
+
+def options_page(root: Path) -> str:
+    """The options of train.py by topic, from its parser, which needs none of train.py's packages."""
+    sys.path.insert(0, str(root))
+    from splatting.training.launch import training_parser
+    from splatting.training.option import TOPICS
+
+    lines = ["# Options of train.py", "", "`train.py -h` lists the first group, and `train.py --help-all` all groups."]
+    for topic, actions in training_parser()[0].by_topic().items():
+        about = TOPICS[topic]
+        lines += ["", f"## {topic.capitalize()}", "", f"{about[0].upper()}{about[1:]}.", ""]
+        lines += ["| option | default | effect |", "| --- | --- | --- |"]
+        for action in actions:
+            effect, default = HELP.fullmatch(action.help.replace("%%", "%")).groups("")
+            value = "" if action.nargs == 0 else " " + (action.metavar or f"{{{','.join(action.choices)}}}")
+            name = f"`{', '.join(action.option_strings)}{value}`"
+            lines.append(f"| {name} | {default} | " + FLAG.sub(r"`\g<0>`", effect) + " |")
+    return "\n".join(lines) + "\n"
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
@@ -56,3 +81,10 @@ def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
     for source in found:
         log.warning("%s loads from another host: %s", page.file.src_uri, source)
     return output
+
+
+@event_priority(-100)  # after the plugin of the search
+def on_post_build(config: MkDocsConfig) -> None:
+    """Write the index of the search as a script, too: pages that are opened from a folder cannot fetch JSON."""
+    index = Path(config.site_dir) / "search" / "search_index.json"
+    index.with_suffix(".js").write_text(f"var __index = {index.read_text(encoding='utf-8')}", encoding="utf-8")

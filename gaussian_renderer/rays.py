@@ -27,6 +27,6 @@ def check_views(
             check_rays(view.lens.scaled(width / view.image_width, height / view.image_height))
         except ValueError as error:
             raise UserError(
-                f"{view.image_name} cannot be drawn at {width} x {height} pixels, as {error}; draw it larger, by "
-                "--resolution (-r) and with no smaller views at first, or give --projection ewa"
+                f"{view.image_name} cannot be rendered at {width} x {height} pixels, as {error}; use a larger "
+                "--resolution (-r) and no smaller views at the start, or --projection ewa"
             ) from error

@@ -182,7 +182,7 @@ def read_colmap_bin_array(path: StrPath) -> np.ndarray:
         if len(shape) != 3 or len(values) != 4 * np.prod(shape):
             raise ValueError(f"sizes {shape}, {len(values)} bytes of values")
     except ValueError as error:
-        raise UserError(f"{path} is not a whole map of COLMAP ({error}); copy the file again") from error
+        raise UserError(f"{path} is not a complete dense map of COLMAP ({error}); copy the file again") from error
     array = np.frombuffer(values, "<f4").reshape(shape, order="F").transpose(1, 0, 2)
     return array.squeeze().copy()
 
@@ -217,8 +217,8 @@ def read_points(path: StrPath, binary: bool) -> Points:
     if part.any() and points.rgb.max() <= 1:
         first = part.argmax()
         raise UserError(
-            f"{places.of(first)} of {path} has the colour {' '.join(map(str, points.rgb[first]))}, and COLMAP's "
-            "range from 0 to 255; multiply the colours of the file by 255"
+            f"{places.of(first)} of {path} has the colour {' '.join(map(str, points.rgb[first]))}, but COLMAP's "
+            "colours range from 0 to 255; multiply all colours in the file by 255"
         )
     return points
 

@@ -127,7 +127,9 @@ class Sleeping:
                 | {"rows": [values[before : before + own] for values in captured["rows"]]}
             )
         except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
-            raise UserError(f"the rows of the checkpoint that slept do not fit ({error}); give another one") from error
+            raise UserError(
+                f"the state of sleeping blocks in the checkpoint does not fit ({error}); use another checkpoint"
+            ) from error
 
     def _put_back(self, state: State) -> None:
         self.awake.copy_(state["awake"])

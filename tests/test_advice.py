@@ -42,7 +42,7 @@ def test_advice_on_a_given_option_or_against_one_is_not_taken(tmp_path, monkeypa
     dataset = argparse.Namespace(model_path=str(tmp_path))
     assert advice.asked_options(dataset, args, ["--app=none", "-r", "2"]) == ["--sky", "auto"]
     said = capsys.readouterr().out
-    assert "--refine_poses is left out: --refine_poses does not work with --projection ray" in said
+    assert "not recommended here: --refine_poses (--refine_poses does not work with" in said
     assert said.count(advice.GUIDE) == 1 and (advice.ROOT / advice.GUIDE).is_file()
     assert [one["options"] for one in json.loads((tmp_path / advice.ADVICE).read_text())] == ["--sky auto", "", ""]
 

@@ -25,6 +25,7 @@ from arguments import (
 )
 from arguments.removed import REMOVED
 from splatting.training.launch import launch_options
+from splatting.training.option import MOST_NEEDED, TOPICS
 from utils.system_utils import UserError
 
 # fmt: off
@@ -78,13 +79,25 @@ def test_defaults_are_the_contracts():
     assert all(len(option.help) > 10 and option.origin for option in OPTIONS)
 
 
-def test_train_help_lists_the_contracts_options(capsys):
+def _help(capsys: pytest.CaptureFixture[str], word: str) -> str:
     with pytest.raises(SystemExit) as exit_info:
-        train.main(["-h"])
+        train.main([word])
     assert exit_info.value.code == 0
-    text = capsys.readouterr().out
+    return capsys.readouterr().out
+
+
+def test_train_help_lists_the_contracts_options(capsys):
+    text = _help(capsys, "--help-all")
     assert [name for name in (*REFERENCE, *OURS, *LAUNCH.split()) if f"--{name}" not in text] == []
     assert "--strategy {auto,adc,mcmc,budget}" in text
+
+
+def test_short_help_fits_on_two_screens_and_names_all_topics(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    text = _help(capsys, "-h")
+    assert text == _help(capsys, "--he") and len(text.splitlines()) <= 60
+    assert [topic for topic in TOPICS if topic not in text] == []
+    assert {option.topic for option in OPTIONS} | {MOST_NEEDED, "viewers"} == {*TOPICS}
 
 
 def test_short_forms_and_unique_prefixes():
@@ -377,7 +390,8 @@ def test_a_mistyped_option_gets_one_line(capsys, words, said):
     with pytest.raises(SystemExit) as ended:
         train.parse(["-s", "x", *words])
     (line,) = capsys.readouterr().err.splitlines()
-    assert ended.value.code == 2 and line.startswith(f"error: {said}") and line.endswith(" -h lists all options)")
+    assert ended.value.code == 2 and line.startswith(f"error: {said}")
+    assert line.endswith(" --help-all lists all options)")
 
 
 @pytest.mark.parametrize("name", REMOVED)

@@ -87,7 +87,7 @@ def test_test_views_may_be_missing_without_eval(blender_scene, capsys):
     with pytest.raises(UserError, match="photos that .* lists are missing: .*; put them there, .*or leave --eval out"):
         read(blender_scene, hold_out=True)
     train = [camera.image_name for camera in read(blender_scene).train_cameras]
-    assert "transforms_test.json do not train: " in capsys.readouterr().err
+    assert "transforms_test.json are not used for training: " in capsys.readouterr().err
     (blender_scene / "transforms_test.json").unlink()
     assert [camera.image_name for camera in read(blender_scene).train_cameras] == train
     assert len(train) == 4 < len(whole.train_cameras) and readNerfSyntheticInfo(blender_scene).train_cameras

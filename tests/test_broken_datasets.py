@@ -233,7 +233,7 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_same_ids("points3D.bin", 51, 8, 43, 8), r"^point 1 and point 2 of .*points3D\.bin both have the id"),
         (
             _lines("points3D.txt", lambda lines: [_replaced(line, SMALL) for line in lines]),
-            r"^line 1 of .*points3D\.txt has the colour 0.0 1.0 0.25, and COLMAP's range from 0 to 255;",
+            r"^line 1 of .*points3D\.txt has the colour 0.0 1.0 0.25, but COLMAP's colours range from 0 to 255;",
         ),
         (_gone(PHOTO), "1 of 9 photos .*are missing: SCENE/images/left/v02.png"),
         (_seven_gone, r"7 of 9 photos that .* lists are missing: .*Right/V03.png, .* and 2 more \(the folder has .*-i"),

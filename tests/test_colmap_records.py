@@ -287,7 +287,7 @@ def test_dense_maps(tmp_path):
         assert array.dtype == np.float32
     for content in (path.read_bytes()[:-1], b"6&4&", b"hello", b"a&b&c&"):
         path.write_bytes(content)
-        with pytest.raises(UserError, match="not a whole map"):
+        with pytest.raises(UserError, match="not a complete dense map"):
             read_colmap_bin_array(path)
 
 

@@ -116,13 +116,15 @@ def test_what_is_written(converted):
 def test_a_second_run_does_only_what_changed(copy, capsys):
     scene = folder_state(copy)
     convert.main(["-s", str(copy), "--no_gpu", "--resize"])
-    assert "done before: photos, features, matching, mapping, undistortion, capture, resize" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "reused from an earlier run: photos, features, matching, mapping, undistortion, capture, resize" in out
     assert folder_state(copy) == scene
     features = Layout(copy).database.read_bytes()
     # Resized copies of the old photos must not stay beside new ones.
     convert.main(["-s", str(copy), "--no_gpu", "--mapper", "global"])
     out = capsys.readouterr().out
-    assert "done before: photos, features, matching (" in out and f"{VIEWS} of {VIEWS} photos placed" in out
+    assert "reused from an earlier run: photos, features, matching;" in out
+    assert f"{VIEWS} of {VIEWS} photos placed" in out
     assert not (copy / "images_2").exists()
     # The focal lengths that global mapping estimates must not get into the database that later runs resume from.
     assert Layout(copy).database.read_bytes() == features
@@ -512,7 +514,8 @@ def test_fisheyes_are_placed_and_stay_as_they_are(tmp_path, capsys):
     _check_places(pycolmap.Reconstruction(tmp_path / "sparse" / "0"), [path.name for path in shots], FISHEYE.model)
     lenses, views = converted("--lenses", "undistort")
     out = capsys.readouterr().out
-    assert "done before: photos, features, matching, mapping (" in out and "undistorted photos, with pinhole" in out
+    assert "reused from an earlier run: photos, features, matching, mapping;" in out
+    assert "undistorted photos, with pinhole" in out
     assert lenses == "undistort" and all(view.native is None for view in views)
     assert shots[0].read_bytes() != views[0].image_path.read_bytes()
 

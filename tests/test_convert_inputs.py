@@ -138,7 +138,7 @@ def test_photos_that_can_not_be_read_stop_unless_they_are_left_out(tmp_path, hei
     picture.info["nclx_profile"]["full_range_flag"] = 1
     picture.save(tmp_path / "7.hif", "HEIF", save_nclx_profile=True)
     said = r"^4 photos in .* cannot be read: 4.NEF, 5.tif \(RAW: export as JPEG or TIFF\); 6.heic \(damaged: copy it "
-    said += r"again\); 7.hif \(HDR picture: export as SDR\); do as said, or pass --skip_unreadable"
+    said += r"again\); 7.hif \(HDR picture: export as SDR\); follow these hints, or pass --skip_unreadable"
     with pytest.raises(UserError, match=said):
         sort_inputs(tmp_path)
     (tmp_path / "8.jpg").write_bytes((tmp_path / "1.jpg").read_bytes()[:-60])

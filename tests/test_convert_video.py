@@ -281,4 +281,4 @@ def test_two_videos_and_photos_make_one_scene(ffmpeg, room, tmp_path, capsys):
     model = pycolmap.Reconstruction(layout.sparse / "0")
     assert {image.name for image in model.images.values()} >= {"left/frame_00005.jpg", "right/frame_00004.jpg"}
     convert.main(["-s", str(layout.scene), "--no_gpu", *videos])
-    assert "done before: video, photos, features, matching, mapping, undistortion" in capsys.readouterr().out
+    assert "reused from an earlier run: video, photos, features, matching, mapping" in capsys.readouterr().out

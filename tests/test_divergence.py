@@ -139,7 +139,7 @@ def test_the_model_before_a_loss_of_nan_is_saved(colmap_scene, tmp_path, monkeyp
 
 def test_a_first_loss_of_nan_leaves_nothing_to_save(colmap_scene, tmp_path, monkeypatch):
     _nan_loss_in(monkeypatch, 1)
-    with pytest.raises(UserError, match="no iteration was trained before it; lower the learning rates"):
+    with pytest.raises(UserError, match="there is no earlier model to save; lower the learning rates"):
         _train(colmap_scene, tmp_path, iterations=5)
     assert not (tmp_path / "point_cloud").exists() and not list(tmp_path.glob("*.pth"))
 
@@ -197,7 +197,7 @@ def test_rates_a_hundred_times_too_high_end_in_a_warning(colmap_scene, tmp_path,
     options = ["--densify_from_iter", 50, "--densification_interval", 50, "--opacity_reset_interval", 300]
     ply = _train(colmap_scene, tmp_path / "high", *options, *high, iterations=600)
     read_model(ply).check_finite(600)
-    assert "the model is worse than the points it began with; lower the learning rates" in capfd.readouterr().err
+    assert "so the model is worse than its start; lower the learning rates" in capfd.readouterr().err
     _train(colmap_scene, tmp_path / "usual", *options, iterations=150)
     assert "the model is worse" not in capfd.readouterr().err
     assert json.loads((tmp_path / "high" / "train_log.json").read_text())[-1]["loss"] > 0

@@ -77,9 +77,17 @@ PROGRAMS = sorted({program for _, program, _ in COMMANDS})
 
 @functools.cache
 def _flags(program: str) -> frozenset[str]:
-    """Every option that `-h` lists. In this process, as importing torch takes seconds."""
+    """Every option that the program's help lists."""
+    said = _help(program, "-h")
+    if "--help-all" in said:
+        said = _help(program, "--help-all")
+    return frozenset(re.findall(r"(?<![\w-])--?[A-Za-z][\w-]*", said))
+
+
+def _help(program: str, word: str) -> str:
+    """What the program prints with one word. In this process, as importing torch takes seconds."""
     said, argv, path = io.StringIO(), sys.argv, sys.path.copy()
-    sys.argv = [program, "-h"]
+    sys.argv = [program, word]
     try:
         with contextlib.redirect_stdout(said), warnings.catch_warnings(), pytest.raises(SystemExit) as ended:
             warnings.simplefilter("ignore")  # a module may be loaded already
@@ -90,7 +98,7 @@ def _flags(program: str) -> frozenset[str]:
     finally:
         sys.argv, sys.path[:] = argv, path
     assert not ended.value.code, said.getvalue()
-    return frozenset(re.findall(r"(?<![\w-])--?[A-Za-z][\w-]*", said.getvalue()))
+    return said.getvalue()
 
 
 def test_every_benchmark_is_shown_and_shows_how_it_is_run():
@@ -152,3 +160,14 @@ def test_the_pages_of_the_code_name_what_is_there():
         name for page in (ROOT / "docs/api").glob("*.md") for name in re.findall(r"^::: (\S+)", page.read_text(), re.M)
     ]
     assert len(names) > 50 and all(pkgutil.resolve_name(name) for name in names)
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *sorted((ROOT / "docs/guide").glob("*.md"))], ids=_name)
+def test_guides_tell_what_to_do(page):
+    """Commits, seeds and spreads are in docs/results, and what failed in docs/inside/notebook.md."""
+    text = page.read_text(encoding="utf-8")
+    commit = r"(?=\d*[a-f])(?=[a-f]*\d)[\da-f]{7,40}"
+    seeds = r"(?:\d+|two|three|four|five) seeds|(?<!--)seeds? \d+"
+    banned = rf"\b(?:marks?|miss(?:es|ed)|standard (?:error|deviation)s?|{commit}|{seeds})\b"
+    assert re.findall(banned, text, re.IGNORECASE) == []
+    assert page.name == "README.md" or len(text.split()) <= 900

@@ -110,7 +110,7 @@ def test_the_rasterizer_is_tried(monkeypatch):
     wrong = lambda **k: (drawn := right(**k))._replace(color=drawn.color + 1e-4)  # noqa: E731
     monkeypatch.setattr(diff_gaussian_rasterization, "rasterize", wrong)
     line = environment._check_rasterizer(torch)
-    assert line.finding and "1.0e-04 off the oracle" in line.text
+    assert line.finding and "differs from its float64 oracle by 1.0e-04" in line.text
 
 
 def test_a_gpu_that_is_not_used(monkeypatch):

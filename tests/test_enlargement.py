@@ -95,7 +95,7 @@ OPTIONS = [
 def test_a_small_unit_changes_no_training(scenes, tmp_path, options, capsys):
     """With starts of one size, rounding alone differs: with those of another unit, the loss is 4 to 20 % off."""
     usual, small = (_train(scene, tmp_path / scene.name, *options) for scene in scenes)
-    assert "all files have the scene's own unit" in capsys.readouterr().out
+    assert "files keep the scene's unit" in capsys.readouterr().out
     assert len(usual) == len(small)
     assert _loss(tmp_path / "small") == pytest.approx(_loss(tmp_path / "usual"), rel=2e-3)
     far = np.abs(_positions(small) / FACTOR - _positions(usual)).max()

@@ -360,7 +360,7 @@ def test_one_far_gaussian_leaves_the_others_of_an_spz(tmp_path, capsys, x):
         return
     assert 900 < far[0] * np.sign(x) < 1100 and np.abs(far[1:]).max() < 0.1
     np.testing.assert_allclose(np.exp(read.log_scales[number]) / abs(far[0]), 0.05, rtol=0.05)  # also in its size
-    assert said.startswith(f"warning: 1 of {COUNT} Gaussians lie more than") and "--crop leaves them out" in said
+    assert said.startswith(f"warning: 1 of {COUNT} Gaussians lie more than") and "--crop drops them" in said
 
 
 def test_positions_that_spz_cannot_hold_are_refused(tmp_path):
@@ -428,7 +428,10 @@ def test_no_changed_byte_of_packed_spz_loads_another_model(tmp_path, version):
 @pytest.mark.parametrize("version", [3, 4])
 @pytest.mark.parametrize(
     ("count", "degree", "said"),
-    [(2_000_000, 0, r"it promises 2,000,000 rows in [\d,]+ bytes"), (500, 255, "SH bands of degree 255, of at most 4")],
+    [
+        (2_000_000, 0, r"its header announces 2,000,000 rows, but the file has only [\d,]+ bytes"),
+        (500, 255, "SH bands of degree 255, of at most 4"),
+    ],
 )
 def test_spz_of_few_bytes_and_much_content_is_refused(tmp_path, version, count, degree, said):
     if version == 4:

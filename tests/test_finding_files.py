@@ -61,7 +61,7 @@ def test_names_that_match_but_for_case_accents_or_slashes(colmap_scene, capsys):
     assert len(cameras) == 17 and all(path.is_file() for path in cameras.values())
     assert cameras[olds[1]].name == Path(olds[1]).name.upper()
     said = capsys.readouterr().err
-    assert said.startswith("2 of 17 photos are used although their file names differ") and said.count("\n") == 1
+    assert said.startswith("2 of 17 photos are matched to files whose names differ") and said.count("\n") == 1
 
     # Two similar names, neither of them the exact one: the reader must not guess.
     shutil.copyfile(pictures / olds[1].upper(), pictures / olds[1].upper().replace("PNG", "Png"))
@@ -75,7 +75,7 @@ def test_photos_of_another_format_are_used_and_named(colmap_scene, capsys):
     first.unlink()
     capsys.readouterr()
     assert read(colmap_scene).train_cameras[0].image_path == first.with_suffix(".jpg")
-    said = f"1 of 17 photos are used although their file names have another suffix .* is {first.stem}.jpg for "
+    said = f"1 of 17 photos are matched to files whose names have another suffix .* is {first.stem}.jpg for "
     assert re.search(said.replace("is ", "is .*"), capsys.readouterr().err)
 
     # One file for two photos, or two files for one photo: the reader must not guess.
@@ -151,7 +151,7 @@ def test_what_is_no_file_is_no_photo(colmap_scene, make):
     path = colmap_scene / "images" / "left" / "v02.png"
     path.unlink()
     make(path)
-    with pytest.raises(UserError, match=r"photos .*left/v02.png \(it is there, but a link to nothing or no file"):
+    with pytest.raises(UserError, match=r"photos .*left/v02.png \(a broken link, or not a file"):
         read(colmap_scene)
 
 

@@ -168,7 +168,7 @@ def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
     for path, at in ((start, start), (None, out / "input.ply"), (None, find_save(str(out), -1)[1])):
         before = Path(at).read_bytes()
         words = ("--ply", path) if path else ("-m", out)
-        with pytest.raises(UserError, match="is a trained model or what it began from; name another file by --to"):
+        with pytest.raises(UserError, match="would overwrite a trained model or its input; choose another file"):
             export.export(*_export_options(*words, "--to", at))
         assert Path(at).read_bytes() == before
 
@@ -194,9 +194,9 @@ def test_a_file_is_thinned_out_by_the_views_of_a_model(tmp_path, colmap_scene, c
         ("--ply a.ply --max_splats 5", "need training views"),
         ("--ply absent.ply", "no file absent.ply; give a model as PLY"),
         ("", "no model folder given"),
-        ("--ply a.ply --to b.splat --path ellipse", "--path is the animation of a page; leave it out for .sp"),
+        ("--ply a.ply --to b.splat --path ellipse", "--path animates an HTML page; leave it out for .sp"),
         ("--ply a.ply --to b.html --path elipse", "--path must be interpolate, ellipse, spiral or a file"),
-        ("--ply a.ply --to b.html", "pages need training views; give -m of their model"),
+        ("--ply a.ply --to b.html", "pages need training views; give their model folder"),
     ],
 )
 def test_export_refuses(words, said):

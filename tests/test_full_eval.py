@@ -459,7 +459,7 @@ def test_seeds_and_option_sets(figures, evaluate, tmp_path, capsys, monkeypatch)
         ("--scenes SCENES/attic SCENES/brick --output_path SCENES/brick/eval", "attic would lie in the scene folder"),
         ("--scenes SCENES/attic --output_path SCENES/attic --skip_training", "would lie in the scene folder"),
         ("-m360 SCENES/nowhere", "no such folder: .*nowhere; pass the folder that has bicycle, flowers"),
-        ("--scenes SCENES/attic --resize", "--resize is of Mip-NeRF 360; give -m360, or"),
+        ("--scenes SCENES/attic --resize", "--resize works with -m360 only; give -m360, or"),
         ("-m360 SCENES", "scenes has none of the scenes of mipnerf360; pass the folder that has bicycle"),
         ("--scenes SCENES/attic --peer other nowhere.csv", "cannot read nowhere.csv"),
     ],
@@ -558,7 +558,7 @@ def test_a_second_call_whose_models_would_lie_in_those_of_the_first_is_refused(e
     evaluate("brick", *sets, "--seeds", 1)
     before = folder_state(evaluate.out)
     for words in (("attic", "--seeds", 1), ("attic", *sets), ("brick",), ("brick", *sets)):
-        with pytest.raises(UserError, match="would lie in each other; give the same --seeds and --configs, or none"):
+        with pytest.raises(UserError, match="would be nested; give the same --seeds and --configs, or none"):
             evaluate(*words)
     assert folder_state(evaluate.out) == before
 

@@ -188,11 +188,11 @@ def test_weights_of_a_folder_are_checked(judges, tmp_path, monkeypatch):
     shutil.copyfile(judges.files["alex"], tmp_path / judges.files["vgg"].name)
     refused("both", f"{judges.files['vgg'].name} is damaged: its SHA-256 begins with")
     monkeypatch.setattr(lpips_utils, "_url", lambda net: judges.urls["alex"])  # the right digest, but another network
-    refused("vgg", "the file of vgg16's weights is another one; put https://somewhere/alexnet.* in its place")
+    refused("vgg", "the file does not have the weights of vgg16; replace it by https://somewhere/alexnet")
     for wrong in ([1, 2], {}, {"features.0.weight": 1}):
         torch.save(wrong, tmp_path / "wrong-.pth")
         monkeypatch.setattr(lpips_utils, "_url", lambda net: "https://somewhere/wrong-.pth")
-        refused("vgg", "is another one")
+        refused("vgg", "does not have the weights")
 
 
 def test_dists_is_the_packages(judges, tmp_path, monkeypatch, capsys):

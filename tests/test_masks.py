@@ -210,7 +210,7 @@ def test_masks_are_found_by_the_names_of_the_pictures(masked_scene, capsys):
 
     next(masked_scene.rglob("masks/left/*.png.png")).unlink()
     (lacking,) = [view.image_name for view in _views(masked_scene, masks="masks") if view.counted_pixels is None]
-    assert f"1 of 17 photos have no mask and count whole: {lacking}" in capsys.readouterr().err
+    assert f"1 of 17 photos have no mask; all their pixels count: {lacking}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("way", ["{0}.mask.png", "{1}.mask.png", "{1}_mask.png", "{0}_mask.png", "{1}_mask.JPG"])
@@ -256,7 +256,7 @@ def test_a_photo_is_not_its_own_mask(tmp_path, way):
         folder = "images"
     elif way != "absolute":
         {"link": os.symlink, "hard link": os.link, "copy": shutil.copyfile}[way](photo, mask)
-    words = "no mask in .* belongs" if way == "absolute" else "has the photos themselves .*x.png. and no mask of them"
+    words = "no mask in .* belongs" if way == "absolute" else "contains the photos .*x.png. and no masks"
     with pytest.raises(UserError, match=words):
         _of_photos(tmp_path, [str(photo)], [], folder)
     _save(tmp_path / folder / "x.png.png", np.zeros((8, 8), np.uint8))
@@ -440,7 +440,7 @@ def test_masks_that_leave_nothing_do_not_train_silently(masked_scene, tmp_path, 
     # One view that trains is enough; a message names the others.
     _save(paths[1], np.full((HEIGHT, WIDTH), 255, np.uint8))
     assert _train(masked_scene, tmp_path / "out", "--masks", "masks")
-    assert capsys.readouterr().err.count("warning: the masks of 13 of 14 views leave none or almost none") == 1
+    assert capsys.readouterr().err.count("warning: the masks of 13 of 14 views exclude all or almost all") == 1
 
 
 def test_views_that_count_are_looked_at_once(capsys):

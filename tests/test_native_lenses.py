@@ -153,6 +153,6 @@ def test_rays_that_are_not_there_leave_a_finished_model_as_it_was(tmp_path, lens
     given = ["-s", tmp_path / "scene", "-m", tmp_path / "out", "--iterations", 1, "--disable_viewer", "--quiet"]
     train.main([*map(str, given)])
     before = {file: file.read_bytes() for file in (tmp_path / "out").rglob("*") if file.is_file()}
-    with pytest.raises(UserError, match=f"cannot be drawn at {size} pixels, as projection='ray' needs tiles"):
+    with pytest.raises(UserError, match=f"cannot be rendered at {size} pixels, as projection='ray' needs tiles"):
         train.main([*map(str, (*given, "--projection", "ray", *words))])
     assert before == {file: file.read_bytes() for file in (tmp_path / "out").rglob("*") if file.is_file()}

@@ -198,11 +198,11 @@ _XML, _JSON, _META = "cameras.xml", "keyframes/corrected_cameras/*.json", "metad
 @pytest.mark.parametrize(
     ("layout", "change", "message"),
     [
-        ("metashape", _replaced(_XML, "<k1>", "<k4>0.1</k4><k1>"), "has k4 for a camera of the type frame.* or export"),
-        ("metashape", _replaced(_XML, "<k1>", "<b2>0.1</b2><k1>"), "has b2 for .*leave them out in Optimize Cameras"),
+        ("metashape", _replaced(_XML, "<k1>", "<k4>0.1</k4><k1>"), "not supported for .* type frame: k4; .* or export"),
+        ("metashape", _replaced(_XML, "<k1>", "<b2>0.1</b2><k1>"), "not supported .*: b2; disable them in"),
         ("metashape", _replaced(_XML, "<k1>", "<corrections /><k1>"), "has corrections for"),
-        ("metashape_fisheye", _replaced(_XML, "<k1>", "<p1>1e-3</p1><k1>"), "has p1 for a camera of the type fisheye"),
-        ("metashape", _replaced(_XML, 'type="frame"', 'type="rpc"'), "type rpc, which cannot be used; export .*Colmap"),
+        ("metashape_fisheye", _replaced(_XML, "<k1>", "<p1>1e-3</p1><k1>"), "not supported for .* type fisheye: p1"),
+        ("metashape", _replaced(_XML, 'type="frame"', 'type="rpc"'), "unsupported type rpc; export .*Colmap"),
         ("metashape", _replaced(_XML, "<calibration", "<other"), "is not readable XML"),
         ("metashape", _replaced(_XML, "calibration", "other"), "has no calibration; align its photos"),
         ("metashape", _replaced(_XML, "<f>", "<f>a "), "cannot be read .*export them again"),

@@ -31,7 +31,7 @@ def _holder(folder: Path) -> subprocess.Popen:
 def test_a_second_training_is_refused_and_a_killed_one_blocks_nothing(tmp_path, capsys):
     holder = _holder(tmp_path)
     try:
-        said = rf"another train.py \(process {holder.pid}\) is at work in .*another -m"
+        said = rf"another train.py \(process {holder.pid}\) is running in .*another -m"
         with pytest.raises(UserError, match=said), own_folder(str(tmp_path)):
             pass
     finally:
@@ -103,7 +103,7 @@ def test_a_folder_that_is_removed_while_training_is_told_of(tmp_path, capsys):
         folder.mkdir()
         (folder / "cfg_args").touch()
     assert "warning: model.json, cameras.json, input.ply in" in (said := capsys.readouterr().err)
-    assert "were removed while training" in said
+    assert "were removed during training" in said
 
 
 def test_points_that_were_missing_before_a_resumed_run_are_no_news(tmp_path, capsys):

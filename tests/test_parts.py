@@ -199,6 +199,6 @@ def test_a_second_provider_of_a_slot_is_refused_with_both_names():
     fill(run, "counts", 1, One())
     fill(run, "counts", 2, One())
     assert run.counts == 2
-    with pytest.raises(UserError, match="--other does not work with --one: both decide on counts"):
+    with pytest.raises(UserError, match="--other does not work with --one: both set counts"):
         fill(run, "counts", 3, Other())
     assert run.counts == 2

@@ -250,4 +250,4 @@ def test_a_training_on_rays_renders_so_and_exports_say_it(colmap_scene, tmp_path
     assert 0 < np.abs(np.subtract(*images, dtype=int)).max() < 100
     monkeypatch.setattr("sys.argv", ["export.py", "-m", str(out), "--to", str(tmp_path / "model.splat")])
     export.main()
-    assert "trained with --projection ray; other programs show large Gaussians off the axis" in capsys.readouterr().out
+    assert "trained with --projection ray; other programs draw large Gaussians off axis" in capsys.readouterr().out

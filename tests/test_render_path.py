@@ -203,8 +203,8 @@ def test_memory_does_not_grow_with_the_length(run, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ("--fps 5", "^--fps is for a path; leave it out, or pass --path, too$"),
-        ("--path ellipse --depth", "^--depth is for the train and test views; leave it out, or --path$"),
+        ("--fps 5", "^--fps works only with --path; leave it out, or pass --path, too$"),
+        ("--path ellipse --depth", "^--depth works only without --path; leave it out, or --path$"),
         ("--path ellipse --fps 241", "^--fps must be 1 to 240, got 241$"),
         ("--path ellipse --size 401 300", "odd side.* use --size 400 300$"),
         ("--path ellipse --size 0 4", "^--size must be two even numbers of 2 to 16384 pixels, got 0 4$"),
@@ -213,7 +213,7 @@ def test_memory_does_not_grow_with_the_length(run, monkeypatch):
         ("--path " + "x" * 5000, "^--path must be .*there is no file xxx"),
         ("--path spiral", "^--path spiral needs training cameras that face one way"),
         ("--path broken.json", "broken.json is not JSON"),
-        ("--path good.json --seconds 3", "^--seconds is for interpolate, ellipse, spiral; the times of .* stand in"),
+        ("--path good.json --seconds 3", "^--seconds works with interpolate, ellipse, spiral only; .* has its own"),
         ("--path 4000.json", "lasts 4000 s, and a path lasts 0.1 to 3600; give the keyframes'"),
         ("--path 5e-324.json", "lasts 4.94066e-324 s, and a path lasts 0.1 to 3600; give the keyframes'"),
     ],

@@ -224,7 +224,7 @@ def test_map_coordinates_change_no_byte_of_the_model(surveyed, tmp_path, capfd):
     outs = [tmp_path / f"{scene.name}_out" for scene in surveyed]
     for scene, out in zip(surveyed, outs, strict=True):
         _train(scene, out, "--eval")
-    assert "training subtracts (500000.0, 4100000.0, 300.0)" in capfd.readouterr().out
+    assert "(500000.0, 4100000.0, 300.0) is subtracted from them" in capfd.readouterr().out
     here, there = (_ply(out).read_bytes() for out in outs)
     comment = b"comment world_offset 500000.0 4100000.0 300.0\n"
     assert comment in there and there.replace(comment, b"") == here

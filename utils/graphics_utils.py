@@ -39,8 +39,8 @@ def rigid_pose(R: np.ndarray, t: np.ndarray, name: str) -> tuple[np.ndarray, np.
     stretch = np.linalg.svd(matrix, compute_uv=False)
     if not (stretch[0] <= (1 + _SHEARED) * stretch[2] and 1 / _SCALED <= stretch[0] <= _SCALED):
         raise UserError(
-            f"the pose of {name} has no rotation, but a matrix that stretches by {stretch[2]:.4g} to "
-            f"{stretch[0]:.4g}; export the cameras again, or take the photo out of the scene"
+            f"the pose of {name} has no valid rotation: its matrix scales by {stretch[2]:.4g} to {stretch[0]:.4g}; "
+            "export the cameras again, or take the photo out of the scene"
         )
     if np.linalg.det(matrix) < 0:
         raise UserError(

@@ -119,7 +119,7 @@ def _fill(model: nn.Module, state: dict[str, torch.Tensor], net: str) -> None:
         found = {name: state[f"features.{name.split('.', 1)[1]}"] for name in own}
         model.load_state_dict(found, strict=False, assign=True)
     except (LookupError, TypeError, RuntimeError) as error:
-        raise UserError(f"the file of {NETS[net]}'s weights is another one; put {_url(net)} in its place") from error
+        raise UserError(f"the file does not have the weights of {NETS[net]}; replace it by {_url(net)}") from error
 
 
 def _checked(file: Path, digest: str, remedy: str) -> Path:

@@ -66,7 +66,7 @@ def _without_outliers(scale: np.ndarray, extent: float) -> np.ndarray:
         return scale
     print(
         f"{stray.sum()} of {len(scale)} points are more than {OUTLIER_SCALE:g} times the scene's extent from their "
-        f"neighbours; their Gaussians begin with a tenth of the extent, {LARGEST_OUTLIER * extent:.3g}",
+        f"neighbours; the scale of their Gaussians starts at a tenth of the extent, {LARGEST_OUTLIER * extent:.3g}",
         file=sys.stderr,
     )
     return np.where(stray, np.float32(LARGEST_OUTLIER * extent), scale)

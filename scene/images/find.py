@@ -109,7 +109,7 @@ def find_images(
             missing = [name if name.lower().endswith(tuple(suffixes)) else name + suffixes[0] for name in missing]
         instead = index.description()
         if os.path.lexists(folder / missing[0]):
-            instead = " (it is there, but a link to nothing or no file)"
+            instead = " (a broken link, or not a file)"
         raise UserError(
             f"{len(missing)} of {len(paths)} {kind} that {listed_by} lists are missing: "
             f"{some([str(folder / name) for name in missing])}{instead}{_broken(paths)}; {remedy}"
@@ -118,7 +118,7 @@ def find_images(
         if changed:
             name, path = next(iter(changed.items()))
             print(
-                f"{len(changed)} of {len(paths)} {kind} are used although their file names {difference} those in "
+                f"{len(changed)} of {len(paths)} {kind} are matched to files whose names {difference} those in "
                 f"{listed_by}; the first is {os.path.relpath(path, folder)} for {name}",
                 file=sys.stderr,
             )

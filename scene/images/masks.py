@@ -175,15 +175,16 @@ def find_masks(
         if files.photos_met:
             met = some(sorted(map(str, files.photos_met)))
             raise UserError(
-                f"{folder} (--masks) has the photos themselves ({met}) and no mask of them; name the folder of the "
-                "masks, or use the photos' alpha channel by --mask_meaning ignore"
+                f"{folder} (--masks) contains the photos ({met}) and no masks; name the folder of the masks, or use "
+                "the photos' alpha channel with --mask_meaning ignore"
             )
         raise UserError(
             f"no mask in {folder} (--masks) belongs to a photo: looked for {names[0]}, {names[0]}.png and other "
             f"suffixes, found {some(sorted(path.name for path in folder.iterdir()))}; name masks like the photos"
         )
     if lacking:
-        print(f"{len(lacking)} of {len(names)} photos have no mask and count whole: {some(lacking)}", file=sys.stderr)
+        said = f"{len(lacking)} of {len(names)} photos have no mask; all their pixels count: {some(lacking)}"
+        print(said, file=sys.stderr)
     files.tell_elsewhere("masks")
     return [None if path is None else options.mask(path) for path in found]
 
@@ -210,7 +211,7 @@ def check_masks(pictures: Sequence[tuple[Path, Mask | None]], options: MaskOptio
         mask, photos = shared[0]
         raise UserError(
             f"{len(shared)} masks belong to several photos each, the first is {mask} for {some(photos)}; put masks "
-            "into the sub-folders of the photos, with the photos' names and .png behind"
+            "into the sub-folders of the photos, with the photos' names and .png appended"
         )
 
 

@@ -333,12 +333,12 @@ def _with_metric_maps(
         width, height = map_size(depth.path) if depth else (camera.width, camera.height)
         if abs(width * camera.height - height * camera.width) > max(camera.width, camera.height):
             raise UserError(
-                f"the depth map {depth.path} has {width} x {height} pixels, and its photo has other sides, "
-                f"{camera.width} x {camera.height}; make it of the whole photo"
+                f"the depth map {depth.path} has {width} x {height} pixels, but its photo has another aspect ratio, "
+                f"{camera.width} x {camera.height}; compute it from the whole photo"
             )
     lacking = [camera.image_name for camera in found if not camera.depth]
     if len(lacking) == len(found):
-        raise UserError(f"no map in {folder} has the name of a training photo; name them so, or leave -d out")
+        raise UserError(f"no depth map in {folder} is named like a training photo; rename the maps, or leave -d out")
     if lacking:
         print(f"{len(lacking)} of {len(found)} training photos have no depth map ({some(lacking)})", file=sys.stderr)
     return found
@@ -378,5 +378,5 @@ def _check_files(cameras: Sequence[CameraInfo]) -> None:
         if min(width, height) < 2 or width * SMALLEST < camera.width or height * SMALLEST < camera.height:
             raise UserError(
                 f"the depth map {camera.depth.path} has only {width} x {height} pixels, and its photo {camera.width} x "
-                f"{camera.height}; make it larger"
+                f"{camera.height}; compute it at a higher resolution"
             )

@@ -117,7 +117,7 @@ def _lens(sensor: ElementTree.Element, path: Path) -> dict[str, Any]:
     """The fields of a lens in transforms.json."""
     kind, size = str(sensor.get("type")), sensor.find("resolution")
     if kind not in _MODELS:
-        raise UserError(f"{path} has a camera of the type {kind}, which cannot be used; {_AS_COLMAP}")
+        raise UserError(f"{path} has a camera of the unsupported type {kind}; {_AS_COLMAP}")
     width, height = float(size.get("width")), float(size.get("height"))
     fields: dict[str, Any] = {"camera_model": _MODELS[kind], "w": width, "h": height}
     if fields["camera_model"] == PANORAMA:
@@ -132,8 +132,8 @@ def _lens(sensor: ElementTree.Element, path: Path) -> dict[str, Any]:
     unknown += ["corrections"] * (adjusted.find("corrections") is not None)
     if unknown:
         raise UserError(
-            f"{path} has {', '.join(unknown)} for a camera of the type {kind}, for which no lens here has a place; "
-            f"leave them out in Optimize Cameras, or {_AS_COLMAP}"
+            f"{path} has lens parameters that are not supported for cameras of the type {kind}: {', '.join(unknown)}; "
+            f"disable them in Optimize Cameras, or {_AS_COLMAP}"
         )
     terms = {name: values.get(name, 0.0) for name in used}
     if "p1" in terms:

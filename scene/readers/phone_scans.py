@@ -103,7 +103,8 @@ def _below(folder: Path, photo: Path) -> str:
 def _say_left_out(count: int, where: str) -> None:
     if count:
         print(
-            f"{count} photos or cameras of {where} have no counterpart of their name and are left out", file=sys.stderr
+            f"{count} photos or cameras of {where} have no counterpart of the same name and are ignored",
+            file=sys.stderr,
         )
 
 

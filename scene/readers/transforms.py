@@ -95,7 +95,7 @@ def _test_frames(path: Path, masks: MaskOptions, suffixes: Sequence[str], needed
     except UserError as error:
         if needed:
             raise UserError(f"{error}, or leave --eval out") from error
-        print(f"the views of {path} do not train: {error}", file=sys.stderr)
+        print(f"the views of {path} are not used for training: {error}", file=sys.stderr)
         return []
 
 
@@ -106,10 +106,12 @@ def _apart(
     tests = {_file(view) for view in test}
     left = [view for view in train if _file(view) not in tests]
     if train and not left:
-        raise UserError(f"all training photos of {listed_by} are test photos, too; give it others, or leave --eval out")
+        raise UserError(
+            f"all training photos of {listed_by} are test photos, too; list other training photos, or leave --eval out"
+        )
     if len(left) < len(train):
         count = len(train) - len(left)
-        print(f"{count} photos of {listed_by} are listed for training and for tests, and only test", file=sys.stderr)
+        print(f"{count} photos of {listed_by} are listed for training and tests; only tests use them", file=sys.stderr)
     return left, test
 
 
@@ -160,7 +162,7 @@ def read_nerfstudio(
             raise
         content = {**content, "frames": content["frames"][: -len(content["test_frames"])], "test_frames": []}
         cameras = read(content)
-        print(f"the test_frames of {path} do not train: {error}", file=sys.stderr)
+        print(f"the test_frames of {path} are not used for training: {error}", file=sys.stderr)
     tests = {_file(view) for view in cameras[len(cameras) - len(content["test_frames"]) :]}
     cameras = _once(cameras, str(path))
     cameras.sort(key=lambda camera: os.fsencode(camera.image_name))

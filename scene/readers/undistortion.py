@@ -73,8 +73,8 @@ def _say_which_are_cut(photos: Sequence[CameraInfo]) -> None:
         plan = undistortion(cut[0].lens, *cut[0].file_size)
         name = Path(cut[0].image_path).name
         print(
-            f"{len(cut)} photos, the first is {name}, have a lens that sees more than a pinhole image can "
-            f"show; {2 * plan.widest:.0f} degrees of its field of view are used",
+            f"{len(cut)} photos, the first is {name}, have a field of view that is too wide for a pinhole image; "
+            f"their inner {2 * plan.widest:.0f} degrees are used",
             file=sys.stderr,
         )
 

@@ -96,8 +96,8 @@ def _checked(offset: tuple[float, float, float], path: str | os.PathLike) -> tup
     farthest = max(map(abs, offset))
     if farthest > LARGEST_OFFSET:
         raise UserError(
-            f"{path} lies {farthest:.3g} from the origin of its world, and {LARGEST_OFFSET:g} is the most; correct its "
-            "positions and its comment world_offset"
+            f"{path} lies {farthest:.3g} from the origin of its world, but at most {LARGEST_OFFSET:g} is supported; "
+            "correct its positions and its comment world_offset"
         )
     return offset
 
@@ -145,7 +145,7 @@ def _near_origin(path: str | os.PathLike, means: np.ndarray) -> tuple[np.ndarray
     origin = origin_near(middle, extent) if extent else np.zeros(3)
     if not origin.any():
         return means, origin
-    print(f"{path}: positions are taken relative to {' '.join(map(repr, origin.tolist()))}, for float32's sake")
+    print(f"{path}: {' '.join(map(repr, origin.tolist()))} is subtracted from all positions to keep float32 precise")
     return (places - origin).astype(np.float32), origin
 
 

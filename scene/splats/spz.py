@@ -85,8 +85,8 @@ def _drawn_in(splats: Splats) -> Splats:
     if not far.any():
         return splats
     print(
-        f"warning: {far.sum()} of {len(splats)} Gaussians lie more than {limit:.3g} from the middle of the model; SPZ "
-        "would round all others for them, so they are written at that distance, and smaller; --crop leaves them out",
+        f"warning: {far.sum()} of {len(splats)} Gaussians lie more than {limit:.3g} from the middle of the model, and "
+        "would cost all others precision in SPZ; they are moved to that distance and scaled down; --crop drops them",
         file=sys.stderr,
     )
     means, log_scales = splats.means.copy(), splats.log_scales.copy()

@@ -68,8 +68,8 @@ def path_request(args: argparse.Namespace) -> PathRequest | None:
     """
     for name in _WITHOUT_PATH if args.path is not None else _WITH_PATH:
         if getattr(args, name) not in (None, False):
-            kind, remedy = ("the train and test views", "or --path") if args.path else ("a path", "or pass --path, too")
-            raise UserError(f"--{name} is for {kind}; leave it out, {remedy}")
+            kind, remedy = ("without --path", "or --path") if args.path else ("with --path", "or pass --path, too")
+            raise UserError(f"--{name} works only {kind}; leave it out, {remedy}")
     if args.path is None:
         return None
     fps = FPS if args.fps is None else args.fps
@@ -105,7 +105,7 @@ def path_maker(path: str, seconds: float | None = None) -> Callable[["Poses"], T
             raise UserError(f"--seconds must be {LEAST_SECONDS} to {MOST_SECONDS}, got {seconds:g}")
         return lambda poses: GENERATED[path](poses, seconds)
     if seconds is not None:
-        raise UserError(f"--seconds is for {', '.join(GENERATED)}; the times of {path} stand in it")
+        raise UserError(f"--seconds works with {', '.join(GENERATED)} only; {path} has its own times")
     if not os.path.exists(path):  # unlike Path.exists, it knows that no file has an empty or an endless name
         raise UserError(f"--path must be {', '.join(GENERATED)} or a file of keyframes; there is no file {path}")
     keyframes = KeyframePath(read_camera_path(Path(path)))

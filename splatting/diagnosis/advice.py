@@ -76,7 +76,9 @@ def asked_options(dataset: argparse.Namespace, args: argparse.Namespace, given: 
     with these options, is left out. With --advise their model folder gets ADVICE.
     """
     if ranks().several:
-        raise UserError("--advise and --options auto need one process; run train.py --advise, and give what it says")
+        raise UserError(
+            "--advise and --options auto need one process; run train.py --advise without torchrun, and give its options"
+        )
     if written := args.advise and dataset.model_path:
         mkdir_p(dataset.model_path)  # if it cannot be, better before the search
     found = advise(dataset, warns=args.advise)  # a training that follows prints them itself
@@ -86,7 +88,7 @@ def asked_options(dataset: argparse.Namespace, args: argparse.Namespace, given: 
         write_json(Path(dataset.model_path) / ADVICE, [advice._asdict() for advice in found])
     words = " ".join(advice.options for advice in found).split()
     print(f"{GUIDE} says what each option does, gains and costs")
-    print(f"options that this scene asks for, besides those given: {' '.join(words) or 'none'}")
+    print(f"recommended options for this scene, besides those given: {' '.join(words) or 'none'}")
     return words
 
 
@@ -101,7 +103,7 @@ def _taken(advice: Advice, args: argparse.Namespace, given: Sequence[str]) -> Ad
         except UserError as error:
             against = str(error)
     if against:
-        print(f"{advice.options} is left out: {against}")
+        print(f"not recommended here: {advice.options} ({against})")
     names = tuple(word.partition("=")[0] for word in given if word.startswith("--") and word != "--")
     return advice._replace(options="") if against or advice.options.startswith(names) else advice
 

@@ -160,5 +160,5 @@ def _check_rasterizer(torch) -> Line:
     error = float((ours - oracle.color).abs().max())
     if not error < _TOLERANCE:
         remedy = f"install it again: {again} ./submodules/diff-gaussian-rasterization"
-        return Line(f"the rasterizer on {device} is {error:.1e} off the oracle", remedy)
+        return Line(f"the rasterizer on {device} differs from its float64 oracle by {error:.1e}", remedy)
     return Line(f"rasterizer on {device} agrees with its float64 oracle to {error:.0e}")

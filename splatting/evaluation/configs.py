@@ -84,7 +84,7 @@ def check_options(words: Sequence[str], where: str, parse: Parse | None) -> None
     except SystemExit as error:  # raised by argparse; without a message for -h
         line = said.getvalue().strip().rpartition("error: ")[2]  # and where to find all options, which follows
         reason = line.rpartition(" (")[0] or f"{' '.join(words)} trains nothing"
-        raise UserError(f"{where}: {reason}; train.py -h lists the options") from error
+        raise UserError(f"{where}: {reason}; train.py --help-all lists the options") from error
     except UserError as error:
         raise UserError(f"{where}: {error}") from error
     args = found[0] if isinstance(found, tuple) else None

@@ -95,7 +95,7 @@ def check_names(scenes: Sequence[SceneEntry]) -> None:
     """Raise UserError if two scenes would share a model folder, or one would use the report's."""
     names = [scene.name for scene in scenes]
     if twice := [name for name in names if names.count(name) > 1]:
-        raise UserError(f"two scenes are named {twice[0]}, but each model has its scene's name; rename one folder")
+        raise UserError(f"two scenes are named {twice[0]}, and model folders are named after scenes; rename one")
     if taken := RESERVED.intersection(names):
         raise UserError(f"a scene cannot be named {min(taken)}: the report uses that folder; rename the scene's")
 
@@ -238,7 +238,7 @@ def check_nesting(runs: Sequence[Run], output: Path) -> None:
         inside = [path.parent for depth in ("*", "*/*") for path in run.model.glob(f"{depth}/{RECORD}")]
         if there := [folder for folder in around if is_model(folder)] + inside:
             raise UserError(
-                f"the model folder {run.model} and that of an earlier call, {there[0]}, would lie in each other; give "
+                f"the model folder {run.model} and that of an earlier call, {there[0]}, would be nested; give "
                 "the same --seeds and --configs, or none, as that call, or choose another --output_path"
             )
 

@@ -56,7 +56,7 @@ def _acquired(stack: contextlib.ExitStack, path: Path, busy: str, option: str) -
             file.seek(0)
             process = file.read().strip() or "not known"
             raise UserError(
-                f"{busy.format(process=process)} is at work in {path.parent}; wait for it, stop it, or choose another "
+                f"{busy.format(process=process)} is running in {path.parent}; wait for it, stop it, or choose another "
                 f"{option}"
             ) from error
         except OSError:

@@ -69,4 +69,4 @@ def check_packed_rows(count: int, size: int) -> None:
     well as one can compress it, 0.95.
     """
     if count > size + _FREE:
-        raise ValueError(f"it promises {count:,} rows in {size:,} bytes, which no honest file does")
+        raise ValueError(f"its header announces {count:,} rows, but the file has only {size:,} bytes")

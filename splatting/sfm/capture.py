@@ -81,13 +81,13 @@ def _again(left_out: list[str], weak: list[str], blurred: list[str], spread: flo
     lines = []
     if left_out:
         lines.append(
-            f"what {some(left_out)} show: they have no place; take photos on the way from there to the others, each "
-            "with 60 to 80 % of the one before"
+            f"what {some(left_out)} show: these photos were not placed; take photos on the way from there to the "
+            "others, each overlapping the one before by 60 to 80 %"
         )
     if weak:
         lines.append(f"around {some(weak)}: they share points with fewer than {FEW} other photos; take more there")
     if blurred:
-        lines.append(f"{some(blurred)}: they are blurred; hold still, or take more light")
+        lines.append(f"{some(blurred)}: they are blurred; hold the camera still, or add light")
     if spread > _SPREAD:
         lines.append(
             f"with a fixed exposure, if you can: the photos' brightness differs by {spread:.1f} stops; train these "
@@ -114,6 +114,6 @@ def too_few(report: Mapping[str, Any]) -> str | None:
     if placed >= LEAST * count:
         return None
     return (
-        f"only {placed} of {count} photos are placed, so the scene shows a part of what was photographed; the lines "
-        "above say what to photograph again"
+        f"only {placed} of {count} photos are placed, so the scene is incomplete; the lines above say what to "
+        "photograph again"
     )

@@ -76,8 +76,8 @@ def sort_inputs(folder: Path, skip_unreadable: bool = False, but: Iterable[Path]
     if unreadable:
         listed = "; ".join(f"{some(names)} ({reason})" for reason, names in unreadable.items())
         raise UserError(
-            f"{sum(map(len, unreadable.values()))} photos in {folder} cannot be read: {listed}; do as said, or pass "
-            "--skip_unreadable to go on without them"
+            f"{sum(map(len, unreadable.values()))} photos in {folder} cannot be read: {listed}; follow these hints, or "
+            "pass --skip_unreadable to leave them out"
         )
     return Inputs(sorted(photos), unused)
 

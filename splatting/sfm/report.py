@@ -81,7 +81,7 @@ def advice(
     if chosen.track_length < SHORT_TRACKS:
         lines.append(
             f"a point is in {chosen.track_length:.1f} photos on average, so the photos overlap little; take more "
-            "photos, each with 60 to 80 % of the one before"
+            "photos, each overlapping the one before by 60 to 80 %"
         )
     if chosen.error > LARGE_ERROR:
         lines.append(

@@ -23,13 +23,14 @@ def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> Non
         tell(found, options.source_path)
     if info.offset.any():
         print(
-            f"the scene's coordinates are large against its extent: training subtracts {tuple(info.offset.tolist())}, "
-            "which model.json keeps; python -m scene.export_world writes the model in the scene's own coordinates"
+            f"the scene's coordinates are large compared with its extent, so {tuple(info.offset.tolist())} is "
+            "subtracted from them (world_offset in model.json); to write the model in the scene's own coordinates, use "
+            "python -m scene.export_world"
         )
     if (factor := scene.gaussians.enlargement) != 1:
         print(
-            f"much of the scene is nearer than {NEAREST} units: depths from {NEAREST / factor:.2g} on are drawn, and "
-            "all files have the scene's own unit"
+            f"much of the scene is nearer than {NEAREST} units, so depths from {NEAREST / factor:.2g} on are drawn; "
+            "files keep the scene's unit"
         )
 
 

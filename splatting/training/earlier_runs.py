@@ -46,7 +46,7 @@ def check_folder(
     if changed and max(stay) > max(saving_iterations, default=0):
         before, after = (" ".join(_typed(n, of[n]) for n in changed) for of in (then, vars(now)))
         raise UserError(
-            f"{kept} with {before}, which {after} would not fit; name another folder by -m, or remove the old one"
+            f"{kept} with {before}, and this one has {after}; name another folder by -m, or remove the old one"
         )
     over = "" if lies_in(checkpoint, folder) else "; this one starts over"
     if over and (replaced := sorted(saved.keys() - {*stay})):
@@ -79,8 +79,8 @@ def report_changes(checkpoint: str, now: argparse.Namespace) -> None:
     changed = _changed(then, now)
     if "eval" in changed and now.eval:
         raise UserError(
-            f"{checkpoint} was trained on all photos, so --eval can hold out none that it has not seen; leave --eval "
-            "out, or start a new training"
+            f"{checkpoint} was trained on all photos, so --eval has no unseen photos to hold out; leave --eval out, or "
+            "start a new training"
         )
     if changed:
         before, after = (" ".join(_typed(n, of[n]) for n in changed) for of in (then, vars(now)))
@@ -103,8 +103,8 @@ def continue_records(model_path: str, checkpoint: str | None, first_iteration: i
         log.not_before(rows[-1])
     elif checkpoint and not log.records:
         print(
-            f"{training_log.NAME} beside {checkpoint} is missing, or has nothing up to iteration {first_iteration}: "
-            "seconds count from there, in the curve too",
+            f"{training_log.NAME} beside {checkpoint} has no records up to iteration {first_iteration}; the seconds of "
+            "this run start at 0 there",
             file=sys.stderr,
         )
     return log, rows

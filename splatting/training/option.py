@@ -10,6 +10,20 @@ from utils.system_utils import UserError
 
 Value = bool | int | float | str
 CFG_ARGS = "cfg_args"  # the file of options in a model folder of the reference
+MOST_NEEDED, NUMBERS = "most needed", "the method's numbers"
+# Groups of options in train.py's help and on the site, in their order.
+TOPICS = {
+    MOST_NEEDED: "options that most trainings need",
+    "data": "photos, start points, masks, depth maps, background",
+    "quality and speed": "schedules, SH degree, aliasing, validation, sky",
+    "photos that vary": "different exposure or white balance, passers-by",
+    "cameras": "lenses, panoramas, wrong poses",
+    "output": "when to score and save, and what is saved",
+    "viewers": "addresses of the web page and the remote viewer",
+    "memory": "where photos and Gaussians are kept",
+    NUMBERS: "learning rates, loss weights, densification",
+    "debugging": "checks and slower paths",
+}
 
 
 @dataclass(frozen=True)
@@ -25,6 +39,7 @@ class Option:
     seen: whether renders of a model differ with its value, if no name of them tells it.
     loaded: what a command that loads a model takes if the option is not given; empty: the stored value.
     called: the default where a program calls `train.training`, if it is another one there.
+    topic: its group in train.py's help, one of TOPICS. unset: what the help shows as the default, if not the value.
     """
 
     name: str
@@ -39,6 +54,8 @@ class Option:
     called: Value | None = None
     seen: bool = True
     after: str = ""
+    topic: str = NUMBERS
+    unset: str = ""
 
     @property
     def ours(self) -> bool:
@@ -59,16 +76,16 @@ class Option:
         else:
             kind = {"type": type(self.default), "metavar": self._metavar()}
         action = group.add_argument(*flags, **kind, default=default, help=text.replace("%", "%%"))
-        action.ours = self.ours  # type: ignore[attr-defined]  # for OptionParser
+        action.ours, action.topic = self.ours, self.topic  # type: ignore[attr-defined]  # for the parsers of arguments/
 
     def _shown(self) -> str:
-        return "off" if self.default is False else repr(self.default) if self.default == "" else str(self.default)
+        return "off" if self.default is False else "none" if self.default == "" else str(self.default)
 
     def _shown_default(self, sentinel: bool) -> str:
         """Text about what counts if the option is not given. sentinel: by a command that loads a model."""
         if sentinel and (self.loaded or self.stored):
             return self.loaded or "that of the model"
-        return f"{self._shown()}; {self.origin}"
+        return self.unset or f"{self._shown()}; {self.origin}"
 
     def _metavar(self) -> str | None:
         if choices := getattr(self.check, "choices", ()):

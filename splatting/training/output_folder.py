@@ -79,7 +79,7 @@ def own_folder(model_path: str) -> Iterator[None]:
         missing = [name for name in _INPUTS if not (folder / name).exists()]
         if missing not in ([], ["input.ply"]):  # a run that is resumed may have begun without the latter
             print(
-                f"warning: {some(missing)} in {folder} were removed while training; the model is saved, but other "
-                "programs may miss them",
+                f"warning: {some(missing)} in {folder} were removed during training; the model is saved, but other "
+                "programs may need them",
                 file=sys.stderr,
             )

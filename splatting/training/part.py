@@ -316,5 +316,5 @@ def fill(owner: Any, slot: str, value: Any, part: Part) -> None:
     """Let a part provide a slot. UserError if another part does already."""
     providers = owner.__dict__.setdefault("_providers", {})
     if (other := providers.setdefault(slot, part.name)) != part.name:
-        raise UserError(f"--{part.name} does not work with --{other}: both decide on {slot}; leave one of them out")
+        raise UserError(f"--{part.name} does not work with --{other}: both set {slot}; leave one of them out")
     setattr(owner, slot, value)

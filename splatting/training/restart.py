@@ -40,5 +40,5 @@ def what_stands(folder: str, start: str | None) -> str:
     """Words about the last checkpoint, for an end that cannot save one. start: the one that the training began with."""
     newest = newest_checkpoint(folder) or start
     if newest is None:
-        return "no checkpoint was saved, so start again, with --checkpoint_iterations"
-    return f"the last checkpoint stands: resume with --start_checkpoint {newest}"
+        return "no checkpoint was saved; start again, with --checkpoint_iterations"
+    return f"the last checkpoint is complete: resume with --start_checkpoint {newest}"

@@ -34,8 +34,8 @@ def faster_alone(ranks: int, on_gpu: bool, count: int) -> str | None:
     if ranks == 1 or not on_gpu or shared < alone:
         return None
     return (
-        f"one GPU is faster here: a step of {count:,} Gaussians takes it about {alone:.1f} ms, and two that share it "
-        f"{shared:.1f} ms; start train.py without torchrun, unless they do not fit"
+        f"one GPU is faster here: a step with {count:,} Gaussians takes about {alone:.1f} ms on one GPU and "
+        f"{shared:.1f} ms on two; start train.py without torchrun, unless they do not fit on one"
     )
 
 
@@ -43,7 +43,7 @@ def without_effect(opt: argparse.Namespace, strategy: str) -> str | None:
     """What to say of given options that belong to another strategy."""
     others = [option for name in strategies() if name != strategy for option in part_class(name).options.optimisation]
     given = [f"--{option.name}" for option in others if getattr(opt, option.name) != option.default]
-    return f"--strategy {strategy} has no use for {some(given)}" if given else None
+    return f"--strategy {strategy} ignores {some(given)}" if given else None
 
 
 def late_reset(density: DensityControl, opt: argparse.Namespace, done: int) -> str | None:
@@ -60,10 +60,10 @@ def late_reset(density: DensityControl, opt: argparse.Namespace, done: int) -> s
     of_white = schedule.schedule_step(due[-1]) % opt.opacity_reset_interval > 0
     remedy = "raise --opacity_reset_interval"
     if of_white:
-        remedy = "lower --densify_from_iter, where a white background has a reset"
+        remedy = "lower --densify_from_iter, at which a white background resets opacities"
     return (
-        f"opacities are reset in iteration {due[-1]}, and {schedule.ends - due[-1]} iterations are too few to recover "
-        f"from that; {remedy}"
+        f"opacities are reset in iteration {due[-1]}, and the remaining {schedule.ends - due[-1]} iterations are too "
+        f"few to recover; {remedy}"
     )
 
 
@@ -82,7 +82,7 @@ def another_number(density: DensityControl, opt: argparse.Namespace, count: int,
     too_many, too_late = 0 < opt.max_num_splats < count, opt.densify_from_iter >= schedule.length
     remover = next((name for name in strategies() if part_class(name).removes), None)
     if not density.grows_to:
-        remedy = f"; --strategy {remover} gets down to it" if remover and not too_late else ""
+        remedy = f"; --strategy {remover} removes the surplus" if remover and not too_late else ""
         adds = f"{opt.strategy} adds none, and removes only faint ones"
         return f"{_start_of(count, opt)}; {adds}{remedy}" if too_many else None
     if reached == aim or ((reached > aim or density.default_is_limit) and not opt.max_num_splats):
@@ -104,8 +104,8 @@ def another_number(density: DensityControl, opt: argparse.Namespace, count: int,
         why = f"--{ending} {density.ends} is not before the end; give {scaled or ends}"
     else:
         why = density.too_slow()
-    return f"--strategy {opt.strategy} gets to {reached:,} Gaussians, not to {aim:,}, as {why}"
+    return f"--strategy {opt.strategy} will reach {reached:,} Gaussians, not {aim:,}, as {why}"
 
 
 def _start_of(count: int, opt: argparse.Namespace) -> str:
-    return f"the start has {count:,} Gaussians, more than --max_num_splats {opt.max_num_splats}"
+    return f"training starts with {count:,} Gaussians, more than --max_num_splats {opt.max_num_splats}"

@@ -9,8 +9,6 @@ import warnings
 from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
 
-from tqdm import tqdm
-
 from splatting.training.option import Option
 from utils.system_utils import UserError
 
@@ -20,7 +18,7 @@ if TYPE_CHECKING:
 VISER = "viser==1.1.1"  # as setup.py names it
 HOST, PORT = "127.0.0.1", 8080
 HOST_OPTION = Option(
-    "viewer_host", HOST, origin="ours",
+    "viewer_host", HOST, origin="ours", topic="viewers",
     help=f"address at which the page listens; others than {HOST} can be reached from outside, and then the page needs "
     "the token that is printed",
 )  # fmt: skip
@@ -107,6 +105,8 @@ def _free_port(address: Address) -> int:
 
 def _announce(address: Address, port: int, token: str | None) -> str:
     """Say where the page is, and who can reach it; its address."""
+    from tqdm import tqdm  # the site reads the options above without it
+
     host, requested = address
     shown = socket.gethostname() if host in ("0.0.0.0", "::", "") else f"[{host}]" if ":" in host else host
     url = f"http://{shown}:{port}/" + ("" if token is None else f"?token={token}")

@@ -272,7 +272,7 @@ def test_maps_of_almost_no_pixels_are_refused(blender_scene, shape, suffix):
             np.save(f"{stem}.npy", np.ones(size))
         else:
             _save(np.ones(size, np.uint16), stem.with_suffix(suffix))
-    said = f"map .*r_2{suffix} has only {shape[1]} x {shape[0]} pixels|r_2.npy has .* and its photo has other sides"
+    said = f"map .*r_2{suffix} has only {shape[1]} x {shape[0]} pixels|r_2.npy has .* but its photo has another aspect"
     with pytest.raises(UserError, match=said):
         _depths(blender_scene, hold_out=True)
 
@@ -468,7 +468,7 @@ def test_metric_maps_that_cannot_be_are_named(blender_scene):
     depths = _depths(blender_scene, hold_out=True)
     assert depths["r_1"] == DepthMap(folder / "r_1.npy", 1.0, metric=True) and depths["r_0"] is None
     np.save(folder / "r_1.npy", np.ones((40, 30)))
-    with pytest.raises(UserError, match="r_1.npy has 30 x 40 pixels, and its photo has other sides, 40 x 30"):
+    with pytest.raises(UserError, match="r_1.npy has 30 x 40 pixels, but its photo has another aspect ratio, 40 x 30"):
         _depths(blender_scene, hold_out=True)
     np.save(folder / "r_1.npy", np.ones((30, 40), np.uint16))
     with pytest.raises(UserError, match="cannot read the depth map .*r_1.npy .*no array .height, width. of floats"):
@@ -478,7 +478,7 @@ def test_metric_maps_that_cannot_be_are_named(blender_scene):
         _depths(blender_scene)
     (folder / "metric.json").unlink()
     (folder / "r_1.npy").rename(folder / "other.npy")
-    with pytest.raises(UserError, match="no map in .*depths has the name of a training photo"):
+    with pytest.raises(UserError, match="no depth map in .*depths is named like a training photo"):
         _depths(blender_scene)
 
 

@@ -96,7 +96,7 @@ def test_a_resumed_training_knows_the_best_so_far(kept, scene, tmp_path):
     kinds = [json.loads((folder / "model.json").read_text())["kept_best"] for folder in (out, tmp_path / "resumed")]
     assert kinds[0] == kinds[1]
     train_on(scene, tmp_path / "plain", *WORDS)
-    with pytest.raises(UserError, match="was trained on the photos that --keep_best would choose by"):
+    with pytest.raises(UserError, match="was trained on the photos that --keep_best holds out"):
         train_on(scene, tmp_path / "no", *WORDS, "--keep_best", start[0], tmp_path / "plain" / "chkpnt200.pth")
     for wrong, words in ((torch.zeros(2, 2), "xyz of the checkpoint has the shape"), (torch.zeros(2, 3), "is damaged")):
         state = torch.load(start[1], weights_only=False)
@@ -132,7 +132,7 @@ def load_views(count: int) -> info.SceneInfo:
 
 
 def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path):
-    with pytest.raises(UserError, match="takes photos away from training and needs 8, and only 7 train; leave it out"):
+    with pytest.raises(UserError, match="needs at least 8 training photos, and there are 7; leave it out"):
         without_validation(load_views(7))
     for words in (("--refine_poses",), ("--appearance", "ppisp"), ("--train_test_exp",)):
         with pytest.raises(UserError, match=f"--keep_best does not work with {words[0]}"):

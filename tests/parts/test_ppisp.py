@@ -178,7 +178,7 @@ def test_the_file_comes_back(tmp_path):
     [
         (lambda table: None, "cannot read .*appearance.json"),
         (lambda table: [1], "is no table of appearances"),
-        (lambda table: table | {"photos": {"a.png": [0, 0, 0]}}, "has nothing of b.png, so it is of other photos"),
+        (lambda table: table | {"photos": {"a.png": [0, 0, 0]}}, "has no entry for b.png, so it belongs to other"),
         (lambda table: table | {"cameras": {"4": table["cameras"]["4"]}}, "has nothing of 7, so"),
         (lambda table: table | {"photos": dict.fromkeys(NAMES, [0, 1])}, "photos in .* are not .3,. finite numbers"),
         (lambda table: table | {"photos": dict.fromkeys(NAMES, "x")}, "is no table of appearances"),
@@ -256,9 +256,9 @@ def test_affine_is_train_test_exp(colmap_scene, tmp_path):
 
 def test_what_cannot_be_is_refused(tmp_path):
     make_colmap_scene(tmp_path / "one", views=2)
-    with pytest.raises(UserError, match="there is only one to train on"):
+    with pytest.raises(UserError, match="needs at least two training photos"):
         train_on(tmp_path / "one", tmp_path / "out", "--eval", "--appearance", "ppisp")
-    with pytest.raises(UserError, match="--train_test_exp is --appearance affine; leave it out"):
+    with pytest.raises(UserError, match="--train_test_exp means --appearance affine; leave out"):
         train_on(tmp_path / "one", tmp_path / "out", "--train_test_exp", "--appearance", "ppisp")
 
 

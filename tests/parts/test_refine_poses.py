@@ -346,7 +346,7 @@ def test_tracks_hold_a_camera(tmp_path):
 def test_a_scene_without_tracks_is_refused(tmp_path):
     make_blender_scene(tmp_path)
     scene = Scene(_options(tmp_path, tmp_path / "out"), GaussianModel(1), start=False)
-    with pytest.raises(UserError, match="--refine_poses needs the tracks of a COLMAP model"):
+    with pytest.raises(UserError, match="--refine_poses needs a COLMAP model with tracks"):
         PoseRefinement(scene, str(tmp_path), 100)
 
 

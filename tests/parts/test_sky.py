@@ -137,14 +137,14 @@ def test_none_begins_in_a_resumed_training(scene, tmp_path, capsys):
     words = ["-s", str(scene), "-m", str(tmp_path), "--no_curve", "--iterations"]
     train.main([*words, "2", "--checkpoint_iterations", "2"])
     train.main([*words, "3", "--sky", "auto", "--start_checkpoint", str(tmp_path / "chkpnt2.pth")])
-    assert "the checkpoint has no sky, and a sky is added only when a training starts" in capsys.readouterr().out
+    assert "the checkpoint has no sky, and only new trainings add one" in capsys.readouterr().out
     assert read_model_json(tmp_path).get("sky") is None
 
 
 def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path):
     with pytest.raises(UserError, match="--sky does not work with --strategy mcmc, which relocates large Gaussians"):
         train.main(["-s", str(scene), "-m", str(tmp_path), "--sky", "auto", "--strategy", "mcmc"])
-    with pytest.raises(UserError, match="--no_sky needs -m of a model that has a sky"):
+    with pytest.raises(UserError, match="--no_sky needs a model folder"):
         left_out(argparse.Namespace(no_sky=True, model_path=str(tmp_path)), torch.zeros(1, 3))
     file = tmp_path / "schedule.json"
     write_schedule(file, Decided(100, [Block(9, 0.0, 1 / 9, 0.0)], 9, 9.0, strategy="mcmc"))
@@ -152,5 +152,5 @@ def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path):
     with pytest.raises(UserError, match="--sky does not work with --strategy mcmc"):  # which is known late
         train.main([*words, "--sky", "auto"])
     for broken in (None, {"center": [0, 1], "radius": 2}, {"center": [0, 1, 2], "radius": math.nan}):
-        with pytest.raises(UserError, match="the sky has no center and radius"):
+        with pytest.raises(UserError, match="the saved sky lacks a valid centre and radius"):
             Shell.restored(broken)

@@ -443,7 +443,7 @@ def test_damaged_sleep_is_refused(scene, tmp_path, cut, what):
     else:
         asleep["terms"] = asleep["terms"][:5]
     save_checkpoint(tmp_path / "bad.pth", capture, iteration)
-    with pytest.raises(UserError, match="that slept do not fit"):
+    with pytest.raises(UserError, match="of sleeping blocks in the checkpoint does not fit"):
         _trained(scene, tmp_path / "b", "--start_checkpoint", tmp_path / "bad.pth")
 
 

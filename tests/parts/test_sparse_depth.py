@@ -124,7 +124,7 @@ def test_off_reads_no_tracks(scene, tmp_path, monkeypatch):
 def test_what_cannot_be_is_refused_in_one_sentence(tmp_path, capsys):
     make_blender_scene(tmp_path / "scene")
     words = ["-s", str(tmp_path / "scene"), "-m", str(tmp_path / "out"), "--sparse_depth"]
-    with pytest.raises(UserError, match="--sparse_depth needs the tracks of a COLMAP model"):
+    with pytest.raises(UserError, match="--sparse_depth needs a COLMAP model with tracks"):
         train.main([*words, "1"])
     with pytest.raises(SystemExit) as ended:
         run_cli(lambda: train.main([*words, "-1"]))

@@ -108,8 +108,8 @@ def test_a_limit_begins_where_the_gpu_has_too_little(monkeypatch):
     memory.expect(1_300_000, SCENE)
     assert memory.limit == int(gpu_memory._USABLE * 2**30)
     said = sentences(memory, 1_300_000, 0.02, True)
-    assert len(said) == 1 and "GiB of 1,300,000 Gaussians go to the memory of the host" in said[0]
-    assert said[0].endswith("the files stay the same")
+    assert len(said) == 1 and "GiB of 1,300,000 Gaussians are kept in the host's memory" in said[0]
+    assert said[0].endswith("the saved files are the same")
     memory.expect(10**9, SCENE)  # no other limit
     assert memory.limit == int(gpu_memory._USABLE * 2**30) and memory.remedy(1000, 1) == ""
     there = GpuMemory(0.0, model(50), False, torch.device("cpu"))
@@ -126,8 +126,8 @@ def test_a_slow_bus_is_told_of_before(monkeypatch):
     memory = _memory(monkeypatch, 1)
     spilled = memory.host_bytes(2_000_000)
     first, second = sentences(memory, 2_000_000, 0.8, False)
-    assert first.endswith("the files stay the same up to rounding")
-    assert f"about {2e3 * 0.8 * spilled / 40e9:.0f} ms a step, which concerns 80% of" in second
+    assert first.endswith("the saved files are the same up to rounding")
+    assert f"about {2e3 * 0.8 * spilled / 40e9:.0f} ms a step, which updates 80% of" in second
 
 
 def test_torch_gets_the_limit_without_the_near_parts(monkeypatch):
@@ -295,7 +295,7 @@ def test_it_is_told_before_what_the_host_has_to_hold(scene, tmp_path, monkeypatc
     train_on(scene, tmp_path, "--iterations", 2, "--disable_viewer", "--init_pcd_path", scene / "points.ply", *SPILL)
     out, err = capfd.readouterr()
     assert re.search(r"CPU memory: about \S+ GiB of 9.31 GiB: \S+ GiB of 40,000 Gaussians", out)
-    assert "go to the memory of the host, as all of them need more than 1.00 GiB of the GPU; the files stay" in out
+    assert "are kept in the host's memory, as all of them need more than 1.00 GiB of the GPU's; the saved files" in out
     assert re.search(r"about \d+ ms a step", out)
     assert "the memory of the CPU seems too small for 40,000 Gaussians; set a lower --max_num_splats" in err
 

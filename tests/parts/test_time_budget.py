@@ -127,7 +127,7 @@ def test_lost_seconds_do_not_make_an_iteration_do_more_than_twice_its_part(capsy
     assert max(schedule.stride(t) for t in range(1, last + 1)) <= 2 * 30_000 / 1000 * 1.001
     assert schedule.schedule_step(last) == 30_000 and len(schedule.blocks) < 420
     assert seconds == pytest.approx(total, abs=0.1)
-    assert capsys.readouterr().err.count("so long that the training needs about") == (total > 10)
+    assert capsys.readouterr().err.count("training will take about") == (total > 10)
 
 
 def test_an_iteration_that_takes_longer_than_the_budget_is_followed_by_the_last(capsys):
@@ -181,8 +181,8 @@ def _with_block(index: int, **values: object) -> dict:
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        ("{", "is no schedule of a run"),
-        ("[" * 100_000, "is no schedule of a run"),
+        ("{", "is not a valid schedule.json"),
+        ("[" * 100_000, "is not a valid schedule.json"),
         ([], "it is not a table"),
         ({name: GOOD[name] for name in GOOD if name != "blocks"}, "'blocks' is missing"),
         (GOOD | {"iterations": 0}, "0 is no whole number from 1 to 2147483647"),
@@ -191,14 +191,14 @@ def _with_block(index: int, **values: object) -> dict:
         (GOOD | {"strategy": ["adc"]}, "is no strategy"),
         (GOOD | {"iterations": True}, "True is no whole number"),
         (GOOD | {"blocks": []}, "its blocks do not follow each other"),
-        (GOOD | {"blocks": [3]}, "is no schedule of a run"),
+        (GOOD | {"blocks": [3]}, "is not a valid schedule.json"),
         (_with_block(1, last=2), "its blocks do not follow each other"),
         (_with_block(1, start=-0.1), "-0.1 is no number from 0 on"),
         (_with_block(0, start=0.3), "its progress does not ascend"),
         (_with_block(1, step=0.2), "its progress goes beyond its end"),
         (GOOD | {"ended": 9}, "its last block does not end with its last iteration"),
         (json.dumps(GOOD).replace("5.0", "NaN"), "nan is no number"),
-        (GOOD | {"time_budget": 10**400}, "is no schedule of a run"),
+        (GOOD | {"time_budget": 10**400}, "is not a valid schedule.json"),
     ],
 )
 def test_a_broken_schedule_is_refused(tmp_path, content, reason):
@@ -395,10 +395,10 @@ def test_what_contradicts_itself_is_refused(colmap_scene, tmp_path):
 
     refused("cannot read .*schedule.json")
     path.write_text(json.dumps(GOOD))
-    refused("give --iterations 100, as in the run that wrote it")
+    refused("was written for --iterations 100")
     more = "--iterations", 100
-    refused("--time_budget and --schedule both give the pace", *more, "--time_budget", 3)
-    refused("is of a run with --resolution_schedule none; leave that", *more, "--resolution_schedule", "pyramid")
+    refused("--time_budget and --schedule both set the schedule", *more, "--time_budget", 3)
+    refused("already sets --resolution_schedule none; leave that", *more, "--resolution_schedule", "pyramid")
     path.write_text(json.dumps(GOOD | {"ended": None}))
     refused("run not finished; resume it", *more)
     path.write_text("{}")
@@ -456,7 +456,7 @@ def test_a_checkpoint_comes_with_its_schedule_and_the_last_one_is_the_end(colmap
         _train(colmap_scene, tmp_path, "--time_budget", 4, "--checkpoint_iterations", 3000)
     (checkpoint,) = tmp_path.glob("chkpnt*.pth")
     assert read_schedule(tmp_path / "schedule.json").ended == int(checkpoint.stem[6:])
-    with pytest.raises(UserError, match="and its schedule ends with .*, so nothing is left to do"):
+    with pytest.raises(UserError, match="and its schedule ends at .*; there is nothing left to"):
         _train(colmap_scene, tmp_path / "on", "--time_budget", 4, "--start_checkpoint", checkpoint)
 
 
@@ -472,7 +472,7 @@ def test_a_steady_run_goes_on_from_a_checkpoint_of_a_budget_and_removes_the_sche
     assert before.ended == max(whole) > on
     more = "--iterations", on + 20, "--checkpoint_iterations", on + 10, "--start_checkpoint"
     _train(colmap_scene, out, *more, late)
-    assert f"and this one has neither: it goes on at iteration {on} of --iterations" in capsys.readouterr().err
+    assert f"this run has neither and continues at iteration {on} of --iterations" in capsys.readouterr().err
     assert not path.exists()
     steady = out / f"chkpnt{on + 10}.pth"
     _train(colmap_scene, out, *more, steady)
@@ -481,7 +481,7 @@ def test_a_steady_run_goes_on_from_a_checkpoint_of_a_budget_and_removes_the_sche
     first = DecidedSchedule(before).up_to(int(early.stem[6:])).blocks
     assert read_schedule(path).blocks[: len(first)] == first and len(first) > 3
     _train(colmap_scene, out, "--iterations", on + 60, "--time_budget", 5, "--start_checkpoint", steady)
-    assert f"has no pace of a time budget: its iterations count as {on + 10} of" in capsys.readouterr().err
+    assert f"was trained without --time_budget; it is iteration {on + 10} of" in capsys.readouterr().err
     assert read_schedule(path).blocks[0].last == on + 10
     _train(colmap_scene, out, "--iterations", 20)
     assert not path.exists()
@@ -492,7 +492,7 @@ def test_a_time_budget_takes_the_strategy_that_is_best_in_it(colmap_scene, tmp_p
     words = "--time_budget", 6, "--checkpoint_iterations", 1800
     first = _train(colmap_scene, tmp_path / "a", *words)
     out = capsys.readouterr().out
-    assert out.count("--time_budget takes --strategy budget, which is best here; name another one to compare") == 1
+    assert out.count("--time_budget chose --strategy budget; give --strategy to use another one") == 1
     assert _stored(tmp_path / "a", "strategy") == read_schedule(tmp_path / "a" / "schedule.json").strategy == "budget"
     repeated = _train(colmap_scene, tmp_path / "b", "--schedule", tmp_path / "a" / "schedule.json")
     assert list(repeated.values()) == [first[max(first)]]
@@ -553,9 +553,7 @@ def test_the_clock_ends_growth_at_the_pace_of_whole_views_and_removes_nothing(si
     fits = 25 * 20.0 / (0.005 + counts[-1] * 1e-6)  # at the pace of whole views with so many
     assert counts[-1] == pytest.approx(fits, rel=0.12)
     (said,) = capsys.readouterr().err.splitlines()
-    assert said.startswith("--time_budget 20 is time for some ") and said.endswith(
-        ", not the 50,000 of --max_num_splats"
-    )
+    assert said.startswith("--time_budget 20 allows about ") and said.endswith(", not the 50,000 of --max_num_splats")
 
 
 def test_a_strategy_of_a_damaged_file_is_none():

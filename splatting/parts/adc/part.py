@@ -11,12 +11,12 @@ class Adc(Strategy):
     """Clones, splits, prunes and resets."""
 
     name = "adc"
-    summary = "adaptive density control, the method's own"
+    summary = "adaptive density control of the 3DGS paper"
     # fmt: off
     options = Options(optimisation=(
         Option("absgrad", False, origin="ours",
-            help="adc: densify by the sum of the pixels' absolute gradients (AbsGS), which do not cancel out where a "
-                 "large Gaussian covers fine detail; absgrad_threshold then stands for densify_grad_threshold"),
+            help="adc: densify by absolute gradients of the pixels (AbsGS), which do not cancel out where a large "
+                 "Gaussian covers fine detail; --absgrad_threshold then replaces --densify_grad_threshold"),
         Option("absgrad_threshold", 0.0008, origin="ours, as gsplat recommends", check=above(0),
             help="adc: absolute screen-space gradient (per NDC unit) that makes a Gaussian clone or split, with "
                  "--absgrad; lower: more Gaussians"),

@@ -11,17 +11,16 @@ class Budget(Strategy):
 
     name = "budget"
     summary = (
-        "growth to --max_num_splats Gaussians, where the error is; 0: one for 64 training pixels, 100,000 to "
-        "1,000,000. budget has larger learning rates of colour, opacity, scale and rotation, the fewer --iterations "
-        "there are"
+        "grows to --max_num_splats Gaussians where the error is largest (0: one for 64 training pixels, 100,000 to "
+        "1,000,000)"
     )
     removes = True
     # fmt: off
     options = Options(optimisation=(
         Option("opacity_decay", 0.98, origin="ours", check=within(0.5, 1),
-            help="budget: factor of all opacities after each densification, so that useless Gaussians fade; 1: none"),
+            help="budget: factor of all opacities after each densification, so that unneeded Gaussians fade; 1: off"),
         Option("prune_opacity", 0.005, origin="ours, and adaptive density control's", check=within(0, 0.5),
-            help="budget: Gaussians of a lower opacity are removed, every densification_interval steps"),
+            help="budget: remove Gaussians of a lower opacity, every --densification_interval steps"),
     ))
     # fmt: on
 

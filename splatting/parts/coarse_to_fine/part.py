@@ -21,10 +21,10 @@ class CoarseToFine(Part):
     # fmt: off
     options = Options(optimisation=(
         Option("resolution_schedule", "auto", origin="ours", check=one_of("auto", "none", "pyramid"),
-            stored=MODEL_JSON,
-            help="smaller views at first, so that the first iterations take less time. pyramid: a quarter of the size "
-                 "up to 10 % of the schedule, half of it up to 25 %; auto: pyramid where a given time leaves no more "
-                 "than an iteration for 4 megapixels of the schedule's views, else none"),
+            stored=MODEL_JSON, topic="quality and speed",
+            help="train on smaller views at first, which takes less time. pyramid: a quarter of the size up to 10 % "
+                 "of the schedule, half of it up to 25 %; auto: pyramid where a given time is short for the size of "
+                 "the photos, else none"),
     ))
     # fmt: on
     _run = None
@@ -51,8 +51,7 @@ class CoarseToFine(Part):
             schedule.levels = PYRAMID if schedule.sizes == "pyramid" else ()
         elif asked not in ("auto", schedule.sizes):
             raise UserError(
-                f"the schedule that this run follows is of a run with --resolution_schedule {schedule.sizes}; leave "
-                "that option out, as it is taken from there"
+                f"the schedule of this run already sets --resolution_schedule {schedule.sizes}; leave that option out"
             )
         self._run = run
         run.opt.resolution_schedule = schedule.sizes

@@ -22,8 +22,8 @@ class Curve(Part):
     switch = "no_curve"
     # fmt: off
     options = Options(launch=(
-        Option("no_curve", False, origin="ours",
-            help="write no error_vs_time.csv and .png, which with --eval cost up to 5 % of the time, more in short "
+        Option("no_curve", False, origin="ours", topic="output",
+            help="do not write error_vs_time.csv and .png; with --eval they cost up to 5 % of the time, more in short "
                  "runs"),
     ))
     # fmt: on

@@ -20,14 +20,15 @@ class DepthMaps(Part):
     # fmt: off
     options = Options(
         model=(
-            Option("depths", "", short="d", stored=CFG_ARGS, seen=False,
-                help="folder of depth maps inside the scene folder, with the photos' names: PNGs of inverse depth, or "
-                     "metric PNGs, .npy or .pfm; they stabilise regions that few photos show; empty: no depth "
-                     "supervision"),
+            Option("depths", "", short="d", stored=CFG_ARGS, seen=False, topic="data",
+                help="folder of depth maps inside the scene folder, named like the photos: PNGs of inverse depth, or "
+                     "metric PNGs, .npy or .pfm; they stabilise regions that few photos show"),
         ),
         optimisation=(
-            Option("depth_l1_weight_init", 1.0, "weight of the depth loss (--depths) at the start", check=at_least(0)),
-            Option("depth_l1_weight_final", 0.01, "weight of the depth loss in the last step", check=at_least(0)),
+            Option("depth_l1_weight_init", 1.0, check=at_least(0), topic="data",
+                help="weight of the depth loss (--depths) at the start"),
+            Option("depth_l1_weight_final", 0.01, check=at_least(0), topic="data",
+                help="weight of the depth loss in the last step"),
         ),
     )
     # fmt: on

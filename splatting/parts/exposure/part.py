@@ -28,16 +28,18 @@ class Exposure(Appearance):
     options = Options(
         model=(
             Option("train_test_exp", False, stored=CFG_ARGS, compared=False, after="white_background",
-                help="train a colour correction of each photo, for photos of different exposure; this trains on the "
-                     "left halves of the test photos too, and only right halves are scored and rendered"),
+                topic="photos that vary",
+                help="train a colour correction of each photo, for photos of different exposure; the left halves of "
+                     "test photos train too, and only their right halves are scored and rendered"),
         ),
         optimisation=(
-            Option("exposure_lr_init", 0.01, check=at_least(0),
+            Option("exposure_lr_init", 0.01, check=at_least(0), topic="photos that vary",
                 help="learning rate of exposures (--train_test_exp) at the start"),
-            Option("exposure_lr_final", 0.001, "learning rate of exposures in the last step", check=at_least(0)),
-            Option("exposure_lr_delay_steps", 0, check=at_least(0),
+            Option("exposure_lr_final", 0.001, check=at_least(0), topic="photos that vary",
+                help="learning rate of exposures in the last step"),
+            Option("exposure_lr_delay_steps", 0, check=at_least(0), topic="photos that vary",
                 help="steps at the start over which the learning rate of exposures rises to its normal value"),
-            Option("exposure_lr_delay_mult", 0.0, check=within(0, 1),
+            Option("exposure_lr_delay_mult", 0.0, check=within(0, 1), topic="photos that vary",
                 help="factor of the learning rate of exposures at step 0, where that rise begins"),
         ),
     )
@@ -66,7 +68,7 @@ class Exposure(Appearance):
     def begin(self, run: Any, state: Any) -> None:
         run.gaussians.exposures.applied = True
         if run.start and state is None:
-            print(f"{run.start} has no exposures: all photos start without a correction")
+            print(f"{run.start} has no exposures; all photos start without a correction")
 
     def save(self, scene: "Scene") -> None:
         from splatting.compat.models import save_exposures

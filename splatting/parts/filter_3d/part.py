@@ -18,9 +18,9 @@ class Filter3d(Part):
     tools = ("drawn",)
     # fmt: off
     options = Options(optimisation=(
-        Option("filter_3d", False, origin="ours",
-            help="let no Gaussian be finer than the training photos can show, so that views from other distances look "
-                 "right. It is part of the PLY, so that every viewer shows it; best with --antialiasing"),
+        Option("filter_3d", False, origin="ours", topic="quality and speed",
+            help="limit how small Gaussians get by the resolution of the training photos (Mip-Splatting), so that "
+                 "views from other distances look right. The PLY contains the filter; best with --antialiasing"),
     ))
     # fmt: on
     needs = Needs(all_rows=True)

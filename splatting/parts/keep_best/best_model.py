@@ -50,7 +50,7 @@ class BestModel:
         """What training says of it. at_end: the score of the last model."""
         who = f"{len(self.cameras)} validation photos ({some(self._names)})"
         if not self.iteration or at_end is None:
-            return f"--keep_best saved the last model: {who} have no PSNR, as no pixel counts, or none differs"
+            return f"--keep_best saved the last model: {who} have no finite PSNR"
         than = f", {self.psnr - at_end:.2f} dB better than the last one" if self.psnr > at_end else ", the last one"
         return f"--keep_best saved the model of iteration {self.iteration}{than}, by {who}: {self.psnr:.2f} dB"
 
@@ -66,7 +66,8 @@ class BestModel:
         """Take the state of `captured()`. UserError for one that does not fit."""
         if not isinstance(state, dict) or state.get("views") != self._names:
             raise UserError(
-                "the checkpoint was trained on the photos that --keep_best would choose by; leave it out, or train anew"
+                "the checkpoint was trained on the photos that --keep_best holds out; leave --keep_best out, or start "
+                "a new training"
             )
         if not state.get("iteration") or state.get("psnr") == math.inf:  # as version 0.1 kept it
             return

@@ -20,13 +20,13 @@ class KeepBest(Part):
     tools = "remarks", "against_overfitting"
     # fmt: off
     options = Options(model=(
-        Option("keep_best", False, origin="ours", stored=MODEL_JSON,
-            help="take every 16th training photo, and at least two, for validation: the last save is the model "
-                 "that showed them best, of all points scored"),
+        Option("keep_best", False, origin="ours", stored=MODEL_JSON, topic="quality and speed",
+            help="hold out every 16th training photo, and at least two, for validation; the last save is the model "
+                 "with the best scores on them"),
     ))
     # fmt: on
     needs = Needs(ranks=False)
-    against = {"needs.photos": "as it keeps Gaussians alone; leave one of them out"}
+    against = {"needs.photos": "which trains more than Gaussians; leave one of them out"}
 
     def dataset(self, info: "SceneInfo", args: "argparse.Namespace", fresh: bool) -> "SceneInfo":
         from splatting.parts.keep_best.validation import without_validation

@@ -14,7 +14,7 @@ def without_validation(info: SceneInfo) -> SceneInfo:
     views = info.train_cameras
     if len(views) < FEWEST:
         raise UserError(
-            f"--keep_best takes photos away from training and needs {FEWEST}, and only {len(views)} train; leave it out"
+            f"--keep_best needs at least {FEWEST} training photos, and there are {len(views)}; leave it out"
         )
     step = min(EVERY, len(views) // 2)
     chosen = range(step // 2, len(views), step)

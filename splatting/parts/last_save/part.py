@@ -22,11 +22,10 @@ class LastSave(Part):
     name = "last_save"
     # fmt: off
     options = Options(optimisation=(
-        Option("keep_unseen", False, origin="ours",
-            help="also save the Gaussians that nobody sees. Without this the last save leaves out those that no "
-                 "training view and no view between neighbouring ones depends on: training views at their training "
-                 "size stay the same, views from elsewhere may change"),
-        Option("prune_sh", -1.0, origin="ours", check=_tolerance,
+        Option("keep_unseen", False, origin="ours", topic="output",
+            help="save invisible Gaussians, too. Without this the last save leaves out those that no training view "
+                 "and no view between neighbours needs; training views stay the same, views from elsewhere may change"),
+        Option("prune_sh", -1.0, origin="ours", check=_tolerance, topic="output",
             help="in the last save, drop the highest SH bands that change no colour (0 to 1) by more than this; 0: "
                  "drop bands that are zero throughout, -1: drop none. The sh_degree in cfg_args follows"),
     ))

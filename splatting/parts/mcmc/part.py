@@ -18,7 +18,7 @@ class Mcmc(Strategy):
     """Moves Gaussians that nobody sees to others. In a given time it is best for few photos, on a GPU."""
 
     name = "mcmc"
-    summary = "Gaussians that nobody sees are moved to others, and positions get noise"
+    summary = "moves transparent Gaussians to opaque ones and adds noise to positions"
     until = "mcmc_until_iter", 5 / 6
     # fmt: off
     options = Options(optimisation=(

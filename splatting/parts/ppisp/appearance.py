@@ -245,7 +245,7 @@ def read_appearance(folder: str | os.PathLike, views: Sequence[CameraInfo]) -> P
     except OSError as error:
         raise UserError(f"cannot read {path} ({error.strerror}); {_REMEDY}") from error
     except KeyError as error:
-        raise UserError(f"{path} has nothing of {error.args[0]}, so it is of other photos; {_REMEDY}") from error
+        raise UserError(f"{path} has no entry for {error.args[0]}, so it belongs to other photos; {_REMEDY}") from error
     except (TypeError, ValueError, RuntimeError, OverflowError, RecursionError) as error:
         raise UserError(f"{path} is no table of appearances; {_REMEDY}") from error
     for kind, values in appearance.numbers.items():

@@ -43,13 +43,13 @@ class Ppisp(Appearance):
 
         views = run.scene.info.train_cameras
         if len(views) < 2:
-            raise UserError("--appearance ppisp compares photos, and there is only one to train on; leave it out")
+            raise UserError("--appearance ppisp needs at least two training photos; leave it out")
         self.photos = appearance_of(views)
         fill(run.gaussians, "exposures", self.photos, self)
         if run.start:
             self.photos.training_setup(run.opt)
             if state is None:
-                print(f"{run.start} has no exposures: all photos start without a correction")
+                print(f"{run.start} has no exposures; all photos start without a correction")
             else:
                 self.photos.restore(state)
 

@@ -22,9 +22,9 @@ class RefinePoses(Part):
     tools = "advise", "for_wrong_poses"
     # fmt: off
     options = Options(model=(
-        Option("refine_poses", False, origin="ours", stored=MODEL_JSON,
-            help="train a small correction of each training camera's pose with the Gaussians. The tracks of a COLMAP "
-                 "scene hold the cameras, and place the test views"),
+        Option("refine_poses", False, origin="ours", stored=MODEL_JSON, topic="cameras",
+            help="correct the pose of each training camera together with the Gaussians, by at most 3 degrees; needs "
+                 "the tracks of a COLMAP scene"),
     ))
     # fmt: on
     needs = Needs(camera_gradient=True, files=True, photos=True)

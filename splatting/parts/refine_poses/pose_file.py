@@ -54,5 +54,5 @@ def _placed(views: Sequence[CameraInfo], entries: Any, path: Path) -> list[Camer
     if any(R.shape != (3, 3) or T.shape != (3,) for R, T in poses):
         raise UserError(f"{path} has a pose that is not R (3, 3) and T (3,); {_REMEDY}")
     if any("lens" in entry for entry in entries):
-        raise UserError(f"{path} has refined lenses, which this version does not know; {_WITHOUT}")
+        raise UserError(f"{path} has refined lenses, which this version does not support; {_WITHOUT}")
     return [view._replace(R=R, T=T) for view, (R, T) in zip(views, poses, strict=True)]

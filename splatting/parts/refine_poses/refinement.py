@@ -43,8 +43,8 @@ class PoseRefinement:
         tracks = read_tracks(source_path, views, info.offset)
         if not any(tracks[:count]):
             raise UserError(
-                "--refine_poses needs the tracks of a COLMAP model, the places of its points in photos that are no "
-                f"panoramas, and {source_path} has none; leave it out"
+                f"--refine_poses needs a COLMAP model with tracks (2D points of its photos, not of panoramas), and "
+                f"{source_path} has none; leave it out"
             )
         given, focals = [_pose_of(camera) for camera in self._cameras], [camera.fx for camera in self._cameras]
         tracked = TrackedPoses(given, tracks, focals, unit)
@@ -139,7 +139,7 @@ class PoseRefinement:
         if not fits:
             raise UserError("the checkpoint has no refined poses of this run's views; leave --refine_poses out")
         if "lenses" in state:
-            raise UserError("the checkpoint has refined lenses, which this version does not know; train from the start")
+            raise UserError("the checkpoint has refined lenses, which are not supported any more; train from the start")
         for name, array in self.arrays.items():
             array[:] = state[name].numpy()
         self._move(range(len(self._cameras)))

@@ -17,9 +17,9 @@ class RemoteViewer(Part):
     name = "remote_viewer"
     # fmt: off
     options = Options(launch=(
-        Option("ip", "127.0.0.1", help="address to listen at for the remote viewer"),
-        Option("port", 6009, help="port for the remote viewer, 0: any free one"),
-        Option("disable_viewer", False, called=True, help="open no port for the remote viewer"),
+        Option("ip", "127.0.0.1", help="address to listen at for the remote viewer", topic="viewers"),
+        Option("port", 6009, help="port for the remote viewer, 0: any free one", topic="viewers"),
+        Option("disable_viewer", False, called=True, help="open no port for the remote viewer", topic="viewers"),
     ))
     # fmt: on
     waits = True

@@ -45,7 +45,7 @@ class Serving:
             if network_gui.conn is None:
                 network_gui.try_connect()
             if network_gui.holds(last=True):
-                print("The model is saved; the viewer keeps this process until it leaves, or Ctrl-C")
+                print("The model is saved; this process runs until the viewer disconnects, or until Ctrl-C")
             self._serve(last=True)
         network_gui.disconnect()
 

@@ -22,9 +22,9 @@ class RobustMask(Part):
     tools = "advise_trained", "examine", "pictures"
     # fmt: off
     options = Options(optimisation=(
-        Option("robust_mask", 0.0, origin="ours", check=within(0, 0.5),
-            help="largest part of a photo that training may leave out because all others disagree with it, as with "
-                 "passers-by; no mask is needed. 0: off"),
+        Option("robust_mask", 0.0, origin="ours", check=within(0, 0.5), topic="photos that vary",
+            help="largest part of a photo that training may ignore because the other photos do not show it, as with "
+                 "passers-by; 0: off"),
     ))
     # fmt: on
     needs = Needs(replay=False, ranks=False)

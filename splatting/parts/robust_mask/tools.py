@@ -15,7 +15,7 @@ from splatting.parts.robust_mask.written import PICTURE
 def advise_trained(scene: Scene, views: ScoredViews) -> Iterator[tuple[str, str]]:
     """Texts on a short training of small photos, and the options that they speak for, or none."""
     share = odd_share(residuals_of(scene.getTrainCameras(), views, scene.gaussians))
-    text = f"{share:.0%} of the photos show what a short training does not, as if someone had passed by"
+    text = f"{share:.0%} of the photos show objects that a short training does not, such as passers-by"
     yield text, f"--robust_mask {MASKED:g}" if share > FEW else ""
 
 
@@ -29,7 +29,7 @@ def examine(scene: Scene, views: ScoredViews, options: argparse.Namespace) -> It
     found = {camera.image_name: masks.counted(camera) for camera in cameras}
     shares = {name: 1 - float(counts.float().mean()) for name, counts in found.items() if counts is not None}
     if worst := sorted(shares, key=shares.get, reverse=True):
-        text = f"{len(worst)} of {len(cameras)} photos show what the model does not, as if someone had passed by"
+        text = f"{len(worst)} of {len(cameras)} photos show objects that the model does not, such as passers-by"
         yield f"{text}: most in {some(worst)}; try --robust_mask {MASKED:g}"
 
 

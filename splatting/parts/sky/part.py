@@ -16,9 +16,9 @@ class Sky(Part):
     tools = "advise", "beside", "add_export_options", "left_out"
     # fmt: off
     options = Options(optimisation=(
-        Option("sky", "off", origin="ours", check=one_of("off", "auto"),
-            help="auto: where directions that photos show have no points, add Gaussians on a far sphere, as a sky "
-                 "behind all; off: add none. By one process, with --strategy adc or budget"),
+        Option("sky", "off", origin="ours", check=one_of("off", "auto"), topic="quality and speed",
+            help="auto: add Gaussians on a far sphere in directions that photos show and that have no points; "
+                 "off: add none. Trains in one process, with --strategy adc or budget"),
     ))
     # fmt: on
     joins = True
@@ -33,7 +33,7 @@ class Sky(Part):
         if state is not None:
             self.shell = shell.resumed_shell(state, run.scene)
         elif run.start:
-            print("--sky auto: the checkpoint has no sky, and a sky is added only when a training starts")
+            print("--sky auto has no effect: the checkpoint has no sky, and only new trainings add one")
         else:
             self.shell = shell.with_shell(run.scene, run.gaussians)
         self.active = self.shell is not None

@@ -77,7 +77,9 @@ class Shell:
             if len(center) != 3 or not all(map(math.isfinite, center)) or not 0 < radius < math.inf:
                 raise ValueError("a number is missing or not finite")
         except (TypeError, ValueError, KeyError) as error:
-            raise UserError(f"the sky has no center and radius ({error}); give the files of its training") from error
+            raise UserError(
+                f"the saved sky lacks a valid centre and radius ({error}); restore the files of its training"
+            ) from error
         return cls(center, radius)
 
     def captured(self) -> dict[str, Any]:
@@ -111,7 +113,7 @@ def with_shell(scene: Scene, gaussians: GaussianModel) -> Shell | None:
     if share < FEWEST:
         print(f"{text}, so there is no sky")
         return None
-    print(f"{text}; {len(cloud.points):,} Gaussians of a sky begin there, {sky.radius:.3g} units away")
+    print(f"{text}; {len(cloud.points):,} Gaussians of a sky are added there, {sky.radius:.3g} units away")
     new = start_rows(cloud, scene.cameras_extent, gaussians.max_sh_degree, gaussians.enlargement)
     new["opacity"] = gaussians.raw_opacity(torch.full_like(new["opacity"], logit(_OPACITY)))
     gaussians.set_rows({name: torch.cat((own, new[name].to(own))) for name, own in gaussians.rows().items()})

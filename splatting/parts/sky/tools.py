@@ -42,5 +42,5 @@ def left_out(args: argparse.Namespace, means: Tensor) -> Tensor | None:
         return None
     found = beside(read_model_json(Path(args.model_path)), means) if args.model_path else None
     if found is None:
-        raise UserError("--no_sky needs -m of a model that has a sky (train.py --sky auto); leave it out")
+        raise UserError("--no_sky needs a model folder (-m) that was trained with --sky auto; leave it out")
     return found

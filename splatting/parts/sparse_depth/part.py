@@ -19,8 +19,8 @@ class SparseDepth(Part):
     tools = ("advise",)
     # fmt: off
     options = Options(optimisation=(
-        Option("sparse_depth", 0.0, origin="ours", check=at_least(0),
-            help="weight of the depth of the scene's own points (COLMAP only), where photos have seen them; 0: off"),
+        Option("sparse_depth", 0.0, origin="ours", check=at_least(0), topic="data",
+            help="weight of the loss of depth at the scene's own points (COLMAP only); 0: off"),
     ))
     # fmt: on
     needs = Needs(depth=True, ranks=False, files=True)

@@ -17,8 +17,8 @@ class SeenPoints:
         self._known: dict[tuple[int, int, int], PointDepths | None] = {}
         if not any(self._tracks):
             raise UserError(
-                "--sparse_depth needs the tracks of a COLMAP model, the places of its points in photos that are no "
-                f"panoramas, and {source_path} has none; leave it out"
+                f"--sparse_depth needs a COLMAP model with tracks (2D points of its photos, not of panoramas), and "
+                f"{source_path} has none; leave it out"
             )
 
     def at(self, camera: Camera) -> PointDepths | None:

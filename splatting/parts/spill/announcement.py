@@ -48,13 +48,13 @@ def sentences(memory: GpuMemory, count: int, seen: float, same: bool) -> list[st
     """
     spilled = memory.host_bytes(count)
     said = [
-        f"{gib(spilled)} of {count:,} Gaussians go to the memory of the host, as all of them need more than "
-        f"{gib(memory.limit)} of the GPU; the files stay the same" + ("" if same else " up to rounding")
+        f"{gib(spilled)} of {count:,} Gaussians are kept in the host's memory, as all of them need more than "
+        f"{gib(memory.limit)} of the GPU's; the saved files are the same" + ("" if same else " up to rounding")
     ]
     milliseconds = 1e3 * 2 * spilled * seen / _BUS
     if milliseconds > _SLOW:
         said.append(
-            f"the bus to that memory will set the pace: about {milliseconds:.0f} ms a step, which concerns "
+            f"transfers from and to that memory limit the speed to about {milliseconds:.0f} ms a step, which updates "
             f"{seen:.0%} of the Gaussians"
         )
     return said

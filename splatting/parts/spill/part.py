@@ -25,9 +25,9 @@ class Spill(Part):
     switch = "gpu_memory"
     # fmt: off
     options = Options(optimisation=(
-        Option("gpu_memory", 0.0, origin="ours", check=within(0, 1_000_000),
-            help="GiB of the GPU that training may take, 0: all. What then does not fit of the SH bands above 0 and "
-                 "their averages of Adam lies in the memory of the host: slower, with the same result"),
+        Option("gpu_memory", 0.0, origin="ours", check=within(0, 1_000_000), topic="memory",
+            help="GiB of the GPU's memory that training may use, 0: all. SH bands above 0 and their Adam state that do "
+                 "not fit are kept in the host's memory; slower, with the same result"),
     ))
     # fmt: on
 

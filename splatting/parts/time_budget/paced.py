@@ -111,8 +111,8 @@ class DecidedSchedule(Schedule):
             self._told = True
             given = f", not the {aim:,} of --max_num_splats" if aim else ""
             tqdm.write(
-                f"--time_budget {self.seconds:g} is time for some {iterations:,} iterations, which train at most about "
-                f"{trained:,} Gaussians, {AN_ITERATION} for each{given}",
+                f"--time_budget {self.seconds:g} allows about {iterations:,} iterations, and so about {trained:,} "
+                f"Gaussians, {AN_ITERATION} for each{given}",
                 file=sys.stderr,
             )
 
@@ -121,8 +121,8 @@ class DecidedSchedule(Schedule):
 
     def nothing_left(self, checkpoint: str, iteration: int) -> str:
         return (
-            f"{checkpoint} is at iteration {iteration}, and its schedule ends with {self.ends}, so nothing is left to "
-            "do; leave it as it is"
+            f"{checkpoint} is at iteration {iteration}, and its schedule ends at {self.ends}; there is nothing left to "
+            "train"
         )
 
     def rate_factor(self, iteration: int) -> float:
@@ -187,7 +187,7 @@ class TimeBudget(DecidedSchedule):
         fit = [name for name in strategies() if f"strategy={name}" not in against]
         best = (name for name in fit if part_class(name).best_in(self.seconds, run))
         strategy = next(best, super().best_strategy(run))
-        print(f"--time_budget takes --strategy {strategy}, which is best here; name another one to compare")
+        print(f"--time_budget chose --strategy {strategy}; give --strategy to use another one")
         return strategy
 
     @property
@@ -260,8 +260,8 @@ class TimeBudget(DecidedSchedule):
         if not self._is_late_told and seconds + undone * self.seconds / _MOST_SHARE > _TOLD * self.seconds:
             self._is_late_told = True
             tqdm.write(
-                "warning: some iterations took so long that the training needs about "
-                f"{seconds + undone * self.seconds / _MOST_SHARE:.0f} s, not the {self.seconds:g} s of --time_budget",
+                f"warning: training will take about {seconds + undone * self.seconds / _MOST_SHARE:.0f} s, more than "
+                f"--time_budget {self.seconds:g}, because some iterations were slow",
                 file=sys.stderr,
             )
         usual = statistics.median_low(self._speeds) / self.seconds  # part of the schedule, of an iteration

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatting.training.option import Option, within
+from splatting.training.option import MOST_NEEDED, Option, within
 from splatting.training.part import Error, Options, Part, fill
 
 if TYPE_CHECKING:
@@ -22,15 +22,13 @@ class TimeBudget(Part):
     tools = ("for_few_iterations",)
     # fmt: off
     options = Options(optimisation=(
-        Option("time_budget", 0.0, origin="ours", check=within(0, 31_536_000),  # a year
-            help="seconds of training that the run takes, without scoring and saving, to 3 %; 0: no budget. It goes "
-                 "through the whole schedule of --iterations in them, in fewer or more iterations, with learning rates "
-                 "that follow their number, and writes schedule.json. --strategy auto takes budget, or on a GPU mcmc "
-                 "for at most 50 photos and 0.25 seconds or more for each; all grow to at most 25 Gaussians for each "
-                 "iteration"),
-        Option("schedule", "", origin="ours",
-            help="schedule.json of a run with --time_budget: train as that run did, without looking at the clock. Or a "
-                 "number: so many iterations, which go through the whole schedule of --iterations in equal parts"),
+        Option("time_budget", 0.0, origin="ours", check=within(0, 31_536_000), topic=MOST_NEEDED,  # a year
+            help="seconds of training, without scoring and saving; 0: no limit. The whole schedule of --iterations is "
+                 "fitted into this time, with at most 25 Gaussians for each iteration. --strategy auto then means "
+                 "budget, or mcmc for at most 50 photos on a GPU with 0.25 seconds or more for each"),
+        Option("schedule", "", origin="ours", topic="quality and speed",
+            help="schedule.json of a run with --time_budget: repeat its schedule, independent of the clock. Or a "
+                 "number: fit the whole schedule of --iterations into this many iterations"),
     ))
     # fmt: on
     traces = (_FILE,)
@@ -44,8 +42,8 @@ class TimeBudget(Part):
     @classmethod
     def dropped(cls, given: "argparse.Namespace", iteration: int) -> str | None:
         return (
-            f"{given.start_checkpoint} is of a run with --time_budget or --schedule, and this one has neither: it goes "
-            f"on at iteration {iteration} of --iterations {given.iterations}"
+            f"{given.start_checkpoint} was trained with --time_budget or --schedule; this run has neither and "
+            f"continues at iteration {iteration} of --iterations {given.iterations}"
         )
 
     def check(self, run: Any, state: Any) -> None:

@@ -42,7 +42,7 @@ def read_schedule(path: Path) -> Decided:
     except OSError as error:
         raise UserError(f"cannot read {path} ({error.strerror}); {remedy}") from error
     except _BROKEN as error:
-        raise UserError(f"{path} is no schedule of a run ({_reason(error)}); {remedy}") from error
+        raise UserError(f"{path} is not a valid {NAME} ({_reason(error)}); {remedy}") from error
 
 
 def _reason(error: Exception) -> str:
@@ -104,7 +104,7 @@ def schedule_of(
     0. share: gives all processes the seconds of one. before: the table in the checkpoint, None: it has none.
     """
     if opt.schedule and opt.time_budget:
-        raise UserError("--time_budget and --schedule both give the pace of a run; leave one out")
+        raise UserError("--time_budget and --schedule both set the schedule; leave one of them out")
     if opt.schedule.isdecimal() and not Path(opt.schedule).exists():
         return DecidedSchedule(_even(int(opt.schedule), opt, sizes))
     if opt.schedule:
@@ -135,8 +135,8 @@ def _fitting(found: Decided, path: Path | str, opt: argparse.Namespace) -> Decid
     """A schedule of a file, if the options fit it (UserError)."""
     if found.iterations != opt.iterations:
         raise UserError(
-            f"{path} is of a schedule of {found.iterations} iterations, not {opt.iterations}; give --iterations "
-            f"{found.iterations}, as in the run that wrote it"
+            f"{path} was written for --iterations {found.iterations}, not {opt.iterations}; give --iterations "
+            f"{found.iterations}"
         )
     return found
 
@@ -144,7 +144,7 @@ def _fitting(found: Decided, path: Path | str, opt: argparse.Namespace) -> Decid
 def _resumed(before: Any, checkpoint: str, opt: argparse.Namespace, sizes: str, first_iteration: int) -> Decided:
     """The schedule so far of the runs that are resumed; one block if their checkpoint has none."""
     if before is None:
-        told = f"{checkpoint} has no pace of a time budget: its iterations count as {first_iteration} of the schedule"
+        told = f"{checkpoint} was trained without --time_budget; it is iteration {first_iteration} of the schedule"
         print(told, file=sys.stderr)
         step = 1.0 / max(opt.iterations, first_iteration + 1)
         return Decided(opt.iterations, [Block(first_iteration, 0.0, step, 0.0)], None, 0.0, sizes)

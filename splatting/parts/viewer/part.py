@@ -3,7 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from splatting.training.option import Option
+from splatting.training.option import MOST_NEEDED, Option
 from splatting.training.part import Error, Needs, Options, Part
 from splatting.viewer.server import HOST_OPTION, PORT
 
@@ -15,7 +15,8 @@ class _Port(Option):
     """An option whose value may be left out."""
 
     def add_to(self, group: argparse._ActionsContainer, sentinel: bool) -> None:
-        group.add_argument(f"--{self.name}", type=int, nargs="?", const=PORT, metavar="PORT", help=self.help)
+        words = {"type": int, "nargs": "?", "const": PORT, "metavar": "PORT", "help": self.help}
+        group.add_argument(f"--{self.name}", **words).topic = self.topic  # type: ignore[arg-type, attr-defined]
 
 
 class Viewer(Part):
@@ -24,9 +25,9 @@ class Viewer(Part):
     name = "viewer"
     # fmt: off
     options = Options(launch=(
-        _Port("viewer", None, origin="ours",
-            help=f"serve a web page that shows the training and controls it, at this port or {PORT}, and stays open "
-                 "after it (default: no page)"),
+        _Port("viewer", None, origin="ours", topic=MOST_NEEDED,
+            help=f"serve a web page that shows and controls the training, at this port or {PORT}; it stays open "
+                 "afterwards (default: no page)"),
         HOST_OPTION,
     ))
     # fmt: on

@@ -136,10 +136,12 @@ class TrainingPage:
         if step.last and step.takes(run.launch.save_iterations):
             self._show_saved(step.iteration)  # the last step has changed the model after that
         self._requests.reset()
-        self._tab.end(f"The training is {how}. This page stays until it is closed here, or by Ctrl-C in its terminal.")
+        self._tab.end(
+            f"The training is {how}. This page stays open until you close it, or until Ctrl-C in its terminal."
+        )
         self._page.notify("The training is over", f"It is {how}; the page stays open")
         sys.stdout.flush()  # which may be a pipe
-        line = f"The page stays open at {self._page.url} until it is closed there, or Ctrl-C"
+        line = f"The page stays open at {self._page.url} until you close it there, or until Ctrl-C"
         tqdm.write(line, file=sys.stderr)
         serve(self._page)
 

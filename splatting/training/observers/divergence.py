@@ -84,8 +84,8 @@ class DivergenceWatch(Part):
         before, after = (sum(losses) / len(losses) for losses in (self._earliest, self._latest))
         if after > before:
             tqdm.write(
-                f"warning: the loss was {before:.3g} at first and is {after:.3g} at the end: the model is worse than "
-                "the points it began with; lower the learning rates, or check poses and photos (doctor.py)",
+                f"warning: the loss rose from {before:.3g} to {after:.3g}, so the model is worse than its start; lower "
+                "the learning rates, or check poses and photos (doctor.py)",
                 file=sys.stderr,
             )
 
@@ -103,7 +103,7 @@ class DivergenceWatch(Part):
     def _rescue(self, iteration: int) -> str:
         """Save the model, all processes together. Return what was saved, and what to do."""
         if iteration == self._run.first_iteration:
-            return "no iteration was trained before it; lower the learning rates"
+            return "there is no earlier model to save; lower the learning rates"
         path = Path(self._run.scene.model_path) / f"chkpnt{iteration}.pth"
         faults = self._ranks.everyone(self._fault(lambda: self._gaussians.check_finite(iteration)))
         fault = next(filter(None, faults), None)

@@ -15,8 +15,8 @@ from utils.system_utils import UserError
 
 _ENOUGH = 100  # if so many views have no pixel that counts, and no view has one, the masks are wrong
 _ALMOST_NOTHING = 1e-3  # share of the pixels
-_INVERT = "is white masked in them (--invert_masks), or do they belong to another scene?"
-_BLACK = "white must be where photos count; make the masks again, or leave them out"
+_INVERT = "give --invert_masks if white is masked in them, or the masks of this scene"
+_BLACK = "masks must be white where photos count; correct the masks, or leave them out"
 
 
 class MaskWatch(Part):
@@ -66,8 +66,8 @@ class MaskWatch(Part):
             raise UserError(f"the masks of all {self._seen} views seen so far leave no pixel to train on; {_BLACK}")
         if self._scanty and (last or not self._left):
             tqdm.write(
-                f"warning: the masks of {len(self._scanty)} of {self._seen} views leave none or almost none of their "
-                f"pixels ({some(self._scanty)}), so these views teach nothing; "
+                f"warning: the masks of {len(self._scanty)} of {self._seen} views exclude all or almost all of their "
+                f"pixels ({some(self._scanty)}), so these views do not contribute; "
                 # Where all are black, inverted masks would keep everything.
                 f"{_INVERT if self._partly else _BLACK}",
                 file=sys.stderr,
