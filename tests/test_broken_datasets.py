@@ -268,7 +268,7 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_frame(transform_matrix=[[0] * 4] * 4), r"^frame 1 \(./train/r_0\) of SCENE/.*Singular matrix"),
         (_pose(3, [1, 2, 3, 4]), "the last row of transform_matrix must be 0 0 0 1"),
         (_pose(0, [1, 0, 0, 1e30]), "camera of r_0 is more than 1e[+]12 from the origin"),
-        (_pose(1, [0, 9, 0, 0]), "pose of r_0 has no rotation, but a matrix that stretches by 0.1111 to 1;"),
+        (_pose(1, [0, 9, 0, 0]), "pose of r_0 has no valid rotation: its matrix scales by 0.1111 to 1;"),
         (_pose(1, [0, -1, 0, 0]), "pose of r_0 is mirrored"),
     ],
     "nerfstudio": [

@@ -107,10 +107,10 @@ def test_a_rounded_rotation_is_taken_as_it_is(make, rounded):
     [
         (R * [1, 1, -1], "mirrored"),
         (-2 * R, "mirrored"),
-        (R * [1, 1, 1.01], "stretches by 1 to 1.01;"),
-        (R + [[0, 0.01, 0], [0, 0, 0], [0, 0, 0]], "stretches by 0.99"),
-        (R * 0, "stretches by 0 to 0;"),
-        (R * 1e7, "stretches by 1e[+]07"),
+        (R * [1, 1, 1.01], "scales by 1 to 1.01;"),
+        (R + [[0, 0.01, 0], [0, 0, 0], [0, 0, 0]], "scales by 0.99"),
+        (R * 0, "scales by 0 to 0;"),
+        (R * 1e7, "scales by 1e[+]07"),
         (R * np.nan, "not finite"),
     ],
 )

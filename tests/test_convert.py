@@ -202,7 +202,7 @@ def _renamed(name: str) -> Callable[[Path], object]:
         ("-s {}", _renamed("images"), r"rename its folder images to input"),
         ("-s {}", _renamed("else"), r"make it and put the photos there, or pass"),
         ("-s {}", lambda scene: (scene / "images").mkdir(), r"already has images, which convert.py did not make"),
-        ("-s {}", _few, r"^1 photos .* in .*input; at least 3 are needed.*walk.mp4 \(video: pass it as --video"),
+        ("-s {}", _few, r"input: fewer than 3 readable photos .1.; add more.*walk.mp4 \(video: pass it as --video"),
         (
             "-s {}",
             lambda scene: (scene / "input" / "1.HEIC").touch(),

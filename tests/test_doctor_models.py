@@ -106,7 +106,7 @@ def test_a_photo_that_somebody_walked_into_is_named(trained, scene, tmp_path):
     Image.fromarray(pixels).save(photo)
     for folder, named in ((scene, []), (other, [photo.name])):
         lines = check_model(str(trained), -1, str(folder))
-        found = [line.text for line in lines if line.note and "passed by" in line.text]
+        found = [line.text for line in lines if line.note and "passers-by" in line.text]
         assert ["most in " + name + ";" in text for text, name in zip(found, named, strict=True)] == [True] * len(named)
 
 
@@ -152,7 +152,7 @@ def test_colours_that_nothing_explains(folder, log):
 def test_opacities_that_were_reset_too_late(folder, monkeypatch):
     log = folder / "train_log.json"
     records = json.loads(log.read_text())
-    said = "warning: opacities are reset in iteration 300, and 100 are too few to recover from that; change it"
+    said = "warning: opacities are reset in iteration 300, and the remaining 100 iterations are too few to recover; change it"
     records[-1]["lines"] = [said, *records[-1].get("lines", [])]
     log.write_text(json.dumps(records))
     assert _problems(folder) == []  # they did recover

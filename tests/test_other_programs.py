@@ -200,7 +200,11 @@ _XML, _JSON, _META = "cameras.xml", "keyframes/corrected_cameras/*.json", "metad
     [
         ("metashape", _replaced(_XML, "<k1>", "<k4>0.1</k4><k1>"), "not supported for .* type frame: k4; .* or export"),
         ("metashape", _replaced(_XML, "<k1>", "<b2>0.1</b2><k1>"), "not supported .*: b2; disable them in"),
-        ("metashape", _replaced(_XML, "<k1>", "<corrections /><k1>"), "has corrections for"),
+        (
+            "metashape",
+            _replaced(_XML, "<k1>", "<corrections /><k1>"),
+            "not supported for cameras of the type frame: corrections;",
+        ),
         ("metashape_fisheye", _replaced(_XML, "<k1>", "<p1>1e-3</p1><k1>"), "not supported for .* type fisheye: p1"),
         ("metashape", _replaced(_XML, 'type="frame"', 'type="rpc"'), "unsupported type rpc; export .*Colmap"),
         ("metashape", _replaced(_XML, "<calibration", "<other"), "is not readable XML"),

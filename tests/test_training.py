@@ -246,7 +246,7 @@ def test_training_is_called_as_the_references(colmap_scene, tmp_path):
 def test_a_late_reset_is_announced(colmap_scene, tmp_path, capfd):
     """Also where --quiet silences the standard output."""
     _train(colmap_scene, tmp_path, "--opacity_reset_interval", 3, "--quiet", iterations=5)
-    assert "warning: opacities are reset in iteration 3, and 2 iterations" in capfd.readouterr().err
+    assert "warning: opacities are reset in iteration 3, and the remaining 2 iterations" in capfd.readouterr().err
 
 
 def test_minus_one_saves_the_last_iteration_only(colmap_scene, tmp_path):

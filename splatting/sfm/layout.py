@@ -62,8 +62,8 @@ def find_images(layout: Layout, skip_unreadable: bool = False, but: Iterable[Pat
     found = sort_inputs(layout.input, skip_unreadable, but)
     if len(found.photos) < FEWEST:
         raise UserError(
-            f"{layout.input} has {len(found.photos)} readable photos, and at least {FEWEST} are needed (20 to 200 with "
-            f"much overlap are usual); {'; '.join(['add more', *unused_lines(found.unused)])}"
+            f"{layout.input}: fewer than {FEWEST} readable photos ({len(found.photos)}); "
+            f"{'; '.join(['add more (20 to 200 with much overlap are usual)', *unused_lines(found.unused)])}"
         )
     return found
 

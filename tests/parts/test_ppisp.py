@@ -179,7 +179,7 @@ def test_the_file_comes_back(tmp_path):
         (lambda table: None, "cannot read .*appearance.json"),
         (lambda table: [1], "is no table of appearances"),
         (lambda table: table | {"photos": {"a.png": [0, 0, 0]}}, "has no entry for b.png, so it belongs to other"),
-        (lambda table: table | {"cameras": {"4": table["cameras"]["4"]}}, "has nothing of 7, so"),
+        (lambda table: table | {"cameras": {"4": table["cameras"]["4"]}}, "has no entry for 7, so"),
         (lambda table: table | {"photos": dict.fromkeys(NAMES, [0, 1])}, "photos in .* are not .3,. finite numbers"),
         (lambda table: table | {"photos": dict.fromkeys(NAMES, "x")}, "is no table of appearances"),
         (lambda table: table | {"photos": dict.fromkeys(NAMES, [1e999] * 3)}, "photos in .* are not"),

@@ -419,8 +419,8 @@ def test_a_checkpoint_finds_its_place_or_is_refused(colmap_scene, tmp_path, monk
     (checkpoint,) = clocked.glob("chkpnt*.pth")
     for reason, more in (
         ("so --iterations 60 leaves nothing to do", ("--iterations", 60)),
-        ("of a schedule of 60 iterations, not 61", ("--iterations", 61, "--time_budget", 9)),
-        ("with --resolution_schedule none; leave", ("--iterations", 60, "--time_budget", 9, "--resolution_schedule",
+        ("was written for --iterations 60, not 61", ("--iterations", 61, "--time_budget", 9)),
+        ("sets --resolution_schedule none; leave", ("--iterations", 60, "--time_budget", 9, "--resolution_schedule",
                                                      "pyramid")),
     ):  # fmt: skip
         with pytest.raises(UserError, match=reason):
@@ -574,6 +574,9 @@ def test_a_number_of_iterations_goes_through_the_whole_schedule(tmp_path):
     )
     write_schedule(tmp_path / "schedule.json", schedule.up_to(1000))
     assert read_schedule(tmp_path / "schedule.json").blocks == schedule.blocks
-    for words, reason in (({"schedule": "0"}, "between 1 and 2147483647"), ({"time_budget": 9.0}, "leave one out")):
+    for words, reason in (
+        ({"schedule": "0"}, "between 1 and 2147483647"),
+        ({"time_budget": 9.0}, "leave one of them out"),
+    ):
         with pytest.raises(UserError, match=reason):
             schedule_of(options(**{"schedule": "7"} | words), "auto", None, 0)
