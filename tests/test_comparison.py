@@ -29,7 +29,6 @@ from splatting.evaluation.comparison import (
 from splatting.evaluation.configs import read_configs, shipped
 from splatting.evaluation.plan import DATASETS
 from splatting.evaluation.report import make_report, render
-from splatting.evaluation.results_page import BEGIN, END, replace_results, results_text
 from splatting.evaluation.tables import front_table, reached_legend, reached_table, result_tables
 from splatting.files.listing import markdown_table
 from utils.system_utils import UserError
@@ -279,28 +278,6 @@ def test_markdown_keeps_columns_apart():
     right = ["| a    |   b |", "| ---- | --: |", "| x\\|y |   1 |", "| z    |  22 |"]
     left = ["| a    | b   |", "| ---- | --- |", "| x\\|y | 1   |", "| z    | 22  |"]
     assert [markdown_table(*table).splitlines(), markdown_table(*table, right=False).splitlines()] == [right, left]
-
-
-@pytest.mark.parametrize("text", ["", BEGIN, f"{END}\n{BEGIN}", f"{BEGIN}{BEGIN}{END}"])
-def test_a_page_without_marks_is_left_alone(text):
-    with pytest.raises(UserError, match="one line <!-- results: begin"):
-        replace_results(text, [])
-
-
-@pytest.mark.parametrize(
-    ("sets", "text"),
-    [
-        ({None: "--iterations 40"}, "Options of every run: `--iterations 40`."),
-        ({"base": "--test_iterations -1 -w", "sh1": "--test_iterations -1 -w --sh_degree 1"},
-         "Options of every run: `--test_iterations -1 -w`.\n\nEach option set adds:\n\n- base: nothing\n"
-         "- sh1: `--sh_degree 1`"),
-        ({"base": "--iterations 40", "long": "--iterations 50"},
-         "Each option set adds:\n\n- base: `--iterations 40`\n- long: `--iterations 50`"),
-    ],
-)  # fmt: skip
-def test_options_that_all_runs_share_are_written_once(sets, text):
-    runs = [run_of(name, 0, (1, 2, 3), added_options=words.split()) for name, words in sets.items()]
-    assert results_text({"summary": summarise(runs), "runs": runs}).split("\n\n", 1)[1] == text
 
 
 def test_shipped_sets_are_options_of_training(tmp_path, monkeypatch):

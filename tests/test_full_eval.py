@@ -27,14 +27,12 @@ import full_eval
 import train
 from arguments import write_cfg_args
 from splatting.evaluation import report as report_module
-from splatting.evaluation import results_page
 from splatting.evaluation.child import Finished, Slot, run_child, share
 from splatting.evaluation.configs import check_options
 from splatting.evaluation.figures import draw_curves, draw_fronts
 from splatting.evaluation.model_folder import SCHEDULE, shorter_ends_there
 from splatting.evaluation.plan import DATASETS, Run, SceneEntry, dataset_scenes, photos_of
 from splatting.evaluation.renders import GAIN, GAP, HEADER, ComparedViews
-from splatting.evaluation.results_page import BEGIN, END
 from splatting.host.interrupt import DeferredInterrupt
 from utils import lpips_utils
 from utils.system_utils import Terminated, UserError
@@ -299,11 +297,11 @@ def test_a_second_one_is_refused_while_the_first_or_its_training_lives(evaluate)
     wait_for(lambda: (attic / "started").exists() or process.poll() is not None)
     trainer = int((model / "pid").read_text())
     try:
-        with pytest.raises(UserError, match=rf"\(process {process.pid}\).* is at work in .*out; wait"):
+        with pytest.raises(UserError, match=rf"\(process {process.pid}\).* is running in .*out; wait"):
             evaluate("attic")
         process.kill()
         process.wait()
-        with pytest.raises(UserError, match="is at work in"):
+        with pytest.raises(UserError, match="is running in"):
             evaluate("attic")  # the training has outlived it
     finally:
         process.kill()
@@ -428,16 +426,6 @@ def test_seeds_and_option_sets(figures, evaluate, tmp_path, capsys, monkeypatch)
         assert f"### {part}" in text
     for name in ("attic_front_seconds", "attic_psnr", "attic_worst_views"):
         assert f"(figures/{name}.png)" in text and (evaluate.out / "figures" / f"{name}.png").is_file()
-
-    page = tmp_path / "training.md"
-    page.write_text(f"before\n\n{BEGIN}\nold\n{END}\n\nafter\n")
-    monkeypatch.setattr(sys, "argv", ["results_page", str(evaluate.out / "report.json"), "--page", str(page)])
-    for _ in range(2):  # the second time nothing changes
-        results_page.main()
-        text = page.read_text()
-        assert text.startswith(f"before\n\n{BEGIN}\n\n| scene") and text.endswith(f"\n\n{END}\n\nafter\n")
-        assert "23.10 ± 0.14" in text and "- sh1: `--sh_degree 1`" in text and "some CPU" in text
-        assert "old" not in text and text.count("| attic") == 2
 
 
 @pytest.mark.parametrize(

@@ -12,5 +12,5 @@ model_folder, renders       readers of model folders, and of the sets of views r
 results, comparison         a run's numbers; those of several: spread, option sets, published tables (published.json)
 tables, report              numbers as tables of text; report.json, its pages (report.jinja in two forms) and figures
 
-Commands: peer_curve makes CSV files of other programs' output, results_page writes docs/results/training.md.
+The command peer_curve makes CSV files of other programs' output.
 """

@@ -1,4 +1,4 @@
-"""Tables of the report: report.json's numbers as text, for the pages, the terminal and docs/results/training.md."""
+"""Tables of the report: report.json's numbers as text, for the pages and the terminal."""
 
 from __future__ import annotations
 
