@@ -1,0 +1,255 @@
+"""gsplat's `rasterization` on our rasterizer, beside plain compositing in float64 by the published rules.
+
+The judge outside of the repository is gsplat 1.5.3's own PyTorch code: its projection and harmonics agree to 1e-13.
+"""
+
+import itertools
+import math
+import sys
+from types import ModuleType
+
+import pytest
+import torch
+from diff_gaussian_rasterization import gsplat
+from diff_gaussian_rasterization.gsplat import MODES, rasterization
+from torch import Tensor
+
+from utils.general_utils import build_rotation
+from utils.sh_utils import eval_sh
+
+WIDTH, HEIGHT, CAMERAS = 40, 31, 2
+DOUBLE = torch.float64
+
+
+class Inputs:
+    """Random Gaussians before two cameras; float64, gradients wanted."""
+
+    def __init__(self, seed: int, channels: int = 3, degree: int | None = None, count: int = 60) -> None:
+        generator = torch.Generator().manual_seed(seed)
+
+        def normal(*shape: int) -> Tensor:
+            return torch.randn(*shape, generator=generator, dtype=DOUBLE)
+
+        self.means, self.quats = 1.2 * normal(count, 3), normal(count, 4)
+        self.scales = (0.7 * normal(count, 3) - 1.8).exp()
+        self.opacities = 0.98 * torch.rand(count, generator=generator, dtype=DOUBLE) + 0.005
+        self.colors = normal(count, channels) if degree is None else 0.3 * normal(count, 16, 3)
+        self.degree, self.backgrounds = degree, normal(CAMERAS, 3 if degree is not None else channels)
+        self.views = torch.eye(4, dtype=DOUBLE).repeat(CAMERAS, 1, 1)
+        self.views[:, :3, :3] = build_rotation(normal(CAMERAS, 4) * 0.1 + torch.tensor([1.0, 0, 0, 0]))
+        self.views[:, :3, 3] = 0.3 * normal(CAMERAS, 3) + torch.tensor([0, 0, 3.0])
+        K = [[35.0, 0, 19], [0, 38, 15], [0, 0, 1]]
+        self.Ks = torch.tensor(K, dtype=DOUBLE).repeat(CAMERAS, 1, 1)
+        self.wanted = {name: getattr(self, name).requires_grad_() for name in NAMES}
+
+    def draw(self, **options) -> tuple[Tensor, Tensor, dict]:
+        return rasterization(
+            self.means, self.quats, self.scales, self.opacities, self.colors, self.views, self.Ks, WIDTH, HEIGHT,
+            sh_degree=self.degree, **{"backgrounds": self.backgrounds} | options,
+        )  # fmt: skip
+
+    def gradients(self, image: Tensor, alpha: Tensor) -> dict[str, Tensor]:
+        generator = torch.Generator().manual_seed(7)
+        loss = sum((torch.randn(t.shape, generator=generator, dtype=DOUBLE) * t).sum() for t in (image, alpha))
+        found = torch.autograd.grad(loss, list(self.wanted.values()), allow_unused=True)
+        return {
+            n: torch.zeros_like(t) if g is None else g for (n, t), g in zip(self.wanted.items(), found, strict=True)
+        }
+
+
+NAMES = ("means", "quats", "scales", "opacities", "colors", "views")
+
+
+def composited(given: Inputs, mode: str, antialiased: bool) -> tuple[Tensor, Tensor]:
+    """Images and alphas of pinholes, pixel by pixel (Zwicker et al. 2001; Kerbl et al. 2023)."""
+    y, x = torch.meshgrid(*(torch.arange(n, dtype=DOUBLE) + 0.5 for n in (HEIGHT, WIDTH)), indexing="ij")
+    images, alphas = [], []
+    for n in range(CAMERAS):
+        view, K = given.views[n], given.Ks[n]
+        at = given.means @ view[:3, :3].T + view[:3, 3]
+        R = view[:3, :3] @ build_rotation(given.quats) * given.scales[:, None]
+        limit = [((size - K[i, 2]) / K[i, i] + 0.15 * size / K[i, i], K[i, 2] / K[i, i] + 0.15 * size / K[i, i])
+                 for i, size in enumerate((WIDTH, HEIGHT))]  # fmt: skip
+        depth = at[:, 2]
+        t = [(at[:, i] / depth).clamp(-low, high) for i, (high, low) in enumerate(limit)]
+        zero = torch.zeros_like(depth)
+        J = torch.stack([K[0, 0] / depth, zero, -K[0, 0] * t[0] / depth,
+                         zero, K[1, 1] / depth, -K[1, 1] * t[1] / depth], 1).view(-1, 2, 3)  # fmt: skip
+        flat = J @ R @ R.mT @ J.mT
+        wide = flat + 0.3 * torch.eye(2, dtype=DOUBLE)
+        opacity = given.opacities * ((flat.det() / wide.det()).clamp_min(0).sqrt() if antialiased else 1)
+        dx, dy = (K[i, i] * at[:, i] / depth + K[i, 2] - p.reshape(-1, 1) for i, p in enumerate((x, y)))
+        inverse = wide.inverse()
+        power = 0.5 * (inverse[:, 0, 0] * dx**2 + inverse[:, 1, 1] * dy**2) + inverse[:, 0, 1] * dx * dy
+        alpha = (opacity * (-power).exp()).clamp_max(0.99)
+        alpha = torch.where((alpha >= 1 / 255) & (depth > 0.01), alpha, 0)
+        order = depth.detach().argsort()
+        alpha = alpha[:, order]
+        alpha = alpha * ((1 - alpha).cumprod(1) >= 1e-4)
+        left = torch.cat([torch.ones(len(alpha), 1, dtype=DOUBLE), (1 - alpha).cumprod(1)], 1)
+        color = given.colors
+        if given.degree is not None:
+            away = torch.nn.functional.normalize(given.means - torch.linalg.inv(view)[:3, 3], dim=1)
+            color = (eval_sh(given.degree, color.mT, away) + 0.5).clamp_min(0)
+        parts = [color] * mode.startswith("RGB") + [depth[:, None]] * mode.endswith("D")
+        behind = torch.nn.functional.pad(given.backgrounds[n], (0, 1))[-sum(part.shape[1] for part in parts) :]
+        behind = given.backgrounds[n] if mode == "RGB" else behind
+        image = (alpha * left[:, :-1]) @ torch.cat(parts, 1)[order] + left[:, -1:] * behind
+        covered = 1 - left[:, -1:]
+        if mode.endswith("ED"):
+            image = torch.cat([image[:, :-1], image[:, -1:] / covered.clamp_min(1e-10)], 1)
+        images.append(image.view(HEIGHT, WIDTH, -1))
+        alphas.append(covered.view(HEIGHT, WIDTH, 1))
+    return torch.stack(images), torch.stack(alphas)
+
+
+@pytest.mark.parametrize(
+    ("mode", "antialiased", "form"),
+    list(itertools.product(MODES, (False, True), ((3, None), (7, None), (3, 2)))),
+)
+def test_images_and_gradients_are_those_of_plain_compositing(mode, antialiased, form):
+    for seed in range(2):
+        given = Inputs(seed, *form)
+        expected = composited(given, mode, antialiased)
+        found = given.draw(render_mode=mode, rasterize_mode="antialiased" if antialiased else "classic")[:2]
+        pairs = dict(zip(("image", "alpha"), zip(found, expected, strict=True), strict=True))
+        both = [given.gradients(*images) for images in (found, expected)]
+        for name, (got, wanted) in (pairs | {n: (both[0][n], both[1][n]) for n in NAMES}).items():
+            if name == "views":
+                got, wanted = got[:, :3], wanted[:, :3]  # the last row of a pose is no input
+            scale = wanted.abs().max().clamp_min(1e-9)
+            assert (got - wanted).abs().max() < 1e-9 * scale, (name, seed)
+
+
+def test_meta_has_what_strategies_read():
+    given = Inputs(1)
+    _, _, meta = given.draw(packed=False)
+    at = torch.stack([given.means @ view[:3, :3].T + view[:3, 3] for view in given.views])
+    assert torch.allclose(meta["depths"], at[..., 2])
+    projected = at @ given.Ks.mT
+    shown = (meta["radii"] > 0).all(-1)
+    assert meta["radii"].dtype == torch.int32 and 20 < shown.sum() < shown.numel()
+    assert torch.allclose(meta["means2d"][shown], (projected[..., :2] / projected[..., 2:])[shown])
+    wide = torch.linalg.inv(meta["conics"][shown][:, [0, 1, 1, 2]].view(-1, 2, 2))
+    extent = (2 * (255 * meta["opacities"][shown]).log()).sqrt().clamp_max(3.33)[:, None]
+    assert torch.equal(meta["radii"][shown].double(), (extent * wide.diagonal(dim1=-2, dim2=-1).sqrt()).ceil())
+    packed = given.draw()[2]
+    image, row = shown.nonzero(as_tuple=True)
+    assert torch.equal(packed["camera_ids"], image) and torch.equal(packed["gaussian_ids"], row)
+    for name in ("radii", "means2d", "depths", "conics", "opacities"):
+        assert torch.equal(packed[name], meta[name][shown]), name
+    assert {packed[name] for name in ("width", "height", "n_cameras")} == {WIDTH, HEIGHT, CAMERAS}
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_means2d_gets_its_gradient_in_pixels(packed):
+    """Beside that of the means: they move on the image by focal length over depth."""
+    given = Inputs(2)
+    image, _, meta = given.draw(packed=packed, absgrad=True)
+    meta["means2d"].retain_grad()
+    image.square().sum().backward()
+    gradient, absolute = meta["means2d"].grad, meta["means2d"].absgrad
+    assert gradient.shape == absolute.shape == meta["means2d"].shape and gradient.any()
+    by_ndc = gradient * torch.tensor([WIDTH, HEIGHT]) / 2
+    assert (absolute[..., 0] * WIDTH / 2 >= by_ndc.norm(dim=-1) * (1 - 1e-9)).all()
+    moved = given.views.detach().clone().requires_grad_()
+    given.wanted["views"] = given.views = moved
+    image, _, meta = given.draw(packed=packed)
+    image.square().sum().backward()
+    # A camera that is moved along x moves all means on the image, and nothing else to first order but their shapes.
+    assert torch.allclose(meta["means2d"].grad, gradient)
+
+
+def test_leading_batches_and_colours_of_each_camera():
+    given, other = Inputs(3), Inputs(4)
+    colors = torch.stack([given.colors, given.colors.flip(0)])
+    both = [torch.stack([getattr(one, name).detach() for one in (given, other)]) for name in NAMES[:4]]
+    rest = torch.stack([colors.detach()] * 2), torch.stack([given.views, other.views]).detach()
+    image, alpha, meta = rasterization(*both, *rest, given.Ks.expand(2, -1, -1, -1), WIDTH, HEIGHT, packed=False)
+    assert image.shape == (2, CAMERAS, HEIGHT, WIDTH, 3) and alpha.shape == (2, CAMERAS, HEIGHT, WIDTH, 1)
+    assert meta["means2d"].shape == (2, CAMERAS, 60, 2) and meta["n_batches"] == 2
+    given.backgrounds = None
+    for n in range(CAMERAS):
+        given.colors = colors[n]
+        assert torch.equal(image[0, n], given.draw()[0][n])
+
+
+def test_planes_and_radii_that_are_left_out():
+    given = Inputs(5)
+    depth = given.draw(packed=False)[2]["depths"]
+    near, far = depth.quantile(0.3).item(), depth.quantile(0.7).item()
+    meta = given.draw(near_plane=near, far_plane=far, packed=False)[2]
+    shown = (meta["radii"] > 0).all(-1)
+    assert shown.any() and ((depth > near) & (depth < far))[shown].all()
+    image, _, clipped = given.draw(radius_clip=6.0, packed=False)
+    radii = given.draw(packed=False)[2]["radii"]
+    small = (radii <= 6).all(-1)
+    assert small.any() and not clipped["radii"][small].any() and torch.equal(clipped["radii"][~small], radii[~small])
+    assert not torch.equal(image, given.draw()[0])
+
+
+def test_covariances_in_place_of_scales():
+    given = Inputs(6)
+    M = build_rotation(given.quats) * given.scales[:, None]
+    image, alpha, _ = rasterization(
+        given.means, None, None, given.opacities, given.colors, given.views, given.Ks, WIDTH, HEIGHT, covars=M @ M.mT
+    )
+    given.backgrounds = None
+    assert torch.allclose(image, given.draw()[0], atol=1e-9) and math.isfinite(alpha.sum())
+
+
+def test_a_fisheye_shows_where_its_lens_does():
+    """One small Gaussian, 60 degrees off the axis: the angle times the focal length."""
+    angle = math.radians(60)
+    mean = torch.tensor([[math.sin(angle), 0, math.cos(angle)]])
+    K = torch.tensor([[[30.0, 0, 50], [0, 30, 40], [0, 0, 1]]])
+    one = torch.ones(1, 3)
+    image, _, meta = rasterization(
+        mean, torch.tensor([[1.0, 0, 0, 0]]), 0.01 * one, torch.ones(1) * 0.9, one, torch.eye(4)[None], K, 100, 80,
+        camera_model="fisheye",
+    )  # fmt: skip
+    assert torch.allclose(meta["means2d"], torch.tensor([[50 + 30 * angle, 40.0]]), atol=1e-4)
+    assert image[0, 40, int(50 + 30 * angle)].min() > 0.3
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"with_ut": True}, "with_ut is not supported; take camera_model='fisheye'"),
+        ({"distributed": True}, "train with torchrun"),
+        ({"sparse_grad": True}, "gradients are dense"),
+        ({"radial_coeffs": torch.zeros(2, 4)}, "radial_coeffs is not supported"),
+        ({"camera_model": "ortho"}, "camera_model 'ortho' is not supported"),
+        ({"eps2d": 0.1}, "eps2d must be 0.3"),
+        ({"render_mode": "N"}, "render_mode must be one of RGB, D"),
+        ({"rasterize_mode": "sharp"}, "rasterize_mode must be"),
+        ({"backgrounds": torch.zeros(1, 3, dtype=DOUBLE)}, r"backgrounds must be \(2, 3\), got \(1, 3\)"),
+        ({"backgrounds": torch.zeros(2, 5, dtype=DOUBLE)}, "the background must have 3 values, or one for all, got 5"),
+        ({"absgrad": True, "render_mode": "RGB+D"}, None),
+    ],
+)
+def test_what_is_not_there_is_refused_by_name(options, words):
+    if words is None:
+        assert Inputs(0).draw(**options)[0].shape[-1] == 4
+        return
+    with pytest.raises(ValueError, match=words):
+        Inputs(0).draw(**options)
+
+
+@pytest.mark.parametrize("installed", [False, True])
+def test_a_program_finds_it_by_gsplats_name(installed, tmp_path, monkeypatch, capsys):
+    own = ModuleType("gsplat"), ModuleType("gsplat.rendering")
+    for module, name in zip(own, ("gsplat", "gsplat.rendering"), strict=True):
+        monkeypatch.setitem(sys.modules, name, module if installed else None)
+    own[0].rendering = own[1]
+    program = tmp_path / "program.py"
+    program.write_text(
+        "import sys\nfrom gsplat.rendering import rasterization\nimport gsplat\n"
+        "print(gsplat.rasterization is rasterization, rasterization.__module__, sys.argv[1:])\n"
+    )
+    monkeypatch.setattr(sys, "argv", ["python -m", str(program), "--steps", "3"])
+    gsplat.run()
+    assert capsys.readouterr().out == "True diff_gaussian_rasterization.gsplat ['--steps', '3']\n"
+    monkeypatch.setattr(sys, "argv", ["python -m"])
+    with pytest.raises(SystemExit, match="name a program"):
+        gsplat.run()
