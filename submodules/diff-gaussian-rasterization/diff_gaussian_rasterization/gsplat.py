@@ -53,7 +53,7 @@ class _Camera(NamedTuple):
     ) -> GaussianRasterizationSettings:
         """The settings of a scene that is scaled. All are differentiable in `view`."""
         view = self.view * torch.cat([self.view.new_ones(4, 3), self.view.new_tensor([[scale]] * 3 + [[1]])], 1)
-        fx, fy, cx, cy = (float(self.K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
         projection = self.view.new_zeros(4, 4)
         projection[0, 0], projection[1, 1] = 2 * fx / self.width, 2 * fy / self.height
         projection[0, 2], projection[1, 2] = 2 * cx / self.width - 1, 2 * cy / self.height - 1
@@ -144,10 +144,8 @@ def rasterization(
     near_plane, far_plane: depths that are shown. radius_clip: Gaussians of radii up to it (px) are left out.
     backgrounds (..., C, D). render_mode: RGB, D (the sum of weights times depth), ED (D over alpha), or both.
     absgrad: meta["means2d"].absgrad gets absolute gradients, of at most four channels; x has the length of x and y in
-    NDC, times 2 / width, and y is 0. channel_chunk, tile_size and segmented change nothing.
-
-    Returns images (..., C, H, W, D), alphas (..., C, H, W, 1) and meta, whose means2d gets a `grad` (px) in backward().
-    Raises ValueError for what is not supported, and for wrong shapes.
+    NDC, times 2 / width, and y is 0. Returns images (..., C, H, W, D), alphas (..., C, H, W, 1) and meta, whose means2d
+    gets a `grad` (px) in backward(). Raises ValueError for what is not supported, and for wrong shapes.
     """
     given = {name: value for name, value in locals().items() if name in _UNSUPPORTED or name in _NEED_UT}
     _refuse(given, rolling_shutter, render_mode, camera_model, rasterize_mode, eps2d, sh_degree)
