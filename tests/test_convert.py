@@ -620,9 +620,12 @@ def test_photos_and_masks_that_can_not_be_used_are_named_at_once(tmp_path):
         Image.new("L", (30, 40)).save(masks / f"{name}.png")
     check_images(layout, names, masks)
     (layout.input / "b.jpg").write_bytes((layout.input / "b.jpg").read_bytes()[:-60])
+    with pytest.raises(UserError, match=r"cannot read .*b.jpg \(.*, or pass --skip_unreadable to go on without"):
+        check_images(layout, names, masks)
     (layout.input / "c.jpg").write_bytes(b"<html>")
     Image.new("L", (40, 30)).save(masks / "e.jpg.png")
     said = "^3 of 5 photos cannot be used: .*b.jpg.*c.jpg.*mask .*e.jpg.png has 40 x 30 pixels, but its photo e.jpg has"
+    said += ".*; replace or remove them, or pass --skip_unreadable to go on without photos that cannot be read$"
     with pytest.raises(UserError, match=said) as error:
         check_images(layout, names, masks)
     assert "\n" not in str(error.value) and "a.jpg" not in str(error.value) and "d.jpg" not in str(error.value)
