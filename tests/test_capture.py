@@ -47,7 +47,7 @@ def test_what_is_weak_blurred_and_darker_is_named(folder):
     assert (found["weakly_connected"], found["blurred"]) == (["d.jpg"], ["b.jpg"])
     assert found["brightness_spread_stops"] == pytest.approx(np.std([0, 0, 0, 2]), abs=0.05)
     assert [line.split(":")[0] for line in found["again"]] == [
-        "what e.jpg show", "around d.jpg", "b.jpg", "with a fixed exposure, if you can",
+        "what is in e.jpg, if it belongs to the scene", "around d.jpg", "b.jpg", "with a fixed exposure, if you can",
     ]  # fmt: skip
     page = folder / "capture.html"
     report = _report(4, 5, "e.jpg") | found
@@ -55,6 +55,13 @@ def test_what_is_weak_blurred_and_darker_is_named(folder):
     text = page.read_text(encoding="utf-8")
     assert "data:image/png;base64," in text and "not placed, matches 0 photos" in text and "2 neighbours" in text
     assert any("d.jpg" in line for line in lines_of(report))
+
+
+def test_the_brightness_of_photos_that_are_not_placed_does_not_count(folder):
+    """Such as a screenshot among the photos, whose brightness would call for --appearance ppisp."""
+    photos = {name: photo for name, photo in _survey()["photos"].items() if name != "d.jpg"}
+    found = findings(_report(3, 4, "d.jpg"), photos, looks_of(folder, NAMES))
+    assert found["brightness_spread_stops"] < 0.05 and found["blurred"] == ["b.jpg"]
 
 
 def test_a_sound_capture_has_nothing_to_photograph_again(folder):

@@ -639,7 +639,10 @@ def _model(registered: int, points: int = 5000, track: float = 5.0, error: float
     ("models", "said"),
     [
         ([_model(40)], []),
-        ([_model(38)], [r"2 of 40 photos were left out \(038, 039\), and 1 of them match no .*--matcher exhaustive"]),
+        (
+            [_model(38)],
+            [r"2 of 40 photos left out \(038, 039\), 1 of them without a match .*something else; --matcher"],
+        ),
         (
             [_model(25), _model(15, first=25)],
             ["15 of 40", r"form 2 unconnected parts \(25 photos are used, the other parts have 15\)"],
