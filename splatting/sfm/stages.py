@@ -200,7 +200,7 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
             lines = report.advice_at_poses(chosen, names)
         else:
             lines = report.advice(models, names, matches, settings.matcher, at_limit)
-            lines += cameras.advice(chosen.cameras, lenses, settings.cameras)
+            lines += cameras.advice(chosen.cameras, lenses, settings.cameras, video.taken_frames(layout))
         native = colmap.is_native(settings.lenses, {camera["model"] for camera in chosen.cameras})
         paths = {"model": layout.models / chosen.folder, "images": root, "out": layout.undistorted}
         job = {name: str(path) for name, path in (paths | {"capture": layout.capture}).items()}
