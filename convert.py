@@ -29,7 +29,7 @@ from splatting.sfm.inputs import sort_inputs, unused_lines
 from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder
 from splatting.sfm.programs import refuse_while_working
 from splatting.sfm.report import lens_words, report_inputs, summary
-from splatting.sfm.video import NOTE, refuse_foreign_frames, report_entries, taken_frames, video_lines
+from splatting.sfm.video import FRAMES_MISSING, NOTE, refuse_foreign_frames, report_entries, taken_frames, video_lines
 from utils.system_utils import UserError, run_cli
 
 
@@ -41,6 +41,8 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     refuse_while_working(layout.log)
     record = stages.StageRecord(layout.stages)
     refuse_foreign_results(layout, record.begun("undistortion"), record.begun("photos"), args.skip_matching)
+    if not videos and record.interrupted("video"):
+        print(f"warning: {FRAMES_MISSING}", file=sys.stderr)
     kept = []
     if videos:
         kept = record.run([_video_stage(layout, record, videos, args)])

@@ -109,6 +109,23 @@ def test_frames_replace_frames_and_nothing_else(tmp_path, monkeypatch):
     assert [path.name for path in _frames(other)] == ["frame_00002.jpg"]
 
 
+def test_frames_that_an_ended_run_left_out_are_said(tmp_path, monkeypatch, capsys):
+    layout, video = Layout(tmp_path / "scene"), tmp_path / "walk.mp4"
+    video.touch()
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", _Decoder())
+    words = ["-s", str(layout.scene), "--mask_path", str(tmp_path)]
+
+    def ended(*more: str) -> bool:
+        with pytest.raises(UserError, match="has a mask"):
+            convert.main([*words, *more])
+        return "warning: an earlier run ended before it had all frames" in capsys.readouterr().err
+
+    assert not ended("--video", str(video)) and not ended()
+    record = json.loads(layout.stages.read_text())
+    layout.stages.write_text(json.dumps(record | {"video": record["video"] | {"done": False}}))
+    assert ended() and not ended("--video", str(video)) and not ended()
+
+
 @pytest.fixture(scope="module")
 def room(once) -> np.ndarray:
     """Frames (16, 180, 240, 3) of a camera that moves around the corner of a room."""

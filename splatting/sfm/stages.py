@@ -61,6 +61,10 @@ class StageRecord:
         """Whether this stage was ever begun in this folder."""
         return name in self._record
 
+    def interrupted(self, name: str) -> bool:
+        """Whether this stage was begun and not finished."""
+        return self.begun(name) and not self._record[name]["done"]
+
     def run(self, stages: list[Stage]) -> list[str]:
         """Do the stages that are not done, in order; return the names of those that were done before.
 

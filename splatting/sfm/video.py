@@ -36,6 +36,7 @@ _COMPRESSED = "tonemap=mobius:param=0.9:peak=4.93:desat=0"
 _DISPLAY = "zscale=t=bt709:m=gbr:r=pc,format=gbrp"
 # What the scores of frames do not tell.
 NOTE = "test views of --eval lie between frames of the same video that train; other places may score lower"
+FRAMES_MISSING = "an earlier run ended before it had all frames of its video; pass that --video again to add the others"
 
 
 def find_decoder() -> Any:
