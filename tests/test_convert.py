@@ -517,6 +517,13 @@ def test_fisheyes_are_placed_and_stay_as_they_are(tmp_path, capsys):
     assert shots[0].read_bytes() != views[0].image_path.read_bytes()
 
 
+def test_cameras_beside_poses_have_no_effect(tmp_path, capsys):
+    for words, said in (([], False), (["--cameras", "shared"], True)):
+        with pytest.raises(UserError, match="no folder input"):
+            convert.main(["-s", str(tmp_path), "--poses", "transforms.json", *words])
+        assert ("warning: --cameras has no effect beside --poses" in capsys.readouterr().err) == said
+
+
 def _given(folder: Path, count: int) -> Path:
     """Write transforms.json with the poses of make_photos's photos, of cameras twice as large; return its path."""
     frames = []
