@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
+import train
 from scene.check.photos import left_out
 from splatting.sfm.capture import findings, lines_of, looks_of, neighbours_of, too_few
 from splatting.sfm.capture_page import from_above, write_page
@@ -92,3 +93,15 @@ def test_a_training_says_what_its_scene_lacks(tmp_path):
     assert left_out(tmp_path) is None
     path.write_text("[]")
     assert left_out(tmp_path) is None
+
+
+@pytest.mark.parametrize(
+    ("given", "kept", "said"),
+    [("native", "undistort", True), ("native", "native", False), ("auto", "undistort", False), ("native", None, False)],
+)
+def test_a_training_says_that_native_lenses_come_too_late(colmap_scene, tmp_path, capsys, given, kept, said):
+    (colmap_scene / "convert_report.json").write_text(json.dumps(_report(17, 17) | ({"lenses": kept} if kept else {})))
+    words = ["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "-r", "24", "--iterations", "1", "--quiet"]
+    train.main([*words, "--lenses", given, "--no_curve", "--test_iterations", "-1"])
+    text = "warning: --lenses native has no effect, since convert.py undistorted the photos of this scene; to train on"
+    assert (text in capsys.readouterr().err) == said
