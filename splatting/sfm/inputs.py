@@ -35,7 +35,7 @@ _RAW_SUFFIXES = (
     *(".gpr", ".rwl", ".x3f"),
 )
 _DNG_VERSION = 50706  # TIFF tag: a RAW file, whose first picture is a thumbnail
-_VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".mpg", ".3gp", ".insv", ".wmv")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".mpg", ".3gp", ".insv", ".wmv")
 _VIDEO_STARTS = (b"\x1a\x45\xdf\xa3", b"\x00\x00\x01\xba")  # Matroska and WebM; MPEG program streams
 # Formats whose files often lie beside a JPEG of the same shot.
 _OFTEN_DOUBLE = ("HEIF", "AVIF", "RAW")
@@ -115,7 +115,7 @@ def _kind(path: Path, thorough: bool) -> _Kind:
     if brand in _HEIF:
         return _heif_kind(path, head, thorough)
     video = brand or head.startswith(_VIDEO_STARTS) or (head[:4], head[8:12]) == (b"RIFF", b"AVI ")
-    if video or suffix in _VIDEO_SUFFIXES:
+    if video or suffix in VIDEO_SUFFIXES:
         return _Kind("", "video: pass it as --video to take frames of it")
     return _picture_kind(path, thorough)
 
