@@ -29,7 +29,7 @@ from splatting.sfm.inputs import sort_inputs, unused_lines
 from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder
 from splatting.sfm.programs import refuse_while_working
 from splatting.sfm.report import lens_words, report_inputs, summary
-from splatting.sfm.video import NOTE, refuse_foreign_frames, report_entries, taken_frames, video_lines
+from splatting.sfm.video import FRAMES_MISSING, NOTE, refuse_foreign_frames, report_entries, taken_frames, video_lines
 from utils.system_utils import UserError, run_cli
 
 
@@ -41,6 +41,8 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     refuse_while_working(layout.log)
     record = stages.StageRecord(layout.stages)
     refuse_foreign_results(layout, record.begun("undistortion"), record.begun("photos"), args.skip_matching)
+    if not videos and record.interrupted("video"):
+        print(f"warning: {FRAMES_MISSING}", file=sys.stderr)
     kept = []
     if videos:
         kept = record.run([_video_stage(layout, record, videos, args)])
@@ -118,14 +120,16 @@ def _settings(args: argparse.Namespace) -> Settings:
     """The choices of the command line. UserError for those that do not fit together."""
     if args.poses:
         _refuse_beside_poses(args)
+        if args.cameras:
+            print("warning: --cameras has no effect beside --poses, which gives each photo its camera", file=sys.stderr)
         camera, mapper = "given", GIVEN
     else:
         camera, mapper = args.camera or "OPENCV", args.mapper or "incremental"
         if camera not in LENS_MODELS:
             raise UserError(f"--camera {camera} is not a supported lens model; choose one of {', '.join(LENS_MODELS)}")
     is_native(args.lenses, [camera])  # refuses what does not fit together
-    matcher = args.matcher or "exhaustive"
-    return Settings(camera, args.max_num_features, matcher, mapper, args.no_gpu, args.cameras, args.lenses)
+    matcher, shared_by = args.matcher or "exhaustive", args.cameras or "per_lens"
+    return Settings(camera, args.max_num_features, matcher, mapper, args.no_gpu, shared_by, args.lenses)
 
 
 def _refuse_beside_poses(args: argparse.Namespace) -> None:
@@ -146,7 +150,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         "computed (default: all are computed)")  # fmt: skip
     add("--camera", default=None, help="lens model to fit; for a fisheye lens OPENCV_FISHEYE, for panoramas "
         "EQUIRECTANGULAR (default: OPENCV)")  # fmt: skip
-    add("--cameras", choices=MODES, default="per_lens",
+    add("--cameras", choices=MODES, default=None,
         help="which photos of one size share a camera: those that EXIF data give one lens and focal length (where they "
         "name none, those of one sub-folder), those of a sub-folder, none, or all (default: per_lens)")  # fmt: skip
     add("--lenses", choices=("auto", "native", "undistort"), default="auto",

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
+import train
 from scene.check.photos import left_out
 from splatting.sfm.capture import findings, lines_of, looks_of, neighbours_of, too_few
 from splatting.sfm.capture_page import from_above, write_page
@@ -47,7 +48,7 @@ def test_what_is_weak_blurred_and_darker_is_named(folder):
     assert (found["weakly_connected"], found["blurred"]) == (["d.jpg"], ["b.jpg"])
     assert found["brightness_spread_stops"] == pytest.approx(np.std([0, 0, 0, 2]), abs=0.05)
     assert [line.split(":")[0] for line in found["again"]] == [
-        "what e.jpg show", "around d.jpg", "b.jpg", "with a fixed exposure, if you can",
+        "what is in e.jpg, if it belongs to the scene", "around d.jpg", "b.jpg", "with a fixed exposure, if you can",
     ]  # fmt: skip
     page = folder / "capture.html"
     report = _report(4, 5, "e.jpg") | found
@@ -55,6 +56,13 @@ def test_what_is_weak_blurred_and_darker_is_named(folder):
     text = page.read_text(encoding="utf-8")
     assert "data:image/png;base64," in text and "not placed, matches 0 photos" in text and "2 neighbours" in text
     assert any("d.jpg" in line for line in lines_of(report))
+
+
+def test_the_brightness_of_photos_that_are_not_placed_does_not_count(folder):
+    """Such as a screenshot among the photos, whose brightness would call for --appearance ppisp."""
+    photos = {name: photo for name, photo in _survey()["photos"].items() if name != "d.jpg"}
+    found = findings(_report(3, 4, "d.jpg"), photos, looks_of(folder, NAMES))
+    assert found["brightness_spread_stops"] < 0.05 and found["blurred"] == ["b.jpg"]
 
 
 def test_a_sound_capture_has_nothing_to_photograph_again(folder):
@@ -85,3 +93,15 @@ def test_a_training_says_what_its_scene_lacks(tmp_path):
     assert left_out(tmp_path) is None
     path.write_text("[]")
     assert left_out(tmp_path) is None
+
+
+@pytest.mark.parametrize(
+    ("given", "kept", "said"),
+    [("native", "undistort", True), ("native", "native", False), ("auto", "undistort", False), ("native", None, False)],
+)
+def test_a_training_says_that_native_lenses_come_too_late(colmap_scene, tmp_path, capsys, given, kept, said):
+    (colmap_scene / "convert_report.json").write_text(json.dumps(_report(17, 17) | ({"lenses": kept} if kept else {})))
+    words = ["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "-r", "24", "--iterations", "1", "--quiet"]
+    train.main([*words, "--lenses", given, "--no_curve", "--test_iterations", "-1"])
+    text = "warning: --lenses native has no effect, since convert.py undistorted the photos of this scene; to train on"
+    assert (text in capsys.readouterr().err) == said

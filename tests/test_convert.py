@@ -520,6 +520,13 @@ def test_fisheyes_are_placed_and_stay_as_they_are(tmp_path, capsys):
     assert shots[0].read_bytes() != views[0].image_path.read_bytes()
 
 
+def test_cameras_beside_poses_have_no_effect(tmp_path, capsys):
+    for words, said in (([], False), (["--cameras", "shared"], True)):
+        with pytest.raises(UserError, match="no folder input"):
+            convert.main(["-s", str(tmp_path), "--poses", "transforms.json", *words])
+        assert ("warning: --cameras has no effect beside --poses" in capsys.readouterr().err) == said
+
+
 def _given(folder: Path, count: int) -> Path:
     """Write transforms.json with the poses of make_photos's photos, of cameras twice as large; return its path."""
     frames = []
@@ -623,9 +630,12 @@ def test_photos_and_masks_that_can_not_be_used_are_named_at_once(tmp_path):
         Image.new("L", (30, 40)).save(masks / f"{name}.png")
     check_images(layout, names, masks)
     (layout.input / "b.jpg").write_bytes((layout.input / "b.jpg").read_bytes()[:-60])
+    with pytest.raises(UserError, match=r"cannot read .*b.jpg \(.*, or pass --skip_unreadable to go on without"):
+        check_images(layout, names, masks)
     (layout.input / "c.jpg").write_bytes(b"<html>")
     Image.new("L", (40, 30)).save(masks / "e.jpg.png")
     said = "^3 of 5 photos cannot be used: .*b.jpg.*c.jpg.*mask .*e.jpg.png has 40 x 30 pixels, but its photo e.jpg has"
+    said += ".*; replace or remove them, or pass --skip_unreadable to go on without photos that cannot be read$"
     with pytest.raises(UserError, match=said) as error:
         check_images(layout, names, masks)
     assert "\n" not in str(error.value) and "a.jpg" not in str(error.value) and "d.jpg" not in str(error.value)
@@ -639,7 +649,10 @@ def _model(registered: int, points: int = 5000, track: float = 5.0, error: float
     ("models", "said"),
     [
         ([_model(40)], []),
-        ([_model(38)], [r"2 of 40 photos were left out \(038, 039\), and 1 of them match no .*--matcher exhaustive"]),
+        (
+            [_model(38)],
+            [r"2 of 40 photos left out \(038, 039\), 1 of them without a match .*something else; --matcher"],
+        ),
         (
             [_model(25), _model(15, first=25)],
             ["15 of 40", r"form 2 unconnected parts \(25 photos are used, the other parts have 15\)"],

@@ -213,6 +213,15 @@ def test_photos_without_exif_among_others_are_named(mode, known, count):
     ] * count
 
 
+def test_frames_of_videos_need_no_exif():
+    known = {"0.jpg": Lens(film=26.0), "1.jpg": Lens(), "frame_00001.jpg": Lens(), "frame_00002.jpg": Lens()}
+    frames = {"frame_00001.jpg", "frame_00002.jpg"}
+    (line,) = cameras.advice([], known, "per_lens", frames)
+    assert line.startswith("the EXIF data of 1 of 2 photos name no lens (1.jpg), and")
+    assert cameras.advice([], known, "per_lens", {*frames, "1.jpg"}) == []
+    assert cameras.advice([], known, "per_lens", {*frames, "0.jpg"}) == []  # of photos none is known
+
+
 def test_the_doctor_compares_cameras_with_exif(colmap_scene):
     """Also where the program that made the scene kept no EXIF data, but the photos that convert.py read are there."""
     views = read_scene(colmap_scene, "images", hold_out=False).train_cameras

@@ -112,6 +112,7 @@ def _fill(folder: Path) -> None:
     (folder / "notes").write_bytes(bytes([0, 0, 2, *[0] * 9, 8, 0, 8, 0, 24, 0]) + bytes(300))  # the header of a TGA
     (folder / "2.CR2").write_bytes(b"II*\x00\x10\x00\x00\x00CR\x02\x00")
     (folder / ".hidden").touch()
+    _save(folder / ".thumbnails" / "1.jpg", "JPEG")
 
 
 def test_every_file_that_is_not_used_is_named(tmp_path):
@@ -146,6 +147,21 @@ def test_photos_that_can_not_be_read_stop_unless_they_are_left_out(tmp_path, hei
     found = sort_inputs(tmp_path, skip_unreadable=True)
     assert found.photos == ["1.jpg", "2.jpg", "3.jpg"]
     assert {"4.NEF", "5.tif", "6.heic", "7.hif", "8.jpg", "9.png"} < found.unused.keys()
+
+
+def test_links_to_folders_are_not_passed_over(tmp_path):
+    """Their photos are not looked for, which may be most of the capture."""
+    _fill(tmp_path / "input")
+    _save(tmp_path / "4.jpg", "JPEG")
+    for name, target in (("day 2", tmp_path), ("5.jpg", tmp_path / "gone.jpg"), ("4.jpg", tmp_path / "4.jpg")):
+        (tmp_path / "input" / name).symlink_to(target)
+    said = (
+        r"^2 photos in .* cannot be read: 5.jpg, day 2 \(a link to a folder or to nothing: copy .* do as said, or pass"
+    )
+    with pytest.raises(UserError, match=said):
+        sort_inputs(tmp_path / "input")
+    found = sort_inputs(tmp_path / "input", skip_unreadable=True)
+    assert found.photos == ["1.jpg", "2.jpg", "3.jpg", "4.jpg"] and found.unused["day 2"].startswith("a link to")
 
 
 def test_without_the_reader_of_heic_the_message_has_the_line_that_installs_it(tmp_path, heif, monkeypatch):

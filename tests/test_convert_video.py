@@ -1,6 +1,7 @@
 """convert.py --video: frames chosen by motion and sharpness, HDR brought to SDR, several videos, videos with photos."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -106,6 +107,23 @@ def test_frames_replace_frames_and_nothing_else(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="frame_00002.jpg has a name that frames of a.mp4 will get; rename it"):
         convert.main(["-s", str(other.scene), "--video", str(one)])
     assert [path.name for path in _frames(other)] == ["frame_00002.jpg"]
+
+
+def test_frames_that_an_ended_run_left_out_are_said(tmp_path, monkeypatch, capsys):
+    layout, video = Layout(tmp_path / "scene"), tmp_path / "walk.mp4"
+    video.touch()
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", _Decoder())
+    words = ["-s", str(layout.scene), "--mask_path", str(tmp_path)]
+
+    def ended(*more: str) -> bool:
+        with pytest.raises(UserError, match="has a mask"):
+            convert.main([*words, *more])
+        return "warning: an earlier run ended before it had all frames" in capsys.readouterr().err
+
+    assert not ended("--video", str(video)) and not ended()
+    record = json.loads(layout.stages.read_text())
+    layout.stages.write_text(json.dumps(record | {"video": record["video"] | {"done": False}}))
+    assert ended() and not ended("--video", str(video)) and not ended()
 
 
 @pytest.fixture(scope="module")
@@ -251,6 +269,20 @@ def test_a_turned_video_gives_upright_frames(ffmpeg, room, tmp_path):
     taken = np.asarray(Image.open(_frames(layout)[0]).convert("L")).astype(float)
     expected = np.rot90(np.asarray(Image.fromarray(room[0]).convert("L")))
     assert np.abs(taken - expected).mean() < 4 < 20 < np.abs(taken - expected[::-1, ::-1]).mean()  # of 0 to 255
+
+
+def test_a_video_that_was_cut_short_is_said(ffmpeg, room, tmp_path, capsys):
+    """By its end, not by its number of frames: there may be fewer, farther apart, and nothing missing."""
+    frames, quick = np.repeat(room[::2], 4, axis=0), ("-preset", "ultrafast", "-pix_fmt", "yuv420p")
+    _write(ffmpeg, tmp_path / "whole.mkv", frames, "-g", "8", *quick)
+    content = (tmp_path / "whole.mkv").read_bytes()
+    (tmp_path / "cut.mkv").write_bytes(content[: len(content) // 2])
+    sparse = "select='lt(n,8)+not(mod(n,4))'", "-fps_mode", "vfr"
+    _write(ffmpeg, tmp_path / "sparse.mkv", frames, "-vf", *sparse, *quick)
+    for name, said in (("cut", True), ("whole", False), ("sparse", False)):
+        _extract(tmp_path / name, tmp_path / f"{name}.mkv", 3)
+        warned = re.search(r"warning: cut.mkv ends after [01]\.\d of 1.1 seconds; if it was", capsys.readouterr().err)
+        assert (warned is not None) == said
 
 
 def test_a_file_that_is_no_video(ffmpeg, tmp_path):

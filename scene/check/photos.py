@@ -250,3 +250,11 @@ def left_out(source: str | os.PathLike) -> str | None:
         return None
     share = f"{placed} of {count} photos ({placed / max(count, 1):.0%})"
     return f"this scene has {share} of its capture; capture.html in it says what is missing" if placed < count else None
+
+
+def already_undistorted(source: str | os.PathLike) -> bool:
+    """Whether convert.py made a scene of undistorted photos."""
+    try:
+        return read_json(Path(source) / "convert_report.json")["lenses"] == "undistort"
+    except (OSError, ValueError, KeyError, TypeError):
+        return False

@@ -1,6 +1,6 @@
 """Photos that share a camera in the reconstruction: those of one size and lens, unless the user says otherwise."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -81,8 +81,13 @@ def described(cameras: Sequence[dict[str, Any]], known: dict[str, Lens]) -> list
     return found
 
 
-def advice(cameras: Sequence[dict[str, Any]], known: dict[str, Lens], mode: str) -> list[str]:
-    """Return a line for each camera whose photos seem to come through several lenses, and one for missing EXIF data."""
+def advice(
+    cameras: Sequence[dict[str, Any]], known: dict[str, Lens], mode: str, frames: Collection[str] = ()
+) -> list[str]:
+    """Return a line for each camera whose photos seem to come through several lenses, and one for missing EXIF data.
+
+    frames: of videos, which never have EXIF data.
+    """
     lines = []
     for camera in cameras:
         fits = {name: fit for name, fit in camera["photos"].items() if fit}
@@ -95,10 +100,11 @@ def advice(cameras: Sequence[dict[str, Any]], known: dict[str, Lens], mode: str)
                 f"{factors[0]:.2f} to {factors[-1]:.2f} times its focal length, as photos through several lenses, or "
                 f"zoomed or cropped ones do; convert again with " + ("--cameras per_lens" if several else _BY_HAND)
             )
-    silent = [name for name, lens in known.items() if not lens.known]
-    if mode == "per_lens" and 0 < len(silent) < len(known):
+    photos = [name for name in known if name not in frames]
+    silent = [name for name in photos if not known[name].known]
+    if mode == "per_lens" and 0 < len(silent) < len(photos):
         lines.append(
-            f"the EXIF data of {len(silent)} of {len(known)} photos name no lens ({some(silent)}), and those of one "
+            f"the EXIF data of {len(silent)} of {len(photos)} photos name no lens ({some(silent)}), and those of one "
             f"size and folder share a camera; if they came through several lenses, use {_BY_HAND}"
         )
     return lines

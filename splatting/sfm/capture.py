@@ -62,13 +62,15 @@ def findings(
     """What a capture is worth, for convert_report.json.
 
     report: the content of that file so far. photos: of capture.json. looks: of all photos. Returns `weakly_connected`
-    and `blurred`, names of photos; `brightness_spread_stops`; and `again`, a line for each thing to photograph again.
+    and `blurred`, names of photos; `brightness_spread_stops`, of the placed ones, which train; and `again`, a line for
+    each thing to photograph again.
     """
     neighbours = neighbours_of(photos)
     weak = sorted(name for name, others in neighbours.items() if len(others) < min(FEW, len(photos) - 1))
     middle = float(np.median([look.sharpness for look in looks.values()])) if looks else 0.0
     blurred = sorted(name for name, look in looks.items() if look.sharpness < _BLURRED * middle)
-    spread = float(np.std([look.brightness for look in looks.values()])) if looks else 0.0
+    bright = [look.brightness for name, look in looks.items() if name in photos]
+    spread = float(np.std(bright)) if bright else 0.0
     return {
         "weakly_connected": weak,
         "blurred": blurred,
@@ -81,8 +83,8 @@ def _again(left_out: list[str], weak: list[str], blurred: list[str], spread: flo
     lines = []
     if left_out:
         lines.append(
-            f"what {some(left_out)} show: these photos were not placed; take photos on the way from there to the "
-            "others, each overlapping the one before by 60 to 80 %"
+            f"what {some(left_out)} show, if it belongs to the scene: take photos on the way from there to the others, "
+            "each overlapping the one before by 60 to 80 %"
         )
     if weak:
         lines.append(f"around {some(weak)}: they share points with fewer than {FEW} other photos; take more there")

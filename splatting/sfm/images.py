@@ -20,6 +20,7 @@ JPEG_QUALITY = 95
 _ORIENTATION = 0x0112  # EXIF tag; 1 or absent: upright
 _LYING = (5, 6, 7, 8)  # values of the tag that exchange width and height
 _MOST_NAMED = 20
+_OR_WITHOUT = "or pass --skip_unreadable to go on without photos that cannot be read"
 # Formats that COLMAP reads, or in which photos of other formats are written for it: HEIC and AVIF lose little as JPEG.
 _WRITTEN = {"JPEG": "JPEG", "MPO": "JPEG", "PNG": "PNG", "TIFF": "TIFF", "BMP": "BMP", "HEIF": "JPEG", "AVIF": "JPEG"}
 _ENDS = {"JPEG": ".jpg", "PNG": ".png", "TIFF": ".tif", "BMP": ".bmp"}
@@ -51,11 +52,14 @@ def check_images(layout: Layout, names: Sequence[str], masks: Path | None) -> No
     with_mask = find_masks(names, masks, layout.input) if masks else {}
 
     def check(name: str) -> None:
-        size = _upright_size(layout.input / name)
+        try:
+            size = _upright_size(layout.input / name)
+        except UserError as error:
+            raise UserError(f"{error}, {_OR_WITHOUT}") from error
         if name in with_mask:
             _check_mask(with_mask[name], name, size)
 
-    _in_threads(check, names, "Checking photos")
+    _in_threads(check, names, "Checking photos", f"replace or remove them, {_OR_WITHOUT}")
 
 
 def find_masks(names: Sequence[str], folder: Path, photos: Path) -> dict[str, Path]:
@@ -173,8 +177,13 @@ def _link(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-def _in_threads(work: Callable[[str], None], names: Sequence[str], title: str) -> None:
-    """Do the work for all names. If it raises UserError for any, raise one UserError that lists them."""
+def _in_threads(
+    work: Callable[[str], None], names: Sequence[str], title: str, remedy: str = "replace or remove them"
+) -> None:
+    """Do the work for all names. If it raises UserError for any, raise one UserError that lists them.
+
+    remedy: for several.
+    """
 
     def attempt(name: str) -> UserError | None:
         try:
@@ -191,4 +200,4 @@ def _in_threads(work: Callable[[str], None], names: Sequence[str], title: str) -
         # List what is wrong with each, without the remedy, which is the same for all.
         listed = "; ".join(str(fault).partition("; ")[0] for fault in faults[:_MOST_NAMED])
         more = f"; and {len(faults) - _MOST_NAMED} more" if len(faults) > _MOST_NAMED else ""
-        raise UserError(f"{len(faults)} of {len(names)} photos cannot be used: {listed}{more}; replace or remove them")
+        raise UserError(f"{len(faults)} of {len(names)} photos cannot be used: {listed}{more}; {remedy}")

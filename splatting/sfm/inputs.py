@@ -35,7 +35,7 @@ _RAW_SUFFIXES = (
     *(".gpr", ".rwl", ".x3f"),
 )
 _DNG_VERSION = 50706  # TIFF tag: a RAW file, whose first picture is a thumbnail
-_VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".mpg", ".3gp", ".insv", ".wmv")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".mpg", ".3gp", ".insv", ".wmv")
 _VIDEO_STARTS = (b"\x1a\x45\xdf\xa3", b"\x00\x00\x01\xba")  # Matroska and WebM; MPEG program streams
 # Formats whose files often lie beside a JPEG of the same shot.
 _OFTEN_DOUBLE = ("HEIF", "AVIF", "RAW")
@@ -44,6 +44,7 @@ _INSTALL = 'HEIC: `pip install pillow-heif` or `pip install ".[heic]"`, or expor
 _DEVELOP = "RAW: export as JPEG or TIFF"
 _HDR = "HDR picture: export as SDR"
 _DAMAGED = "damaged: copy it again"
+_LINK = "a link to a folder or to nothing: copy the photos themselves"
 
 
 class Inputs(NamedTuple):
@@ -54,13 +55,14 @@ class Inputs(NamedTuple):
 
 
 def sort_inputs(folder: Path, skip_unreadable: bool = False, but: Iterable[Path] = ()) -> Inputs:
-    """Tell the photos below a folder from its other files; hidden files, and those of `but`, count as absent.
+    """Tell the photos below a folder from its other files; hidden ones, and those of `but`, count as absent.
 
     skip_unreadable: leave out photos that cannot be read, also damaged ones; else a UserError names them by reason.
     """
     absent = {path.absolute() for path in but}
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith(".")]
-    kinds = {path: _kind(path, skip_unreadable) for path in files if path.absolute() not in absent}
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file() or path.is_symlink()]
+    seen = [path for path in files if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
+    kinds = {path: _kind(path, skip_unreadable) for path in seen if path.absolute() not in absent}
     stems = {path.with_suffix(""): path.name for path, kind in kinds.items() if kind.format not in (*_OFTEN_DOUBLE, "")}
     photos, unused, unreadable = [], {}, {}
     for path, kind in kinds.items():
@@ -99,6 +101,8 @@ class _Kind(NamedTuple):
 
 def _kind(path: Path, thorough: bool) -> _Kind:
     suffix = path.suffix.lower()
+    if not path.is_file():
+        return _Kind("unknown", _LINK)
     try:
         with open(plain(path), "rb") as file:
             head = file.read(16)
@@ -111,7 +115,7 @@ def _kind(path: Path, thorough: bool) -> _Kind:
     if brand in _HEIF:
         return _heif_kind(path, head, thorough)
     video = brand or head.startswith(_VIDEO_STARTS) or (head[:4], head[8:12]) == (b"RIFF", b"AVI ")
-    if video or suffix in _VIDEO_SUFFIXES:
+    if video or suffix in VIDEO_SUFFIXES:
         return _Kind("", "video: pass it as --video to take frames of it")
     return _picture_kind(path, thorough)
 

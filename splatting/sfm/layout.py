@@ -4,10 +4,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from splatting.files.image_files import SUFFIXES
-from splatting.sfm.inputs import Inputs, sort_inputs, unused_lines
+from splatting.sfm.inputs import VIDEO_SUFFIXES, Inputs, sort_inputs, unused_lines
 from utils.system_utils import UserError
 
-_VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts")
 FEWEST = 3
 
 
@@ -43,7 +42,7 @@ def scene_folder(given: str, made: bool = False) -> Path:
         raise UserError(f"the path given as -s contains quotes: {given}; pass {bare}, quoted only once for the shell")
     folder = Path(given)
     if folder.is_file():
-        hint = "pass its folder as -s and the video as --video" if folder.suffix.lower() in _VIDEOS else ""
+        hint = "pass its folder as -s and the video as --video" if folder.suffix.lower() in VIDEO_SUFFIXES else ""
         raise UserError(
             f"{given} is a file; {hint or 'pass the folder that contains the folder input with the photos as -s'}"
         )

@@ -60,10 +60,10 @@ def advice(
     lines = []
     if out:
         lonely = sum(partners.get(name, 0) == 0 for name in out)
-        text = f"{len(out)} of {len(images)} photos were left out ({some(out)})"
+        text = f"{len(out)} of {len(images)} photos left out ({some(out)})"
         if lonely:
-            text += f", and {lonely} of them match no other photo"
-        remedy = "take more photos between them and their neighbours, or remove them if they are blurred"
+            text += f", {lonely} of them without a match in another photo"
+        remedy = "take more photos on the way to the others, or remove what is blurred or shows something else"
         if matcher == "sequential":
             remedy += "; --matcher exhaustive compares every pair"
         lines.append(f"{text}; {remedy}")

@@ -61,6 +61,10 @@ class StageRecord:
         """Whether this stage was ever begun in this folder."""
         return name in self._record
 
+    def interrupted(self, name: str) -> bool:
+        """Whether this stage was begun and not finished."""
+        return self.begun(name) and not self._record[name]["done"]
+
     def run(self, stages: list[Stage]) -> list[str]:
         """Do the stages that are not done, in order; return the names of those that were done before.
 
@@ -200,7 +204,7 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
             lines = report.advice_at_poses(chosen, names)
         else:
             lines = report.advice(models, names, matches, settings.matcher, at_limit)
-            lines += cameras.advice(chosen.cameras, lenses, settings.cameras)
+            lines += cameras.advice(chosen.cameras, lenses, settings.cameras, video.taken_frames(layout))
         native = colmap.is_native(settings.lenses, {camera["model"] for camera in chosen.cameras})
         paths = {"model": layout.models / chosen.folder, "images": root, "out": layout.undistorted}
         job = {name: str(path) for name, path in (paths | {"capture": layout.capture}).items()}

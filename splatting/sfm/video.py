@@ -3,7 +3,9 @@
 ffmpeg reads each video twice: first as grey pictures, which tell motion and sharpness, then the frames that are taken.
 """
 
+import re
 import subprocess
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,7 @@ PATTERN = "frame_[0-9][0-9][0-9][0-9][0-9].jpg"  # of a video's frames
 LEAST = 0.1
 _SIDE = 48  # of the small pictures that are compared
 _STEP = 4  # sharpness is computed on every 4th row and column
+_WHOLE = 0.9  # of the length that a file tells of itself; sound often ends a little after the picture
 _EVERY_FRAME = ["-fps_mode", "passthrough"]  # else frames are doubled or dropped where their times are uneven
 _HDR = {"arib-std-b67": "HLG", "smpte2084": "PQ"}  # ffmpeg's names of the transfer functions of ITU-R BT.2100
 # agamma=0: zscale's approximation of HLG leaves out that its gamma is that of the luminance, and saturates colours.
@@ -33,6 +36,7 @@ _COMPRESSED = "tonemap=mobius:param=0.9:peak=4.93:desat=0"
 _DISPLAY = "zscale=t=bt709:m=gbr:r=pc,format=gbrp"
 # What the scores of frames do not tell.
 NOTE = "test views of --eval lie between frames of the same video that train; other places may score lower"
+FRAMES_MISSING = "an earlier run ended before it had all frames of its video; pass that --video again to add the others"
 
 
 def find_decoder() -> Any:
@@ -138,6 +142,8 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int) -> Non
             small.append(small_picture(frame))
         if not small:
             raise RuntimeError("it has no frames")
+        if expected and len(small) < _WHOLE * expected:
+            _warn_if_cut(decoder, video, header["duration"])
         chosen = choose_frames(sharp, np.stack(small), count)
         hdr = next((name for tag, name in _HDR.items() if tag in colours), "")
         filters = _filters(decoder, video, colours, bool(hdr))
@@ -154,6 +160,20 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int) -> Non
             f"cannot read the video {video} ({reason[-1] if reason else type(error).__name__}); pass another file as "
             f"--video, or put frames of it as JPEG into {folder}"
         ) from error
+
+
+def _warn_if_cut(decoder: Any, video: Path, duration: float) -> None:
+    """Say where the frames of a video end before its duration (seconds); fewer of them may only be far apart."""
+    copied = ["-map", "0:v:0", "-c", "copy", "-f", "null", "-", "-v", "quiet", "-nostats", "-progress", "-"]
+    command = [decoder.get_ffmpeg_exe(), "-i", str(video), *copied]
+    said = subprocess.run(command, capture_output=True, text=True, errors="replace").stdout
+    ends = [int(number) / 1e6 for number in re.findall(r"out_time_us=(\d+)", said)]
+    if ends and max(ends) < _WHOLE * duration:
+        print(
+            f"warning: {video.name} ends after {max(ends):.1f} of {duration:.1f} seconds; if it was cut "
+            "short, copy it again",
+            file=sys.stderr,
+        )
 
 
 def choose_frames(sharp: Sequence[float], small: np.ndarray, count: int) -> list[int]:

@@ -1,9 +1,10 @@
 """Checks made before training, so that a hopeless one fails at once."""
 
 import argparse
+import sys
 
 from scene.check import of_options, tell
-from scene.check.photos import hints, left_out
+from scene.check.photos import already_undistorted, hints, left_out
 from scene.readers.info import NEAREST
 from scene.scene import Scene
 from utils.system_utils import UserError
@@ -31,6 +32,16 @@ def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> Non
         print(
             f"much of the scene is nearer than {NEAREST} units, so depths from {NEAREST / factor:.2g} on are drawn; "
             "files keep the scene's unit"
+        )
+
+
+def check_lenses(options: argparse.Namespace) -> None:
+    """Say where --lenses native, as it was given, comes too late."""
+    if getattr(options, "lenses", "") == "native" and already_undistorted(options.source_path):
+        print(
+            "warning: --lenses native has no effect, since convert.py undistorted the photos of this scene; to train "
+            "on them as they were taken, convert again with --lenses native",
+            file=sys.stderr,
         )
 
 

@@ -64,6 +64,7 @@ class Run(Stepping):
         self.group = ranks()
         checks.check_alone(getattr(pipe, "projection", "ewa"), self.group.several)
         self.start = self.group.shared(resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
+        checks.check_lenses(dataset)  # before auto becomes native
         dataset = self.dataset = earlier_runs.resolve_lenses(dataset, self.start)
         if opt.strategy == "auto" and self.start:
             opt.strategy = earlier_runs.strategy_of(self.start)
