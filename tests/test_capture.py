@@ -48,7 +48,7 @@ def test_what_is_weak_blurred_and_darker_is_named(folder):
     assert (found["weakly_connected"], found["blurred"]) == (["d.jpg"], ["b.jpg"])
     assert found["brightness_spread_stops"] == pytest.approx(np.std([0, 0, 0, 2]), abs=0.05)
     assert [line.split(":")[0] for line in found["again"]] == [
-        "what is in e.jpg, if it belongs to the scene", "around d.jpg", "b.jpg", "with a fixed exposure, if you can",
+        "what e.jpg show, if it belongs to the scene", "around d.jpg", "b.jpg", "with a fixed exposure, if you can",
     ]  # fmt: skip
     page = folder / "capture.html"
     report = _report(4, 5, "e.jpg") | found

@@ -156,7 +156,7 @@ def test_links_to_folders_are_not_passed_over(tmp_path):
     for name, target in (("day 2", tmp_path), ("5.jpg", tmp_path / "gone.jpg"), ("4.jpg", tmp_path / "4.jpg")):
         (tmp_path / "input" / name).symlink_to(target)
     said = (
-        r"^2 photos in .* cannot be read: 5.jpg, day 2 \(a link to a folder or to nothing: copy .* do as said, or pass"
+        r"^2 photos in .* cannot be read: 5.jpg, day 2 \(a link to a folder or to nothing: copy .* follow these hints, or pass"
     )
     with pytest.raises(UserError, match=said):
         sort_inputs(tmp_path / "input")

@@ -152,7 +152,7 @@ def test_colours_that_nothing_explains(folder, log):
 def test_opacities_that_were_reset_too_late(folder, monkeypatch):
     log = folder / "train_log.json"
     records = json.loads(log.read_text())
-    said = "warning: opacities are reset in iteration 300, and the remaining 100 iterations are too few to recover; change it"
+    said = "warning: opacities are reset in iteration 300, and the remaining 100 are too few to recover; change it"
     records[-1]["lines"] = [said, *records[-1].get("lines", [])]
     log.write_text(json.dumps(records))
     assert _problems(folder) == []  # they did recover
