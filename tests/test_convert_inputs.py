@@ -155,9 +155,7 @@ def test_links_to_folders_are_not_passed_over(tmp_path):
     _save(tmp_path / "4.jpg", "JPEG")
     for name, target in (("day 2", tmp_path), ("5.jpg", tmp_path / "gone.jpg"), ("4.jpg", tmp_path / "4.jpg")):
         (tmp_path / "input" / name).symlink_to(target)
-    said = (
-        r"^2 photos in .* cannot be read: 5.jpg, day 2 \(a link to a folder or to nothing: copy .* follow these hints, or pass"
-    )
+    said = r"^2 photos in .* cannot be read: 5.jpg, day 2 \(a link to a folder or to nothing: copy .* hints, or pass"
     with pytest.raises(UserError, match=said):
         sort_inputs(tmp_path / "input")
     found = sort_inputs(tmp_path / "input", skip_unreadable=True)

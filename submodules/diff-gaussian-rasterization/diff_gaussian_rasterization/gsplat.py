@@ -37,6 +37,14 @@ _UNSUPPORTED = {
 _NEED_UT = ("radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs", "viewmats_rs")
 
 
+class _Fisheye(Lens):
+    """An equidistant lens that shows Gaussians whose centres are up to 90 degrees off the axis, as gsplat does."""
+
+    def numbers(self, width: int, height: int) -> tuple[float, ...]:
+        chart, _, reach, _, *rest = super().numbers(width, height)
+        return chart, (math.pi / 2) ** 2, reach, math.pi / 2, *rest
+
+
 class _Camera(NamedTuple):
     """One camera of a call."""
 
@@ -58,7 +66,7 @@ class _Camera(NamedTuple):
         projection[0, 0], projection[1, 1] = 2 * fx / self.width, 2 * fy / self.height
         projection[0, 2], projection[1, 2] = 2 * cx / self.width - 1, 2 * cy / self.height - 1
         projection[2, 2] = projection[3, 2] = 1
-        lens = Lens("equidistant", (fx, fy), (cx - 0.5, cy - 0.5)) if self.model == "fisheye" else None
+        lens = _Fisheye("equidistant", (fx, fy), (cx - 0.5, cy - 0.5)) if self.model == "fisheye" else None
         tangents = self.width / (2 * fx), self.height / (2 * fy)
         center = scale * torch.linalg.inv(self.view)[:3, 3]
         full = (projection @ view).T
