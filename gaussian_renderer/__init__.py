@@ -2,12 +2,15 @@
 
 import argparse
 import math
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
+from typing import NamedTuple
 
 import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings
+from diff_gaussian_rasterization import GaussianRasterizationSettings, rasterize
 from diff_gaussian_rasterization.backend import OPERATORS
+from diff_gaussian_rasterization.channels import rasterize_channels
 from diff_gaussian_rasterization.gaussians import Gaussians
 from diff_gaussian_rasterization.scene import Drawing, Scene, scene_arguments
 from diff_gaussian_rasterization.scene import draw as rasterize_scene
@@ -45,6 +48,7 @@ def render(
     want_inactive_bands: bool = True,
     want_absolute_gradient: bool = False,
     clamp: bool = True,
+    features: Tensor | None = None,
 ) -> dict[str, Tensor | None]:
     """Render one view.
 
@@ -53,14 +57,15 @@ def render(
     model's device. scaling_modifier multiplies all scales. separate_sh: take get_features_dc and get_features_rest even
     if a subclass has overridden them; the 2023 release has override_color in its place. override_color: (N, 3) instead
     of SH. pipe: convert_SHs_python, compute_cov3D_python, debug and, where they are there, antialiasing and projection.
-    use_trained_exp: apply the trained exposure of the view's photo, before the clamp; a view without a photo has none.
+    use_trained_exp: apply the trained exposure of the view's photo, if it has one. features: (N, F) further channels.
 
     Returns
     `render` (3, H, W), clamped to [0, 1] so that values outside get no gradient; unclamped if clamp is False;
     `viewspace_points` (N, 3), whose gradient is that of the screen means, per NDC unit; its third column is 0, or with
     want_absolute_gradient the length that `rasterize` tells of; `visibility_filter` (n, 1) int64 indices of the
     Gaussians with radius > 0, or None without want_visibility, which saves waiting for a GPU; `radii` (N,) int32
-    pixels; `depth` inverse depth (1, H, W) by the world's unit, or None unless want_depth.
+    pixels; `depth` inverse depth (1, H, W) by the world's unit, or None unless want_depth; with features `features`
+    (F, H, W), over a background of 0, and no depth.
     Without want_inactive_bands, get_features_rest gets no gradient at the active degree 0, instead of zeros.
     Raises TypeError for a flag that is neither True nor False, such as the text "no".
     """
@@ -71,7 +76,8 @@ def render(
     if gaussians.sh_rest is not None and pc.active_sh_degree == 0 and not want_inactive_bands:
         gaussians = gaussians._replace(sh_rest=gaussians.sh_rest.detach()[:, :0])
     viewspace_points = _screen_points(*gaussians)
-    result = rasterizer_of(pc)(
+    rasterizer = rasterizer_of(pc) if features is None else partial(_with_features, rasterizer_of(pc), features)
+    result = rasterizer(
         means2d=viewspace_points,
         settings=rasterizer_settings(viewpoint_camera, pc, pipe, bg_color, scaling_modifier),
         want_inverse_depth=want_depth,
@@ -86,7 +92,31 @@ def render(
         "visibility_filter": (result.radii > 0).nonzero() if want_visibility else None,
         "radii": result.radii,
         "depth": in_world_units(result.inverse_depth, pc),
-    }
+    } | ({} if features is None else {"features": result.features})
+
+
+class _Featured(NamedTuple):
+    """What `render` takes of an image with features."""
+
+    color: Tensor
+    radii: Tensor
+    inverse_depth: None
+    features: Tensor
+
+
+def _with_features(
+    rasterizer: Callable,
+    features: Tensor,
+    *,
+    settings: GaussianRasterizationSettings,
+    want_inverse_depth: bool,
+    **given,
+) -> _Featured:
+    if rasterizer is not rasterize:
+        raise ValueError("features need a model that is not divided among processes")
+    behind = torch.cat([settings.bg, settings.bg.new_zeros(features.shape[1])])
+    found = rasterize_channels(settings=settings._replace(bg=behind), features=features, **given)
+    return _Featured(found.image[:3], found.radii, None, found.image[3:])
 
 
 def _screen_points(xyz: Tensor, *others: Tensor | None) -> Tensor:

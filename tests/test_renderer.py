@@ -50,6 +50,20 @@ def test_what_it_returns(camera):
         assert getattr(gaussians, name).grad.shape == getattr(gaussians, name).shape
 
 
+def test_features_are_rendered_beside_colours(camera):
+    gaussians, features = model(40), torch.randn(40, 5, requires_grad=True)
+    plain = render(camera, gaussians, pipeline(), torch.ones(3))
+    package = render(camera, gaussians, pipeline(), torch.ones(3), features=features)
+    assert [*package] == [*plain, "features"] and package["depth"] is None
+    assert torch.allclose(package["render"], plain["render"], atol=1e-6)
+    colors = features[:, :3].detach()
+    apart = render(camera, gaussians, pipeline(), BLACK, override_color=colors, clamp=False)["render"]
+    assert package["features"].shape == (5, HEIGHT, WIDTH)
+    assert torch.allclose(package["features"][:3], apart, atol=1e-5)
+    package["features"].sum().backward()
+    assert features.grad.any() and gaussians._xyz.grad.any()
+
+
 def test_depth_unless_it_is_not_wanted(camera):
     gaussians = model(1)
     with torch.no_grad():
