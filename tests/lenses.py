@@ -51,6 +51,11 @@ class LensView(View):
 
     lens: Lens
 
+    @property
+    def params(self) -> list[float]:
+        """COLMAP's parameters."""
+        return list(self.lens.params)
+
     def rays(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return unit ray directions, as View.rays does."""
         local = colmap_camera(self.lens).cam_ray_from_img(np.column_stack([x, y]).astype(np.float64))

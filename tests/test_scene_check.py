@@ -1,6 +1,7 @@
 """scene/check: each fault of photos, cameras and points is named, and nothing is said of sound scenes."""
 
 import argparse
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from lenses import LensView, make_lens
 from PIL import Image
 from synthetic import as_text, options_of, read
 
@@ -21,7 +23,10 @@ from scene.gaussians.copies import places_of
 from scene.gaussians.start import start_rows
 from scene.images.decode import decode
 from scene.readers.info import CameraInfo, SceneInfo
-from splatting.diagnosis.dataset import check_dataset
+from splatting.demo.make_scene import write_scene
+from splatting.demo.objects import demo_scene
+from splatting.demo.tracer import FISHEYE, PANORAMA, ring_views
+from splatting.diagnosis.dataset import check_dataset, check_geometry
 from splatting.training.checks import check_scene
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
@@ -256,6 +261,30 @@ def test_a_geometric_cause_is_named_before_colours(sound, tmp_path, change, text
         text = text.replace("0.769", "about 0.75")
     lines = "\n".join(line.text for line in check_dataset(str(scene), "images") if line.finding)
     assert text in lines and "each other's names" not in lines
+
+
+@pytest.mark.parametrize(
+    ("lens", "longer"),
+    [("OPENCV", "0.7[4-7]"), ("THIN_PRISM_FISHEYE", "0.7[5-8]"), ("wide", "0.769"), ("panorama", "")],
+)
+def test_focal_lengths_are_judged_by_the_lens(tmp_path, capsys, lens, longer):
+    """By its own projection, also of what a fisheye shows beside and behind it. A panorama has no focal length."""
+    scene, rng, size = tmp_path / "scene", np.random.default_rng(0), (64, 32 if lens == "panorama" else 48)
+    model = {"wide": FISHEYE, "panorama": PANORAMA}.get(lens)
+    views = ring_views(8, *size, rng, model or "PINHOLE")
+    if model is None:
+        given = make_lens(lens, 0.75 * size[0], *size)
+        views = [LensView(**vars(view) | {"model": lens}, lens=given) for view in views]
+    write_scene(scene, views, lambda _: demo_scene(), 300, rng, samples=1)
+    for wrong in (False, True)[: 1 + bool(longer)]:
+        if wrong:
+            model = pycolmap.Reconstruction(scene / "sparse" / "0")
+            _longer(model)
+            model.write_binary(str(scene / "sparse" / "0"))
+        info = read_scene(scene, "images", False, native=True)
+        lines = "\n".join(line.text for line in check_geometry(str(scene), info))
+        assert re.fullmatch(rf"points fit .* focal lengths {longer}\d* times as long .*" if wrong else "", lines)
+        assert "not used" not in capsys.readouterr().err
 
 
 def test_missing_and_broken_photos_are_told_together(sound, tmp_path):

@@ -106,14 +106,17 @@ def pinhole_of(lens: Lens, name: str) -> Pinhole | None:
 def rays_of(lens: Lens, pixels: np.ndarray) -> np.ndarray:
     """x / z and y / z (N, 2) of the rays of pixels (N, 2), pixel centres at .5; NaN where a ray has none.
 
-    A panorama, most of whose rays have none, gives NaN throughout.
+    A panorama, most of whose rays have none, gives NaN throughout. COLMAP's fisheyes name rays of other pixels for
+    those that lie beyond 90 degrees.
     """
     if lens.model == PANORAMA:
         return np.full(pixels.shape, np.nan)
     if lens.model in ("SIMPLE_PINHOLE", "PINHOLE"):  # without pycolmap
         focal, center = np.array(lens.params[:-2]), np.array(lens.params[-2:])
         return (pixels - center) / focal
-    return np.asarray(_camera(lens).cam_from_img(np.ascontiguousarray(pixels)), dtype=np.float64).reshape(-1, 2)
+    camera, pixels = _camera(lens), np.ascontiguousarray(pixels)
+    rays = np.asarray(camera.cam_from_img(pixels), dtype=np.float64).reshape(-1, 2)
+    return np.where(_round_trip(camera, pixels)[:, None] < _ROUND_TRIP, rays, np.nan)
 
 
 def _check_bounds(lens: Lens, focal: Sequence[float], center: Sequence[float], name: str) -> None:

@@ -16,7 +16,7 @@ from diff_gaussian_rasterization.reference.lens import numbers_of
 from diff_gaussian_rasterization.scene import scene_arguments
 
 from scene.colmap_loader import Camera
-from scene.images.lens import PERSPECTIVE, Lens, rays_of
+from scene.images.lens import PANORAMA, PERSPECTIVE, Lens, rays_of
 from scene.readers.colmap import find_model, read_model
 from scene.readers.info import CameraInfo
 from scene.readers.scene_folder import COLMAP, kind_of
@@ -52,12 +52,13 @@ def read_tracks(scene: str | os.PathLike, views: Sequence[CameraInfo], offset: n
     folder, _ = find_model(Path(scene))
     cameras, images, points = read_model(folder, with_2d_points=True)
     photos, found, dropped = {image.name: image for image in images}, [], 0
+    fisheyes = any(camera.model not in (*PERSPECTIVE, PANORAMA) for camera in cameras.values())
     if len(points.ids):
         every = np.concatenate([image.point3D_ids for image in images])
         lengths = np.bincount(np.searchsorted(points.ids, every[np.isin(every, points.ids)]), minlength=len(points.ids))
     for view in views:
         photo = photos.get(view.image_name)
-        if photo is None or not len(points.ids):
+        if photo is None or not len(points.ids) or cameras[photo.camera_id].model == PANORAMA:
             found.append(None)
             continue
         place = np.minimum(np.searchsorted(points.ids, photo.point3D_ids), len(points.ids) - 1)
@@ -65,18 +66,30 @@ def read_tracks(scene: str | os.PathLike, views: Sequence[CameraInfo], offset: n
         rays = _angles(camera, photo.xys) if angular else _rays(camera, photo.xys, view)
         known = points.ids[place] == photo.point3D_ids
         places, longest = photo.xys / (camera.width, camera.height), max(camera.width, camera.height)
-        sound = (np.abs(points.errors[place]) <= longest) & (np.abs(places - 0.5) < _FAR).all(1)
-        dropped += int((known & ~sound).sum())
-        seen = known & sound & np.isfinite(rays).all(1)
-        place, places = place[seen], places[seen]
-        track = Track(
-            points.xyz[place] - offset, rays[seen], places, points.errors[place], lengths[place], place, angular
-        )
+        errors, local = points.errors[place], (points.xyz[place] - offset) @ view.R + view.T
+        if fisheyes:  # COLMAP gives 1e154 pixels, or a part of that, to a point that one shows beyond 90 degrees
+            own = view.fx * np.linalg.norm(rays - rays_to(local, angular), axis=1)
+            errors = np.where(np.abs(errors) <= longest, errors, own)
+        shown, near = np.isfinite(rays).all(1), (np.abs(places - 0.5) < _FAR).all(1)
+        sound = near & (np.abs(errors) <= longest)
+        dropped += int((known & ~sound & (shown | ~near)).sum())
+        seen = known & sound & shown
+        place, places, errors = place[seen], places[seen], errors[seen]
+        track = Track(points.xyz[place] - offset, rays[seen], places, errors, lengths[place], place, angular)
         found.append(track if len(place) >= FEWEST else None)
     if dropped:
         fault = "lie far outside of their photo, or have a reprojection error that is larger than it or no number"
         print(f"{dropped} 2D points of {folder} are not used: they {fault}", file=sys.stderr)
     return found
+
+
+def rays_to(local: np.ndarray, angular: bool) -> np.ndarray:
+    """Rays (N, 2) of points (N, 3) of a view's frame, as `Track` has them; NaN where there is none."""
+    aside, z = local[:, :2], local[:, 2:]
+    if not angular:
+        return aside / np.where(z > 0, z, np.nan)
+    away = np.linalg.norm(aside, axis=1, keepdims=True)
+    return aside * np.where(away > 0, np.arctan2(away, z) / np.where(away > 0, away, 1.0), 0.0)
 
 
 def _angles(camera: Camera, places: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from scene.images.exif import read_lens
 from scene.pose_errors import ADJUSTED, COMPARED, pose_errors, poses_differ
 from scene.readers.enlargement import enlargement
 from scene.readers.info import NEAREST
-from scene.readers.tracks import Track, read_tracks
+from scene.readers.tracks import Track, rays_to, read_tracks
 from splatting.diagnosis import Line, from_error
 from splatting.diagnosis.colors import UNITS, check_colors
 from splatting.files.json_files import read_json
@@ -149,19 +149,15 @@ def check_focal(views: Sequence[CameraInfo], tracks: Sequence[Track | None]) -> 
 
 def _longer(view: CameraInfo, track: Track) -> float:
     """The focal length that fits a track best, by the given one."""
-    places = _places(track.points @ view.R + view.T)
+    places = np.nan_to_num(rays_to(track.points @ view.R + view.T, track.angular))
     return float(np.median((track.rays * places).sum(axis=1) / np.maximum((places**2).sum(axis=1), 1e-9)))
 
 
 def _missed(view: CameraInfo, track: Track, unit: float = 1.0, factor: float = 1.0) -> float:
     """Median distance of points from their rays, in parts of the focal length."""
-    local = unit * track.points @ view.R + view.T
-    away = np.where(local[:, 2] > 0, np.linalg.norm(track.rays - factor * _places(local), axis=1), np.inf)
-    return float(np.median(away))
-
-
-def _places(local: np.ndarray) -> np.ndarray:
-    return local[:, :2] / np.where(local[:, 2:] > 0, local[:, 2:], np.inf)
+    places = rays_to(unit * track.points @ view.R + view.T, track.angular)
+    away = np.linalg.norm(track.rays - factor * places, axis=1)
+    return float(np.median(np.where(np.isnan(away), np.inf, away)))
 
 
 def check_poses(views: Sequence[CameraInfo], tracks: Sequence[Track | None], extent: float) -> Iterator[Line]:

@@ -52,17 +52,20 @@ class SceneEntry:
 
 
 def dataset_scenes(group: str, root: Path, resize: bool = False) -> list[SceneEntry]:
-    """List the scenes of one of DATASETS under its root folder, including missing ones, whose run will fail.
+    """List the scenes of one of DATASETS that its root folder has, and name the others on stderr.
 
     resize: train on the full photos of images/, made smaller here, where others take the data set's own smaller JPEGs.
     UserError if the root has none of them.
     """
-    if not any((root / name).is_dir() for name in DATASETS[group]):
+    missing = [name for name in DATASETS[group] if not (root / name).is_dir()]
+    if len(missing) == len(DATASETS[group]):
         wrong = f"{root} has none of the scenes of {group}" if root.is_dir() else f"no such folder: {root}"
         raise UserError(f"{wrong}; pass the folder that has {', '.join(DATASETS[group])}")
+    if missing:
+        print(f"not found in {root}, left out: {', '.join(missing)}", file=sys.stderr)
     root = root.resolve()
     chosen = {name: ("-r", words[1][-1]) if resize and words else words for name, words in DATASETS[group].items()}
-    return [SceneEntry(name, group, root / name, options) for name, options in chosen.items()]
+    return [SceneEntry(name, group, root / name, options) for name, options in chosen.items() if name not in missing]
 
 
 def folder_scenes(folders: Sequence[Path]) -> list[SceneEntry]:

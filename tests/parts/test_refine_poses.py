@@ -23,7 +23,7 @@ from scene.gaussian_model import GaussianModel
 from scene.images.lens import Lens, rays_of
 from scene.poses import moved
 from scene.readers.colmap import read_colmap
-from scene.readers.tracks import Track, read_tracks
+from scene.readers.tracks import Track, rays_to, read_tracks
 from scene.reprojection import BOUND, moved_pose, nearest_pose, pull, twist_gradient
 from scene.scene import Scene
 from splatting.demo.make_scene import write_scene
@@ -177,24 +177,46 @@ def _tracks(scene: Path, views: list) -> list[Track]:
     return read_tracks(scene, views, np.zeros(3))
 
 
-def test_tracks_of_a_fisheye_reach_beyond_90_degrees(tmp_path):
-    """They are the angles at which its lens shows their places."""
+def test_tracks_of_a_fisheye_reach_beyond_90_degrees(tmp_path, capsys):
+    """They are the angles at which its lens shows their places, and pixels from where COLMAP's model shows them.
+
+    Points beyond 90 degrees have no place in that, so that their errors in the file are no pixels.
+    """
+    pycolmap = pytest.importorskip("pycolmap")
     folder, size, rng = tmp_path / "scene", 64, np.random.default_rng(0)
     views = [replace(v, focal=size / np.radians(200)) for v in ring_views(6, size, size, rng, FISHEYE)]
     write_scene(folder, views, lambda _: demo_scene(), 300, rng, samples=1)
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    assert max(point.error for point in model.points3D.values()) > 1e100
     info = read_colmap(folder, "images", False, native=True)
     angles = []
-    for view, track in zip(info.train_cameras, read_tracks(folder, info.train_cameras, np.zeros(3)), strict=True):
+    for view, track in zip(info.train_cameras, _tracks(folder, info.train_cameras), strict=True):
         shown = pixels_of(view.native, torch.from_numpy(track.rays)).numpy() + 0.5
         np.testing.assert_allclose(shown, track.places * size, atol=1e-5)
-        at = pull(world_to_camera(view.R, view.T), track, view.fx, info.extent)
-        assert track.angular and np.median(at.size) < 2  # pixels
-        angles.append(np.hypot(*track.rays.T).max())
-    assert max(angles) > np.radians(91)
+        (image,) = (image for image in model.images.values() if image.name == view.image_name)
+        assert track.angular and len(track.points) == image.num_points3D and track.errors.max() < 3  # pixels
+        local = track.points @ view.R + view.T
+        theirs = model.cameras[image.camera_id].img_from_cam(local)
+        ahead, away = local[:, 2] > 0, view.fx * np.linalg.norm(track.rays - rays_to(local, True), axis=1)
+        np.testing.assert_allclose(np.linalg.norm(theirs - shown, axis=1)[ahead], away[ahead], atol=1e-6)
+        assert away.max() < 5
+        angles.append(np.degrees(np.arctan2(np.hypot(*local[:, :2].T), local[:, 2])).max())
+    assert max(angles) > 98
     views = read_colmap(folder, "images", False, native=False).train_cameras  # which cuts 60 degrees from the axis
-    for view, track in zip(views, read_tracks(folder, views, np.zeros(3)), strict=True):
+    capsys.readouterr()
+    for view, track in zip(views, _tracks(folder, views), strict=True):
         at = np.abs(track.rays * (view.fx, view.fy) + (view.cx, view.cy) - np.array([view.width, view.height]) / 2)
         assert not track.angular and (at <= np.array([view.width, view.height]) / 2).all()
+    assert "not used" not in capsys.readouterr().err
+
+
+def test_places_beyond_90_degrees_have_no_rays():
+    """pycolmap gives them those of places near 60 degrees."""
+    lens = Lens("OPENCV_FISHEYE", (64 / np.pi, 64 / np.pi, 32.0, 32.0, 0.0, 0.0, 0.0, 0.0), 64, 64)
+    degrees = np.array([0.0, 40.0, 80.0, 91.0, 120.0])
+    rays = rays_of(lens, np.column_stack([32 + np.radians(degrees) * 64 / np.pi, np.full(5, 32.0)]))
+    np.testing.assert_allclose(rays[:3, 0], np.tan(np.radians(degrees[:3])), atol=1e-9)
+    assert np.isnan(rays[3:]).all()
 
 
 def test_rays_of_pinholes_are_those_of_pycolmap():
