@@ -22,7 +22,7 @@ from arguments import OptionParser
 from splatting.host.start import typed_command
 from splatting.sfm import stages
 from splatting.sfm.cameras import MODES
-from splatting.sfm.capture import lines_of, too_few
+from splatting.sfm.capture import lines_of, too_few, training_options
 from splatting.sfm.capture_page import capture_stage
 from splatting.sfm.colmap import GIVEN, LENS_MODELS, Program, Pycolmap, Settings, is_native
 from splatting.sfm.inputs import sort_inputs, unused_lines
@@ -82,10 +82,11 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
         print(f"note: {line}")
     for line in report["advice"]:
         print(f"warning: {line}", file=sys.stderr)
-    print(f"train it with: {typed_command('train.py')} -s {shlex.quote(str(layout.scene))}")
     if text := too_few(report):
         print(f"warning: {text}", file=sys.stderr)
         sys.exit(3)
+    folders = f"-s {shlex.quote(str(layout.scene))} -m {shlex.quote(f'output/{layout.scene.resolve().name}')}"
+    print(f"train it with: {typed_command('train.py')} {folders} --eval {training_options(report)}".rstrip())
 
 
 def _masks(given: str | None) -> Path | None:

@@ -1,8 +1,10 @@
 """convert.py: scenes from photos taken at known places, second runs, interruptions, messages for mistakes."""
 
+import contextlib
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import stat
@@ -26,6 +28,7 @@ import convert
 from scene.dataset_readers import read_scene
 from scene.readers.tracks import read_tracks
 from splatting.sfm import colmap, programs, report
+from splatting.sfm.capture import Look, findings
 from splatting.sfm.colmap import LENS_MODELS, Program, Pycolmap, Settings
 from splatting.sfm.images import check_images, find_masks, prepare_images
 from splatting.sfm.layout import Layout
@@ -129,6 +132,26 @@ def test_a_second_run_does_only_what_changed(copy, capsys):
     # The focal lengths that global mapping estimates must not get into the database that later runs resume from.
     assert Layout(copy).database.read_bytes() == features
     assert len(read_scene(copy, "images", False).train_cameras) == VIEWS
+
+
+@pytest.mark.parametrize(
+    ("placed", "stops", "more"), [(VIEWS, 0.0, []), (VIEWS, 1.0, ["--appearance", "ppisp"]), (2, 0.0, None)]
+)
+def test_the_command_that_trains_can_be_copied(copy, monkeypatch, capsys, placed, stops, more):
+    """It ends the output, unless too few photos are placed."""
+    looks = {name: Look(1.0, stops * (-1) ** number) for number, name in enumerate(NAMES)}
+    found = findings(json.loads((copy / "convert_report.json").read_text()), {}, looks)
+    inputs = convert.report_inputs
+    monkeypatch.setattr(convert, "report_inputs", lambda *a, **k: inputs(*a, **k) | found | {"registered": placed})
+    with pytest.raises(SystemExit, match="3") if more is None else contextlib.nullcontext():
+        convert.main(["-s", str(copy), "--no_gpu", "--resize"])
+    out, err = capsys.readouterr()
+    if more is None:
+        assert "train it with" not in out and "weakly" not in out and "only 2 of 8 photos are placed" in err
+    else:
+        words = shlex.split(out.splitlines()[-1].removeprefix("train it with: "))
+        assert words[-len(more) - 5 :] == ["-s", str(copy), "-m", f"output/{copy.name}", "--eval", *more]
+        assert "no photo is weakly connected" in out
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ _SHARED = 30  # points that a photo shares with another one that is near
 FEW = 2  # such neighbours, with which a photo is weakly connected
 _BLURRED = 0.3  # of the median sharpness
 _SPREAD = 0.5  # stops; photos of one exposure differ by less
+_EXPOSURES = "--appearance ppisp"  # of train.py, for photos that differ by more
 _WIDTH = 640  # pixels at which photos are compared, as sharpness depends on it
 
 
@@ -93,7 +94,7 @@ def _again(left_out: list[str], weak: list[str], blurred: list[str], spread: flo
     if spread > _SPREAD:
         lines.append(
             f"with a fixed exposure, if you can: the photos' brightness differs by {spread:.1f} stops; train these "
-            "with --appearance ppisp"
+            f"with {_EXPOSURES}"
         )
     return lines
 
@@ -101,13 +102,21 @@ def _again(left_out: list[str], weak: list[str], blurred: list[str], spread: flo
 def lines_of(report: Mapping[str, Any]) -> list[str]:
     """The report of a capture in a few lines, after its summary."""
     weak, blurred = report["weakly_connected"], report["blurred"]
-    lines = [
-        f"overlap: {f'{len(weak)} photos weakly connected ({some(weak)})' if weak else 'no photo is weakly connected'}",
+    lines = []
+    if weak or not too_few(report):
+        few = f"{len(weak)} photos weakly connected ({some(weak)})" if weak else "no photo is weakly connected"
+        lines.append(f"overlap: {few}")
+    lines += [
         f"blur: {f'{len(blurred)} photos blurred ({some(blurred)})' if blurred else 'no photo is blurred'}",
         f"brightness: the photos differ by {report['brightness_spread_stops']:.2f} stops",
     ]
     lines += [f"photograph again {line}" for line in report["again"]]
     return lines
+
+
+def training_options(report: Mapping[str, Any]) -> str:
+    """Options of train.py that lines of the report name; "" if there are none."""
+    return _EXPOSURES if any(_EXPOSURES in line for line in report["again"]) else ""
 
 
 def too_few(report: Mapping[str, Any]) -> str | None:
