@@ -70,16 +70,6 @@ GSPLAT = {
 FASTER_GS_MEMORY = {"S": (29, 133), "M+": (159, 900), "L": (362, 2175), "XL": (651, 3942)}
 GSPLAT_MEMORY = {"S": (50, 54), "M+": (411, 482), "L": (1127, 1397), "XL": (2169, 2772)}
 
-# Marks for the time of the kernels (the step's includes loss and density statistics) and the memory of + backward.
-MARKS = {
-    "S": (0.18, 0.42, 0.50),
-    "M": (0.35, 1.0, 1.4),
-    "M+": (0.45, 1.25, 1.7),
-    "L": (0.80, 2.2, 3.2),
-    "XL": (1.3, 3.3, 5.0),
-}
-MEMORY_MARKS = {"S": 70, "M": 400, "M+": 420, "L": 1126, "XL": 2150}
-
 
 def measure_on_cpu(scene: SplatScene, repeats: int) -> dict[str, float]:
     """Return the milliseconds of forward, forward + backward and each stage, and the amount of work."""
@@ -143,12 +133,12 @@ def print_gpu(scenes: Iterator[tuple[str, SplatScene]]) -> None:
     sums = {(w.name, stage): sum(ms for of, _, ms in w.kernels() if of == stage) for w in found for stage in STAGES}
     print_table(["", *names], [[stage, *(f"{sums[name, stage]:.3f}" for name in names)] for stage in STAGES])
     print("\nPeak memory above the inputs, gradients included, MiB")
-    header = ["workload", "forward", "Faster-GS", "gsplat", "+ backward", "Faster-GS", "gsplat", "mark"]
+    header = ["workload", "forward", "Faster-GS", "gsplat", "+ backward", "Faster-GS", "gsplat"]
     print_table(header, [_memory_row(workload) for workload in found])
     print(f"\nMs: medians of {REPEATS} calls after {WARM_UPS}, each on an idle device. Call: events around the call,")
     print("host included. Kernels: the device's own work.")
     header = ["workload", "", "call", "kernels", "Faster-GS", "gsplat", "call / Faster-GS"]
-    print_table([*header, "mark for kernels"], [row for workload in found for row in _time_rows(workload)])
+    print_table(header, [row for workload in found for row in _time_rows(workload)])
 
 
 def _memory_row(workload: Measured) -> list[str]:
@@ -156,7 +146,7 @@ def _memory_row(workload: Measured) -> list[str]:
     for i, own in enumerate(workload.memory):
         others = [of.get(workload.name) for of in (FASTER_GS_MEMORY, GSPLAT_MEMORY)]
         row += [f"{own:.0f}", *(str(other[i]) if other else "" for other in others)]
-    return [*row, str(MEMORY_MARKS.get(workload.name, ""))]
+    return row
 
 
 def _time_rows(workload: Measured) -> list[list[str]]:
@@ -164,10 +154,10 @@ def _time_rows(workload: Measured) -> list[list[str]]:
     for i, step in enumerate(workload.times):
         time = workload.times[step]
         row = [workload.name, step, f"{time.events:.3f}", f"{time.kernels:.3f}"]
-        if workload.name in MARKS:
-            theirs, gsplat, mark = (of[workload.name][i] for of in (FASTER_GS, GSPLAT, MARKS))
-            row += [f"{theirs:.2f}", f"{gsplat:.2f}", f"{time.events / theirs:.2f}", f"{mark:.2f}"]
-        rows.append(row + [""] * (8 - len(row)))
+        if workload.name in GSPLAT:
+            theirs, gsplat = (of[workload.name][i] for of in (FASTER_GS, GSPLAT))
+            row += [f"{theirs:.2f}", f"{gsplat:.2f}", f"{time.events / theirs:.2f}"]
+        rows.append(row + [""] * (7 - len(row)))
     return rows
 
 
