@@ -28,7 +28,7 @@ from splatting.evaluation.model_folder import json_or_none
 from splatting.evaluation.renders import DEPTHS, INCOMPLETE, TIMES, image_of, image_size, mask_of, model_digest
 from splatting.files.json_files import read_json, write_json
 from splatting.host.progress import Bar
-from utils.lpips_utils import MIN_SIDE, LpipsUnavailable, load_dists, load_network
+from utils.lpips_utils import MIN_SIDE, NETS, LpipsUnavailable, load_dists, load_network
 from utils.system_utils import UserError, compute_device, run_cli
 
 CONVENTIONS = {
@@ -189,11 +189,11 @@ def make_metrics(lpips_net: str, weights: Path | None, smallest_side: int) -> di
         mine = [key for key in keys if BACKBONES.get(key) == net]
         try:
             if smallest_side < MIN_SIDE[net]:
-                raise LpipsUnavailable(f"it needs images with sides of at least {MIN_SIDE[net]} pixels")
+                raise LpipsUnavailable(f"{NETS[net]} needs images with sides of at least {MIN_SIDE[net]} pixels")
             network = load_network(net, weights, device)
             metrics.update({key: _lpips_metric(network, key == "LPIPS", device) for key in mine})
         except LpipsUnavailable as reason:
-            print(f"{', '.join(mine)} cannot be computed and are null unless scored before: {reason}")
+            print(f"cannot compute {', '.join(mine)} (null unless scored before): {reason}")
     if weights:
         try:
             metrics["DISTS"] = _dists_metric(load_dists(weights, device), device)

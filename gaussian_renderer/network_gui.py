@@ -59,8 +59,8 @@ def init(wish_host: str, wish_port: int) -> None:
     except (OSError, OverflowError) as error:
         reason = str(getattr(error, "strerror", None) or error).partition(" (")[0]  # it would name the address again
         print(
-            f"warning: cannot listen for the reference's remote viewer at {host}:{port} ({reason}), which the page of "
-            "--viewer does not need; choose another --port (0: any free one), or --disable_viewer",
+            f"warning: cannot listen at {host}:{port} ({reason}), which concerns only the viewer of the reference "
+            "implementation (SIBR); give --disable_viewer to silence this, or --port 0 for any free port",
             file=sys.stderr,
         )
         return

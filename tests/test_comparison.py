@@ -117,7 +117,7 @@ def test_levels_are_reached_on_the_views_that_all_runs_score():
         run |= {"curve": [*easy, run["curve"][-1]], "views": {"test": 8, "train": 7}}
     whole, part = (reached(comparable_sets(some, "attic")) for some in (runs, parts))
     assert (whole["subset"], part["subset"], part["views"]) == (None, 3, 8)
-    assert reached_legend(part).startswith("PSNR of the test views: 3 of 8, the same at all points. In")
+    assert reached_legend(part).startswith("PSNR of the test views: 3 of 8, the same at all points. All 8 decide")
     assert [level["psnr"] - 5 for level in part["levels"]] == pytest.approx([x["psnr"] for x in whole["levels"]])
     for name, cells in whole["sets"].items():
         of_part = [cell["seconds"]["values"] for cell in part["sets"][name]]
@@ -125,6 +125,27 @@ def test_levels_are_reached_on_the_views_that_all_runs_score():
     for row in parts[3]["curve"][:-1]:  # one seed scores others, and compares at its end alone
         row["subset"] = 2
     assert reached(comparable_sets(parts, "attic")) is None
+
+
+def test_all_views_decide_whether_a_run_ends_as_well_as_the_default_set():
+    """One view of the curve's points ranks `better` below base and `worse` above it; all views say the reverse."""
+    runs = []
+    for name, on_one, on_all in (("base", 29.3, 28.0), ("better", 29.2, 28.1), ("worse", 29.4, 27.9)):
+        run = run_of(name, 0, (5, 26.0, 100), (9, on_one, 200))
+        one, end = [row | {"subset": 1} for row in run["curve"]], run["curve"][-1]
+        runs.append(run | {"curve": [*one, end | {"test_psnr": on_all}], "views": {"test": 6, "train": 7}})
+    found = reached(comparable_sets(runs, "attic"))
+    place = next(i for i, level in enumerate(found["levels"]) if level["of_default"])
+    base, better, worse = (found["sets"][name][place] for name in ("base", "better", "worse"))
+    assert base["at_end"] and (better["reached"], worse["reached"]) == (1, 0)
+    assert better["gaussians"]["values"] == [200] and worse["gaussians"]["values"] == [None]
+    assert [row[1 + place] for row in reached_table(found).rows] == ["9.00 s", "at most 9.00 s (100 %)", "not reached"]
+    legend = "1 of 6, the same at all points. All 6 decide whether a run ends as well as base."
+    assert legend in reached_legend(found) and "At most: how much earlier is not known." in reached_legend(found)
+    for run in runs:
+        run["curve"].pop()  # nobody knows better
+    found = reached(comparable_sets(runs, "attic"))
+    assert [found["sets"][name][place]["reached"] for name in ("better", "worse")] == [0, 1]
 
 
 def test_no_level_repeats_the_seconds_of_the_end():

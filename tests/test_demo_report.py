@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from splatting.demo import report
-from splatting.evaluation.renders import GAIN, GAP, HEADER, ComparedViews, contact_sheet
+from splatting.evaluation.renders import GAIN, GAP, HEADER, ComparedViews, contact_sheet, sheet
 from utils.system_utils import UserError
 
 RESULTS = {"ours_30": {"SSIM": 0.5, "PSNR": 20.0, "LPIPS": None}}
@@ -79,15 +79,25 @@ def test_missing_and_damaged_files_are_named(run, model, name, text, sentence):
 
 
 def test_contact_sheet_shows_truth_render_and_amplified_error():
-    truth = Image.new("RGB", (40, 30), (100, 100, 100))
-    render = Image.new("RGB", (40, 30), (110, 90, 100))
+    truth = Image.new("RGB", (140, 30), (100, 100, 100))
+    render = Image.new("RGB", (140, 30), (110, 90, 100))
     sheet = contact_sheet([("a", truth, render), ("b", truth, truth)])
-    assert sheet.size == (3 * (40 + GAP) + GAP, HEADER + 2 * (30 + GAP))
+    assert sheet.size == (3 * (140 + GAP) + GAP, HEADER + 2 * (30 + GAP))
     bottom = HEADER + 29  # below the label
-    assert sheet.getpixel((GAP + 39, bottom)) == (100, 100, 100)
-    assert sheet.getpixel((2 * GAP + 40 + 39, bottom)) == (110, 90, 100)
-    assert sheet.getpixel((3 * GAP + 80 + 39, bottom)) == (10 * GAIN, 10 * GAIN, 0)
-    assert sheet.getpixel((3 * GAP + 80 + 39, bottom + 30 + GAP)) == (0, 0, 0)
+    assert sheet.getpixel((GAP + 139, bottom)) == (100, 100, 100)
+    assert sheet.getpixel((2 * GAP + 140 + 139, bottom)) == (110, 90, 100)
+    assert sheet.getpixel((3 * GAP + 280 + 139, bottom)) == (10 * GAIN, 10 * GAIN, 0)
+    assert sheet.getpixel((3 * GAP + 280 + 139, bottom + 30 + GAP)) == (0, 0, 0)
+
+
+def test_titles_and_labels_of_small_images_are_whole():
+    """Beside images of 40 pixels they are drawn as beside images of 600."""
+    drawn = []
+    for width in (40, 600):
+        image = Image.new("RGB", (width, 30), "white")
+        ink = np.array(sheet(("photo", "left out: dark"), [[("view_004.png", image), ("12%", image)]])) < 255
+        drawn.append((ink[:HEADER].sum(), ink[HEADER:].sum()))
+    assert drawn[0] == drawn[1]
 
 
 def test_views_without_a_psnr_are_on_no_sheet(model, tmp_path):

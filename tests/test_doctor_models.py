@@ -181,6 +181,16 @@ def test_a_good_model_without_a_ply_or_a_curve(folder):
     assert _problems(folder) == []
 
 
+def test_a_model_of_small_photos_is_looked_at_in_their_size(scene, tmp_path):
+    """It has no detail for larger views, where its score would be far below what training recorded."""
+    words = "--eval", "-r", 4, "--iterations", 800, "--test_iterations", 800, "--disable_viewer", "--quiet"
+    train_on(scene, tmp_path / "small", *words)
+    assert _problems(tmp_path / "small") == []
+    said = [line.text for line in check_model(str(tmp_path / "small"), -1)]
+    assert any("rendered 30 pixels wide" in text for text in said)
+    assert not any("passers-by" in text for text in said)
+
+
 def _with_photos(folder: Path, scene: Path, tmp_path: Path) -> list[Path]:
     """Photos of a copy of the scene that the model says it was trained on."""
     other = Path(shutil.copytree(scene, tmp_path / "scene"))

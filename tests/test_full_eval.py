@@ -202,7 +202,7 @@ def test_only_the_first_scoring_tries_a_download(evaluate):
 def test_weights_are_checked_first_and_give_dists(evaluate, tmp_path, monkeypatch):
     assert evaluate("attic")["runs"][0]["iterations"]["40"]["DISTS"] is None and "DISTS" not in evaluate.text("md")
     done = evaluate.calls()
-    with pytest.raises(UserError, match=f"cannot read {tmp_path}/vgg16-397923af.pth .*; put https://.*vgg16.* there"):
+    with pytest.raises(UserError, match=f"{tmp_path} has no file vgg16-397923af.pth, .* download https://.*vgg16"):
         evaluate("brick", "--weights", tmp_path)
     monkeypatch.setattr(lpips_utils, "weights_file", lambda *_: None)
     assert evaluate("attic", "--weights", tmp_path)["summary"][0]["DISTS"]["mean"] == 0.125

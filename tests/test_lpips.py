@@ -148,8 +148,15 @@ def test_downloaded_weights_are_kept_with_a_checked_digest(judges, tmp_path, mon
     assert kept.read_bytes() == judges.files["alex"].read_bytes()
 
 
-@pytest.mark.parametrize(("forbidden", "attempts"), [("", 1), ("0", 0), ("told", 0)])
-def test_without_weights_it_is_refused_after_one_attempt(tmp_path, monkeypatch, forbidden, attempts):
+@pytest.mark.parametrize(
+    ("forbidden", "attempts", "said"),
+    [
+        ("", 1, "the weights of {name} cannot be downloaded; check the network, or put {place}"),
+        ("0", 0, "GS_DOWNLOAD=0 forbids downloading the weights of {name}; unset it, or put {place}"),
+        ("told", 0, "the weights of {name} are missing, as told above"),
+    ],
+)
+def test_without_weights_it_is_refused_after_one_attempt(tmp_path, monkeypatch, forbidden, attempts, said):
     tried = []
 
     def download(url, *_, **__):
@@ -160,8 +167,8 @@ def test_without_weights_it_is_refused_after_one_attempt(tmp_path, monkeypatch, 
     monkeypatch.setenv("GS_DOWNLOAD", forbidden)
     monkeypatch.setattr(torch.hub, "download_url_to_file", download)
     for net, name in NETS.items():
-        said = f"missing; put .*/{name}-.* at {tmp_path}/hub/checkpoints/{name}"
-        with pytest.raises(LpipsUnavailable, match="as told above" if forbidden == "told" else said):
+        place = f"https://.*/{name}-.* at {tmp_path}/hub/checkpoints/{name}-.* or into the folder of --weights"
+        with pytest.raises(LpipsUnavailable, match="^" + said.format(name=name, place=place) + "$"):
             LPIPS(net)
     assert len(tried) == attempts
 
@@ -182,11 +189,12 @@ def test_weights_of_a_folder_are_checked(judges, tmp_path, monkeypatch):
             metrics.make_metrics(net, tmp_path, 40)
 
     monkeypatch.setattr(torch.hub, "download_url_to_file", lambda *_, **__: pytest.fail("a download"))
-    refused("vgg", f"cannot read {tmp_path}/{judges.files['vgg'].name} .*; put {judges.urls['vgg']} there")
+    name, url = judges.files["vgg"].name, judges.urls["vgg"]
+    refused("vgg", f"^{tmp_path} has no file {name}, the weights of vgg16; give the folder .*, or download {url} into")
     shutil.copyfile(judges.files["alex"], tmp_path / judges.files["alex"].name)
     metrics.make_metrics("alex", tmp_path, 40)
     shutil.copyfile(judges.files["alex"], tmp_path / judges.files["vgg"].name)
-    refused("both", f"{judges.files['vgg'].name} is damaged: its SHA-256 begins with")
+    refused("both", f"{name} is damaged: its SHA-256 begins with")
     monkeypatch.setattr(lpips_utils, "_url", lambda net: judges.urls["alex"])  # the right digest, but another network
     refused("vgg", "the file does not have the weights of vgg16; replace it by https://somewhere/alexnet")
     for wrong in ([1, 2], {}, {"features.0.weight": 1}):
@@ -218,4 +226,5 @@ def test_dists_is_the_packages(judges, tmp_path, monkeypatch, capsys):
     assert "DISTS" not in metrics.make_metrics("alex", tmp_path, 40)
     monkeypatch.setitem(sys.modules, "DISTS_pytorch", None)
     assert "DISTS" not in metrics.make_metrics("vgg", folder, 40)
-    assert capsys.readouterr().out.count("DISTS is left out: ") == 2
+    said = capsys.readouterr().out
+    assert said.count("DISTS is left out: ") == 2 and f"{tmp_path} has no file {judges.files['vgg'].name}, the" in said

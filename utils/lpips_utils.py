@@ -88,8 +88,8 @@ def load_dists(folder: Path, device: torch.device) -> nn.Module:
 
     Raises LpipsUnavailable without the package or torchvision's VGG-16 in the folder, and UserError for wrong files.
     """
-    if not (folder / Path(_url("vgg")).name).is_file():
-        raise LpipsUnavailable(f"its weights are missing; put {_url('vgg')} into {folder}")
+    if not (file := folder / Path(_url("vgg")).name).is_file():
+        raise LpipsUnavailable(_lacking(file, "vgg"))
     try:
         package = importlib.import_module("DISTS_pytorch")
     except ImportError as error:
@@ -136,7 +136,16 @@ def _checked(file: Path, digest: str, remedy: str) -> Path:
 def weights_file(net: str, folder: Path) -> Path:
     """torchvision's file of a backbone in a folder; UserError if it is missing, damaged or another one."""
     file = folder / Path(_url(net)).name
-    return _checked(file, _digest_of(file), f"put {_url(net)} there")
+    if not file.exists():
+        raise UserError(_lacking(file, net))
+    return _checked(file, _digest_of(file), f"replace it by {_url(net)}")
+
+
+def _lacking(file: Path, net: str) -> str:
+    return (
+        f"{file.parent} has no file {file.name}, the weights of {NETS[net]}; give the folder that has it as --weights, "
+        f"or download {_url(net)} into this one"
+    )
 
 
 def _url(net: str) -> str:
@@ -160,9 +169,13 @@ def _features_from_cache(net: str) -> dict[str, torch.Tensor]:
     url = _url(net)
     cached = Path(torch.hub.get_dir()) / "checkpoints" / url.rsplit("/", 1)[1]
     if not cached.is_file() and not _download(url, cached):
-        if os.environ.get("GS_DOWNLOAD") == TOLD:
-            raise LpipsUnavailable("its weights are missing, as told above")
-        raise LpipsUnavailable(f"its weights are missing; put {url} at {cached}, or into the folder of --weights")
+        forbidden, weights = os.environ.get("GS_DOWNLOAD"), f"the weights of {NETS[net]}"
+        place = f"put {url} at {cached} or into the folder of --weights"
+        if forbidden == TOLD:
+            raise LpipsUnavailable(f"{weights} are missing, as told above")
+        if forbidden == "0":
+            raise LpipsUnavailable(f"GS_DOWNLOAD=0 forbids downloading {weights}; unset it, or {place}")
+        raise LpipsUnavailable(f"{weights} cannot be downloaded; check the network, or {place}")
     return _load_state(cached)
 
 

@@ -16,7 +16,8 @@ from gaussian_renderer.scored_views import ScoredViews
 from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from scene.readers.info import NEAREST
+from scene.images.sizes import training_size
+from scene.readers.info import NEAREST, CameraInfo, photo_size
 from scene.saved_model import load_saved
 from splatting.diagnosis import Line, from_error
 from splatting.diagnosis.changes import FITS as BAD_PSNR
@@ -48,7 +49,7 @@ RESET_INTERVAL = 3000  # the default of --opacity_reset_interval
 FEW_GAUSSIANS = 2000
 _CLEARLY = 3.0  # dB
 _VIEWS = 4
-_WIDTH = 200
+_WIDTH = 200  # pixels of a view, or fewer where it was trained smaller
 _RESET_SAID = "warning: opacities are reset"  # the beginning of what training/strategy_warnings.py:late_reset says
 
 
@@ -105,12 +106,27 @@ def check_training(model: Path) -> list[Line]:
 
 
 def _load(model_path: str, stored: dict[str, Any], iteration: int) -> tuple[argparse.Namespace, Scene]:
-    # Small images are enough to tell black renders from bad ones.
+    """Options and scene of a model with small views, which are enough to tell black renders from bad ones.
+
+    They are no larger than in training: a model of small photos has no detail for larger ones, and looks broken there.
+    """
     given = {**stored, "model_path": model_path, "resolution": _WIDTH, "images_to_load": 1}
     given |= {option.name: option.default for option in options_of("model") if not option.seen}
     options = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(**given))
     with contextlib.redirect_stdout(io.StringIO()):  # from the readers
-        return options, load_saved(options, iteration)
+        scene = load_saved(options, iteration)
+        trained = stored.get("resolution", -1)
+        widths = [_trained_width(view, trained) for view in scene.info.train_cameras]
+        if min(widths, default=_WIDTH) < _WIDTH:
+            options.resolution = trained if max(widths) <= _WIDTH else min(widths)
+            scene = load_saved(options, iteration)
+        return options, scene
+
+
+def _trained_width(view: CameraInfo, resolution: int) -> int:
+    """Width in pixels at which a photo trains with -r, as far as it may be below _WIDTH: -1 only limits wider ones."""
+    size = photo_size(view)
+    return size[0] if resolution == -1 else training_size(*size, resolution)[0]
 
 
 def _not_finite(gaussians: GaussianModel) -> Iterator[Line]:
@@ -212,7 +228,8 @@ def _renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) 
     elif swapped := others_photos(scene, _scored(scene, options)):  # a few of them leave a good mean
         return swapped, True
     if good and changed is None:
-        return Line(f"{len(views)} training views rendered {_WIDTH} pixels wide: PSNR {means.psnr:.1f} dB"), False
+        width = max(view.image_width for view in views)
+        return Line(f"{len(views)} training views rendered {width} pixels wide: PSNR {means.psnr:.1f} dB"), False
     text = "renders of the training views are black"
     text = text if black else f"training views have a PSNR of only {means.psnr:.1f} dB"
     wrong = _other_background(scene, options, stored, means.psnr)

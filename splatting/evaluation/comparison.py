@@ -227,6 +227,9 @@ def reached(sets: Sets) -> dict[str, Any] | None:
     default: the set that others are compared with. subset: how many of the `views` of the test set the PSNR is of,
     null: all. levels: `psnr`, and `of_default`: it is the mean PSNR at the end of that set. sets: by name the cells,
     one for each level (`_cell`), with `ratio`: its mean seconds as a part of the default's.
+
+    A few views may rank the ends of runs in another way than all views do. Then all views decide whether a run ends as
+    well as the default set.
     """
     every = [run for runs in sets.values() for run in runs]
     subset = common_subset(run["curve"] for run in every)
@@ -236,10 +239,14 @@ def reached(sets: Sets) -> dict[str, Any] | None:
     if len(finals) < 2:
         return None
     default = default_set(finals)
-    own = math.floor(finals[default] * DIGITS) / DIGITS  # a mean of equal numbers may exceed them by a bit
+    own = _floored(finals[default])
     round_ones = [level for level in round_levels(list(finals.values())) if abs(level - own) >= 0.005]
     levels = [{"psnr": level, "of_default": level == own} for level in sorted([*round_ones, own], reverse=True)]
-    table = {name: [_cell(curves[name], **level, is_default=name == default) for level in levels] for name in finals}
+    good = _as_good_at_the_end(sets, default)
+    table = {
+        name: [_cell(curves[name], **level, is_default=name == default, as_good=good[name]) for level in levels]
+        for name in finals
+    }
     for cells in table.values():
         for cell, theirs in zip(cells, table[default], strict=True):
             both = cell["seconds"]["mean"], theirs["seconds"]["mean"]
@@ -248,26 +255,52 @@ def reached(sets: Sets) -> dict[str, Any] | None:
     return {"default": default, "levels": levels, "sets": table, "subset": subset, "views": views}
 
 
-def _cell(curves: Sequence[Sequence[Row]], psnr: float, of_default: bool, is_default: bool) -> dict[str, Any]:
+def _floored(mean: float) -> float:
+    return math.floor(mean * DIGITS) / DIGITS  # a mean of equal numbers may exceed them by a bit
+
+
+def _as_good_at_the_end(sets: Sets, default: str) -> dict[str, list[bool | None]]:
+    """Return of each run whether all test views have the mean PSNR of the default set at its end; None: not known."""
+    ends = {name: [[row["test_psnr"] for row in _line(run, None)][-1:] for run in runs] for name, runs in sets.items()}
+    known = all(ends[default])
+    least = _floored(statistics.fmean(end for (end,) in ends[default])) if known else math.nan
+    return {name: [end[0] >= least if known and end else None for end in seeds] for name, seeds in ends.items()}
+
+
+def _cell(
+    curves: Sequence[Sequence[Row]], psnr: float, of_default: bool, is_default: bool, as_good: Sequence[bool | None]
+) -> dict[str, Any]:
     """Return what the seeds of a set take to reach a level: spreads of seconds and Gaussians.
 
     Seeds that do not reach it have null, and so has the mean then. reached: the number of seeds that do; at_end:
     whether the seconds are all those of each seed. That is so only for the default's own end, unless each seed was as
-    good before.
+    good before. at_most: whether a seed may have taken less. as_good: of `_as_good_at_the_end`.
     """
-    places = [next((i for i, row in enumerate(curve) if row["test_psnr"] >= psnr), None) for curve in curves]
-    lasts = [i in (None, len(curve) - 1) for curve, i in zip(curves, places, strict=True)]
-    at_end = of_default and is_default and any(lasts)
+    asked = [good if of_default and not is_default else None for good in as_good]
+    found = [_reach(curve, psnr, good) for curve, good in zip(curves, asked, strict=True)]
+    rows, seconds, limits = zip(*found, strict=True)
+    count, lasts = sum(row is not None for row in rows), [curve[-1] for curve in curves]
+    at_end = of_default and is_default and any(row in (None, last) for row, last in zip(rows, lasts, strict=True))
     if at_end:
-        rows = [curve[-1] for curve in curves]
-    else:
-        rows = [None if i is None else curve[i] for curve, i in zip(curves, places, strict=True)]
+        rows, seconds = lasts, [row["seconds"] for row in lasts]
     return {
         "at_end": at_end,
+        "at_most": any(limits),
         "gaussians": spread(row and row["gaussians"] for row in rows),
-        "reached": sum(i is not None for i in places),
-        "seconds": spread(curve[-1]["seconds"] if at_end else seconds_to_reach(curve, psnr) for curve in curves),
+        "reached": count,
+        "seconds": spread(seconds),
     }
+
+
+def _reach(curve: Sequence[Row], level: float, as_good: bool | None) -> tuple[Row | None, float | None, bool]:
+    """Return the first row of a curve that reaches a level, the seconds until then, and whether it may be fewer.
+
+    None: it does not, or the seconds are not known. as_good: whether it does at its end, None: as its last row says.
+    """
+    row = next((row for row in curve if row["test_psnr"] >= level), None)
+    if as_good in (None, curve[-1]["test_psnr"] >= level) or (as_good and row is not None):
+        return row, seconds_to_reach(curve, level), False
+    return (curve[-1], curve[-1]["seconds"], True) if as_good else (None, None, False)
 
 
 def uneven_shares(runs: Iterable[Run]) -> tuple[float, float] | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -29,6 +30,7 @@ TIMES = "render_times.json"  # beside the folders of images: the time of each vi
 GAIN = 5  # amplification of the difference
 GAP = 6  # pixels between images of a sheet
 HEADER = 26  # height of a sheet's titles in pixels
+INSET, STROKE = 6, 2  # pixels: a label's distance from the left side of its image, and the line around its letters
 WORST = 3  # views of a sheet
 WIDEST = 480  # largest width, in pixels, of an image in a report
 _QUALITY = 85
@@ -168,26 +170,33 @@ def contact_sheet(views: Sequence[tuple[str, Image.Image, Image.Image]]) -> Imag
 def sheet(
     titles: Sequence[str], rows: Sequence[Sequence[tuple[str, Image.Image]]], widest: int | None = None
 ) -> Image.Image:
-    """Draw rows of labelled images, which may differ in size, under a row of titles.
+    """Draw rows of labelled images, which may differ in size, under a row of titles that fit.
 
     widest: shrink wider images to this width in pixels.
     """
-    cells = [[(label, _shrunk(image, widest)) for label, image in row] for row in rows]
-    cell_width = max(image.width for row in cells for _, image in row)
-    cell_height = max(image.height for row in cells for _, image in row)
-    size = (len(titles) * (cell_width + GAP) + GAP, HEADER + len(cells) * (cell_height + GAP))
-    drawn = Image.new("RGB", size, "white")
-    draw = ImageDraw.Draw(drawn)
     font = ImageFont.load_default(size=15)
-    for column, title in enumerate(titles):
-        draw.text((GAP + column * (cell_width + GAP), 4), as_utf8(title), fill="black", font=font)
+    titles = [as_utf8(title) for title in titles]
+    cells = [[(as_utf8(label), _shrunk(image, widest)) for label, image in row] for row in rows]
+    cell_height = max(image.height for row in cells for _, image in row)
+    lefts = [GAP]  # of the columns, and where one more would begin
+    for title, *column in zip(titles, *cells, strict=True):
+        needed = [width for label, image in column for width in (image.width, _label_width(font, label))]
+        lefts.append(lefts[-1] + max(math.ceil(font.getlength(title)), *needed) + GAP)
+    drawn = Image.new("RGB", (lefts[-1], HEADER + len(cells) * (cell_height + GAP)), "white")
+    draw = ImageDraw.Draw(drawn)
+    for x, title in zip(lefts, titles, strict=False):
+        draw.text((x, 4), title, fill="black", font=font)
     for place, row in enumerate(cells):
         y = HEADER + place * (cell_height + GAP)
-        for column, (label, image) in enumerate(row):
-            x = GAP + column * (cell_width + GAP)
+        for x, (label, image) in zip(lefts, row, strict=False):
             drawn.paste(image, (x, y))
-            draw.text((x + 6, y + 4), as_utf8(label), fill="white", font=font, stroke_width=2, stroke_fill="black")
+            draw.text((x + INSET, y + 4), label, fill="white", font=font, stroke_width=STROKE, stroke_fill="black")
     return drawn
+
+
+def _label_width(font: ImageFont.FreeTypeFont, label: str) -> int:
+    """Pixels from the left side of an image to the end of its label."""
+    return math.ceil(INSET + font.getlength(label) + STROKE) if label else 0
 
 
 def _shrunk(image: Image.Image, widest: int | None) -> Image.Image:

@@ -162,24 +162,26 @@ def _cell(cell: Mapping[str, Any], is_default: bool) -> str:
         return "not reached"
     if not known:
         return "not known"
-    digits = 2 if known[0] < 10 else 1
+    digits, most = 2 if known[0] < 10 else 1, "at most " if cell["at_most"] else ""
     if seconds["mean"] is None:
-        return f"{number(statistics.fmean(known), digits)} s, {len(known)} of {len(seconds['values'])} seeds"
+        return f"{most}{number(statistics.fmean(known), digits)} s, {len(known)} of {len(seconds['values'])} seeds"
     part = "" if is_default or cell["ratio"] is None else f" ({100 * cell['ratio']:.0f} %)"
-    return f"{spread_cell(seconds, digits)} s{part}"
+    return f"{most}{spread_cell(seconds, digits)} s{part}"
 
 
 def reached_legend(found: Mapping[str, Any]) -> str:
     """What is said below `reached_table`, in a line: which views the PSNR is of, and what marks in cells mean."""
-    subset = found["subset"]
-    some = "all" if subset is None else f"{subset} of {found['views']}, the same at all points"
+    subset, views, default = found["subset"], found["views"], found["default"]
+    some = "all." if subset is None else f"{subset} of {views}, the same at all points."
+    some += "" if subset is None else f" All {views} decide whether a run ends as well as {default}."
     texts = [cell for row in reached_table(found).rows for cell in row[1:]]
     parts = {
-        " %)": f"In brackets: the part of {found['default']}'s seconds.",
+        " %)": f"In brackets: the part of {default}'s seconds.",
+        "at most": "At most: how much earlier is not known.",
         " seeds": "1 of 2 seeds: the mean of those that got there.",
     }
     said = [text for mark, text in parts.items() if any(mark in cell for cell in texts)]
-    return " ".join([f"PSNR of the test views: {some}.", *said])
+    return " ".join([f"PSNR of the test views: {some}", *said])
 
 
 def front_table(found: Mapping[str, Any]) -> Table:

@@ -401,8 +401,8 @@ def test_an_address_that_cannot_be_had_is_one_warning(address, capfd):
         network_gui.init(host, port)
     assert network_gui.listener is None and (network_gui.host, network_gui.port) == (host, port)
     (warning,) = capfd.readouterr().err.splitlines()
-    assert f"cannot listen for the reference's remote viewer at {host}:{port}" in warning
-    assert "which the page of --viewer does not need" in warning and "--disable_viewer" in warning
+    assert warning.startswith(f"warning: cannot listen at {host}:{port} (") and "concerns only the viewer" in warning
+    assert warning.endswith("(SIBR); give --disable_viewer to silence this, or --port 0 for any free port")
     network_gui.try_connect()
     assert network_gui.conn is None
 
