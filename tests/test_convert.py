@@ -140,7 +140,8 @@ def test_a_second_run_does_only_what_changed(copy, capsys):
 def test_the_command_that_trains_can_be_copied(copy, monkeypatch, capsys, placed, stops, more):
     """It ends the output, unless too few photos are placed."""
     looks = {name: Look(1.0, stops * (-1) ** number) for number, name in enumerate(NAMES)}
-    found = findings(json.loads((copy / "convert_report.json").read_text()), {}, looks)
+    photos = {name: {"shared": {other: 100 for other in NAMES if other != name}} for name in NAMES}
+    found = findings(json.loads((copy / "convert_report.json").read_text()), photos, looks)
     inputs = convert.report_inputs
     monkeypatch.setattr(convert, "report_inputs", lambda *a, **k: inputs(*a, **k) | found | {"registered": placed})
     with pytest.raises(SystemExit, match="3") if more is None else contextlib.nullcontext():

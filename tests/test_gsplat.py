@@ -212,6 +212,28 @@ def test_a_fisheye_shows_where_its_lens_does():
     assert image[0, 40, int(50 + 30 * angle)].min() > 0.3
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, DOUBLE])
+def test_an_orthographic_image_does_not_depend_on_depth(dtype):
+    like = {"dtype": dtype}
+    mean = torch.tensor([[0.5, -0.25, 2.0]], requires_grad=True, **like)
+    K = torch.tensor([[[20.0, 0, 20.5], [0, 20, 15.5], [0, 0, 1]]], **like)
+    view, images = torch.eye(4, **like), []
+    view[:3, :3] = build_rotation(torch.tensor([[0.9, 0.3, -0.2, 0.1]], **like))[0]
+    for away in (0, 3, 50):
+        far = (mean + torch.tensor([0, 0, away], **like)) @ view[:3, :3]
+        image, _, meta = rasterization(
+            far, torch.tensor([[1.0, 0, 0, 0]], **like), torch.full((1, 3), 0.1, **like), torch.full((1,), 0.9, **like),
+            torch.ones(1, 3, **like), view[None], K, WIDTH, HEIGHT, camera_model="ortho",
+            render_mode="RGB+D",
+        )  # fmt: skip
+        assert torch.allclose(meta["means2d"], torch.tensor([[30.5, 10.5]], **like), atol=2e-4)
+        images.append(image[..., :3])
+        assert abs(image[0, 10, 30, 3].item() - 0.9 * (2 + away)) < 1e-3
+    assert torch.allclose(images[0], images[1], atol=1e-4) and torch.allclose(images[0], images[2], atol=1e-4)
+    (images[0][..., WIDTH // 2 :, :].sum() + images[0][0, 10, 31].sum()).backward()
+    assert mean.grad[0, 0] > 0 and mean.grad[0, 2].abs() < 1e-6
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -219,7 +241,7 @@ def test_a_fisheye_shows_where_its_lens_does():
         ({"distributed": True}, "train with torchrun"),
         ({"sparse_grad": True}, "gradients are dense"),
         ({"radial_coeffs": torch.zeros(2, 4)}, "radial_coeffs is not supported"),
-        ({"camera_model": "ortho"}, "camera_model 'ortho' is not supported"),
+        ({"camera_model": "ftheta"}, "camera_model 'ftheta' is not supported"),
         ({"eps2d": 0.1}, "eps2d must be 0.3"),
         ({"render_mode": "N"}, "render_mode must be one of RGB, D"),
         ({"rasterize_mode": "sharp"}, "rasterize_mode must be"),

@@ -11,6 +11,7 @@ import math
 import runpy
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -27,6 +28,7 @@ _NEAR = 0.2  # of the kernels: kNear in csrc/math/constants.h
 _DILATION = 0.3  # kDilation
 _HALF_LOG2E = 0.5 / math.log(2)
 _MIN_ALPHA = 1 / 255
+_FLAT = 2.0**-40  # of depth
 _SIGMAS = 3.33  # of an opaque Gaussian, beyond which its alpha is below 1/255
 _UNSUPPORTED = {
     "distributed": "train with torchrun and train.py",
@@ -61,12 +63,15 @@ class _Camera(NamedTuple):
     ) -> GaussianRasterizationSettings:
         """The settings of a scene that is scaled. All are differentiable in `view`."""
         view = self.view * torch.cat([self.view.new_ones(4, 3), self.view.new_tensor([[scale]] * 3 + [[1]])], 1)
+        if self.model == "ortho":  # a pinhole for which all is at the same depth, up to rounding
+            view = torch.cat([view[:2], _FLAT * view[2:3] + view.new_tensor([[0, 0, 0, 1]]), view[3:]])
         (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
         projection = self.view.new_zeros(4, 4)
         projection[0, 0], projection[1, 1] = 2 * fx / self.width, 2 * fy / self.height
         projection[0, 2], projection[1, 2] = 2 * cx / self.width - 1, 2 * cy / self.height - 1
         projection[2, 2] = projection[3, 2] = 1
-        lens = _Fisheye("equidistant", (fx, fy), (cx - 0.5, cy - 0.5)) if self.model == "fisheye" else None
+        chart = {"fisheye": partial(_Fisheye, "equidistant"), "ortho": partial(Lens, "perspective")}.get(self.model)
+        lens = chart and chart((fx, fy), (cx - 0.5, cy - 0.5))
         tangents = self.width / (2 * fx), self.height / (2 * fy)
         center = scale * torch.linalg.inv(self.view)[:3, 3]
         full = (projection @ view).T
@@ -230,8 +235,8 @@ def _refuse(given: dict, shutter: Any, mode: str, model: str, rasterize_mode: st
         raise ValueError("rolling_shutter is not supported; take poses of a global shutter")
     if mode not in MODES:
         raise ValueError(f"render_mode must be one of {', '.join(MODES)}, got {mode!r}")
-    if model not in ("pinhole", "fisheye"):
-        raise ValueError(f"camera_model {model!r} is not supported; take pinhole or fisheye")
+    if model not in ("pinhole", "fisheye", "ortho"):
+        raise ValueError(f"camera_model {model!r} is not supported; take pinhole, fisheye or ortho")
     if rasterize_mode not in ("classic", "antialiased"):
         raise ValueError(f"rasterize_mode must be classic or antialiased, got {rasterize_mode!r}")
     if eps2d != _DILATION:
@@ -246,6 +251,7 @@ def _render(
     """An image (H, W, D), its alpha (H, W, 1), what is told of the Gaussians, and the tensor that gets d means2d."""
     # The kernels cull at 0.2. To show nearer things, enlarge the scene, by a power of two so that no bit changes.
     scale = 2.0 ** max(0, math.ceil(math.log2(_NEAR / camera.near))) if camera.near > 0 else 2.0**20
+    scale = 1.0 if camera.model == "ortho" else scale
     depth = rows.means @ camera.view[2, :3] + camera.view[2, 3]
     visible = ((depth > camera.near) & (depth < camera.far)).detach()
     gaussians, features = _scaled(rows, scale, options), []
