@@ -119,6 +119,9 @@ def _video_stage(
 
 def _settings(args: argparse.Namespace) -> Settings:
     """The choices of the command line. UserError for those that do not fit together."""
+    of_matching = "camera", "cameras", "mapper", "matcher", "mask_path", "colmap_executable"
+    if args.skip_matching and (ignored := [f"--{name}" for name in of_matching if getattr(args, name)]):
+        print(f"warning: --skip_matching ignores {', '.join(ignored)}, as the model is there", file=sys.stderr)
     if args.poses:
         _refuse_beside_poses(args)
         if args.cameras:

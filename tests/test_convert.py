@@ -188,7 +188,8 @@ def test_a_model_made_elsewhere_is_undistorted(copy, capsys):
     for frame in sorted(model.reg_frame_ids())[2:]:
         model.deregister_frame(frame)
     model.write_binary(str(small))
-    convert.main(["-s", str(other), "--skip_matching"])
+    convert.main(["-s", str(other), "--skip_matching", "--camera", "PINHOLE", "--mapper", "global"])
+    assert "warning: --skip_matching ignores --camera, --mapper, as the model is there" in capsys.readouterr().err
     assert len(read_scene(other, "images", False).train_cameras) == VIEWS
     assert json.loads((other / "convert_report.json").read_text())["model"] == "1"
 
