@@ -34,7 +34,7 @@ from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.report import make_report, write_report
 from splatting.evaluation.results import read_earlier, read_run
 from splatting.evaluation.stages import Failure, StageFailed
-from splatting.evaluation.tables import MAIN, Table, reached_legend, reached_table, result_tables
+from splatting.evaluation.tables import MAIN, Table, gains_table, reached_legend, reached_table, result_tables
 from splatting.files.folders import locked
 from splatting.files.listing import markdown_table
 from splatting.host.machine import facts_asked
@@ -240,6 +240,8 @@ def _report(
     write_report(report, output)
     for table in result_tables(report["summary"], MAIN):
         print(f"\n{table.title}\n{_text(table)}" if table.title else _text(table))
+    for scene, found in report["gains"].items():
+        print(f"\n{scene}: gain in test PSNR over {found['default']} on the same seeds\n{_text(gains_table(found))}")
     for scene, found in report["reached"].items():
         print(f"\n{scene}: seconds of training to reach a test PSNR\n{_text(reached_table(found))}")
         print(reached_legend(found))

@@ -10,6 +10,7 @@ plan, configs               scene folders, options, model folders and their reco
 stages, child               execution of the plan: each stage is a subprocess, one at a time or one on each GPU
 model_folder, renders       readers of model folders, and of the sets of views rendered there
 results, comparison         a run's numbers; those of several: spread, option sets, published tables (published.json)
+gains                       paired differences over seeds, with intervals and verdicts
 tables, report              numbers as tables of text; report.json, its pages (report.jinja in two forms) and figures
 
 The command peer_curve makes CSV files of other programs' output.

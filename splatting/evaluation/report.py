@@ -20,6 +20,7 @@ from PIL import Image
 from splatting.evaluation import comparison, tables
 from splatting.evaluation.comparison import Sets
 from splatting.evaluation.figures import draw_curves, draw_fronts, draw_poses
+from splatting.evaluation.gains import gains
 from splatting.evaluation.renders import GAIN, ComparedViews
 from splatting.files.json_files import write_json
 from splatting.files.listing import markdown_table
@@ -58,6 +59,7 @@ def make_report(
     return {
         "dataset_means": means,
         "fronts": _of_scenes(runs, comparison.fronts),
+        "gains": gains(runs),
         "manifest": {
             "command": list(command),
             "earlier_commands": [list(words) for words in earlier_commands if list(words) != list(command)],

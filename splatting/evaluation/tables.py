@@ -184,6 +184,17 @@ def reached_legend(found: Mapping[str, Any]) -> str:
     return " ".join([f"PSNR of the test views: {some}", *said])
 
 
+def gains_table(found: Mapping[str, Any]) -> Table:
+    """Table of a scene's gains: a row for each option set but the one that others are compared with."""
+    columns = {
+        "options": lambda one: one[0],
+        "seeds": lambda one: number(one[1]["seeds"], 0),
+        "gain (dB)": lambda one: f"{one[1]['mean']:+.2f} ± {one[1]['half']:.2f}",
+        "verdict": lambda one: one[1]["verdict"],
+    }
+    return table(columns, list(found["sets"].items()))
+
+
 def front_table(found: Mapping[str, Any]) -> Table:
     """Table of a scene's `fronts`: for each option set and cost, whether the set is on the Pareto front."""
     columns = {"options": lambda name: name} | {
