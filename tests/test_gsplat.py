@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 import torch
-from diff_gaussian_rasterization import gsplat
+from diff_gaussian_rasterization import gsplat_programs
 from diff_gaussian_rasterization.gsplat import MODES, rasterization
 from torch import Tensor
 
@@ -258,6 +258,22 @@ def test_what_is_not_there_is_refused_by_name(options, words):
         Inputs(0).draw(**options)
 
 
+def test_parts_of_a_gaussian_follow_the_papers_double_sum():
+    opacities, count = torch.tensor([0.3, 0.9, 0.5, 0.99, 0.2], dtype=DOUBLE), torch.tensor([1, 2, 5, 17, 80])
+    most = 51
+    binoms = torch.tensor([[math.comb(n, k) for k in range(most)] for n in range(most)], dtype=DOUBLE)
+    parts, scales = gsplat_programs.relocated(opacities, torch.ones(5, 3, dtype=DOUBLE), count, binoms)
+    for n, (opacity, number) in enumerate(zip(opacities.tolist(), count.clamp_max(most).tolist(), strict=True)):
+        part = 1 - (1 - opacity) ** (1 / number)
+        sums = (
+            math.comb(i - 1, k) * (-1) ** k * part ** (k + 1) / math.sqrt(k + 1)
+            for i in range(1, number + 1)
+            for k in range(i)
+        )
+        assert parts[n].item() == pytest.approx(part)
+        assert scales[n].tolist() == pytest.approx([opacity / math.fsum(sums)] * 3, rel=1e-6)
+
+
 @pytest.mark.parametrize("installed", [False, True])
 def test_a_program_finds_it_by_gsplats_name(installed, tmp_path, monkeypatch, capsys):
     own = ModuleType("gsplat"), ModuleType("gsplat.rendering")
@@ -270,8 +286,8 @@ def test_a_program_finds_it_by_gsplats_name(installed, tmp_path, monkeypatch, ca
         "print(gsplat.rasterization is rasterization, rasterization.__module__, sys.argv[1:])\n"
     )
     monkeypatch.setattr(sys, "argv", ["python -m", str(program), "--steps", "3"])
-    gsplat.run()
+    gsplat_programs.run()
     assert capsys.readouterr().out == "True diff_gaussian_rasterization.gsplat ['--steps', '3']\n"
     monkeypatch.setattr(sys, "argv", ["python -m"])
     with pytest.raises(SystemExit, match="name a program"):
-        gsplat.run()
+        gsplat_programs.run()

@@ -8,11 +8,8 @@ Names, order, defaults, shapes and results are gsplat's; what it does not have i
 """
 
 import math
-import runpy
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import torch
@@ -365,26 +362,7 @@ def _collector(
     return collect
 
 
-def install() -> None:
-    """Let `import gsplat` find this function: in gsplat, if it is installed, else in a module of that name."""
-    try:
-        import gsplat
-        import gsplat.rendering as rendering
-    except ImportError:
-        gsplat, rendering = ModuleType("gsplat"), ModuleType("gsplat.rendering")
-        gsplat.rendering = rendering
-        sys.modules.update({"gsplat": gsplat, "gsplat.rendering": rendering})
-    gsplat.rasterization = rendering.rasterization = rasterization
-
-
-def run() -> None:
-    """Run the program that the command line names, with its options, after `install`."""
-    if len(sys.argv) < 2:
-        sys.exit("name a program: python -m diff_gaussian_rasterization.gsplat PROGRAM.py [OPTION...]")
-    install()
-    del sys.argv[0]
-    runpy.run_path(sys.argv[0], run_name="__main__")
-
-
 if __name__ == "__main__":
+    from diff_gaussian_rasterization.gsplat_programs import run
+
     run()
