@@ -129,7 +129,10 @@ def test_absolute_gradients_are_those_of_four_channels(device):
     ("change", "words"),
     [
         ({"features": torch.zeros(3, 4)}, "features must be"),
-        ({"features": torch.zeros(50, 4, dtype=torch.float64)}, "features must be"),
+        ({"features": torch.zeros(50, 4, dtype=torch.float64)}, "features must be .* of torch.float64"),
+        ({"features": torch.zeros(50, 4).numpy()}, "features must be a tensor, got numpy.ndarray"),
+        ({"means2d": torch.zeros(50, 2)}, r"means2d must be \(50, 3\) of torch.float32, got \(50, 2\)"),
+        ({"debug": True, "features": torch.full((50, 4), torch.nan)}, "features has 200 values that are not finite"),
         ({"background": torch.zeros(2)}, "the background must have 4 values"),
         ({"want_absolute_gradient": True, "features": torch.zeros(50, 5)}, "at most 4 channels, got 5"),
     ],
@@ -137,7 +140,7 @@ def test_absolute_gradients_are_those_of_four_channels(device):
 def test_wrong_inputs_are_named(change, words):
     scene = ordinary(50)
     given, features, background = inputs_of(scene, 4, "cpu", torch.float32)
-    change = {"features": features, "background": background} | change
-    camera = scene.settings()._replace(bg=change.pop("background"))
-    with pytest.raises(ValueError, match=words):
-        rasterize_channels(means2d=torch.zeros(50, 3), settings=camera, **given, **change)
+    change = {"features": features, "background": background, "means2d": torch.zeros(50, 3), "debug": False} | change
+    camera = scene.settings()._replace(bg=change.pop("background"), debug=change.pop("debug"))
+    with pytest.raises((ValueError, TypeError, FloatingPointError), match=words):
+        rasterize_channels(settings=camera, **given, **change)
