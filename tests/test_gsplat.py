@@ -208,6 +208,15 @@ def test_only_what_a_gradient_is_wanted_of_gets_one():
     assert given.draw()[0].requires_grad
 
 
+def test_autocast_changes_nothing():
+    given = Inputs(0)
+    for name in (*NAMES, "backgrounds"):
+        setattr(given, name, getattr(given, name).detach().float())
+    image = given.draw(render_mode="RGB+D")[0]
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(image, given.draw(render_mode="RGB+D")[0])
+
+
 def test_bands_above_the_highest_degree_are_not_read():
     given = Inputs(0, degree=3)
     image = given.draw()[0]

@@ -166,10 +166,11 @@ def rasterization(
     given = means, quats, scales, opacities, covars, colors, viewmats, Ks, backgrounds
     form = (*means.shape[:-2], viewmats.shape[-3] if viewmats.dim() > 2 else 1)
     options = _Options(sh_degree, render_mode, rasterize_mode == "antialiased", absgrad, radius_clip)
-    drawn = [
-        _render(_Camera(view, K, width, height, camera_model, near_plane, far_plane), rows, background, options)
-        for rows, view, K, background in _images(*given, form[-1], sh_degree is not None)
-    ]
+    with torch.autocast(means.device.type, enabled=False):  # its products of matrices are of 8 or 11 bits
+        drawn = [
+            _render(_Camera(view, K, width, height, camera_model, near_plane, far_plane), rows, background, options)
+            for rows, view, K, background in _images(*given, form[-1], sh_degree is not None)
+        ]
     images, alphas, found, probes = zip(*drawn, strict=True)
     meta = _meta(found, probes, form, (width, height), tile_size, packed, absgrad)
     return torch.stack(images).unflatten(0, form), torch.stack(alphas).unflatten(0, form), meta
