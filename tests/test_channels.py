@@ -1,5 +1,7 @@
 """`rasterize_channels`: images of any number of channels, beside triples of channels that `rasterize` draws."""
 
+import itertools
+
 import pytest
 import torch
 from diff_gaussian_rasterization import rasterize
@@ -38,11 +40,13 @@ def loss_of(image: Tensor) -> Tensor:
 
 
 @BOTH_AND_GPU
-@pytest.mark.parametrize("channels", COUNTS)
-@pytest.mark.parametrize("make", [ordinary, needles])
-def test_channels_equal_triples(make, channels, device, dtype):
+@pytest.mark.parametrize(
+    ("make", "channels", "projection"),
+    [*itertools.product((ordinary, needles), COUNTS, ("ewa",)), (ordinary, 4, "ray"), (needles, 11, "ray")],
+)
+def test_channels_equal_triples(make, channels, projection, device, dtype):
     scene = make(300)
-    camera = on_device(scene.settings(), device)
+    camera = on_device(scene.settings(), device)._replace(projection=projection)
     given, features, background = inputs_of(scene, channels, device, dtype)
     found = []
     for draw in (by_triples, None):

@@ -159,7 +159,8 @@ class _Channels(torch.autograd.Function):
                 rows = found
                 rows[:, SPLAT_VALUES - 1] = 0  # of a channel, not of a depth
             else:
-                rows[:, :_SHOWN] += found[:, :_SHOWN]
+                for sums in (slice(_SHOWN), slice(SPLAT_VALUES, None)):  # the last are those of rays
+                    rows[:, sums] += found[:, sums]
         source = splats, tile_counts, rows, counts
         results = [None] * len(needed)
         if needed[2]:
