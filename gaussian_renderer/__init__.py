@@ -114,7 +114,7 @@ def _with_features(
 ) -> _Featured:
     if rasterizer is not rasterize:
         raise ValueError("features need a model that is not divided among processes")
-    behind = torch.cat([settings.bg, settings.bg.new_zeros(features.shape[1])])
+    behind = torch.nn.functional.pad(settings.bg.reshape(-1), (0, features.shape[-1]))
     found = rasterize_channels(settings=settings._replace(bg=behind), features=features, **given)
     return _Featured(found.image[:3], found.radii, None, found.image[3:])
 

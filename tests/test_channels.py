@@ -1,5 +1,7 @@
 """`rasterize_channels`: images of any number of channels, beside triples of channels that `rasterize` draws."""
 
+import itertools
+
 import pytest
 import torch
 from diff_gaussian_rasterization import rasterize
@@ -38,11 +40,13 @@ def loss_of(image: Tensor) -> Tensor:
 
 
 @BOTH_AND_GPU
-@pytest.mark.parametrize("channels", COUNTS)
-@pytest.mark.parametrize("make", [ordinary, needles])
-def test_channels_equal_triples(make, channels, device, dtype):
+@pytest.mark.parametrize(
+    ("make", "channels", "projection"),
+    [*itertools.product((ordinary, needles), COUNTS, ("ewa",)), (ordinary, 4, "ray"), (needles, 11, "ray")],
+)
+def test_channels_equal_triples(make, channels, projection, device, dtype):
     scene = make(300)
-    camera = on_device(scene.settings(), device)
+    camera = on_device(scene.settings(), device)._replace(projection=projection)
     given, features, background = inputs_of(scene, channels, device, dtype)
     found = []
     for draw in (by_triples, None):
@@ -129,7 +133,10 @@ def test_absolute_gradients_are_those_of_four_channels(device):
     ("change", "words"),
     [
         ({"features": torch.zeros(3, 4)}, "features must be"),
-        ({"features": torch.zeros(50, 4, dtype=torch.float64)}, "features must be"),
+        ({"features": torch.zeros(50, 4, dtype=torch.float64)}, "features must be .* of torch.float64"),
+        ({"features": torch.zeros(50, 4).numpy()}, "features must be a tensor, got numpy.ndarray"),
+        ({"means2d": torch.zeros(50, 2)}, r"means2d must be \(50, 3\) of torch.float32, got \(50, 2\)"),
+        ({"debug": True, "features": torch.full((50, 4), torch.nan)}, "features has 200 values that are not finite"),
         ({"background": torch.zeros(2)}, "the background must have 4 values"),
         ({"want_absolute_gradient": True, "features": torch.zeros(50, 5)}, "at most 4 channels, got 5"),
     ],
@@ -137,7 +144,7 @@ def test_absolute_gradients_are_those_of_four_channels(device):
 def test_wrong_inputs_are_named(change, words):
     scene = ordinary(50)
     given, features, background = inputs_of(scene, 4, "cpu", torch.float32)
-    change = {"features": features, "background": background} | change
-    camera = scene.settings()._replace(bg=change.pop("background"))
-    with pytest.raises(ValueError, match=words):
-        rasterize_channels(means2d=torch.zeros(50, 3), settings=camera, **given, **change)
+    change = {"features": features, "background": background, "means2d": torch.zeros(50, 3), "debug": False} | change
+    camera = scene.settings()._replace(bg=change.pop("background"), debug=change.pop("debug"))
+    with pytest.raises((ValueError, TypeError, FloatingPointError), match=words):
+        rasterize_channels(settings=camera, **given, **change)

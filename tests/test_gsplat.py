@@ -43,9 +43,10 @@ class Inputs:
         self.wanted = {name: getattr(self, name).requires_grad_() for name in NAMES}
 
     def draw(self, **options) -> tuple[Tensor, Tensor, dict]:
+        given = {"viewmats": self.views, "sh_degree": self.degree, "backgrounds": self.backgrounds} | options
         return rasterization(
-            self.means, self.quats, self.scales, self.opacities, self.colors, self.views, self.Ks, WIDTH, HEIGHT,
-            sh_degree=self.degree, **{"backgrounds": self.backgrounds} | options,
+            self.means, self.quats, self.scales, self.opacities, self.colors, Ks=self.Ks, width=WIDTH, height=HEIGHT,
+            **given,
         )  # fmt: skip
 
     def gradients(self, image: Tensor, alpha: Tensor) -> dict[str, Tensor]:
@@ -188,6 +189,41 @@ def test_planes_and_radii_that_are_left_out():
     assert not torch.equal(image, given.draw()[0])
 
 
+@pytest.mark.parametrize("packed", [False, True])
+def test_no_gaussians_show_the_background(packed):
+    given = Inputs(0, count=0)
+    image, alpha, meta = given.draw(packed=packed, absgrad=True)
+    assert torch.equal(image, given.backgrounds[:, None, None].expand_as(image)) and not alpha.any()
+    image.sum().backward()
+    assert given.means.grad.shape == (0, 3) and meta["means2d"].grad.shape[-2:] == (0, 2)
+
+
+def test_only_what_a_gradient_is_wanted_of_gets_one():
+    given = Inputs(0)
+    for name, tensor in given.wanted.items():
+        setattr(given, name, tensor.detach())
+    image, alpha, meta = given.draw()
+    assert not (image.requires_grad or alpha.requires_grad or meta["means2d"].requires_grad)
+    given.backgrounds.requires_grad_()
+    assert given.draw()[0].requires_grad
+
+
+def test_autocast_changes_nothing():
+    given = Inputs(0)
+    for name in (*NAMES, "backgrounds"):
+        setattr(given, name, getattr(given, name).detach().float())
+    image = given.draw(render_mode="RGB+D")[0]
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(image, given.draw(render_mode="RGB+D")[0])
+
+
+def test_bands_above_the_highest_degree_are_not_read():
+    given = Inputs(0, degree=3)
+    image = given.draw()[0]
+    given.colors = torch.cat([given.colors, torch.ones(60, 9, 3, dtype=DOUBLE)], 1)
+    assert torch.equal(image, given.draw()[0])
+
+
 def test_covariances_in_place_of_scales():
     given = Inputs(6)
     M = build_rotation(given.quats) * given.scales[:, None]
@@ -247,6 +283,12 @@ def test_an_orthographic_image_does_not_depend_on_depth(dtype):
         ({"rasterize_mode": "sharp"}, "rasterize_mode must be"),
         ({"backgrounds": torch.zeros(1, 3, dtype=DOUBLE)}, r"backgrounds must be \(2, 3\), got \(1, 3\)"),
         ({"backgrounds": torch.zeros(2, 5, dtype=DOUBLE)}, "the background must have 3 values, or one for all, got 5"),
+        ({"viewmats": torch.eye(4, dtype=DOUBLE)}, r"viewmats must be \(1, 4, 4\), got \(4, 4\)"),
+        (
+            {"viewmats": torch.eye(4).repeat(CAMERAS, 1, 1)},
+            "viewmats must be torch.float64 like means, got torch.float32",
+        ),
+        ({"viewmats": torch.zeros(0, 4, 4)}, r"there must be an image to render, got batches and cameras \(0,\)"),
         ({"absgrad": True, "render_mode": "RGB+D"}, None),
     ],
 )
@@ -281,8 +323,10 @@ def test_a_program_finds_it_by_gsplats_name(installed, tmp_path, monkeypatch, ca
         monkeypatch.setitem(sys.modules, name, module if installed else None)
     own[0].rendering = own[1]
     program = tmp_path / "program.py"
+    (tmp_path / "beside_the_program.py").touch()
+    monkeypatch.setattr(sys, "path", list(sys.path))
     program.write_text(
-        "import sys\nfrom gsplat.rendering import rasterization\nimport gsplat\n"
+        "import sys\nimport beside_the_program\nfrom gsplat.rendering import rasterization\nimport gsplat\n"
         "print(gsplat.rasterization is rasterization, rasterization.__module__, sys.argv[1:])\n"
     )
     monkeypatch.setattr(sys, "argv", ["python -m", str(program), "--steps", "3"])
@@ -290,4 +334,7 @@ def test_a_program_finds_it_by_gsplats_name(installed, tmp_path, monkeypatch, ca
     assert capsys.readouterr().out == "True diff_gaussian_rasterization.gsplat ['--steps', '3']\n"
     monkeypatch.setattr(sys, "argv", ["python -m"])
     with pytest.raises(SystemExit, match="name a program"):
+        gsplat_programs.run()
+    monkeypatch.setattr(sys, "argv", ["python -m", "nowhere.py"])
+    with pytest.raises(SystemExit, match="there is no program nowhere.py"):
         gsplat_programs.run()

@@ -62,6 +62,9 @@ def test_features_are_rendered_beside_colours(camera):
     assert torch.allclose(package["features"][:3], apart, atol=1e-5)
     package["features"].sum().backward()
     assert features.grad.any() and gaussians._xyz.grad.any()
+    for wrong in (torch.zeros(40), torch.zeros(41, 5), torch.zeros(40, 5, dtype=torch.float64)):
+        with pytest.raises(ValueError, match=r"features must be \(40, F\) of torch.float32, got"):
+            render(camera, gaussians, pipeline(), BLACK, features=wrong)
 
 
 def test_depth_unless_it_is_not_wanted(camera):

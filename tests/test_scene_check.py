@@ -12,7 +12,7 @@ import pytest
 import torch
 from lenses import LensView, make_lens
 from PIL import Image
-from synthetic import as_text, options_of, read
+from synthetic import BROWN, as_text, edit_json, make_blender_scene, make_colmap_scene, options_of, read
 
 from scene import Scene
 from scene.check import Finding, findings, tell
@@ -22,7 +22,9 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.copies import places_of
 from scene.gaussians.start import start_rows
 from scene.images.decode import decode
-from scene.readers.info import CameraInfo, SceneInfo
+from scene.images.masks import MaskOptions
+from scene.readers.depth_maps import with_depth_maps
+from scene.readers.info import CameraInfo, SceneInfo, exposure_names
 from splatting.demo.make_scene import write_scene
 from splatting.demo.objects import demo_scene
 from splatting.demo.tracer import FISHEYE, PANORAMA, ring_views
@@ -126,7 +128,7 @@ TURNS = {
 
 
 def lie_down(scene: Path, orientation: int, turn: Image.Transpose) -> None:
-    for path in (scene / "images").rglob("*.png"):
+    for path in scene.rglob("*.png"):
         turned = Image.open(path).transpose(turn)
         exif = turned.getexif()
         exif.update({0x0112: orientation, 0x010F: "maker"})
@@ -159,6 +161,76 @@ def test_photos_that_exif_turns_are_made_upright(sound, tmp_path, monkeypatch, c
         cut = next((tmp_path / "cache" / "turned").iterdir())
         cut.write_bytes(cut.read_bytes()[:-40])
     assert not [line for line in check_dataset(str(scene), "images") if "exchanged" in line.text]
+
+
+def test_photos_of_distorting_lenses_are_turned_before_they_are_undistorted(tmp_path, monkeypatch):
+    monkeypatch.setenv("GS_CACHE", str(tmp_path / "cache"))
+    make_colmap_scene(tmp_path / "sound", model="OPENCV", params=BROWN, views=3)
+    scene = Path(shutil.copytree(tmp_path / "sound", tmp_path / "scene"))
+    lie_down(scene, 6, TURNS[6])
+    for view, upright in zip(read(scene).train_cameras, read(tmp_path / "sound").train_cameras, strict=True):
+        for name in ("fx", "fy", "cx", "cy", "width", "height", "file_size"):
+            assert getattr(view, name) == getattr(upright, name), name
+        size = view.file_size
+        assert torch.equal(decode(view.image_path, size), decode(upright.image_path, size))
+
+
+def test_turned_photos_keep_their_names_even_if_equal(tmp_path, monkeypatch):
+    """Blender's r_0 of both folders: for depth maps, exposures, and the split."""
+    monkeypatch.setenv("GS_CACHE", str(tmp_path / "cache"))
+    make_blender_scene(tmp_path)
+    for split in ("train", "test"):
+        edit_json(tmp_path / f"transforms_{split}.json", lambda content: content.update(w=40, h=30, fl_x=50, fl_y=50))
+        lie_down(tmp_path / split, 8, TURNS[8])
+        for path in (tmp_path / split).iterdir():
+            (tmp_path / "depths" / split).mkdir(parents=True, exist_ok=True)
+            Image.new("I;16", (40, 30), 3000).save(tmp_path / "depths" / split / path.name)
+    info = read(tmp_path, hold_out=True)
+    assert (len(info.train_cameras), len(info.test_cameras)) == (4, 2)
+    found = with_depth_maps(info, tmp_path, "depths").train_cameras
+    assert [Path(view.depth_path).name for view in found] == [f"r_{n}.png" for n in range(4)]
+    names = exposure_names(read(tmp_path).train_cameras)
+    assert names[:2] == ["train/r_0.png", "train/r_1.png"] and len({*names}) == 6
+
+
+@pytest.mark.parametrize(
+    ("exif", "turned"),
+    [
+        (b"Exif\0\0garbage", False),
+        (b"Exif\0\0II*\0\x08\0\0\0\x02\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0"
+         b"\x1a\x01\x02\0\x02\0\0\0a\0\0\0\0\0\0\0", True),  # the resolution is a text
+    ],
+)  # fmt: skip
+def test_damaged_exif_data_are_no_fault_of_a_photo(sound, tmp_path, monkeypatch, exif, turned):
+    monkeypatch.setenv("GS_CACHE", str(tmp_path / "cache"))
+    scene = Path(shutil.copytree(sound, tmp_path / "scene"))
+    for path in (scene / "images").rglob("*.png"):
+        Image.open(path).transpose(TURNS[6]).save(path, exif=exif)
+    if turned:
+        assert {view.file_size for view in read(scene).train_cameras} == {(96, 64)}
+    else:
+        with pytest.raises(UserError, match="17 of 17 photos have the sides of their camera exchanged"):
+            read(scene)
+
+
+def test_tiff_files_that_pillow_turns_are_not_turned_twice(sound, tmp_path):
+    """Their cameras are of the files as they are, so that what Pillow reads lies on its side."""
+    scene = Path(shutil.copytree(sound, tmp_path / "scene"))
+    for path in (scene / "images").rglob("*.png"):
+        Image.open(path).save(path, format="TIFF", tiffinfo={0x0112: 6})
+    with pytest.raises(UserError, match=r"17 of 17 photos have the sides .* \(64 x 96, camera 96 x 64\); turn"):
+        read(scene)
+
+
+def test_masks_that_lie_like_their_turned_photos_are_told(sound, tmp_path, monkeypatch):
+    monkeypatch.setenv("GS_CACHE", str(tmp_path / "cache"))
+    scene = Path(shutil.copytree(sound, tmp_path / "scene"))
+    lie_down(scene, 6, TURNS[6])
+    shutil.copytree(scene / "images", scene / "masks")
+    for path in (scene / "masks").rglob("*.png"):
+        Image.new("L", (64, 96), 255).save(path)
+    with pytest.raises(UserError, match="its photo 96 x 64 when upright; make masks of the same shape as the upright"):
+        read(scene, masks=MaskOptions("masks"))
 
 
 @pytest.mark.parametrize("apart", [0.0, 1e-6])

@@ -174,7 +174,7 @@ def with_depth_maps(info: SceneInfo, scene: Path, depths: str) -> SceneInfo:
 
 
 def _files(cameras: Sequence[CameraInfo], scene: Path, folder: Path, is_colmap: bool) -> SideFiles:
-    photos = [Path(camera.image_path) for camera in cameras]
+    photos = [Path(camera.lying or camera.image_path) for camera in cameras]
     names = [
         camera.image_name if is_colmap or not camera.image_path else os.path.relpath(photo, scene)
         for camera, photo in zip(cameras, photos, strict=True)

@@ -93,7 +93,8 @@ class CameraInfo(_LikeNamedTuple):
     None (scene/readers/pinholes.py). native: the lens of a photo that is taken as it is; fx, fy, cx and cy are then
     those of its axis. mask: of the photo's shape, None if all pixels count. ignore_alpha: transparent pixels of the
     photo do not count. opaque: the photo's alpha is dropped. depth: inverse depth of a training view that has a map
-    (scene/readers/depth_maps.py). image: the photo in memory, which readers leave out: a PIL image, as the 2023 release
+    (scene/readers/depth_maps.py). lying: the photo's own file, where image_path is its upright copy
+    (scene/readers/turned.py). image: the photo in memory, which readers leave out: a PIL image, as the 2023 release
     gave it, or pixels at training size.
     """
 
@@ -121,6 +122,7 @@ class CameraInfo(_LikeNamedTuple):
     ignore_alpha: bool = False
     opaque: bool = False
     depth: Decodable | InMemory | None = None
+    lying: Path | None = None
     image: Any = None
 
     def __post_init__(self) -> None:
@@ -260,7 +262,7 @@ def exposure_names(cameras: Sequence[CameraInfo]) -> list[str]:
     shared = {name for name, count in Counter(names).items() if count > 1}
     if not shared:
         return names
-    paths = [Path(getattr(camera, "image_path", None) or "") for camera in cameras]
+    paths = [Path(getattr(camera, "lying", None) or getattr(camera, "image_path", None) or "") for camera in cameras]
     folder = os.path.commonpath([path.parent for path in paths if path.name] or [""])
     return [
         os.path.relpath(path, folder) if name in shared and path.name else name

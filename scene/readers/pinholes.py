@@ -83,20 +83,21 @@ def finished(cameras: Sequence[CameraInfo], opaque: bool = False) -> list[Camera
     _warn_of_other_shapes(cameras)
     for camera in cameras:
         if camera.mask is not None:
-            _check_mask(camera.mask.path, camera.file_size)
+            _check_mask(camera.mask.path, camera.file_size, camera.lying)
     if distorted := [index for index, camera in enumerate(cameras) if camera.lens]:
         for index, camera in zip(distorted, undistort([cameras[index] for index in distorted]), strict=True):
             cameras[index] = camera
     return cameras
 
 
-def _check_mask(mask: Path, size: tuple[int, int]) -> None:
+def _check_mask(mask: Path, size: tuple[int, int], lying: Path | None = None) -> None:
     mask_size = picture_size(mask)
     # A smaller mask has whole pixels, too: half of 269 is 134 or 135.
     if abs(size[0] * mask_size[1] - size[1] * mask_size[0]) > max(*size, *mask_size):
+        upright = " when upright" if lying else ""
         raise UserError(
-            f"the mask {mask} is {mask_size[0]} x {mask_size[1]} pixels and its photo {size[0]} x {size[1]}; "
-            "make masks of the same shape as the photos"
+            f"the mask {mask} is {mask_size[0]} x {mask_size[1]} pixels and its photo {size[0]} x {size[1]}{upright}; "
+            f"make masks of the same shape as the {'upright ' if lying else ''}photos"
         )
 
 

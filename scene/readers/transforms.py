@@ -121,14 +121,14 @@ def _once(views: list[CameraInfo], listed_by: str) -> list[CameraInfo]:
     for view in views:
         first = found.setdefault(_file(view), view)
         if not (np.allclose(first.R, view.R, atol=_SAME) and np.allclose(first.center, view.center, _SAME, _SAME)):
-            raise UserError(f"{listed_by} lists the photo {view.image_path} twice, with different poses; keep one")
+            raise UserError(f"{listed_by} lists the photo {_file(view)} twice, with different poses; keep one")
     if len(found) < len(views):
         print(f"{len(views) - len(found)} frames of {listed_by} repeat a photo and are left out", file=sys.stderr)
     return list(found.values())
 
 
 def _file(view: CameraInfo) -> str:
-    return os.path.normpath(view.image_path)
+    return os.path.normpath(view.lying or view.image_path)
 
 
 def _ply_in(folder: Path) -> Path | None:
@@ -231,7 +231,7 @@ def _lists_other_frames(name: str, listed: Any) -> bool:
 
 def _say_if_unused(images: str, path: Path, cameras: Sequence[CameraInfo]) -> None:
     """Say that -i has no effect, where it names another folder than that of the photos and not the default."""
-    photos = [Path(camera.image_path) for camera in cameras]
+    photos = [Path(camera.lying or camera.image_path) for camera in cameras]
     if images in ("", "images") or any(photo.is_relative_to(path.parent / images) for photo in photos):
         return
     print(

@@ -14,9 +14,10 @@ from PIL import ExifTags, Image
 from tqdm.contrib.concurrent import thread_map
 
 from scene.images.decode import decode, picture_size
+from scene.images.lens import undistortion
 from scene.readers.info import CameraInfo, are_exchanged
 from splatting.files.folders import cache_folder, remove_temporary_files
-from splatting.files.image_files import open_image
+from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.listing import some
 from splatting.files.plain_files import plain
 from splatting.host.machine import threads
@@ -50,14 +51,15 @@ def turned_by_exif(cameras: Sequence[CameraInfo]) -> list[CameraInfo]:
     except UserError as error:
         raise UserError(f"{error}; turned photos are kept there; set GS_CACHE to use another folder") from error
     remove_temporary_files(folder)
-    paths = thread_map(
-        lambda n: _copy(Path(cameras[n].image_path), turns[n], cameras[n].file_size, folder),
-        turns,
-        max_workers=threads(),
-        desc="Turning photos",
-        unit="photo",
-        leave=False,
-    )
+    bar = {"max_workers": threads(), "unit": "photo", "leave": False}
+    paths = thread_map(lambda n: _place(Path(cameras[n].image_path), folder), turns, desc="Looking up photos", **bar)
+    copies = dict(zip(paths, turns, strict=True))  # one of equal photos
+
+    def copy(path: Path) -> None:
+        n = copies[path]
+        _copy(Path(cameras[n].image_path), turns[n], cameras[n].file_size, path)
+
+    thread_map(copy, copies, desc="Turning photos", **bar)
     print(
         f"{len(turns)} of {len(cameras)} photos are turned as their EXIF orientation says, since their cameras are of "
         f"upright photos: {some([cameras[n].image_name for n in turns])}; the copies are kept in {folder}, which may "
@@ -66,29 +68,49 @@ def turned_by_exif(cameras: Sequence[CameraInfo]) -> list[CameraInfo]:
     )
     result = list(cameras)
     for n, path in zip(turns, paths, strict=True):
-        result[n] = replace(cameras[n], image_path=path, file_size=cameras[n].file_size[::-1])
+        result[n] = _upright(cameras[n], path)
     return result
 
 
+def _upright(camera: CameraInfo, path: Path) -> CameraInfo:
+    size = camera.file_size[::-1]
+    # The reader has planned the undistortion for a photo of the file's size.
+    pinhole = undistortion(camera.lens, *size).pinhole._asdict() if camera.lens else {}
+    return replace(camera, **pinhole, image_path=path, file_size=size, lying=Path(camera.image_path))
+
+
 def _turn(photo: Path) -> int | None:
-    """The EXIF orientation of a readable photo, if it exchanges the sides."""
-    with open_image(photo) as image:
-        orientation = image.getexif().get(ExifTags.Base.Orientation)
+    """The EXIF orientation of a readable photo, if it exchanges the sides. Pillow itself turns TIFF files."""
+    try:
+        with open_image(photo) as image:
+            orientation = None if image.format == "TIFF" else image.getexif().get(ExifTags.Base.Orientation)
+    except UNREADABLE:  # of damaged EXIF data
+        return None
     return orientation if orientation in _TURNS else None
 
 
-def _copy(photo: Path, turn: int, size: tuple[int, int], folder: Path) -> Path:
-    content = plain(photo).read_bytes()
-    path = folder / f"{hashlib.blake2b(content, digest_size=20).hexdigest()}.png"
+def _place(photo: Path, folder: Path) -> Path:
+    return folder / f"{hashlib.blake2b(plain(photo).read_bytes(), digest_size=20).hexdigest()}.png"
+
+
+def _copy(photo: Path, turn: int, size: tuple[int, int], path: Path) -> None:
     try:
         if picture_size(path) == size[::-1]:
-            return path
+            return
     except UserError:
         pass  # not made yet, or cut short
-    with open_image(photo) as image:
-        exif = image.getexif()  # of the lens, for instance
-    del exif[ExifTags.Base.Orientation]
+    exif = _without_turn(photo)
     pixels = decode(photo, size).permute(1, 2, 0).numpy()
     with atomic_write(path, every_rank=True) as temporary:
         Image.fromarray(pixels).transpose(_TURNS[turn]).save(temporary, compress_level=1, exif=exif)
-    return path
+
+
+def _without_turn(photo: Path) -> bytes:
+    """The EXIF data of a photo, of the lens for instance, without its orientation; none if they are damaged."""
+    with open_image(photo) as image:
+        exif = image.getexif()
+    del exif[ExifTags.Base.Orientation]
+    try:
+        return exif.tobytes()
+    except (*UNREADABLE, AttributeError):
+        return b""

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.camera import camera_numbers
+from diff_gaussian_rasterization.checks import check_finite, check_tensors
 from diff_gaussian_rasterization.fakes import SPLAT_VALUES
 from diff_gaussian_rasterization.first_order import first_order
 from diff_gaussian_rasterization.gaussians import Gaussians, lists_gaussians
@@ -56,10 +57,12 @@ def rasterize_channels(
     Gaussians on the rays of a lens have three channels only: ValueError.
     """
     gaussians = Gaussians(means, opacities, **others)
+    _check(gaussians._asdict() | {"features": features}, means2d, depths, settings)
     if features is None:
         features = means.new_empty(len(means), 0)
     if features.shape[:1] != means.shape[:1] or features.dim() != 2 or features.dtype != means.dtype:
-        raise ValueError(f"features must be ({len(means)}, F) of {means.dtype}, got {tuple(features.shape)}")
+        found = f"{tuple(features.shape)} of {features.dtype}"
+        raise ValueError(f"features must be ({len(means)}, F) of {means.dtype}, got {found}")
     shown = features.shape[1]
     if gaussians.colors is None and gaussians.sh_dc is None:
         lacking = max(0, _COLORS - shown)
@@ -79,6 +82,24 @@ def rasterize_channels(
     if len(background) not in (1, shown):
         raise ValueError(f"the background must have {shown} values, or one for all, got {len(background)}")
     return ChannelImage(image + transmittance * background[:, None, None], transmittance, *rest)
+
+
+def _check(
+    given: dict[str, Tensor | None],
+    means2d: Tensor | None,
+    depths: Tensor | None,
+    settings: GaussianRasterizationSettings,
+) -> None:
+    """What the operators that are called do not check, or without the names of the inputs."""
+    check_tensors(given | {"means2d": means2d, "depths": depths, "bg": settings.bg})
+    means = given["means"]
+    if means2d is not None and (means2d.shape != means.shape or means2d.dtype != means.dtype):
+        found = f"{tuple(means2d.shape)} of {means2d.dtype}"
+        raise ValueError(f"means2d must be {tuple(means.shape)} of {means.dtype}, got {found}")
+    if settings.debug:
+        for name, values in given.items():
+            if values is not None:
+                check_finite(name, values)
 
 
 def _passes(splats: Tensor, features: Tensor) -> Iterator[tuple[Tensor, int]]:
@@ -138,7 +159,8 @@ class _Channels(torch.autograd.Function):
                 rows = found
                 rows[:, SPLAT_VALUES - 1] = 0  # of a channel, not of a depth
             else:
-                rows[:, :_SHOWN] += found[:, :_SHOWN]
+                for sums in (slice(_SHOWN), slice(SPLAT_VALUES, None)):  # the last are those of rays
+                    rows[:, sums] += found[:, sums]
         source = splats, tile_counts, rows, counts
         results = [None] * len(needed)
         if needed[2]:

@@ -160,16 +160,16 @@ def rasterization(
     given = {name: value for name, value in locals().items() if name in _UNSUPPORTED or name in _NEED_UT}
     _refuse(given, rolling_shutter, render_mode, camera_model, rasterize_mode, eps2d, sh_degree)
     given = means, quats, scales, opacities, covars, colors, viewmats, Ks, backgrounds
-    form = (*means.shape[:-2], viewmats.shape[-3])
+    form = (*means.shape[:-2], viewmats.shape[-3] if viewmats.dim() > 2 else 1)
     options = _Options(sh_degree, render_mode, rasterize_mode == "antialiased", absgrad, radius_clip)
-    drawn = [
-        _render(_Camera(view, K, width, height, camera_model, near_plane, far_plane), rows, background, options)
-        for rows, view, K, background in _images(*given, sh_degree is not None)
-    ]
+    with torch.autocast(means.device.type, enabled=False):  # its products of matrices are of 8 or 11 bits
+        drawn = [
+            _render(_Camera(view, K, width, height, camera_model, near_plane, far_plane), rows, background, options)
+            for rows, view, K, background in _images(*given, form[-1], sh_degree is not None)
+        ]
     images, alphas, found, probes = zip(*drawn, strict=True)
     meta = _meta(found, probes, form, (width, height), tile_size, packed, absgrad)
-    size = height, width
-    return torch.stack(images).view(*form, *size, -1), torch.stack(alphas).view(*form, *size, 1), meta
+    return torch.stack(images).unflatten(0, form), torch.stack(alphas).unflatten(0, form), meta
 
 
 def _images(
@@ -182,10 +182,13 @@ def _images(
     viewmats: Tensor,
     Ks: Tensor,
     backgrounds: Tensor | None,
+    cameras: int,
     harmonics: bool,
 ) -> Iterator[tuple[_Rows, Tensor, Tensor, Tensor | None]]:
-    """For each image the Gaussians, view, intrinsics and background. ValueError for wrong shapes."""
-    batch, count, cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
+    """For each image the Gaussians, view, intrinsics and background. ValueError for wrong shapes and types."""
+    batch, count = means.shape[:-2], means.shape[-2]
+    if not (cameras and all(batch)):
+        raise ValueError(f"there must be an image to render, got batches and cameras {(*batch, cameras)}")
     each = colors.dim() - len(batch) == 3 + harmonics  # colours of their own for each camera
     shapes = {
         "means": (means, (count, 3)),
@@ -205,11 +208,14 @@ def _images(
         if values is None or values.shape != batch + shape:
             found = None if values is None else tuple(values.shape)
             raise ValueError(f"{name} must be {tuple(batch + shape)}, got {found}")
+        if values.dtype != means.dtype and name not in ("Ks", "backgrounds"):
+            raise ValueError(f"{name} must be {means.dtype} like means, got {values.dtype}")
 
     def item(values: Tensor | None, axes: int, batch: int) -> Tensor | None:
-        return None if values is None else values.reshape(-1, *values.shape[values.dim() - axes :])[batch]
+        return None if values is None else values.reshape(batches, *values.shape[values.dim() - axes :])[batch]
 
-    for at in range(math.prod(batch)):
+    batches = math.prod(batch)
+    for at in range(batches):
         rows = [(means, 2), (quats, 2), (scales, 2), (opacities, 1), (covars, 3)]
         own = [item(values, axes, at) for values, axes in rows]
         shown, views, intrinsics = (
@@ -260,7 +266,8 @@ def _render(
     behind = rows.means.new_zeros(count)  # also of depth
     if background is not None and options.mode.startswith("RGB"):
         behind = torch.nn.functional.pad(background, (0, options.mode.endswith("D")))
-    probe = torch.zeros_like(rows.means, requires_grad=torch.is_grad_enabled())
+    wanted = any(values is not None and values.requires_grad for values in (*rows, camera.view, background))
+    probe = torch.zeros_like(rows.means, requires_grad=wanted and torch.is_grad_enabled())
     out = rasterize_channels(
         rows.means * scale,
         probe,
@@ -290,7 +297,10 @@ def _scaled(rows: _Rows, scale: float, options: _Options) -> dict[str, Tensor]:
         places = (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)
         shape = {"cov3d": torch.stack([rows.covars[:, i, j] for i, j in places], 1) * scale**2}
     if options.mode.startswith("RGB") and options.degree is not None:
-        shape |= {"sh_dc": rows.colors[:, :1].contiguous(), "sh_rest": rows.colors[:, 1:].contiguous()}
+        shape |= {
+            "sh_dc": rows.colors[:, :1].contiguous(),
+            "sh_rest": rows.colors[:, 1 : (MOST_BANDS + 1) ** 2].contiguous(),
+        }
     return shape
 
 
@@ -354,7 +364,7 @@ def _collector(
                 setattr(means2d, name, torch.zeros_like(means2d))
             into = getattr(means2d, name)
             if place is None:
-                into.view(-1, *gradient.shape[:1], 2)[image] += values * per_pixel
+                into.flatten(0, -3)[image] += values * per_pixel
             else:
                 own = place[0] == image
                 into[own] += (values * per_pixel)[place[1][own]]

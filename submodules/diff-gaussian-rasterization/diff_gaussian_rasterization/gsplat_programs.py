@@ -3,6 +3,7 @@
 Without a GPU, two helpers of gsplat's MCMC strategy are computed by PyTorch, as gsplat has kernels alone for them.
 """
 
+import os
 import runpy
 import sys
 from types import ModuleType
@@ -49,6 +50,9 @@ def run() -> None:
     """Run the program that the command line names, with its options, after `install`."""
     if len(sys.argv) < 2:
         sys.exit("name a program: python -m diff_gaussian_rasterization.gsplat PROGRAM.py [OPTION...]")
+    if not os.path.exists(sys.argv[1]):
+        sys.exit(f"there is no program {sys.argv[1]}")
     install()
     del sys.argv[0]
+    sys.path[0] = os.path.dirname(os.path.abspath(sys.argv[0]))  # as python PROGRAM.py does
     runpy.run_path(sys.argv[0], run_name="__main__")
