@@ -300,6 +300,18 @@ def test_what_is_not_there_is_refused_by_name(options, words):
         Inputs(0).draw(**options)
 
 
+def test_strategies_before_1_5_get_one_radius(monkeypatch):
+    own = ModuleType("gsplat"), ModuleType("gsplat.rendering")
+    own[0].rendering, own[0].__version__ = own[1], "1.4.0"
+    for module in own:
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    gsplat_programs.install()
+    given = Inputs(1)
+    rest = given.views, given.Ks, WIDTH, HEIGHT
+    meta = own[1].rasterization(given.means, given.quats, given.scales, given.opacities, given.colors, *rest)[2]
+    assert torch.equal(meta["radii"], given.draw()[2]["radii"].amax(-1)) and meta["radii"].dim() == 1
+
+
 def test_parts_of_a_gaussian_follow_the_papers_double_sum():
     opacities, count = torch.tensor([0.3, 0.9, 0.5, 0.99, 0.2], dtype=DOUBLE), torch.tensor([1, 2, 5, 17, 80])
     most = 51

@@ -7,6 +7,7 @@ import os
 import runpy
 import sys
 from types import ModuleType
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,10 +24,17 @@ def install() -> None:
         gsplat, rendering = ModuleType("gsplat"), ModuleType("gsplat.rendering")
         gsplat.rendering = rendering
         sys.modules.update({"gsplat": gsplat, "gsplat.rendering": rendering})
-    gsplat.rasterization = rendering.rasterization = rasterization
+    version = [int(part) for part in getattr(gsplat, "__version__", "1.5").split(".")[:2]]
+    gsplat.rasterization = rendering.rasterization = rasterization if version >= [1, 5] else with_one_radius
     if hasattr(gsplat, "strategy") and not torch.cuda.is_available():
         gsplat.strategy.ops.compute_relocation = relocated
         gsplat.strategy.ops.quat_scale_to_covar_preci = gsplat.cuda._torch_impl._quat_scale_to_covar_preci
+
+
+def with_one_radius(*inputs: Any, **options: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """`rasterization` for gsplat before 1.5, whose strategies read one radius of a Gaussian, not two."""
+    image, alpha, meta = rasterization(*inputs, **options)
+    return image, alpha, meta | {"radii": meta["radii"].amax(-1)}
 
 
 def relocated(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor) -> tuple[Tensor, Tensor]:
