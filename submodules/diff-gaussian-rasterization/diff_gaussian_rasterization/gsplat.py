@@ -22,6 +22,7 @@ from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 MOST_BANDS = 3  # the highest degree of SH
 _NEAR = 0.2  # of the kernels: kNear in csrc/math/constants.h
+_LARGEST = 2.0**20  # a scene enlarged by far more overflows
 _DILATION = 0.3  # kDilation
 _HALF_LOG2E = 0.5 / math.log(2)
 _MIN_ALPHA = 1 / 255
@@ -253,8 +254,8 @@ def _render(
 ) -> tuple[Tensor, Tensor, _Projected, Tensor]:
     """An image (H, W, D), its alpha (H, W, 1), what is told of the Gaussians, and the tensor that gets d means2d."""
     # The kernels cull at 0.2. To show nearer things, enlarge the scene, by a power of two so that no bit changes.
-    scale = 2.0 ** max(0, math.ceil(math.log2(_NEAR / camera.near))) if camera.near > 0 else 2.0**20
-    scale = 1.0 if camera.model == "ortho" else scale
+    nearest = max(camera.near, _NEAR / _LARGEST)
+    scale = 1.0 if camera.model == "ortho" else 2.0 ** max(0, math.ceil(math.log2(_NEAR / nearest)))
     depth = rows.means @ camera.view[2, :3] + camera.view[2, 3]
     visible = ((depth > camera.near) & (depth < camera.far)).detach()
     gaussians, features = _scaled(rows, scale, options), []
