@@ -152,6 +152,7 @@ LONGEST = Bound(1e-2, 6e-2, "as above, a hundred times longer; parts thinner tha
 GIVEN = Bound(
     2e-2, 4e-2, "float32 covariances hold no needle: rounding moves short axes by 0.06 px^2; negative ones count as 0"
 )
+STRETCHED = Bound(6e-5, 3e-5, "opaque needles up to 5,000 px: one rounding of the inputs moves the image by 1e-5")
 ELSEWHERE = Bound(
     5e-6, 1e-5, "differences of coordinates are exact while the camera is not turned; one rounding is the image"
 )
@@ -244,6 +245,27 @@ def round_ones(g: Generator) -> Problem:
     return among_ordinary(splats(g, 30, sigma=axes(30, 4, 4, 4)))
 
 
+def stretched(
+    length: tuple[float, float],
+    ratio: tuple[float, float],
+    logit: tuple[float, float] = (-2, 2),
+    depth: tuple[float, float] = (2, 6),
+) -> Callable[[Generator], Problem]:
+    """Make needles, pancakes and what lies between, as in trained models: sigma px, axis ratio, logit, depth."""
+
+    def between(g: Generator, low: float, high: float, n: int) -> Tensor:
+        return low * (high / low) ** uniform(g, 0, 1, n)
+
+    def make(g: Generator) -> Problem:
+        n = 200
+        longest, by = between(g, *length, n), between(g, *ratio, n)
+        sigma = torch.stack([longest, longest / by ** uniform(g, 0, 1, n), longest / by], 1)
+        means = placed(uniform(g, 0, 1, n, 2) * torch.tensor([WIDTH, HEIGHT]), between(g, *depth, n), camera())
+        return among_ordinary(splats(g, n, sigma=sigma, means=means, logits=uniform(g, *logit, n)))
+
+    return make
+
+
 SHAPE = [
     *(Case("shape", f"needles, axes 1 : {ratio:.0e}", needles(ratio), STEEP) for ratio in (1e2, 1e4, 1e7)),
     *(Case("shape", f"pancakes, axes 1 : {ratio:.0e}", pancakes(ratio), PLAIN) for ratio in (1e2, 1e4, 1e7)),
@@ -259,6 +281,11 @@ SHAPE = [
     Case("shape", "conics of condition 1e7", needles_of(1700, 1760), LONG, double=1e-11, cut=2e-3),
     Case("shape", "needles of 1e4 to 1e6 px", needles_of(1e4, 1e6), LONGEST, double=1e-10, cut=0.1),
     Case("shape", "needles of 100 to 1,000 px as covariances", needles_as_covariances, GIVEN, double=2e-2, cut=2e-3),
+    # What trained models have besides (benchmarks.accuracy.census).
+    Case("shape", "stretched, 0.05 to 10 px", stretched((0.05, 10), (10, 1e6)), PLAIN),
+    Case("shape", "stretched, opaque", stretched((0.3, 100), (1, 1e6), logit=(4.6, 14)), STRETCHED),
+    Case("shape", "stretched, faint", stretched((0.3, 100), (1, 1e6), logit=(-5.5, -2.2)), PLAIN),
+    Case("shape", "stretched, far", stretched((0.3, 5000), (1, 1e6), logit=(-5.5, 14), depth=(10, 1e4)), STRETCHED),
 ]
 
 # ---- place ----
