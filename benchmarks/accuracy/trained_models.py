@@ -25,7 +25,7 @@ class TrainedModel(NamedTuple):
 
     label: str
     gaussians: Gaussians  # raw, float32
-    cameras: list[GaussianRasterizationSettings]  # sorted by the names of their photos
+    cameras: list[GaussianRasterizationSettings]  # float64, sorted by the names of their photos
     views: list[Camera]  # with the photos, one for each camera; none where the cameras are made
 
     @property
@@ -70,8 +70,29 @@ def _of_training(label: str, folder: Path, iteration: int, device: torch.device 
     scene, pipe = load_saved(models.extract(options), iteration), pipelines.extract(options)
     views = sorted(scene.getTrainCameras() + scene.getTestCameras(), key=lambda view: view.image_name)
     background = torch.full((3,), float(options.white_background), device=scene.gaussians.get_xyz.device)
-    cameras = [rasterizer_settings(view, scene.gaussians, pipe, background) for view in views]
+    cameras = [exact(rasterizer_settings(view, scene.gaussians, pipe, background)) for view in views]
     return TrainedModel(label, _raw(scene.gaussians, device), [on_device(camera, device) for camera in cameras], views)
+
+
+def exact(camera: GaussianRasterizationSettings) -> GaussianRasterizationSettings:
+    """The camera in float64 on the CPU, whose projection and centre follow from its view and tangents without rounding.
+
+    Rounded to float32 they contradict each other by some 1e-7, and an exact image would depend on which one is read.
+    """
+    view = camera.viewmatrix.double().cpu()
+    principal = (torch.linalg.inv(view) @ camera.projmatrix.double().cpu())[2, :2]
+    made = settings(
+        camera.image_width,
+        camera.image_height,
+        view=view.T,
+        principal=tuple(principal.tolist()),
+        fov=2 * math.atan(camera.tanfovx),
+        tan_ratio=camera.tanfovy / camera.tanfovx,
+    )
+    return camera._replace(
+        **{name: getattr(made, name) for name in ("viewmatrix", "projmatrix", "campos", "tanfovx", "tanfovy")},
+        bg=camera.bg.double().cpu(),
+    )
 
 
 def _raw(model: GaussianModel, device: torch.device | str) -> Gaussians:
@@ -94,7 +115,7 @@ def around(gaussians: Gaussians) -> list[GaussianRasterizationSettings]:
     degree = round((gaussians.sh_rest.shape[1] + 1) ** 0.5) - 1
     out = [math.cos(angle) * first + math.sin(angle) * second for angle in angles]
     looks = [_looking(middle + radius * toward, -toward, normal) for toward in out]
-    return [settings(_WIDTH, _HEIGHT, view=view, sh_degree=degree, bg=torch.zeros(3)) for view in looks]
+    return [settings(_WIDTH, _HEIGHT, view=view, sh_degree=degree, bg=torch.zeros(3).double()) for view in looks]
 
 
 def _looking(center: Tensor, forward: Tensor, down: Tensor) -> Tensor:
