@@ -283,8 +283,8 @@ SHAPE = [
     Case("shape", "needles of 100 to 1,000 px as covariances", needles_as_covariances, GIVEN, double=2e-2, cut=2e-3),
     # What trained models have besides (benchmarks.accuracy.census).
     Case("shape", "stretched, 0.05 to 10 px", stretched((0.05, 10), (10, 1e6)), PLAIN),
-    Case("shape", "stretched, opaque", stretched((0.3, 100), (1, 1e6), logit=(4.6, 14)), STRETCHED),
-    Case("shape", "stretched, faint", stretched((0.3, 100), (1, 1e6), logit=(-5.5, -2.2)), PLAIN),
+    Case("shape", "stretched, opaque", stretched((0.3, 100), (1, 1e6), logit=(4.6, 14), depth=(0.21, 6)), STRETCHED),
+    Case("shape", "stretched, faint", stretched((0.3, 100), (1, 1e6), logit=(-5.5, -2.2), depth=(0.21, 6)), PLAIN),
     Case("shape", "stretched, far", stretched((0.3, 5000), (1, 1e6), logit=(-5.5, 14), depth=(10, 1e4)), STRETCHED),
 ]
 
