@@ -13,8 +13,9 @@ from PIL import Image
 from benchmarks.accuracy import error_chart, popping, sampled_pixels
 from benchmarks.accuracy.error_chart import jpeg_noise, tf32
 from benchmarks.accuracy.sampled_pixels import blended, layers, random_pixels, sorted_view
+from benchmarks.accuracy.splat_shapes import seen
 from benchmarks.accuracy.trained_models import TrainedModel
-from benchmarks.workloads.splat_scenes import PARAMETERS, frustum, settings
+from benchmarks.workloads.splat_scenes import PARAMETERS, frustum, on_device, settings
 from utils.system_utils import UserError
 
 WIDTH, HEIGHT = 40, 31
@@ -40,6 +41,22 @@ def test_colours_are_those_of_the_oracle(projection, antialiasing, monkeypatch):
     assert 1 < used.sum(1).max() <= (found.alpha > 0).sum(1).max()
     again, still = blended(found, view.background, found.depth)
     assert torch.equal(again, colors) and torch.equal(still, used)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("projection", ["ewa", "ray"])
+def test_a_gpu_finds_the_same(projection):
+    if not torch.cuda.is_available():
+        pytest.skip("needs a GPU")
+    camera, colors, splats = settings(WIDTH, HEIGHT, projection=projection), {}, {}
+    for device in ("cpu", "cuda"):
+        gaussians = Gaussians(*(None if values is None else values.to(device) for values in scene()))
+        there = on_device(camera, device)
+        view = sorted_view(gaussians, there, projection)
+        colors[device] = blended(layers(view, random_pixels(there, 50, seed=0)), view.background)[0].cpu()
+        (splats[device],) = (torch.stack([*found[1:]]).cpu() for found in seen(gaussians, there))
+    torch.testing.assert_close(colors["cuda"], colors["cpu"], rtol=0, atol=1e-12)
+    torch.testing.assert_close(splats["cuda"], splats["cpu"], rtol=1e-11, atol=1e-12)
 
 
 def test_a_gaussian_is_largest_on_a_ray_where_its_density_is():

@@ -14,6 +14,7 @@ case covers: for two axes at a time, decades that hold splats of a model and non
 """
 
 import argparse
+import math
 from collections import Counter
 from collections.abc import Iterable
 from itertools import combinations
@@ -71,7 +72,7 @@ def census(model: TrainedModel) -> Census:
         raise UserError(f"no view shows a Gaussian of {model.label}; is this the model of these cameras?")
     axes = axes_of(model.gaussians._replace(scales=model.gaussians.scales.double().exp()))
     by_axis = {
-        "ratio": Sorted((axes[:, 0] / axes[:, 2]).nan_to_num(1.0)),
+        "ratio": Sorted((axes[:, 0] / axes[:, 2]).nan_to_num(1.0, posinf=math.inf)),
         "length": Sorted(longest[longest > 0]),
         "condition": condition,
         "opacity": Sorted(model.gaussians.opacities.double().sigmoid().reshape(-1)),

@@ -134,9 +134,7 @@ def jpeg_noise(path: Path, size: tuple[int, int]) -> Tensor | None:
 def errors_of(model: TrainedModel) -> dict[str, float]:
     """The root mean square of each error over a model's views, steps of 8 bits."""
     squares: dict[str, list[Tensor]] = {}
-    count = len(model.cameras)
-    places = torch.linspace(0, count - 1, min(VIEWS, count)).round().long().unique().tolist()
-    for place in tqdm(places, desc=model.label, unit="view", leave=False):
+    for place in tqdm(model.spread(VIEWS), desc=model.label, unit="view", leave=False):
         camera = model.cameras[place]
         found = list(image_errors(model, camera, seed=place))
         if model.views:

@@ -52,12 +52,6 @@ class Popping(NamedTuple):
     jumps: dict[tuple[str, str], Tensor]  # by motion and order
 
 
-def chosen(model: TrainedModel) -> list[int]:
-    """Places of the views that are measured, all over the list."""
-    count = len(model.cameras)
-    return torch.linspace(0, count - 1, min(VIEWS, count)).round().long().unique().tolist()
-
-
 def extent_of(cameras: list[GaussianRasterizationSettings]) -> float:
     """1.1 times the largest distance of a camera from their middle, as trainings define it."""
     places = torch.stack([camera.campos for camera in cameras])
@@ -124,8 +118,8 @@ def jumps_of(
 def popping(model: TrainedModel, projection: str) -> Popping:
     """Measure a model's pixels."""
     differs, change, jumps = [], [], defaultdict(list)
-    extent, places = extent_of(model.cameras), chosen(model)
-    for place in tqdm(places, desc=f"{model.label}, {projection}", unit="view", leave=False):
+    extent = extent_of(model.cameras)
+    for place in tqdm(model.spread(VIEWS), desc=f"{model.label}, {projection}", unit="view", leave=False):
         camera = model.cameras[place]
         pixels = random_pixels(camera, PIXELS, seed=place)
         view = sorted_view(model.gaussians, camera, projection)

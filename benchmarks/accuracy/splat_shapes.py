@@ -43,21 +43,27 @@ def axes_of(gaussians: Gaussians) -> Tensor:
 
 def seen(gaussians: Gaussians, settings: GaussianRasterizationSettings, raw: bool = True) -> Iterator[Splats]:
     """The splats of a view, chunk by chunk. Gaussians that are not finite are left out."""
-    with torch.device(gaussians.means.device):
+    for start in range(0, len(gaussians.means), ROWS):
+        part = Gaussians(*(None if values is None else values[start : start + ROWS].double() for values in gaussians))
+        found = _seen_at_once(part, settings, raw)
+        yield found._replace(row=found.row + start)
+
+
+def _seen_at_once(part: Gaussians, settings: GaussianRasterizationSettings, raw: bool) -> Splats:
+    with torch.device(part.means.device):  # where the oracle makes its constants
         camera = camera_of(settings)
-        for start in range(0, len(gaussians.means), ROWS):
-            part = Gaussians(*(None if t is None else t[start : start + ROWS].double() for t in gaussians))
-            part = activated(part) if raw else part
-            points = project(part.means, torch.zeros_like(part.means), camera)
-            ellipses = project_shapes(part, points, camera, settings.scale_modifier)
-            xx, xy, yy = ellipses.covariance()
-            determinant = (ellipses.r11 * ellipses.r22).square()
-            largest = (xx + yy) / 2 + torch.sqrt(((xx - yy) / 2).square() + xy * xy)
-            axes, opacity = axes_of(part), part.opacities.reshape(-1)
-            values = [axes[:, 0] / axes[:, 2], largest.sqrt(), largest.square() / determinant, opacity, points.depth]
-            finite = torch.stack([largest, opacity, points.depth, axes[:, 0]]).isfinite().all(0)
-            shown = ((radii(points, ellipses, camera) > 0) & finite).nonzero()[:, 0]
-            yield Splats(shown + start, *(value[shown] for value in values))
+        part = activated(part) if raw else part
+        points = project(part.means, torch.zeros_like(part.means), camera)
+        ellipses = project_shapes(part, points, camera, settings.scale_modifier)
+        shown = radii(points, ellipses, camera) > 0
+    xx, xy, yy = ellipses.covariance()
+    determinant = (ellipses.r11 * ellipses.r22).square()
+    largest = (xx + yy) / 2 + torch.sqrt(((xx - yy) / 2).square() + xy * xy)
+    axes, opacity = axes_of(part), part.opacities.reshape(-1)
+    values = [axes[:, 0] / axes[:, 2], largest.sqrt(), largest.square() / determinant, opacity, points.depth]
+    shown &= torch.stack([largest, opacity, points.depth, axes[:, 0]]).isfinite().all(0)
+    row = shown.nonzero()[:, 0]
+    return Splats(row, *(value[row] for value in values))
 
 
 class Histogram:
@@ -77,7 +83,7 @@ class Histogram:
         """The number below which this share lies: its bin's middle, but the exact least and largest."""
         if share in (0.0, 1.0):
             return self.most if share else self.least
-        place = int(torch.searchsorted(self.counts.cumsum(0), share * int(self.counts.sum())))
+        place = int((self.counts.cumsum(0) < share * int(self.counts.sum())).sum())
         return min(max(10 ** ((place + 0.5) / _PER_DECADE + _LOW), self.least), self.most)
 
     def beyond(self, value: float, below: bool = False) -> float:

@@ -32,6 +32,11 @@ class TrainedModel(NamedTuple):
     def count(self) -> int:
         return len(self.gaussians.means)
 
+    def spread(self, count: int) -> list[int]:
+        """Places of so many cameras, or of all there are, evenly over their list."""
+        last = len(self.cameras) - 1
+        return torch.linspace(0, last, min(count, last + 1)).round().long().unique().tolist()
+
 
 def add_models(parser: argparse.ArgumentParser) -> None:
     """Add the argument `models`, whose words `trained` reads."""
