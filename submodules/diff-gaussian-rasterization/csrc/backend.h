@@ -41,6 +41,13 @@ struct RowMemory {
   template <class T>                                                                                 \
   void blend_rows(const Where&, const BlendInput<T>&, const BlendGradient<T>&, const RowMemory<T>&); \
   template <class T>                                                                                 \
+  void blend_channels(const Where&, const BlendInput<T>&, const Channels<T>&, const Blended<T>&);    \
+  /* The same as blend_rows, and the gradient of the channels' values, (N, count), unless null. The  \
+     first three channels' gradients are in the rows, too, as those of a colour. */                  \
+  template <class T>                                                                                 \
+  void channel_rows(const Where&, const BlendInput<T>&, const Channels<T>&, const BlendGradient<T>&, \
+                    const RowMemory<T>&, T* values);                                                 \
+  template <class T>                                                                                 \
   void mark_decisive(const Where&, const BlendInput<T>&, const int32_t* last, bool* decisive);       \
   template <class T>                                                                                 \
   void adam(const Where&, const AdamInput<T>* tensors, int64_t count, const StepGuard<T>&);          \

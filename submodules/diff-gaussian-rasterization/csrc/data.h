@@ -163,6 +163,25 @@ struct Blended {
   T* layers;         // math/layers.h, for the backward; null allowed, and on the CPU
 };
 
+// Blending takes so many channels at once; of more, there are several passes.
+constexpr int kMostChannels = 32;
+
+// Values that splats show in place of colours, any number of them. Then in a BlendInput the background, in Blended and
+// BlendGradient the color have `count` planes, and there are no inverse depth and no layers.
+template <class T>
+struct Channels {
+  const T* values;  // (N, stride), the first splat's
+  int64_t stride;
+  int64_t count;
+  T cap;       // the largest alpha
+  bool stops;  // whether a gradient ends at the cap
+
+  // A pass over those from `first` on.
+  Channels pass(int64_t first) const {
+    return {values + first, stride, count - first < kMostChannels ? count - first : kMostChannels, cap, stops};
+  }
+};
+
 template <class T>
 struct BlendGradient {
   int64_t count, instance_count, slot_count;

@@ -78,6 +78,21 @@ def _(source, *arguments):
     return rows, splats.new_empty((splats.shape[0],), dtype=torch.int32)
 
 
+@_fake("blend_channels")
+def _(splats, channels, instances, ranges, background, height, width, cap):
+    image = splats.new_empty((channels.shape[1], height, width))
+    return image, splats.new_empty((1, height, width)), splats.new_empty((height, width), dtype=torch.int32)
+
+
+@_fake("channel_rows")
+def _(source, channels, grad_color, grad_transmittance, cap, stops, absolute, wanted):
+    splats = source[0]
+    values = splats.shape[1] - SPLAT_VALUES + MOMENT_VALUES + absolute * ABSOLUTE_VALUES
+    rows = splats.new_empty((library.get_ctx().new_dynamic_size(), values))
+    counts = splats.new_empty((splats.shape[0],), dtype=torch.int32)
+    return rows, counts, splats.new_empty((splats.shape[0] if wanted else 0, channels.shape[1]))
+
+
 @_fake("rasterize_vjp")
 def _(means, opacities, *arguments):
     sh_rest, wanted = arguments[5], arguments[11]
