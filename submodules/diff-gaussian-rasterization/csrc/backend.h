@@ -70,6 +70,8 @@ void list_records(const Executor&, const RecordInput&, const RecordLists&);
 template <class T>
 void sum_runs(const Executor&, const SumInput<T>&);
 template <class T>
+void describe(const Executor&, const DescribeInput<T>&, const Descriptions<T>&);
+template <class T>
 void chain_rows(int64_t count, const T* factors, T* logits, T* log_scales);
 
 // What else the CPU offers. sum_rows: the rest of blend_vjp after blend_rows. project_vjp_step: project_vjp, and every
@@ -97,6 +99,7 @@ void observe(const Queue&, const ObserveInput&);
 void displace(const Queue&, const Displacement&);
 void list_records(const Queue&, const RecordInput&, const RecordLists&);
 void sum_runs(const Queue&, const SumInput<float>&);
+void describe(const Queue&, const DescribeInput<float>&, const Descriptions<float>&);
 // Allocates the gradients; called while the GPU is busy, so that the host's work costs no time.
 struct GradientMemory {
   SceneGradient<float> (*take)(void* context);

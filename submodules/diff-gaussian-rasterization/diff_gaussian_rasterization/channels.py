@@ -51,6 +51,7 @@ def rasterize_channels(
     features: Tensor | None = None,
     depths: Tensor | None = None,
     raw: bool = False,
+    any_rotation: bool = False,
     want_absolute_gradient: bool = False,
     most_alpha: float | None = None,
     **others: Tensor | None,
@@ -58,10 +59,11 @@ def rasterize_channels(
     """Renders Gaussians with C channels: the colours, if there are any, then the features.
 
     features (N, F): further channels, finite; or all of them, where neither colours nor SH are given. depths (N,): what
-    orders the Gaussians, in place of their depths in the view. most_alpha: a larger alpha counts as this one, without a
-    gradient; None: 0.99, where the gradient passes. settings.bg: (C,) or (1,). Differentiable in all of these but
-    depths. Other arguments and errors are those of `rasterize`; absolute gradients need at most 32 channels.
-    Gaussians on the rays of a lens have three channels only: ValueError.
+    orders the Gaussians, in place of their depths in the view. any_rotation: rotations have any length, though others
+    are not raw. most_alpha: a larger alpha counts as this one, without a gradient; None: 0.99, where the gradient
+    passes. settings.bg: (C,) or (1,). Differentiable in all of these but depths. Other arguments and errors are those
+    of `rasterize`; absolute gradients need at most 32 channels. Gaussians on the rays of a lens have three channels
+    only: ValueError.
     """
     gaussians = Gaussians(means, opacities, **others)
     _check(gaussians._asdict() | {"features": features}, means2d, depths, settings)
@@ -86,7 +88,7 @@ def rasterize_channels(
     if len(background) not in (1, count):
         raise ValueError(f"the background must have {count} values, or one for all, got {len(background)}")
     blending = _Blending(most_alpha or _MOST_ALPHA, most_alpha is not None, colored, want_absolute_gradient)
-    scene = scene_arguments(gaussians, settings, raw)
+    scene = scene_arguments(gaussians, settings, 1 if raw else 2 * any_rotation)
     camera = camera_numbers(scene, settings)
     return ChannelImage(*_Channels.apply(blending, depths, camera, means2d, features, background, *scene))
 

@@ -48,7 +48,7 @@ def _blended(like: Tensor, height: int, width: int, inverse_depth: bool, train: 
 
 def _splats(means: Tensor, lens: tuple[float, ...], options: tuple[int, ...]) -> Tensor:
     rays = any(options[5:])
-    values = SPLAT_VALUES + RAY_VALUES * rays + LENS_RAY_VALUES * (rays and len(lens) > 3)
+    values = SPLAT_VALUES + RAY_VALUES * rays + LENS_RAY_VALUES * (rays and len(lens) > 5)
     return means.new_empty((means.shape[0], values))
 
 
@@ -93,6 +93,13 @@ def _(source, channels, grad_color, grad_transmittance, cap, stops, absolute, wa
     return rows, counts, splats.new_empty((splats.shape[0] if wanted else 0, channels.shape[1]))
 
 
+@_fake("describe")
+def _(splats, depths, tile_counts):
+    count = splats.shape[0]
+    floats = (splats.new_empty((count, *row)) for row in ((2,), (), (3,), ()))
+    return splats.new_empty((count, 2), dtype=torch.int32), *floats
+
+
 @_fake("rasterize_vjp")
 def _(means, opacities, *arguments):
     sh_rest, wanted = arguments[5], arguments[11]
@@ -106,7 +113,7 @@ def _(means, opacities, *arguments):
 def _(means, *arguments):
     lens = arguments[10]
     blocks = -(-means.shape[0] // SLEEP_BLOCK)
-    return means.new_empty((blocks, CAMERA_NUMBERS[len(lens) > 3]), dtype=torch.float64)
+    return means.new_empty((blocks, CAMERA_NUMBERS[len(lens) > 5]), dtype=torch.float64)
 
 
 @_fake("sum_blocks")

@@ -11,6 +11,7 @@ namespace cuda {
 
 namespace {
 
+constexpr int kRowBatch = 32;                             // splats whose rows are written at once
 constexpr int32_t kChunkOfFew = 256, kChunkOfMany = 512;  // splats, in an image of few tiles and of many
 
 // A lane has fewer pixels where each takes many registers.
@@ -97,9 +98,58 @@ __device__ __forceinline__ float warp_sum(const float (&v)[kCount], int first, i
   }
 }
 
+template <int kCount>
+__device__ __forceinline__ void warp_sums(const float (&v)[kCount], float* sums) {
+  int value;
+  const float sum = warp_sum(v, 0, kCount, value);
+  if (value >= 0) sums[value] = sum;
+}
+
 // Geometry's sums: moments, those of rays, and those of absolute gradients.
 template <int kRays, bool kAbsolute>
 constexpr int kShapes = 6 + (kRays ? kRayValues : 0) + (kAbsolute ? kAbsoluteValues : 0);
+
+// Leaves the sums of a splat's geometry over a warp's pixels in `sums`.
+template <bool kAbsolute, class Splat, class Row, class Moments>
+__device__ __forceinline__ void sum_shapes(const Splat& splat, const Row& row, const Moments& moments, float absolute_u,
+                                           float absolute_uv, float* sums) {
+  constexpr int kRays = std::is_same_v<Splat, LocalSplat<float>> ? kNoRays : kPinholeRays;
+  constexpr int kOwn = kShapes<kRays, kAbsolute>;
+  float shape[kOwn];
+  const auto keep = [&](const auto& all) {
+#pragma unroll
+    for (int i = 0; i < kOwn; ++i) shape[i] = all[i];
+  };
+  if constexpr (kRays != kNoRays) {
+    const RayMoments<float> rays = moments.moments(row, splat);
+    const auto& m = rays.on_image;
+    const float all[] = {m.q, m.qu, m.qv, m.quu, m.quv, m.qvv, rays.pu, rays.pv, rays.pp, 0, absolute_u, absolute_uv};
+    keep(all);
+  } else {
+    const auto m = moments.moments(row);
+    const float all[] = {m.q, m.qu, m.qv, m.quu, m.quv, m.qvv, absolute_u, absolute_uv};
+    keep(all);
+  }
+  warp_sums(shape, sums);
+}
+
+// The same of its channels.
+template <class L, int kWidth>
+__device__ __forceinline__ void sum_channels(const ChannelPixels<L, kWidth>& pixels, const float (&weight)[L::kRun],
+                                             float* sums) {
+  constexpr int kGroup = kWidth < 16 ? kWidth : 16;  // of more, a lane's registers would not hold the sums
+#pragma unroll
+  for (int c = 0; c < kWidth; c += kGroup) {
+    float shown[kGroup];
+#pragma unroll
+    for (int i = 0; i < kGroup; ++i) {
+      shown[i] = weight[0] * pixels.gradient[0][c + i];
+#pragma unroll
+      for (int p = 1; p < L::kRun; ++p) shown[i] += weight[p] * pixels.gradient[p][c + i];
+    }
+    warp_sums(shown, sums + c);
+  }
+}
 
 // Steps the lanes over splat k of the batch, whose first splat is the chunk's splat `first`, and leaves the sums over
 // the warp's pixels in `sums`: geometry's, then the channels'.
@@ -109,7 +159,7 @@ __device__ __forceinline__ void splat_gradient(const Batch<kBatch, kRays>& batch
                                                const ChannelPixels<L, kWidth>& pixels, const Channels<float>& pass,
                                                const L& at, int k, int first, float (&transmittance)[L::kRun],
                                                float (&behind)[L::kRun], float* sums) {
-  constexpr int kRun = L::kRun, kOwn = kShapes<kRays, kAbsolute>;
+  constexpr int kRun = L::kRun;
   const auto splat = batch.local(k);
   const auto row = terms_of(splat, at.y);
   float exponent[kRun], weight[kRun], value[kRun];
@@ -140,39 +190,8 @@ __device__ __forceinline__ void splat_gradient(const Batch<kBatch, kRays>& batch
       absolute_u += fabsf(q * by.x), absolute_uv += fabsf(q * (splat.l12 * by.x + splat.l22 * by.y));
     }
   }
-  const auto sum_up = [&](const auto& v, int begin, int end) {
-    int place;
-    const float sum = warp_sum(v, begin, end, place);
-    if (place >= 0) sums[place] = sum;
-  };
-  float shape[kOwn];
-  const auto keep = [&](const auto& all) {
-#pragma unroll
-    for (int i = 0; i < kOwn; ++i) shape[i] = all[i];
-  };
-  if constexpr (kRays != kNoRays) {
-    const RayMoments<float> rays = moments.moments(row, splat);
-    const Moments<float>& m = rays.on_image;
-    const float all[] = {m.q, m.qu, m.qv, m.quu, m.quv, m.qvv, rays.pu, rays.pv, rays.pp, 0, absolute_u, absolute_uv};
-    keep(all);
-  } else {
-    const Moments<float> m = moments.moments(row);
-    const float all[] = {m.q, m.qu, m.qv, m.quu, m.quv, m.qvv, absolute_u, absolute_uv};
-    keep(all);
-  }
-  sum_up(shape, 0, kOwn);
-  constexpr int kGroup = kWidth < 16 ? kWidth : 16;  // of more, a lane's registers would not hold the sums
-#pragma unroll
-  for (int c = 0; c < kWidth; c += kGroup) {
-    float shown[kGroup];
-#pragma unroll
-    for (int i = 0; i < kGroup; ++i) {
-      shown[i] = weight[0] * pixels.gradient[0][c + i];
-#pragma unroll
-      for (int p = 1; p < kRun; ++p) shown[i] += weight[p] * pixels.gradient[p][c + i];
-    }
-    sum_up(shown, kOwn + c, kOwn + c + kGroup);
-  }
+  sum_shapes<kAbsolute>(splat, row, moments, absolute_u, absolute_uv, sums);
+  sum_channels(pixels, weight, sums + kShapes<kRays, kAbsolute>);
 }
 
 // Computes the layers of all chunks but the first of each tile, a block each.
@@ -226,6 +245,32 @@ __global__ void __launch_bounds__(Layout<2>::kThreads)
   for (int p = 0; p < kRun; ++p) to[at.column(p)] = {value[p], transmittance[p]};
 }
 
+// Writes the rows of a batch from the sums of a block's warps.
+template <int kRays, int kWidth, bool kAbsolute>
+__device__ void write_rows(const float* sums, const int64_t* row_of, int count, int64_t channels,
+                           const PassRows& rows) {
+  using L = LayoutOf<kWidth>;
+  constexpr int kOwn = kShapes<kRays, kAbsolute>, kValues = kOwn + kWidth;
+  constexpr int kRow = kGradientRow<kRays> + (kAbsolute ? kAbsoluteValues : 0);
+  constexpr int kColors = kRow - kOwn;  // after the moments
+  const auto sum_of = [&](int k, int value) {
+    float sum = 0;
+    for (int w = 0; w < L::kWarps; ++w) sum += sums[(w * kRowBatch + k) * kValues + value];
+    return sum;
+  };
+  for (int i = threadIdx.x; i < count * kRow; i += L::kThreads) {
+    const int k = i / kRow, v = i % kRow, channel = v - 6;
+    float* to = rows.shapes + kRow * row_of[k] + v;
+    if (v < 6 || channel >= kColors)
+      *to = sum_of(k, v < 6 ? v : v - kColors) + (rows.adds ? *to : 0);
+    else if (!rows.adds)
+      *to = channel < 3 && channel < channels ? sum_of(k, kOwn + channel) : 0;
+  }
+  if (rows.channels)
+    for (int i = threadIdx.x; i < count * kWidth; i += L::kThreads)
+      rows.channels[kWidth * row_of[i / kWidth] + i % kWidth] = sum_of(i / kWidth, kOwn + i % kWidth);
+}
+
 // Walks each chunk back to front, a block each, and writes its rows.
 template <int kRays, int kWidth, bool kAbsolute>
 __global__ void __launch_bounds__(LayoutOf<kWidth>::kThreads)
@@ -234,9 +279,7 @@ __global__ void __launch_bounds__(LayoutOf<kWidth>::kThreads)
                         PassRows rows) {
   if (!begin_work(halted)) return;
   using L = LayoutOf<kWidth>;
-  constexpr int kBatch = 32, kOwn = kShapes<kRays, kAbsolute>, kValues = kOwn + kWidth;
-  constexpr int kRow = kGradientRow<kRays> + (kAbsolute ? kAbsoluteValues : 0);
-  constexpr int kColors = kRow - kOwn;  // after the moments
+  constexpr int kBatch = kRowBatch, kValues = kShapes<kRays, kAbsolute> + kWidth;
   __shared__ Batch<kBatch, kRays> batch;
   __shared__ ChannelBatch<kBatch, kWidth> channels;
   __shared__ float sums[L::kWarps * kBatch * kValues];
@@ -271,22 +314,7 @@ __global__ void __launch_bounds__(LayoutOf<kWidth>::kThreads)
                                   own + k * kValues);
       }
     __syncthreads();
-    const auto sum_of = [&](int k, int value) {
-      float sum = 0;
-      for (int w = 0; w < L::kWarps; ++w) sum += sums[(w * kBatch + k) * kValues + value];
-      return sum;
-    };
-    for (int i = threadIdx.x; i < count * kRow; i += L::kThreads) {
-      const int k = i / kRow, v = i % kRow, channel = v - 6;
-      float* to = rows.shapes + kRow * row_of[k] + v;
-      if (v < 6 || channel >= kColors)
-        *to = sum_of(k, v < 6 ? v : v - kColors) + (rows.adds ? *to : 0);
-      else if (!rows.adds)
-        *to = channel < 3 && channel < pass.count ? sum_of(k, kOwn + channel) : 0;
-    }
-    if (rows.channels)
-      for (int i = threadIdx.x; i < count * kWidth; i += L::kThreads)
-        rows.channels[kWidth * row_of[i / kWidth] + i % kWidth] = sum_of(i / kWidth, kOwn + i % kWidth);
+    write_rows<kRays, kWidth, kAbsolute>(sums, row_of, count, pass.count, rows);
   }
 }
 

@@ -764,7 +764,7 @@ void test_given_covariances_and_colors() {
       covariances.push_back(diagonal ? std::exp(2 * p.scales[i]) : 0);
   }
   gs::Scene<float> scene = scene_of(p, {40, 24}, false);
-  scene.raw = false;
+  scene.raw = scene.any_rotation = false;
   scene.scales = scene.rotations = scene.sh_dc = scene.sh_rest = nullptr, scene.rest_bands = 0;
   scene.cov3d = covariances.data(), scene.colors = colors.data();
   gs::SceneGradient<float> g{};

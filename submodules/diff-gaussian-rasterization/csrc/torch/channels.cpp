@@ -69,6 +69,34 @@ std::tuple<Tensor, Tensor, Tensor> channel_rows_op(List<Tensor> source, const Te
   return {rows, counts, gradient};
 }
 
+// Splats as programs for gsplat know them, zeros where they have no tile (math/describe.h).
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> describe_op(const Tensor& splats, const Tensor& depths,
+                                                               const Tensor& tile_counts) {
+  check_splats(splats);
+  const int64_t n = splats.size(0);
+  check_tensor(depths, "depths", splats.scalar_type(), splats.device(), {n});
+  check_counts(tile_counts, n, splats.device());
+  const Tensor rows = packed(splats), from = packed(depths), counts = packed(tile_counts);
+  const Tensor radii = empty<int32_t>({n, 2}, splats), centers = empty({n, 2}, splats), to = empty({n}, splats);
+  const Tensor conics = empty({n, 3}, splats), opacities = empty({n}, splats);
+  with_scalar(splats.scalar_type(), [&](auto zero) {
+    using T = decltype(zero);
+    const gs::DescribeInput<T> in{n, int(splats.size(1)), read<T>(rows), read<T>(from), read<int32_t>(counts)};
+    const gs::Descriptions<T> out{write<int32_t>(radii), write<T>(centers), write<T>(to), write<T>(conics),
+                                  write<T>(opacities)};
+    if (!splats.is_cuda()) return gs::describe(gs::torch_executor(), in, out);
+#ifdef GS_CUDA
+    if constexpr (std::is_same_v<T, float>) {
+      gs::TorchQueue queue(splats.device());
+      gs::cuda::describe(queue.queue(), in, out);
+      return;
+    }
+#endif
+    GS_CHECK(false, kFloatAlone);
+  });
+  return {radii, centers, to, conics, opacities};
+}
+
 }  // namespace
 
 GS_OPERATORS(diff_gaussian_rasterization, m) {
@@ -80,6 +108,10 @@ GS_OPERATORS(diff_gaussian_rasterization, m) {
       "channel_rows(Tensor[] source, Tensor channels, Tensor grad_color, Tensor? grad_transmittance, float cap, bool "
       "stops, bool absolute, bool wanted) -> (Tensor rows, Tensor counts, Tensor gradient)",
       TORCH_BOX(&channel_rows_op));
+  m.define(
+      "describe(Tensor splats, Tensor depths, Tensor tile_counts) -> (Tensor radii, Tensor centers, Tensor depths, "
+      "Tensor conics, Tensor opacities)",
+      TORCH_BOX(&describe_op));
 }
 
 }  // namespace gs::ops
