@@ -36,7 +36,10 @@ def main() -> int:
         help="train on these scenes with each fault, and print the PSNR that it costs, instead of tests")  # fmt: skip
     parser.add_argument("--folder", type=Path, default=ROOT / "build" / "mutations", help="of the private copy")
     args = parser.parse_args()
-    check(ROOT)
+    try:
+        check(ROOT)
+    except ValueError as error:
+        parser.error(str(error))
     chosen = [fault for fault in FAULTS if not args.names or any(name in fault.name for name in args.names)]
     copy = PrivateCopy(args.folder)
     return _costs(copy, chosen, [scene.resolve() for scene in args.psnr]) if args.psnr else _found(copy, chosen)
