@@ -138,7 +138,9 @@ def test_absolute_gradients_are_those_of_four_channels(device):
         ({"means2d": torch.zeros(50, 2)}, r"means2d must be \(50, 3\) of torch.float32, got \(50, 2\)"),
         ({"debug": True, "features": torch.full((50, 4), torch.nan)}, "features has 200 values that are not finite"),
         ({"background": torch.zeros(2)}, "the background must have 4 values"),
-        ({"want_absolute_gradient": True, "features": torch.zeros(50, 5)}, "at most 4 channels, got 5"),
+        ({"want_absolute_gradient": True, "features": torch.zeros(50, 33)}, "at most 32 channels, got 33"),
+        ({"features": torch.zeros(50, 0), "background": torch.zeros(1)}, "features must have a channel"),
+        ({"most_alpha": 1.0}, "most_alpha must be above 1/255 and below 1, got 1.0"),
     ],
 )
 def test_wrong_inputs_are_named(change, words):

@@ -32,7 +32,8 @@ class Inputs:
 
         self.means, self.quats = 1.2 * normal(count, 3), normal(count, 4)
         self.scales = (0.7 * normal(count, 3) - 1.8).exp()
-        self.opacities = 0.98 * torch.rand(count, generator=generator, dtype=DOUBLE) + 0.005
+        opaque = 1.1 * torch.rand(count, generator=generator, dtype=DOUBLE) + 0.005
+        self.opacities = opaque.clamp_max(1.0)
         self.colors = normal(count, channels) if degree is None else 0.3 * normal(count, 16, 3)
         self.degree, self.backgrounds = degree, normal(CAMERAS, 3 if degree is not None else channels)
         self.views = torch.eye(4, dtype=DOUBLE).repeat(CAMERAS, 1, 1)
@@ -61,7 +62,7 @@ class Inputs:
 NAMES = ("means", "quats", "scales", "opacities", "colors", "views")
 
 
-def composited(given: Inputs, mode: str, antialiased: bool) -> tuple[Tensor, Tensor]:
+def composited(given: Inputs, mode: str, antialiased: bool, eps2d: float) -> tuple[Tensor, Tensor]:
     """Images and alphas of pinholes, pixel by pixel (Zwicker et al. 2001; Kerbl et al. 2023)."""
     y, x = torch.meshgrid(*(torch.arange(n, dtype=DOUBLE) + 0.5 for n in (HEIGHT, WIDTH)), indexing="ij")
     images, alphas = [], []
@@ -77,12 +78,12 @@ def composited(given: Inputs, mode: str, antialiased: bool) -> tuple[Tensor, Ten
         J = torch.stack([K[0, 0] / depth, zero, -K[0, 0] * t[0] / depth,
                          zero, K[1, 1] / depth, -K[1, 1] * t[1] / depth], 1).view(-1, 2, 3)  # fmt: skip
         flat = J @ R @ R.mT @ J.mT
-        wide = flat + 0.3 * torch.eye(2, dtype=DOUBLE)
+        wide = flat + eps2d * torch.eye(2, dtype=DOUBLE)
         opacity = given.opacities * ((flat.det() / wide.det()).clamp_min(0).sqrt() if antialiased else 1)
         dx, dy = (K[i, i] * at[:, i] / depth + K[i, 2] - p.reshape(-1, 1) for i, p in enumerate((x, y)))
         inverse = wide.inverse()
         power = 0.5 * (inverse[:, 0, 0] * dx**2 + inverse[:, 1, 1] * dy**2) + inverse[:, 0, 1] * dx * dy
-        alpha = (opacity * (-power).exp()).clamp_max(0.99)
+        alpha = (opacity * (-power).exp()).clamp_max(0.999)
         alpha = torch.where((alpha >= 1 / 255) & (depth > 0.01), alpha, 0)
         order = depth.detach().argsort()
         alpha = alpha[:, order]
@@ -106,13 +107,14 @@ def composited(given: Inputs, mode: str, antialiased: bool) -> tuple[Tensor, Ten
 
 @pytest.mark.parametrize(
     ("mode", "antialiased", "form"),
-    list(itertools.product(MODES, (False, True), ((3, None), (7, None), (3, 2)))),
+    list(itertools.product(MODES, (False, True), ((3, None), (7, None), (37, None), (3, 2)))),
 )
 def test_images_and_gradients_are_those_of_plain_compositing(mode, antialiased, form):
-    for seed in range(2):
+    for seed, eps2d in enumerate((0.3, 0.05)):
         given = Inputs(seed, *form)
-        expected = composited(given, mode, antialiased)
-        found = given.draw(render_mode=mode, rasterize_mode="antialiased" if antialiased else "classic")[:2]
+        expected = composited(given, mode, antialiased, eps2d)
+        options = {"rasterize_mode": "antialiased" if antialiased else "classic", "eps2d": eps2d}
+        found = given.draw(render_mode=mode, **options)[:2]
         pairs = dict(zip(("image", "alpha"), zip(found, expected, strict=True), strict=True))
         both = [given.gradients(*images) for images in (found, expected)]
         for name, (got, wanted) in (pairs | {n: (both[0][n], both[1][n]) for n in NAMES}).items():
@@ -126,9 +128,9 @@ def test_meta_has_what_strategies_read():
     given = Inputs(1)
     _, _, meta = given.draw(packed=False)
     at = torch.stack([given.means @ view[:3, :3].T + view[:3, 3] for view in given.views])
-    assert torch.allclose(meta["depths"], at[..., 2])
     projected = at @ given.Ks.mT
     shown = (meta["radii"] > 0).all(-1)
+    assert torch.allclose(meta["depths"], at[..., 2] * shown)
     assert meta["radii"].dtype == torch.int32 and 20 < shown.sum() < shown.numel()
     assert torch.allclose(meta["means2d"][shown], (projected[..., :2] / projected[..., 2:])[shown])
     wide = torch.linalg.inv(meta["conics"][shown][:, [0, 1, 1, 2]].view(-1, 2, 2))
@@ -159,6 +161,18 @@ def test_means2d_gets_its_gradient_in_pixels(packed):
     image.square().sum().backward()
     # A camera that is moved along x moves all means on the image, and nothing else to first order but their shapes.
     assert torch.allclose(meta["means2d"].grad, gradient)
+
+
+def test_sparse_gradients_have_the_rows_that_are_shown():
+    grads = []
+    for sparse in (False, True):
+        given = Inputs(2, count=200)
+        image, _, meta = given.draw(sparse_grad=sparse)
+        image.square().sum().backward()
+        grads.append([given.wanted[name].grad for name in ("means", "quats", "scales")])
+    for dense, sparse in zip(*grads, strict=True):
+        assert sparse.is_sparse and torch.equal(sparse.to_dense(), dense)
+        assert torch.equal(sparse.coalesce().indices()[0], meta["gaussian_ids"].unique()) and sparse._nnz() < 200
 
 
 def test_leading_batches_and_colours_of_each_camera():
@@ -279,10 +293,10 @@ def test_an_orthographic_image_does_not_depend_on_depth(dtype):
     [
         ({"with_ut": True}, "with_ut is not supported; take camera_model='fisheye'"),
         ({"distributed": True}, "train with torchrun"),
-        ({"sparse_grad": True}, "gradients are dense"),
+        ({"sparse_grad": True, "packed": False}, "sparse_grad needs packed=True"),
         ({"radial_coeffs": torch.zeros(2, 4)}, "radial_coeffs is not supported"),
         ({"camera_model": "ftheta"}, "camera_model 'ftheta' is not supported"),
-        ({"eps2d": 0.1}, "eps2d must be 0.3"),
+        ({"eps2d": 1.5}, "eps2d must be 0 to 1 px.2, got 1.5"),
         ({"render_mode": "N"}, "render_mode must be one of RGB, D"),
         ({"rasterize_mode": "sharp"}, "rasterize_mode must be"),
         ({"backgrounds": torch.zeros(1, 3, dtype=DOUBLE)}, r"backgrounds must be \(2, 3\), got \(1, 3\)"),

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, reference
+from diff_gaussian_rasterization.lens import Lens
 from rasterizer_tools import activated, error, leaves, loss_of, render, rigid
 from torch import Tensor
 
@@ -107,6 +108,28 @@ def test_outputs_and_gradients_agree_with_the_oracle(dtype, kind, camera, antial
     allowed = 0 if dtype == torch.float64 else (wanted[0].radii > 1e4).sum()
     assert (difference > 0).sum() <= allowed
     assert (difference <= 1).all()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"dilation": 0.05},
+        {"near": 2.5},
+        {"near": 4.0, "lens": Lens("equidistant", (60.0, 60.0), (23.5, 19.0))},
+        {"dilation": 0.0, "antialiasing": True},
+        {"dilation": 0.9, "antialiasing": True, "projection": "ray"},
+        {"dilation": 0.1, "lens": Lens("equidistant", (60.0, 60.0), (23.5, 19.0)), "projection": "ray"},
+    ],
+    ids=lambda changes: " ".join(map(str, changes)),
+)
+def test_another_dilation_and_near_plane(changes):
+    parameters = _parameters("ordinary", "plain")
+    camera = settings(*SIZE, torch.float64, **changes)
+    wanted = _evaluate(parameters, torch.float64, camera, function=reference.render)
+    got = _evaluate(parameters, torch.float64, camera, wanted[1])
+    _compare(got, wanted, 1e-12, str(changes))
+    usual = _evaluate(parameters, torch.float64, camera._replace(dilation=0.3, near=0.2), wanted[1])[0]
+    assert (usual.color - got[0].color).abs().max() > 1e-3
 
 
 def _activated(covariances: bool) -> dict[str, Tensor]:

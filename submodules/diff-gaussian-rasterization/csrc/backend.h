@@ -41,6 +41,13 @@ struct RowMemory {
   template <class T>                                                                                 \
   void blend_rows(const Where&, const BlendInput<T>&, const BlendGradient<T>&, const RowMemory<T>&); \
   template <class T>                                                                                 \
+  void blend_channels(const Where&, const BlendInput<T>&, const Channels<T>&, const Blended<T>&);    \
+  /* The same as blend_rows, and the gradient of the channels' values, (N, count), unless null. The  \
+     first three channels' gradients are in the rows, too, as those of a colour. */                  \
+  template <class T>                                                                                 \
+  void channel_rows(const Where&, const BlendInput<T>&, const Channels<T>&, const BlendGradient<T>&, \
+                    const RowMemory<T>&, T* values);                                                 \
+  template <class T>                                                                                 \
   void mark_decisive(const Where&, const BlendInput<T>&, const int32_t* last, bool* decisive);       \
   template <class T>                                                                                 \
   void adam(const Where&, const AdamInput<T>* tensors, int64_t count, const StepGuard<T>&);          \
@@ -62,6 +69,8 @@ void displace(const Executor&, const Displacement&);
 void list_records(const Executor&, const RecordInput&, const RecordLists&);
 template <class T>
 void sum_runs(const Executor&, const SumInput<T>&);
+template <class T>
+void describe(const Executor&, const DescribeInput<T>&, const Descriptions<T>&);
 template <class T>
 void chain_rows(int64_t count, const T* factors, T* logits, T* log_scales);
 
@@ -90,6 +99,7 @@ void observe(const Queue&, const ObserveInput&);
 void displace(const Queue&, const Displacement&);
 void list_records(const Queue&, const RecordInput&, const RecordLists&);
 void sum_runs(const Queue&, const SumInput<float>&);
+void describe(const Queue&, const DescribeInput<float>&, const Descriptions<float>&);
 // Allocates the gradients; called while the GPU is busy, so that the host's work costs no time.
 struct GradientMemory {
   SceneGradient<float> (*take)(void* context);

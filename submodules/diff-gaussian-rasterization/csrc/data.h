@@ -31,6 +31,18 @@ struct Lens {
 };
 constexpr int kLensNumbers = 22;
 
+// What is added to both variances on the image, so that a splat covers at least a pixel.
+template <class T>
+struct Dilation {
+  T area;       // px^2, at most 1
+  T exponents;  // area over kHalfLog2e
+};
+constexpr double kUsualNear = 0.2, kUsualDilation = 0.3;
+template <class T>
+constexpr Dilation<T> dilation_of(double area) {
+  return {T(area), T(area / (0.5 / 0.693147180559945309417))};
+}
+
 // How pixels see Gaussians: by EWA, or on their rays (math/ray.h), those of a pinhole or of a lens (math/lens_rays.h).
 enum Rays : int { kNoRays, kPinholeRays, kLensRays };
 
@@ -62,6 +74,9 @@ struct Scene {
   int64_t listed = 0;
   Lens<T> lens = {};
   bool on_rays = false;  // in place of EWA
+  Dilation<T> dilation = dilation_of<T>(kUsualDilation);
+  T near = T(kUsualNear);     // culled at or below this depth in the view
+  bool any_rotation = false;  // whether rotations have any length, as raw ones have
 
   GS_HD Rays rays() const { return !on_rays ? kNoRays : lens.chart == Chart::kPinhole ? kPinholeRays : kLensRays; }
   // Rows of what is made of the Gaussians: a row for each, or for those of the listed blocks alone.
@@ -163,6 +178,25 @@ struct Blended {
   T* layers;         // math/layers.h, for the backward; null allowed, and on the CPU
 };
 
+// Blending takes so many channels at once; of more, there are several passes.
+constexpr int kMostChannels = 32;
+
+// Values that splats show in place of colours, any number of them. Then in a BlendInput the background, in Blended and
+// BlendGradient the color have `count` planes, and there are no inverse depth and no layers.
+template <class T>
+struct Channels {
+  const T* values;  // (N, stride), the first splat's
+  int64_t stride;
+  int64_t count;
+  T cap;       // the largest alpha
+  bool stops;  // whether a gradient ends at the cap
+
+  // A pass over those from `first` on.
+  Channels pass(int64_t first) const {
+    return {values + first, stride, count - first < kMostChannels ? count - first : kMostChannels, cap, stops};
+  }
+};
+
 template <class T>
 struct BlendGradient {
   int64_t count, instance_count, slot_count;
@@ -259,6 +293,23 @@ struct RecordLists {
 // Records are counted in blocks of so many splats.
 constexpr int64_t kRecordBlock = 256;
 constexpr int64_t record_blocks(int64_t count) { return (count + kRecordBlock - 1) / kRecordBlock; }
+
+// Splats to be described (math/describe.h), rows of `row` values.
+template <class T>
+struct DescribeInput {
+  int64_t count;
+  int row;
+  const T *splats, *depths;
+  const int32_t* tile_counts;
+};
+template <class T>
+struct Descriptions {
+  int32_t* radii;  // (N, 2) px
+  T* centers;      // (N, 2) px, pixel centres at halves
+  T* depths;       // (N)
+  T* conics;       // (N, 3) xx xy yy of the inverse covariance
+  T* opacities;    // (N)
+};
 
 // Runs of rows that lie side by side, some of which become one row each, the sum of theirs.
 template <class T>

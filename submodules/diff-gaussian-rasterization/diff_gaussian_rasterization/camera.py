@@ -9,7 +9,8 @@ from diff_gaussian_rasterization.scene import Scene
 from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 
 _RAY_LIMIT = 1.3  # kJacobianClamp in csrc/math/constants.h
-_PLAIN = 3  # numbers of Scene.lens without a lens
+_PLAIN = 3  # numbers of Scene.lens before those of a lens
+_VALUES = _PLAIN + 7  # where Lens.values begin
 
 
 def camera_numbers(scene: Scene, settings: GaussianRasterizationSettings) -> Tensor | None:
@@ -26,7 +27,7 @@ def camera_numbers(scene: Scene, settings: GaussianRasterizationSettings) -> Ten
     view, projection, center = (values.to(**double) for values in scene[8:11])
     rows = view[:3, :3].T
     size = torch.tensor(scene.size[::-1], **double)
-    if len(scene.lens) == _PLAIN:
+    if settings.lens is None:
         # The projection's own entries: inverse(view) @ full, by dual rows as in csrc/math/camera.h.
         dual = torch.linalg.cross(rows.roll(-1, 0), rows.roll(-2, 0))
         entries = dual @ projection[:3, :2] / (rows[0] @ dual[0])
@@ -34,7 +35,9 @@ def camera_numbers(scene: Scene, settings: GaussianRasterizationSettings) -> Ten
         own = torch.cat([size / (2 * tangent), (size * (1 + shift) - 1) / 2, size / 2 * entries.diagonal()])
     else:
         own = (
-            torch.tensor(scene.lens[-LENS_VALUES:], **double) if settings.lens_values is None else settings.lens_values
+            torch.tensor(scene.lens[_VALUES : _VALUES + LENS_VALUES], **double)
+            if settings.lens_values is None
+            else settings.lens_values
         )
         own = own.to(**double)
         reach = scene.lens[_PLAIN + 2]

@@ -1,10 +1,8 @@
 """Images of any number of channels, blended over one sorted list: colours, features, depths.
 
-A pass of the kernels blends four channels, in the places of a splat's colour and inverse depth. Projection, sorting and
-the gradients of the Gaussians' shapes are computed once for all passes.
+The kernels blend up to 32 channels at once. Projection and sorting are computed once for all of them.
 """
 
-from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -13,15 +11,13 @@ from torch import Tensor
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.camera import camera_numbers
 from diff_gaussian_rasterization.checks import check_finite, check_tensors
-from diff_gaussian_rasterization.fakes import SPLAT_VALUES
 from diff_gaussian_rasterization.first_order import first_order
 from diff_gaussian_rasterization.gaussians import Gaussians, lists_gaussians
 from diff_gaussian_rasterization.scene import Scene, scene_arguments
 from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 
-_COLORS = 3
-_PASS = 4  # channels of a pass
-_SHOWN = SPLAT_VALUES - _PASS  # where a splat's channels begin, and those of a gradient row
+MOST_CHANNELS = 32  # that are blended at once: kMostChannels in csrc/data.h
+_MOST_ALPHA = 0.99  # kMaxAlpha in csrc/math/constants.h
 _GAUSSIANS = len(Gaussians._fields)
 
 
@@ -36,6 +32,15 @@ class ChannelImage(NamedTuple):
     tile_counts: Tensor  # (N,) int32, tiles that each Gaussian reaches
 
 
+class _Blending(NamedTuple):
+    """How alphas are blended, and what else is wanted."""
+
+    cap: float  # the largest alpha
+    stops: bool  # whether gradients end there
+    colored: bool  # whether colours come before the features
+    absolute: bool  # whether absolute gradients are wanted
+
+
 @lists_gaussians
 def rasterize_channels(
     means: Tensor,
@@ -46,15 +51,19 @@ def rasterize_channels(
     features: Tensor | None = None,
     depths: Tensor | None = None,
     raw: bool = False,
+    any_rotation: bool = False,
     want_absolute_gradient: bool = False,
+    most_alpha: float | None = None,
     **others: Tensor | None,
 ) -> ChannelImage:
     """Renders Gaussians with C channels: the colours, if there are any, then the features.
 
     features (N, F): further channels, finite; or all of them, where neither colours nor SH are given. depths (N,): what
-    orders the Gaussians, in place of their depths in the view. settings.bg: (C,) or (1,). Differentiable in all of
-    these but depths. Other arguments and errors are those of `rasterize`; absolute gradients need at most 4 channels.
-    Gaussians on the rays of a lens have three channels only: ValueError.
+    orders the Gaussians, in place of their depths in the view. any_rotation: rotations have any length, though others
+    are not raw. most_alpha: a larger alpha counts as this one, without a gradient; None: 0.99, where the gradient
+    passes. settings.bg: (C,) or (1,). Differentiable in all of these but depths. Other arguments and errors are those
+    of `rasterize`; absolute gradients need at most 32 channels. Gaussians on the rays of a lens have three channels
+    only: ValueError.
     """
     gaussians = Gaussians(means, opacities, **others)
     _check(gaussians._asdict() | {"features": features}, means2d, depths, settings)
@@ -63,25 +72,25 @@ def rasterize_channels(
     if features.shape[:1] != means.shape[:1] or features.dim() != 2 or features.dtype != means.dtype:
         found = f"{tuple(features.shape)} of {features.dtype}"
         raise ValueError(f"features must be ({len(means)}, F) of {means.dtype}, got {found}")
-    shown = features.shape[1]
-    if gaussians.colors is None and gaussians.sh_dc is None:
-        lacking = max(0, _COLORS - shown)
-        first = torch.nn.functional.pad(features[:, :_COLORS], (0, lacking))
-        gaussians, features = gaussians._replace(colors=first), features[:, _COLORS:]
-    else:
-        shown += _COLORS
-    if want_absolute_gradient and shown > _PASS:
-        raise ValueError(f"absolute gradients need at most {_PASS} channels, got {shown}")
+    colored = gaussians.colors is not None or gaussians.sh_dc is not None
+    count = features.shape[1] + 3 * colored
+    if not count:
+        raise ValueError("features must have a channel where neither colours nor SH are given")
+    if not colored:
+        gaussians = gaussians._replace(colors=means.new_zeros(len(means), 3))  # projection asks for a colour
+    if want_absolute_gradient and count > MOST_CHANNELS:
+        raise ValueError(f"absolute gradients need at most {MOST_CHANNELS} channels, got {count}")
     if settings.projection == "ray" and settings.lens is not None:
         raise ValueError("Gaussians on the rays of a lens have three channels only; take projection='ewa'")
-    scene = scene_arguments(gaussians, settings, raw)
+    if most_alpha is not None and not 1 / 255 < most_alpha < 1:
+        raise ValueError(f"most_alpha must be above 1/255 and below 1, got {most_alpha}")
+    background = settings.bg.to(means).reshape(-1)
+    if len(background) not in (1, count):
+        raise ValueError(f"the background must have {count} values, or one for all, got {len(background)}")
+    blending = _Blending(most_alpha or _MOST_ALPHA, most_alpha is not None, colored, want_absolute_gradient)
+    scene = scene_arguments(gaussians, settings, 1 if raw else 2 * any_rotation)
     camera = camera_numbers(scene, settings)
-    image, transmittance, *rest = _Channels.apply(want_absolute_gradient, depths, camera, means2d, features, *scene)
-    image = image[:shown]
-    background = settings.bg.to(image).reshape(-1)
-    if len(background) not in (1, shown):
-        raise ValueError(f"the background must have {shown} values, or one for all, got {len(background)}")
-    return ChannelImage(image + transmittance * background[:, None, None], transmittance, *rest)
+    return ChannelImage(*_Channels.apply(blending, depths, camera, means2d, features, background, *scene))
 
 
 def _check(
@@ -102,88 +111,49 @@ def _check(
                 check_finite(name, values)
 
 
-def _passes(splats: Tensor, features: Tensor) -> Iterator[tuple[Tensor, int]]:
-    """The splats of each pass, and how many channels it shows."""
-    first = min(features.shape[1], _PASS - _COLORS)
-    if first:
-        splats = splats.clone()
-        splats[:, SPLAT_VALUES - 1] = features[:, 0]
-    yield splats, _COLORS + first
-    for begin in range(first, features.shape[1], _PASS):
-        group = features[:, begin : begin + _PASS]
-        rows = splats.clone()
-        rows[:, _SHOWN : _SHOWN + group.shape[1]] = group
-        yield rows, group.shape[1]
-
-
 class _Channels(torch.autograd.Function):
-    """Inputs: whether absolute gradients are wanted, depths, the camera's numbers, means2d, features, and `Scene`'s."""
+    """Inputs: `_Blending`, depths, the camera's numbers, means2d, features, the background, and `Scene`'s."""
 
     @staticmethod
-    def forward(ctx, absolute, order, camera, means2d, features, *scene):
+    def forward(ctx, blending, order, camera, means2d, features, background, *scene):
         with torch._C._AutoDispatchBelowAutograd():
             given = Scene(*scene)
             splats, depths, rects, tile_counts, radii = OPERATORS.project(*given)
             lists = OPERATORS.bin(splats, depths if order is None else order, rects, tile_counts, *given.size, True)
-            planes, kept = [], []
-            for rows, shown in _passes(splats, features):
-                out = OPERATORS.blend(rows, *lists[:2], rows.new_zeros(3), *given.size, shown == _PASS, True)
-                color, transmittance, last, inverse_depth = *out[:2], out[3], out[2]
-                planes.append(color[:shown] if shown < _PASS else torch.cat([color, inverse_depth]))
-                kept.append(out[4])
-        ctx.absolute, ctx.numbers, ctx.passes = absolute, scene[11:], len(kept)
+            values = torch.cat([splats[:, 6:9], features], 1) if blending.colored else features
+            behind = background.expand(values.shape[1])
+            image, transmittance, last = OPERATORS.blend_channels(
+                splats, values, *lists[:2], behind, *given.size, blending.cap
+            )
+        ctx.blending, ctx.numbers, ctx.background = blending, scene[11:], background.shape
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*scene[:11], splats, features, tile_counts, *lists, last, transmittance, *kept)
+        kept = splats, tile_counts, *lists, last, splats.new_zeros(0), behind, transmittance
+        ctx.save_for_backward(*scene[:11], values, *kept)
         ctx.mark_non_differentiable(radii, splats, depths, tile_counts)
-        return torch.cat(planes), transmittance, radii, splats, depths, tile_counts
+        return image, transmittance, radii, splats, depths, tile_counts
 
     @staticmethod
     @first_order("rasterize_channels")
     def backward(ctx, grad_image, grad_transmittance, *_):
-        saved, needed = ctx.saved_tensors, ctx.needs_input_grad
-        scene = (*saved[:11], *ctx.numbers)
-        splats, features, tile_counts, *lists, last, transmittance = saved[11 : -ctx.passes]
+        blending, needed = ctx.blending, ctx.needs_input_grad
+        scene, values, kept = (*ctx.saved_tensors[:11], *ctx.numbers), ctx.saved_tensors[11], ctx.saved_tensors[12:]
+        splats, tile_counts, last, transmittance = kept[0], kept[1], kept[6], kept[9]
         if grad_image is None:
-            grad_image = splats.new_zeros(_COLORS + features.shape[1], *last.shape)
-        rows, of_features, place = None, [], 0
-        for (one, shown), layers in zip(_passes(splats, features), saved[-ctx.passes :], strict=True):
-            kept = one, tile_counts, *lists, last, layers, splats.new_zeros(3), transmittance
-            planes = _planes(grad_image[place : place + shown])
-            place += shown
-            found, counts = OPERATORS.blend_rows(kept, planes[0], grad_transmittance, planes[1], ctx.absolute)
-            grad_transmittance = None  # counts once
-            begin = SPLAT_VALUES - 1 if rows is None else _SHOWN
-            if needed[4] and begin < _SHOWN + shown:
-                of_features.append(_sums(found[:, begin : _SHOWN + shown], counts))
-            if rows is None:
-                rows = found
-                rows[:, SPLAT_VALUES - 1] = 0  # of a channel, not of a depth
-            else:
-                for sums in (slice(_SHOWN), slice(SPLAT_VALUES, None)):  # the last are those of rays
-                    rows[:, sums] += found[:, sums]
-        source = splats, tile_counts, rows, counts
-        results = [None] * len(needed)
+            grad_image = splats.new_zeros(values.shape[1], *last.shape)
+        rows, counts, of_values = OPERATORS.channel_rows(
+            kept, values, grad_image, grad_transmittance, blending.cap, blending.stops, blending.absolute, needed[4]
+        )
+        source, results = (splats, tile_counts, rows, counts), [None] * len(needed)
         if needed[2]:
-            results[2] = OPERATORS.sum_blocks(OPERATORS.camera_vjp(*scene, source, ctx.absolute))
-        if of_features:
-            results[4] = torch.cat(of_features, 1)
-        places = [3, *range(5, 5 + _GAUSSIANS)]
+            results[2] = OPERATORS.sum_blocks(OPERATORS.camera_vjp(*scene, source, blending.absolute))
+        if needed[4]:
+            results[4] = of_values[:, 3:] if blending.colored else of_values
+        if needed[5]:
+            results[5] = torch.mv(grad_image.flatten(1), transmittance.flatten()).sum_to_size(ctx.background)
+        places = [3, *range(6, 6 + _GAUSSIANS)]
         wanted = [needed[at] for at in places]
         if any(wanted):
-            gradients = OPERATORS.rasterize_vjp(*scene, wanted, source, None, None, None, ctx.absolute)
+            gradients = OPERATORS.rasterize_vjp(*scene, wanted, source, None, None, None, blending.absolute)
             for at, gradient in zip(places, gradients, strict=True):
                 results[at] = gradient if needed[at] else None
         return tuple(results)
-
-
-def _planes(gradient: Tensor) -> tuple[Tensor, Tensor | None]:
-    """The gradients of colour and inverse depth of a pass, from those of its channels."""
-    if len(gradient) == _PASS:
-        return gradient[:_COLORS].contiguous(), gradient[_COLORS:].contiguous()
-    missing = gradient.new_zeros(_COLORS - len(gradient), *gradient.shape[1:])
-    return torch.cat([gradient, missing]), None
-
-
-def _sums(rows: Tensor, counts: Sequence[int]) -> Tensor:
-    """The sum of each splat's rows, which lie side by side."""
-    return torch.segment_reduce(rows.contiguous(), "sum", lengths=counts.long(), axis=0, unsafe=True)

@@ -48,7 +48,7 @@ def _blended(like: Tensor, height: int, width: int, inverse_depth: bool, train: 
 
 def _splats(means: Tensor, lens: tuple[float, ...], options: tuple[int, ...]) -> Tensor:
     rays = any(options[5:])
-    values = SPLAT_VALUES + RAY_VALUES * rays + LENS_RAY_VALUES * (rays and len(lens) > 3)
+    values = SPLAT_VALUES + RAY_VALUES * rays + LENS_RAY_VALUES * (rays and len(lens) > 5)
     return means.new_empty((means.shape[0], values))
 
 
@@ -78,6 +78,28 @@ def _(source, *arguments):
     return rows, splats.new_empty((splats.shape[0],), dtype=torch.int32)
 
 
+@_fake("blend_channels")
+def _(splats, channels, instances, ranges, background, height, width, cap):
+    image = splats.new_empty((channels.shape[1], height, width))
+    return image, splats.new_empty((1, height, width)), splats.new_empty((height, width), dtype=torch.int32)
+
+
+@_fake("channel_rows")
+def _(source, channels, grad_color, grad_transmittance, cap, stops, absolute, wanted):
+    splats = source[0]
+    values = splats.shape[1] - SPLAT_VALUES + MOMENT_VALUES + absolute * ABSOLUTE_VALUES
+    rows = splats.new_empty((library.get_ctx().new_dynamic_size(), values))
+    counts = splats.new_empty((splats.shape[0],), dtype=torch.int32)
+    return rows, counts, splats.new_empty((splats.shape[0] if wanted else 0, channels.shape[1]))
+
+
+@_fake("describe")
+def _(splats, depths, tile_counts):
+    count = splats.shape[0]
+    floats = (splats.new_empty((count, *row)) for row in ((2,), (), (3,), ()))
+    return splats.new_empty((count, 2), dtype=torch.int32), *floats
+
+
 @_fake("rasterize_vjp")
 def _(means, opacities, *arguments):
     sh_rest, wanted = arguments[5], arguments[11]
@@ -91,7 +113,7 @@ def _(means, opacities, *arguments):
 def _(means, *arguments):
     lens = arguments[10]
     blocks = -(-means.shape[0] // SLEEP_BLOCK)
-    return means.new_empty((blocks, CAMERA_NUMBERS[len(lens) > 3]), dtype=torch.float64)
+    return means.new_empty((blocks, CAMERA_NUMBERS[len(lens) > 5]), dtype=torch.float64)
 
 
 @_fake("sum_blocks")

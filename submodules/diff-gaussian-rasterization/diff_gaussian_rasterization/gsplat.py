@@ -3,8 +3,7 @@
     from diff_gaussian_rasterization.gsplat import rasterization
     python -m diff_gaussian_rasterization.gsplat PROGRAM.py [OPTION...]    # runs a program whose gsplat is this one
 
-Names, order, defaults, shapes and results are gsplat's; what it does not have is refused by name. An alpha is at most
-0.99, where gsplat has 0.999, and keeps its gradient there.
+Names, order, defaults, shapes and results are gsplat's; what it does not have is refused by name.
 """
 
 import math
@@ -12,27 +11,24 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from diff_gaussian_rasterization.channels import ChannelImage, rasterize_channels
+from diff_gaussian_rasterization.backend import OPERATORS
+from diff_gaussian_rasterization.channels import rasterize_channels
 from diff_gaussian_rasterization.lens import Lens
 from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 
 MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 MOST_BANDS = 3  # the highest degree of SH
-_NEAR = 0.2  # of the kernels: kNear in csrc/math/constants.h
-_LARGEST = 2.0**20  # a scene enlarged by far more overflows
-_DILATION = 0.3  # kDilation
-_HALF_LOG2E = 0.5 / math.log(2)
-_MIN_ALPHA = 1 / 255
+_ENDLESS = 1e10  # far_plane, if nobody gives one
+_MOST_ALPHA = 0.999
 _FLAT = 2.0**-40  # of depth
-_SIGMAS = 3.33  # of an opaque Gaussian, beyond which its alpha is below 1/255
 _UNSUPPORTED = {
     "distributed": "train with torchrun and train.py",
     "with_ut": "take camera_model='fisheye', or a Lens with rasterize_channels",
     "with_eval3d": "take projection='ray' with rasterize",
-    "sparse_grad": "leave it out: gradients are dense",
 }
 _NEED_UT = ("radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs", "viewmats_rs")
 
@@ -49,7 +45,7 @@ class _Camera(NamedTuple):
     """One camera of a call."""
 
     view: Tensor  # (4, 4) world to view
-    K: Tensor  # (3, 3)
+    numbers: np.ndarray  # (25,) the same, then K (3, 3)
     width: int
     height: int
     model: str
@@ -57,25 +53,31 @@ class _Camera(NamedTuple):
     far: float
 
     def settings(
-        self, scale: float, degree: int, antialiased: bool, background: Tensor
+        self, degree: int, antialiased: bool, dilation: float, background: Tensor
     ) -> GaussianRasterizationSettings:
-        """The settings of a scene that is scaled. All are differentiable in `view`."""
-        view = self.view * torch.cat([self.view.new_ones(4, 3), self.view.new_tensor([[scale]] * 3 + [[1]])], 1)
-        if self.model == "ortho":  # a pinhole for which all is at the same depth, up to rounding
-            view = torch.cat([view[:2], _FLAT * view[2:3] + view.new_tensor([[0, 0, 0, 1]]), view[3:]])
-        (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
-        projection = self.view.new_zeros(4, 4)
-        projection[0, 0], projection[1, 1] = 2 * fx / self.width, 2 * fy / self.height
-        projection[0, 2], projection[1, 2] = 2 * cx / self.width - 1, 2 * cy / self.height - 1
-        projection[2, 2] = projection[3, 2] = 1
+        """The settings, differentiable in `view`."""
+        fx, _, cx, _, fy, cy, *_ = self.numbers[16:].tolist()
+        width, height, focal = self.width, self.height, (fx, fy)
+        rows = [[2 * fx / width, 0, 2 * cx / width - 1, 0], [0, 2 * fy / height, 2 * cy / height - 1, 0]]
+        projection = np.array([*rows, [0, 0, 1, 0], [0, 0, 1, 0]])
+        # An orthographic camera is a pinhole for which all is at the same depth, up to rounding.
+        flat = np.diag([1, 1, _FLAT if self.model == "ortho" else 1, 1])
+        flat[2, 3] = self.model == "ortho"
+        if self.view.requires_grad:
+            view, center = self.view.new_tensor(flat) @ self.view, torch.linalg.inv(self.view)[:3, 3]
+            full = self.view.new_tensor(projection) @ view
+            packed = torch.cat([view.T.flatten(), full.T.flatten(), center])
+        else:  # matrices are made on the host and go to the device in one copy
+            view = self.numbers[:16].reshape(4, 4)
+            center, view = np.linalg.inv(view)[:3, 3], flat @ view
+            packed = torch.from_numpy(np.concatenate([view.T.ravel(), (projection @ view).T.ravel(), center]))
+            packed = packed.to(self.view)
         chart = {"fisheye": partial(_Fisheye, "equidistant"), "ortho": partial(Lens, "perspective")}.get(self.model)
-        lens = chart and chart((fx, fy), (cx - 0.5, cy - 0.5))
-        tangents = self.width / (2 * fx), self.height / (2 * fy)
-        center = scale * torch.linalg.inv(self.view)[:3, 3]
-        full = (projection @ view).T
         return GaussianRasterizationSettings(
-            self.height, self.width, *tangents, background, 1.0, view.T, full, degree, center, False, False,
-            antialiased, lens=lens,
+            height, width, width / (2 * fx), height / (2 * fy), background, 1.0, packed[:16].view(4, 4),
+            packed[16:32].view(4, 4), degree, packed[32:35], False, False, antialiased,
+            lens=chart and chart(focal, (cx - 0.5, cy - 0.5)), dilation=dilation,
+            near=0.0 if self.model == "ortho" else self.near,
         )  # fmt: skip
 
 
@@ -96,12 +98,33 @@ class _Options(NamedTuple):
     degree: int | None  # of SH
     mode: str
     antialiased: bool
+    dilation: float  # px^2
     absgrad: bool
     clip: float  # px
 
 
-class _Projected(NamedTuple):
-    """What gsplat tells of the N Gaussians of an image."""
+class _Sparse(torch.autograd.Function):
+    """The same values, whose gradient has the rows of `shown` alone; that is a list which the rendering fills."""
+
+    @staticmethod
+    def forward(ctx, values: Tensor, shown: list[Tensor]) -> Tensor:
+        ctx.shown = shown
+        return values.view_as(values)
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:
+        rows = torch.cat(ctx.shown).unique()
+        return torch.sparse_coo_tensor(rows[None], gradient[rows], gradient.shape, check_invariants=False), None
+
+
+def _sparse(given: tuple[Tensor | None, ...], shown: list[Tensor], packed: bool) -> Iterator[Tensor | None]:
+    if not packed or given[0].dim() != 2:
+        raise ValueError("sparse_grad needs packed=True, and no batches")
+    return (None if values is None else _Sparse.apply(values, shown) for values in given)
+
+
+class _Described(NamedTuple):
+    """What gsplat tells of the N Gaussians of an image; zeros where they are not shown."""
 
     radii: Tensor  # (N, 2) int32, px
     means2d: Tensor  # (N, 2) px, pixel centres at halves
@@ -109,6 +132,15 @@ class _Projected(NamedTuple):
     conics: Tensor  # (N, 3): xx, xy, yy of the inverse covariance
     opacities: Tensor  # (N,), of antialiased ones with their factor
     tiles: Tensor  # (N,) int32
+
+
+class _Drawn(NamedTuple):
+    """An image, and what the notes need of it."""
+
+    image: Tensor  # (H, W, D)
+    alpha: Tensor  # (H, W, 1)
+    found: _Described
+    probe: Tensor  # (N, 3), which gets the gradient of the means on the image, in NDC
 
 
 def rasterization(
@@ -149,28 +181,33 @@ def rasterization(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Renders N Gaussians with C cameras, and leading batch dimensions, as gsplat 1.5.3 does.
 
-    means (..., N, 3); quats (..., N, 4): w x y z, any length; scales (..., N, 3), or covars (..., N, 3, 3) in place of
-    both; opacities (..., N). colors (..., N, D) or (..., C, N, D); with sh_degree, at most 3, SH (..., N, K, 3) or
+    means (..., N, 3); quats (..., N, 4): w x y z, any length; scales (..., N, 3); or covars (..., N, 3, 3) for both;
+    opacities (..., N). colors (..., N, D) or (..., C, N, D); with sh_degree, at most 3, SH (..., N, K, 3) or
     (..., C, N, K, 3). viewmats (..., C, 4, 4): world to view, differentiable. Ks (..., C, 3, 3): no gradient.
-    near_plane, far_plane: depths that are shown. radius_clip: Gaussians of radii up to it (px) are left out.
-    backgrounds (..., C, D). render_mode: RGB, D (the sum of weights times depth), ED (D over alpha), or both.
-    absgrad: meta["means2d"].absgrad gets absolute gradients, of at most four channels; x has the length of x and y in
-    NDC, times 2 / width, and y is 0. Returns images (..., C, H, W, D), alphas (..., C, H, W, 1) and meta, whose means2d
-    gets a `grad` (px) in backward(). Raises ValueError for what is not supported, and for wrong shapes.
+    near_plane, far_plane: depths that are shown. radius_clip (px): smaller Gaussians are left out. eps2d (px^2): added
+    to variances, 0 to 1. backgrounds (..., C, D). render_mode: D is the sum of weights times depth, ED is D over alpha.
+    sparse_grad: gradients of means, quats and scales are sparse. absgrad: meta["means2d"].absgrad, of at most 32
+    channels; x has the length of x and y in NDC, times 2 / width, and y is 0. Returns images (..., C, H, W, D), alphas
+    (..., C, H, W, 1) and meta, whose means2d gets a `grad` (px). ValueError: what is not supported, and wrong shapes.
     """
-    given = {name: value for name, value in locals().items() if name in _UNSUPPORTED or name in _NEED_UT}
-    _refuse(given, rolling_shutter, render_mode, camera_model, rasterize_mode, eps2d, sh_degree)
+    _refuse(locals())
     given = means, quats, scales, opacities, covars, colors, viewmats, Ks, backgrounds
-    form = (*means.shape[:-2], viewmats.shape[-3] if viewmats.dim() > 2 else 1)
-    options = _Options(sh_degree, render_mode, rasterize_mode == "antialiased", absgrad, radius_clip)
+    shown: list[Tensor] = []
+    given = (*_sparse(given[:3], shown, packed), *given[3:]) if sparse_grad else given
+    form = *means.shape[:-2], viewmats.shape[-3] if viewmats.dim() > 2 else 1
+    options = _Options(sh_degree, render_mode, rasterize_mode == "antialiased", eps2d, absgrad, radius_clip)
+    frame = width, height, camera_model, near_plane, far_plane
     with torch.autocast(means.device.type, enabled=False):  # its products of matrices are of 8 or 11 bits
-        drawn = [
-            _render(_Camera(view, K, width, height, camera_model, near_plane, far_plane), rows, background, options)
-            for rows, view, K, background in _images(*given, form[-1], sh_degree is not None)
-        ]
-    images, alphas, found, probes = zip(*drawn, strict=True)
-    meta = _meta(found, probes, form, (width, height), tile_size, packed, absgrad)
-    return torch.stack(images).unflatten(0, form), torch.stack(alphas).unflatten(0, form), meta
+        images = _images(*given, form[-1], sh_degree is not None)
+        drawn = [_render(_Camera(*view, *frame), rows, background, options) for rows, view, background in images]
+    meta = _meta(drawn, form, (width, height), tile_size, packed, absgrad)
+    shown += [meta["gaussian_ids"]]
+    return *(_together([one[at].contiguous() for one in drawn], form) for at in (0, 1)), meta
+
+
+def _together(parts: Sequence[Tensor], form: tuple[int, ...]) -> Tensor:
+    """Tensors of all images as one."""
+    return parts[0][None] if form == (1,) else torch.stack(parts).unflatten(0, form)
 
 
 def _images(
@@ -185,8 +222,8 @@ def _images(
     backgrounds: Tensor | None,
     cameras: int,
     harmonics: bool,
-) -> Iterator[tuple[_Rows, Tensor, Tensor, Tensor | None]]:
-    """For each image the Gaussians, view, intrinsics and background. ValueError for wrong shapes and types."""
+) -> Iterator[tuple[_Rows, tuple[Tensor, Tensor], Tensor | None]]:
+    """For each image the Gaussians, the first fields of `_Camera`, and the background. ValueError for wrong inputs."""
     batch, count = means.shape[:-2], means.shape[-2]
     if not (cameras and all(batch)):
         raise ValueError(f"there must be an image to render, got batches and cameras {(*batch, cameras)}")
@@ -212,139 +249,121 @@ def _images(
         if values.dtype != means.dtype and name not in ("Ks", "backgrounds"):
             raise ValueError(f"{name} must be {means.dtype} like means, got {values.dtype}")
 
-    def item(values: Tensor | None, axes: int, batch: int) -> Tensor | None:
-        return None if values is None else values.reshape(batches, *values.shape[values.dim() - axes :])[batch]
+    def item(values: Tensor | None, axes: int, at: int) -> Tensor | None:
+        if values is None or not batch:
+            return values
+        return values.reshape(batches, *values.shape[values.dim() - axes :])[at]
 
     batches = math.prod(batch)
+    numbers = torch.cat([viewmats.detach().flatten(-2), Ks.detach().to(viewmats).flatten(-2)], -1)
+    numbers = numbers.double().cpu().numpy().reshape(batches, cameras, -1)
     for at in range(batches):
         rows = [(means, 2), (quats, 2), (scales, 2), (opacities, 1), (covars, 3)]
         own = [item(values, axes, at) for values, axes in rows]
-        shown, views, intrinsics = (
-            item(colors, 2 + harmonics + each, at), item(viewmats, 3, at), item(Ks, 3, at)
-        )  # fmt: skip
-        behind = item(backgrounds, 2, at)
+        shown, views, behind = item(colors, 2 + harmonics + each, at), item(viewmats, 3, at), item(backgrounds, 2, at)
         for n in range(cameras):
-            background = None if behind is None else behind[n]
-            yield _Rows(*own, shown[n] if each else shown), views[n], intrinsics[n], background
+            camera = views[n], numbers[at, n]
+            yield _Rows(*own, shown[n] if each else shown), camera, None if behind is None else behind[n]
 
 
-def _refuse(given: dict, shutter: Any, mode: str, model: str, rasterize_mode: str, eps2d: float, degree: Any) -> None:
+def _refuse(given: dict[str, Any]) -> None:
     for name, remedy in _UNSUPPORTED.items():
         if given[name]:
             raise ValueError(f"{name} is not supported; {remedy}")
     for name in _NEED_UT:
         if given[name] is not None:
             raise ValueError(f"{name} is not supported; {_UNSUPPORTED['with_ut']}")
+    shutter, degree, eps2d = given["rolling_shutter"], given["sh_degree"], given["eps2d"]
     if shutter is not None and getattr(shutter, "name", "GLOBAL") != "GLOBAL":
         raise ValueError("rolling_shutter is not supported; take poses of a global shutter")
-    if mode not in MODES:
-        raise ValueError(f"render_mode must be one of {', '.join(MODES)}, got {mode!r}")
-    if model not in ("pinhole", "fisheye", "ortho"):
-        raise ValueError(f"camera_model {model!r} is not supported; take pinhole, fisheye or ortho")
-    if rasterize_mode not in ("classic", "antialiased"):
-        raise ValueError(f"rasterize_mode must be classic or antialiased, got {rasterize_mode!r}")
-    if eps2d != _DILATION:
-        raise ValueError(f"eps2d must be {_DILATION}, got {eps2d}")
+    if given["render_mode"] not in MODES:
+        raise ValueError(f"render_mode must be one of {', '.join(MODES)}, got {given['render_mode']!r}")
+    if given["camera_model"] not in ("pinhole", "fisheye", "ortho"):
+        raise ValueError(f"camera_model {given['camera_model']!r} is not supported; take pinhole, fisheye or ortho")
+    if given["rasterize_mode"] not in ("classic", "antialiased"):
+        raise ValueError(f"rasterize_mode must be classic or antialiased, got {given['rasterize_mode']!r}")
+    if not 0 <= eps2d <= 1:
+        raise ValueError(f"eps2d must be 0 to 1 px^2, got {eps2d}")
     if degree is not None and not 0 <= degree <= MOST_BANDS:
         raise ValueError(f"sh_degree must be 0 to {MOST_BANDS}, got {degree}")
 
 
-def _render(
-    camera: _Camera, rows: _Rows, background: Tensor | None, options: _Options
-) -> tuple[Tensor, Tensor, _Projected, Tensor]:
-    """An image (H, W, D), its alpha (H, W, 1), what is told of the Gaussians, and the tensor that gets d means2d."""
-    # The kernels cull at 0.2. To show nearer things, enlarge the scene, by a power of two so that no bit changes.
-    nearest = max(camera.near, _NEAR / _LARGEST)
-    scale = 1.0 if camera.model == "ortho" else 2.0 ** max(0, math.ceil(math.log2(_NEAR / nearest)))
-    depth = rows.means @ camera.view[2, :3] + camera.view[2, 3]
-    visible = ((depth > camera.near) & (depth < camera.far)).detach()
-    gaussians, features = _scaled(rows, scale, options), []
+def _render(camera: _Camera, rows: _Rows, background: Tensor | None, options: _Options) -> _Drawn:
+    gaussians, features, depth = _shapes(rows, options), [], None
+    cuts = camera.model != "pinhole" or camera.far < _ENDLESS  # the kernels know the near plane of a pinhole alone
+    with_depth = options.mode.endswith("D")
+    if cuts or with_depth:
+        depth = rows.means @ camera.view[2, :3] + camera.view[2, 3]
     if options.mode.startswith("RGB") and options.degree is None:
         features.append(rows.colors)
-    if options.mode.endswith("D"):
+    if with_depth:
         features.append(depth[:, None])
-    count = sum(part.shape[1] for part in features) + 3 * ("sh_dc" in gaussians)
-    behind = rows.means.new_zeros(count)  # also of depth
+    behind = rows.means.new_zeros(1)  # also of depth
     if background is not None and options.mode.startswith("RGB"):
-        behind = torch.nn.functional.pad(background, (0, options.mode.endswith("D")))
+        behind = torch.nn.functional.pad(background, (0, 1)) if with_depth else background
+    opacities = rows.opacities
+    if cuts:
+        opacities = torch.where((depth > camera.near) & (depth < camera.far), opacities, 0)
     wanted = any(values is not None and values.requires_grad for values in (*rows, camera.view, background))
-    probe = torch.zeros_like(rows.means, requires_grad=wanted and torch.is_grad_enabled())
+    probe = torch.empty_like(rows.means).requires_grad_(wanted and torch.is_grad_enabled())
+    settings = camera.settings(options.degree or 0, options.antialiased, options.dilation, behind)
     out = rasterize_channels(
-        rows.means * scale,
+        rows.means,
         probe,
-        torch.where(visible, rows.opacities, 0),
-        camera.settings(scale, options.degree or 0, options.antialiased, behind),
-        features=torch.cat(features, 1) if features else None,
-        depths=depth.detach(),
+        opacities,
+        settings,
+        features=(features[0] if len(features) == 1 else torch.cat(features, 1)) if features else None,
+        depths=depth.detach() if cuts else None,
+        any_rotation=True,
         want_absolute_gradient=options.absgrad,
+        most_alpha=_MOST_ALPHA,
         **gaussians,
     )
-    projected = _projected(out, depth.detach(), visible)
-    small = (projected.radii > 0).all(1) & (projected.radii <= options.clip).all(1)
-    if options.clip > 0 and small.any():
-        rest = rows._replace(opacities=torch.where(small, 0, rows.opacities))
-        return _render(camera, rest, background, options._replace(clip=0.0))
-    image, alpha = out.image.permute(1, 2, 0), 1 - out.transmittance.permute(1, 2, 0)
+    depths = depth.detach() if cuts else out.depths
+    found = _Described(*OPERATORS.describe(out.splats, depths, out.tile_counts), out.tile_counts)
+    if options.clip > 0:
+        small = (found.radii > 0).all(1) & (found.radii <= options.clip).all(1)
+        if small.any():
+            rest = rows._replace(opacities=torch.where(small, 0, rows.opacities))
+            return _render(camera, rest, background, options._replace(clip=0.0))
+    image, alpha = out.image.permute(1, 2, 0), (1 - out.transmittance).view(camera.height, camera.width, 1)
     if options.mode.endswith("ED"):
         image = torch.cat([image[..., :-1], image[..., -1:] / alpha.clamp_min(1e-10)], -1)
-    return image, alpha, projected, probe
+    return _Drawn(image, alpha, found, probe)
 
 
-def _scaled(rows: _Rows, scale: float, options: _Options) -> dict[str, Tensor]:
-    """Shapes in a scene that is so many times as large, and SH, by the names of `Gaussians`."""
+def _shapes(rows: _Rows, options: _Options) -> dict[str, Tensor]:
+    """Shapes and SH, by the names of `Gaussians`."""
     if rows.covars is None:
-        shape = {"scales": rows.scales * scale, "rotations": torch.nn.functional.normalize(rows.quats, dim=-1)}
+        shape = {"scales": rows.scales, "rotations": rows.quats}
     else:
         places = (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)
-        shape = {"cov3d": torch.stack([rows.covars[:, i, j] for i, j in places], 1) * scale**2}
+        shape = {"cov3d": torch.stack([rows.covars[:, i, j] for i, j in places], 1)}
     if options.mode.startswith("RGB") and options.degree is not None:
-        shape |= {
-            "sh_dc": rows.colors[:, :1].contiguous(),
-            "sh_rest": rows.colors[:, 1 : (MOST_BANDS + 1) ** 2].contiguous(),
-        }
+        sh_dc, sh_rest = rows.colors[:, :1], rows.colors[:, 1 : (MOST_BANDS + 1) ** 2]
+        shape |= {"sh_dc": sh_dc.contiguous(), "sh_rest": sh_rest.contiguous()}
     return shape
 
 
-@torch.no_grad()
-def _projected(out: ChannelImage, depth: Tensor, visible: Tensor) -> _Projected:
-    """From rows of splats. log2(alpha) = log2_opacity - |L d|^2, with L upper triangular (csrc/math/footprint.h)."""
-    x, y, l11, l12, l22, log2_opacity = out.splats[:, :6].unbind(1)
-    l11 = l11.abs()
-    conics = torch.stack([l11 * l11, l11 * l12, l12 * l12 + l22 * l22], 1) / _HALF_LOG2E
-    opacity = log2_opacity.exp2()
-    sigmas = (2 * (opacity / _MIN_ALPHA).log()).clamp_min(0).sqrt().clamp_max(_SIGMAS)
-    across = _HALF_LOG2E**0.5 * torch.stack([torch.hypot(1 / l11, l12 / (l11 * l22)), 1 / l22], 1)
-    radii = (sigmas[:, None] * across).ceil()
-    means2d = torch.stack([x, y], 1) + 0.5
-    shown = visible & (out.tile_counts > 0)  # rows of others are zero
-    radii = torch.where(shown[:, None], radii, 0).int()
-    return _Projected(radii, means2d, depth, conics, opacity, out.tile_counts)
-
-
 def _meta(
-    found: Sequence[_Projected],
-    probes: Sequence[Tensor],
-    form: tuple[int, ...],
-    size: tuple[int, int],
-    tile: int,
-    packed: bool,
-    absgrad: bool,
+    drawn: Sequence[_Drawn], form: tuple[int, ...], size: tuple[int, int], tile: int, packed: bool, absgrad: bool
 ) -> dict[str, Any]:
     """The notes, in which means2d gets `grad`, and `absgrad`, when the gradients of its parts are known."""
-    all_of = _Projected(*map(torch.stack, zip(*found, strict=True)))
-    count, ids = all_of.radii.shape[1], dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids"))
-    place = None
+    ids = dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids"))
+    rows = None
     if packed:
-        place = (all_of.radii > 0).all(-1).nonzero(as_tuple=True)
-        image, gaussian = place
-        ids = {"batch_ids": image // form[-1], "camera_ids": image % form[-1], "gaussian_ids": gaussian}
-        values = _Projected(*(part[place] for part in all_of))
+        rows = [(one.found.radii > 0).all(1).nonzero()[:, 0] for one in drawn]
+        image = torch.cat([torch.full_like(own, n) for n, own in enumerate(rows)])
+        ids = {"batch_ids": image // form[-1], "camera_ids": image % form[-1], "gaussian_ids": torch.cat(rows)}
+        parts = zip(*([part[own] for part in one.found] for one, own in zip(drawn, rows, strict=True)), strict=True)
+        values = _Described(*(part[0] if len(part) == 1 else torch.cat(part) for part in parts))
     else:
-        values = _Projected(*(part.reshape(*form, count, *part.shape[2:]) for part in all_of))
-    means2d = values.means2d.clone().requires_grad_(probes[0].requires_grad)
-    if means2d.requires_grad:
-        for n, probe in enumerate(probes):
-            probe.register_hook(_collector(means2d, n, place, absgrad, size))
+        values = _Described(*(_together(part, form) for part in zip(*(d.found for d in drawn), strict=True)))
+    means2d = values.means2d.requires_grad_(drawn[0].probe.requires_grad)
+    begin = 0
+    for n, one in enumerate(drawn) if means2d.requires_grad else ():
+        place = n if rows is None else slice(begin, begin := begin + len(rows[n]))
+        one.probe.register_hook(_collector(means2d, place, rows and rows[n], absgrad, size))
     notes = {"radii": values.radii, "means2d": means2d, "depths": values.depths, "conics": values.conics}
     notes |= {"opacities": values.opacities, "tiles_per_gauss": values.tiles}
     (width, height), across, down = size, *(-(-pixels // tile) for pixels in size)
@@ -353,22 +372,20 @@ def _meta(
 
 
 def _collector(
-    means2d: Tensor, image: int, place: tuple[Tensor, Tensor] | None, absgrad: bool, size: tuple[int, int]
+    means2d: Tensor, place: int | slice, rows: Tensor | None, absgrad: bool, size: tuple[int, int]
 ) -> Callable[[Tensor], None]:
-    """What puts the gradients of an image's means, which are per NDC unit, into `means2d`."""
+    """What puts the gradients of an image's means, which are per NDC unit, into `means2d`; of packed ones, its rows."""
 
     def collect(gradient: Tensor) -> None:
-        per_pixel = 2 / gradient.new_tensor(size)
-        length = torch.nn.functional.pad(gradient[:, 2:], (0, 1))
-        for name, values in (("grad", gradient[:, :2]), ("absgrad", length))[: 1 + absgrad]:
+        if rows is not None:
+            gradient = gradient[rows]
+        for name, first in (("grad", 0), ("absgrad", 2))[: 1 + absgrad]:
             if getattr(means2d, name, None) is None:
                 setattr(means2d, name, torch.zeros_like(means2d))
             into = getattr(means2d, name)
-            if place is None:
-                into.flatten(0, -3)[image] += values * per_pixel
-            else:
-                own = place[0] == image
-                into[own] += (values * per_pixel)[place[1][own]]
+            own = into[place] if rows is not None else into.flatten(0, -3)[place]
+            for axis in range(2 if first == 0 else 1):
+                own[:, axis].add_(gradient[:, first + axis], alpha=2 / size[axis])
 
     return collect
 

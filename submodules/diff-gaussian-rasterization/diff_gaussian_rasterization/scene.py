@@ -15,6 +15,7 @@ from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 
 PROJECTIONS = ("ewa", "ray")
 _WIDEST = 1.35  # radians from the middle of a tile to its corners: tiles are seen as by pinholes
+_USUAL = tuple(GaussianRasterizationSettings._field_defaults[name] for name in ("dilation", "near"))
 _FLAGS = ("prefiltered", "debug", "antialiasing", "inverse_depth")
 
 _NONE = torch.empty(0)  # stands for a tensor that is not given
@@ -37,8 +38,8 @@ class Scene(NamedTuple):
     view: Tensor
     projection: Tensor
     center: Tensor
-    lens: tuple[float, ...]  # tan_x, tan_y, scale_modifier, and perhaps Lens.numbers
-    options: tuple[int, ...]  # height, width, sh_degree, antialiasing, raw, and perhaps True: on rays
+    lens: tuple[float, ...]  # tan_x, tan_y, scale_modifier; perhaps Lens.numbers; perhaps dilation and near
+    options: tuple[int, ...]  # height, width, sh_degree, antialiasing, raw (2: rotations alone); perhaps True: on rays
 
     @property
     def gaussians(self) -> tuple[Tensor | None, ...]:
@@ -82,7 +83,7 @@ class Drawing(NamedTuple):
         return *self[4:], background, self[1]
 
 
-def scene_arguments(gaussians: Gaussians, settings: GaussianRasterizationSettings, raw: bool) -> Scene:
+def scene_arguments(gaussians: Gaussians, settings: GaussianRasterizationSettings, raw: int) -> Scene:
     """Put Gaussians and camera into the form of the operators' arguments."""
     for name in _FLAGS:
         if (flag := getattr(settings, name)) is not True and flag is not False and flag is not None:
@@ -99,6 +100,8 @@ def scene_arguments(gaussians: Gaussians, settings: GaussianRasterizationSetting
         lens += shown.numbers(*size[::-1])
         if settings.projection == "ray":
             check_rays(shown)
+    if (settings.dilation, settings.near) != _USUAL:
+        lens += float(settings.dilation), float(settings.near)
     place = settings.viewmatrix, settings.projmatrix, settings.campos
     camera = camera_arguments(*place, lens, *size, settings.sh_degree, settings.antialiasing, raw)
     scene = Scene(*gaussians, *camera)
@@ -128,7 +131,7 @@ def camera_arguments(
     width: float,
     degree: int,
     antialiasing: bool | None,
-    raw: bool,
+    raw: int,
 ) -> tuple:
     """The fields of `Scene.camera`, from what the reference takes: further axes of length 1, and whole floats."""
     size = [int(n) if isinstance(n, float) and n.is_integer() else n for n in (height, width)]

@@ -34,3 +34,5 @@ class GaussianRasterizationSettings(NamedTuple):
     lens: Lens | None = None  # in place of a pinhole: then tanfovx, tanfovy and projmatrix are not read
     lens_values: Tensor | None = None  # (15,) in place of those of the lens: Lens.values
     projection: str = "ewa"  # or "ray": a pixel sees a Gaussian along its own ray, not by EWA's affine map
+    dilation: float = 0.3  # px^2, 0 to 1: added to both variances on the image, so that a Gaussian covers a pixel
+    near: float = 0.2  # Gaussians at or before this depth in the view are left out

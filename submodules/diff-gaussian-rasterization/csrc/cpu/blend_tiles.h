@@ -86,11 +86,12 @@ struct ForwardState {
   alignas(64) typename IntOf<T>::type last[kPixels];
 };
 
-// Blends a chunk into a strip. position: of its first splat in the tile's list. Returns false once all of the strip's
-// pixels have ended.
-template <class T, bool kDepth, bool kLast, int kRays>
-bool blend_strip(const Chunk<T, kChunk, kRays>& chunk, const Strip<T, kRays>& strip, int64_t position,
-                 ForwardState<T>& state) {
+// Calls add(k, weight) for the splats of a chunk that a strip blends. position: of the chunk's first splat in the
+// tile's list. Returns false once all of the strip's pixels have ended.
+template <class T, bool kLast, int kRays, class Add>
+__attribute__((always_inline)) inline bool blend_weights(const Chunk<T, kChunk, kRays>& chunk,
+                                                         const Strip<T, kRays>& strip, int64_t position, T cap,
+                                                         ForwardState<T>& state, const Add& add) {
   using S = Simd<T>;
   using V = typename S::Vec;
   using M = typename S::Mask;
@@ -99,17 +100,14 @@ bool blend_strip(const Chunk<T, kChunk, kRays>& chunk, const Strip<T, kRays>& st
   const auto x = strip.places.from(strip.at(), strip.first);
   const V zero = {}, never = zero + std::numeric_limits<T>::infinity();
   V left = S::load(state.transmittance + at), threshold = S::load(state.threshold + at);
-  V red = S::load(state.color[0] + at), green = S::load(state.color[1] + at), blue = S::load(state.color[2] + at);
-  V depth = zero;
   M last = {};
-  if (kDepth) depth = S::load(state.depth + at);
   if (kLast) std::memcpy(&last, state.last + at, sizeof last);
   bool open = true;
   strip.each(chunk, [&](int k, const auto& terms) {
     const V t = exponent_at(terms, x);
     M reached = t >= threshold;
     if (!S::any(reached)) return true;
-    const V alpha = capped<V, T>(exp2_lanes<V, M>(reached ? t : zero, T()));
+    const V alpha = capped<V, T>(exp2_lanes<V, M>(reached ? t : zero, T()), cap);
     const V after = left - alpha * left;
     const M ends = reached & (after < least_left);
     if (S::any(ends)) {
@@ -117,17 +115,32 @@ bool blend_strip(const Chunk<T, kChunk, kRays>& chunk, const Strip<T, kRays>& st
       reached &= ~ends;
       open = S::any(threshold < never);
     }
-    const V weight = reached ? alpha * left : zero;
-    red += weight * chunk.r[k], green += weight * chunk.g[k], blue += weight * chunk.b[k];
-    if (kDepth) depth += weight * chunk.inverse_depth[k];
+    add(k, V(reached ? alpha * left : zero));
     if (kLast) last = reached ? M{} + typename S::Int(position + k + 1) : last;
     left = reached ? after : left;
     return open;
   });
   S::store(state.transmittance + at, left), S::store(state.threshold + at, threshold);
+  if (kLast) std::memcpy(state.last + at, &last, sizeof last);
+  return open;
+}
+
+// Blends a chunk into a strip, as above.
+template <class T, bool kDepth, bool kLast, int kRays>
+bool blend_strip(const Chunk<T, kChunk, kRays>& chunk, const Strip<T, kRays>& strip, int64_t position,
+                 ForwardState<T>& state) {
+  using S = Simd<T>;
+  using V = typename S::Vec;
+  const int at = strip.at();
+  V red = S::load(state.color[0] + at), green = S::load(state.color[1] + at), blue = S::load(state.color[2] + at);
+  V depth = {};
+  if (kDepth) depth = S::load(state.depth + at);
+  const bool open = blend_weights<T, kLast>(chunk, strip, position, T(kMaxAlpha), state, [&](int k, V weight) {
+    red += weight * chunk.r[k], green += weight * chunk.g[k], blue += weight * chunk.b[k];
+    if (kDepth) depth += weight * chunk.inverse_depth[k];
+  });
   S::store(state.color[0] + at, red), S::store(state.color[1] + at, green), S::store(state.color[2] + at, blue);
   if (kDepth) S::store(state.depth + at, depth);
-  if (kLast) std::memcpy(state.last + at, &last, sizeof last);
   return open;
 }
 

@@ -374,12 +374,12 @@ class GradientRows {
     rows_ = memory(before_.back());
   }
 
-  // The row of a slot; for a slot without one, the next row.
-  T* row(int64_t slot) const {
+  // The number of a slot's row; for a slot without one, of the next row.
+  int64_t number(int64_t slot) const {
     const uint64_t lower = (uint64_t(1) << (slot & 63)) - 1;
-    const int64_t rank = before_[slot >> 6] + (slot & 63 ? __builtin_popcountll(bits_[slot >> 6] & lower) : 0);
-    return rows_ + kRow * rank;
+    return before_[slot >> 6] + (slot & 63 ? __builtin_popcountll(bits_[slot >> 6] & lower) : 0);
   }
+  T* row(int64_t slot) const { return rows_ + kRow * number(slot); }
 
  private:
   std::vector<uint8_t> marks_;
@@ -388,31 +388,37 @@ class GradientRows {
   T* rows_ = nullptr;
 };
 
+// Reads where the tile's pixels ended.
 template <class T, int kRays>
-void read_state(const BlendInput<T>& in, const BlendGradient<T>& g, const Tile& tile, int64_t index,
-                BackwardState<T, kRays>& state) {
-  const int64_t plane = int64_t(in.image.width) * in.image.height;
+void read_ends(const BlendInput<T>& in, const BlendGradient<T>& g, const Tile& tile, int64_t index,
+               BackwardState<T, kRays>& state) {
   std::fill_n(state.last, kPixels, 0);
   std::fill_n(state.transmittance, kPixels, T(1));
-  std::fill_n(state.behind, kPixels, T(0));
-  std::fill_n(state.color[0], 3 * kPixels, T(0));
-  std::fill_n(state.depth, kPixels, T(0));
   read_tile(g.last, in.image, tile, state.last);
   read_tile(g.transmittance, in.image, tile, state.transmittance);
-  for (int c = 0; c < 3; ++c) read_tile(g.color + c * plane, in.image, tile, state.color[c]);
-  if (g.inverse_depth) read_tile(g.inverse_depth, in.image, tile, state.depth);
-  if (g.transmittance_gradient) read_tile(g.transmittance_gradient, in.image, tile, state.behind);
-  for (int p = 0; p < kPixels; ++p)
-    for (int c = 0; c < 3; ++c) state.behind[p] += in.background[c] * state.color[c][p];
   for (int row = 0; row < kTile; ++row)
     state.row_last[row] = *std::max_element(state.last + row * kTile, state.last + (row + 1) * kTile);
   if constexpr (kRays == kLensRays) {
     state.in_place = state.places = TilePlaces<T, kRays>(in, index);
     interleave<T>(state.in_place.x), interleave<T>(state.in_place.y);
   }
-  interleave<T>(state.last);
-  for (T* pixels : {state.transmittance, state.behind, state.color[0], state.color[1], state.color[2], state.depth})
-    interleave<T>(pixels);
+  interleave<T>(state.last), interleave<T>(state.transmittance);
+}
+
+template <class T, int kRays>
+void read_state(const BlendInput<T>& in, const BlendGradient<T>& g, const Tile& tile, int64_t index,
+                BackwardState<T, kRays>& state) {
+  const int64_t plane = int64_t(in.image.width) * in.image.height;
+  std::fill_n(state.color[0], 3 * kPixels, T(0));
+  std::fill_n(state.depth, kPixels, T(0));
+  std::fill_n(state.behind, kPixels, T(0));
+  for (int c = 0; c < 3; ++c) read_tile(g.color + c * plane, in.image, tile, state.color[c]);
+  if (g.inverse_depth) read_tile(g.inverse_depth, in.image, tile, state.depth);
+  if (g.transmittance_gradient) read_tile(g.transmittance_gradient, in.image, tile, state.behind);
+  for (int p = 0; p < kPixels; ++p)
+    for (int c = 0; c < 3; ++c) state.behind[p] += in.background[c] * state.color[c][p];
+  read_ends(in, g, tile, index, state);
+  for (T* pixels : {state.behind, state.color[0], state.color[1], state.color[2], state.depth}) interleave<T>(pixels);
 }
 
 template <class T, int kRays, bool kDepth, bool kAbsolute>
@@ -437,11 +443,11 @@ void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t 
   }
 }
 
-template <class T, int kRays, bool kAbsolute, class Memory>
-GradientRows<T, kSums<kRays, kAbsolute>> fill_rows(const Executor& executor, const BlendInput<T>& in,
-                                                   const BlendGradient<T>& g, const Memory& memory) {
+// Marks the slots of the instances that some pixel has processed. Returns how far into each tile's list they reach.
+template <class T, int kRow>
+std::vector<int32_t> mark_rows(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g,
+                               GradientRows<T, kRow>& rows) {
   const int64_t tiles = tiles_of(in.image);
-  GradientRows<T, kSums<kRays, kAbsolute>> rows(g.slot_count);
   std::vector<int32_t> processed(tiles);
   for_dynamic(executor, tiles, 4, [&](int64_t begin, int64_t end) {
     for (int64_t index = begin; index < end; ++index) {
@@ -453,10 +459,18 @@ GradientRows<T, kSums<kRays, kAbsolute>> fill_rows(const Executor& executor, con
         rows.mark(slot_of(g.slots, in.instances[in.ranges[index] + k], tile.x / kTile, tile.y / kTile));
     }
   });
+  return processed;
+}
+
+template <class T, int kRays, bool kAbsolute, class Memory>
+GradientRows<T, kSums<kRays, kAbsolute>> fill_rows(const Executor& executor, const BlendInput<T>& in,
+                                                   const BlendGradient<T>& g, const Memory& memory) {
+  GradientRows<T, kSums<kRays, kAbsolute>> rows(g.slot_count);
+  const std::vector<int32_t> processed = mark_rows(executor, in, g, rows);
   rows.allocate(memory);
   const auto run =
       g.inverse_depth ? blend_tile_vjp<T, kRays, true, kAbsolute> : blend_tile_vjp<T, kRays, false, kAbsolute>;
-  for_dynamic(executor, tiles, 1, [&](int64_t tile, int64_t) { run(in, g, tile, processed[tile], rows); });
+  for_dynamic(executor, tiles_of(in.image), 1, [&](int64_t tile, int64_t) { run(in, g, tile, processed[tile], rows); });
   return rows;
 }
 

@@ -1,21 +1,14 @@
 // The backward of blending. A tile's list is cut into chunks, a block each, because one long list would outlast all
 // others together. Layers tell a chunk what lies behind it. In images of few tiles the forward has made them; else they
 // are made first, one of every chunk.
-#include <thrust/iterator/counting_iterator.h>
-#include <thrust/iterator/transform_iterator.h>
-
-#include <cub/cub.cuh>
-#include <optional>
-#include <type_traits>
-
 #include "../backend.h"
 #include "../math/slots.h"
-#include "ahead.cuh"
+#include "behind.cuh"
 #include "blend_layers.cuh"
 #include "blend_layout.cuh"
 #include "gradient_rows.cuh"
-#include "host_numbers.cuh"
-#include "schedule.cuh"
+#include "pixel_sums.cuh"
+#include "processed.cuh"
 
 namespace gs {
 namespace cuda {
@@ -27,60 +20,6 @@ constexpr int kChunkOfFew = kLayerChunk, kChunkOfMany = 512;
 
 // Going back to front, a splat costs a warp as much as several pixels. So a lane takes 4, even if few warps run.
 using Backward = Layout<4>;
-
-// Up to this many instances, each one gets a gradient row, 40 MiB at most. Then the host need not wait for the number
-// of processed instances.
-constexpr int64_t kRowsUnasked = 1 << 20;
-
-struct ProcessedLength {
-  const int32_t* processed;
-  __device__ int64_t operator()(int tile) const { return processed[tile]; }
-};
-
-struct CountBits {
-  const uint32_t* bits;
-  int64_t words;
-  __host__ __device__ int32_t operator()(int64_t word) const {
-#ifdef __CUDA_ARCH__
-    return word < words ? __popc(bits[word]) : 0;
-#else
-    return 0;
-#endif
-  }
-};
-
-// Finds how far each tile's backward has to go, and marks the slots of the instances up to there.
-__global__ void __launch_bounds__(kTile* kTile)
-    mark_kernel(const int32_t* halted, BlendInput<float> in, const int32_t* last, const SplatSlots* slots,
-                int32_t* processed, uint32_t* bits) {
-  if (!begin_work(halted)) return;
-  __shared__ int32_t most;
-  if (threadIdx.x == 0) most = 0;
-  __syncthreads();
-  const int across = tile_count(in.image.width), tile = blockIdx.x;
-  const int x = tile % across * kTile + threadIdx.x % kTile, y = tile / across * kTile + threadIdx.x / kTile;
-  const int mine = x < in.image.width && y < in.image.height ? last[int64_t(y) * in.image.width + x] : 0;
-  const int warp_most = __reduce_max_sync(kWarp, mine);
-  if (threadIdx.x % 32 == 0) atomicMax(&most, warp_most);
-  __syncthreads();
-  if (threadIdx.x == 0) processed[tile] = most;
-  constexpr int kThreads = kTile * kTile, kAhead = 4;  // slots that are found at once
-  const int32_t* list = in.instances + in.ranges[tile];
-  for (int k = threadIdx.x; k < most; k += kAhead * kThreads) {
-    int64_t slot[kAhead];
-#pragma unroll
-    for (int j = 0; j < kAhead; ++j)
-      if (k + j * kThreads < most) slot[j] = slot_of(slots, list[k + j * kThreads], tile % across, tile / across);
-#pragma unroll
-    for (int j = 0; j < kAhead; ++j)
-      if (k + j * kThreads < most) atomicOr(bits + (slot[j] >> 5), 1u << (slot[j] & 31));
-  }
-}
-
-__global__ void judge_rows_kernel(const int32_t* halted, Ahead ahead, const int32_t* rows) {
-  begin_work(halted);  // a halted step is reported, too
-  judge_rows(ahead, *rows);
-}
 
 // Values that a lane sums: kGradientRow, and perhaps kAbsoluteValues.
 template <int kRays, bool kAbsolute>
@@ -116,11 +55,6 @@ __device__ __forceinline__ float transposed_sum(const float (&v)[kCount], int& v
   value = exists ? (b16 ? kHalf : 0) + within : -1;
   return sum;
 }
-
-// A chunk as a pixel sees it: with `behind` behind the chunk, the pixel has value + transmittance * behind.
-struct alignas(8) Layer {
-  float value, transmittance;
-};
 
 // The backward's inputs at a lane's pixels. Positions count from the chunk's first splat, which saves a register.
 template <class L, bool kDepth>
@@ -201,25 +135,8 @@ __global__ void __launch_bounds__(L::kThreads)
 
 using OfPixels = float[Backward::kRun];  // a value for each of a lane's pixels
 
-// Starts the backward of a lane's pixels at their chunk's end. Behind the chunk lie `count` layers from `first` on,
-// then the background: `behind` is what they show together, `through` their transmittance.
-template <bool kDepth>
-__device__ __forceinline__ void start_behind(const Pixels<Backward, kDepth>& pixels, const Backward& at,
-                                             const Layer* layers, int32_t first, int count, OfPixels& transmittance,
-                                             OfPixels& behind, OfPixels& through) {
-  constexpr int kRun = Backward::kRun;
-  for (int p = 0; p < kRun; ++p) behind[p] = pixels.background[p], through[p] = 1;
-  for (int c = count - 1; c >= 0; --c)
-    for (int p = 0; p < kRun; ++p) {
-      const int pixel = at.y * kTile + at.x + at.column(p);
-      const Layer layer = layers[int64_t(kTile * kTile) * (first + c) + pixel];
-      behind[p] = layer.value + layer.transmittance * behind[p];
-      through[p] *= layer.transmittance;
-    }
-  for (int p = 0; p < kRun; ++p) transmittance[p] = pixels.transmittance[p] / through[p];
-}
-
-// The same from the forward's layers, of which one stands for all that lies behind the chunk. length: the chunk's.
+// Starts as start_behind, from the forward's layers, of which one stands for all that lies behind the chunk. length:
+// the chunk's.
 template <bool kDepth>
 __device__ __forceinline__ void start_before(const Pixels<Backward, kDepth>& pixels, const Backward& at,
                                              const MadeLayers& layers, int64_t layer, int length,
@@ -235,57 +152,6 @@ __device__ __forceinline__ void start_before(const Pixels<Backward, kDepth>& pix
   }
 }
 
-// Sums over a lane's pixels, which lie in one row. Along it v is constant, so three of the moments come last.
-struct FlatRowSums {
-  float q = 0, qu = 0, quu = 0;
-
-  __device__ void add(float u, float q_here) {
-    const float qu_here = q_here * u;
-    q += q_here, qu += qu_here, quu += qu_here * u;
-  }
-  __device__ Moments<float> moments(const RowTerms<float>& row) const {
-    return {q, qu, row.v * q, quu, row.v * qu, row.v * row.v * q};
-  }
-};
-
-// Of a lane's pixels, on the rays of a lens.
-struct LensRowSums : PlaceSums<float> {
-  using PlaceSums<float>::moments;
-  __device__ RayMoments<float> moments(const LensTerms<float>&, const LensLocal&) const { return moments(); }
-};
-struct RayRowMoments : RayRowSums<float> {
-  using RayRowSums<float>::moments;
-  __device__ RayMoments<float> moments(const RayRow<float>& row, const LocalRaySplat<float>& splat) const {
-    return moments(row, splat.slope_v);
-  }
-};
-template <class Sums, class Row, class Here>
-__device__ __forceinline__ void add_pixel(Sums& sums, const Row&, const Here& here, float q) {
-  sums.add(here, q);
-}
-__device__ __forceinline__ void add_pixel(LensRowSums& sums, const LensTerms<float>& terms, const AtPlace<float>& here,
-                                          float q) {
-  sums.add(terms, here, q);
-}
-
-// What moves the mean, whitened: u and v, or w a / s.
-__device__ float2 pull(const LocalSplat<float>&, const RowTerms<float>& row, float u) { return {u, row.v}; }
-__device__ float2 pull(const LocalRaySplat<float>& splat, const RayRow<float>& row, const AtPixel<float>& at) {
-  const RayWeights<float> weights = ray_weights(row, at, splat.slope_v);
-  return {weights.au, weights.av};
-}
-
-__device__ float2 pull(const LensLocal&, const LensTerms<float>& terms, const AtPlace<float>& at) {
-  const RayWeights<float> weights = ray_weights(terms, at);
-  return {weights.au, weights.av};
-}
-
-template <class AnySplat>
-__device__ __forceinline__ auto terms_of(const AnySplat& splat, int y) {
-  return row_terms(splat, float(y));
-}
-__device__ __forceinline__ const LensTerms<float>& terms_of(const LensLocal& splat, int) { return splat.terms; }
-
 // Steps the lanes over splat k of the batch, whose first splat is the chunk's splat `first`, and leaves the sums over
 // the warp's pixels in `sums`. A splat that reaches none of them changes nothing.
 template <bool kDepth, bool kAbsolute, int kBatch, int kRays>
@@ -296,8 +162,7 @@ __device__ __forceinline__ void splat_gradient(const Batch<kBatch, kRays>& batch
   const auto splat = batch.local(k);
   const float4 c = batch.color[k];
   const auto row = terms_of(splat, at.y);
-  std::conditional_t<kRays == kLensRays, LensRowSums, std::conditional_t<kRays == kNoRays, FlatRowSums, RayRowMoments>>
-      moments;
+  LaneMoments<kRays> moments;
   float r = 0, gr = 0, b = 0, d = 0, absolute_u = 0, absolute_uv = 0;
   bool any = false;
 #pragma unroll
@@ -439,33 +304,15 @@ auto blend_vjp_kernel_for(bool depth, bool made) {
 template <int kRays, class Take>
 FilledRows<kRays> blend_back(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g,
                              bool absolute, bool exact, const Take& take) {
-  const cudaStream_t stream = stream_of(queue);
-  const unsigned tiles = unsigned(tiles_of(in.image));
-  const int64_t words = (g.slot_count + 31) / 32;
-  uint32_t* bits = queue.array<uint32_t>(words + 1);
-  int32_t *before = queue.array<int32_t>(words + 1), *processed = queue.array<int32_t>(tiles);
-  GS_CUDA_CHECK(cudaMemsetAsync(bits, 0, (words + 1) * sizeof *bits, stream));
-  launch(queue, "mark", mark_kernel, tiles, kTile * kTile, in, g.last, g.slots, processed, bits);
-  const auto counts = thrust::make_transform_iterator(thrust::counting_iterator<int64_t>(0), CountBits{bits, words});
-  with_memory(queue, [&](void* memory, size_t& bytes) {
-    return cub::DeviceScan::ExclusiveSum(memory, bytes, counts, before, words + 1, stream);
-  });
-  const int chunk_size = tiles <= kFewTiles ? kChunkOfFew : kChunkOfMany;
-  int64_t rows = g.ahead ? g.ahead->room.rows : g.instance_count;  // an upper bound
-  std::optional<HostNumbers<int32_t>> processed_count;
-  if (g.ahead) {
-    launch(queue, "judge_rows", judge_rows_kernel, 1, 1, *g.ahead, before + words);
-  } else if (exact || rows > kRowsUnasked)
-    processed_count.emplace(queue, before + words, 1);
-  Schedule schedule = longest_first(queue, tiles, ProcessedLength{processed}, chunk_size, rows);
-  if (processed_count) rows = *processed_count->wait(), schedule = schedule.shortened(rows);
-  const GradientRows<kRays> gradients{{bits, before}, take(rows)};
+  const bool few = tiles_of(in.image) <= kFewTiles;
+  const int chunk_size = few ? kChunkOfFew : kChunkOfMany;
+  const auto [places, processed, schedule, rows] = find_processed(queue, in, g, chunk_size, exact);
+  const GradientRows<kRays> gradients{places, take(rows)};
   const bool made = g.layers && makes_layers(in.image);
   Layer* layers = queue.array<Layer>(made ? 0 : size_t(schedule.places) * kTile * kTile);
   if (schedule.places && !made)
-    (tiles <= kFewTiles ? find_layers<Layout<1>, kRays> : find_layers<Layout<2>, kRays>)(queue, in, g, schedule,
-                                                                                         layers);
-  const AbsoluteRows lengths{{bits, before}, queue.array<float>(absolute ? size_t(rows) * kAbsoluteValues : 0)};
+    (few ? find_layers<Layout<1>, kRays> : find_layers<Layout<2>, kRays>)(queue, in, g, schedule, layers);
+  const AbsoluteRows lengths{places, queue.array<float>(absolute ? size_t(rows) * kAbsoluteValues : 0)};
   const bool depth = g.inverse_depth;
   const auto kernel =
       absolute ? blend_vjp_kernel_for<kRays, true>(depth, made) : blend_vjp_kernel_for<kRays, false>(depth, made);

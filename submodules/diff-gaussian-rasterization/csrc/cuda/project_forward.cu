@@ -22,7 +22,7 @@ constexpr int kThreads = kSleepBlock;
 __device__ bool near_view(const Camera<float>& cam, Vec3<float> view) {
   const float x = cam.mean_focal_x * view.x + cam.axis_x * view.z, y = cam.mean_focal_y * view.y + cam.axis_y * view.z;
   const float spare_x = 0.1f * cam.width * view.z, spare_y = 0.1f * cam.height * view.z;
-  return in_front(view.z) && x > -spare_x && x < cam.width * view.z + spare_x && y > -spare_y &&
+  return in_front(cam, view.z) && x > -spare_x && x < cam.width * view.z + spare_x && y > -spare_y &&
          y < cam.height * view.z + spare_y;
 }
 

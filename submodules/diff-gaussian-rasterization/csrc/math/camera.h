@@ -18,6 +18,7 @@ struct Camera {
   T ray_min_x, ray_max_x;          // limits of x/z in the Jacobian
   T ray_min_y, ray_max_y;
   int width, height;
+  T near;
 };
 
 // Whether two vectors agree within the rounding of a cross product of unit vectors.
@@ -41,14 +42,14 @@ GS_HD void clamp_rays(double shift_x, double shift_y, double tan_x, double tan_y
 // is 1e5 times the shift.
 template <class T>
 GS_HD Camera<T> make_camera(const T* view, const T* full, const T* center, double tan_x, double tan_y, int width,
-                            int height) {
+                            int height, T near) {
   const auto column = [](const T* m, int c) { return Vec3<T>{m[c], m[4 + c], m[8 + c]}; };
   const auto wide = [](Vec3<T> v) { return Vec3<double>{v.x, v.y, v.z}; };
   Camera<T> cam;
   cam.row_x = column(view, 0), cam.row_y = column(view, 1), cam.row_z = column(view, 2);
   cam.translation = {view[12], view[13], view[14]};
   cam.center = load3(center);
-  cam.width = width, cam.height = height;
+  cam.width = width, cam.height = height, cam.near = near;
   cam.focal_x = T(width / (2 * tan_x)), cam.focal_y = T(height / (2 * tan_y));
   cam.dual_x = cross(cam.row_y, cam.row_z), cam.dual_y = cross(cam.row_z, cam.row_x);
   cam.dual_z = cross(cam.row_x, cam.row_y);
@@ -76,9 +77,9 @@ GS_HD Vec3<V> to_view(const Camera<T>& cam, Vec3<V> p) {
 }
 
 // The near rule of the reference; false for NaN.
-template <class T>
-GS_HD Truth<T> in_front(T view_z) {
-  return view_z > Scalar<T>(kNear);
+template <class T, class V>
+GS_HD Truth<V> in_front(const Camera<T>& cam, V view_z) {
+  return view_z > cam.near;
 }
 
 GS_ISA_END

@@ -134,7 +134,8 @@ GS_HD void camera_vjp_row(const Scene<T>& s, const AnyCamera& camera, const Row&
   mean_vjp(in.footprint, moments, in.pixel[0], in.pixel[1]);
   in.shape = footprint_vjp(in.footprint, moments, s.antialiasing);
   const Vec3<V> m1 = in.shape.m1, m2 = in.shape.m2;
-  const auto& [d, c] = gaussian.axes;
+  const auto& d = gaussian.axes.direction;
+  const auto& c = gaussian.axes.scale;
   in.p1 = (c[0] * m1.x) * d[0] + (c[1] * m1.y) * d[1] + (c[2] * m1.z) * d[2];
   in.p2 = (c[0] * m2.x) * d[0] + (c[1] * m2.y) * d[1] + (c[2] * m2.z) * d[2];
   const V row1[3] = {m1.x, m1.y, m1.z}, row2[3] = {m2.x, m2.y, m2.z};

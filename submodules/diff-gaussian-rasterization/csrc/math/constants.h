@@ -5,8 +5,6 @@
 GS_ISA_BEGIN
 
 constexpr int kTile = 16;                // pixels a side
-constexpr double kNear = 0.2;            // culled at or below this view-space z (markVisible has the same rule)
-constexpr double kDilation = 0.3;        // px^2 added to both variances, so that a splat covers at least a pixel
 constexpr double kJacobianClamp = 1.3;   // half images; beyond, the affine approximation explodes
 constexpr double kSleepTurn = 0.1;       // radians that a fisheye's direction may have turned: _TURN in lens.py
 constexpr double kPole = 1e-3;           // least angle from the poles of a panorama, radians

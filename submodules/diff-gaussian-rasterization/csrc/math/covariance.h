@@ -1,5 +1,6 @@
 #pragma once
 // A Gaussian's shape as three axes: its 3D covariance is the sum of axis axis^T, axis_k = scale_k * column k of R.
+#include "../data.h"
 #include "activation.h"
 #include "vec.h"
 
@@ -9,6 +10,7 @@ template <class T>
 struct Axes {
   Vec3<T> direction[3];  // columns of R; unit vectors for a unit quaternion
   T scale[3];
+  Dilation<Scalar<T>> dilation;
 };
 
 // Columns of R(q). As in the reference, q is used as it is: for |q| != 1 the result is no rotation.
@@ -38,7 +40,7 @@ GS_HD Axes<T> axes_of_covariance(const T* c) {
   const T e = root(larger(c[3] - b * b, zero));
   const T f = e > 0 ? (c[4] - b * d) / e : zero;
   const T g = root(larger(c[5] - d * d - f * f, zero));
-  return {{{a, b, d}, {zero, e, f}, {zero, zero, g}}, {one, one, one}};
+  return {{{a, b, d}, {zero, e, f}, {zero, zero, g}}, {one, one, one}, {}};
 }
 
 GS_ISA_END

@@ -1,8 +1,7 @@
 #pragma once
 // A splat's footprint on the image plane: from M (2x3, rows m1, m2; covariance M M^T + dilation) to the factor of the
 // conic, and the derivative.
-#include "constants.h"
-#include "vec.h"
+#include "camera.h"
 
 GS_ISA_BEGIN
 
@@ -18,16 +17,17 @@ struct Footprint {
   T l11, l12, l22;
   T compensation;  // sqrt(det undilated / det), floored: the antialiasing factor
   Truth<T> floored;
+  Dilation<Scalar<T>> dilation;
 };
 
 // det = |m1 x m2|^2 + h (|m1|^2 + |m2|^2) + h^2 (Cauchy-Binet) has only non-negative terms, so nothing cancels. All is
 // divided by c, so that nothing overflows. With S = log2(e)/2 covariance^-1 = L^T L:
 // l22 = sqrt(k/c), l11 = sqrt(k c/det), l12 = -(b/c) l11.
 template <class T>
-GS_HD Footprint<T> make_footprint(Vec3<T> m1, Vec3<T> m2, Vec3<T> minors) {
-  const Scalar<T> h = Scalar<T>(kDilation), k = Scalar<T>(kHalfLog2e);
+GS_HD Footprint<T> make_footprint(Vec3<T> m1, Vec3<T> m2, Vec3<T> minors, Dilation<Scalar<T>> dilation) {
+  const Scalar<T> h = dilation.area, k = Scalar<T>(kHalfLog2e);
   Footprint<T> f;
-  f.m1 = m1, f.m2 = m2, f.minors = minors;
+  f.m1 = m1, f.m2 = m2, f.minors = minors, f.dilation = dilation;
   f.a0 = dot(m1, m1), f.c0 = dot(m2, m2);
   f.a = f.a0 + h, f.b = dot(m1, m2), f.c = f.c0 + h;
   const T width = root(f.c);
@@ -76,7 +76,7 @@ struct ShapeGradient {
 template <class T>
 GS_HD void whitened_rows(const Footprint<T>& f, Vec3<T>& u, Vec3<T>& v) {
   const T part = 1 / root(f.c);  // scales both factors, because their product overflows
-  u = f.l11 * (cross(part * f.m2, part * f.minors) + (Scalar<T>(kDilation) / f.c) * f.m1), v = f.l22 * f.m2;
+  u = f.l11 * (cross(part * f.m2, part * f.minors) + (f.dilation.area / f.c) * f.m1), v = f.l22 * f.m2;
 }
 
 // W is 4 ln2^2 W2, W2 the second moments. With antialiasing the opacity carries sqrt(det0/det), which adds
@@ -84,11 +84,11 @@ GS_HD void whitened_rows(const Footprint<T>& f, Vec3<T>& u, Vec3<T>& v) {
 // out with det0 = a0 c0 - b^2, its terms in b and c cancel on paper.
 template <class T>
 GS_HD void second_moments(const Footprint<T>& f, const Moments<T>& s, bool antialiasing, T& uu, T& uv, T& vv) {
-  const Scalar<T> h = Scalar<T>(kDilation), four_ln2_sq = Scalar<T>(4 * kLn2 * kLn2);
+  const Scalar<T> h = f.dilation.area, four_ln2_sq = Scalar<T>(4 * kLn2 * kLn2);
   uu = four_ln2_sq * s.quu, uv = four_ln2_sq * s.quv, vv = four_ln2_sq * s.qvv;
   if (antialiasing && any(!f.floored)) {
     const T inverse_ratio = 1 / (f.compensation * f.compensation), slope = f.b / f.c;
-    const T k = Scalar<T>(kDilation / kHalfLog2e) * s.q * inverse_ratio;
+    const T k = f.dilation.exponents * s.q * inverse_ratio;
     uu = f.floored ? uu : uu + k * ((slope / f.schur) * slope + f.c0 / f.c / f.schur);
     uv = f.floored ? uv : uv - k * (slope / root(f.schur) / root(f.c));
     vv = f.floored ? vv : vv + k * ((f.compensation * f.compensation + h * (f.a0 / f.c / f.schur)) / f.c);
@@ -119,7 +119,7 @@ GS_HD void covariance2d_vjp(const Footprint<T>& f, const Moments<T>& s, bool ant
   g[1] = two_ln2_sq * (f.l12 * uu + f.l22 * uv);
   g[2] = two_ln2_sq * (f.l12 * vu + f.l22 * vv);
   if (!antialiasing || !any(!f.floored)) return;
-  const Scalar<T> h = Scalar<T>(kDilation);
+  const Scalar<T> h = f.dilation.area;
   const T excess = compensation_excess(f), half_per_det = Scalar<T>(0.5) * s.q / f.schur / f.c;
   g[0] = f.floored ? g[0] : g[0] + half_per_det * (excess * f.c0 - h);
   g[1] = f.floored ? g[1] : g[1] - half_per_det * (excess * f.b);

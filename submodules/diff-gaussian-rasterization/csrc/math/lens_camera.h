@@ -38,7 +38,7 @@ GS_HD V depth_of(const LensCamera<T>& cam, Vec3<V> view) {
 }
 template <class T, class V>
 GS_HD Truth<V> shown(const LensCamera<T>& cam, Vec3<V> view) {
-  return in_front(depth_of(cam, view));
+  return in_front(cam, depth_of(cam, view));
 }
 
 // By lanes, because vectors have no arc tangent.
@@ -92,11 +92,12 @@ GS_HD Truth<V> image_point(const LensCamera<T>& cam, const LensView<V>& p, V& x,
 
 template <class T, class V>
 GS_HD Footprint<V> splat_footprint(const LensCamera<T>&, const LensView<V>& p, const Axes<V>& axes) {
-  const auto& [d, s] = axes;
+  const auto& d = axes.direction;
+  const auto& s = axes.scale;
   const Vec3<V> normal = cross(p.p1, p.p2);
   const Vec3<V> minors = {s[1] * s[2] * dot(normal, cross(d[1], d[2])), s[2] * s[0] * dot(normal, cross(d[2], d[0])),
                           s[0] * s[1] * dot(normal, cross(d[0], d[1]))};
-  return make_footprint(row_of(p.p1, axes), row_of(p.p2, axes), minors);
+  return make_footprint(row_of(p.p1, axes), row_of(p.p2, axes), minors, axes.dilation);
 }
 
 // dP's rows on the axes of the view.

@@ -107,7 +107,7 @@ GS_HD void take_toward(const LensRayCamera<T>& cam, const Gaussian<V>& gaussian,
   V c2[3], third[2];
   covariance2d_vjp(f, pulling_moments(f, m, s, third), false, c2);
   const Vec3<V> j1 = load3(p.on.first[0]), j2 = load3(p.on.first[1]), normal = cross(j1, j2);
-  const V per_volume = Number(-2 * kDilation) / dot(p.n, normal);
+  const V per_volume = -2 * f.dilation.area / dot(p.n, normal);
   const Vec3<V> b1 = per_volume * cross(j2, p.n), b2 = per_volume * cross(p.n, j1);
   const Vec3<V> h1 = c2[0] * b1 + c2[1] * b2, h2 = c2[1] * b1 + c2[2] * b2;
   p.deep = Number(0.5) * (third[0] * b1 + third[1] * b2);

@@ -27,8 +27,8 @@ struct Perspective {
 };
 
 template <class T, class V>
-GS_HD Truth<V> shown(const Camera<T>&, Vec3<V> view) {
-  return in_front(view.z);
+GS_HD Truth<V> shown(const Camera<T>& cam, Vec3<V> view) {
+  return in_front(cam, view.z);
 }
 template <class T, class V>
 GS_HD V depth_of(const Camera<T>&, Vec3<V> view) {
@@ -57,7 +57,8 @@ GS_HD Truth<V> image_point(const Camera<T>& cam, const Perspective<V>& p, V& x, 
 // A row of M from that of J W.
 template <class V>
 GS_HD Vec3<V> row_of(Vec3<V> p, const Axes<V>& axes) {
-  const auto& [d, s] = axes;
+  const auto& d = axes.direction;
+  const auto& s = axes.scale;
   return {s[0] * dot(p, d[0]), s[1] * dot(p, d[1]), s[2] * dot(p, d[2])};
 }
 
@@ -66,13 +67,14 @@ GS_HD Vec3<V> row_of(Vec3<V> p, const Axes<V>& axes) {
 // products, however thin the splat.
 template <class T, class V>
 GS_HD Footprint<V> splat_footprint(const Camera<T>& cam, const Perspective<V>& p, const Axes<V>& axes) {
-  const auto& [d, s] = axes;
+  const auto& d = axes.direction;
+  const auto& s = axes.scale;
   const Vec3<V> ray = cam.dual_z + p.clamped_x * cam.dual_x + p.clamped_y * cam.dual_y;
   const V fx = cam.focal_x * p.inverse_depth, fy = cam.focal_y * p.inverse_depth;
   const Vec3<V> minors = {(fx * s[1]) * (fy * s[2]) * dot(ray, cross(d[1], d[2])),
                           (fx * s[2]) * (fy * s[0]) * dot(ray, cross(d[2], d[0])),
                           (fx * s[0]) * (fy * s[1]) * dot(ray, cross(d[0], d[1]))};
-  return make_footprint(row_of(p.p1, axes), row_of(p.p2, axes), minors);
+  return make_footprint(row_of(p.p1, axes), row_of(p.p2, axes), minors, axes.dilation);
 }
 
 // Computes a splat except its colour. Opacity, scales and rotation must be finite. Returns false if it is culled:
@@ -114,7 +116,7 @@ GS_HD V outside(const Camera<T>& cam, V x, V y) {
 template <class T, class V, class Scale>
 GS_HD Truth<V> surely_outside(const Camera<T>& cam, Vec3<V> mean, const Scale& largest_scale) {
   const Vec3<V> view = to_view(cam, mean);
-  const Truth<V> front = in_front(view.z);
+  const Truth<V> front = in_front(cam, view.z);
   const Perspective<V> p = perspective(cam, view);
   const V x = cam.mean_focal_x * p.ray_x + cam.axis_x, y = cam.mean_focal_y * p.ray_y + cam.axis_y;
   const V deviations = (outside<T, V>(cam, x, y) - 3) / T(3.5);

@@ -44,7 +44,7 @@ struct Slopes {
 // ((m1 x m2) m3)^2 + h (|m1 x m3|^2 + |m2 x m3|^2) + h^2 |m3|^2 over c schur.
 template <class T>
 GS_HD Slopes<T> make_slopes(const Footprint<T>& f, Vec3<T> m3) {
-  const Scalar<T> h = Scalar<T>(kDilation), two_ln2 = Scalar<T>(2 * kLn2);
+  const Scalar<T> h = f.dilation.area, two_ln2 = Scalar<T>(2 * kLn2);
   Slopes<T> s;
   whitened_rows(f, s.lm_u, s.lm_v);
   s.slope_u = -two_ln2 * dot(s.lm_u, m3), s.slope_v = -two_ln2 * dot(s.lm_v, m3);
@@ -82,7 +82,7 @@ template <class T, class V, class Scale>
 GS_HD Truth<V> surely_outside(const RayCamera<T>& cam, Vec3<V> mean, const Scale& largest_scale) {
   const Camera<T>& flat = cam;
   const Vec3<V> view = to_view(cam, mean);
-  const Truth<V> out = surely_outside(flat, mean, largest_scale), front = in_front(view.z), off = out & front;
+  const Truth<V> out = surely_outside(flat, mean, largest_scale), front = in_front(cam, view.z), off = out & front;
   if (!any(off)) return out;
   const V per_depth = 1 / view.z, scale = largest_scale();
   Truth<V> beyond = !front;

@@ -9,7 +9,7 @@ GS_ISA_BEGIN
 
 template <class T>
 GS_HD Camera<T> camera_of(const Scene<T>& s) {
-  return make_camera(s.view, s.projection, s.center, s.tan_x, s.tan_y, s.image.width, s.image.height);
+  return make_camera(s.view, s.projection, s.center, s.tan_x, s.tan_y, s.image.width, s.image.height, s.near);
 }
 
 template <class T>
@@ -71,7 +71,7 @@ struct SceneRow {
 template <class V>
 struct Loaded {
   Gaussian<V> gaussian;
-  Quat<V> rotation;  // as used: normalised if raw
+  Quat<V> rotation;  // as used
   V rotation_norm;
 };
 
@@ -84,11 +84,13 @@ GS_HD Loaded<V> load(const Scene<T>& s, const Row& row) {
   g.log2_opacity = s.raw ? log2_sigmoid(row.opacity()) : binary_log(row.opacity());
   if (s.cov3d) {
     g.axes = axes_of_covariance(row.cov3d());
+    g.axes.dilation = s.dilation;
     return out;
   }
   out.rotation = row.rotation();
-  if (s.raw) out.rotation = normalise(out.rotation, out.rotation_norm);
+  if (s.any_rotation) out.rotation = normalise(out.rotation, out.rotation_norm);
   rotation_columns(out.rotation, g.axes.direction);
+  g.axes.dilation = s.dilation;
   for (int k = 0; k < 3; ++k) {
     const V scale = row.scale(k);
     g.axes.scale[k] = s.scale_modifier * (s.raw ? exponential(scale) : scale);
@@ -203,7 +205,7 @@ GS_HD void project_vjp_row(const Scene<T>& s, const AnyCamera& camera, const Row
   const Loaded<V> in = load(s, row);
   V* g_covariance = out.cov3d ? out.cov3d + 6 * to : nullptr;
   const auto shape_gradient = [&](const auto& moments) {
-    return project_splat_vjp(camera, in.gaussian, s.antialiasing, s.raw, g_covariance, moments, m[9]);
+    return project_splat_vjp(camera, in.gaussian, s.antialiasing, s.any_rotation, g_covariance, moments, m[9]);
   };
   GaussianGradient<V> g;
   if constexpr (kOnRays<AnyCamera> != kNoRays)
@@ -229,8 +231,8 @@ GS_HD void project_vjp_row(const Scene<T>& s, const AnyCamera& camera, const Row
       out.scales[3 * to + k] = scale != 0 ? g.log_scale[k] / scale : V{};  // the loss is even in the scale
     }
   if (out.rotations && s.rotations) {
-    const Quat<V> q =
-        s.raw ? normalise_vjp(in.rotation, in.rotation_norm, g.torque) : rotation_columns_vjp(in.rotation, g.direction);
+    const Quat<V> q = s.any_rotation ? normalise_vjp(in.rotation, in.rotation_norm, g.torque)
+                                     : rotation_columns_vjp(in.rotation, g.direction);
     V* to_row = out.rotations + 4 * to;
     to_row[0] = q.w, to_row[1] = q.x, to_row[2] = q.y, to_row[3] = q.z;
   }

@@ -139,7 +139,8 @@ GS_HD Truth<V> surely_unseen(const Watch<Camera<T>>& watch, Vec3<V> mean, V larg
   const V scale = largest_scale * per_depth;
   const V variance = scale * scale * (watch.wide_x * watch.wide_x + watch.wide_y * watch.wide_y);
   const V farthest = view.z + watch.z;
-  return (!in_front(farthest)) | (in_front(nearest) & too_far<V>(larger<V>(away_x, away_y), variance));
+  return (!in_front(watch.cam, farthest)) |
+         (in_front(watch.cam, nearest) & too_far<V>(larger<V>(away_x, away_y), variance));
 }
 
 // The least distance from the image, px, of where a lens shows a point of the view that has moved by a ball.
@@ -170,7 +171,7 @@ GS_HD Truth<V> surely_unseen(const Watch<LensCamera<T>>& watch, Vec3<V> mean, V 
     for (int lane = 0; lane < int(sizeof(V) / sizeof(T)); ++lane)
       away[lane] = least_away(watch.cam, Vec3<T>{view.x[lane], view.y[lane], view.z[lane]}, watch.ball, nearest[lane]);
   const V variance = scale * scale * (watch.wide * watch.wide), farthest = depth + watch.ball;
-  return (!in_front(farthest)) | (in_front(nearest) & too_far<V>(away, variance));
+  return (!in_front(watch.cam, farthest)) | (in_front(watch.cam, nearest) & too_far<V>(away, variance));
 }
 
 GS_ISA_END

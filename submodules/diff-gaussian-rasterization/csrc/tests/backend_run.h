@@ -79,7 +79,7 @@ gs::Scene<T> scene_of(Parameters<T>& p, gs::Image image, bool antialiasing) {
   scene.scales = p.scales.data(), scene.rotations = p.rotations.data();
   scene.sh_dc = p.dc.data(), scene.sh_rest = p.rest.data();
   scene.dc_stride = 3, scene.rest_stride = 45, scene.rest_bands = 15, scene.sh_degree = 3;
-  scene.raw = true, scene.antialiasing = antialiasing, scene.scale_modifier = 1;
+  scene.raw = scene.any_rotation = true, scene.antialiasing = antialiasing, scene.scale_modifier = 1;
   scene.view = p.view, scene.projection = p.full, scene.center = center;
   scene.tan_x = scene.tan_y = 0.6, scene.image = image, scene.lens = p.lens, scene.on_rays = p.rays;
   return scene;

@@ -4,6 +4,7 @@
 #include <cstring>
 
 #include "backend_run.h"
+#include "channels_run.h"
 #include "emulated_queue.h"
 #include "exchange_run.h"
 #include "front_first.cuh"
@@ -119,6 +120,36 @@ void test_rays() {
       if (count == 33) p.distort_view();
       check_scene(p, image, antialiasing, antialiasing);
     }
+}
+
+// Passes of all widths, of one channel to several passes.
+void test_channels() {
+  using gs::emulation::Order;
+  for (const auto& [count, channels, image] : {std::tuple{0, 3, gs::Image{16, 16}},
+                                               {1, 1, {1, 1}},
+                                               {33, 5, {70, 33}},
+                                               {100, 16, {70, 33}},
+                                               {100, 37, {70, 33}},
+                                               {400, 20, {48, 40}}}) {
+    Parameters<float> p(count);
+    if (count == 400)  // lists of two chunks
+      for (float& opacity : p.opacities) opacity -= 4;
+    for (const bool rays : {false, true}) {
+      p.rays = rays;
+      const bool absolute = channels < 32 && rays != (count == 33), stops = count == 100;
+      const ChannelsRun cpu = run_channels(gs::serial_executor(), p, image, channels, absolute, stops);
+      std::vector<ChannelsRun> found;
+      for (const Order order : {Order::forward, Order::shuffled}) {
+        gs::emulation::order = order;
+        gs::emulation::Memory memory;
+        found.push_back(run_channels(memory.queue(), p, image, channels, absolute, stops));
+      }
+      const ChannelsRun& got = found[0];
+      CHECK(got == found[1] && got.last == cpu.last && got.counts == cpu.counts);
+      check_near(got.color, cpu.color, 2e-5), check_near(got.transmittance, cpu.transmittance, 2e-5);
+      check_near(got.rows, cpu.rows, 2e-5), check_near(got.values, cpu.values, 2e-5);
+    }
+  }
 }
 
 // More tiles than kFewTiles, so that fewer warps share one, and a list of two chunks. One order only, because it is
@@ -733,7 +764,7 @@ void test_given_covariances_and_colors() {
       covariances.push_back(diagonal ? std::exp(2 * p.scales[i]) : 0);
   }
   gs::Scene<float> scene = scene_of(p, {40, 24}, false);
-  scene.raw = false;
+  scene.raw = scene.any_rotation = false;
   scene.scales = scene.rotations = scene.sh_dc = scene.sh_rest = nullptr, scene.rest_bands = 0;
   scene.cov3d = covariances.data(), scene.colors = colors.data();
   gs::SceneGradient<float> g{};
@@ -856,6 +887,7 @@ int main() {
                          test_against_cpu,
                          test_lenses,
                          test_rays,
+                         test_channels,
                          test_lists_of_all_lengths,
                          [] { test_many_tiles(gs::kNoRays); },
                          [] { test_many_tiles(gs::kPinholeRays); },

@@ -33,7 +33,7 @@ Camera<double> camera(double principal_x, double principal_y) {
     full[4 * i + 1] = view[4 * i + 1] / tan_y + principal_y * view[4 * i + 2];
     full[4 * i + 3] = view[4 * i + 2];
   }
-  return make_camera(view, full, center, tan_x, tan_y, kWidth, kHeight);
+  return make_camera(view, full, center, tan_x, tan_y, kWidth, kHeight, gs::kUsualNear);
 }
 
 bool reaches_image(Splat<double>& splat) {
@@ -56,7 +56,7 @@ template <class AnyCamera, class AnySplat>
 void test_surely_outside(const AnyCamera& cam) {
   int outside = 0, empty = 0;
   for (int trial = 0; trial < 10000; ++trial) {
-    Gaussian<double> g;
+    Gaussian<double> g = {{}, {{}, {}, gs::dilation_of<double>(gs::kUsualDilation)}, 0};
     g.mean = {4 * normal(), 4 * normal(), 4 * normal()};
     double norm, largest = 0;
     rotation_columns(normalise(Quat<double>{normal(), normal(), normal(), normal()}, norm), g.axes.direction);
@@ -77,7 +77,7 @@ void test_surely_outside(const AnyCamera& cam) {
 
 // A large Gaussian in front of the camera, or around it; one of five is flat.
 Gaussian<double> large_gaussian() {
-  Gaussian<double> g;
+  Gaussian<double> g = {{}, {{}, {}, gs::dilation_of<double>(gs::kUsualDilation)}, 0};
   double norm;
   g.mean = {normal(), normal(), 3 + normal()};
   rotation_columns(normalise(Quat<double>{normal(), normal(), normal(), normal()}, norm), g.axes.direction);

@@ -53,14 +53,14 @@ void check_counts(const Tensor& tile_counts, int64_t count, Device device) {
   check_tensor(tile_counts, "tile_counts", ScalarType::Int, device, {count});
 }
 
-Tensor background_like(const Tensor& background, const Tensor& splats) {
-  check_precise(background, "background", {3});
+Tensor background_like(const Tensor& background, const Tensor& splats, int64_t channels) {
+  check_precise(background, "background", {channels});
   return converted(background, splats);
 }
 
 int64_t row_values(bool absolute, gs::Rays rays) { return gradient_row(rays) + (absolute ? kAbsoluteValues : 0); }
 
-BlendBackward::BlendBackward(SOURCE_PARAMETERS, const Tensor& table) : table_(table) {
+BlendBackward::BlendBackward(SOURCE_PARAMETERS, const Tensor& table, int64_t channels) : table_(table) {
   GS_CHECK_VALUE(source.size() == kKept, "a backward takes ", int(kKept), " tensors that a forward has kept, got ",
                  source.size());
   std::copy(source.begin(), source.end(), kept_.begin());
@@ -68,8 +68,9 @@ BlendBackward::BlendBackward(SOURCE_PARAMETERS, const Tensor& table) : table_(ta
   image_ = image_of(kept_[kLast], splats());
   check_lists_of_forward();
   for (Kept one : {kInstances, kRanges, kSplatSlots, kLast, kTransmittance}) kept_[one] = packed(kept_[one]);
-  kept_[kSplats] = aligned(splats(), 2), kept_[kBackground] = background_like(kept_[kBackground], splats());
-  color_ = plane(grad_color, 3), alpha_ = plane(grad_transmittance, 1), depth_ = plane(grad_inverse_depth, 1);
+  kept_[kSplats] = aligned(splats(), 2);
+  kept_[kBackground] = background_like(kept_[kBackground], splats(), channels);
+  color_ = plane(grad_color, channels), alpha_ = plane(grad_transmittance, 1), depth_ = plane(grad_inverse_depth, 1);
   check_given(color_, "grad_color");
   check_layers();
   kept_[kLayers] = aligned(kept_[kLayers], 4);

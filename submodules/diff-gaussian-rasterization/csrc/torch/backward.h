@@ -35,7 +35,7 @@ void check_lists(const Tensor& instances, const Tensor& ranges, const Tensor& sp
 void check_counts(const Tensor& tile_counts, int64_t count, Device device);
 // The size of the image whose `last` this is.
 gs::Image image_of(const Tensor& last, const Tensor& splats);
-Tensor background_like(const Tensor& background, const Tensor& splats);
+Tensor background_like(const Tensor& background, const Tensor& splats, int64_t channels = 3);
 
 // Refuses splats on the rays of a lens, too: these ops have no lens.
 void check_staged(const Tensor& splats);
@@ -54,10 +54,10 @@ gs::BlendInput<T> blend_input(const Tensor& splats, const Tensor& instances, con
 }
 
 // Owns the tensors that the gs::BlendInput and gs::BlendGradient of a backward point into. source: Kept. table: of
-// gs::BlendInput, or undefined.
+// gs::BlendInput, or undefined. channels: of the image.
 class BlendBackward {
  public:
-  BlendBackward(SOURCE_PARAMETERS, const Tensor& table);
+  BlendBackward(SOURCE_PARAMETERS, const Tensor& table, int64_t channels = 3);
 
   const Tensor& splats() const { return kept_[kSplats]; }
 

@@ -185,7 +185,7 @@ Tensor decisive_op(const Tensor& splats, const Tensor& instances, const Tensor& 
   const gs::Image image = image_of(last, splats);
   check_lists(instances, ranges, splats, image);
   const bool through_lens = rays_of(splats) == gs::kLensRays;
-  GS_CHECK_VALUE(!through_lens || lens.size() == 3 + gs::kLensNumbers, "give the lens of splats on its rays");
+  GS_CHECK_VALUE(!through_lens || lens.size() >= 3 + gs::kLensNumbers, "give the lens of splats on its rays");
   const Tensor table = through_lens ? table_of(lens.data() + 3, image, splats) : Tensor();
   Tensor decisive = torch::stable::new_zeros(splats, {splats.size(0)}, ScalarType::Bool);
   const Tensor rows = aligned(splats, 2), no_background = torch::stable::new_zeros(splats, {3});

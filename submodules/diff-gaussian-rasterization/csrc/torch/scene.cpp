@@ -55,14 +55,18 @@ gs::Image checked_image(int64_t height, int64_t width) {
 SceneTensors::SceneTensors(const std::array<const Tensor*, kInputs - 1>& gaussians,
                            const std::array<const Tensor*, 3>& camera, List<double> lens, Sizes options)
     : dtype_(ScalarType::Float), device_(DeviceType::CPU) {
-  const bool plain = lens.size() == 3;
-  GS_CHECK_VALUE((plain || lens.size() == 3 + gs::kLensNumbers) && (options.size() == 5 || options.size() == 6),
-                 "lens must have 3 entries or 25, and options 5 or 6, got ", lens.size(), " and ", options.size());
+  const bool plain = lens.size() < 3 + gs::kLensNumbers;
+  const int64_t further = int64_t(lens.size()) - 3 - (plain ? 0 : gs::kLensNumbers);
+  GS_CHECK_VALUE((further == 0 || further == 2) && (options.size() == 5 || options.size() == 6),
+                 "lens must have 3, 5, 25 or 27 entries, and options 5 or 6, got ", lens.size(), " and ",
+                 options.size());
+  if (further) dilation_ = lens[lens.size() - 2], near_ = lens[lens.size() - 1];
   tan_x_ = lens[0], tan_y_ = lens[1], scale_modifier_ = lens[2];
   for (int k = 0; !plain && k < gs::kLensNumbers; ++k) lens_[k] = lens[3 + k];
   image_ = checked_image(options[0], options[1]);
   GS_CHECK_VALUE(options[2] >= 0 && options[2] <= kMaxShDegree, "sh_degree must be 0 to 3, got ", options[2]);
-  sh_degree_ = int(options[2]), antialiasing_ = options[3], raw_ = options[4];
+  sh_degree_ = int(options[2]), antialiasing_ = options[3];
+  raw_ = options[4] == 1, any_rotation_ = options[4] != 0;
   rays_ = options.size() > 5 && options[5];
   const auto has = [&](Input input) { return gaussians[input - 1] != nullptr; };
   GS_CHECK_TYPE(has(kMeans) && gaussians[0]->defined(), "means must be a tensor, got None");
@@ -126,6 +130,8 @@ void SceneTensors::check_settings() const {
   GS_CHECK_VALUE(lens_[0] >= 0 && lens_[0] <= 3 && lens_[0] == int(lens_[0]), "a lens's chart is 1, 2 or 3, got ",
                  lens_[0]);
   for (const double number : lens_) GS_CHECK_VALUE(!std::isnan(number), "a lens has a number that is NaN");
+  GS_CHECK_VALUE(dilation_ >= 0 && dilation_ <= 1, "the dilation must be 0 to 1 px^2, got ", dilation_);
+  GS_CHECK_VALUE(near_ >= 0 && std::isfinite(near_), "the near plane must be 0 or more, got ", near_);
   GS_CHECK_VALUE(std::isfinite(scale_modifier_), "scale_modifier must be finite, got ", scale_modifier_);
   GS_CHECK(count() < std::numeric_limits<int32_t>::max(), "more than 2^31 Gaussians");
 }

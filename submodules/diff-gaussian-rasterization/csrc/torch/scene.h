@@ -8,8 +8,8 @@
 #include "tensors.h"
 
 // The Gaussians, of which some may be null; the view matrix and the full projection, both transposed, and the centre;
-// tan_x, tan_y and scale_modifier, and perhaps the numbers of a gs::Lens; height, width, sh_degree, antialiasing, raw,
-// and perhaps whether Gaussians are seen on rays.
+// tan_x, tan_y and scale_modifier, perhaps the numbers of a gs::Lens, and perhaps dilation and near; height, width,
+// sh_degree, antialiasing, raw (2: rotations alone have any length), and perhaps whether Gaussians are seen on rays.
 #define CAMERA_SCHEMA "float[] lens, int[] options"
 #define SCENE_SCHEMA                                                                                   \
   "Tensor means, Tensor opacities, Tensor? scales, Tensor? rotations, Tensor? cov3d, Tensor? colors, " \
@@ -129,7 +129,10 @@ class SceneTensors {
             blocks_.defined() ? read<int32_t>(blocks_) : nullptr,
             blocks_.defined() ? blocks_.size(0) : 0,
             lens_from<T>(lens_.data()),
-            rays_};
+            rays_,
+            gs::dilation_of<T>(dilation_),
+            T(near_),
+            any_rotation_};
   }
 
  private:
@@ -140,10 +143,10 @@ class SceneTensors {
   Device device_;
   InputTensors inputs_;  // means2d stays undefined
   Tensor view_, projection_, center_, awake_, blocks_;
-  double tan_x_, tan_y_, scale_modifier_;
+  double tan_x_, tan_y_, scale_modifier_, dilation_ = gs::kUsualDilation, near_ = gs::kUsualNear;
   std::array<double, gs::kLensNumbers> lens_ = {};  // gs::Lens; a pinhole if it is not given
   int sh_degree_;
-  bool antialiasing_, raw_, rays_;
+  bool antialiasing_, raw_, any_rotation_, rays_;
   gs::Image image_;
 };
 

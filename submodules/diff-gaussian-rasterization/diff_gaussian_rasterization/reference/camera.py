@@ -9,7 +9,6 @@ from diff_gaussian_rasterization.lens import Lens
 from diff_gaussian_rasterization.reference import lens as lenses
 from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 
-NEAR = 0.2  # world units; a Gaussian whose depth is not above is culled
 RAY_LIMIT = 1.3  # half images from the centre; beyond it the Jacobian is taken at this limit
 
 
@@ -25,6 +24,8 @@ class Camera(NamedTuple):
     world_to_clip: Tensor  # (4, 4)
     principal: Tensor  # (2,) NDC: where the optical axis meets the image, 0 in its middle
     lens: Lens | None  # in place of a pinhole
+    dilation: float  # px^2, added to both variances on the image
+    near: float  # depth
 
 
 class Points(NamedTuple):
@@ -52,6 +53,8 @@ def camera_of(settings: GaussianRasterizationSettings) -> Camera:
         world_to_clip,
         view_to_clip[2, :2],
         settings.lens,
+        settings.dilation,
+        settings.near,
     )
 
 
@@ -62,7 +65,7 @@ def project(means: Tensor, means2d: Tensor, camera: Camera) -> Points:
     shift = means2d[:, :2] * camera.size / 2
     if camera.lens is not None:
         return _through_lens(view, shift, camera)
-    in_front = view[:, 2] > NEAR
+    in_front = view[:, 2] > camera.near
     depth = torch.where(in_front, view[:, 2], 1.0)
     ndc = clip[:, :2] / torch.where(in_front, clip[:, 3], 1.0)[:, None]
     return Points(view, in_front, depth, ((ndc + 1) * camera.size - 1) / 2 + shift, shift)
@@ -74,7 +77,7 @@ def _through_lens(view: Tensor, shift: Tensor, camera: Camera) -> Points:
     depth = view[:, 2] if lens.chart == "perspective" else view.norm(dim=1)
     off_axis = torch.hypot(view[:, 0], view[:, 1])
     field = off_axis / depth if lens.chart == "perspective" else torch.atan2(off_axis, view[:, 2])
-    in_front = (depth > NEAR) & (field * field <= limit)
+    in_front = (depth > camera.near) & (field * field <= limit)
     view, depth = torch.where(in_front[:, None], view, 1.0), torch.where(in_front, depth, 1.0)
     return Points(view, in_front, depth, lenses.pixels(lens, view) + shift, shift)
 

@@ -37,7 +37,7 @@ def ray_shapes(gaussians: Gaussians, points: Points, camera: Camera, scale_modif
     else:
         by_depth = points.view / depth
     rows = torch.cat([J, (by_depth / depth)[:, None]], 1) @ camera.world_to_view[:3, :3].T
-    ellipses = ellipses_of(rows[:, :2], *(shape := in_space(gaussians, scale_modifier)))
+    ellipses = ellipses_of(rows[:, :2], *(shape := in_space(gaussians, scale_modifier)), camera.dilation)
     half, Sigma = shape
     Sigma = rows @ Sigma @ rows.transpose(1, 2) if half is None else (rows @ half) @ (rows @ half).transpose(1, 2)
     k, c = Sigma[:, :2, 2], Sigma[:, 2, 2]

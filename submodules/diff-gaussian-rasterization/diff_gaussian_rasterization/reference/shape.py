@@ -14,7 +14,6 @@ from torch import Tensor
 from diff_gaussian_rasterization.gaussians import Gaussians
 from diff_gaussian_rasterization.reference.camera import Camera, Points, world_to_image
 
-DILATION = 0.3  # px^2, added to both variances: an ellipse covers about a pixel at least
 TILE = 16  # px; a radius counts only where its square touches a tile of the image
 
 
@@ -25,6 +24,7 @@ class Ellipses(NamedTuple):
     r12: Tensor
     r22: Tensor
     undilated: Tensor  # (N,) px^4: determinant before the dilation
+    dilation: float  # px^2
 
     def covariance(self) -> tuple[Tensor, Tensor, Tensor]:
         """Entries xx, xy and yy, px^2."""
@@ -45,7 +45,7 @@ def activated(raw: Gaussians) -> Gaussians:
 
 def project_shapes(gaussians: Gaussians, points: Points, camera: Camera, scale_modifier: float) -> Ellipses:
     """J W Sigma W^T J^T (Kerbl et al. 2023, eq. 5), plus the dilation."""
-    return ellipses_of(world_to_image(points, camera), *in_space(gaussians, scale_modifier))
+    return ellipses_of(world_to_image(points, camera), *in_space(gaussians, scale_modifier), camera.dilation)
 
 
 def in_space(gaussians: Gaussians, scale_modifier: float) -> tuple[Tensor | None, Tensor | None]:
@@ -56,9 +56,11 @@ def in_space(gaussians: Gaussians, scale_modifier: float) -> tuple[Tensor | None
     return rotation_matrices(gaussians.rotations) * S[:, None, :], None
 
 
-def ellipses_of(JW: Tensor, RS: Tensor | None, Sigma: Tensor | None) -> Ellipses:
+def ellipses_of(JW: Tensor, RS: Tensor | None, Sigma: Tensor | None, dilation: float) -> Ellipses:
     """The dilated ellipses of Gaussians of `in_space` under linear maps JW (N, 2, 3)."""
-    return _factor_of_covariance(JW @ Sigma @ JW.transpose(1, 2)) if RS is None else _factor(JW @ RS)
+    if RS is None:
+        return _factor_of_covariance(JW @ Sigma @ JW.transpose(1, 2), dilation)
+    return _factor(JW @ RS, dilation)
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:
@@ -73,11 +75,12 @@ def rotation_matrices(quaternions: Tensor) -> Tensor:
 def compensation(ellipses: Ellipses) -> Tensor:
     """The antialiasing factor of opacities (N,): sqrt(det / dilated det), as in Yu et al. 2024 (Mip-Splatting).
 
-    The ratio is 1 / (1 + grown / det), where grown = dilated det - det = 0.3 (trace - 0.3) with the dilated trace.
+    The ratio is 1 / (1 + grown / det), where grown = dilated det - det = h (trace - h) with the dilated trace and the
+    dilation h.
     Subtracting the determinants would lose every digit of `grown` on splats of 1,000 px.
     """
     xx, _, yy = ellipses.covariance()
-    grown = DILATION * (xx + yy - DILATION)
+    grown = ellipses.dilation * (xx + yy - ellipses.dilation)
     ratio = 1 / (1 + grown / torch.clamp(ellipses.undilated, min=1e-8))  # a smaller det gives the floor below anyway
     return torch.sqrt(torch.clamp(ratio, min=2.5e-5))
 
@@ -104,19 +107,19 @@ def _normalised(quaternions: Tensor) -> Tensor:
     return torch.where(is_zero, identity, quaternions / torch.where(is_zero, 1.0, length))
 
 
-def _factor(half: Tensor) -> Ellipses:
-    """The ellipses of half half^T + 0.3 I, where half (N, 2, 3) is J W R S."""
+def _factor(half: Tensor, dilation: float) -> Ellipses:
+    """The ellipses of half half^T + dilation I, where half (N, 2, 3) is J W R S."""
     across, down = half.unbind(1)
     xx, xy, yy = (across * across).sum(1), (across * down).sum(1), (down * down).sum(1)
     undilated = torch.linalg.cross(across, down).square().sum(1)  # Cauchy-Binet: nothing cancels
-    dilated = undilated + DILATION * (xx + yy) + DILATION**2
-    r11 = torch.sqrt(xx + DILATION)
-    return Ellipses(r11, xy / r11, torch.sqrt(dilated) / r11, undilated)
+    dilated = undilated + dilation * (xx + yy) + dilation**2
+    r11 = torch.sqrt(xx + dilation)
+    return Ellipses(r11, xy / r11, torch.sqrt(dilated) / r11, undilated, dilation)
 
 
-def _factor_of_covariance(covariance: Tensor) -> Ellipses:
-    """The ellipses of covariances (N, 2, 2) + 0.3 I, by Cholesky's formulas."""
+def _factor_of_covariance(covariance: Tensor, dilation: float) -> Ellipses:
+    """The ellipses of covariances (N, 2, 2) + dilation I, by Cholesky's formulas."""
     xx, xy, yy = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    dilated = (xx + DILATION) * (yy + DILATION) - xy * xy
-    r11 = torch.sqrt(xx + DILATION)
-    return Ellipses(r11, xy / r11, torch.sqrt(dilated) / r11, xx * yy - xy * xy)
+    dilated = (xx + dilation) * (yy + dilation) - xy * xy
+    r11 = torch.sqrt(xx + dilation)
+    return Ellipses(r11, xy / r11, torch.sqrt(dilated) / r11, xx * yy - xy * xy, dilation)

@@ -1,0 +1,66 @@
+#pragma once
+// What a splat's gradient sums over the pixels of a lane.
+#include <type_traits>
+
+#include "blend_layout.cuh"
+
+namespace gs {
+namespace cuda {
+
+// Sums over a lane's pixels, which lie in one row. Along it v is constant, so three of the moments come last.
+struct FlatRowSums {
+  float q = 0, qu = 0, quu = 0;
+
+  __device__ void add(float u, float q_here) {
+    const float qu_here = q_here * u;
+    q += q_here, qu += qu_here, quu += qu_here * u;
+  }
+  __device__ Moments<float> moments(const RowTerms<float>& row) const {
+    return {q, qu, row.v * q, quu, row.v * qu, row.v * row.v * q};
+  }
+};
+
+// Of a lane's pixels, on the rays of a lens.
+struct LensRowSums : PlaceSums<float> {
+  using PlaceSums<float>::moments;
+  __device__ RayMoments<float> moments(const LensTerms<float>&, const LensLocal&) const { return moments(); }
+};
+struct RayRowMoments : RayRowSums<float> {
+  using RayRowSums<float>::moments;
+  __device__ RayMoments<float> moments(const RayRow<float>& row, const LocalRaySplat<float>& splat) const {
+    return moments(row, splat.slope_v);
+  }
+};
+template <class Sums, class Row, class Here>
+__device__ __forceinline__ void add_pixel(Sums& sums, const Row&, const Here& here, float q) {
+  sums.add(here, q);
+}
+__device__ __forceinline__ void add_pixel(LensRowSums& sums, const LensTerms<float>& terms, const AtPlace<float>& here,
+                                          float q) {
+  sums.add(terms, here, q);
+}
+
+// What moves the mean, whitened: u and v, or w a / s.
+__device__ inline float2 pull(const LocalSplat<float>&, const RowTerms<float>& row, float u) { return {u, row.v}; }
+__device__ inline float2 pull(const LocalRaySplat<float>& splat, const RayRow<float>& row, const AtPixel<float>& at) {
+  const RayWeights<float> weights = ray_weights(row, at, splat.slope_v);
+  return {weights.au, weights.av};
+}
+
+__device__ inline float2 pull(const LensLocal&, const LensTerms<float>& terms, const AtPlace<float>& at) {
+  const RayWeights<float> weights = ray_weights(terms, at);
+  return {weights.au, weights.av};
+}
+
+template <class AnySplat>
+__device__ __forceinline__ auto terms_of(const AnySplat& splat, int y) {
+  return row_terms(splat, float(y));
+}
+__device__ __forceinline__ const LensTerms<float>& terms_of(const LensLocal& splat, int) { return splat.terms; }
+
+template <int kRays>
+using LaneMoments = std::conditional_t<kRays == kLensRays, LensRowSums,
+                                       std::conditional_t<kRays == kNoRays, FlatRowSums, RayRowMoments>>;
+
+}  // namespace cuda
+}  // namespace gs
