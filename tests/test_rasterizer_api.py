@@ -439,7 +439,7 @@ def test_wrong_inputs_are_named(name, value, error, message):
         ({"campos": torch.zeros(3, dtype=torch.int64)}, "center must be float32 or float64, got torch.int64"),
         ({"bg": torch.zeros(1)}, r"background must be \(3,\), got \(1,\)"),
         ({"bg": torch.zeros(3).half()}, "background must be float32 or float64, got torch.float16"),
-        ({"tanfovx": 0.0}, "tan_x must be the tangent of half an angle of view, got 0"),
+        ({"tanfovx": -1.0}, "tan_x must be the tangent of half an angle of view, got -1"),
         ({"tanfovy": float("nan")}, "tan_y must be the tangent of half an angle of view, got nan"),
         ({"tanfovx": float("inf")}, "tan_x must be the tangent"),
         ({"scale_modifier": float("nan")}, "scale_modifier must be finite, got nan"),

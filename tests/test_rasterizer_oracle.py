@@ -115,6 +115,7 @@ def test_outputs_and_gradients_agree_with_the_oracle(dtype, kind, camera, antial
     [
         {"dilation": 0.05},
         {"near": 2.5},
+        {"dilation": 0.2, "tanfovx": 0.0, "tanfovy": 0.0},
         {"near": 4.0, "lens": Lens("equidistant", (60.0, 60.0), (23.5, 19.0))},
         {"dilation": 0.0, "antialiasing": True},
         {"dilation": 0.9, "antialiasing": True, "projection": "ray"},

@@ -31,7 +31,8 @@ def camera_numbers(scene: Scene, settings: GaussianRasterizationSettings) -> Ten
         # The projection's own entries: inverse(view) @ full, by dual rows as in csrc/math/camera.h.
         dual = torch.linalg.cross(rows.roll(-1, 0), rows.roll(-2, 0))
         entries = dual @ projection[:3, :2] / (rows[0] @ dual[0])
-        shift, tangent = entries[2], torch.stack([torch.as_tensor(tan, **double) for tan in tangents])
+        given = torch.stack([torch.as_tensor(tan, **double) for tan in tangents])
+        shift, tangent = entries[2], torch.where(given > 0, given, 1 / entries.diagonal().abs().detach())
         own = torch.cat([size / (2 * tangent), (size * (1 + shift) - 1) / 2, size / 2 * entries.diagonal()])
     else:
         own = (

@@ -8,10 +8,9 @@ Names, order, defaults, shapes and results are gsplat's; what it does not have i
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import lru_cache
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -45,7 +44,7 @@ class _Camera(NamedTuple):
     """One camera of a call."""
 
     view: Tensor  # (4, 4) world to view
-    numbers: np.ndarray  # (25,) the same, then K (3, 3)
+    K: Tensor  # (3, 3)
     width: int
     height: int
     model: str
@@ -53,32 +52,32 @@ class _Camera(NamedTuple):
     far: float
 
     def settings(
-        self, degree: int, antialiased: bool, dilation: float, background: Tensor
+        self, degree: int | None, antialiased: bool, dilation: float, background: Tensor
     ) -> GaussianRasterizationSettings:
-        """The settings, differentiable in `view`."""
-        fx, _, cx, _, fy, cy, *_ = self.numbers[16:].tolist()
-        width, height, focal = self.width, self.height, (fx, fy)
-        rows = [[2 * fx / width, 0, 2 * cx / width - 1, 0], [0, 2 * fy / height, 2 * cy / height - 1, 0]]
-        projection = np.array([*rows, [0, 0, 1, 0], [0, 0, 1, 0]])
-        # An orthographic camera is a pinhole for which all is at the same depth, up to rounding.
-        flat = np.diag([1, 1, _FLAT if self.model == "ortho" else 1, 1])
-        flat[2, 3] = self.model == "ortho"
-        if self.view.requires_grad:
-            view, center = self.view.new_tensor(flat) @ self.view, torch.linalg.inv(self.view)[:3, 3]
-            full = self.view.new_tensor(projection) @ view
-            packed = torch.cat([view.T.flatten(), full.T.flatten(), center])
-        else:  # matrices are made on the host and go to the device in one copy
-            view = self.numbers[:16].reshape(4, 4)
-            center, view = np.linalg.inv(view)[:3, 3], flat @ view
-            packed = torch.from_numpy(np.concatenate([view.T.ravel(), (projection @ view).T.ravel(), center]))
-            packed = packed.to(self.view)
-        chart = {"fisheye": partial(_Fisheye, "equidistant"), "ortho": partial(Lens, "perspective")}.get(self.model)
+        """The settings, differentiable in `view`. Of a pinhole no number goes to the host, which would wait for it."""
+        view, width, height = self.view.double(), self.width, self.height
+        center = torch.linalg.inv(view)[:3, 3] if degree else view[:3, 3]  # SH of degree 0 have no direction
+        lens, near = None, self.near
+        if self.model != "pinhole":
+            fx, _, cx, _, fy, cy, *_ = self.K.flatten().tolist()
+            lens = (_Fisheye if self.model == "fisheye" else Lens)(
+                "equidistant" if self.model == "fisheye" else "perspective", (fx, fy), (cx - 0.5, cy - 0.5)
+            )
+        if self.model == "ortho":  # a pinhole for which all is at the same depth, up to rounding
+            view, near = torch.cat([view[:2], _FLAT * view[2:3] + view.new_tensor([[0, 0, 0, 1]]), view[3:]]), 0.0
+        full = view[:3].T @ self.K.double().T @ _clip(width, height, view.device)
+        matrices = torch.cat([view.T.flatten(), full.flatten(), center]).to(self.view.dtype)
         return GaussianRasterizationSettings(
-            height, width, width / (2 * fx), height / (2 * fy), background, 1.0, packed[:16].view(4, 4),
-            packed[16:32].view(4, 4), degree, packed[32:35], False, False, antialiased,
-            lens=chart and chart(focal, (cx - 0.5, cy - 0.5)), dilation=dilation,
-            near=0.0 if self.model == "ortho" else self.near,
+            height, width, 0.0, 0.0, background, 1.0, matrices[:16].view(4, 4), matrices[16:32].view(4, 4),
+            degree or 0, matrices[32:], False, False, antialiased, lens=lens, dilation=dilation, near=near,
         )  # fmt: skip
+
+
+@lru_cache
+def _clip(width: int, height: int, device: torch.device) -> Tensor:
+    """From pixels times depth to clip coordinates, transposed (3, 4)."""
+    rows = [[2 / width, 0, -1], [0, 2 / height, -1], [0, 0, 1], [0, 0, 1]]
+    return torch.tensor(rows, dtype=torch.float64, device=device).T.contiguous()
 
 
 class _Rows(NamedTuple):
@@ -255,14 +254,13 @@ def _images(
         return values.reshape(batches, *values.shape[values.dim() - axes :])[at]
 
     batches = math.prod(batch)
-    numbers = torch.cat([viewmats.detach().flatten(-2), Ks.detach().to(viewmats).flatten(-2)], -1)
-    numbers = numbers.double().cpu().numpy().reshape(batches, cameras, -1)
     for at in range(batches):
         rows = [(means, 2), (quats, 2), (scales, 2), (opacities, 1), (covars, 3)]
         own = [item(values, axes, at) for values, axes in rows]
-        shown, views, behind = item(colors, 2 + harmonics + each, at), item(viewmats, 3, at), item(backgrounds, 2, at)
+        shown, behind = item(colors, 2 + harmonics + each, at), item(backgrounds, 2, at)
+        views, intrinsics = item(viewmats, 3, at), item(Ks.detach(), 3, at)
         for n in range(cameras):
-            camera = views[n], numbers[at, n]
+            camera = views[n], intrinsics[n]
             yield _Rows(*own, shown[n] if each else shown), camera, None if behind is None else behind[n]
 
 
@@ -306,7 +304,7 @@ def _render(camera: _Camera, rows: _Rows, background: Tensor | None, options: _O
         opacities = torch.where((depth > camera.near) & (depth < camera.far), opacities, 0)
     wanted = any(values is not None and values.requires_grad for values in (*rows, camera.view, background))
     probe = torch.empty_like(rows.means).requires_grad_(wanted and torch.is_grad_enabled())
-    settings = camera.settings(options.degree or 0, options.antialiased, options.dilation, behind)
+    settings = camera.settings(options.degree, options.antialiased, options.dilation, behind)
     out = rasterize_channels(
         rows.means,
         probe,
@@ -340,8 +338,9 @@ def _shapes(rows: _Rows, options: _Options) -> dict[str, Tensor]:
         places = (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)
         shape = {"cov3d": torch.stack([rows.covars[:, i, j] for i, j in places], 1)}
     if options.mode.startswith("RGB") and options.degree is not None:
-        sh_dc, sh_rest = rows.colors[:, :1], rows.colors[:, 1 : (MOST_BANDS + 1) ** 2]
-        shape |= {"sh_dc": sh_dc.contiguous(), "sh_rest": sh_rest.contiguous()}
+        most = (MOST_BANDS + 1) ** 2
+        harmonics = rows.colors if rows.colors.shape[1] <= most else rows.colors[:, :most]
+        shape["sh_dc"], shape["sh_rest"] = harmonics.split((1, harmonics.shape[1] - 1), 1)
     return shape
 
 

@@ -19,7 +19,7 @@ class GaussianRasterizationSettings(NamedTuple):
 
     image_height: int
     image_width: int
-    tanfovx: float | Tensor  # tan of half the field of view
+    tanfovx: float | Tensor  # tan of half the field of view; 0: that of projmatrix
     tanfovy: float | Tensor
     bg: Tensor  # (3,)
     scale_modifier: float

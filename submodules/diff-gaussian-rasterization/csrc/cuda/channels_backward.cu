@@ -341,7 +341,7 @@ template <int kRays, bool kAbsolute>
 void run_passes(const Queue& queue, const BlendInput<float>& in, const Channels<float>& channels,
                 const BlendGradient<float>& g, const RowMemory<float>& memory, float* values) {
   const int32_t chunk_size = tiles_of(in.image) <= kFewTiles ? kChunkOfFew : kChunkOfMany;
-  const auto found = find_processed(queue, in, g, chunk_size, true);
+  const auto found = find_processed(queue, in, g, chunk_size, false);
   float* const shapes = memory.take(memory.context, found.rows);
   Layer* layers = queue.array<Layer>(size_t(found.schedule.places) * kTile * kTile);
   const int64_t widest = channels.count > 16 ? kMostChannels : 16;

@@ -39,7 +39,7 @@ GS_HD void clamp_rays(double shift_x, double shift_y, double tan_x, double tan_y
 // Makes a camera from the reference's settings: the view and the full projection matrix, both transposed (for row
 // vectors), row-major. Dot products with the dual rows extract the projection's own entries from the full matrix. They
 // are computed in double, without the part from x . z, which is 0 up to rounding: in a narrow field of view the scale
-// is 1e5 times the shift.
+// is 1e5 times the shift. A tangent of 0 stands for the projection's own.
 template <class T>
 GS_HD Camera<T> make_camera(const T* view, const T* full, const T* center, double tan_x, double tan_y, int width,
                             int height, T near) {
@@ -67,6 +67,8 @@ GS_HD Camera<T> make_camera(const T* view, const T* full, const T* center, doubl
   const double shift_y = per_z * (dot(clip_y, dual_z) - scale_y * dot(y, dual_z));
   cam.mean_focal_x = T(0.5 * width * scale_x), cam.mean_focal_y = T(0.5 * height * scale_y);
   cam.axis_x = T(0.5 * (width * (1 + shift_x) - 1)), cam.axis_y = T(0.5 * (height * (1 + shift_y) - 1));
+  if (tan_x == 0) cam.focal_x = magnitude(cam.mean_focal_x), tan_x = T(0.5) * width / cam.focal_x;
+  if (tan_y == 0) cam.focal_y = magnitude(cam.mean_focal_y), tan_y = T(0.5) * height / cam.focal_y;
   clamp_rays(shift_x, shift_y, tan_x, tan_y, cam);
   return cam;
 }

@@ -126,7 +126,7 @@ Tensor SceneTensors::checked_rest(const Tensor& t) const {
 
 void SceneTensors::check_settings() const {
   for (const auto& [name, tan] : {std::pair("tan_x", tan_x_), std::pair("tan_y", tan_y_)})
-    GS_CHECK_VALUE(tan > 0 && std::isfinite(tan), name, " must be the tangent of half an angle of view, got ", tan);
+    GS_CHECK_VALUE(tan >= 0 && std::isfinite(tan), name, " must be the tangent of half an angle of view, got ", tan);
   GS_CHECK_VALUE(lens_[0] >= 0 && lens_[0] <= 3 && lens_[0] == int(lens_[0]), "a lens's chart is 1, 2 or 3, got ",
                  lens_[0]);
   for (const double number : lens_) GS_CHECK_VALUE(!std::isnan(number), "a lens has a number that is NaN");

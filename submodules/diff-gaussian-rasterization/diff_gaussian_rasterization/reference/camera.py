@@ -43,11 +43,13 @@ def camera_of(settings: GaussianRasterizationSettings) -> Camera:
     width, height = settings.image_width, settings.image_height
     world_to_view, world_to_clip = settings.viewmatrix.double(), settings.projmatrix.double()
     view_to_clip = torch.linalg.inv(world_to_view) @ world_to_clip
+    tangents = torch.tensor([settings.tanfovx, settings.tanfovy], dtype=torch.float64)
+    own = 1 / view_to_clip.diagonal()[:2].abs()  # those of the projection
     return Camera(
         width,
         height,
         torch.tensor([width, height], dtype=torch.float64),
-        torch.tensor([settings.tanfovx, settings.tanfovy], dtype=torch.float64),
+        torch.where(tangents > 0, tangents, own),
         settings.campos.double(),
         world_to_view,
         world_to_clip,
