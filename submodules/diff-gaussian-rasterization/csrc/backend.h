@@ -43,7 +43,8 @@ struct RowMemory {
   template <class T>                                                                                 \
   void blend_channels(const Where&, const BlendInput<T>&, const Channels<T>&, const Blended<T>&);    \
   /* The same as blend_rows, and the gradient of the channels' values, (N, count), unless null. The  \
-     first three channels' gradients are in the rows, too, as those of a colour. */                  \
+     first three channels' gradients are in the rows, too, as those of a colour. On a GPU there may  \
+     be more rows than those of all splats, which come first. */                                     \
   template <class T>                                                                                 \
   void channel_rows(const Where&, const BlendInput<T>&, const Channels<T>&, const BlendGradient<T>&, \
                     const RowMemory<T>&, T* values);                                                 \

@@ -47,6 +47,8 @@ ChannelsRun run_channels(const Where& where, Parameters<float>& p, gs::Image ima
     return to.rows.data();
   };
   channel_rows(where, in, shown, g, gs::RowMemory<float>{take, &out, out.counts.data(), absolute}, out.values.data());
-  CHECK(int64_t(out.rows.size()) / out.row == std::accumulate(out.counts.begin(), out.counts.end(), int64_t(0)));
+  const size_t filled = out.row * std::accumulate(out.counts.begin(), out.counts.end(), size_t(0));
+  CHECK(out.rows.size() >= filled);
+  out.rows.resize(filled);
   return out;
 }

@@ -40,7 +40,8 @@ std::tuple<Tensor, Tensor, Tensor> blend_channels_op(const Tensor& splats, const
 }
 
 // The rows of blend_rows, in which the first three channels stand for the colour, and the gradient of the channels,
-// of no rows unless it is wanted. stops: whether gradients end where alpha is `cap`.
+// of no rows unless it is wanted. On a GPU rows of no splat may follow. stops: whether gradients end where alpha is
+// `cap`.
 std::tuple<Tensor, Tensor, Tensor> channel_rows_op(List<Tensor> source, const Tensor& channels,
                                                    const Tensor& grad_color, const MaybeTensor& grad_transmittance,
                                                    double cap, bool stops, bool absolute, bool wanted) {
