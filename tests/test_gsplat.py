@@ -175,6 +175,14 @@ def test_sparse_gradients_have_the_rows_that_are_shown():
         assert torch.equal(sparse.coalesce().indices()[0], meta["gaussian_ids"].unique()) and sparse._nnz() < 200
 
 
+def test_four_numbers_of_an_intrinsic_matrix_count():
+    given = Inputs(5)
+    image = given.draw()[0]
+    given.Ks = given.Ks.clone()
+    given.Ks[:, 0, 1], given.Ks[:, 2] = 7.0, torch.tensor([0.1, 0.2, 3.0])
+    assert torch.equal(given.draw()[0], image)
+
+
 def test_leading_batches_and_colours_of_each_camera():
     given, other = Inputs(3), Inputs(4)
     colors = torch.stack([given.colors, given.colors.flip(0)])

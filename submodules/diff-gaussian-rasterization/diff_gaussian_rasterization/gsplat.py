@@ -65,7 +65,8 @@ class _Camera(NamedTuple):
             )
         if self.model == "ortho":  # a pinhole for which all is at the same depth, up to rounding
             view, near = torch.cat([view[:2], _FLAT * view[2:3] + view.new_tensor([[0, 0, 0, 1]]), view[3:]]), 0.0
-        full = view[:3].T @ self.K.double().T @ _clip(width, height, view.device)
+        kept, last, clip = _of_pixels(width, height, view.device)
+        full = view[:3].T @ torch.addcmul(last, self.K.double(), kept).T @ clip
         matrices = torch.cat([view.T.flatten(), full.flatten(), center]).to(self.view.dtype)
         return GaussianRasterizationSettings(
             height, width, 0.0, 0.0, background, 1.0, matrices[:16].view(4, 4), matrices[16:32].view(4, 4),
@@ -74,10 +75,14 @@ class _Camera(NamedTuple):
 
 
 @lru_cache
-def _clip(width: int, height: int, device: torch.device) -> Tensor:
-    """From pixels times depth to clip coordinates, transposed (3, 4)."""
-    rows = [[2 / width, 0, -1], [0, 2 / height, -1], [0, 0, 1], [0, 0, 1]]
-    return torch.tensor(rows, dtype=torch.float64, device=device).T.contiguous()
+def _of_pixels(width: int, height: int, device: torch.device) -> list[Tensor]:
+    """What K makes a projection with: its entries that count (3, 3), as in gsplat, and the others.
+
+    Then from pixels times depth to clip coordinates, transposed (3, 4).
+    """
+    clip = [[2 / width, 0, 0, 0], [0, 2 / height, 0, 0], [-1, -1, 1, 1]]
+    kept, last = [[1, 0, 1], [0, 1, 1], [0, 0, 0]], [[0, 0, 0], [0, 0, 0], [0, 0, 1]]
+    return [torch.tensor(rows, dtype=torch.float64, device=device) for rows in (kept, last, clip)]
 
 
 class _Rows(NamedTuple):
@@ -258,7 +263,7 @@ def _images(
         rows = [(means, 2), (quats, 2), (scales, 2), (opacities, 1), (covars, 3)]
         own = [item(values, axes, at) for values, axes in rows]
         shown, behind = item(colors, 2 + harmonics + each, at), item(backgrounds, 2, at)
-        views, intrinsics = item(viewmats, 3, at), item(Ks.detach(), 3, at)
+        views, intrinsics = item(viewmats, 3, at), item(Ks.detach().to(means.device), 3, at)
         for n in range(cameras):
             camera = views[n], intrinsics[n]
             yield _Rows(*own, shown[n] if each else shown), camera, None if behind is None else behind[n]
