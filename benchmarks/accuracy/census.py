@@ -13,7 +13,6 @@ and in percent how many Gaussians or splats of the model that has the most are m
 case covers: for two axes at a time, decades that hold splats of a model and none of any case.
 """
 
-import argparse
 import math
 from collections import Counter
 from collections.abc import Iterable
@@ -26,8 +25,8 @@ from diff_gaussian_rasterization import Gaussians
 from tqdm import tqdm
 
 from benchmarks.accuracy.splat_shapes import Histogram, Sorted, Splats, axes_of, cells, seen
-from benchmarks.accuracy.trained_models import TrainedModel, add_models, trained
-from benchmarks.harness.measuring import add_device, chosen_device, describe, print_table
+from benchmarks.accuracy.trained_models import TrainedModel, model_parser, trained
+from benchmarks.harness.measuring import chosen_device, describe, print_table
 from benchmarks.workloads.stability_cases import CASES, Case
 from utils.system_utils import UserError, atomic_write, run_cli
 
@@ -192,11 +191,7 @@ def draw(path: Path, censuses: list[Census], by_case: dict[Case, tuple[Splats, S
 
 @torch.no_grad()
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    add_models(parser)
-    add_device(parser)
-    parser.add_argument("--figure", type=Path, help="image file to write")
-    args = parser.parse_args()
+    args = model_parser(__doc__, figure=True).parse_args()
     device = chosen_device(args)
     censuses = []
     for word in args.models:

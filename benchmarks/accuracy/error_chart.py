@@ -18,7 +18,6 @@ All but the last two are measured on the same random pixels of some views of eac
 - the model: the differences from the photos, of training and test, which no arithmetic removes.
 """
 
-import argparse
 import io
 import math
 from collections.abc import Callable, Iterator
@@ -33,8 +32,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks.accuracy.sampled_pixels import blended, layers, random_pixels, sorted_view
-from benchmarks.accuracy.trained_models import TrainedModel, add_models, trained
-from benchmarks.harness.measuring import add_device, chosen_device, describe, print_table
+from benchmarks.accuracy.trained_models import TrainedModel, model_parser, trained
+from benchmarks.harness.measuring import chosen_device, describe, print_table
 from benchmarks.workloads.splat_scenes import PARAMETERS, on_device
 from scene.cameras import Camera
 from utils.system_utils import atomic_write, run_cli
@@ -193,11 +192,7 @@ def draw(path: Path, found: dict[str, dict[str, float]], title: str) -> None:
 
 @torch.no_grad()
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    add_models(parser)
-    add_device(parser)
-    parser.add_argument("--figure", type=Path, help="image file to write")
-    args = parser.parse_args()
+    args = model_parser(__doc__, figure=True).parse_args()
     device = chosen_device(args)
     machine, found = describe(device), {}
     print(machine)

@@ -15,7 +15,6 @@ EWA and with rays; nothing else differs. Counted are
   pixel gets another ray, which meets them in an order of its own. The order of means stays, as all depths change alike.
 """
 
-import argparse
 import math
 from collections import defaultdict
 from typing import NamedTuple
@@ -34,8 +33,8 @@ from benchmarks.accuracy.sampled_pixels import (
     random_pixels,
     sorted_view,
 )
-from benchmarks.accuracy.trained_models import TrainedModel, add_models, trained
-from benchmarks.harness.measuring import add_device, chosen_device, describe, print_table
+from benchmarks.accuracy.trained_models import TrainedModel, model_parser, trained
+from benchmarks.harness.measuring import chosen_device, describe, print_table
 from utils.system_utils import run_cli
 
 VIEWS, PIXELS = 8, 300  # of a model, and of a view
@@ -151,10 +150,7 @@ def row(model: TrainedModel, projection: str, found: Popping) -> list[str]:
 
 @torch.no_grad()
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    add_models(parser)
-    add_device(parser)
-    args = parser.parse_args()
+    args = model_parser(__doc__).parse_args()
     device = chosen_device(args)
     print(describe(device))
     rows = []

@@ -10,6 +10,7 @@ from diff_gaussian_rasterization import GaussianRasterizationSettings, Gaussians
 from torch import Tensor
 
 from arguments import ModelParams, PipelineParams, read_cfg_args
+from benchmarks.harness.measuring import add_device
 from benchmarks.workloads.splat_scenes import COLUMNS, PARAMETERS, on_device, settings
 from gaussian_renderer import rasterizer_settings
 from scene.cameras import Camera
@@ -38,14 +39,19 @@ class TrainedModel(NamedTuple):
         return torch.linspace(0, last, min(count, last + 1)).round().long().unique().tolist()
 
 
-def add_models(parser: argparse.ArgumentParser) -> None:
-    """Add the argument `models`, whose words `trained` reads."""
+def model_parser(doc: str, figure: bool = False) -> argparse.ArgumentParser:
+    """A parser with `models`, whose words `trained` reads, --device, and perhaps --figure."""
+    parser = argparse.ArgumentParser(description=doc.splitlines()[0])
     parser.add_argument(
         "models",
         nargs="+",
         metavar="[LABEL=]MODEL",
         help="folder of train.py (its newest save), a PLY in it, or any PLY, which gets made cameras",
     )
+    add_device(parser)
+    if figure:
+        parser.add_argument("--figure", type=Path, help="image file to write")
+    return parser
 
 
 def trained(word: str, device: torch.device | str) -> TrainedModel:

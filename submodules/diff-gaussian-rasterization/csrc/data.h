@@ -190,12 +190,20 @@ struct Channels {
   int64_t count;
   T cap;       // the largest alpha
   bool stops;  // whether a gradient ends at the cap
-
-  // A pass over those from `first` on.
-  Channels pass(int64_t first) const {
-    return {values + first, stride, count - first < kMostChannels ? count - first : kMostChannels, cap, stops};
-  }
 };
+
+// Calls run(first, pass, in, plane) for each pass over channels: where its channels begin, the pass as channels and as
+// an input of blending, and where its planes of an image begin.
+template <class T, class Run>
+void each_pass(const Channels<T>& all, const BlendInput<T>& in, const Run& run) {
+  for (int64_t first = 0; first < all.count; first += kMostChannels) {
+    const int64_t left = all.count - first, count = left < kMostChannels ? left : kMostChannels;
+    BlendInput<T> own = in;
+    own.background += first;
+    run(first, Channels<T>{all.values + first, all.stride, count, all.cap, all.stops}, own,
+        first * in.image.width * in.image.height);
+  }
+}
 
 template <class T>
 struct BlendGradient {

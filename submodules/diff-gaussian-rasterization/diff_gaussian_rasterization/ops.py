@@ -17,7 +17,7 @@ from diff_gaussian_rasterization.gaussians import Gaussians, lists_gaussians
 from diff_gaussian_rasterization.scene import Drawing, draw, scene_arguments
 from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 
-_NEAR = 0.2  # as in csrc/math/constants.h
+_NEAR = 0.2  # kUsualNear in csrc/data.h
 _DIFFERENTIABLE = ("viewmatrix", "projmatrix", "campos", "lens_values")  # of the settings
 _CAMERA = 19  # place of the camera's numbers among the operator's inputs
 

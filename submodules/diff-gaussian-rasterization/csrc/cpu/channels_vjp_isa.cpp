@@ -151,17 +151,15 @@ void run_passes(const Executor& executor, const BlendInput<T>& in, const Channel
     return memory.take(memory.context, count);
   });
   const auto first_row = [&](int64_t splat) { return shapes.number(g.slots[splat].first); };
-  for (int64_t first = 0; first < channels.count; first += kMostChannels) {
-    const Channels<T> pass = channels.pass(first);
-    BlendInput<T> own = in;
+  each_pass(channels, in, [&](int64_t first, const Channels<T>& pass, const BlendInput<T>& own, int64_t plane) {
     BlendGradient<T> gradient = g;
-    own.background += first, gradient.color += first * in.image.width * in.image.height;
+    gradient.color += plane;
     if (first > 0) gradient.transmittance_gradient = nullptr;
     const PassRows<T, kRow> rows{shapes, of_channels.get(), first > 0};
     for_dynamic(executor, tiles_of(in.image), 1, [&](int64_t tile, int64_t) {
       channels_of_tile_vjp<T, kRays, kAbsolute>(own, pass, gradient, tile, processed[tile], rows);
     });
-    if (!values) continue;
+    if (!values) return;
     for_dynamic(executor, g.count, 1024, [&](int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i) {
         double sums[kMostChannels] = {};  // a splat may have thousands of tiles
@@ -170,7 +168,7 @@ void run_passes(const Executor& executor, const BlendInput<T>& in, const Channel
         std::copy_n(sums, pass.count, values + channels.stride * i + first);
       }
     });
-  }
+  });
   for_dynamic(executor, g.count, 1024, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) memory.counts[i] = int32_t(first_row(i + 1) - first_row(i));
   });

@@ -346,11 +346,9 @@ void run_passes(const Queue& queue, const BlendInput<float>& in, const Channels<
   Layer* layers = queue.array<Layer>(size_t(found.schedule.places) * kTile * kTile);
   const int64_t widest = channels.count > 16 ? kMostChannels : 16;
   float* const sums = values ? queue.array<float>(size_t(found.rows) * widest) : nullptr;
-  for (int64_t first = 0; first < channels.count; first += kMostChannels) {
-    const Channels<float> pass = channels.pass(first);
-    BlendInput<float> own = in;
+  each_pass(channels, in, [&](int64_t first, const Channels<float>& pass, const BlendInput<float>& own, int64_t plane) {
     BlendGradient<float> gradient = g;
-    own.background += first, gradient.color += first * in.image.width * in.image.height;
+    gradient.color += plane;
     if (first > 0) gradient.transmittance_gradient = nullptr;
     by_width(pass.count, [&](auto width) {
       if (found.schedule.places)
@@ -363,7 +361,7 @@ void run_passes(const Queue& queue, const BlendInput<float>& in, const Channels<
         launch(queue, "sum_channels", sum_channels_kernel<width>, blocks_for(g.count * width, 256), 256, g.count,
                found.places, sums, g.slots, pass, values + first);
     });
-  }
+  });
   if (g.count) count_rows(queue, g.count, found.places, g.slots, memory.counts);
 }
 

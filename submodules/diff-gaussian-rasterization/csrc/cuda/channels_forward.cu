@@ -124,16 +124,14 @@ __global__ void __launch_bounds__(L::kThreads)
 template <>
 void blend_channels<float>(const Queue& queue, const BlendInput<float>& in, const Channels<float>& channels,
                            const Blended<float>& out) {
-  for (int64_t first = 0; first < channels.count; first += kMostChannels) {
-    const Channels<float> pass = channels.pass(first);
-    BlendInput<float> own = in;
+  each_pass(channels, in, [&](int64_t, const Channels<float>& pass, const BlendInput<float>& own, int64_t plane) {
     Blended<float> image = out;
-    own.background += first, image.color += first * in.image.width * in.image.height;
+    image.color += plane;
     by_width(pass.count, [&](auto width) {
       const auto kernel = in.rays ? blend_channels_kernel<kPinholeRays, width> : blend_channels_kernel<kNoRays, width>;
       launch(queue, "blend_channels", kernel, unsigned(tiles_of(in.image)), L::kThreads, own, pass, image);
     });
-  }
+  });
 }
 
 }  // namespace cuda

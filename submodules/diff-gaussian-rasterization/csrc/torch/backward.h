@@ -53,6 +53,29 @@ gs::BlendInput<T> blend_input(const Tensor& splats, const Tensor& instances, con
           image,           instances.size(0),        rays_of(splats),       table.defined() ? read<T>(table) : nullptr};
 }
 
+// Gradient rows, which a backend allocates once it knows their number, and the number of each splat's.
+class KeptRows {
+ public:
+  Tensor rows, counts;
+
+  KeptRows(const Tensor& splats, bool absolute)
+      : counts(empty<int32_t>({splats.size(0)}, splats)), splats_(splats), absolute_(absolute) {}
+
+  template <class T>
+  gs::RowMemory<T> memory() {
+    const auto take = [](void* context, int64_t count) {
+      auto& to = *static_cast<KeptRows*>(context);
+      to.rows = empty({count, row_values(to.absolute_, rays_of(to.splats_))}, to.splats_);
+      return write<T>(to.rows);
+    };
+    return {take, this, write<int32_t>(counts), absolute_};
+  }
+
+ private:
+  Tensor splats_;
+  bool absolute_;
+};
+
 // Owns the tensors that the gs::BlendInput and gs::BlendGradient of a backward point into. source: Kept. table: of
 // gs::BlendInput, or undefined. channels: of the image.
 class BlendBackward {

@@ -54,20 +54,13 @@ std::tuple<Tensor, Tensor, Tensor> channel_rows_op(List<Tensor> source, const Te
   GS_CHECK(!ahead(), "channel_rows waits for the number of rows, so the host cannot run ahead");
   const Tensor values = packed(channels);
   const Tensor gradient = empty({wanted ? splats.size(0) : 0, channels.size(1)}, splats);
-  Tensor rows, counts = empty<int32_t>({splats.size(0)}, splats);
+  KeptRows kept(splats, absolute);
   with_scalar(splats.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    auto take = [&](int64_t count) {
-      rows = empty({count, row_values(absolute, rays_of(splats))}, splats);
-      return write<T>(rows);
-    };
-    using Take = decltype(take);
-    const gs::RowMemory<T> memory{[](void* context, int64_t count) { return (*static_cast<Take*>(context))(count); },
-                                  &take, write<int32_t>(counts), absolute};
     GS_RUN(T, splats, channel_rows, in.input<T>(), channels_of<T>(values, cap, stops), in.gradient<T>(nullptr, {}),
-           memory, wanted ? write<T>(gradient) : nullptr);
+           kept.memory<T>(), wanted ? write<T>(gradient) : nullptr);
   });
-  return {rows, counts, gradient};
+  return {kept.rows, kept.counts, gradient};
 }
 
 // Splats as programs for gsplat know them, zeros where they have no tile (math/describe.h).

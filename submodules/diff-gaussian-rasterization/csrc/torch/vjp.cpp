@@ -24,19 +24,12 @@ std::tuple<Tensor, Tensor> blend_rows_op(SOURCE_PARAMETERS, bool absolute) {
   check_staged(in.splats());
   GS_CHECK(!ahead(), "blend_rows waits for the number of rows, so the host cannot run ahead");
   const Tensor& splats = in.splats();
-  Tensor rows, counts = empty<int32_t>({splats.size(0)}, splats);
+  KeptRows kept(splats, absolute);
   with_scalar(splats.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    auto take = [&](int64_t count) {
-      rows = empty({count, row_values(absolute, rays_of(splats))}, splats);
-      return write<T>(rows);
-    };
-    using Take = decltype(take);
-    const gs::RowMemory<T> memory{[](void* context, int64_t count) { return (*static_cast<Take*>(context))(count); },
-                                  &take, write<int32_t>(counts), absolute};
-    GS_RUN(T, splats, blend_rows, in.input<T>(), in.gradient<T>(nullptr, {}), memory);
+    GS_RUN(T, splats, blend_rows, in.input<T>(), in.gradient<T>(nullptr, {}), kept.memory<T>());
   });
-  return {rows, counts};
+  return {kept.rows, kept.counts};
 }
 
 // What blocks of gs::kSleepBlock Gaussians add to the gradients of the camera's numbers, (blocks, numbers) float64
