@@ -33,6 +33,9 @@ RASTERIZER = (
     "rasterize_vjp",
     "rasterize_vjp of rows",
     "blend_rows",
+    "blend_channels",
+    "channel_rows",
+    "describe",
     "camera_vjp",
     "sum_runs",
 )
@@ -257,8 +260,22 @@ WRONG = {
         (ValueError, "give 8 tensors of the Gaussians and 3 or 4 of the camera", {"camera": lambda t: t[:2]}),
     ],
     "project": [
-        (ValueError, "lens must have 3 entries or 25, and options 5 or 6, got 2 and 5", {"lens": [0.5, 0.5]}),
-        (ValueError, "lens must have 3 entries or 25, and options 5 or 6, got 3 and 4", {"options": [7, 18, 3, 0]}),
+        (ValueError, "lens must have 3, 5, 25 or 27 entries, and options 5 or 6, got 2 and 5", {"lens": [0.5, 0.5]}),
+        (
+            ValueError,
+            "lens must have 3, 5, 25 or 27 entries, and options 5 or 6, got 3 and 4",
+            {"options": [7, 18, 3, 0]},
+        ),
+    ],
+    "blend_channels": [
+        (ValueError, "channels must have a column", {"channels": lambda t: t[:, :0], "background": lambda t: t[:0]}),
+        *((ValueError, "cap must be between 0 and 1", {"cap": cap}) for cap in (0.0, 1.0, float("nan"))),
+        (ValueError, r"background must be \(5,\)", {"background": torch.rand(3)}),
+    ],
+    "channel_rows": [
+        (ValueError, "cap must be between 0 and 1", {"cap": 1.0}),
+        (ValueError, r"channels must be \(3, -1", {"channels": lambda t: t[1:]}),
+        (ValueError, r"the gradient of an image must be \(5, 7, 18\)", {"grad_color": lambda t: t[:3]}),
     ],
     "displace_": [
         (ValueError, "give logits, or items", {"items": torch.arange(3)}),

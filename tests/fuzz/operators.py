@@ -32,6 +32,8 @@ def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict
     drawn = Drawing(*planes, radii, splats, counts, instances, ranges, *slots, last, layers)
     state, planes = list(drawn.kept(background)), [*map(torch.ones_like, planes)]
     rows = ops.blend_rows(state, *planes)
+    values, behind, picture = rand(len(splats), 5), rand(5), rand(5, height, width)
+    shown = [*state[:8], behind, state[9]]
     reach = [rects, counts, integers([[0, 2], [2, 5]])]
     wanted = [True, True, True, True, True, False, False, True, True]
     source = [splats, counts, *rows]
@@ -53,6 +55,9 @@ def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict
         "blend": (ops.blend, [splats, instances, ranges, background, height, width, True, True]),
         "list_records": (ops.list_records, [*reach, int(ops.list_records(*reach, 0)[0][-1].sum())]),
         "sum_runs": (ops.sum_runs, [*rows, rows[1].clamp_max(1), int(rows[1].count_nonzero())]),
+        "blend_channels": (ops.blend_channels, [splats, values, instances, ranges, behind, height, width, 0.99]),
+        "channel_rows": (ops.channel_rows, [shown, values, picture, planes[1], 0.99, True, True, True]),
+        "describe": (ops.describe, [splats, depths, counts]),
         "blend_rows": (ops.blend_rows, [state, *planes, True]),
         "rasterize": (ops.rasterize, [torch.zeros_like(raw["means"]), *scene, background, True, True]),
         "rasterize_vjp": (ops.rasterize_vjp, [*scene, wanted, state, *planes]),

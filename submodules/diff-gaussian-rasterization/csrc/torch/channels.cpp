@@ -6,8 +6,11 @@ namespace gs::ops {
 namespace {
 
 // The values (N, C) that splats show. They are finite: a weight of 0 does not hide others.
-void check_channels(const Tensor& channels, const Tensor& splats) {
+// cap: the largest alpha, by whose complement a backward divides.
+void check_channels(const Tensor& channels, const Tensor& splats, double cap) {
   check_tensor(channels, "channels", splats.scalar_type(), splats.device(), {splats.size(0), -1});
+  GS_CHECK_VALUE(channels.size(1) > 0, "channels must have a column, got ", channels.sizes());
+  GS_CHECK_VALUE(cap > 0 && float(cap) < 1, "cap must be between 0 and 1, got ", cap);
 }
 
 template <class T>
@@ -21,7 +24,7 @@ std::tuple<Tensor, Tensor, Tensor> blend_channels_op(const Tensor& splats, const
                                                      const Tensor& background, int64_t height, int64_t width,
                                                      double cap) {
   check_staged(splats);
-  check_channels(channels, splats);
+  check_channels(channels, splats, cap);
   const gs::Image image = checked_image(height, width);
   check_lists(instances, ranges, splats, image);
   const Tensor rows = aligned(splats, 2), values = packed(channels);
@@ -50,7 +53,7 @@ std::tuple<Tensor, Tensor, Tensor> channel_rows_op(List<Tensor> source, const Te
   const BlendBackward in(source, grad_color, grad_transmittance, {}, {}, channels.size(1));
   const Tensor& splats = in.splats();
   check_staged(splats);
-  check_channels(channels, splats);
+  check_channels(channels, splats, cap);
   GS_CHECK(!ahead(), "channel_rows waits for the number of rows, so the host cannot run ahead");
   const Tensor values = packed(channels);
   const Tensor gradient = empty({wanted ? splats.size(0) : 0, channels.size(1)}, splats);
