@@ -13,7 +13,7 @@ from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianR
 
 import metrics
 import render
-from benchmarks.peers import curve, gaussian_splatting_training, gsplat_training, timed
+from benchmarks.peers import curve, figure, gaussian_splatting_training, gsplat_training, timed
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from splatting.evaluation import peer_curve
@@ -322,3 +322,33 @@ def test_gaussian_splatting_of_pypi_trains_on_training_photos_alone(colmap_scene
     monkeypatch.setattr(sys, "argv", [*words[:4], str(tmp_path / "other"), "-w"])
     with pytest.raises(UserError, match="black background alone"):
         timed.train(argparse.ArgumentParser(), gaussian_splatting_training.start)
+
+
+PUBLISHED = (
+    "method,scene,iteration,seconds,test_psnr",
+    *("a,garden,1000,10,20", "a,garden,2000,30,24", "a,room,1000,6,30", "a,room,2000,10,31", "a,room,3000,12,32"),
+    "b,room,1000,5,28",
+)
+
+
+def test_a_figure_of_several_scenes_has_the_means_at_iterations_that_all_share(tmp_path, monkeypatch):
+    table = str(written(tmp_path / "published.csv", *PUBLISHED))
+    assert figure.published(table, ["room", "garden"]) == {"a": [(8, 25), (20, 27.5)]}
+    assert figure.published(table, ["room"]) == {"a": [(6, 30), (10, 31), (12, 32)], "b": [(5, 28)]}
+    for scenes, sentence in ((["truck"], "no method with truck"), ([], "name one")):
+        with pytest.raises(UserError, match=sentence):
+            figure.published(table, scenes)
+
+    head = "iteration,seconds,test_psnr"
+    files = [str(written(tmp_path / name, head, *rows)) for name, rows in (
+        ("a.csv", ("7,1,20", "9,2,22")), ("b.csv", ("8,2,25", "9,4,30")), ("c.csv", ("8,1,20",)))]  # fmt: skip
+    assert figure.line_of(files[:2]) == [(3, 26)] and figure.line_of(files[:1]) == [(1, 20), (2, 22)]
+    assert figure.end_of(files) == (pytest.approx(7 / 3), 24)
+    with pytest.raises(UserError, match="share no iteration"):
+        figure.line_of(files)
+
+    png = tmp_path / "means.png"
+    words = ["figure", str(png), "--ours", "adc", *files[:2], "--budget", files[2], "--budget", *files[:2]]
+    monkeypatch.setattr(sys, "argv", [*words, "--peer", "gsplat", files[0], "--published", table, "room", "garden"])
+    figure.main()
+    assert png.read_bytes().startswith(b"\x89PNG")
