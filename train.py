@@ -17,6 +17,7 @@ import torch
 
 from arguments import write_cfg_args, write_model_json
 from splatting.distributed.consistency import agree_on_options
+from splatting.host.energy import joules_counter, nvml_name
 from splatting.parts import check_together, chosen, tools
 from splatting.training.earlier_runs import resolve_lenses
 from splatting.training.launch import launch_options, training_parser
@@ -48,6 +49,7 @@ def train(
     with own_folder(folder := dataset.model_path), records_kept(folder), run.resources:
         run.writer = prepare_output_and_logger(run.options, **run.entries) if run.group.first else None
         run.report = training_report
+        run.joules = joules_counter(run.group.everyone(nvml_name(run.device)))
         run.begin()
         run_training(run, standard_observers(run))
 

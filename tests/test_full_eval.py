@@ -127,8 +127,8 @@ def test_commands_of_a_plain_scene(figures, evaluate):
     assert first["finished"] and first["failure"] is None and first["model"] == "attic"
     assert first["iterations"]["40"] == {
         "PSNR": 23.0, "SSIM": 0.9, "LPIPS": None, "DISTS": None, "fps": 250.0, "gaussians": 16000,
-        "gaussians_saved": 16000, "peak_memory_mib": 340.0, "ply_mb": 36e-6, "render_ms": 4.0, "seconds": 16.0,
-        "views": 2, "PSNR_given_poses": None, "PSNR_fitted_appearance": None,
+        "gaussians_saved": 16000, "joules": None, "peak_memory_mib": 340.0, "ply_mb": 36e-6, "render_ms": 4.0,
+        "seconds": 16.0, "views": 2, "PSNR_given_poses": None, "PSNR_fitted_appearance": None,
     }  # fmt: skip
     assert first["views"] == {"test": 2, "train": 7} and first["test_sizes"] == [[120, 80]]
     assert first["worst_views"][0] == {"PSNR": 22.0, "file": "00001.png", "picture": "photo_1.jpg"}

@@ -124,6 +124,7 @@ def main() -> None:
     print()
     head = [text for target in TARGETS for text in (f"within {target:g} dB", "median (s)")]
     print_table(["program", "runs", "fewest samples", *head], _table(curves, by_target))
+    print("\nOf all runs: one that never arrives counts as never. The first sample counts; nothing is interpolated.")
     mkdir_p(args.figures)
     panels = {
         f"within {target:g} dB of the best known": {name: ecdf(values) for name, values in seconds.items()}

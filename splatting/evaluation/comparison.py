@@ -24,8 +24,8 @@ BESIDE = (GIVEN_POSES, FITTED)
 SCORES = ("PSNR", "SSIM", "LPIPS", "DISTS")
 OTHER_SCORES = tuple(f"PSNR_{name}" for name in BESIDE)
 QUANTITIES = (
-    *(*SCORES, "seconds", "process_seconds", "cpu_seconds", "gaussians", "gaussians_saved", "peak_memory_mib"),
-    *("render_ms", "fps", "ply_mb", *OTHER_SCORES),
+    *(*SCORES, "seconds", "joules", "process_seconds", "cpu_seconds", "gaussians", "gaussians_saved"),
+    *("peak_memory_mib", "render_ms", "fps", "ply_mb", *OTHER_SCORES),
 )
 COMPARED = (*SCORES[:3], "seconds", "gaussians")  # with published numbers
 DEFAULT = ("adc", "default", "defaults", "base")  # names of the set that others are compared with, the first there is

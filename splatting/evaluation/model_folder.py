@@ -87,6 +87,11 @@ def training_seconds(model: Path, iteration: int) -> float | None:
     return logged(model, warn=True).get(iteration, {}).get("seconds")
 
 
+def training_joules(model: Path, iteration: int) -> float | None:
+    """Read the joules of the GPUs in those seconds; None if they are not known."""
+    return logged(model).get(iteration, {}).get("joules")
+
+
 def logged(model: Path, warn: bool = False) -> dict[int, dict[str, Any]]:
     """Read the records of train_log.json by their iterations; none without the file, or if it is damaged."""
     try:

@@ -144,6 +144,7 @@ def _iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, Any]:
         "fps": times.get("fps"),
         "gaussians": folder_of.trained_gaussians(model, iteration),
         "gaussians_saved": folder_of.count_gaussians(model, iteration),
+        "joules": folder_of.training_joules(model, iteration),
         # Only of a point at this very iteration: the memory of an earlier one would be a lower bound.
         "peak_memory_mib": point.get("peak_memory_mib"),
         "ply_mb": saved_ply(model, iteration).stat().st_size / MB,

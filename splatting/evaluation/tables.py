@@ -12,6 +12,7 @@ QUANTITIES = {  # heading and digits
     **{"PSNR": ("PSNR (dB)", 2), "SSIM": ("SSIM", 4), "LPIPS": ("LPIPS", 4), "DISTS": ("DISTS", 4)},
     **{
         "seconds": ("training (s)", 1),
+        "joules": ("GPU energy (J)", 0),
         "process_seconds": ("process (s)", 1),
         "cpu_seconds": ("CPU (s)", 1),
         "gaussians": ("Gaussians trained", 0),
@@ -25,7 +26,7 @@ _LAST_OF_PEER = {  # heading, and digits, of a column of a peer's curve
 }
 
 
-MAIN = (*SCORES, *OTHER_SCORES, "seconds", "gaussians", "ply_mb")  # what a report shows first
+MAIN = (*SCORES, *OTHER_SCORES, "seconds", "joules", "gaussians", "ply_mb")  # what a report shows first
 REST = tuple(name for name in QUANTITIES if name not in MAIN)
 
 
@@ -96,7 +97,7 @@ def means_table(means: Sequence[Mapping[str, Any]]) -> Table:
         "iteration": lambda mean: number(mean["iteration"], 0),
     }
     for name, (head, digits) in QUANTITIES.items():
-        if name in ("DISTS", *OTHER_SCORES) and not any(mean.get(name) for mean in means):
+        if name in ("DISTS", "joules", *OTHER_SCORES) and not any(mean.get(name) for mean in means):
             continue
         columns[head] = lambda mean, name=name, digits=digits: number(mean[name], digits)
     return table(columns, means)

@@ -3,7 +3,7 @@
 import math
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,17 +15,23 @@ from utils.system_utils import UserError, compute_device
 NAME = "train_log.json"
 SHORT = 2000  # iterations; after trainings up to this length, what training says at its end is short
 DEGREES, PERCENT = "pose_degrees", "pose_percent"  # mean correction of refined poses: turn, and part of the extent
-_OTHERS = "loss", "peak_memory_mib", "wall_seconds", "max_num_splats", "default_budget"
+_OTHERS = "loss", "joules", "peak_memory_mib", "wall_seconds", "max_num_splats", "default_budget"
 _FINITE = (DEGREES, PERCENT, *_OTHERS)  # if present
 
 
 class Stopwatch:
     """Seconds since its construction, without those inside `paused()` or of a stopped process, where it stands still.
 
+    counter: reads joules (host/energy.py), which are counted like the seconds, but also while the process is stopped.
+    It is read inside of pauses, so that it costs no seconds. None: no joules are known.
+
     spent: the seconds inside, by their purpose. Of a pause in another one, they count for the inner purpose.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, counter: Callable[[], float] | None = None) -> None:
+        self._counter = counter or (lambda: math.nan)
+        self._joules = self._counter()  # at the start, later without those of pauses
+        self._joules_stopped = math.nan
         self._start = running_seconds()
         self._stopped: float | None = None  # when the outermost pause began
         self.spent: dict[str, float] = {}
@@ -34,13 +40,23 @@ class Stopwatch:
     def seconds(self) -> float:
         return (running_seconds() if self._stopped is None else self._stopped) - self._start
 
+    @property
+    def joules(self) -> float | None:
+        """Joules in these seconds; None if they are not known."""
+        joules = (self._counter() if self._stopped is None else self._joules_stopped) - self._joules
+        return None if math.isnan(joules) else joules
+
     @contextmanager
     def paused(self, purpose: str) -> Iterator[None]:
         before, outer, others = running_seconds(), self._stopped, sum(self.spent.values())
         self._stopped = before if outer is None else outer
+        if outer is None:
+            self._joules_stopped = self._counter()
         try:
             yield
         finally:
+            if outer is None:
+                self._joules += self._counter() - self._joules_stopped
             taken = running_seconds() - before
             inner = sum(self.spent.values()) - others
             self.spent[purpose] = self.spent.get(purpose, 0.0) + taken - inner
@@ -53,8 +69,9 @@ class TrainingLog:
     """Records of one model folder, written whole after each addition.
 
     A record has `iteration`; `seconds` of training, without evaluation, saving and a stopped process; `wall_seconds`
-    since the process started; `peak_memory_mib`, the most so far; `gaussians`; `loss`, a running mean; and for each set
-    tested `<set>_l1`, `<set>_psnr`. Seconds and memory include the runs that were resumed. The last record also has
+    since the process started; `joules` of all GPUs in the seconds of training, where known; `peak_memory_mib`, the most
+    so far; `gaussians`; `loss`, a running mean; and for each set tested `<set>_l1`, `<set>_psnr`. Seconds, joules and
+    memory include the runs that were resumed. The last record also has
     `gaussians_left_out`, those that the last save does not have, the costs of the curve (curve_recorder.py), the
     seconds of this process by what they were spent on (training/observers/records.py), `iterations_planned`,
     `strategy`, and `max_num_splats` or `default_budget` (what_to_try.py), and `lines`, what training said at its end.
@@ -79,10 +96,16 @@ class TrainingLog:
         last = self.records[-1] if self.records else {"seconds": 0.0}
         self.seconds_before = last["seconds"]
         self.wall_seconds_before = last.get("wall_seconds") or last["seconds"]
+        self._joules_before: float | None = last.get("joules") if self.records else 0.0
         self._peak_before: float | None = last.get("peak_memory_mib")
 
     def not_before(self, row: dict[str, float | None]) -> None:
-        """Continue counting from a row of the earlier runs' curve if it is later than their log."""
+        """Continue counting from a row of the earlier runs' curve if it is later than their log.
+
+        The row has no joules, so those of this training are not known then.
+        """
+        if row["seconds"] > self.seconds_before:
+            self._joules_before = None
         self.seconds_before = max(self.seconds_before, row["seconds"])
         self.wall_seconds_before = max(self.wall_seconds_before, row["wall_seconds"] or 0.0)
 
@@ -96,8 +119,8 @@ class TrainingLog:
         peaks = [peak for peak in (self._peak_before, peak_memory_mib(compute_device())) if peak is not None]
         return round(max(peaks), 1) if peaks else None
 
-    def add(self, iteration: int, seconds: float, **values: float) -> None:
-        """Append a record, or add to that of the same iteration.
+    def add(self, iteration: int, seconds: float, joules: float | None = None, **values: float) -> None:
+        """Append a record, or add to that of the same iteration. seconds, joules: of this run.
 
         A value that is not finite (PSNR of equal images) becomes null.
         """
@@ -108,6 +131,8 @@ class TrainingLog:
             "seconds": round(self.seconds_before + seconds, 3),
             "wall_seconds": round(self.wall_seconds_before + wall_seconds(), 3),
         }
+        if joules is not None and self._joules_before is not None:
+            record["joules"] = round(self._joules_before + joules, 1)
         if self.records and self.records[-1]["iteration"] == iteration:
             before = self.records.pop()
             record = before | record | {"seconds": max(before["seconds"], record["seconds"])}

@@ -3,6 +3,7 @@
 import argparse
 import copy
 import sys
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -42,12 +43,13 @@ class Run(Stepping):
     resumed, or None. From `begin` on: log, rows (of the curve so far), losses (running mean of the total) and clock
     (seconds of training). lost: steps that an error has taken back. interrupt: a signal that asks the loop to stop; an
     observer that waits has to look at it. resources: what parts have open, closed when the training is over, however it
-    ends. report: `training_report`, or what replaces it; writer: its first argument. checkpoints: writes them, while
-    the loop runs. final_iteration: that of the model of the last save.
+    ends. report: `training_report`, or what replaces it; writer: its first argument. joules: what the clock reads
+    (host/energy.py). checkpoints: writes them, while the loop runs. final_iteration: that of the last save's model.
     """
 
     writer: Any = None
     report: Any = None
+    joules: Callable[[], float] | None = None
     checkpoints: Any = None
     final_iteration: int | None = None
     last_iteration: int | None = None
@@ -198,7 +200,7 @@ class Run(Stepping):
         announce_memory(self.scene, self.gaussians, *wants, self.group.size)
         self.log, self.rows = earlier_runs.continue_records(folder, start, self.first_iteration)
         self.losses = LossWatch(self.log.loss)
-        self.clock = Stopwatch()
+        self.clock = Stopwatch(self.joules)
         for opened in self.each("opened"):
             opened(self)
 

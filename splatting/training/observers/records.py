@@ -27,7 +27,8 @@ class Records(Part):
         self._seconds = seconds = run.clock.seconds if step.scored_at is None else step.scored_at
         with run.clock.paused("saving"):
             values = (step.record or {}) | added
-            run.log.add(step.iteration, seconds, gaussians=run.gaussians.gaussian_count, loss=run.losses.mean, **values)
+            values |= {"gaussians": run.gaussians.gaussian_count, "loss": run.losses.mean}
+            run.log.add(step.iteration, seconds, run.clock.joules, **values)
 
     def ended(self, error: Error) -> None:
         """Note how the training was planned, what to try next, and the seconds of this process by their purpose."""

@@ -61,7 +61,8 @@ class Checkpoints(Part):
             path = Path(run.scene.model_path) / f"chkpnt{step.iteration}.pth"
             run.scene.save_beside()
             save_checkpoint(path, run.checkpoint_state(), step.iteration)
-            run.log.add(step.iteration, seconds, gaussians=run.gaussians.gaussian_count, loss=run.losses.mean)
+            numbers = {"gaussians": run.gaussians.gaussian_count, "loss": run.losses.mean}
+            run.log.add(step.iteration, seconds, run.clock.joules, **numbers)
             if step.stopping:
                 run.scene.save(step.iteration)
         if step.stopping:
