@@ -56,7 +56,7 @@ class _Camera(NamedTuple):
     ) -> GaussianRasterizationSettings:
         """The settings, differentiable in `view`. Of a pinhole no number goes to the host, which would wait for it."""
         view, width, height = self.view.double(), self.width, self.height
-        center = torch.linalg.inv(view)[:3, 3] if degree else view[:3, 3]  # SH of degree 0 have no direction
+        center = torch.linalg.inv_ex(view)[0][:3, 3] if degree else view[:3, 3]  # SH of degree 0 have no direction
         lens, near = None, self.near
         if self.model != "pinhole":
             fx, _, cx, _, fy, cy, *_ = self.K.flatten().tolist()
