@@ -91,11 +91,12 @@ def main() -> None:
     axes = figure.subplots()
     if args.published:
         for n, (name, points) in enumerate(published(args.published[0], args.published[1:]).items()):
-            axes.plot(
-                *zip(*points, strict=True), color="0.75", linestyle=LINES[n % len(LINES)], linewidth=1, label=name
-            )
+            style = {"color": "0.75", "linestyle": LINES[n % len(LINES)], "linewidth": 1}
+            axes.plot(*zip(*points, strict=True), label=f"{name}, published", **style)
     for n, (name, *files) in enumerate(args.peer):
-        axes.plot(*zip(*line_of(files), strict=True), color=PEERS, linestyle=LINES[n % len(LINES)], label=name)
+        line = line_of(files)
+        style = {"marker": "s"} if len(line) == 1 else {"linestyle": LINES[n % len(LINES)]}
+        axes.plot(*zip(*line, strict=True), color=PEERS, label=name, **style)
     for n, (name, *files) in enumerate(args.ours):
         axes.plot(*zip(*line_of(files), strict=True), color=OURS[n % len(OURS)], linewidth=2, label=name)
     if args.budget:

@@ -286,6 +286,7 @@ SHAPE = [
     Case("shape", "stretched, opaque", stretched((0.3, 100), (1, 1e6), logit=(4.6, 14), depth=(0.21, 6)), STRETCHED),
     Case("shape", "stretched, faint", stretched((0.3, 100), (1, 1e6), logit=(-5.5, -2.2), depth=(0.21, 6)), PLAIN),
     Case("shape", "stretched, far", stretched((0.3, 5000), (1, 1e6), logit=(-5.5, 14), depth=(10, 1e4)), STRETCHED),
+    Case("shape", "stretched, flat", stretched((0.05, 1000), (1e6, 1e11), logit=(-5.5, 5), depth=(2, 1e4)), STRETCHED),
 ]
 
 # ---- place ----
