@@ -39,7 +39,9 @@ def train(
 
     launch: the options of splatting/training/launch.py.
     """
-    dataset.model_path = dataset.model_path or folder_of(launch.start_checkpoint) or new_folder()
+    if not all([prepare(dataset, opt, launch) for prepare in tools("prepare")]):
+        return
+    dataset.model_path = dataset.model_path or folder_of(launch.start_checkpoint) or new_folder(dataset.source_path)
     run = Run(dataset, opt, pipe, launch)
     if not run.start:
         print(f"Optimizing {dataset.model_path}")
@@ -79,7 +81,7 @@ def prepare_output_and_logger(args: argparse.Namespace, **entries: Any) -> Any |
 
     An empty model_path becomes that of a new folder. Returns a TensorBoard writer, or None without TensorBoard.
     """
-    args.model_path = args.model_path or new_folder()
+    args.model_path = args.model_path or new_folder(getattr(args, "source_path", ""))
     print(f"Output folder: {args.model_path}")
     mkdir_p(args.model_path)
     write_cfg_args(args.model_path, args)

@@ -28,7 +28,7 @@ class ModelParams(OptionTable):
         Option("source_path", "", short="s", stored=CFG_ARGS, topic=MOST_NEEDED, unset="none, must be given",
             help="scene folder: COLMAP, Blender, nerfstudio, or an export of Metashape, Polycam or Record3D"),
         Option("model_path", "", short="m", stored=CFG_ARGS, compared=False, loaded="none, must be given",
-            topic=MOST_NEEDED, unset="a new folder under ./output, named after OAR_JOB_ID or at random",
+            topic=MOST_NEEDED, unset="a new folder under ./output, named after OAR_JOB_ID or the scene",
             help="model folder"),
         Option("images", "images", short="i", stored=CFG_ARGS, topic="data",
             help="folder of the photos inside the scene folder (COLMAP only)"),
@@ -43,7 +43,7 @@ class ModelParams(OptionTable):
                  "memory, the host's memory holds them, and each is copied to the GPU before it is used. Without a "
                  "usable GPU, cuda means cpu"),
         Option("eval", False, stored=CFG_ARGS, topic=MOST_NEEDED,
-            help="hold out a test set, which training does not use: every 8th photo by name, or Blender's test frames"),
+            help="hold out every 8th photo by name, or Blender's test frames, to test the model"),
         Option("init_pcd_path", "", origin="ours", topic="data",
             help="file of points to start from instead of the scene's own: PLY, npz (points, colors), or text with "
                  "x y z or x y z red green blue in each line"),

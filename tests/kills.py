@@ -2,10 +2,11 @@
 
 python -m tests.kills N [SEED]
 
-Kills are SIGKILL: after a random time, and before, in or after the n-th write of a file. A trial kills one to three
-times, each time resuming from the newest checkpoint. At its end the PLYs, the tensors of the checkpoints and the names
-of all files must be those of the training that was let be, with no temporary file or lock left over. Trainings are
-forked from this process, which has everything imported.
+Kills are SIGKILL: after a random time, and before, in or after the n-th write of a file. A trial kills one to ten
+times, and repeats the same command with --resume until the training is finished. Checkpoints for --resume are written
+in every 5th iteration; half of the trials plan others besides. At its end the PLYs, the tensors of the checkpoints and
+the names of all files must be those of the training that was let be, with no temporary file or lock left over.
+Trainings are forked from this process, which has everything imported.
 """
 
 import argparse
@@ -19,7 +20,7 @@ import tempfile
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ import torch
 import train
 import utils.system_utils
 from scene.readers.point_cloud import write_point_cloud
+from splatting.parts.resume import part as resume
 from splatting.parts.tensorboard import tools as tensorboard
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -39,9 +41,11 @@ from trainings import leaves  # noqa: E402
 
 OPTIONS = (
     *("--iterations", "60", "--eval", "--quiet", "--test_iterations", "30", "60", "--save_iterations", "20", "40"),
-    *("--checkpoint_iterations", "10", "20", "30", "40", "50", "60", "--densify_from_iter", "5"),
-    *("--densification_interval", "10", "--opacity_reset_interval", "25", "--train_test_exp"),
+    *("--densify_from_iter", "5", "--densification_interval", "10", "--opacity_reset_interval", "25"),
+    *("--train_test_exp", "--resume"),
 )
+PLANNED = "--checkpoint_iterations", "10", "20", "30", "40", "50", "60"
+MOST = 10  # kills of a trial
 MOMENTS = ("before", "in", "after")
 
 
@@ -58,10 +62,11 @@ def main() -> int:
         make_blender_scene(scene)
         points = np.random.default_rng(0).normal(size=(300, 3))  # a scene without points would start with 100,000
         write_point_cloud(scene / "points3d.ply", points, np.full((300, 3), 127, np.uint8))
-        expected, seconds, writes = _undisturbed(scene, Path(folder, "undisturbed"))
+        kinds = [(words, *_undisturbed(scene, Path(folder, "undisturbed"), words)) for words in ((), PLANNED)]
         while counts.total() < args.kills:
             shutil.rmtree(out, ignore_errors=True)
-            done = _trial(rng, scene, out, seconds, writes)
+            words, expected, seconds, writes = kinds[trials % 2]
+            done = _trial(rng, scene, out, words, seconds, writes)
             counts.update(name.split()[0] for name in done)
             trials += 1
             if differences := expected ^ _state(out):
@@ -73,28 +78,38 @@ def main() -> int:
     return 1 if wrong else 0
 
 
-def _undisturbed(scene: Path, out: Path) -> tuple[set[tuple[str, str]], float, int]:
+def _undisturbed(scene: Path, out: Path, words: Sequence[str]) -> tuple[set[tuple[str, str]], float, int]:
     """State of the training that is let be, its seconds, and the number of its writes."""
-    _wait(_start(scene, out, lambda: None), out)  # the first one warms caches up
+    shutil.rmtree(out, ignore_errors=True)
+    _wait(_start(scene, out, words, _without_resume), out)  # the first one warms caches up
+    expected = _state(out)
     shutil.rmtree(out)
     begin, counter = time.monotonic(), out.parent / "writes"
-    _wait(_start(scene, out, lambda: _at_write(lambda *_: counter.open("a").write("x"))), out)
-    return _state(out), time.monotonic() - begin, len(counter.read_text()) // len(MOMENTS)
+    counter.unlink(missing_ok=True)
+    _wait(_start(scene, out, words, lambda: _at_write(lambda *_: counter.open("a").write("x"))), out)
+    if differences := expected ^ _state(out):
+        raise RuntimeError(f"--resume alone changes {sorted(differences)}")
+    return expected, time.monotonic() - begin, len(counter.read_text()) // len(MOMENTS)
 
 
-def _trial(rng: random.Random, scene: Path, out: Path, seconds: float, writes: int) -> list[str]:
-    """Train with one to three kills and a last run without; return what was done. Fewer if a run ends before."""
+def _without_resume() -> None:
+    """Let a training write no checkpoint that was not asked for, but the last."""
+    resume.LEAST = float("inf")
+
+
+def _trial(rng: random.Random, scene: Path, out: Path, words: Sequence[str], seconds: float, writes: int) -> list[str]:
+    """Train with one to MOST kills and a last run without; return what was done. Fewer if a run ends before."""
     done = []
-    for _ in range(rng.randint(1, 3)):
+    for _ in range(rng.randint(1, MOST)):
         if rng.random() < 0.5:
-            child, delay = _start(scene, out, lambda: None), rng.uniform(0, seconds)
+            child, delay = _start(scene, out, words, lambda: None), rng.uniform(0, seconds)
             what = f"random {delay:.2f} s"
             time.sleep(delay)
             os.kill(child, signal.SIGKILL)
         else:
             moment, number = rng.choice(MOMENTS), rng.randrange(writes)
             what = f"{moment} write {number}"
-            child = _start(scene, out, lambda m=moment, n=number: _at_write(_killer(m, n)))
+            child = _start(scene, out, words, lambda m=moment, n=number: _at_write(_killer(m, n)))
         status = os.waitpid(child, 0)[1]
         if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL:
             done.append(what)
@@ -102,37 +117,30 @@ def _trial(rng: random.Random, scene: Path, out: Path, seconds: float, writes: i
             break  # it was faster, or has fewer writes when resumed
         else:
             raise RuntimeError(f"a training ended with status {status} after {done}: {_errors(out)}")
-    if _newest(out) != 60 or done:
-        _wait(_start(scene, out, lambda: None), out)
+    _wait(_start(scene, out, words, lambda: None), out)  # which does nothing where the training is finished
     return done
 
 
-def _start(scene: Path, out: Path, prepare: Callable[[], Any]) -> int:
+def _start(scene: Path, out: Path, words: Sequence[str], prepare: Callable[[], Any]) -> int:
     """Fork a training that resumes from the newest checkpoint, and return its process."""
     child = os.fork()
     if child:
         return child
     status = 1
     try:
+        resume.LEAST, resume.SHARE, resume.EVERY = 0.0, float("inf"), 5
         prepare()
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         os.dup2(os.open(out.parent / "errors", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
-        words = ["-s", str(scene), "-m", str(out), *OPTIONS]
-        if newest := min(_newest(out), 50):  # the last one leaves nothing to train
-            words += ["--start_checkpoint", str(out / f"chkpnt{newest}.pth")]
         tensorboard.summary_writer = lambda folder: None
         torch.set_num_threads(1)
-        train.main(words)
+        train.main(["-s", str(scene), "-m", str(out), *OPTIONS, *words])
         status = 0
     except BaseException:
         traceback.print_exc()
     finally:
         sys.stderr.flush()
         os._exit(status)
-
-
-def _newest(out: Path) -> int:
-    return max((int(path.stem.removeprefix("chkpnt")) for path in out.glob("chkpnt*.pth")), default=0)
 
 
 def _wait(child: int, out: Path) -> None:

@@ -43,6 +43,7 @@ MACHINE = {
     "commit": "abc", "cpu": "some CPU", "gpu": None, "instruction_set": "avx2", "packages": {"torch": "2"},
     "python": "3.11", "threads": 2,
 }  # fmt: skip
+OWN = "--disable_viewer --quiet --no_last_checkpoint"
 BASE_AND_SH1 = '{"base": [], "sh1": ["--sh_degree", 1]}'
 
 
@@ -117,8 +118,8 @@ def test_commands_of_a_plain_scene(figures, evaluate):
     out, scene = str(evaluate.out / "attic"), str(evaluate.scenes / "attic")
     attic, render, brick, _ = map(" ".join, evaluate.calls())
     shared, switches = "--eval --test_iterations -1", "--antialiasing --iterations 40 -r 2"
-    assert attic == f"train -s {scene} -m {out} --disable_viewer --quiet {shared} {switches}"
-    assert brick.endswith(f" --quiet {shared} -w {switches}")
+    assert attic == f"train -s {scene} -m {out} {OWN} {shared} {switches}"
+    assert brick.endswith(f" {OWN} {shared} -w {switches}")
     assert render == f"render -m {out} -s {scene} --iteration 40 --skip_train --eval --quiet --antialiasing"
     first = report["runs"][0]
     load = {name: first["iterations"]["40"].pop(name) for name in ("process_seconds", "cpu_seconds")}
@@ -147,7 +148,7 @@ def test_data_sets_get_the_options_of_the_paper(evaluate, tmp_path, capsys):
     full_eval.main([str(word) for word in words], run)
     assert f"not found in {tanks}, left out: train\n" in capsys.readouterr().err
     log = [json.loads(line) for root in (mip, tanks) for line in (root / "calls.txt").read_text().splitlines()]
-    trained = {Path(words[2]).name: words[10:] for words in log if words[0] == "train"}
+    trained = {Path(words[2]).name: words[11:] for words in log if words[0] == "train"}
     switches = ["-d", "depths2/", *full_eval.EXPOSURE, "--optimizer_type", "sparse_adam"]
     assert trained["garden"] == ["-i", "images_4", *switches] and trained["room"] == ["-i", "images_2", *switches]
     assert trained["truck"] == switches

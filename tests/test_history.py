@@ -49,13 +49,15 @@ def _elsewhere(checkpoint: Path, folder: Path) -> Path:
     return Path(shutil.copy(checkpoint, folder / "moved"))
 
 
-def test_the_same_command_overwrites_in_silence(colmap_scene, tmp_path, capfd):
+def test_the_same_command_overwrites_and_says_so(colmap_scene, tmp_path, capfd):
     out = tmp_path / "out"
     first = _train(colmap_scene, out, "--save_iterations", 2, iterations=3)
     (tmp_path / "link").symlink_to(colmap_scene)
     assert _train(tmp_path / "link", out, "--save_iterations", 2, iterations=3) == first
     said = capfd.readouterr().err
-    assert _warnings(said) == [] and "train_log" not in said
+    (warning,) = _warnings(said)
+    assert "holds a training that was finished, of --iterations 3, and this one starts over" in warning
+    assert "train_log" not in said
 
 
 def test_iterations_that_stay_are_warned_of(colmap_scene, tmp_path, capfd):
@@ -66,7 +68,8 @@ def test_iterations_that_stay_are_warned_of(colmap_scene, tmp_path, capfd):
     (out / "point_cloud" / "iteration_30000" / "point_cloud.ply").touch()
     capfd.readouterr()
     _train(colmap_scene, out, "--save_iterations", 1, 30000, "--checkpoint_iterations", 3, iterations=4)
-    (warning,) = _warnings(capfd.readouterr().err)
+    finished, warning = _warnings(capfd.readouterr().err)
+    assert "of --iterations 5, and this one starts over" in finished
     assert "keeps iteration 3, 5, 30000 of an earlier training; this one starts over" in warning
     # Files that a resumed run saved before do not belong to another training.
     _train(colmap_scene, out, "--start_checkpoint", out / "chkpnt3.pth", iterations=6)

@@ -107,7 +107,7 @@ def test_the_guards_stand_where_they_must(colmap_scene, tmp_path, monkeypatch):
         return listed
 
     _train(colmap_scene, tmp_path, monkeypatch, observers, "--eval")
-    assert names[0] == "DivergenceWatch" and names[-3:] == ["MemoryGuard", "Checkpoints", "RemoteViewer"]
+    assert names[0] == "DivergenceWatch" and names[-4:] == ["MemoryGuard", "Checkpoints", "Resume", "RemoteViewer"]
     between = ["Curve", "Tensorboard", "Scores", "Saves", "Records", "MemoryGuard"]
     assert [name for name in names if name in between] == between
 

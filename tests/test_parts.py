@@ -39,7 +39,11 @@ KNOWN = {  # words in files that are options of a part, and mean something else 
     ("viewer_host", "splatting/viewer/server.py"),
     ("port", "view.py"),
     *((option, "gaussian_renderer/network_gui.py") for option in ("port", "disable_viewer", "viewer")),  # its sentence
-    *(("disable_viewer", f"splatting/{of}.py") for of in ("evaluation/stages", "diagnosis/advice")),  # of own trainings
+    *(
+        (option, f"splatting/{of}.py")  # of own trainings
+        for option in ("disable_viewer", "no_last_checkpoint")
+        for of in ("evaluation/stages", "diagnosis/advice")
+    ),
     ("disable_viewer", "integrations/nerfbaselines/method.py"),
 }
 COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "export", "view")

@@ -250,6 +250,7 @@ def test_a_late_reset_is_announced(colmap_scene, tmp_path, capfd):
 
 
 def test_minus_one_saves_the_last_iteration_only(colmap_scene, tmp_path):
-    _train(colmap_scene, tmp_path, "--save_iterations", -1, "--checkpoint_iterations", -1, iterations=2)
+    words = "--save_iterations", -1, "--checkpoint_iterations", -1, "--no_last_checkpoint"
+    _train(colmap_scene, tmp_path, *words, iterations=2)
     assert [path.name for path in (tmp_path / "point_cloud").iterdir()] == ["iteration_2"]
     assert not list(tmp_path.glob("*.pth"))

@@ -178,6 +178,7 @@ def _of_short_training(dataset: argparse.Namespace) -> Iterator[Advice]:
     """What a short training of small photos leaves over."""
     with tempfile.TemporaryDirectory() as folder:
         own = ["-m", folder, "-r", _WIDTH, "--iterations", _ITERATIONS, "--quiet", "--no_curve", "--disable_viewer"]
+        own += ["--no_last_checkpoint"]
         _trained([sys.executable, str(ROOT / "train.py"), *map(str, own), *_data_words(dataset)])
         scene, views = load_scored(folder)
         yield from (Advice(*one) for advise_part in tools("advise_trained") for one in advise_part(scene, views))

@@ -67,7 +67,8 @@ def train(run: Run, machine: dict[str, Any], child: Child) -> None:
     before = record.stage("train_interrupted") or {}
     before = before if before.get("checkpoint") in there else {}
     command = _script("train.py", "-s", source, "-m", str(run.model), "--disable_viewer", "--quiet")
-    command += [*run.options, *(("--start_checkpoint", str(run.model / before["checkpoint"])) if before else ())]
+    command += ["--no_last_checkpoint", *run.options]
+    command += ("--start_checkpoint", str(run.model / before["checkpoint"])) if before else ()
     done = child(command, "training" + _from_where(before, record))
     spent = _sum(before, done)
     if done.status and (left := [name for name, stamp in _checkpoints(run).items() if stamp != there.get(name)]):

@@ -33,6 +33,7 @@ PARTS = (
     "spill",  # after all that moves rows, and before sleep, which pays where rows lie on the host
     "sleep",  # after all that decides whether every step concerns all rows
     "tensorboard",  # from here on, those that only watch
+    "resume",  # before all that may let the training wait
     "remote_viewer",
     "viewer",  # last: its pause is of all else
 )
@@ -144,6 +145,7 @@ def tools(name: str) -> list[Callable]:
     remarks(lines): lines of a training that reports show. against_overfitting(record): an option to try, or None.
     pictures(model): files in a model folder that reports show, where they are there.
     summary_writer(folder): TensorBoard's, as `train.prepare_output_and_logger` returns it, or None.
+    prepare(dataset, opt, launch): may name the checkpoint to start with; False: nothing is left to train.
     report_to(writer, iteration): what writes losses, images, scores and the model of a training report by one.
     """
     having = [part for part in PARTS if name in part_class(part).tools]

@@ -4,8 +4,8 @@ import contextlib
 import os
 import shlex
 import sys
-import uuid
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 
 from scene.saved_model import saves_in
@@ -19,10 +19,13 @@ _RECORDS = ("cfg_args", "model.json", "cameras.json", "train_log.json", "error_v
 _INPUTS = ("cfg_args", "model.json", "cameras.json", "input.ply")
 
 
-def new_folder() -> str:
-    """Name of a new folder under ./output, after OAR_JOB_ID or at random, as in the reference."""
-    name = os.environ.get("OAR_JOB_ID") or str(uuid.uuid4())
-    return os.path.join("./output/", ranks().shared(name)[:10])
+def new_folder(scene: str = "") -> str:
+    """Name of a folder under ./output: OAR_JOB_ID as in the reference, else a new one after the folder of the scene."""
+    if job := os.environ.get("OAR_JOB_ID"):
+        return os.path.join("./output/", ranks().shared(job)[:10])
+    name = os.path.join("./output/", os.path.basename(os.path.realpath(scene)) or "model")
+    names = (f"{name}_{number}" if number > 1 else name for number in count(1))
+    return ranks().shared(next(new for new in names if not os.path.exists(new)))
 
 
 def folder_of(checkpoint: str | None) -> str | None:

@@ -8,7 +8,8 @@ from pathlib import Path
 from splatting.host import torchrun
 from splatting.host.clock import seconds_since_start
 
-_CHECKPOINT = re.compile(r"chkpnt(\d+)\.pth")
+REPLACED = "chkpnt_resume.pth"  # one that is replaced while the training goes on, never of its last iteration
+_CHECKPOINT = re.compile(r"chkpnt(\d+)\.pth|" + re.escape(REPLACED))
 
 
 def resumed(start: str | None, folder: str, iterations: int) -> str | None:
@@ -22,17 +23,20 @@ def resumed(start: str | None, folder: str, iterations: int) -> str | None:
     return newest or start
 
 
-def newest_checkpoint(folder: str, below: float = float("inf")) -> str | None:
-    """The chkpntN.pth of the highest N under `below` that torchrun's processes have written, over all restarts.
+def newest_checkpoint(folder: str, below: float = float("inf"), since: float | None = None) -> str | None:
+    """The newest checkpoint of an iteration under `below`; of equally new ones, that of the highest.
 
-    Those of earlier trainings in the folder are older than torchrun.
+    since: when it was written, in seconds since 1970. None: since torchrun began, so that it is of its processes, over
+    all restarts, and of no earlier training in the folder.
     """
-    began = time.time() - (seconds_since_start(os.getppid()) or float("inf"))
+    began = time.time() - (seconds_since_start(os.getppid()) or float("inf")) if since is None else since
     found = {}
     for path in Path(folder).glob("chkpnt*.pth"):
         match = _CHECKPOINT.fullmatch(path.name)
-        if match and int(match[1]) < below and path.stat().st_mtime >= began:
-            found[int(match[1])] = path
+        number = int(match[1] or 0) if match else 0
+        written = path.stat()
+        if match and number < below and written.st_mtime >= began:
+            found[written.st_mtime_ns, number] = path
     return str(found[max(found)]) if found else None
 
 

@@ -50,15 +50,18 @@ class Checkpoints(Part):
         if step.stopping or step.takes(self._run.launch.checkpoint_iterations):
             self.save(step)
 
-    def save(self, step: Iteration) -> None:
-        """Write a checkpoint after an iteration that is due, and say how to resume if the training stops."""
+    def save(self, step: Iteration, name: str = "") -> None:
+        """Write a checkpoint after an iteration that is due, and say how to resume if the training stops.
+
+        name: of the file, chkpntN.pth if it is empty.
+        """
         run = self._run
         self._watch.look(step.iteration, stepped=not step.last)
         seconds = run.clock.seconds
         with run.clock.paused("saving"):
             run.gaussians.check_finite(step.iteration)
             tqdm.write(f"[ITER {step.iteration}] Saving Checkpoint", file=sys.stdout)
-            path = Path(run.scene.model_path) / f"chkpnt{step.iteration}.pth"
+            path = Path(run.scene.model_path) / (name or f"chkpnt{step.iteration}.pth")
             run.scene.save_beside()
             save_checkpoint(path, run.checkpoint_state(), step.iteration)
             numbers = {"gaussians": run.gaussians.gaussian_count, "loss": run.losses.mean}

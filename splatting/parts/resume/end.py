@@ -1,0 +1,35 @@
+"""The note in model.json that a training has reached its end: only then all of its files are complete."""
+
+import contextlib
+import os
+import shlex
+from pathlib import Path
+from typing import Any
+
+from arguments import add_to_model_json
+from splatting.files.json_files import MODEL_JSON, read_model_json
+from utils.system_utils import UserError
+
+FINISHED = "finished"  # entry of model.json: --iterations of the training that has ended
+
+
+def finished(folder: str | os.PathLike) -> int:
+    """The --iterations of the training that has reached its end in a model folder, 0 if none has."""
+    with contextlib.suppress(UserError, OSError):  # a broken file notes nothing
+        found = read_model_json(folder).get(FINISHED)
+        return found if type(found) is int and found > 0 else 0
+    return 0
+
+
+def note_finished(run: Any) -> None:
+    """Note that a training has reached its end, and say how to continue it from its last checkpoint, if it has one."""
+    folder = Path(run.scene.model_path)
+    if not (folder / MODEL_JSON).is_file():  # the folder was removed meanwhile, which is told of
+        return
+    add_to_model_json(folder, **{FINISHED: run.opt.iterations})
+    last = folder / f"chkpnt{run.last_iteration}.pth"
+    if last.is_file() and not run.schedule.paced:
+        print(
+            f"Last checkpoint: {shlex.quote(str(last))} ({last.stat().st_size / 1e6:.3g} MB); the same command with "
+            "--resume and more --iterations continues this training"
+        )

@@ -1,0 +1,149 @@
+"""Trainings that --resume continues, and what a finished one leaves."""
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+from trainings import train_on
+
+from scene.gaussians.checkpoint import load_checkpoint
+from splatting.files.json_files import read_model_json
+from splatting.parts.resume import part as resume
+from splatting.parts.resume.end import finished
+from splatting.training.launch import launch_options
+from splatting.training.output_folder import new_folder
+from splatting.training.restart import REPLACED
+from utils.system_utils import UserError
+
+WORDS = ("-r", 24, "--no_curve", "--disable_viewer", "--test_iterations", -1)
+GROWING = ("--densify_from_iter", 5, "--densification_interval", 10, "--opacity_reset_interval", 25)
+
+
+@pytest.fixture(autouse=True)
+def own_streams(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
+
+
+def _checkpoints(folder: Path) -> set[str]:
+    return {path.name for path in folder.glob("*.pth")}
+
+
+def _train(scene: Path, out: Path, iterations: int, *words: object) -> bytes:
+    return train_on(scene, out, *WORDS, *GROWING, "--iterations", iterations, *words)[iterations]
+
+
+class Killed(BaseException):
+    """Ends a training as a signal would that nobody catches."""
+
+
+def _killed(monkeypatch: pytest.MonkeyPatch, iteration: int) -> None:
+    """Let a training end in an iteration, at once."""
+    stepped = resume.Resume.stepped
+
+    def kill(self: resume.Resume, at: object) -> None:
+        stepped(self, at)
+        if at.iteration == iteration:
+            raise Killed
+
+    monkeypatch.setattr(resume.Resume, "stepped", kill)
+
+
+def test_resumed_to_the_same_bytes_by_the_same_command(colmap_scene, tmp_path, monkeypatch, capfd):
+    whole = _train(colmap_scene, tmp_path / "whole", 40)
+    out = tmp_path / "out"
+    monkeypatch.setattr(resume, "LEAST", 0.0)
+    monkeypatch.setattr(resume, "SHARE", float("inf"))
+    monkeypatch.setattr(resume, "EVERY", 10)
+    for iteration, newest in ((7, None), (14, 10), (39, 30)):
+        with monkeypatch.context() as patch, pytest.raises(Killed):
+            _killed(patch, iteration)
+            _train(colmap_scene, out, 40, "--resume")
+        assert _checkpoints(out) == ({REPLACED} if newest else set())
+        assert newest is None or load_checkpoint(out / REPLACED)[1] == newest
+        assert finished(out) == 0
+    assert _train(colmap_scene, out, 40, "--resume") == whole
+    assert _checkpoints(out) == {"chkpnt40.pth"} and finished(out) == 40
+    said = rf"^Last checkpoint: {out}/chkpnt40.pth \(1.\d+ MB\); the same command with --resume"
+    assert re.search(said, capfd.readouterr().out, re.MULTILINE)
+    before = (out / "cfg_args").stat().st_mtime_ns
+    for name in (".train.lock", REPLACED):  # as of a training that was killed between its note and its end
+        (out / name).touch()
+    assert _train(colmap_scene, out, 40, "--resume") == whole and (out / "cfg_args").stat().st_mtime_ns == before
+    assert _checkpoints(out) == {"chkpnt40.pth"} and not (out / ".train.lock").exists()
+    assert "has a finished training of --iterations 40; give more to continue it" in capfd.readouterr().out
+
+
+def test_a_model_alone_is_no_end(colmap_scene, tmp_path, monkeypatch):
+    """A training that is killed after its last save goes through its end again."""
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        _killed(patch, 12)
+        _train(colmap_scene, tmp_path, 12, "--resume")
+    assert _checkpoints(tmp_path) == {"chkpnt12.pth"} and finished(tmp_path) == 0
+    _train(colmap_scene, tmp_path, 12, "--resume")
+    assert finished(tmp_path) == 12
+
+
+def test_more_iterations_continue_a_finished_training(colmap_scene, tmp_path, capfd):
+    _train(colmap_scene, tmp_path, 12)
+    _train(colmap_scene, tmp_path, 20, "--resume")
+    assert f"Resuming {tmp_path} at iteration 12" in (said := capfd.readouterr()).out
+    assert _checkpoints(tmp_path) == {"chkpnt12.pth", "chkpnt20.pth"} and finished(tmp_path) == 20
+    assert "starts over" not in said.err
+    _train(colmap_scene, tmp_path, 20)
+    assert (
+        f"warning: {tmp_path} holds a training that was finished, of --iterations 20, and this one starts over; "
+        "--resume with more --iterations continues the old one from its last checkpoint" in capfd.readouterr().err
+    )
+
+
+def test_no_last_checkpoint(colmap_scene, tmp_path, capfd):
+    _train(colmap_scene, tmp_path, 12, "--no_last_checkpoint")
+    assert _checkpoints(tmp_path) == set() and read_model_json(tmp_path)["finished"] == 12
+    assert "Last checkpoint" not in capfd.readouterr().out
+    assert launch_options().no_last_checkpoint  # as a call of the reference's `training` leaves none
+
+
+def test_a_training_by_the_clock_leaves_no_checkpoint(colmap_scene, tmp_path):
+    _train(colmap_scene, tmp_path, 12, "--schedule", 12)
+    assert _checkpoints(tmp_path) == set()
+
+
+def test_a_training_that_starts_over_removes_what_another_would_resume(colmap_scene, tmp_path):
+    (tmp_path / REPLACED).write_bytes(b"of another training")
+    _train(colmap_scene, tmp_path, 12, "--no_last_checkpoint")
+    assert not (tmp_path / REPLACED).exists()
+
+
+def test_a_full_disk_ends_no_training(colmap_scene, tmp_path, capfd):
+    (tmp_path / "chkpnt12.pth").mkdir()  # which cannot be replaced by a file
+    _train(colmap_scene, tmp_path, 12)
+    assert f"warning: cannot write {tmp_path / 'chkpnt12.pth'}" in capfd.readouterr().err
+    assert finished(tmp_path) == 12
+
+
+def test_resume_needs_a_folder(colmap_scene):
+    with pytest.raises(UserError, match="^--resume needs -m"):
+        train_on(colmap_scene, "", "--resume")
+
+
+@pytest.mark.parametrize(
+    ("spent", "seconds", "wanted"), [(0, 59, False), (0, 61, True), (3, 299, False), (3, 420, True)]
+)
+def test_checkpoints_take_a_hundredth_of_the_time(spent, seconds, wanted):
+    """Of 100,000 Gaussians, which a slow disk writes in 0.36 s."""
+    part = resume.Resume()
+    part._before, part._spent, part._speed = 0.0, spent, resume._SPEED
+    clock, gaussians = type("", (), {"seconds": seconds}), type("", (), {"gaussian_count": 100_000})
+    part._run = type("", (), {"clock": clock, "gaussians": gaussians})
+    assert part._has_time() == wanted
+
+
+def test_new_folders_are_named_after_the_scene(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("OAR_JOB_ID", raising=False)
+    (tmp_path / "garden").mkdir()
+    for name in ("garden", "garden_2", "garden_3"):
+        assert new_folder("garden/") == f"./output/{name}"
+        (tmp_path / "output" / name).mkdir(parents=True)
+    assert new_folder() == f"./output/{tmp_path.name}"
