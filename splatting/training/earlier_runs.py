@@ -62,16 +62,16 @@ def lies_in(checkpoint: str | None, folder: str | os.PathLike) -> bool:
     return checkpoint is not None and _same_place(Path(checkpoint).parent, folder)
 
 
-def report_changes(checkpoint: str, now: argparse.Namespace) -> None:
+def report_changes(checkpoint: str, now: argparse.Namespace, grown: bool = False) -> None:
     """Warn if the run that wrote a checkpoint had other options than this run, `now`.
 
     now: all options. Those that the checkpoint's folder does not record are not compared. UserError for another scene,
-    and for --eval after a training on all photos.
+    unless it is the same that has grown, and for --eval after a training on all photos.
     """
     folder = Path(checkpoint).parent
     then = _options_of(folder)
     trained_on = str(then.get("source_path", ""))
-    if other_scene(trained_on, now.source_path):
+    if not grown and other_scene(trained_on, now.source_path):
         raise UserError(
             f"{checkpoint} is of another scene, {trained_on}; resume it with that one, or start from its model with "
             "--init_ply"

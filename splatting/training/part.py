@@ -34,6 +34,7 @@ model.exposures what photos make of renders, trained with the Gaussians (scene/g
 model.pinned which Gaussians density control leaves where they are, and as large as they are
 model.room   where rows lie: on the device, or a part of them on the host (scene/gaussians/room.py)
 run.schedule which steps of the schedule an iteration stands for
+run.views    the view of an iteration
 run.sizes    the size of a view in an iteration
 run.sleeping which blocks of rows take a step (scene/sleeping.py)
 run.counts   which pixels of a view count in its loss

@@ -45,6 +45,7 @@ class Run(Stepping):
     observer that waits has to look at it. resources: what parts have open, closed when the training is over, however it
     ends. report: `training_report`, or what replaces it; writer: its first argument. joules: what the clock reads
     (host/energy.py). checkpoints: writes them, while the loop runs. final_iteration: that of the last save's model.
+    grown: whether the scene has more photos than the checkpoint was trained on.
     """
 
     writer: Any = None
@@ -53,6 +54,7 @@ class Run(Stepping):
     checkpoints: Any = None
     final_iteration: int | None = None
     last_iteration: int | None = None
+    grown = False
 
     def __init__(
         self, dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, launch: argparse.Namespace
@@ -167,7 +169,7 @@ class Run(Stepping):
         saves = [self.schedule.known(one) for one in (self.launch.save_iterations, self.launch.checkpoint_iterations)]
         earlier_runs.check_folder(self.options, saves[0], start, self.first_iteration, saves[1])
         if start:
-            earlier_runs.report_changes(start, self.options)
+            earlier_runs.report_changes(start, self.options, self.grown)
 
     @property
     def _all_options(self) -> argparse.Namespace:

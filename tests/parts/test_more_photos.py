@@ -1,0 +1,152 @@
+"""Checkpoints that are resumed with more photos than they were trained on."""
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from synthetic import make_colmap_scene
+from trainings import train_on
+
+from splatting.parts.more_photos.order import Added, added_order
+from splatting.training.iteration import ViewOrder
+from splatting.training.run import Run
+from utils.system_utils import UserError
+
+WORDS = ("-r", 24, "--no_curve", "--disable_viewer", "--test_iterations", -1, "--densify_until_iter", 0)
+FIRST = 40
+
+
+class _View:
+    def __init__(self, name: str) -> None:
+        self.image_name = name
+
+
+@pytest.fixture(autouse=True)
+def own_streams(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
+
+
+def _without(scene: Path, folder: Path, names: list[str], shift: float = 0.0) -> Path:
+    """The scene without some photos, its model moved by `shift`."""
+    import pycolmap
+
+    shutil.copytree(scene, folder)
+    model = pycolmap.Reconstruction(str(folder / "sparse/0"))
+    for image in list(model.images.values()):
+        if image.name in names:
+            model.deregister_frame(image.frame_id)
+            (folder / "images" / image.name).unlink()
+    if shift:
+        model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), [shift, 0, 0]))
+    model.write_binary(str(folder / "sparse/0"))
+    return folder
+
+
+def _names(scene: Path) -> list[str]:
+    images = scene / "images"
+    return sorted(path.relative_to(images).as_posix() for path in images.rglob("*.png"))
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory) -> tuple[Path, Path, list[str]]:
+    """A scene, the same without two photos, and their names."""
+    folder = tmp_path_factory.mktemp("grown")
+    make_colmap_scene(folder / "whole")
+    new = _names(folder / "whole")[-2:]
+    return folder / "whole", _without(folder / "whole", folder / "part", new), new
+
+
+@pytest.fixture(scope="module")
+def first(scenes, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("first")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stdout", sys.stdout)
+        train_on(scenes[1], out, *WORDS, "--iterations", FIRST)
+    return out / f"chkpnt{FIRST}.pth"
+
+
+def _seen(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the views that a training takes, as they come."""
+    names, iterations = [], Run.iterations
+
+    def noted(self: Run):
+        for step in iterations(self):
+            names.append(step.camera.image_name)
+            yield step
+
+    monkeypatch.setattr(Run, "iterations", noted)
+    return names
+
+
+def test_new_photos_train_more_often_at_first(scenes, first, tmp_path, monkeypatch, capfd):
+    whole, _, new = scenes
+    names, out = _seen(monkeypatch), tmp_path / "out"
+    train_on(whole, out, *WORDS, "--start_checkpoint", first, "--iterations", 80)
+    # Trained 40 / 15 times each: the two new ones catch up within 10 iterations.
+    said = capfd.readouterr()
+    assert "2 photos are new; until iteration 50 every second one trains on one of them" in said.out
+    assert f"was trained with --source_path {scenes[1]}, this run has --source_path {whole}" in said.err
+    assert names[:10:2] == [name for name in names[:10] if name in new] and {*names[:4:2]} == {*new}
+    assert len({*names[10:27]}) > 13 and len(names) == 40
+    old = [name for name in _names(whole) if name not in new]
+    assert {*names[1:10:2]} <= {*old}
+
+
+def test_resumed_to_the_same_bytes(scenes, first, tmp_path, monkeypatch):
+    words = *WORDS, "--iterations", 70, "--images_to_load", 3
+    start = "--start_checkpoint", first, "--checkpoint_iterations", 45
+    whole = train_on(scenes[0], tmp_path / "out", *words, *start)[70]
+    for path in (tmp_path / "out").glob("point_cloud"):
+        shutil.rmtree(path)
+    names = _seen(monkeypatch)
+    again = train_on(scenes[0], tmp_path / "out", *words, "--start_checkpoint", tmp_path / "out/chkpnt45.pth")[70]
+    assert again == whole and sum(name in scenes[2] for name in names[:5]) in (2, 3)
+
+
+def test_the_checkpoints_folder_keeps_its_photos(scenes, first):
+    with pytest.raises(
+        UserError, match=r"has photos that .*chkpnt40.pth was not trained on; name another folder by -m"
+    ):
+        train_on(scenes[0], first.parent, *WORDS, "--start_checkpoint", first, "--iterations", 80)
+
+
+def test_moved_photos_are_refused(scenes, first, tmp_path):
+    moved = _without(scenes[0], tmp_path / "moved", [], shift=0.5)
+    with pytest.raises(UserError, match="have other poses than when .* was trained .*with all others fixed"):
+        train_on(moved, tmp_path / "out", *WORDS, "--start_checkpoint", first, "--iterations", 80)
+
+
+def test_another_scene_is_refused(scenes, first, tmp_path):
+    part = _without(scenes[1], tmp_path / "other", [])
+    with pytest.raises(UserError, match="is of another scene"):
+        train_on(part, tmp_path / "out", *WORDS, "--start_checkpoint", first, "--iterations", 80)
+
+
+def test_photos_that_trained_are_not_held_out(scenes, tmp_path):
+    whole = scenes[0]
+    part = _without(whole, tmp_path / "part", _names(whole)[:1])
+    train_on(part, tmp_path / "first", *WORDS, "--eval", "--iterations", 20)
+    words = *WORDS, "--eval", "--iterations", 40, "--start_checkpoint", tmp_path / "first/chkpnt20.pth"
+    with pytest.raises(UserError, match="--eval would hold out photos that .* was trained on"):
+        train_on(whole, tmp_path / "out", *words)
+
+
+def test_the_order_takes_all_views():
+    views = [_View(str(number)) for number in range(7)]
+    every = ViewOrder(views, 0)
+    order = added_order(every, Added.at(100, 1000, ["5", "6"], views))
+    assert Added.at(100, 1000, ["5", "6"], views).until == 180 and Added.at(100, 120, ["5"], views).until == 110
+    names = [order[t].image_name for t in range(101, 181)]
+    assert {names[t] for t in range(0, 80, 2)} == {"5", "6"} and {*names[1::2]} == {*"01234"}
+    assert all(order[t] is every[t] for t in (99, 100, 181, 500))
+    assert len({*order.coming(101, 7)}) == len(order.coming(101, 7)) == 5
+    assert added_order(every, Added(1, 9, ["x"])) is every
+
+
+@pytest.mark.parametrize(
+    "state", [None, {}, {"since": 1.5, "until": 3, "names": []}, {"since": 1, "until": 3, "names": 4}]
+)
+def test_damaged_records(state):
+    with pytest.raises(UserError, match="record of added photos is damaged"):
+        Added.restored(state)
