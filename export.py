@@ -12,6 +12,7 @@ if __name__ == "__main__":
     import splatting.host.early  # noqa: F401  (before the other imports, which take a second)
 
 import argparse
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -31,7 +32,7 @@ from scene.scene import Scene
 from scene.splats.reading import READABLE, read_splats
 from scene.splats.splats import Splats, choose, selected, tidy, used_sh_degree, with_sh_degree
 from scene.with_splats import load_file, splats_of
-from splatting.exports.formats import FORMATS, Format, format_of
+from splatting.exports.formats import FORMATS, Around, Format, format_of
 from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json
 from splatting.parts import tools
 from utils.general_utils import safe_state
@@ -50,7 +51,7 @@ def load(args: argparse.Namespace, options: argparse.Namespace, needs_views: boo
     if needs_views:
         if not args.model_path:
             raise UserError(
-                "--max_splats and HTML pages need training views; give their model folder with -m beside "
+                "--max_splats, pages and meshes need training views; give their model folder with -m beside "
                 f"--ply {args.ply}"
             )
         options.images_to_load = 1  # each image is used once or twice
@@ -105,7 +106,7 @@ def thin_out(
 
 def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse.Namespace, entry: Format) -> None:
     """Write the file that the command line asks for. UserError if there is nothing to load or to write."""
-    make_path = _path_maker(args.path, entry)
+    _check_fitting(args, entry)
     entry.check(args.to)
     _refuse_to_replace_a_model(Path(args.to), args.ply)
     splats, scene = load(args, options, needs_views=bool(args.max_splats) or entry.of_scene)
@@ -121,15 +122,18 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
         print("The model was trained with --projection ray; other programs draw large Gaussians off axis differently")
     start = time.perf_counter()
     background = (1.0, 1.0, 1.0) if options.white_background else (0.0, 0.0, 0.0)
-    entry.write(args.to, chosen, *((scene.getTrainCameras(), make_path, background) if entry.of_scene else ()))
+    around = entry.of_scene and Around(scene.getTrainCameras(), background, pipe, _path_maker(args.path), args.voxel)
+    what = entry.write(args.to, chosen, *((around,) if around else ()))
     size, seconds = Path(args.to).stat().st_size, time.perf_counter() - start
-    kept = degree if entry.bands else 0
-    spare = args.typed_sh_degree is None and entry.bands and degree < splats.sh_degree
-    unused = " (higher bands are zero)" if spare else ""
-    what = f"{len(chosen):,} of {len(splats):,} Gaussians, SH degree {kept}{unused}"
-    print(
-        f"Wrote {args.to}: {what}, {size / 1e6:.2f} MB ({size / max(len(chosen), 1):.0f} bytes each), {seconds:.1f} s"
-    )
+    if what is None:
+        kept = degree if entry.bands else 0
+        spare = args.typed_sh_degree is None and entry.bands and degree < splats.sh_degree
+        unused = " (higher bands are zero)" if spare else ""
+        each = f" ({size / max(len(chosen), 1):.0f} bytes each)"
+        what = f"{len(chosen):,} of {len(splats):,} Gaussians, SH degree {kept}{unused}"
+    else:
+        each = ""
+    print(f"Wrote {args.to}: {what}, {size / 1e6:.2f} MB{each}, {seconds:.1f} s")
 
 
 def _refuse_to_replace_a_model(file: Path, source: str | None) -> None:
@@ -138,12 +142,18 @@ def _refuse_to_replace_a_model(file: Path, source: str | None) -> None:
         raise UserError(f"--to {file} would overwrite a trained model or its input; choose another file")
 
 
-def _path_maker(path: str | None, entry: Format) -> Callable[[Poses], TimedPath] | None:
+def _check_fitting(args: argparse.Namespace, entry: Format) -> None:
+    """UserError for an option that is for files of another kind."""
+    for option in ("path", "voxel"):
+        if getattr(args, option) is not None and entry.option != option:
+            endings = " or ".join(other.ending for other in FORMATS if other.option == option)
+            raise UserError(f"--{option} is for {endings}; leave it out, or end --to with {endings}")
+
+
+def _path_maker(path: str | None) -> Callable[[Poses], TimedPath] | None:
     """What makes the animation of a page; None: the page's own."""
     if path is None:
         return None
-    if not entry.of_scene:
-        raise UserError(f"--path animates an HTML page; leave it out for {entry.ending}, or end --to with .html")
     from splatting.camera_paths.render_path import path_maker
 
     return path_maker(path)
@@ -176,6 +186,8 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
     add("--path", metavar="PATH",
         help="animation of an .html: interpolate, ellipse, spiral, or a JSON file of keyframes "
         "(default: around the model, or a sway if the first camera is within it)")  # fmt: skip
+    add("--voxel", type=float, metavar="UNITS",
+        help="size of a mesh's voxels in the scene's unit (default: two pixels at the median depth)")  # fmt: skip
     add("--quiet", action="store_true", help="print nothing to stdout (default: off)")
     return parser, model_params, pipeline_params
 
@@ -187,6 +199,8 @@ def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) ->
         raise UserError(f"--min_opacity must be from 0 to 1, got {args.min_opacity}")
     if args.max_splats < 0:
         raise UserError(f"--max_splats must be 0, no limit, or above, got {args.max_splats}")
+    if args.voxel is not None and not 0 < args.voxel < math.inf:
+        raise UserError(f"--voxel must be above 0, got {args.voxel}")
     if args.crop and not all(low < high for low, high in zip(args.crop[:3], args.crop[3:], strict=True)):
         raise UserError(f"--crop takes the smaller corner first, x0 y0 z0 x1 y1 z1, got {args.crop}")
     if args.model_path or not args.ply:

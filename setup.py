@@ -47,7 +47,9 @@ setup(
     version=version(),
     license="Apache-2.0",
     extras_require={
-        "export": [  # .usdz and .spz
+        "export": [  # .usdz, .spz and meshes
+            'scikit-image==0.25.2; python_version < "3.11"',
+            'scikit-image==0.26.0; python_version >= "3.11"',
             'usd-core==26.8; python_version < "3.11"',
             'usd-core==26.11; python_version >= "3.11"',
             "zstandard==0.25.0",

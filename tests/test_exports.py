@@ -307,7 +307,7 @@ def test_weights_are_those_of_blending():
 
 
 def test_unknown_endings_and_files_are_refused(tmp_path):
-    with pytest.raises(UserError, match=r"format of a.obj is unknown; end its name with one of .compressed.ply, .ply"):
+    with pytest.raises(UserError, match=r"format of a.obj is unknown; end its name with one of mesh.ply, mesh.glb, "):
         format_of("a.obj")
     assert format_of("A.Compressed.PLY").ending == ".compressed.ply" and format_of("b.ply").ending == ".ply"
     assert len({entry.ending for entry in FORMATS}) == len(FORMATS)

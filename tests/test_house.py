@@ -49,7 +49,7 @@ MAY_IMPORT = {
     "splatting.distributed.consistency": ("scene", "splatting.training.restart"),
     "splatting.distributed.rendering": ("gaussian_renderer", "scene"),
     "splatting.camera_paths": ("gaussian_renderer", "scene"),
-    "splatting.exports": ("splatting.camera_paths", "scene"),
+    "splatting.exports": ("splatting.camera_paths", "gaussian_renderer", "scene"),
     "splatting.evaluation": ("arguments", "scene.saved_iterations", "scene.readers.info", "splatting.parts"),
     "splatting.training": (
         *("splatting.evaluation", "splatting.parts"),

@@ -1,43 +1,78 @@
 """The formats of files that export.py writes, by the ending of a name."""
 
-import os
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from __future__ import annotations
 
+import argparse
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from scene.cameras import Camera
 from scene.splats.dot_splat import write_splat
 from scene.splats.ply import write_compressed_ply, write_plain_ply
+from scene.splats.splats import Splats
 from scene.splats.spz import find_zstandard, write_spz
+from splatting.exports.mesh_files import find_skimage, write_glb_mesh, write_ply_mesh
 from splatting.exports.scene_formats import find_pxr, write_glb, write_usdz
 from splatting.exports.sog import find_program, write_sog
 from utils.system_utils import UserError
+
+if TYPE_CHECKING:  # SciPy takes a while to import
+    from splatting.camera_paths.keyframes import TimedPath
+    from splatting.camera_paths.poses import Poses
+    from splatting.exports.mesh import Mesh
+
+
+class Around(NamedTuple):
+    """What the formats of a scene take besides its splats."""
+
+    cameras: Sequence[Camera]  # the training views
+    background: tuple[float, float, float]  # RGB in [0, 1]
+    pipe: argparse.Namespace
+    make_path: Callable[[Poses], TimedPath] | None  # of a page's animation
+    voxel: float | None  # of a mesh, in the world's unit
 
 
 @dataclass(frozen=True)
 class Format:
     """A format. ending: of its files' names; what: for people.
 
-    write: writes a file of splats, whole or not at all. UserError if it cannot be written. of_scene: it also takes the
-    further arguments of `write_html`. bands: it keeps SH bands. check: raises UserError if a package or program that
-    the file needs is missing.
+    write: writes a file of splats, whole or not at all, and returns what it is, where it is not splats. UserError if it
+    cannot be written. of_scene: it also takes `Around`. option: of export.py that is for this kind of files only.
+    bands: it keeps SH bands. check: raises UserError if a package or program that the file needs is missing.
     """
 
     ending: str
     write: Callable[..., None]
     what: str
     of_scene: bool = False
+    option: str = ""
     bands: bool = True
     check: Callable[[str | os.PathLike], Any] = lambda path: None
 
 
-def _write_html(*arguments: Any) -> None:
+def _write_html(path: str | os.PathLike, splats: Splats, around: Around) -> None:
     from splatting.exports.html import write_html  # SciPy and jinja2 take a while to import
 
-    write_html(*arguments)
+    write_html(path, splats, around.cameras, around.make_path, around.background)
+
+
+def _mesh_by(write: Callable[[str | os.PathLike, Mesh, Splats], None]) -> Callable[..., str]:
+    def write_mesh(path: str | os.PathLike, splats: Splats, around: Around) -> str:
+        from splatting.exports.mesh import mesh_of  # as does this
+
+        mesh, text = mesh_of(splats, around.cameras, around.pipe, around.voxel)
+        write(path, mesh, splats)
+        return text
+
+    return write_mesh
 
 
 # An ending that ends with another one comes before it.
 FORMATS = (
+    Format("mesh.ply", _mesh_by(write_ply_mesh), "surfaces, as coloured triangles", True, "voxel", False, find_skimage),
+    Format("mesh.glb", _mesh_by(write_glb_mesh), "the same, as glTF", True, "voxel", False, find_skimage),
     Format(".compressed.ply", write_compressed_ply, "PlayCanvas, SuperSplat"),
     Format(".ply", write_plain_ply, "float32, everything kept"),
     Format(".splat", write_splat, "antimatter15, 32 bytes a splat, no SH bands", bands=False),
@@ -45,7 +80,7 @@ FORMATS = (
     Format(".sog", write_sog, "PlayCanvas, through splat-transform", check=find_program),
     Format(".glb", write_glb, "glTF with KHR_gaussian_splatting, float32"),
     Format(".usdz", write_usdz, "OpenUSD, float32", check=find_pxr),
-    Format(".html", _write_html, "a page with a viewer", of_scene=True),
+    Format(".html", _write_html, "a page with a viewer", of_scene=True, option="path"),
 )
 
 

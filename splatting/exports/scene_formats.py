@@ -12,6 +12,7 @@ import json
 import os
 import struct
 import zipfile
+from collections.abc import Collection
 from pathlib import Path
 from types import ModuleType
 
@@ -34,22 +35,33 @@ def write_glb(path: str | os.PathLike, splats: Splats) -> None:
     Without splats it has a node without a mesh, as glTF has no empty one.
     """
     attributes = _attributes(splats) if len(splats) else {}
-    sizes = [values.nbytes for values in attributes.values()]
-    document = _document(attributes, sizes, splats.antialiasing)
+    document = _document(attributes, [values.nbytes for values in attributes.values()], splats.antialiasing)
+    write_binary_gltf(
+        path, document, attributes.values(), "leave Gaussians out by --max_splats, or bands by --sh_degree"
+    )
+
+
+def write_binary_gltf(
+    path: str | os.PathLike, document: dict, arrays: Collection[np.ndarray], if_too_large: str
+) -> None:
+    """Write a document and the arrays of its one buffer, whole or not at all. UserError above LARGEST bytes.
+
+    arrays: of sizes that are multiples of 4 bytes, one after another. if_too_large: the remedy.
+    """
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
-    length = 12 + len(chunks) + (8 + sum(sizes) if attributes else 0)
+    size = sum(values.nbytes for values in arrays)
+    length = 12 + len(chunks) + (8 + size if arrays else 0)
     if length > LARGEST:
         raise UserError(
-            f"{path} would have {length / 1e9:.1f} GB, and a GLB has at most {LARGEST / 1e9:.1f}; leave Gaussians out "
-            "by --max_splats, or bands by --sh_degree"
+            f"{path} would have {length / 1e9:.1f} GB, and a GLB has at most {LARGEST / 1e9:.1f}; {if_too_large}"
         )
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
         file.write(struct.pack("<4sII", b"glTF", 2, length) + chunks)
-        if attributes:
-            file.write(struct.pack("<I4s", sum(sizes), b"BIN\0"))
-        for values in attributes.values():  # one by one, as all of them together take much memory
+        if arrays:
+            file.write(struct.pack("<I4s", size, b"BIN\0"))
+        for values in arrays:  # one by one, as all of them together take much memory
             file.write(np.ascontiguousarray(values))
 
 
