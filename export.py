@@ -51,7 +51,7 @@ def load(args: argparse.Namespace, options: argparse.Namespace, needs_views: boo
     if needs_views:
         if not args.model_path:
             raise UserError(
-                "--max_splats, pages and meshes need training views; give their model folder with -m beside "
+                "--max_splats, --clean, pages and meshes need training views; give their model folder with -m beside "
                 f"--ply {args.ply}"
             )
         options.images_to_load = 1  # each image is used once or twice
@@ -104,18 +104,45 @@ def thin_out(
     return thinned
 
 
+def cleaned(scene: Scene, most: float, pipe: argparse.Namespace, options: argparse.Namespace, to: str) -> np.ndarray:
+    """(N,) bool: what the training views need, to within `most` dB each; print what goes, and write a picture of it."""
+    from splatting.exports.cleaning import clean, write_picture
+
+    cameras, background = scene.getTrainCameras(), torch.full((3,), float(options.white_background))
+    if not cameras:
+        raise UserError("--clean needs training views, and the scene has none; leave it out")
+    views = ScoredViews(pipe, background.to(compute_device()), scene.halves)
+    cleaning = clean(scene.gaussians, cameras, views, most)
+    loss = {camera.image_name: cleaning.before[id(camera)] - cleaning.after[id(camera)] for camera in cameras}
+    finite = {name: value for name, value in loss.items() if math.isfinite(value)} or {cameras[0].image_name: 0.0}
+    worst, mean = max(finite, key=finite.get), sum(finite.values()) / len(finite)
+    gone, total = int((~cleaning.keep).sum()), len(cleaning.keep)
+    print(
+        f"--clean {most:g}: {gone:,} of {total:,} Gaussians go ({100 * gone / total:.1f} %); training views change by "
+        f"{-mean:+.3f} dB in the mean, and {worst} most, by {-finite[worst]:+.3f} dB"
+    )
+    if gone:
+        picture = Path(to).with_name(f"{Path(to).name}.removed.png")
+        write_picture(picture, scene.gaussians, cleaning.keep, cameras, views)
+        print(f"{picture}: before, what goes, and after")
+    return cleaning.keep.cpu().numpy()
+
+
 def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse.Namespace, entry: Format) -> None:
     """Write the file that the command line asks for. UserError if there is nothing to load or to write."""
     _check_fitting(args, entry)
     entry.check(args.to)
     _refuse_to_replace_a_model(Path(args.to), args.ply)
-    splats, scene = load(args, options, needs_views=bool(args.max_splats) or entry.of_scene)
+    needs_views = bool(args.max_splats or args.clean) or entry.of_scene
+    splats, scene = load(args, options, needs_views)
     degree = used_sh_degree(splats) if args.typed_sh_degree is None else min(args.typed_sh_degree, splats.sh_degree)
     keep = choose(splats, args.crop, args.min_opacity)
     for left_out in tools("left_out"):
         if (found := left_out(args, torch.from_numpy(splats.means))) is not None:
             keep &= ~found.numpy()
-    if scene is not None and args.max_splats:
+    if args.clean:
+        keep &= cleaned(scene, args.clean, pipe, options, args.to)
+    if args.max_splats:
         keep = thin_out(scene, keep, degree, args.max_splats, pipe, options, scored=args.crop is None)
     chosen = tidy(with_sh_degree(selected(splats, keep), degree))
     if getattr(pipe, "projection", "ewa") == "ray":
@@ -181,6 +208,9 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
     add("--min_opacity", type=float, default=0.0, help="leave fainter Gaussians out, 0 to 1 (default: 0)")
     for add_options in tools("add_export_options"):
         add_options(add)
+    add("--clean", type=float, nargs="?", const=0.05, metavar="DB",
+        help="leave out floaters and what else the training views do not need, while none loses more than this "
+        "(default: off; 0.05 without a number)")  # fmt: skip
     add("--max_splats", type=int, default=0, metavar="N",
         help="keep N Gaussians; what adds least to the training views goes first (default: 0, no limit)")  # fmt: skip
     add("--path", metavar="PATH",
@@ -199,6 +229,8 @@ def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) ->
         raise UserError(f"--min_opacity must be from 0 to 1, got {args.min_opacity}")
     if args.max_splats < 0:
         raise UserError(f"--max_splats must be 0, no limit, or above, got {args.max_splats}")
+    if args.clean is not None and not 0 < args.clean < math.inf:
+        raise UserError(f"--clean must be above 0 dB, got {args.clean}")
     if args.voxel is not None and not 0 < args.voxel < math.inf:
         raise UserError(f"--voxel must be above 0, got {args.voxel}")
     if args.crop and not all(low < high for low, high in zip(args.crop[:3], args.crop[3:], strict=True)):

@@ -20,7 +20,7 @@ class ScoredViews:
     halves: only right halves count, and they are rendered with exposures (the half-image protocol). Photos that the
     model's exposures cover are rendered as these show them, too.
     draw: renders a camera and a model to (3, H, W) in [0, 1]; None: `render` does. whole: the same, the render before
-    `part` cuts it.
+    `part` cuts it. pipe: the pipeline options.
     """
 
     def __init__(
@@ -30,7 +30,7 @@ class ScoredViews:
         halves: bool,
         draw: Callable[[Camera, GaussianModel], Tensor] | None = None,
     ) -> None:
-        self._pipe = pipe
+        self.pipe = pipe
         self._background = background
         self.halves = halves
         self.whole = draw or self._render
@@ -38,7 +38,7 @@ class ScoredViews:
     def _render(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
         exposed = self.halves or shown_as_trained(camera, gaussians)
         options = {"use_trained_exp": exposed, "want_depth": False, "want_visibility": False}
-        return render(camera, gaussians, self._pipe, self._background, **options)["render"]
+        return render(camera, gaussians, self.pipe, self._background, **options)["render"]
 
     def part(self, image: Tensor) -> Tensor:
         """The scored part of an image (C, H, W): all of it, or its right half."""

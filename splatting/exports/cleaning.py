@@ -1,0 +1,138 @@
+"""Leaving out what the training views do not need: what their photos speak against, then what adds least to them.
+
+Leaving a Gaussian out changes a view's squared error by about the opacity times minus its derivative (Molchanov et al.
+2017, "Pruning convolutional neural networks for resource efficient inference"). Where the sum over the views is
+negative, the photos speak against the Gaussian, as they do for floaters. The others add to a view what they have of its
+blending weights. Both count by the view's error, as a view with a small one is the first to lose dB.
+"""
+
+import os
+from collections.abc import Sequence
+from itertools import chain
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gaussian_renderer.blending import weighted_sums
+from gaussian_renderer.free_view import FRACTIONS, neighbours, views_between
+from gaussian_renderer.scored_views import ScoredViews
+from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
+from splatting.files.image_files import save_png
+from splatting.host.progress import Bar
+from utils.image_utils import as_float, pixels_that_count
+
+_STEPS = 1000  # a search ends within N / _STEPS of the most that may go
+_SOLID = 1e-3  # least transparency in the derivative by an opacity
+_EXACT = 1e-12  # least squared error of a view
+_SHOWN = 3  # views of the picture
+
+
+class Cleaning:
+    """A model of which more and more is left out, as long as no view loses more than `most` dB of its best PSNR.
+
+    keep: (N,) bool. before, after: PSNR by view, dB.
+    """
+
+    def __init__(self, gaussians: GaussianModel, cameras: Sequence[Camera], views: ScoredViews, most: float) -> None:
+        self._gaussians, self._cameras, self._views, self._most = gaussians, list(cameras), views, most
+        self.keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.get_xyz.device)
+        self.before = {id(camera): self._psnr(camera, gaussians) for camera in self._cameras}
+        self.after = dict(self.before)
+        self._best = dict(self.before)
+
+    def _part(self, keep: Tensor) -> GaussianModel:
+        return self._gaussians.part(keep, self._gaussians.max_sh_degree)
+
+    def _psnr(self, camera: Camera, gaussians: GaussianModel) -> float:
+        return self._views.scores([camera], gaussians).get("psnr", float("inf"))
+
+    def _scores(self, keep: Tensor) -> dict[int, float] | None:
+        """PSNR by view without some Gaussians; None if one loses too much, which is asked first from then on."""
+        gaussians, found = self._part(keep), {}
+        for camera in self._cameras:
+            found[id(camera)] = self._psnr(camera, gaussians)
+            if self._best[id(camera)] - found[id(camera)] > self._most:
+                self._cameras.remove(camera)
+                self._cameras.insert(0, camera)
+                return None
+        return found
+
+    def leave_out(self, order: Tensor) -> None:
+        """Leave out as many Gaussians as may go, from the start of `order`, (n,) indices: by bisection."""
+        low, high, scores = 0, len(order) + 1, None
+        with Bar(desc="Trying what may go", unit="try", leave=False) as bar:
+            while high - low > max(1, len(self._gaussians) // _STEPS):
+                middle = (low + high) // 2
+                keep = self.keep.clone()
+                keep[order[:middle]] = False
+                tried = self._scores(keep) if keep.any() else None
+                low, high, scores = (middle, high, tried) if tried else (low, middle, scores)
+                bar.update()
+        if scores:
+            self.keep[order[:low]] = False
+            self.after = scores
+            self._best = {view: max(score, scores[view]) for view, score in self._best.items()}
+
+    def changes(self) -> Tensor:
+        """(N,) float64: the change of the views' errors without a Gaussian, as a sum of shares of these errors."""
+        gaussians, found = self._part(self.keep), torch.zeros_like(self.keep, dtype=torch.float64)
+        logits = gaussians.raw("opacity")
+        transparency = (1 - gaussians.get_opacity.detach()[:, 0]).clamp_min(_SOLID)
+        for camera in Bar(self._cameras, desc="Asking the photos", unit="view", leave=False):
+            with torch.enable_grad():
+                image, target, mask = self._views.compared(camera, gaussians)
+                if mask is not None and not mask.any():
+                    continue
+                error = pixels_that_count(image - as_float(target), mask).square().mean()
+                (slope,) = torch.autograd.grad(error, logits)
+            found[self.keep] -= (slope[:, 0] / transparency).double() / error.detach().double().clamp_min(_EXACT)
+        return found.nan_to_num(0.0)
+
+    def added(self) -> Tensor:
+        """(N,) float64: the most that a Gaussian has of a view's weights, by the mean over pixels and by its error.
+
+        Of the training views, and of views between neighbours, where others than these photos may show it.
+        """
+        gaussians, found = self._part(self.keep), torch.zeros_like(self.keep, dtype=torch.float64)
+        errors = [max(10 ** (-self.after[id(camera)] / 10), _EXACT) for camera in self._cameras]
+        pairs = neighbours(self._cameras, 0)
+        between = chain.from_iterable(views_between(self._cameras[i], self._cameras[j]) for i, j in pairs)
+        views = chain(zip(self._cameras, errors, strict=True), ((view, sum(errors) / len(errors)) for view in between))
+        count = len(errors) + len(FRACTIONS) * len(pairs)
+        for camera, error in Bar(views, desc="Weighing Gaussians", total=count, unit="view", leave=False):
+            black = gaussians.get_xyz.new_zeros(3)
+            weights = weighted_sums(camera, gaussians, self._views.pipe, black, torch.ones_like)[:, 0].double()
+            weights /= error * camera.image_width * camera.image_height
+            found[self.keep] = torch.maximum(found[self.keep], weights)
+        return found.nan_to_num(0.0)
+
+
+@torch.no_grad()
+def clean(gaussians: GaussianModel, cameras: Sequence[Camera], views: ScoredViews, most: float) -> Cleaning:
+    """Leave Gaussians out of a model, so that no view's PSNR falls by more than `most` dB.
+
+    The model does not change. A view that gets better may not lose more than that of its gain either.
+    """
+    cleaning = Cleaning(gaussians, cameras, views, most)
+    changes = cleaning.changes()
+    order = torch.argsort(changes, stable=True)
+    cleaning.leave_out(order[(changes < 0)[order]])
+    order = torch.argsort(cleaning.added(), stable=True)
+    cleaning.leave_out(order[cleaning.keep[order]])
+    return cleaning
+
+
+@torch.no_grad()
+def write_picture(
+    path: str | os.PathLike, gaussians: GaussianModel, keep: Tensor, cameras: Sequence[Camera], views: ScoredViews
+) -> None:
+    """Write a PNG of the views that change most: before, what goes, and after, side by side, a row for each view."""
+    degree = gaussians.max_sh_degree
+    gone, after = gaussians.part(~keep, degree), gaussians.part(keep, degree)
+    changes = [float((views.image(c, gaussians) - views.image(c, after)).square().mean()) for c in cameras]
+    chosen = sorted(range(len(cameras)), key=lambda k: -changes[k])[:_SHOWN]
+    rows = [torch.cat([views.image(cameras[k], model) for model in (gaussians, gone, after)], 2) for k in chosen]
+    width = max(row.shape[2] for row in rows)
+    save_png(torch.cat([torch.nn.functional.pad(row, (0, width - row.shape[2])) for row in rows], 1), Path(path))
