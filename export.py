@@ -1,7 +1,7 @@
 """Write a trained model in the file format of another program.
 
 python export.py -m MODEL --to FILE [--iteration N] [--sh_degree D] [--crop X0 Y0 Z0 X1 Y1 Z1] [--max_splats N]
-python export.py --ply MODEL_OF_ANY_TOOL --to FILE
+python export.py MODEL_OF_ANY_TOOL --to FILE
 
 The ending of FILE names the format; splatting/exports/formats.py has the table.
 """
@@ -29,10 +29,12 @@ from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import change_on_views
 from scene.saved_model import find_save, load_saved, read_model
 from scene.scene import Scene
-from scene.splats.reading import READABLE, read_splats
+from scene.splats.reading import READABLE
 from scene.splats.splats import Splats, choose, selected, tidy, used_sh_degree, with_sh_degree
 from scene.with_splats import load_file, splats_of
+from splatting.camera_paths.without_scene import circle
 from splatting.exports.formats import FORMATS, Around, Format, format_of
+from splatting.exports.reading import ANY, read_any
 from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json
 from splatting.parts import tools
 from utils.general_utils import safe_state
@@ -59,7 +61,7 @@ def load(args: argparse.Namespace, options: argparse.Namespace, needs_views: boo
         scene = load_file(options, args.ply, smooth) if args.ply else load_saved(options, args.iteration)
         return splats_of(scene.gaussians, smooth.antialiasing), scene
     if args.ply:
-        splats = read_splats(args.ply)
+        splats = read_any(args.ply)
         return replace(splats, antialiasing=splats.antialiasing or bool(args.antialiasing)), None
     _, path = find_save(options.model_path, args.iteration)
     gaussians = read_model(path)
@@ -133,7 +135,7 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     _check_fitting(args, entry)
     entry.check(args.to)
     _refuse_to_replace_a_model(Path(args.to), args.ply)
-    needs_views = bool(args.max_splats or args.clean) or entry.of_scene
+    needs_views = bool(args.max_splats or args.clean) or entry.of_scene and not (args.file and entry.around)
     splats, scene = load(args, options, needs_views)
     degree = used_sh_degree(splats) if args.typed_sh_degree is None else min(args.typed_sh_degree, splats.sh_degree)
     keep = choose(splats, args.crop, args.min_opacity)
@@ -149,7 +151,8 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
         print("The model was trained with --projection ray; other programs draw large Gaussians off axis differently")
     start = time.perf_counter()
     background = (1.0, 1.0, 1.0) if options.white_background else (0.0, 0.0, 0.0)
-    around = entry.of_scene and Around(scene.getTrainCameras(), background, pipe, _path_maker(args.path), args.voxel)
+    cameras = circle(chosen.means) if scene is None and entry.around else scene and scene.getTrainCameras()
+    around = entry.of_scene and Around(cameras, background, pipe, _path_maker(args.path), args.voxel)
     what = entry.write(args.to, chosen, *((around,) if around else ()))
     size, seconds = Path(args.to).stat().st_size, time.perf_counter() - start
     if what is None:
@@ -195,6 +198,7 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
     add = parser.add_argument
     endings = "; ".join(f"{entry.ending}: {entry.what}" for entry in FORMATS)
     add("--to", required=True, metavar="FILE", help=f"file to write; its ending is the format. {endings}")
+    add("file", nargs="?", default="", metavar="MODEL", help=f"write this model, of any tool, without a scene: {ANY}")
     add("--iteration", type=int, default=-1, help="saved iteration to write (default: -1, the last)")
     add(
         "--ply",
@@ -225,6 +229,9 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
 def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Parse the command line; with --ply, no model folder is read. UserError for values out of range."""
     args = parser.parse_args(argv)
+    if args.file and (args.ply or args.model_path):
+        raise UserError(f"{args.file} stands alone; beside -m or --ply, give one file by --ply and leave it out")
+    args.ply = args.file or args.ply
     if not 0 <= args.min_opacity <= 1:
         raise UserError(f"--min_opacity must be from 0 to 1, got {args.min_opacity}")
     if args.max_splats < 0:

@@ -1,6 +1,7 @@
 """Show a trained model on a web page that this process serves.
 
 python view.py -m MODEL [--iteration N] [--port PORT]
+python view.py FILE                                     # a model of any tool, without a scene
 """
 
 from __future__ import annotations
@@ -10,12 +11,41 @@ if __name__ == "__main__":
 
 import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 
+import argparse
+import os
+import sys
+from pathlib import Path
+
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
-from scene.saved_model import load_saved
+from scene.saved_model import find_save, load_saved, read_model
+from scene.scene import Scene
+from scene.splats.splats import drawable, selected
+from scene.with_splats import model_of
+from splatting.camera_paths.without_scene import WithoutScene, circle, recorded_cameras
+from splatting.exports.reading import ANY, read_any
 from splatting.viewer.page import Page, serve
 from splatting.viewer.server import HOST_OPTION, PORT, checked_address
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, run_cli
+
+
+def of_file(path: str, pipeline: argparse.Namespace) -> WithoutScene:
+    """The model of a file, seen from a circle around it. `pipeline` gets antialiasing if the file says so."""
+    splats = read_any(path)
+    splats = selected(splats, drawable(splats))
+    pipeline.antialiasing = pipeline.antialiasing or splats.antialiasing
+    folder, name = os.path.split(os.path.abspath(path))
+    return WithoutScene(model_of(splats), folder, name, circle(splats.means))
+
+
+def of_folder(options: argparse.Namespace, args: argparse.Namespace) -> Scene | WithoutScene:
+    """The model of a folder with its scene, or where that is gone with the poses that the folder records."""
+    record = Path(options.model_path) / "cameras.json"
+    if os.path.isdir(options.source_path) or not record.is_file():
+        return load_saved(options, args.iteration, args.typed_sh_degree)
+    iteration, path = find_save(options.model_path, args.iteration)
+    print(f"warning: the scene {options.source_path} is gone, so there are poses, but no photos", file=sys.stderr)
+    return WithoutScene(read_model(path), options.model_path, iteration, recorded_cameras(record))
 
 
 def main() -> None:
@@ -26,14 +56,21 @@ def main() -> None:
     parser.add_argument("--port", type=int, default=PORT, help=f"port of the page, 0: any (default: {PORT})")
     HOST_OPTION.add_to(parser, sentinel=False)
     parser.add_argument("--quiet", action="store_true", help="print nothing to stdout (default: off)")
-    args = get_combined_args(parser)
+    parser.add_argument("file", nargs="?", default="", metavar="FILE", help=f"model in place of -m: {ANY}")
+    args = parser.parse_args()
+    if args.file and args.model_path:
+        raise UserError(f"-m {args.model_path} has a model of its own; leave {args.file} or -m out")
+    args = args if args.file else get_combined_args(parser)
     options, pipeline = model_params.extract(args), pipeline_params.extract(args)
     place = checked_address(args.viewer_host, args.port)
     safe_state(args.quiet)
-    warn_of_background(options)
-    scene = load_saved(options, args.iteration, args.typed_sh_degree)
+    if args.file:
+        scene = of_file(args.file, pipeline)
+    else:
+        warn_of_background(options)
+        scene = of_folder(options, args)
     if len(scene.gaussians) == 0:
-        raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
+        raise UserError(f"{scene.loaded_iter} of {scene.model_path} has no Gaussians; choose another model")
     page = Page(place, scene, pipeline, options.white_background, scene.halves)
     try:
         raise serve(page)

@@ -40,7 +40,8 @@ class Format:
 
     write: writes a file of splats, whole or not at all, and returns what it is, where it is not splats. UserError if it
     cannot be written. of_scene: it also takes `Around`. option: of export.py that is for this kind of files only.
-    bands: it keeps SH bands. check: raises UserError if a package or program that the file needs is missing.
+    around: views from around a model do, where there is no scene. bands: it keeps SH bands. check: raises UserError if
+    a package or program that the file needs is missing.
     """
 
     ending: str
@@ -49,6 +50,7 @@ class Format:
     of_scene: bool = False
     option: str = ""
     bands: bool = True
+    around: bool = False
     check: Callable[[str | os.PathLike], Any] = lambda path: None
 
 
@@ -71,8 +73,16 @@ def _mesh_by(write: Callable[[str | os.PathLike, Mesh, Splats], None]) -> Callab
 
 # An ending that ends with another one comes before it.
 FORMATS = (
-    Format("mesh.ply", _mesh_by(write_ply_mesh), "surfaces, as coloured triangles", True, "voxel", False, find_skimage),
-    Format("mesh.glb", _mesh_by(write_glb_mesh), "the same, as glTF", True, "voxel", False, find_skimage),
+    Format(
+        "mesh.ply",
+        _mesh_by(write_ply_mesh),
+        "surfaces, as coloured triangles",
+        True,
+        "voxel",
+        bands=False,
+        check=find_skimage,
+    ),
+    Format("mesh.glb", _mesh_by(write_glb_mesh), "the same, as glTF", True, "voxel", bands=False, check=find_skimage),
     Format(".compressed.ply", write_compressed_ply, "PlayCanvas, SuperSplat"),
     Format(".ply", write_plain_ply, "float32, everything kept"),
     Format(".splat", write_splat, "antimatter15, 32 bytes a splat, no SH bands", bands=False),
@@ -80,7 +90,7 @@ FORMATS = (
     Format(".sog", write_sog, "PlayCanvas, through splat-transform", check=find_program),
     Format(".glb", write_glb, "glTF with KHR_gaussian_splatting, float32"),
     Format(".usdz", write_usdz, "OpenUSD, float32", check=find_pxr),
-    Format(".html", _write_html, "a page with a viewer", of_scene=True, option="path"),
+    Format(".html", _write_html, "a page with a viewer", of_scene=True, option="path", around=True),
 )
 
 

@@ -1,0 +1,75 @@
+"""Cameras of a model whose scene is not at hand: those that its folder records, or a circle around it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
+from scene.readers.info import CameraInfo
+from splatting.camera_paths.poses import facing
+from splatting.files.json_files import read_json
+from utils.system_utils import UserError
+
+COUNT, SIZE = 12, (960, 720)  # of the circle's views
+_FOCAL = 0.9  # of their widths
+_FAR = 3.5  # their distance, in median distances of the means from the middle
+_HIGH = 0.3  # of their distance
+
+
+@dataclass
+class WithoutScene:
+    """What a viewer takes of a scene, with cameras that have no photos. loaded_iter: the iteration, or a name."""
+
+    gaussians: GaussianModel
+    model_path: str
+    loaded_iter: int | str
+    train: Sequence[Camera]
+    test: Sequence[Camera] = field(default_factory=list)
+    halves: bool = False
+
+    def getTrainCameras(self) -> list[Camera]:
+        return list(self.train)
+
+    def getTestCameras(self) -> list[Camera]:
+        return list(self.test)
+
+
+def circle(means: np.ndarray) -> list[Camera]:
+    """Views that look from a circle at the middle of positions (N, 3): their median. Up is -y, as of most models."""
+    middle = np.median(means, axis=0).astype(np.float64) if len(means) else np.zeros(3)
+    radius = _FAR * float(np.median(np.linalg.norm(means - middle, axis=1))) if len(means) else 0.0
+    infos = []
+    for number, angle in enumerate(2 * np.pi * np.arange(COUNT) / COUNT):
+        away = np.array([np.sin(angle), -_HIGH, -np.cos(angle)])
+        turn = facing(-away, np.array([0.0, -1.0, 0.0]))
+        infos.append(_info(number, f"around {number}", turn, middle + (radius or 1.0) * away, *SIZE, _FOCAL * SIZE[0]))
+    return _cameras(infos)
+
+
+def recorded_cameras(path: Path) -> list[Camera]:
+    """The cameras of a model folder's cameras.json. UserError if there is none, or it is damaged."""
+    try:
+        return _cameras([_recorded(number, entry) for number, entry in enumerate(read_json(path))])
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{path} has no cameras that can be read ({error}); give the scene with -s") from error
+
+
+def _recorded(number: int, entry: Mapping[str, Any]) -> CameraInfo:
+    turn, place = (np.array(entry[name], np.float64) for name in ("rotation", "position"))
+    numbers = (int(entry["width"]), int(entry["height"]), float(entry["fx"]), float(entry["fy"]))
+    return _info(number, str(entry["img_name"]), turn, place, *numbers)
+
+
+def _info(
+    number: int, name: str, turn: np.ndarray, place: np.ndarray, width: int, height: int, fx: float, fy: float = 0.0
+) -> CameraInfo:
+    options = {"image_name": name, "image_path": name, "width": width, "height": height}
+    return CameraInfo(number, turn, -turn.T @ place, fx=fx, fy=fy or fx, **options)
+
+
+def _cameras(infos: Sequence[CameraInfo]) -> list[Camera]:
+    return [Camera(info, (info.width, info.height), number) for number, info in enumerate(infos)]

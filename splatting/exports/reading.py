@@ -1,0 +1,27 @@
+"""Reading a model in any format: also those that other programs read for us."""
+
+import os
+import subprocess
+from pathlib import Path
+
+from scene.splats.reading import READABLE, read_splats
+from scene.splats.splats import Splats
+from splatting.exports.sog import find_program
+from utils.system_utils import UserError, temporary_folder
+
+ANY = f"{READABLE}, or .sog through splat-transform"
+
+
+def read_any(path: str | os.PathLike) -> Splats:
+    """The Gaussians of a file, as `read_splats`; of a SOG as PlayCanvas' program reads it. UserError without that."""
+    if Path(path).suffix.lower() != ".sog" or not os.path.isfile(path):
+        return read_splats(path)
+    program = find_program(path)
+    with temporary_folder() as folder:
+        model = folder / "model.ply"
+        command = [program, "--quiet", str(path), str(model)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode or not model.is_file():
+            said = (done.stderr or done.stdout).strip().splitlines() or ["it said nothing"]
+            raise UserError(f"{path} is not read by {program} ({said[-1]}); save or download it again")
+        return read_splats(model)

@@ -1,0 +1,103 @@
+"""Models without a scene, viewed and exported from a circle around them, or from the poses that a folder records."""
+
+import argparse
+import json
+
+import numpy as np
+import pytest
+import torch
+from gaussians import pipeline
+from html_scene import balls
+from small_splats import written
+
+import export
+import view
+from gaussian_renderer import render
+from scene.splats.reading import read_splats
+from scene.with_splats import model_of
+from splatting.camera_paths.without_scene import COUNT, circle, recorded_cameras
+from splatting.exports.reading import read_any
+from splatting.viewer.views import SceneCameras
+from utils.camera_utils import camera_to_JSON
+from utils.system_utils import UserError
+
+
+def test_all_views_of_the_circle_show_the_model():
+    splats = balls()
+    gaussians = model_of(splats)
+    for camera in circle(splats.means):
+        image = render(camera, gaussians, pipeline(), torch.zeros(3))["render"].detach()
+        shown = (image.sum(0) > 0.1).double()
+        rows, columns = shown.nonzero().double().mean(0).tolist()
+        assert 0.02 < shown.mean() < 0.75
+        assert abs(rows / camera.image_height - 0.5) < 0.15 and abs(columns / camera.image_width - 0.5) < 0.15
+    empty = circle(np.zeros((0, 3), np.float32))
+    assert len(empty) == COUNT and np.isfinite(empty[0].T).all()
+
+
+def test_recorded_poses_are_those_of_the_record(tmp_path):
+    record = tmp_path / "cameras.json"
+    cameras = circle(balls().means)
+    for camera in cameras:
+        camera.width, camera.height = camera.image_width, camera.image_height
+    record.write_text(json.dumps([camera_to_JSON(n, camera) for n, camera in enumerate(cameras)]))
+    for one, other in zip(recorded_cameras(record), cameras, strict=True):
+        assert one.image_name == other.image_name
+        torch.testing.assert_close(one.full_proj_transform, other.full_proj_transform, rtol=0, atol=1e-5)
+    record.write_text('[{"img_name": "a"}]')
+    with pytest.raises(UserError, match="has no cameras that can be read .'rotation'.; give the scene with -s"):
+        recorded_cameras(record)
+
+
+def test_a_viewer_begins_at_the_circle(tmp_path):
+    path, options = written(tmp_path, ".splat", balls()), pipeline()
+    scene = view.of_file(str(path), options)
+    assert scene.loaded_iter == path.name and len(scene.gaussians) == len(balls())
+    shown = SceneCameras(scene.getTrainCameras(), scene.getTestCameras())
+    assert len(shown.by_name) == COUNT and np.allclose(shown.up, [0, -1, 0], atol=1e-6)
+    antialiased = written(tmp_path, ".ply", balls().__class__(**(vars(balls()) | {"antialiasing": True})))
+    view.of_file(str(antialiased), options)
+    assert options.antialiasing
+
+
+def test_a_folder_whose_scene_is_gone_keeps_its_poses(tmp_path, capsys):
+    (tmp_path / "point_cloud/iteration_7").mkdir(parents=True)
+    written(tmp_path, ".ply", balls()).rename(tmp_path / "point_cloud/iteration_7/point_cloud.ply")
+    (tmp_path / "cameras.json").write_text(json.dumps([]))
+    options = argparse.Namespace(model_path=str(tmp_path), source_path=str(tmp_path / "gone"))
+    scene = view.of_folder(options, argparse.Namespace(iteration=-1, typed_sh_degree=None))
+    assert scene.loaded_iter == 7 and len(scene.gaussians) == len(balls())
+    assert "gone is gone, so there are poses, but no photos" in capsys.readouterr().err
+
+
+def test_export_takes_a_file_alone(tmp_path, monkeypatch):
+    path = written(tmp_path, ".splat", balls())
+
+    def run(*words: str) -> None:
+        monkeypatch.setattr("sys.argv", ["export.py", *words])
+        export.main()
+
+    run(str(path), "--to", str(tmp_path / "out.ply"))
+    np.testing.assert_array_equal(read_splats(tmp_path / "out.ply").means, read_splats(path).means)
+    run(str(path), "--to", str(tmp_path / "page.html"), "--path", "ellipse")
+    assert "around 11" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    for words, said in (
+        (["--max_splats", "10", "--to", "a.ply"], "--max_splats, --clean, pages and meshes need training views"),
+        (["--to", "mesh.ply"], "--max_splats, --clean, pages and meshes need training views"),
+        (["-m", str(tmp_path), "--to", "a.ply"], "stands alone; beside -m or --ply, give one file by --ply"),
+    ):
+        with pytest.raises(UserError, match=said):
+            run(str(path), *words)
+
+
+def test_a_sog_needs_its_program(tmp_path, monkeypatch):
+    (tmp_path / "a.sog").write_bytes(b"PK")
+    monkeypatch.setattr("shutil.which", lambda *_, **__: None)
+    with pytest.raises(UserError, match="a.sog needs splat-transform; install Node"):
+        read_any(tmp_path / "a.sog")
+    program = tmp_path / "program"
+    program.write_text("#!/bin/sh\necho no model >&2; exit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setattr("shutil.which", lambda *_, **__: str(program))
+    with pytest.raises(UserError, match=r"a.sog is not read by .*program .no model.; save or download it again"):
+        read_any(tmp_path / "a.sog")
