@@ -13,6 +13,7 @@ if __name__ == "__main__":
 
 import argparse
 import math
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -27,12 +28,13 @@ from arguments import ModelParams, OptionParser, PipelineParams, get_combined_ar
 from gaussian_renderer.blending import blending_weights, most_important
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import change_on_views
+from scene.cameras import Camera
 from scene.saved_model import find_save, load_saved, read_model
 from scene.scene import Scene
 from scene.splats.reading import READABLE
 from scene.splats.splats import Splats, choose, selected, tidy, used_sh_degree, with_sh_degree
 from scene.with_splats import load_file, splats_of
-from splatting.camera_paths.without_scene import circle
+from splatting.camera_paths.without_scene import RECORD, circle, recorded_cameras
 from splatting.exports.formats import FORMATS, Around, Format, format_of
 from splatting.exports.reading import ANY, read_any
 from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json
@@ -68,7 +70,7 @@ def load(args: argparse.Namespace, options: argparse.Namespace, needs_views: boo
     record = read_model_json(options.model_path)
     gaussians.world_offset = tuple(record.get(OFFSET, (0.0, 0.0, 0.0)))
     gaussians.enlargement = record.get(ENLARGEMENT, 1.0)
-    return splats_of(gaussians, args.antialiasing), None
+    return splats_of(gaussians, bool(args.antialiasing)), None
 
 
 @torch.no_grad()
@@ -135,8 +137,9 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     _check_fitting(args, entry)
     entry.check(args.to)
     _refuse_to_replace_a_model(Path(args.to), args.ply)
-    needs_views = bool(args.max_splats or args.clean) or entry.of_scene and not (args.file and entry.around)
-    splats, scene = load(args, options, needs_views)
+    needs_photos = bool(args.max_splats or args.clean)
+    poses = stand_ins(args, options) if entry.around and not needs_photos else None
+    splats, scene = load(args, options, needs_photos or entry.of_scene and not poses)
     degree = used_sh_degree(splats) if args.typed_sh_degree is None else min(args.typed_sh_degree, splats.sh_degree)
     keep = choose(splats, args.crop, args.min_opacity)
     for left_out in tools("left_out"):
@@ -151,7 +154,7 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
         print("The model was trained with --projection ray; other programs draw large Gaussians off axis differently")
     start = time.perf_counter()
     background = (1.0, 1.0, 1.0) if options.white_background else (0.0, 0.0, 0.0)
-    cameras = circle(chosen.means) if scene is None and entry.around else scene and scene.getTrainCameras()
+    cameras = poses(chosen) if poses else scene and scene.getTrainCameras()
     around = entry.of_scene and Around(cameras, background, pipe, _path_maker(args.path), args.voxel)
     what = entry.write(args.to, chosen, *((around,) if around else ()))
     size, seconds = Path(args.to).stat().st_size, time.perf_counter() - start
@@ -164,6 +167,15 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     else:
         each = ""
     print(f"Wrote {args.to}: {what}, {size / 1e6:.2f} MB{each}, {seconds:.1f} s")
+
+
+def stand_ins(args: argparse.Namespace, options: argparse.Namespace) -> Callable[[Splats], list[Camera]] | None:
+    """What makes cameras for a model without a scene, or whose scene is gone; None: the scene has them."""
+    if not args.model_path:
+        return lambda splats: circle(splats.means)
+    if os.path.isdir(options.source_path) or not (record := Path(args.model_path) / RECORD).is_file():
+        return None
+    return lambda _: recorded_cameras(record)
 
 
 def _refuse_to_replace_a_model(file: Path, source: str | None) -> None:

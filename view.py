@@ -21,7 +21,7 @@ from scene.saved_model import find_save, load_saved, read_model
 from scene.scene import Scene
 from scene.splats.splats import drawable, selected
 from scene.with_splats import model_of
-from splatting.camera_paths.without_scene import WithoutScene, circle, recorded_cameras
+from splatting.camera_paths.without_scene import RECORD, WithoutScene, circle, recorded_cameras
 from splatting.exports.reading import ANY, read_any
 from splatting.viewer.page import Page, serve
 from splatting.viewer.server import HOST_OPTION, PORT, checked_address
@@ -40,7 +40,7 @@ def of_file(path: str, pipeline: argparse.Namespace) -> WithoutScene:
 
 def of_folder(options: argparse.Namespace, args: argparse.Namespace) -> Scene | WithoutScene:
     """The model of a folder with its scene, or where that is gone with the poses that the folder records."""
-    record = Path(options.model_path) / "cameras.json"
+    record = Path(options.model_path) / RECORD
     if os.path.isdir(options.source_path) or not record.is_file():
         return load_saved(options, args.iteration, args.typed_sh_degree)
     iteration, path = find_save(options.model_path, args.iteration)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from gaussians import pipeline
 from html_scene import CENTRE, cameras
 from plyfile import PlyData
@@ -16,13 +17,15 @@ import train
 from benchmarks.exports import mesh as benchmark
 from benchmarks.exports.mesh import true_distances
 from gaussian_renderer.median_depth import surface_of
+from scene.gaussian_model import GaussianModel
+from scene.scene import Scene
 from scene.splats.splats import Splats
 from scene.with_splats import model_of
 from splatting.demo.make_scene import make_scene
 from splatting.demo.objects import Box, Ground, Sphere, Thing, Torus
 from splatting.exports import mesh
 from splatting.exports.formats import format_of
-from splatting.exports.mesh import Mesh, large_parts, mesh_of, volume_of, zero_level
+from splatting.exports.mesh import Mesh, large_parts, mesh_of, pinholes, volume_of, zero_level
 from splatting.exports.mesh_files import write_glb_mesh, write_ply_mesh
 from utils.sh_utils import C0
 from utils.system_utils import UserError
@@ -118,6 +121,18 @@ def test_small_parts_are_left_out_and_large_ones_kept():
     kept = large_parts(some)
     assert sorted(set(kept.vertices[:, 2])) == [0.0, 3.0] and len(kept.faces) == 4004
     assert kept.faces.max() == len(kept.vertices) - 1
+
+
+def test_a_lens_gives_way_to_a_pinhole_in_its_place(tmp_path):
+    make_scene(tmp_path / "scene", 3, 60, 60, 300, 0, "fisheye")
+    parser, models, _ = export.options()
+    words = ["-s", str(tmp_path / "scene"), "-m", str(tmp_path / "model"), "--ply", "a.ply", "--to", "b.ply"]
+    options = models.extract(export.parse(parser, [*words, "--lenses", "native"]))
+    cameras = Scene(options, GaussianModel(0), shuffle=False, start=False).getTrainCameras()
+    for view, camera in zip(pinholes(cameras), cameras, strict=True):
+        assert camera.lens is not None and getattr(view, "lens", None) is None
+        assert view.FoVy == pytest.approx(np.radians(60))
+        torch.testing.assert_close(view.world_view_transform, camera.world_view_transform, rtol=0, atol=1e-5)
 
 
 def test_files_hold_the_mesh(tmp_path, ball, of_ball):

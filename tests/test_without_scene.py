@@ -70,6 +70,17 @@ def test_a_folder_whose_scene_is_gone_keeps_its_poses(tmp_path, capsys):
     assert "gone is gone, so there are poses, but no photos" in capsys.readouterr().err
 
 
+def test_a_page_of_a_folder_whose_scene_is_gone_has_its_poses(tmp_path, monkeypatch):
+    (tmp_path / "point_cloud/iteration_7").mkdir(parents=True)
+    written(tmp_path, ".ply", balls()).rename(tmp_path / "point_cloud/iteration_7/point_cloud.ply")
+    (tmp_path / "cfg_args").write_text(f"Namespace(sh_degree=1, source_path='{tmp_path}/gone', white_background=False)")
+    entry = {"img_name": "IMG_7", "width": 64, "height": 48, "position": [0.0, 0, -4], "fx": 60.0, "fy": 60.0}
+    (tmp_path / "cameras.json").write_text(json.dumps([entry | {"rotation": np.eye(3).tolist()}]))
+    monkeypatch.setattr("sys.argv", ["export.py", "-m", str(tmp_path), "--to", str(tmp_path / "page.html")])
+    export.main()
+    assert "IMG_7" in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
 def test_export_takes_a_file_alone(tmp_path, monkeypatch):
     path = written(tmp_path, ".splat", balls())
 

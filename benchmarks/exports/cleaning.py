@@ -63,7 +63,11 @@ def main() -> None:
     scene, rows = load_saved(options, -1), []
     background = torch.full((3,), float(options.white_background), device=compute_device())
     views = ScoredViews(pipelines.extract(args), background, scene.halves)
-    train, test, splats = scene.getTrainCameras(), scene.getTestCameras(), splats_of(scene.gaussians, args.antialiasing)
+    train, test, splats = (
+        scene.getTrainCameras(),
+        scene.getTestCameras(),
+        splats_of(scene.gaussians, bool(args.antialiasing)),
+    )
     for count in args.floaters:
         model = model_of(with_floaters(splats, poses_of(train), count, args.opacity))
         scores = [views.scores(cameras, model).get("psnr", np.nan) for cameras in (train, test)]

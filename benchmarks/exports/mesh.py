@@ -85,7 +85,7 @@ def main() -> None:
     parser.add_argument("--voxels", type=float, nargs="+", default=[0.03, 0.015], help="sizes (default: 0.03 0.015)")
     args = get_combined_args(parser)
     pipe, scene, things = pipelines.extract(args), load_saved(models.extract(args), -1), demo_scene()
-    cameras, splats = scene.getTrainCameras(), splats_of(scene.gaussians, args.antialiasing)
+    cameras, splats = scene.getTrainCameras(), splats_of(scene.gaussians, bool(args.antialiasing))
     places, rows = seen_places(things, cameras, PLACES), []
     for voxel in args.voxels:
         start = time.perf_counter()

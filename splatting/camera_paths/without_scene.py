@@ -14,6 +14,7 @@ from splatting.camera_paths.poses import facing
 from splatting.files.json_files import read_json
 from utils.system_utils import UserError
 
+RECORD = "cameras.json"  # in a model folder
 COUNT, SIZE = 12, (960, 720)  # of the circle's views
 _FOCAL = 0.9  # of their widths
 _FAR = 3.5  # their distance, in median distances of the means from the middle
