@@ -173,7 +173,7 @@ def stand_ins(args: argparse.Namespace, options: argparse.Namespace) -> Callable
     """What makes cameras for a model without a scene, or whose scene is gone; None: the scene has them."""
     if not args.model_path:
         return lambda splats: circle(splats.means)
-    if os.path.isdir(options.source_path) or not (record := Path(args.model_path) / RECORD).is_file():
+    if os.path.isdir(options.source_path or "") or not (record := Path(args.model_path) / RECORD).is_file():
         return None
     return lambda _: recorded_cameras(record)
 

@@ -41,7 +41,7 @@ def of_file(path: str, pipeline: argparse.Namespace) -> WithoutScene:
 def of_folder(options: argparse.Namespace, args: argparse.Namespace) -> Scene | WithoutScene:
     """The model of a folder with its scene, or where that is gone with the poses that the folder records."""
     record = Path(options.model_path) / RECORD
-    if os.path.isdir(options.source_path) or not record.is_file():
+    if os.path.isdir(options.source_path or "") or not record.is_file():
         return load_saved(options, args.iteration, args.typed_sh_degree)
     iteration, path = find_save(options.model_path, args.iteration)
     print(f"warning: the scene {options.source_path} is gone, so there are poses, but no photos", file=sys.stderr)
