@@ -3,6 +3,7 @@
 python convert.py -s SCENE                 photos in SCENE/input
 python convert.py -s SCENE --video FILE    frames of a video, written to SCENE/input
 python convert.py -s SCENE --poses FILE    points at the poses of a transforms.json, or of a COLMAP model
+python convert.py -s SCENE --add           new photos of SCENE/input beside those of a finished run
 
 Writes SCENE/images, SCENE/sparse/0, SCENE/convert_report.json, and intermediate results in SCENE/distorted. A second
 run resumes after the last finished stage, and repeats the stages that changed options or photos affect.
@@ -21,16 +22,19 @@ from pathlib import Path
 from arguments import OptionParser
 from splatting.host.start import typed_command
 from splatting.sfm import stages
+from splatting.sfm.adding import added_line, forget_base, keep_base
 from splatting.sfm.cameras import MODES
 from splatting.sfm.capture import lines_of, too_few, training_options
 from splatting.sfm.capture_page import capture_stage
-from splatting.sfm.colmap import GIVEN, LENS_MODELS, Program, Pycolmap, Settings, is_native
+from splatting.sfm.colmap import ADDING, GIVEN, LENS_MODELS, Program, Pycolmap, Settings, is_native
 from splatting.sfm.inputs import sort_inputs, unused_lines
 from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder
 from splatting.sfm.programs import refuse_while_working
 from splatting.sfm.report import lens_words, report_inputs, summary
 from splatting.sfm.video import FRAMES_MISSING, NOTE, refuse_foreign_frames, report_entries, taken_frames, video_lines
 from utils.system_utils import UserError, run_cli
+
+_BESIDE_POSES = ("camera", "mapper", "video", "skip_matching", "colmap_executable")
 
 
 def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> None:
@@ -61,6 +65,10 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
         program = args.colmap_executable
         backend = Program(program, layout, settings) if program else Pycolmap(layout, settings)
         program, made_from = backend.identity, None
+        if args.add:
+            keep_base(layout, record.finished("undistortion"), names)
+        else:
+            forget_base(layout)
         planned = [stages.image_stage(layout, names, masks)]
         if args.poses:
             planned.append(stages.poses_stage(layout, Path(args.poses)))
@@ -78,6 +86,8 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     print("\n".join((summary(report), lens_words(report), *lines_of(report), f"all of it: {layout.page}")))
     if found.unused:
         print(f"{len(found.unused)} files in {layout.input.name} were not used; {layout.report.name} has the reasons")
+    if args.add:
+        print(added_line(layout, report["left_out"]))
     for line in notes:
         print(f"note: {line}")
     for line in report["advice"]:
@@ -122,13 +132,15 @@ def _settings(args: argparse.Namespace) -> Settings:
     of_matching = "camera", "cameras", "mapper", "matcher", "mask_path", "colmap_executable"
     if args.skip_matching and (ignored := [f"--{name}" for name in of_matching if getattr(args, name)]):
         print(f"warning: --skip_matching ignores {', '.join(ignored)}, as the model is there", file=sys.stderr)
+    if args.add:
+        _refuse_beside("add", "which keeps the poses of pycolmap's model", args, "poses", *_BESIDE_POSES)
     if args.poses:
-        _refuse_beside_poses(args)
+        _refuse_beside("poses", "which gives poses and lenses to pycolmap", args, *_BESIDE_POSES)
         if args.cameras:
             print("warning: --cameras has no effect beside --poses, which gives each photo its camera", file=sys.stderr)
         camera, mapper = "given", GIVEN
     else:
-        camera, mapper = args.camera or "OPENCV", args.mapper or "incremental"
+        camera, mapper = args.camera or "OPENCV", ADDING if args.add else args.mapper or "incremental"
         if camera not in LENS_MODELS:
             raise UserError(f"--camera {camera} is not a supported lens model; choose one of {', '.join(LENS_MODELS)}")
     is_native(args.lenses, [camera])  # refuses what does not fit together
@@ -136,11 +148,11 @@ def _settings(args: argparse.Namespace) -> Settings:
     return Settings(camera, args.max_num_features, matcher, mapper, args.no_gpu, shared_by, args.lenses)
 
 
-def _refuse_beside_poses(args: argparse.Namespace) -> None:
-    """Raise UserError for an option that says what --poses says, or that needs what it leaves out."""
-    for option in ("camera", "mapper", "video", "skip_matching", "colmap_executable"):
-        if getattr(args, option):
-            raise UserError(f"--{option} does not go with --poses, which gives poses and lenses to pycolmap; omit one")
+def _refuse_beside(option: str, reason: str, args: argparse.Namespace, *others: str) -> None:
+    """Raise UserError for another option that says what an option says, or that needs what it leaves out."""
+    for other in others:
+        if getattr(args, other):
+            raise UserError(f"--{other} does not go with --{option}, {reason}; omit one")
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -152,6 +164,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--poses", default="", metavar="FILE",
         help="poses and lenses that are given, by a transforms.json or the folder of a COLMAP model; only points are "
         "computed (default: all are computed)")  # fmt: skip
+    add("--add", action="store_true", help="place new photos of SCENE/input beside those of a finished run, which keep "
+        "their poses (default: new photos let a run begin anew)")  # fmt: skip
     add("--camera", default=None, help="lens model to fit; for a fisheye lens OPENCV_FISHEYE, for panoramas "
         "EQUIRECTANGULAR (default: OPENCV)")  # fmt: skip
     add("--cameras", choices=MODES, default=None,

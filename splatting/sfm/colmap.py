@@ -23,6 +23,7 @@ from utils.system_utils import UserError, atomic_write
 Command = list[str]
 TOLERANCE = 1e-6  # of the cost in global bundle adjustment, as in the reference: much faster, hardly worse
 GIVEN = "triangulation"  # the mapper where poses are given
+ADDING = "adding"  # the mapper that keeps the poses of a scene
 PANORAMA = "EQUIRECTANGULAR"  # photos of all directions, twice as wide as high; no pinhole image shows them
 LENS_MODELS = (
     PANORAMA,
@@ -95,12 +96,12 @@ class Pycolmap(Backend):
         return self._command("matching")
 
     def mapping(self) -> list[Command]:
-        step = "triangulation" if self.settings.mapper == GIVEN else "mapping"
+        step = self.settings.mapper if self.settings.mapper in (GIVEN, ADDING) else "mapping"
         return self._command(step, database=str(self.mapped), tolerance=TOLERANCE)
 
     def _command(self, step: str, **job: Any) -> list[Command]:
         places = {"database": self.layout.database, "images": self.layout.prepared, "models": self.layout.models}
-        places["given"] = self.layout.given
+        places |= {"given": self.layout.given, "base": self.layout.base_model}
         common = {**asdict(self.settings), **{name: str(path) for name, path in places.items()}}
         return [worker_command(self.layout, step, **{**common, **job})]
 
@@ -198,6 +199,11 @@ def count_rows(database: Path, table: str) -> int:
     """Count the rows of a table; 0 while it does not exist or is locked."""
     rows = _query(database, f"SELECT COUNT(*) FROM {table}")
     return rows[0][0] if rows else 0
+
+
+def names_in(database: Path) -> list[str]:
+    """List the photos of a database, sorted."""
+    return sorted(name for (name,) in _query(database, "SELECT name FROM images"))
 
 
 def most_features(database: Path) -> int:

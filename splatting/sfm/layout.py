@@ -24,6 +24,8 @@ class Layout:
         self.database = work / "database.db"
         self.calibrated = work / "calibrated.db"  # a copy, into which global mapping writes its focal lengths
         self.frames = work / "frames.json"  # which of `input` are frames of videos
+        self.base = work / "base"  # what --add adds to
+        self.base_database, self.base_model = self.base / self.database.name, self.base / "model"
         self.given = work / "given.json"  # poses and cameras of --poses, for the photos that are here
         self.capture = work / "capture.json"  # of worker.py, for the report of the capture
         self.log, self.stages = work / "colmap.log", work / "stages.json"

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 from splatting.files.json_files import read_json, write_json
 from splatting.sfm import cameras, colmap, images, report, video
+from splatting.sfm.adding import base_state
 from splatting.sfm.colmap import Backend, Settings, worker_command
 from splatting.sfm.given_poses import files_of, given_names, posed_photos, write_given
 from splatting.sfm.layout import Layout, image_names
@@ -61,9 +62,13 @@ class StageRecord:
         """Whether this stage was ever begun in this folder."""
         return name in self._record
 
+    def finished(self, name: str) -> bool:
+        """Whether this stage was finished."""
+        return self.begun(name) and self._record[name]["done"]
+
     def interrupted(self, name: str) -> bool:
         """Whether this stage was begun and not finished."""
-        return self.begun(name) and not self._record[name]["done"]
+        return self.begun(name) and not self.finished(name)
 
     def run(self, stages: list[Stage]) -> list[str]:
         """Do the stages that are not done, in order; return the names of those that were done before.
@@ -151,6 +156,8 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
             groups = cameras.group(layout.prepared, image_names(layout.prepared), settings.cameras)
             print(cameras.listing(groups))
             names = [group.names for group in groups]
+        if settings.mapper == colmap.ADDING:
+            colmap.copy_database(layout.base_database, layout.database)
         run(backend.features(names, masks), "Features", sum(map(len, names)), partial(rows, "keypoints"), hint)
 
     def matching() -> None:
@@ -175,6 +182,8 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
 
     files = [layout.database.with_name(layout.database.name + end) for end in ("", "-wal", "-shm", "-journal")]
     features_from = [backend.identity, settings.camera, settings.cameras, settings.max_num_features, settings.no_gpu]
+    if settings.mapper == colmap.ADDING:
+        features_from.append(base_state(layout))
     return [
         Stage("features", features_from, lambda: _remove(*files), features, check=check_sizes),
         Stage("matching", [settings.matcher], lambda: colmap.forget_matches(layout.database), matching, resumable=True),

@@ -27,7 +27,10 @@ FISHEYE_ANGLE = 2.6  # radians along the longer side, 150 degrees: first guess f
 
 
 def features(job: dict[str, Any]) -> None:
-    """Write SIFT features of groups of photos into a new database, with one camera per group, or with given cameras."""
+    """Write SIFT features of groups of photos into a database, with one camera per group, or with given cameras.
+
+    Photos that the database has stay; what is in a group with some of them takes their camera.
+    """
     reader = pycolmap.ImageReaderOptions()
     if job["masks"]:
         reader.mask_path = job["masks"]
@@ -40,12 +43,22 @@ def features(job: dict[str, Any]) -> None:
         reader.camera_model = job["camera"]
         # Import the photos first, in order: threads would number them in the order in which they happen to finish. The
         # camera of a group begins with the focal length that the EXIF data of its first photo tell, if they do.
+        known = _cameras_by_name(job["database"])
         for names in job["groups"]:
-            pycolmap.import_images(job["database"], job["images"], pycolmap.CameraMode.SINGLE, names, reader)
+            reader.existing_camera_id = next((known[name] for name in names if name in known), -1)
+            if new := [name for name in names if name not in known]:
+                pycolmap.import_images(job["database"], job["images"], pycolmap.CameraMode.SINGLE, new, reader)
     names = [name for group in job["groups"] for name in group]
     pycolmap.extract_features(
         job["database"], job["images"], names, pycolmap.CameraMode.AUTO, reader, options, _device(job)
     )
+
+
+def _cameras_by_name(path: str) -> dict[str, int]:
+    database = pycolmap.Database.open(path)
+    known = {image.name: image.camera_id for image in database.read_all_images()}
+    database.close()
+    return known
 
 
 def matching(job: dict[str, Any]) -> None:
@@ -81,11 +94,25 @@ def mapping(job: dict[str, Any]) -> None:
         options.random_seed, options.num_threads = SEED, THREADS
         pycolmap.global_mapping(job["database"], job["images"], job["models"], options)
         return
+    options = _incremental(job)
+    options.min_model_size = 3  # a small model is better than none; the report shows its size
+    pycolmap.incremental_mapping(job["database"], job["images"], job["models"], options)
+
+
+def _incremental(job: dict[str, Any]) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed, options.num_threads = SEED, THREADS
     options.ba_global_function_tolerance = job["tolerance"]
-    options.min_model_size = 3  # a small model is better than none; the report shows its size
-    pycolmap.incremental_mapping(job["database"], job["images"], job["models"], options)
+    return options
+
+
+def adding(job: dict[str, Any]) -> None:
+    """Place further photos beside those of the model `base`, whose poses and lenses stay as they are."""
+    folder, options = Path(job["models"], "0"), _incremental(job)
+    folder.mkdir(parents=True)
+    options.multiple_models, options.fix_existing_frames = False, True
+    options.constant_cameras = set(pycolmap.Reconstruction(job["base"]).cameras)
+    pycolmap.incremental_mapping(job["database"], job["images"], str(folder), options, job["base"])
 
 
 def triangulation(job: dict[str, Any]) -> None:
@@ -237,7 +264,7 @@ def _end_with_input() -> None:
     os._exit(1)
 
 
-STEPS = {step.__name__: step for step in (features, matching, mapping, triangulation, survey, undistort)}
+STEPS = {step.__name__: step for step in (features, matching, mapping, adding, triangulation, survey, undistort)}
 
 
 def main(path: str) -> None:
