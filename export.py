@@ -35,6 +35,8 @@ from scene.splats.reading import READABLE
 from scene.splats.splats import Splats, choose, selected, tidy, used_sh_degree, with_sh_degree
 from scene.with_splats import load_file, splats_of
 from splatting.camera_paths.without_scene import RECORD, circle, recorded_cameras
+from splatting.exports.cleaning import OPTION as CLEAN_OPTION
+from splatting.exports.cleaning import check_clean, clean_scene, write_picture
 from splatting.exports.formats import FORMATS, Around, Format, format_of
 from splatting.exports.reading import ANY, read_any
 from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json
@@ -110,24 +112,10 @@ def thin_out(
 
 def cleaned(scene: Scene, most: float, pipe: argparse.Namespace, options: argparse.Namespace, to: str) -> np.ndarray:
     """(N,) bool: what the training views need, to within `most` dB each; print what goes, and write a picture of it."""
-    from splatting.exports.cleaning import clean, write_picture
-
-    cameras, background = scene.getTrainCameras(), torch.full((3,), float(options.white_background))
-    if not cameras:
-        raise UserError("--clean needs training views, and the scene has none; leave it out")
-    views = ScoredViews(pipe, background.to(compute_device()), scene.halves)
-    cleaning = clean(scene.gaussians, cameras, views, most)
-    loss = {camera.image_name: cleaning.before[id(camera)] - cleaning.after[id(camera)] for camera in cameras}
-    finite = {name: value for name, value in loss.items() if math.isfinite(value)} or {cameras[0].image_name: 0.0}
-    worst, mean = max(finite, key=finite.get), sum(finite.values()) / len(finite)
-    gone, total = int((~cleaning.keep).sum()), len(cleaning.keep)
-    print(
-        f"--clean {most:g}: {gone:,} of {total:,} Gaussians go ({100 * gone / total:.1f} %); training views change by "
-        f"{-mean:+.3f} dB in the mean, and {worst} most, by {-finite[worst]:+.3f} dB"
-    )
-    if gone:
+    cleaning, views = clean_scene(scene, most, pipe, options.white_background)
+    if not cleaning.keep.all():
         picture = Path(to).with_name(f"{Path(to).name}.removed.png")
-        write_picture(picture, scene.gaussians, cleaning.keep, cameras, views)
+        write_picture(picture, scene.gaussians, cleaning.keep, scene.getTrainCameras(), views)
         print(f"{picture}: before, what goes, and after")
     return cleaning.keep.cpu().numpy()
 
@@ -224,9 +212,8 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
     add("--min_opacity", type=float, default=0.0, help="leave fainter Gaussians out, 0 to 1 (default: 0)")
     for add_options in tools("add_export_options"):
         add_options(add)
-    add("--clean", type=float, nargs="?", const=0.05, metavar="DB",
-        help="leave out floaters and what else the training views do not need, while none loses more than this "
-        "(default: off; 0.05 without a number)")  # fmt: skip
+    add("--clean", **CLEAN_OPTION, help="leave out floaters and what else the training views do not need, while none "
+        "loses more than this (default: off; 0.05 without a number)")  # fmt: skip
     add("--max_splats", type=int, default=0, metavar="N",
         help="keep N Gaussians; what adds least to the training views goes first (default: 0, no limit)")  # fmt: skip
     add("--path", metavar="PATH",
@@ -248,8 +235,7 @@ def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) ->
         raise UserError(f"--min_opacity must be from 0 to 1, got {args.min_opacity}")
     if args.max_splats < 0:
         raise UserError(f"--max_splats must be 0, no limit, or above, got {args.max_splats}")
-    if args.clean is not None and not 0 < args.clean < math.inf:
-        raise UserError(f"--clean must be above 0 dB, got {args.clean}")
+    check_clean(args.clean)
     if args.voxel is not None and not 0 < args.voxel < math.inf:
         raise UserError(f"--voxel must be above 0, got {args.voxel}")
     if args.crop and not all(low < high for low, high in zip(args.crop[:3], args.crop[3:], strict=True)):

@@ -16,12 +16,16 @@ import os
 import sys
 from pathlib import Path
 
+from torch import Tensor
+
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
 from scene.saved_model import find_save, load_saved, read_model
 from scene.scene import Scene
 from scene.splats.splats import drawable, selected
 from scene.with_splats import model_of
 from splatting.camera_paths.without_scene import RECORD, WithoutScene, circle, recorded_cameras
+from splatting.exports.cleaning import OPTION as CLEAN_OPTION
+from splatting.exports.cleaning import check_clean, clean_scene
 from splatting.exports.reading import ANY, read_any
 from splatting.viewer.page import Page, serve
 from splatting.viewer.server import HOST_OPTION, PORT, checked_address
@@ -48,6 +52,17 @@ def of_folder(options: argparse.Namespace, args: argparse.Namespace) -> Scene | 
     return WithoutScene(read_model(path), options.model_path, iteration, recorded_cameras(record))
 
 
+def kept(
+    scene: Scene | WithoutScene, args: argparse.Namespace, pipe: argparse.Namespace, options: argparse.Namespace
+) -> Tensor | None:
+    """(N,) bool: what --clean leaves, None without it. UserError where the photos are gone."""
+    if not args.clean:
+        return None
+    if isinstance(scene, WithoutScene):
+        raise UserError(f"--clean needs the photos of {options.source_path}, which is gone; leave it out")
+    return clean_scene(scene, args.clean, pipe, options.white_background)[0].keep
+
+
 def main() -> None:
     parser = OptionParser(description="Show a trained model on a web page, until Ctrl-C.")
     model_params = ModelParams(parser, sentinel=True)
@@ -55,11 +70,16 @@ def main() -> None:
     parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to show (default: -1, the last)")
     parser.add_argument("--port", type=int, default=PORT, help=f"port of the page, 0: any (default: {PORT})")
     HOST_OPTION.add_to(parser, sentinel=False)
+    parser.add_argument("--clean", **CLEAN_OPTION, help="let the tab View show what export.py --clean leaves out "
+        "(default: off; 0.05 without a number)")  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="print nothing to stdout (default: off)")
     parser.add_argument("file", nargs="?", default="", metavar="FILE", help=f"model in place of -m: {ANY}")
     args = parser.parse_args()
     if args.file and args.model_path:
         raise UserError(f"-m {args.model_path} has a model of its own; leave {args.file} or -m out")
+    check_clean(args.clean)
+    if args.clean and args.file:
+        raise UserError("--clean needs training views; give the model's folder with -m")
     args = args if args.file else get_combined_args(parser)
     options, pipeline = model_params.extract(args), pipeline_params.extract(args)
     place = checked_address(args.viewer_host, args.port)
@@ -71,7 +91,7 @@ def main() -> None:
         scene = of_folder(options, args)
     if len(scene.gaussians) == 0:
         raise UserError(f"{scene.loaded_iter} of {scene.model_path} has no Gaussians; choose another model")
-    page = Page(place, scene, pipeline, options.white_background, scene.halves)
+    page = Page(place, scene, pipeline, options.white_background, scene.halves, kept(scene, args, pipeline, options))
     try:
         raise serve(page)
     finally:

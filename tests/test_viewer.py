@@ -144,6 +144,18 @@ def test_the_crop_box_leaves_gaussians_out_and_the_model_alone(gaussians):
     assert not drawn(gaussians, crop=((9.0,) * 3, (8.0,) * 3)).any()
 
 
+def test_what_cleaning_leaves_and_what_it_takes_are_drawn_apart(gaussians):
+    kept = torch.arange(200) % 3 > 0
+    box = (-1.0, -0.2, -1.0), (1.0, 1.0, 0.0)
+    for cleaning, part in ((views.STAYS, kept), (views.GOES, ~kept)):
+        chosen = replace(PLAIN, cleaning=cleaning)
+        assert torch.equal(shown_part(gaussians, chosen, kept).get_xyz, gaussians.get_xyz[part])
+        both = shown_part(gaussians, replace(chosen, crop=box), kept).get_xyz
+        assert torch.equal(both, gaussians.get_xyz[part & inside(gaussians.get_xyz, *box)])
+        assert shown_part(gaussians, chosen) is gaussians  # nobody has cleaned
+    assert shown_part(gaussians, PLAIN, kept) is gaussians
+
+
 def test_the_sh_degree_of_a_frame_is_not_that_of_the_model(gaussians):
     low = shown_part(gaussians, replace(PLAIN, sh_degree=1))
     assert low.active_sh_degree == 1 and gaussians.active_sh_degree == 3

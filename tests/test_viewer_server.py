@@ -16,6 +16,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from gaussians import model, pipeline
 from synthetic import options_of
 
@@ -35,7 +36,7 @@ from splatting.viewer.auth import Auth, is_accepted  # noqa: E402
 from splatting.viewer.page import Page, answer  # noqa: E402
 from splatting.viewer.server import Address  # noqa: E402
 from splatting.viewer.tabs import first_box  # noqa: E402
-from splatting.viewer.views import Settings  # noqa: E402
+from splatting.viewer.views import GOES, WHOLE, Settings  # noqa: E402
 from utils.graphics_utils import camera_center  # noqa: E402
 from utils.system_utils import UserError  # noqa: E402
 
@@ -557,6 +558,19 @@ def test_reset_gives_the_view_its_first_values(page):
         _set(client, _button(page, "Reset"), True)
         wait_for(lambda: view.read() == first and not view.crop_file.field.visible)
     assert view.corners() == first_box(page._gaussians.get_xyz)
+
+
+def test_cleaning_is_shown_where_it_is_known(page, _colmap_master, tmp_path):
+    assert not page.view.cleaning.visible and page.frames.kept is None
+    scene = Scene(options_of(_colmap_master, tmp_path, eval=True), model(200), shuffle=False, start=False)
+    kept = torch.arange(200) > 20
+    own = Page(ANY, scene, pipeline(), False, False, kept)
+    try:
+        assert own.view.cleaning.visible and own.settings().cleaning == WHOLE
+        own.view.cleaning.value = GOES
+        assert own.settings().cleaning == GOES and own.frames.kept is kept
+    finally:
+        own.stop()
 
 
 def test_browsers_begin_at_the_chosen_camera_and_render_alone_leads_nowhere(page):

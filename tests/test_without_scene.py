@@ -68,6 +68,8 @@ def test_a_folder_whose_scene_is_gone_keeps_its_poses(tmp_path, capsys):
     scene = view.of_folder(options, argparse.Namespace(iteration=-1, typed_sh_degree=None))
     assert scene.loaded_iter == 7 and len(scene.gaussians) == len(balls())
     assert "gone is gone, so there are poses, but no photos" in capsys.readouterr().err
+    with pytest.raises(UserError, match="gone, which is gone; leave it out"):
+        view.kept(scene, argparse.Namespace(clean=0.05), pipeline(), options)
 
 
 def test_a_page_of_a_folder_whose_scene_is_gone_has_its_poses(tmp_path, monkeypatch):

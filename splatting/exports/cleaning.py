@@ -6,6 +6,8 @@ negative, the photos speak against the Gaussian, as they do for floaters. The ot
 blending weights. Both count by the view's error, as a view with a small one is the first to lose dB.
 """
 
+import argparse
+import math
 import os
 from collections.abc import Sequence
 from itertools import chain
@@ -19,10 +21,14 @@ from gaussian_renderer.free_view import FRACTIONS, neighbours, views_between
 from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
+from scene.scene import Scene
+from splatting.camera_paths.without_scene import WithoutScene
 from splatting.files.image_files import save_png
 from splatting.host.progress import Bar
 from utils.image_utils import as_float, pixels_that_count
+from utils.system_utils import UserError, compute_device
 
+OPTION = {"type": float, "nargs": "?", "const": 0.05, "metavar": "DB"}  # --clean, as argparse takes it
 _STEPS = 1000  # a search ends within N / _STEPS of the most that may go
 _SOLID = 1e-3  # least transparency in the derivative by an opacity
 _EXACT = 1e-12  # least squared error of a view
@@ -122,6 +128,32 @@ def clean(gaussians: GaussianModel, cameras: Sequence[Camera], views: ScoredView
     order = torch.argsort(cleaning.added(), stable=True)
     cleaning.leave_out(order[cleaning.keep[order]])
     return cleaning
+
+
+def check_clean(most: float | None) -> None:
+    """UserError for a number that --clean does not take."""
+    if most is not None and not 0 < most < math.inf:
+        raise UserError(f"--clean must be above 0 dB, got {most}")
+
+
+def clean_scene(
+    scene: Scene | WithoutScene, most: float, pipe: argparse.Namespace, white: bool
+) -> tuple[Cleaning, ScoredViews]:
+    """Clean a scene's model, and print what goes and what its training views lose. UserError if it has none."""
+    cameras, background = scene.getTrainCameras(), torch.full((3,), float(white))
+    if not cameras:
+        raise UserError("--clean needs training views, and the scene has none; leave it out")
+    views = ScoredViews(pipe, background.to(compute_device()), scene.halves)
+    cleaning = clean(scene.gaussians, cameras, views, most)
+    loss = {camera.image_name: cleaning.before[id(camera)] - cleaning.after[id(camera)] for camera in cameras}
+    finite = {name: value for name, value in loss.items() if math.isfinite(value)} or {cameras[0].image_name: 0.0}
+    worst, mean = max(finite, key=finite.get), sum(finite.values()) / len(finite)
+    gone, total = int((~cleaning.keep).sum()), len(cleaning.keep)
+    print(
+        f"--clean {most:g}: {gone:,} of {total:,} Gaussians go ({100 * gone / total:.1f} %); training views change by "
+        f"{-mean:+.3f} dB in the mean, and {worst} most, by {-finite[worst]:+.3f} dB"
+    )
+    return cleaning, views
 
 
 @torch.no_grad()

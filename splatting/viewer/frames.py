@@ -38,7 +38,7 @@ class Frame(NamedTuple):
 class Frames:
     """Draws frames of a model. with_exposures: as `use_trained_exp` of `render`, for an image beside its target.
 
-    Used by one thread. Nothing of the model changes.
+    kept: (N,) bool, what cleaning leaves, None: nobody asked. Used by one thread. Nothing of the model changes.
     """
 
     def __init__(
@@ -48,6 +48,7 @@ class Frames:
         self._cameras = cameras
         self._pipe = pipe
         self._with_exposures = with_exposures
+        self.kept: Tensor | None = None
         self.masks: Callable[[Camera], Tensor | None] = lambda _: None  # pixels of a photo that train, None: all
         self._compared: tuple[object, tuple[Tensor, Tensor, Legend]] = (None, ())
 
@@ -85,7 +86,7 @@ class Frames:
 
     def _image(self, settings: Settings, view: Camera | MiniCam, target: Tensor | None = None) -> tuple[Tensor, Legend]:
         """The mode's image (3, H, W) in [0, 1]. Without a target there is no error, and the colour is drawn."""
-        part = shown_part(self.gaussians, settings)
+        part = shown_part(self.gaussians, settings, self.kept)
         if settings.mode == views.COUNT:
             return count_colors(blend_depth(view, part, self._pipe, settings.scaling))
         if settings.mode in (views.DEPTH, views.OPACITY):
@@ -144,11 +145,14 @@ def _fitted(image: Tensor, pose: Pose) -> Tensor:
 
 
 @torch.no_grad()
-def shown_part(gaussians: GaussianModel, settings: Settings) -> GaussianModel:
-    """The Gaussians in the crop box, with the SH degree of the settings at most."""
+def shown_part(gaussians: GaussianModel, settings: Settings, kept: Tensor | None = None) -> GaussianModel:
+    """The Gaussians in the crop box that cleaning keeps or leaves out, with the settings' SH degree at most."""
     degree = min(settings.sh_degree, gaussians.active_sh_degree)
-    if settings.crop is not None:
-        part = gaussians.part(inside(gaussians.get_xyz, *settings.crop), gaussians.max_sh_degree)
+    chosen = [] if settings.crop is None else [inside(gaussians.get_xyz, *settings.crop)]
+    if kept is not None and settings.cleaning != views.WHOLE:
+        chosen.append(kept if settings.cleaning == views.STAYS else ~kept)
+    if chosen:
+        part = gaussians.part(torch.stack(chosen).all(0), gaussians.max_sh_degree)
     elif degree == gaussians.active_sh_degree:
         return gaussians
     else:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from torch import Tensor
 from tqdm import tqdm
 
 from scene.gaussian_model import GaussianModel
@@ -47,13 +48,23 @@ class Page:
     """
 
     def __init__(
-        self, address: Address, scene: Scene, pipe: argparse.Namespace, white: bool, with_exposures: bool
+        self,
+        address: Address,
+        scene: Scene,
+        pipe: argparse.Namespace,
+        white: bool,
+        with_exposures: bool,
+        kept: Tensor | None = None,
     ) -> None:
-        """Start to listen. UserError if that cannot be done. white: the background at first, else black."""
+        """Start to listen. UserError if that cannot be done. white: the background at first, else black.
+
+        kept: (N,) bool, what cleaning leaves of the model, if that is known.
+        """
         gaussians, folder = scene.gaussians, Path(scene.model_path)
         self._gaussians, self._antialiasing = gaussians, pipe.antialiasing
         self._cameras = SceneCameras(scene.getTrainCameras(), scene.getTestCameras())
         self.frames = Frames(gaussians, self._cameras, pipe, with_exposures)
+        self.frames.kept = kept
         self.watchers = Watchers()
         self.requests = Requests(self.watchers.wake)
         self._faults: dict[int, str] = {}  # of the browsers' last frames
@@ -68,7 +79,8 @@ class Page:
         with self.tabs.add_tab("View"):
             background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
             calls = self.watchers.changed, self.requests.crop
-            self.view = ViewTab(self.server, *calls, folder / CROPS, gaussians.get_xyz, degree, background)
+            of_model = folder / CROPS, gaussians.get_xyz, degree
+            self.view = ViewTab(self.server, *calls, *of_model, background, kept is not None)
         with self.tabs.add_tab("Photos"):
             self.images = ImagesTab(self.server, self.watchers.changed, self._cameras)
         with self.tabs.add_tab("Path"):

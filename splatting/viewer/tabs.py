@@ -81,10 +81,10 @@ class FileName:
 
 
 class ViewTab:
-    """Controls for mode, scaling modifier, SH degree, background and crop box.
+    """Controls for mode, scaling modifier, SH degree, background, cleaning and crop box.
 
     changed: called when one of them moves. export: called when the crop box is to be written. folder: for its files.
-    positions: (N, 3) of the Gaussians, for a first crop box.
+    positions: (N, 3) of the Gaussians, for a first crop box. cleaned: whether it is known what cleaning leaves.
     """
 
     def __init__(
@@ -96,12 +96,16 @@ class ViewTab:
         positions: Tensor,
         sh_degree: int,
         background: Vector,
+        cleaned: bool,
     ) -> None:
         gui, self._scene = server.gui, server.scene
         self.mode = gui.add_dropdown("Show", views.MODES)
         self.scaling = gui.add_slider("Scaling modifier", 0.01, _MOST_SCALING, 0.01, 1.0)
         self.degree = gui.add_slider("SH degree", 0, max(sh_degree, 1), 1, sh_degree, visible=sh_degree > 0)
         self.background = gui.add_rgb("Background", tuple(round(255 * x) for x in background))
+        self.cleaning = gui.add_dropdown(
+            "Cleaning", views.CLEANINGS, visible=cleaned, hint="what export.py --clean does"
+        )
         self.crop = gui.add_checkbox("Crop box", False, hint="Gaussians outside are not drawn; the model stays whole")
         low, high = first_box(positions)
         longest = max(b - a for a, b in zip(low, high, strict=True))
@@ -113,9 +117,10 @@ class ViewTab:
         self._of_crop = *self.box, self.crop_file.field, written
         self._edges = None
         self._show_box()
-        shown = self.mode, self.scaling, self.degree, self.background, self.crop, *self.box
+        drawn = self.mode, self.scaling, self.degree, self.background, self.cleaning
+        shown = *drawn, self.crop, *self.box
         self._first = [(handle, handle.value) for handle in shown]
-        for handle in (self.mode, self.scaling, self.degree, self.background):
+        for handle in drawn:
             handle.on_update(lambda _: changed())
         for handle in (self.crop, *self.box):
             handle.on_update(serialized(lambda _: (self._show_box(), changed())))
@@ -152,6 +157,7 @@ class ViewTab:
             sh_degree=max(int(self.degree.value), 0),
             background=tuple(min(max(x / 255, 0.0), 1.0) for x in self.background.value),
             crop=box,
+            cleaning=self.cleaning.value,
         )
 
 

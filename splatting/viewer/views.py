@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import viser
 
 COLOUR, DEPTH, OPACITY, COUNT, ERROR = MODES = ("Colour", "Depth", "Opacity", "Gaussians per pixel", "Error")
+WHOLE, STAYS, GOES = CLEANINGS = ("Whole model", "What stays", "What goes")
 ALONE, SLIDER, BESIDE = COMPARISONS = ("Render alone", "Slider", "Side by side")
 
 Vector = tuple[float, float, float]
@@ -46,8 +47,9 @@ class Pose:
 class Settings:
     """mode: of MODES. scaling: factor of all scales. sh_degree: highest that is drawn. background: RGB in [0, 1].
 
-    crop: opposite corners of the box outside of which nothing is drawn, world coordinates, or None. camera: name of the
-    chosen camera, None: none. comparison: of COMPARISONS. slider: share of the width that is the scene's image.
+    crop: opposite corners of the box outside of which nothing is drawn, world coordinates, or None. cleaning: of
+    CLEANINGS. camera: name of the chosen camera, None: none. comparison: of COMPARISONS. slider: share of the width
+    that is the scene's image.
     """
 
     mode: str = COLOUR
@@ -55,6 +57,7 @@ class Settings:
     sh_degree: int = 3
     background: Vector = (0.0, 0.0, 0.0)
     crop: tuple[Vector, Vector] | None = None
+    cleaning: str = WHOLE
     camera: str | None = None
     comparison: str = ALONE
     slider: float = 0.5
