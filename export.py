@@ -123,8 +123,11 @@ def cleaned(scene: Scene, most: float, pipe: argparse.Namespace, options: argpar
 def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse.Namespace, entry: Format) -> None:
     """Write the file that the command line asks for. UserError if there is nothing to load or to write."""
     _check_fitting(args, entry)
+    make_path = _path_maker(args.path)
     entry.check(args.to)
     _refuse_to_replace_a_model(Path(args.to), args.ply)
+    if entry.clean and not (args.raw or args.clean) and stand_ins(args, options) is None:
+        args.clean = CLEAN_OPTION["const"]
     needs_photos = bool(args.max_splats or args.clean)
     poses = stand_ins(args, options) if entry.around and not needs_photos else None
     splats, scene = load(args, options, needs_photos or entry.of_scene and not poses)
@@ -143,7 +146,7 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     start = time.perf_counter()
     background = (1.0, 1.0, 1.0) if options.white_background else (0.0, 0.0, 0.0)
     cameras = poses(chosen) if poses else scene and scene.getTrainCameras()
-    around = entry.of_scene and Around(cameras, background, pipe, _path_maker(args.path), args.voxel)
+    around = entry.of_scene and Around(cameras, background, pipe, make_path, args.voxel, args.start, args.title)
     what = entry.write(args.to, chosen, *((around,) if around else ()))
     size, seconds = Path(args.to).stat().st_size, time.perf_counter() - start
     if what is None:
@@ -174,9 +177,9 @@ def _refuse_to_replace_a_model(file: Path, source: str | None) -> None:
 
 def _check_fitting(args: argparse.Namespace, entry: Format) -> None:
     """UserError for an option that is for files of another kind."""
-    for option in ("path", "voxel"):
-        if getattr(args, option) is not None and entry.option != option:
-            endings = " or ".join(other.ending for other in FORMATS if other.option == option)
+    for option in ("path", "voxel", "start", "title", "raw"):
+        if getattr(args, option) and option not in entry.options:
+            endings = " or ".join(other.ending for other in FORMATS if option in other.options)
             raise UserError(f"--{option} is for {endings}; leave it out, or end --to with {endings}")
 
 
@@ -219,6 +222,10 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
     add("--path", metavar="PATH",
         help="animation of an .html: interpolate, ellipse, spiral, or a JSON file of keyframes "
         "(default: around the model, or a sway if the first camera is within it)")  # fmt: skip
+    add("--start", metavar="PHOTO", help="training photo that an .html begins at (default: one that looks straight at "
+        "the middle)")  # fmt: skip
+    add("--title", metavar="TEXT", help="title of an .html (default: the name of the file)")
+    add("--raw", action="store_true", help="do not --clean an .html (default: cleaned, if its scene is there)")
     add("--voxel", type=float, metavar="UNITS",
         help="size of a mesh's voxels in the scene's unit (default: two pixels at the median depth)")  # fmt: skip
     add("--quiet", action="store_true", help="print nothing to stdout (default: off)")
@@ -236,6 +243,8 @@ def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) ->
     if args.max_splats < 0:
         raise UserError(f"--max_splats must be 0, no limit, or above, got {args.max_splats}")
     check_clean(args.clean)
+    if args.raw and args.clean:
+        raise UserError("--raw and --clean contradict each other; leave one out")
     if args.voxel is not None and not 0 < args.voxel < math.inf:
         raise UserError(f"--voxel must be above 0, got {args.voxel}")
     if args.crop and not all(low < high for low, high in zip(args.crop[:3], args.crop[3:], strict=True)):

@@ -194,9 +194,9 @@ def test_a_file_is_thinned_out_by_the_views_of_a_model(tmp_path, colmap_scene, c
         ("--ply a.ply --max_splats 5", "need training views"),
         ("--ply absent.ply", "no file absent.ply; give a model as PLY"),
         ("", "no model folder given"),
-        ("--ply a.ply --to b.splat --path ellipse", "--path animates an HTML page; leave it out for .sp"),
+        ("--ply a.ply --to b.splat --path ellipse", "--path is for .html; leave it out, or end --to with .html"),
         ("--ply a.ply --to b.html --path elipse", "--path must be interpolate, ellipse, spiral or a file"),
-        ("--ply a.ply --to b.html", "pages need training views; give their model folder"),
+        ("--ply a.ply --to b.html", "no file a.ply"),
     ],
 )
 def test_export_refuses(words, said):

@@ -6,13 +6,16 @@ import argparse
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+from urllib.parse import quote
 
 from scene.cameras import Camera
 from scene.splats.dot_splat import write_splat
 from scene.splats.ply import write_compressed_ply, write_plain_ply
 from scene.splats.splats import Splats
 from scene.splats.spz import find_zstandard, write_spz
+from splatting.camera_paths.poses import poses_of
 from splatting.exports.mesh_files import find_skimage, write_glb_mesh, write_ply_mesh
 from splatting.exports.scene_formats import find_pxr, write_glb, write_usdz
 from splatting.exports.sog import find_program, write_sog
@@ -32,6 +35,8 @@ class Around(NamedTuple):
     pipe: argparse.Namespace
     make_path: Callable[[Poses], TimedPath] | None  # of a page's animation
     voxel: float | None  # of a mesh, in the world's unit
+    start: str | None  # of a page: the photo that it begins at
+    title: str | None  # of a page
 
 
 @dataclass(frozen=True)
@@ -39,25 +44,35 @@ class Format:
     """A format. ending: of its files' names; what: for people.
 
     write: writes a file of splats, whole or not at all, and returns what it is, where it is not splats. UserError if it
-    cannot be written. of_scene: it also takes `Around`. option: of export.py that is for this kind of files only.
-    around: views from around a model do, where there is no scene. bands: it keeps SH bands. check: raises UserError if
-    a package or program that the file needs is missing.
+    cannot be written. of_scene: it also takes `Around`. options: of export.py that are for this kind of files only.
+    around: views from around a model do, where there is no scene. clean: it is cleaned unless --raw is given. bands: it
+    keeps SH bands. check: raises UserError if a package or program that the file needs is missing.
     """
 
     ending: str
     write: Callable[..., None]
     what: str
     of_scene: bool = False
-    option: str = ""
+    options: tuple[str, ...] = ()
     bands: bool = True
     around: bool = False
+    clean: bool = False
     check: Callable[[str | os.PathLike], Any] = lambda path: None
 
 
 def _write_html(path: str | os.PathLike, splats: Splats, around: Around) -> None:
     from splatting.exports.html import write_html  # SciPy and jinja2 take a while to import
+    from splatting.exports.page_start import best_start, named_start, write_preview
 
-    write_html(path, splats, around.cameras, around.make_path, around.background)
+    names = [str(camera.image_name) for camera in around.cameras]
+    if around.start is not None:
+        start = named_start(around.start, names)
+    else:
+        start = best_start(poses_of(around.cameras)) if names else 0
+    picture = Path(path).with_suffix(".jpg")
+    how = around.make_path, around.background, around.title, start, quote(os.fsencode(picture.name))
+    write_html(path, splats, around.cameras, *how)
+    write_preview(picture, splats, around.cameras[start], around.pipe, around.background)
 
 
 def _mesh_by(write: Callable[[str | os.PathLike, Mesh, Splats], None]) -> Callable[..., str]:
@@ -78,11 +93,13 @@ FORMATS = (
         _mesh_by(write_ply_mesh),
         "surfaces, as coloured triangles",
         True,
-        "voxel",
+        ("voxel",),
         bands=False,
         check=find_skimage,
     ),
-    Format("mesh.glb", _mesh_by(write_glb_mesh), "the same, as glTF", True, "voxel", bands=False, check=find_skimage),
+    Format(
+        "mesh.glb", _mesh_by(write_glb_mesh), "the same, as glTF", True, ("voxel",), bands=False, check=find_skimage
+    ),
     Format(".compressed.ply", write_compressed_ply, "PlayCanvas, SuperSplat"),
     Format(".ply", write_plain_ply, "float32, everything kept"),
     Format(".splat", write_splat, "antimatter15, 32 bytes a splat, no SH bands", bands=False),
@@ -90,7 +107,9 @@ FORMATS = (
     Format(".sog", write_sog, "PlayCanvas, through splat-transform", check=find_program),
     Format(".glb", write_glb, "glTF with KHR_gaussian_splatting, float32"),
     Format(".usdz", write_usdz, "OpenUSD, float32", check=find_pxr),
-    Format(".html", _write_html, "a page with a viewer", of_scene=True, option="path", around=True),
+    Format(
+        ".html", _write_html, "a page with a viewer", True, ("path", "start", "title", "raw"), around=True, clean=True
+    ),
 )
 
 

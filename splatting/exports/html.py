@@ -56,13 +56,16 @@ def write_html(
     make_path: Callable[[Poses], TimedPath] | None = None,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     title: str | None = None,
+    start: int = 0,
+    picture: str = "",
 ) -> None:
     """Write the page, whole or not at all.
 
-    cameras: the training views, the first of which is where the page begins; up to 25 of them become bookmarks.
-    make_path: makes the animation from their poses, as of splatting/camera_paths/render_path.py. None: the viewer's
-    own, which goes around the model, or sways where the first camera is in the model's box. background: RGB in [0,1].
-    title: None: the file's name. UserError without a camera.
+    cameras: the training views; up to 25 of them become bookmarks. make_path: makes the animation from their poses, as
+    of splatting/camera_paths/render_path.py. None: the viewer's own, which goes around the model, or sways where the
+    page's first camera is in the model's box. background: RGB in [0,1]. title: None: the file's name. start: which
+    camera the page begins at. picture: address of an image that is shown beside a link to the page; empty: none.
+    UserError without a camera.
     """
     if not cameras:
         raise UserError("a page needs at least one training camera, from which it shows the model; the scene has none")
@@ -70,12 +73,14 @@ def write_html(
     turn = turn_upright(up_of(poses))
     names = [str(camera.image_name) for camera in cameras]
     camera_path = make_path(poses) if make_path else None
-    # The median distance of the Gaussians from the first camera.
-    distance = float(np.median(np.linalg.norm(splats.means - poses.positions[0], axis=1))) if len(splats) else 1.0
+    # The median distance of the Gaussians from the page's first camera.
+    distance = float(np.median(np.linalg.norm(splats.means - poses.positions[start], axis=1))) if len(splats) else 1.0
+    aspects = [camera.image_width / camera.image_height for camera in cameras]
     page = {
         "antialiasing": splats.antialiasing,
+        "aspect": aspects[start],
         "name": _NAME,
-        "settings": settings(poses, names, turn, camera_path, background, distance),
+        "settings": settings(poses, names, turn, camera_path, background, distance, start, aspects),
     }
     options = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     environment = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), **options)
@@ -85,6 +90,7 @@ def write_html(
         licence=(FOLDER / "LICENSE").read_text(encoding="utf-8"),
         model=_packed_model(turned(splats, turn)),
         # No text in the JSON may end the script element that it stands in.
+        picture=picture,
         page=json.dumps(page, allow_nan=False).replace("<", "\\u003c"),
         record=read_json(RECORD),
         title=Path(path).stem if title is None else title,
@@ -159,13 +165,16 @@ def settings(
     path: TimedPath | None,
     background: tuple[float, float, float],
     distance: float = 1.0,
+    start: int = 0,
+    aspects: Sequence[float] | None = None,
 ) -> dict[str, Any]:
     """The settings of a model that was turned by `turn` (3,3).
 
-    poses, names: of the training cameras before that, the first of which is where the viewer begins. path: the
-    animation, in the same frame. background: RGB in [0,1]. distance: of the model, about which cameras that are all in
-    one place turn. Opening angles are vertical, in degrees.
+    poses, names: of the training cameras before that. path: the animation, in the same frame. background: RGB in [0,1].
+    distance: of the model, about which cameras that are all in one place turn. start: which camera the viewer begins
+    at. aspects: width over height of the photos; None: all are square. Opening angles are vertical, in degrees.
     """
+    aspects = aspects or [1.0] * len(poses)
     axes = _VIEWER_AXES @ turn
     focus = focus_point(poses)
     depths = _depths(poses, focus, distance)
@@ -178,8 +187,8 @@ def settings(
         "background": {"color": list(background)},
         "postEffectSettings": _NO_EFFECTS,
         "animTracks": [] if path is None else [_track(path, axes, float(np.median(depths)))],
-        "cameras": [{"initial": cameras[0]}],
-        "annotations": [_bookmark(names[n], cameras[n], lean(axes @ poses.turns[n])) for n in marked],
+        "cameras": [{"initial": cameras[start]}],
+        "annotations": [_bookmark(names[n], cameras[n], lean(axes @ poses.turns[n]), aspects[n]) for n in marked],
         "startMode": "default" if path is None else "animTrack",
     }
 
@@ -207,15 +216,18 @@ def _look(axes: np.ndarray, position: np.ndarray, turn: np.ndarray, depth: float
     return {"position": (axes @ position).tolist(), "target": (axes @ target).tolist(), "fov": float(fov)}
 
 
-def _bookmark(name: str, camera: dict[str, Any], degrees: float) -> dict[str, Any]:
-    """An annotation at the camera's own place. The viewer's cameras are level, so our page adds the lean."""
+def _bookmark(name: str, camera: dict[str, Any], degrees: float, aspect: float) -> dict[str, Any]:
+    """An annotation at the camera's own place. The viewer's cameras are level, so our page adds the lean.
+
+    aspect: of the photo, which the page lets fill a window's width.
+    """
     title = name if len(name) <= _TITLE else "…" + name[1 - _TITLE :]
     return {
         "position": camera["position"],
         "title": title,
         "text": "",
         "camera": {"initial": camera},
-        "extras": {"lean": degrees},
+        "extras": {"lean": degrees, "aspect": aspect},
     }
 
 

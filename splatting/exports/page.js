@@ -12,10 +12,19 @@ const unpacked = (id) => {
   return new Response(packed.pipeThrough(new DecompressionStream('gzip')));
 };
 
-// The viewer takes opening angles across the longer side of the window; the settings have vertical ones.
-const fit = (degrees) => {
-  const aspect = innerWidth / innerHeight;
-  return aspect > 1 ? Math.atan(Math.tan(degrees * Math.PI / 360) * aspect) * 360 / Math.PI : degrees;
+// The viewer takes opening angles across the longer side of the window; the settings have vertical ones. A photo of
+// another aspect fills the window's width, as nobody has seen what is beside it, but half of its height is shown at least.
+const fit = (degrees, photo = Infinity) => {
+  const aspect = innerWidth / innerHeight, shown = Math.max(Math.min(1, photo / aspect), 0.5);
+  return Math.atan(Math.tan(degrees * Math.PI / 360) * shown * Math.max(aspect, 1)) * 360 / Math.PI;
+};
+
+// The viewer keeps whether its help is open. On a small screen with touch it would cover the model, so it begins closed.
+const closeHelp = () => {
+  const key = 'controlsPanelOpen';
+  try {
+    if (matchMedia('(pointer: coarse)').matches && localStorage.getItem(key) === null) localStorage.setItem(key, 'false');
+  } catch { /* nothing is kept on this machine */ }
 };
 
 // The viewer's cameras are level, and those of the photos were not always. At a bookmark the picture leans as its photo
@@ -43,10 +52,11 @@ const leaning = (viewer, annotations) => {
 };
 
 try {
-  const { antialiasing, name, settings } = JSON.parse(document.getElementById('page').textContent);
-  const cameras = [...settings.cameras, ...settings.annotations.map((annotation) => annotation.camera)];
-  for (const { initial } of cameras) initial.fov = fit(initial.fov);
-  for (const { keyframes: { values } } of settings.animTracks) values.fov = values.fov.map(fit);
+  const { antialiasing, aspect, name, settings } = JSON.parse(document.getElementById('page').textContent);
+  for (const { initial } of settings.cameras) initial.fov = fit(initial.fov, aspect);
+  for (const { camera: { initial }, extras } of settings.annotations) initial.fov = fit(initial.fov, extras.aspect);
+  for (const { keyframes: { values } } of settings.animTracks) values.fov = values.fov.map((degrees) => fit(degrees));
+  closeHelp();
   const code = new Blob([await unpacked('viewer').text()], { type: 'text/javascript' });
   const { createViewer } = await import(URL.createObjectURL(code));
   const viewer = await createViewer({

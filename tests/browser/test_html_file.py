@@ -10,14 +10,16 @@ import numpy as np
 import pytest
 import torch
 from gaussians import pipeline
-from html_scene import SIZE, balls, cameras
+from html_scene import FOV, SIZE, balls, cameras
 from PIL import Image
 
 from gaussian_renderer import render
+from gaussian_renderer.free_view import free_view
 from scene.with_splats import model_of
 from splatting.camera_paths.generated import Ellipse
 from splatting.camera_paths.poses import poses_of
 from splatting.exports.html import write_html
+from splatting.exports.page_start import narrowed
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -92,6 +94,27 @@ def test_a_bookmark_shows_the_picture_of_its_camera(tab, page, splats):
     show(tab, page)
     tab.evaluate("viewer.selectAnnotation(3)")
     assert psnr(settled(tab), expected(splats, cameras()[3])) > 33
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 720), (390, 844)])
+def test_a_photo_fills_a_window_of_any_shape(browser, page, splats, width, height):
+    """Nothing beside the photo is shown; on a phone the help, which covers the model, begins closed."""
+    phone = width < height
+    context = browser.new_context(viewport={"width": width, "height": height}, has_touch=phone, is_mobile=phone)
+    tab = context.new_page()
+    show(tab, page)
+    shown = settled(tab)
+    camera = cameras()[0]
+    fov, (position, turn) = narrowed(math.radians(FOV), SIZE[0] / SIZE[1], width / height), placed(camera)
+    view = free_view(width, height, fov, position, turn, "cpu")
+    assert psnr(shown, expected(splats, view)) > 31
+    assert tab.locator(".sse-controlsHint").evaluate("e => e.classList.contains('sse-hidden')") == phone
+    context.close()
+
+
+def placed(camera) -> tuple[list[float], list[float]]:
+    poses = poses_of([camera])
+    return poses.positions[0].tolist(), poses.quaternions[0].tolist()
 
 
 def test_the_animation_goes_along_the_path(tab, splats, tmp_path):

@@ -22,14 +22,17 @@ def finished(folder: str | os.PathLike) -> int:
 
 
 def note_finished(run: Any) -> None:
-    """Note that a training has reached its end, and say how to continue it from its last checkpoint, if it has one."""
+    """Note that a training has reached its end."""
     folder = Path(run.scene.model_path)
     if not (folder / MODEL_JSON).is_file():  # the folder was removed meanwhile, which is told of
         return
     add_to_model_json(folder, **{FINISHED: run.opt.iterations})
-    last = folder / f"chkpnt{run.last_iteration}.pth"
-    if last.is_file() and not run.schedule.paced:
-        print(
-            f"Last checkpoint: {shlex.quote(str(last))} ({last.stat().st_size / 1e6:.3g} MB); the same command with "
-            "--resume and more --iterations continues this training"
-        )
+
+
+def checkpoint_line(path: Path) -> str:
+    """How to continue a training from its last checkpoint."""
+    size = f"{path.stat().st_size / 1e6:.3g} MB"
+    return (
+        f"Last checkpoint: {shlex.quote(str(path))} ({size}); the same command with --resume and more --iterations "
+        "continues this training"
+    )

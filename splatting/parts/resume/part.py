@@ -88,6 +88,16 @@ class Resume(Part):
             self._spent += taken
             self._speed = _BYTES * self._run.gaussians.gaussian_count / taken
             self._before = self._run.clock.seconds
+        if at.last:
+            self._tell(Path(self._run.scene.model_path) / f"chkpnt{at.iteration}.pth")
+
+    def _tell(self, last: Path) -> None:
+        from tqdm import tqdm
+
+        from splatting.parts.resume.end import checkpoint_line
+
+        if self._run.group.first and not self._run.schedule.paced and last.is_file():
+            tqdm.write(checkpoint_line(last), file=sys.stdout)
 
     def _save(self, at: "Iteration", name: str = "") -> None:
         """Write a checkpoint. A disk that is full is told, and ends nothing: nobody has asked for this file."""

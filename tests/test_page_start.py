@@ -1,0 +1,108 @@
+"""Where a page begins, its title and picture, and that it is cleaned."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from gaussians import pipeline
+from html_scene import FOV, SIZE, balls, cameras
+from PIL import Image
+from test_html_export import Page
+
+import export
+from gaussian_renderer import render
+from gaussian_renderer.free_view import free_view
+from scene.with_splats import model_of
+from splatting.camera_paths.poses import Poses, poses_of
+from splatting.exports import cleaning
+from splatting.exports.formats import Around, format_of
+from splatting.exports.page_start import LEAST, PICTURE, best_start, named_start, narrowed, write_preview
+from utils.system_utils import UserError
+
+
+def _meta(page: Path) -> dict[str, str]:
+    return {
+        attributes.get("property") or attributes.get("name"): attributes.get("content")
+        for tag, attributes in Page(page).tags
+        if tag == "meta"
+    }
+
+
+def test_a_page_begins_at_a_usual_camera_that_looks_at_the_middle():
+    poses = poses_of(cameras(8))
+    assert best_start(poses) == 0  # all are alike
+    turns, places = poses.turns.copy(), poses.positions.copy()
+    turns[:3] = turns[:3] @ np.array([[[0.9, 0, 0.435889894], [0, 1, 0], [-0.435889894, 0, 0.9]]])  # look aside
+    middle = places.mean(0)
+    places[3] = middle + 3 * (places[3] - middle)
+    assert best_start(Poses(places, turns, poses.fov)) >= 4
+    assert best_start(poses[np.array([0])]) == 0  # looks at nothing in common
+
+
+def test_a_start_is_named_with_or_without_its_ending():
+    names = [f"photo_{n}.jpg" for n in range(8)]
+    assert named_start("photo_3.jpg", names) == named_start("photo_3", names) == 3
+    with pytest.raises(UserError, match=r"--start photo is no training photo; there are photo_0.jpg, .* and 3 more"):
+        named_start("photo", names)
+
+
+def test_a_photo_fills_the_width_of_a_window_unless_that_is_very_wide():
+    fov = math.radians(40)
+    assert narrowed(fov, 1.5, 1.5) == narrowed(fov, 1.5, 0.5) == pytest.approx(fov)
+    assert math.tan(narrowed(fov, 1.2, 1.6) / 2) * 1.6 == pytest.approx(math.tan(fov / 2) * 1.2)
+    assert math.tan(narrowed(fov, 0.5, 2.0) / 2) == pytest.approx(LEAST * math.tan(fov / 2))
+
+
+def test_the_picture_beside_a_link_is_the_first_one(tmp_path):
+    splats, camera = balls(), cameras(rolls=())[2]
+    write_preview(tmp_path / "page.jpg", splats, camera, pipeline(), (0.2, 0.4, 0.3))
+    shown = np.asarray(Image.open(tmp_path / "page.jpg"), np.float64)
+    assert shown.shape == (*PICTURE[::-1], 3)
+    poses, fov = poses_of([camera]), narrowed(math.radians(FOV), SIZE[0] / SIZE[1], PICTURE[0] / PICTURE[1])
+    view = free_view(*PICTURE, fov, poses.positions[0].tolist(), poses.quaternions[0].tolist(), "cpu")
+    with torch.no_grad():
+        image = render(view, model_of(splats), pipeline(), torch.tensor([0.2, 0.4, 0.3]))["render"]
+    assert np.abs(shown - 255 * image.clamp(0, 1).permute(1, 2, 0).numpy()).mean() < 2
+
+
+def test_a_title_is_text_whatever_it_holds(tmp_path):
+    title = "<script>alert(1)</script> & \"quotes'"
+    around = Around(cameras(), (0.0, 0.0, 0.0), pipeline(), None, None, "photo_5", title)
+    path = tmp_path / "my page #1.html"
+    format_of(path).write(path, balls(), around)
+    page, meta = Page(path), _meta(path)
+    assert page.texts["title"] == meta["og:title"] == title and "alert(1)</script>" not in path.read_text()
+    assert meta["og:type"] == "website" and meta["og:image"] == "my%20page%20%231.jpg"
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["my page #1.html", "my page #1.jpg"]
+
+
+def test_pages_are_cleaned_unless_they_are_raw(colmap_scene, tmp_path, monkeypatch, capsys):
+    asked = []
+
+    def clean_scene(scene, most, pipe, white):
+        asked.append(most)
+        raise UserError("enough is known")
+
+    monkeypatch.setattr(export, "clean_scene", clean_scene)
+    import train
+
+    model = tmp_path / "model"
+    train.main(["-s", str(colmap_scene), "-m", str(model), "--iterations", "2", "--disable_viewer", "--quiet"])
+
+    def run(*words: str) -> None:
+        monkeypatch.setattr("sys.argv", ["export.py", "-m", str(model), "--to", str(tmp_path / "page.html"), *words])
+        export.main()
+
+    for words, most in (((), cleaning.OPTION["const"]), (("--clean", "0.2"), 0.2)):
+        with pytest.raises(UserError, match="enough is known"):
+            run(*words)
+        assert asked.pop() == most
+    run("--raw", "--title", "Room")
+    assert not asked and (tmp_path / "page.jpg").is_file() and _meta(tmp_path / "page.html")["og:title"] == "Room"
+    with pytest.raises(UserError, match="contradict"):
+        run("--raw", "--clean")
+    monkeypatch.setattr("sys.argv", ["export.py", "-m", str(model), "--to", str(tmp_path / "a.ply"), "--title", "Room"])
+    with pytest.raises(UserError, match=r"--title is for \.html"):
+        export.main()
