@@ -159,6 +159,15 @@ def test_no_level_repeats_the_seconds_of_the_end():
     assert reached_table(found).rows[1] == ["other", *["not known"] * len(found["levels"])]
 
 
+def test_a_level_that_the_first_point_has_took_at_most_its_seconds():
+    points = (0.23, 33.0, 100), (0.4, 33.2, 200), (0.8, 33.4, 300)
+    runs = [run_of("adc", 0, (0.2, 20.0, 1), (0.4, 33.1, 1), (0.8, 33.4, 1)), run_of("quick", 0, *points)]
+    found = reached(comparable_sets(runs, "attic"))
+    cells = dict(zip(reached_table(found).header, reached_table(found).rows[1], strict=True))
+    assert cells["33.0 dB"].startswith("at most 0.23 s (") and cells["32.5 dB"].startswith("at most 0.23 s (")
+    assert "At most: how much earlier is not known." in reached_legend(found)
+
+
 def test_equal_seeds_reach_their_own_mean():
     """The mean of three equal numbers may be a bit above them."""
     points = (1, 20.0, 1), (2, 29.839999999999996, 2)

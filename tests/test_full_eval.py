@@ -622,7 +622,8 @@ def test_each_model_becomes_a_page_that_the_report_links(evaluate):
     assert [entry["page"] for entry in report["runs"]] == pages
     made = evaluate.calls("export")
     assert made[0] == ["export", "-m", str(evaluate.out / "attic/seed_0"), "-s", str(evaluate.scenes / "attic"),
-                       "--iteration", "40", "--to", str(evaluate.out / pages[0]), "--antialiasing"]  # fmt: skip
+                       "--iteration", "40", "--to", str(evaluate.out / pages[0]), "--raw",
+                       "--antialiasing"]  # fmt: skip
     for page in pages:
         assert f'<a href="{page}">' in evaluate.text("html") and f"]({page})" in evaluate.text("md")
         assert (evaluate.out / page).is_file()

@@ -295,11 +295,13 @@ def _cell(
 def _reach(curve: Sequence[Row], level: float, as_good: bool | None) -> tuple[Row | None, float | None, bool]:
     """Return the first row of a curve that reaches a level, the seconds until then, and whether it may be fewer.
 
-    None: it does not, or the seconds are not known. as_good: whether it does at its end, None: as its last row says.
+    It may where that is the curve's first row. None: no row does, or the seconds are not known. as_good: whether the
+    curve does at its end, None: as its last row says.
     """
     row = next((row for row in curve if row["test_psnr"] >= level), None)
     if as_good in (None, curve[-1]["test_psnr"] >= level) or (as_good and row is not None):
-        return row, seconds_to_reach(curve, level), False
+        first = row is not None and row is curve[0]
+        return row, row["seconds"] if first else seconds_to_reach(curve, level), first
     return (curve[-1], curve[-1]["seconds"], True) if as_good else (None, None, False)
 
 

@@ -234,7 +234,7 @@ def page(run: Run, output: Path, options: Sequence[str], child: Child) -> None:
     last, file = _saved(run, "html")[-1], page_file(run.model, output)
     mkdir_p(file.parent)
     command = _script("export.py", "-m", str(run.model), *_source(run), "--iteration", str(last))
-    command += ["--to", str(file), *options]
+    command += ["--to", str(file), "--raw", *options]  # what was scored
     requested = {"model": _stamp(saved_ply(run.model, last)), "options": list(options)}
     say = "writing the model as a page"
     _once(child, Record(run.model), "html", say, command, requested, lambda: {} if file.is_file() else None)

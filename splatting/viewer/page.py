@@ -161,9 +161,9 @@ class Page:
         if client is not None:
             client.add_notification(title, as_utf8(body), auto_close_seconds=_READ, **look)
 
-    def show_numbers(self, iteration: int, gaussians: int) -> None:
-        """Show the iteration and the number of Gaussians."""
-        self.iteration.value, self.count.value = f"{iteration:,}", f"{gaussians:,}"
+    def show_numbers(self, iteration: int, gaussians: int, of: str = "") -> None:
+        """Show the iteration, of how many it is, such as " of 7,000", and the number of Gaussians."""
+        self.iteration.value, self.count.value = f"{iteration:,}{of}", f"{gaussians:,}"
 
     def notify(self, title: str, body: str, **look: Any) -> None:
         """Show a notification to all, and wait until it has probably been sent."""

@@ -82,13 +82,21 @@ class Requests:
         self._set(paused=False, stopped=False, _steps=0, _checkpoints=0)
 
 
+def duration(seconds: float) -> str:
+    """Seconds for people: "34 s", "3 min 20 s", "2 h 5 min"."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, part = divmod(minutes, 60)
+    return f"{hours} h {part} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
 class TrainingTab:
-    """Buttons that make requests; iterations a second, loss, and the error against time."""
+    """Buttons that make requests; iterations a second, time to go, loss, and the error against time."""
 
     def __init__(self, server: "viser.ViserServer", requests: Requests) -> None:
         gui = server.gui
         self._requests = requests
         self.speed = gui.add_text("Iterations per second", "", disabled=True)
+        self.left = gui.add_text("Time to go", "", disabled=True)
         self.loss = gui.add_text("Loss", "", disabled=True)
         self.state = gui.add_markdown("", visible=False)
         self.pause, step = gui.add_button("Pause"), gui.add_button("One step")
@@ -112,6 +120,11 @@ class TrainingTab:
         for end in (stop, self.close):
             end.on_click(lambda _: requests.stop())
 
+    def begin_paused(self) -> None:
+        """Let the training wait after its first iteration."""
+        self._requests.pause()
+        self._label()
+
     def _turn(self) -> None:
         (self._requests.resume if self._requests.paused else self._requests.pause)()
         self._label()
@@ -120,13 +133,19 @@ class TrainingTab:
         self.pause.label = "Resume" if self._requests.paused else "Pause"
 
     def show(
-        self, speed: float | None, loss: float, rows: Sequence[dict[str, float | None]], subset: float | None
+        self,
+        speed: float | None,
+        left: float | None,
+        loss: float,
+        rows: Sequence[dict[str, float | None]],
+        subset: float | None,
     ) -> None:
-        """Show iterations a second (None: not known), the loss, and the curve's rows so far, which score a subset.
+        """Show iterations a second, seconds to go (None: not known), the loss, and the curve's rows, of a subset.
 
         subset: how many test views these are, None for all.
         """
         self.speed.value = "" if speed is None else f"{speed:.3g}"
+        self.left.value = "" if left is None else duration(left)
         self.loss.value = f"{loss:.5f}"
         if len(rows) != self._rows:
             self._rows = len(rows)

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -154,7 +155,9 @@ def test_the_page_shows_how_the_training_goes(colmap_scene, tmp_path, monkeypatc
 
     def note(watched: Watched) -> None:
         tab = watched.observer._tab
-        seen.append((int(watched.page.iteration.value), float(tab.speed.value), len(tab.curve.data[0])))
+        iteration, _, total = watched.page.iteration.value.partition(" of ")
+        assert total == "120" and tab.left.value.endswith(" s")
+        seen.append((int(iteration), float(tab.speed.value), len(tab.curve.data[0])))
 
     watched = Watched(monkeypatch, {2: Watched.connect, 33: note, 34: note, 60: note, 115: note})
     _train(colmap_scene, tmp_path / "out", "--test_iterations", *range(10, 120, 10))
@@ -163,6 +166,45 @@ def test_the_page_shows_how_the_training_goes(colmap_scene, tmp_path, monkeypatc
     tab = watched.observer._tab
     seconds, psnr = tab.curve.data
     assert (seconds[1:] >= seconds[:-1]).all() and tab.curve.visible and 5 < psnr.mean() < 60 and float(tab.loss.value)
+
+
+def test_a_training_can_begin_paused(colmap_scene, tmp_path, monkeypatch):
+    """Its bytes are those of one that does not."""
+    _train(colmap_scene, tmp_path / "plain", "--no_curve", viewer=False)
+    labels = []
+
+    def begin(watched: Watched) -> None:
+        labels.append(watched.observer._tab.pause.label)
+        threading.Thread(target=_after(0.2, lambda: wait_for(lambda: watched.paused), watched.requests.resume)).start()
+
+    watched = Watched(monkeypatch, {1: begin})
+    _train(colmap_scene, tmp_path / "out", "--no_curve", "--paused")
+    assert watched.paused == [1] and labels == ["Resume"]
+    plys = [folder / "point_cloud/iteration_120/point_cloud.ply" for folder in (tmp_path / "plain", tmp_path / "out")]
+    assert plys[0].read_bytes() == plys[1].read_bytes()
+
+
+def test_a_pause_needs_a_page(colmap_scene, tmp_path):
+    with pytest.raises(UserError, match="--paused needs --viewer"):
+        train.main(["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "--paused", "--iterations", "2"])
+    assert not (tmp_path / "out").exists()
+
+
+def test_time_to_go_is_that_of_the_clock_or_of_the_speed():
+    def page(**schedule: object) -> SimpleNamespace:
+        run = SimpleNamespace(
+            schedule=SimpleNamespace(by_clock=False, expected=None, seconds=0.0) ,
+            log=SimpleNamespace(seconds_before=5.0), clock=SimpleNamespace(seconds=12.0),
+        )  # fmt: skip
+        vars(run.schedule).update(schedule)
+        return SimpleNamespace(_run=run)
+
+    left = observed.TrainingPage._left
+    assert left(page(expected=1000), 400, 20.0) == 30 and left(page(expected=1000), 400, None) is None
+    assert left(page(), 400, 20.0) is None
+    assert left(page(by_clock=True, seconds=60.0), 400, None) == 43
+    said = [training_tab.duration(seconds) for seconds in (0.4, 59.6, 200, 7500)]
+    assert said == ["0 s", "1 min 0 s", "3 min 20 s", "2 h 5 min"]
 
 
 @pytest.mark.parametrize("end", ["stop", "signal"])
@@ -246,7 +288,7 @@ def test_a_training_that_the_page_stops_can_be_looked_at(colmap_scene, tmp_path,
     watched = _Staying(monkeypatch, {33: lambda w: w.requests.stop()}, _Staying.look_and_close)
     with pytest.raises(KeyboardInterrupt, match="stopped from the page"):
         _train(colmap_scene, tmp_path / "out", "--no_curve")
-    assert watched.seen[0].std() > 5 and watched.page.iteration.value == "33"
+    assert watched.seen[0].std() > 5 and watched.page.iteration.value == "33 of 120"
     assert f"saved as {tmp_path / 'out/chkpnt33.pth'}" in watched.observer._tab.state.content
     assert load_checkpoint(str(tmp_path / "out/chkpnt33.pth"))[1] == 33
     assert "with --start_checkpoint" in capfd.readouterr().err
@@ -296,10 +338,10 @@ def test_neither_a_checkpoint_nor_a_frame_that_fails_ends_a_training(colmap_scen
 def test_points_of_some_test_views_are_called_so():
     tab = training_tab.TrainingTab(mock.MagicMock(), mock.MagicMock())
     rows = [{"seconds": s, "test_psnr": p} for s, p in ((1.0, 20.0), (2.0, 25.0))]
-    tab.show(None, 0.1, rows, 4)
+    tab.show(None, None, 0.1, rows, 4)
     assert [values.tolist() for values in tab.curve.data] == [[1.0, 2.0], [20.0, 25.0]]
     assert tab.note.content == "Points score 4 of the test views." and tab.note.visible
-    tab.show(None, 0.1, [*rows, {"seconds": 3.0, "test_psnr": 26.0}], None)
+    tab.show(None, None, 0.1, [*rows, {"seconds": 3.0, "test_psnr": 26.0}], None)
     assert len(tab.curve.data[0]) == 3 and not tab.note.visible
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 from splatting.training.option import MOST_NEEDED, Option
 from splatting.training.part import Error, Needs, Options, Part
 from splatting.viewer.server import HOST_OPTION, PORT
+from utils.system_utils import UserError
 
 if TYPE_CHECKING:
     from splatting.training.iteration import Iteration
@@ -29,14 +30,22 @@ class Viewer(Part):
             help=f"serve a web page that shows and controls the training, at this port or {PORT}; it stays open "
                  "afterwards (default: no page)"),
         HOST_OPTION,
+        Option("paused", False, origin="ours", topic="viewers",
+            help="with --viewer: wait after the first iteration until the page lets the training go on"),
     ))
     # fmt: on
     needs = Needs(ranks=False)
     waits = True
 
+    @classmethod
+    def wanted(cls, given: argparse.Namespace) -> bool:
+        return getattr(given, "viewer", None) is not None or getattr(given, "paused", False)
+
     def check(self, run: Any, state: Any) -> None:
         from splatting.viewer.server import checked_address
 
+        if run.launch.viewer is None:
+            raise UserError("--paused needs --viewer, whose page lets the training go on")
         self._address = checked_address(run.launch.viewer_host, run.launch.viewer)
 
     def opened(self, run: Any) -> None:

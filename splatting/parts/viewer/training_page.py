@@ -37,6 +37,8 @@ class TrainingPage:
             self._page.frames.masks = run.counts.counted
         with self._page.tabs.add_tab("Training"):
             self._tab = TrainingTab(self._page.server, self._requests)
+        if run.launch.paused:
+            self._tab.begin_paused()
         self.budget = Budget()
         self._wish: Wish | None = None
         self._numbers = (0.0, 0, 0.0)  # when they were shown, the iteration, and its seconds of training
@@ -111,9 +113,21 @@ class TrainingPage:
         self._numbers = now, iteration, run.clock.seconds
         took = run.clock.seconds - seconds
         speed = (iteration - before) / took if before and took > 0 else None
-        self._page.show_numbers(iteration, run.gaussians.gaussian_count)
+        expected = run.schedule.expected
+        of = "" if expected is None else f" of {'about ' if run.schedule.by_clock else ''}{round(expected):,}"
+        self._page.show_numbers(iteration, run.gaussians.gaussian_count, of)
         subset = common_subset([run.rows])
-        self._tab.show(speed, run.losses.mean, rows_on(run.rows, subset), subset)
+        left = self._left(iteration, speed)
+        self._tab.show(speed, left, run.losses.mean, rows_on(run.rows, subset), subset)
+
+    def _left(self, iteration: int, speed: float | None) -> float | None:
+        """Seconds of training to go; None: not known."""
+        run = self._run
+        if run.schedule.by_clock:
+            return max(0.0, run.schedule.seconds - run.log.seconds_before - run.clock.seconds)
+        if run.schedule.expected is None or not speed:
+            return None
+        return max(0.0, run.schedule.expected - iteration) / speed
 
     def ended(self, error: Error) -> None:
         """Let the page stay, unless an error or a signal ended the training."""
