@@ -29,6 +29,7 @@ from splatting.sfm.capture_page import capture_stage
 from splatting.sfm.colmap import ADDING, GIVEN, LENS_MODELS, Program, Pycolmap, Settings, is_native
 from splatting.sfm.inputs import sort_inputs, unused_lines
 from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder
+from splatting.sfm.orienting import said_of
 from splatting.sfm.programs import refuse_while_working
 from splatting.sfm.report import lens_words, report_inputs, summary
 from splatting.sfm.video import FRAMES_MISSING, NOTE, refuse_foreign_frames, report_entries, taken_frames, video_lines
@@ -76,14 +77,14 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     made = {"camera": settings.camera, "mapper": settings.mapper, "matcher": settings.matcher, "program": program}
     planned.append(stages.undistortion_stage(layout, settings, made_from, **made, shared_by=settings.cameras))
     planned.append(capture_stage(layout, names))
-    if args.resize:
-        planned.append(stages.resize_stage(layout))
+    planned += stages.wanted_stages(layout, args.resize, args.orient)
     kept += record.run(planned)
     if kept:
         print(f"reused from an earlier run: {', '.join(kept)}; remove {layout.work} to start from the beginning")
     notes = [NOTE] if taken_frames(layout) else []
     report = report_inputs(layout.report, notes=notes, unused=found.unused, videos=report_entries(layout))
-    print("\n".join((summary(report), lens_words(report), *lines_of(report), f"all of it: {layout.page}")))
+    print("\n".join((summary(report), lens_words(report), *lines_of(report), *said_of(layout))))
+    print(f"all of it: {layout.page}")
     if found.unused:
         print(f"{len(found.unused)} files in {layout.input.name} were not used; {layout.report.name} has the reasons")
     if args.add:
@@ -183,6 +184,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     add(
         "--resize", action="store_true", help="also write images_2, images_4, images_8, whose sides are divided by that"
     )
+    add("--orient", action="store_true", help="find where the scene is upright, and its size by GPS, for exports")
     add("--video", nargs="+", action="extend", default=[], metavar="FILE",
         help="take frames of these videos as photos, besides those in input; needs imageio-ffmpeg")  # fmt: skip
     add("--video_frames", type=int, default=150, metavar="N",

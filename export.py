@@ -39,6 +39,7 @@ from splatting.exports.cleaning import OPTION as CLEAN_OPTION
 from splatting.exports.cleaning import check_clean, clean_scene, write_picture
 from splatting.exports.formats import FORMATS, Around, Format, format_of
 from splatting.exports.reading import ANY, read_any
+from splatting.exports.upright import add_upright_options, placed
 from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json
 from splatting.parts import tools
 from utils.general_utils import safe_state
@@ -147,6 +148,7 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     background = (1.0, 1.0, 1.0) if options.white_background else (0.0, 0.0, 0.0)
     cameras = poses(chosen) if poses else scene and scene.getTrainCameras()
     around = entry.of_scene and Around(cameras, background, pipe, make_path, args.voxel, args.start, args.title)
+    chosen, around = placed(args, entry.of_scene, chosen, around)
     what = entry.write(args.to, chosen, *((around,) if around else ()))
     size, seconds = Path(args.to).stat().st_size, time.perf_counter() - start
     if what is None:
@@ -228,6 +230,7 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
     add("--raw", action="store_true", help="do not --clean an .html (default: cleaned, if its scene is there)")
     add("--voxel", type=float, metavar="UNITS",
         help="size of a mesh's voxels in the scene's unit (default: two pixels at the median depth)")  # fmt: skip
+    add_upright_options(add)
     add("--quiet", action="store_true", help="print nothing to stdout (default: off)")
     return parser, model_params, pipeline_params
 

@@ -37,6 +37,7 @@ class Around(NamedTuple):
     voxel: float | None  # of a mesh, in the world's unit
     start: str | None  # of a page: the photo that it begins at
     title: str | None  # of a page
+    upright: bool = False  # whether -y of all of these is up, so that a page need not find it
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def _write_html(path: str | os.PathLike, splats: Splats, around: Around) -> None
         start = best_start(poses_of(around.cameras)) if names else 0
     picture = Path(path).with_suffix(".jpg")
     how = around.make_path, around.background, around.title, start, quote(os.fsencode(picture.name))
-    write_html(path, splats, around.cameras, *how)
+    write_html(path, splats, around.cameras, *how, around.upright)
     write_preview(picture, splats, around.cameras[start], around.pipe, around.background)
 
 

@@ -58,6 +58,7 @@ def write_html(
     title: str | None = None,
     start: int = 0,
     picture: str = "",
+    upright: bool = False,
 ) -> None:
     """Write the page, whole or not at all.
 
@@ -65,12 +66,12 @@ def write_html(
     of splatting/camera_paths/render_path.py. None: the viewer's own, which goes around the model, or sways where the
     page's first camera is in the model's box. background: RGB in [0,1]. title: None: the file's name. start: which
     camera the page begins at. picture: address of an image that is shown beside a link to the page; empty: none.
-    UserError without a camera.
+    upright: whether up is UP already; if not, it is found by the cameras. UserError without a camera.
     """
     if not cameras:
         raise UserError("a page needs at least one training camera, from which it shows the model; the scene has none")
     poses = poses_of(cameras)
-    turn = turn_upright(up_of(poses))
+    turn = np.eye(3) if upright else turn_upright(up_of(poses))
     names = [str(camera.image_name) for camera in cameras]
     camera_path = make_path(poses) if make_path else None
     # The median distance of the Gaussians from the page's first camera.

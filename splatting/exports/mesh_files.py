@@ -11,7 +11,7 @@ from plyfile import PlyData, PlyElement
 
 from scene.gaussians.ply import frame_comments
 from scene.splats.splats import Splats
-from splatting.exports.scene_formats import write_binary_gltf
+from splatting.exports.scene_formats import georeference, write_binary_gltf
 from utils.system_utils import UserError, atomic_write
 
 if TYPE_CHECKING:  # which needs SciPy
@@ -46,7 +46,7 @@ def write_ply_mesh(path: str | os.PathLike, mesh: Mesh, splats: Splats) -> None:
 
 
 def write_glb_mesh(path: str | os.PathLike, mesh: Mesh, splats: Splats) -> None:
-    """Write a GLB, whole or not at all. UserError if it is too large. splats: not needed here."""
+    """Write a GLB, whole or not at all. UserError if it is too large. splats: those of the mesh, with its place."""
     alpha = np.full((len(mesh.colors), 1), 255, np.uint8)
     arrays = {
         "POSITION": mesh.vertices.astype("<f4"),
@@ -79,6 +79,7 @@ def write_glb_mesh(path: str | os.PathLike, mesh: Mesh, splats: Splats) -> None:
         ],
         "buffers": [{"byteLength": starts[-1]}],
     }
+    georeference(document, splats.place)
     write_binary_gltf(path, document, arrays.values(), "give a larger --voxel")
 
 

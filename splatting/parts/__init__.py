@@ -33,6 +33,7 @@ PARTS = (
     "last_save",  # after keep_best, which may choose another model
     "spill",  # after all that moves rows, and before sleep, which pays where rows lie on the host
     "sleep",  # after all that decides whether every step concerns all rows
+    "upright",  # only keeps a record
     "tensorboard",  # from here on, those that only watch
     "resume",  # before all that may let the training wait
     "remote_viewer",

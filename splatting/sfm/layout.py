@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from splatting.files.image_files import SUFFIXES
+from splatting.files.similarity import FILE
 from splatting.sfm.inputs import VIDEO_SUFFIXES, Inputs, sort_inputs, unused_lines
 from utils.system_utils import UserError
 
@@ -17,6 +18,7 @@ class Layout:
         self.scene = scene
         self.input, self.images, self.sparse = scene / "input", scene / "images", scene / "sparse"
         self.report, self.page = scene / "convert_report.json", scene / "capture.html"
+        self.orientation = scene / FILE
         self.work = work = scene / "distorted"
         self.prepared = work / "photos"  # for COLMAP: upright, in formats that it reads
         self.masks, self.undistorted = work / "masks", work / "undistorted"

@@ -19,6 +19,7 @@ from splatting.sfm.adding import base_state
 from splatting.sfm.colmap import Backend, Settings, worker_command
 from splatting.sfm.given_poses import files_of, given_names, posed_photos, write_given
 from splatting.sfm.layout import Layout, image_names
+from splatting.sfm.orienting import orient
 from splatting.sfm.programs import run_programs
 from utils.system_utils import UserError, mkdir_p
 
@@ -228,7 +229,7 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
                 f"{len(missing)} photos of the model in {layout.models / chosen.folder} are not in {root}, the first "
                 f"is {missing[0]}; put them there under the names that they have in the model"
             )
-        _remove(layout.images, layout.sparse, layout.report, *map(layout.resized, FACTORS))
+        _remove(layout.images, layout.sparse, layout.report, layout.orientation, *map(layout.resized, FACTORS))
         mkdir_p(layout.sparse)
         (layout.undistorted / "sparse").rename(layout.sparse / "0")
         written.rename(layout.images)
@@ -251,6 +252,16 @@ def resize_stage(layout: Layout) -> Stage:
 
     # No reset: undistortion removes the copies when it replaces the photos that they were made from.
     return Stage("resize", list(FACTORS), lambda: None, work)
+
+
+def wanted_stages(layout: Layout, resize: bool, orient: bool) -> list[Stage]:
+    """Make the stages, after all others, of what a user may ask for."""
+    return [*([resize_stage(layout)] if resize else []), *([orient_stage(layout)] if orient else [])]
+
+
+def orient_stage(layout: Layout) -> Stage:
+    """Make the stage that finds where the scene is upright."""
+    return Stage("orient", 1, lambda: _remove(layout.orientation), lambda: orient(layout))
 
 
 def model_state(layout: Layout) -> list[Any]:

@@ -1,0 +1,95 @@
+"""Where a photo was taken and which way was down, as its EXIF data tell it."""
+
+import math
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from PIL import ExifTags
+
+from splatting.files.image_files import UNREADABLE, open_image
+
+_APPLE = b"Apple iOS\0"
+_ACCELERATION = 8  # tag of Apple's notes: three signed rationals (ExifTool, "Apple Tags", AccelerationVector)
+_SIGNED_RATIONAL = 10
+# What turns (right, down) of the stored pixels to those of the upright photo, by EXIF orientation.
+_TURNED = {1: (1, 0, 0, 1), 3: (-1, 0, 0, -1), 6: (0, -1, 1, 0), 8: (0, 1, -1, 0)}
+
+
+class PhotoPlace(NamedTuple):
+    """gps: latitude and longitude in degrees, height in metres, or None. down: (3,) of length 1 in the axes of the
+    upright photo's camera (x right, y down, z forward), or None."""
+
+    gps: tuple[float, float, float] | None = None
+    down: np.ndarray | None = None
+
+
+def read_place(photo: Path) -> PhotoPlace:
+    """Read both from a photo's header; what is missing or damaged is None."""
+    try:
+        with open_image(photo) as image:
+            exif = image.getexif()
+            gps, more = exif.get_ifd(ExifTags.IFD.GPSInfo), exif.get_ifd(ExifTags.IFD.Exif)
+    except UNREADABLE:
+        return PhotoPlace()
+    note = more.get(ExifTags.Base.MakerNote)
+    down = _down(note, exif.get(ExifTags.Base.Orientation, 1)) if isinstance(note, bytes) else None
+    return PhotoPlace(_gps(gps), down)
+
+
+def _gps(tags: Mapping[int, Any]) -> tuple[float, float, float] | None:
+    tag = ExifTags.GPS
+    try:
+        latitude = _degrees(tags[tag.GPSLatitude], tags.get(tag.GPSLatitudeRef, "N") == "S")
+        longitude = _degrees(tags[tag.GPSLongitude], tags.get(tag.GPSLongitudeRef, "E") == "W")
+        below = tags.get(tag.GPSAltitudeRef, b"\0") in (1, b"\1")
+        height = float(tags.get(tag.GPSAltitude, 0.0)) * (-1 if below else 1)
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None
+    sound = abs(latitude) <= 90 and abs(longitude) <= 180 and math.isfinite(height)
+    return (latitude, longitude, height) if sound and (latitude or longitude) else None
+
+
+def _degrees(parts: tuple[Any, Any, Any], negative: bool) -> float:
+    degrees, minutes, seconds = map(float, parts)
+    return (degrees + minutes / 60 + seconds / 3600) * (-1 if negative else 1)
+
+
+def _down(note: bytes, orientation: Any) -> np.ndarray | None:
+    """Down by an Apple note: acceleration in the device's axes, x right, y to its top, z out of its screen.
+
+    A phone that lies on its back has (0, 0, -1). Its rear camera's stored pixels have their right at the device's
+    bottom, and their lower side at its left.
+    """
+    vector = _acceleration(note)
+    if vector is None or orientation not in _TURNED:
+        return None
+    length = float(np.linalg.norm(vector))
+    if not 0.8 < length < 1.2:  # shaken, or damaged
+        return None
+    x, y, z = vector / length
+    right, low = -y, -x
+    a, b, c, d = _TURNED[orientation]
+    return np.array([a * right + b * low, c * right + d * low, -z])
+
+
+def _acceleration(note: bytes) -> np.ndarray | None:
+    """The vector (3,) of an Apple note, a big-endian directory whose offsets count from its first byte."""
+    if not note.startswith(_APPLE) or note[12:14] != b"MM":
+        return None
+    try:
+        for entry in range(*_entries(note)):
+            tag, kind, count, offset = struct.unpack_from(">HHII", note, entry)
+            if (tag, kind, count) == (_ACCELERATION, _SIGNED_RATIONAL, 3):
+                values = np.array(struct.unpack_from(">6i", note, offset), np.float64).reshape(3, 2)
+                return values[:, 0] / values[:, 1] if values[:, 1].all() else None
+    except struct.error:
+        pass
+    return None
+
+
+def _entries(note: bytes) -> tuple[int, int, int]:
+    (count,) = struct.unpack_from(">H", note, 14)
+    return 16, 16 + 12 * count, 12

@@ -1,0 +1,110 @@
+"""Exports in the upright frame of a model's similarity: splats, cameras and paths under it."""
+
+import argparse
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from scene.cameras import Camera
+from scene.splats.splats import Splats
+from splatting.camera_paths.keyframes import Keyframe, TimedPath
+from splatting.camera_paths.poses import keyframe, poses_of
+from splatting.files.json_files import OFFSET, read_model_json
+from splatting.files.similarity import ENTRY, Similarity
+from utils.system_utils import UserError
+
+
+def add_upright_options(add: Callable[..., Any]) -> None:
+    """Add options to those of export.py."""
+    add("--upright", action="store_true",
+        help="turn and scale the model as convert.py --orient found (default: on for pages and meshes)")  # fmt: skip
+    add("--no_upright", action="store_true", help="keep pages and meshes in the frame of the scene (default: off)")
+
+
+def placed(args: argparse.Namespace, of_scene: bool, splats: Splats, around: Any) -> tuple[Splats, Any]:
+    """The splats, and the `Around` of a page or mesh (`of_scene`), in the frame that the options ask for.
+
+    UserError for --upright of a model that does not say where it is upright.
+    """
+    if args.upright and args.no_upright:
+        raise UserError("--upright and --no_upright contradict each other; leave one out")
+    if args.no_upright or not (args.upright or of_scene):
+        return splats, around
+    record = read_model_json(args.model_path) if args.model_path else {}
+    if ENTRY not in record:
+        if args.upright:
+            raise UserError(
+                "--upright needs a model folder (-m) whose model.json has a similarity; run convert.py --orient on its "
+                "scene and train again, or leave it out"
+            )
+        return splats, around
+    similarity = Similarity.of(record[ENTRY], f"model.json of {args.model_path}")
+    local = similarity.from_local(record.get(OFFSET, (0.0, 0.0, 0.0)))
+    return moved_splats(splats, local), moved_around(around, local) if around else around
+
+
+def moved_splats(splats: Splats, similarity: Similarity) -> Splats:
+    """The same Gaussians under a similarity of their frame; they have no offset then.
+
+    Directions turn with the world, so SH bands do; a larger scale needs no enlargement where they are drawn.
+    """
+    from splatting.exports.html import turned  # SciPy and jinja2 take a while to import
+
+    enlargement = 2.0 ** np.ceil(np.log2(splats.enlargement / similarity.scale))
+    return replace(
+        turned(splats, similarity.rotation),
+        means=similarity.points(splats.means).astype(np.float32),
+        log_scales=splats.log_scales + np.float32(np.log(similarity.scale)),
+        enlargement=max(1.0, float(enlargement)),
+        place=similarity.place,
+    )
+
+
+def moved_cameras(cameras: Sequence[Camera], similarity: Similarity) -> list[Camera]:
+    """Copies of cameras that see moved splats as the cameras see the splats."""
+    poses = poses_of(cameras)
+    places, turns = similarity.points(poses.positions), similarity.rotation @ poses.turns
+    twins = [copy.copy(camera) for camera in cameras]
+    for twin, place, turn in zip(twins, places, turns, strict=True):
+        twin.place(turn, -turn.T @ place)
+    return twins
+
+
+@dataclass(frozen=True)
+class MovedPath:
+    """A camera path under a similarity."""
+
+    path: TimedPath
+    similarity: Similarity
+
+    @property
+    def seconds(self) -> float:
+        return self.path.seconds
+
+    @property
+    def closed(self) -> bool:
+        return self.path.closed
+
+    def at(self, seconds: float) -> Keyframe:
+        """The pose at a moment."""
+        from scipy.spatial.transform import Rotation
+
+        key = self.path.at(seconds)
+        place = self.similarity.points(np.array([key.position]))[0]
+        turn = self.similarity.rotation @ Rotation.from_quat(key.wxyz, scalar_first=True).as_matrix()
+        return keyframe(key.seconds, place, turn, key.fov)
+
+
+def moved_around(around: Any, similarity: Similarity) -> Any:
+    """What pages and meshes take besides splats (splatting/exports/formats.py), under a similarity.
+
+    A path is made in the model's own frame, in which files of keyframes are.
+    """
+    cameras, make = around.cameras, around.make_path
+    if not cameras:
+        return around
+    make_moved = make and (lambda _: MovedPath(make(poses_of(cameras)), similarity))
+    return around._replace(cameras=moved_cameras(cameras, similarity), make_path=make_moved, upright=True)

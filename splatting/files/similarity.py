@@ -1,0 +1,67 @@
+"""Where a scene stands upright, in metres: a similarity, in a file beside the scene and in model.json."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatting.files.json_files import read_json
+from utils.system_utils import UserError
+
+FILE = "orientation.json"  # of convert.py --orient, in a scene's folder
+PLACE = "latitude", "longitude", "height"  # of the record, where GPS is known
+ENTRY = "similarity"  # of model.json, with the content of that file
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """A point x (3,) of the scene's world becomes scale * rotation @ x + translation, float64.
+
+    There y is down, as in a usual capture. rotation: (3,3). place: latitude and longitude (degrees) and height (metres)
+    of the origin, where x is east and z north, in metres; empty: unknown.
+    """
+
+    rotation: np.ndarray
+    scale: float
+    translation: np.ndarray
+    place: tuple[float, ...] = ()
+
+    @classmethod
+    def of(cls, record: Any, where: str) -> "Similarity":
+        """That of a record, which is read at `where`. UserError if it is none."""
+        try:
+            rotation = np.array(record["rotation"], np.float64)
+            scale, translation = float(record["scale"]), np.array(record["translation"], np.float64)
+            turns = rotation.shape == (3, 3) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+            sound = turns and np.linalg.det(rotation) > 0 and 0 < scale < np.inf
+            place = tuple(float(record[name]) for name in PLACE) if PLACE[0] in record else ()
+            if not (sound and translation.shape == (3,) and np.isfinite([*translation, *place]).all()):
+                raise ValueError
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(
+                f"{where} has no rotation, scale and translation of a similarity; run convert.py --orient again"
+            ) from error
+        return cls(rotation, scale, translation, place)
+
+    def from_local(self, offset: np.ndarray) -> "Similarity":
+        """The similarity for coordinates from which an offset (3,) of the world was subtracted."""
+        moved = self.scale * self.rotation @ np.asarray(offset, np.float64) + self.translation
+        return replace(self, translation=moved)
+
+    def points(self, points: np.ndarray) -> np.ndarray:
+        """Where points (N,3) come to lie, float64."""
+        return self.scale * np.asarray(points, np.float64) @ self.rotation.T + self.translation
+
+
+def read_orientation(scene: Path) -> dict[str, Any] | None:
+    """The record beside a scene; None without one. UserError if it is damaged."""
+    path = scene / FILE
+    if not path.is_file():
+        return None
+    try:
+        record = read_json(path)
+    except (OSError, ValueError, RecursionError) as error:
+        raise UserError(f"{path} is not JSON; run convert.py --orient again, or remove it") from error
+    Similarity.of(record, str(path))
+    return record

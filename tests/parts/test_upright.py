@@ -1,0 +1,179 @@
+"""Models of scenes that convert.py --orient has oriented: model.json, and exports in the upright frame."""
+
+import argparse
+import json
+import math
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from gaussians import pipeline
+from html_scene import FOV, SIZE, balls
+from html_scene import cameras as free_cameras
+from scipy.spatial.transform import Rotation
+
+import export
+import train
+from gaussian_renderer import render
+from scene.cameras import Camera
+from scene.readers.info import CameraInfo
+from scene.splats.reading import read_splats
+from scene.with_splats import model_of
+from splatting.camera_paths.keyframes import CameraPath, Keyframe, KeyframePath
+from splatting.camera_paths.poses import poses_of
+from splatting.exports.formats import Around
+from splatting.exports.html import write_html
+from splatting.exports.mesh import Mesh
+from splatting.exports.mesh_files import write_glb_mesh
+from splatting.exports.scene_formats import write_glb
+from splatting.exports.upright import moved_around, moved_cameras, moved_splats, placed
+from splatting.files.json_files import read_model_json
+from splatting.files.similarity import Similarity
+from utils.system_utils import UserError
+
+TURN = Rotation.from_rotvec([1.0, -2.0, 0.5]).as_matrix()
+SOME = Similarity(TURN, 2.5, np.array([3.0, -1.0, 0.5]))
+
+
+def cameras() -> list[Camera]:
+    """The ring of cameras as training views."""
+    poses = poses_of(free_cameras())
+    focal = SIZE[1] / 2 / math.tan(math.radians(FOV) / 2)
+    size = {"width": SIZE[0], "height": SIZE[1], "image_path": ""}
+    infos = [
+        CameraInfo(n, turn, -turn.T @ place, fx=focal, fy=focal, image_name=str(n), **size)
+        for n, (turn, place) in enumerate(zip(poses.turns, poses.positions, strict=True))
+    ]
+    return [Camera(info, SIZE, info.uid) for info in infos]
+
+
+def rendered(splats, camera) -> np.ndarray:
+    with torch.no_grad():
+        return render(camera, model_of(splats), pipeline(), torch.zeros(3))["render"].numpy()
+
+
+def around(make_path=None) -> Around:
+    known = {"cameras": cameras(), "background": (0.0, 0.0, 0.0), "make_path": make_path}
+    return Around(**{name: known.get(name) for name in Around._fields})
+
+
+@pytest.mark.parametrize("scale", [2.5, 0.02])
+def test_a_moved_model_looks_the_same_from_a_moved_camera(scale):
+    """Of SH degree 3. Float32 rounds to other values, so few weights pass the rasterizer's cutoff of 1/255, or fail."""
+    similarity, splats, camera = replace(SOME, scale=scale), balls(degree=3), cameras()[1]
+    moved, (other,) = moved_splats(splats, similarity), moved_cameras([camera], similarity)
+    before, after = rendered(splats, camera), rendered(moved, other)
+    assert before.max() > 0.5 and 10 * math.log10(1 / np.square(before - after).mean()) > 80
+    assert np.abs(before - after).max() < 2 / 255
+    assert np.abs(before - rendered(replace(moved, sh=splats.sh), other)).max() > 0.05
+    assert camera.R is not other.R and np.abs(before - rendered(splats, camera)).max() == 0
+
+
+def test_large_coordinates_lose_nothing():
+    """The world's offset goes through the similarity in double, and the frame after it is small."""
+    offset = np.array([455000.25, 5412000.5, 300.0])
+    world = Similarity(TURN, 2.5, -2.5 * TURN @ (offset + 0.125))
+    splats = replace(balls(degree=0), world_offset=tuple(offset))
+    moved = moved_splats(splats, world.from_local(offset))
+    expected = world.points(splats.means.astype(np.float64) + offset)
+    np.testing.assert_allclose(moved.means, expected, atol=2e-6)
+    assert moved.world_offset == (0, 0, 0) and np.abs(moved.means).max() < 10
+
+
+def test_paths_of_keyframes_move_with_the_model():
+    key = Keyframe(0.0, (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), 40.0)
+    path = KeyframePath(CameraPath((key, replace(key, seconds=2.0)), "linear"))
+    moved = moved_around(around(lambda poses: path), SOME)
+    found = moved.make_path(None).at(1.0)
+    np.testing.assert_allclose(found.position, SOME.points(np.array([key.position]))[0])
+    np.testing.assert_allclose(Rotation.from_quat(found.wxyz, scalar_first=True).as_matrix(), TURN, atol=1e-9)
+    assert found.fov == 40 and moved.make_path(None).seconds == 2
+    np.testing.assert_allclose(poses_of(moved.cameras).positions, SOME.points(poses_of(cameras()).positions), atol=1e-5)
+
+
+def _args(folder: Path | str, upright=False, no_upright=False) -> argparse.Namespace:
+    return argparse.Namespace(model_path=str(folder), upright=upright, no_upright=no_upright)
+
+
+def test_pages_and_meshes_are_upright_by_default_and_others_on_request(tmp_path):
+    record = {"rotation": TURN.tolist(), "scale": 2.5, "translation": [3.0, -1.0, 0.5]}
+    (tmp_path / "model.json").write_text(json.dumps({"similarity": record, "world_offset": [1.0, 2.0, 3.0]}))
+    splats = replace(balls(), world_offset=(1.0, 2.0, 3.0))
+    moved = SOME.points(splats.means.astype(np.float64) + [1.0, 2.0, 3.0])
+    for of_scene, options, is_moved in (
+        (True, {}, True),
+        (True, {"no_upright": True}, False),
+        (False, {}, False),
+        (False, {"upright": True}, True),
+    ):
+        found, _ = placed(_args(tmp_path, **options), of_scene, splats, None)
+        np.testing.assert_allclose(found.means, moved if is_moved else splats.means, atol=1e-5)
+    with pytest.raises(UserError, match="contradict"):
+        placed(_args(tmp_path, True, True), True, splats, None)
+
+
+def test_models_without_a_similarity_stay_and_say_so_when_asked(tmp_path):
+    splats = balls()
+    for folder in ("", tmp_path):
+        assert placed(_args(folder), True, splats, None) == (splats, None)
+        with pytest.raises(UserError, match=r"needs a model folder \(-m\) whose model.json has a similarity"):
+            placed(_args(folder, upright=True), False, splats, None)
+
+
+def _trained(scene: Path, out: Path) -> Path:
+    train.main(["-s", str(scene), "-m", str(out), "--iterations", "3", "--disable_viewer", "--quiet"])
+    return out
+
+
+def test_a_training_keeps_the_similarity_for_exports(colmap_scene, tmp_path, monkeypatch):
+    record = {"rotation": TURN.tolist(), "scale": 2.5, "translation": [3.0, -1.0, 0.5], "unit": "metre"}
+    (colmap_scene / "orientation.json").write_text(json.dumps(record))
+    model = _trained(colmap_scene, tmp_path / "model")
+    assert read_model_json(model)["similarity"] == record
+    for name, more in (("plain", []), ("upright", ["--upright"])):
+        monkeypatch.setattr(sys, "argv", ["export.py", "-m", str(model), "--to", str(tmp_path / f"{name}.ply"), *more])
+        export.main()
+    plain, upright = (read_splats(tmp_path / f"{name}.ply") for name in ("plain", "upright"))
+    np.testing.assert_allclose(upright.means, SOME.points(plain.means), atol=1e-5)
+    (colmap_scene / "orientation.json").unlink()
+    assert "similarity" not in read_model_json(_trained(colmap_scene, tmp_path / "other"))
+
+
+@pytest.mark.parametrize("place", [(47.25, 8.5, 410.0), ()])
+@pytest.mark.parametrize("kind", ["splats", "mesh"])
+def test_glb_tells_where_on_earth_it_is(tmp_path, place, kind):
+    """-x of the turned node is east, y up, z north (README of EXT_georeference); x, y, z were east, down, north."""
+    splats = replace(moved_splats(balls(), replace(SOME, place=place)), world_offset=(0.0, 0.0, 0.0))
+    if kind == "mesh":
+        triangle = Mesh(np.eye(3, dtype=np.float32), np.int32([[0, 1, 2]]), np.zeros((3, 3), np.uint8))
+        write_glb_mesh(tmp_path / "x.glb", triangle, splats)
+    else:
+        write_glb(tmp_path / "x.glb", splats)
+    content = (tmp_path / "x.glb").read_bytes()
+    document = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    (node,) = document["nodes"]
+    turn = Rotation.from_quat(node["rotation"]).as_matrix()
+    if not place:
+        assert "EXT_georeference" not in document["extensionsUsed"] and "extensions" not in node
+        np.testing.assert_allclose(turn, np.diag([1, -1, -1]), atol=1e-9)
+    else:
+        assert "EXT_georeference" in document["extensionsUsed"]
+        assert node["extensions"] == {"EXT_georeference": {"latitude": 47.25, "longitude": 8.5}}
+        np.testing.assert_allclose(turn, np.diag([-1, -1, 1]), atol=1e-9)
+
+
+def test_a_page_takes_the_vertical_of_the_similarity(tmp_path):
+    """Also where the cameras' horizons, all tilted here, say otherwise: the page's model is the moved one."""
+    moved, places = moved_splats(balls(), SOME), moved_around(around(), SOME)
+    settings = {}
+    for name, value in (("kept", places), ("found", places._replace(upright=False))):
+        write_html(tmp_path / f"{name}.html", moved, value.cameras, upright=value.upright)
+        text = (tmp_path / f"{name}.html").read_text(encoding="utf-8")
+        settings[name] = json.loads(re.search(r'<script[^>]*id="page"[^>]*>(.*?)</script>', text, re.S)[1])["settings"]
+    position = poses_of(places.cameras).positions[0] * [-1, -1, 1]  # the viewer turns models half around z
+    np.testing.assert_allclose(settings["kept"]["cameras"][0]["initial"]["position"], position, atol=1e-6)
+    assert np.abs(settings["found"]["cameras"][0]["initial"]["position"] - position).max() > 0.1
