@@ -1,6 +1,7 @@
 """Show a trained model on a web page that this process serves.
 
 python view.py -m MODEL [--iteration N] [--port PORT]
+python view.py -s SCENE                                 # cameras, photos and points, before a training
 python view.py FILE                                     # a model of any tool, without a scene
 """
 
@@ -29,6 +30,7 @@ from splatting.exports.cleaning import check_clean, clean_scene
 from splatting.exports.reading import ANY, read_any
 from splatting.viewer.page import Page, serve
 from splatting.viewer.server import HOST_OPTION, PORT, checked_address
+from splatting.viewer.untrained import untrained
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, run_cli
 
@@ -78,20 +80,25 @@ def main() -> None:
     if args.file and args.model_path:
         raise UserError(f"-m {args.model_path} has a model of its own; leave {args.file} or -m out")
     check_clean(args.clean)
-    if args.clean and args.file:
-        raise UserError("--clean needs training views; give the model's folder with -m")
-    args = args if args.file else get_combined_args(parser)
+    if args.clean and not args.model_path:
+        raise UserError("--clean needs training views of a model; give the model's folder with -m")
+    before = bool(args.source_path) and not (args.file or args.model_path)
+    args = args if args.file or before else get_combined_args(parser)
     options, pipeline = model_params.extract(args), pipeline_params.extract(args)
     place = checked_address(args.viewer_host, args.port)
     safe_state(args.quiet)
     if args.file:
         scene = of_file(args.file, pipeline)
+    elif before:
+        scene = untrained(options)
     else:
         warn_of_background(options)
         scene = of_folder(options, args)
     if len(scene.gaussians) == 0:
         raise UserError(f"{scene.loaded_iter} of {scene.model_path} has no Gaussians; choose another model")
     page = Page(place, scene, pipeline, options.white_background, scene.halves, kept(scene, args, pipeline, options))
+    if before:
+        page.before_training()
     try:
         raise serve(page)
     finally:

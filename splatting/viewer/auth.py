@@ -6,7 +6,9 @@ connections as come. Each of these could end a training.
 
 import asyncio
 import contextlib
+import gzip
 import hmac
+import html
 import http
 import logging
 import math
@@ -28,6 +30,7 @@ MOST = 64  # connections at a time, those that have not said anything yet among 
 LARGEST = 1 << 16  # bytes of a message; a browser's have some hundred
 UNREAD = 8 << 20  # bytes that may wait for a browser to read them when more are to be sent; a frame has fewer
 PATIENCE = 60.0  # seconds in which a browser has to read what was sent
+_TITLE = b"<title>Viser</title>"  # of viser's document
 _GOODBYE = 0.5  # seconds that the end waits for a browser that does not answer
 _LEAST_UP = 1e-6  # length of a camera's upward direction; without one, viser cannot move the camera
 _LARGEST_NUMBER = 2**53  # of a control. Up to it, floats are exact, and its whole numbers can be sent to others
@@ -165,7 +168,7 @@ class Auth:
     addresses, a random `token` is needed: in the address (?token=), or in the cookie that is set by the first answer.
 
     present: the connections, in the order in which they came. control: as for `is_accepted`. stands: whether viser has
-    asked for requests to be checked.
+    asked for requests to be checked. title: of the document.
     """
 
     def __init__(self, host: str) -> None:
@@ -173,6 +176,7 @@ class Auth:
         self.present: dict[_Checked, None] = {}
         self.control: Callable[[str], Any] = lambda uuid: None
         self.stands = False
+        self.title = ""
 
     def has_room(self) -> bool:
         """Whether one more connection may come. For it, the oldest goes that has opened no websocket.
@@ -216,11 +220,23 @@ class Auth:
             return connection.respond(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
         response = further(connection, request)
         if response is not None:
+            self._entitle(response)
             host = request.headers["Host"]
             response.headers.update(_HEADERS | {"Content-Security-Policy": _policy(host)})
             if self.token is not None:
                 response.headers["Set-Cookie"] = f"{_cookie(host)}={self.token}; HttpOnly; SameSite=Strict; Path=/"
         return response
+
+    def _entitle(self, response: Response) -> None:
+        """Give the document, which is called after viser, the page's own title."""
+        if not response.headers.get("Content-Type", "").startswith("text/html"):
+            return
+        packed = response.headers.get("Content-Encoding") == "gzip"
+        body = gzip.decompress(response.body) if packed else response.body
+        body = body.replace(_TITLE, f"<title>{html.escape(self.title)}</title>".encode(), 1)
+        response.body = gzip.compress(body, 1) if packed else body
+        del response.headers["Content-Length"]
+        response.headers["Content-Length"] = str(len(response.body))
 
     @contextlib.contextmanager
     def in_front_of_viser(self) -> Iterator[None]:

@@ -117,6 +117,11 @@ class Page:
         self._gaussians = self.frames.gaussians = gaussians
         self.show_numbers(iteration, len(gaussians))
 
+    def before_training(self) -> None:
+        """Show that the Gaussians are the points of a scene, and where its cameras stand."""
+        self.iteration.visible, self.count.label = False, "Points"
+        self.images.draw_cameras()
+
     def settings(self) -> Settings:
         """What the controls say now."""
         return self.images.read(self.view.read())

@@ -57,6 +57,7 @@ def serve(address: Address, label: str) -> tuple["viser.ViserServer", str]:
     warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)
     port = _free_port(address)
     auth = Auth(address.host)
+    auth.title = label
     with auth.in_front_of_viser(), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(address.host, port, label=label, verbose=False)
     if not auth.stands:

@@ -183,7 +183,9 @@ class ImagesTab:
         hint = "shown while the view is that of the chosen camera"
         self.comparison = gui.add_dropdown("Compare", views.COMPARISONS, hint=hint)
         self.slider = gui.add_slider("Slider", 0.0, 1.0, 0.005, 0.5, hint="0: render, 1: photo", visible=False)
-        shown = gui.add_checkbox("Draw cameras", False, hint="a click on one jumps there; those near the view fade")
+        shown = self._shown = gui.add_checkbox(
+            "Draw cameras", False, hint="a click on one jumps there; those near the view fade"
+        )
         colours = gui.add_markdown("Training views are blue, test views orange.", visible=False)
         self._begin()
         # In turn, so that the view does not get its place from one camera and its direction from the next.
@@ -196,6 +198,10 @@ class ImagesTab:
     def read(self, settings: Settings) -> Settings:
         """The settings, with what these controls say."""
         return replace(settings, camera=self.camera.value, comparison=self.comparison.value, slider=self.slider.value)
+
+    def draw_cameras(self) -> None:
+        """Draw the cameras from the start."""
+        self._shown.value = True
 
     def _begin(self) -> None:
         """Let browsers that come from now on begin at the chosen camera."""
