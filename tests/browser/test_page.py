@@ -53,7 +53,7 @@ def _field(tab, label: str):
 
 
 def _number(tab, label: str) -> float:
-    return float(_field(tab, label).input_value().replace(",", "") or "nan")
+    return float(_field(tab, label).input_value().split(" of ")[0].replace(",", "") or "nan")
 
 
 def _until(holds: Callable[[], bool], what: str) -> None:

@@ -13,7 +13,7 @@ from report_runs import set_runs
 from splatting.evaluation.report import make_report, write_report
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Page
+    from playwright.sync_api import Locator, Page
 
 pytestmark = pytest.mark.browser
 WINDOW = 1280, 720
@@ -77,6 +77,22 @@ def test_each_scene_fills_a_screen_and_nothing_overflows(tab, report, width, hei
     assert max(tab.evaluate(lines)) < 2.5  # no cell is broken into three lines
     figures = tab.locator(".figures img").all()
     assert len(figures) == 2 * 5 and min(figure.bounding_box()["width"] for figure in figures) > 330
+
+
+def test_a_table_that_is_too_wide_has_a_shadow_at_its_edge(tab, report):
+    tab.set_viewport_size({"width": 390, "height": 844})
+    tab.goto(report.as_uri())
+    wide = [it for it in tab.locator(".scroll:visible").all() if it.evaluate("it => it.scrollWidth > it.clientWidth")]
+    assert wide
+    for box in wide:
+        assert _edge(box) < 190  # grey
+        box.evaluate("it => { it.scrollLeft = it.scrollWidth; }")
+        assert _edge(box) > 240
+
+
+def _edge(box: "Locator") -> float:
+    """The median brightness of a table's last column of pixels but one."""
+    return float(np.median(np.asarray(Image.open(io.BytesIO(box.screenshot())).convert("L"))[:, -2]))
 
 
 def test_the_option_sets_lie_side_by_side_for_the_same_view(tab, report):

@@ -1,0 +1,78 @@
+"""Pages before a training and at its beginning, in a real browser, on a screen and on a phone."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from synthetic import make_colmap_scene
+
+pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
+pytestmark = pytest.mark.browser
+ROOT = Path(__file__).resolve().parents[2]
+WINDOW = 1280, 720
+SIZES = pytest.mark.parametrize("size", [(1280, 720), (390, 844)])
+TIMEOUT = 60_000  # ms
+
+
+@contextmanager
+def _serving(*words: object) -> Iterator[tuple[str, subprocess.Popen]]:
+    """A command that serves a page: its address, and its process."""
+    streams = {"stderr": subprocess.PIPE, "stdout": subprocess.DEVNULL, "text": True}
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen([sys.executable, *map(str, words)], cwd=ROOT, env=environment, **streams)
+    try:
+        said = ""
+        while not (found := re.search(r"viewer: (http://\S+)", said)):
+            line = process.stderr.readline()
+            assert line, said
+            said += line
+        yield found[1], process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def _field(tab, label: str):
+    return tab.locator(f'label:text-is("{label}")').locator("xpath=following::input[not(@type='hidden')][1]")
+
+
+@SIZES
+def test_a_scene_is_shown_before_its_training(tab, tmp_path, size):
+    make_colmap_scene(tmp_path / "attic")
+    tab.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
+    with _serving("view.py", "-s", tmp_path / "attic", "--port", 0) as (address, _):
+        tab.goto(address)
+        tab.get_by_role("tab", name="Photos").click(timeout=TIMEOUT)
+        assert tab.title() == "attic"
+        assert _field(tab, "Points").input_value() == "300" and tab.get_by_text("Iteration", exact=True).count() == 0
+        assert tab.get_by_role("checkbox", name="Draw cameras").is_checked()
+        tab.get_by_role("combobox", name="Compare").wait_for()
+
+
+@SIZES
+def test_a_paused_training_says_its_length_and_ends_by_a_signal(tab, tmp_path, size):
+    make_colmap_scene(tmp_path / "attic")
+    tab.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
+    words = "-s", tmp_path / "attic", "-m", tmp_path / "out", "--iterations", 7000, "--viewer", 0, "--paused"
+    with _serving("train.py", *words) as (address, process):
+        tab.goto(address)
+        tab.get_by_role("tab", name="Training").click(timeout=TIMEOUT)
+        assert tab.title() == "out"
+        tab.get_by_role("button", name="Resume").wait_for(timeout=TIMEOUT)
+        assert _field(tab, "Iteration").input_value() == "1 of 7,000"
+        tab.get_by_role("button", name="Resume").click()
+        tab.wait_for_function(
+            "[...document.querySelectorAll('input')].some((it) => / to go$/.test(it.value))", timeout=TIMEOUT
+        )
+        tab.get_by_role("button", name="Pause").click()
+        process.send_signal(signal.SIGINT)
+        said = process.communicate(timeout=60)[1]
+        assert process.returncode == 130 and "Traceback" not in said
+        assert list((tmp_path / "out").glob("chkpnt*.pth"))
+        tab.goto("about:blank")
