@@ -68,7 +68,8 @@ def test_a_paused_training_says_its_length_and_ends_by_a_signal(tab, tmp_path, s
         assert _field(tab, "Iteration").input_value() == "1 of 7,000"
         tab.get_by_role("button", name="Resume").click()
         tab.wait_for_function(
-            "[...document.querySelectorAll('input')].some((it) => / to go$/.test(it.value))", timeout=TIMEOUT
+            r"[...document.querySelectorAll('input')].some((it) => /^(\d+ \w+ )?\d+ (s|min)$/.test(it.value))",
+            timeout=TIMEOUT,
         )
         tab.get_by_role("button", name="Pause").click()
         process.send_signal(signal.SIGINT)
