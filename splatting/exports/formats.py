@@ -87,6 +87,12 @@ def _mesh_by(write: Callable[[str | os.PathLike, Mesh, Splats], None]) -> Callab
     return write_mesh
 
 
+def _write_tileset(path: str | os.PathLike, splats: Splats, around: Around) -> str:
+    from splatting.exports.tiles3d import write_tileset  # as it imports the rasterizer
+
+    return write_tileset(path, splats, around)
+
+
 # An ending that ends with another one comes before it.
 FORMATS = (
     Format(
@@ -107,6 +113,7 @@ FORMATS = (
     Format(".spz", write_spz, "Niantic, version 4", check=find_zstandard),
     Format(".sog", write_sog, "PlayCanvas, through splat-transform", check=find_program),
     Format(".glb", write_glb, "glTF with KHR_gaussian_splatting, float32"),
+    Format("tileset.json", _write_tileset, "3D Tiles of such GLB, by levels of detail", of_scene=True, around=True),
     Format(".usdz", write_usdz, "OpenUSD, float32", check=find_pxr),
     Format(
         ".html", _write_html, "a page with a viewer", True, ("path", "start", "title", "raw"), around=True, clean=True

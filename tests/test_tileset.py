@@ -1,0 +1,193 @@
+"""tileset.json: Gaussians merged by moments, the octree, 3D Tiles by their specification, and what levels lose."""
+
+import argparse
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from gaussians import pipeline
+from scipy.spatial.transform import Rotation
+from small_splats import extreme_splats, splats
+
+from scene.splats.splats import Splats, opacities, selected
+from splatting.camera_paths.without_scene import circle
+from splatting.exports import tiles3d
+from splatting.exports.formats import Around, format_of
+from splatting.exports.levels import GROUP, joined, losses, octree
+from splatting.exports.merging import areas, footprints, merged
+from utils.system_utils import UserError
+
+
+def _around(some: Splats) -> Around:
+    return Around(circle(some.means)[:1], (0.0, 0.0, 0.0), pipeline(), None, None)
+
+
+def _written(path: Path, some: Splats) -> dict:
+    format_of(path).write(path, some, _around(some))
+    return json.loads(path.read_text())
+
+
+def _judged_covariances(some: Splats) -> np.ndarray:
+    """By SciPy's rotations, which have the real part last."""
+    turns = Rotation.from_quat(some.rotations[:, [1, 2, 3, 0]].astype(np.float64)).as_matrix()
+    return np.einsum("nik,nk,njk->nij", turns, np.exp(2 * some.log_scales.astype(np.float64)), turns)
+
+
+def test_merging_keeps_the_moments_of_each_group():
+    some, starts = splats(50, 2), np.array([0, 1, 9, 30])
+    one, spread = merged(some, starts)
+    weights = opacities(some) * areas(np.exp(some.log_scales.astype(np.float64)))
+    ours, judged = _judged_covariances(one), _judged_covariances(some)
+    for k, rows in enumerate(np.split(np.arange(50), starts[1:])):
+        share = weights[rows] / weights[rows].sum()
+        mean = share @ some.means[rows].astype(np.float64)
+        apart = some.means[rows] - mean
+        between = np.einsum("n,ni,nj->ij", share, apart, apart)
+        covariance = np.einsum("n,nij->ij", share, judged[rows]) + between
+        np.testing.assert_allclose(one.means[k], mean, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(ours[k], covariance, atol=2e-6 * np.abs(covariance).max())
+        np.testing.assert_allclose(one.sh[k], np.einsum("n,nkc->kc", share, some.sh[rows]), rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(spread[k], np.sqrt(np.trace(between)), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(footprints(one), np.add.reduceat(weights, starts), rtol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(one.rotations, axis=1), 1, atol=1e-6)
+
+
+def test_a_merged_gaussian_of_one_is_that_one():
+    some = splats(30)
+    one, spread = merged(some, np.arange(30))
+    np.testing.assert_allclose(_judged_covariances(one), _judged_covariances(some), rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(opacities(one), np.minimum(opacities(some), 0.999), rtol=1e-4)
+    assert not spread.any()
+
+
+def test_areas_are_those_of_shadows():
+    np.testing.assert_allclose(areas(np.array([[2.0, 2, 2]])), np.pi * 4)
+    # A disc's shadows have half of its area in the mean.
+    np.testing.assert_allclose(areas(np.array([[3.0, 3, 1e-9]])), np.pi * 9 / 2, rtol=0.012)
+
+
+def test_transparent_groups_and_copies_merge():
+    some = splats(8, 0)
+    some.opacity_logits[:4], some.log_scales[:4] = -np.inf, -80  # a footprint of 0
+    some.means[4:] = some.means[4]
+    one, spread = merged(some, np.array([0, 4]))
+    assert opacities(one)[0] < 1e-300 and np.isfinite(one.means).all() and spread[1] < 1e-12
+    np.testing.assert_allclose(one.means[0], some.means[:4].mean(axis=0), rtol=1e-5, atol=1e-6)
+
+
+def test_every_gaussian_is_in_one_leaf_and_levels_shrink():
+    some = splats(3000, 1)
+    some.means[7] = [1e6, 0, 0]
+    root = octree(some, most=200)
+    leaves = [tile for tile in root.all() if not tile.children]
+    assert max(len(leaf.splats) for leaf in leaves) <= 200
+    together = joined([leaf.splats for leaf in leaves])
+    for name in ("means", "log_scales", "opacity_logits"):
+        one, other = (np.sort(getattr(each, name), axis=0) for each in (together, some))
+        np.testing.assert_array_equal(one, other)
+    for tile in root.all():
+        if tile.children:
+            assert len(tile.splats) == -(-sum(len(child.splats) for child in tile.children) // GROUP)
+    counts = [sum(len(tile.splats) for tile in root.level(depth)) for depth in range(root.levels)]
+    assert counts == sorted(counts) and counts[-1] == 3000
+    copies = selected(some, np.zeros(500, int))
+    assert not octree(copies, most=200).children  # which no cell can split
+
+
+def _corners(box: list[float]) -> tuple[np.ndarray, np.ndarray]:
+    middle, half = np.array(box[:3]), np.array(box[3:]).reshape(3, 3)
+    assert not (half - np.diag(np.diag(half))).any() and (np.diag(half) >= 0).all()
+    return middle - np.diag(half), middle + np.diag(half)
+
+
+def _positions(path: Path) -> np.ndarray:
+    """POSITION of a GLB as a viewer of tiles places it: by the node's half turn, then from y up to z up."""
+    content = path.read_bytes()
+    (size,) = struct.unpack_from("<I", content, 12)
+    gltf, binary = json.loads(content[20 : 20 + size]), content[28 + size :]
+    assert gltf["nodes"][0]["rotation"] == [1, 0, 0, 0] and gltf["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    accessor = gltf["accessors"][gltf["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
+    view = gltf["bufferViews"][accessor["bufferView"]]
+    flat = np.frombuffer(binary, "<f4", 3 * accessor["count"], view["byteOffset"]).reshape(-1, 3)
+    turned = Rotation.from_quat([1, 0, 0, 0]).apply(flat)
+    return Rotation.from_euler("x", 90, degrees=True).apply(turned)
+
+
+def test_tilesets_are_as_3d_tiles_asks(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(tiles3d, "octree", lambda some: octree(some, most=150))
+    some = splats(1000, 1)
+    tileset = _written(tmp_path / "tileset.json", some)
+    assert tileset["asset"]["version"] == "1.1" and tileset["root"]["refine"] == "REPLACE"
+    assert tileset["geometricError"] >= tileset["root"]["geometricError"]
+    found, contents = [], []
+
+    def check(tile: dict) -> None:
+        low, high = _corners(tile["boundingVolume"]["box"])
+        contents.append(tile["content"]["uri"])
+        places = _positions(tmp_path / tile["content"]["uri"])
+        slack = 1e-5 * np.abs([low, high]).max()
+        assert (places >= low - slack).all() and (places <= high + slack).all()
+        for child in tile.get("children", ()):
+            below, above = _corners(child["boundingVolume"]["box"])
+            assert (below >= low - slack).all() and (above <= high + slack).all()
+            assert child["geometricError"] < tile["geometricError"]
+            check(child)
+        if "children" not in tile:
+            assert tile["geometricError"] == 0
+            found.append(places)
+
+    check(tileset["root"])
+    files = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.glb")}
+    assert files == set(contents) and len(contents) == len(files) > 9
+    leaves = np.concatenate(found)[:, [0, 2, 1]] * [1, -1, 1]
+    np.testing.assert_allclose(np.sort(leaves, axis=0), np.sort(some.means, axis=0), atol=1e-5)
+    printed = capsys.readouterr().out
+    assert " 1,000 | " in printed and "equal" in printed and "photos" not in printed
+
+
+def test_a_new_tileset_takes_the_place_of_the_earlier_one(tmp_path):
+    path = tmp_path / "tileset.json"
+    first = _written(path, splats(20, 0))
+    assert _written(path, splats(20, 0)) == first
+    second = _written(path, splats(30, 0))
+    assert {entry.name for entry in tmp_path.iterdir()} == {"tileset.json", second["asset"]["extras"]["folder"]}
+
+
+def test_a_failed_tileset_leaves_the_earlier_one(tmp_path, monkeypatch):
+    path = tmp_path / "tileset.json"
+    _written(path, splats(20, 0))
+    before = {entry.name for entry in tmp_path.rglob("*")}
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(tiles3d, "write_glb", full)
+    with pytest.raises(UserError, match="No space left"):
+        _written(path, splats(30, 0))
+    assert {entry.name for entry in tmp_path.rglob("*")} == before
+    monkeypatch.undo()
+    monkeypatch.setattr(tiles3d, "document", full)
+    with pytest.raises(UserError, match="No space left"):
+        _written(path, splats(30, 0))
+    assert {entry.name for entry in tmp_path.rglob("*")} == before
+
+
+@pytest.mark.parametrize("some", [splats(0, 0), extreme_splats()], ids=["empty", "extreme"])
+def test_empty_and_extreme_models_have_tilesets(tmp_path, some, monkeypatch):
+    monkeypatch.setattr(tiles3d, "octree", lambda some: octree(some, most=2))
+    tileset = _written(tmp_path / "tileset.json", some)
+    assert ("content" in tileset["root"]) == bool(len(some))
+    assert np.isfinite(tileset["root"]["boundingVolume"]["box"]).all()
+
+
+def test_finer_levels_lose_less():
+    some = splats(1200, 0)
+    root = octree(some, most=60)
+    around = _around(some)
+    found = losses(root, around.cameras, around.background, argparse.Namespace(**vars(around.pipe)))
+    scores = [level["psnr"] for level in found]
+    assert scores[-1] is None and scores[:-1] == sorted(scores[:-1]) and scores[0] > 5
+    assert all(level["photos"] is None for level in found) and torch.is_grad_enabled()
