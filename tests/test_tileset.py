@@ -16,6 +16,7 @@ from scene.splats.splats import Splats, opacities, selected
 from splatting.camera_paths.without_scene import circle
 from splatting.exports import tiles3d
 from splatting.exports.formats import Around, format_of
+from splatting.exports.grouping import groups_of
 from splatting.exports.levels import GROUP, joined, losses, octree
 from splatting.exports.merging import areas, footprints, merged
 from utils.system_utils import UserError
@@ -76,6 +77,25 @@ def test_transparent_groups_and_copies_merge():
     one, spread = merged(some, np.array([0, 4]))
     assert opacities(one)[0] < 1e-300 and np.isfinite(one.means).all() and spread[1] < 1e-12
     np.testing.assert_allclose(one.means[0], some.means[:4].mean(axis=0), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 4, 5, 63, 1000])
+def test_groups_are_full_and_close(count):
+    some = splats(count, 0)
+    order, starts = groups_of(some, 4)
+    sizes = np.diff(np.append(starts, count))
+    assert sorted(order) == list(range(count)) and len(starts) == -(-count // 4)
+    assert starts[0] == 0 and sizes.min() >= 1 and sizes.max() <= 4
+    if count == 1000:
+        assert merged(selected(some, order), starts)[1].mean() < merged(some, starts)[1].mean() / 2
+
+
+def test_groups_keep_colours_apart():
+    some = splats(64, 0)
+    some.means[1:] = 0
+    some.sh[::2], some.sh[1::2] = 3, -3
+    order, starts = groups_of(some, 4)
+    assert set(np.abs(merged(selected(some, order), starts)[0].sh[:, 0, 0]).round(4)) == {3}
 
 
 def test_every_gaussian_is_in_one_leaf_and_levels_shrink():

@@ -11,16 +11,18 @@ import torch
 
 from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
-from scene.gaussians.morton import morton_codes
 from scene.splats.splats import Splats, selected
 from scene.with_splats import model_of
+from splatting.exports.grouping import groups_of
 from splatting.exports.merging import covariances, merged
 from splatting.host.progress import Bar
 from utils.image_utils import as_float, mean_psnr, pixels_that_count
 from utils.system_utils import compute_device
 
 MOST = 4096  # Gaussians of a leaf, about 1 MB
-GROUP = 8  # Gaussians of a tile's children that become one of the tile
+# Gaussians of a tile's children that become one of the tile: half the resolution of a surface. So tiles of all levels
+# are of about one size.
+GROUP = 4
 _DEEPEST = 40  # level of leaves that are not split any more, as of many Gaussians at one place
 _REACH = 3.0  # standard deviations of a Gaussian that a box holds
 
@@ -69,10 +71,8 @@ def octree(splats: Splats, most: int = MOST, name: str = "r") -> Tile:
     octants = (splats.means > (low + high) / 2) @ np.array([1, 2, 4])
     children = tuple(octree(selected(splats, octants == k), most, f"{name}{k}") for k in np.unique(octants))
     below = joined([child.splats for child in children])
-    codes = morton_codes(torch.from_numpy(below.means - middle_of(below)), _unit(below))
-    order = np.argsort(codes.numpy(), kind="stable")
-    groups = -(-len(below) // GROUP)
-    own, spread = merged(selected(below, order), np.arange(groups) * len(below) // groups)
+    order, starts = groups_of(below, GROUP)
+    own, spread = merged(selected(below, order), starts)
     error = max(child.error for child in children) + float(np.sqrt(np.mean(spread**2)))
     corners = [_box(own), *((child.low, child.high) for child in children)]
     lows, highs = zip(*corners, strict=True)
@@ -83,16 +83,6 @@ def joined(several: Sequence[Splats]) -> Splats:
     """Splats of several tiles, one after another."""
     names = ("means", "log_scales", "rotations", "opacity_logits", "sh")
     return replace(several[0], **{name: np.concatenate([getattr(some, name) for some in several]) for name in names})
-
-
-def middle_of(splats: Splats) -> np.ndarray:
-    """The median (3,) of the means."""
-    return np.median(splats.means, axis=0)
-
-
-def _unit(splats: Splats) -> float:
-    """What the places on the Morton curve are relative to: a median distance from the middle."""
-    return float(np.median(np.abs(splats.means - middle_of(splats)).max(axis=1))) or 1.0
 
 
 def _bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
