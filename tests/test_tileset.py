@@ -1,7 +1,8 @@
-"""tileset.json: Gaussians merged by moments, the octree, 3D Tiles by their specification, and what levels lose."""
+"""tileset.json and lod-meta.json: Gaussians merged by moments, the octree, both formats, and what levels lose."""
 
 import argparse
 import json
+import shutil
 import struct
 from pathlib import Path
 
@@ -12,13 +13,15 @@ from gaussians import pipeline
 from scipy.spatial.transform import Rotation
 from small_splats import extreme_splats, splats
 
+from scene.splats.reading import read_splats
 from scene.splats.splats import Splats, opacities, selected
 from splatting.camera_paths.without_scene import circle
-from splatting.exports import tiles3d
+from splatting.exports import streamed, tiles3d
 from splatting.exports.formats import Around, format_of
 from splatting.exports.grouping import groups_of
 from splatting.exports.levels import GROUP, joined, losses, octree
 from splatting.exports.merging import areas, footprints, merged
+from splatting.exports.sog import PROGRAM, run_program
 from utils.system_utils import UserError
 
 
@@ -211,3 +214,26 @@ def test_finer_levels_lose_less():
     scores = [level["psnr"] for level in found]
     assert scores[-1] is None and scores[:-1] == sorted(scores[:-1]) and scores[0] > 5
     assert all(level["photos"] is None for level in found) and torch.is_grad_enabled()
+
+
+@pytest.mark.skipif(not shutil.which(PROGRAM), reason=f"{PROGRAM} is not on PATH: npm i -g @playcanvas/splat-transform")
+def test_streamed_sog_has_every_level(tmp_path, monkeypatch):
+    monkeypatch.setattr(streamed, "octree", lambda some: octree(some, most=150))
+    some, path = splats(600, 0), tmp_path / "out" / "lod-meta.json"
+    content = _written(path, some)
+    root = octree(some, most=150)
+    counts = [sum(len(tile.splats) for tile in root.level(depth)) for depth in range(root.levels)]
+    assert content["counts"] == counts[::-1] and content["lodLevels"] == root.levels
+    (finest,) = (name for name in content["filenames"] if "/0_" in name)
+    run_program(PROGRAM, [str(path.parent / finest)], tmp_path / "read.ply", finest)
+    read = read_splats(tmp_path / "read.ply")
+    np.testing.assert_allclose(np.sort(read.means, axis=0), np.sort(some.means, axis=0), atol=1e-3)
+    assert _written(path, some) == content
+    assert {entry.name for entry in path.parent.iterdir()} == {path.name, content["asset"]["extras"]["folder"]}
+
+
+def test_streamed_sog_needs_its_program(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match="needs splat-transform; install Node"):
+        format_of("lod-meta.json").check("lod-meta.json")

@@ -93,6 +93,12 @@ def _write_tileset(path: str | os.PathLike, splats: Splats, around: Around) -> s
     return write_tileset(path, splats, around)
 
 
+def _write_lod_meta(path: str | os.PathLike, splats: Splats, around: Around) -> str:
+    from splatting.exports.streamed import write_lod_meta  # as it imports the rasterizer, too
+
+    return write_lod_meta(path, splats, around)
+
+
 # An ending that ends with another one comes before it.
 FORMATS = (
     Format(
@@ -114,6 +120,14 @@ FORMATS = (
     Format(".sog", write_sog, "PlayCanvas, through splat-transform", check=find_program),
     Format(".glb", write_glb, "glTF with KHR_gaussian_splatting, float32"),
     Format("tileset.json", _write_tileset, "3D Tiles of such GLB, by levels of detail", of_scene=True, around=True),
+    Format(
+        "lod-meta.json",
+        _write_lod_meta,
+        "streamed SOG, by the same levels",
+        of_scene=True,
+        around=True,
+        check=find_program,
+    ),
     Format(".usdz", write_usdz, "OpenUSD, float32", check=find_pxr),
     Format(
         ".html", _write_html, "a page with a viewer", True, ("path", "start", "title", "raw"), around=True, clean=True

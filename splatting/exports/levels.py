@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from scene.splats.splats import Splats, selected
 from scene.with_splats import model_of
 from splatting.exports.grouping import groups_of
 from splatting.exports.merging import covariances, merged
+from splatting.files.listing import markdown_table
 from splatting.host.progress import Bar
 from utils.image_utils import as_float, mean_psnr, pixels_that_count
 from utils.system_utils import compute_device
@@ -94,6 +96,30 @@ def _box(splats: Splats) -> tuple[np.ndarray, np.ndarray]:
     low, _ = _bounds(splats.means - reach)
     _, high = _bounds(splats.means + reach)
     return low, high
+
+
+class Views(Protocol):
+    """What levels are compared on: as `splatting.exports.formats.Around`."""
+
+    cameras: Sequence[Camera]
+    background: Sequence[float]
+    pipe: argparse.Namespace
+
+
+def table(root: Tile, sizes: Sequence[int], around: Views) -> str:
+    """What each level has and loses, coarsest first, as Markdown. sizes: of the levels, bytes."""
+    found = losses(root, around.cameras, around.background, around.pipe)
+    best, rows = found[-1]["photos"], []
+    for depth, (loss, size) in enumerate(zip(found, sizes, strict=True)):
+        tiles = root.level(depth)
+        counts = len(tiles), sum(len(tile.splats) for tile in tiles), size
+        row = [str(depth), *(f"{count:,}" for count in counts), f"{max(tile.error for tile in tiles):.3g}"]
+        row.append("equal" if loss["psnr"] is None else f"{loss['psnr']:.2f}")
+        if best is not None:
+            row += [f"{loss['photos']:.2f}", f"{loss['photos'] - best:+.2f}"]
+        rows.append(row)
+    header = ["level", "tiles", "Gaussians", "bytes", "error (units)", "dB to the model"]
+    return markdown_table(header + ["dB to the photos", "change"] * (best is not None), rows).rstrip("\n")
 
 
 @torch.no_grad()

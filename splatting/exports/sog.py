@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
@@ -33,15 +34,20 @@ def write_sog(path: str | os.PathLike, splats: Splats) -> None:
     with temporary_folder() as folder, atomic_write(path) as temporary:
         model, packed = folder / "model.ply", folder / "model.sog"
         write_plain_ply(model, splats)
-        # Without a GPU, as its results differ from machine to machine.
-        options = [os.environ.get("NODE_OPTIONS", ""), f"--import=data:text/javascript,{quote(_SEEDED)}"]
-        environment = {**os.environ, "NODE_OPTIONS": " ".join(options).strip()}
-        command = [program, "--quiet", "--overwrite", "--gpu", "cpu", str(model), str(packed)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
-        if done.returncode or not packed.is_file():
-            said = (done.stderr or done.stdout).strip().splitlines() or ["it said nothing"]
-            raise UserError(f"{PROGRAM} could not write {path} ({said[-1]}); choose another format, or update it")
+        run_program(program, [str(model)], packed, path)
         _copy_without_dates(packed, temporary)
+
+
+def run_program(program: str, inputs: Sequence[str], output: Path, path: str | os.PathLike) -> None:
+    """Have splat-transform write `output`, the same bytes each time. UserError, about `path`, if it cannot."""
+    # Without a GPU, as its results differ from machine to machine.
+    options = [os.environ.get("NODE_OPTIONS", ""), f"--import=data:text/javascript,{quote(_SEEDED)}"]
+    environment = {**os.environ, "NODE_OPTIONS": " ".join(options).strip()}
+    command = [program, "--quiet", "--overwrite", "--gpu", "cpu", *inputs, str(output)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    if done.returncode or not output.is_file():
+        said = (done.stderr or done.stdout).strip().splitlines() or ["it said nothing"]
+        raise UserError(f"{PROGRAM} could not write {path} ({said[-1]}); choose another format, or update it")
 
 
 def _copy_without_dates(source: Path, target: Path) -> None:

@@ -5,33 +5,19 @@ and tiles have z up, so a viewer turns x y z of a GLB to x -z y. Boxes are in th
 globe.
 """
 
-import contextlib
-import hashlib
 import json
 import os
-import shutil
-from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from scene.splats.splats import Splats
-from splatting.exports.levels import Tile, losses, octree
+from splatting.exports.beside import PLACE, with_folder
+from splatting.exports.levels import Tile, Views, octree, table
 from splatting.exports.scene_formats import EXTENSION, write_glb
-from splatting.files.listing import markdown_table
-from utils.system_utils import atomic_write, mkdir_p
 
 _ANNOUNCED = "3DTILES_content_gltf"  # says ahead of loading which extensions GLB files use
-_FOLDER = "tiles-"
-
-
-class Views(Protocol):
-    """What the levels are compared on: as `splatting.exports.formats.Around`."""
-
-    cameras: Any
-    background: Any
-    pipe: Any
 
 
 def write_tileset(path: str | os.PathLike, splats: Splats, around: Views) -> str:
@@ -39,23 +25,16 @@ def write_tileset(path: str | os.PathLike, splats: Splats, around: Views) -> str
 
     The files of an earlier tileset of this name go once the new one is there.
     """
-    root, path = octree(splats), Path(path)
-    sizes, earlier = {}, _folder_of(path)
-    with contextlib.ExitStack() as stack:
-        temporary = stack.enter_context(atomic_write(path))
-        folder = stack.enter_context(_new_folder(path.parent))
+    root, path, sizes = octree(splats), Path(path), {}
+    with with_folder(path, "tiles-") as folder:
         for tile in root.all():
             if len(tile.splats):
                 write_glb(folder / f"{tile.name}.glb", tile.splats)
                 sizes[tile.name] = (folder / f"{tile.name}.glb").stat().st_size
-        final = path.parent / (_FOLDER + _digest(folder))
-        temporary.write_text(json.dumps(document(root, final.name), allow_nan=False), encoding="utf-8")
-        if not final.exists():  # else these are the same files
-            os.replace(folder, final)
-    if earlier and earlier != final:
-        shutil.rmtree(earlier, ignore_errors=True)
-    print(table(root, sizes, around))
-    return f"{root.levels} levels, {len(sizes)} tiles with {sum(sizes.values()) / 1e6:.2f} MB in {final.name}"
+        (folder / path.name).write_text(json.dumps(document(root, PLACE), allow_nan=False), encoding="utf-8")
+    levels = [root.level(depth) for depth in range(root.levels)]
+    print(table(root, [sum(sizes.get(tile.name, 0) for tile in level) for level in levels], around))
+    return f"{root.levels} levels, {len(sizes)} tiles with {sum(sizes.values()) / 1e6:.2f} MB in a folder beside it"
 
 
 def document(root: Tile, folder: str) -> dict[str, Any]:
@@ -86,48 +65,3 @@ def box(low: np.ndarray, high: np.ndarray) -> list[float]:
     """
     middle, half = ((low + high) / 2)[[0, 2, 1]] * [1, 1, -1], ((high - low) / 2)[[0, 2, 1]]
     return [*middle.tolist(), *np.diag(half).ravel().tolist()]
-
-
-def table(root: Tile, sizes: Mapping[str, int], around: Views) -> str:
-    """What each level has and loses, coarsest first, as Markdown."""
-    found = losses(root, around.cameras, around.background, around.pipe)
-    best, rows = found[-1]["photos"], []
-    for depth, loss in enumerate(found):
-        tiles = root.level(depth)
-        counts = len(tiles), sum(len(tile.splats) for tile in tiles), sum(sizes.get(tile.name, 0) for tile in tiles)
-        row = [str(depth), *(f"{count:,}" for count in counts), f"{max(tile.error for tile in tiles):.3g}"]
-        row.append("equal" if loss["psnr"] is None else f"{loss['psnr']:.2f}")
-        if best is not None:
-            row += [f"{loss['photos']:.2f}", f"{loss['photos'] - best:+.2f}"]
-        rows.append(row)
-    header = ["level", "tiles", "Gaussians", "bytes", "error (units)", "dB to the model"]
-    return markdown_table(header + ["dB to the photos", "change"] * (best is not None), rows).rstrip("\n")
-
-
-@contextlib.contextmanager
-def _new_folder(parent: Path) -> Iterator[Path]:
-    """A hidden folder, which is deleted at the end unless it has another name by then."""
-    folder = parent / f".tiles.{os.getpid()}.tmp"
-    mkdir_p(folder)
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _digest(folder: Path) -> str:
-    """A name for the files of a folder, by their names and bytes."""
-    found = hashlib.sha256()
-    for path in sorted(folder.iterdir()):
-        found.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
-    return found.hexdigest()[:12]
-
-
-def _folder_of(path: Path) -> Path | None:
-    """The folder of an earlier tileset that export.py wrote; None without one."""
-    try:
-        name = json.loads(path.read_text(encoding="utf-8"))["asset"]["extras"]["folder"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    known = isinstance(name, str) and name.startswith(_FOLDER) and Path(name).name == name
-    return path.parent / name if known else None
