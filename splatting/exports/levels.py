@@ -114,7 +114,8 @@ def table(root: Tile, sizes: Sequence[int], around: Views) -> str:
         tiles = root.level(depth)
         counts = len(tiles), sum(len(tile.splats) for tile in tiles), size
         row = [str(depth), *(f"{count:,}" for count in counts), f"{max(tile.error for tile in tiles):.3g}"]
-        row.append("equal" if loss["psnr"] is None else f"{loss['psnr']:.2f}")
+        same = "equal" if around.cameras else "no views"
+        row.append(same if loss["psnr"] is None else f"{loss['psnr']:.2f}")
         if best is not None:
             row += [f"{loss['photos']:.2f}", f"{loss['photos'] - best:+.2f}"]
         rows.append(row)
