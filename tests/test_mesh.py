@@ -229,5 +229,5 @@ def test_export_writes_meshes(trained, monkeypatch, tmp_path, capsys):
 
 
 def test_meshes_have_names_of_their_own():
-    assert format_of("out/mesh.ply").option == format_of("room.MESH.glb").option == "voxel"
-    assert format_of("out/meshes.ply").option == ""
+    assert format_of("out/mesh.ply").options == format_of("room.MESH.glb").options == ("voxel",)
+    assert format_of("out/meshes.ply").options == ()

@@ -33,10 +33,10 @@ class Around(NamedTuple):
     cameras: Sequence[Camera]  # the training views
     background: tuple[float, float, float]  # RGB in [0, 1]
     pipe: argparse.Namespace
-    make_path: Callable[[Poses], TimedPath] | None  # of a page's animation
-    voxel: float | None  # of a mesh, in the world's unit
-    start: str | None  # of a page: the photo that it begins at
-    title: str | None  # of a page
+    make_path: Callable[[Poses], TimedPath] | None = None  # of a page's animation
+    voxel: float | None = None  # of a mesh, in the world's unit
+    start: str | None = None  # of a page: the photo that it begins at
+    title: str | None = None  # of a page
     upright: bool = False  # whether -y of all of these is up, so that a page need not find it
 
 
