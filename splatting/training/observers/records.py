@@ -43,7 +43,8 @@ class Records(Part):
         log.keep(*run.warnings)
         log.advise(*what_to_try(run.rows, log.records))
         first, spent = run.first_done, run.clock.spent
-        parts = {"training": self._seconds, "scoring": 0.0, "saving": 0.0} | spent
+        seconds = max(self._seconds, log.records[-1]["seconds"] - log.seconds_before)  # perhaps of a later checkpoint
+        parts = {"training": seconds, "scoring": 0.0, "saving": 0.0} | spent
         log.note(
             first_iteration_seconds=None if first is None else round(first, 3),
             **{f"{part}_seconds": round(seconds, 3) for part, seconds in parts.items()},
