@@ -5,9 +5,11 @@ ends when its standard input closes, so it does not outlive a caller that was ki
 since only its own folder is on the path.
 """
 
+import contextlib
 import json
 import os
 import shutil
+import sqlite3
 import sys
 import threading
 from collections import Counter
@@ -43,7 +45,7 @@ def features(job: dict[str, Any]) -> None:
         reader.camera_model = job["camera"]
         # Import the photos first, in order: threads would number them in the order in which they happen to finish. The
         # camera of a group begins with the focal length that the EXIF data of its first photo tell, if they do.
-        known = _cameras_by_name(job["database"])
+        known = _cameras_by_name(Path(job["base"]).with_name("database.db")) if job["mapper"] == "adding" else {}
         for names in job["groups"]:
             reader.existing_camera_id = next((known[name] for name in names if name in known), -1)
             if new := [name for name in names if name not in known]:
@@ -54,11 +56,10 @@ def features(job: dict[str, Any]) -> None:
     )
 
 
-def _cameras_by_name(path: str) -> dict[str, int]:
-    database = pycolmap.Database.open(path)
-    known = {image.name: image.camera_id for image in database.read_all_images()}
-    database.close()
-    return known
+def _cameras_by_name(path: Path) -> dict[str, int]:
+    connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
+    with contextlib.closing(connection):
+        return dict(connection.execute("SELECT name, camera_id FROM images"))
 
 
 def matching(job: dict[str, Any]) -> None:

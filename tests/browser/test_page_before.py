@@ -16,7 +16,7 @@ pytest.importorskip("viser", reason="viser is not installed: pip install '.[view
 pytestmark = pytest.mark.browser
 ROOT = Path(__file__).resolve().parents[2]
 WINDOW = 1280, 720
-SIZES = pytest.mark.parametrize("size", [(1280, 720), (390, 844)])
+SIZES = (1280, 720), (390, 844)
 TIMEOUT = 60_000  # ms
 
 
@@ -42,30 +42,31 @@ def _field(tab, label: str):
     return tab.locator(f'label:text-is("{label}")').locator("xpath=following::input[not(@type='hidden')][1]")
 
 
-@SIZES
-def test_a_scene_is_shown_before_its_training(tab, tmp_path, size):
+def test_a_scene_is_shown_before_its_training(tab, tmp_path):
     make_colmap_scene(tmp_path / "attic")
-    tab.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
     with _serving("view.py", "-s", tmp_path / "attic", "--port", 0) as (address, _):
-        tab.goto(address)
-        tab.get_by_role("tab", name="Photos").click(timeout=TIMEOUT)
-        assert tab.title() == "attic"
-        assert _field(tab, "Points").input_value() == "300" and tab.get_by_text("Iteration", exact=True).count() == 0
-        assert tab.get_by_role("checkbox", name="Draw cameras").is_checked()
-        tab.get_by_role("combobox", name="Compare").wait_for()
+        for width, height in SIZES:
+            tab.set_viewport_size({"width": width, "height": height})
+            tab.goto(address)
+            tab.get_by_role("tab", name="Photos").click(timeout=TIMEOUT)
+            assert tab.title() == "attic"
+            assert _field(tab, "Points").input_value() == "300"
+            assert tab.get_by_text("Iteration", exact=True).count() == 0
+            assert tab.get_by_role("checkbox", name="Draw cameras").is_checked()
+            tab.get_by_role("combobox", name="Compare").wait_for()
 
 
-@SIZES
-def test_a_paused_training_says_its_length_and_ends_by_a_signal(tab, tmp_path, size):
+def test_a_paused_training_says_its_length_and_ends_by_a_signal(tab, tmp_path):
     make_colmap_scene(tmp_path / "attic")
-    tab.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
     words = "-s", tmp_path / "attic", "-m", tmp_path / "out", "--iterations", 7000, "--viewer", 0, "--paused"
     with _serving("train.py", *words) as (address, process):
-        tab.goto(address)
-        tab.get_by_role("tab", name="Training").click(timeout=TIMEOUT)
-        assert tab.title() == "out"
-        tab.get_by_role("button", name="Resume").wait_for(timeout=TIMEOUT)
-        assert _field(tab, "Iteration").input_value() == "1 of 7,000"
+        for width, height in SIZES:
+            tab.set_viewport_size({"width": width, "height": height})
+            tab.goto(address)
+            tab.get_by_role("tab", name="Training").click(timeout=TIMEOUT)
+            assert tab.title() == "out"
+            tab.get_by_role("button", name="Resume").wait_for(timeout=TIMEOUT)
+            assert _field(tab, "Iteration").input_value() == "1 of 7,000"
         tab.get_by_role("button", name="Resume").click()
         tab.wait_for_function(
             r"[...document.querySelectorAll('input')].some((it) => /^(\d+ \w+ )?\d+ (s|min)$/.test(it.value))",
