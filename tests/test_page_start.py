@@ -70,12 +70,12 @@ def test_the_picture_beside_a_link_is_the_first_one(tmp_path):
 def test_a_title_is_text_whatever_it_holds(tmp_path):
     title = "<script>alert(1)</script> & \"quotes'"
     around = Around(cameras(), (0.0, 0.0, 0.0), pipeline(), None, None, "photo_5", title)
-    path = tmp_path / "my page #1.html"
+    path = tmp_path / "my page #1.html"  # a photo "my page #1.jpg" beside it would stay
     format_of(path).write(path, balls(), around)
     page, meta = Page(path), _meta(path)
     assert page.texts["title"] == meta["og:title"] == title and "alert(1)</script>" not in path.read_text()
-    assert meta["og:type"] == "website" and meta["og:image"] == "my%20page%20%231.jpg"
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["my page #1.html", "my page #1.jpg"]
+    assert meta["og:type"] == "website" and meta["og:image"] == "my%20page%20%231.html.jpg"
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["my page #1.html", "my page #1.html.jpg"]
 
 
 def test_pages_are_cleaned_unless_they_are_raw(colmap_scene, tmp_path, monkeypatch, capsys):
@@ -100,7 +100,7 @@ def test_pages_are_cleaned_unless_they_are_raw(colmap_scene, tmp_path, monkeypat
             run(*words)
         assert asked.pop() == most
     run("--raw", "--title", "Room")
-    assert not asked and (tmp_path / "page.jpg").is_file() and _meta(tmp_path / "page.html")["og:title"] == "Room"
+    assert not asked and (tmp_path / "page.html.jpg").is_file() and _meta(tmp_path / "page.html")["og:title"] == "Room"
     with pytest.raises(UserError, match="contradict"):
         run("--raw", "--clean")
     monkeypatch.setattr("sys.argv", ["export.py", "-m", str(model), "--to", str(tmp_path / "a.ply"), "--title", "Room"])

@@ -70,7 +70,7 @@ def _write_html(path: str | os.PathLike, splats: Splats, around: Around) -> None
         start = named_start(around.start, names)
     else:
         start = best_start(poses_of(around.cameras)) if names else 0
-    picture = Path(path).with_suffix(".jpg")
+    picture = Path(path).with_name(f"{Path(path).name}.jpg")  # no photo has such a name
     how = around.make_path, around.background, around.title, start, quote(os.fsencode(picture.name))
     write_html(path, splats, around.cameras, *how, around.upright)
     write_preview(picture, splats, around.cameras[start], around.pipe, around.background)
