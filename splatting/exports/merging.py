@@ -11,6 +11,7 @@ rendering of very large datasets".
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from scene.splats.splats import Splats, opacities
 
@@ -33,7 +34,10 @@ def footprints(splats: Splats) -> np.ndarray:
 
 def covariances(splats: Splats) -> np.ndarray:
     """Covariances (N, 3, 3) float64."""
-    axes = _matrices(splats.rotations) * np.exp(splats.log_scales.astype(np.float64))[:, None]
+    axes = (
+        Rotation.from_quat(splats.rotations, scalar_first=True).as_matrix()
+        * np.exp(splats.log_scales.astype(np.float64))[:, None]
+    )
     return axes @ axes.transpose(0, 2, 1)
 
 
@@ -71,36 +75,10 @@ def merged(splats: Splats, starts: np.ndarray) -> tuple[Splats, np.ndarray]:
     return replace(splats, **{name: value.astype(np.float32) for name, value in values.items()}), spread
 
 
-def _matrices(rotations: np.ndarray) -> np.ndarray:
-    """Rotation matrices (N, 3, 3) float64 of unit quaternions (N, 4), wxyz."""
-    w, x, y, z = rotations.astype(np.float64).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)
-
-
 def _axes(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Scales (N, 3) and quaternions (N, 4), wxyz, of covariances (N, 3, 3)."""
     squares, axes = np.linalg.eigh(covariance)
     axes[np.linalg.det(axes) < 0, :, 0] *= -1  # a rotation, not a reflection
     scales = np.sqrt(np.maximum(squares, 0))
     scales = np.maximum(scales, _THIN * scales.max(axis=1, keepdims=True))
-    return np.maximum(scales, np.exp(-80.0)), _quaternions(axes)
-
-
-def _quaternions(turns: np.ndarray) -> np.ndarray:
-    """Unit quaternions (N, 4), wxyz, of rotation matrices (N, 3, 3).
-
-    They are the main eigenvectors of a symmetric matrix (Bar-Itzhack 2000), which needs no cases.
-    """
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(turns, 0, 2)
-    rows = [
-        [xx + yy + zz, zy - yz, xz - zx, yx - xy],
-        [zy - yz, xx - yy - zz, xy + yx, xz + zx],
-        [xz - zx, xy + yx, yy - xx - zz, yz + zy],
-        [yx - xy, xz + zx, yz + zy, zz - xx - yy],
-    ]
-    return np.linalg.eigh(np.moveaxis(np.array(rows), 2, 0))[1][:, :, -1]
+    return np.maximum(scales, np.exp(-80.0)), Rotation.from_matrix(axes).as_quat(scalar_first=True)
