@@ -2,10 +2,6 @@
 
 import io
 import json
-import os
-import re
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from served_page import labelled, serving
 from synthetic import make_colmap_scene
 
 pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
 pytestmark = pytest.mark.browser
-ROOT = Path(__file__).resolve().parents[2]
 PICTURE = 900, 600
 WINDOW = PICTURE[0] + 324, PICTURE[1]  # with the controls beside the picture
 SECONDS = 60  # until something must have happened
@@ -30,30 +26,14 @@ def training(tmp_path_factory) -> Iterator[tuple[str, Path]]:
     folder = tmp_path_factory.mktemp("page")
     make_colmap_scene(folder / "scene")
     words = ["-s", folder / "scene", "-m", folder / "out", "--eval", "--viewer", 0, "--iterations", 30_000]
-    command = [sys.executable, "train.py", *map(str, words)]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}  # the browser needs a core, too
-    streams = {"stderr": subprocess.PIPE, "stdout": subprocess.DEVNULL, "text": True}
-    process = subprocess.Popen(command, cwd=ROOT, env=environment, **streams)
-    try:
-        said = ""
-        while not (found := re.search(r"viewer: (http://\S+)", said)):
-            line = process.stderr.readline()
-            assert line, said
-            said += line
+    with serving("train.py", *words) as (address, process):
         # Read on, so that the progress bar never waits for a reader.
         threading.Thread(target=process.stderr.read, daemon=True).start()
-        yield found[1], folder / "scene"
-    finally:
-        process.kill()
-        process.wait()
-
-
-def _field(tab, label: str):
-    return tab.locator(f'label:text-is("{label}")').locator("xpath=following::input[not(@type='hidden')][1]")
+        yield address, folder / "scene"
 
 
 def _number(tab, label: str) -> float:
-    return float(_field(tab, label).input_value().split(" of ")[0].replace(",", "") or "nan")
+    return float(labelled(tab, label).input_value().split(" of ")[0].replace(",", "") or "nan")
 
 
 def _until(holds: Callable[[], bool], what: str) -> None:
@@ -105,7 +85,7 @@ def test_the_training_pauses_and_resumes_and_its_curve_is_drawn(tab, training):
 
 def _type(tab, label: str, text: str) -> None:
     """Type a text, and again where the field falls back to its value before: it does if it is drawn anew meanwhile."""
-    field = _field(tab, label)
+    field = labelled(tab, label)
 
     def holds() -> bool:
         field.fill(text)
@@ -144,7 +124,7 @@ def test_every_kind_of_control_is_heard(tab, training):
     red = np.array([250, 0, 0])
     _until(lambda: abs(np.median(_picture(tab)[150:], (0, 1)) - red).max() < 5, "the crop box was not heard")
     tab.get_by_role("button", name="Reset").click()
-    _until(lambda: _field(tab, "Background").input_value() == "rgb(0, 0, 0)", "the background stays")
+    _until(lambda: labelled(tab, "Background").input_value() == "rgb(0, 0, 0)", "the background stays")
 
 
 def test_the_slider_shows_the_photo(tab, training):
@@ -165,7 +145,7 @@ def test_the_slider_shows_the_photo(tab, training):
         small = np.asarray(shown.resize((columns, 64), Image.Resampling.BOX)).astype(float)
         return abs(small - photo[:, :columns])[2:-2, 2:-2].mean()
 
-    field = _field(tab, "Slider")
+    field = labelled(tab, "Slider")
     field.fill("1")
     field.press("Enter")
     _until(lambda: error() < 10, "the photo is not shown")

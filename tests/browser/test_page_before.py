@@ -1,56 +1,27 @@
 """Pages before a training and at its beginning, in a real browser, on a screen and on a phone."""
 
-import os
-import re
 import signal
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
+from served_page import labelled, serving
 from synthetic import make_colmap_scene
 
 pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
 pytestmark = pytest.mark.browser
-ROOT = Path(__file__).resolve().parents[2]
 WINDOW = 1280, 720
 SIZES = (1280, 720), (390, 844)
 TIMEOUT = 60_000  # ms
 
 
-@contextmanager
-def _serving(*words: object) -> Iterator[tuple[str, subprocess.Popen]]:
-    """A command that serves a page: its address, and its process."""
-    streams = {"stderr": subprocess.PIPE, "stdout": subprocess.DEVNULL, "text": True}
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    process = subprocess.Popen([sys.executable, *map(str, words)], cwd=ROOT, env=environment, **streams)
-    try:
-        said = ""
-        while not (found := re.search(r"viewer: (http://\S+)", said)):
-            line = process.stderr.readline()
-            assert line, said
-            said += line
-        yield found[1], process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-def _field(tab, label: str):
-    return tab.locator(f'label:text-is("{label}")').locator("xpath=following::input[not(@type='hidden')][1]")
-
-
 def test_a_scene_is_shown_before_its_training(tab, tmp_path):
     make_colmap_scene(tmp_path / "attic")
-    with _serving("view.py", "-s", tmp_path / "attic", "--port", 0) as (address, _):
+    with serving("view.py", "-s", tmp_path / "attic", "--port", 0) as (address, _):
         for width, height in SIZES:
             tab.set_viewport_size({"width": width, "height": height})
             tab.goto(address)
             tab.get_by_role("tab", name="Photos").click(timeout=TIMEOUT)
             assert tab.title() == "attic"
-            assert _field(tab, "Points").input_value() == "300"
+            assert labelled(tab, "Points").input_value() == "300"
             assert tab.get_by_text("Iteration", exact=True).count() == 0
             assert tab.get_by_role("checkbox", name="Draw cameras").is_checked()
             tab.get_by_role("combobox", name="Compare").wait_for()
@@ -59,14 +30,14 @@ def test_a_scene_is_shown_before_its_training(tab, tmp_path):
 def test_a_paused_training_says_its_length_and_ends_by_a_signal(tab, tmp_path):
     make_colmap_scene(tmp_path / "attic")
     words = "-s", tmp_path / "attic", "-m", tmp_path / "out", "--iterations", 7000, "--viewer", 0, "--paused"
-    with _serving("train.py", *words) as (address, process):
+    with serving("train.py", *words) as (address, process):
         for width, height in SIZES:
             tab.set_viewport_size({"width": width, "height": height})
             tab.goto(address)
             tab.get_by_role("tab", name="Training").click(timeout=TIMEOUT)
             assert tab.title() == "out"
             tab.get_by_role("button", name="Resume").wait_for(timeout=TIMEOUT)
-            assert _field(tab, "Iteration").input_value() == "1 of 7,000"
+            assert labelled(tab, "Iteration").input_value() == "1 of 7,000"
         tab.get_by_role("button", name="Resume").click()
         tab.wait_for_function(
             r"[...document.querySelectorAll('input')].some((it) => /^(\d+ \w+ )?\d+ (s|min)$/.test(it.value))",
