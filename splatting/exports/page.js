@@ -59,8 +59,10 @@ try {
   closeHelp();
   const code = new Blob([await unpacked('viewer').text()], { type: 'text/javascript' });
   const { createViewer } = await import(URL.createObjectURL(code));
+  // The name is given, too, as the viewer cannot take it from an address in a frame whose own is about:srcdoc.
   const viewer = await createViewer({
-    container: document.body, settings, contentUrl: name, contents: Promise.resolve(unpacked('model')), noanim: true,
+    container: document.body, settings, contentUrl: name, contentFilename: name,
+    contents: Promise.resolve(unpacked('model')), noanim: true,
   });
   viewer.app.scene.gsplat.antiAlias = antialiasing;
   viewer.app.on('update', leaning(viewer, settings.annotations));

@@ -1,6 +1,7 @@
 """One-file HTML of a model in a real browser, opened from disk."""
 
 import dataclasses
+import html
 import io
 import math
 from pathlib import Path
@@ -22,7 +23,7 @@ from splatting.exports.html import write_html
 from splatting.exports.page_start import narrowed
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Page
+    from playwright.sync_api import Frame, Page
 
 pytestmark = pytest.mark.browser
 WINDOW = SIZE
@@ -47,15 +48,20 @@ def psnr(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def show(tab: "Page", path: Path) -> None:
-    """Open a page and wait for its first picture. Polls, as the page's policy forbids playwright's own way."""
+    """Open a page and wait for its first picture."""
     tab.goto(path.as_uri())
+    wait_for_picture(tab)
+
+
+def wait_for_picture(page: "Page | Frame") -> None:
+    """Polls, as the page's policy forbids playwright's own way."""
     for _ in range(10 * SECONDS):
-        if tab.evaluate("window.viewer?.state.loaded ?? false"):
+        if page.evaluate("window.viewer?.state.loaded ?? false"):
             break
-        tab.wait_for_timeout(100)
+        page.wait_for_timeout(100)
     else:
-        pytest.fail(f"no picture after {SECONDS} s: {tab.locator('body').inner_text()}")
-    tab.add_style_tag(content=BARE)
+        pytest.fail(f"no picture after {SECONDS} s: {page.locator('body').inner_text()}")
+    page.add_style_tag(content=BARE)
 
 
 def settled(tab: "Page") -> np.ndarray:
@@ -88,6 +94,17 @@ def test_the_page_begins_with_the_picture_of_its_first_camera(tab, page, splats)
     assert psnr(shown, expected(splats, cameras()[0])) > 33
     level = psnr(shown, expected(splats, cameras(rolls=())[0]))
     assert level < 27, "a camera that leans by 12 degrees makes no difference"
+
+
+def test_a_frame_of_a_notebook_shows_the_page(tab, page, splats, tmp_path):
+    """All of it stands in an attribute, so the frame has no address, and it may do nothing but run scripts."""
+    style, text = "position: fixed; inset: 0; width: 100%; height: 100%; border: 0", page.read_text(encoding="utf-8")
+    frame = f'<iframe sandbox="allow-scripts" style="{style}" srcdoc="{html.escape(text)}"></iframe>'
+    host = tmp_path / "notebook.html"
+    host.write_text(f'<!DOCTYPE html><meta charset="utf-8"><link rel="icon" href="data:,">{frame}', encoding="utf-8")
+    tab.goto(host.as_uri())
+    wait_for_picture(tab.frames[1])
+    assert psnr(settled(tab), expected(splats, cameras()[0])) > 33
 
 
 def test_a_bookmark_shows_the_picture_of_its_camera(tab, page, splats):
