@@ -1,0 +1,120 @@
+"""The notebook docs/notebooks/first_scene.ipynb: it is stored as before its first run, and all cells run."""
+
+import html
+import re
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+from nbclient.exceptions import CellExecutionError
+from photo_room import make_photos
+from test_house import COMMANDS, ROOMS
+
+ROOT = Path(__file__).resolve().parents[1]
+FILE = ROOT / "docs/notebooks/first_scene.ipynb"
+# Colab's module, whose dialogs have an answer each.
+COLAB = """
+import sys
+from types import ModuleType, SimpleNamespace
+
+answers = {answers}
+colab = ModuleType("google.colab")
+colab.files = SimpleNamespace(upload=lambda: {{answers.pop(0): b""}}, download=lambda path: print("downloads:", [path]))
+sys.modules |= {{"google": ModuleType("google"), "google.colab": colab}}
+"""
+
+
+def _read() -> nbformat.NotebookNode:
+    return nbformat.read(FILE, as_version=4)
+
+
+def _parameters(book: nbformat.NotebookNode) -> nbformat.NotebookNode:
+    (cell,) = [cell for cell in book.cells if "parameters" in cell.metadata.get("tags", [])]
+    return cell
+
+
+@pytest.fixture
+def executed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., nbformat.NotebookNode]:
+    """A function that runs all cells in an empty folder, and returns the notebook with its outputs.
+
+    first: a cell before the others. The rest replaces parameters.
+    """
+    for name in ("IPYTHONDIR", "JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR", "JUPYTER_RUNTIME_DIR"):
+        monkeypatch.setenv(name, str(tmp_path / "jupyter"))
+    work = tmp_path / "work"
+    work.mkdir()
+
+    def execute(first: str = "", **parameters: object) -> nbformat.NotebookNode:
+        book = _read()
+        _parameters(book).source += "".join(f"\n{name} = {value!r}" for name, value in parameters.items())
+        book.cells.insert(0, nbformat.v4.new_code_cell(first))
+        return NotebookClient(book, timeout=120, resources={"metadata": {"path": str(work)}}).execute()
+
+    return execute
+
+
+def _outputs(book: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
+    return [output for cell in book.cells for output in cell.get("outputs", [])]
+
+
+def _displayed(book: nbformat.NotebookNode, kind: str) -> list[str]:
+    """What the cells displayed of one MIME type."""
+    return [output.data[kind] for output in _outputs(book) if kind in output.get("data", {})]
+
+
+def test_it_is_stored_without_outputs():
+    book = _read()
+    nbformat.validate(book)
+    code = [cell for cell in book.cells if cell.cell_type == "code"]
+    assert len(code) > 8 and not any(cell.outputs or cell.execution_count for cell in code)
+    assert book.metadata.kernelspec.name == "python3" and len({cell.id for cell in book.cells}) == len(book.cells)
+
+
+def test_a_sentence_stands_before_each_cell_and_the_parameters_come_first():
+    title, *cells = _read().cells
+    assert title.source.startswith("# ")
+    assert [cell.cell_type for cell in cells] == ["markdown", "code"] * (len(cells) // 2)
+    assert all(re.fullmatch(r"[^.\n]+\.", cell.source) for cell in cells[::2])
+    assert cells[1] == _parameters(_read())
+    for name in re.findall(r"^[A-Z_]+(?= = )", cells[1].source, re.MULTILINE):
+        assert any(re.search(rf"\b{name}\b", cell.source) for cell in cells[3::2]), name
+
+
+@pytest.mark.slow
+def test_the_demo_becomes_a_picture_and_a_page(executed, tmp_path):
+    book = executed(CODE=str(ROOT), OUT=str(tmp_path / "out"), SECONDS=2, DEMO_WIDTH=80)
+    assert len(_displayed(book, "image/png")) == len(_displayed(book, "image/jpeg")) == 1
+    frame, link = _displayed(book, "text/html")
+    page = html.unescape(re.search(r'<iframe [^>]*srcdoc="([^"]*)"', frame)[1])
+    assert page == (tmp_path / "out/demo_80_model.html").read_text(encoding="utf-8")
+    assert "href='../out/demo_80_model.zip'" in link
+    with zipfile.ZipFile(tmp_path / "out/demo_80_model.zip") as archive:
+        names = {"demo_80_model.html", "demo_80_model.html.jpg", "point_cloud.ply", "error_vs_time.png"}
+        assert set(archive.namelist()) == names and archive.testzip() is None
+
+
+@pytest.mark.slow
+def test_colab_asks_for_the_project_and_for_photos(executed, tmp_path):
+    work = tmp_path / "work"
+    files = [path for room in ROOMS for path in (ROOT / room).rglob("*") if path.is_file()]
+    files += [ROOT / f"{name}.py" for name in COMMANDS]
+    make_photos(tmp_path / "photos", 12)
+    with zipfile.ZipFile(work / "code.zip", "w") as code, zipfile.ZipFile(work / "photos.zip", "w") as photos:
+        for path in files:
+            code.write(path, Path("gaussian-splatting-1", path.relative_to(ROOT)))
+        for path in (tmp_path / "photos").iterdir():
+            photos.write(path, path.name)
+    book = executed(COLAB.format(answers=["code.zip", "photos.zip"]), PHOTOS="upload", SECONDS=2)
+    out = work / "project/gaussian-splatting-1/output/first_scene"
+    assert "12 of 12 photos placed" in "".join(output.get("text", "") for output in _outputs(book))
+    assert len(_displayed(book, "text/html")) == 1  # the page; Colab has no link to a file
+    assert f"downloads: {[str(out / 'upload_model.zip')]}" in _outputs(book)[-1].text
+    assert (out / "upload_model.zip").is_file()
+
+
+def test_a_program_that_fails_stops_the_run(executed, tmp_path):
+    with pytest.raises(CellExecutionError, match="make_scene ended with status 2"):
+        executed(CODE=str(ROOT), OUT=str(tmp_path / "out"), DEMO_WIDTH=1)
