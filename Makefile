@@ -84,7 +84,8 @@ test-browser: install
 
 test-foreign: install
 	@if command -v npm > /dev/null; then cd tests/foreign && npm ci --ignore-scripts --no-audit --no-fund --silent; fi
-	$(BIN)/python -m pytest tests/test_exports_foreign.py
+	PATH="$(CURDIR)/tests/foreign/node_modules/.bin:$$PATH" $(BIN)/python -m pytest tests/test_exports_foreign.py \
+	    tests/test_tileset.py tests/browser/test_streamed.py
 
 lint: $(VENV)/.requirements
 	$(BIN)/ruff check .
