@@ -2,7 +2,8 @@
 # make test   lint, format check, C++ tests of the CPU, pytest but for slow tests: three to five minutes
 # make check  make test, CUDA kernels emulated, and slow tests; what CI runs
 # make test-aarch64, test-windows, test-macos   the C++ tests, built for another platform and run under an emulator
-# make test-browser   the tests that need Chromium, which is installed first where Debian's package manager may be used
+# make test-browser   the tests that need Chromium, which is installed first where Debian's package manager may be used;
+#             without npm, those of other people's viewers skip
 # make test-foreign   the tests by programs of npm that read our exports; they skip without npm
 # make format rewrites what the format check would complain about
 # make wheels a wheel for every torch from 2.10 and every Python, one with CUDA kernels where nvcc is found, and the
@@ -78,11 +79,13 @@ test-aarch64 test-windows test-macos:
 
 test-browser: install
 	tests/browser/install.sh
+	@if command -v npm > /dev/null; then cd tests/browser && npm ci --ignore-scripts --no-audit --no-fund --silent; fi
 	$(BIN)/python -m pytest -m browser tests/browser
 
 test-foreign: install
 	@if command -v npm > /dev/null; then cd tests/foreign && npm ci --ignore-scripts --no-audit --no-fund --silent; fi
-	$(BIN)/python -m pytest tests/test_exports_foreign.py
+	PATH="$(CURDIR)/tests/foreign/node_modules/.bin:$$PATH" $(BIN)/python -m pytest tests/test_exports_foreign.py \
+	    tests/test_tileset.py tests/browser/test_streamed.py
 
 lint: $(VENV)/.requirements
 	$(BIN)/ruff check .

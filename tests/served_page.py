@@ -1,11 +1,14 @@
-"""A command that serves a web page, and the page's fields, for tests in a browser."""
+"""Commands and folders that serve a web page, and the page's fields, for tests in a browser."""
 
+import http.server
 import os
 import re
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,6 +34,20 @@ def serving(*words: object) -> Iterator[tuple[str, subprocess.Popen]]:
     finally:
         process.kill()
         process.wait()
+
+
+@contextmanager
+def serving_folder(folder: Path) -> Iterator[str]:
+    """The address of a folder, which ends with a slash."""
+    handler = partial(http.server.SimpleHTTPRequestHandler, directory=folder)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}/"
+        finally:
+            server.shutdown()
+            thread.join()
 
 
 def labelled(tab: "Page", label: str) -> "Locator":

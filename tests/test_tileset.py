@@ -1,6 +1,7 @@
 """tileset.json and lod-meta.json: Gaussians merged by moments, the octree, both formats, and what levels lose."""
 
 import argparse
+import dataclasses
 import json
 import shutil
 import struct
@@ -169,6 +170,30 @@ def test_tilesets_are_as_3d_tiles_asks(tmp_path, monkeypatch, capsys):
     np.testing.assert_allclose(np.sort(leaves, axis=0), np.sort(some.means, axis=0), atol=1e-5)
     printed = capsys.readouterr().out
     assert " 1,000 | " in printed and "equal" in printed and "photos" not in printed
+
+
+@pytest.mark.parametrize("place", [(0, 0, 0), (47.25, 8.5, 410), (-33.9, 151.2, -20), (90, 0, 0), (45, 180, 8000)])
+def test_places_on_the_globe_are_those_of_colmap(place):
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap has no wheel for this platform")
+    earth = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    points = np.random.default_rng(0).normal(scale=1000, size=(20, 3))  # metres east, north, up
+    transform = np.reshape(tiles3d.on_globe(place), (4, 4)).T
+    found = points @ transform[:3, :3].T + transform[:3, 3]
+    np.testing.assert_allclose(found, earth.enu_to_ecef(points, *place), rtol=0, atol=1e-6)
+    assert transform[3].tolist() == [0, 0, 0, 1]
+
+
+def test_only_the_root_knows_the_place_on_the_globe(tmp_path, monkeypatch):
+    """GLB that told it, too, would be turned: x y z were east, down, north, and are east, north, up in tiles."""
+    monkeypatch.setattr(tiles3d, "octree", lambda some: octree(some, most=30))
+    some = dataclasses.replace(splats(60, 0), place=(47.25, 8.5, 410.0))
+    tileset = _written(tmp_path / "tileset.json", some)
+    assert tileset["root"]["transform"] == tiles3d.on_globe(some.place)
+    assert not any("transform" in tile for tile in tileset["root"]["children"])
+    for tile in octree(some, most=30).all():
+        found = _positions(next(tmp_path.rglob(f"{tile.name}.glb")))
+        np.testing.assert_allclose(found, tile.splats.means[:, [0, 2, 1]] * [1, 1, -1], atol=1e-5)
+    assert "transform" not in _written(tmp_path / "tileset.json", splats(60, 0))["root"]
 
 
 def test_a_new_tileset_takes_the_place_of_the_earlier_one(tmp_path):

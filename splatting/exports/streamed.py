@@ -29,7 +29,7 @@ def write_lod_meta(path: str | os.PathLike, splats: Splats, around: Views) -> st
         for level in range(root.levels):  # 0 is the finest there
             model = models / f"{level}.ply"
             write_plain_ply(model, joined([tile.splats for tile in root.level(root.levels - 1 - level)]))
-            inputs += [str(model), "--lod", str(level)]
+            inputs += [str(model), "-l", str(level)]  # whose long name differs between its versions
         written = folder / "lod-meta.json"
         run_program(program, inputs, written, path)
         content = json.loads(written.read_text(encoding="utf-8"))

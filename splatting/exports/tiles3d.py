@@ -1,12 +1,13 @@
 """3D Tiles 1.1 (OGC 22-025r4): tileset.json beside a folder of GLB with KHR_gaussian_splatting, for large models.
 
 A viewer draws the tiles of an octree that are as fine as the distance asks for, and loads no others. A GLB has y up,
-and tiles have z up, so a viewer turns x y z of a GLB to x -z y. Boxes are in these axes. Nothing places the model on a
-globe.
+and tiles have z up, so a viewer turns x y z of a GLB to x -z y. Boxes are in these axes. Where GPS is known, they are
+east, north and up, and the root's transform places them on the globe.
 """
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from splatting.exports.beside import PLACE, with_folder
 from splatting.exports.levels import Tile, Views, octree, table
 from splatting.exports.scene_formats import EXTENSION, write_glb
 
+_EQUATOR, _FLATTENING = 6378137.0, 1 / 298.257223563  # of WGS 84: the radius in metres
 _ANNOUNCED = "3DTILES_content_gltf"  # says ahead of loading which extensions GLB files use
 
 
@@ -29,7 +31,7 @@ def write_tileset(path: str | os.PathLike, splats: Splats, around: Views) -> str
     with with_folder(path, "tiles-") as folder:
         for tile in root.all():
             if len(tile.splats):
-                write_glb(folder / f"{tile.name}.glb", tile.splats)
+                write_glb(folder / f"{tile.name}.glb", replace(tile.splats, place=()))  # which the root has
                 sizes[tile.name] = (folder / f"{tile.name}.glb").stat().st_size
         (folder / path.name).write_text(json.dumps(document(root, PLACE), allow_nan=False), encoding="utf-8")
     levels = [root.level(depth) for depth in range(root.levels)]
@@ -40,12 +42,13 @@ def write_tileset(path: str | os.PathLike, splats: Splats, around: Views) -> str
 def document(root: Tile, folder: str) -> dict[str, Any]:
     """The content of tileset.json."""
     width = float(np.linalg.norm(root.high - root.low))
+    transform = {"transform": on_globe(root.splats.place)} if root.splats.place else {}
     return {
         "asset": {"version": "1.1", "extras": {"generator": "export.py", "folder": folder}},
         "extensionsUsed": [_ANNOUNCED],
         "extensions": {_ANNOUNCED: {"extensionsUsed": [EXTENSION]}},
         "geometricError": max(width, 2 * root.error),  # of a viewer that draws nothing
-        "root": {"refine": "REPLACE", **_entry(root, folder)},
+        "root": {"refine": "REPLACE", **transform, **_entry(root, folder)},
     }
 
 
@@ -65,3 +68,19 @@ def box(low: np.ndarray, high: np.ndarray) -> list[float]:
     """
     middle, half = ((low + high) / 2)[[0, 2, 1]] * [1, 1, -1], ((high - low) / 2)[[0, 2, 1]]
     return [*middle.tolist(), *np.diag(half).ravel().tolist()]
+
+
+def on_globe(place: tuple[float, ...]) -> list[float]:
+    """The transform from metres east, north and up of a place, as of `Splats`, to EPSG:4978: 16 numbers by columns.
+
+    Formulas of geodetic coordinates: EPSG guidance note 7-2, 4.1.1. The height counts from the ellipsoid here, and in
+    EXIF data usually from the sea level, which is up to 107 m away.
+    """
+    (sin_b, cos_b), (sin_l, cos_l) = ((np.sin(angle), np.cos(angle)) for angle in np.radians(place[:2]))
+    east, up = np.array([-sin_l, cos_l, 0]), np.array([cos_b * cos_l, cos_b * sin_l, sin_b])
+    eccentricity = _FLATTENING * (2 - _FLATTENING)  # squared
+    radius = _EQUATOR / np.sqrt(1 - eccentricity * sin_b**2)
+    origin = (radius + place[2]) * up - [0, 0, eccentricity * radius * sin_b]
+    transform = np.eye(4)
+    transform[:3] = np.stack([east, np.cross(up, east), up, origin], axis=1)
+    return transform.T.ravel().tolist()

@@ -2,21 +2,16 @@
 
 import dataclasses
 import html
-import io
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-import torch
-from gaussians import pipeline
 from html_scene import FOV, SIZE, balls, cameras
-from PIL import Image
+from tab_pictures import BACKGROUND, SECONDS, expected, psnr, settled
 
-from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
-from scene.with_splats import model_of
 from splatting.camera_paths.generated import Ellipse
 from splatting.camera_paths.poses import poses_of
 from splatting.exports.html import write_html
@@ -27,24 +22,7 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.browser
 WINDOW = SIZE
-SECONDS = 60  # until something must have happened
 BARE = ".sse-viewer > :not(canvas) { display: none !important }"  # the picture without buttons
-BACKGROUND = (0.2, 0.4, 0.3)
-
-
-def picture(tab: "Page") -> np.ndarray:
-    return np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB"), np.float64)
-
-
-def expected(splats, camera) -> np.ndarray:
-    """Our render, in 0 to 255."""
-    with torch.no_grad():
-        image = render(camera, model_of(splats), pipeline(antialiasing=splats.antialiasing), torch.tensor(BACKGROUND))
-    return image["render"].clamp(0, 1).permute(1, 2, 0).numpy() * 255.0
-
-
-def psnr(one: np.ndarray, other: np.ndarray) -> float:
-    return 10 * math.log10(255**2 / np.square(one - other).mean())
 
 
 def show(tab: "Page", path: Path) -> None:
@@ -62,18 +40,6 @@ def wait_for_picture(page: "Page | Frame") -> None:
     else:
         pytest.fail(f"no picture after {SECONDS} s: {page.locator('body').inner_text()}")
     page.add_style_tag(content=BARE)
-
-
-def settled(tab: "Page") -> np.ndarray:
-    """The picture, once the camera is at rest."""
-    before = picture(tab)
-    for _ in range(4 * SECONDS):
-        tab.wait_for_timeout(250)
-        now = picture(tab)
-        if np.array_equal(now, before):
-            return now
-        before = now
-    pytest.fail(f"the picture is not at rest after {SECONDS} s")
 
 
 @pytest.fixture(scope="module")

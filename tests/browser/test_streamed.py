@@ -1,13 +1,9 @@
 """A streamed SOG in a real browser, over HTTP: PlayCanvas' viewer, as our pages have it, loads our levels."""
 
 import gzip
-import http.server
-import io
 import json
 import shutil
-import threading
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +11,8 @@ import numpy as np
 import pytest
 from gaussians import pipeline
 from html_scene import SIZE, balls, cameras
-from PIL import Image
+from served_page import serving_folder
+from tab_pictures import SECONDS, picture
 
 from splatting.exports import html, streamed
 from splatting.exports.formats import Around
@@ -30,7 +27,6 @@ pytestmark = [
     pytest.mark.skipif(not shutil.which(PROGRAM), reason=f"{PROGRAM} is not on PATH"),
 ]
 WINDOW = SIZE
-SECONDS = 60
 PAGE = """<!doctype html><link rel="icon" href="data:,"><body><script type="module">
 import { createViewer } from './viewer.js';
 const settings = await (await fetch('settings.json')).json();
@@ -51,13 +47,8 @@ def address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     (tmp_path / "settings.json").write_text(json.dumps(settings))
     (tmp_path / "viewer.js").write_bytes(gzip.decompress((html.FOLDER / html.VIEWER).read_bytes()))
     (tmp_path / "index.html").write_text(PAGE)
-    handler = partial(http.server.SimpleHTTPRequestHandler, directory=tmp_path)
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield f"http://127.0.0.1:{server.server_port}/index.html"
-        server.shutdown()
-        thread.join()
+    with serving_folder(tmp_path) as where:
+        yield f"{where}index.html"
 
 
 def test_the_viewer_loads_the_levels(tab: "Page", address: str):
@@ -69,6 +60,6 @@ def test_the_viewer_loads_the_levels(tab: "Page", address: str):
     chunks = [url for _, url in asked if "/sog-" in url]
     assert chunks and {status for status, _ in asked} == {200}
     assert any(url.endswith("meta.json") for url in chunks) and any(url.endswith(".webp") for url in chunks)
-    shown = np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB"), np.float64)
+    shown = picture(tab)
     plain = np.abs(shown - shown[0, 0]).max(axis=2) < 8
     assert 0.05 < (~plain).mean() < 0.95, "the balls are not to be seen"
