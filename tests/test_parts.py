@@ -11,6 +11,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+from forks import fork
 from synthetic import make_colmap_scene
 
 from splatting.parts import PARTS, part_class, strategies, tools
@@ -139,11 +140,10 @@ print(*(option.name for option in OPTIONS), *vars(launch_options()))
 @pytest.mark.parametrize("name", PARTS)
 def test_without_a_part_all_else_imports_and_lacks_its_options_alone(name):
     words = [name, *ROOMS, *(f"{command}.py" for command in COMMANDS)]
-    command = [sys.executable, "-c", WITHOUT + IMPORTED, *words]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    done = fork(WITHOUT + IMPORTED, *words)
+    assert done.status == 0, done.output
     every = {option for other in PARTS for option in _options(other)}
-    there = {*done.stdout.split()}
+    there = {*done.output.split()}
     assert not there & _options(name) and every - _options(name) <= there
 
 
@@ -169,9 +169,8 @@ def scene(once) -> Path:
 def _trained(scene: Path, out: Path, name: str, hidden: str) -> bytes:
     """Train without the part `hidden`, by the first strategy that is not `name`."""
     other = next(strategy for strategy in strategies() if strategy != name)
-    command = [sys.executable, "-c", WITHOUT + TRAINED, hidden, str(scene), str(out), other]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    done = fork(WITHOUT + TRAINED, hidden, str(scene), str(out), other)
+    assert done.status == 0, done.output
     return (out / "point_cloud/iteration_20/point_cloud.ply").read_bytes()
 
 
