@@ -60,7 +60,7 @@ build() {
   export TORCH_CUDA_ARCH_LIST
   local key wheels new
   key=$( (
-    echo "$TORCH_CUDA_ARCH_LIST"
+    echo "$TORCH_CUDA_ARCH_LIST ${NVCC_APPEND_FLAGS:-}"
     cat version.txt setup.py requirements.txt
     find submodules -type f \( -name '*.py' -o -name '*.toml' -o -name '*.h' -o -name '*.cpp' -o -name '*.cu*' \) \
       -not -path '*/build/*' -print0 | LC_ALL=C sort -z | xargs -0 sha256sum

@@ -18,7 +18,7 @@ RUN python3 -m venv /opt/venv && pip install "setuptools==84.2.1" -r requirement
 COPY version.txt ./
 COPY submodules submodules
 # No GPU is visible here, so the architectures are named; PTX serves newer ones.
-ENV GS_CUDA=1 CUDA_HOME=/usr/local/cuda TORCH_CUDA_ARCH_LIST="8.0;8.6;8.9;9.0;10.0;12.0+PTX"
+ENV GS_CUDA=1 CUDA_HOME=/usr/local/cuda TORCH_CUDA_ARCH_LIST="7.5;8.0;8.6;8.9;9.0;10.0;12.0+PTX"
 RUN pip install --no-deps --no-build-isolation \
     ./submodules/simple-knn ./submodules/fused-ssim ./submodules/diff-gaussian-rasterization
 

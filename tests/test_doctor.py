@@ -122,6 +122,15 @@ def test_a_gpu_that_is_not_used(monkeypatch):
     assert "update the driver" in problems([environment._check_gpu(torch)])[0]
 
 
+@pytest.mark.parametrize(("capability", "served"), [((7, 0), False), ((7, 5), True), ((12, 0), True)])
+def test_a_gpu_that_is_too_old(monkeypatch, capability, served):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "V100")
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: capability)
+    found = problems([environment._check_gpu(torch)])
+    assert not found if served else "use a GPU of 7.5 or newer" in found[0]
+
+
 @pytest.fixture
 def info(colmap_scene):
     """The synthetic scene: cameras around a unit cube of points, all facing it."""

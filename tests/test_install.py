@@ -43,7 +43,7 @@ def fake_nvcc(folder: Path, release: str = "13.0") -> Path:
     nvcc.parent.mkdir(parents=True)
     nvcc.write_text(
         f'#!/bin/sh\nif [ "$1" = --version ]; then echo "Cuda compilation tools, release {release}, V{release}.1"\n'
-        'elif [ "$1" = --list-gpu-arch ]; then printf "compute_%s\\n" 75 80 86 90 100 103 120\n'
+        'elif [ "$1" = --list-gpu-arch ]; then printf "compute_%s\\n" 70 75 80 86 90 100 103 120\n'
         f"else echo '#$ _HERE_={folder}/bin' >&2; echo '#$ TOP={folder}/bin/..' >&2; fi\n"
     )
     nvcc.chmod(0o755)
@@ -127,10 +127,10 @@ def test_architectures(builder, monkeypatch, tmp_path):
         last = [f"-gencode=arch=compute_{and_ptx},code=[sm_{and_ptx},compute_{and_ptx}]"] if and_ptx else []
         return [f"-gencode=arch=compute_{n},code=[sm_{n}]" for n in names] + last
 
-    assert builder.architecture_flags(nvcc, []) == flags("80", "90", "100", and_ptx="120")
-    assert builder.architecture_flags(nvcc, [(9, 0), (8, 6), (9, 0)]) == flags("86", "90", and_ptx="")
-    with pytest.raises(SystemExit, match="^error: the CUDA backend needs compute capability 8.0 or newer, not 7.5"):
-        builder.architecture_flags(nvcc, [(7, 5)])
+    assert builder.architecture_flags(nvcc, []) == flags("75", "80", "90", "100", and_ptx="120")
+    assert builder.architecture_flags(nvcc, [(9, 0), (7, 5), (9, 0)]) == flags("75", "90", and_ptx="")
+    with pytest.raises(SystemExit, match="^error: the CUDA backend needs compute capability 7.5 or newer, not 7.0"):
+        builder.architecture_flags(nvcc, [(7, 0)])
     monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.6;9.0a+PTX")
     assert builder.architecture_flags(nvcc, [(12, 0)]) == flags("86", and_ptx="90a")
 

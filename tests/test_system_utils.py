@@ -35,6 +35,21 @@ def test_run_cli_says_one_line_and_exits(error, status, said, capsys):
 
 
 @pytest.mark.parametrize(
+    ("capability", "said"),
+    [
+        ((7, 0), "capability 7.0, but 7.5 is the oldest that works: set CUDA_VISIBLE_DEVICES= to use the CPU\n"),
+        ((8, 6), "capability 8.6, for which torch or this build has no code: run `pip install --force-reinstall .`\n"),
+    ],
+)
+def test_a_gpu_without_code(capability, said, capsys, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "The GPU")
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: capability)
+    with pytest.raises(SystemExit) as exit_info:
+        run_cli(lambda: _raise(RuntimeError("project: no kernel image is available for execution on the device")))
+    assert exit_info.value.code == 2 and capsys.readouterr().err == f"error: The GPU has compute {said}"
+
+
+@pytest.mark.parametrize(
     ("sent", "status", "said"),
     [
         (["SIGINT"], 130, "interrupted\n"),

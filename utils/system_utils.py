@@ -12,7 +12,7 @@ from splatting.distributed.ranks import ranks
 from splatting.host import start, torchrun
 from splatting.host.errors import UserError, first_line
 from splatting.host.interrupt import Terminated, let_signals_end
-from splatting.host.machine import compute_device
+from splatting.host.machine import compute_device, without_code
 from splatting.host.memory import is_out_of_memory, shortage
 
 __all__ = [
@@ -100,6 +100,8 @@ def _outcome(main: Callable[[], object]) -> tuple[int, str]:
     except UserError as error:
         return 2, f"error: {error}"
     except (MemoryError, RuntimeError) as error:
+        if said := without_code(error):
+            return 2, f"error: {said}"
         if not is_out_of_memory(error):
             raise
         reason = f"error: ran out of memory ({shortage(error, compute_device())})"

@@ -75,8 +75,12 @@ def _version(name: str) -> str | None:
 
 def _check_gpu(torch) -> Line:
     if torch.cuda.is_available():
-        name, (major, minor) = torch.cuda.get_device_name(), torch.cuda.get_device_capability()
-        return Line(f"GPU {name}, compute capability {major}.{minor}, CUDA {torch.version.cuda} of torch")
+        from splatting.host.machine import OLDEST_GPU
+
+        name, found = torch.cuda.get_device_name(), torch.cuda.get_device_capability()
+        remedy = f"use a GPU of {OLDEST_GPU[0]}.{OLDEST_GPU[1]} or newer, or set CUDA_VISIBLE_DEVICES= to use the CPU"
+        text = f"GPU {name}, compute capability {found[0]}.{found[1]}, CUDA {torch.version.cuda} of torch"
+        return Line(text, remedy if found < OLDEST_GPU else "")
     if not (gpu := _nvidia_gpu()):
         return Line("no NVIDIA GPU; everything runs on the CPU")
     if torch.version.cuda is None:

@@ -24,6 +24,7 @@ _ROOT = Path(__file__).resolve().parents[2]
 _VERSION = _ROOT / "version.txt"  # the one place where the version is written by hand
 VERSION = _VERSION.read_text(encoding="utf-8").strip() if _VERSION.is_file() else "unknown"  # only the code was copied
 MOST_THREADS = 16  # for work on image files: more threads only wait for memory and disk
+OLDEST_GPU = (7, 5)  # compute capability, as in submodules/common/build_extension.py
 _PACKAGES = ("lpips", "numpy", "pillow", "pycolmap", "torch", "torchvision")
 _CGROUPS = Path("/sys/fs/cgroup")
 _OWN_CGROUPS = Path("/proc/self/cgroup")
@@ -34,6 +35,20 @@ def compute_device() -> torch.device:
     import torch
 
     return torch.device("cuda" if torch.cuda.is_available() and _has_cuda_kernels() else "cpu")
+
+
+def without_code(error: BaseException) -> str:
+    """What to say of an error if torch or an extension has no code for the current GPU; empty if it is another."""
+    if "no kernel image is available" not in str(error):
+        return ""
+    import torch
+
+    major, minor = torch.cuda.get_device_capability()
+    gpu = f"{torch.cuda.get_device_name()} has compute capability {major}.{minor}"
+    if (major, minor) < OLDEST_GPU:
+        oldest = ".".join(map(str, OLDEST_GPU))
+        return f"{gpu}, but {oldest} is the oldest that works: set CUDA_VISIBLE_DEVICES= to use the CPU"
+    return f"{gpu}, for which torch or this build has no code: run `pip install --force-reinstall .`"
 
 
 def _has_cuda_kernels() -> bool:

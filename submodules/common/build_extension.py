@@ -9,7 +9,7 @@ one source nor parallel compilation without ninja, so this runs the commands.
 
 Environment: CXX (compiler), CUDA_HOME (toolkit), GS_CUDA=0|1 (never, or always, build CUDA; unset: where nvcc is
 found and torch was built with CUDA), TORCH_CUDA_ARCH_LIST ("9.0" or "8.0;9.0+PTX"; unset: those of the GPUs that are
-visible, or with none all major ones from 8.0).
+visible, or with none 7.5 and all major ones from 8.0).
 """
 
 import os
@@ -30,7 +30,7 @@ from setuptools.command.build_py import build_py
 
 VERSION = (Path(__file__).resolve().parents[2] / "version.txt").read_text(encoding="utf-8").strip()
 OLDEST_TORCH = (2, 10)  # the first whose stable interface has all that csrc/torch calls
-OLDEST_ARCHITECTURE = 80  # reductions over a warp in one instruction
+OLDEST_ARCHITECTURE = 75  # the oldest that CUDA 13 compiles for; see gs/gpu_forms.h
 SEEDED_CUDA = (12, 9)  # the first whose nvcc knows -frandom-seed
 COMMON_INCLUDE = Path(__file__).resolve().parent / "include"
 SHARED_MODULES = Path(__file__).resolve().parent / "package"
@@ -262,15 +262,15 @@ def architecture_flags(nvcc: str, at_hand: list[tuple[int, int]]) -> list[str]:
     names = os.environ.get("TORCH_CUDA_ARCH_LIST", "").replace(";", " ").split()
     names = names or sorted({f"{major}.{minor}" for major, minor in at_hand})
     if not names:
-        known = sorted(int(n) for n in re.findall(r"^compute_(\d+0)$", run([nvcc, "--list-gpu-arch"]), re.MULTILINE))
-        names = [f"{n // 10}.0" for n in known if n >= OLDEST_ARCHITECTURE]
+        known = re.findall(r"^compute_(75|\d+0)$", run([nvcc, "--list-gpu-arch"]), re.MULTILINE)
+        names = [f"{n // 10}.{n % 10}" for n in sorted(map(int, known)) if n >= OLDEST_ARCHITECTURE]
         names[-1] += "+PTX"
     flags = []
     for name in names:
         number = name.removesuffix("+PTX").replace(".", "")
         if int(re.sub(r"\D", "", number) or 0) < OLDEST_ARCHITECTURE:
             fail(
-                f"the CUDA backend needs compute capability 8.0 or newer, not {name}: set TORCH_CUDA_ARCH_LIST to the "
+                f"the CUDA backend needs compute capability 7.5 or newer, not {name}: set TORCH_CUDA_ARCH_LIST to the "
                 "GPUs to run on, or GS_CUDA=0 to build for the CPU only"
             )
         code = f"sm_{number},compute_{number}" if name.endswith("+PTX") else f"sm_{number}"

@@ -13,7 +13,7 @@ namespace gs {
 // What every kernel that `launch` launches calls first: waits for the work before it, and tells whether that was halted
 // (cuda_queue.h). Memory may not be touched before.
 __device__ __forceinline__ bool begin_work(const int32_t* halted) {
-#if __CUDA_ARCH__ >= 900
+#if __CUDA_ARCH__ >= 900 && !defined(GS_PLAIN_GPU)
   cudaTriggerProgrammaticLaunchCompletion();
   cudaGridDependencySynchronize();
 #endif
@@ -25,12 +25,16 @@ static __global__ void version_kernel() {}
 
 // Whether kernels of this library wait in begin_work. Tried with compute capability 9 alone.
 inline bool waits_in_kernels() {
+#ifdef GS_PLAIN_GPU  // gs/gpu_forms.h
+  return false;
+#else
   int device, major;
   GS_CUDA_CHECK(cudaGetDevice(&device));
   GS_CUDA_CHECK(cudaDeviceGetAttribute(&major, cudaDevAttrComputeCapabilityMajor, device));
   cudaFuncAttributes version;
   GS_CUDA_CHECK(cudaFuncGetAttributes(&version, version_kernel));
   return major == 9 && version.ptxVersion >= 90;
+#endif
 }
 
 // Launches a kernel whose first parameter is Queue::halted. Throws std::runtime_error that names it.

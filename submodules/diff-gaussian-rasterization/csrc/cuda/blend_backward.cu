@@ -81,7 +81,7 @@ struct Pixels {
       if (g.transmittance_gradient && inside) background[p] += g.transmittance_gradient[pixel];
       furthest = last[p] > furthest ? last[p] : furthest;
     }
-    furthest = __reduce_max_sync(kWarp, furthest);
+    furthest = warp_max(furthest);
   }
 
   __device__ float value(int p, const float4& color, float inverse_depth) const {

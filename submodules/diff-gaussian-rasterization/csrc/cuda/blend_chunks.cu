@@ -292,7 +292,7 @@ struct Blender {
 
 // Bounding blocks per multiprocessor limits the kernel to 48 registers on sm_90.
 template <int kRays, bool kDepth, bool kLast>
-__global__ void __launch_bounds__(L::kThreads, kRays == kLensRays ? 4 : 5)
+__global__ void __launch_bounds__(L::kThreads, blocks_at_once(kRays == kLensRays ? 4 : 5, L::kThreads))
     blend_chunks_kernel(const int32_t* halted, BlendInput<float> in, Progress progress, Layers layers,
                         Blended<float> out) {
   if (!begin_work(halted)) return;  // then nobody has set up `progress` either

@@ -12,7 +12,7 @@ using L = Layout<2>;
 
 // Bounding blocks per multiprocessor limits the kernel to 56 registers on sm_90, without spills but on rays with depth.
 template <int kRays, bool kDepth, bool kLast>
-__global__ void __launch_bounds__(L::kThreads, kRays == kLensRays ? 6 : 9)
+__global__ void __launch_bounds__(L::kThreads, blocks_at_once(kRays == kLensRays ? 6 : 9, L::kThreads))
     blend_kernel(const int32_t* halted, BlendInput<float> in, Blended<float> out) {
   if (!begin_work(halted)) return;
   constexpr int kBatch = L::kThreads, kRun = L::kRun;

@@ -53,7 +53,7 @@ struct ChannelPixels {
       }
       furthest = last[p] > furthest ? last[p] : furthest;
     }
-    furthest = __reduce_max_sync(kWarp, furthest);
+    furthest = warp_max(furthest);
   }
 
   // What a splat's channels add to the loss, for each pixel.

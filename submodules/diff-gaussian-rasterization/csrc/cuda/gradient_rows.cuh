@@ -59,10 +59,10 @@ struct WarpSums {
     const bool many = end - begin > kOwnRows;
     for (int v = 0; v < kValues; ++v) sums[v] = 0;
 
-    const unsigned last = __reduce_max_sync(kWarp, end);
+    const unsigned last = warp_max(end);
     for (unsigned next = begin;;) {
       const bool open = !many && next < end;
-      const unsigned first = __reduce_min_sync(kWarp, open ? next : ~0u);
+      const unsigned first = warp_min(open ? next : ~0u);
       if (first == ~0u) break;
       const float2* from = reinterpret_cast<const float2*>(rows + int64_t(kValues) * first);
       const int pairs = kValues / 2 * int(last - first < kStaged ? last - first : kStaged);

@@ -50,7 +50,7 @@ __global__ void __launch_bounds__(kTile* kTile)
   const int across = tile_count(in.image.width), tile = blockIdx.x;
   const int x = tile % across * kTile + threadIdx.x % kTile, y = tile / across * kTile + threadIdx.x / kTile;
   const int mine = x < in.image.width && y < in.image.height ? last[int64_t(y) * in.image.width + x] : 0;
-  const int warp_most = __reduce_max_sync(kWarp, mine);
+  const int warp_most = warp_max(mine);
   if (threadIdx.x % 32 == 0) atomicMax(&most, warp_most);
   __syncthreads();
   if (threadIdx.x == 0) processed[tile] = most;

@@ -5,6 +5,7 @@
 #include "gs/cuda_check.h"
 #include "gs/cuda_launch.h"
 #include "gs/cuda_queue.h"
+#include "gs/gpu_forms.h"
 
 namespace gs {
 namespace cuda {

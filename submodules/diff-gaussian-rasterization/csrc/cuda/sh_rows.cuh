@@ -1,8 +1,6 @@
 #pragma once
 // Moves rows of sh_rest and of its gradient through shared memory, because a thread's own 180 bytes are not coalesced.
 // A warp moves the rows of its own 32 Gaussians.
-#include <cuda_pipeline.h>
-
 #include "../math/sh.h"
 #include "queue.cuh"
 
@@ -30,14 +28,13 @@ __device__ inline unsigned fetch_rows(const float* global, int64_t first, int64_
 #pragma unroll
     for (int k = 0; k < (kRest * 32 + 127) / 128; ++k) {
       const int at = 4 * (32 * k + lane);
-      if (at < kRest * 32) __pipeline_memcpy_async(rows + at, from + at, 16);
+      if (at < kRest * 32) start_copy(reinterpret_cast<float4*>(rows + at), reinterpret_cast<const float4*>(from + at));
     }
     wanted = kWarp;
   } else {
     for (unsigned left = wanted; left; left &= left - 1) {
       const int row = __ffs(left) - 1;
-      for (int v = lane; v < values; v += 32)
-        __pipeline_memcpy_async(rows + row * kRest + v, from + row * stride + v, sizeof(float));
+      for (int v = lane; v < values; v += 32) start_copy(rows + row * kRest + v, from + row * stride + v);
     }
   }
   __pipeline_commit();

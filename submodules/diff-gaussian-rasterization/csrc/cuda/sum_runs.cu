@@ -41,8 +41,8 @@ __global__ void __launch_bounds__(kThreads)
   alignas(8) float sums[kValues];
   Sums::add_up(in.from, kept == 1 ? unsigned(from) : 0, kept == 1 ? unsigned(from + count) : 0, sums, stage);
 
-  const unsigned first = __reduce_min_sync(kWarp, kept ? unsigned(to) : ~0u);
-  const unsigned end = __reduce_max_sync(kWarp, unsigned(kept ? to + kept : 0));
+  const unsigned first = warp_min(kept ? unsigned(to) : ~0u);
+  const unsigned end = warp_max(unsigned(kept ? to + kept : 0));
   if (first >= end) return;
   const bool staged = end - first <= kRows;
   float* new_rows = in.to + int64_t(kValues) * first;

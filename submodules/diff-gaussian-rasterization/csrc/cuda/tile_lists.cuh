@@ -330,7 +330,7 @@ __device__ __forceinline__ void sort_piece(Buckets& shared, const uint64_t* keys
     const uint32_t depth = uint32_t(key[r] >> 32);
     low = depth < low ? depth : low, high = depth > high ? depth : high;
   }
-  low = __reduce_min_sync(kWarp, low), high = __reduce_max_sync(kWarp, high);
+  low = warp_min(low), high = warp_max(high);
   if (threadIdx.x % 32 == 0) atomicMin(&shared.least, low), atomicMax(&shared.most, high);
   __syncthreads();
   const uint32_t least = shared.least;

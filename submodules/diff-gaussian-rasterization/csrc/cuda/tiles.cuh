@@ -90,7 +90,7 @@ __device__ inline uint32_t warp_tiles_reached(const Test& test, int x0, int y0, 
   unsigned kept = 0;  // lane k keeps round k's hits
   for (unsigned base = 0, begun = 0; base < total; base += 32) {
     const unsigned in_round = start - base;
-    const unsigned starts = __reduce_or_sync(kWarp, in_round < 32 ? 1u << in_round : 0u);
+    const unsigned starts = warp_or(in_round < 32 ? 1u << in_round : 0u);
     const int owner = begun + __popc(starts & ((2u << lane) - 1)) - 1;
     begun += __popc(starts);
     const int k = int(base + lane - from_lane(start, owner)), row = k * from_lane(inverse, owner) >> 10;

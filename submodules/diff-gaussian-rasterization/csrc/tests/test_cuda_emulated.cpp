@@ -9,6 +9,7 @@
 #include "exchange_run.h"
 #include "front_first.cuh"
 #include "gs/check_shared.h"
+#include "gs/gpu_forms.h"
 #include "long_lists.h"
 #include "math/camera_gradient.h"
 #include "math/step_now.h"
@@ -864,6 +865,38 @@ void test_longest_first() {
     }
 }
 
+// The plain forms for older GPUs beside the others (gs/gpu_forms.h).
+void test_plain_forms() {
+  for (const auto order : gs::emulation::kOrders) {
+    gs::emulation::order = order;
+    std::vector<int> values(32);
+    alignas(16) float from[32][4], shared[2][32][4] = {};
+    for (int k = 0; k < 32; ++k) {
+      values[k] = int(1e8 * normal());
+      for (float& value : from[k]) value = float(normal());
+    }
+    unsigned all = 0;
+    for (const int value : values) all |= unsigned(value);
+    const auto [least, most] = std::minmax_element(values.begin(), values.end());
+    const auto unsigned_least = unsigned(*least) ^ 1u << 31, unsigned_most = unsigned(*most) ^ 1u << 31;
+    gs::emulation::run_grid(1, 32, 0, [&] {
+      const int lane = gs::emulation::lane(), mine = values[lane];
+      const unsigned shifted = unsigned(mine) ^ 1u << 31;  // in the same order
+      CHECK(gs::warp_max(mine) == *most && gs::plain::warp_max(mine) == *most);
+      CHECK(gs::warp_max(shifted) == unsigned_most && gs::plain::warp_max(shifted) == unsigned_most);
+      CHECK(gs::warp_min(shifted) == unsigned_least && gs::plain::warp_min(shifted) == unsigned_least);
+      CHECK(gs::warp_or(unsigned(mine)) == all && gs::plain::warp_or(unsigned(mine)) == all);
+      const float4* row = reinterpret_cast<const float4*>(from[lane]);
+      gs::start_copy(reinterpret_cast<float4*>(shared[0][lane]), row);
+      gs::plain::start_copy(reinterpret_cast<float4*>(shared[1][lane]), row);
+      __pipeline_commit();
+      __pipeline_wait_prior(0);
+      __syncwarp();
+      for (const auto& rows : shared) CHECK(std::memcmp(rows[31 - lane], from[31 - lane], sizeof *from) == 0);
+    });
+  }
+}
+
 }  // namespace
 
 void before() {
@@ -893,6 +926,7 @@ int main() {
                          [] { test_many_tiles(gs::kPinholeRays); },
                          [] { test_many_tiles(gs::kLensRays); },
                          test_shared_lists_are_blended_as_whole_ones,
+                         test_plain_forms,
                          test_longest_first,
                          test_front_first,
                          test_records,
