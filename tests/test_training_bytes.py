@@ -32,7 +32,7 @@ RESUMED = (  # each has a state of its own
 LOOKS = ("--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44, "--checkpoint_iterations", 21, ITERATIONS)
 # Whose steps are queued one call after the other.
 WITHOUT_GRAPHS = ("depth", "masks", "together", "poses, no graph", "points")
-WITHOUT_GRAPHS += "robust mask", "points and poses"
+WITHOUT_GRAPHS += "robust mask", "region", "points and poses"
 KINDS = {"degree 0": 1, "two phases": 5, "appearance": 5, "exposure": 8, "budget errors": 7}  # half images count, too
 KINDS["exposure and sizes"] = 9
 

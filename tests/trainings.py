@@ -54,6 +54,7 @@ OPTIONS = {
     "budget": BUDGET,
     "sky": ("--sky", "auto", "--densify_grad_threshold", 1e-5),
     "robust mask": ("--robust_mask", 0.3, "--opacity_reset_interval", 3000),
+    "region": ("--region", "0.8 0 0 0.7"),
     "points and poses": ("--sparse_depth", 0.5, "--refine_poses"),
     "poses": ("--refine_poses", "--resolution_schedule", "pyramid"),
     "poses, no graph": ("--refine_poses", "--train_test_exp", "-d", "depths", "--depth_l1_weight_init", 1),

@@ -102,16 +102,25 @@ def random_in_frusta(cameras: list[CameraInfo]) -> BasicPointCloud:
 
 def _focus_distance(cameras: list[CameraInfo]) -> float:
     extent = scene_extent(cameras)
+    focus = focus_of(cameras)
+    return focus[1] if focus and focus[1] > 0.1 * extent else extent
+
+
+def focus_of(cameras: list[CameraInfo]) -> tuple[np.ndarray, float] | None:
+    """The point (3,) nearest to all optical axes, and the cameras' median distance from it along these.
+
+    None where the axes are within about 2 degrees of each other, or the point is behind most cameras.
+    """
     axes = np.array([camera.R[:, 2] for camera in cameras])
     centers = np.array([camera.center for camera in cameras])
     # Least squares: the sum of I - a aᵀ over the axes a, times the point, is the sum of (I - a aᵀ) center.
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     normal = across.sum(axis=0)
-    if np.linalg.eigvalsh(normal)[0] < 1e-3 * len(cameras):  # axes within about 2 degrees of each other
-        return extent
+    if np.linalg.eigvalsh(normal)[0] < 1e-3 * len(cameras):
+        return None
     focus = np.linalg.solve(normal, (across @ centers[:, :, None]).sum(axis=0)[:, 0])
     distance = float(np.median(((focus - centers) * axes).sum(axis=1)))
-    return distance if distance > 0.1 * extent else extent
+    return (focus, distance) if distance > 0 else None
 
 
 def _grey(points: np.ndarray) -> BasicPointCloud:
