@@ -20,6 +20,7 @@ from pathlib import Path
 from torch import Tensor
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
+from scene.gaussians.morton import sort_scattered
 from scene.saved_model import find_save, load_saved, read_model
 from scene.scene import Scene
 from scene.splats.splats import drawable, selected
@@ -41,7 +42,9 @@ def of_file(path: str, pipeline: argparse.Namespace) -> WithoutScene:
     splats = selected(splats, drawable(splats))
     pipeline.antialiasing = pipeline.antialiasing or splats.antialiasing
     folder, name = os.path.split(os.path.abspath(path))
-    return WithoutScene(model_of(splats), folder, name, circle(splats.means))
+    gaussians = model_of(splats)
+    sort_scattered(gaussians)
+    return WithoutScene(gaussians, folder, name, circle(splats.means))
 
 
 def of_folder(options: argparse.Namespace, args: argparse.Namespace) -> Scene | WithoutScene:

@@ -12,6 +12,7 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import Rows
 from scene.gaussians.checkpoint import extra_state, load_checkpoint, unpack
 from scene.gaussians.finite import warn_of_undrawn
+from scene.gaussians.morton import sort_scattered
 from scene.gaussians.ply import read_ply
 from scene.saved_iterations import saved_ply
 from scene.scene import Scene
@@ -77,10 +78,12 @@ def _degree(coefficients: int) -> int:
 def load_saved(options: argparse.Namespace, iteration: int, sh_degree: int | None = None) -> Scene:
     """Scene of the model options, whose `gaussians` are those of a saved iteration, -1: the newest one.
 
-    sh_degree: degree that the file must have, None: any. UserError as from Scene and the functions above.
+    Rows that are in no order in space are sorted, which draws faster. sh_degree: degree that the file must have, None:
+    any. UserError as from Scene and the functions above.
     """
     iteration, path = find_save(options.model_path, iteration)
     gaussians = read_model(path, sh_degree)
+    sort_scattered(gaussians)
     scene = Scene(options, gaussians, load_iteration=iteration, shuffle=False, start=False)
     print(f"Loading trained model at iteration {iteration}" + (f" from {path}" if path.suffix == ".pth" else ""))
     scene.load_beside(options)

@@ -14,6 +14,7 @@ import torch
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import attributes
+from scene.gaussians.morton import sort_scattered
 from scene.scene import Scene
 from scene.splats.ply import columns_of
 from scene.splats.reading import is_point_cloud, read_splats
@@ -104,6 +105,7 @@ def load_file(options: argparse.Namespace, path: str, pipeline: argparse.Namespa
     if splats is None:
         raise UserError(f"{path} is a point cloud; start a training from it with train.py --init_pcd_path {path}")
     scene.gaussians, scene.loaded_iter = model_of(splats), Path(path).name.split(".")[0]
+    sort_scattered(scene.gaussians)
     scene.gaussians.start_exposures(scene.info.train_cameras)
     pipeline.antialiasing = pipeline.antialiasing or splats.antialiasing
     return scene

@@ -1,10 +1,11 @@
 """Rows along a Morton curve: the codes against bits by hand, and what moves with a row."""
 
 import numpy as np
+import pytest
 import torch
 from gaussians import model, parameters
 
-from scene.gaussians.morton import morton_codes, sort_rows
+from scene.gaussians.morton import morton_codes, sort_rows, sort_scattered
 
 
 def _by_hand(point: np.ndarray, scale: float) -> int:
@@ -57,3 +58,25 @@ def test_without_memory_rows_move_within_their_own(monkeypatch):
     monkeypatch.undo()
     for name, values in parameters(one).items():
         assert torch.equal(values, parameters(other)[name]), name
+
+
+def test_scattered_rows_are_sorted_and_a_model_in_its_order_keeps_it():
+    gaussians = model(5000, seed=3)
+    scattered = parameters(gaussians)
+    sort_scattered(gaussians)
+    one = parameters(gaussians)
+    sort_rows(gaussians)
+    assert all(torch.equal(one[name], values) for name, values in parameters(gaussians).items())
+    assert not torch.equal(one["xyz"], scattered["xyz"])
+    with torch.no_grad():  # as training moves Gaussians after the last sort
+        gaussians._xyz += 0.01 * torch.randn(gaussians._xyz.shape, generator=torch.Generator().manual_seed(0))
+    moved = parameters(gaussians)
+    sort_scattered(gaussians)
+    assert torch.equal(parameters(gaussians)["xyz"], moved["xyz"])
+    codes = morton_codes(moved["xyz"], gaussians.spatial_lr_scale)
+    assert (codes[1:] < codes[:-1]).any()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_rows_have_an_order(count):
+    sort_scattered(model(count, seed=1))
