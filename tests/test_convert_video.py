@@ -261,11 +261,12 @@ def test_an_ffmpeg_that_can_not_convert_hdr_is_refused(ffmpeg, room, tmp_path, m
     assert not list((tmp_path / "scene" / "input").iterdir())
 
 
-def test_a_turned_video_gives_upright_frames(ffmpeg, room, tmp_path):
+def test_a_turned_video_gives_upright_frames_without_a_warning(ffmpeg, room, tmp_path, caplog):
     _write(ffmpeg, tmp_path / "flat.mp4", room[:3], "-crf", "10", "-pix_fmt", "yuv420p")
     command = [ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-display_rotation", "90", "-i", tmp_path / "flat.mp4"]
     subprocess.run([*command, "-c", "copy", tmp_path / "turned.mp4"], check=True)
     layout = _extract(tmp_path / "scene", tmp_path / "turned.mp4", 3)
+    assert not caplog.records
     taken = np.asarray(Image.open(_frames(layout)[0]).convert("L")).astype(float)
     expected = np.rot90(np.asarray(Image.fromarray(room[0]).convert("L")))
     assert np.abs(taken - expected).mean() < 4 < 20 < np.abs(taken - expected[::-1, ::-1]).mean()  # of 0 to 255
