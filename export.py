@@ -132,6 +132,8 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     needs_photos = bool(args.max_splats or args.clean)
     poses = stand_ins(args, options) if entry.around and not needs_photos else None
     splats, scene = load(args, options, needs_photos or entry.of_scene and not poses)
+    if scene:
+        _check_views(args, make_path, scene.getTrainCameras())
     degree = used_sh_degree(splats) if args.typed_sh_degree is None else min(args.typed_sh_degree, splats.sh_degree)
     keep = choose(splats, args.crop, args.min_opacity)
     for left_out in tools("left_out"):
@@ -183,6 +185,19 @@ def _check_fitting(args: argparse.Namespace, entry: Format) -> None:
         if getattr(args, option) and option not in entry.options:
             endings = " or ".join(other.ending for other in FORMATS if option in other.options)
             raise UserError(f"--{option} is for {endings}; leave it out, or end --to with {endings}")
+
+
+def _check_views(
+    args: argparse.Namespace, make_path: Callable[[Poses], TimedPath] | None, cameras: list[Camera]
+) -> None:
+    """UserError for a --start or --path that the training views do not have, before they are rendered."""
+    from splatting.camera_paths.poses import poses_of  # SciPy takes a while to import
+    from splatting.exports.page_start import named_start
+
+    if args.start is not None:
+        named_start(args.start, [str(camera.image_name) for camera in cameras])
+    if make_path and cameras:
+        make_path(poses_of(cameras))
 
 
 def _path_maker(path: str | None) -> Callable[[Poses], TimedPath] | None:

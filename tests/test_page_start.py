@@ -111,6 +111,10 @@ def test_pages_are_cleaned_unless_they_are_raw(colmap_scene, tmp_path, monkeypat
         with pytest.raises(UserError, match="enough is known"):
             run(*words)
         assert asked.pop() == most
+    with pytest.raises(UserError, match="--start nowhere is no training photo"):  # before the views are rendered
+        run("--start", "nowhere")
+    with pytest.raises(UserError, match="--path"):
+        run("--path", "spiral")
     run("--raw", "--title", "Room")
     assert not asked and (tmp_path / "page.html.jpg").is_file() and _meta(tmp_path / "page.html")["og:title"] == "Room"
     with pytest.raises(UserError, match="contradict"):
