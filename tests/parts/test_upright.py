@@ -14,6 +14,7 @@ import torch
 from gaussians import pipeline
 from html_scene import FOV, SIZE, balls
 from html_scene import cameras as free_cameras
+from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
 import export
@@ -25,7 +26,7 @@ from scene.splats.reading import read_splats
 from scene.with_splats import model_of
 from splatting.camera_paths.keyframes import CameraPath, Keyframe, KeyframePath
 from splatting.camera_paths.poses import poses_of
-from splatting.exports.formats import Around
+from splatting.exports.formats import Around, format_of
 from splatting.exports.html import write_html
 from splatting.exports.mesh import Mesh
 from splatting.exports.mesh_files import write_glb_mesh
@@ -164,6 +165,25 @@ def test_glb_tells_where_on_earth_it_is(tmp_path, place, kind):
         assert "EXT_georeference" in document["extensionsUsed"]
         assert node["extensions"] == {"EXT_georeference": {"latitude": 47.25, "longitude": 8.5}}
         np.testing.assert_allclose(turn, np.diag([-1, -1, 1]), atol=1e-9)
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_a_ply_of_an_upright_mesh_has_z_up(tmp_path, monkeypatch, upright):
+    """As Blender reads it: what was x right, y down, z forward is x right, y forward, z up."""
+    points = np.float32([[1, 2, 3], [4, 5, 6], [7, 8, 10]])
+    mesh = Mesh(points, np.int32([[0, 1, 2]]), np.zeros((3, 3), np.uint8))
+    monkeypatch.setattr("splatting.exports.mesh.mesh_of", lambda *_: (mesh, "a triangle"))
+    for ending, expected in (("ply", points[:, [0, 2, 1]] * [1, 1, -1] if upright else points), ("glb", points)):
+        path = tmp_path / f"mesh.{ending}"
+        format_of(path).write(path, balls(), around()._replace(upright=upright))
+        if ending == "ply":
+            read = PlyData.read(path)["vertex"]
+            found = np.column_stack([read[name] for name in "xyz"])
+        else:  # its node turns it
+            content = path.read_bytes()
+            start = 28 + int.from_bytes(content[12:16], "little")
+            found = np.frombuffer(content, "<f4", 9, start).reshape(3, 3)
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_a_page_takes_the_vertical_of_the_similarity(tmp_path):
