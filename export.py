@@ -14,6 +14,7 @@ if __name__ == "__main__":
 import argparse
 import math
 import os
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -39,7 +40,7 @@ from splatting.exports.cleaning import OPTION as CLEAN_OPTION
 from splatting.exports.cleaning import check_clean, clean_scene, write_picture
 from splatting.exports.formats import FORMATS, Around, Format, format_of
 from splatting.exports.reading import ANY, read_any
-from splatting.exports.upright import add_upright_options, placed
+from splatting.exports.upright import add_upright_options, check_upright, placed
 from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json
 from splatting.parts import tools
 from utils.general_utils import safe_state
@@ -58,7 +59,7 @@ def load(args: argparse.Namespace, options: argparse.Namespace, needs_views: boo
     if needs_views:
         if not args.model_path:
             raise UserError(
-                "--max_splats, --clean, pages and meshes need training views; give their model folder with -m beside "
+                "--max_splats, --clean and meshes need training views; give their model folder with -m, and beside it "
                 f"--ply {args.ply}"
             )
         options.images_to_load = 1  # each image is used once or twice
@@ -127,11 +128,16 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     make_path = _path_maker(args.path)
     entry.check(args.to)
     _refuse_to_replace_a_model(Path(args.to), args.ply)
+    check_upright(args)
     if entry.clean and not (args.raw or args.clean) and stand_ins(args, options) is None:
         args.clean = CLEAN_OPTION["const"]
     needs_photos = bool(args.max_splats or args.clean)
     poses = stand_ins(args, options) if entry.around and not needs_photos else None
+    if poses and entry.clean and args.model_path and not args.raw:
+        print(f"not cleaned, as there is no scene folder {options.source_path}; name it with -s", file=sys.stderr)
     splats, scene = load(args, options, needs_photos or entry.of_scene and not poses)
+    if scene:
+        _check_views(args, make_path, scene.getTrainCameras())
     degree = used_sh_degree(splats) if args.typed_sh_degree is None else min(args.typed_sh_degree, splats.sh_degree)
     keep = choose(splats, args.crop, args.min_opacity)
     for left_out in tools("left_out"):
@@ -183,6 +189,19 @@ def _check_fitting(args: argparse.Namespace, entry: Format) -> None:
         if getattr(args, option) and option not in entry.options:
             endings = " or ".join(other.ending for other in FORMATS if option in other.options)
             raise UserError(f"--{option} is for {endings}; leave it out, or end --to with {endings}")
+
+
+def _check_views(
+    args: argparse.Namespace, make_path: Callable[[Poses], TimedPath] | None, cameras: list[Camera]
+) -> None:
+    """UserError for a --start or --path that the training views do not have, before they are rendered."""
+    from splatting.camera_paths.poses import poses_of  # SciPy takes a while to import
+    from splatting.exports.page_start import named_start
+
+    if args.start is not None:
+        named_start(args.start, [str(camera.image_name) for camera in cameras])
+    if make_path and cameras:
+        make_path(poses_of(cameras))
 
 
 def _path_maker(path: str | None) -> Callable[[Poses], TimedPath] | None:

@@ -16,6 +16,7 @@ from skimage.metrics import structural_similarity
 
 import convert
 from splatting.sfm import video as video_module
+from splatting.sfm.colmap import Pycolmap, Settings
 from splatting.sfm.layout import Layout
 from splatting.sfm.video import choose_frames, extract_videos, sharpness, small_picture
 from utils.system_utils import UserError
@@ -124,6 +125,32 @@ def test_frames_that_an_ended_run_left_out_are_said(tmp_path, monkeypatch, capsy
     record = json.loads(layout.stages.read_text())
     layout.stages.write_text(json.dumps(record | {"video": record["video"] | {"done": False}}))
     assert ended() and not ended("--video", str(video)) and not ended()
+
+
+def test_a_later_run_without_the_video_matches_as_before(tmp_path, monkeypatch):
+    """Such as one for --orient: other matches would give other poses, and a trained model would be of another scene."""
+    layout, matchers = Layout(tmp_path / "scene"), []
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", _Decoder())
+
+    def backend(layout: Layout, settings: Settings) -> Pycolmap:
+        matchers.append(settings.matcher)
+        return Pycolmap(layout, settings)
+
+    monkeypatch.setattr(convert, "Pycolmap", backend)
+    for name in ("a.mp4", "b.mp4"):
+        (tmp_path / name).touch()
+
+    def matcher(*words: str) -> str:
+        with pytest.raises(UserError, match="has a mask"):
+            convert.main(["-s", str(layout.scene), "--mask_path", str(tmp_path), *words])
+        return matchers.pop()
+
+    assert matcher("--video", str(tmp_path / "a.mp4")) == matcher() == matcher("--orient") == "sequential"
+    assert matcher("--matcher", "exhaustive") == "exhaustive"
+    Image.new("RGB", (40, 30)).save(layout.input / "mine.jpg")
+    assert matcher() == "exhaustive"
+    (layout.input / "mine.jpg").unlink()
+    assert matcher("--video", str(tmp_path / "a.mp4"), str(tmp_path / "b.mp4")) == matcher() == "exhaustive"
 
 
 @pytest.fixture(scope="module")
@@ -261,11 +288,12 @@ def test_an_ffmpeg_that_can_not_convert_hdr_is_refused(ffmpeg, room, tmp_path, m
     assert not list((tmp_path / "scene" / "input").iterdir())
 
 
-def test_a_turned_video_gives_upright_frames(ffmpeg, room, tmp_path):
+def test_a_turned_video_gives_upright_frames_without_a_warning(ffmpeg, room, tmp_path, caplog):
     _write(ffmpeg, tmp_path / "flat.mp4", room[:3], "-crf", "10", "-pix_fmt", "yuv420p")
     command = [ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-display_rotation", "90", "-i", tmp_path / "flat.mp4"]
     subprocess.run([*command, "-c", "copy", tmp_path / "turned.mp4"], check=True)
     layout = _extract(tmp_path / "scene", tmp_path / "turned.mp4", 3)
+    assert not caplog.records
     taken = np.asarray(Image.open(_frames(layout)[0]).convert("L")).astype(float)
     expected = np.rot90(np.asarray(Image.fromarray(room[0]).convert("L")))
     assert np.abs(taken - expected).mean() < 4 < 20 < np.abs(taken - expected[::-1, ::-1]).mean()  # of 0 to 255

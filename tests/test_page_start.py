@@ -9,13 +9,14 @@ import torch
 from gaussians import pipeline
 from html_scene import FOV, SIZE, balls, cameras
 from PIL import Image
+from scipy.spatial.transform import Rotation
 from test_html_export import Page
 
 import export
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
 from scene.with_splats import model_of
-from splatting.camera_paths.poses import Poses, poses_of
+from splatting.camera_paths.poses import Poses, focus_point, poses_of
 from splatting.exports import cleaning
 from splatting.exports.formats import Around, format_of
 from splatting.exports.page_start import LEAST, PICTURE, best_start, named_start, narrowed, write_preview
@@ -39,6 +40,17 @@ def test_a_page_begins_at_a_usual_camera_that_looks_at_the_middle():
     places[3] = middle + 3 * (places[3] - middle)
     assert best_start(Poses(places, turns, poses.fov)) >= 4
     assert best_start(poses[np.array([0])]) == 0  # looks at nothing in common
+
+
+@pytest.mark.parametrize(("farther", "chosen"), [(1.0, True), (1.4, True), (3.0, False), (0.7, False)])
+def test_a_page_may_begin_somewhat_farther_away(farther, chosen):
+    poses = poses_of(cameras(8))
+    turns, places = poses.turns.copy(), poses.positions.copy()
+    middle = focus_point(poses)
+    places[5] = middle + farther * (places[5] - middle)
+    others = np.arange(8) != 5
+    turns[others] = turns[others] @ Rotation.from_rotvec([0, 0.1, 0]).as_matrix()  # look slightly aside
+    assert (best_start(Poses(places, turns, poses.fov)) == 5) == chosen
 
 
 def test_a_start_is_named_with_or_without_its_ending():
@@ -99,6 +111,10 @@ def test_pages_are_cleaned_unless_they_are_raw(colmap_scene, tmp_path, monkeypat
         with pytest.raises(UserError, match="enough is known"):
             run(*words)
         assert asked.pop() == most
+    with pytest.raises(UserError, match="--start nowhere is no training photo"):  # before the views are rendered
+        run("--start", "nowhere")
+    with pytest.raises(UserError, match="--path"):
+        run("--path", "spiral")
     run("--raw", "--title", "Room")
     assert not asked and (tmp_path / "page.html.jpg").is_file() and _meta(tmp_path / "page.html")["og:title"] == "Room"
     with pytest.raises(UserError, match="contradict"):

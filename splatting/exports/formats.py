@@ -16,7 +16,7 @@ from scene.splats.ply import write_compressed_ply, write_plain_ply
 from scene.splats.splats import Splats
 from scene.splats.spz import find_zstandard, write_spz
 from splatting.camera_paths.poses import poses_of
-from splatting.exports.mesh_files import find_skimage, write_glb_mesh, write_ply_mesh
+from splatting.exports.mesh_files import find_skimage, with_z_up, write_glb_mesh, write_ply_mesh
 from splatting.exports.scene_formats import find_pxr, write_glb, write_usdz
 from splatting.exports.sog import find_program, write_sog
 from utils.system_utils import UserError
@@ -76,12 +76,16 @@ def _write_html(path: str | os.PathLike, splats: Splats, around: Around) -> None
     write_preview(picture, splats, around.cameras[start], around.pipe, around.background)
 
 
-def _mesh_by(write: Callable[[str | os.PathLike, Mesh, Splats], None]) -> Callable[..., str]:
+def _mesh_by(
+    write: Callable[[str | os.PathLike, Mesh, Splats], None], turn: Callable[[Mesh], Mesh] | None = None
+) -> Callable[..., str]:
+    """What writes meshes. turn: of a mesh that is upright, before."""
+
     def write_mesh(path: str | os.PathLike, splats: Splats, around: Around) -> str:
         from splatting.exports.mesh import mesh_of  # as does this
 
         mesh, text = mesh_of(splats, around.cameras, around.pipe, around.voxel)
-        write(path, mesh, splats)
+        write(path, turn(mesh) if turn and around.upright else mesh, splats)
         return text
 
     return write_mesh
@@ -103,7 +107,7 @@ def _write_lod_meta(path: str | os.PathLike, splats: Splats, around: Around) -> 
 FORMATS = (
     Format(
         "mesh.ply",
-        _mesh_by(write_ply_mesh),
+        _mesh_by(write_ply_mesh, with_z_up),
         "surfaces, as coloured triangles",
         True,
         ("voxel",),

@@ -1,8 +1,12 @@
-"""Files of meshes: PLY in the axes of the model, and GLB (binary glTF 2.0) with y up by a node that turns it."""
+"""Files of meshes: PLY, and GLB (binary glTF 2.0) with y up by a node that turns it.
+
+PLY has the axes of the model, or z up where it is known what is up: PLY has no convention, and Blender takes z.
+"""
 
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from types import ModuleType
 from typing import TYPE_CHECKING
 
@@ -30,6 +34,12 @@ def find_skimage(path: str | os.PathLike) -> ModuleType:
     except ImportError as error:
         raise UserError(f"{path} needs the package scikit-image; run pip install '.[export]'") from error
     return skimage
+
+
+def with_z_up(mesh: Mesh) -> Mesh:
+    """A mesh with z up instead of -y. Where x was east and z north, x is east, y north and z up."""
+    x, y, z = mesh.vertices.T
+    return replace(mesh, vertices=np.stack([x, z, -y], axis=1))
 
 
 def write_ply_mesh(path: str | os.PathLike, mesh: Mesh, splats: Splats) -> None:

@@ -23,17 +23,22 @@ LEAST = 0.5  # of a photo's height that is shown, however wide the window is
 PICTURE = 1200, 630  # px, as services ask for
 _QUALITY = 88  # of its JPEG
 _ALIKE = 1e-3  # scores that differ by less are equal
+_FARTHER = 1.5  # of the usual distance: from there a view shows more of the middle, and no less well
 
 
 def best_start(poses: Poses) -> int:
-    """The camera that looks most straight at what all look at, from a usual distance; the first of equals."""
+    """The camera that looks most straight at what all look at, from a usual distance or somewhat farther away.
+
+    The first of equals. One radian off the axis counts as much as being nearer, or too far, by a factor of e.
+    """
     focus = focus_point(poses)
     if focus is None:
         return 0
     offsets = focus - poses.positions
     distances = np.linalg.norm(offsets, axis=1).clip(1e-9)
     angles = np.arccos(np.clip((offsets * poses.forward).sum(1) / distances, -1, 1))
-    scores = angles + np.abs(np.log(distances / np.median(distances)))
+    usual = np.median(distances)
+    scores = angles + np.abs(np.log(distances / np.clip(distances, usual, _FARTHER * usual)))
     return int(np.argmax(scores <= scores.min() + _ALIKE))
 
 

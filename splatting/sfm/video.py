@@ -3,6 +3,7 @@
 ffmpeg reads each video twice: first as grey pictures, which tell motion and sharpness, then the frames that are taken.
 """
 
+import logging
 import re
 import subprocess
 import sys
@@ -48,6 +49,8 @@ def find_decoder() -> Any:
             "--video needs the package imageio-ffmpeg; `pip install imageio-ffmpeg`, or put frames of the video into "
             "the folder input yourself"
         ) from error
+    # It warns of every turned video, as phones make them; the frames are upright all the same.
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
     return imageio_ffmpeg
 
 

@@ -97,6 +97,17 @@ def test_more_iterations_continue_a_finished_training(colmap_scene, tmp_path, ca
     )
 
 
+def test_a_finished_training_without_its_last_checkpoint_is_not_said_to_continue(colmap_scene, tmp_path, capfd):
+    """Whose checkpoint of another iteration, as of Ctrl-C, is not its end."""
+    _train(colmap_scene, tmp_path, 12, "--no_last_checkpoint", "--checkpoint_iterations", 5)
+    _train(colmap_scene, tmp_path, 12, "--resume")
+    said = "of --iterations 12; it left no checkpoint of its end to continue; leave --resume out to start over"
+    assert said in capfd.readouterr().out
+    _train(colmap_scene, tmp_path, 20)
+    said = capfd.readouterr().err
+    assert "of --iterations 12, and this one starts over; the old one left no checkpoint of its end" in said
+
+
 def test_no_last_checkpoint(colmap_scene, tmp_path, capfd):
     _train(colmap_scene, tmp_path, 12, "--no_last_checkpoint")
     assert _checkpoints(tmp_path) == set() and read_model_json(tmp_path)["finished"] == 12

@@ -14,6 +14,7 @@ import torch
 from gaussians import pipeline
 from html_scene import FOV, SIZE, balls
 from html_scene import cameras as free_cameras
+from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
 import export
@@ -25,12 +26,12 @@ from scene.splats.reading import read_splats
 from scene.with_splats import model_of
 from splatting.camera_paths.keyframes import CameraPath, Keyframe, KeyframePath
 from splatting.camera_paths.poses import poses_of
-from splatting.exports.formats import Around
+from splatting.exports.formats import Around, format_of
 from splatting.exports.html import write_html
 from splatting.exports.mesh import Mesh
 from splatting.exports.mesh_files import write_glb_mesh
 from splatting.exports.scene_formats import write_glb
-from splatting.exports.upright import moved_around, moved_cameras, moved_splats, placed
+from splatting.exports.upright import check_upright, moved_around, moved_cameras, moved_splats, placed
 from splatting.files.json_files import read_model_json
 from splatting.files.similarity import Similarity
 from utils.system_utils import UserError
@@ -112,8 +113,9 @@ def test_pages_and_meshes_are_upright_by_default_and_others_on_request(tmp_path)
     ):
         found, _ = placed(_args(tmp_path, **options), of_scene, splats, None)
         np.testing.assert_allclose(found.means, moved if is_moved else splats.means, atol=1e-5)
+    check_upright(_args(tmp_path, upright=True))
     with pytest.raises(UserError, match="contradict"):
-        placed(_args(tmp_path, True, True), True, splats, None)
+        check_upright(_args(tmp_path, True, True))
 
 
 def test_models_without_a_similarity_stay_and_say_so_when_asked(tmp_path):
@@ -121,7 +123,7 @@ def test_models_without_a_similarity_stay_and_say_so_when_asked(tmp_path):
     for folder in ("", tmp_path):
         assert placed(_args(folder), True, splats, None) == (splats, None)
         with pytest.raises(UserError, match=r"needs a model folder \(-m\) whose model.json has a similarity"):
-            placed(_args(folder, upright=True), False, splats, None)
+            check_upright(_args(folder, upright=True))
 
 
 def _trained(scene: Path, out: Path) -> Path:
@@ -139,6 +141,10 @@ def test_a_training_keeps_the_similarity_for_exports(colmap_scene, tmp_path, mon
         export.main()
     plain, upright = (read_splats(tmp_path / f"{name}.ply") for name in ("plain", "upright"))
     np.testing.assert_allclose(upright.means, SOME.points(plain.means), atol=1e-5)
+    monkeypatch.setattr(export, "load", lambda *_: pytest.fail("this is refused before anything is loaded"))
+    monkeypatch.setattr(sys, "argv", [*sys.argv, "--no_upright"])
+    with pytest.raises(UserError, match="contradict"):
+        export.main()
     (colmap_scene / "orientation.json").unlink()
     assert "similarity" not in read_model_json(_trained(colmap_scene, tmp_path / "other"))
 
@@ -164,6 +170,25 @@ def test_glb_tells_where_on_earth_it_is(tmp_path, place, kind):
         assert "EXT_georeference" in document["extensionsUsed"]
         assert node["extensions"] == {"EXT_georeference": {"latitude": 47.25, "longitude": 8.5}}
         np.testing.assert_allclose(turn, np.diag([-1, -1, 1]), atol=1e-9)
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_a_ply_of_an_upright_mesh_has_z_up(tmp_path, monkeypatch, upright):
+    """As Blender reads it: what was x right, y down, z forward is x right, y forward, z up."""
+    points = np.float32([[1, 2, 3], [4, 5, 6], [7, 8, 10]])
+    mesh = Mesh(points, np.int32([[0, 1, 2]]), np.zeros((3, 3), np.uint8))
+    monkeypatch.setattr("splatting.exports.mesh.mesh_of", lambda *_: (mesh, "a triangle"))
+    for ending, expected in (("ply", points[:, [0, 2, 1]] * [1, 1, -1] if upright else points), ("glb", points)):
+        path = tmp_path / f"mesh.{ending}"
+        format_of(path).write(path, balls(), around()._replace(upright=upright))
+        if ending == "ply":
+            read = PlyData.read(path)["vertex"]
+            found = np.column_stack([read[name] for name in "xyz"])
+        else:  # its node turns it
+            content = path.read_bytes()
+            start = 28 + int.from_bytes(content[12:16], "little")
+            found = np.frombuffer(content, "<f4", 9, start).reshape(3, 3)
+        np.testing.assert_array_equal(found, expected)
 
 
 def test_a_page_takes_the_vertical_of_the_similarity(tmp_path):

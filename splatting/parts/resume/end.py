@@ -21,6 +21,14 @@ def finished(folder: str | os.PathLike) -> int:
     return 0
 
 
+def continues(folder: str | os.PathLike, iterations: int) -> bool:
+    """Whether the finished training of so many --iterations left the checkpoint of its end, as none by the clock does.
+
+    Checkpoints of earlier iterations, as of Ctrl-C, repeat what the training then did.
+    """
+    return (Path(folder) / f"chkpnt{iterations}.pth").is_file()
+
+
 def note_finished(run: Any) -> None:
     """Note that a training has reached its end."""
     folder = Path(run.scene.model_path)

@@ -41,12 +41,14 @@ class Resume(Part):
         return True
 
     def check(self, run: Any, state: Any) -> None:
-        from splatting.parts.resume.end import finished
+        from splatting.parts.resume.end import continues, finished
 
-        if run.start is None and run.group.first and (there := finished(run.dataset.model_path)):
+        folder = run.dataset.model_path
+        if run.start is None and run.group.first and (there := finished(folder)):
+            instead = "--resume with more --iterations continues the old one from its last checkpoint"
             print(
-                f"warning: {run.dataset.model_path} holds a training that was finished, of --iterations {there}, and "
-                "this one starts over; --resume with more --iterations continues the old one from its last checkpoint",
+                f"warning: {folder} holds a training that was finished, of --iterations {there}, and this one starts "
+                f"over; {instead if continues(folder, there) else 'the old one left no checkpoint of its end'}",
                 file=sys.stderr,
             )
 

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from splatting.parts.resume.end import finished
+from splatting.parts.resume.end import continues, finished
 from splatting.training.output_folder import folder_of, own_folder
 from splatting.training.restart import REPLACED, newest_checkpoint
 from utils.system_utils import UserError
@@ -23,7 +23,9 @@ def prepare(dataset: argparse.Namespace, opt: argparse.Namespace, launch: argpar
     if done >= opt.iterations:
         with own_folder(folder):  # which removes what a training leaves that was killed after its note
             (Path(folder) / REPLACED).unlink(missing_ok=True)
-        print(f"{folder} has a finished training of --iterations {done}; give more to continue it")
+        more = "it left no checkpoint of its end to continue; leave --resume out to start over"
+        more = "give more to continue it" if continues(folder, done) else more
+        print(f"{folder} has a finished training of --iterations {done}; {more}")
         return False
     launch.start_checkpoint = newest_checkpoint(folder, opt.iterations, since=0) or launch.start_checkpoint
     return True
