@@ -14,6 +14,7 @@ if __name__ == "__main__":
 import argparse
 import math
 import os
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -58,7 +59,7 @@ def load(args: argparse.Namespace, options: argparse.Namespace, needs_views: boo
     if needs_views:
         if not args.model_path:
             raise UserError(
-                "--max_splats, --clean, pages and meshes need training views; give their model folder with -m beside "
+                "--max_splats, --clean and meshes need training views; give their model folder with -m, and beside it "
                 f"--ply {args.ply}"
             )
         options.images_to_load = 1  # each image is used once or twice
@@ -131,6 +132,8 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
         args.clean = CLEAN_OPTION["const"]
     needs_photos = bool(args.max_splats or args.clean)
     poses = stand_ins(args, options) if entry.around and not needs_photos else None
+    if poses and entry.clean and args.model_path and not args.raw:
+        print(f"not cleaned, as there is no scene folder {options.source_path}; name it with -s", file=sys.stderr)
     splats, scene = load(args, options, needs_photos or entry.of_scene and not poses)
     if scene:
         _check_views(args, make_path, scene.getTrainCameras())

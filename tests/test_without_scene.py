@@ -72,7 +72,7 @@ def test_a_folder_whose_scene_is_gone_keeps_its_poses(tmp_path, capsys):
         view.kept(scene, argparse.Namespace(clean=0.05), pipeline(), options)
 
 
-def test_a_page_of_a_folder_whose_scene_is_gone_has_its_poses(tmp_path, monkeypatch):
+def test_a_page_of_a_folder_whose_scene_is_gone_has_its_poses(tmp_path, monkeypatch, capsys):
     (tmp_path / "point_cloud/iteration_7").mkdir(parents=True)
     written(tmp_path, ".ply", balls()).rename(tmp_path / "point_cloud/iteration_7/point_cloud.ply")
     (tmp_path / "cfg_args").write_text(f"Namespace(sh_degree=1, source_path='{tmp_path}/gone', white_background=False)")
@@ -81,6 +81,7 @@ def test_a_page_of_a_folder_whose_scene_is_gone_has_its_poses(tmp_path, monkeypa
     monkeypatch.setattr("sys.argv", ["export.py", "-m", str(tmp_path), "--to", str(tmp_path / "page.html")])
     export.main()
     assert "IMG_7" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert f"not cleaned, as there is no scene folder {tmp_path}/gone; name it with -s" in capsys.readouterr().err
 
 
 def test_export_takes_a_file_alone(tmp_path, monkeypatch):
@@ -95,8 +96,8 @@ def test_export_takes_a_file_alone(tmp_path, monkeypatch):
     run(str(path), "--to", str(tmp_path / "page.html"), "--path", "ellipse")
     assert "around 11" in (tmp_path / "page.html").read_text(encoding="utf-8")
     for words, said in (
-        (["--max_splats", "10", "--to", "a.ply"], "--max_splats, --clean, pages and meshes need training views"),
-        (["--to", "mesh.ply"], "--max_splats, --clean, pages and meshes need training views"),
+        (["--max_splats", "10", "--to", "a.ply"], "--max_splats, --clean and meshes need training views"),
+        (["--to", "mesh.ply"], "--max_splats, --clean and meshes need training views"),
         (["-m", str(tmp_path), "--to", "a.ply"], "stands alone; beside -m or --ply, give one file by --ply"),
     ):
         with pytest.raises(UserError, match=said):
