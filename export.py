@@ -40,7 +40,7 @@ from splatting.exports.cleaning import OPTION as CLEAN_OPTION
 from splatting.exports.cleaning import check_clean, clean_scene, write_picture
 from splatting.exports.formats import FORMATS, Around, Format, format_of
 from splatting.exports.reading import ANY, read_any
-from splatting.exports.upright import add_upright_options, placed
+from splatting.exports.upright import add_upright_options, check_upright, placed
 from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json
 from splatting.parts import tools
 from utils.general_utils import safe_state
@@ -128,6 +128,7 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     make_path = _path_maker(args.path)
     entry.check(args.to)
     _refuse_to_replace_a_model(Path(args.to), args.ply)
+    check_upright(args)
     if entry.clean and not (args.raw or args.clean) and stand_ins(args, options) is None:
         args.clean = CLEAN_OPTION["const"]
     needs_photos = bool(args.max_splats or args.clean)

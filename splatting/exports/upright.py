@@ -24,22 +24,28 @@ def add_upright_options(add: Callable[..., Any]) -> None:
     add("--no_upright", action="store_true", help="keep pages and meshes in the frame of the scene (default: off)")
 
 
+def check_upright(args: argparse.Namespace) -> None:
+    """UserError for --upright of a model that does not say where it is upright, or beside its contrary."""
+    if args.upright and args.no_upright:
+        raise UserError("--upright and --no_upright contradict each other; leave one out")
+    if args.upright and ENTRY not in _record(args):
+        raise UserError(
+            "--upright needs a model folder (-m) whose model.json has a similarity; run convert.py --orient on its "
+            "scene and train again, or leave it out"
+        )
+
+
+def _record(args: argparse.Namespace) -> dict[str, Any]:
+    return read_model_json(args.model_path) if args.model_path else {}
+
+
 def placed(args: argparse.Namespace, of_scene: bool, splats: Splats, around: Any) -> tuple[Splats, Any]:
     """The splats, and the `Around` of a page or mesh (`of_scene`), in the frame that the options ask for.
 
-    UserError for --upright of a model that does not say where it is upright.
+    They have passed `check_upright`.
     """
-    if args.upright and args.no_upright:
-        raise UserError("--upright and --no_upright contradict each other; leave one out")
-    if args.no_upright or not (args.upright or of_scene):
-        return splats, around
-    record = read_model_json(args.model_path) if args.model_path else {}
-    if ENTRY not in record:
-        if args.upright:
-            raise UserError(
-                "--upright needs a model folder (-m) whose model.json has a similarity; run convert.py --orient on its "
-                "scene and train again, or leave it out"
-            )
+    record = _record(args)
+    if args.no_upright or not (args.upright or of_scene) or ENTRY not in record:
         return splats, around
     similarity = Similarity.of(record[ENTRY], f"model.json of {args.model_path}")
     local = similarity.from_local(record.get(OFFSET, (0.0, 0.0, 0.0)))

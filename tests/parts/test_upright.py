@@ -31,7 +31,7 @@ from splatting.exports.html import write_html
 from splatting.exports.mesh import Mesh
 from splatting.exports.mesh_files import write_glb_mesh
 from splatting.exports.scene_formats import write_glb
-from splatting.exports.upright import moved_around, moved_cameras, moved_splats, placed
+from splatting.exports.upright import check_upright, moved_around, moved_cameras, moved_splats, placed
 from splatting.files.json_files import read_model_json
 from splatting.files.similarity import Similarity
 from utils.system_utils import UserError
@@ -113,8 +113,9 @@ def test_pages_and_meshes_are_upright_by_default_and_others_on_request(tmp_path)
     ):
         found, _ = placed(_args(tmp_path, **options), of_scene, splats, None)
         np.testing.assert_allclose(found.means, moved if is_moved else splats.means, atol=1e-5)
+    check_upright(_args(tmp_path, upright=True))
     with pytest.raises(UserError, match="contradict"):
-        placed(_args(tmp_path, True, True), True, splats, None)
+        check_upright(_args(tmp_path, True, True))
 
 
 def test_models_without_a_similarity_stay_and_say_so_when_asked(tmp_path):
@@ -122,7 +123,7 @@ def test_models_without_a_similarity_stay_and_say_so_when_asked(tmp_path):
     for folder in ("", tmp_path):
         assert placed(_args(folder), True, splats, None) == (splats, None)
         with pytest.raises(UserError, match=r"needs a model folder \(-m\) whose model.json has a similarity"):
-            placed(_args(folder, upright=True), False, splats, None)
+            check_upright(_args(folder, upright=True))
 
 
 def _trained(scene: Path, out: Path) -> Path:
@@ -140,6 +141,10 @@ def test_a_training_keeps_the_similarity_for_exports(colmap_scene, tmp_path, mon
         export.main()
     plain, upright = (read_splats(tmp_path / f"{name}.ply") for name in ("plain", "upright"))
     np.testing.assert_allclose(upright.means, SOME.points(plain.means), atol=1e-5)
+    monkeypatch.setattr(export, "load", lambda *_: pytest.fail("this is refused before anything is loaded"))
+    monkeypatch.setattr(sys, "argv", [*sys.argv, "--no_upright"])
+    with pytest.raises(UserError, match="contradict"):
+        export.main()
     (colmap_scene / "orientation.json").unlink()
     assert "similarity" not in read_model_json(_trained(colmap_scene, tmp_path / "other"))
 
