@@ -553,7 +553,7 @@ def test_the_clock_ends_growth_at_the_pace_of_whole_views_and_removes_nothing(si
     fits = 25 * 20.0 / (0.005 + counts[-1] * 1e-6)  # at the pace of whole views with so many
     assert counts[-1] == pytest.approx(fits, rel=0.12)
     (said,) = capsys.readouterr().err.splitlines()
-    assert said.startswith("--time_budget 20 allows about ") and said.endswith(", not the 50,000 of --max_num_splats")
+    assert said.startswith("at this speed, --time_budget 20 would allow ") and said.endswith(", not 50,000")
 
 
 def test_a_strategy_of_a_damaged_file_is_none():

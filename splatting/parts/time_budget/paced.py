@@ -109,10 +109,10 @@ class DecidedSchedule(Schedule):
         """Say once how many Gaussians a time budget trains."""
         if not self._told:
             self._told = True
-            given = f", not the {aim:,} of --max_num_splats" if aim else ""
+            aimed = f", not {aim:,}" if aim else ""
             tqdm.write(
-                f"--time_budget {self.seconds:g} allows about {iterations:,} iterations, and so about {trained:,} "
-                f"Gaussians, {AN_ITERATION} for each{given}",
+                f"at this speed, --time_budget {self.seconds:g} would allow {iterations:,} iterations with views of "
+                f"full size, which train about {trained:,} Gaussians, {AN_ITERATION} for each{aimed}",
                 file=sys.stderr,
             )
 
