@@ -88,9 +88,9 @@ def _again(left_out: list[str], weak: list[str], blurred: list[str], spread: flo
             "each overlapping the one before by 60 to 80 %"
         )
     if weak:
-        lines.append(f"around {some(weak)}: they share points with fewer than {FEW} other photos; take more there")
+        lines.append(f"around {some(weak)}: fewer than {FEW} other photos share points with each; take more there")
     if blurred:
-        lines.append(f"{some(blurred)}: they are blurred; hold the camera still, or add light")
+        lines.append(f"{some(blurred)}: blurred; hold the camera still, or add light")
     if spread > _SPREAD:
         lines.append(
             f"with a fixed exposure, if you can: the photos' brightness differs by {spread:.1f} stops; train these "
@@ -104,10 +104,11 @@ def lines_of(report: Mapping[str, Any]) -> list[str]:
     weak, blurred = report["weakly_connected"], report["blurred"]
     lines = []
     if weak or not too_few(report):
-        few = f"{len(weak)} photos weakly connected ({some(weak)})" if weak else "no photo is weakly connected"
-        lines.append(f"overlap: {few}")
+        few = f"{len(weak)} of {report['registered']} photos weakly connected ({some(weak)})"
+        lines.append(f"overlap: {few if weak else 'no photo is weakly connected'}")
+    soft = f"{len(blurred)} of {report['photos']} photos blurred ({some(blurred)})"
     lines += [
-        f"blur: {f'{len(blurred)} photos blurred ({some(blurred)})' if blurred else 'no photo is blurred'}",
+        f"blur: {soft if blurred else 'no photo is blurred'}",
         f"brightness: the photos differ by {report['brightness_spread_stops']:.2f} stops",
     ]
     lines += [f"photograph again {line}" for line in report["again"]]
