@@ -56,7 +56,7 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     for line in unused_lines(found.unused):
         print(line)
     names = found.photos
-    alone = len(videos) == 1 and taken_frames(layout) >= set(names)
+    alone = len(videos or report_entries(layout)) == 1 and taken_frames(layout) >= set(names)  # also of an earlier run
     settings = replace(settings, matcher=args.matcher or ("sequential" if alone else "exhaustive"))
     if args.skip_matching:
         planned = []

@@ -16,6 +16,7 @@ from skimage.metrics import structural_similarity
 
 import convert
 from splatting.sfm import video as video_module
+from splatting.sfm.colmap import Pycolmap, Settings
 from splatting.sfm.layout import Layout
 from splatting.sfm.video import choose_frames, extract_videos, sharpness, small_picture
 from utils.system_utils import UserError
@@ -124,6 +125,32 @@ def test_frames_that_an_ended_run_left_out_are_said(tmp_path, monkeypatch, capsy
     record = json.loads(layout.stages.read_text())
     layout.stages.write_text(json.dumps(record | {"video": record["video"] | {"done": False}}))
     assert ended() and not ended("--video", str(video)) and not ended()
+
+
+def test_a_later_run_without_the_video_matches_as_before(tmp_path, monkeypatch):
+    """Such as one for --orient: other matches would give other poses, and a trained model would be of another scene."""
+    layout, matchers = Layout(tmp_path / "scene"), []
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", _Decoder())
+
+    def backend(layout: Layout, settings: Settings) -> Pycolmap:
+        matchers.append(settings.matcher)
+        return Pycolmap(layout, settings)
+
+    monkeypatch.setattr(convert, "Pycolmap", backend)
+    for name in ("a.mp4", "b.mp4"):
+        (tmp_path / name).touch()
+
+    def matcher(*words: str) -> str:
+        with pytest.raises(UserError, match="has a mask"):
+            convert.main(["-s", str(layout.scene), "--mask_path", str(tmp_path), *words])
+        return matchers.pop()
+
+    assert matcher("--video", str(tmp_path / "a.mp4")) == matcher() == matcher("--orient") == "sequential"
+    assert matcher("--matcher", "exhaustive") == "exhaustive"
+    Image.new("RGB", (40, 30)).save(layout.input / "mine.jpg")
+    assert matcher() == "exhaustive"
+    (layout.input / "mine.jpg").unlink()
+    assert matcher("--video", str(tmp_path / "a.mp4"), str(tmp_path / "b.mp4")) == matcher() == "exhaustive"
 
 
 @pytest.fixture(scope="module")
