@@ -115,8 +115,13 @@ def test_pages_are_cleaned_unless_they_are_raw(colmap_scene, tmp_path, monkeypat
         run("--start", "nowhere")
     with pytest.raises(UserError, match="--path"):
         run("--path", "spiral")
+    capsys.readouterr()
     run("--raw", "--title", "Room")
+    assert "warning" not in capsys.readouterr().err
     assert not asked and (tmp_path / "page.html.jpg").is_file() and _meta(tmp_path / "page.html")["og:title"] == "Room"
+    monkeypatch.setattr(export, "have_moved", lambda *_: True)
+    run("--raw")
+    assert "warning: the scene's poses are not those that" in capsys.readouterr().err
     with pytest.raises(UserError, match="contradict"):
         run("--raw", "--clean")
     monkeypatch.setattr("sys.argv", ["export.py", "-m", str(model), "--to", str(tmp_path / "a.ply"), "--title", "Room"])

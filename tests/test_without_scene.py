@@ -15,7 +15,7 @@ import view
 from gaussian_renderer import render
 from scene.splats.reading import read_splats
 from scene.with_splats import model_of
-from splatting.camera_paths.without_scene import COUNT, circle, recorded_cameras
+from splatting.camera_paths.without_scene import COUNT, circle, have_moved, recorded_cameras
 from splatting.exports.reading import read_any
 from splatting.viewer.views import SceneCameras
 from utils.camera_utils import camera_to_JSON
@@ -58,6 +58,26 @@ def test_a_viewer_begins_at_the_circle(tmp_path):
     antialiased = written(tmp_path, ".ply", balls().__class__(**(vars(balls()) | {"antialiasing": True})))
     view.of_file(str(antialiased), options)
     assert options.antialiasing
+
+
+def test_poses_that_moved_since_the_training_are_told(tmp_path):
+    record, cameras = tmp_path / "cameras.json", circle(balls().means)
+    for camera in cameras:
+        camera.width, camera.height = camera.image_width, camera.image_height
+    assert not have_moved(tmp_path, cameras)  # as there is none
+    for step, moved in ((0.0, False), (1e-6, False), (0.03, True)):
+        entries = [camera_to_JSON(number, camera) for number, camera in enumerate(cameras)]
+        for entry in entries:
+            entry["position"] = [entry["position"][0] + step * COUNT, *entry["position"][1:]]
+        record.write_text(json.dumps(entries))
+        assert have_moved(tmp_path, cameras[:8]) == moved
+    (tmp_path / "poses.json").touch()
+    assert not have_moved(tmp_path, cameras)  # which are corrected
+    (tmp_path / "poses.json").unlink()
+    record.write_text(json.dumps([entry | {"img_name": "other"} for entry in entries]))
+    assert not have_moved(tmp_path, cameras)
+    record.write_text("[{}]")
+    assert not have_moved(tmp_path, cameras)
 
 
 def test_a_folder_whose_scene_is_gone_keeps_its_poses(tmp_path, capsys):

@@ -1,4 +1,7 @@
-"""Cameras of a model whose scene is not at hand: those that its folder records, or a circle around it."""
+"""Cameras of a model whose scene is not at hand: those that its folder records, or a circle around it.
+
+And whether a scene that is at hand still has those cameras.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,15 +13,17 @@ import numpy as np
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.readers.info import CameraInfo
-from splatting.camera_paths.poses import facing
+from splatting.camera_paths.poses import facing, poses_of
 from splatting.files.json_files import read_json
 from utils.system_utils import UserError
 
 RECORD = "cameras.json"  # in a model folder
+_CORRECTED = "poses.json"  # there, if the training corrected the dataset's poses, which the record has
 COUNT, SIZE = 12, (960, 720)  # of the circle's views
 _FOCAL = 0.9  # of their widths
 _FAR = 3.5  # their distance, in median distances of the means from the middle
 _HIGH = 0.3  # of their distance
+_MOVED = 1e-3  # of the mean distance of cameras from their middle; other programs round the poses that they record
 
 
 @dataclass
@@ -57,6 +62,25 @@ def recorded_cameras(path: Path) -> list[Camera]:
         return _cameras([_recorded(number, entry) for number, entry in enumerate(read_json(path))])
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path} has no cameras that can be read ({error}); give the scene with -s") from error
+
+
+def have_moved(folder: Path, cameras: Sequence[Camera]) -> bool:
+    """Whether cameras are elsewhere than a model folder's cameras.json has those of their names.
+
+    No if it has none, or the training corrected poses.
+    """
+    if (folder / _CORRECTED).is_file():
+        return False
+    try:
+        recorded = {camera.image_name: camera for camera in recorded_cameras(folder / RECORD)}
+    except (OSError, UserError):
+        return False
+    pairs = [(camera, recorded[camera.image_name]) for camera in cameras if camera.image_name in recorded]
+    if not pairs:
+        return False
+    now, then = (poses_of(each) for each in zip(*pairs, strict=True))
+    apart = np.linalg.norm(now.positions - then.positions, axis=1)
+    return bool(np.median(apart) > _MOVED * then.spread > 0)
 
 
 def _recorded(number: int, entry: Mapping[str, Any]) -> CameraInfo:
