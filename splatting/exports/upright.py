@@ -4,6 +4,7 @@ import argparse
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from scene.splats.splats import Splats
 from splatting.camera_paths.keyframes import Keyframe, TimedPath
 from splatting.camera_paths.poses import keyframe, poses_of
 from splatting.files.json_files import OFFSET, read_model_json
-from splatting.files.similarity import ENTRY, Similarity
+from splatting.files.similarity import ENTRY, Similarity, read_orientation
 from utils.system_utils import UserError
 
 
@@ -30,13 +31,18 @@ def check_upright(args: argparse.Namespace) -> None:
         raise UserError("--upright and --no_upright contradict each other; leave one out")
     if args.upright and ENTRY not in _record(args):
         raise UserError(
-            "--upright needs a model folder (-m) whose model.json has a similarity; run convert.py --orient on its "
-            "scene and train again, or leave it out"
+            "--upright needs a model folder (-m) of a scene that was oriented; run convert.py --orient on it, or leave "
+            "--upright out"
         )
 
 
 def _record(args: argparse.Namespace) -> dict[str, Any]:
-    return read_model_json(args.model_path) if args.model_path else {}
+    """model.json, with the similarity of the scene where that was oriented after the training."""
+    record = read_model_json(args.model_path) if args.model_path else {}
+    if args.model_path and args.source_path and ENTRY not in record:
+        found = read_orientation(Path(args.source_path))
+        record = record if found is None else record | {ENTRY: found}
+    return record
 
 
 def placed(args: argparse.Namespace, of_scene: bool, splats: Splats, around: Any) -> tuple[Splats, Any]:
@@ -47,7 +53,7 @@ def placed(args: argparse.Namespace, of_scene: bool, splats: Splats, around: Any
     record = _record(args)
     if args.no_upright or not (args.upright or of_scene) or ENTRY not in record:
         return splats, around
-    similarity = Similarity.of(record[ENTRY], f"model.json of {args.model_path}")
+    similarity = Similarity.of(record[ENTRY], f"orientation of {args.model_path}")
     local = similarity.from_local(record.get(OFFSET, (0.0, 0.0, 0.0)))
     return moved_splats(splats, local), moved_around(around, local) if around else around
 

@@ -97,7 +97,7 @@ def test_paths_of_keyframes_move_with_the_model():
 
 
 def _args(folder: Path | str, upright=False, no_upright=False) -> argparse.Namespace:
-    return argparse.Namespace(model_path=str(folder), upright=upright, no_upright=no_upright)
+    return argparse.Namespace(model_path=str(folder), source_path="", upright=upright, no_upright=no_upright)
 
 
 def test_pages_and_meshes_are_upright_by_default_and_others_on_request(tmp_path):
@@ -122,7 +122,7 @@ def test_models_without_a_similarity_stay_and_say_so_when_asked(tmp_path):
     splats = balls()
     for folder in ("", tmp_path):
         assert placed(_args(folder), True, splats, None) == (splats, None)
-        with pytest.raises(UserError, match=r"needs a model folder \(-m\) whose model.json has a similarity"):
+        with pytest.raises(UserError, match=r"needs a model folder \(-m\) of a scene that was oriented"):
             check_upright(_args(folder, upright=True))
 
 
@@ -147,6 +147,18 @@ def test_a_training_keeps_the_similarity_for_exports(colmap_scene, tmp_path, mon
         export.main()
     (colmap_scene / "orientation.json").unlink()
     assert "similarity" not in read_model_json(_trained(colmap_scene, tmp_path / "other"))
+
+
+def test_a_scene_that_is_oriented_after_the_training_orients_exports(colmap_scene, tmp_path, monkeypatch):
+    model, written = _trained(colmap_scene, tmp_path / "model"), []
+    record = {"rotation": TURN.tolist(), "scale": 2.5, "translation": [3.0, -1.0, 0.5]}
+    for name in ("plain", "upright"):
+        words = ["-m", str(model), "--to", str(tmp_path / f"{name}.ply"), *(["--upright"] if written else [])]
+        monkeypatch.setattr(sys, "argv", ["export.py", *words])
+        export.main()
+        written.append(read_splats(tmp_path / f"{name}.ply").means)
+        (colmap_scene / "orientation.json").write_text(json.dumps(record))
+    np.testing.assert_allclose(written[1], SOME.points(written[0]), atol=1e-5)
 
 
 @pytest.mark.parametrize("place", [(47.25, 8.5, 410.0), ()])
