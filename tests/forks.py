@@ -14,12 +14,12 @@ _FORKS = """
 import io, json, os, sys, traceback
 import numpy, plyfile, scipy.spatial, torch
 for line in sys.stdin:
-    code, words, said = json.loads(line)
+    code, words, out, err = json.loads(line)
     child = os.fork()
     if not child:
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-        os.dup2(os.open(said, os.O_WRONLY), 1)
-        os.dup2(1, 2)
+        os.dup2(os.open(out, os.O_WRONLY), 1)
+        os.dup2(os.open(err, os.O_WRONLY), 2)
         sys.argv, status = ["-c", *words], 1
         try:
             exec(compile(code, "<program>", "exec"), {"__name__": "__main__"})
@@ -37,10 +37,11 @@ _kept: list[subprocess.Popen] = []
 
 
 class Done(NamedTuple):
-    """How a program has ended, and what it printed and complained of."""
+    """How a program has ended, and what it printed."""
 
     status: int
-    output: str
+    stdout: str
+    stderr: str
 
 
 def fork(code: str, *words: str) -> Done:
@@ -53,7 +54,7 @@ def fork(code: str, *words: str) -> Done:
         streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
         environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
         _kept.append(subprocess.Popen(command, cwd=ROOT, env=environment, text=True, bufsize=1, **streams))
-    with tempfile.NamedTemporaryFile() as said:
-        print(json.dumps([code, words, said.name]), file=_kept[0].stdin)
+    with tempfile.NamedTemporaryFile() as out, tempfile.NamedTemporaryFile() as err:
+        print(json.dumps([code, words, out.name, err.name]), file=_kept[0].stdin)
         status = int(_kept[0].stdout.readline())
-        return Done(status, Path(said.name).read_text())
+        return Done(status, Path(out.name).read_text(), Path(err.name).read_text())

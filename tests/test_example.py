@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from forks import Done, fork
 
 ROOT = Path(__file__).resolve().parents[1]
 WITH_EXAMPLE = """
@@ -21,9 +22,8 @@ train.main([*options, *words])
 """
 
 
-def _train(scene: Path, *words: object) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-c", WITH_EXAMPLE, str(scene), *map(str, words)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+def _train(scene: Path, *words: object) -> Done:
+    return fork(WITH_EXAMPLE, str(scene), *map(str, words))
 
 
 def _ply(out: Path) -> bytes:
@@ -33,9 +33,9 @@ def _ply(out: Path) -> bytes:
 @pytest.mark.slow
 def test_an_option_a_term_a_state_and_a_line(colmap_scene, tmp_path):
     plain, whole, resumed = (tmp_path / name for name in ("plain", "whole", "resumed"))
-    assert _train(colmap_scene, "-m", plain).returncode == 0
+    assert _train(colmap_scene, "-m", plain).status == 0
     done = _train(colmap_scene, "-m", whole, "--grey", 5, "--checkpoint_iterations", 20)
-    assert done.returncode == 0 and "Grey=" in done.stderr and _ply(whole) != _ply(plain), done.stderr
+    assert done.status == 0 and "Grey=" in done.stderr and _ply(whole) != _ply(plain), done.stderr
     (said,) = [line.partition(" [")[0] for line in done.stdout.splitlines() if line.startswith("--grey: ")]
     last = float(said.split()[-4])
     checkpoint = whole / "chkpnt20.pth"
@@ -58,14 +58,14 @@ def test_a_strategy_with_a_value_for_each_gaussian(colmap_scene, tmp_path):
     often = ["--densify_from_iter", 2, "--densification_interval", 4, "--densify_grad_threshold", 1e-5]
     counts = {}
     for name, words in {"adc": [], "one": ["--strategy", "patient", "--patience", 1]}.items():
-        assert _train(colmap_scene, "-m", tmp_path / name, *often, *words).returncode == 0
+        assert _train(colmap_scene, "-m", tmp_path / name, *often, *words).status == 0
         counts[name] = _ply(tmp_path / name)
     assert counts["one"] == counts["adc"]  # who waits for one is adaptive density control
     two, checkpoint = ["--strategy", "patient", *often], tmp_path / "two" / "chkpnt20.pth"
     done = _train(colmap_scene, "-m", tmp_path / "two", "--checkpoint_iterations", 20, *two)
-    assert done.returncode == 0, done.stderr
+    assert done.status == 0, done.stderr
     streaks = torch.load(checkpoint, weights_only=False)[0][10]["patient"]
     assert {0, 1} <= {*streaks.tolist()} and _ply(tmp_path / "two") != counts["adc"]
     # Its name is in model.json, so the strategy joins late.
     again = _train(colmap_scene, "-m", tmp_path / "resumed", "--start_checkpoint", checkpoint, *often)
-    assert again.returncode == 0 and _ply(tmp_path / "resumed") == _ply(tmp_path / "two"), again.stderr
+    assert again.status == 0 and _ply(tmp_path / "resumed") == _ply(tmp_path / "two"), again.stderr

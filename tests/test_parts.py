@@ -141,9 +141,9 @@ print(*(option.name for option in OPTIONS), *vars(launch_options()))
 def test_without_a_part_all_else_imports_and_lacks_its_options_alone(name):
     words = [name, *ROOMS, *(f"{command}.py" for command in COMMANDS)]
     done = fork(WITHOUT + IMPORTED, *words)
-    assert done.status == 0, done.output
+    assert done.status == 0, done.stderr
     every = {option for other in PARTS for option in _options(other)}
-    there = {*done.output.split()}
+    there = {*done.stdout.split()}
     assert not there & _options(name) and every - _options(name) <= there
 
 
@@ -170,7 +170,7 @@ def _trained(scene: Path, out: Path, name: str, hidden: str) -> bytes:
     """Train without the part `hidden`, by the first strategy that is not `name`."""
     other = next(strategy for strategy in strategies() if strategy != name)
     done = fork(WITHOUT + TRAINED, hidden, str(scene), str(out), other)
-    assert done.status == 0, done.output
+    assert done.status == 0, done.stderr
     return (out / "point_cloud/iteration_20/point_cloud.ply").read_bytes()
 
 
