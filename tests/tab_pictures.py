@@ -29,12 +29,12 @@ def picture(tab: "Page") -> np.ndarray:
 
 
 def settled(tab: "Page") -> np.ndarray:
-    """The picture, once it does not change any more."""
+    """The picture, once it does not change any more. One of a single colour was taken before anything was drawn."""
     before = picture(tab)
     for _ in range(4 * SECONDS):
         tab.wait_for_timeout(250)
         now = picture(tab)
-        if np.array_equal(now, before):
+        if np.array_equal(now, before) and (now != now[0, 0]).any():
             return now
         before = now
     pytest.fail(f"the picture is not at rest after {SECONDS} s")
