@@ -40,7 +40,7 @@ from splatting.exports.cleaning import OPTION as CLEAN_OPTION
 from splatting.exports.cleaning import check_clean, clean_scene, write_picture
 from splatting.exports.formats import FORMATS, Around, Format, format_of
 from splatting.exports.reading import ANY, read_any
-from splatting.exports.upright import add_upright_options, check_upright, placed
+from splatting.exports.upright import add_upright_options, check_upright, oriented_later, placed
 from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json
 from splatting.parts import tools
 from utils.general_utils import safe_state
@@ -135,7 +135,8 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     poses = stand_ins(args, options) if entry.around and not needs_photos else None
     if poses and entry.clean and args.model_path and not args.raw:
         print(f"not cleaned, as there is no scene folder {options.source_path}; name it with -s", file=sys.stderr)
-    splats, scene = load(args, options, needs_photos or entry.of_scene and not poses)
+    needs_views = needs_photos or entry.of_scene and not poses or oriented_later(args)
+    splats, scene = load(args, options, needs_views)
     if scene:
         _check_views(args, make_path, scene.getTrainCameras())
     degree = used_sh_degree(splats) if args.typed_sh_degree is None else min(args.typed_sh_degree, splats.sh_degree)

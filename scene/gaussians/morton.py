@@ -10,7 +10,7 @@ from torch import Tensor
 from scene.gaussians.parameters import GaussianParameters
 
 _HALF = 1 << 20  # cells of an axis on either side of the origin
-_SCATTERED = 0.25  # distance of rows beside each other, by that of rows half of the model apart
+_SCATTERED = 0.25  # distance of Gaussians in rows beside each other, by that of rows half of the model apart
 _SPREAD = {32: 0x1F00000000FFFF, 16: 0x1F0000FF0000FF, 8: 0x100F00F00F00F00F, 4: 0x10C30C30C30C30C3,
            2: 0x1249249249249249}  # shifts and masks that leave two zeros between the bits of a cell's 21  # fmt: skip
 
@@ -29,7 +29,7 @@ def sort_rows(gaussians: GaussianParameters) -> None:
 def sort_scattered(gaussians: GaussianParameters) -> None:
     """Sort rows whose neighbours in memory are far apart in the scene, as in files of other programs.
 
-    A model that was sorted in its training keeps its order: there they are some hundredth apart of what they are here.
+    A model that was sorted in its training keeps its order: its neighbours are some fifty times nearer to each other.
     """
     means, half = gaussians.raw("xyz"), len(gaussians) // 2
     beside, across = (torch.linalg.norm(means.roll(rows, 0) - means, dim=1) for rows in (1, half))

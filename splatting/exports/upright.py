@@ -36,6 +36,11 @@ def check_upright(args: argparse.Namespace) -> None:
         )
 
 
+def oriented_later(args: argparse.Namespace) -> bool:
+    """Whether --upright follows the orientation of the scene, which a model of other poses does not fit."""
+    return args.upright and ENTRY not in read_model_json(args.model_path)
+
+
 def _record(args: argparse.Namespace) -> dict[str, Any]:
     """model.json, with the similarity of the scene where that was oriented after the training."""
     record = read_model_json(args.model_path) if args.model_path else {}

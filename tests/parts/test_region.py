@@ -10,11 +10,11 @@ from synthetic import make_colmap_scene
 from trainings import train_on
 
 import export
+from benchmarks.scenes import region as benchmark
 from scene.splats.reading import read_splats
-from splatting.parts.region.numbers import VALID, problem
-from splatting.parts.region.part import OUTSIDE, Region
+from splatting.parts.region.part import OUTSIDE, VALID, Region, problem
 from splatting.parts.region.shape import Box, Sphere, restored
-from utils.system_utils import run_cli
+from utils.system_utils import UserError, run_cli
 
 SHAPES = [
     Sphere([0.3, -0.2, 4.0], 1.0),
@@ -70,6 +70,20 @@ def test_pixels_outside_weigh_a_tenth_and_all_one_in_the_mean():
     assert torch.allclose(gradients[inside], gradients[inside].mean(), rtol=1e-5)
 
 
+@pytest.mark.parametrize(("text", "seen_by"), [("0 0 -4 1", "no pixel"), ("0 0 0.2 1", "all pixels")])
+def test_a_region_that_changes_nothing_is_refused(text, seen_by):
+    scene = SimpleNamespace(
+        info=SimpleNamespace(train_cameras=[], offset=np.zeros(3)), getTrainCameras=lambda: [_view(False)]
+    )
+    with pytest.raises(UserError, match=f"{seen_by} of the training photos would see --region"):
+        Region().begin(SimpleNamespace(opt=SimpleNamespace(region=text), scene=scene), None)
+
+
+def test_numbers_are_in_the_coordinates_of_the_scene():
+    sphere, box = (restored(numbers, [1, 2, 3]).facts() for numbers in ([1, 2, 3, 0.5], [1, 2, 3, 2, 4, 6]))
+    assert sphere == [0, 0, 0, 0.5] and box == [0, 0, 0, 1, 2, 3]
+
+
 @pytest.mark.parametrize("text", ["1 2 3", "0 0 0 -1", "0 0 0 1 1 -1", "0 0 0 nan", "middle", "1 2 3 4 5"])
 def test_other_regions_are_refused(text):
     assert problem(text) == VALID
@@ -97,3 +111,14 @@ def test_a_training_keeps_its_region_for_exports(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit):
         run_cli(export.main)
     assert "--only_region needs a model folder (-m) that was trained with --region" in capsys.readouterr().err
+
+
+def test_both_parts_of_a_picture_make_its_psnr(colmap_scene, tmp_path, monkeypatch, capsys):
+    error, mask = torch.rand(3, 8, 9), torch.rand(1, 8, 9) < 0.3
+    squares = [10 ** (-benchmark._psnr(error, part) / 10) * 3 * int(part.sum()) for part in (mask, ~mask)]
+    assert sum(squares) == pytest.approx(error.sum().item(), rel=1e-5) and benchmark._psnr(error, mask & ~mask) is None
+    train_on(colmap_scene, tmp_path / "model", "--eval", "-r", 2, "--iterations", 2, "--no_curve", "--disable_viewer")
+    monkeypatch.setattr(sys, "argv", ["region", str(tmp_path / "model"), "--region", "0 0 0 0.5"])
+    benchmark.main()
+    row = [cell.strip() for cell in capsys.readouterr().out.splitlines()[-1].split("|")]
+    assert float(row[2]) > 0 and float(row[3]) > 0 and row[5].endswith("of 300")

@@ -149,7 +149,7 @@ def test_a_training_keeps_the_similarity_for_exports(colmap_scene, tmp_path, mon
     assert "similarity" not in read_model_json(_trained(colmap_scene, tmp_path / "other"))
 
 
-def test_a_scene_that_is_oriented_after_the_training_orients_exports(colmap_scene, tmp_path, monkeypatch):
+def test_a_scene_that_is_oriented_after_the_training_orients_exports(colmap_scene, tmp_path, monkeypatch, capsys):
     model, written = _trained(colmap_scene, tmp_path / "model"), []
     record = {"rotation": TURN.tolist(), "scale": 2.5, "translation": [3.0, -1.0, 0.5]}
     for name in ("plain", "upright"):
@@ -159,6 +159,13 @@ def test_a_scene_that_is_oriented_after_the_training_orients_exports(colmap_scen
         written.append(read_splats(tmp_path / f"{name}.ply").means)
         (colmap_scene / "orientation.json").write_text(json.dumps(record))
     np.testing.assert_allclose(written[1], SOME.points(written[0]), atol=1e-5)
+    assert "poses are not those" not in capsys.readouterr().err
+    record = json.loads((model / "cameras.json").read_text())
+    for entry in record:  # as if the scene had got other poses since
+        entry["position"][0] += 0.5
+    (model / "cameras.json").write_text(json.dumps(record))
+    export.main()
+    assert "poses are not those" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("place", [(47.25, 8.5, 410.0), ()])

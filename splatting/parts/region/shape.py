@@ -4,12 +4,12 @@ from typing import Protocol
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from scene.cameras import Camera
 from scene.readers.start_cloud import focus_of
 from scene.scene import Scene
-from splatting.parts.region.numbers import numbers_of
 from utils.system_utils import UserError
 
 _NEAR = 0.25  # radius of a region that is found, over the cameras' median distance from its middle
@@ -83,24 +83,22 @@ def _local(camera: Camera) -> tuple[Tensor, Tensor]:
     return ((x - camera.cx) / camera.fx)[None], ((y - camera.cy) / camera.fy)[:, None]
 
 
-def restored(numbers: list[float]) -> Sphere | Box:
-    """A region from `facts`."""
-    return Sphere(numbers[:3], numbers[3]) if len(numbers) == 4 else Box(numbers[:3], numbers[3:])
+def restored(numbers: list[float], origin: ArrayLike = (0, 0, 0)) -> Sphere | Box:
+    """A region from `facts`, in a frame with that origin."""
+    first, rest = np.subtract(numbers[:3], origin), numbers[3:]
+    return Sphere(first, rest[0]) if len(rest) == 1 else Box(first, np.subtract(rest, origin))
 
 
-def found(text: str, scene: Scene) -> Sphere | Box:
-    """The region of --region in the frame of a training. UserError where it cannot be found, or a view has a lens."""
+def found(numbers: list[float] | None, scene: Scene) -> Sphere | Box:
+    """The region in the frame of a training. UserError where it cannot be found, or a view has a lens.
+
+    numbers: as `facts`, in the coordinates of the dataset; None: a sphere around the point that the cameras look at.
+    """
     views, offset = scene.info.train_cameras, scene.info.offset
     if any(view.native for view in views):
         raise UserError("--region needs photos without distortion; take --lenses undistort, or leave it out")
-    numbers = numbers_of(text)
     if numbers is not None:
-        shape = restored(numbers)
-        return (
-            Sphere(shape.center - offset, shape.radius)
-            if len(numbers) == 4
-            else Box(shape.low - offset, shape.high - offset)
-        )
+        return restored(numbers, offset)
     focus = focus_of(views)
     if focus is None:
         raise UserError("--region auto finds no point that the cameras look at; give a sphere or a box in numbers")

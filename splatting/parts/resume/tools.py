@@ -23,9 +23,11 @@ def prepare(dataset: argparse.Namespace, opt: argparse.Namespace, launch: argpar
     if done >= opt.iterations:
         with own_folder(folder):  # which removes what a training leaves that was killed after its note
             (Path(folder) / REPLACED).unlink(missing_ok=True)
-        more = "it left no checkpoint of its end to continue; leave --resume out to start over"
-        more = "give more to continue it" if continues(folder, done) else more
-        print(f"{folder} has a finished training of --iterations {done}; {more}")
+        if continues(folder, done):
+            what = "give more to continue it"
+        else:
+            what = "it left no checkpoint of its end to continue; leave --resume out to start over"
+        print(f"{folder} has a finished training of --iterations {done}; {what}")
         return False
     launch.start_checkpoint = newest_checkpoint(folder, opt.iterations, since=0) or launch.start_checkpoint
     return True
