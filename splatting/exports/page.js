@@ -52,6 +52,8 @@ const leaning = (viewer, annotations) => {
 };
 
 try {
+  // A frame of another page may run this before it has a size, and none while it is hidden.
+  while (!innerWidth || !innerHeight) await new Promise(requestAnimationFrame);
   const { antialiasing, aspect, name, settings } = JSON.parse(document.getElementById('page').textContent);
   for (const { initial } of settings.cameras) initial.fov = fit(initial.fov, aspect);
   for (const { camera: { initial }, extras } of settings.annotations) initial.fov = fit(initial.fov, extras.aspect);

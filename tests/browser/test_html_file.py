@@ -34,7 +34,7 @@ def show(tab: "Page", path: Path) -> None:
 def wait_for_picture(page: "Page | Frame") -> None:
     """Polls, as the page's policy forbids playwright's own way."""
     for _ in range(10 * SECONDS):
-        if page.evaluate("window.viewer?.state.loaded ?? false"):
+        if page.evaluate("window.viewer?.state?.loaded ?? false"):
             break
         page.wait_for_timeout(100)
     else:
@@ -63,12 +63,17 @@ def test_the_page_begins_with_the_picture_of_its_first_camera(tab, page, splats)
 
 
 def test_a_frame_of_a_notebook_shows_the_page(tab, page, splats, tmp_path):
-    """All of it stands in an attribute, so the frame has no address, and it may do nothing but run scripts."""
+    """All of it stands in an attribute, so the frame has no address, and it may do nothing but run scripts.
+
+    While the frame is hidden it has no size, by which the page would choose its opening angle.
+    """
     style, text = "position: fixed; inset: 0; width: 100%; height: 100%; border: 0", page.read_text(encoding="utf-8")
-    frame = f'<iframe sandbox="allow-scripts" style="{style}" srcdoc="{html.escape(text)}"></iframe>'
+    frame = f'<iframe hidden sandbox="allow-scripts" style="{style}" srcdoc="{html.escape(text)}"></iframe>'
     host = tmp_path / "notebook.html"
     host.write_text(f'<!DOCTYPE html><meta charset="utf-8"><link rel="icon" href="data:,">{frame}', encoding="utf-8")
     tab.goto(host.as_uri())
+    tab.wait_for_timeout(500)
+    tab.evaluate("document.querySelector('iframe').hidden = false")
     wait_for_picture(tab.frames[1])
     assert psnr(settled(tab), expected(splats, cameras()[0])) > 33
 
