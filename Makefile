@@ -25,7 +25,7 @@ CXX_TESTS := $(patsubst submodules/%.cpp,build/%,$(wildcard submodules/*/csrc/te
 CXX_TEST_OBJECTS := $(patsubst submodules/%.cpp,build/%.o,$(wildcard submodules/*/csrc/cpu/*.cpp))
 CORES := $(shell nproc 2> /dev/null || getconf _NPROCESSORS_ONLN)
 # The address sanitizer sees what the checks see that are left out, which take a third of the compiler's time.
-CXX_TEST_FLAGS := -std=c++17 -O1 -g1 -Wall -Wextra -Werror -fsanitize=address,undefined -fno-sanitize-recover=all -pthread \
+CXX_TEST_FLAGS := -std=c++17 -O1 -Wall -Wextra -Werror -fsanitize=address,undefined -fno-sanitize-recover=all -pthread \
                   -fno-sanitize=null,object-size,pointer-overflow
 
 CXX_SOURCES := $(shell find submodules -name build -prune -o \( -name '*.cpp' -o -name '*.cu*' -o -name '*.h' \) -print)

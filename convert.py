@@ -77,7 +77,7 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     made = {"camera": settings.camera, "mapper": settings.mapper, "matcher": settings.matcher, "program": program}
     planned.append(stages.undistortion_stage(layout, settings, made_from, **made, shared_by=settings.cameras))
     planned.append(capture_stage(layout, names))
-    planned += stages.wanted_stages(layout, args.resize, args.orient)
+    planned += stages.wanted_stages(layout, record, args)
     kept += record.run(planned)
     if kept:
         print(f"reused from an earlier run: {', '.join(kept)}; remove {layout.work} to start from the beginning")

@@ -48,8 +48,10 @@ def test_old_photos_keep_poses_and_bytes_and_new_ones_are_placed(room, capsys):
     scene = room / "scene"
     before = pycolmap.Reconstruction(str(scene / "sparse" / "0"))
     pictures = {path.name: path.read_bytes() for path in (scene / "images").iterdir()}
+    _run(scene, "--orient")
     _put(room, *LATER[:1])
     _run(scene, "--add")
+    assert (scene / "orientation.json").is_file()  # asked for once
     assert f"added: 1 of 1 new photos; the {PLACES - 2} before keep their poses" in capsys.readouterr().out
     _put(room, *LATER[1:])
     model = _run(scene, "--add")
@@ -68,7 +70,10 @@ def test_old_photos_keep_poses_and_bytes_and_new_ones_are_placed(room, capsys):
         where = model.find_image_with_name(name).projection_center()
         assert np.abs(where - places[int(name[6:8])]).max() < 0.04
     _run(scene, "--add")
-    assert "reused from an earlier run: photos, features, matching, mapping, undistortion" in capsys.readouterr().out
+    assert (
+        "reused from an earlier run: photos, features, matching, mapping, undistortion, capture, orient"
+        in capsys.readouterr().out
+    )
 
 
 def test_an_interrupted_run_keeps_what_it_adds_to_and_leaves_out_photos_of_another_place(room, monkeypatch, capsys):

@@ -270,8 +270,9 @@ def orbit_strayed(scene: Path, truth: pycolmap.Reconstruction, sources: list[str
 
 @pytest.mark.slow
 def test_real_photos_through_two_lenses(shared_dir, tmp_path, monkeypatch, capsys):
-    """As good as with the cameras that a hand gave the same photos without EXIF data, and far better than with one."""
-    source, quality = shared_dir / "scenes" / "fox_full", {}
+    """Placed as with the cameras that a hand gives the same photos without EXIF data, and trained far better than with
+    one."""
+    source, strays, quality = shared_dir / "scenes" / "fox_full", {}, {}
     truth = pycolmap.Reconstruction(source / "sparse" / "0")
 
     def by_hand(_: Path, names: list[str], mode: str) -> list[cameras.Group]:
@@ -284,18 +285,15 @@ def test_real_photos_through_two_lenses(shared_dir, tmp_path, monkeypatch, capsy
                 patch.setattr(cameras, "group", by_hand)
             sources = through_two_lenses(source / "images", tmp_path / kind, told=kind == "by exif")
             convert.main(["-s", str(tmp_path / kind), "--no_gpu"])
-        words = [
-            *("-r", "2", "--iterations", "600", "--test_iterations", "600"),
-            "--eval",
-            "--quiet",
-            "--disable_viewer",
-        ]
-        train.main(["-s", str(tmp_path / kind), "-m", str(tmp_path / f"{kind} model"), *words])
-        log = json.loads((tmp_path / f"{kind} model" / "train_log.json").read_text())
-        quality[kind] = log[-1]["test_psnr"], orbit_strayed(tmp_path / kind, truth, sources)
         said = capsys.readouterr().err
         assert ("photos that share a camera" in said) == (kind == "one")
+        strays[kind] = orbit_strayed(tmp_path / kind, truth, sources)
+        if kind != "by hand":
+            words = ["-s", str(tmp_path / kind), "-m", str(tmp_path / f"{kind} model"), "-r", "2", "--eval", "--quiet"]
+            train.main([*words, "--disable_viewer", "--iterations", "600", "--test_iterations", "600"])
+            log = json.loads((tmp_path / f"{kind} model" / "train_log.json").read_text())
+            quality[kind] = log[-1]["test_psnr"]
     for kind in ("by exif", "by hand"):
-        assert len(quality[kind][1]) == 24 and quality[kind][1].max() < 0.02
-    assert np.median(quality["one"][1]) > 0.2
-    assert quality["by exif"][0] > quality["by hand"][0] - 0.1 and quality["by exif"][0] > quality["one"][0] + 1
+        assert len(strays[kind]) == 24 and strays[kind].max() < 0.02
+    assert np.median(strays["one"]) > 0.2
+    assert quality["by exif"] > quality["one"] + 1

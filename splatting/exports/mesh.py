@@ -114,6 +114,7 @@ def _empty_volume(
     coarser: bool,
 ) -> Volume:
     """The blocks of all surfaces nearer than `far`, empty. coarser: of a larger voxel, where they would be too many."""
+    given = voxel
     while True:
         volume = Volume(voxel, gaussians.get_xyz.device)
         try:
@@ -121,13 +122,13 @@ def _empty_volume(
                 depth = _within(surface_of(view, gaussians, pipe).depth, far)
                 volume.add_blocks(view, depth, MOST_VOXELS // SIDE**3)
         except TooManyBlocks:
-            if not coarser:
-                raise UserError(
-                    f"--voxel {voxel:g} makes more than {MOST_VOXELS / 1e6:.0f} million voxels of "
-                    f"{BYTES * MOST_VOXELS / 1e9:.0f} GB; give a larger one, such as {2 * voxel:g}"
-                ) from None
-            voxel *= _COARSER
+            voxel = float(f"{_COARSER * voxel:.2g}")  # as a user would type it
             continue
+        if voxel > given and not coarser:
+            raise UserError(
+                f"--voxel {given:g} makes more than {MOST_VOXELS / 1e6:.0f} million voxels of "
+                f"{BYTES * MOST_VOXELS / 1e9:.0f} GB; give {voxel:g} or more"
+            )
         volume.start()
         return volume
 

@@ -3,6 +3,7 @@
 A second run does only the rest.
 """
 
+import argparse
 import contextlib
 import hashlib
 import json
@@ -254,9 +255,10 @@ def resize_stage(layout: Layout) -> Stage:
     return Stage("resize", list(FACTORS), lambda: None, work)
 
 
-def wanted_stages(layout: Layout, resize: bool, orient: bool) -> list[Stage]:
-    """Make the stages, after all others, of what a user may ask for."""
-    return [*([resize_stage(layout)] if resize else []), *([orient_stage(layout)] if orient else [])]
+def wanted_stages(layout: Layout, record: StageRecord, args: argparse.Namespace) -> list[Stage]:
+    """Make the stages, after all others, of what a user asks for, or, with --add, has asked for before."""
+    last = resize_stage(layout), orient_stage(layout)
+    return [stage for stage in last if getattr(args, stage.name) or (args.add and record.begun(stage.name))]
 
 
 def orient_stage(layout: Layout) -> Stage:
