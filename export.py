@@ -179,7 +179,8 @@ def stand_ins(args: argparse.Namespace, options: argparse.Namespace) -> Callable
 
 
 def _refuse_to_replace_a_model(file: Path, source: str | None) -> None:
-    saved = file.absolute().parent.parent.name == "point_cloud" or (file.parent / "cfg_args").is_file()
+    saved = file.absolute().parent.parent.name == "point_cloud"
+    saved |= file.name == "input.ply" and (file.parent / "cfg_args").is_file()
     if saved and file.exists() or (source and file.exists() and file.samefile(source)):
         raise UserError(f"--to {file} would overwrite a trained model or its input; choose another file")
 

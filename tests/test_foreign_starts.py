@@ -171,6 +171,8 @@ def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
         with pytest.raises(UserError, match="would overwrite a trained model or its input; choose another file"):
             export.export(*_export_options(*words, "--to", at))
         assert Path(at).read_bytes() == before
+    for _ in range(2):  # an earlier export in the model's folder is replaced
+        export.export(*_export_options("-m", out, "--to", out / "model.ply"))
 
 
 def test_a_file_is_thinned_out_by_the_views_of_a_model(tmp_path, colmap_scene, capsys):

@@ -108,14 +108,15 @@ class TrainingPage:
     def _show_numbers(self, iteration: int) -> None:
         run, now = self._run, time.perf_counter()
         _, before, seconds = self._numbers
-        if iteration == before:  # a pause has shown it
+        expected = run.schedule.expected
+        of = "" if expected is None else f" of {'about ' if run.schedule.by_clock else ''}{round(expected):,}"
+        of += ", paused" if self._requests.paused else ""
+        self._page.show_numbers(iteration, run.gaussians.gaussian_count, of)
+        if iteration == before:  # a pause has shown the rest
             return
         self._numbers = now, iteration, run.clock.seconds
         took = run.clock.seconds - seconds
         speed = (iteration - before) / took if before and took > 0 else None
-        expected = run.schedule.expected
-        of = "" if expected is None else f" of {'about ' if run.schedule.by_clock else ''}{round(expected):,}"
-        self._page.show_numbers(iteration, run.gaussians.gaussian_count, of)
         subset = common_subset([run.rows])
         left = self._left(iteration, speed)
         self._tab.show(speed, left, run.losses.mean, rows_on(run.rows, subset), subset)
