@@ -14,10 +14,9 @@ from scene.view import View
 
 def sampling_rate(points: Tensor, view: Any, enlargement: float = 1.0) -> Tensor:
     """Pixels of a view by unit of length at points (N, 3); (N,), 0 at points that it does not show.
-    enlargement: of the model where
-       it is drawn.
 
-       A lens counts by its focal length on the axis; in a fisheye or a panorama, pixels are proportional to angles.
+    enlargement: of the model where it is drawn. A lens counts by its focal length on the axis; in a fisheye or a
+    panorama, pixels are proportional to angles.
     """
     lens = getattr(view, "lens", None)
     if lens and lens.chart != "perspective":

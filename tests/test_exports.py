@@ -364,7 +364,7 @@ def test_one_far_gaussian_leaves_the_others_of_an_spz(tmp_path, capsys, x):
 
 
 def test_positions_that_spz_cannot_hold_are_refused(tmp_path):
-    with pytest.raises(UserError, match=r"can hold positions to 8,388,607, not 1e\+07; end --to with .ply"):
+    with pytest.raises(UserError, match=r"can hold positions to 8,388,607, not 1e\+07; leave the"):
         written(tmp_path, ".spz", replace(cube(), means=cube().means + np.float32(1e7)))
     assert not list(tmp_path.iterdir())
 

@@ -172,6 +172,30 @@ def test_tilesets_are_as_3d_tiles_asks(tmp_path, monkeypatch, capsys):
     assert " 1,000 | " in printed and "equal" in printed and "photos" not in printed
 
 
+def test_tiles_of_cesium_have_spz_in_place_of_attributes(tmp_path, monkeypatch):
+    """All that CesiumJS 1.145 asks for; tests/browser/test_tiles.py shows them in it."""
+    monkeypatch.setattr(tiles3d, "octree", lambda some: octree(some, most=150))
+    some = splats(400, 2)
+    tileset = _written(tmp_path / "cesium.json", some)
+    both = ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
+    assert tileset["extensions"]["3DTILES_content_gltf"] == {"extensionsUsed": both, "extensionsRequired": both}
+    for tile in octree(some, most=150).all():
+        content = next(tmp_path.rglob(f"{tile.name}.glb")).read_bytes()
+        (size,) = struct.unpack_from("<I", content, 12)
+        gltf, count = json.loads(content[20 : 20 + size]), len(tile.splats)
+        (primitive,) = gltf["meshes"][0]["primitives"]
+        assert gltf["extensionsRequired"] == both and "rotation" not in gltf["nodes"][0]
+        assert primitive["extensions"][both[0]]["extensions"] == {both[1]: {"bufferView": 0}}
+        assert sum("SH_DEGREE_" in name for name in primitive["attributes"]) == 8  # without band 0
+        assert all(accessor["count"] == count and "bufferView" not in accessor for accessor in gltf["accessors"])
+        (tmp_path / "a.spz").write_bytes(content[28 + size :][: gltf["bufferViews"][0]["byteLength"]])
+        read = read_splats(tmp_path / "a.spz")
+        for name, most in {"means": 1e-5, "log_scales": 1 / 30, "sh": 1 / 50}.items():
+            np.testing.assert_allclose(getattr(read, name), getattr(tile.splats, name), rtol=0, atol=most)
+        np.testing.assert_allclose(opacities(read), opacities(tile.splats), rtol=0, atol=0.002)
+        assert np.abs((read.rotations * tile.splats.rotations).sum(axis=1)).min() > 0.9985  # 0.998 if each were rounded to the nearest
+
+
 @pytest.mark.parametrize("place", [(0, 0, 0), (47.25, 8.5, 410), (-33.9, 151.2, -20), (90, 0, 0), (45, 180, 8000)])
 def test_places_on_the_globe_are_those_of_colmap(place):
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap has no wheel for this platform")
@@ -223,12 +247,27 @@ def test_a_failed_tileset_leaves_the_earlier_one(tmp_path, monkeypatch):
     assert {entry.name for entry in tmp_path.rglob("*")} == before
 
 
-@pytest.mark.parametrize("some", [splats(0, 0), extreme_splats()], ids=["empty", "extreme"])
-def test_empty_and_extreme_models_have_tilesets(tmp_path, some, monkeypatch):
+NEAR = selected(extreme_splats(), np.arange(7))  # SPZ cannot hold the last one
+
+
+@pytest.mark.parametrize(
+    ("name", "some"),
+    [
+        *((name, splats(0, 0)) for name in ("tileset.json", "cesium.json")),
+        *(("tileset.json", extreme_splats()), ("cesium.json", NEAR)),
+    ],
+)
+def test_empty_and_extreme_models_have_tilesets(tmp_path, some, monkeypatch, name):
     monkeypatch.setattr(tiles3d, "octree", lambda some: octree(some, most=2))
-    tileset = _written(tmp_path / "tileset.json", some)
+    tileset = _written(tmp_path / name, some)
     assert ("content" in tileset["root"]) == bool(len(some))
     assert np.isfinite(tileset["root"]["boundingVolume"]["box"]).all()
+
+
+def test_tiles_of_cesium_refuse_positions_that_spz_cannot_hold(tmp_path):
+    with pytest.raises(UserError, match=r"SPZ can hold positions to 8,388,607, not 1.*e\+30; leave the farthest out"):
+        _written(tmp_path / "cesium.json", extreme_splats())
+    assert not any(tmp_path.iterdir())
 
 
 def test_finer_levels_lose_less():

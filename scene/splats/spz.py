@@ -1,9 +1,10 @@
-"""SPZ, the format of Niantic and Adobe: version 4 is written, versions 2 to 4 are read.
+"""SPZ, the format of Niantic and Adobe: versions 4 and 2 are written, versions 2 to 4 are read.
 
 Published in the README of github.com/nianticlabs/spz. Version 4 is a header of 32 bytes, a table of streams, and a zstd
 stream for each attribute: positions (24-bit fixed point), opacities, colours, logarithms of scales (steps of 1/16 from
 -10), rotations (the index of the largest component in 2 bits, the others in 10: sign and size) and SH coefficients
-(range +-1, all 8 bits used), one splat after the other. Axes are those of OpenGL: x right, y up, z back.
+(range +-1, all 8 bits used), one splat after the other. Axes are those of OpenGL: x right, y up, z back. Version 2 is
+one gzip stream of all these, with rotations of 3 bytes: x, y and z of the quaternion whose w is not negative.
 """
 
 import gzip
@@ -50,28 +51,46 @@ def write_spz(path: str | os.PathLike, splats: Splats) -> None:
     zstandard = find_zstandard(path)
     splats = _drawn_in(splats)
     splats = half_turned(selected(splats, morton_order(splats.means)))
+    bits, streams = _streams(splats, _rotation_codes(splats.rotations))
+    compressor = zstandard.ZstdCompressor(level=_LEVEL, write_checksum=True)
+    packed = [compressor.compress(stream) for stream in streams]
+    table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
+    header = _packed_header(4, splats, bits, len(streams)) + _HEADER_END.pack(_HEADER.size + _HEADER_END.size)
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(header + table + b"".join(packed))
+
+
+def packed_spz_2(splats: Splats) -> bytes:
+    """A whole file of version 2, in which the splats keep their order. UserError for positions that it cannot hold."""
+    splats = half_turned(splats)
+    bits, streams = _streams(splats, _three_bytes(splats.rotations))
+    return gzip.compress(_packed_header(2, splats, bits, 0) + b"".join(streams), mtime=0)
+
+
+def _packed_header(version: int, splats: Splats, bits: int, streams: int) -> bytes:
+    flags = _ANTIALIASED if splats.antialiasing else 0
+    return _HEADER.pack(MAGIC, version, len(splats), splats.sh_degree, bits, flags, streams)
+
+
+def _streams(splats: Splats, rotations: np.ndarray) -> tuple[int, list[bytes]]:
+    """Bits of a position's fraction, and the attributes of splats with OpenGL's axes. rotations: of the version."""
     farthest = float(np.abs(splats.means).max(initial=0))
     if farthest > _LARGEST_POSITION:
-        raise UserError(f"{path} can hold positions to {_LARGEST_POSITION:,}, not {farthest:.3g}; end --to with .ply")
+        raise UserError(
+            f"SPZ can hold positions to {_LARGEST_POSITION:,}, not {farthest:.3g}; leave the farthest out by --crop, "
+            "or end --to with .ply"
+        )
     bits = int(np.clip(np.floor(np.log2(_LARGEST_POSITION / max(farthest, 1e-30))), 0, _MOST_BITS))
     tables = [
         _fixed_point(splats.means, bits),
         to_bytes(opacities(splats) * 255),
         to_bytes((splats.sh[:, 0].astype(np.float64) * _COLOR + 0.5) * 255),
         to_bytes((splats.log_scales.astype(np.float64) + 10) * 16),
-        _rotation_codes(splats.rotations),
+        rotations,
     ]
     if splats.sh_degree:  # readers refuse an empty stream
         tables.append(to_bytes(splats.sh[:, 1:] * 128 + 128))
-    streams = [table.tobytes() for table in tables]
-    compressor = zstandard.ZstdCompressor(level=_LEVEL, write_checksum=True)
-    packed = [compressor.compress(stream) for stream in streams]
-    table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
-    flags = _ANTIALIASED if splats.antialiasing else 0
-    header = _HEADER.pack(MAGIC, 4, len(splats), splats.sh_degree, bits, flags, len(streams))
-    header += _HEADER_END.pack(_HEADER.size + _HEADER_END.size)
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(header + table + b"".join(packed))
+    return bits, [table.tobytes() for table in tables]
 
 
 def _drawn_in(splats: Splats) -> Splats:
@@ -108,6 +127,22 @@ def find_zstandard(path: str | os.PathLike) -> ModuleType:
 def _fixed_point(means: np.ndarray, bits: int) -> np.ndarray:
     fixed = np.clip(np.round(means.astype(np.float64) * 2**bits), -_LARGEST_POSITION, _LARGEST_POSITION)
     return fixed.astype("<i4").view(np.uint8).reshape(-1, 3, 4)[:, :, :3]
+
+
+def _three_bytes(wxyz: np.ndarray) -> np.ndarray:
+    """Rotations of version 2. A reader finds w by the others, whose rounding matters much where w is small.
+
+    So x, y and z are each rounded down or up by what gives the nearest rotation.
+    """
+    places = (wxyz[:, 1:] * np.where(wxyz[:, :1] < 0, -1, 1) + 1) * 127.5
+    best, nearest = np.zeros(places.shape, np.uint8), np.full(len(wxyz), -1.0)
+    for up in np.ndindex(2, 2, 2):
+        codes = np.clip(np.floor(places) + up, 0, 255).astype(np.uint8)
+        read = _read_rotations(codes)
+        cosine = np.abs((read * wxyz).sum(axis=1)) / np.linalg.norm(read, axis=1)
+        better = cosine > nearest
+        best[better], nearest[better] = codes[better], cosine[better]
+    return best
 
 
 def _rotation_codes(wxyz: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ import argparse
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import quote
@@ -91,10 +92,10 @@ def _mesh_by(
     return write_mesh
 
 
-def _write_tileset(path: str | os.PathLike, splats: Splats, around: Around) -> str:
+def _write_tileset(path: str | os.PathLike, splats: Splats, around: Around, compressed: bool = False) -> str:
     from splatting.exports.tiles3d import write_tileset  # as it imports the rasterizer
 
-    return write_tileset(path, splats, around)
+    return write_tileset(path, splats, around, compressed)
 
 
 def _write_lod_meta(path: str | os.PathLike, splats: Splats, around: Around) -> str:
@@ -123,6 +124,9 @@ FORMATS = (
     Format(".spz", write_spz, "Niantic, version 4", check=find_zstandard),
     Format(".sog", write_sog, "PlayCanvas, through splat-transform", check=find_program),
     Format(".glb", write_glb, "glTF with KHR_gaussian_splatting, float32"),
+    Format(
+        "cesium.json", partial(_write_tileset, compressed=True), "3D Tiles for CesiumJS, as SPZ 2", True, around=True
+    ),
     Format("tileset.json", _write_tileset, "3D Tiles of such GLB, by levels of detail", of_scene=True, around=True),
     Format(
         "lod-meta.json",

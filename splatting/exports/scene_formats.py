@@ -5,6 +5,9 @@ The values are those of the model, in COLMAP's axes. A node, or the prim, turns 
 GLB has the Khronos extension KHR_gaussian_splatting: splats are points with attributes, float32, with quaternions xyzw,
 and each SH coefficient as an attribute. COLOR_0 shows programs without the extension a coloured point cloud.
 
+A compressed GLB has all of this as SPZ of version 2, by KHR_gaussian_splatting_compression_spz_2, a draft. CesiumJS
+reads no other GLB of splats. SPZ has the axes of OpenGL, and band 0 and opacity are in COLOR_0 alone.
+
 USDZ has the schema ParticleField3DGaussianSplat of OpenUSD 26.3 and later; SH coefficients lie splat by splat.
 """
 
@@ -19,10 +22,12 @@ from types import ModuleType
 import numpy as np
 
 from scene.splats.packing import rgba_bytes
-from scene.splats.splats import Splats, opacities
+from scene.splats.splats import Splats, half_turned, opacities
+from scene.splats.spz import packed_spz_2
 from utils.system_utils import UserError, atomic_write, temporary_folder
 
 EXTENSION = "KHR_gaussian_splatting"
+COMPRESSION = "KHR_gaussian_splatting_compression_spz_2"
 GEOREFERENCE = "EXT_georeference"
 LARGEST = 2**32 - 1  # bytes of a GLB: the header has 32 bits for them
 PRIM = "/World/Splats"
@@ -41,6 +46,22 @@ def write_glb(path: str | os.PathLike, splats: Splats) -> None:
     write_binary_gltf(
         path, document, attributes.values(), "leave Gaussians out by --max_splats, or bands by --sh_degree"
     )
+
+
+def write_compressed_glb(path: str | os.PathLike, splats: Splats) -> None:
+    """Write a compressed GLB of one splat or more, whole or not at all. UserError for what it cannot hold."""
+    packed = packed_spz_2(splats)
+    elsewhere = f"{EXTENSION}:OPACITY", f"{EXTENSION}:SH_DEGREE_0_COEF_0"
+    attributes = {name: x for name, x in _attributes(half_turned(splats)).items() if name not in elsewhere}
+    document = _document(attributes, [len(packed)], splats.antialiasing)
+    document["extensionsUsed"] = document["extensionsRequired"] = [EXTENSION, COMPRESSION]
+    (primitive,) = document["meshes"][0]["primitives"]
+    primitive["extensions"][EXTENSION]["extensions"] = {COMPRESSION: {"bufferView": 0}}
+    for accessor in document["accessors"]:
+        del accessor["bufferView"]
+    del document["bufferViews"][0]["target"], document["nodes"][0]["rotation"]
+    content = np.frombuffer(packed + b"\0" * (-len(packed) % 4), np.uint8)
+    write_binary_gltf(path, document, [content], "leave Gaussians out by --max_splats, or bands by --sh_degree")
 
 
 def georeference(document: dict, place: tuple[float, ...]) -> None:

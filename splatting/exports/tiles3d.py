@@ -1,5 +1,7 @@
 """3D Tiles 1.1 (OGC 22-025r4): tileset.json beside a folder of GLB with KHR_gaussian_splatting, for large models.
 
+Those of three.js have float32, those of CesiumJS are compressed (splatting/exports/scene_formats.py).
+
 A viewer draws the tiles of an octree that are as fine as the distance asks for, and loads no others. A GLB has y up,
 and tiles have z up, so a viewer turns x y z of a GLB to x -z y. Boxes are in these axes. Where GPS is known, they are
 east, north and up, and the root's transform places them on the globe.
@@ -16,37 +18,43 @@ import numpy as np
 from scene.splats.splats import Splats
 from splatting.exports.beside import PLACE, with_folder
 from splatting.exports.levels import Tile, Views, octree, table
-from splatting.exports.scene_formats import EXTENSION, write_glb
+from splatting.exports.scene_formats import COMPRESSION, EXTENSION, write_compressed_glb, write_glb
 
 _EQUATOR, _FLATTENING = 6378137.0, 1 / 298.257223563  # of WGS 84: the radius in metres
 _ANNOUNCED = "3DTILES_content_gltf"  # says ahead of loading which extensions GLB files use
 
 
-def write_tileset(path: str | os.PathLike, splats: Splats, around: Views) -> str:
+def write_tileset(path: str | os.PathLike, splats: Splats, around: Views, compressed: bool = False) -> str:
     """Write a tileset, whole or not at all, print what each level loses, and return a part of a sentence about it.
 
-    The files of an earlier tileset of this name go once the new one is there.
+    The files of an earlier tileset of this name go once the new one is there. compressed: for CesiumJS.
     """
     root, path, sizes = octree(splats), Path(path), {}
+    write = write_compressed_glb if compressed else write_glb
     with with_folder(path, "tiles-") as folder:
         for tile in root.all():
             if len(tile.splats):
-                write_glb(folder / f"{tile.name}.glb", replace(tile.splats, place=()))  # which the root has
+                write(folder / f"{tile.name}.glb", replace(tile.splats, place=()))  # which the root has
                 sizes[tile.name] = (folder / f"{tile.name}.glb").stat().st_size
-        (folder / path.name).write_text(json.dumps(document(root, PLACE), allow_nan=False), encoding="utf-8")
+        (folder / path.name).write_text(
+            json.dumps(document(root, PLACE, compressed), allow_nan=False), encoding="utf-8"
+        )
     levels = [root.level(depth) for depth in range(root.levels)]
     print(table(root, [sum(sizes.get(tile.name, 0) for tile in level) for level in levels], around))
     return f"{root.levels} levels, {len(sizes)} tiles with {sum(sizes.values()) / 1e6:.2f} MB in a folder beside it"
 
 
-def document(root: Tile, folder: str) -> dict[str, Any]:
+def document(root: Tile, folder: str, compressed: bool = False) -> dict[str, Any]:
     """The content of tileset.json."""
+    announced = {"extensionsUsed": [EXTENSION]}
+    if compressed:  # CesiumJS takes tiles for splats where both are required
+        announced = dict.fromkeys(("extensionsUsed", "extensionsRequired"), [EXTENSION, COMPRESSION])
     width = float(np.linalg.norm(root.high - root.low))
     transform = {"transform": on_globe(root.splats.place)} if root.splats.place else {}
     return {
         "asset": {"version": "1.1", "extras": {"generator": "export.py", "folder": folder}},
         "extensionsUsed": [_ANNOUNCED],
-        "extensions": {_ANNOUNCED: {"extensionsUsed": [EXTENSION]}},
+        "extensions": {_ANNOUNCED: announced},
         "geometricError": max(width, 2 * root.error),  # of a viewer that draws nothing
         "root": {"refine": "REPLACE", **transform, **_entry(root, folder)},
     }
