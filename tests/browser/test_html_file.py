@@ -76,6 +76,8 @@ def test_a_frame_of_a_notebook_shows_the_page(tab, page, splats, tmp_path):
     tab.evaluate("document.querySelector('iframe').hidden = false")
     wait_for_picture(tab.frames[1])
     assert psnr(settled(tab), expected(splats, cameras()[0])) > 33
+    link = tab.frames[1].locator(".sse-viewerBranding")
+    assert link.get_attribute("href") and link.evaluate("e => getComputedStyle(e).display") == "none"
 
 
 def test_a_bookmark_shows_the_picture_of_its_camera(tab, page, splats):
