@@ -35,7 +35,7 @@ from scene.scene import Scene
 from scene.splats.reading import READABLE
 from scene.splats.splats import Splats, choose, selected, tidy, used_sh_degree, with_sh_degree
 from scene.with_splats import load_file, splats_of
-from splatting.camera_paths.without_scene import RECORD, circle, have_moved, recorded_cameras
+from splatting.camera_paths.without_scene import RECORD, circle, recorded_cameras, warn_if_moved
 from splatting.exports.cleaning import OPTION as CLEAN_OPTION
 from splatting.exports.cleaning import check_clean, clean_scene, write_picture
 from splatting.exports.formats import FORMATS, Around, Format, format_of
@@ -203,12 +203,8 @@ def _check_views(
     from splatting.camera_paths.poses import poses_of  # SciPy takes a while to import
     from splatting.exports.page_start import named_start
 
-    if not args.ply and have_moved(Path(args.model_path), cameras):
-        print(
-            f"warning: the scene's poses are not those that {args.model_path} was trained with, so the model does not "
-            "fit its photos; train again, or name its scene by -s",
-            file=sys.stderr,
-        )
+    if not args.ply:
+        warn_if_moved(args.model_path, cameras)
     if args.start is not None:
         named_start(args.start, [str(camera.image_name) for camera in cameras])
     if make_path and cameras:

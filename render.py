@@ -196,7 +196,12 @@ def _loaded(
     scene.loaded_iter = f"{scene.loaded_iter}{dataset.marks}" if getattr(dataset, "marks", "") else scene.loaded_iter
     if len(scene.gaussians) == 0:
         raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
-    check_views(pipeline, (*scene.getTrainCameras(), *scene.getTestCameras()))
+    views = *scene.getTrainCameras(), *scene.getTestCameras()
+    check_views(pipeline, views)
+    if not (ply or getattr(dataset, "other_scene", "")):
+        from splatting.camera_paths.without_scene import warn_if_moved  # SciPy takes a while to import
+
+        warn_if_moved(scene.model_path, views)
     return scene, torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
 
 

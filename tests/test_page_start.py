@@ -16,6 +16,7 @@ import export
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
 from scene.with_splats import model_of
+from splatting.camera_paths import without_scene
 from splatting.camera_paths.poses import Poses, focus_point, poses_of
 from splatting.exports import cleaning
 from splatting.exports.formats import Around, format_of
@@ -119,7 +120,7 @@ def test_pages_are_cleaned_unless_they_are_raw(colmap_scene, tmp_path, monkeypat
     run("--raw", "--title", "Room")
     assert "warning" not in capsys.readouterr().err
     assert not asked and (tmp_path / "page.html.jpg").is_file() and _meta(tmp_path / "page.html")["og:title"] == "Room"
-    monkeypatch.setattr(export, "have_moved", lambda *_: True)
+    monkeypatch.setattr(without_scene, "have_moved", lambda *_: True)
     run("--raw")
     assert "warning: the scene's poses are not those that" in capsys.readouterr().err
     with pytest.raises(UserError, match="contradict"):

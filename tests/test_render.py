@@ -22,6 +22,7 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import attributes
 from scene.gaussians.ply import write_ply
 from scene.saved_model import load_saved
+from splatting.camera_paths import without_scene
 from splatting.evaluation.renders import INCOMPLETE, summarise_times
 from splatting.files.image_files import read_plane, to_bytes, write_plane
 from utils.system_utils import UserError
@@ -136,7 +137,7 @@ def test_views_by_the_references_arguments(tmp_path, rendered, capsys):
     assert np.array_equal(half, to_bytes(image[..., 2:]).numpy())
 
 
-def test_sets_by_the_references_arguments(folder, colmap_scene):
+def test_sets_by_the_references_arguments(folder, colmap_scene, monkeypatch, capsys):
     shutil.copytree(folder / "point_cloud" / "iteration_7", folder / "point_cloud" / "iteration_30")
     parser = ArgumentParser()
     options, pipeline = ModelParams(parser), PipelineParams(parser)
@@ -149,8 +150,11 @@ def test_sets_by_the_references_arguments(folder, colmap_scene):
 
     assert render.render_sets(dataset, 7, pipeline.extract(args), True, False) is None
     assert written() == {"test/ours_7": 3}
+    assert "warning" not in capsys.readouterr().err
+    monkeypatch.setattr(without_scene, "have_moved", lambda *_: True)
     render.render_sets(dataset, -1, pipeline.extract(args), False, True, False)
     assert written() == {"test/ours_7": 3, "train/ours_30": 14}
+    assert "warning: the scene's poses are not those that" in capsys.readouterr().err
     assert vars(dataset) == before
 
 

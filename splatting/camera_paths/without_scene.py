@@ -3,6 +3,8 @@
 And whether a scene that is at hand still has those cameras.
 """
 
+import os
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -62,6 +64,16 @@ def recorded_cameras(path: Path) -> list[Camera]:
         return _cameras([_recorded(number, entry) for number, entry in enumerate(read_json(path))])
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path} has no cameras that can be read ({error}); give the scene with -s") from error
+
+
+def warn_if_moved(model: str | os.PathLike, cameras: Sequence[Camera]) -> None:
+    """Print a warning where `have_moved`."""
+    if have_moved(Path(model), cameras):
+        print(
+            f"warning: the scene's poses are not those that {model} was trained with, so the model does not fit its "
+            "photos; train again, or name its scene by -s",
+            file=sys.stderr,
+        )
 
 
 def have_moved(folder: Path, cameras: Sequence[Camera]) -> bool:
