@@ -37,7 +37,7 @@ def test_a_paused_training_says_its_length_and_ends_by_a_signal(tab, tmp_path):
             tab.get_by_role("tab", name="Training").click(timeout=TIMEOUT)
             assert tab.title() == "out"
             tab.get_by_role("button", name="Resume").wait_for(timeout=TIMEOUT)
-            assert labelled(tab, "Iteration").input_value() == "1 of 7,000"
+            assert labelled(tab, "Iteration").input_value() == "1 of 7,000, paused"
         tab.get_by_role("button", name="Resume").click()
         tab.wait_for_function(
             r"[...document.querySelectorAll('input')].some((it) => /^(\d+ \w+ )?\d+ (s|min)$/.test(it.value))",
