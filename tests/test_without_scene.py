@@ -15,7 +15,8 @@ import view
 from gaussian_renderer import render
 from scene.splats.reading import read_splats
 from scene.with_splats import model_of
-from splatting.camera_paths.without_scene import COUNT, circle, have_moved, recorded_cameras
+from splatting.camera_paths import without_scene
+from splatting.camera_paths.without_scene import COUNT, WithoutScene, circle, have_moved, recorded_cameras
 from splatting.exports.reading import read_any
 from splatting.viewer.views import SceneCameras
 from utils.camera_utils import camera_to_JSON
@@ -90,6 +91,14 @@ def test_a_folder_whose_scene_is_gone_keeps_its_poses(tmp_path, capsys):
     assert "gone is gone, so there are poses, but no photos" in capsys.readouterr().err
     with pytest.raises(UserError, match="gone, which is gone; leave it out"):
         view.kept(scene, argparse.Namespace(clean=0.05), pipeline(), options)
+
+
+def test_a_viewer_says_that_poses_have_moved(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(view, "load_saved", lambda *_: WithoutScene(None, "", 7, ()))
+    monkeypatch.setattr(without_scene, "have_moved", lambda *_: True)
+    options = argparse.Namespace(model_path=str(tmp_path), source_path=str(tmp_path))
+    assert view.of_folder(options, argparse.Namespace(iteration=-1, typed_sh_degree=None)).loaded_iter == 7
+    assert "warning: the scene's poses are not those that" in capsys.readouterr().err
 
 
 def test_a_page_of_a_folder_whose_scene_is_gone_has_its_poses(tmp_path, monkeypatch, capsys):

@@ -21,6 +21,7 @@ from splatting.distributed.process_group import TIMEOUT, SeveralRanks
 from splatting.distributed.ranks import refuse_differences, using
 from splatting.host import torchrun
 from splatting.host.errors import UserError
+from splatting.host.interrupt import let_signals_end
 from splatting.host.machine import compute_device, cores, device_name, instruction_set
 from splatting.host.memory import is_out_of_memory
 
@@ -44,6 +45,7 @@ def run_together(main: Callable[[], object], outcome: Callable[[Callable[[], obj
         except SystemExit as end:  # of argparse, which has said why
             status, line = end.code or 0, ""
         except RuntimeError as error:
+            let_signals_end()  # torchrun sends one now, which would print a traceback
             if is_out_of_memory(error) or not _is_lost(error):
                 raise
             status, line = 1, "error: another rank has ended, or did not answer in time; see torchrun's report"
