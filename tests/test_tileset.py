@@ -283,10 +283,10 @@ def test_finer_levels_lose_less():
 
 @pytest.mark.skipif(not shutil.which(PROGRAM), reason=f"{PROGRAM} is not on PATH: npm i -g @playcanvas/splat-transform")
 def test_streamed_sog_has_every_level(tmp_path, monkeypatch):
-    monkeypatch.setattr(streamed, "octree", lambda some: octree(some, most=150))
-    some, path = splats(600, 0), tmp_path / "out" / "lod-meta.json"
+    monkeypatch.setattr(streamed, "octree", lambda some: octree(some, most=250))
+    some, path = splats(400, 0), tmp_path / "out" / "lod-meta.json"
     content = _written(path, some)
-    root = octree(some, most=150)
+    root = octree(some, most=250)
     counts = [sum(len(tile.splats) for tile in root.level(depth)) for depth in range(root.levels)]
     assert content["counts"] == counts[::-1] and content["lodLevels"] == root.levels
     (finest,) = (name for name in content["filenames"] if "/0_" in name)
