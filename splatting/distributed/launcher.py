@@ -45,9 +45,9 @@ def run_together(main: Callable[[], object], outcome: Callable[[Callable[[], obj
         except SystemExit as end:  # of argparse, which has said why
             status, line = end.code or 0, ""
         except RuntimeError as error:
-            let_signals_end()  # torchrun sends one now, which would print a traceback
             if is_out_of_memory(error) or not _is_lost(error):
                 raise
+            let_signals_end()  # torchrun sends SIGTERM now; as an exception it would print a traceback
             status, line = 1, "error: another rank has ended, or did not answer in time; see torchrun's report"
     if rank > 0 and status == _REFUSED:
         try:

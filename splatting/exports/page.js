@@ -52,7 +52,7 @@ const leaning = (viewer, annotations) => {
 };
 
 try {
-  // A frame of another page may run this before it has a size, and none while it is hidden.
+  // Angles are fitted to the size of the window. In a frame this runs before there is a size; a hidden frame has none.
   while (!innerWidth || !innerHeight) await new Promise(requestAnimationFrame);
   const { antialiasing, aspect, name, settings } = JSON.parse(document.getElementById('page').textContent);
   for (const { initial } of settings.cameras) initial.fov = fit(initial.fov, aspect);
