@@ -13,6 +13,7 @@ import pytest
 import stand_ins
 import torch
 from pycolmap import Reconstruction
+from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 import full_eval
@@ -22,6 +23,7 @@ from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT
 from benchmarks.harness.calls import by_stage
 from benchmarks.harness.measuring import GpuTime, short_name
 from benchmarks.kernels import rasterizer
+from benchmarks.parallel import kernels as kernels_of_steps
 from benchmarks.parallel import steps, workload
 from benchmarks.scenes import made, scores, step_profile
 from benchmarks.scenes.thinned import thinned
@@ -210,9 +212,11 @@ def test_steps_of_ranks_and_of_a_spilled_model_stand_beside_those_of_one_process
     launch = steps.launch  # one rank needs no process of its own
     here = lambda case, limit: steps.measure(case) if case["ranks"] == 1 else launch(case, limit)  # noqa: E731
     monkeypatch.setattr(steps, "launch", here)
-    monkeypatch.setattr(sys, "argv", ["steps", "--ranks", "1", "2", *words.split()])
+    monkeypatch.setattr(sys, "argv", ["steps", "--ranks", "1", "2", "--kernels", *words.split()])
     steps.main()
-    rows = _rows(capsys.readouterr().out, "city")
+    said = capsys.readouterr().out
+    rows = _rows(said, "city")
+    assert [row[0] for row in _rows(said, "")[-3:]] == ["all kernels", "messages", "packing"]
     assert [row[1:3] for row in rows] == [["1", "gpu"], ["2", "gpu"]]
     assert rows[0][6] == "1.00" and float(rows[1][6]) > 0
     monkeypatch.setattr(
@@ -221,6 +225,33 @@ def test_steps_of_ranks_and_of_a_spilled_model_stand_beside_those_of_one_process
     steps.main()
     rows = _rows(capsys.readouterr().out, "city")
     assert rows[0][-1] == rows[1][-1] != ""
+
+
+def test_kernels_are_messages_or_pack_them_or_neither():
+    def launched(name: str, us: float) -> tuple[SimpleNamespace, SimpleNamespace]:
+        span = SimpleNamespace(elapsed_us=lambda: us)
+        on_device = SimpleNamespace(name=name, device_type=DeviceType.CUDA, time_range=span)
+        return on_device, SimpleNamespace(name=name, duration=us)
+
+    kernels = [
+        launched("void gs::list<5>(int)", 4000),
+        launched("ncclDevKernel_SendRecv(x)", 2000),
+        launched("a", 1000),
+    ]
+    inner = SimpleNamespace(name="op", device_type=DeviceType.CPU, kernels=[k[1] for k in kernels[:2]], cpu_children=[])
+    scope = SimpleNamespace(name="send_splats", device_type=DeviceType.CPU, kernels=[], cpu_children=[inner])
+    spans = [launched("send_splats", 9000)[0], launched("nccl:all_to_all", 9000)[0]]
+    found = kernels_of_steps.sums_of([*(k[0] for k in kernels), inner, scope, *spans], 2)
+    names = {"list": 2.0, "ncclDevKernel_SendRecv": 1.0, "a": 0.5}
+    assert found == {"all kernels": 3.5, "messages": 1.0, "packing": 2.0, **names}
+    assert kernels_of_steps.kernel_rows([{"all kernels": 2.0, "messages": 0.0, "packing": 0.0, "a": 1.5}, found]) == [
+        ["all kernels", "2.000", "3.500"],
+        ["messages", "0.000", "1.000"],
+        ["packing", "0.000", "2.000"],
+        ["list", "", "2.000"],
+        ["a", "1.500", "0.500"],
+        ["ncclDevKernel_SendRecv", "", "1.000"],
+    ]
 
 
 def test_bytes_of_a_gaussian_are_those_of_a_line():

@@ -2,12 +2,13 @@
 
 import pytest
 import torch
-from diff_gaussian_rasterization.fakes import ABSOLUTE_VALUES, MOMENT_VALUES
+from diff_gaussian_rasterization.fakes import ABSOLUTE_VALUES, MOMENT_VALUES, RAY_VALUES, SPLAT_VALUES
 from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, moved_by_a_word, ops
 from torch import Tensor
 
-from splatting.distributed.ranks import Ranks
-from splatting.distributed.rendering.exchange import Sent, return_rows
+from splatting.distributed.ranks import ALONE, Ranks
+from splatting.distributed.rendering.bands import Bands
+from splatting.distributed.rendering.exchange import Sent, return_rows, send_splats
 from splatting.host.read_later import read_later
 
 LARGE = 20_000  # more than a thread of the CPU takes at once, and no multiple of anything
@@ -37,20 +38,54 @@ def recorded_by_torch(rects: Tensor, tile_counts: Tensor, limits: Tensor) -> tup
     return reached.sum(1), gaussian, numbers[band + len(reached) * gaussian].int()
 
 
-@CPU_AND_GPU
+def with_empty(counts: Tensor, empty: list[int]) -> Tensor:
+    """The counts of `list_records`, and behind them so many empty records for each band."""
+    return torch.cat((counts, counts.new_tensor([*empty, sum(empty)])[:, None]), 1)
+
+
+@BOTH_AND_GPU
+@pytest.mark.parametrize("values", [SPLAT_VALUES, SPLAT_VALUES + RAY_VALUES])
 @pytest.mark.parametrize("kind", ["none", "one", "unseen", "some", "many bands"])
-def test_records_are_counted_and_listed(kind, device):
+def test_records_are_counted_and_listed(kind, values, device, dtype):
     reach = reach_of(kind, device)
+    count = len(reach[0])
+    splats, depths = (
+        torch.rand(count, values, device=device, dtype=dtype),
+        torch.rand(count, device=device, dtype=dtype),
+    )
     numbers, gaussians, places = recorded_by_torch(*reach)
-    counts, *found = ops.list_records(*reach, len(gaussians))
+    counts = ops.list_records(*reach)[0]
     assert torch.equal(counts[:-1].sum(1), numbers) and torch.equal(counts[-1], counts[:-1].sum(0))
-    assert torch.equal(found[0], gaussians) and torch.equal(found[1], places)
-    for room in (len(gaussians) // 2, len(gaussians) + 7):
-        _, *part = ops.list_records(*reach, room)
-        assert len(part[0]) == len(part[1]) == room
+    empty = [(3 * band + 1) % 4 for band in range(len(numbers))]
+    counts, total = with_empty(counts, empty), len(gaussians) + sum(empty)
+    _, *found = ops.list_records(*reach, counts, splats, depths, total)
+    filled = found[0] < count
+    assert torch.equal(found[0][filled], gaussians) and torch.equal(found[1][filled], places)
+    assert found[1][~filled].tolist() == list(range(len(gaussians), total))
+    ends = torch.tensor([int(n) + k for n, k in zip(numbers, empty, strict=True)]).cumsum(0).tolist()
+    assert (~filled).nonzero()[:, 0].tolist() == [
+        e - k for e, n in zip(ends, empty, strict=True) for k in range(n, 0, -1)
+    ]
+    for one, other in zip(found[2:], (splats, depths, *reach[:2]), strict=True):
+        assert torch.equal(one[filled], other[gaussians]) and not one[~filled].any()
+    for room in (total // 2, total + 7):
+        _, *part = ops.list_records(*reach, counts, splats, depths, room)
         for one, other in zip(part, found, strict=True):
-            assert torch.equal(one[: len(other)], other[:room])
+            assert len(one) == room and torch.equal(one[:total], other[:room])
     assert kind != "some" or len(gaussians) > LARGE / 2
+
+
+@CPU_AND_GPU
+@pytest.mark.parametrize("seen", [0, 1, 2, 3, 4])
+def test_records_are_sent_in_fours_of_which_the_last_is_empty(seen, device):
+    rects = torch.tensor([[0, 0, 1, 1]] * 5, dtype=torch.int32, device=device)
+    tile_counts = (torch.arange(5, device=device) < seen).int()
+    splats, depths = torch.rand(5, SPLAT_VALUES, device=device), torch.rand(5, device=device)
+    arrived, sent = send_splats(ALONE, Bands([0, 1], 16, 0, device), (splats, depths, rects, tile_counts))
+    assert sent.sizes == sent.received == [4 * (seen // 4 + 1)]
+    for one, other in zip(arrived, (splats, depths, rects, tile_counts), strict=True):
+        assert torch.equal(one[:seen], other[:seen]) and not one[seen:].any()
+    assert sent.gaussians.tolist() == [*range(seen), *[5] * (sent.sizes[0] - seen)]
 
 
 def some_counts(kind: str) -> Tensor:
@@ -94,6 +129,12 @@ def test_runs_are_added_up(kind, values, device, dtype):
     assert torch.equal(again[~whole], found[:-3][kept == 1])
     wide = torch.cat((rows, rows), 1)[:, values:]
     assert torch.equal(ops.sum_runs(wide, counts, kept, int(kept.sum())), again)
+    # In another order.
+    order = (run % 7).argsort(stable=True)
+    places = torch.empty_like(counts).index_copy_(0, order, run.int())
+    moved = ops.sum_runs(rows, counts, kept, int(kept.sum()), places)
+    pieces = again.split(kept.tolist())
+    assert torch.equal(moved, torch.cat([again[:0], *(pieces[place] for place in order.tolist())]))
 
 
 class _Both(Ranks):
@@ -112,21 +153,22 @@ class _Both(Ranks):
 @CPU_AND_GPU
 @pytest.mark.parametrize("counts", [[2, 0, 1, 5, 3], [0, 0, 1, 0, 0], [1, 1, 1, 1, 1], [0] * 5])
 def test_sums_come_back_in_even_numbers_and_rows_of_borders_as_they_are(counts, device):
-    """Gaussians 0 and 1 of the first rank's band, 1, 2 and 4 of the other's; number 1 reaches both."""
-    counts = torch.tensor(counts, dtype=torch.int32, device=device)
+    """Gaussians 0 and 3 of the first rank's band, 1, 3 and 4 of the other's; number 3 reaches both."""
+    counts = torch.tensor([*counts[:2], 0, 0, *counts[2:], 0], dtype=torch.int32, device=device)
     rows = torch.randn(int(counts.sum()), 10, generator=torch.Generator().manual_seed(2)).to(device)
-    gaussians = torch.tensor([0, 1, 1, 2, 4], device=device)
-    inside = torch.tensor([True, False, False, True, True], device=device)
-    places = torch.tensor([0, 1, 2, 3, 4], dtype=torch.int32, device=device)
-    ranks, sent = _Both(), Sent(gaussians, [2, 3], [2, 3], places)
+    gaussians = torch.tensor([0, 3, 5, 5, 1, 3, 4, 5], device=device)
+    inside = torch.tensor([True, False, True, True, True, False, True, True], device=device)
+    places = torch.tensor([0, 2, 5, 6, 1, 3, 4, 7], dtype=torch.int32, device=device)
+    ranks, sent = _Both(), Sent(gaussians, [4, 4], [4, 4], places)
     returned, total = return_rows(ranks, sent, 5, rows, counts, inside)
-    assert ranks.sent[0] == [3, 4] and all(size % 2 == 0 for size in ranks.sent[1])
+    assert ranks.sent[0] == [4, 4] and all(size % 2 == 0 for size in ranks.sent[1])
     wanted = []
     for part, whole in zip(rows.split(counts.tolist()), inside.tolist(), strict=True):
         wanted.append(part.sum(0, keepdim=True)[: len(part)] if whole else part)
-    torch.testing.assert_close(returned, torch.cat(wanted))
     per_record = torch.tensor([len(part) for part in wanted], dtype=torch.int32, device=device)
-    assert torch.equal(total, torch.zeros_like(counts).index_add_(0, gaussians, per_record))
+    torch.testing.assert_close(returned, torch.cat([wanted[record] for record in places.argsort().tolist()]))
+    sums = torch.zeros(6, dtype=torch.int32, device=device).index_add_(0, gaussians, per_record)
+    assert torch.equal(total, sums[:5])
 
 
 @pytest.mark.gpu

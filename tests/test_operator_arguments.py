@@ -40,7 +40,17 @@ RASTERIZER = (
     "sum_runs",
 )
 # Tensors that may be None.
-NEEDLESS = ("means2d", "grad_transmittance", "grad_inverse_depth", "stopped", "words", "of", "planes[1]", "planes[2]")
+NEEDLESS = (
+    "means2d",
+    "grad_transmittance",
+    "grad_inverse_depth",
+    "stopped",
+    "words",
+    "of",
+    "planes[1]",
+    "planes[2]",
+    "places",
+)
 
 
 @pytest.fixture(scope="module")
@@ -187,6 +197,12 @@ WRONG = {
         (TypeError, "limits must be torch.int32", {"limits": Tensor.long}),
         (RuntimeError, "a room of 2147483648 is not from 0 to 2", {"room": 2**31}),
     ],
+    "list_records with counts": [
+        (TypeError, "counts, splats and depths must be given together", {"depths": None}),
+        (ValueError, r"counts must be \(3, 2\)", {"counts": lambda t: t[:, :1]}),
+        (ValueError, r"depths must be \(3,\)", {"depths": lambda t: t[1:]}),
+        (TypeError, "depths must be torch.float32", {"depths": Tensor.double}),
+    ],
     "sum_runs": [
         (ValueError, r"rows must be \(R, 10\) or \(R, 12\), got \(5, 11\)", _sums((5,), (1,), values=11)),
         (ValueError, r"kept must be \(2,\)", _sums((3, 2), (1,))),
@@ -195,6 +211,15 @@ WRONG = {
         (ValueError, "kept must be 0, 1 or the run's count, got 2 of run 0", _sums((3, 2), (2, 2))),
         (ValueError, "kept adds up to 4 rows, for which a room of 3 is too small", _sums((3, 2), (3, 1))),
         (RuntimeError, "a room of -1 is not from 0 to 2", _sums((3, 2), (1, 1), room=-1)),
+        (ValueError, r"places must be \(2,\)", _sums((3, 2), (1, 1))),
+        *(
+            (
+                ValueError,
+                f"places must be 0 to 2 in any order, got {wrong} of run 2",
+                {"places": _integers(1, 0, wrong)},
+            )
+            for wrong in (1, -1, 3)
+        ),
     ],
     "rasterize_vjp of rows": [
         (ValueError, r"rows must be \(-1, 12\)", {"absolute": True}),

@@ -38,7 +38,7 @@ def test_the_fake_kernels_have_the_sizes_of_the_real_ones():
     assert torch.equal(ops.sum_blocks(torch.cat([sums[0], 3 * sums[0]])), sums[0][0] + 3 * sums[0][0])
     rects, limits = torch.zeros(fakes.RECORD_BLOCK + 1, 4, dtype=torch.int32), torch.zeros(2, 3, dtype=torch.int32)
     for splats, blocks in ((fakes.RECORD_BLOCK, 1), (fakes.RECORD_BLOCK + 1, 2)):
-        assert ops.list_records(rects[:splats], rects[:splats, 0], limits, 0)[0].shape == (4, blocks)
+        assert ops.list_records(rects[:splats], rects[:splats, 0], limits)[0].shape == (4, blocks)
 
 
 @pytest.mark.parametrize(

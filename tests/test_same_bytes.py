@@ -17,7 +17,7 @@ from rasterizer_tools import BOTH_AND_GPU, adam, error, gradients, ops
 from simple_knn._C import distCUDA2
 from test_add_noise import GATE, WHERE
 from test_add_noise import _gaussians as noisy_gaussians
-from test_exchange import reach_of, recorded_by_torch, some_counts
+from test_exchange import reach_of, recorded_by_torch, some_counts, with_empty
 from test_fused_ssim import EPS, image_pair, with_gradient
 from test_gaussian_step import Case, start_and_camera, step_fused
 from test_gradient_rows import Forward, scene_of
@@ -109,11 +109,18 @@ def _exchange(device: str, dtype: torch.dtype) -> Callable[[], Results]:
     counts, reach = some_counts("giants").to(device), reach_of("some", device)
     rows = torch.randn(int(counts.sum()), 12).to(device, dtype)
     numbers, *lists = recorded_by_torch(*reach)
+    places = torch.randperm(len(counts)).to(device, torch.int32)
+    splats = (
+        torch.rand(len(reach[0]), 10, device=device, dtype=dtype),
+        torch.rand(len(reach[0]), device=device, dtype=dtype),
+    )
 
     def all_of_it() -> Results:
-        _, *recorded = ops.list_records(*reach, int(numbers.sum()))
-        assert all(torch.equal(*pair) for pair in zip(recorded, lists, strict=True))
-        return [*recorded, ops.sum_runs(rows, counts, torch.ones_like(counts), len(counts))]
+        numbered = with_empty(ops.list_records(*reach)[0], [0] * len(numbers))
+        _, *recorded = ops.list_records(*reach, numbered, *splats, int(numbers.sum()))
+        assert all(torch.equal(*pair) for pair in zip(recorded[:2], lists, strict=True))
+        sums = ops.sum_runs(rows, counts, torch.ones_like(counts), len(counts))
+        return [*recorded, sums, ops.sum_runs(rows, counts, counts, len(rows), places)]
 
     return all_of_it
 

@@ -35,6 +35,7 @@ def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict
     values, behind, picture = rand(len(splats), 5), rand(5), rand(5, height, width)
     shown = [*state[:8], behind, state[9]]
     reach = [rects, counts, integers([[0, 2], [2, 5]])]
+    numbered = torch.cat([ops.list_records(*reach)[0], integers([[1], [1], [2]])], 1)
     wanted = [True, True, True, True, True, False, False, True, True]
     source = [splats, counts, *rows]
     sums = list(ops.rasterize_vjp(*scene, wanted, source))
@@ -53,8 +54,9 @@ def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict
         "project": (ops.project, [*scene]),
         "bin": (ops.bin, [splats, depths, rects, counts, height, width, True]),
         "blend": (ops.blend, [splats, instances, ranges, background, height, width, True, True]),
-        "list_records": (ops.list_records, [*reach, int(ops.list_records(*reach, 0)[0][-1].sum())]),
-        "sum_runs": (ops.sum_runs, [*rows, rows[1].clamp_max(1), int(rows[1].count_nonzero())]),
+        "list_records": (ops.list_records, reach),
+        "list_records with counts": (ops.list_records, [*reach, numbered, splats, depths, int(numbered[-1].sum())]),
+        "sum_runs": (ops.sum_runs, [*rows, rows[1].clamp_max(1), int(rows[1].count_nonzero()), integers([1, 2, 0])]),
         "blend_channels": (ops.blend_channels, [splats, values, instances, ranges, behind, height, width, 0.99]),
         "channel_rows": (ops.channel_rows, [shown, values, picture, planes[1], 0.99, True, True, True]),
         "describe": (ops.describe, [splats, depths, counts]),

@@ -126,5 +126,5 @@ def decisive_in(view: View) -> Tensor:
     splats, instances, ranges, sent = view.drawing.splats, view.drawing.instances, view.drawing.ranges, view.sent
     mask = OPERATORS.decisive(splats, instances, ranges, view.last)
     by_band, _ = view.ranks.send(mask, sent.received, sent.sizes)
-    found = torch.zeros(len(view.radii), dtype=torch.int32, device=splats.device)
-    return found.index_add_(0, sent.gaussians, by_band.int()) > 0
+    found = torch.zeros(len(view.radii) + 1, dtype=torch.int32, device=splats.device)
+    return found.index_add_(0, sent.gaussians, by_band.int())[:-1] > 0

@@ -67,7 +67,10 @@ struct RowMemory {
 // Compiled once: see gs/rounded.h.
 void observe(const Executor&, const ObserveInput&);
 void displace(const Executor&, const Displacement&);
-void list_records(const Executor&, const RecordInput&, const RecordLists&);
+// How many records each block of splats has: (bands + 1, record_blocks), last those of all bands.
+void count_records(const Executor&, const RecordInput&, int32_t* counts);
+template <class T>
+void list_records(const Executor&, const RecordInput&, const RecordLists<T>&);
 template <class T>
 void sum_runs(const Executor&, const SumInput<T>&);
 template <class T>
@@ -98,7 +101,8 @@ namespace cuda {
 GS_BACKEND(Queue)
 void observe(const Queue&, const ObserveInput&);
 void displace(const Queue&, const Displacement&);
-void list_records(const Queue&, const RecordInput&, const RecordLists&);
+void count_records(const Queue&, const RecordInput&, int32_t* counts);
+void list_records(const Queue&, const RecordInput&, const RecordLists<float>&);
 void sum_runs(const Queue&, const SumInput<float>&);
 void describe(const Queue&, const DescribeInput<float>&, const Descriptions<float>&);
 // Allocates the gradients; called while the GPU is busy, so that the host's work costs no time.
@@ -121,6 +125,6 @@ void rows_vjp_step(const Queue&, const Scene<float>&, const SplatRows<float>&, c
 void camera_vjp(const Queue&, const Scene<float>&, const SplatRows<float>&, double* sums);
 void sum_blocks(const Queue&, int64_t blocks, int64_t numbers, const double* sums, double* out);
 }  // namespace cuda
-using cuda::observe, cuda::displace, cuda::list_records;
+using cuda::observe, cuda::displace, cuda::count_records;
 
 }  // namespace gs

@@ -291,11 +291,19 @@ struct RecordInput {
   const int32_t* limits;       // (2, bands): rows of tiles where each begins, and where it ends
 };
 
+// Records, ascending by splat for each band, band after band.
+template <class T>
 struct RecordLists {
-  int64_t room;        // records without room are left out
-  int32_t* counts;     // (bands + 1, record_blocks) written: of each block, last those of all bands
-  int64_t* gaussians;  // (room) written: ascending for each band, band after band
-  int32_t* places;     // (room) written: the record's number by splat, then by band
+  int64_t room;  // records without room are left out
+  int row;       // values of a splat
+  // (bands + 1, record_blocks + 1): how many count_records found, and in one more block how many empty records each
+  // band gets behind its own. They are zeros, and of no splat: number N.
+  const int32_t* counts;
+  const T *splats, *depths;      // (N, row) and (N)
+  int64_t* gaussians;            // (room) written, as is all that follows: the splat's number
+  int32_t* places;               // (room) the record's number by splat, then by band
+  T *new_splats, *new_depths;    // (room, row) and (room)
+  int32_t *rects, *tile_counts;  // (room, 4) and (room)
 };
 
 // Records are counted in blocks of so many splats.
@@ -322,12 +330,13 @@ struct Descriptions {
 // Runs of rows that lie side by side, some of which become one row each, the sum of theirs.
 template <class T>
 struct SumInput {
-  int64_t runs, rows, room;  // rows: all of all runs; room: rows of `to`
-  int values;                // of a row: 10 or 12
-  const int32_t* counts;     // (runs) rows of each run
-  const int32_t* kept;       // (runs) 1: their sum, also of no rows; 0: nothing; else all of them
-  const T* from;             // (rows, values)
-  T* to;                     // (room, values), written as far as `kept` goes
+  int64_t runs, rows, room;         // rows: all of all runs; room: rows of `to`
+  int values;                       // of a row: 10 or 12
+  const int32_t* counts;            // (runs) rows of each run
+  const int32_t* kept;              // (runs) 1: their sum, also of no rows; 0: nothing; else all of them
+  const T* from;                    // (rows, values)
+  T* to;                            // (room, values), written as far as `kept` goes
+  const int32_t* places = nullptr;  // (runs) the number of each run in the order of `to`; null: the same order
 };
 
 // Weights of a Gaussian's opacity and of each of its scales in the loss (math/penalty.h).

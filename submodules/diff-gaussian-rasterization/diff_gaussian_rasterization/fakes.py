@@ -138,13 +138,16 @@ def _(splats, *_):
 
 
 @_fake("list_records")
-def _(rects, tile_counts, limits, room):
-    counts = rects.new_empty((limits.shape[1] + 1, -(-rects.shape[0] // RECORD_BLOCK)))
-    return counts, rects.new_empty((room,), dtype=torch.int64), rects.new_empty((room,))
+def _(rects, tile_counts, limits, counts=None, splats=None, depths=None, room=0):
+    if counts is None:
+        counts = rects.new_empty((limits.shape[1] + 1, -(-rects.shape[0] // RECORD_BLOCK)))
+        return counts, *(rects.new_empty((0,)) for _ in range(6))
+    lists = rects.new_empty((0,)), rects.new_empty((room,), dtype=torch.int64), rects.new_empty((room,))
+    return *lists, *(t.new_empty((room, *t.shape[1:])) for t in (splats, depths, rects, tile_counts))
 
 
 @_fake("sum_runs")
-def _(rows, counts, kept, room):
+def _(rows, counts, kept, room, places=None):
     return rows.new_empty((room, rows.shape[1]))
 
 

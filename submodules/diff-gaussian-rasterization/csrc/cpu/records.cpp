@@ -21,6 +21,8 @@ void for_blocks(const Executor& executor, const RecordInput& in, const Body& bod
   });
 }
 
+}  // namespace
+
 void count_records(const Executor& executor, const RecordInput& in, int32_t* counts) {
   const int64_t blocks = record_blocks(in.count);
   for_blocks(executor, in, [&](int64_t block, int64_t begin, int64_t end) {
@@ -34,17 +36,28 @@ void count_records(const Executor& executor, const RecordInput& in, int32_t* cou
   });
 }
 
-}  // namespace
-
-void list_records(const Executor& executor, const RecordInput& in, const RecordLists& to) {
-  count_records(executor, in, to.counts);
-  const int64_t blocks = record_blocks(in.count), by_band = in.bands * blocks;
+template <class T>
+void list_records(const Executor& executor, const RecordInput& in, const RecordLists<T>& to) {
+  const int64_t blocks = record_blocks(in.count) + 1, by_band = in.bands * blocks;
   std::vector<int64_t> begins(by_band + blocks);
   int64_t sum = 0;
   for (int64_t k = 0; k < by_band + blocks; ++k) {
     if (k == by_band) sum = 0;
     begins[k] = sum, sum += to.counts[k];
   }
+  const auto write = [&](int64_t at, int64_t place, int64_t i) {
+    if (uint64_t(at) >= uint64_t(to.room)) return;
+    const bool found = i < in.count;
+    const auto copy = [&](auto* from, auto* rows, int64_t values) {
+      if (found)
+        std::copy_n(from + values * i, values, rows + values * at);
+      else
+        std::fill_n(rows + values * at, values, 0);
+    };
+    to.gaussians[at] = i, to.places[at] = int32_t(place);
+    copy(to.splats, to.new_splats, to.row), copy(to.depths, to.new_depths, 1);
+    copy(in.rects, to.rects, 4), copy(in.tile_counts, to.tile_counts, 1);
+  };
   for_blocks(executor, in, [&](int64_t block, int64_t begin, int64_t end) {
     std::vector<int64_t> next(in.bands);
     for (int band = 0; band < in.bands; ++band) next[band] = begins[band * blocks + block];
@@ -52,11 +65,15 @@ void list_records(const Executor& executor, const RecordInput& in, const RecordL
     for (int64_t i = begin; i < end; ++i)
       for (int band = 0; band < in.bands; ++band) {
         if (!reaches(in, i, band)) continue;
-        const int64_t at = next[band]++;
-        if (uint64_t(at) < uint64_t(to.room)) to.gaussians[at] = i, to.places[at] = int32_t(place);
-        ++place;
+        write(next[band]++, place++, i);
       }
   });
+  int64_t place = begins.back();
+  for (int64_t last = blocks - 1; last < by_band; last += blocks)
+    for (int32_t k = 0; k < to.counts[last]; ++k) write(begins[last] + k, place++, in.count);
 }
+
+template void list_records<float>(const Executor&, const RecordInput&, const RecordLists<float>&);
+template void list_records<double>(const Executor&, const RecordInput&, const RecordLists<double>&);
 
 }  // namespace gs

@@ -14,12 +14,13 @@ using baseline::kAbsoluteValues, baseline::kGradientValues;
 template <class T>
 void sum_runs(const Executor& executor, const SumInput<T>& in) {
   std::vector<int64_t> begins(in.runs + 1, 0), new_begins(in.runs + 1, 0);
-  for (int64_t i = 0; i < in.runs; ++i)
-    begins[i + 1] = begins[i] + in.counts[i], new_begins[i + 1] = new_begins[i] + in.kept[i];
+  const auto place = [&](int64_t i) { return in.places ? int64_t(in.places[i]) : i; };
+  for (int64_t i = 0; i < in.runs; ++i) begins[i + 1] = begins[i] + in.counts[i], new_begins[place(i) + 1] = in.kept[i];
+  for (int64_t i = 0; i < in.runs; ++i) new_begins[i + 1] += new_begins[i];
   executor.run(in.runs, 4096, [&](int64_t first, int64_t end) {
     for (int64_t i = first; i < end; ++i) {
       const T *from = in.from + in.values * begins[i], *stop = in.from + in.values * begins[i + 1];
-      T* to = in.to + in.values * new_begins[i];
+      T* to = in.to + in.values * new_begins[place(i)];
       if (in.kept[i] != 1) {
         std::copy_n(from, in.values * int64_t(in.kept[i]), to);
         continue;

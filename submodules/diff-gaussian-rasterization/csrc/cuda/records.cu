@@ -4,10 +4,13 @@
 #include <cub/cub.cuh>
 
 #include "../backend.h"
+#include "../math/splat.h"
 #include "queue.cuh"
 
 namespace gs {
 namespace cuda {
+
+using baseline::splat_row;
 
 namespace {
 
@@ -61,35 +64,67 @@ __global__ void __launch_bounds__(kThreads) count_kernel(RecordInput in, int64_t
   if (threadIdx.x == 0) counts[in.bands * blocks + blockIdx.x] = all;
 }
 
-// begins: where the records of each band and block begin; and those of each block, in the order of Gaussians.
+// What a record has of a splat; nothing if there is none.
+template <int kPairs>
+struct Row {
+  float2 splat[kPairs] = {};
+  float depth = 0;
+  int4 rect = {};
+  int32_t tile_count = 0;
+
+  __device__ void read(const RecordInput& in, const RecordLists<float>& from, int64_t i) {
+    for (int k = 0; k < kPairs; ++k) splat[k] = reinterpret_cast<const float2*>(from.splats)[kPairs * i + k];
+    depth = from.depths[i], rect = reinterpret_cast<const int4*>(in.rects)[i], tile_count = in.tile_counts[i];
+  }
+  __device__ void write(const RecordLists<float>& to, int64_t at, int32_t place, int64_t i) const {
+    if (uint64_t(at) >= uint64_t(to.room)) return;
+    to.gaussians[at] = i, to.places[at] = place;
+    for (int k = 0; k < kPairs; ++k) reinterpret_cast<float2*>(to.new_splats)[kPairs * at + k] = splat[k];
+    to.new_depths[at] = depth, reinterpret_cast<int4*>(to.rects)[at] = rect, to.tile_counts[at] = tile_count;
+  }
+};
+
+// begins: where the records of each band and block begin; and those of each block, in the order of Gaussians. The last
+// block has no Gaussians.
+template <int kPairs>
 __global__ void __launch_bounds__(kThreads)
-    list_kernel(RecordInput in, int64_t blocks, const int32_t* begins, RecordLists to) {
+    list_kernel(RecordInput in, int64_t blocks, const int32_t* begins, RecordLists<float> to) {
   __shared__ Reached reached;
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  Row<kPairs> row;
   int32_t place = begins[in.bands * blocks + blockIdx.x];
+  if (blockIdx.x == blocks - 1) {
+    if (threadIdx.x == 0)
+      for (int64_t last = blocks - 1; last < in.bands * blocks; last += blocks)
+        for (int32_t k = 0; k < to.counts[last]; ++k) row.write(to, int64_t(begins[last]) + k, place++, in.count);
+    return;
+  }
   for (int first = 0; first < in.bands; first += kBands) {
     const int count = reached.find(in, i, first);
     for (int band = 0; band < count; ++band) place += reached.before(band);
   }
+  if (i < in.count && in.tile_counts[i] > 0) row.read(in, to, i);
   for (int first = 0; first < in.bands; first += kBands) {
     const int count = reached.find(in, i, first);
     for (int band = 0; band < count; ++band) {
       if (!reached.has(band)) continue;
-      const int64_t at = int64_t(begins[(first + band) * blocks + blockIdx.x]) + reached.before(band);
-      if (uint64_t(at) < uint64_t(to.room)) to.gaussians[at] = i, to.places[at] = place;
-      ++place;
+      row.write(to, int64_t(begins[(first + band) * blocks + blockIdx.x]) + reached.before(band), place++, i);
     }
   }
 }
 
 }  // namespace
 
-void list_records(const Queue& queue, const RecordInput& in, const RecordLists& to) {
-  const cudaStream_t stream = stream_of(queue);
+void count_records(const Queue& queue, const RecordInput& in, int32_t* counts) {
   const unsigned blocks = blocks_for(in.count, kThreads);
   if (!blocks) return;
-  count_kernel<<<blocks, kThreads, 0, stream>>>(in, blocks, to.counts);
+  count_kernel<<<blocks, kThreads, 0, stream_of(queue)>>>(in, blocks, counts);
   check_launch("count_records");
+}
+
+void list_records(const Queue& queue, const RecordInput& in, const RecordLists<float>& to) {
+  const cudaStream_t stream = stream_of(queue);
+  const unsigned blocks = blocks_for(in.count, kThreads) + 1;
   const int64_t by_band = int64_t(in.bands) * blocks;
   int32_t* begins = queue.array<int32_t>(by_band + blocks);
   const auto scan = [&](int64_t first, int64_t count) {
@@ -98,7 +133,9 @@ void list_records(const Queue& queue, const RecordInput& in, const RecordLists& 
     });
   };
   scan(0, by_band), scan(by_band, blocks);
-  list_kernel<<<blocks, kThreads, 0, stream>>>(in, blocks, begins, to);
+  const auto list =
+      to.row == splat_row(kNoRays) ? list_kernel<splat_row(kNoRays) / 2> : list_kernel<splat_row(kPinholeRays) / 2>;
+  list<<<blocks, kThreads, 0, stream>>>(in, blocks, begins, to);
   check_launch("list_records");
 }
 

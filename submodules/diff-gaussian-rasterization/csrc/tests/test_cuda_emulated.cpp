@@ -513,12 +513,14 @@ void test_records() {
   for (const int bands : {1, 2, 3, 40})
     for (const int64_t count : {0, 1, 255, 600})
       in_every_order([bands, count](const gs::Queue& queue) {
-        const SomeRects rects(count, bands);
-        for (const int64_t room : {int64_t(0), int64_t(3), bands * count}) {
+        const SomeRects rects(count, bands, count == 255 ? 14 : 10);
+        for (const int64_t room : {int64_t(0), int64_t(3), bands * (count + 2)}) {
           const SomeRecords wanted = records(gs::serial_executor(), rects, room), got = records(queue, rects, room);
-          CHECK(got.counts == wanted.counts && got.gaussians == wanted.gaussians && got.places == wanted.places);
+          CHECK(got == wanted);
           CHECK(count < 255 || room < count ||
                 std::count(got.places.begin(), got.places.end(), -77) < room - count / 8);
+          CHECK(room < bands * (count + 2) ||
+                std::count(got.gaussians.begin(), got.gaussians.end(), count) == 3 * bands / 2);
         }
       });
 }
@@ -526,15 +528,19 @@ void test_records() {
 // Sums of few rows have the CPU's bits but for its double precision; rows that are kept, all of them.
 void test_runs() {
   for (const int values : {10, 12})
-    for (const std::vector<int32_t>& counts : counts_of_runs())
-      in_every_order([values, &counts](const gs::Queue& queue) {
-        const SomeSums sums(counts, values);
-        const std::vector<float> wanted = sum(gs::serial_executor(), sums), got = sum(queue, sums);
-        for (size_t k = 0, run = 0, next = 0; run < counts.size(); ++run)
-          for (next += size_t(values) * sums.kept[run]; k < next; ++k)
-            CHECK(counts[run] == 1 || sums.kept[run] > 1 ? got[k] == wanted[k] : std::abs(got[k] - wanted[k]) < 1e-3);
-        CHECK(std::count(got.end() - 2 * values, got.end(), -77.0f) == 2 * values);
-      });
+    for (const bool moved : {false, true})
+      for (const std::vector<int32_t>& counts : counts_of_runs())
+        in_every_order([values, moved, &counts](const gs::Queue& queue) {
+          const SomeSums sums(counts, values, moved);
+          const std::vector<float> wanted = sum(gs::serial_executor(), sums), got = sum(queue, sums);
+          std::vector<size_t> runs(counts.size());
+          for (size_t i = 0; i < runs.size(); ++i) runs[moved ? sums.places[i] : i] = i;
+          size_t k = 0, next = 0;
+          for (const size_t run : runs)
+            for (next += size_t(values) * sums.kept[run]; k < next; ++k)
+              CHECK(counts[run] == 1 || sums.kept[run] > 1 ? got[k] == wanted[k] : std::abs(got[k] - wanted[k]) < 1e-3);
+          CHECK(std::count(got.end() - 2 * values, got.end(), -77.0f) == 2 * values);
+        });
 }
 
 // What the CPU refuses stays within memory on a GPU.
@@ -543,6 +549,11 @@ void test_runs_that_do_not_fit() {
   for (const auto& [run, count, kept] : {std::tuple{3, 1000, 1}, {3, -1000, 1}, {3, 2, -5}, {3, 2, 9}, {299, 2, 9}}) {
     SomeSums sums(std::vector<int32_t>(300, 2), 10);
     sums.counts[run] = count, sums.kept[run] = kept;
+    CHECK(sum(memory.queue(), sums).size() == size_t(10 * sums.room));
+  }
+  for (const int32_t place : {-1, 5, 300}) {
+    SomeSums sums(std::vector<int32_t>(300, 2), 10, true);
+    sums.places[7] = place;
     CHECK(sum(memory.queue(), sums).size() == size_t(10 * sums.room));
   }
 }
