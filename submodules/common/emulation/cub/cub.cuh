@@ -30,7 +30,10 @@ struct DeviceRadixSort {
     std::stable_sort(order.begin(), order.end(), [&](int64_t a, int64_t b) { return part(a) < part(b); });
     for (int64_t i = 0; i < int64_t(n); ++i)
       keys.Alternate()[i] = keys.Current()[order[i]], values.Alternate()[i] = values.Current()[order[i]];
-    keys.selector ^= 1, values.selector ^= 1;
+    if ((end_bit - begin_bit + 7) / 8 % 2)  // the passes of a GPU, each of which changes sides
+      keys.selector ^= 1, values.selector ^= 1;
+    else
+      std::copy_n(keys.Alternate(), n, keys.Current()), std::copy_n(values.Alternate(), n, values.Current());
     return cudaSuccess;
   }
 };

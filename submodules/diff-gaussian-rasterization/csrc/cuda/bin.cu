@@ -1,13 +1,24 @@
-// Binning by counting: the splats of each tile are counted, put into the tile's list, and sorted there.
+// Binning in one of two ways with the same bytes. Lists: the splats of each tile are counted, put into the tile's list,
+// and sorted there. Sorting: all splats are sorted by depth, and all instances by tile.
+//
+// A block of the first way takes neighbouring rows, and counts in its own memory how often they reach each tile. That
+// is fast if few blocks reach a tile, as with rows in Morton order. If neighbouring rows lie scattered over the image,
+// almost every block reaches almost every tile, and instances are written one by one all over memory. Sorting takes the
+// same time for any order of rows, but more launches. So it is taken if a survey finds scattered rows, or very many
+// instances (survey.cuh). Small scenes are not surveyed, and neither are those of a host that runs ahead: the host has
+// to know the way before it launches, so the survey would make it wait.
 #include <cuda_runtime.h>
 
 #include <algorithm>
+#include <optional>
 
 #include "../backend.h"
 #include "../math/slots.h"
 #include "ahead.cuh"
 #include "host_numbers.cuh"
 #include "make_records.cuh"
+#include "sorted_lists.cuh"
+#include "survey.cuh"
 #include "tile_lists.cuh"
 
 namespace gs {
@@ -19,16 +30,11 @@ constexpr int64_t kLeastShare = 2 * kListThreads, kMostShares = 1024;  // shares
 constexpr int64_t kMostPlaces = 1 << 24;                               // 64 MiB; images of many tiles get fewer shares
 constexpr unsigned kMostBlocks = 8192;
 
-}  // namespace
-
-template <>
-void bin<float>(const Queue& queue, int64_t count, const Projected<float>& given, Image image,
-                const BinMemory& memory) {
+// made: records to release once they have been read, or null. seen: the totals, if the host knows them.
+void make_lists(const Queue& queue, int64_t count, const Projected<float>& in, const TileRecord* made, Image image,
+                const BinMemory& memory, const std::optional<Survey>& seen) {
   const cudaStream_t stream = stream_of(queue);
   const int64_t tiles = tiles_of(image);
-  Projected<float> in = given;
-  TileRecord* made = nullptr;
-  if (count && !in.records && has_records(image)) in.records = made = make_records(queue, count, in, image);
   const int64_t most = std::clamp<int64_t>(kMostPlaces / tiles, 1, kMostShares);
   const int64_t splats = std::max<int64_t>(kLeastShare, (count / most / kListThreads + 1) * kListThreads);
   const unsigned shares = unsigned(count / splats) + 1;  // the last has the slots behind all splats
@@ -53,6 +59,8 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& given
   Room room;
   if (memory.ahead) {
     room = memory.ahead->room;
+  } else if (seen) {
+    room = {seen->instances, seen->slots, 0, 0};
   } else {
     const HostNumbers<int64_t> needed(queue, totals, 2);
     room = {needed.wait()[0], needed.wait()[1], 0, 0};
@@ -70,6 +78,22 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& given
   const unsigned blocks = std::min(pieces, kMostBlocks);
   launch(queue, "sort", sort_kernel, blocks, kListThreads, work, further, pieces, out);
   if (further) launch(queue, "merge", merge_kernel, blocks, kListThreads, work, further, pieces, out.instances);
+}
+
+}  // namespace
+
+template <>
+void bin<float>(const Queue& queue, int64_t count, const Projected<float>& given, Image image,
+                const BinMemory& memory) {
+  Projected<float> in = given;
+  TileRecord* made = nullptr;
+  if (count && !in.records && has_records(image)) in.records = made = make_records(queue, count, in, image);
+  std::optional<Survey> seen;
+  if (!memory.ahead && in.records && count >= kLeastSurveyed) seen = survey(queue, count, in);
+  if (seen && sorting_pays(*seen))
+    sort_lists(queue, count, in, made, image, memory, *seen);
+  else
+    make_lists(queue, count, in, made, image, memory, seen);
 }
 
 }  // namespace cuda

@@ -1,9 +1,7 @@
 #pragma once
 // The kernels that make each tile's list. A tile's instances are counted, put into its list in any order, and sorted
 // there by depth, then by splat.
-#include "splat_row.cuh"
-#include "tile_record.cuh"
-#include "tiles.cuh"
+#include "each_tile.cuh"
 
 namespace gs {
 namespace cuda {
@@ -31,27 +29,6 @@ __device__ inline T sum_before(T value, T& total) {
   }
   __syncthreads();
   return before + end - value;
-}
-
-constexpr int kTaken = 4;  // tiles whose memory accesses do not wait for each other
-
-// Calls take(tiles) for the tiles that a splat reaches by its mask, kTaken at a time; -1 stands for none.
-template <class Take>
-__device__ __forceinline__ void each_tile(const Reached& reached, int columns, const Take& take) {
-  const TileRect& rect = reached.rect;
-  const int wide = rect.x1 - rect.x0, corner = rect.y0 * columns + rect.x0;
-  const float inverse = 1 / float(wide);
-  for (uint64_t mask = reached.mask; mask;) {
-    int tiles[kTaken];
-#pragma unroll
-    for (int& tile : tiles) {
-      // Adding a half keeps the quotient off whole numbers, so that rounding does not matter.
-      const int place = __ffsll(mask) - 1, row = int((float(place) + 0.5f) * inverse);
-      tile = mask ? corner + place + row * (columns - wide) : -1;
-      mask &= mask - 1;
-    }
-    take(tiles);
-  }
 }
 
 // A block takes splats that lie side by side, which mostly reach the same tiles, so it counts in shared memory first:
@@ -137,13 +114,7 @@ __device__ __forceinline__ void each_large(const Projected<float>& in, Image ima
   constexpr unsigned kWarps = kListThreads / 32;
   for (int k = int(block * kWarps + threadIdx.x / 32), all = *counts.larges; k < all; k += blocks * kWarps) {
     const int32_t splat = counts.large[k];
-    const TileRect rect = reached_by(in, splat).rect;
-    const auto test = test_of(load_shape<kRays>(in.splats, splat), rect, image, in.table);
-    const int wide = rect.x1 - rect.x0, area = wide * (rect.y1 - rect.y0);
-    for (int place = threadIdx.x % 32; place < area; place += 32) {
-      const int x = rect.x0 + place % wide, y = rect.y0 + place / wide;
-      if (tile_reached<true>(test, float(x), float(y))) take(y * tile_count(image.width) + x, splat);
-    }
+    each_tested<kRays>(in, splat, image, threadIdx.x % 32, 32, [&](int tile) { take(tile, splat); });
   }
 }
 

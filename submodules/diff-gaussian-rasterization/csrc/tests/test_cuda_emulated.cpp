@@ -11,9 +11,11 @@
 #include "gs/check_shared.h"
 #include "gs/gpu_forms.h"
 #include "long_lists.h"
+#include "make_records.cuh"
 #include "math/camera_gradient.h"
 #include "math/step_now.h"
 #include "rows_run.h"
+#include "sorted_lists.cuh"
 #include "step_run.h"
 
 namespace {
@@ -405,6 +407,173 @@ void test_lists_without_records() {
   for (float& scale : p.scales) scale -= 3;
   p.means[0] = 0.59f * 4, p.means[1] = 0, p.means[2] = 4;
   check_bins(p, wide);
+}
+
+// Where binning puts its lists.
+gs::BinMemory lists_in(Rendered& to, int64_t count, gs::Image image, bool slots) {
+  to.ranges.resize(tiles_of(image) + 1), to.slots.resize(slots ? count + 1 : 0);
+  const auto take = [](void* context, int64_t instances, int64_t slot_count) {
+    Rendered& r = *static_cast<Rendered*>(context);
+    r.instances.resize(instances), r.slot_count = slot_count;
+    return gs::Binned{r.instances.data(), r.ranges.data()};
+  };
+  return {take, &to, slots ? to.slots.data() : nullptr};
+}
+
+// Checks that sorting everything gives the CPU's lists, of splats that the CPU has projected.
+void check_sorted(Parameters<float>& p, gs::Image image) {
+  const gs::Scene<float> scene = scene_of(p, image, false);
+  const auto cpu = bin_scene(gs::serial_executor(), scene, {true, false, true});
+  for (const gs::emulation::Order order : gs::emulation::kOrders)
+    for (const bool slots : {false, true}) {
+      if (!slots && order != gs::emulation::Order::shuffled) continue;
+      gs::emulation::order = order;
+      gs::emulation::Memory memory;
+      const gs::Queue queue = memory.queue();
+      gs::Projected<float> in{cpu->splats.data(), cpu->depths.data(),
+                              cpu->rects.data(),  cpu->tile_counts.data(),
+                              cpu->radii.data(),  nullptr,
+                              scene.rays(),       cpu->table.data()};
+      gs::TileRecord* const made = in.records = gs::cuda::make_records(queue, p.count, in, image);
+      const gs::cuda::Survey seen = gs::cuda::survey(queue, p.count, in);
+      CHECK(seen.instances == int64_t(cpu->instances.size()) && seen.slots == cpu->slot_count);
+      if (!seen.instances) {
+        CHECK(!gs::cuda::sorting_pays(seen));
+        continue;
+      }
+      Rendered got;
+      gs::cuda::sort_lists(queue, p.count, in, made, image, lists_in(got, p.count, image, slots), seen);
+      CHECK(got.instances == cpu->instances && got.ranges == cpu->ranges);
+      CHECK(std::equal(got.slots.begin(), got.slots.end(), cpu->slots.begin(), same_slots));
+      CHECK(got.slot_count == (slots ? cpu->slot_count : 0));
+    }
+}
+
+// Splats without a mask, some over all tiles, among small and culled ones and ones of equal depth: on rays or not, and
+// on an image of more tiles than 16 bits count.
+void test_sorted_lists() {
+  for (const gs::Rays rays : {gs::kNoRays, gs::kPinholeRays, gs::kLensRays}) {
+    Parameters<float> p(600);
+    p.rays = rays != gs::kNoRays;
+    if (rays == gs::kLensRays) p.lens = fisheye(275.0f, 164.5f, 34.5f);
+    for (int64_t i = 0; i < p.count; ++i) {
+      if (i % 2 == 0) p.means[3 * i] = p.means[3 * i + 1] = 0, p.means[3 * i + 2] = 4;
+      if (i % 7 == 3) p.means[3 * i + 2] = -1;
+      for (int k = 0; k < 3 && i % 20 == 1; ++k) p.scales[3 * i + k] = i % 40 == 1 ? 0 : -1.5f;
+    }
+    check_sorted(p, gs::Image{330, 70});
+    if (rays == gs::kNoRays) check_sorted(p, gs::Image{40, 20});
+  }
+  Parameters<float> p(40);
+  p.means[0] = 0, p.means[1] = 2.4f, p.means[2] = 4;  // over a thousand tiles, also the last ones
+  for (int k = 0; k < 3; ++k) p.scales[k] = -1;
+  check_sorted(p, gs::Image{4112, 4096});
+  for (int64_t i = 0; i < p.count; ++i) p.means[3 * i + 2] = -1;
+  check_sorted(p, gs::Image{330, 70});
+}
+
+// Rows of records alone: three of four reach a tile or two, side by side. in_order: neighbouring rows lie near.
+struct RecordRows {
+  static constexpr gs::Image kImage{16 * 40, 16 * 30};
+  std::vector<gs::TileRecord> records;
+  std::vector<float> depths;
+
+  RecordRows(int64_t count, bool in_order) {
+    for (int64_t i = 0; i < count; ++i) {
+      const uint16_t x = uint16_t(i * 39 / count), y = uint16_t(i * 117 / count % 27 + generator() % 3);
+      const bool seen = i % 4 != 0;
+      records.push_back(seen ? gs::TileRecord{i % 3 ? 1u : 3u, x, y, uint16_t(x + (i % 3 ? 1 : 2)), uint16_t(y + 1)}
+                             : gs::TileRecord{});
+      depths.push_back(seen ? float(1 + generator() % 50) : INFINITY);
+    }
+    std::vector<int64_t> rows(count);
+    std::iota(rows.begin(), rows.end(), int64_t(0));
+    if (!in_order) std::shuffle(rows.begin(), rows.end(), generator);
+    const RecordRows given = *this;
+    for (int64_t i = 0; i < count; ++i) records[i] = given.records[rows[i]], depths[i] = given.depths[rows[i]];
+  }
+  gs::Projected<float> projected() { return {nullptr, depths.data(), nullptr, nullptr, nullptr, records.data()}; }
+};
+
+void test_survey() {
+  for (const bool in_order : {false, true})
+    for (const int64_t count : {1, 5000}) {
+      RecordRows rows(count, in_order);
+      gs::cuda::Survey wanted{};
+      for (int64_t i = 0; i < count; ++i) {
+        const gs::TileRecord &a = rows.records[i], &b = rows.records[i + 1 < count ? i + 1 : i];
+        wanted.instances += a.x1 - a.x0, wanted.slots += a.x1 - a.x0;
+        if (i + 1 == count || i % 32 == 31 || a.x1 == a.x0 || b.x1 == b.x0) continue;
+        ++wanted.pairs;
+        wanted.far += std::max(std::abs(a.x0 - b.x0), std::abs(a.y0 - b.y0)) > gs::cuda::kFarTiles;
+      }
+      for (const gs::emulation::Order order : gs::emulation::kOrders) {
+        gs::emulation::order = order;
+        gs::emulation::Memory memory;
+        const gs::cuda::Survey seen = gs::cuda::survey(memory.queue(), count, rows.projected());
+        CHECK(seen.instances == wanted.instances && seen.slots == wanted.slots);
+        CHECK(seen.pairs == wanted.pairs && seen.far == wanted.far);
+        CHECK(gs::cuda::sorting_pays(seen) == (count == 5000 && !in_order));
+      }
+    }
+  CHECK(gs::cuda::sorting_pays({gs::cuda::kManyInstances + 1, 0, 100, 0}));
+}
+
+// Memory that notes what is asked for.
+struct NotedMemory {
+  gs::emulation::Memory memory;
+  std::vector<size_t> asked;
+  gs::Queue queue() {
+    gs::Queue queue = memory.queue();
+    queue.context = this;
+    queue.allocate = [](void* context, size_t bytes) {
+      auto& self = *static_cast<NotedMemory*>(context);
+      self.asked.push_back(bytes);
+      const gs::Queue plain = self.memory.queue();
+      return plain.allocate(plain.context, bytes);
+    };
+    queue.release = [](void* context, const void* memory) {
+      const gs::Queue plain = static_cast<NotedMemory*>(context)->memory.queue();
+      plain.release(plain.context, memory);
+    };
+    queue.pinned = [](void* context, int64_t count) {
+      const gs::Queue plain = static_cast<NotedMemory*>(context)->memory.queue();
+      return plain.pinned(plain.context, count);
+    };
+    return queue;
+  }
+};
+
+// Binning surveys many rows, unless the host runs ahead, and takes the way that pays. Lists alone have a key of 8 bytes
+// for every instance.
+void test_ways() {
+  constexpr int64_t count = gs::cuda::kLeastSurveyed;
+  const gs::Image image = RecordRows::kImage;
+  const int columns = tile_count(image.width);
+  for (const auto& [in_order, runs_ahead] : {std::pair{true, false}, {false, false}, {false, true}}) {
+    RecordRows rows(count, in_order);
+    std::vector<std::tuple<int, float, int32_t>> wanted;
+    for (int64_t i = 0; i < count; ++i)
+      for (int x = rows.records[i].x0; x < rows.records[i].x1; ++x)
+        wanted.emplace_back(rows.records[i].y0 * columns + x, rows.depths[i], int32_t(i));
+    std::sort(wanted.begin(), wanted.end());
+    const int64_t instances = int64_t(wanted.size());
+    int32_t halted = 0;
+    int64_t done = 0;
+    gs::Room needed{};
+    const gs::Ahead ahead{&halted, &needed, &done, {instances, instances, 0, 0}, nullptr, 0};
+    Rendered got;
+    gs::BinMemory to = lists_in(got, count, image, true);
+    if (runs_ahead) to.ahead = &ahead;
+    gs::emulation::order = gs::emulation::Order::forward;
+    NotedMemory memory;
+    gs::cuda::bin(memory.queue(), count, rows.projected(), image, to);
+    CHECK(int64_t(got.instances.size()) == instances && got.slot_count == instances);
+    CHECK(got.ranges.back() == instances && got.slots.back().first == instances);
+    for (size_t k = 0; k < wanted.size(); ++k) CHECK(got.instances[k] == std::get<2>(wanted[k]));
+    const bool lists = std::count(memory.asked.begin(), memory.asked.end(), 8 * wanted.size());
+    CHECK(lists == (in_order || runs_ahead));
+  }
 }
 
 // Takes iteration `number` on the CPU or the GPU from given gradients and radii.
@@ -925,7 +1094,10 @@ int main() {
                          [] { test_wake(3, gs::Chart::kPerspective); },
                          [] { test_wake(0); },
                          test_listed_blocks,
+                         test_ways,
                          test_lists,
+                         test_sorted_lists,
+                         test_survey,
                          test_ahead,
                          test_pixels_that_end_in_every_chunk,
                          test_against_cpu,
