@@ -9,7 +9,9 @@ namespace gs {
 namespace cuda {
 
 constexpr int64_t kLeastSurveyed = 1 << 18;    // rows; with fewer a survey may cost more than it gains
-constexpr int64_t kManyInstances = 8'000'000;  // from which even rows in order are sorted
+constexpr int64_t kManyInstances = 8'000'000;  // that are sorted in any case
+constexpr int64_t kInstancesOfRow = 2;         // up to which sorting all rows by depth takes longer than it saves
+constexpr int64_t kManyTiles = 1 << 14;        // which lists need several windows for (tile_lists.cuh)
 constexpr int kFarTiles = 8;
 constexpr double kScatteredShare = 0.25;
 
@@ -20,8 +22,10 @@ struct Survey {
 };
 
 // Whether two sorts of everything take less time than lists of tiles.
-inline bool sorting_pays(const Survey& seen) {
-  return seen.instances > kManyInstances || double(seen.far) > kScatteredShare * double(seen.pairs);
+inline bool sorting_pays(const Survey& seen, int64_t rows, int64_t tiles) {
+  const bool scattered = double(seen.far) > kScatteredShare * double(seen.pairs);
+  return seen.instances > kManyInstances ||
+         (seen.instances > kInstancesOfRow * rows && (scattered || tiles > kManyTiles));
 }
 
 constexpr int kSurveyThreads = 256;

@@ -438,7 +438,7 @@ void check_sorted(Parameters<float>& p, gs::Image image) {
       const gs::cuda::Survey seen = gs::cuda::survey(queue, p.count, in);
       CHECK(seen.instances == int64_t(cpu->instances.size()) && seen.slots == cpu->slot_count);
       if (!seen.instances) {
-        CHECK(!gs::cuda::sorting_pays(seen));
+        CHECK(!gs::cuda::sorting_pays(seen, p.count, tiles_of(image)));
         continue;
       }
       Rendered got;
@@ -472,7 +472,7 @@ void test_sorted_lists() {
   check_sorted(p, gs::Image{330, 70});
 }
 
-// Rows of records alone: three of four reach a tile or two, side by side. in_order: neighbouring rows lie near.
+// Rows of records alone: three of four reach three or four tiles, side by side. in_order: neighbouring rows lie near.
 struct RecordRows {
   static constexpr gs::Image kImage{16 * 40, 16 * 30};
   std::vector<gs::TileRecord> records;
@@ -480,9 +480,9 @@ struct RecordRows {
 
   RecordRows(int64_t count, bool in_order) {
     for (int64_t i = 0; i < count; ++i) {
-      const uint16_t x = uint16_t(i * 39 / count), y = uint16_t(i * 117 / count % 27 + generator() % 3);
+      const uint16_t x = uint16_t(i * 37 / count), y = uint16_t(i * 117 / count % 27 + generator() % 3);
       const bool seen = i % 4 != 0;
-      records.push_back(seen ? gs::TileRecord{i % 3 ? 1u : 3u, x, y, uint16_t(x + (i % 3 ? 1 : 2)), uint16_t(y + 1)}
+      records.push_back(seen ? gs::TileRecord{i % 3 ? 7u : 15u, x, y, uint16_t(x + (i % 3 ? 3 : 4)), uint16_t(y + 1)}
                              : gs::TileRecord{});
       depths.push_back(seen ? float(1 + generator() % 50) : INFINITY);
     }
@@ -513,10 +513,13 @@ void test_survey() {
         const gs::cuda::Survey seen = gs::cuda::survey(memory.queue(), count, rows.projected());
         CHECK(seen.instances == wanted.instances && seen.slots == wanted.slots);
         CHECK(seen.pairs == wanted.pairs && seen.far == wanted.far);
-        CHECK(gs::cuda::sorting_pays(seen) == (count == 5000 && !in_order));
+        const int64_t many = gs::cuda::kManyTiles;
+        CHECK(gs::cuda::sorting_pays(seen, count, many) == (count == 5000 && !in_order));
+        CHECK(gs::cuda::sorting_pays(seen, count, many + 1) == (count == 5000));
+        CHECK(!gs::cuda::sorting_pays(seen, 2 * count, many + 1));
       }
     }
-  CHECK(gs::cuda::sorting_pays({gs::cuda::kManyInstances + 1, 0, 100, 0}));
+  CHECK(gs::cuda::sorting_pays({gs::cuda::kManyInstances + 1, 0, 100, 0}, gs::cuda::kManyInstances, 1));
 }
 
 // Memory that notes what is asked for.
