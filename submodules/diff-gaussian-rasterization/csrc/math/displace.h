@@ -6,33 +6,56 @@
 
 namespace gs {
 
+template <class T>
 struct Offset {
-  double x, y, z;
+  T x, y, z;
 };
 
-GS_HD Offset rounded_cross(const Offset& a, const Offset& b) {
+template <class T>
+GS_HD Offset<T> rounded_cross(const Offset<T>& a, const Offset<T>& b) {
   return {rounded_product(a.y, b.z) - rounded_product(a.z, b.y), rounded_product(a.z, b.x) - rounded_product(a.x, b.z),
           rounded_product(a.x, b.y) - rounded_product(a.y, b.x)};
 }
 
-// v turned by a quaternion (w, x, y, z) of any length: v + 2 w (u x v) + 2 u x (u x v), with (w, u) of unit length.
-GS_HD Offset rotated(const float* quaternion, const Offset& v) {
-  double q[4], square = 0;
-  for (int k = 0; k < 4; ++k) q[k] = quaternion[k], square += rounded_product(q[k], q[k]);
-  const double root = std::sqrt(square), length = root < 1e-12 ? 1e-12 : root;
-  const double w = q[0] / length;
-  const Offset u = {q[1] / length, q[2] / length, q[3] / length}, once = rounded_cross(u, v);
-  const Offset twice = {once.x * 2, once.y * 2, once.z * 2}, more = rounded_cross(u, twice);
-  return {(v.x + rounded_product(w, twice.x)) + more.x, (v.y + rounded_product(w, twice.y)) + more.y,
-          (v.z + rounded_product(w, twice.z)) + more.z};
-}
+// A rotation: a quaternion (w, u) of unit length.
+template <class T>
+struct Rotation {
+  T w;
+  Offset<T> u;
+
+  // q: (w, x, y, z) of any length. In float its squares may overflow or vanish, so it is scaled first.
+  GS_HD explicit Rotation(const float* q) {
+    T scaled[4], square = 0, unit = 1;
+    if constexpr (sizeof(T) == sizeof(float)) {
+      unit = T(1e-12);
+      for (int k = 0; k < 4; ++k) unit = std::abs(q[k]) > unit ? std::abs(q[k]) : unit;
+    }
+    for (int k = 0; k < 4; ++k) scaled[k] = q[k] / unit, square += rounded_product(scaled[k], scaled[k]);
+    const T root = std::sqrt(square), least = T(1e-12) / unit, length = root < least ? least : root;
+    w = scaled[0] / length, u = {scaled[1] / length, scaled[2] / length, scaled[3] / length};
+  }
+
+  GS_HD Rotation back() const {
+    Rotation inverse = *this;
+    inverse.u = {-u.x, -u.y, -u.z};
+    return inverse;
+  }
+
+  // v + 2 w (u x v) + 2 u x (u x v).
+  GS_HD Offset<T> of(const Offset<T>& v) const {
+    const Offset<T> once = rounded_cross(u, v), twice = {once.x * 2, once.y * 2, once.z * 2};
+    const Offset<T> more = rounded_cross(u, twice);
+    return {(v.x + rounded_product(w, twice.x)) + more.x, (v.y + rounded_product(w, twice.y)) + more.y,
+            (v.z + rounded_product(w, twice.z)) + more.z};
+  }
+};
 
 // Moves the mean of parent `i` to its child: by R e, where e is normal with the parent's scales.
 GS_HD void split_position(const Displacement& in, int64_t i) {
   double e[4];
   normals(philox({{uint32_t(in.items[i]), in.draw, in.iteration, in.stream}}, in.seed), e);
-  for (int k = 0; k < 3; ++k) e[k] = rounded_product(e[k], portable::exp(in.log_scales[3 * i + k]));
-  const Offset offset = rotated(in.rotations + 4 * i, {e[0], e[1], e[2]});
+  for (int k = 0; k < 3; ++k) e[k] = rounded_product(e[k], portable::exp(double(in.log_scales[3 * i + k])));
+  const Offset<double> offset = Rotation<double>(in.rotations + 4 * i).of({e[0], e[1], e[2]});
   float* mean = in.means + 3 * i;
   mean[0] = float(mean[0] + offset.x), mean[1] = float(mean[1] + offset.y), mean[2] = float(mean[2] + offset.z);
 }
@@ -55,21 +78,19 @@ GS_HD bool noise_is_lost(const Displacement& in, int64_t i) {
 // its opacity o, the steepness k and the threshold t. A mean that would not be finite stays.
 GS_HD void add_noise_to(const Displacement& in, int64_t i) {
   if (noise_is_lost(in, i)) return;
-  const double opacity = 1 / (1 + portable::exp(-double(in.logits[i])));
-  const double above = rounded_product(in.steepness, opacity - in.threshold);
-  const double size = in.size / (1 + portable::exp(above));
-  double n[4];
+  const float opacity = 1 / (1 + portable::exp(-in.logits[i]));
+  const float above = rounded_product(float(in.steepness), opacity - float(in.threshold));
+  const float size = float(in.size) / (1 + portable::exp(above));
+  float n[4];
   normals(philox({{uint32_t(in.first + i), 0, in.iteration, in.stream}}, in.seed), n);
-  const float* q = in.rotations + 4 * i;
-  const float back[4] = {q[0], -q[1], -q[2], -q[3]};
-  const Offset own = rotated(back, {n[0], n[1], n[2]});
-  double e[3] = {own.x, own.y, own.z};
-  for (int k = 0; k < 3; ++k) e[k] = rounded_product(e[k], portable::exp(2 * double(in.log_scales[3 * i + k])));
-  const Offset offset = rotated(q, {e[0], e[1], e[2]});
+  const Rotation<float> rotation(in.rotations + 4 * i);
+  const Offset<float> own = rotation.back().of({n[0], n[1], n[2]});
+  float e[3] = {own.x, own.y, own.z};
+  for (int k = 0; k < 3; ++k) e[k] = rounded_product(e[k], portable::exp(2 * in.log_scales[3 * i + k]));
+  const Offset<float> offset = rotation.of({e[0], e[1], e[2]});
   float* mean = in.means + 3 * i;
-  const float x = float(mean[0] + rounded_product(size, offset.x)),
-              y = float(mean[1] + rounded_product(size, offset.y)),
-              z = float(mean[2] + rounded_product(size, offset.z));
+  const float x = mean[0] + rounded_product(size, offset.x), y = mean[1] + rounded_product(size, offset.y),
+              z = mean[2] + rounded_product(size, offset.z);
   if (std::isfinite(x) && std::isfinite(y) && std::isfinite(z)) mean[0] = x, mean[1] = y, mean[2] = z;
 }
 

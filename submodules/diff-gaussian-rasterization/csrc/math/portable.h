@@ -1,6 +1,7 @@
 #pragma once
-// Elementary functions in double from operations that IEEE 754 rounds in one way only: a GPU and every CPU give the
-// same bits. For sources that are compiled once (gs/rounded.h).
+// Elementary functions from operations that IEEE 754 rounds in one way only: a GPU and every CPU give the same bits.
+// For sources that are compiled once (gs/rounded.h). Those of float are for what each step computes: most GPUs compute
+// in double 32 or 64 times as slowly.
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -15,9 +16,9 @@ constexpr double kLn2Low = 0x1.a39ef35793c76p-33;
 constexpr double kHalfPi = 1.5707963267948966;
 
 // A polynomial by its coefficients, highest power first.
-template <int N>
-GS_HD double polynomial(double x, const double (&coefficients)[N]) {
-  double result = coefficients[0];
+template <class T, int N>
+GS_HD T polynomial(T x, const T (&coefficients)[N]) {
+  T result = coefficients[0];
   for (int k = 1; k < N; ++k) result = rounded_product(result, x) + coefficients[k];
   return result;
 }
@@ -38,6 +39,19 @@ GS_HD double exp(double x) {
   return polynomial(r, coefficients) * power;
 }
 
+// e^x to 2e-7 of the result, infinite from 88 on, 0 below -87. NaN stays.
+GS_HD float exp(float x) {
+  if (!(x <= 88 && x >= -87)) return x > 88 ? INFINITY : x < -87 ? 0 : x;
+  const float exponent = std::rint(x * 1.44269504f);
+  // The first product is exact. |r| <= 0.347: what is left out of the Taylor series is below 6e-9.
+  const float r = (x - rounded_product(exponent, 0.693359375f)) - rounded_product(exponent, -2.12194440e-4f);
+  const float coefficients[] = {1 / 5040.0f, 1 / 720.0f, 1 / 120.0f, 1 / 24.0f, 1 / 6.0f, 1 / 2.0f, 1, 1};
+  const int32_t bits = (int32_t(exponent) + 127) << 23;
+  float power;
+  std::memcpy(&power, &bits, sizeof power);
+  return polynomial(r, coefficients) * power;
+}
+
 // The natural logarithm of a positive finite number, to 1e-15 relative to max(1, |result|).
 GS_HD double log(double x) {
   int whole;
@@ -51,12 +65,35 @@ GS_HD double log(double x) {
   return rounded_product(exponent, kLn2High) + (rounded_product(exponent, kLn2Low) + series);
 }
 
+// The same of a normal float, to 2e-7.
+GS_HD float log(float x) {
+  int32_t bits;
+  std::memcpy(&bits, &x, sizeof bits);
+  int32_t whole = (bits >> 23) - 126;
+  bits = (bits & 0x7fffff) | 126 << 23;
+  float mantissa;
+  std::memcpy(&mantissa, &bits, sizeof mantissa);
+  if (mantissa < 0.70710678f) mantissa *= 2, --whole;
+  const float exponent = float(whole);
+  const float z = (mantissa - 1) / (mantissa + 1);  // z^11 / 11 is below 4e-10
+  const float coefficients[] = {2 / 9.0f, 2 / 7.0f, 2 / 5.0f, 2 / 3.0f, 2};
+  const float series = rounded_product(z, polynomial(z * z, coefficients));
+  return rounded_product(exponent, 0.693359375f) + (rounded_product(exponent, -2.12194440e-4f) + series);
+}
+
+template <class T>
 struct CosSin {
-  double cos, sin;
+  T cos, sin;
+
+  // Of an angle of the first quadrant, turned by as many quadrants as the upper two bits say.
+  GS_HD CosSin turned(uint32_t turns) const {
+    const CosSin once = turns & 0x40000000u ? CosSin{-sin, cos} : *this;
+    return turns & 0x80000000u ? CosSin{-once.cos, -once.sin} : once;
+  }
 };
 
 // cos and sin of 2 pi * turns / 2^32, with an absolute error of 1e-16.
-GS_HD CosSin cos_sin_turns(uint32_t turns) {
+GS_HD void cos_sin_turns(uint32_t turns, CosSin<double>& out) {
   const double angle = double(turns & 0x3fffffffu) * (kHalfPi * 0x1p-30);
   const double square = angle * angle;  // angle < pi / 2: the first terms left out are below 1e-18
   const double of_cos[] = {-1 / 1124000727777607680000.0,
@@ -84,9 +121,16 @@ GS_HD CosSin cos_sin_turns(uint32_t turns) {
                            1 / 120.0,
                            -1 / 6.0,
                            1};
-  const double cos = polynomial(square, of_cos), sin = angle * polynomial(square, of_sin);
-  const CosSin turned = turns & 0x40000000u ? CosSin{-sin, cos} : CosSin{cos, sin};
-  return turns & 0x80000000u ? CosSin{-turned.cos, -turned.sin} : turned;
+  out = CosSin<double>{polynomial(square, of_cos), angle * polynomial(square, of_sin)}.turned(turns);
+}
+
+// The same with an absolute error of 2e-7.
+GS_HD void cos_sin_turns(uint32_t turns, CosSin<float>& out) {
+  const float angle = float(turns & 0x3fffffffu) * float(kHalfPi * 0x1p-30);
+  const float square = angle * angle;  // the first terms left out are below 6e-9
+  const float of_cos[] = {1 / 479001600.0f, -1 / 3628800.0f, 1 / 40320.0f, -1 / 720.0f, 1 / 24.0f, -1 / 2.0f, 1};
+  const float of_sin[] = {1 / 6227020800.0f, -1 / 39916800.0f, 1 / 362880.0f, -1 / 5040.0f, 1 / 120.0f, -1 / 6.0f, 1};
+  out = CosSin<float>{polynomial(square, of_cos), angle * polynomial(square, of_sin)}.turned(turns);
 }
 
 }  // namespace portable

@@ -24,12 +24,14 @@ GS_HD RandomWords philox(const RandomWords& counter, uint64_t seed) {
 }
 
 // Four standard normal numbers (Box and Muller 1958), of which words 0 and 2 decide lengths, 1 and 3 directions.
-GS_HD void normals(const RandomWords& bits, double (&out)[4]) {
+template <class T>
+GS_HD void normals(const RandomWords& bits, T (&out)[4]) {
   for (int pair = 0; pair < 2; ++pair) {
-    const double uniform = (double(bits.w[2 * pair]) + 1) * 0x1p-32;  // in (0, 1]
-    const double radius = std::sqrt(portable::log(uniform) * -2);
-    const portable::CosSin turn = portable::cos_sin_turns(bits.w[2 * pair + 1]);
-    out[pair] = radius * turn.cos, out[pair + 2] = radius * turn.sin;
+    const T uniform = (T(bits.w[2 * pair]) + 1) * T(0x1p-32);  // in (0, 1]
+    const T radius = std::sqrt(portable::log(uniform) * -2);
+    portable::CosSin<T> turn;
+    portable::cos_sin_turns(bits.w[2 * pair + 1], turn);
+    out[pair] = rounded_product(radius, turn.cos), out[pair + 2] = rounded_product(radius, turn.sin);
   }
 }
 
