@@ -363,6 +363,18 @@ def test_one_far_gaussian_leaves_the_others_of_an_spz(tmp_path, capsys, x):
     assert said.startswith(f"warning: 1 of {COUNT} Gaussians lie more than") and "--crop drops them" in said
 
 
+@pytest.mark.parametrize(("unit", "cut"), [(1, 0), (1e4, COUNT), (1e-5, COUNT)])
+def test_sizes_that_spz_cannot_hold_are_told(tmp_path, capsys, unit, cut):
+    """Thin axes are not, as no image shows how thin they are."""
+    some = cube()
+    some.log_scales[:] = np.log(0.5 * unit)
+    some.log_scales[:, 1] = -20
+    written(tmp_path, ".spz", replace(some, means=some.means * np.float32(unit)))
+    said = capsys.readouterr().err
+    assert (f"{cut} of {COUNT} Gaussians are not between 4.5e-05 and 403 units long" in said) == (cut > 0)
+    assert bool(said) == (cut > 0)
+
+
 def test_positions_that_spz_cannot_hold_are_refused(tmp_path):
     with pytest.raises(UserError, match=r"can hold positions to 8,388,607, not 1e\+07; leave the"):
         written(tmp_path, ".spz", replace(cube(), means=cube().means + np.float32(1e7)))
