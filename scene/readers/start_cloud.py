@@ -17,6 +17,8 @@ RANDOM_POINTS = 100_000
 RANDOM_HALF_SIZE = 1.3  # the NeRF-synthetic objects lie within this cube
 _NEAREST, _FARTHEST = 0.25, 2.5  # depths of random points, as parts of the distance from cameras to their focus
 _GREY = 127 / 255
+# Mean squared sine of the angles between optical axes, about, below which they have no focus: 1.8 degrees.
+_PARALLEL = 1e-3
 
 
 class StartOptions(NamedTuple):
@@ -102,21 +104,20 @@ def random_in_frusta(cameras: list[CameraInfo]) -> BasicPointCloud:
 
 def _focus_distance(cameras: list[CameraInfo]) -> float:
     extent = scene_extent(cameras)
-    focus = focus_of(cameras)
+    focus = focus_of(np.array([c.center for c in cameras]), np.array([c.R[:, 2] for c in cameras]))
     return focus[1] if focus and focus[1] > 0.1 * extent else extent
 
 
-def focus_of(cameras: list[CameraInfo]) -> tuple[np.ndarray, float] | None:
-    """The point (3,) nearest to all optical axes, and the cameras' median distance from it along these.
+def focus_of(centers: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, float] | None:
+    """The point (3,) nearest to the optical axes (N, 3) of cameras, and their median distance from it along these.
 
-    None where the axes are within about 2 degrees of each other, or the point is behind most cameras.
+    None where the axes are within about 2 degrees of each other, or the point is behind most cameras. Least squares:
+    the sum of (I - a aᵀ) (x - c) over the axes a from centers c is zero (Traa, "Least-squares intersection of lines",
+    2013).
     """
-    axes = np.array([camera.R[:, 2] for camera in cameras])
-    centers = np.array([camera.center for camera in cameras])
-    # Least squares: the sum of I - a aᵀ over the axes a, times the point, is the sum of (I - a aᵀ) center.
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     normal = across.sum(axis=0)
-    if np.linalg.eigvalsh(normal)[0] < 1e-3 * len(cameras):
+    if np.linalg.eigvalsh(normal)[0] < _PARALLEL * len(axes):
         return None
     focus = np.linalg.solve(normal, (across @ centers[:, :, None]).sum(axis=0)[:, 0])
     distance = float(np.median(((focus - centers) * axes).sum(axis=1)))

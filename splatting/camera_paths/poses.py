@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scene.cameras import Camera
+from scene.readers.start_cloud import focus_of
 from splatting.camera_paths.keyframes import Keyframe
 
 if TYPE_CHECKING:
@@ -14,8 +15,6 @@ if TYPE_CHECKING:
 
 SAME_PLACE = 1e-6  # of the distance from the origin, or of 1: float32 tells no smaller distances apart
 WIDEST = 60.0  # degrees; vertical opening of a pinhole view in place of a fisheye's or a panorama's
-# Mean squared sine of the angles between the axes, about, below which no point is found: 1.8 degrees.
-PARALLEL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -101,16 +100,6 @@ def keyframe(seconds: float, position: np.ndarray, turn: np.ndarray, fov: float)
 
 
 def focus_point(poses: Poses) -> np.ndarray | None:
-    """The point (3,) nearest to all optical axes, None if these are parallel or most cameras look away from it.
-
-    Least squares: the sum of (I - d d^T) (x - c) over the axes from c along d is zero (Traa, "Least-squares
-    intersection of lines", 2013).
-    """
-    axes = poses.forward
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    matrix, side = across.mean(axis=0), (across @ poses.positions[:, :, None]).mean(axis=0)[:, 0]
-    if np.linalg.eigvalsh(matrix)[0] < PARALLEL:
-        return None
-    point = np.linalg.solve(matrix, side)
-    ahead = ((point - poses.positions) * axes).sum(axis=1)
-    return point if np.median(ahead) > 0 else None
+    """The point (3,) nearest to all optical axes, None if these are parallel or most cameras look away from it."""
+    found = focus_of(poses.positions, poses.forward)
+    return found[0] if found else None
