@@ -1,7 +1,12 @@
 """Messages between the processes of a training."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import torch
+from launching import ROOT
 from processes import in_ranks
 
 from splatting.distributed.ranks import ALONE, Ranks, ranks
@@ -83,3 +88,24 @@ def test_a_process_by_itself_is_all_ranks():
     assert ALONE.numbers(4, 5).tolist() == [[4, 5]] and ALONE.before(3) == (0, 3)
     assert ALONE.send(rows, [3]) == (rows, [3]) and ALONE.added(rows) is rows and ALONE.table(rows).shape == (1, 3, 2)
     assert ALONE.shared(rows) is rows and ALONE.anyone(True) and not ALONE.anyone(False)
+
+
+_LEAVE = """
+from pathlib import Path
+import torch.distributed as dist
+from splatting.distributed.process_group import SeveralRanks
+dist.init_process_group("gloo", store=dist.HashStore(), rank=0, world_size=1)
+ranks = SeveralRanks()
+ranks.itself = ranks
+threads = lambda: [name.read_text() for name in Path("/proc/self/task").glob("*/comm")]
+assert ranks.numbers(7).tolist() == [[7]] and any("gloo" in name for name in threads())
+ranks.leave()
+assert not any("gloo" in name for name in threads())
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="the names of threads are read from /proc")
+def test_no_thread_of_a_group_is_left_behind():
+    """It would end with Python, whose lock it may wait for, and abort the process."""
+    done = subprocess.run([sys.executable, "-c", _LEAVE], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr

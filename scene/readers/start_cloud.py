@@ -104,11 +104,16 @@ def random_in_frusta(cameras: list[CameraInfo]) -> BasicPointCloud:
 
 def _focus_distance(cameras: list[CameraInfo]) -> float:
     extent = scene_extent(cameras)
-    focus = focus_of(np.array([c.center for c in cameras]), np.array([c.R[:, 2] for c in cameras]))
+    focus = focus_of(cameras)
     return focus[1] if focus and focus[1] > 0.1 * extent else extent
 
 
-def focus_of(centers: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, float] | None:
+def focus_of(cameras: list[CameraInfo]) -> tuple[np.ndarray, float] | None:
+    """The point (3,) that cameras look at, and their distance from it: `nearest_to_axes`."""
+    return nearest_to_axes(np.array([c.center for c in cameras]), np.array([c.R[:, 2] for c in cameras]))
+
+
+def nearest_to_axes(centers: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, float] | None:
     """The point (3,) nearest to the optical axes (N, 3) of cameras, and their median distance from it along these.
 
     None where the axes are within about 2 degrees of each other, or the point is behind most cameras. Least squares:
@@ -117,7 +122,7 @@ def focus_of(centers: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, float] 
     """
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     normal = across.sum(axis=0)
-    if np.linalg.eigvalsh(normal)[0] < _PARALLEL * len(axes):
+    if np.linalg.eigvalsh(normal)[0] <= _PARALLEL * len(axes):
         return None
     focus = np.linalg.solve(normal, (across @ centers[:, :, None]).sum(axis=0)[:, 0])
     distance = float(np.median(((focus - centers) * axes).sum(axis=1)))

@@ -13,6 +13,7 @@ import os
 import struct
 import sys
 import zlib
+from collections.abc import Sequence
 from dataclasses import replace
 from types import ModuleType
 from typing import NamedTuple
@@ -32,7 +33,7 @@ _COLOR = 0.15  # colours are 0.5 + 0.15 SH0, so that those beyond [0, 1] fit
 _MOST_BITS = 20  # of a position's fraction
 _LARGEST_POSITION = (1 << 23) - 1
 _FARTHEST = 1000.0  # usual distances from the middle; no move within the model shows how far it is beyond
-_SIZES = -10.0, 6.0  # logarithms of scales that it can hold
+_SIZES = -10.0, 255 / 16 - 10  # logarithms of scales that it can hold
 _LEVEL = 3  # of zstd; level 19 takes 70 times as long and saves 2 %
 
 
@@ -51,7 +52,7 @@ def write_spz(path: str | os.PathLike, splats: Splats) -> None:
     """Write version 4, whole or not at all. UserError without the package zstandard."""
     zstandard = find_zstandard(path)
     splats = _drawn_in(splats)
-    warn_of_sizes(splats)
+    warn_of_sizes([splats])
     splats = half_turned(selected(splats, morton_order(splats.means)))
     bits, streams = _streams(splats, _rotation_codes(splats.rotations))
     compressor = zstandard.ZstdCompressor(level=_LEVEL, write_checksum=True)
@@ -117,14 +118,14 @@ def _drawn_in(splats: Splats) -> Splats:
     return replace(splats, means=means, log_scales=log_scales)
 
 
-def warn_of_sizes(splats: Splats) -> None:
+def warn_of_sizes(parts: Sequence[Splats]) -> None:
     """Say how many splats have a size that the format cannot hold, if any do: those of a model in another unit."""
     least, most = _SIZES
-    longest = splats.log_scales.max(axis=1)
+    longest = np.concatenate([splats.log_scales.max(axis=1, initial=-np.inf) for splats in parts])
     if cut := int(((longest < least) | (longest > most)).sum()):
         print(
-            f"warning: {cut} of {len(splats)} Gaussians are not between {np.exp(least):.2g} and {np.exp(most):.0f} "
-            "units long, as SPZ needs, and become so; choose a format that keeps sizes, such as .ply",
+            f"warning: {cut} of {len(longest)} Gaussians are not between {np.exp(least):.2g} and {np.exp(most):.0f} "
+            "units long, as SPZ needs, and become so; choose a format that keeps sizes, such as .ply or tileset.json",
             file=sys.stderr,
         )
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scene.cameras import Camera
-from scene.readers.start_cloud import focus_of
+from scene.readers.start_cloud import nearest_to_axes
 from splatting.camera_paths.keyframes import Keyframe
 
 if TYPE_CHECKING:
@@ -101,5 +101,5 @@ def keyframe(seconds: float, position: np.ndarray, turn: np.ndarray, fov: float)
 
 def focus_point(poses: Poses) -> np.ndarray | None:
     """The point (3,) nearest to all optical axes, None if these are parallel or most cameras look away from it."""
-    found = focus_of(poses.positions, poses.forward)
+    found = nearest_to_axes(poses.positions, poses.forward)
     return found[0] if found else None

@@ -88,7 +88,7 @@ def _join_and_run(main: Callable[[], object]) -> None:
     refuse_differences(ranks.everyone(_machine(device)), "start all ranks with the same installation")
     with using(ranks):
         main()
-    dist.destroy_process_group()
+    ranks.leave()
 
 
 def _own_device() -> torch.device:

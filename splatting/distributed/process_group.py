@@ -33,6 +33,11 @@ class SeveralRanks(Ranks):
         self._silence = torch.zeros(_NEWS, dtype=torch.int64, device=self._place)
         self._news, self._heard = [0] * _NEWS, [0] * _NEWS
 
+    def leave(self) -> None:
+        """Leave the group, and end its threads. One that met the end of Python would abort the process."""
+        self._numbers = None  # which keeps the threads
+        dist.destroy_process_group()
+
     def numbers(self, *values: int) -> Tensor:
         mine = torch.tensor(values, dtype=torch.int64)
         everyone = [torch.empty_like(mine) for _ in range(self.size)]

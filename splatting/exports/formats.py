@@ -15,7 +15,7 @@ from scene.cameras import Camera
 from scene.splats.dot_splat import write_splat
 from scene.splats.ply import write_compressed_ply, write_plain_ply
 from scene.splats.splats import Splats
-from scene.splats.spz import find_zstandard, warn_of_sizes, write_spz
+from scene.splats.spz import find_zstandard, write_spz
 from splatting.camera_paths.poses import poses_of
 from splatting.exports.mesh_files import find_skimage, with_z_up, write_glb_mesh, write_ply_mesh
 from splatting.exports.scene_formats import find_pxr, write_glb, write_usdz
@@ -95,8 +95,6 @@ def _mesh_by(
 def _write_tileset(path: str | os.PathLike, splats: Splats, around: Around, compressed: bool = False) -> str:
     from splatting.exports.tiles3d import write_tileset  # as it imports the rasterizer
 
-    if compressed:
-        warn_of_sizes(splats)
     return write_tileset(path, splats, around, compressed)
 
 

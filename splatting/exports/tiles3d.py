@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from scene.splats.splats import Splats
+from scene.splats.spz import warn_of_sizes
 from splatting.exports.beside import PLACE, with_folder
 from splatting.exports.levels import Tile, Views, octree, table
 from splatting.exports.scene_formats import COMPRESSION, EXTENSION, write_compressed_glb, write_glb
@@ -31,6 +32,8 @@ def write_tileset(path: str | os.PathLike, splats: Splats, around: Views, compre
     """
     root, path, sizes = octree(splats), Path(path), {}
     write = write_compressed_glb if compressed else write_glb
+    if compressed:
+        warn_of_sizes([tile.splats for tile in root.all()])
     with with_folder(path, "tiles-") as folder:
         for tile in root.all():
             if len(tile.splats):

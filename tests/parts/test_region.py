@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from synthetic import make_colmap_scene
 from trainings import train_on
 
@@ -13,7 +14,7 @@ import export
 from benchmarks.scenes import region as benchmark
 from scene.splats.reading import read_splats
 from splatting.parts.region.part import OUTSIDE, VALID, Region, problem
-from splatting.parts.region.shape import Box, Sphere, restored
+from splatting.parts.region.shape import Box, Sphere, found, restored
 from utils.system_utils import UserError, run_cli
 
 SHAPES = [
@@ -92,6 +93,17 @@ def test_other_regions_are_refused(text):
 @pytest.mark.parametrize("text", ["", "auto", "0 0 0 2", "-1,-1,-1,1,1,2.5"])
 def test_regions_are_spheres_or_boxes(text):
     assert problem(text) is None
+
+
+def test_auto_is_a_sphere_around_what_the_cameras_look_at(capsys):
+    turn, away = Rotation.from_euler("y", [[0], [40], [80]], degrees=True).as_matrix(), np.array([0, 0, -4])
+    views = [SimpleNamespace(native=None, R=r, center=r @ away + [1, 2, 3]) for r in turn]
+    info = SimpleNamespace(train_cameras=views, offset=np.array([10.0, 0, 0]))
+    assert found(None, SimpleNamespace(info=info)).facts()[:3] == pytest.approx([1, 2, 3])
+    assert '--region auto takes the sphere "11 2 3 ' in capsys.readouterr().out
+    info.train_cameras = views[:1]
+    with pytest.raises(UserError, match="finds no point that the cameras look at"):
+        found(None, SimpleNamespace(info=info))
 
 
 def test_a_training_keeps_its_region_for_exports(tmp_path, monkeypatch, capsys):

@@ -15,7 +15,8 @@ from splatting.distributed.ranks import Ranks
 from splatting.distributed.rendering.bands import Bands
 from splatting.host.read_later import read_later
 
-# Records for a rank are a multiple of it, so that all messages begin at a multiple of 16 bytes: else NCCL takes longer.
+# Records for a rank are a multiple of it, so that messages of words begin at a multiple of 16 bytes: else NCCL takes
+# longer.
 _EVEN = 4
 
 

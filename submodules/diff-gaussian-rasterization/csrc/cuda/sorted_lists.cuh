@@ -25,8 +25,8 @@ static __global__ void __launch_bounds__(kEmitThreads)
   if (i < n) keys[i] = __float_as_uint(depths[i]), order[i] = int32_t(i);
 }
 
-// Returns the splats by depth, ties by index: the sort is stable and starts from that order. Culled splats are
-// infinitely far and come last.
+// Returns the splats by depth, ties by index: the sort is stable and starts from that order. Culled splats have no
+// instances, so it does not matter where they come.
 inline const int32_t* sort_by_depth(const Queue& queue, int64_t n, const float* depths) {
   cub::DoubleBuffer<uint32_t> keys(queue.array<uint32_t>(n), queue.array<uint32_t>(n));
   cub::DoubleBuffer<int32_t> order(queue.array<int32_t>(n), queue.array<int32_t>(n));
