@@ -124,8 +124,8 @@ def warn_of_sizes(parts: Sequence[Splats]) -> None:
     longest = np.concatenate([splats.log_scales.max(axis=1, initial=-np.inf) for splats in parts])
     if cut := int(((longest < least) | (longest > most)).sum()):
         print(
-            f"warning: {cut} of {len(longest)} Gaussians are not between {np.exp(least):.2g} and {np.exp(most):.0f} "
-            "units long, as SPZ needs, and become so; choose a format that keeps sizes, such as .ply or tileset.json",
+            f"warning: SPZ holds lengths from {np.exp(least):.2g} to {np.exp(most):.0f} units; {cut} of {len(longest)} "
+            "Gaussians are shorter or longer, and change; choose a format that keeps them: .ply, or tileset.json",
             file=sys.stderr,
         )
 
