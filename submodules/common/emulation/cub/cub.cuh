@@ -36,6 +36,20 @@ struct DeviceRadixSort {
       std::copy_n(keys.Alternate(), n, keys.Current()), std::copy_n(values.Alternate(), n, values.Current());
     return cudaSuccess;
   }
+
+  template <class Key, class Value, class Count>
+  static cudaError_t SortPairs(void* memory, size_t& bytes, const Key* keys, Key* sorted, const Value* values,
+                               Value* sorted_values, Count n, int begin_bit, int end_bit, cudaStream_t stream) {
+    if (!memory) return bytes = 1, cudaSuccess;
+    std::vector<Key> own_keys(keys, keys + n);
+    std::vector<Value> own_values(values, values + n);
+    DoubleBuffer<Key> of_keys(own_keys.data(), sorted);
+    DoubleBuffer<Value> of_values(own_values.data(), sorted_values);
+    SortPairs(memory, bytes, of_keys, of_values, n, begin_bit, end_bit, stream);
+    if (of_keys.Current() != sorted) std::copy_n(of_keys.Current(), n, sorted);
+    if (of_values.Current() != sorted_values) std::copy_n(of_values.Current(), n, sorted_values);
+    return cudaSuccess;
+  }
 };
 
 struct DeviceScan {

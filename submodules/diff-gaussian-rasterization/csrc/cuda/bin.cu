@@ -4,10 +4,10 @@
 // A block of the first way takes neighbouring rows, and counts in its own memory how often they reach each tile. That
 // is fast if few blocks reach a tile, as with rows in Morton order. If neighbouring rows lie scattered over the image,
 // almost every block reaches almost every tile, and instances are written one by one all over memory. Sorting takes the
-// same time for any order of rows, but more launches, and a sort of all rows. So it is taken if a survey finds very
-// many instances, or many of a row where rows are scattered or the image has many tiles (survey.cuh). Small scenes are
-// not surveyed, and neither are those of a host that runs ahead: the host has to know the way before it launches, so
-// the survey would make it wait.
+// same time for any order of rows, but more launches, and a sort of all rows. So it is taken if a survey finds many
+// instances of a row where rows are scattered or the image has many tiles (survey.cuh). Small scenes are not surveyed,
+// and neither are those of a host that runs ahead: the host has to know the way before it launches, so the survey would
+// make it wait.
 #include <cuda_runtime.h>
 
 #include <algorithm>
@@ -90,7 +90,7 @@ void bin<float>(const Queue& queue, int64_t count, const Projected<float>& given
   TileRecord* made = nullptr;
   if (count && !in.records && has_records(image)) in.records = made = make_records(queue, count, in, image);
   std::optional<Survey> seen;
-  if (!memory.ahead && in.records && count >= kLeastSurveyed) seen = survey(queue, count, in);
+  if (!memory.ahead && in.records && survey_pays(count, tiles_of(image))) seen = survey(queue, count, in);
   if (seen && sorting_pays(*seen, count, tiles_of(image)))
     sort_lists(queue, count, in, made, image, memory, *seen);
   else

@@ -6,7 +6,6 @@
 #include <thrust/iterator/transform_iterator.h>
 
 #include <cub/cub.cuh>
-#include <initializer_list>
 
 #include "../backend.h"
 #include "each_tile.cuh"
@@ -16,37 +15,55 @@ namespace gs {
 namespace cuda {
 
 constexpr int kEmitThreads = 256;
+constexpr int kStaged = 2048;  // instances that a block gathers in its own memory
+constexpr int kRanged = 8;     // neighbouring instances of a thread
 
-// What the sort by depth starts from. Positive floats sort like their bits.
 static __global__ void __launch_bounds__(kEmitThreads)
-    number_kernel(const int32_t* halted, int64_t n, const float* depths, uint32_t* keys, int32_t* order) {
+    number_kernel(const int32_t* halted, int64_t n, int32_t* numbers) {
   if (!begin_work(halted)) return;
   const int64_t i = int64_t(blockIdx.x) * kEmitThreads + threadIdx.x;
-  if (i < n) keys[i] = __float_as_uint(depths[i]), order[i] = int32_t(i);
+  if (i < n) numbers[i] = int32_t(i);
 }
 
 // Returns the splats by depth, ties by index: the sort is stable and starts from that order. Culled splats have no
 // instances, so it does not matter where they come.
 inline const int32_t* sort_by_depth(const Queue& queue, int64_t n, const float* depths) {
-  cub::DoubleBuffer<uint32_t> keys(queue.array<uint32_t>(n), queue.array<uint32_t>(n));
-  cub::DoubleBuffer<int32_t> order(queue.array<int32_t>(n), queue.array<int32_t>(n));
-  launch(queue, "number", number_kernel, blocks_for(n, kEmitThreads), kEmitThreads, n, depths, keys.Current(),
-         order.Current());
+  int32_t *numbers = queue.array<int32_t>(n), *order = queue.array<int32_t>(n);
+  uint32_t* sorted = queue.array<uint32_t>(n);
+  launch(queue, "number", number_kernel, blocks_for(n, kEmitThreads), kEmitThreads, n, numbers);
+  // Positive floats sort like their bits.
+  const auto* keys = reinterpret_cast<const uint32_t*>(depths);
   with_memory(queue, [&](void* memory, size_t& bytes) {
-    return cub::DeviceRadixSort::SortPairs(memory, bytes, keys, order, int32_t(n), 0, 32, stream_of(queue));
+    return cub::DeviceRadixSort::SortPairs(memory, bytes, keys, sorted, static_cast<const int32_t*>(numbers), order,
+                                           int32_t(n), 0, 32, stream_of(queue));
   });
-  queue.release(queue.context, keys.Current()), queue.release(queue.context, keys.Alternate());
-  queue.release(queue.context, order.Alternate());
-  return order.Current();
+  queue.release(queue.context, numbers), queue.release(queue.context, sorted);
+  return order;
+}
+
+static __global__ void __launch_bounds__(kEmitThreads)
+    line_up_kernel(const int32_t* halted, int64_t n, const int32_t* order, const TileRecord* records,
+                   TileRecord* lined) {
+  if (!begin_work(halted)) return;
+  const int64_t k = int64_t(blockIdx.x) * kEmitThreads + threadIdx.x;
+  if (k < n) lined[k] = load_whole(records + order[k]);
+}
+
+// Returns the same splats with records by depth, which are then read one after the other.
+inline Projected<float> line_up(const Queue& queue, int64_t n, const Projected<float>& in, const int32_t* order) {
+  Projected<float> lined = in;
+  lined.records = queue.array<TileRecord>(n);
+  launch(queue, "line_up", line_up_kernel, blocks_for(n, kEmitThreads), kEmitThreads, n, order, in.records,
+         lined.records);
+  return lined;
 }
 
 // The number of instances of the k-th splat by depth.
 struct CountInOrder {
-  Projected<float> in;
-  const int32_t* order;
+  Projected<float> lined;
   __host__ __device__ int32_t operator()(int32_t k) const {
 #ifdef __CUDA_ARCH__
-    return reached_by(in, order[k]).count;
+    return reached_by(lined, k).count;
 #else
     return k;
 #endif
@@ -54,9 +71,9 @@ struct CountInOrder {
 };
 
 // Returns the first instance of each splat, by depth.
-inline const int32_t* find_offsets(const Queue& queue, int64_t n, const Projected<float>& in, const int32_t* order) {
+inline const int32_t* find_offsets(const Queue& queue, int64_t n, const Projected<float>& lined) {
   int32_t* offsets = queue.array<int32_t>(n);
-  const auto counts = thrust::make_transform_iterator(thrust::counting_iterator<int32_t>(0), CountInOrder{in, order});
+  const auto counts = thrust::make_transform_iterator(thrust::counting_iterator<int32_t>(0), CountInOrder{lined});
   with_memory(queue, [&](void* memory, size_t& bytes) {
     return cub::DeviceScan::ExclusiveSum(memory, bytes, counts, offsets, int32_t(n), stream_of(queue));
   });
@@ -105,20 +122,27 @@ inline void find_slots(const Queue& queue, int64_t n, const Projected<float>& in
 }
 
 // Writes the tile and the splat of every instance. A thread takes the k-th splat by depth. The warps of its block share
-// the tiles of each splat without a mask, whose instances come in any order: the sort by tile parts them anyway.
+// the tiles of each splat without a mask, whose instances come in any order: the sort by tile parts them anyway. The
+// block's instances lie side by side, so if they are few enough, it gathers them first and writes whole memory sectors.
 template <class Key, int kRays>
 __global__ void __launch_bounds__(kEmitThreads)
-    emit_kernel(const int32_t* halted, int64_t n, const int32_t* order, const int32_t* offsets, Projected<float> in,
-                Image image, Key* tiles, int32_t* splats) {
+    emit_kernel(const int32_t* halted, int64_t n, int32_t instances, const int32_t* order, const int32_t* offsets,
+                Projected<float> in, Projected<float> lined, Image image, Key* tiles, int32_t* splats) {
   if (!begin_work(halted)) return;
   __shared__ int32_t large[kEmitThreads], next[kEmitThreads], larges;  // next: the place of its next instance
+  __shared__ Key staged_tiles[kStaged];
+  __shared__ int32_t staged_splats[kStaged];
   if (threadIdx.x == 0) larges = 0;
   __syncthreads();
-  const int64_t k = int64_t(blockIdx.x) * kEmitThreads + threadIdx.x;
+  const int64_t begin = int64_t(blockIdx.x) * kEmitThreads, end = begin + kEmitThreads, k = begin + threadIdx.x;
+  const int32_t first = offsets[begin], count = (end < n ? offsets[end] : instances) - first;
+  const bool staged = count <= kStaged;
+  Key* const to_tiles = staged ? staged_tiles : tiles + first;
+  int32_t* const to_splats = staged ? staged_splats : splats + first;
   if (k < n) {
     const int32_t splat = order[k];
-    const Reached reached = reached_by(in, splat);
-    int32_t at = offsets[k];
+    const Reached reached = reached_by(lined, int32_t(k));
+    int32_t at = offsets[k] - first;
     if (reached.count && !reached.mask) {
       const int32_t u = atomicAdd(&larges, 1);
       large[u] = splat, next[u] = at;
@@ -126,17 +150,21 @@ __global__ void __launch_bounds__(kEmitThreads)
     each_tile(reached, tile_count(image.width), [&](const int (&its)[kTaken]) {
 #pragma unroll
       for (const int tile : its)
-        if (tile >= 0) tiles[at] = Key(tile), splats[at] = splat, ++at;
+        if (tile >= 0) to_tiles[at] = Key(tile), to_splats[at] = splat, ++at;
     });
   }
   __syncthreads();
   for (int u = 0; u < larges; ++u) {
-    const int first = (threadIdx.x + 96 * u) % kEmitThreads;  // most have fewer tiles than the block has threads
-    each_tested<kRays>(in, large[u], image, first, kEmitThreads, [&](int tile) {
+    const int from = (threadIdx.x + 96 * u) % kEmitThreads;  // most have fewer tiles than the block has threads
+    each_tested<kRays>(in, large[u], image, from, kEmitThreads, [&](int tile) {
       const int32_t at = atomicAdd(next + u, 1);
-      tiles[at] = Key(tile), splats[at] = large[u];
+      to_tiles[at] = Key(tile), to_splats[at] = large[u];
     });
   }
+  if (!staged) return;
+  __syncthreads();
+  for (int i = threadIdx.x; i < count; i += kEmitThreads)
+    tiles[first + i] = staged_tiles[i], splats[first + i] = staged_splats[i];
 }
 
 // Finds where each tile's list begins. An instance begins the lists of all tiles after the previous instance's tile, up
@@ -145,10 +173,17 @@ template <class Key>
 __global__ void __launch_bounds__(kEmitThreads)
     ranges_kernel(const int32_t* halted, int64_t instances, int64_t tiles, const Key* sorted, int64_t* ranges) {
   if (!begin_work(halted)) return;
-  const int64_t i = int64_t(blockIdx.x) * kEmitThreads + threadIdx.x;
-  if (i > instances) return;
-  const int64_t end = i < instances ? int64_t(sorted[i]) : tiles;
-  for (int64_t tile = i ? int64_t(sorted[i - 1]) + 1 : 0; tile <= end; ++tile) ranges[tile] = i;
+  const int64_t first = (int64_t(blockIdx.x) * kEmitThreads + threadIdx.x) * kRanged;
+  if (first > instances) return;
+  int64_t tile = first ? int64_t(sorted[first - 1]) + 1 : 0;
+  Key its[kRanged];
+#pragma unroll
+  for (int r = 0; r < kRanged; ++r) its[r] = first + r < instances ? sorted[first + r] : Key(0);
+#pragma unroll
+  for (int r = 0; r < kRanged; ++r) {
+    const int64_t i = first + r, last = i < instances ? int64_t(its[r]) : i == instances ? tiles : -1;
+    for (; tile <= last; ++tile) ranges[tile] = i;
+  }
 }
 
 inline int bits_for(int64_t values) {
@@ -157,20 +192,22 @@ inline int bits_for(int64_t values) {
   return bits;
 }
 
-// Emits the instances and sorts them by tile. Releases `read`, some of which may be null, once they are emitted.
+// Emits the instances and sorts them by tile. Releases what it reads, and `made`, once they are emitted.
 template <class Key>
-void sort_by_tile(const Queue& queue, int64_t n, const Projected<float>& in, Image image, const int32_t* order,
-                  const int32_t* offsets, std::initializer_list<const void*> read, int64_t instances,
-                  const Binned& out) {
+void sort_by_tile(const Queue& queue, int64_t n, const Projected<float>& in, const TileRecord* made, Image image,
+                  const int32_t* order, int64_t instances, const Binned& out) {
   const int64_t tiles = tiles_of(image);
+  const Projected<float> lined = line_up(queue, n, in, order);
+  const int32_t* offsets = find_offsets(queue, n, lined);
   Key* emitted = queue.array<Key>(instances);
   const auto emit = in.rays == kLensRays ? emit_kernel<Key, kLensRays>
                     : in.rays            ? emit_kernel<Key, kPinholeRays>
                                          : emit_kernel<Key, kNoRays>;
-  launch(queue, "emit", emit, blocks_for(n, kEmitThreads), kEmitThreads, n, order, offsets, in, image, emitted,
-         out.instances);
-  for (const void* memory : read)
-    if (memory) queue.release(queue.context, memory);
+  launch(queue, "emit", emit, blocks_for(n, kEmitThreads), kEmitThreads, n, int32_t(instances), order, offsets, in,
+         lined, image, emitted, out.instances);
+  queue.release(queue.context, order), queue.release(queue.context, offsets);
+  queue.release(queue.context, lined.records);
+  if (made) queue.release(queue.context, made);
   cub::DoubleBuffer<Key> keys(emitted, queue.array<Key>(instances));
   cub::DoubleBuffer<int32_t> splats(out.instances, queue.array<int32_t>(instances));
   with_memory(queue, [&](void* memory, size_t& bytes) {
@@ -180,18 +217,18 @@ void sort_by_tile(const Queue& queue, int64_t n, const Projected<float>& in, Ima
   if (splats.Current() != out.instances)  // after an odd number of passes, of 7 or 8 bits each
     GS_CUDA_CHECK(cudaMemcpyAsync(out.instances, splats.Current(), instances * sizeof(int32_t),
                                   cudaMemcpyDeviceToDevice, stream_of(queue)));
-  launch(queue, "ranges", ranges_kernel<Key>, blocks_for(instances + 1, kEmitThreads), kEmitThreads, instances, tiles,
-         keys.Current(), out.ranges);
+  launch(queue, "ranges", ranges_kernel<Key>, blocks_for(instances / kRanged + 1, kEmitThreads), kEmitThreads,
+         instances, tiles, keys.Current(), out.ranges);
 }
 
 // Bins splats that have records and at least one instance. made: the records, if they are to be released, or null.
 inline void sort_lists(const Queue& queue, int64_t n, const Projected<float>& in, const TileRecord* made, Image image,
                        const BinMemory& memory, const Survey& seen) {
-  const int32_t *order = sort_by_depth(queue, n, in.depths), *offsets = find_offsets(queue, n, in, order);
+  const int32_t* order = sort_by_depth(queue, n, in.depths);
   if (memory.slots) find_slots(queue, n, in, memory.slots);
   const Binned out = memory.take(memory.context, seen.instances, memory.slots ? seen.slots : 0);
   const auto sort = tiles_of(image) < 1 << 16 ? sort_by_tile<uint16_t> : sort_by_tile<uint32_t>;
-  sort(queue, n, in, image, order, offsets, {order, offsets, made}, seen.instances, out);
+  sort(queue, n, in, made, image, order, seen.instances, out);
 }
 
 }  // namespace cuda

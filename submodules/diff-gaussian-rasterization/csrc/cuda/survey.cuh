@@ -8,10 +8,9 @@
 namespace gs {
 namespace cuda {
 
-constexpr int64_t kLeastSurveyed = 1 << 18;    // rows; with fewer a survey may cost more than it gains
-constexpr int64_t kManyInstances = 8'000'000;  // that are sorted in any case
-constexpr int64_t kInstancesOfRow = 2;         // up to which sorting all rows by depth takes longer than it saves
-constexpr int64_t kManyTiles = 1 << 14;        // which lists need several windows for (tile_lists.cuh)
+constexpr int64_t kManyTiles = 1 << 14;  // which lists need several windows for (tile_lists.cuh)
+constexpr int64_t kLeastSurveyed = 1 << 18, kLeastOfFewTiles = 1 << 21;  // rows; of fewer, both ways take equally long
+constexpr int64_t kInstancesOfRow = 2;  // up to which sorting all rows by depth takes longer than it saves
 constexpr int kFarTiles = 8;
 constexpr double kScatteredShare = 0.25;
 
@@ -21,11 +20,15 @@ struct Survey {
   int64_t far;    // those whose rectangles begin more than kFarTiles apart, across or down
 };
 
+// Whether a survey may gain more than it costs.
+inline bool survey_pays(int64_t rows, int64_t tiles) {
+  return rows >= (tiles > kManyTiles ? kLeastSurveyed : kLeastOfFewTiles);
+}
+
 // Whether two sorts of everything take less time than lists of tiles.
 inline bool sorting_pays(const Survey& seen, int64_t rows, int64_t tiles) {
   const bool scattered = double(seen.far) > kScatteredShare * double(seen.pairs);
-  return seen.instances > kManyInstances ||
-         (seen.instances > kInstancesOfRow * rows && (scattered || tiles > kManyTiles));
+  return seen.instances > kInstancesOfRow * rows && (scattered || tiles > kManyTiles);
 }
 
 constexpr int kSurveyThreads = 256;

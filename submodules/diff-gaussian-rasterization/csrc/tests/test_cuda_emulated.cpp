@@ -519,7 +519,10 @@ void test_survey() {
         CHECK(!gs::cuda::sorting_pays(seen, 2 * count, many + 1));
       }
     }
-  CHECK(gs::cuda::sorting_pays({gs::cuda::kManyInstances + 1, 0, 100, 0}, gs::cuda::kManyInstances, 1));
+  for (const int64_t spare : {0, 1}) {
+    CHECK(gs::cuda::survey_pays(gs::cuda::kLeastSurveyed - spare, gs::cuda::kManyTiles + 1) == !spare);
+    CHECK(gs::cuda::survey_pays(gs::cuda::kLeastOfFewTiles - spare, gs::cuda::kManyTiles) == !spare);
+  }
 }
 
 // Memory that notes what is asked for.
@@ -547,14 +550,16 @@ struct NotedMemory {
   }
 };
 
-// Binning surveys many rows, unless the host runs ahead, and takes the way that pays. Lists alone have a key of 8 bytes
-// for every instance.
+// Binning surveys many rows of an image of many tiles, unless the host runs ahead, and takes the way that pays. Lists
+// alone have a key of 8 bytes for every instance.
 void test_ways() {
   constexpr int64_t count = gs::cuda::kLeastSurveyed;
-  const gs::Image image = RecordRows::kImage;
-  const int columns = tile_count(image.width);
-  for (const auto& [in_order, runs_ahead] : {std::pair{true, false}, {false, false}, {false, true}}) {
-    RecordRows rows(count, in_order);
+  constexpr gs::Image many_tiles{16 * 129, 16 * 128};
+  CHECK(tiles_of(many_tiles) > gs::cuda::kManyTiles && tiles_of(RecordRows::kImage) <= gs::cuda::kManyTiles);
+  for (const auto& [image, runs_ahead] :
+       {std::pair{RecordRows::kImage, false}, {many_tiles, false}, {many_tiles, true}}) {
+    const int columns = tile_count(image.width);
+    RecordRows rows(count, false);
     std::vector<std::tuple<int, float, int32_t>> wanted;
     for (int64_t i = 0; i < count; ++i)
       for (int x = rows.records[i].x0; x < rows.records[i].x1; ++x)
@@ -575,7 +580,7 @@ void test_ways() {
     CHECK(got.ranges.back() == instances && got.slots.back().first == instances);
     for (size_t k = 0; k < wanted.size(); ++k) CHECK(got.instances[k] == std::get<2>(wanted[k]));
     const bool lists = std::count(memory.asked.begin(), memory.asked.end(), 8 * wanted.size());
-    CHECK(lists == (in_order || runs_ahead));
+    CHECK(lists == (runs_ahead || image.width < many_tiles.width));
   }
 }
 
