@@ -116,8 +116,6 @@ __global__ void __launch_bounds__(kThreads, kOnRays<AnyCamera> == kLensRays ? kB
   __shared__ AnyCamera camera;
   __shared__ __align__(16) float rest[kThreads * kRest];
   __shared__ __align__(16) float stage[kThreads / 32 * kStage];
-  if (threadIdx.x == 0) set_camera(s, camera);
-  __syncthreads();
   const int64_t i = block * kThreads + threadIdx.x, first = i - (threadIdx.x & 31);
   const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x;  // in what the forward has made
   const bool seen = i < s.count && source.seen(at);
@@ -127,9 +125,13 @@ __global__ void __launch_bounds__(kThreads, kOnRays<AnyCamera> == kLensRays ? kB
   if (!s.colors)
     fetch_rows(s.sh_rest, first, s.count, s.rest_stride, 3 * (sh_count(s.sh_degree) - 1), __ballot_sync(kWarp, seen), 0,
                warp_rows);
+  // One thread makes the camera, in double, while the block's memory arrives.
+  if (threadIdx.x == 0) set_camera(s, camera);
+  __syncwarp();
   float m[kGradientRow<kRays>];
   source.read(at, seen, m, warp_stage);
   wait_for_rows();
+  __syncthreads();
   RowGradient g = {};
   const SceneGradient<float> mine = g.pointers(out, i);
   if (seen) {

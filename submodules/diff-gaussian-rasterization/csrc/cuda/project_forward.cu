@@ -44,9 +44,11 @@ __global__ void __launch_bounds__(kThreads)
   if (block < 0) return leave_out(row, s.rows(), out);
   __shared__ AnyCamera camera;
   __shared__ __align__(16) float rest[kThreads * kRest];
+  const int64_t i = block * kThreads + threadIdx.x;
+  // One thread makes the camera, in double, while the means arrive.
+  const Vec3<float> mean = i < s.count ? load3(s.means + 3 * i) : Vec3<float>{};
   if (threadIdx.x == 0) set_camera(s, camera);
   __syncthreads();
-  const int64_t i = block * kThreads + threadIdx.x;
   SplatOf<float, kOnRays<AnyCamera>> splat = {};
   float depth = INFINITY;
   int radius = 0;
@@ -57,7 +59,7 @@ __global__ void __launch_bounds__(kThreads)
                            __ballot_sync(kWarp, wanted), flowing, rest + (threadIdx.x & ~31) * kRest);
   };
   // The coefficients of Gaussians that are likely seen arrive while the warp computes shapes.
-  const bool likely = i < s.count && near_view(camera, to_view(camera, load3(s.means + 3 * i)));
+  const bool likely = i < s.count && near_view(camera, to_view(camera, mean));
   fetch(likely);
   const bool visible = i < s.count && project_shape(s, camera, SceneRow<float>{s, i}, splat, depth, radius);
   TileRect rect = {0, 0, 0, 0};
