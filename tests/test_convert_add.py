@@ -44,6 +44,7 @@ def _put(room: Path, *names: str) -> None:
         shutil.copy2(room / "all" / name, room / "scene" / "input")
 
 
+@pytest.mark.slow
 def test_old_photos_keep_poses_and_bytes_and_new_ones_are_placed(room, capsys):
     scene = room / "scene"
     before = pycolmap.Reconstruction(str(scene / "sparse" / "0"))
