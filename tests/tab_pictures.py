@@ -29,12 +29,16 @@ def picture(tab: "Page") -> np.ndarray:
 
 
 def settled(tab: "Page") -> np.ndarray:
-    """The picture, once it does not change any more. One of a single colour was taken before anything was drawn."""
-    before = picture(tab)
+    """The picture, once it does not change for a second, as viewers sort in other threads, which a busy machine delays.
+
+    One of a single colour was taken before anything was drawn.
+    """
+    before, equal = picture(tab), 0
     for _ in range(4 * SECONDS):
         tab.wait_for_timeout(250)
         now = picture(tab)
-        if np.array_equal(now, before) and (now != now[0, 0]).any():
+        equal = equal + 1 if np.array_equal(now, before) and (now != now[0, 0]).any() else 0
+        if equal == 4:
             return now
         before = now
     pytest.fail(f"the picture is not at rest after {SECONDS} s")
