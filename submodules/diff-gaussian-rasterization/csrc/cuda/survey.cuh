@@ -9,7 +9,8 @@ namespace gs {
 namespace cuda {
 
 constexpr int64_t kManyTiles = 1 << 14;  // which lists need several windows for (tile_lists.cuh)
-constexpr int64_t kLeastSurveyed = 1 << 18, kLeastOfFewTiles = 1 << 21;  // rows; of fewer, both ways take equally long
+// Rows from which on a survey is taken, of images of more tiles and of others. With fewer, neither way is much faster.
+constexpr int64_t kLeastSurveyed = 1 << 18, kLeastOfFewTiles = 1 << 21;
 constexpr int64_t kInstancesOfRow = 2;  // up to which sorting all rows by depth takes longer than it saves
 constexpr int kFarTiles = 8;
 constexpr double kScatteredShare = 0.25;
