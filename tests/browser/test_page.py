@@ -36,6 +36,11 @@ def _number(tab, label: str) -> float:
     return float(labelled(tab, label).input_value().split(" of ")[0].replace(",", "") or "nan")
 
 
+def _paused_at(tab) -> float:
+    """The iteration at which the training waits; NaN while it takes one."""
+    return _number(tab, "Iteration") if labelled(tab, "Iteration").input_value().endswith("paused") else float("nan")
+
+
 def _until(holds: Callable[[], bool], what: str) -> None:
     deadline = time.monotonic() + SECONDS
     while not holds():
@@ -74,10 +79,10 @@ def test_the_training_pauses_and_resumes_and_its_curve_is_drawn(tab, training):
     tab.locator(".uplot canvas").wait_for(timeout=1000 * SECONDS)
     tab.get_by_role("button", name="Pause").click()
     tab.get_by_role("button", name="Resume").wait_for()
-    time.sleep(1.0)
-    paused = _number(tab, "Iteration")
+    _until(lambda: _paused_at(tab) > 0, "the training does not pause")
+    paused = _paused_at(tab)
     tab.get_by_role("button", name="One step").click()
-    _until(lambda: _number(tab, "Iteration") == paused + 1, "no step was taken")
+    _until(lambda: _paused_at(tab) == paused + 1, "no step was taken")
     tab.get_by_role("button", name="Resume").click()
     _until(lambda: _number(tab, "Iteration") > paused + 1, "the training does not resume")
     assert _number(tab, "Loss") > 0 and _number(tab, "Gaussians") > 0

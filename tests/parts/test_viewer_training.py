@@ -57,9 +57,9 @@ class Watched:
                 watched.frames.append((version, self._page.view.mode.value))
                 super()._draw(wish, version)
 
-            def _show_numbers(self, iteration) -> None:
-                super()._show_numbers(iteration)
-                if self._requests.paused and iteration not in watched.paused:
+            def _show_numbers(self, iteration, paused=False) -> None:
+                super()._show_numbers(iteration, paused)
+                if paused and iteration not in watched.paused:
                     watched.paused.append(iteration)
 
             def ended(self, error) -> None:

@@ -75,7 +75,7 @@ class TrainingPage:
         """Do what was asked for, and return when the training is to go on, or with `step.stopping` set."""
         run, requests = self._run, self._requests
         if requests.paused:
-            self._show_numbers(step.iteration)
+            self._show_numbers(step.iteration, paused=True)
         while True:
             if requests.stopped or run.interrupt.requested:
                 step.stopping = run.interrupt.requested or KeyboardInterrupt("stopped from the page")
@@ -105,12 +105,12 @@ class TrainingPage:
         else:
             self._page.notify("Saved", f"chkpnt{step.iteration}.pth")
 
-    def _show_numbers(self, iteration: int) -> None:
+    def _show_numbers(self, iteration: int, paused: bool = False) -> None:
         run, now = self._run, time.perf_counter()
         _, before, seconds = self._numbers
         expected = run.schedule.expected
         of = "" if expected is None else f" of {'about ' if run.schedule.by_clock else ''}{round(expected):,}"
-        of += ", paused" if self._requests.paused else ""
+        of += ", paused" if paused else ""
         self._page.show_numbers(iteration, run.gaussians.gaussian_count, of)
         if iteration == before:  # a pause has shown the rest
             return
