@@ -2,6 +2,8 @@
 
 import io
 import math
+import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +22,15 @@ if TYPE_CHECKING:
     from scene.splats.splats import Splats
 
 BACKGROUND = 0.2, 0.4, 0.3
-SECONDS = 60  # until something must have happened
+SECONDS = 120  # until something must have happened; a busy machine takes many times as long as an idle one
+
+
+def until(holds: Callable[[], bool], what: str) -> None:
+    """Wait until a condition holds. what: what is wrong if it never does."""
+    deadline = time.monotonic() + SECONDS
+    while not holds():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.1)
 
 
 def picture(tab: "Page") -> np.ndarray:

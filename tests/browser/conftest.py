@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 import pytest
+from tab_pictures import SECONDS
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -36,6 +37,7 @@ def tab(browser: "Browser", request: pytest.FixtureRequest) -> "Iterator[Page]":
     """
     width, height = request.module.WINDOW
     context = browser.new_context(viewport={"width": width, "height": height})
+    context.set_default_timeout(1000 * SECONDS)
     page, errors, asked = context.new_page(), [], []
     page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: errors.append(str(error)))

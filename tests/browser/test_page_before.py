@@ -5,12 +5,12 @@ import signal
 import pytest
 from served_page import labelled, serving
 from synthetic import make_colmap_scene
+from tab_pictures import until
 
 pytest.importorskip("viser", reason="viser is not installed: pip install '.[viewer]'")
 pytestmark = pytest.mark.browser
 WINDOW = 1280, 720
 SIZES = (1280, 720), (390, 844)
-TIMEOUT = 60_000  # ms
 
 
 def test_a_scene_is_shown_before_its_training(tab, tmp_path):
@@ -19,7 +19,7 @@ def test_a_scene_is_shown_before_its_training(tab, tmp_path):
         for width, height in SIZES:
             tab.set_viewport_size({"width": width, "height": height})
             tab.goto(address)
-            tab.get_by_role("tab", name="Photos").click(timeout=TIMEOUT)
+            tab.get_by_role("tab", name="Photos").click()
             assert tab.title() == "attic"
             assert labelled(tab, "Points").input_value() == "300"
             assert tab.get_by_text("Iteration", exact=True).count() == 0
@@ -34,14 +34,14 @@ def test_a_paused_training_says_its_length_and_ends_by_a_signal(tab, tmp_path):
         for width, height in SIZES:
             tab.set_viewport_size({"width": width, "height": height})
             tab.goto(address)
-            tab.get_by_role("tab", name="Training").click(timeout=TIMEOUT)
+            tab.get_by_role("tab", name="Training").click()
             assert tab.title() == "out"
-            tab.get_by_role("button", name="Resume").wait_for(timeout=TIMEOUT)
-            assert labelled(tab, "Iteration").input_value() == "1 of 7,000, paused"
+            tab.get_by_role("button", name="Resume").wait_for()
+            iteration = labelled(tab, "Iteration")
+            until(lambda it=iteration: it.input_value() == "1 of 7,000, paused", "the training does not wait")
         tab.get_by_role("button", name="Resume").click()
         tab.wait_for_function(
-            r"[...document.querySelectorAll('input')].some((it) => /^(\d+ \w+ )?\d+ (s|min)$/.test(it.value))",
-            timeout=TIMEOUT,
+            r"[...document.querySelectorAll('input')].some((it) => /^(\d+ \w+ )?\d+ (s|min)$/.test(it.value))"
         )
         tab.get_by_role("button", name="Pause").click()
         process.send_signal(signal.SIGINT)

@@ -12,7 +12,7 @@ import pytest
 from gaussians import pipeline
 from html_scene import SIZE, balls, cameras
 from served_page import serving_folder
-from tab_pictures import SECONDS, picture
+from tab_pictures import settled
 
 from splatting.exports import html, streamed
 from splatting.exports.formats import Around
@@ -55,11 +55,10 @@ def test_the_viewer_loads_the_levels(tab: "Page", address: str):
     asked = []
     tab.on("response", lambda answer: asked.append((answer.status, answer.url)))
     tab.goto(address)
-    tab.wait_for_function("window.viewer?.state.loaded", timeout=1000 * SECONDS)
-    tab.wait_for_timeout(1000)
+    tab.wait_for_function("window.viewer?.state.loaded")
+    shown = settled(tab)
     chunks = [url for _, url in asked if "/sog-" in url]
     assert chunks and {status for status, _ in asked} == {200}
     assert any(url.endswith("meta.json") for url in chunks) and any(url.endswith(".webp") for url in chunks)
-    shown = picture(tab)
     plain = np.abs(shown - shown[0, 0]).max(axis=2) < 8
     assert 0.05 < (~plain).mean() < 0.95, "the balls are not to be seen"

@@ -13,7 +13,7 @@ import pytest
 from gaussians import pipeline
 from html_scene import FOV, SIZE, balls, cameras
 from served_page import serving_folder
-from tab_pictures import BACKGROUND, SECONDS, expected, psnr, settled
+from tab_pictures import BACKGROUND, expected, psnr, settled
 
 from scene.splats.splats import Splats
 from splatting.camera_paths.poses import poses_of
@@ -77,7 +77,7 @@ def show(
     (folder / MODULES.name).symlink_to(MODULES)
     with serving_folder(folder) as address:
         tab.goto(f"{address}index.html")
-        tab.wait_for_function("window.loaded", timeout=1000 * SECONDS)
+        tab.wait_for_function("window.loaded")
         shown = settled(tab)
         assert tab.evaluate("failed") == []
         names = {Path(uri).stem for uri in tab.evaluate("visible()")}
