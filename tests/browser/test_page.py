@@ -169,7 +169,7 @@ def test_a_click_on_a_drawn_camera_leads_there(tab, training):
     middle = PICTURE[0] / 2, PICTURE[1] / 2
     tab.mouse.move(*middle)
 
-    def leads() -> bool:  # at once only if the cameras are drawn
+    def leads() -> bool:  # a click before the cameras are drawn does nothing
         tab.mouse.click(*middle, delay=50)
         time.sleep(2.0)
         return camera["img_name"] in chosen.input_value()
