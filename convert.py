@@ -16,18 +16,21 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from arguments import OptionParser
+from scene.readers.scene_folder import is_scene
+from splatting.files.image_files import SUFFIXES
+from splatting.host import torchrun
 from splatting.host.start import typed_command
 from splatting.sfm import stages
 from splatting.sfm.adding import added_line, forget_base, keep_base
 from splatting.sfm.cameras import MODES
-from splatting.sfm.capture import lines_of, too_few, training_options
+from splatting.sfm.capture import lines_of, training_options, unusable
 from splatting.sfm.capture_page import capture_stage
 from splatting.sfm.colmap import ADDING, GIVEN, LENS_MODELS, Program, Pycolmap, Settings, is_native
-from splatting.sfm.inputs import sort_inputs, unused_lines
+from splatting.sfm.images import link
+from splatting.sfm.inputs import VIDEO_SUFFIXES, sort_inputs, unused_lines
 from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder
 from splatting.sfm.orienting import said_of
 from splatting.sfm.programs import refuse_while_working
@@ -56,8 +59,6 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     for line in unused_lines(found.unused):
         print(line)
     names = found.photos
-    alone = len(videos or report_entries(layout)) == 1 and taken_frames(layout) >= set(names)  # also of an earlier run
-    settings = replace(settings, matcher=args.matcher or ("sequential" if alone else "exhaustive"))
     if args.skip_matching:
         planned = []
         program = "--skip_matching: the model that was in distorted/sparse"
@@ -76,7 +77,7 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
         planned += stages.reconstruction_stages(backend, masks is not None)
     made = {"camera": settings.camera, "mapper": settings.mapper, "matcher": settings.matcher, "program": program}
     planned.append(stages.undistortion_stage(layout, settings, made_from, **made, shared_by=settings.cameras))
-    planned.append(capture_stage(layout, names))
+    planned.append(capture_stage(layout, names, record.seconds))
     planned += stages.wanted_stages(layout, record, args)
     kept += record.run(planned)
     if kept:
@@ -93,11 +94,32 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
         print(f"note: {line}")
     for line in report["advice"]:
         print(f"warning: {line}", file=sys.stderr)
-    if text := too_few(report):
+    if text := unusable(report):
         print(f"warning: {text}", file=sys.stderr)
         sys.exit(3)
     folders = f"-s {shlex.quote(str(layout.scene))} -m {shlex.quote(f'output/{layout.scene.resolve().name}')}"
     print(f"train it with: {typed_command('train.py')} {folders} --eval {training_options(report)}".rstrip())
+
+
+def convert_first(source: str) -> None:
+    """For train.py: convert a folder of photos or videos that has no cameras yet; do nothing with any other folder.
+
+    The photos are in its sub-folder `input`, or directly in it: then `input` gets links to them.
+    """
+    folder = Path(source)
+    if not folder.is_dir() or is_scene(folder) or torchrun.size() > 1:
+        return
+    layout = Layout(folder.absolute())
+    own = layout.input.is_dir() and not report_entries(layout)
+    beside = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
+    photos = [] if layout.input.is_dir() else [path for path in beside if path.suffix.lower() in SUFFIXES]
+    videos = [] if own else [str(path) for path in beside if path.suffix.lower() in VIDEO_SUFFIXES]
+    if not (layout.input.is_dir() or photos or videos):
+        return
+    for path in photos:
+        link(path, layout.input / path.name)
+    print(f"{folder} has no cameras: converting its photos first, as convert.py does without options")
+    main(["-s", source, *(["--video", *videos] if videos else [])])
 
 
 def _masks(given: str | None) -> Path | None:
@@ -141,11 +163,11 @@ def _settings(args: argparse.Namespace) -> Settings:
             print("warning: --cameras has no effect beside --poses, which gives each photo its camera", file=sys.stderr)
         camera, mapper = "given", GIVEN
     else:
-        camera, mapper = args.camera or "OPENCV", ADDING if args.add else args.mapper or "incremental"
+        camera, mapper = args.camera or "OPENCV", ADDING if args.add else args.mapper or "auto"
         if camera not in LENS_MODELS:
             raise UserError(f"--camera {camera} is not a supported lens model; choose one of {', '.join(LENS_MODELS)}")
     is_native(args.lenses, [camera])  # refuses what does not fit together
-    matcher, shared_by = args.matcher or "exhaustive", args.cameras or "per_lens"
+    matcher, shared_by = args.matcher or "auto", args.cameras or "per_lens"
     return Settings(camera, args.max_num_features, matcher, mapper, args.no_gpu, shared_by, args.lenses)
 
 
@@ -190,11 +212,12 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--video_frames", type=int, default=150, metavar="N",
         help="largest number of frames of each video, the sharpest of each of N equal parts of its motion "
         "(default: 150)")  # fmt: skip
-    add("--matcher", choices=("exhaustive", "sequential"), default=None,
-        help="match every pair, or neighbours by name (default: exhaustive; of one video sequential)")  # fmt: skip
-    add("--mapper", choices=("incremental", "global"), default=None,
-        help="place one photo after another, or all at once, which is faster for hundreds of photos "
-        "(default: incremental)")  # fmt: skip
+    add("--matcher", choices=("auto", "exhaustive", "sequential"), default=None,
+        help="auto: match every pair of few photos, and of many those that are near by name, by GPS and by look; "
+        "exhaustive: every pair; sequential: neighbours by name (default: auto)")  # fmt: skip
+    add("--mapper", choices=("auto", "incremental", "global"), default=None,
+        help="incremental: place one photo after another; global: all at once; auto: in both ways, until the poses "
+        "agree with the matches (default: auto)")  # fmt: skip
     add("--max_num_features", type=int, default=8192, metavar="N",
         help="largest number of features per photo; more help on surfaces with little texture, but are slower "
         "(default: 8192)")  # fmt: skip

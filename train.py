@@ -16,6 +16,7 @@ import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
 
 from arguments import write_cfg_args, write_model_json
+from scene.readers.scene_folder import is_scene
 from splatting.distributed.consistency import agree_on_options
 from splatting.host.energy import joules_counter, nvml_name
 from splatting.parts import check_together, chosen, tools
@@ -107,6 +108,10 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, ...]:
 def main(argv: Sequence[str] | None = None) -> None:
     """Train as the command line says."""
     args, dataset, opt, pipe = parse(argv)
+    if dataset.source_path and not is_scene(dataset.source_path):
+        from convert import convert_first  # which no other training needs
+
+        convert_first(dataset.source_path)
     if args.advise or args.options == "auto":
         from splatting.diagnosis.advice import asked_options  # which no other training needs
 

@@ -1,6 +1,7 @@
 """The report of a capture: what it finds, its page, and what train.py says of it."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from PIL import Image, ImageFilter
 
 import train
 from scene.check.photos import left_out
-from splatting.sfm.capture import findings, lines_of, looks_of, neighbours_of, too_few
+from splatting.sfm.capture import findings, lines_of, looks_of, neighbours_of, unusable
 from splatting.sfm.capture_page import from_above, write_page
 
 NAMES = ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
@@ -50,12 +51,7 @@ def test_what_is_weak_blurred_and_darker_is_named(folder):
     assert [line.split(":")[0] for line in found["again"]] == [
         "what e.jpg show, if it belongs to the scene", "around d.jpg", "b.jpg", "with a fixed exposure, if you can",
     ]  # fmt: skip
-    page = folder / "capture.html"
-    report = _report(4, 5, "e.jpg") | found
-    write_page(page, report, _survey(), looks, [*NAMES, "e.jpg"])
-    text = page.read_text(encoding="utf-8")
-    assert "data:image/png;base64," in text and "not placed, matches 0 photos" in text and "2 neighbours" in text
-    assert lines_of(report)[:2] == [
+    assert lines_of(_report(4, 5, "e.jpg") | found)[:2] == [
         "overlap: 1 of 4 photos weakly connected (d.jpg)", "blur: 1 of 5 photos blurred (b.jpg)",
     ]  # fmt: skip
 
@@ -74,6 +70,52 @@ def test_a_sound_capture_has_nothing_to_photograph_again(folder):
     assert found == {"weakly_connected": [], "blurred": [], "brightness_spread_stops": 0.0, "again": []}
 
 
+def _page(folder, names, survey, **report) -> str:
+    looks = looks_of(folder, NAMES)
+    report = _report(len(survey["photos"]), len(names), *sorted(set(names) - set(survey["photos"]))) | report
+    report |= findings(report, survey["photos"], looks)
+    write_page(folder / "capture.html", report, survey, looks, names, folder)
+    return (folder / "capture.html").read_text(encoding="utf-8")
+
+
+def test_the_page_shows_what_is_wrong_with_each_photo(folder):
+    """Of e and f there are no files."""
+    text = _page(folder, [*NAMES, "e<&.jpg", "f.jpg"], _survey(), tried=[{"way": "global", "against": ["f.jpg"]}])
+    cards = re.findall(r'<div id="photo\d+".*?<b>(.*?)</b>\n(.*?)</div>', text, re.S)
+    assert [(name, re.findall('"problem">(.*?)<', card)) for name, card in cards] == [
+        ("b.jpg", ["blurred"]), ("d.jpg", ["weakly connected"]), ("e&lt;&amp;.jpg", ["not placed"]),
+        ("f.jpg", ["left out: its matches contradict the others"]), ("a.jpg", []), ("c.jpg", []),
+    ]  # fmt: skip
+    assert "<dt>neighbours</dt><dd>2</dd>" in cards[0][1] and "<dt>matching photos</dt><dd>0</dd>" in cards[2][1]
+    assert [re.findall("brightness</dt><dd>(.*?)<", card) for _, card in cards[1:5]] == [["-2.0"], [], [], ["+0.0"]]
+    assert text.count("data:image/jpeg;base64,") == len(NAMES) and "e<&" not in text
+    assert re.findall('<a href="#photo(.)"( class="weak")?.*?<title>(.*?)</title>', text) == [
+        ("5", "", "c.jpg"), ("4", "", "a.jpg"), ("1", ' class="weak"', "d.jpg"), ("0", "", "b.jpg"),
+    ]  # fmt: skip
+    assert '<li class="problem">4 of 6 photos placed' in text and "<li>around d.jpg: fewer than 2 other" in text
+
+
+def test_a_page_of_many_photos_has_thumbnails_of_those_with_a_problem(folder):
+    survey = _survey()
+    survey["photos"] |= {f"{number:03d}.jpg": survey["photos"]["a.jpg"] for number in range(297)}
+    text = _page(folder, sorted(survey["photos"]), survey)
+    assert text.count("data:image/jpeg;base64,") == 2 and "only 2 photos with a problem have one" in text
+
+
+def test_the_page_shows_how_poses_were_judged_and_the_time_of_each_stage(folder):
+    text = _page(folder, NAMES, _survey())
+    assert "How the poses were judged" not in text and "<h2>Time</h2>" not in text
+    judged = {"photos": 4, "pairs": 6, "agreeing": 3, "bound": 4, "contradicting": 0.245, "error": 0.52}
+    tried = [{"way": "global", "seconds": 1.0, "own_error": 0.16} | judged, {"way": "incremental", "seconds": 2.0}]
+    text = _page(folder, NAMES, _survey(), tried=tried, seconds={"features": 2.04, "mapping": 61.0})
+    rows = [re.findall("<td>(.*?)</td>", row) for row in re.findall("<tr.*?</tr>", text, re.S)]
+    assert [row for row in rows if row] == [
+        ["global (chosen)", "4", "3 of 4", "24.5%", "0.52", "0.16"], ["incremental", "0", "-", "-", "-", "-"],
+        ["mapping", "61.0"], ["features", "2.0"],
+    ]  # fmt: skip
+    assert '<p class="warning">no way of mapping found poses that agree' in text
+
+
 def test_the_picture_is_from_above_and_not_mirrored():
     up = np.array([[0.0, -1.0, 0.1], [0.0, -1.0, -0.1]])
     across, forth = from_above(up)
@@ -82,7 +124,7 @@ def test_the_picture_is_from_above_and_not_mirrored():
 
 @pytest.mark.parametrize(("placed", "said"), [(5, True), (6, False), (10, False)])
 def test_too_few_photos_are_said(placed, said):
-    text = too_few(_report(placed, 10))
+    text = unusable(_report(placed, 10))
     assert (text is not None) == said and (not said or "only 5 of 10 photos" in text)
 
 

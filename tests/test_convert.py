@@ -108,7 +108,9 @@ def test_what_is_written(converted):
     content = json.loads((converted / "convert_report.json").read_text())
     assert list(content) == sorted(content)
     assert (content["registered"], content["photos"], content["left_out"], content["advice"]) == (VIEWS, VIEWS, {}, [])
-    assert content["points"] == len(read_scene(converted, "images", False).point_cloud.points)
+    assert content["points"] > 1000 and content["more_points"] > 1000
+    points = len(read_scene(converted, "images", False).point_cloud.points)
+    assert content["points"] + content["more_points"] == points
     for name in NAMES:
         with Image.open(converted / "images" / name) as whole:
             for factor in (2, 4, 8):
@@ -435,7 +437,7 @@ def test_gpu_options_have_the_names_of_the_colmap_that_is_there(tmp_path, prefix
     ((_, *match),) = program.matching()
     database = ["--database_path", str(layout.database)]
     assert match == ["exhaustive_matcher", *database, f"--{prefix}Matching.use_gpu", "0"]
-    (mapper,) = program.mapping()
+    (mapper,) = program.mapping("incremental", layout.models)
     assert mapper[1] == "mapper" and mapper[-2:] == ["--Mapper.ba_global_function_tolerance", "1e-06"]
 
 
@@ -445,11 +447,12 @@ def test_programs_that_can_not_do_it(tmp_path):
         Program("/bin/true", layout, SETTINGS)
     with pytest.raises(UserError, match="lists neither --FeatureExtraction.use_gpu nor --SiftExtraction.use_gpu"):
         Program(_fake_colmap(tmp_path, "New"), layout, SETTINGS)
-    calibrate, mapper = Program(_fake_colmap(tmp_path, "Sift"), layout, whole).mapping()
+    program = Program(_fake_colmap(tmp_path, "Sift"), layout, whole)
+    ((calibrate,), (mapper,)) = program.calibration(), program.mapping("global", layout.models)
     assert [calibrate[1], mapper[1]] == ["view_graph_calibrator", "global_mapper"]
     assert calibrate[3] == mapper[3] == str(layout.calibrated)
     old = _fake_colmap(tmp_path, "Sift", without="global_mapper")
-    Program(old, layout, SETTINGS)
+    assert Program(old, layout, replace(SETTINGS, mapper="auto")).ways == ("incremental",)
     with pytest.raises(UserError, match="COLMAP 9.9.*has no global_mapper; use --mapper incremental"):
         Program(old, layout, whole)
 
@@ -587,6 +590,8 @@ def test_points_are_computed_at_given_poses(tmp_path, capsys):
         # The walls are the planes x = 0, y = 0 and z = 0, some 4 units away, where a pixel is 0.02 units.
         off = np.abs([point.xyz for point in model.points3D.values()]).min(axis=1)
         assert len(off) > 1000 and np.median(off) < 0.005 and np.percentile(off, 95) < 0.04
+        alone = np.array([not point.track.length() for point in model.points3D.values()])  # of dense_points.py
+        assert alone.sum() > 1000 and np.median(off[alone]) < 0.01 and np.percentile(off[alone], 95) < 0.04
         views = read_scene(tmp_path, "images", hold_out=False).train_cameras
         assert all(read_tracks(tmp_path, views, np.zeros(3)))
 

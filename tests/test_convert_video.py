@@ -16,7 +16,6 @@ from skimage.metrics import structural_similarity
 
 import convert
 from splatting.sfm import video as video_module
-from splatting.sfm.colmap import Pycolmap, Settings
 from splatting.sfm.layout import Layout
 from splatting.sfm.video import choose_frames, extract_videos, sharpness, small_picture
 from utils.system_utils import UserError
@@ -125,32 +124,6 @@ def test_frames_that_an_ended_run_left_out_are_said(tmp_path, monkeypatch, capsy
     record = json.loads(layout.stages.read_text())
     layout.stages.write_text(json.dumps(record | {"video": record["video"] | {"done": False}}))
     assert ended() and not ended("--video", str(video)) and not ended()
-
-
-def test_a_later_run_without_the_video_matches_as_before(tmp_path, monkeypatch):
-    """Such as one for --orient: other matches would give other poses, and a trained model would be of another scene."""
-    layout, matchers = Layout(tmp_path / "scene"), []
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", _Decoder())
-
-    def backend(layout: Layout, settings: Settings) -> Pycolmap:
-        matchers.append(settings.matcher)
-        return Pycolmap(layout, settings)
-
-    monkeypatch.setattr(convert, "Pycolmap", backend)
-    for name in ("a.mp4", "b.mp4"):
-        (tmp_path / name).touch()
-
-    def matcher(*words: str) -> str:
-        with pytest.raises(UserError, match="has a mask"):
-            convert.main(["-s", str(layout.scene), "--mask_path", str(tmp_path), *words])
-        return matchers.pop()
-
-    assert matcher("--video", str(tmp_path / "a.mp4")) == matcher() == matcher("--orient") == "sequential"
-    assert matcher("--matcher", "exhaustive") == "exhaustive"
-    Image.new("RGB", (40, 30)).save(layout.input / "mine.jpg")
-    assert matcher() == "exhaustive"
-    (layout.input / "mine.jpg").unlink()
-    assert matcher("--video", str(tmp_path / "a.mp4"), str(tmp_path / "b.mp4")) == matcher() == "exhaustive"
 
 
 @pytest.fixture(scope="module")
@@ -333,7 +306,7 @@ def test_two_videos_and_photos_make_one_scene(ffmpeg, room, tmp_path, capsys):
     assert "left.mp4: 5 of 15 frames taken, not 150, since the others hardly differ" in said
     assert "12 of 12 photos placed" in said and f"note: {video_module.NOTE}" in said
     content = json.loads(layout.report.read_text())
-    assert content["notes"] == [video_module.NOTE] and content["matcher"] == "exhaustive"
+    assert content["notes"] == [video_module.NOTE] and content["matcher"] == "auto"
     assert content["videos"] == [
         {"video": "left.mp4", "frames": 15, "taken": 5, "asked": 150, "hdr": ""},
         {"video": "right.mp4", "frames": 12, "taken": 4, "asked": 150, "hdr": ""},

@@ -63,7 +63,7 @@ MAY_IMPORT = {
         *("arguments", "gaussian_renderer", "splatting.evaluation", "scene"),
         "splatting.parts",
     ),
-    "splatting.sfm": ("scene.readers", "scene.images", "splatting.parts"),
+    "splatting.sfm": ("scene.agreement", "scene.readers", "scene.images", "splatting.parts"),
     "splatting.demo": ("arguments", "splatting.evaluation"),
     "splatting": (),
     "benchmarks": (),

@@ -41,6 +41,11 @@ def kind_of(source_path: str | os.PathLike) -> str:
     return kind
 
 
+def is_scene(folder: str | os.PathLike) -> bool:
+    """Whether a folder has cameras of one of the kinds."""
+    return _kind(Path(folder)) is not None
+
+
 def _kind(folder: Path) -> str | None:
     if (folder / "sparse").is_dir():
         return COLMAP

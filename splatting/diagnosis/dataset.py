@@ -33,6 +33,7 @@ _WIDE = 1600
 _MOST = 0.75  # share of the views that another cause makes better
 _LONGER = 0.03  # difference of a focal length that counts; tracks tell a hundredth of it
 _ADJUST = "adjust the model again (COLMAP: bundle_adjuster)"
+_BENT = 2.0  # times the error of pairs alone, that a model's poses may have
 _WRONG = 5.0  # pixels, beyond which poses are wrong even if no better ones are near
 
 
@@ -54,7 +55,7 @@ def check_dataset(source: str, images: str) -> list[Line]:
         [Line(*one[:2]) for one in found],
     ]
     if not any(one.of_lens for one in found):  # else poses and colours have that cause
-        checks.append(check_geometry(source, info))
+        checks += [check_geometry(source, info), check_agreement(Path(source) / "sparse" / "0")]
     return [*_warnings(said.getvalue()), *chain(*checks, _check_registered(Path(source) / "convert_report.json"))]
 
 
@@ -172,6 +173,29 @@ def check_poses(views: Sequence[CameraInfo], tracks: Sequence[Track | None], ext
         yield Line(f"{text}, and {best:.2g} with better poses", ", or ".join(remedies))
     elif given > _WRONG:
         yield Line(text, "; ".join([_ADJUST, *(remedy(False) for remedy in tools("for_wrong_poses"))]))
+
+
+def check_agreement(folder: Path) -> Iterator[Line]:
+    """Photos of a COLMAP model whose tracks contradict each other, as where a part of it is in a wrong place."""
+    import pycolmap
+
+    from scene.agreement import FLOOR, pairs_by_tracks, verdict
+
+    try:
+        pairs = list(pairs_by_tracks(pycolmap.Reconstruction(str(folder))))
+    except (ValueError, RuntimeError, IndexError, OSError):
+        return  # no model of COLMAP's; the readers have said what is wrong with one
+    if not pairs:
+        return
+    photos = len({name for pair in pairs for name in (pair.first, pair.second)})
+    found, side = verdict(pairs), max(pair.side for pair in pairs)
+    text = f"the tracks of {found['agreeing']} of {photos} photos agree with each other"
+    bent = found["error"] > max(_BENT * found["own_error"], FLOOR * side)
+    if bent or found["agreeing"] < REGISTERED * photos:
+        errors = f"{found['error']:.2g} pixels by the poses and {found['own_error']:.2g} by pairs alone"
+        yield Line(f"only {text} (errors of {errors})", "compute the poses again, with convert.py or more photos")
+    else:
+        yield Line(text)
 
 
 def _check_registered(path: Path) -> Iterator[Line]:

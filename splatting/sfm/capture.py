@@ -15,6 +15,7 @@ from tqdm.contrib.concurrent import thread_map
 from splatting.files.image_files import open_image
 from splatting.files.listing import some
 from splatting.host.machine import threads
+from splatting.sfm.mapping import is_wrong
 from splatting.sfm.video import sharpness
 
 LEAST = 0.6  # share of the photos, below which too few are placed
@@ -67,6 +68,7 @@ def findings(
     each thing to photograph again.
     """
     neighbours = neighbours_of(photos)
+    against = {name for found in report.get("tried", [])[:1] for name in found.get("against", ())}
     weak = sorted(name for name, others in neighbours.items() if len(others) < min(FEW, len(photos) - 1))
     middle = float(np.median([look.sharpness for look in looks.values()])) if looks else 0.0
     blurred = sorted(name for name, look in looks.items() if look.sharpness < _BLURRED * middle)
@@ -76,7 +78,7 @@ def findings(
         "weakly_connected": weak,
         "blurred": blurred,
         "brightness_spread_stops": round(spread, 3),
-        "again": _again(sorted(report["left_out"]), weak, blurred, spread),
+        "again": _again(sorted(set(report["left_out"]) - against), weak, blurred, spread),
     }
 
 
@@ -103,7 +105,7 @@ def lines_of(report: Mapping[str, Any]) -> list[str]:
     """The report of a capture in a few lines, after its summary."""
     weak, blurred = report["weakly_connected"], report["blurred"]
     lines = []
-    if weak or not too_few(report):
+    if weak or not unusable(report):
         few = f"{len(weak)} of {report['registered']} photos weakly connected ({some(weak)})"
         lines.append(f"overlap: {few if weak else 'no photo is weakly connected'}")
     soft = f"{len(blurred)} of {report['photos']} photos blurred ({some(blurred)})"
@@ -120,9 +122,11 @@ def training_options(report: Mapping[str, Any]) -> str:
     return _EXPOSURES if any(_EXPOSURES in line for line in report["again"]) else ""
 
 
-def too_few(report: Mapping[str, Any]) -> str | None:
-    """What to say where too few photos are placed."""
+def unusable(report: Mapping[str, Any]) -> str | None:
+    """What to say where too few photos are placed, or where they contradict each other."""
     placed, count = report["registered"], report["photos"]
+    if report.get("tried") and is_wrong(report["tried"][0]):
+        return "no way of mapping found poses that agree with the photos' matches, so do not train on this scene"
     if placed >= LEAST * count:
         return None
     return (

@@ -1,70 +1,125 @@
 """The last stage of a conversion: what the capture is worth, and its page, capture.html.
 
-The page has the lines of the report, a picture of cameras and points from above, and a row for each photo.
+What the page shows is computed here; its texts are in capture.html.jinja.
 """
 
 import base64
-import html
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jinja2
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageOps
+from tqdm.contrib.concurrent import thread_map
 
+from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.json_files import read_json, write_json
-from splatting.sfm.capture import FEW, Look, findings, lines_of, looks_of, neighbours_of
+from splatting.host.machine import threads
+from splatting.sfm.capture import Look, findings, lines_of, looks_of, neighbours_of, training_options, unusable
 from splatting.sfm.layout import Layout, image_names
+from splatting.sfm.mapping import is_wrong
 from splatting.sfm.report import summary
 from splatting.sfm.stages import Stage
 from utils.system_utils import atomic_write
 
-_SIDE, _MARGIN, _ARROW = 900, 60, 24  # pixels of the picture
-_STYLE = "body{font:15px sans-serif;max-width:60em;margin:2em auto}td,th{padding:2px 12px;text-align:left}"
+_SIDE, _MARGIN = 900, 50  # pixels of the picture from above
+_THUMBNAIL = 120  # pixels of the longer side
+_MOST = 300  # thumbnails, of about 4 kB each
+_Data = Mapping[str, Any]  # of a JSON file
 
 
-def capture_stage(layout: Layout, names: Sequence[str]) -> Stage:
-    """Make the stage that looks at the finished scene, adds what it is worth to the report, and writes the page."""
+def capture_stage(layout: Layout, names: Sequence[str], seconds: Callable[[], dict[str, float]]) -> Stage:
+    """Make the stage that looks at the finished scene, adds what it is worth to the report, and writes the page.
+
+    seconds: of the stages before.
+    """
 
     def work() -> None:
         survey, root = read_json(layout.capture), layout.prepared if layout.prepared.is_dir() else layout.input
         looks = looks_of(root, image_names(root))
         report = read_json(layout.report)
-        report |= findings(report, survey["photos"], looks)
+        report |= {"seconds": seconds()} | findings(report, survey["photos"], looks)
         write_json(layout.report, report)
-        write_page(layout.page, report, survey, looks, sorted({*looks, *survey["photos"]}))
+        write_page(layout.page, report, survey, looks, sorted({*looks, *survey["photos"]}), root)
 
     return Stage("capture", list(names), lambda: None, work)
 
 
 def write_page(
-    path: Path, report: Mapping[str, Any], survey: Mapping[str, Any], looks: Mapping[str, Look], names: Sequence[str]
+    path: Path, report: _Data, survey: _Data, looks: Mapping[str, Look], names: Sequence[str], root: Path
 ) -> None:
-    """Write the page. survey: the content of capture.json. names: of all photos, in order."""
-    photos, neighbours = survey["photos"], neighbours_of(survey["photos"])
-    rows = []
-    for name in names:
-        if name in photos:
-            place = f"{photos[name]['points']} points, {len(neighbours[name])} neighbours"
-        else:
-            place = f"not placed, matches {report['left_out'].get(name, {}).get('partners', 0)} photos"
-        look = looks.get(name)
-        cells = [name, place, *((f"{look.sharpness:.0f}", f"{look.brightness:+.2f}") if look else ("", ""))]
-        rows.append("".join(f"<td>{html.escape(cell)}</td>" for cell in cells))
-    head = "".join(f"<th>{title}</th>" for title in ("photo", "place", "sharpness", "brightness (stops)"))
-    said = summary(report), *lines_of(report), *report["advice"]
-    listed = "".join(f"<li>{html.escape(line)}</li>" for line in said)
-    picture = base64.b64encode(_from_above(survey)).decode()
-    text = (
-        f"<!doctype html><meta charset=utf-8><title>Capture</title><style>{_STYLE}</style><h1>Capture</h1>"
-        f"<ul>{listed}</ul><h2>From above</h2><img width='100%' alt='cameras and points from above' "
-        f"src='data:image/png;base64,{picture}'><h2>Photos</h2><table><tr>{head}</tr>"
-        + "".join(f"<tr>{row}</tr>" for row in rows)
-        + "</table>\n"
-    )
+    """Write the page. survey: the content of capture.json. names: of all photos, in order. root: their folder."""
+    photos = _photos(report, survey["photos"], looks, names)
+    pictured = [photo for photo in photos if photo["problems"] or len(photos) <= _MOST][:_MOST]
+    files = [root / photo["name"] for photo in pictured]
+    thumbnails = thread_map(_thumbnail, files, max_workers=threads(), desc="Making thumbnails", dynamic_ncols=True)
+    for photo, thumbnail in zip(pictured, thumbnails, strict=True):
+        photo["thumbnail"] = thumbnail
+    options = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    environment = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), **options)
+    text = environment.get_template("capture.html.jinja").render(
+        above=_from_above(survey), is_wrong=is_wrong, lines=_lines(report), photos=photos, pictured=len(pictured),
+        report=report, scene=path.absolute().parent.name, unusable=unusable(report),
+    )  # fmt: skip
     with atomic_write(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        # Names that are not UTF-8 have surrogates, which appear as numbers.
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+
+
+def _lines(report: _Data) -> list[tuple[str, bool]]:
+    """The lines of the report but what to photograph again, each with whether it tells of a problem."""
+    found = {"overlap": report["weakly_connected"], "blur": report["blurred"], "brightness": training_options(report)}
+    said = lines_of(report)[: -len(report["again"]) or None]  # what to photograph again comes last
+    return [
+        (summary(report), bool(report["left_out"])),
+        *((line, bool(found.get(line.split(":")[0]))) for line in said),
+        *((line, True) for line in report["advice"]),
+    ]
+
+
+def _photos(report: _Data, placed: _Data, looks: Mapping[str, Look], names: Sequence[str]) -> list[dict[str, Any]]:
+    """Of each photo its name, problems and facts by title, those with problems first; `row` numbers them."""
+    neighbours, against = neighbours_of(placed), set((report.get("tried") or [{}])[0].get("against", ()))
+    sharpness, brightness = np.median(list(looks.values()), axis=0) if looks else (1, 0)
+    problems = {
+        "left out: its matches contradict the others": against,
+        "not placed": set(names) - set(placed) - against,
+        "weakly connected": set(report["weakly_connected"]),
+        "blurred": set(report["blurred"]),
+    }
+    photos = []
+    for name in names:
+        if name in placed:
+            facts = {"points": placed[name]["points"], "neighbours": len(neighbours[name])}
+        else:
+            facts = {"matching photos": report["left_out"].get(name, {}).get("partners", 0)}
+        if look := looks.get(name):
+            facts["sharpness"] = f"{look.sharpness / max(sharpness, 1e-9):.0%}"
+            facts["brightness"] = f"{round(look.brightness - brightness, 1) + 0:+.1f}"  # 0 is added as it ends -0.0
+        found = [problem for problem, of in problems.items() if name in of]
+        photos.append({"name": name, "problems": found, "facts": facts, "thumbnail": None})
+    photos.sort(key=lambda photo: not photo["problems"])
+    return [photo | {"row": row} for row, photo in enumerate(photos)]
+
+
+def _thumbnail(path: Path) -> str | None:
+    """A photo as a small embedded JPEG; None if it is missing or cannot be read."""
+    try:
+        with open_image(path) as image:
+            image.draft("RGB", (2 * _THUMBNAIL, 2 * _THUMBNAIL))  # decodes a large JPEG at a fraction of its size
+            small = ImageOps.exif_transpose(image).convert("RGB")
+    except UNREADABLE:
+        return None
+    small.thumbnail((_THUMBNAIL, _THUMBNAIL))
+    return _embedded(small, "JPEG", quality=70, optimize=True)
+
+
+def _embedded(image: Image.Image, kind: str, **options: Any) -> str:
+    buffer = io.BytesIO()
+    image.save(buffer, kind, **options)
+    return f"data:image/{kind.lower()};base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
 def from_above(directions: np.ndarray) -> np.ndarray:
@@ -76,35 +131,22 @@ def from_above(directions: np.ndarray) -> np.ndarray:
     return np.stack([first, np.cross(up, first)])
 
 
-def _from_above(survey: Mapping[str, Any]) -> bytes:
-    """A PNG: points in their colours, and each camera as an arrow along its view, the weakly connected ones red."""
+def _from_above(survey: _Data) -> dict[str, Any]:
+    """The picture from above: its size, the points as a PNG, and of each camera by name x, y, degrees and length."""
     photos = survey["photos"]
     places, views, ups = (np.array([photo[key] for photo in photos.values()]) for key in ("place", "view", "up"))
-    axes = from_above(ups)
+    axes = from_above(ups) * [[1], [-1]]  # y of a picture goes down
     points, colors = np.array(survey["points"]).reshape(-1, 3), np.array(survey["colors"], np.uint8).reshape(-1, 3)
-    weak = [len(others) < FEW for others in neighbours_of(photos).values()]
     flat, seen, along = places @ axes.T, points @ axes.T, views @ axes.T
     # Without the farthest points, which would leave the cameras a spot.
     low, high = (np.quantile(np.concatenate([flat, seen]), part, axis=0) for part in (0.02, 0.98))
     low, high = np.minimum(low, flat.min(0)), np.maximum(high, flat.max(0))
     scale = (_SIDE - 2 * _MARGIN) / max(float((high - low).max()), 1e-9)
-
-    def pixels(flat: np.ndarray) -> np.ndarray:
-        return _SIDE / 2 + (flat - (low + high) / 2) * [scale, -scale]
-
-    canvas = np.full((_SIDE, _SIDE, 3), 255, np.uint8)
-    x, y = pixels(seen).astype(int).T
-    inside = (x >= 0) & (x < _SIDE - 1) & (y >= 0) & (y < _SIDE - 1)
-    for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        canvas[y[inside] + down, x[inside] + right] = colors[inside]
-    picture = Image.fromarray(canvas)
-    draw = ImageDraw.Draw(picture)
-    for start, way, is_weak in zip(pixels(flat), along * [1, -1], weak, strict=True):
-        color, across = "red" if is_weak else "blue", np.array([-way[1], way[0]])
-        end = start + _ARROW * way
-        draw.line([tuple(start), tuple(end)], fill=color, width=2)
-        head = (end, end - 0.4 * _ARROW * way + 0.2 * _ARROW * across, end - 0.4 * _ARROW * way - 0.2 * _ARROW * across)
-        draw.polygon([tuple(corner) for corner in head], fill=color)
-    buffer = io.BytesIO()
-    picture.save(buffer, "PNG")
-    return buffer.getvalue()
+    size = ((high - low) * scale + 2 * _MARGIN).astype(int)
+    spots = ((seen - low) * scale + _MARGIN).astype(int) // 2  # half the picture's size, so that a point is 2 pixels
+    inside = ((spots >= 0) & (spots < size // 2)).all(1)
+    canvas = np.full((*size[::-1] // 2, 3), 255, np.uint8)
+    canvas[spots[inside, 1], spots[inside, 0]] = colors[inside]
+    cameras = np.c_[(flat - low) * scale + _MARGIN, np.degrees(np.arctan2(*along.T[::-1])), np.hypot(*along.T)]
+    named = dict(zip(photos, cameras.tolist(), strict=True))
+    return {"size": size.tolist(), "points": _embedded(Image.fromarray(canvas), "PNG", optimize=True), "cameras": named}

@@ -22,6 +22,7 @@ from utils.system_utils import UserError, atomic_write
 
 Command = list[str]
 TOLERANCE = 1e-6  # of the cost in global bundle adjustment, as in the reference: much faster, hardly worse
+ALL_PAIRS = 60  # photos of which --matcher auto matches every pair
 GIVEN = "triangulation"  # the mapper where poses are given
 ADDING = "adding"  # the mapper that keeps the poses of a scene
 PANORAMA = "EQUIRECTANGULAR"  # photos of all directions, twice as wide as high; no pinhole image shows them
@@ -34,6 +35,7 @@ LENS_MODELS = (
 # Fisheyes and panoramas, which see too much for a pinhole image, and through which train.py shows Gaussians.
 _WIDE = {model for model, (chart, *_) in MODELS.items() if chart != "perspective"}
 _WORKER = Path(__file__).with_name("worker.py")
+_GLOBAL = "view_graph_calibrator", "global_mapper"  # commands that older versions of COLMAP lack
 _PAIR = 2147483647  # COLMAP: pair_id = smaller image_id * this + larger image_id
 
 
@@ -42,7 +44,7 @@ class Settings:
     """The user's choices.
 
     camera: COLMAP's name of the lens model to fit. cameras: what shares one (cameras.MODES). lenses: native, undistort
-    or auto.
+    or auto. matcher: exhaustive, sequential or auto. mapper: global, incremental, auto, GIVEN or ADDING.
     """
 
     camera: str
@@ -76,10 +78,15 @@ class Backend:
     """
 
     identity: str
+    ways: tuple[str, ...]  # of mapping, in the order in which they are tried until a model agrees with its pairs
 
     def __init__(self, layout: Layout, settings: Settings) -> None:
         self.layout, self.settings = layout, settings
-        self.mapped = layout.calibrated if settings.mapper == "global" else layout.database
+        self.ways = ("global", "incremental", "free") if settings.mapper == "auto" else (settings.mapper,)
+
+    def calibration(self) -> list[Command]:
+        """Commands that write focal lengths into `layout.calibrated`, a copy of the database."""
+        return [worker_command(self.layout, "calibrate", calibrated=str(self.layout.calibrated))]
 
 
 class Pycolmap(Backend):
@@ -93,11 +100,12 @@ class Pycolmap(Backend):
         return self._command("features", groups=groups, masks=str(self.layout.masks) if masks else "")
 
     def matching(self) -> list[Command]:
-        return self._command("matching")
+        return self._command("matching", all_of=ALL_PAIRS)
 
-    def mapping(self) -> list[Command]:
-        step = self.settings.mapper if self.settings.mapper in (GIVEN, ADDING) else "mapping"
-        return self._command(step, database=str(self.mapped), tolerance=TOLERANCE)
+    def mapping(self, way: str, models: Path) -> list[Command]:
+        step = way if way in (GIVEN, ADDING) else "mapping"
+        places = {"models": str(models), "calibrated": str(self.layout.calibrated)}
+        return self._command(step, mapper=way, tolerance=TOLERANCE, **places)
 
     def _command(self, step: str, **job: Any) -> list[Command]:
         places = {"database": self.layout.database, "images": self.layout.prepared, "models": self.layout.models}
@@ -123,17 +131,19 @@ class Program(Backend):
                 "or omit the option to use pycolmap"
             )
         self.identity = named[0]
-        self._matcher = f"{settings.matcher}_matcher"
+        self._matcher = f"{'exhaustive' if settings.matcher == 'auto' else settings.matcher}_matcher"
         switch = "0" if settings.no_gpu else "1"
         # COLMAP 3.12 renamed these options when it got features other than SIFT.
         self._gpu_for_features = [self._known("feature_extractor", "Extraction.use_gpu"), switch]
         self._gpu_for_matching = [self._known(self._matcher, "Matching.use_gpu"), switch]
-        commands = ("view_graph_calibrator", "global_mapper") if settings.mapper == "global" else ()
-        if any(self._output(command, "-h") is None for command in commands):
+        self._maps_globally = all(self._output(name, "-h") is not None for name in _GLOBAL)
+        if settings.mapper == "global" and not self._maps_globally:
             raise UserError(
                 f"{executable} ({self.identity}) has no global_mapper; use --mapper incremental, or omit "
                 "--colmap_executable to use pycolmap's global mapper"
             )
+        if settings.mapper == "auto":
+            self.ways = ("global", "incremental") if self._maps_globally else ("incremental",)
 
     def features(self, groups: list[list[str]], masks: bool) -> list[Command]:
         commands = []
@@ -159,13 +169,17 @@ class Program(Backend):
     def matching(self) -> list[Command]:
         return [self._start(self._matcher, self.layout.database) + self._gpu_for_matching]
 
-    def mapping(self) -> list[Command]:
-        self.layout.models.mkdir(parents=True)
-        paths = ["--image_path", str(self.layout.prepared), "--output_path", str(self.layout.models)]
-        if self.settings.mapper == "global":
-            calibrate = self._start("view_graph_calibrator", self.mapped)
-            return [calibrate, [*self._start("global_mapper", self.mapped), *paths]]
-        return [[*self._start("mapper", self.mapped), *paths, "--Mapper.ba_global_function_tolerance", str(TOLERANCE)]]
+    def calibration(self) -> list[Command]:
+        calibrator, _ = _GLOBAL
+        return [self._start(calibrator, self.layout.calibrated)] if self._maps_globally else super().calibration()
+
+    def mapping(self, way: str, models: Path) -> list[Command]:
+        models.mkdir(parents=True)
+        paths = ["--image_path", str(self.layout.prepared), "--output_path", str(models)]
+        if way == "global":
+            return [[*self._start(_GLOBAL[1], self.layout.calibrated), *paths]]
+        started = self._start("mapper", self.layout.database)
+        return [[*started, *paths, "--Mapper.ba_global_function_tolerance", str(TOLERANCE)]]
 
     def _start(self, name: str, database: Path) -> Command:
         return [self._executable, name, "--database_path", str(database)]

@@ -112,7 +112,7 @@ def _prepare_image(source: Path, target: Path, taken: Collection[Path]) -> Path:
                 while target in taken:
                     target = target.with_name(target.name + _ENDS[written])
             if linked and image.getexif().get(_ORIENTATION, 1) in (0, 1):
-                _link(source, target)
+                link(source, target)
                 return target
             upright = ImageOps.exif_transpose(image)
             _save(upright, target, image, exif=upright.getexif())
@@ -170,7 +170,9 @@ def _save(image: Image.Image, target: Path, like: Image.Image, **options: object
     image.save(target, written, **options)
 
 
-def _link(source: Path, target: Path) -> None:
+def link(source: Path, target: Path) -> None:
+    """Make a hard link to a photo, or a copy of it where links are impossible."""
+    target.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(source, target)
     except OSError:

@@ -24,7 +24,9 @@ class Layout:
         self.masks, self.undistorted = work / "masks", work / "undistorted"
         self.models = work / "sparse"  # one sub-folder per model of the mapper: 0, 1, ...
         self.database = work / "database.db"
-        self.calibrated = work / "calibrated.db"  # a copy, into which global mapping writes its focal lengths
+        self.calibrated = work / "calibrated.db"  # a copy with focal lengths that the pairs tell
+        self.tried = work / "tried"  # models of each way of mapping, until one is chosen
+        self.judged = work / "judged.json"  # how far each agrees with its pairs, the chosen one first
         self.frames = work / "frames.json"  # which of `input` are frames of videos
         self.base = work / "base"  # what --add adds to
         self.base_database, self.base_model = self.base / self.database.name, self.base / "model"

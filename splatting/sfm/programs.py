@@ -5,6 +5,7 @@ working, and keep the lock on the log that they write to.
 """
 
 import fcntl
+import os
 import subprocess
 import time
 from collections.abc import Callable, Sequence
@@ -15,22 +16,39 @@ from splatting.host.interrupt import DeferredInterrupt
 from splatting.host.progress import Bar
 from utils.system_utils import UserError
 
+# worker.py is started by its path, and imports modules of the project.
+_ROOT = str(Path(__file__).resolve().parents[2])
+_FINDS = {"PYTHONPATH": os.pathsep.join(filter(None, [_ROOT, os.environ.get("PYTHONPATH")]))}
 _PATIENCE = 5.0  # seconds that a program gets to end by itself
+_TOLD = 0.05  # share of a stage, after which the time to go is guessed
 _ORPHAN_PATIENCE = 2.0  # seconds that a worker gets to notice that its caller was killed
 
 
 def run_programs(
-    log: Path, commands: Sequence[Sequence[str]], title: str, total: int, done: Callable[[], int], hint: str = ""
+    log: Path,
+    commands: Sequence[Sequence[str]],
+    title: str,
+    total: int,
+    done: Callable[[], int],
+    hint: str = "",
+    later: float = 0.0,
 ) -> None:
     """Run commands one after the other, append their output to `log`, and show `done()` of `total` as a bar.
 
+    later: how much longer than this all later stages take, for a guess at the time to go over all; 0: not known.
     UserError with the last line of the output if a command fails. Ctrl-C and SIGTERM end the command first.
     """
     with Bar(total=total, desc=title, dynamic_ncols=True) as bar, open(log, "ab") as output:
         _lock(output)
 
+        start = time.monotonic()
+
         def look() -> None:
             bar.update(min(max(done(), bar.n), total) - bar.n)
+            if later and bar.n > _TOLD * total:
+                whole = (time.monotonic() - start) * total / bar.n
+                to_go = whole * (1 + later) - (time.monotonic() - start)
+                bar.set_postfix_str(f"about {bar.format_interval(to_go)} for all", refresh=False)
 
         for command in commands:
             status = _run(command, output, look)
@@ -69,7 +87,9 @@ def _lock(output: BinaryIO) -> None:
 def _run(command: Sequence[str], output: BinaryIO, look: Callable[[], None]) -> int:
     with DeferredInterrupt() as interrupt:
         try:
-            process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT)
+            process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT, env=os.environ | _FINDS
+            )
         except OSError as error:
             raise UserError(f"cannot run {command[0]} ({error.strerror}); pass the program's full path") from error
         try:

@@ -1,11 +1,12 @@
 """Report of a conversion: the photos that were placed, and advice if the model is weak."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from splatting.files.json_files import read_json, write_json
 from splatting.files.listing import some
+from splatting.sfm.mapping import is_wrong
 from utils.system_utils import UserError
 
 FEWEST_POINTS = 1000  # with fewer, density control has to find the scene by itself
@@ -44,20 +45,28 @@ def refuse_nothing(models: Sequence[Model], images: Sequence[str], partners: dic
         reason = f"{matched} of them match another photo, but no pair has enough parallax or matches to start from"
     remedy = "take sharp, evenly lit photos that overlap by 60 to 80 %, from places some steps apart"
     if matcher == "sequential":
-        remedy += ", or use --matcher exhaustive"
+        remedy += ", or use --matcher auto"
     raise UserError(f"none of {len(images)} photos could be placed: {reason}; {remedy}")
 
 
 def advice(
-    models: Sequence[Model], images: Sequence[str], partners: dict[str, int], matcher: str, at_limit: int = 0
+    models: Sequence[Model],
+    images: Sequence[str],
+    partners: dict[str, int],
+    matcher: str,
+    at_limit: int = 0,
+    tried: Sequence[Mapping[str, Any]] = (),
+    more_points: int = 0,
 ) -> list[str]:
     """Return one line for each weakness of the chosen model, models[0], that training will show.
 
-    at_limit: --max_num_features if a photo reached it, else 0.
+    at_limit: --max_num_features if a photo reached it, else 0. tried: the models of mapping.py, the chosen one first.
+    more_points: of dense_points.py.
     """
     chosen = models[0]
-    out = sorted(set(images) - set(chosen.registered))
-    lines = []
+    against = list(tried[0].get("against", ())) if tried else []
+    out = sorted(set(images) - set(chosen.registered) - set(against))
+    lines = _of_judgement(tried[0], len(images)) if tried else []
     if out:
         lonely = sum(partners.get(name, 0) == 0 for name in out)
         text = f"{len(out)} of {len(images)} photos left out ({some(out)})"
@@ -65,18 +74,20 @@ def advice(
             text += f", {lonely} of them without a match in another photo"
         remedy = "take more photos on the way to the others, or remove what is blurred or shows something else"
         if matcher == "sequential":
-            remedy += "; --matcher exhaustive compares every pair"
+            remedy += "; --matcher auto compares more than neighbours"
         lines.append(f"{text}; {remedy}")
     others = [len(model.registered) for model in models[1:] if set(model.registered) - set(chosen.registered)]
     if others:
         sizes = ", ".join(map(str, others))
         lines.append(
             f"the photos form {len(others) + 1} unconnected parts ({len(chosen.registered)} photos are used, "
-            f"the other parts have {sizes}); take photos that lead from one part to the next, or try --mapper global, "
-            "and --cameras per_photo if they came through several lenses"
+            f"the other parts have {sizes}); take photos that lead from one part to the next, or try --cameras "
+            "per_photo if they came through several lenses"
         )
-    if chosen.points < FEWEST_POINTS:
-        text = f"only {chosen.points} points; a good start needs {FEWEST_POINTS}; use larger or more photos"
+    if chosen.points + more_points < FEWEST_POINTS:
+        text = (
+            f"only {chosen.points + more_points} points; a good start needs {FEWEST_POINTS}; use larger or more photos"
+        )
         lines.append(text + (f", or --max_num_features {2 * at_limit}" if at_limit else ""))
     if chosen.track_length < SHORT_TRACKS:
         lines.append(
@@ -88,6 +99,24 @@ def advice(
             f"the mean reprojection error is {chosen.error:.1f} pixels; if objects moved, mask them (--mask_path); if "
             "the photos come from several lenses, try --cameras per_photo; for a fisheye lens use --camera "
             "OPENCV_FISHEYE"
+        )
+    return lines
+
+
+def _of_judgement(found: Mapping[str, Any], photos: int) -> list[str]:
+    """What the matches say of the chosen model (mapping.py)."""
+    lines, against = [], found.get("against", ())
+    if is_wrong(found):
+        lines.append(
+            f"the poses contradict {found['contradicting']:.0%} of the matches that they were made from, so they are "
+            "probably wrong; if the photos came through several lenses, or are zoomed or cropped, use --cameras "
+            "per_photo; else remove photos of other things, and take more that overlap"
+        )
+    if against:
+        lines.append(
+            f"{len(against)} of {photos} photos left out ({some(against)}), since their matches contradict the others; "
+            "if they came through another lens, or are zoomed or cropped, use --cameras per_photo; else remove them, "
+            "and take more there"
         )
     return lines
 
@@ -116,6 +145,7 @@ def summary(report: dict[str, Any]) -> str:
     return (
         f"{report['registered']} of {report['photos']} photos placed; {report['points']} points, each in "
         f"{report['mean_track_length']:.1f} photos, mean error {report['mean_error_px']:.2f} pixels"
+        + (f"; {more} more points at these poses" if (more := report.get("more_points")) else "")
     )
 
 

@@ -1,8 +1,8 @@
 """pycolmap's long steps in their own process: `python worker.py JOB.json`, a file with {"step": ..., ...}.
 
 In another process, steps can be stopped at once, log to a file, and do not crash the caller when they crash. The worker
-ends when its standard input closes, so it does not outlive a caller that was killed. It imports nothing of the project,
-since only its own folder is on the path.
+ends when its standard input closes, so it does not outlive a caller that was killed. Of the project it imports only
+modules that need no torch.
 """
 
 import contextlib
@@ -19,7 +19,14 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from scene.agreement import judge
+from splatting.sfm import pairing
+
 SEED = 0
+LONGEST, LONGEST_OF_MANY = 1600, 1280  # pixels of a photo's longer side on which features are found
+MANY = 100  # photos
+_ABOUT = 1.05  # of LONGEST, that an enlarged photo may have
+TRACKS = 100  # points of a photo that global mapping of many photos solves for; all are triangulated afterwards
 FEWEST_SEEN = 50  # points of a photo that tell its focal length
 MOST_SEEN = 400  # that are asked: more take longer and tell no more
 _NEIGHBOURS, _SHOWN = 30, 5000  # other photos of a photo, and points, in capture.json
@@ -50,10 +57,28 @@ def features(job: dict[str, Any]) -> None:
             reader.existing_camera_id = next((known[name] for name in names if name in known), -1)
             if new := [name for name in names if name not in known]:
                 pycolmap.import_images(job["database"], job["images"], pycolmap.CameraMode.SINGLE, new, reader)
-    names = [name for group in job["groups"] for name in group]
-    pycolmap.extract_features(
-        job["database"], job["images"], names, pycolmap.CameraMode.AUTO, reader, options, _device(job)
-    )
+    for (octave, longest), names in _by_scale(job["database"]).items():
+        options.sift.first_octave, options.max_image_size = octave, longest
+        pycolmap.extract_features(
+            job["database"], job["images"], names, pycolmap.CameraMode.AUTO, reader, options, _device(job)
+        )
+
+
+def _by_scale(path: str) -> dict[tuple[int, int], list[str]]:
+    """Photos of a database by SIFT's first octave, which is -1 where they are enlarged twofold, and longest side.
+
+    The time grows with the pixels, and the error of the poses hardly falls with more of them.
+    """
+    database = pycolmap.Database.open(path)
+    images, sizes = database.read_all_images(), {one.camera_id: one for one in database.read_all_cameras()}
+    database.close()
+    longest = LONGEST if len(images) <= MANY else LONGEST_OF_MANY
+    found: dict[tuple[int, int], list[str]] = {}
+    for image in images:
+        camera = sizes[image.camera_id]
+        enlarged = 2 * max(camera.width, camera.height) <= _ABOUT * longest
+        found.setdefault((-1 if enlarged else 0, longest), []).append(image.name)
+    return found
 
 
 def _cameras_by_name(path: Path) -> dict[str, int]:
@@ -64,11 +89,18 @@ def _cameras_by_name(path: Path) -> dict[str, int]:
 
 def matching(job: dict[str, Any]) -> None:
     """Match and verify pairs of photos; skip pairs that the database already has."""
-    _assume_focal_lengths(job["database"])
-    match = {"exhaustive": pycolmap.match_exhaustive, "sequential": pycolmap.match_sequential}[job["matcher"]]
+    path = job["database"]
+    pairing.restore_names(path)
+    _assume_focal_lengths(path)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
-    match(job["database"], verification_options=verification, device=_device(job))
+    how = {"verification_options": verification, "device": _device(job)}
+    if job["matcher"] == "auto":
+        for pairs in pairing.rounds(path, job["all_of"]):
+            pairing.match(path, pairs, Path(path).with_name("pairs.txt"), **how)
+        return
+    match = {"exhaustive": pycolmap.match_exhaustive, "sequential": pycolmap.match_sequential}[job["matcher"]]
+    match(path, **how)
 
 
 def _assume_focal_lengths(path: str) -> None:
@@ -83,21 +115,45 @@ def _assume_focal_lengths(path: str) -> None:
     database.close()
 
 
+def calibrate(job: dict[str, Any]) -> None:
+    """Estimate focal lengths from pairs, where photos do not tell them, and write them into the database."""
+    options = pycolmap.ViewGraphCalibrationOptions()
+    options.random_seed = SEED
+    pycolmap.calibrate_view_graph(job["calibrated"], options)
+
+
 def mapping(job: dict[str, Any]) -> None:
-    """Compute poses and points; write one or more models into sub-folders of `models`."""
+    """Compute poses and points in the way `mapper`; write one or more models into sub-folders of `models`.
+
+    The ways global and incremental begin with the focal lengths of `calibrate`; free begins with none.
+    """
     os.makedirs(job["models"])
+    database = job["database" if job["mapper"] == "free" else "calibrated"]
     if job["mapper"] == "global":
-        # Global mapping needs initial focal lengths; this estimates them from the pairs.
-        calibration = pycolmap.ViewGraphCalibrationOptions()
-        calibration.random_seed = SEED
-        pycolmap.calibrate_view_graph(job["database"], calibration)
         options = pycolmap.GlobalPipelineOptions()
         options.random_seed, options.num_threads = SEED, THREADS
-        pycolmap.global_mapping(job["database"], job["images"], job["models"], options)
+        if _photos(database) > MANY:
+            options.mapper.track_required_tracks_per_view = TRACKS
+        pycolmap.global_mapping(database, job["images"], job["models"], options)
         return
     options = _incremental(job)
     options.min_model_size = 3  # a small model is better than none; the report shows its size
-    pycolmap.incremental_mapping(job["database"], job["images"], job["models"], options)
+    pycolmap.incremental_mapping(database, job["images"], job["models"], options)
+
+
+def _photos(path: str) -> int:
+    database = pycolmap.Database.open(path)
+    count = database.num_images()
+    database.close()
+    return count
+
+
+def keep(job: dict[str, Any]) -> None:
+    """Take the photos `left_out` out of the model in the folder `model`."""
+    model = pycolmap.Reconstruction(job["model"])
+    for name in job["left_out"]:
+        model.deregister_frame(model.find_image_with_name(name).frame_id)
+    model.write(job["model"])
 
 
 def _incremental(job: dict[str, Any]) -> pycolmap.IncrementalPipelineOptions:
@@ -154,25 +210,39 @@ def _enter_given(job: dict[str, Any]) -> None:
     database.close()
 
 
+def judging(job: dict[str, Any]) -> None:
+    """Judge the largest model in `models` by the pairs of `calibrated`; write its folder and that to the JSON `out`."""
+    models = _models(job["models"])
+    content = {"folder": models[0][0], "photos": models[0][1].num_reg_images()} if models else {}
+    content |= judge(models[0][1], job["calibrated"]) if models else {}
+    Path(job["out"]).write_text(json.dumps(content), encoding="utf-8")
+
+
 def survey(job: dict[str, Any]) -> None:
     """Write the contents of the models to the JSON file `out`."""
-    models = []
-    for folder in sorted(Path(job["models"]).iterdir()):
+    models = [
+        {
+            "folder": folder,
+            "registered": sorted(model.images[i].name for i in model.reg_image_ids()),
+            "points": model.num_points3D(),
+            "track_length": model.compute_mean_track_length(),
+            "error": model.compute_mean_reprojection_error(),
+            "cameras": [_camera(model, camera) for _, camera in sorted(model.cameras.items())],
+        }
+        for folder, model in _models(job["models"])
+    ]
+    Path(job["out"]).write_text(json.dumps(models), encoding="utf-8")
+
+
+def _models(path: str) -> list[tuple[str, pycolmap.Reconstruction]]:
+    """The models in the sub-folders of a folder, by name, the one with the most photos first."""
+    found = []
+    for folder in sorted(Path(path).iterdir()):
         try:
-            model = pycolmap.Reconstruction(str(folder))
+            found.append((folder.name, pycolmap.Reconstruction(str(folder))))
         except (ValueError, RuntimeError, IndexError):
             continue  # no model, or one whose writing was interrupted
-        models.append(
-            {
-                "folder": folder.name,
-                "registered": sorted(model.images[i].name for i in model.reg_image_ids()),
-                "points": model.num_points3D(),
-                "track_length": model.compute_mean_track_length(),
-                "error": model.compute_mean_reprojection_error(),
-                "cameras": [_camera(model, camera) for _, camera in sorted(model.cameras.items())],
-            }
-        )
-    Path(job["out"]).write_text(json.dumps(models), encoding="utf-8")
+    return sorted(found, key=lambda one: (-one[1].num_reg_images(), -one[1].num_points3D(), one[0]))
 
 
 def _camera(model: pycolmap.Reconstruction, camera: pycolmap.Camera) -> dict[str, Any]:
@@ -265,7 +335,10 @@ def _end_with_input() -> None:
     os._exit(1)
 
 
-STEPS = {step.__name__: step for step in (features, matching, mapping, adding, triangulation, survey, undistort)}
+STEPS = {
+    step.__name__: step
+    for step in (features, matching, calibrate, mapping, adding, triangulation, judging, keep, survey, undistort)
+}
 
 
 def main(path: str) -> None:

@@ -1,0 +1,231 @@
+"""Is a model right? It is judged, without any truth, by the pairs of photos that it was made from.
+
+A pair of photos has matches that passed a geometric check of the pair alone. Under the poses and lenses of a model, and
+under the pair's own best geometry, they have an epipolar error. A pair contradicts the model where the first is much
+larger. Photos are then grouped so that pairs within a group agree and pairs between groups contradict (correlation
+clustering by greedy additive edge contraction, Keuper et al. 2015): a part of the scene in a wrong place agrees with
+itself, and so do its photos with their neighbours, but not with the rest.
+"""
+
+import heapq
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pycolmap
+
+FEWEST = 15  # matches of a pair that is asked
+WORSE = 2.5  # times a pair's own error, beyond which it contradicts,
+FLOOR = 5e-4  # if that is also this share of the photo's longer side
+_HEARD = 100  # matches of a pair that count; or two photos that show nearly the same would outvote all others
+_SHARING = 10  # other photos of a photo, whose tracks are compared
+_ROUNDS = 3  # of reweighted least squares
+# Other pairs' focal lengths are not known well enough, or they show nothing of depth (COLMAP's configurations).
+_CALIBRATED = {
+    int(kind)
+    for kind in (
+        pycolmap.TwoViewGeometryConfiguration.CALIBRATED,
+        pycolmap.TwoViewGeometryConfiguration.PLANAR,
+        pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC,
+    )
+}
+
+
+class Pair(NamedTuple):
+    """Two photos of a model. error, own_error: medians (pixels) by the model and by the pair's own best geometry.
+
+    side: the longer one of the photos, pixels.
+    """
+
+    first: str
+    second: str
+    matches: int
+    error: float
+    own_error: float
+    side: int
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the model cannot explain what the pair by itself can."""
+        return self.error > max(WORSE * self.own_error, FLOOR * self.side)
+
+
+def judge(model: pycolmap.Reconstruction, database: str) -> dict[str, Any]:
+    """Judge a model by the verified pairs of a database whose focal lengths are calibrated; the result is JSON.
+
+    It is `verdict`, with bound: the number of photos that pairs join to one another, those without a pose, too.
+    """
+    return verdict(list(pairs_of(model, database))) | {"bound": len(joined(_linked(database)))}
+
+
+def verdict(pairs: Sequence[Pair]) -> dict[str, Any]:
+    """What pairs say of a model.
+
+    pairs: how many there are. contradicting: the share of their matches that belongs to pairs that contradict. error,
+    own_error: medians over pairs, pixels. agreeing: number of photos in the largest group. against: photos that
+    contradict this group; others may have no pair with it.
+    """
+    groups = consistent_groups(pairs)
+    member = {name: number for number, group in enumerate(groups) for name in group}
+    votes: dict[int, float] = {}
+    for pair in pairs:
+        one, other = sorted((member[pair.first], member[pair.second]))
+        if one == 0 < other:
+            votes[other] = votes.get(other, 0.0) + _vote(pair)
+    matches = sum(pair.matches for pair in pairs)
+    wrong = sum(pair.matches for pair in pairs if pair.contradicts)
+    return {
+        "pairs": len(pairs),
+        "contradicting": round(wrong / matches, 4) if matches else 0.0,
+        "error": round(float(np.median([pair.error for pair in pairs])), 4) if pairs else 0.0,
+        "own_error": round(float(np.median([pair.own_error for pair in pairs])), 4) if pairs else 0.0,
+        "agreeing": len(groups[0]) if groups else 0,
+        "against": sorted(name for number, vote in votes.items() if vote < 0 for name in groups[number]),
+    }
+
+
+def pairs_of(model: pycolmap.Reconstruction, path: str) -> Iterator[Pair]:
+    """The pairs of a database whose photos both have a pose in the model."""
+    database = pycolmap.Database.open(path)
+    posed = {image.name: image for image in model.images.values() if image.has_pose}
+    images = {one.image_id: posed[one.name] for one in database.read_all_images() if one.name in posed}
+    rays = {number: _rays(image.camera, database.read_keypoints(number)) for number, image in images.items()}
+    for number, geometry in zip(*database.read_two_view_geometries(), strict=True):
+        first, second = pycolmap.pair_id_to_image_pair(number)
+        if first in images and second in images and int(geometry.config) in _CALIBRATED:
+            matches = geometry.inlier_matches
+            seen = rays[first][matches[:, 0]], rays[second][matches[:, 1]]
+            if pair := judged_pair(images[first], images[second], *seen):
+                yield pair
+    database.close()
+
+
+def pairs_by_tracks(model: pycolmap.Reconstruction) -> Iterator[Pair]:
+    """Pairs of photos that share points of the model, where it has no database: for each photo those that share most.
+
+    They are of little weight where a program has left out what did not fit.
+    """
+    images = {number: model.images[number] for number in model.reg_image_ids()}
+    seen: dict[int, dict[int, int]] = {number: {} for number in images}
+    shared = {number: Counter() for number in images}
+    for number, point in model.points3D.items():
+        places = {element.image_id: element.point2D_idx for element in point.track.elements}
+        for image, place in places.items():
+            seen[image][number] = place
+            shared[image].update(other for other in places if other != image)
+    chosen = {(min(i, j), max(i, j)) for i in images for j, n in shared[i].most_common(_SHARING) if n >= FEWEST}
+    rays = {i: _rays(image.camera, np.array([p.xy for p in image.points2D])) for i, image in images.items() if seen[i]}
+    for first, second in sorted(chosen):
+        both = sorted(seen[first].keys() & seen[second].keys())
+        matched = (rays[i][[seen[i][number] for number in both]] for i in (first, second))
+        if pair := judged_pair(images[first], images[second], *matched):
+            yield pair
+
+
+def judged_pair(one: pycolmap.Image, other: pycolmap.Image, rays: np.ndarray, seen: np.ndarray) -> Pair | None:
+    """Judge the unit rays (N, 3) of matches in two photos by the photos' poses; None if there are too few."""
+    usable = np.isfinite(rays).all(1) & np.isfinite(seen).all(1)
+    rays, seen = rays[usable], seen[usable]
+    if len(rays) < FEWEST:
+        return None
+    moved = other.cam_from_world() * one.cam_from_world().inverse()
+    x, y, z = moved.translation / max(float(np.linalg.norm(moved.translation)), 1e-12)
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ moved.rotation.matrix()
+    scale = (_pixels(one.camera) + _pixels(other.camera)) / 2
+    errors = (float(np.median(error)) * scale for error in (angles(essential, rays, seen), own_angles(rays, seen)))
+    return Pair(one.name, other.name, len(rays), *errors, max(one.camera.width, one.camera.height))
+
+
+def angles(essential: np.ndarray, rays: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Angles (N,), radians, by which unit rays (N, 3) miss an essential matrix (3, 3).
+
+    Sampson's first-order distance (Hartley and Zisserman, eq. 11.9), with derivatives on the unit sphere instead of the
+    image plane, so that it holds for fisheyes and panoramas, too.
+    """
+    across, back = rays @ essential.T, seen @ essential
+    missed = (seen * across).sum(1)
+    slope = (across**2).sum(1) + (back**2).sum(1) - missed**2 - (back * rays).sum(1) ** 2
+    return np.abs(missed) / np.sqrt(np.maximum(slope, 1e-24))
+
+
+def own_angles(rays: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """`angles` (N,) of the matrix that fits the rays best: the eight-point algorithm, robust by reweighting.
+
+    The matrix need not be essential, so that a wrong lens counts, and a plane, which several matrices fit, does not.
+    """
+    # Spread over all directions by a change of axes, or the equations of a narrow view are nearly singular.
+    one, other = (np.linalg.inv(np.linalg.cholesky(ray.T @ ray / len(ray) + 1e-12 * np.eye(3))) for ray in (rays, seen))
+    rows = np.einsum("ni,nj->nij", seen @ other.T, rays @ one.T).reshape(len(rays), 9)
+    weights = error = np.ones(len(rays))
+    for _ in range(_ROUNDS):
+        matrix = other.T @ np.linalg.eigh((rows * weights[:, None]).T @ rows)[1][:, 0].reshape(3, 3) @ one
+        error = angles(matrix, rays, seen)
+        slope = ((rays @ matrix.T) ** 2).sum(1) + ((seen @ matrix) ** 2).sum(1)
+        usual = max(1.5 * float(np.median(error)), 1e-12)
+        weights = 1 / ((1 + (error / usual) ** 2) * np.maximum(slope, 1e-18))
+    return error
+
+
+def consistent_groups(pairs: Iterable[Pair]) -> list[list[str]]:
+    """Groups of photos, the largest first: join the two with the most votes between them while these are positive."""
+    votes: dict[str, dict[str, float]] = {}
+    for pair in pairs:
+        for one, other in ((pair.first, pair.second), (pair.second, pair.first)):
+            votes.setdefault(one, {})[other] = _vote(pair)
+    groups = {name: [name] for name in votes}
+    heap = [(-vote, one, other) for one, row in votes.items() for other, vote in row.items() if vote > 0]
+    heapq.heapify(heap)
+    while heap:
+        vote, one, other = heapq.heappop(heap)
+        if one not in votes or votes[one].get(other) != -vote:
+            continue  # joined since, or with other votes
+        if len(votes[one]) < len(votes[other]):
+            one, other = other, one
+        groups[one] += groups.pop(other)
+        for third, more in votes.pop(other).items():
+            del votes[third][other]
+            if third != one:
+                votes[one][third] = votes[third][one] = total = votes[one].get(third, 0.0) + more
+                if total > 0:
+                    heapq.heappush(heap, (-total, one, third))
+    return sorted(groups.values(), key=lambda group: (-len(group), min(group)))
+
+
+def joined(links: Iterable[tuple[Any, Any]]) -> set[Any]:
+    """The largest set of things that links connect."""
+    near: dict[Any, set[Any]] = {}
+    for one, other in links:
+        near.setdefault(one, set()).add(other)
+        near.setdefault(other, set()).add(one)
+    largest: set[Any] = set()
+    while near:
+        found, new = set(), {next(iter(near))}
+        while new:
+            found |= new
+            new = set().union(*(near.pop(one) for one in new)) - found
+        largest = max(largest, found, key=len)
+    return largest
+
+
+def _linked(path: str) -> list[tuple[int, int]]:
+    database = pycolmap.Database.open(path)
+    counted = zip(*database.read_two_view_geometry_num_inliers(), strict=True)
+    links = [pycolmap.pair_id_to_image_pair(number) for number, count in counted if count >= 2 * FEWEST]
+    database.close()
+    return links
+
+
+def _vote(pair: Pair) -> float:
+    return min(pair.matches, _HEARD) * (-1.0 if pair.contradicts else 1.0)
+
+
+def _rays(camera: pycolmap.Camera, keypoints: Any) -> np.ndarray:
+    places = np.asarray(getattr(keypoints, "data", keypoints), float)[:, :2]
+    rays = np.asarray(camera.cam_ray_from_img(places), float).reshape(-1, 3)
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def _pixels(camera: pycolmap.Camera) -> float:
+    """Pixels of a radian in the middle of a photo."""
+    return camera.mean_focal_length() if camera.focal_length_idxs() else camera.width / (2 * np.pi)

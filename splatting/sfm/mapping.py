@@ -1,0 +1,94 @@
+"""Mapping in several ways, until a model agrees with the pairs of photos that it was made from (scene/agreement.py).
+
+Each way fails on some captures, without saying so. The best model is kept, without photos that contradict the others.
+"""
+
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from splatting.files.json_files import read_json, write_json
+from splatting.sfm.colmap import (
+    ADDING,
+    ALL_PAIRS,
+    GIVEN,
+    Backend,
+    copy_database,
+    count_rows,
+    names_in,
+    worker_command,
+)
+
+AGREEING = 0.9  # share of the photos that pairs bind, which agree in a model that is kept at once
+CONTRADICTING = 0.1  # share of the matches, of which right models had 0.06 at most, and wrong ones 0.07 to 0.81
+SOUND = 0.6  # share of a model's photos that have to agree, or it is called wrong
+_NAMES = {"free": "incremental mapping without given focal lengths"}
+
+
+def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str, Any], None]) -> None:
+    """Fill `layout.models` with the models of the best way, and `layout.judged`.
+
+    run: runs commands. place: runs those of a way under a title.
+    """
+    layout = backend.layout
+    if backend.settings.mapper == GIVEN:
+        place("Mapping", backend.mapping(GIVEN, layout.models))
+        return
+    copy_database(layout.database, layout.calibrated)
+    run(backend.calibration(), "Calibrating")
+    tried: list[dict[str, Any]] = []
+    few = count_rows(layout.database, "images") <= ALL_PAIRS
+    ways = sorted(backend.ways, key=lambda way: (way == "free", few == (way == "global")))
+    for number, way in enumerate(ways):
+        start, models = time.monotonic(), layout.tried / way
+        place("Mapping" if not number else f"Mapping, try {number + 1}", backend.mapping(way, models))
+        found = {"way": way, "seconds": round(time.monotonic() - start, 1)} | _judged(backend, models, run)
+        tried.append(found)
+        if agrees(found):
+            break
+        if number + 1 < len(ways):
+            print(f"{_words(found)}; trying {_name(ways[number + 1])}")
+    tried.sort(key=lambda found: (found.get("agreeing", 0), found.get("photos", 0)), reverse=True)
+    best = tried[0]
+    (layout.tried / best["way"]).rename(layout.models)
+    shutil.rmtree(layout.tried, ignore_errors=True)
+    if best.get("against") and backend.settings.mapper == ADDING:
+        old = set(names_in(layout.base_database))
+        best["against"] = [name for name in best["against"] if name not in old]
+    if best.get("against"):
+        model = str(layout.models / best["folder"])
+        run([worker_command(layout, "keep", model=model, left_out=best["against"])], "Leaving out photos")
+    write_json(layout.judged, tried)
+
+
+def agrees(found: Mapping[str, Any]) -> bool:
+    """Whether a judged model is kept without another try."""
+    many = found.get("agreeing", 0) >= AGREEING * found.get("bound", 0) > 0
+    return many and found["contradicting"] <= CONTRADICTING
+
+
+def is_wrong(found: Mapping[str, Any]) -> bool:
+    """Whether a judged model is to be called wrong, although it is the best. One without pairs cannot be judged."""
+    if not found.get("pairs"):
+        return False
+    return found["contradicting"] > CONTRADICTING or found["agreeing"] < SOUND * found["photos"]
+
+
+def _judged(backend: Backend, models: Path, run: Callable[..., None]) -> dict[str, Any]:
+    out = backend.layout.work / "judging.json"
+    places = {"models": str(models), "calibrated": str(backend.layout.calibrated), "out": str(out)}
+    run([worker_command(backend.layout, "judging", **places)], "Judging")
+    return read_json(out)
+
+
+def _name(way: str) -> str:
+    return _NAMES.get(way, f"{way} mapping")
+
+
+def _words(found: Mapping[str, Any]) -> str:
+    if not found.get("photos"):
+        return f"{_name(found['way'])} placed no photo"
+    agree = f"{found['agreeing']} of {found['bound']} photos"
+    return f"{_name(found['way'])}: the matches of {agree} agree with their poses"

@@ -1,0 +1,199 @@
+"""Whether a model is right, judged by the pairs it was made from; and in which ways photos are mapped."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pycolmap
+import pytest
+from photo_room import cam_to_world, camera_centers
+from scipy.optimize import minimize
+
+from scene.agreement import Pair, angles, consistent_groups, joined, judge, own_angles, pairs_by_tracks, verdict
+from splatting.diagnosis.dataset import check_agreement
+from splatting.sfm import mapping
+
+COUNT, POINTS = 12, 200
+
+
+def _room(moved: dict[int, np.ndarray] | None = None, noise: float = 0.2) -> pycolmap.Reconstruction:
+    """Photos of random points, with noisy observations (pixels); moved: by number of photo, how far it is put away."""
+    rng = np.random.default_rng(0)
+    model, camera = pycolmap.Reconstruction(), pycolmap.Camera(
+        model="PINHOLE", width=800, height=600, params=[700.0, 700.0, 400.0, 300.0], camera_id=1
+    )  # fmt: skip
+    model.add_camera_with_trivial_rig(camera)
+    points = rng.uniform(-0.8, 0.8, (POINTS, 3)) + [0, 0, 0.6]
+    tracks = [pycolmap.Track() for _ in points]
+    for number, center in enumerate(camera_centers(COUNT)):
+        turn = pycolmap.Rotation3d(cam_to_world(center).T)
+        seen = camera.img_from_cam((cam_to_world(center).T @ (points - center).T).T)
+        seen = np.asarray(seen) + noise * rng.normal(size=(POINTS, 2))
+        center = center + (moved or {}).get(number, 0.0)
+        pose = pycolmap.Rigid3d(turn, -(turn.matrix() @ center))
+        image = pycolmap.Image(name=f"{number:02d}.jpg", keypoints=seen, camera_id=1, image_id=number + 1)
+        model.add_image_with_trivial_frame(image, pose)
+        for place, track in enumerate(tracks):
+            track.add_element(number + 1, place)
+    for point, track in zip(points, tracks, strict=True):
+        model.add_point3D(point, track, np.zeros(3, np.uint8))
+    return model
+
+
+def test_angles_are_the_least_by_which_both_rays_must_turn():
+    """To first order, by SciPy; for rays in all directions, as panoramas have them."""
+    rng = np.random.default_rng(0)
+    essential = np.array([[0, -0.3, 0.2], [0.3, 0, -1.0], [-0.2, 1.0, 0]])
+    rays = _unit(rng.normal(size=(8, 3)))
+    planes = _unit(rays @ essential.T)
+    seen = _unit(np.cross(planes, rng.normal(size=(8, 3))) + 1e-3 * planes)
+
+    def turned(by: np.ndarray, one: np.ndarray, other: np.ndarray) -> float:
+        first, second = (
+            _unit((ray + np.cross(turn, ray))[None])[0]
+            for ray, turn in zip((one, other), (by[:3], by[3:]), strict=True)
+        )
+        return second @ essential @ first
+
+    for one, other, found in zip(rays, seen, angles(essential, rays, seen), strict=True):
+        met = {"type": "eq", "fun": turned, "args": (one, other)}
+        best = minimize(lambda by: by @ by, np.full(6, 1e-4), constraints=[met], tol=1e-14)
+        assert best.success and found == pytest.approx(np.sqrt(best.fun), rel=0.01)
+
+
+def _unit(rows: np.ndarray) -> np.ndarray:
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def test_own_geometry_of_a_pair_is_found_beside_matches_that_are_off():
+    """A tenth of them by 4 pixels, as many as COLMAP's check lets pass; the others lie where they should."""
+    model = _room(noise=0.0)
+    pair = next(iter(pairs_by_tracks(model)))
+    assert pair.error < 1e-6 and pair.own_error < 1e-6
+    rng, rays = np.random.default_rng(0), []
+    for number in (1, 2):
+        seen = np.array([point.xy for point in model.images[number].points2D])
+        seen[:20] += rng.normal(scale=4, size=(20, 2))
+        rays.append(_unit(np.asarray(model.cameras[1].cam_ray_from_img(seen))))
+    assert np.median(own_angles(*rays)[20:]) * 700 < 0.3  # pixels
+
+
+def test_a_photo_in_a_wrong_place_is_named():
+    found = verdict([*pairs_by_tracks(_room())])
+    assert (found["agreeing"], found["contradicting"], found["against"]) == (COUNT, 0, [])
+    found = verdict([*pairs_by_tracks(_room({5: np.array([0.1, -0.1, 0.2])}))])
+    assert found["against"] == ["05.jpg"] and found["agreeing"] == COUNT - 1
+
+
+def test_a_part_in_a_wrong_place_is_named_although_it_agrees_with_itself():
+    aside = dict.fromkeys(range(8, COUNT), np.array([0.3, 0.2, 0.4]))
+    found = verdict([*pairs_by_tracks(_room(aside))])
+    assert found["against"] == [f"{number:02d}.jpg" for number in range(8, COUNT)] and found["agreeing"] == 8
+
+
+def test_the_doctor_names_a_model_whose_tracks_contradict_each_other(tmp_path):
+    for name, moved in (("right", {}), ("wrong", dict.fromkeys(range(8, COUNT), np.array([0.3, 0.2, 0.4])))):
+        (tmp_path / name).mkdir()
+        _room(moved).write(str(tmp_path / name))
+        (line,) = check_agreement(tmp_path / name)
+        assert line.finding == (name == "wrong")
+        assert f"the tracks of {8 if moved else COUNT} of {COUNT} photos agree with each other" in line.text
+    assert not [*check_agreement(tmp_path / "nothing")]
+
+
+def _pair(one: str, other: str, wrong: bool = False, matches: int = 50) -> Pair:
+    return Pair(one, other, matches, 9.0 if wrong else 0.1, 0.1, 800)
+
+
+def test_groups_are_those_between_which_pairs_contradict():
+    chain = [_pair(a, b) for a, b in ("ab", "bc", "ac", "de", "ef", "df")]
+    groups = consistent_groups([*chain, _pair("c", "d", wrong=True), _pair("a", "f", matches=20)])
+    assert [sorted(group) for group in groups] == [[*"abc"], [*"def"]]
+    groups = consistent_groups([*chain, _pair("c", "d", wrong=True), _pair("a", "f", matches=60)])
+    assert [sorted(group) for group in groups] == [[*"abcdef"]]
+    # Hundreds of matches of two photos that show nearly the same do not outvote several other pairs.
+    voted = [_pair("a", "d", matches=900), *(_pair(a, b, wrong=True) for a, b in ("bd", "cd", "be"))]
+    assert len(consistent_groups([*chain, *voted])) == 2
+
+
+def test_the_largest_joined_set():
+    assert joined([(1, 2), (3, 4), (4, 5)]) == {3, 4, 5} and joined([]) == set()
+
+
+def test_pairs_of_a_database_judge_a_model(tmp_path):
+    """Only photos with a pose in the model are asked, and only pairs of known focal lengths."""
+    model, path = _room(), str(tmp_path / "database.db")
+    database = pycolmap.Database.open(path)
+    database.write_camera(model.cameras[1], use_camera_id=True)
+    database.write_rig(model.rigs[1], use_rig_id=True)
+    for number, image in sorted(model.images.items()):
+        database.write_frame(model.frames[number], use_frame_id=True)
+        database.write_image(image, use_image_id=True)
+        database.write_keypoints(number, np.array([point.xy for point in image.points2D], np.float32))
+    same = np.repeat(np.arange(POINTS, dtype=np.uint32)[:, None], 2, axis=1)
+    for one in range(1, COUNT + 1):
+        for other in range(one + 1, COUNT + 1):
+            kind = pycolmap.TwoViewGeometryConfiguration
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = kind.UNCALIBRATED if other == one + 1 else kind.CALIBRATED
+            geometry.inlier_matches = same[:POINTS]
+            database.write_two_view_geometry(one, other, geometry)
+    database.close()
+    wrong = _room({5: np.array([0.1, -0.1, 0.2])})
+    wrong.deregister_frame(wrong.images[1].frame_id)
+    found = judge(wrong, path)
+    assert (found["pairs"], found["agreeing"], found["bound"]) == (10 * 9 // 2, COUNT - 2, COUNT)
+    assert found["against"] == ["05.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("count", "agreeing", "tried", "kept"),
+    [
+        (20, {"incremental": 20}, ["incremental"], "incremental"),
+        (20, {"incremental": 12, "global": 19}, ["incremental", "global"], "global"),
+        (90, {"global": 90}, ["global"], "global"),
+        (90, {"global": 50, "incremental": 70, "free": 60}, ["global", "incremental", "free"], "incremental"),
+    ],
+)
+def test_ways_are_tried_until_one_agrees(tmp_path, monkeypatch, capsys, count, agreeing, tried, kept):
+    work, done = tmp_path / "distorted", []
+    layout = SimpleNamespace(
+        database=work / "a.db", calibrated=work / "b.db", tried=work / "tried", models=work / "sparse", work=work,
+        judged=work / "judged.json",
+    )  # fmt: skip
+    work.mkdir()
+    settings = SimpleNamespace(mapper="auto")
+    backend = SimpleNamespace(
+        layout=layout, settings=settings, ways=("global", "incremental", "free"), calibration=lambda: [],
+        mapping=lambda way, models: [(way, models)],
+    )  # fmt: skip
+
+    def place(_: str, commands: list[tuple[str, Path]]) -> None:
+        ((way, models),) = commands
+        done.append(way)
+        (models / "0").mkdir(parents=True)
+        (models / "0" / way).touch()
+
+    def run(_: list, title: str) -> None:
+        if title == "Judging":
+            agree = agreeing[done[-1]]
+            found = {"folder": "0", "photos": count, "pairs": 99, "agreeing": agree, "bound": count}
+            found |= {"contradicting": 0.01, "against": [], "error": 0.1, "own_error": 0.1}
+            (work / "judging.json").write_text(json.dumps(found))
+
+    monkeypatch.setattr(mapping, "copy_database", lambda *_: None)
+    monkeypatch.setattr(mapping, "count_rows", lambda *_: count)
+    mapping.map_photos(backend, run, place)
+    assert done == tried and (layout.models / "0" / kept).is_file() and not layout.tried.exists()
+    judged = json.loads(layout.judged.read_text())
+    assert judged[0]["way"] == kept and len(judged) == len(tried)
+    assert capsys.readouterr().out.count("; trying ") == len(tried) - 1
+
+
+def test_when_a_model_is_called_wrong():
+    right = {"pairs": 90, "contradicting": 0.05, "agreeing": 40, "photos": 42, "bound": 42}
+    assert mapping.agrees(right) and not mapping.is_wrong(right)
+    assert not mapping.agrees(right | {"agreeing": 30}) and not mapping.is_wrong(right | {"agreeing": 30})
+    assert mapping.is_wrong(right | {"agreeing": 20}) and mapping.is_wrong(right | {"contradicting": 0.3})
+    assert not mapping.is_wrong({"pairs": 0}) and not mapping.agrees({})  # nothing to judge by
