@@ -18,6 +18,7 @@ import pycolmap
 FEWEST = 15  # matches of a pair that is asked
 WORSE = 2.5  # times a pair's own error, beyond which it contradicts,
 FLOOR = 5e-4  # if that is also this share of the photo's longer side
+_BEHIND = 0.7  # share of a pair's matches behind a photo, from which it contradicts; without parallax it is a half
 _HEARD = 100  # matches of a pair that count; or two photos that show nearly the same would outvote all others
 _SHARING = 10  # other photos of a photo, whose tracks are compared
 _ROUNDS = 3  # of reweighted least squares
@@ -35,7 +36,7 @@ _CALIBRATED = {
 class Pair(NamedTuple):
     """Two photos of a model. error, own_error: medians (pixels) by the model and by the pair's own best geometry.
 
-    side: the longer one of the photos, pixels.
+    side: the longer one of the photos, pixels. behind: share of the matches that the model puts behind a photo.
     """
 
     first: str
@@ -44,11 +45,12 @@ class Pair(NamedTuple):
     error: float
     own_error: float
     side: int
+    behind: float = 0.0
 
     @property
     def contradicts(self) -> bool:
         """Whether the model cannot explain what the pair by itself can."""
-        return self.error > max(WORSE * self.own_error, FLOOR * self.side)
+        return self.error > max(WORSE * self.own_error, FLOOR * self.side) or self.behind > _BEHIND
 
 
 def judge(model: pycolmap.Reconstruction, database: str) -> dict[str, Any]:
@@ -134,7 +136,20 @@ def judged_pair(one: pycolmap.Image, other: pycolmap.Image, rays: np.ndarray, se
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ moved.rotation.matrix()
     scale = (_pixels(one.camera) + _pixels(other.camera)) / 2
     errors = (float(np.median(error)) * scale for error in (angles(essential, rays, seen), own_angles(rays, seen)))
-    return Pair(one.name, other.name, len(rays), *errors, max(one.camera.width, one.camera.height))
+    side = max(one.camera.width, one.camera.height)
+    behind = share_behind(moved.rotation.matrix(), np.array([x, y, z]), rays, seen)
+    return Pair(one.name, other.name, len(rays), *errors, side, behind)
+
+
+def share_behind(rotation: np.ndarray, shift: np.ndarray, rays: np.ndarray, seen: np.ndarray) -> float:
+    """Share of matches whose rays (N, 3) meet behind one of two cameras, as where their order along a path is turned.
+
+    rotation (3, 3), shift (3,): from the first camera to the second. An essential matrix has no such sign.
+    """
+    turned = rays @ rotation.T
+    apart = np.cross(turned, seen)
+    depths = (np.cross(seen, shift) * apart).sum(1), (np.cross(turned, shift) * apart).sum(1)  # times a square
+    return float(((depths[0] < 0) | (depths[1] < 0)).mean())
 
 
 def angles(essential: np.ndarray, rays: np.ndarray, seen: np.ndarray) -> np.ndarray:

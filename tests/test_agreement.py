@@ -10,7 +10,17 @@ import pytest
 from photo_room import cam_to_world, camera_centers
 from scipy.optimize import minimize
 
-from scene.agreement import Pair, angles, consistent_groups, joined, judge, own_angles, pairs_by_tracks, verdict
+from scene.agreement import (
+    Pair,
+    angles,
+    consistent_groups,
+    joined,
+    judge,
+    own_angles,
+    pairs_by_tracks,
+    share_behind,
+    verdict,
+)
 from splatting.diagnosis.dataset import check_agreement
 from splatting.sfm import mapping
 
@@ -100,6 +110,18 @@ def test_the_doctor_names_a_model_whose_tracks_contradict_each_other(tmp_path):
         assert line.finding == (name == "wrong")
         assert f"the tracks of {8 if moved else COUNT} of {COUNT} photos agree with each other" in line.text
     assert not [*check_agreement(tmp_path / "nothing")]
+
+
+def test_an_order_that_is_turned_contradicts_though_its_epipolar_planes_fit():
+    model = _room(noise=0.0)
+    one, other = (model.images[number] for number in (1, 2))
+    rays = [
+        _unit(np.asarray(model.cameras[1].cam_ray_from_img(np.array([p.xy for p in i.points2D])))) for i in (one, other)
+    ]
+    moved = other.cam_from_world() * one.cam_from_world().inverse()
+    assert share_behind(moved.rotation.matrix(), moved.translation, *rays) == 0
+    assert share_behind(moved.rotation.matrix(), -moved.translation, *rays) == 1
+    assert _pair("a", "b")._replace(behind=0.9).contradicts and not _pair("a", "b")._replace(behind=0.5).contradicts
 
 
 def _pair(one: str, other: str, wrong: bool = False, matches: int = 50) -> Pair:
