@@ -23,6 +23,7 @@ from scene.agreement import (
 )
 from splatting.diagnosis.dataset import check_agreement
 from splatting.sfm import mapping
+from utils.system_utils import UserError
 
 COUNT, POINTS = 12, 200
 
@@ -176,6 +177,7 @@ def test_pairs_of_a_database_judge_a_model(tmp_path):
         (20, {"incremental": 12, "global": 19}, ["incremental", "global"], "global"),
         (90, {"global": 90}, ["global"], "global"),
         (90, {"global": 50, "incremental": 70, "free": 60}, ["global", "incremental", "free"], "incremental"),
+        (90, {"incremental": 89}, ["global", "incremental"], "incremental"),  # the first one fails
     ],
 )
 def test_ways_are_tried_until_one_agrees(tmp_path, monkeypatch, capsys, count, agreeing, tried, kept):
@@ -194,6 +196,8 @@ def test_ways_are_tried_until_one_agrees(tmp_path, monkeypatch, capsys, count, a
     def place(_: str, commands: list[tuple[str, Path]]) -> None:
         ((way, models),) = commands
         done.append(way)
+        if way not in agreeing:
+            raise UserError("no such way")
         (models / "0").mkdir(parents=True)
         (models / "0" / way).touch()
 
@@ -211,6 +215,22 @@ def test_ways_are_tried_until_one_agrees(tmp_path, monkeypatch, capsys, count, a
     judged = json.loads(layout.judged.read_text())
     assert judged[0]["way"] == kept and len(judged) == len(tried)
     assert capsys.readouterr().out.count("; trying ") == len(tried) - 1
+
+
+def test_mapping_that_fails_in_every_way_says_why(tmp_path, monkeypatch):
+    def fail(*_: object) -> None:
+        raise UserError("no disk left")
+
+    monkeypatch.setattr(mapping, "copy_database", lambda *_: None)
+    layout = SimpleNamespace(
+        database=tmp_path / "a.db", calibrated=tmp_path / "b.db", tried=tmp_path / "tried", work=tmp_path
+    )
+    settings = SimpleNamespace(mapper="auto")
+    backend = SimpleNamespace(
+        layout=layout, settings=settings, ways=("global", "free"), calibration=lambda: [], mapping=lambda *_: []
+    )
+    with pytest.raises(UserError, match="no disk left"):
+        mapping.map_photos(backend, lambda *_: None, fail)
 
 
 def test_when_a_model_is_called_wrong():

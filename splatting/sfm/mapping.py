@@ -4,9 +4,10 @@ Each way fails on some captures, without saying so. The best model is kept, with
 """
 
 import shutil
+import sys
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 from splatting.files.json_files import read_json, write_json
@@ -15,11 +16,13 @@ from splatting.sfm.colmap import (
     ALL_PAIRS,
     GIVEN,
     Backend,
+    Command,
     copy_database,
     count_rows,
     names_in,
     worker_command,
 )
+from utils.system_utils import UserError
 
 AGREEING = 0.9  # share of the photos that pairs bind, which agree in a model that is kept at once
 CONTRADICTING = 0.1  # share of the matches, of which right models had 0.06 at most, and wrong ones 0.07 to 0.81
@@ -42,16 +45,18 @@ def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str,
     few = count_rows(layout.database, "images") <= ALL_PAIRS
     ways = sorted(backend.ways, key=lambda way: (way == "free", few == (way == "global")))
     for number, way in enumerate(ways):
-        start, models = time.monotonic(), layout.tried / way
-        place("Mapping" if not number else f"Mapping, try {number + 1}", backend.mapping(way, models))
-        found = {"way": way, "seconds": round(time.monotonic() - start, 1)} | _judged(backend, models, run)
-        tried.append(found)
-        if agrees(found):
+        title = "Mapping" if not number else f"Mapping, try {number + 1}"
+        tried.append(_tried(backend, way, partial(place, title), run))
+        if agrees(tried[-1]):
             break
         if number + 1 < len(ways):
-            print(f"{_words(found)}; trying {_name(ways[number + 1])}")
+            print(f"{_words(tried[-1])}; trying {_name(ways[number + 1])}")
     tried.sort(key=lambda found: (found.get("agreeing", 0), found.get("photos", 0)), reverse=True)
     best = tried[0]
+    if "failed" in best:
+        if not any((layout.tried / best["way"]).glob("*/*")):
+            raise UserError(best["failed"])
+        print(f"warning: the poses could not be judged: {best['failed']}", file=sys.stderr)
     (layout.tried / best["way"]).rename(layout.models)
     shutil.rmtree(layout.tried, ignore_errors=True)
     if best.get("against") and backend.settings.mapper == ADDING:
@@ -76,11 +81,19 @@ def is_wrong(found: Mapping[str, Any]) -> bool:
     return found["contradicting"] > CONTRADICTING or found["agreeing"] < SOUND * found["photos"]
 
 
-def _judged(backend: Backend, models: Path, run: Callable[..., None]) -> dict[str, Any]:
-    out = backend.layout.work / "judging.json"
+def _tried(
+    backend: Backend, way: str, place: Callable[[list[Command]], None], run: Callable[..., None]
+) -> dict[str, Any]:
+    """Map in one way, and judge what comes out. `failed` is a message, instead of what the judgement found."""
+    start, models, out = time.monotonic(), backend.layout.tried / way, backend.layout.work / "judging.json"
     places = {"models": str(models), "calibrated": str(backend.layout.calibrated), "out": str(out)}
-    run([worker_command(backend.layout, "judging", **places)], "Judging")
-    return read_json(out)
+    try:
+        place(backend.mapping(way, models))
+        run([worker_command(backend.layout, "judging", **places)], "Judging")
+        found = read_json(out)
+    except UserError as error:
+        found = {"failed": str(error)}
+    return {"way": way, "seconds": round(time.monotonic() - start, 1)} | found
 
 
 def _name(way: str) -> str:
@@ -88,6 +101,8 @@ def _name(way: str) -> str:
 
 
 def _words(found: Mapping[str, Any]) -> str:
+    if "failed" in found:
+        return f"{_name(found['way'])} failed"
     if not found.get("photos"):
         return f"{_name(found['way'])} placed no photo"
     agree = f"{found['agreeing']} of {found['bound']} photos"
