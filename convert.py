@@ -61,6 +61,7 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     names = found.photos
     if args.skip_matching:
         planned = []
+        layout.judged.unlink(missing_ok=True)  # of the models of an earlier run
         program = "--skip_matching: the model that was in distorted/sparse"
         made_from = [names, stages.model_state(layout)]
     else:

@@ -176,8 +176,13 @@ def test_pairs_of_a_database_judge_a_model(tmp_path):
         (20, {"incremental": 20}, ["incremental"], "incremental"),
         (20, {"incremental": 12, "global": 19}, ["incremental", "global"], "global"),
         (90, {"global": 90}, ["global"], "global"),
-        (90, {"global": 50, "incremental": 70, "free": 60}, ["global", "incremental", "free"], "incremental"),
-        (90, {"incremental": 89}, ["global", "incremental"], "incremental"),  # the first one fails
+        (
+            90,
+            {"global": 50, "simple": 40, "incremental": 70, "free": 60},
+            ["global", "simple", "incremental", "free"],
+            "incremental",
+        ),
+        (90, {"incremental": 89}, ["global", "simple", "incremental"], "incremental"),  # the first two fail
     ],
 )
 def test_ways_are_tried_until_one_agrees(tmp_path, monkeypatch, capsys, count, agreeing, tried, kept):
@@ -189,7 +194,7 @@ def test_ways_are_tried_until_one_agrees(tmp_path, monkeypatch, capsys, count, a
     work.mkdir()
     settings = SimpleNamespace(mapper="auto")
     backend = SimpleNamespace(
-        layout=layout, settings=settings, ways=("global", "incremental", "free"), calibration=lambda: [],
+        layout=layout, settings=settings, ways=("global", "simple", "incremental", "free"), calibration=lambda: [],
         mapping=lambda way, models: [(way, models)],
     )  # fmt: skip
 

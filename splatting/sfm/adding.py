@@ -25,7 +25,7 @@ def keep_base(layout: Layout, finished: bool, names: Sequence[str]) -> None:
         shutil.rmtree(new, ignore_errors=True)
         new.mkdir()
         copy_database(layout.database, new / layout.database.name)
-        largest = read_survey(layout.work / "survey.json")[0]
+        largest = read_survey(layout)[0]
         shutil.copytree(layout.models / largest.folder, new / layout.base_model.name)
         shutil.rmtree(layout.base, ignore_errors=True)
         new.rename(layout.base)

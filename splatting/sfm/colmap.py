@@ -82,7 +82,7 @@ class Backend:
 
     def __init__(self, layout: Layout, settings: Settings) -> None:
         self.layout, self.settings = layout, settings
-        self.ways = ("global", "incremental", "free") if settings.mapper == "auto" else (settings.mapper,)
+        self.ways = ("global", "simple", "incremental", "free") if settings.mapper == "auto" else (settings.mapper,)
 
     def calibration(self) -> list[Command]:
         """Commands that write focal lengths into `layout.calibrated`, a copy of the database."""

@@ -30,8 +30,8 @@ _ANGLES = 2.0, 25.0  # degrees between the rays of two photos to the same point
 _OTHERS = 4  # photos in which a patch is looked for
 _AGREE = 0.85  # correlation of the second best of them
 _TEXTURE = 0.02  # least standard deviation of a patch, of full scale
-_MOST = 150_000  # patches of all photos together
-_EACH = 100, 1500  # of a photo, least and most
+_MOST = 100_000  # patches of all photos together
+_EACH = 100, 800  # of a photo, least and most
 _AT_ONCE = 32  # photos that are decoded together, with those beside them
 _ASKED = 200  # points of a photo that tell its depths
 

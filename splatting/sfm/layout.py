@@ -26,6 +26,7 @@ class Layout:
         self.database = work / "database.db"
         self.calibrated = work / "calibrated.db"  # a copy with focal lengths that the pairs tell
         self.tried = work / "tried"  # models of each way of mapping, until one is chosen
+        self.survey = work / "survey.json"  # what the models contain
         self.judged = work / "judged.json"  # how far each agrees with its pairs, the chosen one first
         self.frames = work / "frames.json"  # which of `input` are frames of videos
         self.base = work / "base"  # what --add adds to

@@ -27,7 +27,10 @@ from utils.system_utils import UserError
 AGREEING = 0.9  # share of the photos that pairs bind, which agree in a model that is kept at once
 CONTRADICTING = 0.1  # share of the matches, of which right models had 0.06 at most, and wrong ones 0.07 to 0.81
 SOUND = 0.6  # share of a model's photos that have to agree, or it is called wrong
-_NAMES = {"free": "incremental mapping without given focal lengths"}
+_NAMES = {
+    "simple": "global mapping, at first without distortion",
+    "free": "incremental mapping without given focal lengths",
+}
 
 
 def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str, Any], None]) -> None:
@@ -43,7 +46,7 @@ def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str,
     run(backend.calibration(), "Calibrating")
     tried: list[dict[str, Any]] = []
     few = count_rows(layout.database, "images") <= ALL_PAIRS
-    ways = sorted(backend.ways, key=lambda way: (way == "free", few == (way == "global")))
+    ways = sorted(backend.ways, key=lambda way: (way == "free", few and way != "incremental"))
     for number, way in enumerate(ways):
         title = "Mapping" if not number else f"Mapping, try {number + 1}"
         tried.append(_tried(backend, way, partial(place, title), run))
@@ -51,7 +54,7 @@ def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str,
             break
         if number + 1 < len(ways):
             print(f"{_words(tried[-1])}; trying {_name(ways[number + 1])}")
-    tried.sort(key=lambda found: (found.get("agreeing", 0), found.get("photos", 0)), reverse=True)
+    tried.sort(key=lambda found: (not is_wrong(found), found.get("agreeing", 0), found.get("photos", 0)), reverse=True)
     best = tried[0]
     if "failed" in best:
         if not any((layout.tried / best["way"]).glob("*/*")):

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 from splatting.files.json_files import read_json, write_json
 from splatting.files.listing import some
+from splatting.sfm.layout import Layout
 from splatting.sfm.mapping import is_wrong
 from utils.system_utils import UserError
 
@@ -28,10 +29,13 @@ class Model(NamedTuple):
     cameras: list[dict[str, Any]]
 
 
-def read_survey(path: Path) -> list[Model]:
-    """Read the models that worker.py's survey found, sorted by photos, then points, the largest first."""
-    models = [Model(**entry) for entry in read_json(path)]
-    return sorted(models, key=lambda model: (-len(model.registered), -model.points, model.folder))
+def read_survey(layout: Layout) -> list[Model]:
+    """Read the models that worker.py's survey found: the one that mapping.py chose, then the largest ones first."""
+    chosen = read_json(layout.judged)[0].get("folder") if layout.judged.is_file() else None
+    models = [Model(**entry) for entry in read_json(layout.survey)]
+    return sorted(
+        models, key=lambda model: (model.folder != chosen, -len(model.registered), -model.points, model.folder)
+    )
 
 
 def refuse_nothing(models: Sequence[Model], images: Sequence[str], partners: dict[str, int], matcher: str) -> None:

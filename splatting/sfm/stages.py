@@ -216,10 +216,9 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
     """
 
     def work() -> None:
-        out = layout.work / "survey.json"
-        survey = worker_command(layout, "survey", models=str(layout.models), out=str(out))
-        run_programs(layout.log, [survey], "Reading models", 1, out.exists)
-        models = report.read_survey(out)
+        survey = worker_command(layout, "survey", models=str(layout.models), out=str(layout.survey))
+        run_programs(layout.log, [survey], "Reading models", 1, layout.survey.exists)
+        models = report.read_survey(layout)
         root = layout.prepared if layout.prepared.is_dir() else layout.input
         names = image_names(root)
         matches = colmap.partners(layout.database)

@@ -26,9 +26,11 @@ SEED = 0
 LONGEST, LONGEST_OF_MANY = 1600, 1280  # pixels of a photo's longer side on which features are found
 MANY = 100  # photos
 _ABOUT = 1.05  # of LONGEST, that an enlarged photo may have
-TRACKS = 100  # points of a photo that global mapping of many photos solves for; all are triangulated afterwards
+DENSE = 1000  # matches of a photo, verified
+TRACKS = 100  # points of a photo that global mapping solves for where there are more; all are triangulated afterwards
 FEWEST_SEEN = 50  # points of a photo that tell its focal length
 MOST_SEEN = 400  # that are asked: more take longer and tell no more
+_JUDGED = 3  # models; others are far smaller
 _NEIGHBOURS, _SHOWN = 30, 5000  # other photos of a photo, and points, in capture.json
 # Of mapping, -1: all cores. Several add numbers in the order in which they happen to finish, so one repeats bytes.
 THREADS = 1 if os.environ.get("OMP_NUM_THREADS") == "1" else -1
@@ -125,27 +127,34 @@ def calibrate(job: dict[str, Any]) -> None:
 def mapping(job: dict[str, Any]) -> None:
     """Compute poses and points in the way `mapper`; write one or more models into sub-folders of `models`.
 
-    The ways global and incremental begin with the focal lengths of `calibrate`; free begins with none.
+    All but free begin with the focal lengths of `calibrate`. simple is global, with lenses without distortion until all
+    photos are placed: where few points hold each photo, distortion otherwise bends the scene.
     """
     os.makedirs(job["models"])
     database = job["database" if job["mapper"] == "free" else "calibrated"]
-    if job["mapper"] == "global":
+    if job["mapper"] in ("global", "simple"):
         options = pycolmap.GlobalPipelineOptions()
         options.random_seed, options.num_threads = SEED, THREADS
-        if _photos(database) > MANY:
+        if _is_dense(database):
             options.mapper.track_required_tracks_per_view = TRACKS
-        pycolmap.global_mapping(database, job["images"], job["models"], options)
+        options.mapper.bundle_adjustment.refine_extra_params = job["mapper"] == "global"
+        models = pycolmap.global_mapping(database, job["images"], job["models"], options)
+        for number, model in models.items() if job["mapper"] == "simple" else ():
+            pycolmap.bundle_adjustment(model, pycolmap.BundleAdjustmentOptions(print_summary=False))
+            model.update_point_3d_errors()
+            model.write(str(Path(job["models"], str(number))))
         return
     options = _incremental(job)
     options.min_model_size = 3  # a small model is better than none; the report shows its size
     pycolmap.incremental_mapping(database, job["images"], job["models"], options)
 
 
-def _photos(path: str) -> int:
+def _is_dense(path: str) -> bool:
+    """Whether there are many photos with many matches, of which some are enough."""
     database = pycolmap.Database.open(path)
-    count = database.num_images()
+    count, matches = database.num_images(), database.num_inlier_matches()
     database.close()
-    return count
+    return count > MANY and matches > DENSE * count
 
 
 def keep(job: dict[str, Any]) -> None:
@@ -211,11 +220,16 @@ def _enter_given(job: dict[str, Any]) -> None:
 
 
 def judging(job: dict[str, Any]) -> None:
-    """Judge the largest model in `models` by the pairs of `calibrated`; write its folder and that to the JSON `out`."""
-    models = _models(job["models"])
-    content = {"folder": models[0][0], "photos": models[0][1].num_reg_images()} if models else {}
-    content |= judge(models[0][1], job["calibrated"]) if models else {}
-    Path(job["out"]).write_text(json.dumps(content), encoding="utf-8")
+    """Judge the largest models in `models` by the pairs of `calibrated`, and write the best one's folder to `out`.
+
+    The JSON file has the folder, the number of its photos, and what the judgement found.
+    """
+    found = [
+        {"folder": folder, "photos": model.num_reg_images()} | judge(model, job["calibrated"])
+        for folder, model in _models(job["models"])[:_JUDGED]
+    ]
+    best = max(found, key=lambda one: (one["agreeing"], one["photos"]), default={})
+    Path(job["out"]).write_text(json.dumps(best), encoding="utf-8")
 
 
 def survey(job: dict[str, Any]) -> None:
