@@ -108,7 +108,12 @@ class Pycolmap(Backend):
         return self._command(step, mapper=way, tolerance=TOLERANCE, **places)
 
     def _command(self, step: str, **job: Any) -> list[Command]:
-        places = {"database": self.layout.database, "images": self.layout.prepared, "models": self.layout.models}
+        places = {
+            "database": self.layout.database,
+            "images": self.layout.prepared,
+            "small": self.layout.small,
+            "models": self.layout.models,
+        }
         places |= {"given": self.layout.given, "base": self.layout.base_model}
         common = {**asdict(self.settings), **{name: str(path) for name, path in places.items()}}
         return [worker_command(self.layout, step, **{**common, **job})]

@@ -21,6 +21,7 @@ class Layout:
         self.orientation = scene / FILE
         self.work = work = scene / "distorted"
         self.prepared = work / "photos"  # for COLMAP: upright, in formats that it reads
+        self.small = work / "small"  # copies of those, in which features are found
         self.masks, self.undistorted = work / "masks", work / "undistorted"
         self.models = work / "sparse"  # one sub-folder per model of the mapper: 0, 1, ...
         self.database = work / "database.db"

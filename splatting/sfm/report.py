@@ -12,7 +12,7 @@ from utils.system_utils import UserError
 
 FEWEST_POINTS = 1000  # with fewer, density control has to find the scene by itself
 SHORT_TRACKS = 3.0  # views per point; with fewer, most points depend on a single pair
-LARGE_ERROR = 1.5  # pixels; a good model of sharp photos has 0.3 to 1
+LARGE_ERROR = 1.5, 1e-3  # pixels, and share of the longer side; a good model of sharp photos has 0.3 to 1 pixels
 
 
 class Model(NamedTuple):
@@ -98,7 +98,7 @@ def advice(
             f"a point is in {chosen.track_length:.1f} photos on average, so the photos overlap little; take more "
             "photos, each overlapping the one before by 60 to 80 %"
         )
-    if chosen.error > LARGE_ERROR:
+    if _is_large(chosen):
         lines.append(
             f"the mean reprojection error is {chosen.error:.1f} pixels; if objects moved, mask them (--mask_path); if "
             "the photos come from several lenses, try --cameras per_photo; for a fisheye lens use --camera "
@@ -125,6 +125,12 @@ def _of_judgement(found: Mapping[str, Any], photos: int) -> list[str]:
     return lines
 
 
+def _is_large(model: Model) -> bool:
+    """Whether the error is that of a weak model, in photos of its size."""
+    pixels, share = LARGE_ERROR
+    return model.error > max([pixels, *(share * max(camera["size"]) for camera in model.cameras)])
+
+
 def advice_at_poses(model: Model, images: Sequence[str]) -> list[str]:
     """Return one line for each weakness of a model at given poses. UserError if the photos contradict the poses."""
     fit = f"{model.points} points, mean error {model.error:.1f} pixels"
@@ -135,7 +141,7 @@ def advice_at_poses(model: Model, images: Sequence[str]) -> list[str]:
     if out:
         text = f"{len(out)} of {len(images)} photos have no pose in the file and were left out ({some(out)})"
         lines.append(f"{text}; add their poses, or omit --poses")
-    if model.points < FEWEST_POINTS or model.error > LARGE_ERROR:
+    if model.points < FEWEST_POINTS or _is_large(model):
         # Imported here: it loads torch, which no other conversion needs.
         from splatting.parts import tools
 

@@ -203,7 +203,7 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
     if settings.mapper == colmap.ADDING:
         features_from.append(base_state(layout))
     return [
-        Stage("features", features_from, lambda: _remove(*files), features, check=check_sizes),
+        Stage("features", features_from, lambda: _remove(*files, layout.small), features, check=check_sizes),
         Stage("matching", [settings.matcher], lambda: colmap.forget_matches(layout.database), matching, resumable=True),
         Stage("mapping", [settings.mapper], lambda: _remove(*mapped), mapping),
     ]
@@ -216,10 +216,11 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
     """
 
     def work() -> None:
-        survey = worker_command(layout, "survey", models=str(layout.models), out=str(layout.survey))
+        root = layout.prepared if layout.prepared.is_dir() else layout.input
+        places = {"models": str(layout.models), "images": str(root), "out": str(layout.survey)}
+        survey = worker_command(layout, "survey", **places)
         run_programs(layout.log, [survey], "Reading models", 1, layout.survey.exists)
         models = report.read_survey(layout)
-        root = layout.prepared if layout.prepared.is_dir() else layout.input
         names = image_names(root)
         matches = colmap.partners(layout.database)
         report.refuse_nothing(models, names, matches, settings.matcher)

@@ -11,6 +11,7 @@ import os
 import shutil
 import sqlite3
 import sys
+import tempfile
 import threading
 from collections import Counter
 from pathlib import Path
@@ -21,11 +22,9 @@ import pycolmap
 
 from scene.agreement import judge
 from splatting.sfm import pairing
+from splatting.sfm.reduced import ABOUT, FEW, enlarged, longest_side, reduce_photos
 
 SEED = 0
-LONGEST, LONGEST_OF_MANY = 1600, 1280  # pixels of a photo's longer side on which features are found
-MANY = 100  # photos
-_ABOUT = 1.05  # of LONGEST, that an enlarged photo may have
 DENSE = 1000  # matches of a photo, verified
 TRACKS = 100  # points of a photo that global mapping solves for where there are more; all are triangulated afterwards
 FEWEST_SEEN = 50  # points of a photo that tell its focal length
@@ -48,6 +47,8 @@ def features(job: dict[str, Any]) -> None:
     options = pycolmap.FeatureExtractionOptions()
     options.sift.max_num_features = job["max_num_features"]
     pycolmap.Database.open(job["database"]).close()
+    # Masks and given cameras belong to the photos as they are.
+    images = job["images"] if job["masks"] or job["mapper"] == "triangulation" else job["small"]
     if job["mapper"] == "triangulation":
         _enter_given(job)
     else:
@@ -55,38 +56,40 @@ def features(job: dict[str, Any]) -> None:
         # Import the photos first, in order: threads would number them in the order in which they happen to finish. The
         # camera of a group begins with the focal length that the EXIF data of its first photo tell, if they do.
         known = _cameras_by_name(Path(job["base"]).with_name("database.db")) if job["mapper"] == "adding" else {}
+        longest = longest_side(sum(map(len, job["groups"])))
         for names in job["groups"]:
-            reader.existing_camera_id = next((known[name] for name in names if name in known), -1)
+            reader.existing_camera_id = next((known[name][0] for name in names if name in known), -1)
             if new := [name for name in names if name not in known]:
-                pycolmap.import_images(job["database"], job["images"], pycolmap.CameraMode.SINGLE, new, reader)
-    for (octave, longest), names in _by_scale(job["database"]).items():
-        options.sift.first_octave, options.max_image_size = octave, longest
+                if images != job["images"]:
+                    size = next((known[name][1] for name in names if name in known), None)
+                    reduce_photos(Path(job["images"]), Path(images), new, longest, size)
+                pycolmap.import_images(job["database"], images, pycolmap.CameraMode.SINGLE, new, reader)
+    for octave, names in _by_octave(job["database"]).items():
+        options.sift.first_octave = octave
         pycolmap.extract_features(
-            job["database"], job["images"], names, pycolmap.CameraMode.AUTO, reader, options, _device(job)
+            job["database"], images, names, pycolmap.CameraMode.AUTO, reader, options, _device(job)
         )
 
 
-def _by_scale(path: str) -> dict[tuple[int, int], list[str]]:
-    """Photos of a database by SIFT's first octave, which is -1 where they are enlarged twofold, and longest side.
-
-    The time grows with the pixels, and the error of the poses hardly falls with more of them.
-    """
+def _by_octave(path: str) -> dict[int, list[str]]:
+    """Photos of a database by SIFT's first octave, which is -1 where they are small and enlarged twofold."""
     database = pycolmap.Database.open(path)
     images, sizes = database.read_all_images(), {one.camera_id: one for one in database.read_all_cameras()}
     database.close()
-    longest = LONGEST if len(images) <= MANY else LONGEST_OF_MANY
-    found: dict[tuple[int, int], list[str]] = {}
+    longest = ABOUT * longest_side(len(images))
+    found: dict[int, list[str]] = {}
     for image in images:
         camera = sizes[image.camera_id]
-        enlarged = 2 * max(camera.width, camera.height) <= _ABOUT * longest
-        found.setdefault((-1 if enlarged else 0, longest), []).append(image.name)
+        found.setdefault(-1 if 2 * max(camera.width, camera.height) <= longest else 0, []).append(image.name)
     return found
 
 
-def _cameras_by_name(path: Path) -> dict[str, int]:
+def _cameras_by_name(path: Path) -> dict[str, tuple[int, tuple[int, int]]]:
+    """Camera and size of each photo of a database."""
     connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
     with contextlib.closing(connection):
-        return dict(connection.execute("SELECT name, camera_id FROM images"))
+        rows = connection.execute("SELECT name, camera_id, width, height FROM images JOIN cameras USING (camera_id)")
+        return {name: (camera, (width, height)) for name, camera, width, height in rows}
 
 
 def matching(job: dict[str, Any]) -> None:
@@ -138,7 +141,7 @@ def mapping(job: dict[str, Any]) -> None:
         if _is_dense(database):
             options.mapper.track_required_tracks_per_view = TRACKS
         options.mapper.bundle_adjustment.refine_extra_params = job["mapper"] == "global"
-        models = pycolmap.global_mapping(database, job["images"], job["models"], options)
+        models = pycolmap.global_mapping(database, _photos(job), job["models"], options)
         for number, model in models.items() if job["mapper"] == "simple" else ():
             pycolmap.bundle_adjustment(model, pycolmap.BundleAdjustmentOptions(print_summary=False))
             model.update_point_3d_errors()
@@ -146,7 +149,12 @@ def mapping(job: dict[str, Any]) -> None:
         return
     options = _incremental(job)
     options.min_model_size = 3  # a small model is better than none; the report shows its size
-    pycolmap.incremental_mapping(database, job["images"], job["models"], options)
+    pycolmap.incremental_mapping(database, _photos(job), job["models"], options)
+
+
+def _photos(job: dict[str, Any]) -> str:
+    """The folder of the photos in which features were found, from which points take their colours."""
+    return job["small"] if Path(job["small"]).is_dir() else job["images"]
 
 
 def _is_dense(path: str) -> bool:
@@ -154,7 +162,7 @@ def _is_dense(path: str) -> bool:
     database = pycolmap.Database.open(path)
     count, matches = database.num_images(), database.num_inlier_matches()
     database.close()
-    return count > MANY and matches > DENSE * count
+    return count > FEW and matches > DENSE * count
 
 
 def keep(job: dict[str, Any]) -> None:
@@ -178,7 +186,7 @@ def adding(job: dict[str, Any]) -> None:
     folder.mkdir(parents=True)
     options.multiple_models, options.fix_existing_frames = False, True
     options.constant_cameras = set(pycolmap.Reconstruction(job["base"]).cameras)
-    pycolmap.incremental_mapping(job["database"], job["images"], str(folder), options, job["base"])
+    pycolmap.incremental_mapping(job["database"], _photos(job), str(folder), options, job["base"])
 
 
 def triangulation(job: dict[str, Any]) -> None:
@@ -243,17 +251,21 @@ def survey(job: dict[str, Any]) -> None:
             "error": model.compute_mean_reprojection_error(),
             "cameras": [_camera(model, camera) for _, camera in sorted(model.cameras.items())],
         }
-        for folder, model in _models(job["models"])
+        for folder, model in _models(job["models"], Path(job["images"]))
     ]
     Path(job["out"]).write_text(json.dumps(models), encoding="utf-8")
 
 
-def _models(path: str) -> list[tuple[str, pycolmap.Reconstruction]]:
-    """The models in the sub-folders of a folder, by name, the one with the most photos first."""
+def _models(path: str, photos: Path | None = None) -> list[tuple[str, pycolmap.Reconstruction]]:
+    """The models in the sub-folders of a folder, by name, the one with the most photos first.
+
+    photos: folder of the photos to whose size they are brought; None: they stay as they are.
+    """
     found = []
     for folder in sorted(Path(path).iterdir()):
         try:
-            found.append((folder.name, pycolmap.Reconstruction(str(folder))))
+            model = enlarged(str(folder), photos) if photos else pycolmap.Reconstruction(str(folder))
+            found.append((folder.name, model))
         except (ValueError, RuntimeError, IndexError):
             continue  # no model, or one whose writing was interrupted
     return sorted(found, key=lambda one: (-one[1].num_reg_images(), -one[1].num_points3D(), one[0]))
@@ -326,7 +338,7 @@ def undistort(job: dict[str, Any]) -> None:
 
     capture: of _write_capture.
     """
-    model, out = pycolmap.Reconstruction(job["model"]), Path(job["out"])
+    model, out = enlarged(job["model"], Path(job["images"])), Path(job["out"])
     _write_capture(model, job["capture"])
     if job["native"]:
         for name in [model.images[i].name for i in model.reg_image_ids()]:
@@ -335,7 +347,9 @@ def undistort(job: dict[str, Any]) -> None:
         (out / "sparse").mkdir()
         model.write(str(out / "sparse"))
         return
-    pycolmap.undistort_images(job["out"], job["model"], job["images"], jpeg_quality=job["jpeg_quality"])
+    with tempfile.TemporaryDirectory(dir=out.parent) as folder:
+        model.write(folder)
+        pycolmap.undistort_images(job["out"], folder, job["images"], jpeg_quality=job["jpeg_quality"])
 
 
 def _device(job: dict[str, Any]) -> pycolmap.Device:
