@@ -25,6 +25,7 @@ SIDE = 800  # pixels of a photo's longer side
 _COARSE = 4  # times smaller photos, in which all depths are tried
 _DEPTHS, _STEPS = 64, 9  # tried in small and in large photos
 _NEAR, _FAR = 0.7, 1.5  # times the depths of a photo's points between which more are looked for
+_SPAN = 1000  # largest depth by the least
 _PATCH = 3, 2  # pixels beside the middle of a patch, in large and in small photos
 _ANGLES = 2.0, 25.0  # degrees between the rays of two photos to the same point
 _OTHERS = 4  # photos in which a patch is looked for
@@ -39,7 +40,8 @@ _ASKED = 200  # points of a photo that tell its depths
 class View(NamedTuple):
     """A pinhole photo: grey pixels (1, 1, H, W) of full scale 1, colours (H, W, 3) uint8, and its camera.
 
-    rotation (3, 3), translation (3,): world to camera. intrinsics: (3, 3), pixels.
+    rotation (3, 3), translation (3,): to the camera, from the world moved to the cameras' middle. intrinsics: (3, 3),
+    pixels.
     """
 
     grey: torch.Tensor
@@ -76,6 +78,8 @@ def more_points(
     """
     images = {image.name: image for image in (model.images[number] for number in model.reg_image_ids())}
     each = int(np.clip(_MOST // max(len(images), 1), *_EACH))
+    # Far from the origin, as maps are, float32 has few digits left.
+    origin = np.mean([image.projection_center() for image in images.values()], axis=0) if images else np.zeros(3)
     depths = {name: _depths(model, image) for name, image in images.items()}
     others = {name: _others(images, name, shared.get(name, {}), depths[name]) for name in sorted(images)}
     names = [name for name, found in others.items() if len(found) >= 2]
@@ -87,7 +91,7 @@ def more_points(
             wanted = sorted({*part, *(other for name in part for other in others[name])})
             views = {name: views[name] for name in wanted if name in views}
             new = [name for name in wanted if name not in views]
-            load = partial(_load, images, photos, device)
+            load = partial(_load, images, photos, origin, device)
             views |= zip(new, thread_map(load, new, max_workers=threads(), disable=True), strict=True)
             for number, name in enumerate(part, start):
                 beside = [views[other] for other in others[name]]
@@ -95,7 +99,7 @@ def more_points(
                 points.append(found)
                 colors.append(shades)
                 bar.update()
-    return np.concatenate(points), np.concatenate(colors)
+    return np.concatenate(points) + origin, np.concatenate(colors)
 
 
 def _depths(model: Any, image: Any) -> np.ndarray:
@@ -119,7 +123,7 @@ def _others(images: Mapping[str, Any], name: str, shared: Mapping[str, int], dep
     return chosen[:_OTHERS]
 
 
-def _load(images: Mapping[str, Any], folder: Path, device: torch.device, name: str) -> View:
+def _load(images: Mapping[str, Any], folder: Path, origin: np.ndarray, device: torch.device, name: str) -> View:
     image = images[name]
     with open_image(folder / name) as photo:
         scale = min(1.0, SIDE / max(photo.size))
@@ -130,7 +134,8 @@ def _load(images: Mapping[str, Any], folder: Path, device: torch.device, name: s
     intrinsics[:2] *= torch.tensor([[size[0] / image.camera.width], [size[1] / image.camera.height]])
     pose = image.cam_from_world()
     grey = torch.from_numpy(colors.astype(np.float32).mean(2) / 255)[None, None].to(device)
-    placed = (torch.tensor(part, dtype=torch.float32) for part in (pose.rotation.matrix(), pose.translation))
+    rotation = pose.rotation.matrix()
+    placed = (torch.tensor(part, dtype=torch.float32) for part in (rotation, pose.translation + rotation @ origin))
     return View(grey, colors, *(part.to(device) for part in (*placed, intrinsics)))
 
 
@@ -139,10 +144,10 @@ def _of_photo(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, 3) and colours (N, 3) of a photo."""
     pixels = _textured(view.grey, count, seed)  # (P, 2)
-    if not len(pixels):
-        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     low, high = np.quantile(depths, (0.02, 0.98))
-    ends = 1 / (_FAR * high), 1 / (_NEAR * max(low, 1e-6))
+    if high <= 0 or not len(pixels):
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    ends = 1 / (_FAR * high), 1 / (_NEAR * max(low, high / _SPAN))
     steps = torch.linspace(*ends, _DEPTHS, device=pixels.device).expand(len(pixels), -1)
     scores = _agreement(view, others, pixels, steps, _COARSE, _PATCH[1])
     best = scores.argmax(1, keepdim=True)

@@ -51,11 +51,14 @@ def _reduce(photos: Path, target: Path, longest: int, size: tuple[int, int] | No
             except OSError:
                 shutil.copyfile(source, copy)
             return
-        exif = image.getexif()
+        # The data of a TIFF are those of its own strips, too.
+        options = {} if image.format == "TIFF" else {"exif": image.getexif()}
         image.draft("RGB", wanted)  # a JPEG is decoded at about this size
+        if image.mode.startswith("I"):  # 16 bits, which Pillow would cut off at 255
+            image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
         small = image.convert("RGB").resize(wanted, Image.Resampling.LANCZOS)
     temporary = copy.with_name(f".{os.getpid()}.{copy.name}")
-    small.save(temporary, exif=exif, **({"quality": _QUALITY} if copy.suffix.lower() in (".jpg", ".jpeg") else {}))
+    small.save(temporary, **options, **({"quality": _QUALITY} if copy.suffix.lower() in (".jpg", ".jpeg") else {}))
     temporary.replace(copy)
 
 

@@ -244,7 +244,8 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
                 f"is {missing[0]}; put them there under the names that they have in the model"
             )
         shared = {name: photo["shared"] for name, photo in read_json(layout.capture)["photos"].items()}
-        more = add_points(layout.undistorted, shared, settings.no_gpu)
+        # Patches could lie where masks leave photos out.
+        more = 0 if layout.masks.is_dir() else add_points(layout.undistorted, shared, settings.no_gpu)
         tried = read_json(layout.judged) if layout.judged.is_file() else []
         if not given:
             lines += report.advice(models, names, matches, settings.matcher, at_limit, tried, more)
