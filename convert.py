@@ -19,8 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from arguments import OptionParser
-from scene.readers.scene_folder import is_scene
-from splatting.files.image_files import SUFFIXES
+from scene.readers.scene_folder import is_apart
 from splatting.host import torchrun
 from splatting.host.start import typed_command
 from splatting.sfm import stages
@@ -30,7 +29,7 @@ from splatting.sfm.capture import lines_of, training_options, unusable
 from splatting.sfm.capture_page import capture_stage
 from splatting.sfm.colmap import ADDING, GIVEN, LENS_MODELS, Program, Pycolmap, Settings, is_native
 from splatting.sfm.images import link
-from splatting.sfm.inputs import VIDEO_SUFFIXES, sort_inputs, unused_lines
+from splatting.sfm.inputs import PHOTO_SUFFIXES, VIDEO_SUFFIXES, sort_inputs, unused_lines
 from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder
 from splatting.sfm.orienting import said_of
 from splatting.sfm.programs import refuse_while_working
@@ -61,7 +60,6 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     names = found.photos
     if args.skip_matching:
         planned = []
-        layout.judged.unlink(missing_ok=True)  # of the models of an earlier run
         program = "--skip_matching: the model that was in distorted/sparse"
         made_from = [names, stages.model_state(layout)]
     else:
@@ -108,18 +106,22 @@ def convert_first(source: str) -> None:
     The photos are in its sub-folder `input`, or directly in it: then `input` gets links to them.
     """
     folder = Path(source)
-    if not folder.is_dir() or is_scene(folder) or torchrun.size() > 1:
+    if not folder.is_dir() or not is_apart(folder) or torchrun.size() > 1:
         return
     layout = Layout(folder.absolute())
-    own = layout.input.is_dir() and not report_entries(layout)
-    beside = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
-    photos = [] if layout.input.is_dir() else [path for path in beside if path.suffix.lower() in SUFFIXES]
-    videos = [] if own else [str(path) for path in beside if path.suffix.lower() in VIDEO_SUFFIXES]
-    if not (layout.input.is_dir() or photos or videos):
+    files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
+    photos = [path for path in files if path.suffix.lower() in PHOTO_SUFFIXES]
+    inputs = {path.name for path in layout.input.iterdir()} if layout.input.is_dir() else set()
+    # An `input` that has nothing but what lies beside it is one that an earlier run made.
+    photos = photos if inputs <= {path.name for path in photos} else []
+    is_video = not photos and (not inputs or report_entries(layout))
+    videos = [str(path) for path in files if path.suffix.lower() in VIDEO_SUFFIXES] if is_video else []
+    if not (inputs or photos or videos):
         return
     for path in photos:
-        link(path, layout.input / path.name)
-    print(f"{folder} has no cameras: converting its photos first, as convert.py does without options")
+        if path.name not in inputs:
+            link(path, layout.input / path.name)
+    print(f"{folder} has no cameras: converting what is in it first, as convert.py does without options")
     main(["-s", source, *(["--video", *videos] if videos else [])])
 
 
@@ -217,7 +219,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         help="auto: match every pair of few photos, and of many those that are near by name, by GPS and by look; "
         "exhaustive: every pair; sequential: neighbours by name (default: auto)")  # fmt: skip
     add("--mapper", choices=("auto", "incremental", "global"), default=None,
-        help="incremental: place one photo after another; global: all at once; auto: in both ways, until the poses "
+        help="incremental: place one photo after another; global: all at once; auto: in several ways, until the poses "
         "agree with the matches (default: auto)")  # fmt: skip
     add("--max_num_features", type=int, default=8192, metavar="N",
         help="largest number of features per photo; more help on surfaces with little texture, but are slower "

@@ -110,7 +110,8 @@ def test_the_page_shows_how_poses_were_judged_and_the_time_of_each_stage(folder)
     text = _page(folder, NAMES, _survey(), tried=tried, seconds={"features": 2.04, "mapping": 61.0})
     rows = [re.findall("<td>(.*?)</td>", row) for row in re.findall("<tr.*?</tr>", text, re.S)]
     assert [row for row in rows if row] == [
-        ["global (chosen)", "4", "3 of 4", "24.5%", "0.52", "0.16"], ["incremental", "0", "-", "-", "-", "-"],
+        ["global mapping (chosen)", "4", "3 of 4", "24.5%", "0.52", "0.16"],
+        ["incremental mapping", "0", "-", "-", "-", "-"],
         ["mapping", "61.0"], ["features", "2.0"],
     ]  # fmt: skip
     assert '<p class="warning">no way of mapping found poses that agree' in text

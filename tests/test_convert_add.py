@@ -83,7 +83,7 @@ def test_an_interrupted_run_keeps_what_it_adds_to_and_leaves_out_photos_of_anoth
     noise = np.random.default_rng(0).integers(0, 255, (180, 240, 3), dtype=np.uint8)
     Image.fromarray(noise).save(scene / "input" / "elsewhere.png")
     with monkeypatch.context() as patch:
-        patch.setattr(stages.report, "read_survey", lambda path: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(stages.report, "read_survey", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             _run(scene, "--add")
     new = _poses(_run(scene, "--add"))

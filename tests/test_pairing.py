@@ -115,7 +115,7 @@ def test_train_converts_photos_that_have_no_cameras(tmp_path, capsys):
     for first in (True, False):
         train.main([*words, "--test_iterations", "-1"])
         out = capsys.readouterr().out
-        assert ("converting its photos first" in out) == ("8 of 8 photos placed" in out) == first
+        assert ("converting what is in it first" in out) == ("8 of 8 photos placed" in out) == first
     assert {path.name: path.read_bytes() for path in (tmp_path / "room").iterdir() if path.is_file()} == before | {
         name: (tmp_path / "room" / name).read_bytes() for name in ("capture.html", "convert_report.json")
     }
@@ -125,19 +125,22 @@ def test_train_converts_photos_that_have_no_cameras(tmp_path, capsys):
 def test_what_train_converts(tmp_path, monkeypatch):
     calls = []
     monkeypatch.setattr(convert, "main", calls.append)
-    for name, files in (
-        ("video", ["walk.mp4"]),
-        ("photos", ["input/a.png"]),
-        ("scene", ["sparse/x", "a.png"]),
-        ("none", []),
-    ):
+    made = {"video": ["walk.mp4"], "photos": ["input/a.png", "b.png"], "none": ["a.ply"]}
+    made |= {"scene": ["sparse/x", "a.png"], "above": ["one/sparse/x", "a.png"], "live": ["a.HEIC", "a.mov"]}
+    for name, files in made.items():
         for file in files:
             (tmp_path / name / file).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / name / file).touch()
         (tmp_path / name).mkdir(exist_ok=True)
         convert.convert_first(str(tmp_path / name))
     convert.convert_first(str(tmp_path / "missing"))
-    video, photos = (str(tmp_path / name) for name in ("video", "photos"))
-    assert calls == [["-s", video, "--video", f"{video}/walk.mp4"], ["-s", photos]]
+    video, photos, live = (str(tmp_path / name) for name in ("video", "photos", "live"))
+    assert calls == [["-s", video, "--video", f"{video}/walk.mp4"], ["-s", photos], ["-s", live]]
+    assert [path.name for path in (tmp_path / "photos" / "input").iterdir()] == ["a.png"]  # b was not put there
+    assert not (tmp_path / "above" / "input").exists()
+    # Photos that come later, where the first ones were.
+    (tmp_path / "live" / "b.HEIC").touch()
+    convert.convert_first(live)
+    assert sorted(path.name for path in (tmp_path / "live" / "input").iterdir()) == ["a.HEIC", "b.HEIC"]
     with pytest.raises(UserError, match="is not a scene"):
         train.main(["-s", str(tmp_path / "none"), "-m", str(tmp_path / "out")])

@@ -246,7 +246,9 @@ def left_out(source: str | os.PathLike) -> str | None:
     try:
         report = read_json(Path(source) / "convert_report.json")
         placed, count = int(report["registered"]), int(report["photos"])
-    except (OSError, ValueError, KeyError, TypeError):
+        if text := report.get("unusable"):
+            return f"convert.py says of this scene: {text}"
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
     share = f"{placed} of {count} photos ({placed / max(count, 1):.0%})"
     return f"this scene has {share} of its capture; capture.html in it says what is missing" if placed < count else None

@@ -46,6 +46,12 @@ def is_scene(folder: str | os.PathLike) -> bool:
     return _kind(Path(folder)) is not None
 
 
+def is_apart(folder: Path) -> bool:
+    """Whether a folder is no scene and no model, has no scene in it, and lies in none."""
+    inner = any(path.is_dir() and _kind(path) for path in folder.iterdir())
+    return not (inner or _above(folder) or (folder / "cfg_args").is_file())
+
+
 def _kind(folder: Path) -> str | None:
     if (folder / "sparse").is_dir():
         return COLMAP

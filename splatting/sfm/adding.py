@@ -11,7 +11,7 @@ from typing import Any
 from splatting.files.listing import some
 from splatting.sfm.colmap import copy_database, names_in
 from splatting.sfm.layout import Layout, image_names
-from splatting.sfm.report import read_survey
+from splatting.sfm.report import read_survey, read_tried
 from utils.system_utils import UserError
 
 
@@ -25,7 +25,7 @@ def keep_base(layout: Layout, finished: bool, names: Sequence[str]) -> None:
         shutil.rmtree(new, ignore_errors=True)
         new.mkdir()
         copy_database(layout.database, new / layout.database.name)
-        largest = read_survey(layout)[0]
+        largest = read_survey(layout, read_tried(layout))[0]
         shutil.copytree(layout.models / largest.folder, new / layout.base_model.name)
         shutil.rmtree(layout.base, ignore_errors=True)
         new.rename(layout.base)

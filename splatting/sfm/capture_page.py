@@ -19,7 +19,7 @@ from splatting.files.json_files import read_json, write_json
 from splatting.host.machine import threads
 from splatting.sfm.capture import Look, findings, lines_of, looks_of, neighbours_of, training_options, unusable
 from splatting.sfm.layout import Layout, image_names
-from splatting.sfm.mapping import is_wrong
+from splatting.sfm.mapping import is_wrong, name_of
 from splatting.sfm.report import summary
 from splatting.sfm.stages import Stage
 from utils.system_utils import atomic_write
@@ -41,6 +41,7 @@ def capture_stage(layout: Layout, names: Sequence[str], seconds: Callable[[], di
         looks = looks_of(root, image_names(root))
         report = read_json(layout.report)
         report |= {"seconds": seconds()} | findings(report, survey["photos"], looks)
+        report["unusable"] = unusable(report)
         write_json(layout.report, report)
         write_page(layout.page, report, survey, looks, sorted({*looks, *survey["photos"]}), root)
 
@@ -60,8 +61,8 @@ def write_page(
     options = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     environment = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), **options)
     text = environment.get_template("capture.html.jinja").render(
-        above=_from_above(survey), is_wrong=is_wrong, lines=_lines(report), photos=photos, pictured=len(pictured),
-        report=report, scene=path.absolute().parent.name, unusable=unusable(report),
+        above=_from_above(survey), is_wrong=is_wrong, name_of=name_of, lines=_lines(report), photos=photos,
+        pictured=len(pictured), report=report, scene=path.absolute().parent.name, unusable=unusable(report),
     )  # fmt: skip
     with atomic_write(path) as temporary:
         # Names that are not UTF-8 have surrogates, which appear as numbers.

@@ -174,7 +174,7 @@ def link(source: Path, target: Path) -> None:
     """Make a hard link to a photo, or a copy of it where links are impossible."""
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
-        os.link(source, target)
+        os.link(source.resolve(), target)
     except OSError:
         shutil.copyfile(source, target)
 

@@ -34,6 +34,8 @@ _RAW_SUFFIXES = (
     *(".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".orf", ".rw2", ".pef", ".srw", ".3fr", ".iiq"),
     *(".gpr", ".rwl", ".x3f"),
 )
+# Of files that are taken for photos before they are opened; those that cannot be used are named later.
+PHOTO_SUFFIXES = (*SUFFIXES, *_HEIF_SUFFIXES, *_RAW_SUFFIXES, ".jp2", ".tga", ".ppm")
 _DNG_VERSION = 50706  # TIFF tag: a RAW file, whose first picture is a thumbnail
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".mpg", ".3gp", ".insv", ".wmv")
 _VIDEO_STARTS = (b"\x1a\x45\xdf\xa3", b"\x00\x00\x01\xba")  # Matroska and WebM; MPEG program streams

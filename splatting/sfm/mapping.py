@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from splatting.files.json_files import read_json, write_json
@@ -43,7 +44,10 @@ def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str,
         place("Mapping", backend.mapping(GIVEN, layout.models))
         return
     copy_database(layout.database, layout.calibrated)
-    run(backend.calibration(), "Calibrating")
+    try:
+        run(backend.calibration(), "Calibrating")
+    except UserError as error:  # some ways do without
+        print(f"warning: focal lengths could not be estimated: {error}", file=sys.stderr)
     tried: list[dict[str, Any]] = []
     few = count_rows(layout.database, "images") <= ALL_PAIRS
     ways = sorted(backend.ways, key=lambda way: (way == "free", few and way != "incremental"))
@@ -53,8 +57,9 @@ def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str,
         if agrees(tried[-1]):
             break
         if number + 1 < len(ways):
-            print(f"{_words(tried[-1])}; trying {_name(ways[number + 1])}")
-    tried.sort(key=lambda found: (not is_wrong(found), found.get("agreeing", 0), found.get("photos", 0)), reverse=True)
+            print(f"{_words(tried[-1])}; trying {name_of(ways[number + 1])}")
+    most = max(found.get("photos", 0) for found in tried)
+    tried.sort(key=partial(_rank, most), reverse=True)
     best = tried[0]
     if "failed" in best:
         if not any((layout.tried / best["way"]).glob("*/*")):
@@ -68,6 +73,7 @@ def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str,
     if best.get("against"):
         model = str(layout.models / best["folder"])
         run([worker_command(layout, "keep", model=model, left_out=best["against"])], "Leaving out photos")
+        best |= {**_judgement(backend, layout.models, run), "against": best["against"]}  # of those that are left
     write_json(layout.judged, tried)
 
 
@@ -88,25 +94,36 @@ def _tried(
     backend: Backend, way: str, place: Callable[[list[Command]], None], run: Callable[..., None]
 ) -> dict[str, Any]:
     """Map in one way, and judge what comes out. `failed` is a message, instead of what the judgement found."""
-    start, models, out = time.monotonic(), backend.layout.tried / way, backend.layout.work / "judging.json"
-    places = {"models": str(models), "calibrated": str(backend.layout.calibrated), "out": str(out)}
+    start, models = time.monotonic(), backend.layout.tried / way
     try:
         place(backend.mapping(way, models))
-        run([worker_command(backend.layout, "judging", **places)], "Judging")
-        found = read_json(out)
+        found = _judgement(backend, models, run)
     except UserError as error:
         found = {"failed": str(error)}
     return {"way": way, "seconds": round(time.monotonic() - start, 1)} | found
 
 
-def _name(way: str) -> str:
+def _judgement(backend: Backend, models: Path, run: Callable[..., None]) -> dict[str, Any]:
+    out = backend.layout.work / "judging.json"
+    places = {"models": str(models), "calibrated": str(backend.layout.calibrated), "out": str(out)}
+    run([worker_command(backend.layout, "judging", **places)], "Judging")
+    return read_json(out)
+
+
+def _rank(most: int, found: Mapping[str, Any]) -> tuple[bool, bool, int, int]:
+    """How good a model is. most: number of photos of the largest; one that is far smaller may be right by chance."""
+    photos = found.get("photos", 0)
+    return photos > 0, not is_wrong(found) and 2 * photos >= most, found.get("agreeing", 0), photos
+
+
+def name_of(way: str) -> str:
     return _NAMES.get(way, f"{way} mapping")
 
 
 def _words(found: Mapping[str, Any]) -> str:
     if "failed" in found:
-        return f"{_name(found['way'])} failed"
+        return f"{name_of(found['way'])} failed"
     if not found.get("photos"):
-        return f"{_name(found['way'])} placed no photo"
+        return f"{name_of(found['way'])} placed no photo"
     agree = f"{found['agreeing']} of {found['bound']} photos"
-    return f"{_name(found['way'])}: the matches of {agree} agree with their poses"
+    return f"{name_of(found['way'])}: the matches of {agree} agree with their poses"

@@ -80,6 +80,8 @@ def likeness(database: pycolmap.Database, numbers: list[int]) -> np.ndarray:
     """
     rng = np.random.default_rng(_SEED)
     sample = np.concatenate([_some(_features(database, number), rng) for number in numbers])
+    if not len(sample):
+        return np.zeros((len(numbers), len(numbers)), np.float32)
     words = sample[rng.permutation(len(sample))[:_WORDS]]
     for _ in range(_ROUNDS):
         words = _unit(_sums(sample, (sample @ words.T).argmax(1), len(words)))

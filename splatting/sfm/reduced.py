@@ -6,6 +6,7 @@ photos one after another, which for large ones takes longer than their features.
 
 import os
 import shutil
+import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -21,6 +22,8 @@ FEW = 100  # photos
 LONGEST_OF_FEW, LONGEST = 1600, 1280  # pixels of a copy's longer side
 ABOUT = 1.05  # times that, which photos may have that stay as they are
 _QUALITY = 95  # of JPEG
+_THREADS = 16  # each may hold a photo of 50 megapixels
+_ROUNDED = 1.5  # pixels by which a smaller copy's side may differ from the photo's proportions
 
 
 def longest_side(count: int) -> int:
@@ -29,11 +32,11 @@ def longest_side(count: int) -> int:
 
 
 def reduce_photos(photos: Path, target: Path, names: Sequence[str], longest: int, size: tuple[int, int] | None) -> None:
-    """Write copies of photos into a folder, with their EXIF data; photos that are small enough are linked.
+    """Write copies of photos into a folder, with their EXIF data but for TIFF; photos that are small enough are linked.
 
     size: width and height, if they are to be those of a camera that is known.
     """
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, _THREADS)) as pool:
         list(pool.map(partial(_reduce, photos, target, longest, size), names))
 
 
@@ -52,7 +55,7 @@ def _reduce(photos: Path, target: Path, longest: int, size: tuple[int, int] | No
                 shutil.copyfile(source, copy)
             return
         # The data of a TIFF are those of its own strips, too.
-        options = {} if image.format == "TIFF" else {"exif": image.getexif()}
+        options = {"compression": "raw"} if image.format == "TIFF" else {"exif": image.getexif()}
         image.draft("RGB", wanted)  # a JPEG is decoded at about this size
         if image.mode.startswith("I"):  # 16 bits, which Pillow would cut off at 255
             image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
@@ -60,6 +63,15 @@ def _reduce(photos: Path, target: Path, longest: int, size: tuple[int, int] | No
     temporary = copy.with_name(f".{os.getpid()}.{copy.name}")
     small.save(temporary, **options, **({"quality": _QUALITY} if copy.suffix.lower() in (".jpg", ".jpeg") else {}))
     temporary.replace(copy)
+
+
+def _refuse_other_shape(image: pycolmap.Image, width: int, height: int) -> None:
+    """End the program where a photo has not the proportions of its camera, as one that was turned."""
+    camera = image.camera
+    rounded = _ROUNDED * max(1.0, width / camera.width)
+    if abs(width * camera.height / camera.width - height) > rounded:
+        of_camera = f"{camera.width} x {camera.height}"
+        sys.exit(f"the photo {image.name} has {width} x {height} pixels, but its camera in the model {of_camera}")
 
 
 def enlarged(path: str, photos: Path) -> pycolmap.Reconstruction:
@@ -71,6 +83,7 @@ def enlarged(path: str, photos: Path) -> pycolmap.Reconstruction:
         if image.camera_id not in sizes and (photos / image.name).is_file():
             with open_image(photos / image.name) as photo:
                 sizes[image.camera_id] = photo.size
+            _refuse_other_shape(image, *photo.size)
     changed = False
     for image in model.images.values():
         camera = model.cameras[image.camera_id]

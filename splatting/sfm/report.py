@@ -29,9 +29,14 @@ class Model(NamedTuple):
     cameras: list[dict[str, Any]]
 
 
-def read_survey(layout: Layout) -> list[Model]:
-    """Read the models that worker.py's survey found: the one that mapping.py chose, then the largest ones first."""
-    chosen = read_json(layout.judged)[0].get("folder") if layout.judged.is_file() else None
+def read_tried(layout: Layout) -> list[dict[str, Any]]:
+    """What mapping.py found of each way, the chosen one first; nothing where it did not judge."""
+    return read_json(layout.judged) if layout.judged.is_file() else []
+
+
+def read_survey(layout: Layout, tried: Sequence[Mapping[str, Any]]) -> list[Model]:
+    """Read the models that worker.py's survey found: the one that was chosen (`read_tried`), then the largest first."""
+    chosen = tried[0].get("folder") if tried else None
     models = [Model(**entry) for entry in read_json(layout.survey)]
     return sorted(
         models, key=lambda model: (model.folder != chosen, -len(model.registered), -model.points, model.folder)

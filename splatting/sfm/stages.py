@@ -220,7 +220,8 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
         places = {"models": str(layout.models), "images": str(root), "out": str(layout.survey)}
         survey = worker_command(layout, "survey", **places)
         run_programs(layout.log, [survey], "Reading models", 1, layout.survey.exists)
-        models = report.read_survey(layout)
+        tried = report.read_tried(layout) if made_from is None else []  # else a model was made elsewhere
+        models = report.read_survey(layout, tried)
         names = image_names(root)
         matches = colmap.partners(layout.database)
         report.refuse_nothing(models, names, matches, settings.matcher)
@@ -246,7 +247,6 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
         shared = {name: photo["shared"] for name, photo in read_json(layout.capture)["photos"].items()}
         # Patches could lie where masks leave photos out.
         more = 0 if layout.masks.is_dir() else add_points(layout.undistorted, shared, settings.no_gpu)
-        tried = read_json(layout.judged) if layout.judged.is_file() else []
         if not given:
             lines += report.advice(models, names, matches, settings.matcher, at_limit, tried, more)
             lines += cameras.advice(chosen.cameras, lenses, settings.cameras, video.taken_frames(layout))

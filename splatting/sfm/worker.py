@@ -64,10 +64,23 @@ def features(job: dict[str, Any]) -> None:
                     size = next((known[name][1] for name in names if name in known), None)
                     reduce_photos(Path(job["images"]), Path(images), new, longest, size)
                 pycolmap.import_images(job["database"], images, pycolmap.CameraMode.SINGLE, new, reader)
+    _refuse_strangers(job)
     for octave, names in _by_octave(job["database"]).items():
         options.sift.first_octave = octave
         pycolmap.extract_features(
             job["database"], images, names, pycolmap.CameraMode.AUTO, reader, options, _device(job)
+        )
+
+
+def _refuse_strangers(job: dict[str, Any]) -> None:
+    """End the program if COLMAP did not take all photos: it leaves out those of another size than their camera."""
+    database = pycolmap.Database.open(job["database"])
+    known = {image.name for image in database.read_all_images()}
+    database.close()
+    if missing := [name for names in job["groups"] for name in names if name not in known]:
+        sys.exit(
+            f"{len(missing)} photos, such as {missing[0]}, have another size than the camera that they would share; "
+            "give them a sub-folder of their own, or omit --mask_path if the photos before had no masks"
         )
 
 
