@@ -675,6 +675,15 @@ def _model(registered: int, points: int = 5000, track: float = 5.0, error: float
     return report.Model("0", [f"{i:03d}" for i in range(first, first + registered)], points, track, error, [])
 
 
+def test_poses_that_no_pair_judged_are_not_called_right():
+    photos = [f"{i:03d}" for i in range(40)]
+    words = [_model(40)], photos, dict.fromkeys(photos, 3), "auto", 0
+    (line,) = report.advice(*words, tried=[{"way": "global", "photos": 40, "pairs": 0}])
+    assert line.startswith("the poses could not be judged")
+    judged = {"way": "global", "photos": 40, "pairs": 90, "agreeing": 40, "contradicting": 0.02}
+    assert report.advice(*words, tried=[judged]) == []
+
+
 @pytest.mark.parametrize(
     ("models", "said"),
     [

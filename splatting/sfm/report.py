@@ -115,6 +115,11 @@ def advice(
 def _of_judgement(found: Mapping[str, Any], photos: int) -> list[str]:
     """What the matches say of the chosen model (mapping.py)."""
     lines, against = [], found.get("against", ())
+    if not found.get("pairs") and "failed" not in found:
+        lines.append(
+            "the poses could not be judged, since no two photos have enough matches with known focal lengths; look at "
+            "capture.html, or take more photos that overlap"
+        )
     if is_wrong(found):
         lines.append(
             f"the poses contradict {found['contradicting']:.0%} of the matches that they were made from, so they are "
