@@ -163,6 +163,12 @@ def test_frames_follow_the_motion(ffmpeg, room, tmp_path):
     assert [place // 4 for place in _places(room, [np.asarray(Image.open(p)) for p in _frames(layout)])] == [0, 1, 2, 3]
 
 
+def test_more_frames_than_one_sum_of_ffmpeg_holds(ffmpeg, tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (150, 32, 32, 3), dtype=np.uint8)
+    _write(ffmpeg, tmp_path / "long.mp4", noise, "-crf", "18", "-pix_fmt", "yuv420p")
+    assert len(_frames(_extract(tmp_path / "scene", tmp_path / "long.mp4", 150))) == 150
+
+
 def test_a_change_of_exposure_is_no_motion(room):
     frame = room[0].mean(axis=2)
     brighter = [small_picture((frame * factor).astype(np.uint8)) for factor in np.linspace(0.5, 1, 20)]

@@ -126,7 +126,7 @@ def crops(scene: Path, out: Path, count: int) -> None:
             shift = whole / 2 + rng.uniform(-1, 1, 2) * room - turn @ size / 2
             matrix = np.column_stack([turn, shift]).ravel().tolist()
             part = image.convert("RGB").transform(
-                size.tolist(), Image.Transform.AFFINE, matrix, Image.Resampling.BICUBIC
+                tuple(size.tolist()), Image.Transform.AFFINE, matrix, Image.Resampling.BICUBIC
             )
         part.save(out / "input" / f"crop_{number:05d}.jpg", quality=_QUALITY)
 

@@ -288,7 +288,8 @@ def main() -> None:
             result = measured(photos, out / "runs" / folder, words, checkout.resolve(), args.train)
             labels.append([*([str(checkout)] if several else []), row.name, options.replace("{set}/", "")])
             results.append(result)
-            print(*labels[-1], *filter(None, cells(result)), sep="  ", file=sys.stderr, flush=True)
+            shown = filter(None, [*labels[-1], *cells(result), *result.psnr])
+            print(*shown, sep="  ", file=sys.stderr, flush=True)
     scored = [[f"{psnr:.2f}" if psnr is not None else "" for psnr in result.psnr] for result in results]
     code = ["code"] if several else []
     print(describe())

@@ -19,7 +19,8 @@ from PIL import Image
 from splatting.files.image_files import open_image
 
 FEW = 100  # photos
-LONGEST_OF_FEW, LONGEST = 1600, 1280  # pixels of a copy's longer side
+LONGEST_OF_FEW, LONGEST = 1600, 900  # pixels of a copy's longer side
+ENLARGED = 1280  # to which small photos are enlarged, which have few features
 ABOUT = 1.05  # times that, which photos may have that stay as they are
 _QUALITY = 95  # of JPEG
 _THREADS = 16  # each may hold a photo of 50 megapixels

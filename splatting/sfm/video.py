@@ -247,10 +247,15 @@ def _filters(decoder: Any, video: Path, colours: str, hdr: bool) -> list[str]:
     return [*known, _LINEAR, *([_COMPRESSED] if hdr else []), _DISPLAY]
 
 
+def _any(numbers: Sequence[int]) -> str:
+    """ffmpeg's expression for frames of these numbers: a balanced tree, as ffmpeg 8 refuses sums of over 100 terms."""
+    half = len(numbers) // 2
+    return f"({_any(numbers[:half])}+{_any(numbers[half:])})" if half else rf"eq(n\,{numbers[0]})"
+
+
 def _read(decoder: Any, video: Path, numbers: Sequence[int], filters: Sequence[str]) -> Iterator[np.ndarray]:
     """Yield the frames (H, W, 3) uint8 of these numbers."""
-    select = "select=" + "+".join(rf"eq(n\,{number})" for number in numbers)
-    options = ["-vf", ",".join([select, *filters]), *_EVERY_FRAME, "-frames:v", str(len(numbers))]
+    options = ["-vf", ",".join([f"select={_any(numbers)}", *filters]), *_EVERY_FRAME, "-frames:v", str(len(numbers))]
     reader = decoder.read_frames(str(video), output_params=options)
     width, height = next(reader)["size"]
     for data in reader:

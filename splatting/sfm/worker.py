@@ -22,7 +22,7 @@ import pycolmap
 
 from scene.agreement import judge
 from splatting.sfm import pairing
-from splatting.sfm.reduced import ABOUT, FEW, enlarged, longest_side, reduce_photos
+from splatting.sfm.reduced import ABOUT, ENLARGED, FEW, enlarged, longest_side, reduce_photos
 
 SEED = 0
 DENSE = 1000  # matches of a photo, verified
@@ -89,7 +89,7 @@ def _by_octave(path: str) -> dict[int, list[str]]:
     database = pycolmap.Database.open(path)
     images, sizes = database.read_all_images(), {one.camera_id: one for one in database.read_all_cameras()}
     database.close()
-    longest = ABOUT * longest_side(len(images))
+    longest = ABOUT * max(longest_side(len(images)), ENLARGED)
     found: dict[int, list[str]] = {}
     for image in images:
         camera = sizes[image.camera_id]
