@@ -170,9 +170,11 @@ def record3d(model: pycolmap.Reconstruction, images: Path, folder: Path, r3d: bo
     return points_of(model)
 
 
-def metashape(model: pycolmap.Reconstruction, images: Path, folder: Path) -> np.ndarray:
+def metashape(model: pycolmap.Reconstruction, images: Path, folder: Path, rig: bool = False) -> np.ndarray:
     """Export Cameras as Agisoft XML: poses in the chunk's frame, a component with the way to the world, unaligned
     photos, photos in sub-folders by their bare names, the point cloud of the world as points3D.ply.
+
+    rig: each photo has a sensor, whose place is told beside the first one's, and the third photo alone has a pose.
     """
     camera = next(iter(model.cameras.values()))
     fx, fy, cx, cy, *terms = camera.params.tolist()
@@ -183,13 +185,20 @@ def metashape(model: pycolmap.Reconstruction, images: Path, folder: Path) -> np.
     document = ElementTree.Element("document", version="2.0.0")
     chunk = ElementTree.SubElement(document, "chunk", label="Chunk 1", enabled="true")
     kind, size = "fisheye" if fisheye else "frame", {"width": str(camera.width), "height": str(camera.height)}
-    sensor = ElementTree.SubElement(_under(chunk, "sensors"), "sensor", id="0", label="unknown", type=kind)
-    ElementTree.SubElement(sensor, "resolution", size)
-    for state, numbers in (("adjusted", values), ("initial", {"f": 50.0})):
-        calibration = ElementTree.SubElement(sensor, "calibration", {"type": kind, "class": state})
-        ElementTree.SubElement(calibration, "resolution", size)
-        for name, value in numbers.items():
-            _under(calibration, name, value)
+    sensors, first = _under(chunk, "sensors"), _photos(model)[0].cam_from_world()
+    for number, image in enumerate(_photos(model)[: None if rig else 1]):
+        about = {"id": str(number), "label": "unknown", "type": kind} | ({"master_id": "0"} if number else {})
+        sensor = ElementTree.SubElement(sensors, "sensor", about)
+        ElementTree.SubElement(sensor, "resolution", size)
+        for state, numbers in (("adjusted", values), ("initial", {"f": 50.0})):
+            calibration = ElementTree.SubElement(sensor, "calibration", {"type": kind, "class": state})
+            ElementTree.SubElement(calibration, "resolution", size)
+            for name, value in numbers.items():
+                _under(calibration, name, value)
+        if number:
+            place = (first * image.cam_from_world().inverse()).matrix()
+            _under(sensor, "rotation", place[:, :3])
+            _under(sensor, "location", place[:, 3])
     component = ElementTree.SubElement(_under(chunk, "components"), "component", id="0", label="Component 1")
     to_world = _under(component, "transform")
     for name, value in (("rotation", TURN), ("translation", SHIFT), ("scale", SCALE)):
@@ -198,10 +207,13 @@ def metashape(model: pycolmap.Reconstruction, images: Path, folder: Path) -> np.
     for number, image in enumerate(_photos(model)):
         part = ("left", "right")[number % 2]
         _copy(images / image.name, folder / "images" / part / f"{stem_of(image).upper()}.JPG")
-        about = {"id": str(number), "sensor_id": "0", "component_id": "0", "label": stem_of(image).upper()}
+        about = {"id": str(number), "sensor_id": str(number * rig), "label": stem_of(image).upper()}
+        if rig and number != 2:
+            ElementTree.SubElement(cameras, "camera", about, master_id="2")
+            continue
         pose = np.eye(4)
         pose[:3] = image.cam_from_world().inverse().matrix()
-        _under(ElementTree.SubElement(cameras, "camera", about), "transform", pose)
+        _under(ElementTree.SubElement(cameras, "camera", about, component_id="0"), "transform", pose)
     ElementTree.SubElement(cameras, "camera", id="99", sensor_id="0", label="unaligned")
     ElementTree.ElementTree(document).write(folder / "cameras.xml", encoding="UTF-8", xml_declaration=True)
     points = SCALE * points_of(model) @ TURN.T + SHIFT

@@ -33,6 +33,7 @@ LAYOUTS = {
     "record3d_r3d": (partial(programs.record3d, r3d=True), "PINHOLE"),
     "metashape": (programs.metashape, "OPENCV"),
     "metashape_fisheye": (programs.metashape, "OPENCV_FISHEYE"),
+    "metashape_rig": (partial(programs.metashape, rig=True), "OPENCV"),
 }
 
 
@@ -91,7 +92,7 @@ def _by_photo(info, images: Path, model: pycolmap.Reconstruction) -> list[tuple[
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_points_fall_where_pycolmap_projects_them(make, once, layout):
     folder, model, points = make(layout)
-    has_points = layout in ("realityscan", "opf2colmap", "nerfstudio", "metashape", "metashape_fisheye")
+    has_points = layout in ("realityscan", "opf2colmap", "nerfstudio") or layout.startswith("metashape")
     info = read(folder, native=True, init_type="sfm" if has_points else "random")
     lens = LAYOUTS[layout][1]
     pairs = _by_photo(info, once(f"scene_{lens}", lambda _: None) / "images", model)
@@ -138,7 +139,17 @@ def test_cameras_of_metashape_follow_its_manual(make, layout):
 def test_what_is_left_out_is_said(make, capsys):
     folder, _, _ = make("metashape")
     read(folder)
-    assert "1 cameras of" in (said := capsys.readouterr().err) and "not aligned or not enabled: unaligned" in said
+    assert "1 cameras of" in (said := capsys.readouterr().err) and "or are not enabled: unaligned" in said
+    assert "not used" not in said
+    _replaced(_XML, "<k1>", "<k5>0.1</k5><rolling_shutter /><k1>")(folder)
+    read(folder)
+    assert "elements of" in (said := capsys.readouterr().err) and "not used: k5, rolling_shutter\n" in said
+    folder, _, _ = make("metashape_rig")
+    _replaced(_XML, "location", "offset")(folder)
+    _replaced(_XML, "rotation", "turn")(folder)
+    assert len(read(folder).train_cameras) == 1
+    assert "9 cameras of" in (said := capsys.readouterr().err) and "have no place in their rig" in said
+    assert "not used: offset, turn" in said
     folder, _, _ = make("polycam")
     read(folder, init_type="random")
     assert capsys.readouterr().err == ""
@@ -212,6 +223,10 @@ _XML, _JSON, _META = "cameras.xml", "keyframes/corrected_cameras/*.json", "metad
         ("metashape", _replaced(_XML, "<f>", "<f>a "), "cannot be read .*export them again"),
         ("metashape", _replaced(_XML, 'sensor_id="0"', 'sensor_id="7"'), "cannot be read .KeyError: '7'.; export them"),
         ("metashape", _replaced(_XML, "0.0 1.0</transform>", "0.0 1.0 2.0</transform>"), "has 17 numbers and needs 16"),
+        *(
+            ("metashape", _replaced(_XML, "2.5</scale>", f"{value}</scale>"), "component in .* has the scale")
+            for value in ("0", "-1", "nan", "1e-300", "1e300")
+        ),
         ("metashape", _replaced(_XML, "chunk", "chunks"), "has 0 chunks and needs one; choose Export Cameras"),
         ("metashape", _replaced(_XML, "component_id", 'enabled="false" component_id'), "has no aligned camera; align"),
         ("metashape", lambda folder: shutil.copy(folder / _XML, folder / "b.xml"), "several files .*b.xml, came"),

@@ -4,6 +4,9 @@ The formulas of its camera model are in an appendix of its manual: with x, y of 
 axis, x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + p1 (r^2 + 2 x^2) + 2 p2 x y, and likewise for y with p1 and p2
 exchanged; then u = w/2 + cx + x f + x b1 + y b2, v = h/2 + cy + y f. So its p1 is OpenCV's p2. A fisheye first scales
 the direction so that r is the angle.
+
+Of a rig, only the master camera has a pose. The others name it, and their sensors have a rotation and a location in the
+frame of the master's sensor, in the unit of the chunk.
 """
 
 import os
@@ -19,13 +22,17 @@ from scene.images.lens import PANORAMA
 from splatting.files.image_files import SUFFIXES
 from splatting.files.listing import some
 from splatting.files.plain_files import MOST, plain
+from splatting.files.unread import say_unread
 from utils.system_utils import UserError
 
 _HEAD = 1024  # bytes in which the file says what it is
 _MODELS = {"frame": "OPENCV", "fisheye": "OPENCV_FISHEYE", "spherical": PANORAMA}
 _USED = {"OPENCV": ("k1", "k2", "k3", "p1", "p2"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4")}
-_NO_NUMBER = ("resolution", "corrections")
+_LENS = ("f", "cx", "cy", "b1", "k1", "k2", "k3")
 _REFUSED = ("k4", "p1", "p2", "p3", "p4", "b2")  # where the model has no place for them
+_LARGEST = 1e9  # scale of a chunk, which has the metres of its unit
+_READ = {"sensors", "components", "cameras", "sensor", "component", "camera", "calibration", "transform"}
+_READ |= {"resolution", "rotation", *(_PLACE := ("location", "translation")), *_LENS, *_REFUSED}
 _AS_COLMAP = "export the cameras as Colmap (*.txt), which Metashape 2.2 and later can"
 
 
@@ -57,18 +64,18 @@ def read_metashape(path: Path, images: str) -> dict[str, Any]:
     try:
         lenses = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
         parts = [part for part in chunk.iter("component") if part.find("transform") is not None]
-        to_world = {part.get("id"): _similarity(part) for part in parts}
-        whole, folder = _similarity(chunk), path.parent / (images or "images")
+        to_world = {part.get("id"): _similarity(part, path) for part in parts}
+        whole, folder = _similarity(chunk, path), path.parent / (images or "images")
         folder = folder if folder.is_dir() else path.parent
-        index = FileIndex(folder)
-        frames, without = [], []
-        for camera in chunk.find("cameras").iter("camera"):
-            label, place = str(camera.get("label")), camera.find("transform")
-            if place is None or camera.get("enabled", "1").lower() in ("0", "false"):
+        index, cameras = FileIndex(folder), list(chunk.find("cameras").iter("camera"))
+        by_id, frames, without = {camera.get("id"): camera for camera in cameras}, [], []
+        for camera in cameras:
+            label, master = str(camera.get("label")), by_id.get(camera.get("master_id"), camera)
+            pose = _pose(camera, master, lenses)
+            if pose is None or camera.get("enabled", "1").lower() in ("0", "false"):
                 without.append(label)
                 continue
-            scale, rotation, shift = to_world.get(camera.get("component_id"), whole)
-            pose = _numbers(place, 16).reshape(4, 4)
+            scale, rotation, shift = to_world.get(camera.get("component_id", master.get("component_id")), whole)
             pose[:3, 3] = scale * rotation @ pose[:3, 3] + shift
             pose[:3, :3] = rotation @ pose[:3, :3] * (1, -1, -1)  # y down and z forward there
             photo, lens = _photo(index, label, path) or folder / label, _lens(lenses[camera.get("sensor_id")], path)
@@ -80,7 +87,10 @@ def read_metashape(path: Path, images: str) -> dict[str, Any]:
     if not frames:
         raise UserError(f"{path} has no aligned camera; align the photos in Metashape, and choose Export Cameras")
     if without:
-        print(f"{len(without)} cameras of {path} are not aligned or not enabled: {some(without)}", file=sys.stderr)
+        why = "are not aligned, have no place in their rig, or are not enabled"
+        print(f"{len(without)} cameras of {path} {why}: {some(without)}", file=sys.stderr)
+    told = [chunk, *cameras, *(part for tag in ("sensor", "component", "calibration") for part in chunk.iter(tag))]
+    say_unread(path, "metashape", {part.tag for of in told for part in of} - _READ)
     return {"frames": frames}
 
 
@@ -104,11 +114,47 @@ def _numbers(element: ElementTree.Element, count: int) -> np.ndarray:
     return values
 
 
-def _similarity(part: ElementTree.Element) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale, rotation (3,3) and shift (3,) from the frame of a chunk or component to the world's."""
+def _pose(
+    camera: ElementTree.Element, master: ElementTree.Element, sensors: dict[str | None, ElementTree.Element]
+) -> np.ndarray | None:
+    """From the frame of a camera to the chunk's (4,4), if need be by the master camera of its rig; None: unknown."""
+    if (place := camera.find("transform")) is not None:
+        return _numbers(place, 16).reshape(4, 4)
+    if (place := master.find("transform")) is None:
+        return None
+    own, masters = (_in_rig(sensors[part.get("sensor_id")]) for part in (camera, master))
+    if own is None or masters is None:
+        return None
+    return _numbers(place, 16).reshape(4, 4) @ np.linalg.inv(masters) @ own
+
+
+def _in_rig(sensor: ElementTree.Element) -> np.ndarray | None:
+    """From the frame of a sensor to that of the rig (4,4), which is the master sensor's; None: unknown."""
+    rotation, *places = map(sensor.find, ("rotation", *_PLACE))
+    place = next((one for one in places if one is not None), None)
+    if rotation is place is None and sensor.get("master_id"):
+        return None
+    pose = np.eye(4)
+    if rotation is not None:
+        pose[:3, :3] = _numbers(rotation, 9).reshape(3, 3)
+    if place is not None:
+        pose[:3, 3] = _numbers(place, 3)
+    return pose
+
+
+def _similarity(part: ElementTree.Element, path: Path) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale, rotation (3,3) and shift (3,) from the frame of a chunk or component to the world's.
+
+    UserError for a scale that leaves no scene.
+    """
     found = part.find("transform")
     parts = {} if found is None else {child.tag: child for child in found}
     scale = float(_numbers(parts["scale"], 1)[0]) if "scale" in parts else 1.0
+    if not 1 / _LARGEST <= scale <= _LARGEST:
+        raise UserError(
+            f"the {part.tag} in {path} has the scale {scale:g}, which no scene has; reset the transform of the chunk "
+            "in Metashape, or set its reference again, and export the cameras again"
+        )
     rotation = _numbers(parts["rotation"], 9).reshape(3, 3) if "rotation" in parts else np.eye(3)
     return scale, rotation, _numbers(parts["translation"], 3) if "translation" in parts else np.zeros(3)
 
@@ -126,7 +172,7 @@ def _lens(sensor: ElementTree.Element, path: Path) -> dict[str, Any]:
     adjusted = next((found for found in every if found.get("class") == "adjusted"), every[-1] if every else None)
     if adjusted is None:
         raise UserError(f"a camera in {path} has no calibration; align its photos in Metashape, and export again")
-    values = {child.tag: float(_numbers(child, 1)[0]) for child in adjusted if child.tag not in _NO_NUMBER}
+    values = {child.tag: float(_numbers(child, 1)[0]) for child in adjusted if child.tag in (*_LENS, *_REFUSED)}
     used = _USED[fields["camera_model"]]
     unknown = [name for name in _REFUSED if values.get(name) and name not in used]
     unknown += ["corrections"] * (adjusted.find("corrections") is not None)

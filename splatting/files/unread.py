@@ -13,13 +13,17 @@ class Form(NamedTuple):
     harmless: frozenset[str]
 
 
+_METASHAPE = (
+    "bands black_level camera_ids covariance data_type frames layer_index location_covariance markers meta orientation "
+    "partition photo property reference region rotation_covariance scalebars sensitivity settings shapes vignetting"
+)
 # By the name of the kind of file.
 FORMS = {
     "transforms": Form("fields", frozenset()),
     "frames": Form("fields of the frames", frozenset()),  # of transforms.json
     "ply": Form("columns", frozenset()),
     "spz": Form("records", frozenset()),
-    "metashape": Form("elements", frozenset()),
+    "metashape": Form("elements", frozenset(_METASHAPE.split())),
     "colmap": Form("files", frozenset()),
 }
 _TOLD = 3  # names
