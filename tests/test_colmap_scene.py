@@ -77,6 +77,18 @@ def test_a_model_may_have_files_of_both_kinds(colmap_scene, text):
     _assert_same(read(colmap_scene), whole)
 
 
+def test_files_beside_a_model_that_are_not_used_are_named(colmap_scene, capsys):
+    model = colmap_scene / "sparse" / "0"
+    for name in ("project.ini", "depth_params.json", ".DS_Store"):
+        (model / name).touch()
+    read(colmap_scene)
+    assert "not used" not in capsys.readouterr().err
+    for name in ("test.txt", "points.ply"):
+        (model / name).touch()
+    read(colmap_scene)
+    assert f"files of {model} that are not used: points.ply, test.txt\n" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("start", [{"init_type": "random"}, {"init_pcd_path": "cloud.ply"}, {"init_pcd_path": CLOUD}])
 def test_a_model_may_have_no_points(colmap_scene, start):
     sparse = colmap_scene / "sparse" / "0"

@@ -1,7 +1,4 @@
-"""COLMAP scenes: a model in the folder sparse, photos in a folder beside it.
-
-rigs and frames of COLMAP 4 are not read: its images file has the poses that follow from them.
-"""
+"""COLMAP scenes: a model in the folder sparse, photos in a folder beside it."""
 
 import os
 import sys
@@ -19,6 +16,7 @@ from scene.readers.info import CameraInfo, Posed, SceneInfo, split_by_order
 from scene.readers.pinholes import camera_info, finished
 from scene.readers.point_cloud import check_finite, read_point_cloud
 from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, random_in_frusta, scene_info
+from splatting.files.unread import say_unread
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 
@@ -50,6 +48,7 @@ def read_colmap(
     Arguments and errors as for `scene.dataset_readers.read_scene`; start None: without points.
     """
     model_folder, model = find_model(folder)
+    say_unread(model_folder, "colmap", _side_files(model_folder))
     if not model.images:
         raise UserError(f"the COLMAP model in {model_folder} has no registered photo; reconstruct the scene again")
     photos = sorted(model.images, key=lambda image: os.fsencode(image.name))
@@ -213,6 +212,12 @@ def _kinds(folder: Path) -> list[str]:
     """The kinds of a model's files, the binary one first; none where a file that every model has is missing."""
     there = [kind for kind in _SUFFIXES if any((folder / f"{name}.{kind}").is_file() for name in (*_NEEDED, _POINTS))]
     return [] if _lacking(folder) else there
+
+
+def _side_files(folder: Path) -> set[str]:
+    """The names of files that lie beside a model and are no part of it; those of the system are hidden."""
+    own = {f"{name}.{kind}" for name in (*_NEEDED, _POINTS) for kind in _SUFFIXES} | {f"{_POINTS}.ply"}
+    return {path.name for path in folder.iterdir() if path.is_file() and path.name[0] != "."} - own
 
 
 def _lacking(folder: Path) -> list[str]:

@@ -13,18 +13,36 @@ class Form(NamedTuple):
     harmless: frozenset[str]
 
 
+_ABOUT = (  # where a file comes from
+    "author comment created creator dataset date description exporter generator id license name scene software source "
+    "title version"
+)
+_TRANSFORMS = (  # what nerfstudio, instant-ngp, Blender's exporters and SDFStudio keep for their own use
+    "aabb aabb_scale applied_scale applied_transform auto_scale_poses_override center_method_override "
+    "depth_integer_scale depth_unit_scale_factor enable_depth_loading enable_ray_loading far fps frame_count from_na "
+    "has_foreground_mask has_mask has_mono_prior has_sparse_sfm_points importance_sampling integer_depth_scale "
+    "n_extra_learnable_dims n_frames near num_frames offset orientation_override render_aabb render_aabb_to_local "
+    "scale scene_box up worldtogt"
+)
+_FRAMES = (
+    "blur_score cam_id cam_name camera_id camera_label camera_name center_depth colmap_camera_id colmap_id "
+    "colmap_im_id colmap_image_id far frame_id image_id image_name index label manual_keyframe near neighbors "
+    "original_file_path original_name original_path rotation sharpness timestamp"
+)
 _METASHAPE = (
     "bands black_level camera_ids covariance data_type frames layer_index location_covariance markers meta orientation "
     "partition photo property reference region rotation_covariance scalebars sensitivity settings shapes vignetting"
 )
+# The images file has the poses that follow from rigs and frames; depth maps have the parameters.
+_COLMAP = "depth_params.json desktop.ini frames.bin frames.txt project.ini rigs.bin rigs.txt Thumbs.db"
 # By the name of the kind of file.
 FORMS = {
-    "transforms": Form("fields", frozenset()),
-    "frames": Form("fields of the frames", frozenset()),  # of transforms.json
+    "transforms": Form("fields", frozenset([*_ABOUT.split(), *_TRANSFORMS.split()])),
+    "frames": Form("fields of the frames", frozenset([*_ABOUT.split(), *_FRAMES.split()])),  # of transforms.json
     "ply": Form("columns", frozenset()),
     "spz": Form("records", frozenset()),
     "metashape": Form("elements", frozenset(_METASHAPE.split())),
-    "colmap": Form("files", frozenset()),
+    "colmap": Form("files", frozenset(_COLMAP.split())),
 }
 _TOLD = 3  # names
 
