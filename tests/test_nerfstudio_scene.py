@@ -2,7 +2,9 @@
 
 import json
 import math
+import os
 import shutil
+import unicodedata
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +16,7 @@ from synthetic import FakeGaussians, edit_json, folder_state, make_nerfstudio_sc
 from scene import Scene
 from scene.dataset_readers import read_scene
 from scene.images.lens import Lens
-from scene.readers.transforms import lens_of
+from scene.readers.transforms_lens import lens_of
 from utils.system_utils import UserError
 
 
@@ -76,6 +78,38 @@ def test_split_lists(scene):
     _edit(scene, lambda content: content.update(test_filenames=7))
     with pytest.raises(UserError, match="test_filenames in .*must be a list"):
         read(scene, hold_out=True)
+
+
+@pytest.mark.parametrize(
+    "spelled",
+    [
+        lambda name: name.replace("/", "\\"),
+        lambda name: f".\\{name.upper()}",
+        lambda name: unicodedata.normalize("NFD", name),
+        lambda name: name.removesuffix(".png"),
+        lambda name: name.replace("images", "images/../images").replace(".png", ".JPG"),
+    ],
+)
+def test_split_lists_match_as_photos_are_found(scene, capsys, spelled):
+    names = [camera.image_name for camera in read(scene).train_cameras]
+    accented = str(Path(names[0]).with_name("Früh.png"))
+    (scene / names[0]).rename(scene / accented)
+
+    def change(content):
+        for frame in content["frames"]:
+            if os.path.normpath(frame["file_path"]) == names[0]:
+                frame["file_path"] = accented
+        train = [spelled(name) for name in names[4:]]
+        content |= {"train_filenames": [*train, "images/lost.png"], "test_filenames": [spelled(accented)]}
+
+    _edit(scene, change)
+    capsys.readouterr()
+    info = read(scene, hold_out=True)
+    assert [view.image_name for view in info.test_cameras] == [accented]
+    assert [view.image_name for view in info.train_cameras] == names[4:]
+    said = capsys.readouterr().err
+    assert "1 entries of the lists" in said and "match no photo of its frames: images/lost.png" in said
+    assert "3 photos of" in said and f"are left out: {names[1]}, {names[2]}" in said
 
 
 @pytest.mark.parametrize("again", [0, 3])
@@ -140,19 +174,20 @@ def test_fields_that_are_not_used_are_named(scene, capsys):
     assert capsys.readouterr().err == ""
 
     def change(content):
-        content["frames"][1].update(is_bad=True, time=0.5)
+        content["frames"][1].update(is_bad=[[1], [1, 2]], time=0.5)
         for frame in content["frames"]:
-            frame.update(
-                depth_file_path="depths/a.png", rolling_shutter=[0.0, 0.0, 0.0, 0.0], is_bad=frame.get("is_bad", False)
-            )
-
-        content["val_frames"] = content["frames"][:2]
+            frame.update(depth_file_path="a.png", rolling_shutter=[0.0, 0.0], shift=None, rotation=0.1, gain=1.5)
+        content |= {"val_frames": content["frames"][:2], "x_fov": 50, "aabb_scale": 16, "k_1": False}
 
     _edit(scene, change)
     read(scene)
-    said = capsys.readouterr().err
-    named = "is_bad (1 frames), depth_file_path (17 frames), time (1 frames), val_frames (2 frames)"
-    assert f"transforms.json that are not used: {named}" in said
+    whole, frames = capsys.readouterr().err.splitlines()
+    assert f"fields of {scene}/transforms.json that are not used: val_frames, x_fov" == whole
+    named = "depth_file_path, gain, is_bad and 1 more"
+    assert f"fields of the frames of {scene}/transforms.json that are not used: {named}" == frames
+    _edit(scene, lambda content: [frame.update(time=0.5) for frame in content["frames"]])
+    read(scene)
+    assert capsys.readouterr().err.endswith("depth_file_path, gain, is_bad\n")  # of one moment
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
@@ -200,6 +235,35 @@ def test_masks_of_frames(scene):
     assert mask.shape == (1, 64, 96) and mask[:, 32:].all() and not mask[:, :32].any()
     _edit(scene, lambda content: content["frames"][3].update(mask_path="masks/two.png"))
     with pytest.raises(UserError, match=r"1 of 1 masks that .*transforms.json lists are missing"):
+        read(scene)
+
+
+@pytest.mark.parametrize("native", [False, True])
+def test_the_circle_of_a_fisheye_is_a_mask(scene, native):
+    """Of each photo, also beside a mask of its own, whose black half stays masked."""
+    grey = np.full((64, 96), 255, np.uint8)
+    grey[:, :48] = 0
+    Image.fromarray(grey).save(scene / "mask.png")
+
+    def change(content):
+        content |= {"fisheye_crop_radius": 24, "w": 96, "h": 64, "k1": 0.0 if native else 1e-6}
+        content["frames"][0].update(mask_path="mask.png")
+        content["frames"][1].update(fisheye_crop_radius=None)
+
+    _edit(scene, change)
+    views = {view.image_name: view for view in read(scene, native=native).train_cameras}
+    own, without, *others = (
+        views[os.path.normpath(frame["file_path"])]
+        for frame in json.loads((scene / "transforms.json").read_text())["frames"]
+    )
+    kept = [view.mask.decode((view.width, view.height))[0].numpy() == 255 for view in (own, *others)]
+    assert kept[0].sum() == pytest.approx(np.pi * 24**2 / 2, rel=0.1) and not kept[0][:, :46].any()
+    for one in kept[1:]:
+        assert one.sum() == pytest.approx(np.pi * 24**2, rel=0.08) and one[12:50, 40:56].all()
+        assert not native or one.sum() == (np.hypot(*(np.mgrid[-31.5:32, -47.5:48])) <= 24).sum()
+    assert without.mask is None or without.mask.decode((96, 64)).all()
+    _edit(scene, lambda content: content.update(fisheye_crop_radius=-3))
+    with pytest.raises(UserError, match="fisheye_crop_radius in .*transforms.json must be .* above 0, got -3"):
         read(scene)
 
 
@@ -254,6 +318,26 @@ def _lens(fields: dict, shared: dict | None = None) -> Lens:
         ),
         ({"fl_x": 90, "is_fisheye": True, "k1": 0.1}, "OPENCV_FISHEYE", (90, 90, 100, 50, 0.1, 0, 0, 0)),
         ({"fl_x": 100, "fl_y": 100, "camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR", (200, 100)),
+        (
+            {"fl_x": 90, "distortion_params": [0.1, 0.2, 0, 0, 0.3, 0.4]},
+            "OPENCV",
+            (90, 90, 100, 50, 0.1, 0.2, 0.3, 0.4),
+        ),
+        (
+            {"fl_x": 90, "is_fisheye": True, "distortion_params": [0.1, 0.2, 0.3, 0.4, 0, 0]},
+            "OPENCV_FISHEYE",
+            (90, 90, 100, 50, 0.1, 0.2, 0.3, 0.4),
+        ),
+        (
+            {"fl_x": 90, "camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k3": 0.3, "p1": 0.5, "p2": 0.6},
+            "THIN_PRISM_FISHEYE",
+            (90, 90, 100, 50, 0.1, 0, 0.5, 0.6, 0.3, 0, 0, 0),
+        ),
+        (
+            {"fl_x": 90, "camera_model": "FISHEYE624", "distortion_params": [n / 100 for n in range(12)]},
+            "RAD_TAN_THIN_PRISM_FISHEYE",
+            (90, 90, 100, 50, *(n / 100 for n in range(12))),
+        ),
     ],
 )
 def test_intrinsics(fields, model, params):
@@ -265,6 +349,14 @@ def test_intrinsics(fields, model, params):
     ):
         assert lens.model == model and (lens.width, lens.height) == (200, 100)
     np.testing.assert_allclose(_lens(fields).params, expected.params, rtol=1e-12)
+
+
+def test_listed_distortion_gives_way_to_the_terms_of_a_frame():
+    listed = {"fl_x": 90, "k1": 9.0, "distortion_params": [0.1, 0.2, 0, 0, 0, 0]}
+    assert _lens({"k1": 0.5}, listed).params[4:6] == (0.5, 0.2) and _lens({}, listed).params[4:6] == (0.1, 0.2)
+    for wrong in ([0.1, 0.2], [0.0] * 12, {"k1": 1}, "0.1"):
+        with pytest.raises(UserError, match="distortion_params in transforms.json must be a list of 6 numbers, k1 k2"):
+            _lens({"distortion_params": wrong}, listed)
 
 
 def test_frames_have_their_own_intrinsics(scene, blender_scene):

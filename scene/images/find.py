@@ -99,10 +99,7 @@ def find_images(
     """
     if names and not folder.is_dir():
         raise UserError(f"there is no folder {folder}, where {listed_by} has its {kind}; {remedy}")
-    index = FileIndex(folder)
-    paths = [index.find(name, *(name + suffix for suffix in suffixes)) for name in names]
-    others = _in_another_format(index, names, paths)
-    paths = [others.get(name, path) for name, path in zip(names, paths, strict=True)]
+    paths, others = find_listed(index := FileIndex(folder), names, suffixes)
     missing = [name for name, path in zip(names, paths, strict=True) if path is None]
     if missing:
         if suffixes:
@@ -123,6 +120,15 @@ def find_images(
                 file=sys.stderr,
             )
     return paths
+
+
+def find_listed(
+    index: FileIndex, names: Sequence[str], suffixes: Sequence[str]
+) -> tuple[list[Path | None], dict[str, Path]]:
+    """The files of photos as `find_images` finds them, None without one; and those with another suffix, by name."""
+    paths = [index.find(name, *(name + suffix for suffix in suffixes)) for name in names]
+    others = _in_another_format(index, names, paths)
+    return [others.get(name, path) for name, path in zip(names, paths, strict=True)], others
 
 
 def _in_another_format(index: FileIndex, names: Sequence[str], paths: Sequence[Path | None]) -> dict[str, Path]:

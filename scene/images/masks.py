@@ -67,11 +67,17 @@ NO_MASKS = MaskOptions()
 
 @dataclass(frozen=True)
 class Mask:
-    """A mask file, whether white is masked in it, and the meaning of masked pixels (IGNORE or TRANSPARENT)."""
+    """A mask file, whether white is masked in it, and the meaning of masked pixels (IGNORE or TRANSPARENT).
+
+    circle: its radius in widths of the photo; what lies outside of it, about the photo's middle, is masked, too. drawn:
+    whether the file is a mask; False: it is the photo itself, of which the circle alone masks a part.
+    """
 
     path: Path
     inverted: bool = False
     meaning: str = IGNORE
+    circle: float | None = None
+    drawn: bool = True
     pixel_bytes: ClassVar[int] = 1
 
     def decode(self, size: tuple[int, int]) -> Tensor:
@@ -82,9 +88,7 @@ class Mask:
         differs from the file's, IGNORE keeps only pixels to which no masked pixel contributes when resized by
         `scene.images.decode.decode`.
         """
-        grey = _in_full_range(grey_values(self.path), lossy=self.path.suffix.lower() in (".jpg", ".jpeg"))
-        if self.inverted:
-            grey = 255 - grey
+        grey = self._grey()
         if self.meaning == TRANSPARENT:
             image = Image.fromarray(np.ascontiguousarray(grey))
             image = image if image.size == size else image.resize(size, Image.Resampling.BICUBIC)
@@ -95,6 +99,18 @@ class Mask:
         elif size != kept.size:
             kept = kept.resize(size, Image.Resampling.BOX).filter(_REACH)
         return torch.from_numpy(np.where(np.asarray(kept) == 255, np.uint8(255), np.uint8(0)))[None]
+
+    def _grey(self) -> np.ndarray:
+        """The values (H, W) uint8 of the file, of which 255 keeps."""
+        if self.drawn:
+            grey = _in_full_range(grey_values(self.path), lossy=self.path.suffix.lower() in (".jpg", ".jpeg"))
+            grey = 255 - grey if self.inverted else grey
+        else:
+            grey = np.full(picture_size(self.path)[::-1], 255, np.uint8)
+        if self.circle is not None:
+            y, x = (np.arange(side) + 0.5 - side / 2 for side in grey.shape)
+            grey = np.where(y[:, None] ** 2 + x**2 <= (self.circle * len(x)) ** 2, grey, np.uint8(0))
+        return grey
 
 
 @dataclass(frozen=True)

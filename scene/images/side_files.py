@@ -51,7 +51,7 @@ class SideFiles:
         self.names = names_below(names, base)
         self._endings, self._photos = endings_of(self.names), photos
         self._index = FileIndex(folder)
-        self._identities = set(filter(None, map(_identity, photos)))
+        self._identities = set(filter(None, map(identity, photos)))
 
     def find(self, place: int, spelled: Callable[[str], Iterable[str]]) -> Path | None:
         """The file of a photo, by its place in the list; None without one. spelled: file names for a photo's name."""
@@ -79,7 +79,7 @@ class SideFiles:
 
     def _is_photo(self, path: Path, place: int) -> bool:
         own = self._photos[place]
-        found = _identity(path) in self._identities or (os.path.isfile(own) and filecmp.cmp(own, path, shallow=False))
+        found = identity(path) in self._identities or (os.path.isfile(own) and filecmp.cmp(own, path, shallow=False))
         if found:
             self.photos_met.add(path)
         return found
@@ -93,9 +93,10 @@ def _stem(name: str) -> str:
     return os.path.splitext(name)[0].casefold()
 
 
-def _identity(path: str | Path) -> tuple[int, int] | None:
+def identity(path: str | Path | None) -> tuple[int, int] | None:
+    """What tells a file from others, by whatever name; None where there is none."""
     try:
-        info = os.stat(path)
+        info = os.stat(path or "")
     except OSError:
         return None
     return info.st_dev, info.st_ino

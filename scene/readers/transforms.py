@@ -5,7 +5,8 @@ Exports of other programs are read as the transforms.json that they stand for.
 
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from scene.images.decode import picture_sizes
-from scene.images.find import FileIndex, find_images
-from scene.images.lens import PANORAMA, Lens
+from scene.images.find import FileIndex, find_images, find_listed
+from scene.images.lens import Lens
 from scene.images.masks import NO_MASKS, Mask, MaskOptions, find_masks
+from scene.images.side_files import identity
 from scene.readers.info import CameraInfo, Posed, SceneInfo, held_out, split_by_order
 from scene.readers.metashape import read_metashape
 from scene.readers.phone_scans import read_polycam, read_record3d
@@ -23,18 +25,17 @@ from scene.readers.pinholes import camera_info, finished
 from scene.readers.point_cloud import read_point_cloud
 from scene.readers.scene_folder import camera_file
 from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, random_in_cube, random_in_frusta, scene_info
+from scene.readers.transforms_lens import FIELDS, circle_of, lens_of
 from splatting.files.image_files import SUFFIXES
 from splatting.files.json_files import read_json
-from utils.graphics_utils import fov2focal
+from splatting.files.listing import some
+from splatting.files.unread import say_unread
 from utils.system_utils import UserError
 
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
-_BROWN = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-_OTHER_LENSES = ("equirectangular", "orthographic")  # the first one's rows are steps of the sine of the latitude
-_UNUSED = ("is_bad", "depth_file_path", "depth_path", "time", "rolling_shutter", "rolling_shutter_time")
+_READ = {"file_path", "transform_matrix", "mask_path", "ply_file_path", "frames", "test_frames", *SPLITS, *FIELDS}
 _ESCAPED = {8: "\\b", 9: "\\t", 10: "\\n", 12: "\\f", 13: "\\r"}  # what a lone backslash in a path made of its letter
 _SAME = 1e-6  # of poses, which decimals may have rounded
-_FISHEYE = ("FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 
 
 def read_blender(
@@ -193,7 +194,7 @@ def _content(path: Path, images: str) -> dict[str, Any]:
 def _read(path: Path, load: Callable[[Path], Any] = read_json) -> dict[str, Any]:
     """A camera file's content, with a list of frames that have a file_path and a transform_matrix.
 
-    Those of test_frames are the last of them. A message names fields that are not used.
+    Those of test_frames are the last of them. A message names fields that are not used and may change the result.
     """
     try:
         content = load(path)
@@ -207,26 +208,26 @@ def _read(path: Path, load: Callable[[Path], Any] = read_json) -> dict[str, Any]
         if lacking:
             fault = f"has no {' and no '.join(lacking)}; fix the frame, or take it out"
             raise UserError(f"{_where(path, number, frame)} {fault}")
-        for key in frame:
-            if key.endswith("_path") and isinstance(frame[key], str):
-                frame[key] = frame[key].translate(_ESCAPED)
+    for part in (content, *content["frames"]):
+        for key in part:
+            if key.endswith("_path") and isinstance(part[key], str):
+                part[key] = part[key].translate(_ESCAPED)
     _say_what_is_unused(path, content)
     return content
 
 
 def _say_what_is_unused(path: Path, content: dict[str, Any]) -> None:
-    """Name the fields that would change the result in the programs that write them."""
-    fields = [{**content, **frame} for frame in content["frames"]]
-    counts = {name: sum(bool(np.any(frame.get(name) or 0)) for frame in fields) for name in _UNUSED}
-    if len({str(frame.get("time")) for frame in fields}) < 2:
-        counts["time"] = 0  # the photos are of one moment
-    counts |= {name: len(listed) for name, listed in content.items() if _lists_other_frames(name, listed)}
-    if said := [f"{name} ({count} frames)" for name, count in counts.items() if count]:
-        print(f"fields of {path} that are not used: {', '.join(said)}", file=sys.stderr)
+    frames = content["frames"]
+    told = {name for frame in frames for name, value in frame.items() if name not in _READ and _tells(value)}
+    if len({str(frame.get("time")) for frame in frames}) < 2:
+        told.discard("time")  # the photos are of one moment
+    say_unread(path, "transforms", {name for name, value in content.items() if name not in _READ and _tells(value)})
+    say_unread(path, "frames", told)
 
 
-def _lists_other_frames(name: str, listed: Any) -> bool:
-    return name.endswith("_frames") and name != "test_frames" and isinstance(listed, list)
+def _tells(value: Any) -> bool:
+    """Whether a value, or one in its lists, is neither zero, false nor empty."""
+    return bool(np.any(np.array(value, dtype=object)))
 
 
 def _say_if_unused(images: str, path: Path, cameras: Sequence[CameraInfo]) -> None:
@@ -272,6 +273,8 @@ def _cameras(
     sizes, cameras = picture_sizes(photos), []
     for index, (frame, photo, mask, (R, T)) in enumerate(zip(frames, photos, found, poses, strict=True)):
         lens = _lens(path, content, frame, sizes[index])
+        if circle := circle_of(frame, content, lens.width, path):
+            mask = replace(mask or Mask(photo, drawn=False), circle=circle)
         name = photo.stem if by_stem else names[index]
         cameras.append(camera_info(index, name, photo, lens, R, T, mask, masks.ignore_alpha, native))
     return finished(cameras, masks.drop_alpha)
@@ -329,81 +332,34 @@ def _own_split(
     """Training and test views by the file's lists, and by the photos of its test_frames; None without any of them, or
     without hold_out.
     """
-    lists = []
+    lists, photos = [], [identity(path.parent / camera.image_name) for camera in cameras]
     for name in SPLITS:
         listed = content.get(name) or []
         if not isinstance(listed, list):
             raise UserError(f"{name} in {path} must be a list of file names; fix it, or leave it out")
-        lists.append({os.path.normpath(str(entry)) for entry in listed})
-    train_names, test_names = lists[0], lists[2] or lists[1]
-    if not hold_out or not (test_names or tests):
+        names = [str(entry).translate(_ESCAPED) for entry in listed]
+        lists.append(dict(zip(names, find_listed(FileIndex(path.parent), names, SUFFIXES)[0], strict=True)))
+    if not hold_out or not (any(lists[1:]) or tests):
         return None
-    test, train = [], []
-    for camera in cameras:
-        name = os.path.normpath(camera.image_name)
-        if name in test_names or _file(camera) in tests:
-            test.append(camera)
-        elif name in train_names or not train_names:
-            train.append(camera)
+    known = set(photos)
+    without = [name for files in lists for name, file in files.items() if identity(file) not in known]
+    if without:
+        said = f"{len(without)} entries of the lists of training and test photos in {path} match no photo of its frames"
+        print(f"{said}: {some(without)}", file=sys.stderr)
+    trained, tested = ({identity(file) for file in files.values()} for files in (lists[0], lists[2] or lists[1]))
+    test, train, left = [], [], []
+    for camera, photo in zip(cameras, photos, strict=True):
+        is_test = photo in tested or _file(camera) in tests
+        (test if is_test else train if photo in trained or not lists[0] else left).append(camera)
     if not test or not train:
         raise UserError(
             f"of the photos in {path}, {len(train)} are in train_filenames and {len(test)} in test_filenames (or "
             "val_filenames, or test_frames), but each list needs at least one; fix the lists or leave --eval out"
         )
+    if left:
+        names = some([camera.image_name for camera in left])
+        print(
+            f"{len(left)} photos of {path} are in no list for training or tests and are left out: {names}",
+            file=sys.stderr,
+        )
     return train, held_out(test)
-
-
-def lens_of(frame: Mapping[str, Any], shared: Mapping[str, Any], size: tuple[int, int], file: Path) -> Lens:
-    """The lens of a frame: each value from the frame's own fields, else from those of the whole file.
-
-    Fields: fl_x, fl_y in pixels, or camera_angle_x, camera_angle_y in radians (a missing y equals x); cx, cy (default:
-    the middle); w, h (default: `size`, the photo's width and height); camera_model, or is_fisheye; k1 ... k6, p1, p2 as
-    in OpenCV. A panorama needs camera_model alone. UserError for a lens that cannot be used; TypeError, ValueError,
-    OverflowError for a value that is not a number.
-    """
-    fields = {**shared, **frame}
-
-    def number(name: str, default: float) -> float:
-        value = fields.get(name)
-        return default if value is None else float(value)
-
-    width, height = int(number("w", size[0])), int(number("h", size[1]))
-    model = str(fields.get("camera_model") or ("FISHEYE" if fields.get("is_fisheye") else "PERSPECTIVE")).upper()
-    if model == "LATLONG" or fields.get("latlong"):
-        model = PANORAMA
-    other = [name for name, value in fields.items() if value and (name in _OTHER_LENSES or name.startswith("ftheta_p"))]
-    if other:
-        raise UserError(
-            f"{file} has {other[0]}, a lens of instant-ngp that cannot be used; convert the photos to pinhole images"
-        )
-    if model == PANORAMA:  # of all directions, whatever its focal lengths are said to be
-        return Lens(PANORAMA, (width, height), width, height)
-    for name in ("camera_angle_x", "camera_angle_y"):
-        if not 0 < number(name, 1.0) < np.pi:
-            raise UserError(f"{name} in {file} must lie between 0 and pi, got {number(name, 1.0)}; give it in radians")
-    if fields.get("fl_x") is None and fields.get("camera_angle_x") is None:
-        raise UserError(f"{file} has neither camera_angle_x nor fl_x; export the cameras with one of them")
-    fx = number("fl_x", fov2focal(number("camera_angle_x", 1.0), width))
-    angle_y = fields.get("camera_angle_y")
-    fy = number("fl_y", fx if angle_y is None or fields.get("fl_x") is not None else fov2focal(float(angle_y), height))
-    pinhole = (fx, fy, number("cx", width / 2), number("cy", height / 2))
-    k1, k2, k3, k4, k5, k6, p1, p2 = (number(name, 0.0) for name in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"))
-
-    if model in _FISHEYE:
-        return Lens("OPENCV_FISHEYE", (*pinhole, k1, k2, k3, k4), width, height)
-    if model not in _BROWN:
-        raise UserError(
-            f"the camera_model {model} in {file} cannot be used, only {', '.join((*_BROWN, *_FISHEYE, PANORAMA))}; "
-            "convert the photos to one of these"
-        )
-    if not any((k1, k2, k3, k4, k5, k6, p1, p2)):
-        return Lens("PINHOLE", pinhole, width, height)
-    if model != "FULL_OPENCV" and any((k4, k5, k6)):
-        # OpenCV divides by 1 + k4 r^2 + ..., nerfstudio adds k4 r^8, and the file does not say which one is meant.
-        raise UserError(
-            f"{file} has k4, k5 or k6 for the camera_model {model}, on whose meaning programs disagree; set them to 0, "
-            "or camera_model to FULL_OPENCV if they are OpenCV's"
-        )
-    if any((k3, k4, k5, k6)):
-        return Lens("FULL_OPENCV", (*pinhole, k1, k2, p1, p2, k3, k4, k5, k6), width, height)
-    return Lens("OPENCV", (*pinhole, k1, k2, p1, p2), width, height)

@@ -90,6 +90,8 @@ def _key(photo: CameraInfo, version: str) -> str:
     digest.update(repr((_FORMAT, version, tuple(photo.lens), photo.file_size, mask, photo.ignore_alpha)).encode())
     if photo.opaque:
         digest.update(b"opaque")
+    if photo.mask and photo.mask.circle:
+        digest.update(repr((photo.mask.circle, photo.mask.drawn)).encode())
     for path in (photo.image_path, photo.mask.path if photo.mask else None):
         if path is not None:
             try:
