@@ -25,6 +25,7 @@ from scene.images.decode import decode
 from scene.images.masks import MaskOptions
 from scene.readers.depth_maps import with_depth_maps
 from scene.readers.info import CameraInfo, SceneInfo, exposure_names
+from scene.readers.world_offset import local, world_offset
 from splatting.demo.make_scene import write_scene
 from splatting.demo.objects import demo_scene
 from splatting.demo.tracer import FISHEYE, PANORAMA, ring_views
@@ -54,6 +55,38 @@ def _with_photos(*photos: np.ndarray) -> SceneInfo:
 
 def _alpha(*values: float | np.ndarray) -> SceneInfo:
     return _with_photos(*(np.dstack([COLORS, np.broadcast_to(np.uint8(value), (48, 64))]) for value in values))
+
+
+@pytest.mark.parametrize("part", ["centers", "moves", "points"])
+@pytest.mark.parametrize(
+    ("kept", "step"),
+    [
+        (lambda x: float(f"{x:.6g}"), "10"),
+        (lambda x: float(f"{x:.8g}"), "0.1"),
+        (lambda x: round(x, 1), "0.1"),
+        (np.float32, "0.5"),
+        (lambda x: float(f"{x:.10g}"), None),
+        (float, None),
+    ],
+)
+def test_rounded_coordinates_of_maps(kept, step, part):
+    """Of cameras, as transforms.json or COLMAP have them, or of points; heights stay far from the large numbers."""
+    random, place = np.random.default_rng(1), np.array([500123.4, 4649777.7, 312.3])
+    centers, points = place + random.normal(0, 20, (12, 3)), place + random.normal(0, 20, (500, 3))
+    keep = {name: np.vectorize(kept if name == part else float) for name in ("centers", "moves", "points")}
+    views = []
+    for n, center in enumerate(keep["centers"](centers)):
+        turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
+        turn *= np.linalg.det(turn)
+        move = keep["moves"](-turn.T @ center)
+        views.append(CameraInfo(n, turn, move, FovX=1, FovY=1, image_name=f"v{n}", width=64, height=48,
+                                image=Image.fromarray(COLORS)))  # fmt: skip
+    cloud = BasicPointCloud(keep["points"](points), np.zeros((500, 3)), np.zeros((500, 3)))
+    info = SceneInfo(cloud, views, [], {"radius": 1.0}, None)
+    found = said(local(info, world_offset(info)))
+    what = "points" if part == "points" else "cameras"
+    assert (f"coordinates are rounded: the {what} to steps of {step}, in a scene with" in found) == bool(step)
+    assert ("are rounded" in found) == bool(step)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Faults of cameras: sides of photos, opening angles, principal points, places."""
+"""Faults of cameras: sides of photos, opening angles, principal points, places, rounded coordinates."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -24,11 +24,16 @@ _FISHEYE = (10.0, 359.0)  # degrees, of a fisheye: its focal length times the an
 _EDGE = 0.02  # of a side: a principal point so near to an edge
 _CORNER = 0.3  # of both sides, from the middle
 _ASPECT = 2.0  # most of one focal length over the other; anamorphic lenses have up to 1.8
+_STEP = 1e-3  # of the extent: half a pixel or more in photos that are not small
+_OFF = 0.02  # steps from a rounded number, which arithmetic leaves
+_NEARLY_ALL = 0.99
+_SAMPLE = 5000  # points
 
 
 def of_cameras(info: SceneInfo) -> Iterator[Finding]:
     """What is wrong with the cameras."""
     views = [*info.train_cameras, *info.test_cameras]
+    yield from _rounded(info, views)
     yield from _exchanged(views)
     pinholes = [view for view in views if _chart(view) != "equirectangular"]
     yield from _angles(pinholes)
@@ -39,6 +44,40 @@ def of_cameras(info: SceneInfo) -> Iterator[Finding]:
 def _chart(view: CameraInfo) -> str:
     native = getattr(view, "native", None)
     return native.chart if native else "perspective"
+
+
+def _rounded(info: SceneInfo, views: Sequence[CameraInfo]) -> Iterator[Finding]:
+    """Large coordinates, as of maps, that were written with too few digits for the scene's extent."""
+    if not (info.offset.any() and info.extent):
+        return
+    centers = camera_centers(views) + info.offset
+    moves = np.array([view.T - view.R.T @ info.offset for view in views])  # as COLMAP's files have them
+    points = np.zeros((0, 3)) if info.point_cloud is None else np.asarray(info.point_cloud.points, np.float64)
+    least = _STEP * info.extent
+    steps = {
+        "cameras": _step(centers, least) or _step(moves, least),
+        "points": _step(points[:: 1 + len(points) // _SAMPLE] + info.offset, least),
+    }
+    if told := [f"the {what} to steps of {step:.2g}" for what, step in steps.items() if step]:
+        text = f"coordinates are rounded: {', '.join(told)}, in a scene with an extent of {info.extent:.3g}"
+        remedy = "export them with more digits, or subtract the coordinates of a place in the scene before"
+        yield Finding(text, remedy, of_lens=True)
+
+
+def _step(values: np.ndarray, least: float) -> float | None:
+    """The step, `least` or more, to which the largest values are rounded: by decimal digits, or as float32."""
+    size = np.abs(values)
+    if not np.isfinite(size).all() or not size.any():
+        return None
+    values, size = values[large := size > 0.01 * size.max()], size[large]  # others may have finer steps
+    places = np.floor(np.log10(size)) + 1  # before the point
+    finest = int(np.floor(places.max() - np.log10(least)))
+    rounded = [(10.0 ** (places - digits), 10.0 ** (places.max() - digits)) for digits in range(1, finest + 1)]
+    single = np.spacing(size.astype(np.float32)).astype(np.float64)
+    for steps, largest in [*rounded, *([(single, float(single.max()))] if single.max() >= least else [])]:
+        if (np.abs(values / steps - np.round(values / steps)) < _OFF).mean() > _NEARLY_ALL:
+            return float(largest)
+    return None
 
 
 def _exchanged(views: Sequence[CameraInfo]) -> Iterator[Finding]:
