@@ -206,9 +206,16 @@ Scene(SimpleNamespace(**{values!r}), GaussianModel(3), load_iteration=-1)
     _run("import scene; assert not hasattr(scene, 'ModelParams')", tmp_path)
 
 
-def test_a_broken_model_json_is_refused_when_a_model_is_loaded(colmap_scene, tmp_path):
+@pytest.mark.parametrize(
+    ("entry", "fault"),
+    [
+        (f'"{OFFSET}": [1, 2]', "world_offset must be three numbers"),
+        ('"enlargement": 1e300', r"enlargement must be a number above 0, to 1e\+15, got 1e\+300"),
+    ],
+)
+def test_a_broken_model_json_is_refused_when_a_model_is_loaded(colmap_scene, tmp_path, entry, fault):
     args = _args(colmap_scene, tmp_path / "out")
     Scene(args, FakeGaussians()).save(1)
-    (tmp_path / "out" / "model.json").write_text(f'{{"{OFFSET}": [1, 2]}}')
-    with pytest.raises(UserError, match="model.json: world_offset must be three numbers"):
+    (tmp_path / "out" / "model.json").write_text(f"{{{entry}}}")
+    with pytest.raises(UserError, match=f"model.json: {fault}"):
         Scene(args, FakeGaussians(), load_iteration=1)

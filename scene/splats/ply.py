@@ -87,7 +87,7 @@ def stored_enlargement(path: str | os.PathLike) -> float:
         words = line.split()
         if words[:2] == ["comment", "enlargement"] and len(words) == 3:
             with contextlib.suppress(ValueError):
-                if 0 < (factor := float(words[2])) < math.inf:
+                if 0 < (factor := float(words[2])) <= LARGEST_OFFSET:
                     return factor
     return 1.0
 

@@ -4,7 +4,6 @@ arguments/stored.py says which options are in it.
 """
 
 import json
-import math
 import os
 import re
 from pathlib import Path
@@ -62,8 +61,9 @@ def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
             f"{path}: {OFFSET} must be three numbers to {LARGEST_OFFSET:g}, got {offset!r:.40}; restore the file"
         )
     factor = record.get(ENLARGEMENT, 1.0)
-    if not (type(factor) in (int, float) and 0 < factor < math.inf):
-        raise UserError(f"{path}: {ENLARGEMENT} must be a number above 0, got {factor!r:.40}; restore the file")
+    if not (_fits(factor) and factor > 0):
+        fault = f"must be a number above 0, to {LARGEST_OFFSET:g}, got {factor!r:.40}"
+        raise UserError(f"{path}: {ENLARGEMENT} {fault}; restore the file")
     return record
 
 

@@ -6,12 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from splatting.files.json_files import read_json
+from splatting.files.json_files import LARGEST_OFFSET, read_json
 from utils.system_utils import UserError
 
 FILE = "orientation.json"  # of convert.py --orient, in a scene's folder
 PLACE = "latitude", "longitude", "height"  # of the record, where GPS is known
 ENTRY = "similarity"  # of model.json, with the content of that file
+_LARGEST = 1e9  # scale, or one over it
+_FARTHEST = 90, 360, 1e9  # PLACE
 
 
 @dataclass(frozen=True)
@@ -34,13 +36,15 @@ class Similarity:
             rotation = np.array(record["rotation"], np.float64)
             scale, translation = float(record["scale"]), np.array(record["translation"], np.float64)
             turns = rotation.shape == (3, 3) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
-            sound = turns and np.linalg.det(rotation) > 0 and 0 < scale < np.inf
+            sound = turns and np.linalg.det(rotation) > 0 and 1 / _LARGEST <= scale <= _LARGEST
+            sound = sound and translation.shape == (3,) and np.abs(translation).max() <= LARGEST_OFFSET
             place = tuple(float(record[name]) for name in PLACE) if PLACE[0] in record else ()
-            if not (sound and translation.shape == (3,) and np.isfinite([*translation, *place]).all()):
+            if not (sound and (np.abs(place or (0, 0, 0)) <= _FARTHEST).all()):
                 raise ValueError
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise UserError(
-                f"{where} has no rotation, scale and translation of a similarity; run convert.py --orient again"
+                f"{where} has no rotation, scale and translation of a similarity that a scene may have; run convert.py "
+                "--orient again"
             ) from error
         return cls(rotation, scale, translation, place)
 

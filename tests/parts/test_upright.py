@@ -33,7 +33,7 @@ from splatting.exports.mesh_files import write_glb_mesh
 from splatting.exports.scene_formats import write_glb
 from splatting.exports.upright import check_upright, moved_around, moved_cameras, moved_splats, placed
 from splatting.files.json_files import read_model_json
-from splatting.files.similarity import Similarity
+from splatting.files.similarity import Similarity, read_orientation
 from utils.system_utils import UserError
 
 TURN = Rotation.from_rotvec([1.0, -2.0, 0.5]).as_matrix()
@@ -116,6 +116,24 @@ def test_pages_and_meshes_are_upright_by_default_and_others_on_request(tmp_path)
     check_upright(_args(tmp_path, upright=True))
     with pytest.raises(UserError, match="contradict"):
         check_upright(_args(tmp_path, True, True))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        *({"scale": value} for value in (1e300, 1e-300, 0, -1, 10**400)),
+        *({"translation": value} for value in ([1e300, 0, 0], [[1], [1, 2]])),
+        {"rotation": [[1], [1, 2]]},
+        {"latitude": 1e300, "longitude": 0, "height": 0},
+    ],
+)
+def test_a_similarity_that_leaves_no_scene_is_refused(tmp_path, change):
+    record = {"rotation": TURN.tolist(), "scale": 2.5, "translation": [3.0, -1.0, 0.5], **change}
+    (tmp_path / "model.json").write_text(json.dumps({"similarity": record}))
+    (tmp_path / "orientation.json").write_text(json.dumps(record))
+    for read in (lambda: placed(_args(tmp_path), True, balls(), None), lambda: read_orientation(tmp_path)):
+        with pytest.raises(UserError, match="no rotation, scale and translation of a similarity that a scene may"):
+            read()
 
 
 def test_models_without_a_similarity_stay_and_say_so_when_asked(tmp_path):
