@@ -185,6 +185,8 @@ def test_fields_that_are_not_used_are_named(scene, capsys):
     assert f"fields of {scene}/transforms.json that are not used: val_frames, x_fov" == whole
     named = "depth_file_path, gain, is_bad and 1 more"
     assert f"fields of the frames of {scene}/transforms.json that are not used: {named}" == frames
+    read(scene)
+    assert capsys.readouterr().err == ""  # once
     _edit(scene, lambda content: [frame.update(time=0.5) for frame in content["frames"]])
     read(scene)
     assert capsys.readouterr().err.endswith("depth_file_path, gain, is_bad\n")  # of one moment

@@ -1,6 +1,5 @@
 """The lens of a frame of transforms.json, and the circle that its picture fills."""
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ _BROWN = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL",
 _FISHEYE = ("FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 _ARIA = "FISHEYE624"  # of Project Aria, with the parameters of COLMAP's RAD_TAN_THIN_PRISM_FISHEYE
 _OTHER_LENSES = ("equirectangular", "orthographic")  # the first one's rows are steps of the sine of the latitude
+_LARGEST = 1e9  # pixels
 _TERMS, _ARIA_TERMS = "k1 k2 k3 k4 p1 p2", "k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4"  # in the order of distortion_params
 _OTHERS = "fl_x fl_y camera_angle_x camera_angle_y cx cy w h camera_model is_fisheye latlong distortion_params"
 FIELDS = {*_OTHERS.split(), *_ARIA_TERMS.split(), "fisheye_crop_radius"}  # that are read
@@ -28,9 +28,9 @@ def circle_of(frame: Mapping[str, Any], shared: Mapping[str, Any], width: int, f
     radius = {**shared, **frame}.get("fisheye_crop_radius")
     if radius is None:
         return None
-    if not (isinstance(radius, int | float) and 0 < radius < math.inf):
+    if not (isinstance(radius, int | float) and 0 < radius <= _LARGEST):
         raise UserError(f"fisheye_crop_radius in {file} must be a number of pixels above 0, got {radius!r:.40}")
-    return radius / width
+    return radius / max(width, 1)
 
 
 def lens_of(frame: Mapping[str, Any], shared: Mapping[str, Any], size: tuple[int, int], file: Path) -> Lens:

@@ -1,5 +1,6 @@
 """What a file has and no reader uses, told in one line: fields, columns and records of other programs."""
 
+import functools
 import os
 import sys
 from collections.abc import Iterable
@@ -55,4 +56,9 @@ def say_unread(path: str | os.PathLike, form: str, names: Iterable[str]) -> None
     parts, harmless = FORMS[form]
     if left := sorted(set(names) - harmless):
         more = f" and {len(left) - _TOLD} more" if len(left) > _TOLD else ""
-        print(f"{parts} of {path} that are not used: {', '.join(left[:_TOLD])}{more}", file=sys.stderr)
+        _say(f"{parts} of {path} that are not used: {', '.join(left[:_TOLD])}{more}")
+
+
+@functools.cache  # a file may be read several times
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
