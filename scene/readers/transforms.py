@@ -332,15 +332,18 @@ def _own_split(
     """Training and test views by the file's lists, and by the photos of its test_frames; None without any of them, or
     without hold_out.
     """
-    lists, photos = [], [identity(path.parent / camera.image_name) for camera in cameras]
+    if not hold_out:
+        return None
+    lists, index = [], FileIndex(path.parent)
     for name in SPLITS:
         listed = content.get(name) or []
         if not isinstance(listed, list):
             raise UserError(f"{name} in {path} must be a list of file names; fix it, or leave it out")
         names = [str(entry).translate(_ESCAPED) for entry in listed]
-        lists.append(dict(zip(names, find_listed(FileIndex(path.parent), names, SUFFIXES)[0], strict=True)))
-    if not hold_out or not (any(lists[1:]) or tests):
+        lists.append(dict(zip(names, find_listed(index, names, SUFFIXES)[0], strict=True)))
+    if not (any(lists[1:]) or tests):
         return None
+    photos = [identity(path.parent / camera.image_name) for camera in cameras]
     known = set(photos)
     without = [name for files in lists for name, file in files.items() if identity(file) not in known]
     if without:
