@@ -1,5 +1,6 @@
 """point_cloud.ply: the reference's layout byte for byte, files of other writers, clear messages."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -126,6 +127,98 @@ def test_bands_above_degree_3_are_left_out(tmp_path, capsys, degree):
     _assert_equal(gaussians, _loaded(tmp_path / "b.ply"))
     assert f"SH bands of degree {degree} are left out; models have at most degree 3" in capsys.readouterr().err
     np.testing.assert_array_equal(read_splats(tmp_path / "b.ply").sh, gaussians.get_features.detach().numpy())
+
+
+def _with(folder: Path, **columns: object) -> Path:
+    """The PLY of a model of ten Gaussians with other columns, or further ones; None: without one."""
+    model(10).save_ply(folder / "a.ply")
+    more = {name: values for name, values in columns.items() if values is not None}
+    _rewritten(folder / "a.ply", folder / "b.ply", lambda name: "" if name in columns else name, **more)
+    return folder / "b.ply"
+
+
+@pytest.mark.parametrize("load", [read_model, read_splats, _loaded])
+def test_the_filter_of_mip_splatting_is_applied(tmp_path, capsys, load):
+    """Its paper: variances grow by the filter's, and opacities fall with the square root of the determinant."""
+    widths, alone = np.linspace(0, 2, 10, dtype=np.float32), model(10)
+    found = load(_with(tmp_path, filter_3D=widths))
+    names = ("_opacity", "_scaling") if isinstance(found, GaussianModel) else ("opacity_logits", "log_scales")
+    logits, scales = (torch.as_tensor(getattr(found, name)).detach().double() for name in names)
+    before = alone._scaling.detach().double().exp() ** 2
+    after = before + torch.as_tensor(widths).double()[:, None] ** 2
+    torch.testing.assert_close(scales.exp(), after.sqrt(), rtol=1e-5, atol=0)
+    opacity = alone._opacity.detach().double().sigmoid()[:, 0] * (before.prod(1) / after.prod(1)).sqrt()
+    torch.testing.assert_close(logits.flatten().sigmoid(), opacity, rtol=1e-4, atol=0)
+    said = capsys.readouterr().err
+    assert "3D filter of Mip-Splatting (filter_3D), which is applied" in said and "not used" not in said
+
+
+LOGITS, SIZES = np.linspace(0.01, 0.99, 10), np.linspace(0.004, 0.05, 10)
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        ({}, ""),
+        ({name: 200 for name in ("red", "green", "blue", "alpha")}, ""),
+        (
+            {"trbf_center": 0.5, "motion_0": 1, "motion_1": 2, "motion_2": 3},
+            r"columns of \S+b.ply that are not used: motion_0, motion_1, motion_2 and 1 more\n"
+            r"warning: \S+b.ply is a model that moves, of which only one state is drawn.*\n",
+        ),
+        ({"segment": 4}, r"columns of \S+b.ply that are not used: segment\n"),
+        (
+            {"opacity": LOGITS},
+            "warning: all opacities of .* are from 0.01 to 0.99, so they may be no logits;.*\n",
+        ),
+        ({"opacity": 255 * LOGITS}, "warning: all opacities of .* are from 2.55 to 252, so they may be no logits.*\n"),
+        ({"opacity": 8 * LOGITS - 1}, ""),
+        (
+            {f"f_dc_{i}": LOGITS for i in range(3)},
+            "warning: all colours of .* are from 0.01 to 0.99, so they may be no SH coefficients; export.*\n",
+        ),
+        (
+            {f"scale_{i}": SIZES for i in range(3)},
+            "warning: all scales of .* are above 0, so they may be no logarithms; export.*\n",
+        ),
+        ({**{f"scale_{i}": SIZES for i in range(3)}, "x": 10_000 * LOGITS}, ""),  # of a scene in small units
+    ],
+)
+def test_what_a_foreign_file_may_mean_is_told_once(tmp_path, capsys, columns, said):
+    path = _with(tmp_path, **columns)
+    capsys.readouterr()
+    for _ in range(2):
+        read_model(path)
+    assert re.fullmatch(said, capsys.readouterr().err)
+
+
+def test_other_elements_and_lists_are_named(tmp_path, capsys):
+    points = np.zeros(2, [(name, "O" if name == "opacity" else "f4") for name in ORDER])
+    others = [PlyElement.describe(np.zeros(1, [("x", "f4")]), name) for name in ("face", "delta_vertex_0")]
+    points["opacity"] = [np.zeros(2, "f4")] * 2
+    PlyData([PlyElement.describe(points, "vertex")]).write(tmp_path / "lists.ply")
+    with pytest.raises(UserError, match="it lacks the properties opacity; give"):
+        read_model(tmp_path / "lists.ply")
+    path = _with(tmp_path)
+    PlyData([PlyData.read(path)["vertex"], *others]).write(tmp_path / "c.ply")
+    read_model(tmp_path / "c.ply")
+    said = capsys.readouterr().err
+    assert "elements of" in said and "not used: delta_vertex_0\n" in said and "a model that moves" in said
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        ({"f_rest_44": None}, "44 of 45, without f_rest_44"),
+        ({"f_rest_7": None, "f_rest_999": 1}, "44 of 45, without f_rest_7"),
+        ({"f_rest_45": 1}, "46 of 72, without f_rest_46"),
+        ({f"f_rest_{i}": None for i in range(1, 45)}, "1 of 9, without f_rest_1"),
+    ],
+)
+@pytest.mark.parametrize("degree", [None, 3])
+def test_coefficients_that_are_incomplete_are_counted(tmp_path, columns, said, degree):
+    with pytest.raises(UserError, match=f"SH coefficients f_rest of .* are incomplete: {said}; export the model again"):
+        read_model(_with(tmp_path, **columns), degree)
 
 
 def test_names_of_cloudcompare(tmp_path):

@@ -1,5 +1,6 @@
 """PLY files of trained models, with the columns of the reference in its order, as other tools read them."""
 
+import math
 import os
 import sys
 from collections import deque
@@ -13,13 +14,13 @@ from torch import Tensor
 
 from scene.gaussians.attributes import IN_CHECKPOINT, Rows, attributes
 from scene.gaussians.finite import with_scales
+from scene.gaussians.foreign import as_others_mean
 from splatting.distributed.rows import WHOLE, Shards
 from splatting.files.ply_header import read_elements
 from utils.system_utils import UserError, atomic_write, writes_files
 
 FLAT = "flat Gaussians of two scales (2DGS), which this rasterizer cannot draw; give a 3DGS model"
-MOST_BANDS = 3  # the highest SH degree of a model
-_HIGHEST = 8  # and that of a file
+MOST_BANDS = 3  # the highest SH degree of a model; a file may have a higher one
 _NORMALS = ["nx", "ny", "nz"]  # zeros after the positions, as in the reference's files
 
 
@@ -83,9 +84,11 @@ def frame_comments(world_offset: Sequence[float], enlargement: float) -> list[st
     return kept + ([f"enlargement {enlargement!r}"] if enlargement != 1 else [])
 
 
-def _degree(names: Iterable[str]) -> int | None:
-    rest = sum(name.startswith("f_rest_") for name in names)
-    return next((degree for degree in range(_HIGHEST + 1) if 3 * ((degree + 1) ** 2 - 1) == rest), None)
+def _bands(names: Iterable[str]) -> tuple[int, list[str]]:
+    """The least SH degree of so many f_rest, and those of that degree that are missing."""
+    rest = {name for name in names if name.startswith("f_rest_")}
+    degree = math.ceil((len(rest) / 3 + 1) ** 0.5) - 1
+    return degree, [name for i in range(3 * ((degree + 1) ** 2 - 1)) if (name := f"f_rest_{i}") not in rest]
 
 
 @np.errstate(over="ignore")  # doubles that float32 cannot hold become Inf
@@ -96,29 +99,30 @@ def read_ply(path: str | os.PathLike, sh_degree: int | None, flat: bool = False,
     the paper's six, too.
 
     SH bands that the file lacks are zero: the last save of a training leaves out those that are. Bands above degree 3
-    are left out, with a warning. Scales of 0 become tiny (`with_scales`). Names may begin with scalar_, as CloudCompare
-    writes them. sh_degree: None: that of the file, up to 3. UserError when the file is missing or unreadable, lacks
-    properties (the message names them), or has a higher degree.
+    are left out, with a warning. Scales of 0 become tiny (`with_scales`). What other programs mean in other ways is
+    taken so, or told (`as_others_mean`). Names may begin with scalar_, as CloudCompare writes them. sh_degree: None:
+    that of the file, up to 3. UserError when the file is missing or unreadable, lacks properties (the message names
+    them), or has a higher degree.
     """
     vertices = _as_named(read_vertices(path))
-    present = set(vertices.dtype.names or ())
-    degree = _degree(present)
-    if sh_degree is None:
-        sh_degree = 3 if degree is None else degree
-    table = attributes(sh_degree if degree is None else min(degree, sh_degree), further)
+    present = {name for name in vertices.dtype.names or () if not vertices.dtype[name].hasobject}  # no list
+    degree, lacking = _bands(present)
+    sh_degree = min(degree, MOST_BANDS) if sh_degree is None else sh_degree
+    table = attributes(min(degree, sh_degree), further)
     parts = {name: attribute.columns for name, attribute in table.items()}
-    wanted = parts["f_rest"]
-    rest = sum(name.startswith("f_rest_") for name in present)
     missing = [name for part, columns in parts.items() if part != "f_rest" for name in columns if name not in present]
     if flat and missing == ["scale_2"]:
         parts["scaling"] = parts["scaling"][:2]
     elif missing:
         raise UserError(_why_no_model(path, missing, present))
-    if rest != len(wanted) or not present.issuperset(wanted):
-        found = "no known SH degree" if degree is None else f"SH degree {degree}"
+    every = 3 * ((degree + 1) ** 2 - 1)
+    if lacking:
+        found = f"{every - len(lacking)} of {every}, without {lacking[0]}"
+        raise UserError(f"the SH coefficients f_rest of {path} are incomplete: {found}; export the model again")
+    if degree > sh_degree:
         raise UserError(
-            f"{path} has {rest} f_rest properties, those of {found}, but SH degree {sh_degree} needs {len(wanted)}; "
-            "give the --sh_degree of the file"
+            f"{path} has {every} f_rest properties, those of SH degree {degree}, but SH degree {sh_degree} needs "
+            f"{len(parts['f_rest'])}; give the --sh_degree of the file"
         )
     rows = {}
     for (name, attribute), values in zip(table.items(), _columns(vertices, list(parts.values())), strict=True):
@@ -127,6 +131,7 @@ def read_ply(path: str | os.PathLike, sh_degree: int | None, flat: bool = False,
             values = values.reshape(len(vertices), channels, bands).transpose(1, 2).contiguous()
         rows[name] = values
     rows["scaling"] = with_scales(rows["scaling"])
+    rows = as_others_mean(path, rows, vertices, {name for columns in parts.values() for name in columns})
     absent = attributes(sh_degree)["f_rest"].shape[0] - rows["f_rest"].shape[1]
     rows["f_rest"] = torch.nn.functional.pad(rows["f_rest"], (0, 0, 0, absent))
     return rows
@@ -138,16 +143,14 @@ def _as_named(vertices: np.ndarray) -> np.ndarray:
     if "scalar_f_dc_0" in names:
         vertices = rename_fields(vertices, {name: name.removeprefix("scalar_") for name in names})
         names = list(vertices.dtype.names)
-    degree = _degree(names)
-    if degree is None or degree <= MOST_BANDS:
-        return vertices
+    degree, lacking = _bands(names)
+    if lacking or degree <= MOST_BANDS:
+        return vertices  # a caller names what is lacking
     print(
         f"warning: SH bands of degree {degree} are left out; models have at most degree {MOST_BANDS}", file=sys.stderr
     )
     each, kept = (degree + 1) ** 2 - 1, (MOST_BANDS + 1) ** 2 - 1
     rest = [f"f_rest_{channel * each + index}" for channel in range(3) for index in range(kept)]
-    if not set(rest) <= set(names):
-        return vertices  # whose properties the caller names
     others = [name for name in names if not name.startswith("f_rest_")]
     cut = repack_fields(vertices[others + rest])
     return rename_fields(cut, {name: f"f_rest_{index}" for index, name in enumerate(rest)})

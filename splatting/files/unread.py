@@ -1,9 +1,9 @@
 """What a file has and no reader uses, told in one line: fields, columns and records of other programs."""
 
-import functools
 import os
 import sys
 from collections.abc import Iterable
+from functools import cache
 from typing import NamedTuple
 
 
@@ -36,12 +36,15 @@ _METASHAPE = (
 )
 # The images file has the poses that follow from rigs and frames; depth maps have the parameters.
 _COLMAP = "depth_params.json desktop.ini frames.bin frames.txt project.ini rigs.bin rigs.txt Thumbs.db"
+_PLY = "nx ny nz red green blue alpha Original_cloud_index"  # colours of band 0, for viewers of points; CloudCompare's
+_PLY_ELEMENTS = "face camera extrinsic intrinsic image_size frame disparity version"  # MeshLab's, Apple's SHARP's
 # By the name of the kind of file.
 FORMS = {
     "transforms": Form("fields", frozenset([*_ABOUT.split(), *_TRANSFORMS.split()])),
     "frames": Form("fields of the frames", frozenset([*_ABOUT.split(), *_FRAMES.split()])),  # of transforms.json
-    "ply": Form("columns", frozenset()),
-    "spz": Form("records", frozenset()),
+    "ply": Form("columns", frozenset(_PLY.split())),
+    "ply elements": Form("elements", frozenset(_PLY_ELEMENTS.split())),
+    "spz": Form("records", frozenset({"0xADBE0002"})),  # limits of a viewer's camera
     "metashape": Form("elements", frozenset(_METASHAPE.split())),
     "colmap": Form("files", frozenset(_COLMAP.split())),
 }
@@ -56,9 +59,10 @@ def say_unread(path: str | os.PathLike, form: str, names: Iterable[str]) -> None
     parts, harmless = FORMS[form]
     if left := sorted(set(names) - harmless):
         more = f" and {len(left) - _TOLD} more" if len(left) > _TOLD else ""
-        _say(f"{parts} of {path} that are not used: {', '.join(left[:_TOLD])}{more}")
+        say_once(f"{parts} of {path} that are not used: {', '.join(left[:_TOLD])}{more}")
 
 
-@functools.cache  # a file may be read several times
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)
+@cache
+def say_once(line: str) -> None:
+    """Print a line to stderr, but once in a process: some commands read a file several times."""
+    print(line, file=sys.stderr)

@@ -14,7 +14,8 @@ from trainings import ITERATIONS, OPTIONS, plain_training, shared_scene, trained
 from gaussian_renderer import render
 from scene import GaussianModel, Scene
 from scene.gaussians.checkpoint import extra_state, load_checkpoint, save_checkpoint, with_extra_state
-from splatting.parts.filter_3d.smoothing import filter_widths, filtered
+from scene.gaussians.filtered import filtered
+from splatting.parts.filter_3d.smoothing import filter_widths
 from utils.system_utils import UserError
 
 ON = "--filter_3d", "--antialiasing"

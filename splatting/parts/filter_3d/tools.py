@@ -3,7 +3,8 @@
 from typing import Any
 
 from scene.gaussians.attributes import Rows
-from splatting.parts.filter_3d.smoothing import check_widths, filtered
+from scene.gaussians.filtered import filtered
+from splatting.parts.filter_3d.smoothing import check_widths
 
 
 def drawn(rows: Rows, states: dict[str, Any]) -> Rows:

@@ -1,0 +1,66 @@
+"""What PLYs of other programs say in columns of their own, or in other units than ours."""
+
+import math
+import os
+from collections.abc import Collection
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scene.gaussians.attributes import Rows
+from scene.gaussians.filtered import filtered
+from splatting.files.ply_header import header_lines
+from splatting.files.unread import say_once, say_unread
+
+_FILTER = "filter_3D"  # the width of a Gaussian's filter, which Mip-Splatting and what follows it leave to the renderer
+_MOVING = ("trbf_", "motion_", "omega_")  # beginnings of columns: Gaussians that come, go and move
+_LARGE = 0.01  # of the model's extent: a usual size that no trained model has
+_NO_LOGIT = 50.0  # beyond it, values are percent or bytes
+
+
+def as_others_mean(path: str | os.PathLike, rows: Rows, vertices: np.ndarray, used: Collection[str]) -> Rows:
+    """Rows of a PLY with the 3D filter that it has beside them; lines tell of that, and of what is not used.
+
+    A warning tells of values that are no logits or logarithms. used: names of the columns that the rows are from.
+    """
+    _warn_of_units(path, rows)
+    names = set(vertices.dtype.names or ()) - set(used)
+    if _FILTER in names and not vertices.dtype[_FILTER].hasobject and rows["scaling"].shape[1] == 3:
+        names.remove(_FILTER)
+        say_once(
+            f"{path} has the 3D filter of Mip-Splatting ({_FILTER}), which is applied; its renders are right with "
+            "--antialiasing"
+        )
+        widths = torch.from_numpy(np.asarray(vertices[_FILTER], np.float32).reshape(-1, 1).copy())
+        opacity, scaling = filtered(rows["opacity"], rows["scaling"], widths)
+        rows = rows | {"opacity": opacity, "scaling": scaling}
+    say_unread(path, "ply", names)
+    elements = {words[1] for line in header_lines(path) if len(words := line.split()) == 3 and words[0] == "element"}
+    say_unread(path, "ply elements", elements - {"vertex"})
+    if any(name.startswith(_MOVING) for name in names) or any(name.startswith("delta_") for name in elements):
+        say_once(f"warning: {path} is a model that moves, of which only one state is drawn; some of it may look wrong")
+    return rows
+
+
+def _warn_of_units(path: str | os.PathLike, rows: Rows) -> None:
+    """Warn of opacities, colours and scales as they are drawn, instead of logits, SH coefficients and logarithms.
+
+    A trained model has faint and dark Gaussians, whose values are below 0, and sizes far below its extent.
+    """
+    if not len(rows["xyz"]):
+        return
+    remedy = "export the model again in the form of 3DGS"
+    for what, part, form in (("opacities", "opacity", "logits"), ("colours", "f_dc", "SH coefficients")):
+        low, high = float(rows[part].min()), float(rows[part].max())
+        if low >= 0 and (0 < high <= 1 or _NO_LOGIT < high < math.inf):
+            found = f"{what} of {path} are from {low:.3g} to {high:.3g}"
+            say_once(f"warning: all {found}, so they may be no {form}; {remedy}")
+    scales = rows["scaling"]
+    if scales.min() >= 0 and scales.max() > 0 and float(scales.median().exp()) > _LARGE * _extent(rows["xyz"]):
+        say_once(f"warning: all scales of {path} are above 0, so they may be no logarithms; {remedy}")
+
+
+def _extent(points: Tensor) -> float:
+    """The usual distance of points (N, 3) from their middle."""
+    return float((points - points.median(dim=0).values).norm(dim=1).median())
