@@ -10,6 +10,7 @@ import warnings
 import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -37,11 +38,12 @@ from scene.splats.splats import (
     with_sh_degree,
     within_box,
 )
+from scene.splats.spz import packed_spz_2
+from scene.splats.turning import turned
 from scene.with_splats import model_of, splats_of
 from splatting.exports import scene_formats
 from splatting.exports.formats import FORMATS, format_of
-from splatting.exports.html import turned
-from utils.sh_utils import C0
+from utils.sh_utils import C0, sh_basis
 from utils.system_utils import UserError
 
 READABLE = (".ply", ".compressed.ply", ".splat", ".spz")
@@ -240,6 +242,75 @@ def test_spz_of_version_2_is_read(tmp_path):
     np.testing.assert_allclose(read.rotations, [[0.8, 0.6, 0, 0]], atol=0.005)
     np.testing.assert_allclose(read.sh[0, 0], [0.5 / 0.15, 0, -0.5 / 0.15], atol=0.02)
     assert read.antialiasing and abs(opacities(read)[0] - 128 / 255) < 1e-6
+
+
+def test_spz_of_version_1_is_read(tmp_path):
+    """As version 2, but for positions of 16-bit floats."""
+    header = struct.pack("<IIIBBBB", 0x5053474E, 1, 1, 0, 0, 0, 0)
+    body = np.float16([1.5, 2.0, -3.0]).tobytes() + bytes([128, 255, 127, 0, 160, 80, 0, 204, 127, 127])
+    (tmp_path / "a.spz").write_bytes(gzip.compress(header + body))
+    read = read_splats(tmp_path / "a.spz")
+    np.testing.assert_allclose(read.means, [[1.5, -2.0, 3.0]])
+    np.testing.assert_allclose(read.log_scales, [[0.0, -5.0, -10.0]])
+    np.testing.assert_allclose(read.rotations, [[0.8, 0.6, 0, 0]], atol=0.005)
+
+
+def _with_records(folder: Path, version: int, records: bytes, flags: int = 2) -> Path:
+    """An SPZ of 20 splats with extension records."""
+    path = folder / f"{version}.spz"
+    if version == 4:
+        content = bytearray(written(folder, ".spz", splats(20), "4").read_bytes())
+        content[14] |= flags
+        content[16:20] = (32 + len(records)).to_bytes(4, "little")
+        content[32:32] = records
+    else:
+        content = bytearray(gzip.decompress(packed_spz_2(splats(20))))
+        content[14] |= flags
+        content = gzip.compress(content + records)
+    path.write_bytes(content)
+    return path
+
+
+TOLD = {"R": [1, 0, 0], "L": [-1, 0, 0], "D": [0, 1, 0], "U": [0, -1, 0], "F": [0, 0, 1], "B": [0, 0, -1]}
+
+
+@pytest.mark.parametrize("version", [2, 4])
+@pytest.mark.parametrize(
+    ("number", "axes"),
+    [(0, "RUB"), (4, "RUB"), (6, "RDF"), (1, "LDB"), (3, "LUB"), (8, "RUF"), (9, "LFD"), (12, "RFU"), (15, "LBU")],
+)
+def test_axes_that_an_spz_declares_are_its_axes(tmp_path, version, number, axes):
+    """Positions, shapes and colours by direction, of the values in the file."""
+    plain = half_turned(read_splats(_with_records(tmp_path, version, b"", 0)))  # as it is in the file
+    read = read_splats(_with_records(tmp_path, version, struct.pack("<III", 0xADBE0003, 4, number)))
+    turn = np.array([TOLD[letter] for letter in axes]).T
+    np.testing.assert_allclose(read.means, plain.means @ turn.T, atol=1e-6)
+    spreads = []
+    for some in (read, plain):
+        axis = np.stack([rotation_matrix(wxyz) for wxyz in some.rotations.astype(float)])
+        spreads.append(axis * np.exp(2 * some.log_scales)[:, None] @ axis.transpose(0, 2, 1))
+    np.testing.assert_allclose(spreads[0], turn @ spreads[1] @ turn.T, atol=1e-6)
+    seen = torch.nn.functional.normalize(torch.randn(9, 3, generator=torch.Generator().manual_seed(0)).double())
+    shown = [
+        np.einsum("dk,nkc->ndc", sh_basis(3, x).numpy(), y.sh)
+        for x, y in ((seen @ torch.tensor(turn.T).double(), read), (seen, plain))
+    ]
+    np.testing.assert_allclose(*shown, atol=1e-5)
+
+
+@pytest.mark.parametrize("version", [2, 4])
+def test_other_records_of_an_spz_are_named(tmp_path, version, capsys):
+    records = struct.pack("<IIf", 0xADBE0002, 4, 1.0) + struct.pack("<II3x", 0x12340001, 3)
+    path = _with_records(tmp_path, version, records + struct.pack("<III", 0xADBE0003, 4, 99), 0x82)
+    folder = tmp_path / "plain"
+    folder.mkdir()
+    means = [read_splats(file).means for file in (path, _with_records(folder, version, b"", 0))]
+    np.testing.assert_array_equal(*means)
+    said = f"records of {path} that are not used: 0x12340001, 0xADBE0003 (axes 99), flags 0x80\n"
+    assert capsys.readouterr().err == said
+    for cut in (records[:5], records[:-1]):
+        with pytest.raises(UserError, match="is not a complete SPZ file"):
+            read_splats(_with_records(tmp_path, version, cut))
 
 
 def test_a_glb_of_more_bytes_than_its_header_can_say_is_refused(tmp_path, monkeypatch):

@@ -20,12 +20,13 @@ from scipy.spatial.transform import Rotation
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
 from scene.splats.ply import read_compressed_ply
+from scene.splats.turning import turned
 from scene.with_splats import model_of
 from splatting.camera_paths.generated import Ellipse
 from splatting.camera_paths.keyframes import CameraPath, Keyframe, KeyframePath
 from splatting.camera_paths.poses import Poses, facing, poses_of
 from splatting.exports import html, vendor
-from splatting.exports.html import BOOKMARKS, lean, settings, turn_upright, turned, up_of, write_html
+from splatting.exports.html import BOOKMARKS, lean, settings, turn_upright, up_of, write_html
 from utils.system_utils import UserError
 
 # Addresses in the viewer's code. It asks for none of them here: those of PlayCanvas and Khronos are in texts, SVG is a

@@ -1,10 +1,14 @@
-"""SPZ, the format of Niantic and Adobe: versions 4 and 2 are written, versions 2 to 4 are read.
+"""SPZ, the format of Niantic and Adobe: versions 4 and 2 are written, versions 1 to 4 are read.
 
 Published in the README of github.com/nianticlabs/spz. Version 4 is a header of 32 bytes, a table of streams, and a zstd
 stream for each attribute: positions (24-bit fixed point), opacities, colours, logarithms of scales (steps of 1/16 from
 -10), rotations (the index of the largest component in 2 bits, the others in 10: sign and size) and SH coefficients
-(range +-1, all 8 bits used), one splat after the other. Axes are those of OpenGL: x right, y up, z back. Version 2 is
-one gzip stream of all these, with rotations of 3 bytes: x, y and z of the quaternion whose w is not negative.
+(range +-1, all 8 bits used), one splat after the other. Axes are those of OpenGL: x right, y up, z back. Version 3 is
+one gzip stream of all these, version 2 with rotations of 3 bytes: x, y and z of the quaternion whose w is not negative.
+Version 1 has positions of 16-bit floats.
+
+Extension records (kind, size and content) stand before the table, or at the end of the gzip stream. One of them says
+that the axes are others.
 """
 
 import gzip
@@ -22,13 +26,21 @@ import numpy as np
 
 from scene.splats.packing import morton_order, smallest_three, spread, to_bytes, whole_quaternions
 from scene.splats.splats import Splats, half_turned, logits, opacities, selected
+from scene.splats.turning import from_axes
 from splatting.files.plain_files import check_packed_rows
+from splatting.files.unread import say_unread
 from utils.system_utils import UserError, atomic_write
 
 MAGIC = 0x5053474E
 _HEADER = struct.Struct("<IIIBBBB")  # magic, version, splats, SH degree, bits of a fraction, flags, streams
 _HEADER_END = struct.Struct("<I12x")  # of version 4: where the table of streams begins
-_ANTIALIASED = 1
+_ANTIALIASED, _EXTENDED = 1, 2  # flags
+_COORDINATES = 0xADBE0003  # a record of one number: that of the file's axes
+_SYSTEMS = (  # by that number, from 1
+    *(x + y + z for z in "BF" for y in "DU" for x in "LR"),
+    *(x + y + z for y in "FB" for z in "DU" for x in "LR"),
+)
+_MOST_RECORDS = 1 << 24  # bytes, as a packed stream may have any number
 _COLOR = 0.15  # colours are 0.5 + 0.15 SH0, so that those beyond [0, 1] fit
 _MOST_BITS = 20  # of a position's fraction
 _LARGEST_POSITION = (1 << 23) - 1
@@ -172,7 +184,7 @@ def read_spz(path: str | os.PathLike) -> Splats:
     with open(path, "rb") as file:
         content = file.read()
     try:
-        return _read_gzip(content) if content[:2] == b"\x1f\x8b" else _read_zstd(content, path)
+        return (_read_gzip if content[:2] == b"\x1f\x8b" else _read_zstd)(content, path)
     except (ValueError, struct.error, EOFError, OSError, zlib.error, IndexError, MemoryError) as error:
         raise UserError(f"{path} is not a complete SPZ file ({error}); save or download it again") from error
 
@@ -192,7 +204,28 @@ def _header(content: bytes, versions: tuple[int, ...], size: int) -> _Header:
 
 def _widths(header: _Header) -> list[int]:
     """Bytes a splat of each stream: positions, opacities, colours, scales, rotations, SH bands."""
-    return [9, 1, 3, 3, 3 if header.version == 2 else 4, 3 * ((header.degree + 1) ** 2 - 1)]
+    position, rotation = 6 if header.version == 1 else 9, 3 if header.version < 3 else 4
+    return [position, 1, 3, 3, rotation, 3 * ((header.degree + 1) ** 2 - 1)]
+
+
+def _axes(records: bytes, header: _Header, path: str | os.PathLike) -> str:
+    """The axes that a record declares, or OpenGL's. What else records and flags say is named."""
+    place, axes, others = 0, "RUB", []
+    while place < len(records):
+        kind, size = struct.unpack_from("<II", records, place)
+        content = records[place + 8 : place + 8 + size]
+        if len(content) < size:
+            raise ValueError(f"an extension record has {len(content)} of {size} bytes")
+        number = int.from_bytes(content[:4], "little")
+        if kind == _COORDINATES and 0 < number <= len(_SYSTEMS):
+            axes = _SYSTEMS[number - 1]
+        else:
+            others.append(f"0x{kind:08X}" + (f" (axes {number})" if kind == _COORDINATES else ""))
+        place += 8 + size
+    if flags := header.flags & ~(_ANTIALIASED | _EXTENDED):
+        others.append(f"flags 0x{flags:02X}")
+    say_unread(path, "spz", others)
+    return axes
 
 
 def _read_zstd(content: bytes, path: str | os.PathLike) -> Splats:
@@ -213,20 +246,22 @@ def _read_zstd(content: bytes, path: str | os.PathLike) -> Splats:
         except zstandard.ZstdError as error:
             raise ValueError(f"stream {index}: {error}") from error
         begin += packed
-    return _splats(parts, header)
+    records = content[_HEADER.size + _HEADER_END.size : table] if header.flags & _EXTENDED else b""
+    return _splats(parts, header, _axes(records, header, path))
 
 
-def _read_gzip(content: bytes) -> Splats:
+def _read_gzip(content: bytes, path: str | os.PathLike) -> Splats:
     stream = gzip.GzipFile(fileobj=io.BytesIO(content))
-    header = _header(stream.read(_HEADER.size), (2, 3), len(content))
+    header = _header(stream.read(_HEADER.size), (1, 2, 3), len(content))
     # No more than that, however much is packed.
     parts = [stream.read(width * header.count) for width in _widths(header)]
+    records = stream.read(_MOST_RECORDS) if header.flags & _EXTENDED else b""
     if stream.read(1):  # at the end it checks the sum
         raise ValueError("it holds more than its header says")
-    return _splats(parts, header)
+    return _splats(parts, header, _axes(records, header, path))
 
 
-def _splats(parts: list[bytes], header: _Header) -> Splats:
+def _splats(parts: list[bytes], header: _Header, axes: str) -> Splats:
     count, degree = header.count, header.degree
     tables = [
         np.frombuffer(part, np.uint8).reshape(count, width) for part, width in zip(parts, _widths(header), strict=True)
@@ -237,14 +272,18 @@ def _splats(parts: list[bytes], header: _Header) -> Splats:
     rest -= 1
     if degree > 3:
         print(f"warning: SH bands of degree {degree} are left out; models have at most degree 3", file=sys.stderr)
-    wide = np.zeros((count, 3, 4), np.uint8)
-    wide[:, :, 1:] = positions.reshape(count, 3, 3)
-    means = (wide.view("<i4")[:, :, 0] >> 8) / 2.0**header.bits
+    if header.version == 1:
+        means = np.ascontiguousarray(positions).view("<f2")
+    else:
+        wide = np.zeros((count, 3, 4), np.uint8)
+        wide[:, :, 1:] = positions.reshape(count, 3, 3)
+        means = (wide.view("<i4")[:, :, 0] >> 8) / 2.0**header.bits
     base = (color / 255.0 - 0.5) / _COLOR
     sh = np.concatenate([base.astype(np.float32)[:, None], rest], axis=1)
     values = (means, scales / 16.0 - 10, _read_rotations(rotations), logits(alpha[:, 0] / 255.0, 1 / 255), sh)
     values = (x.astype(np.float32, copy=False) for x in values)
-    return half_turned(Splats(*values, bool(header.flags & _ANTIALIASED)))
+    splats = Splats(*values, bool(header.flags & _ANTIALIASED))
+    return half_turned(splats) if axes == "RUB" else from_axes(splats, axes)
 
 
 def _read_rotations(table: np.ndarray) -> np.ndarray:

@@ -10,30 +10,27 @@ import io
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import jinja2
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from scene.cameras import Camera
 from scene.splats.ply import packed_ply
 from scene.splats.splats import Splats
+from scene.splats.turning import turned
 from splatting.camera_paths.keyframes import TimedPath
 from splatting.camera_paths.poses import Poses, focus_point, poses_of
 from splatting.exports.vendor import FOLDER, RECORD, VIEWER
 from splatting.files.json_files import read_json
-from utils.sh_utils import sh_basis
 from utils.system_utils import UserError, atomic_write
 
 LONGEST = 500_000_000  # letters of a page's text; Chromium's strings end at 2^29
 _NAME = "scene.compressed.ply"  # its ending tells the viewer the format
 UP = np.array([0.0, -1.0, 0.0])  # of the turned model, as in a usual capture
 _MEAN_UP = 0.01  # weight of the mean up beside the cameras' horizons
-_DIRECTIONS = 64  # more than the 25 coefficients that they determine
 BOOKMARKS = 25  # the viewer's own limit of annotations
 _TITLE = 60  # and of letters in their titles
 _KEYS_A_SECOND = 10
@@ -137,26 +134,6 @@ def turn_upright(up: np.ndarray) -> np.ndarray:
     sine = float(np.linalg.norm(axis))
     axis = axis / sine if sine > 1e-9 else np.array([0.0, 0.0, 1.0])
     return Rotation.from_rotvec(axis * np.arctan2(sine, cosine)).as_matrix()
-
-
-def turned(splats: Splats, turn: np.ndarray) -> Splats:
-    """The same Gaussians in a world turned by a rotation (3,3); its offset is not kept."""
-    rotation = Rotation.from_matrix(turn) * Rotation.from_quat(splats.rotations, scalar_first=True)
-    return replace(
-        splats,
-        means=(splats.means @ turn.T).astype(np.float32),
-        rotations=rotation.as_quat(scalar_first=True).astype(np.float32),
-        sh=np.einsum("jk,nkc->njc", _sh_turn(splats.sh_degree, turn).astype(np.float32), splats.sh),
-        world_offset=(0.0, 0.0, 0.0),
-    )
-
-
-def _sh_turn(degree: int, turn: np.ndarray) -> np.ndarray:
-    """The matrix (K,K) of SH coefficients: the new function at a direction d is the old one at turn^T d."""
-    directions = torch.randn(_DIRECTIONS, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    directions = torch.nn.functional.normalize(directions)
-    new, old = sh_basis(degree, directions), sh_basis(degree, directions @ torch.from_numpy(turn))
-    return torch.linalg.lstsq(new, old).solution.numpy()
 
 
 def settings(

@@ -11,6 +11,7 @@ import numpy as np
 
 from scene.cameras import Camera
 from scene.splats.splats import Splats
+from scene.splats.turning import turned
 from splatting.camera_paths.keyframes import Keyframe, TimedPath
 from splatting.camera_paths.poses import keyframe, poses_of
 from splatting.files.json_files import OFFSET, read_model_json
@@ -68,8 +69,6 @@ def moved_splats(splats: Splats, similarity: Similarity) -> Splats:
 
     Directions turn with the world, so SH bands do; a larger scale needs no enlargement where they are drawn.
     """
-    from splatting.exports.html import turned  # SciPy and jinja2 take a while to import
-
     enlargement = 2.0 ** np.ceil(np.log2(splats.enlargement / similarity.scale))
     return replace(
         turned(splats, similarity.rotation),
