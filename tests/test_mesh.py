@@ -157,6 +157,10 @@ def test_too_small_voxels_are_refused_or_enlarged(ball, views, monkeypatch):
     with pytest.raises(UserError, match=r"--voxel 0.04 makes more than 0 million voxels.*; give .* or more") as refused:
         volume_of(ball, views[:4], pipeline(), 0.04)
     volume_of(ball, views[:4], pipeline(), float(str(refused.value).split()[-3]))
+    for voxel in (1e-3, 1e-9, 1e-300):
+        with pytest.raises(UserError, match=rf"--voxel {voxel:g} is far below a pixel, .*; give .* or more") as refused:
+            volume_of(ball, views[:4], pipeline(), voxel)
+        assert 0.05 < float(str(refused.value).split()[-3]) < 0.5
     volume = volume_of(ball, views[:4], pipeline())
     assert len(volume.keys) * 512 <= 60_000
 

@@ -61,7 +61,7 @@ def volume_of(
     """Distances from the surfaces that cameras see.
 
     voxel: its size in the world's unit. None: two pixels at the median depth, or larger where the voxels would be more
-    than MOST_VOXELS. UserError if a given size makes more, and if no camera sees a surface.
+    than MOST_VOXELS. UserError if a given size makes more or is far below a pixel, and if no camera sees a surface.
     """
     gaussians = model_of(splats)
     pipe = argparse.Namespace(**(vars(pipe) | {"antialiasing": splats.antialiasing}))
@@ -73,7 +73,12 @@ def volume_of(
     if not any(spans):
         raise UserError("a mesh needs surfaces, and no training view shows anything opaque; train for longer")
     depth, pixel = np.median([span for span in spans if span], axis=0).tolist()
-    volume = _empty_volume(gaussians, views, pipe, voxel or _PIXELS * pixel, _FAR * depth, coarser=not voxel)
+    small = voxel is not None and SIDE * voxel < pixel  # blocks around the surface in neighbouring pixels do not touch
+    size = _PIXELS * pixel if voxel is None or small else voxel
+    volume = _empty_volume(gaussians, views, pipe, size, _FAR * depth, coarser=voxel is None or small)
+    if small:
+        usual = f"which is {pixel:.2g} at the usual depth"
+        raise UserError(f"--voxel {voxel:g} is far below a pixel, {usual}; give {volume.voxel:.2g} or more")
     for view in Bar(views, desc="Fusing depths", unit="view"):
         surface = surface_of(view, gaussians, pipe)
         volume.add_view(view, _within(surface.depth, _FAR * depth), surface.color)
