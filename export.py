@@ -34,14 +34,13 @@ from scene.saved_model import find_save, load_saved, read_model
 from scene.scene import Scene
 from scene.splats.reading import READABLE
 from scene.splats.splats import Splats, choose, selected, tidy, used_sh_degree, with_sh_degree
-from scene.with_splats import load_file, splats_of
+from scene.with_splats import load_file, place, splats_of
 from splatting.camera_paths.without_scene import RECORD, circle, recorded_cameras, warn_if_moved
 from splatting.exports.cleaning import OPTION as CLEAN_OPTION
 from splatting.exports.cleaning import check_clean, clean_scene, write_picture
 from splatting.exports.formats import FORMATS, Around, Format, format_of
 from splatting.exports.reading import ANY, read_any
 from splatting.exports.upright import add_upright_options, check_upright, oriented_later, placed
-from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json
 from splatting.parts import tools
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, compute_device, run_cli
@@ -71,9 +70,7 @@ def load(args: argparse.Namespace, options: argparse.Namespace, needs_views: boo
         return replace(splats, antialiasing=splats.antialiasing or bool(args.antialiasing)), None
     _, path = find_save(options.model_path, args.iteration)
     gaussians = read_model(path)
-    record = read_model_json(options.model_path)
-    gaussians.world_offset = tuple(record.get(OFFSET, (0.0, 0.0, 0.0)))
-    gaussians.enlargement = record.get(ENLARGEMENT, 1.0)
+    place(gaussians, options.model_path)
     return splats_of(gaussians, bool(args.antialiasing)), None
 
 

@@ -48,8 +48,8 @@ class ModelParams(OptionTable):
             help="file of points to start from instead of the scene's own: PLY, npz (points, colors), or text with "
                  "x y z or x y z red green blue in each line"),
         Option("init_ply", "", origin="ours", topic="data",
-            help="model whose Gaussians training starts from: PLY or compressed PLY of any program, SPZ or .splat; "
-                 "a point cloud is read as by --init_pcd_path"),
+            help="model whose Gaussians training starts from: PLY or compressed PLY of any program, SPZ, .splat, "
+                 "or a checkpoint of train.py, gsplat or nerfstudio; a point cloud is read as by --init_pcd_path"),
         Option("init_type", "sfm", origin="ours", check=one_of("sfm", "random"), topic="data",
             help="points to start from without --init_pcd_path and --init_ply. sfm: the scene's own; random: grey "
                  "points in the cameras' frusta, or in the reference's cube for Blender scenes"),

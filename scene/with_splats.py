@@ -5,6 +5,7 @@ A file's Gaussians are the start of a training, or other people's models in our 
 
 import argparse
 import copy
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,12 @@ import torch
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import attributes
 from scene.gaussians.morton import sort_scattered
+from scene.saved_model import read_model
 from scene.scene import Scene
 from scene.splats.ply import columns_of
 from scene.splats.reading import is_point_cloud, read_splats
 from scene.splats.splats import Splats, base_colors, drawable, selected
+from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json
 from utils.general_utils import inverse_sigmoid
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
@@ -35,6 +38,22 @@ def splats_of(gaussians: GaussianModel, antialiasing: bool = False) -> Splats:
     values = (gaussians.get_xyz, scales, gaussians.get_rotation, logits[:, 0], gaussians.get_features)
     means, scales, rotations, logits, sh = (x.detach().float().cpu().contiguous().numpy() for x in values)
     return Splats(means, scales, rotations, logits, sh, antialiasing, gaussians.world_offset, gaussians.enlargement)
+
+
+def splats_in(path: str | os.PathLike) -> Splats:
+    """The Gaussians of a file, as `read_splats`, or of a checkpoint of train.py, ours or the reference's."""
+    if Path(path).suffix.lower() != ".pth" or not os.path.isfile(path):
+        return read_splats(path)
+    gaussians = read_model(Path(path))
+    place(gaussians, Path(path).parent)
+    return splats_of(gaussians)
+
+
+def place(gaussians: GaussianModel, model_path: str | os.PathLike) -> None:
+    """Give a model the place and the enlargement that its folder records."""
+    record = read_model_json(model_path)
+    gaussians.world_offset = tuple(record.get(OFFSET, (0.0, 0.0, 0.0)))
+    gaussians.enlargement = record.get(ENLARGEMENT, 1.0)
 
 
 def model_of(splats: Splats, sh_degree: int | None = None) -> GaussianModel:
@@ -79,7 +98,7 @@ def scene_with(
     if is_point_cloud(path):
         options.init_pcd_path = path
         return Scene(options, gaussians, shuffle=False, start=False, **of_scene), None
-    splats = read_splats(path)
+    splats = splats_in(path)
     splats = selected(splats, drawable(splats))
     if not len(splats):
         raise UserError(f"{path} has no Gaussians that are drawn; give another model")

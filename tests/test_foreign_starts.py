@@ -3,12 +3,14 @@
 import json
 import re
 import sys
+from collections import OrderedDict
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from gaussians import options
 from plyfile import PlyData, PlyElement
 from small_splats import splats, written
 
@@ -17,6 +19,7 @@ import render
 import train
 from gaussian_renderer.blending import blending_weights, most_important
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.checkpoint import save_checkpoint
 from scene.gaussians.ply import read_ply
 from scene.readers.point_cloud import read_point_cloud
 from scene.saved_model import find_save, load_saved, read_model
@@ -25,6 +28,8 @@ from scene.splats.splats import Splats, selected
 from scene.with_splats import model_of, splats_of
 from splatting.camera_paths.keyframes import CameraPath, Keyframe
 from splatting.exports.formats import format_of
+from splatting.exports.reading import read_any
+from utils.sh_utils import C0
 from utils.system_utils import UserError
 
 
@@ -90,6 +95,67 @@ def test_training_starts_from_the_gaussians_of_a_file(tmp_path, colmap_scene, en
     for name, values in vars(_by_place(splats_of(model_of(read_splats(path), degree)))).items():
         np.testing.assert_allclose(getattr(started, name), values, rtol=0, atol=1e-6)
     assert len(read_point_cloud(tmp_path / "out/input.ply").points) == 30
+
+
+def _checkpoint(path: Path, some: Splats, kind: str) -> Path:
+    """What a program's trainer saves of splats."""
+    values = {name: torch.from_numpy(x) for name, x in vars(some).items() if isinstance(x, np.ndarray)}
+    sh, logits = values["sh"], values["opacity_logits"]
+    named = {"means": values["means"], "scales": values["log_scales"], "quats": values["rotations"]}
+    if kind == "gsplat":
+        splats = torch.nn.ParameterDict(named | {"opacities": logits, "sh0": sh[:, :1], "shN": sh[:, 1:]})
+        torch.save({"step": 9, "splats": splats.state_dict()}, path)
+    elif kind == "nerfstudio":
+        first = sh[:, 0] if sh.shape[1] > 1 else torch.logit(sh[:, 0] * C0 + 0.5)
+        named |= {"opacities": logits[:, None], "features_dc": first, "features_rest": sh[:, 1:]}
+        state = {f"_model.gauss_params.{name}": x for name, x in named.items()} | {"_model.device": torch.empty(0)}
+        torch.save({"step": 9, "pipeline": OrderedDict(state), "optimizers": {}, "scalers": {"scale": 1.0}}, path)
+    else:
+        gaussians = model_of(some)
+        gaussians.training_setup(options())
+        save_checkpoint(path, gaussians.capture(), 9)
+    return path
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+@pytest.mark.parametrize("kind", ["gsplat", "nerfstudio", "train.py"])
+def test_checkpoints_are_models(tmp_path, kind, degree, capsys):
+    some = splats(30, degree)
+    path = _checkpoint(
+        tmp_path / {"gsplat": "a_rank0.pt", "nerfstudio": "a.ckpt", "train.py": "a.pth"}[kind], some, kind
+    )
+    assert not is_point_cloud(path)
+    read = read_any(path)
+    for name, values in vars(some).items():
+        np.testing.assert_allclose(getattr(read, name), values, rtol=0, atol=1e-5)
+    assert (f"{path} is of {kind}: it fits the cameras" in capsys.readouterr().err) == (kind != "train.py")
+
+
+def test_a_checkpoint_of_train_py_starts_where_its_folder_says(tmp_path, colmap_scene, capsys):
+    path = _checkpoint(tmp_path / "chkpnt9.pth", start := splats(30, 0), "train.py")
+    (tmp_path / "model.json").write_text(json.dumps({"world_offset": [1.0, -2.0, 3.0]}))
+    means = _by_place(splats_of(_train(colmap_scene, tmp_path / "out", "--init_ply", path))).means
+    np.testing.assert_allclose(means, _by_place(start).means + [1.0, -2.0, 3.0], rtol=0, atol=1e-6)
+
+
+def test_parts_of_a_checkpoint_and_other_checkpoints_are_told(tmp_path, capsys):
+    for rank in range(2):
+        path = _checkpoint(tmp_path / f"ckpt_6_rank{rank}.pt", splats(5), "gsplat")
+    read_splats(path)
+    said = "warning: .*_rank1.pt has a part of the Gaussians; all are in ckpt_6_rank0.pt to ckpt_6_rank1.pt"
+    assert re.search(said, capsys.readouterr().err)
+    for content in ({"model": torch.zeros(3)}, {"splats": {"means": torch.zeros(3, 3)}}, torch.zeros(4), [1, 2]):
+        torch.save(content, tmp_path / "a.pt")
+        with pytest.raises(UserError, match="is a checkpoint without Gaussians of gsplat or nerfstudio; export"):
+            read_splats(tmp_path / "a.pt")
+    torch.save({"splats": Path("a")}, tmp_path / "b.ckpt")
+    (tmp_path / "c.pt").write_text("words")
+    for name in ("b.ckpt", "c.pt"):
+        with pytest.raises(UserError, match="is not a checkpoint that can be read .*; export a PLY with the program"):
+            read_splats(tmp_path / name)
+    torch.save({"model": 1}, tmp_path / "d.pth")
+    with pytest.raises(UserError, match="d.pth is not a checkpoint of train.py"):
+        read_any(tmp_path / "d.pth")
 
 
 def test_a_point_cloud_is_one_by_either_option(tmp_path, colmap_scene):

@@ -9,16 +9,18 @@ from scene.splats.dot_splat import read_splat
 from scene.splats.ply import read_compressed_ply, read_plain_ply
 from scene.splats.splats import Splats, tidy
 from scene.splats.spz import read_spz
+from scene.splats.trained import read_trained
 from splatting.files.ply_header import header_lines
 from utils.system_utils import UserError
 
-READABLE = "PLY, compressed PLY, SPZ or .splat"
+READABLE = "PLY, compressed PLY, SPZ, .splat, or a checkpoint"
+CHECKPOINTS = (".pth", ".pt", ".ckpt")  # train.py's, gsplat's and nerfstudio's
 _SPZ = (b"NGSP", b"\x1f\x8b")  # how its files begin
 
 
 def is_point_cloud(path: str | os.PathLike) -> bool:
     """Whether a file has points instead of splats: a PLY without their properties, or a file of another kind."""
-    if not os.path.isfile(path) or Path(path).suffix.lower() in (".splat", ".spz"):
+    if not os.path.isfile(path) or Path(path).suffix.lower() in (".splat", ".spz", *CHECKPOINTS):
         return False
     names = _properties(path)
     if names is None:
@@ -50,6 +52,8 @@ def read_splats(path: str | os.PathLike) -> Splats:
         read = read_spz
     elif Path(path).suffix.lower() == ".splat":  # it has no sign of its own
         read = read_splat
+    elif Path(path).suffix.lower() in CHECKPOINTS:
+        read = read_trained
     else:
         raise UserError(f"{path} is no model that this program reads; give {READABLE}")
     return tidy(read(path))

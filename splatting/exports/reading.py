@@ -4,8 +4,9 @@ import os
 import subprocess
 from pathlib import Path
 
-from scene.splats.reading import READABLE, read_splats
+from scene.splats.reading import READABLE
 from scene.splats.splats import Splats
+from scene.with_splats import splats_in
 from splatting.exports.sog import find_program
 from utils.system_utils import UserError, temporary_folder
 
@@ -13,9 +14,9 @@ ANY = f"{READABLE}, or .sog through splat-transform"
 
 
 def read_any(path: str | os.PathLike) -> Splats:
-    """The Gaussians of a file, as `read_splats`; of a SOG as PlayCanvas' program reads it. UserError without that."""
+    """The Gaussians of a file, as `splats_in`; of a SOG as PlayCanvas' program reads it. UserError without that."""
     if Path(path).suffix.lower() != ".sog" or not os.path.isfile(path):
-        return read_splats(path)
+        return splats_in(path)
     program = find_program(path)
     with temporary_folder() as folder:
         model = folder / "model.ply"
@@ -24,4 +25,4 @@ def read_any(path: str | os.PathLike) -> Splats:
         if done.returncode or not model.is_file():
             said = (done.stderr or done.stdout).strip().splitlines() or ["it said nothing"]
             raise UserError(f"{path} is not read by {program} ({said[-1]}); save or download it again")
-        return read_splats(model)
+        return splats_in(model)
