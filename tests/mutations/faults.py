@@ -80,7 +80,7 @@ FAULTS = (
     Fault(
         "3D filter's opacity factor overflows",
         "brush#522",
-        "splatting/parts/filter_3d/smoothing.py",
+        "scene/gaussians/filtered.py",
         "fainter = wider[:, :1] + wider[:, 1:2] + wider[:, 2:]",
         "before, after = (exp(2 * t).prod(1, keepdim=True).float() for t in (s, s + wider))\n"
         "        fainter = 0.5 * log((after / before).double())",
