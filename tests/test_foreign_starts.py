@@ -63,6 +63,12 @@ def test_what_is_no_3dgs_model_is_refused_by_name(tmp_path):
     assert not is_point_cloud(packed)
     with pytest.raises(UserError, match=r"is a compressed PLY; unpack it with export.py --ply .*b.compressed.ply"):
         read_ply(packed, 3)
+    said = {"a.sog": "is a SOG; give a PLY of it, by export.py .*a.sog --to", "a.glb": "is no model that this program"}
+    for name, words in said.items():
+        (tmp_path / name).write_bytes(b"PK")
+        assert not is_point_cloud(tmp_path / name)
+        with pytest.raises(UserError, match=f"{name} {words}"):
+            read_splats(tmp_path / name)
     plain = tmp_path / "c.ply"
     export.export(*_export_options("--ply", packed, "--to", plain))
     assert read_ply(plain, 3, further=False)["xyz"].shape == (5, 3)

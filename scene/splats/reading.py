@@ -15,12 +15,13 @@ from utils.system_utils import UserError
 
 READABLE = "PLY, compressed PLY, SPZ, .splat, or a checkpoint"
 CHECKPOINTS = (".pth", ".pt", ".ckpt")  # train.py's, gsplat's and nerfstudio's
+_OTHERS = (".sog", ".ksplat", ".glb", ".gltf", ".usdz")  # models that other programs read
 _SPZ = (b"NGSP", b"\x1f\x8b")  # how its files begin
 
 
 def is_point_cloud(path: str | os.PathLike) -> bool:
     """Whether a file has points instead of splats: a PLY without their properties, or a file of another kind."""
-    if not os.path.isfile(path) or Path(path).suffix.lower() in (".splat", ".spz", *CHECKPOINTS):
+    if not os.path.isfile(path) or Path(path).suffix.lower() in (".splat", ".spz", *CHECKPOINTS, *_OTHERS):
         return False
     names = _properties(path)
     if names is None:
@@ -54,6 +55,8 @@ def read_splats(path: str | os.PathLike) -> Splats:
         read = read_splat
     elif Path(path).suffix.lower() in CHECKPOINTS:
         read = read_trained
+    elif Path(path).suffix.lower() == ".sog":  # which export.py has another program read
+        raise UserError(f"{path} is a SOG; give a PLY of it, by export.py {path} --to FILE.ply")
     else:
         raise UserError(f"{path} is no model that this program reads; give {READABLE}")
     return tidy(read(path))
