@@ -34,7 +34,7 @@ from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_res
 from splatting.sfm.orienting import said_of
 from splatting.sfm.programs import refuse_while_working
 from splatting.sfm.report import lens_words, report_inputs, summary
-from splatting.sfm.video import FRAMES_MISSING, NOTE, refuse_foreign_frames, report_entries, taken_frames, video_lines
+from splatting.sfm.video import FRAMES_MISSING, NOTE, report_entries, taken_frames, video_lines
 from utils.system_utils import UserError, run_cli
 
 _BESIDE_POSES = ("camera", "mapper", "video", "skip_matching", "colmap_executable")
@@ -52,7 +52,7 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
         print(f"warning: {FRAMES_MISSING}", file=sys.stderr)
     kept = []
     if videos:
-        kept = record.run([_video_stage(layout, record, videos, args)])
+        kept = record.run([_video_stage(layout, videos, args)])
         print("\n".join(video_lines(layout)))
         found = find_images(layout, args.skip_unreadable, but=videos)
     for line in unused_lines(found.unused):
@@ -75,7 +75,7 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
             planned.append(stages.poses_stage(layout, Path(args.poses)))
         planned += stages.reconstruction_stages(backend, masks is not None)
     made = {"camera": settings.camera, "mapper": settings.mapper, "matcher": settings.matcher, "program": program}
-    planned.append(stages.undistortion_stage(layout, settings, made_from, **made, shared_by=settings.cameras))
+    planned.append(stages.undistortion_stage(layout, settings, record, made_from, **made, shared_by=settings.cameras))
     planned.append(capture_stage(layout, names, record.seconds))
     planned += stages.wanted_stages(layout, record, args)
     kept += record.run(planned)
@@ -115,14 +115,14 @@ def convert_first(source: str) -> None:
     # An `input` that has nothing but what lies beside it is one that an earlier run made.
     photos = photos if inputs <= {path.name for path in photos} else []
     is_video = not photos and (not inputs or report_entries(layout))
-    videos = [str(path) for path in files if path.suffix.lower() in VIDEO_SUFFIXES] if is_video else []
+    videos = [str(path.absolute()) for path in files if path.suffix.lower() in VIDEO_SUFFIXES] if is_video else []
     if not (inputs or photos or videos):
         return
     for path in photos:
         if path.name not in inputs:
             link(path, layout.input / path.name)
     print(f"{folder} has no cameras: converting what is in it first, as convert.py does without options")
-    main(["-s", source, *(["--video", *videos] if videos else [])])
+    main(["-s", str(layout.scene), *(["--video", *videos] if videos else [])])
 
 
 def _masks(given: str | None) -> Path | None:
@@ -142,15 +142,11 @@ def _videos(given: Sequence[str]) -> list[Path]:
     return videos
 
 
-def _video_stage(
-    layout: Layout, record: stages.StageRecord, videos: Sequence[Path], args: argparse.Namespace
-) -> stages.Stage:
+def _video_stage(layout: Layout, videos: Sequence[Path], args: argparse.Namespace) -> stages.Stage:
     """Make the stage of the videos. UserError for photos beside them that cannot be used, before minutes of work."""
-    begun = record.begun("video")
-    refuse_foreign_frames(layout, videos, begun)
     if layout.input.is_dir():
         sort_inputs(layout.input, args.skip_unreadable, but=videos)
-    return stages.video_stage(layout, videos, args.video_frames, begun)
+    return stages.video_stage(layout, videos, args.video_frames)
 
 
 def _settings(args: argparse.Namespace) -> Settings:

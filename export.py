@@ -37,10 +37,11 @@ from scene.splats.splats import Splats, choose, selected, tidy, used_sh_degree, 
 from scene.with_splats import load_file, place, splats_of
 from splatting.camera_paths.without_scene import RECORD, circle, recorded_cameras, warn_if_moved
 from splatting.exports.cleaning import OPTION as CLEAN_OPTION
-from splatting.exports.cleaning import check_clean, clean_scene, write_picture
+from splatting.exports.cleaning import check_clean, clean_scene, write_comparison
 from splatting.exports.formats import FORMATS, Around, Format, format_of
 from splatting.exports.reading import ANY, read_any
 from splatting.exports.upright import add_upright_options, check_upright, oriented_later, placed
+from splatting.files.ours import refuse_foreign
 from splatting.parts import tools
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, compute_device, run_cli
@@ -113,10 +114,14 @@ def cleaned(scene: Scene, most: float, pipe: argparse.Namespace, options: argpar
     """(N,) bool: what the training views need, to within `most` dB each; print what goes, and write a picture of it."""
     cleaning, views = clean_scene(scene, most, pipe, options.white_background)
     if not cleaning.keep.all():
-        picture = Path(to).with_name(f"{Path(to).name}.removed.png")
-        write_picture(picture, scene.gaussians, cleaning.keep, scene.getTrainCameras(), views)
+        picture = _picture_of_removed(to)
+        write_comparison(picture, scene.gaussians, cleaning.keep, scene.getTrainCameras(), views)
         print(f"{picture}: before, what goes, and after")
     return cleaning.keep.cpu().numpy()
+
+
+def _picture_of_removed(to: str) -> Path:
+    return Path(to).with_name(f"{Path(to).name}.removed.png")
 
 
 def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse.Namespace, entry: Format) -> None:
@@ -128,6 +133,8 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     check_upright(args)
     if entry.clean and not (args.raw or args.clean) and stand_ins(args, options) is None:
         args.clean = CLEAN_OPTION["const"]
+    if args.clean:
+        refuse_foreign(_picture_of_removed(args.to))
     needs_photos = bool(args.max_splats or args.clean)
     poses = stand_ins(args, options) if entry.around and not needs_photos else None
     if poses and entry.clean and args.model_path and not args.raw:

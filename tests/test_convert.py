@@ -134,6 +134,25 @@ def test_a_second_run_does_only_what_changed(copy, capsys):
     # The focal lengths that global mapping estimates must not get into the database that later runs resume from.
     assert Layout(copy).database.read_bytes() == features
     assert len(read_scene(copy, "images", False).train_cameras) == VIEWS
+    # Those of a user stay, and a link goes without what it leads to.
+    record = json.loads(Layout(copy).stages.read_text())
+    Layout(copy).stages.write_text(json.dumps({name: entry for name, entry in record.items() if name != "resize"}))
+    (copy / "images_2").mkdir()
+    (copy / "images").rename(copy / "elsewhere")
+    (copy / "images").symlink_to(copy / "elsewhere")
+    convert.main(["-s", str(copy), "--no_gpu", "--mapper", "global", "--lenses", "native"])
+    assert (copy / "images_2").is_dir() and any((copy / "elsewhere").iterdir())
+    assert len(read_scene(copy, "images", False).train_cameras) == VIEWS and not (copy / "images").is_symlink()
+
+
+@pytest.mark.parametrize("name", ["../a.png", "/a.png", "deep/../../a.png"])
+def test_photos_of_a_model_stay_in_their_folder(tmp_path, name):
+    layout = Layout(tmp_path)
+    layout.work.mkdir()
+    model = report.Model("0", [name], 1, 1.0, 1.0, [])
+    layout.survey.write_text(json.dumps([model._asdict()]))
+    with pytest.raises(UserError, match="names a photo .*a.png, outside of the folder of its photos"):
+        report.read_survey(layout, [])
 
 
 @pytest.mark.parametrize(
@@ -229,6 +248,12 @@ def _renamed(name: str) -> Callable[[Path], object]:
         ("-s {}", _renamed("images"), r"rename its folder images to input"),
         ("-s {}", _renamed("else"), r"make it and put the photos there, or pass"),
         ("-s {}", lambda scene: (scene / "images").mkdir(), r"already has images, which convert.py did not make"),
+        (
+            "-s {}",
+            lambda scene: (scene / "capture.html").touch(),
+            r"already has capture.html, which convert.py did",
+        ),
+        ("-s {} --resize", lambda scene: (scene / "images_4").mkdir(), r"did not make .*images_4, and --resize would"),
         ("-s {}", _few, r"input: fewer than 3 readable photos .1.; add more.*walk.mp4 \(video: pass it as --video"),
         (
             "-s {}",

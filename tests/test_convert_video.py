@@ -17,7 +17,15 @@ from skimage.metrics import structural_similarity
 import convert
 from splatting.sfm import video as video_module
 from splatting.sfm.layout import Layout
-from splatting.sfm.video import choose_frames, extract_videos, sharpness, small_picture
+from splatting.sfm.video import (
+    choose_frames,
+    extract_videos,
+    frame_folders,
+    refuse_foreign_frames,
+    remove_frames,
+    sharpness,
+    small_picture,
+)
 from utils.system_utils import UserError
 
 
@@ -109,6 +117,30 @@ def test_frames_replace_frames_and_nothing_else(tmp_path, monkeypatch):
     assert [path.name for path in _frames(other)] == ["frame_00002.jpg"]
 
 
+def test_frames_go_by_what_they_are_not_by_what_a_record_says(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", _Decoder())
+    layout = _extract(tmp_path / "scene", Path("any.mp4"), 4)
+    (entry,), frames = json.loads(layout.frames.read_text()), _frames(layout)
+    _frame_elsewhere = frames[3].rename(tmp_path / "frame_00004.jpg")
+    for name in ("../../frame_00004.jpg", str(tmp_path / "frame_00004.jpg"), ".hidden/frame_00004.jpg", "mine.jpg", 5):
+        layout.frames.write_text(json.dumps([entry | {"names": [name]}]))
+        with pytest.raises(UserError, match="frames.json is damaged; remove "):
+            remove_frames(layout)
+    assert _frame_elsewhere.is_file()
+    layout.frames.write_text(json.dumps([entry]))
+    Image.open(frames[1]).rotate(90).save(frames[1])
+    with pytest.raises(UserError, match="frame_00002.jpg has a name that frames of any.mp4 will get"):
+        refuse_foreign_frames(layout, [Path("any.mp4")])
+    remove_frames(layout)
+    assert _frames(layout) == [frames[1]]
+
+
+def test_folders_of_frames_stay_in_the_input(tmp_path):
+    layout = Layout(tmp_path)
+    folders = frame_folders(layout, [Path("a.mp4"), Path(".b.mp4"), Path("...mp4")])
+    assert [folder.relative_to(layout.input).as_posix() for folder in folders] == ["a", "b", "video"]
+
+
 def test_frames_that_an_ended_run_left_out_are_said(tmp_path, monkeypatch, capsys):
     layout, video = Layout(tmp_path / "scene"), tmp_path / "walk.mp4"
     video.touch()
@@ -143,6 +175,30 @@ def _write(ffmpeg, path: Path, frames: np.ndarray, *options: str, pixels: str = 
 def _places(room: np.ndarray, frames: list[np.ndarray]) -> list[int]:
     """The place in the room that each frame shows."""
     return [int(np.abs(room.astype(np.int16) - frame).mean(axis=(1, 2, 3)).argmin()) for frame in frames]
+
+
+@pytest.mark.parametrize("name", ["12:30.mp4", "-x.mp4", "file,5.mp4", "a%03d.mp4", "concat:a.mp4"])
+def test_names_are_neither_options_nor_addresses(ffmpeg, room, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    _write(ffmpeg, tmp_path / name, room[:2])
+    assert _frames(_extract(tmp_path / "scene", Path(name), 2))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "ffconcat version 1.0\nfile secret.mp4\n",
+        "#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:1,\nsecret.mp4\n#EXT-X-ENDLIST\n",
+        "v=0\no=- 0 0 IN IP4 127.0.0.1\nc=IN IP4 127.0.0.1\nm=video 5004 RTP/AVP 96\na=rtpmap:96 H264/90000\n",
+    ],
+)
+@pytest.mark.parametrize("ending", ["mp4", "m3u8"])
+def test_a_text_does_not_lead_to_other_files(ffmpeg, room, tmp_path, text, ending):
+    _write(ffmpeg, tmp_path / "secret.mp4", room[:2])
+    (tmp_path / f"a.{ending}").write_text(text)
+    with pytest.raises(UserError, match="cannot read the video .*a.m"):
+        _extract(tmp_path / "scene", tmp_path / f"a.{ending}", 2)
+    assert not list((tmp_path / "scene" / "input").iterdir())
 
 
 def test_frames_follow_the_motion(ffmpeg, room, tmp_path):

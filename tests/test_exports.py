@@ -537,7 +537,7 @@ def test_splats_that_pack_well_are_read(tmp_path):
 @pytest.mark.parametrize("ending", [".usdz", ".sog"])
 def test_without_a_temporary_folder_an_export_says_so(tmp_path, ending, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "absent"))
-    monkeypatch.setattr("shutil.which", lambda name, **_: name)
+    monkeypatch.setattr("shutil.which", lambda name, **_: f"/bin/{name}")
     with pytest.raises(UserError, match=r"cannot make a temporary folder \(.*absent.*environment variable TMPDIR"):
         written(tmp_path, ending, splats(5))
     assert not list(tmp_path.iterdir())

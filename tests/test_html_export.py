@@ -99,7 +99,7 @@ def test_vendor_writes_nothing_that_differs_from_the_record(tmp_path, monkeypatc
     replaced |= {"_installed": lambda *_: (tmp_path, Path("esbuild"))}
     for name, value in replaced.items():
         monkeypatch.setattr(vendor, name, value)
-    monkeypatch.setattr("shutil.which", lambda _: "npm")
+    monkeypatch.setattr("shutil.which", lambda *_, **__: "/bin/npm")
     digest = hashlib.sha256(b"other").hexdigest()
     with pytest.raises(UserError, match=f'the files differ from those of .*"LICENSE": "{digest}"'):
         vendor.main([])

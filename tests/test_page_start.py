@@ -108,6 +108,18 @@ def test_pages_are_cleaned_unless_they_are_raw(colmap_scene, tmp_path, monkeypat
         monkeypatch.setattr("sys.argv", ["export.py", "-m", str(model), "--to", str(tmp_path / "page.html"), *words])
         export.main()
 
+    for picture, words in (
+        ("page.html.jpg", ()),
+        ("page.html.removed.png", ()),
+        ("page.html.removed.png", ("--clean",)),
+    ):
+        (tmp_path / picture).write_bytes(b"mine")
+        with pytest.raises(
+            UserError, match=f"no export wrote .*{picture} as it is, and this one would replace it; move"
+        ):
+            run(*words)
+        assert (tmp_path / picture).read_bytes() == b"mine" and not asked
+        (tmp_path / picture).unlink()
     for words, most in (((), cleaning.OPTION["const"]), (("--clean", "0.2"), 0.2)):
         with pytest.raises(UserError, match="enough is known"):
             run(*words)

@@ -121,7 +121,7 @@ def test_the_command_that_a_person_types(monkeypatch, tmp_path):
     assert typed_command("view.py") == f"'{tmp_path}/bin x/python' view.py"
     monkeypatch.chdir(tmp_path)
     assert typed_command("view.py") == f"'bin x/python' {ROOT}/view.py"
-    monkeypatch.setattr("shutil.which", {"python": sys.executable}.get)
+    monkeypatch.setattr("shutil.which", lambda *_, **__: sys.executable)
     assert typed_command("view.py") == f"python {ROOT}/view.py"
     monkeypatch.chdir("/")
     assert typed_command("view.py") == f"python {ROOT}/view.py"

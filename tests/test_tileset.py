@@ -229,6 +229,60 @@ def test_a_new_tileset_takes_the_place_of_the_earlier_one(tmp_path):
     assert {entry.name for entry in tmp_path.iterdir()} == {"tileset.json", second["asset"]["extras"]["folder"]}
 
 
+@pytest.mark.parametrize("name", ["tileset.json", "cesium.json"])
+def test_each_tileset_has_a_folder_of_its_own(tmp_path, name):
+    one, other = tmp_path / f"a.{name}", tmp_path / f"b.{name}"
+    first, second = _written(one, splats(20, 0)), _written(other, splats(20, 0))
+    _written(one, splats(30, 0))
+    assert not (tmp_path / first["asset"]["extras"]["folder"]).exists()
+    assert (tmp_path / second["root"]["content"]["uri"]).is_file()
+
+
+def test_only_a_folder_of_ours_goes_with_the_earlier_tileset(tmp_path, capsys):
+    path, photos = tmp_path / "tileset.json", tmp_path / "tiles-2024"
+    photos.mkdir()
+    (photos / "photo.jpg").touch()
+
+    def stays(folder: str, reason: str) -> bool:
+        _written(path, splats(30, 0))
+        said = f"warning: the folder {tmp_path / folder} of the earlier tileset.json stays, as it {reason}"
+        return (tmp_path / folder).is_dir() and said in capsys.readouterr().err
+
+    for name in ("tiles-2024", "..", ".", "", "/", str(photos), "tiles-2024/../tiles-2024", 5, ["a"], None):
+        path.write_text(json.dumps({"asset": {"extras": {"folder": name}}}))
+        _written(path, splats(30, 0))
+        assert (photos / "photo.jpg").is_file()
+    capsys.readouterr()
+    path.write_text(json.dumps({"asset": {"extras": {"folder": "tiles-2024"}}}))
+    assert stays("tiles-2024", "was not written by an export for this file")
+    folder = _written(path, splats(20, 0))["asset"]["extras"]["folder"]
+    (tmp_path / folder / "mine.txt").touch()
+    assert stays(folder, "was not written by an export for this file, or has changed since")
+    folder = _written(path, splats(21, 0))["asset"]["extras"]["folder"]
+    shutil.copy(path, tmp_path / "copy.JSON")
+    assert stays(folder, "is named by copy.JSON")
+    moved = tmp_path / "moved"
+    (tmp_path / folder).rename(moved)
+    (tmp_path / folder).symlink_to(moved)
+    shutil.copy(tmp_path / "copy.JSON", path)
+    (tmp_path / "copy.JSON").unlink()
+    assert stays(folder, "was not written") and any(moved.iterdir())
+
+
+def test_exporting_again_repairs_tiles(tmp_path):
+    path = tmp_path / "tileset.json"
+    first = _written(path, splats(20, 0))
+    tile = tmp_path / first["root"]["content"]["uri"]
+    whole = tile.read_bytes()
+    (tile.parent / "mine.txt").touch()
+    for damage in (tile.unlink, lambda: tile.write_bytes(whole[:-1] + b"x"), lambda: path.write_text("{")):
+        damage()
+        assert _written(path, splats(20, 0)) == first and tile.read_bytes() == whole
+    (tmp_path / "usual").mkdir()
+    assert (tile.parent / "mine.txt").is_file()
+    assert tile.parent.stat().st_mode == (tmp_path / "usual").stat().st_mode  # so that a web server may read it
+
+
 def test_a_failed_tileset_leaves_the_earlier_one(tmp_path, monkeypatch):
     path = tmp_path / "tileset.json"
     _written(path, splats(20, 0))

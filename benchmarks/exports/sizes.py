@@ -8,7 +8,6 @@ views around the model's middle, float32 and unrounded. Those of a format withou
 
 import argparse
 import json
-import shutil
 import struct
 import subprocess
 import tempfile
@@ -31,6 +30,7 @@ from splatting.camera_paths.poses import facing, keyframe
 from splatting.exports.formats import FORMATS
 from splatting.exports.scene_formats import PRIM
 from splatting.exports.sog import PROGRAM
+from splatting.host.programs import find_program
 from utils.system_utils import UserError, compute_device, run_cli
 
 
@@ -42,7 +42,7 @@ def read_back(path: Path) -> Splats:
 
 def read_by_splat_transform(path: Path) -> Splats:
     """The splats of a file as PlayCanvas' program reads them, which writes them as PLY. UserError without it."""
-    program = shutil.which(PROGRAM)
+    program = find_program(PROGRAM)
     if program is None:
         raise UserError(f"{path} is read by {PROGRAM}; run npm ci in tests/foreign, and add its .bin folder to PATH")
     with tempfile.TemporaryDirectory() as folder:

@@ -10,6 +10,7 @@ from typing import IO
 
 import numpy as np
 
+from splatting.host.programs import find_program, forget_relative_path
 from utils.system_utils import UserError, atomic_write
 
 # Of x264, 0 to 51, smaller is better. At 16 a render keeps 35 dB and more; what is lost is colour at edges, as yuv420p
@@ -24,13 +25,17 @@ def find_ffmpeg() -> str:
         import imageio_ffmpeg
     except ImportError as error:
         raise UserError("videos need the package imageio-ffmpeg; `pip install '.[video]'` installs it") from error
+    forget_relative_path()  # as imageio-ffmpeg looks there, too
     try:
-        return imageio_ffmpeg.get_ffmpeg_exe()
-    except RuntimeError as error:
+        program = find_program(imageio_ffmpeg.get_ffmpeg_exe())
+    except RuntimeError:
+        program = None
+    if program is None:
         raise UserError(
             "the package imageio-ffmpeg has no ffmpeg program for this machine; install ffmpeg, and name it in the "
             "environment variable IMAGEIO_FFMPEG_EXE"
-        ) from error
+        )
+    return program
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], width: int, height: int, fps: int) -> None:

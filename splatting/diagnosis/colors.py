@@ -5,11 +5,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from PIL import Image
 
 from scene.dataset_readers import CameraInfo, SceneInfo
 from scene.readers.tracks import projected
 from splatting.diagnosis import Line
+from splatting.files.image_files import open_image
 from splatting.files.listing import some
 from utils.graphics_utils import BasicPointCloud
 
@@ -50,7 +50,7 @@ def check_colors(info: SceneInfo) -> Iterator[Line]:
 
 def _pixels(camera: CameraInfo) -> np.ndarray:
     """A photo, small, (H, W, 3) in [0, 1]."""
-    with Image.open(camera.image_path) as image:
+    with open_image(camera.image_path) as image:
         image.draft("RGB", (_SMALL, _SMALL))
         image = image.convert("RGB")
         image.thumbnail((_SMALL, _SMALL))

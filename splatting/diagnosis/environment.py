@@ -8,12 +8,12 @@ import importlib.metadata
 import math
 import platform
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 from splatting.diagnosis import Line
+from splatting.host.programs import find_program
 
 ROOT = Path(__file__).resolve().parents[2]
 EXTENSIONS = ("diff-gaussian-rasterization", "fused-ssim", "simple-knn")  # folders and distributions of packages
@@ -93,7 +93,7 @@ def _check_gpu(torch) -> Line:
 
 def _nvidia_gpu() -> str:
     """Name of the first GPU that the driver's own tool lists; empty if there is none."""
-    tool = shutil.which("nvidia-smi")
+    tool = find_program("nvidia-smi")
     if not tool:
         return ""
     try:

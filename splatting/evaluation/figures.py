@@ -12,7 +12,7 @@ import gc
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -85,9 +85,18 @@ def _label(axes: Axes, x: str, y: str, log: bool = False) -> None:
     axes.grid(True, which="both", alpha=0.3, linewidth=0.5)
 
 
+@cache
+def _forget_settings() -> None:
+    """Those of a matplotlibrc in the folder that a user works in, which may call for TeX, would count."""
+    from matplotlib import rcdefaults
+
+    rcdefaults()
+
+
 def _figure(rows: int, size: tuple[float, float], title: str) -> tuple[Figure, Any]:
     from matplotlib.figure import Figure  # imported here: it takes long, and most programs draw nothing
 
+    _forget_settings()
     figure = Figure(figsize=size, layout="constrained")
     figure.suptitle(as_utf8(title))
     return figure, figure.subplots(rows, 1, sharex=True)
@@ -143,6 +152,7 @@ def _panel(path: Path, title: str, log: bool, labels: tuple[str, str], draw: Cal
     """
     from matplotlib import rc_context
 
+    _forget_settings()
     with rc_context({"font.size": FONT}):
         figure, axes = _figure(1, PANEL, title)
         said = draw(axes)

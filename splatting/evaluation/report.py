@@ -15,13 +15,13 @@ from urllib.parse import quote
 
 import jinja2
 from markupsafe import Markup
-from PIL import Image
 
 from splatting.evaluation import comparison, tables
 from splatting.evaluation.comparison import Sets
 from splatting.evaluation.figures import draw_curves, draw_fronts, draw_poses
 from splatting.evaluation.gains import gains
 from splatting.evaluation.renders import GAIN, ComparedViews
+from splatting.files.image_files import open_image
 from splatting.files.json_files import write_json
 from splatting.files.listing import markdown_table
 from splatting.host.machine import one_line
@@ -264,7 +264,7 @@ def _data_uri(path: Path) -> str:
     if len(content) <= _PHOTOGRAPHIC:
         return _uri(content, "png")
     buffer = io.BytesIO()
-    with Image.open(path) as image:
+    with open_image(path) as image:
         image.convert("RGB").save(buffer, "JPEG", quality=_QUALITY)
     return _uri(buffer.getvalue())
 

@@ -88,7 +88,7 @@ def train(run: Run, machine: dict[str, Any], child: Child) -> None:
 
 def _remove_stop(run: Run, iteration: int) -> None:
     """Remove what an interrupt has saved, unless that iteration was asked for, too."""
-    if str(iteration) not in run.options:
+    if isinstance(iteration, int) and str(iteration) not in run.options:  # not what a damaged record has
         shutil.rmtree(saved_ply(run.model, iteration).parent, ignore_errors=True)
         (run.model / f"chkpnt{iteration}.pth").unlink(missing_ok=True)
 

@@ -14,6 +14,7 @@ from itertools import chain
 from pathlib import Path
 
 import torch
+from PIL import Image
 from torch import Tensor
 
 from gaussian_renderer.blending import weighted_sums
@@ -23,7 +24,8 @@ from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.scene import Scene
 from splatting.camera_paths.without_scene import WithoutScene
-from splatting.files.image_files import save_png
+from splatting.files.image_files import to_bytes
+from splatting.files.ours import write_picture
 from splatting.host.progress import Bar
 from utils.image_utils import as_float, pixels_that_count
 from utils.system_utils import UserError, compute_device
@@ -157,7 +159,7 @@ def clean_scene(
 
 
 @torch.no_grad()
-def write_picture(
+def write_comparison(
     path: str | os.PathLike, gaussians: GaussianModel, keep: Tensor, cameras: Sequence[Camera], views: ScoredViews
 ) -> None:
     """Write a PNG of the views that change most: before, what goes, and after, side by side, a row for each view."""
@@ -167,4 +169,5 @@ def write_picture(
     chosen = sorted(range(len(cameras)), key=lambda k: -changes[k])[:_SHOWN]
     rows = [torch.cat([views.image(cameras[k], model) for model in (gaussians, gone, after)], 2) for k in chosen]
     width = max(row.shape[2] for row in rows)
-    save_png(torch.cat([torch.nn.functional.pad(row, (0, width - row.shape[2])) for row in rows], 1), Path(path))
+    whole = torch.cat([torch.nn.functional.pad(row, (0, width - row.shape[2])) for row in rows], 1)
+    write_picture(Path(path), Image.fromarray(to_bytes(whole).numpy()))

@@ -19,7 +19,8 @@ from scene.splats.spz import find_zstandard, write_spz
 from splatting.camera_paths.poses import poses_of
 from splatting.exports.mesh_files import find_skimage, with_z_up, write_glb_mesh, write_ply_mesh
 from splatting.exports.scene_formats import find_pxr, write_glb, write_usdz
-from splatting.exports.sog import find_program, write_sog
+from splatting.exports.sog import find_splat_transform, write_sog
+from splatting.files.ours import refuse_foreign
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:  # SciPy takes a while to import
@@ -48,7 +49,8 @@ class Format:
     write: writes a file of splats, whole or not at all, and returns what it is, where it is not splats. UserError if it
     cannot be written. of_scene: it also takes `Around`. options: of export.py that are for this kind of files only.
     around: views from around a model do, where there is no scene. clean: it is cleaned unless --raw is given. bands: it
-    keeps SH bands. check: raises UserError if a package or program that the file needs is missing.
+    keeps SH bands. check: raises UserError if a package or program that the file needs is missing, or if a
+    file of the user is in the way of one that is written beside it.
     """
 
     ending: str
@@ -62,6 +64,10 @@ class Format:
     check: Callable[[str | os.PathLike], Any] = lambda path: None
 
 
+def _picture_of(page: str | os.PathLike) -> Path:
+    return Path(page).with_name(f"{Path(page).name}.jpg")  # no photo has such a name
+
+
 def _write_html(path: str | os.PathLike, splats: Splats, around: Around) -> None:
     from splatting.exports.html import write_html  # SciPy and jinja2 take a while to import
     from splatting.exports.page_start import best_start, named_start, write_preview
@@ -71,7 +77,7 @@ def _write_html(path: str | os.PathLike, splats: Splats, around: Around) -> None
         start = named_start(around.start, names)
     else:
         start = best_start(poses_of(around.cameras)) if names else 0
-    picture = Path(path).with_name(f"{Path(path).name}.jpg")  # no photo has such a name
+    picture = _picture_of(path)
     how = around.make_path, around.background, around.title, start, quote(os.fsencode(picture.name))
     write_html(path, splats, around.cameras, *how, around.upright)
     write_preview(picture, splats, around.cameras[start], around.pipe, around.background)
@@ -122,7 +128,7 @@ FORMATS = (
     Format(".ply", write_plain_ply, "float32, everything kept"),
     Format(".splat", write_splat, "antimatter15, 32 bytes a splat, no SH bands", bands=False),
     Format(".spz", write_spz, "Niantic, version 4", check=find_zstandard),
-    Format(".sog", write_sog, "PlayCanvas, through splat-transform", check=find_program),
+    Format(".sog", write_sog, "PlayCanvas, through splat-transform", check=find_splat_transform),
     Format(".glb", write_glb, "glTF with KHR_gaussian_splatting, float32"),
     Format(
         "cesium.json", partial(_write_tileset, compressed=True), "3D Tiles for CesiumJS, as SPZ 2", True, around=True
@@ -134,11 +140,18 @@ FORMATS = (
         "streamed SOG, by the same levels",
         of_scene=True,
         around=True,
-        check=find_program,
+        check=find_splat_transform,
     ),
     Format(".usdz", write_usdz, "OpenUSD, float32", check=find_pxr),
     Format(
-        ".html", _write_html, "a page with a viewer", True, ("path", "start", "title", "raw"), around=True, clean=True
+        ".html",
+        _write_html,
+        "a page with a viewer",
+        True,
+        ("path", "start", "title", "raw"),
+        around=True,
+        clean=True,
+        check=lambda path: refuse_foreign(_picture_of(path)),
     ),
 )
 

@@ -4,6 +4,7 @@ import argparse
 import math
 import os
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -17,7 +18,8 @@ from scene.with_splats import model_of
 from splatting.camera_paths.poses import Poses, focus_point, opening, poses_of
 from splatting.files.image_files import to_bytes
 from splatting.files.listing import some
-from utils.system_utils import UserError, atomic_write
+from splatting.files.ours import write_picture
+from utils.system_utils import UserError
 
 LEAST = 0.5  # of a photo's height that is shown, however wide the window is
 PICTURE = 1200, 630  # px, as services ask for
@@ -74,5 +76,4 @@ def write_preview(
     view = free_view(width, height, fov, *place, model.get_xyz.device)
     pipe = argparse.Namespace(**(vars(pipe) | {"antialiasing": splats.antialiasing}))
     image = render(view, model, pipe, model.get_xyz.new_tensor(background), want_depth=False)["render"]
-    with atomic_write(path) as temporary:
-        Image.fromarray(to_bytes(image).numpy()).save(temporary, "JPEG", quality=_QUALITY)
+    write_picture(Path(path), Image.fromarray(to_bytes(image).numpy()), quality=_QUALITY)

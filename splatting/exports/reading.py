@@ -7,7 +7,7 @@ from pathlib import Path
 from scene.splats.reading import READABLE
 from scene.splats.splats import Splats
 from scene.with_splats import splats_in
-from splatting.exports.sog import find_program
+from splatting.exports.sog import find_splat_transform
 from utils.system_utils import UserError, temporary_folder
 
 ANY = f"{READABLE}, or .sog through splat-transform"
@@ -17,10 +17,10 @@ def read_any(path: str | os.PathLike) -> Splats:
     """The Gaussians of a file, as `splats_in`; of a SOG as PlayCanvas' program reads it. UserError without that."""
     if Path(path).suffix.lower() != ".sog" or not os.path.isfile(path):
         return splats_in(path)
-    program = find_program(path)
+    program = find_splat_transform(path)
     with temporary_folder() as folder:
         model = folder / "model.ply"
-        command = [program, "--quiet", str(path), str(model)]
+        command = [program, "--quiet", os.path.abspath(path), str(model)]  # which is neither an option nor an address
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode or not model.is_file():
             said = (done.stderr or done.stdout).strip().splitlines() or ["it said nothing"]

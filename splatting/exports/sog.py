@@ -1,7 +1,6 @@
 """SOG, the format of PlayCanvas. Its own program splat-transform writes it, which needs Node."""
 
 import os
-import shutil
 import subprocess
 import zipfile
 from collections.abc import Sequence
@@ -10,6 +9,7 @@ from urllib.parse import quote
 
 from scene.splats.ply import write_plain_ply
 from scene.splats.splats import Splats
+from splatting.host.programs import find_program
 from utils.system_utils import UserError, atomic_write, temporary_folder
 
 PROGRAM = "splat-transform"
@@ -18,17 +18,17 @@ PROGRAM = "splat-transform"
 _SEEDED = "let s=1;Math.random=()=>{s^=s<<13;s^=s>>>17;s^=s<<5;return(s>>>0)/2**32}"
 
 
-def find_program(path: str | os.PathLike) -> str:
+def find_splat_transform(path: str | os.PathLike) -> str:
     """The program that a file of this name needs. UserError without it."""
-    program = shutil.which(PROGRAM) or shutil.which(PROGRAM, path="node_modules/.bin")
+    program = find_program(PROGRAM)
     if program is None:
         raise UserError(f"{path} needs {PROGRAM}; install Node, then run npm install -g @playcanvas/splat-transform")
     return program
 
 
 def write_sog(path: str | os.PathLike, splats: Splats) -> None:
-    """Write a SOG file, whole or not at all. UserError without splat-transform, on PATH or in ./node_modules."""
-    program = find_program(path)
+    """Write a SOG file, whole or not at all. UserError without splat-transform."""
+    program = find_splat_transform(path)
     if not len(splats):
         raise UserError(f"{path} would have no splats, which {PROGRAM} does not write; choose another format")
     with temporary_folder() as folder, atomic_write(path) as temporary:
@@ -43,7 +43,7 @@ def run_program(program: str, inputs: Sequence[str], output: Path, path: str | o
     # Without a GPU, as its results differ from machine to machine.
     options = [os.environ.get("NODE_OPTIONS", ""), f"--import=data:text/javascript,{quote(_SEEDED)}"]
     environment = {**os.environ, "NODE_OPTIONS": " ".join(options).strip()}
-    command = [program, "--quiet", "--overwrite", "--gpu", "cpu", *inputs, str(output)]
+    command = [program, "--quiet", "--overwrite", "--gpu", "cpu", *inputs, os.path.abspath(output)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     if done.returncode or not output.is_file():
         said = (done.stderr or done.stdout).strip().splitlines() or ["it said nothing"]

@@ -10,12 +10,12 @@ machine; other code is an error, and nothing is written.
 import gzip
 import hashlib
 import json
-import shutil
 import subprocess
 from argparse import ArgumentParser
 from collections.abc import Sequence
 from pathlib import Path
 
+from splatting.host.programs import find_program
 from utils.system_utils import UserError, atomic_write, run_cli, temporary_folder
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     description = f"Make {FOLDER.relative_to(ROOT)}/ from the npm package and minifier that its vendored.json names."
     ArgumentParser(prog="python -m splatting.exports.vendor", description=description).parse_args(argv)
     record = json.loads(RECORD.read_text(encoding="utf-8"))
-    if not shutil.which("npm"):
+    if not find_program("npm"):
         raise UserError("npm is not installed; install Node 20 or later, which brings it")
     with temporary_folder() as folder:
         package, minifier = _installed(record, folder)
@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def _installed(record: dict, folder: Path) -> tuple[Path, Path]:
     """The package's folder, and the minifier."""
     named = f"{record['package']}@{record['version']}", f"esbuild@{record['esbuild']}"
-    _output(["npm", "install", "--silent", "--ignore-scripts", "--no-save", "--prefix", folder, *named])
+    _output([find_program("npm"), "install", "--silent", "--ignore-scripts", "--no-save", "--prefix", folder, *named])
     modules = folder / "node_modules"
     return modules / record["package"], modules / ".bin" / "esbuild"
 

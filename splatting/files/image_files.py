@@ -105,7 +105,7 @@ def write_plane(path: str | os.PathLike, values: np.ndarray, largest: float | No
 def read_plane(path: str | os.PathLike) -> np.ndarray:
     """Read what `write_plane` wrote: (H, W) float64, each within half a step. UserError for a file that is no plane."""
     try:
-        with Image.open(plain(path)) as image:
+        with open_image(Path(path)) as image:
             return np.asarray(image, dtype=np.float64) * float(image.text[SCALE])
     except (*UNREADABLE, AttributeError, KeyError, ValueError) as error:
         raise UserError(f"cannot read {path} as a plane of numbers ({error}); render.py writes such files") from error

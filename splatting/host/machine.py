@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import splatting.host.openmp  # noqa: F401  (for programs that imported torch before)
 from splatting.host import torchrun
+from splatting.host.programs import find_program
 
 if TYPE_CHECKING:
     import torch
@@ -142,7 +143,8 @@ def commit() -> str:
 def _output(*command: str) -> str:
     """Output of a program; empty if it is missing or fails."""
     try:
-        done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True)
+        program = find_program(command[0]) or "/"  # which cannot be run
+        done = subprocess.run([program, *command[1:]], cwd=_ROOT, capture_output=True, text=True)
     except OSError:
         return ""
     return done.stdout.strip() if done.returncode == 0 else ""

@@ -10,7 +10,6 @@ import importlib.util
 import io
 import os
 import shlex
-import shutil
 import signal
 import sys
 import threading
@@ -18,6 +17,7 @@ from pathlib import Path
 
 from splatting.host import torchrun
 from splatting.host.interrupt import raise_on_signals
+from splatting.host.programs import find_program, forget_relative_path
 
 _TRIM, _SEPARATE = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of mallopt
 _KEPT = 256 << 20  # bytes that may lie free
@@ -45,8 +45,11 @@ def prepare() -> None:
 def imported() -> None:
     """Call when all is imported: signals raise exceptions from now on, and garbage is collected, but for the imports.
 
+    Programs are not looked for in the current folder.
+
     Without `prepare`, as where other code calls this, its garbage is its own.
     """
+    forget_relative_path()
     global _waiting
     if _waiting:
         gc.freeze()
@@ -125,7 +128,7 @@ def _make_context() -> None:
 
 def typed_command(script: str) -> str:
     """How a command of this program is called from here: its Python (python where that is what runs), and its path."""
-    found, own = shutil.which("python"), Path(sys.executable)
+    found, own = find_program("python"), Path(sys.executable)
     python = "python" if found and Path(found).absolute() == own.absolute() else _typed(own)
     return f"{python} {_typed(_ROOT / script)}"
 

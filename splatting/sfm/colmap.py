@@ -17,6 +17,7 @@ from typing import Any
 
 from diff_gaussian_rasterization.lens import MODELS
 
+from splatting.host.programs import find_program
 from splatting.sfm.layout import Layout
 from utils.system_utils import UserError, atomic_write
 
@@ -128,7 +129,12 @@ class Program(Backend):
 
     def __init__(self, executable: str, layout: Layout, settings: Settings) -> None:
         super().__init__(layout, settings)
-        self._executable = executable
+        self._executable = find_program(executable)
+        if self._executable is None:
+            raise UserError(
+                f"there is no {executable} on PATH; pass the path of COLMAP as --colmap_executable, or omit the option "
+                "to use pycolmap"
+            )
         named = [line for line in (self._output("help") or "").splitlines() if line.startswith("COLMAP")]
         if not named:
             raise UserError(

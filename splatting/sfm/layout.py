@@ -99,12 +99,19 @@ def _is_image(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
+def _has(path: Path, form: str | None) -> bool:
+    """Whether a file has a text by which those of convert.py are known."""
+    return form is not None and path.is_file() and form in path.read_text(encoding="utf-8", errors="replace")
+
+
 def refuse_foreign_results(layout: Layout, scene_made: bool, work_made: bool, skip_matching: bool) -> None:
     """Raise UserError if writing would overwrite a scene or a COLMAP project that convert.py did not make.
 
     scene_made, work_made: whether an earlier run here began to write the scene, or into the work folder.
     """
-    there = [] if scene_made else [path.name for path in (layout.images, layout.sparse) if path.exists()]
+    forms = dict.fromkeys((layout.images, layout.sparse, layout.orientation))
+    forms |= {layout.report: '"left_out"', layout.page: "<title>Capture: "}
+    there = [] if scene_made else [path.name for path, form in forms.items() if path.exists() and not _has(path, form)]
     owned = (
         work_made
         or skip_matching

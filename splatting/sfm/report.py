@@ -1,7 +1,7 @@
 """Report of a conversion: the photos that were placed, and advice if the model is weak."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 from splatting.files.json_files import read_json, write_json
@@ -35,9 +35,15 @@ def read_tried(layout: Layout) -> list[dict[str, Any]]:
 
 
 def read_survey(layout: Layout, tried: Sequence[Mapping[str, Any]]) -> list[Model]:
-    """Read the models that worker.py's survey found: the one that was chosen (`read_tried`), then the largest first."""
+    """Read the models that worker.py's survey found: the one that was chosen (`read_tried`), then the largest first.
+
+    UserError for a photo's name that leads out of the folder of photos.
+    """
     chosen = tried[0].get("folder") if tried else None
     models = [Model(**entry) for entry in read_json(layout.survey)]
+    for name in (name for model in models for name in model.registered):
+        if PurePath(name).is_absolute() or ".." in PurePath(name).parts:
+            raise UserError(f"the model in {layout.models} names a photo {name}, outside of the folder of its photos")
     return sorted(
         models, key=lambda model: (model.folder != chosen, -len(model.registered), -model.points, model.folder)
     )

@@ -117,14 +117,19 @@ class StageRecord:
         write_json(self._path, self._record)
 
 
-def video_stage(layout: Layout, videos: Sequence[Path], count: int, begun: bool) -> Stage:
-    """Make the stage that writes frames of videos into `input`. begun: an earlier run did so."""
+def video_stage(layout: Layout, videos: Sequence[Path], count: int) -> Stage:
+    """Make the stage that writes frames of videos into `input`."""
+
+    def check() -> None:
+        video.find_decoder()
+        video.refuse_foreign_frames(layout, videos)
+
     return Stage(
         "video",
         [[_state(path) for path in videos], count],
-        reset=partial(video.remove_frames, layout, begun),
+        reset=partial(video.remove_frames, layout),
         work=partial(video.extract_videos, layout, videos, count),
-        check=video.find_decoder,
+        check=check,
     )
 
 
@@ -209,10 +214,11 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
     ]
 
 
-def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **made: Any) -> Stage:
+def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, made_from: Any, **made: Any) -> Stage:
     """Make the stage that writes the largest model and its photos to `images` and `sparse/0`, and the report.
 
-    made: settings to report. The scene of an earlier run stays until the new one is complete.
+    made: settings to report. record: of what goes with the scene of an earlier run, which stays until the new one is
+    complete.
     """
 
     def work() -> None:
@@ -250,7 +256,8 @@ def undistortion_stage(layout: Layout, settings: Settings, made_from: Any, **mad
         if not given:
             lines += report.advice(models, names, matches, settings.matcher, at_limit, tried, more)
             lines += cameras.advice(chosen.cameras, lenses, settings.cameras, video.taken_frames(layout))
-        _remove(layout.images, layout.sparse, layout.report, layout.orientation, *map(layout.resized, FACTORS))
+        later = [path for name, paths in _written_by(layout).items() if record.begun(name) for path in paths]
+        _remove(layout.images, layout.sparse, layout.report, *later)
         mkdir_p(layout.sparse)
         (layout.undistorted / "sparse").rename(layout.sparse / "0")
         written.rename(layout.images)
@@ -276,9 +283,21 @@ def resize_stage(layout: Layout) -> Stage:
 
 
 def wanted_stages(layout: Layout, record: StageRecord, args: argparse.Namespace) -> list[Stage]:
-    """Make the stages, after all others, of what a user asks for, or, with --add, has asked for before."""
+    """Make the stages, after all others, of what a user asks for, or, with --add, has asked for before.
+
+    UserError for what they would replace, if no earlier run began them.
+    """
     last = resize_stage(layout), orient_stage(layout)
-    return [stage for stage in last if getattr(args, stage.name) or (args.add and record.begun(stage.name))]
+    wanted = [stage for stage in last if getattr(args, stage.name) or (args.add and record.begun(stage.name))]
+    for name in (stage.name for stage in wanted if not record.begun(stage.name)):
+        if there := [path for path in _written_by(layout)[name] if path.exists()]:
+            raise UserError(f"convert.py did not make {there[0]}, and --{name} would replace it; move it away")
+    return wanted
+
+
+def _written_by(layout: Layout) -> dict[str, list[Path]]:
+    """What the stages that a user asks for write into the scene, by their names."""
+    return {"resize": [*map(layout.resized, FACTORS)], "orient": [layout.orientation]}
 
 
 def orient_stage(layout: Layout) -> Stage:
@@ -322,7 +341,7 @@ def _state(path: Path) -> list[Any]:
 
 def _remove(*paths: Path) -> None:
     for path in paths:
-        if path.is_dir():
+        if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
         else:
             path.unlink(missing_ok=True)

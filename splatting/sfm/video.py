@@ -4,6 +4,7 @@ ffmpeg reads each video twice: first as grey pictures, which tell motion and sha
 """
 
 import logging
+import os
 import re
 import subprocess
 import sys
@@ -15,12 +16,20 @@ import numpy as np
 from PIL import Image
 
 from splatting.files.json_files import read_json, write_json
+from splatting.files.ours import is_ours, write_picture
+from splatting.host.programs import forget_relative_path
 from splatting.host.progress import Bar
 from splatting.sfm.images import JPEG_QUALITY
 from splatting.sfm.layout import Layout
-from utils.system_utils import UserError, atomic_write, mkdir_p
+from utils.system_utils import UserError, mkdir_p
 
+# ffmpeg goes by a file's content, and a text can be a list of other files or addresses. These formats are one file.
+_ONE_FILE = [
+    *("-protocol_whitelist", "file", "-format_whitelist"),
+    "mov,matroska,avi,mpegts,mpeg,mpegvideo,asf,flv,ogg,mxf,gif,yuv4mpegpipe,h264,hevc,mjpeg,dv,ivf,obu,nut,rm",
+]
 PATTERN = "frame_[0-9][0-9][0-9][0-9][0-9].jpg"  # of a video's frames
+_NAME = re.compile(r"([^/.][^/]*/)?frame_\d{5,}\.jpg")  # below `input`, which a record of others may not leave
 # Difference, as of `_differ`, between frames that follow each other: photos of fox_raw, monstree_raw and bonsai_full
 # reach it when they move by 0.3 to 0.6 % of their width; strong noise (6 of 255 levels) reaches 0.03.
 LEAST = 0.1
@@ -42,6 +51,7 @@ FRAMES_MISSING = "an earlier run ended before it had all frames of its video; pa
 
 def find_decoder() -> Any:
     """Return the package that reads videos. UserError if it is not installed."""
+    forget_relative_path()  # as imageio-ffmpeg looks there, too
     try:
         import imageio_ffmpeg
     except ImportError as error:
@@ -58,7 +68,7 @@ def frame_folders(layout: Layout, videos: Sequence[Path]) -> list[Path]:
     """The folder of each video's frames: `input` of one alone, of several a sub-folder each, named by the video."""
     if len(videos) == 1:
         return [layout.input]
-    stems = [video.stem for video in videos]
+    stems = [video.stem.lstrip(".") or "video" for video in videos]  # hidden folders are not looked into
     return [
         layout.input / (stem if stems.index(stem) == place else f"{stem}_{place + 1}")
         for place, stem in enumerate(stems)
@@ -70,15 +80,11 @@ def taken_frames(layout: Layout) -> set[str]:
     return {name for entry in _record(layout) for name in entry["names"]}
 
 
-def refuse_foreign_frames(layout: Layout, videos: Sequence[Path], begun: bool) -> None:
+def refuse_foreign_frames(layout: Layout, videos: Sequence[Path]) -> None:
     """Raise UserError if a file that is no frame of an earlier run has a name that frames may get."""
-    ours = taken_frames(layout)
-    if begun and not ours:
-        return  # frames of a version that kept no record
+    ours = {layout.input / name for name in taken_frames(layout)}
     for folder, video in zip(frame_folders(layout, videos), videos, strict=True):
-        foreign = [
-            path for path in sorted(folder.glob(PATTERN)) if path.relative_to(layout.input).as_posix() not in ours
-        ]
+        foreign = [path for path in sorted(folder.glob(PATTERN)) if not (path in ours and is_ours(path))]
         if foreign:
             raise UserError(
                 f"{foreign[0]} has a name that frames of {video.name} will get; rename it, or convert the video in "
@@ -86,12 +92,11 @@ def refuse_foreign_frames(layout: Layout, videos: Sequence[Path], begun: bool) -
             )
 
 
-def remove_frames(layout: Layout, begun: bool) -> None:
-    """Remove the frames of an earlier run. begun: there was one."""
-    names = taken_frames(layout)
-    frames = [layout.input / name for name in names]
-    for path in frames or (layout.input.glob(PATTERN) if begun else []):
-        path.unlink(missing_ok=True)
+def remove_frames(layout: Layout) -> None:
+    """Remove the frames of an earlier run, but for those that were changed since."""
+    for path in (layout.input / name for name in taken_frames(layout)):
+        if is_ours(path):
+            path.unlink()
     layout.frames.unlink(missing_ok=True)
 
 
@@ -122,8 +127,11 @@ def video_lines(layout: Layout) -> list[str]:
 
 def _record(layout: Layout) -> list[dict[str, Any]]:
     try:
-        return read_json(layout.frames) if layout.frames.is_file() else []
-    except (OSError, ValueError, RecursionError) as error:
+        record = read_json(layout.frames) if layout.frames.is_file() else []
+        if not all(_NAME.fullmatch(name) for entry in record for name in entry["names"]):
+            raise ValueError
+        return record
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         raise UserError(f"{layout.frames} is damaged; remove {layout.work} to convert from the beginning") from error
 
 
@@ -135,7 +143,8 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int) -> Non
     decoder = find_decoder()
     try:
         sharp, small = [], []
-        reader = decoder.read_frames(str(video), pix_fmt="gray", bits_per_pixel=8, output_params=_EVERY_FRAME)
+        grey = {"pix_fmt": "gray", "bits_per_pixel": 8}
+        reader = decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=_EVERY_FRAME, **grey)
         header = next(reader)
         colours, (width, height) = header["pix_fmt"], header["size"]
         expected = round(header["duration"] * header["fps"]) or None
@@ -155,20 +164,26 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int) -> Non
         entry = {"video": video.name, "frames": len(small), "asked": count, "names": names, "hdr": hdr}
         write_json(layout.frames, [*_record(layout), entry])
         for path, frame in zip(paths, _read(decoder, video, chosen, filters), strict=True):
-            with atomic_write(path) as temporary:
-                Image.fromarray(frame).save(temporary, "JPEG", quality=JPEG_QUALITY, subsampling=0)
+            write_picture(path, Image.fromarray(frame), quality=JPEG_QUALITY, subsampling=0)
     except (OSError, RuntimeError, ValueError, StopIteration) as error:
         reason = str(error).strip().splitlines()
+        if "not on whitelist" in str(error):
+            reason = ["it is no file of a video, but may be a list of others"]
         raise UserError(
             f"cannot read the video {video} ({reason[-1] if reason else type(error).__name__}); pass another file as "
             f"--video, or put frames of it as JPEG into {folder}"
         ) from error
 
 
+def _address(video: Path) -> str:
+    """A video's name for ffmpeg, to which "12:30.mp4" is a protocol."""
+    return os.path.abspath(video)
+
+
 def _warn_if_cut(decoder: Any, video: Path, duration: float) -> None:
     """Say where the frames of a video end before its duration (seconds); fewer of them may only be far apart."""
     copied = ["-map", "0:v:0", "-c", "copy", "-f", "null", "-", "-v", "quiet", "-nostats", "-progress", "-"]
-    command = [decoder.get_ffmpeg_exe(), "-i", str(video), *copied]
+    command = [decoder.get_ffmpeg_exe(), *_ONE_FILE, "-i", _address(video), *copied]
     said = subprocess.run(command, capture_output=True, text=True, errors="replace").stdout
     ends = [int(number) / 1e6 for number in re.findall(r"out_time_us=(\d+)", said)]
     if ends and max(ends) < _WHOLE * duration:
@@ -256,7 +271,7 @@ def _any(numbers: Sequence[int]) -> str:
 def _read(decoder: Any, video: Path, numbers: Sequence[int], filters: Sequence[str]) -> Iterator[np.ndarray]:
     """Yield the frames (H, W, 3) uint8 of these numbers."""
     options = ["-vf", ",".join([f"select={_any(numbers)}", *filters]), *_EVERY_FRAME, "-frames:v", str(len(numbers))]
-    reader = decoder.read_frames(str(video), output_params=options)
+    reader = decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=options)
     width, height = next(reader)["size"]
     for data in reader:
         yield np.frombuffer(data, np.uint8).reshape(height, width, 3)

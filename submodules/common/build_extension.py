@@ -100,6 +100,8 @@ class BuildBackends(build_ext):
         return str(Path(*fullname.split(".")).with_suffix(".so"))
 
     def build_extensions(self) -> None:
+        # Compilers are not looked for in the current folder, for which an empty entry stands, too.
+        os.environ["PATH"] = os.pathsep.join(filter(os.path.isabs, os.environ.get("PATH", "").split(os.pathsep)))
         torch, cxx = import_torch(), find_compiler()
         nvcc = find_nvcc(torch.version.cuda)
         plans = {}
