@@ -19,7 +19,7 @@ from PIL import Image
 from splatting.files.image_files import open_image
 
 FEW = 100  # photos
-LONGEST_OF_FEW, LONGEST = 1600, 900  # pixels of a copy's longer side
+LONGEST_OF_FEW, LONGEST = 1600, 800  # pixels of a copy's longer side
 ENLARGED = 1280  # to which small photos are enlarged, which have few features
 ABOUT = 1.05  # times that, which photos may have that stay as they are
 _QUALITY = 95  # of JPEG
