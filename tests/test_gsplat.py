@@ -44,11 +44,9 @@ class Inputs:
         self.wanted = {name: getattr(self, name).requires_grad_() for name in NAMES}
 
     def draw(self, **options) -> tuple[Tensor, Tensor, dict]:
-        given = {"viewmats": self.views, "sh_degree": self.degree, "backgrounds": self.backgrounds} | options
-        return rasterization(
-            self.means, self.quats, self.scales, self.opacities, self.colors, Ks=self.Ks, width=WIDTH, height=HEIGHT,
-            **given,
-        )  # fmt: skip
+        given = {name: getattr(self, name) for name in ("means", "quats", "scales", "opacities", "colors", "Ks")}
+        given |= {"viewmats": self.views, "sh_degree": self.degree, "backgrounds": self.backgrounds}
+        return rasterization(**given | {"width": WIDTH, "height": HEIGHT} | options)
 
     def gradients(self, image: Tensor, alpha: Tensor) -> dict[str, Tensor]:
         generator = torch.Generator().manual_seed(7)
@@ -303,7 +301,7 @@ def test_an_orthographic_image_does_not_depend_on_depth(dtype):
         ({"distributed": True}, "train with torchrun"),
         ({"sparse_grad": True, "packed": False}, "sparse_grad needs packed=True"),
         ({"radial_coeffs": torch.zeros(2, 4)}, "radial_coeffs is not supported"),
-        ({"camera_model": "ftheta"}, "camera_model 'ftheta' is not supported"),
+        ({"camera_model": "ftheta"}, "camera_model must be one of pinhole, fisheye, ortho, got 'ftheta'"),
         ({"eps2d": 1.5}, "eps2d must be 0 to 1 px.2, got 1.5"),
         ({"render_mode": "N"}, "render_mode must be one of RGB, D"),
         ({"rasterize_mode": "sharp"}, "rasterize_mode must be"),
@@ -316,6 +314,16 @@ def test_an_orthographic_image_does_not_depend_on_depth(dtype):
         ),
         ({"viewmats": torch.zeros(0, 4, 4)}, r"there must be an image to render, got batches and cameras \(0,\)"),
         ({"absgrad": True, "render_mode": "RGB+D"}, None),
+        ({"width": 0}, "width must be a whole number of 1 or more, got 0"),
+        ({"height": -4}, "height must be a whole number of 1 or more, got -4"),
+        ({"width": 16.0}, "width must be a whole number of 1 or more, got 16.0"),
+        ({"height": torch.tensor(16.5)}, r"height must be a whole number of 1 or more, got tensor\(16.5"),
+        ({"tile_size": 0}, "tile_size must be a whole number of 1 or more, got 0"),
+        ({"sh_degree": 2.0}, "sh_degree must be a whole number of 0 or more, got 2.0"),
+        ({"means": torch.zeros(3)}, r"means must be \(..., N, 3\), got \(3,\)"),
+        ({"colors": None}, r"colors must be \(..., N, D\), got None"),
+        ({"backgrounds": torch.zeros(3, dtype=DOUBLE), "packed": False}, r"backgrounds must be \(2, 3\), got \(3,\)"),
+        ({"backgrounds": torch.tensor(0.5)}, r"backgrounds must be \(2,\), got \(\)"),
     ],
 )
 def test_what_is_not_there_is_refused_by_name(options, words):
@@ -324,6 +332,19 @@ def test_what_is_not_there_is_refused_by_name(options, words):
         return
     with pytest.raises(ValueError, match=words):
         Inputs(0).draw(**options)
+
+
+def test_sizes_may_be_tensors_and_packed_images_share_a_background():
+    given = Inputs(0)
+    given.backgrounds = given.backgrounds[:1].expand(CAMERAS, 3)
+    sizes = {"width": torch.tensor(float(WIDTH)), "height": torch.tensor(HEIGHT)}
+    image, _, meta = given.draw(backgrounds=given.backgrounds[0], **sizes)
+    assert torch.equal(image, given.draw()[0]) and type(meta["width"]) is int
+
+
+def test_lists_are_refused_by_name():
+    with pytest.raises(TypeError, match="means must be a tensor, got list"):
+        Inputs(0).draw(means=[[0.0, 0, 1]])
 
 
 def test_strategies_before_1_5_get_one_radius(monkeypatch):

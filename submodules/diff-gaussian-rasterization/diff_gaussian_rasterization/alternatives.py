@@ -4,6 +4,7 @@ from torch import Tensor
 
 from diff_gaussian_rasterization.gaussians import Gaussians
 
+MOST_DEGREE = 3
 MOST_BANDS = 16  # of degree 3; those above are not read
 
 

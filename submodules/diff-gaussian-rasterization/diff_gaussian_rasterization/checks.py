@@ -15,6 +15,16 @@ def check_tensors(inputs: Mapping[str, object]) -> None:
             raise TypeError(f"{name} must be a tensor, got {found}: convert it with torch.as_tensor")
 
 
+def whole_number(name: str, value: object, least: int = 1) -> int:
+    """The number that `value` is, or that a tensor of one value holds. Raises ValueError for others than whole ones."""
+    number = value.item() if isinstance(value, Tensor) and value.numel() == 1 else value
+    if isinstance(value, Tensor) and isinstance(number, float) and number.is_integer():
+        number = int(number)
+    if not hasattr(number, "__index__") or isinstance(number, Tensor) or number < least:
+        raise ValueError(f"{name} must be a whole number of {least} or more, got {value!r:.80}")
+    return int(number)
+
+
 def check_flag(name: str, value: object) -> None:
     """Raises TypeError for a value that is not True, False, 1, 0, None, or a tensor of one value."""
     if value is not None and (value.numel() != 1 if isinstance(value, Tensor) else value not in (False, True)):

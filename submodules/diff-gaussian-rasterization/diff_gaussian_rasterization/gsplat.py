@@ -14,22 +14,33 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from diff_gaussian_rasterization.alternatives import MOST_BANDS, MOST_DEGREE
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.channels import rasterize_channels
+from diff_gaussian_rasterization.checks import check_tensors, whole_number
 from diff_gaussian_rasterization.lens import Lens
 from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
 
 MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-MOST_BANDS = 3  # the highest degree of SH
+_CHOICES = {
+    "render_mode": MODES,
+    "camera_model": ("pinhole", "fisheye", "ortho"),
+    "rasterize_mode": ("classic", "antialiased"),
+}
 _ENDLESS = 1e10  # far_plane, if nobody gives one
 _MOST_ALPHA = 0.999
 _FLAT = 2.0**-40  # of depth
+_NO_UT = "take camera_model='fisheye', or a Lens with rasterize_channels"
 _UNSUPPORTED = {
     "distributed": "train with torchrun and train.py",
-    "with_ut": "take camera_model='fisheye', or a Lens with rasterize_channels",
+    "with_ut": _NO_UT,
     "with_eval3d": "take projection='ray' with rasterize",
+    **dict.fromkeys(
+        ("radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs", "viewmats_rs"), _NO_UT
+    ),
 }
-_NEED_UT = ("radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs", "viewmats_rs")
+_NEEDED = {"means": "(..., N, 3)", "colors": "(..., N, D)", "viewmats": "(..., C, 4, 4)"}
+_OTHERS = ("quats", "scales", "opacities", "Ks", "backgrounds", "covars")
 
 
 class _Fisheye(Lens):
@@ -189,12 +200,12 @@ def rasterization(
     opacities (..., N). colors (..., N, D) or (..., C, N, D); with sh_degree, at most 3, SH (..., N, K, 3) or
     (..., C, N, K, 3). viewmats (..., C, 4, 4): world to view, differentiable. Ks (..., C, 3, 3): no gradient.
     near_plane, far_plane: depths that are shown. radius_clip (px): smaller Gaussians are left out. eps2d (px^2): added
-    to variances, 0 to 1. backgrounds (..., C, D). render_mode: D is the sum of weights times depth, ED is D over alpha.
-    sparse_grad: gradients of means, quats and scales are sparse. absgrad: meta["means2d"].absgrad, of at most 32
-    channels; x has the length of x and y in NDC, times 2 / width, and y is 0. Returns images (..., C, H, W, D), alphas
-    (..., C, H, W, 1) and meta, whose means2d gets a `grad` (px). ValueError: what is not supported, and wrong shapes.
+    to variances, 0 to 1. backgrounds (..., C, D), or packed (D,). render_mode: D is the sum of weights times depth, ED
+    is D over alpha. sparse_grad: gradients of means, quats and scales are sparse. absgrad: meta["means2d"].absgrad, of
+    at most 32 channels; x has the length of x and y in NDC, times 2 / width, and y is 0. Returns images (..., C, H, W,
+    D), alphas (..., C, H, W, 1), and meta, whose means2d gets a `grad` (px). ValueError: what cannot be drawn.
     """
-    _refuse(locals())
+    width, height, tile_size, backgrounds = _checked(locals())
     given = means, quats, scales, opacities, covars, colors, viewmats, Ks, backgrounds
     shown: list[Tensor] = []
     given = (*_sparse(given[:3], shown, packed), *given[3:]) if sparse_grad else given
@@ -245,7 +256,7 @@ def _images(
         shapes |= {"covars": (covars, (count, 3, 3))}
         quats = scales = None
     if backgrounds is not None:
-        shapes |= {"backgrounds": (backgrounds, (cameras, backgrounds.shape[-1]))}
+        shapes |= {"backgrounds": (backgrounds, (cameras, *backgrounds.shape[-1:]))}
     for name, (values, shape) in shapes.items():
         if values is None or values.shape != batch + shape:
             found = None if values is None else tuple(values.shape)
@@ -269,26 +280,29 @@ def _images(
             yield _Rows(*own, shown[n] if each else shown), camera, None if behind is None else behind[n]
 
 
-def _refuse(given: dict[str, Any]) -> None:
+def _checked(given: dict[str, Any]) -> tuple[int, int, int, Tensor | None]:
+    """Width, height, tile_size and backgrounds of the arguments of `rasterization`. ValueError for wrong arguments."""
     for name, remedy in _UNSUPPORTED.items():
-        if given[name]:
+        if isinstance(given[name], Tensor) or given[name]:
             raise ValueError(f"{name} is not supported; {remedy}")
-    for name in _NEED_UT:
-        if given[name] is not None:
-            raise ValueError(f"{name} is not supported; {_UNSUPPORTED['with_ut']}")
     shutter, degree, eps2d = given["rolling_shutter"], given["sh_degree"], given["eps2d"]
+    check_tensors({name: given[name] for name in (*_NEEDED, *_OTHERS)})
+    for name, shape in _NEEDED.items():
+        if (found := given[name]) is None or found.dim() < 2:
+            raise ValueError(f"{name} must be {shape}, got {None if found is None else tuple(found.shape)}")
     if shutter is not None and getattr(shutter, "name", "GLOBAL") != "GLOBAL":
         raise ValueError("rolling_shutter is not supported; take poses of a global shutter")
-    if given["render_mode"] not in MODES:
-        raise ValueError(f"render_mode must be one of {', '.join(MODES)}, got {given['render_mode']!r}")
-    if given["camera_model"] not in ("pinhole", "fisheye", "ortho"):
-        raise ValueError(f"camera_model {given['camera_model']!r} is not supported; take pinhole, fisheye or ortho")
-    if given["rasterize_mode"] not in ("classic", "antialiased"):
-        raise ValueError(f"rasterize_mode must be classic or antialiased, got {given['rasterize_mode']!r}")
+    for name, choices in _CHOICES.items():
+        if given[name] not in choices:
+            raise ValueError(f"{name} must be one of {', '.join(choices)}, got {given[name]!r}")
     if not 0 <= eps2d <= 1:
         raise ValueError(f"eps2d must be 0 to 1 px^2, got {eps2d}")
-    if degree is not None and not 0 <= degree <= MOST_BANDS:
-        raise ValueError(f"sh_degree must be 0 to {MOST_BANDS}, got {degree}")
+    if degree is not None and whole_number("sh_degree", degree, 0) > MOST_DEGREE:
+        raise ValueError(f"sh_degree must be 0 to {MOST_DEGREE}, got {degree}")
+    behind = given["backgrounds"]
+    if given["packed"] and behind is not None and behind.dim() == 1:  # gsplat's rows that are packed have no cameras
+        behind = behind.expand(*given["means"].shape[:-2], *given["viewmats"].shape[-3:-2], -1)
+    return *(whole_number(name, given[name]) for name in ("width", "height", "tile_size")), behind
 
 
 def _render(camera: _Camera, rows: _Rows, background: Tensor | None, options: _Options) -> _Drawn:
@@ -343,8 +357,7 @@ def _shapes(rows: _Rows, options: _Options) -> dict[str, Tensor]:
         places = (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)
         shape = {"cov3d": torch.stack([rows.covars[:, i, j] for i, j in places], 1)}
     if options.mode.startswith("RGB") and options.degree is not None:
-        most = (MOST_BANDS + 1) ** 2
-        harmonics = rows.colors if rows.colors.shape[1] <= most else rows.colors[:, :most]
+        harmonics = rows.colors if rows.colors.shape[1] <= MOST_BANDS else rows.colors[:, :MOST_BANDS]
         shape["sh_dc"], shape["sh_rest"] = harmonics.split((1, harmonics.shape[1] - 1), 1)
     return shape
 

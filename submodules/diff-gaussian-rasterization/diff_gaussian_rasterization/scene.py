@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diff_gaussian_rasterization.alternatives import shaped
+from diff_gaussian_rasterization.alternatives import MOST_DEGREE, shaped
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.checks import check_flag
 from diff_gaussian_rasterization.gaussians import Gaussians
@@ -133,9 +133,12 @@ def camera_arguments(
     antialiasing: bool | None,
     raw: int,
 ) -> tuple:
-    """The fields of `Scene.camera`, from what the reference takes: further axes of length 1, and whole floats."""
+    """The fields of `Scene.camera`, from what the reference takes.
+
+    That is also further axes of length 1, whole floats, and a degree above 3, of which it draws 3.
+    """
     size = [int(n) if isinstance(n, float) and n.is_integer() else n for n in (height, width)]
-    options = (*size, degree, bool(antialiasing), raw)
+    options = (*size, min(degree, MOST_DEGREE), bool(antialiasing), raw)
     return shaped(view, 4, 4), shaped(projection, 4, 4), shaped(center, 3), lens, options
 
 

@@ -25,7 +25,7 @@ class GaussianRasterizationSettings(NamedTuple):
     scale_modifier: float
     viewmatrix: Tensor  # (4, 4) world to view, transposed; a rigid motion, or any other invertible map
     projmatrix: Tensor  # (4, 4) world to clip, transposed
-    sh_degree: int  # active degree, 0..3
+    sh_degree: int  # active degree, from 0 on; one above 3 counts as 3
     campos: Tensor  # (3,) world
     prefiltered: bool  # accepted for compatibility; culling does not rely on it
     debug: bool  # check inputs, image and gradients for NaN and Inf; the error names the tensor and the place
