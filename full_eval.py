@@ -141,6 +141,7 @@ def _plan(args: Namespace, more: Sequence[str]) -> list[Run]:
     plan.check_outside_scenes(runs)
     plan.check_nesting(runs, args.output_path.resolve())
     if not args.skip_training:
+        plan.check_photos(runs)
         plan.check_folders(runs)
     return runs
 

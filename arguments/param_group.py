@@ -2,11 +2,15 @@
 
 import argparse
 import difflib
+import re
 from collections.abc import Collection
 from typing import Any, ClassVar, NoReturn
 
 from arguments.removed import REMOVED
 from splatting.training.option import Option
+
+_FOLDERS = {"-s": "scene", "-m": "model", "--scenes": "scene"}
+_NUMBERS = {int: "a whole number in digits alone", float: "a number without a unit"}
 
 
 class OptionParser(argparse.ArgumentParser):
@@ -27,13 +31,24 @@ class OptionParser(argparse.ArgumentParser):
     def _unknown(self, words: list[str]) -> str:
         word = next((word for word in words if word.startswith("-")), words[0])
         if not word.startswith("-"):
-            folder = "; name a model folder by -m" if "-m" in self._option_string_actions else ""
-            return f"{word} belongs to no option{folder}"
+            ways = [f"a {kind} by {flag}" for flag, kind in _FOLDERS.items() if flag in self._option_string_actions]
+            named = f"name {' or '.join(ways)}, and " if ways else ""
+            return f"{word} belongs to no option; {named}quote names with spaces"
         name = word.partition("=")[0]
         if remedy := REMOVED.get(name.removeprefix("--")):
             return f"{name} was removed; {remedy}"
         near = difflib.get_close_matches(name, self._option_string_actions, 1)
         return f"there is no option {word}" + (f"; did you mean {near[0]}?" if near else "")
+
+    def _get_value(self, action: argparse.Action, text: str) -> Any:
+        try:
+            return super()._get_value(action, text)
+        except argparse.ArgumentError as error:
+            if action.type not in _NUMBERS:
+                raise
+            about = re.split(r"; |\. | ?\(", action.help or "")[0]
+            said = f"takes {_NUMBERS[action.type]}" + (f" ({about})" if about else "")
+            raise argparse.ArgumentError(action, f"{said}, got {text!r}") from error
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"error: {message} ({self.prog} {self.lists_all} lists all options)\n")

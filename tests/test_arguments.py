@@ -382,8 +382,17 @@ def test_abbreviations_of_the_reference_mean_the_same_in_spite_of_our_options(ca
     [
         (["--densify_untill_iter=5"], "there is no option --densify_untill_iter=5; did you mean --densify_until_iter"),
         (["--xyzzy=3"], "there is no option --xyzzy=3 ("),
-        (["stray"], "stray belongs to no option; name a model folder by -m"),
-        (["--iterations", "many"], "argument --iterations: invalid int value: 'many'"),
+        (["stray"], "stray belongs to no option; name a scene by -s or a model by -m, and quote names with spaces"),
+        (
+            ["--iterations", "7k"],
+            "argument --iterations: takes a whole number in digits alone (training steps, one photo each), "
+            "got '7k'",
+        ),
+        (
+            ["--time_budget", "5m"],
+            "argument --time_budget: takes a number without a unit (seconds of training, without scoring and saving), "
+            "got '5m'",
+        ),
     ],
 )
 def test_a_mistyped_option_gets_one_line(capsys, words, said):

@@ -142,7 +142,7 @@ def test_commands_of_a_plain_scene(figures, evaluate):
 
 def test_data_sets_get_the_options_of_the_paper(evaluate, tmp_path, capsys):
     mip, tanks = tmp_path / "mip", tmp_path / "tat"
-    for folder in (*(mip / name for name in DATASETS["mipnerf360"]), tanks / "truck"):
+    for folder in (*(mip / name / words[1] for name, words in DATASETS["mipnerf360"].items()), tanks / "truck"):
         folder.mkdir(parents=True)
     words = ["-m360", mip, "-tat", tanks, "--output_path", evaluate.out, "--fast", "--use_depth", "--use_expcomp"]
     full_eval.main([str(word) for word in words], run)
@@ -455,10 +455,12 @@ def test_seeds_and_option_sets(figures, evaluate, tmp_path, capsys, monkeypatch)
         ("-m360 SCENES/nowhere", "no such folder: .*nowhere; pass the folder that has bicycle, flowers"),
         ("--scenes SCENES/attic --resize", "--resize works with -m360 only; give -m360, or"),
         ("-m360 SCENES", "scenes has none of the scenes of mipnerf360; pass the folder that has bicycle"),
+        ("-m360 SCENES/mip", "mip/room has no folder images_2; give --resize, which makes photos of images smaller"),
         ("--scenes SCENES/attic --peer other nowhere.csv", "cannot read nowhere.csv"),
     ],
 )
 def test_refusals(evaluate, words, sentence):
+    (evaluate.scenes / "mip/room").mkdir(parents=True)
     before = folder_state(evaluate.scenes)
     with pytest.raises(UserError, match=sentence):
         full_eval.main(
@@ -477,7 +479,7 @@ def test_refusals(evaluate, words, sentence):
         ('{"seed_1": []}', "cannot name a folder"),
         ('{"a": "--sh_degree 1"}', "a must be a list"),
         ('{"a": ["-s", "x"]}', "a: full_eval.py sets -s itself"),
-        ('{"a": [], "b": ["--iterations", "many"]}', "json, b: argument --iterations: invalid int value"),
+        ('{"a": [], "b": ["--iterations", "many"]}', "json, b: argument --iterations: takes a whole number in digits"),
         ('{"a": ["--opacity_lr", -1]}', "a: --opacity_lr must be at least 0"),
         ('{"' + "a" * 300 + '": []}', "the name aaaaaaaaaaaaaaaaaaaa... is too long for a folder"),
     ],

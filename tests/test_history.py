@@ -33,13 +33,14 @@ def _warnings(text: str) -> list[str]:
 # Into a folder with a model
 
 
-def test_a_model_of_another_scene_is_refused_and_nothing_of_it_changes(colmap_scene, blender_scene, tmp_path):
+def test_a_model_of_another_scene_is_refused_and_nothing_of_it_changes(colmap_scene, blender_scene, tmp_path, capfd):
     out = tmp_path / "out"
     _train(colmap_scene, out, "--checkpoint_iterations", 2, iterations=3)
     before = folder_state(out)
     for options in ([], ["--start_checkpoint", _elsewhere(out / "chkpnt2.pth", tmp_path)]):
         with pytest.raises(UserError, match=rf"out holds a model of another scene, {colmap_scene}; name another"):
             _train(blender_scene, out, *options, iterations=4)
+        assert "holds a training" not in capfd.readouterr().err  # as it is refused
         assert folder_state(out) == before
 
 
@@ -68,7 +69,7 @@ def test_iterations_that_stay_are_warned_of(colmap_scene, tmp_path, capfd):
     (out / "point_cloud" / "iteration_30000" / "point_cloud.ply").touch()
     capfd.readouterr()
     _train(colmap_scene, out, "--save_iterations", 1, 30000, "--checkpoint_iterations", 3, iterations=4)
-    finished, warning = _warnings(capfd.readouterr().err)
+    warning, finished = _warnings(capfd.readouterr().err)
     assert "of --iterations 5, and this one starts over" in finished
     assert "keeps iteration 3, 5, 30000 of an earlier training; this one starts over" in warning
     # Files that a resumed run saved before do not belong to another training.

@@ -18,7 +18,7 @@ from scene.gaussians.checkpoint import load_checkpoint
 from scene.images import decode
 from splatting.host import memory
 from splatting.host.memory import free_memory, gib, is_out_of_memory, shortage
-from splatting.training import memory_estimate
+from splatting.training import disk_space, memory_estimate
 from splatting.training.memory_estimate import training_bytes
 from splatting.training.steps import fused
 from splatting.training.steps.graphs import Graphs
@@ -52,6 +52,24 @@ def test_which_errors_mean_too_little_memory():
     assert is_out_of_memory(ON_A_GPU)
     others = RuntimeError("shapes differ"), ValueError("out of memory"), UserError("no"), KeyboardInterrupt(), None
     assert not any(map(is_out_of_memory, others))
+
+
+def test_a_disk_without_space_is_told_before_the_training(colmap_scene, tmp_path, monkeypatch, capfd):
+    words = ["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "-r", "48", "--disable_viewer", "--iterations", "3"]
+    words += ["--save_iterations", "2", "--test_iterations", "-1"]
+    free = Mock(return_value=Mock(free=50_000))
+    monkeypatch.setattr(disk_space.shutil, "disk_usage", free)
+    said = "the disk of .*out has 0.1 MB free, and a model of 300 Gaussians takes 0.1 MB; free space there, or name"
+    with pytest.raises(UserError, match=said):
+        train.main(words)
+    assert not (tmp_path / "out").exists()
+    free.return_value.free = 100_000  # one PLY has 74,400 bytes
+    train.main(words)
+    told = re.findall("warning: the disk of .*", capfd.readouterr().err)
+    assert [re.search("[\\d.]+ MB if there are [\\d,]+", text)[0] for text in told] == [
+        "3.0 MB if there are 6,000",
+        "0.1 MB if there are 300",
+    ]
 
 
 def test_numbers_of_an_error():

@@ -122,11 +122,14 @@ def test_a_frame_that_lacks_its_photo_says_so(gaussians, scene_cameras):
         {"mode": views.ERROR},
         {"comparison": views.SLIDER},
         {"mode": views.DEPTH, "comparison": "Slider"},
+        {"mode": views.ERROR, "comparison": "Side by side"},
     ):
         there = frame(gaussians, at(camera), scene_cameras, camera=name, **settings).legend
         away = frame(gaussians, FRONT, scene_cameras, camera=name, **settings).legend
         assert not there.warning and "No photo was taken from here" in away.html() and not away.sides
-        assert ("Photo left of the line" in there.html()) == ("comparison" in settings)
+        shown = {views.ERROR: "error", views.DEPTH: "depth"}.get(settings.get("mode"), "render")
+        said = {"Slider": f"Photo left of the line, {shown} right", "Side by side": f"From the left: photo, {shown}"}
+        assert there.sides == said.get(settings.get("comparison"), "")
         assert away.numbers == () or settings["mode"] == views.DEPTH
     assert frame(gaussians, at(camera), scene_cameras, camera=name, mode=views.ERROR).legend.numbers[-1] == 51
     assert not frame(gaussians, FRONT, scene_cameras, camera=name).legend.html()
@@ -197,7 +200,7 @@ def test_side_by_side_are_image_render_and_error(gaussians, scene_cameras):
     top, left = (shown.shape[0] - 64) // 2, (shown.shape[1] - 3 * 96) // 2
     target, image, error = np.split(shown[top : top + 64, left : left + 3 * 96], 3, axis=1)
     assert abs(error - np.minimum(abs(target - image) * 5, 255)).max() <= 4  # rounded before the difference
-    for mode, sides in ((views.COLOUR, "photo, render, error"), (views.DEPTH, "photo, render")):
+    for mode, sides in ((views.COLOUR, "photo, render, error"), (views.DEPTH, "photo, depth")):
         words = frame(gaussians, at(camera), scene_cameras, camera=name, comparison=views.BESIDE, mode=mode).legend
         assert f"left: {sides}</div>" in words.html()
     alone = drawn(gaussians, at(camera), scene_cameras, camera=name, mode=views.ERROR).astype(int)

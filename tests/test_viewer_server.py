@@ -30,6 +30,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
 
 from scene import Scene  # noqa: E402
+from splatting.camera_paths.without_scene import WithoutScene, circle  # noqa: E402
 from splatting.viewer import auth, watchers  # noqa: E402
 from splatting.viewer import server as servers  # noqa: E402
 from splatting.viewer.auth import Auth, is_accepted  # noqa: E402
@@ -569,6 +570,16 @@ def test_cleaning_is_shown_where_it_is_known(page, _colmap_master, tmp_path):
         assert own.view.cleaning.visible and own.settings().cleaning == WHOLE
         own.view.cleaning.value = GOES
         assert own.settings().cleaning == GOES and own.frames.kept is kept
+    finally:
+        own.stop()
+
+
+def test_the_page_of_a_file_has_its_name(tmp_path):
+    gaussians = model(20)
+    around = circle(gaussians.get_xyz.detach().numpy())
+    own = Page(ANY, WithoutScene(gaussians, str(tmp_path), "fox.spz", around), pipeline(), False, False)
+    try:
+        assert b"<title>fox.spz</title>" in get(own.server.get_port())[2] and not own.iteration.visible
     finally:
         own.stop()
 

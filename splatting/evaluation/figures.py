@@ -60,10 +60,12 @@ def _draw(axes: Axes, points: Sequence[Point], label: str | None, **style: Any) 
 
 
 def _views_text(subset: int | None, count: int | None, kind: str = "test") -> str:
-    """Which views of a set of so many points score; count: None where it differs."""
+    """Which views of a set of so many points score; count: None where it differs. Few of the train views are."""
+    if kind == "train":
+        return f"{count if subset is None else subset:,} train views"
     if subset is None:
-        return " ".join(["all", *([] if count is None else [f"{count:,}"]), kind, "views"])
-    return f"{subset:,} of {'the' if count is None else f'{count:,}'} {kind} views"
+        return " ".join(["all", *([] if count is None else [f"{count:,}"]), "test views"])
+    return f"{subset:,} of {'the' if count is None else f'{count:,}'} test views"
 
 
 def _label(axes: Axes, x: str, y: str, log: bool = False) -> None:

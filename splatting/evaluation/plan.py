@@ -145,11 +145,26 @@ class Run:
 
 def photos_of(options: Sequence[str]) -> str:
     """Say in a few words which photos words for train.py choose, and how these are made smaller."""
+    chosen = _photo_options(options)
+    return chosen.images if chosen.resolution == "-1" else f"{chosen.images}, resized by -r {chosen.resolution}"
+
+
+def _photo_options(words: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("-i", "--images", default="images")
     parser.add_argument("-r", "--resolution", default="-1")
-    chosen = parser.parse_known_args(list(options))[0]
-    return chosen.images if chosen.resolution == "-1" else f"{chosen.images}, resized by -r {chosen.resolution}"
+    return parser.parse_known_args(list(words))[0]
+
+
+def check_photos(runs: Sequence[Run]) -> None:
+    """Raise UserError if a scene of Mip-NeRF 360 lacks the folder of its smaller photos."""
+    for run in runs:
+        images = _photo_options(run.options).images
+        if run.scene.options[:1] == ("-i",) and not (run.scene.source / images).is_dir():
+            raise UserError(
+                f"{run.scene.source} has no folder {images}; give --resize, which makes photos of images smaller, or "
+                "get the data set with its smaller photos"
+            )
 
 
 class Record:

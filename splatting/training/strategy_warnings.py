@@ -1,4 +1,4 @@
-"""Warnings on what the chosen strategy cannot reach, and on processes that do not help."""
+"""Warnings on what the chosen strategy cannot reach, on a full disk, and on processes that do not help."""
 
 import argparse
 from collections.abc import Iterator
@@ -8,6 +8,7 @@ from scene.gaussians import density_rules as rules
 from splatting.files.listing import some
 from splatting.parts import part_class, strategies, tools
 from splatting.training.density import DensityControl
+from splatting.training.disk_space import little_space
 from splatting.training.memory_estimate import expected_count
 from splatting.training.schedule import USUAL
 
@@ -19,7 +20,9 @@ def warnings_of(run: Any, given: argparse.Namespace) -> Iterator[str]:
     """Warnings before a run (splatting/training/run.py). given: the optimisation options as they were given."""
     density, opt, count, done = run.density, run.opt, run.gaussians.gaussian_count, run.first_iteration
     expected = expected_count(density.max_gaussians, count)
+    sure = min(count, density.max_gaussians or count)
     found = (
+        little_space(run, sure, expected, done + 1) if run.group.first else None,
         faster_alone(run.group.size, run.device.type == "cuda", expected),
         late_reset(density, opt, done),
         without_effect(given, opt.strategy),

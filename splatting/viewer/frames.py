@@ -108,8 +108,12 @@ def _needs_photo(settings: Settings) -> bool:
 
 def _sides(settings: Settings) -> str:
     """Which of the images of `_composed` is where."""
+    shown = "render" if settings.mode == views.COLOUR else settings.mode.lower()
     error = ", error" if settings.mode == views.COLOUR else ""
-    sides = {views.SLIDER: "Photo left of the line, render right", views.BESIDE: f"From the left: photo, render{error}"}
+    sides = {
+        views.SLIDER: f"Photo left of the line, {shown} right",
+        views.BESIDE: f"From the left: photo, {shown}{error}",
+    }
     return sides.get(settings.comparison, "")
 
 

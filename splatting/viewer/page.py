@@ -69,9 +69,11 @@ class Page:
         self.requests = Requests(self.watchers.wake)
         self._faults: dict[int, str] = {}  # of the browsers' last frames
         self._legends: dict[int, viser.GuiHtmlHandle] = {}
-        self.server, self.url = servers.serve(address, as_utf8(folder.resolve().name))
+        of_file = isinstance(scene.loaded_iter, str)  # its name
+        name = scene.loaded_iter if of_file else folder.resolve().name
+        self.server, self.url = servers.serve(address, as_utf8(name))
         gui = self.server.gui
-        self.iteration = gui.add_text("Iteration", str(scene.loaded_iter or 0), disabled=True)
+        self.iteration = gui.add_text("Iteration", str(scene.loaded_iter or 0), disabled=True, visible=not of_file)
         self.count = gui.add_text("Gaussians", f"{len(gaussians):,}", disabled=True)
         self.tabs = gui.add_tab_group()
         # A training adds bands until its end; of a saved model those beyond its last one that is used are all zero.

@@ -40,7 +40,8 @@ class Resume(Part):
     def wanted(cls, given: "argparse.Namespace") -> bool:
         return True
 
-    def check(self, run: Any, state: Any) -> None:
+    def ready(self, run: Any) -> None:
+        """Say what this training does to that of its folder, once nothing can refuse it."""
         from splatting.parts.resume.end import continues, finished
 
         folder = run.dataset.model_path

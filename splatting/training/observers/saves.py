@@ -6,6 +6,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from scene.gaussians.checkpoint import save_checkpoint
+from splatting.training.disk_space import little_space
 from splatting.training.iteration import Iteration, Losses
 from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.output_folder import view_command
@@ -32,8 +33,11 @@ class Saves(Part):
             tqdm.write(f"[ITER {step.iteration}] Saving Gaussians", file=sys.stdout)
             if step.last:
                 run.save_last(step.iteration)
-            else:
-                run.scene.save(step.iteration)
+                return
+            count = run.gaussians.gaussian_count
+            if run.group.first and (text := little_space(run, count, count, step.iteration)):
+                tqdm.write(f"warning: {text}", file=sys.stderr)
+            run.scene.save(step.iteration)
 
 
 class Checkpoints(Part):
