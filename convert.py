@@ -222,11 +222,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         "(default: 8192)")  # fmt: skip
     add("--mask_path", default=None, metavar="FOLDER",
         help="masks with the photos' names and .png appended; black areas get no features (default: none)")  # fmt: skip
-    add("stray", nargs="*", help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
-    if args.stray:
-        whole = " ".join([args.source_path, *args.stray])
-        raise UserError(f"unexpected argument {args.stray[0]}; quote paths with spaces: -s {shlex.quote(whole)}")
     for option, least in (("max_num_features", 100), ("video_frames", FEWEST)):
         if getattr(args, option) < least:
             raise UserError(f"--{option} must be at least {least}, got {getattr(args, option)}")

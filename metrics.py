@@ -74,15 +74,16 @@ def find_pairs(model: Path) -> dict[str, list[Pair]]:
     UserError if anything prevents scoring.
     """
     if not model.is_dir():
-        raise UserError(f"no such model folder: {model}")
+        raise UserError(f"no such model folder: {model}; pass one that render.py has written into as -m")
     test = model / "test"
     methods = sorted(folder for folder in test.iterdir() if folder.is_dir()) if test.is_dir() else []
     if not methods:
-        without_eval = trained_with_eval(model) is False
-        cause = (
-            "; the model was trained without --eval and has no test views: train with --eval" if without_eval else ""
-        )
-        raise UserError(f"no rendered test views in {test}{cause or f'; run render.py -m {model} first'}")
+        remedy = f"run render.py -m {model} first"
+        if trained_with_eval(model) is False:
+            remedy = "the model was trained without --eval and has no test views: train with --eval"
+        elif not (model / "cfg_args").is_file():
+            remedy = "pass a model folder that render.py has written into as -m"
+        raise UserError(f"no rendered test views in {test}; {remedy}")
     return {folder.name: _pairs_of(folder) for folder in methods}
 
 

@@ -10,6 +10,7 @@ from arguments.removed import REMOVED
 from splatting.training.option import Option
 
 _FOLDERS = {"-s": "scene", "-m": "model", "--scenes": "scene"}
+_TRUTHS = ("true", "false", "yes", "no", "on", "off", "1", "0")
 _NUMBERS = {int: "a whole number in digits alone", float: "a number without a unit"}
 
 
@@ -33,11 +34,13 @@ class OptionParser(argparse.ArgumentParser):
         if not word.startswith("-"):
             ways = [f"a {kind} by {flag}" for flag, kind in _FOLDERS.items() if flag in self._option_string_actions]
             named = f"name {' or '.join(ways)}, and " if ways else ""
-            return f"{word} belongs to no option; {named}quote names with spaces"
+            flags = "; a flag such as --eval takes no value" if word.lower() in _TRUTHS else ""
+            return f"{word} belongs to no option; {named}quote names with spaces{flags}"
         name = word.partition("=")[0]
         if remedy := REMOVED.get(name.removeprefix("--")):
             return f"{name} was removed; {remedy}"
         near = difflib.get_close_matches(name, self._option_string_actions, 1)
+        near = near or [flag for flag in _FOLDERS if name == flag[1:3] and flag in self._option_string_actions]
         return f"there is no option {word}" + (f"; did you mean {near[0]}?" if near else "")
 
     def _get_value(self, action: argparse.Action, text: str) -> Any:
@@ -51,6 +54,7 @@ class OptionParser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, f"{said}, got {text!r}") from error
 
     def error(self, message: str) -> NoReturn:
+        message = re.sub("ignored explicit argument (.*)", r"takes no value, got \1; give it alone", message)
         self.exit(2, f"error: {message} ({self.prog} {self.lists_all} lists all options)\n")
 
     def _get_option_tuples(self, option_string: str) -> list[Any]:

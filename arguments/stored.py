@@ -44,7 +44,8 @@ def read_cfg_args(model_path: str | os.PathLike) -> dict[str, Value]:
     """
     path = Path(model_path) / CFG_ARGS
     if not Path(model_path).is_dir():
-        raise UserError(f"no such model folder: {model_path}; pass the folder that train.py wrote as -m")
+        wrong = "is a file, and no model folder" if os.path.isfile(model_path) else "does not exist"
+        raise UserError(f"{model_path} {wrong}; pass the folder that train.py wrote as -m")
     if not path.is_file():
         raise UserError(f"no cfg_args in {model_path}; pass the folder that train.py wrote as -m")
     broken = f"{path} is not one line Namespace(name=value, ...) of plain values; restore it or train again"

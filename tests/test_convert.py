@@ -231,6 +231,16 @@ def _photos_beside(scene: Path) -> None:
         path.rename(scene / path.name)
 
 
+def _trained(scene: Path) -> None:
+    _photos_beside(scene)
+    (scene / "cfg_args").touch()
+
+
+def _converted(scene: Path) -> None:
+    (scene / "input").rename(scene / "images")
+    (scene / "transforms.json").touch()
+
+
 def _few(scene: Path) -> None:
     for number in (1, 2):
         (scene / "input" / f"photo_0{number}.png").unlink()
@@ -263,7 +273,8 @@ def _renamed(name: str) -> Callable[[Path], object]:
         ("-s {}/input", None, r"room/input is the folder of the photos itself; pass its parent folder as -s: .*room$"),
         ("-s {}/nowhere", None, r"no folder .*nowhere; make it, put the photos into a folder input"),
         ("-s '{}'", None, r"contains quotes: '.*room'; pass /.*room, quoted only once for the shell"),
-        ("-s {} of mine", None, r"unexpected argument of; quote paths.*room of mine'"),
+        ("-s {}", _trained, r"room is a model that train.py wrote; pass the folder of its photos as -s"),
+        ("-s {}", _converted, r"no folder input in .*room, which is a scene already: train.py takes it as it is"),
         ("-s {}/input/photo_00.png", None, r"photo_00.png is a file; pass the folder that contains"),
         ("-s {} --camera PINHOLEY", None, r"--camera PINHOLEY is not a supported lens model.*OPENCV_FISHEYE"),
         (

@@ -267,6 +267,7 @@ def test_a_file_is_thinned_out_by_the_views_of_a_model(tmp_path, colmap_scene, c
         ("--ply a.ply --crop 1 0 0 0 1 1", "--crop takes the smaller corner first"),
         ("--ply a.ply --max_splats 5", "need training views"),
         ("--ply absent.ply", "no file absent.ply; give a model as PLY"),
+        ("--ply .", ". is a folder; give the file of a model in it"),
         ("", "no model folder given"),
         ("--ply a.ply --to b.splat --path ellipse", "--path is for .html; leave it out, or end --to with .html"),
         ("--ply a.ply --to b.html --path elipse", "--path must be interpolate, ellipse, spiral or a file"),

@@ -262,9 +262,13 @@ def without_test(model: Path, stored: str = "eval=True") -> None:
         (lambda model: (model / "test/ours_30" / INCOMPLETE).touch(), "ours_30 was interrupted; run render.py again"),
         (emptied, "no images"),
         (lambda model: emptied(model, "renders"), "renders is missing"),
-        (without_test, "no rendered test views .*render.py"),
+        (without_test, "no rendered test views .*; run render.py"),
+        (
+            lambda model: (without_test(model), (model / "cfg_args").unlink()),
+            "no rendered test views .*; pass a model folder that render.py has written into",
+        ),
         (lambda model: without_test(model, "eval=False"), "no rendered test views .*without --eval"),
-        (shutil.rmtree, "no such model folder"),
+        (shutil.rmtree, "no such model folder: .*; pass one"),
     ],
 )
 def test_what_cannot_be_scored_is_said_before_a_file_is_written(model, damage, words):

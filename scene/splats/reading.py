@@ -40,6 +40,10 @@ def _properties(path: str | os.PathLike) -> set[str] | None:
 @np.errstate(over="ignore", invalid="ignore")  # what float32 cannot hold becomes Inf or NaN, which is not drawn
 def read_splats(path: str | os.PathLike) -> Splats:
     """The Gaussians of a file. UserError if it is missing, damaged, or of another format."""
+    if os.path.isdir(path):
+        raise UserError(
+            f"{path} is a folder; give the file of a model in it, or where there is -m, a model folder by -m"
+        )
     if not os.path.isfile(path):
         raise UserError(f"no file {path}; give a model as {READABLE}")
     try:

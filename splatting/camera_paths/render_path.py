@@ -41,7 +41,7 @@ def add_path_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--fps", type=int, metavar="N", help="frames a second (default: 30)")
     size = "width and height, even (default: that of the first training camera, made even)"
     group.add_argument("--size", type=int, nargs=2, metavar=("W", "H"), help=size)
-    group.add_argument("--seconds", type=float, metavar="S", help="of a path that is no file (default: 10)")
+    group.add_argument("--seconds", type=float, metavar="S", help="seconds of a path that is no file (default: 10)")
     group.add_argument("--frames", action="store_true", help="write each frame as PNG, too (default: off)")
 
 

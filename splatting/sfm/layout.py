@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from pathlib import Path
 
+from scene.readers.scene_folder import is_scene
 from splatting.files.image_files import SUFFIXES
 from splatting.files.similarity import FILE
 from splatting.sfm.inputs import VIDEO_SUFFIXES, Inputs, sort_inputs, unused_lines
@@ -84,13 +85,20 @@ def _no_input(layout: Layout) -> str:
     scene = layout.scene
     if scene.name == "input":
         return f"{scene} is the folder of the photos itself; pass its parent folder as -s: {scene.parent}"
+    if (scene / "cfg_args").is_file():
+        return f"{scene} is a model that train.py wrote; pass the folder of its photos as -s"
+    if is_scene(scene):
+        return (
+            f"no folder input in {scene}, which is a scene already: train.py takes it as it is; to convert again, make "
+            f"{layout.input} and put the photos there"
+        )
     beside = sum(map(_is_image, scene.iterdir()))
     if beside:
         return (
             f"no folder input in {scene}, but {beside} photos directly in it; make {layout.input}, move them there, "
             f"and run again with -s {scene}"
         )
-    if (scene / "images").is_dir() and not (scene / "sparse").is_dir():
+    if (scene / "images").is_dir():
         return f"no folder input in {scene}; rename its folder images to input"
     return f"no folder input in {scene}; make it and put the photos there, or pass a video as --video"
 
