@@ -12,6 +12,7 @@ from scene.check.findings import Finding
 from scene.images.decode import picture_size
 from scene.images.masks import Mask
 from scene.readers.info import SceneInfo
+from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.json_files import read_json
 from splatting.files.listing import some
@@ -153,6 +154,7 @@ def _sampled(image: Image.Image) -> tuple[np.ndarray, bool]:
     if image.mode.startswith("I"):
         grey = np.clip(_thinned(np.asarray(image)), 0, 65535) / 65535
         return np.repeat(grey[..., None], 3, axis=2), True
+    image = in_srgb(image)
     image = image.convert("RGBA" if image.has_transparency_data else "RGB")
     return _thinned(np.asarray(image)) / 255.0, False
 

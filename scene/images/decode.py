@@ -10,27 +10,30 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from splatting.files.image_files import UNREADABLE, open_image
+from splatting.files.color_profiles import has_other_colors, in_srgb
+from splatting.files.image_files import UNREADABLE, eight_bits, open_image, sixteen_bits
 from splatting.files.listing import some
 from splatting.files.plain_files import not_the_file
 from utils.system_utils import UserError
 
 _TAIL = 4096
-_EIGHT_BITS = ((np.arange(1 << 16) + 128) // 257).astype(np.uint8)  # of a 16-bit grey; 255 is 65535
 # Large photos are normal here; Pillow's own limit still refuses absurd sizes. The filter is set once, because filters
 # set for a block apply to all threads.
 warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
 
 
-def picture_size(path: Path) -> tuple[int, int]:
+def picture_size(path: Path, colors: bool = False) -> tuple[int, int]:
     """Size (width, height) of an image file, from its header. UserError for a file that is broken or cut short.
 
-    A file that lacks its format's end mark is decoded, to find out whether it is complete.
+    A file that lacks its format's end mark is decoded, to find out whether it is complete. colors: of a photo, whose
+    colour profile is told of before anything is decoded.
     """
     try:
         with open_image(path) as image:
             size = image.size
             _refuse_float(image)
+            if colors:
+                has_other_colors(image)
             if not _has_end_mark(path, image.format):
                 image.load()
     except (*UNREADABLE, MemoryError) as error:
@@ -39,11 +42,11 @@ def picture_size(path: Path) -> tuple[int, int]:
 
 
 def picture_sizes(paths: Sequence[Path]) -> list[tuple[int, int]]:
-    """The sizes of image files. A UserError names all that are broken or cut short."""
+    """The sizes of photos. A UserError names all that are broken or cut short."""
     sizes, errors = [], []
     for path in paths:
         try:
-            sizes.append(picture_size(Path(path)))
+            sizes.append(picture_size(Path(path), colors=True))
         except UserError as error:
             errors.append((path, error))
     if len(errors) > 1:
@@ -83,7 +86,8 @@ def grey_values(path: Path) -> np.ndarray:
     try:
         with open_image(path) as image:
             if image.mode.startswith("I"):
-                return np.clip(np.asarray(image), 0, 65535).astype(np.uint16)
+                return np.asarray(sixteen_bits(image))
+            image.info.pop("icc_profile", None)  # its values are no colours
             pixels = pixels_of(image, image.size).numpy()
     except (*UNREADABLE, MemoryError) as error:
         raise _unreadable(path, error) from error
@@ -94,7 +98,8 @@ def pixels_of(image: Image.Image, size: tuple[int, int], opaque: bool = False) -
     """Image (3,H,W) uint8, or (4,H,W) with straight alpha if it has any, at size (width, height).
 
     Resized by Pillow's bicubic filter, antialiased when shrinking, with colours weighted by alpha (premultiplied).
-    Grey, palette, CMYK and 16-bit images become 8-bit RGB. opaque: alpha is dropped first.
+    Grey, palette, CMYK and 16-bit images become 8-bit RGB; a colour profile is followed to sRGB. opaque: alpha is
+    dropped first.
     """
     image = _to_rgb_or_rgba(image, opaque)
     if image.size != size:
@@ -128,11 +133,9 @@ def _refuse_float(image: Image.Image) -> None:
 
 
 def _to_rgb_or_rgba(image: Image.Image, opaque: bool) -> Image.Image:
-    if image.mode.startswith("I"):
-        # Pillow's own conversion of 16-bit grey clips at 255.
-        grey = np.asarray(image)
-        grey = grey if grey.dtype == np.uint16 else np.clip(grey, 0, 65535)
-        return Image.fromarray(_EIGHT_BITS[grey]).convert("RGB")
     _refuse_float(image)
+    image = in_srgb(image)
+    if image.mode.startswith("I"):
+        return eight_bits(image).convert("RGB")
     has_alpha = image.has_transparency_data and not opaque
     return image.convert("RGBA" if has_alpha else "RGB")

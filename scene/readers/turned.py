@@ -23,6 +23,7 @@ from splatting.files.plain_files import plain
 from splatting.host.machine import threads
 from utils.system_utils import UserError, atomic_write, mkdir_p
 
+_FORMAT = b"sRGB"  # of the files in the cache; change it when the same input must give other files
 _TURNS = {
     5: Image.Transpose.TRANSPOSE,
     6: Image.Transpose.ROTATE_270,
@@ -90,7 +91,8 @@ def _turn(photo: Path) -> int | None:
 
 
 def _place(photo: Path, folder: Path) -> Path:
-    return folder / f"{hashlib.blake2b(plain(photo).read_bytes(), digest_size=20).hexdigest()}.png"
+    digest = hashlib.blake2b(plain(photo).read_bytes(), digest_size=20, person=_FORMAT)
+    return folder / f"{digest.hexdigest()}.png"
 
 
 def _copy(photo: Path, turn: int, size: tuple[int, int], path: Path) -> None:

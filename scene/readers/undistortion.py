@@ -26,7 +26,7 @@ from splatting.files.plain_files import plain
 from splatting.host.machine import threads
 from utils.system_utils import UserError, atomic_write, mkdir_p
 
-_FORMAT = "2"  # of the files in the cache; raise it when the same input must give other files
+_FORMAT = "3"  # of the files in the cache; raise it when the same input must give other files
 
 _HAS_MASK = "mask"  # text in an undistorted file, yes or no, so that a deleted mask is noticed
 

@@ -9,6 +9,7 @@ import numpy as np
 from scene.dataset_readers import CameraInfo, SceneInfo
 from scene.readers.tracks import projected
 from splatting.diagnosis import Line
+from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import open_image
 from splatting.files.listing import some
 from utils.graphics_utils import BasicPointCloud
@@ -52,7 +53,7 @@ def _pixels(camera: CameraInfo) -> np.ndarray:
     """A photo, small, (H, W, 3) in [0, 1]."""
     with open_image(camera.image_path) as image:
         image.draft("RGB", (_SMALL, _SMALL))
-        image = image.convert("RGB")
+        image = in_srgb(image).convert("RGB")
         image.thumbnail((_SMALL, _SMALL))
         return np.asarray(image) / 255
 

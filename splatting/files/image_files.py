@@ -32,6 +32,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "JPEG2000", "AVIF", "HEIF", "TGA")
 SCALE = "scale"  # key of a plane's text chunk: value = pixel * scale
 _STEPS = 65535
+_EIGHT_BITS = ((np.arange(1 << 16) + 128) // 257).astype(np.uint8)  # of a 16-bit grey; 255 is 65535
 _DIM = 0.3  # brightness of what a mask leaves out
 
 
@@ -55,6 +56,16 @@ def open_render(path: Path) -> Image.Image:
         raise Image.DecompressionBombError(str(error)) from error
     finally:
         Image.MAX_IMAGE_PIXELS = usual
+
+
+def sixteen_bits(image: Image.Image) -> Image.Image:
+    """A grey image of 16 bits, which Pillow has in several modes, in mode I;16."""
+    return Image.fromarray(np.clip(np.asarray(image), 0, 65535).astype(np.uint16))
+
+
+def eight_bits(image: Image.Image) -> Image.Image:
+    """A grey image of 16 bits in mode L. Pillow's own conversion clips at 255."""
+    return Image.fromarray(_EIGHT_BITS[np.asarray(sixteen_bits(image))])
 
 
 def to_bytes(image: torch.Tensor) -> torch.Tensor:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm.contrib.concurrent import thread_map
 
+from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import open_image
 from splatting.files.listing import some
 from splatting.host.machine import threads
@@ -43,7 +44,7 @@ def looks_of(folder: Path, names: Sequence[str]) -> dict[str, Look]:
 
 def _look(path: Path) -> Look:
     with open_image(path) as image:
-        small = image.convert("RGB")
+        small = in_srgb(image).convert("RGB")
         small.thumbnail((_WIDTH, _WIDTH))
         pixels = np.asarray(small)
     light = (pixels.astype(np.float32).mean() / 255) ** 2.2  # about the inverse of sRGB's curve

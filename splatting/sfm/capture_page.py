@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image, ImageOps
 from tqdm.contrib.concurrent import thread_map
 
+from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.json_files import read_json, write_json
 from splatting.host.machine import threads
@@ -110,7 +111,7 @@ def _thumbnail(path: Path) -> str | None:
     try:
         with open_image(path) as image:
             image.draft("RGB", (2 * _THUMBNAIL, 2 * _THUMBNAIL))  # decodes a large JPEG at a fraction of its size
-            small = ImageOps.exif_transpose(image).convert("RGB")
+            small = in_srgb(ImageOps.exif_transpose(image)).convert("RGB")
     except UNREADABLE:
         return None
     small.thumbnail((_THUMBNAIL, _THUMBNAIL))

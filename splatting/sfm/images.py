@@ -11,6 +11,7 @@ from tqdm.contrib.concurrent import thread_map
 from scene.images.decode import picture_size
 from scene.images.masks import Mask, mask_names
 from scene.images.side_files import SideFiles
+from splatting.files.color_profiles import has_other_colors, in_srgb
 from splatting.files.image_files import SUFFIXES, UNREADABLE, open_image
 from splatting.host.machine import threads
 from splatting.sfm.layout import Layout, image_names
@@ -30,9 +31,10 @@ _LINKED = ("JPEG", "MPO", "PNG", "TIFF", "BMP")
 def prepare_images(layout: Layout, names: Sequence[str], masks: Path | None) -> None:
     """Fill `layout.prepared`, and `layout.masks` if a folder of masks is given.
 
-    A photo is linked, or copied if links are impossible. A photo that its EXIF orientation turns, or whose format
-    COLMAP cannot read, is rewritten, with upright pixels and the other EXIF data kept. A name without the suffix of
-    its format gets one appended. Masks: see `_prepare_mask`.
+    A photo is linked, or copied if links are impossible. A photo that its EXIF orientation turns, whose format
+    COLMAP cannot read, or whose colours are not sRGB, which COLMAP takes those of points for, is rewritten, with
+    upright pixels in sRGB and the other EXIF data kept. A name without the suffix of its format gets one appended.
+    Masks: see `_prepare_mask`.
     `check_images` must have passed before; UserError for files whose pixels turn out to be broken.
     """
     with_mask = find_masks(names, masks, layout.input) if masks else {}
@@ -111,7 +113,7 @@ def _prepare_image(source: Path, target: Path, taken: Collection[Path]) -> Path:
                 target = target.with_name(target.name + _ENDS[written])
                 while target in taken:
                     target = target.with_name(target.name + _ENDS[written])
-            if linked and image.getexif().get(_ORIENTATION, 1) in (0, 1):
+            if linked and image.getexif().get(_ORIENTATION, 1) in (0, 1) and not has_other_colors(image):
                 link(source, target)
                 return target
             upright = ImageOps.exif_transpose(image)
@@ -128,7 +130,7 @@ def _written(image: Image.Image) -> str:
 
 
 def _upright_size(photo: Path) -> tuple[int, int]:
-    width, height = picture_size(photo)  # UserError for a truncated file or one of another kind
+    width, height = picture_size(photo, colors=True)  # UserError for a truncated file or one of another kind
     try:
         with open_image(photo) as image:
             lies = image.getexif().get(_ORIENTATION, 1) in _LYING
@@ -160,9 +162,10 @@ def _prepare_mask(source: Path | None, target: Path, photo: Path) -> None:
 
 
 def _save(image: Image.Image, target: Path, like: Image.Image, **options: object) -> None:
-    """Save in the format and with the colour profile of the photo `like` that the image was made from."""
+    """Save in sRGB, in the format of the photo `like` that the image was made from."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    if profile := like.info.get("icc_profile"):
+    image = in_srgb(image)
+    if profile := image.info.get("icc_profile"):
         options["icc_profile"] = profile
     written = _written(like)
     if written == "JPEG":
