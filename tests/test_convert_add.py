@@ -1,6 +1,8 @@
 """convert.py --add: new photos beside those of a scene, which stay where they are."""
 
+import contextlib
 import shutil
+import sqlite3
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,9 @@ from PIL import Image
 
 import convert
 from splatting.sfm import stages
+from splatting.sfm.adding import keep_base
+from splatting.sfm.images import prepare_images
+from splatting.sfm.layout import Layout, image_names
 from utils.system_utils import UserError
 
 PLACES = 10
@@ -108,3 +113,22 @@ def test_what_cannot_be_added_is_said(room, tmp_path, capsys):
     _run(scene)
     assert "without --add, photos that were added before get new poses" in capsys.readouterr().err
     assert not (scene / "distorted" / "base").exists()
+
+
+def test_photos_that_are_prepared_under_other_names_are_known(tmp_path):
+    """By files of kinds that COLMAP does not read, or without a suffix; the model is not asked."""
+    layout, names = Layout(tmp_path), ["a.webp", "b.jp2", "c", "d.avif", "e.png"]
+    layout.input.mkdir()
+    for name, kind in zip(names, ("WEBP", "JPEG2000", "TIFF", "AVIF", "PNG"), strict=True):
+        Image.new("RGB", (32, 24)).save(layout.input / name, kind)
+    prepare_images(layout, names, None)
+    with pytest.raises(UserError, match="has no new photos"):
+        keep_base(layout, True, names)
+    layout.base.mkdir()
+    with contextlib.closing(sqlite3.connect(layout.base_database)) as database:
+        database.execute("CREATE TABLE images (name TEXT)")
+        database.executemany("INSERT INTO images VALUES (?)", [(name,) for name in image_names(layout.prepared)])
+        database.commit()
+    keep_base(layout, False, [*names, "new.png"])
+    with pytest.raises(UserError, match=r"lacks a\.webp; put them back"):
+        keep_base(layout, False, names[1:])

@@ -10,6 +10,8 @@ from typing import Any
 
 from splatting.files.listing import some
 from splatting.sfm.colmap import copy_database, names_in
+from splatting.sfm.images import prepared_names
+from splatting.sfm.inputs import PHOTO_SUFFIXES
 from splatting.sfm.layout import Layout, image_names
 from splatting.sfm.report import read_survey, read_tried
 from utils.system_utils import UserError
@@ -18,9 +20,11 @@ from utils.system_utils import UserError
 def keep_base(layout: Layout, finished: bool, names: Sequence[str]) -> None:
     """Keep what new photos are added to. UserError if there is nothing, or if some of its photos are gone.
 
-    finished: whether the last conversion was. One that was interrupted while it added photos keeps its base.
+    finished: whether the last conversion was. One that was interrupted while it added photos keeps its base. names: of
+    the photos in `input`.
     """
-    if finished and not set(names) <= set(image_names(layout.prepared)):
+    prepared = set(prepared_names(layout, names).values())
+    if finished and not prepared <= set(image_names(layout.prepared)):
         new = layout.base.with_name(layout.base.name + ".new")
         shutil.rmtree(new, ignore_errors=True)
         new.mkdir()
@@ -35,11 +39,18 @@ def keep_base(layout: Layout, finished: bool, names: Sequence[str]) -> None:
             if finished
             else f"--add needs a scene that convert.py has finished, and {layout.scene} is none; leave --add out"
         )
-    if gone := sorted(set(names_in(layout.base_database)) - set(names)):
+    if gone := sorted(set(names_in(layout.base_database)) - prepared):
+        lacking = some([_before(name) for name in gone])
         raise UserError(
-            f"--add keeps the photos of the scene, and {layout.input} lacks {some(gone)}; put them back, or leave "
-            "--add out to begin anew"
+            f"--add keeps the photos of the scene, and {layout.input} lacks {lacking}; put them back, or leave --add "
+            "out to begin anew"
         )
+
+
+def _before(name: str) -> str:
+    """A prepared photo's name without the suffix that was appended to that of a photo."""
+    own = name.rpartition(".")[0]
+    return own if own.lower().endswith(PHOTO_SUFFIXES) else name
 
 
 def forget_base(layout: Layout) -> None:

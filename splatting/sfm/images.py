@@ -1,5 +1,6 @@
 """Photos for COLMAP: upright, in a readable format, with their masks."""
 
+import contextlib
 import os
 import shutil
 from collections.abc import Callable, Collection, Sequence
@@ -47,6 +48,17 @@ def prepare_images(layout: Layout, names: Sequence[str], masks: Path | None) -> 
             _prepare_mask(with_mask.get(name), mask.with_name(f"{mask.name}.png"), prepared)
 
     _in_threads(prepare, names, "Preparing photos")
+
+
+def prepared_names(layout: Layout, names: Sequence[str]) -> dict[str, str]:
+    """The names that `prepare_images` gives photos, by their own; a photo that cannot be read keeps its own."""
+    found, taken = {}, {layout.prepared / name for name in names}
+    for name in names:
+        found[name] = name
+        with contextlib.suppress(*UNREADABLE), open_image(layout.input / name) as image:
+            target = _named(image, layout.prepared / name, taken)
+            found[name] = target.relative_to(layout.prepared).as_posix()
+    return found
 
 
 def check_images(layout: Layout, names: Sequence[str], masks: Path | None) -> None:
@@ -100,20 +112,16 @@ def resize_images(layout: Layout, factor: int) -> None:
 
 
 def _prepare_image(source: Path, target: Path, taken: Collection[Path]) -> Path:
-    """Write the prepared photo and return its path: `target`, with the suffix of its format appended if it has none.
-
-    taken: paths of other photos.
-    """
+    """Write the prepared photo and return its path, `_named`. taken: paths of other photos."""
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         with open_image(source) as image:
-            written = _written(image)
-            linked = image.format in _LINKED
-            if target.suffix.lower() not in (set(SUFFIXES) - {".webp"} if linked else {_ENDS[written]}):
-                target = target.with_name(target.name + _ENDS[written])
-                while target in taken:
-                    target = target.with_name(target.name + _ENDS[written])
-            if linked and image.getexif().get(_ORIENTATION, 1) in (0, 1) and not has_other_colors(image):
+            target = _named(image, target, taken)
+            if (
+                image.format in _LINKED
+                and image.getexif().get(_ORIENTATION, 1) in (0, 1)
+                and not has_other_colors(image)
+            ):
                 link(source, target)
                 return target
             upright = ImageOps.exif_transpose(image)
@@ -121,6 +129,16 @@ def _prepare_image(source: Path, target: Path, taken: Collection[Path]) -> Path:
             return target
     except UNREADABLE as error:
         raise UserError(f"cannot rewrite the photo {source} for COLMAP ({error}); replace or remove it") from error
+
+
+def _named(image: Image.Image, target: Path, taken: Collection[Path]) -> Path:
+    """The path of a prepared photo: `target`, with the suffix of its format appended if it has none."""
+    end = _ENDS[_written(image)]
+    if target.suffix.lower() not in (set(SUFFIXES) - {".webp"} if image.format in _LINKED else {end}):
+        target = target.with_name(target.name + end)
+        while target in taken:
+            target = target.with_name(target.name + end)
+    return target
 
 
 def _written(image: Image.Image) -> str:
