@@ -207,7 +207,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     )
     add("--orient", action="store_true", help="find where the scene is upright, and its size by GPS, for exports")
     add("--video", nargs="+", action="extend", default=[], metavar="FILE",
-        help="take frames of these videos as photos, besides those in input; needs imageio-ffmpeg")  # fmt: skip
+        help="take frames of these videos as photos, besides those in input; needs pip install '.[video]'")  # fmt: skip
     add("--video_frames", type=int, default=150, metavar="N",
         help="largest number of frames of each video, the sharpest of each of N equal parts of its motion "
         "(default: 150)")  # fmt: skip

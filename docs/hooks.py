@@ -21,7 +21,7 @@ PAGES = {
     "SECURITY.md": "security.md",
     "benchmarks/README.md": "benchmarks.md",
 }
-OPTIONS = "reference/options.md"
+OPTIONS = "reference/options.md"  # in the repository it says which command lists them
 SOURCES = {page: source for source, page in PAGES.items()}
 LINK = re.compile(r"(?<=\]\()([^()\s#:]+\.md)")
 HELP = re.compile(r"(.*?)(?: \(default: (.*)\))?")  # of an option: its effect and its default
@@ -34,11 +34,10 @@ log = logging.getLogger("mkdocs.hooks")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that lie outside of docs/, and the page of train.py's options."""
+    """Add the pages that lie outside of docs/."""
     root = Path(config.config_file_path).parent
     for source, page in PAGES.items():
         files.append(File.generated(config, page, content=(root / source).read_text(encoding="utf-8")))
-    files.append(File.generated(config, OPTIONS, content=options_page(root)))
     return files
 
 
@@ -62,8 +61,10 @@ def options_page(root: Path) -> str:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Links are relative to a page's place in the repository; point them at places in the site."""
+    """Write the page of options. Links are relative to a page's place in the repository; point them into the site."""
     here = page.file.src_uri
+    if here == OPTIONS:
+        return options_page(Path(config.config_file_path).parent)
     folder = posixpath.dirname(SOURCES.get(here, f"docs/{here}"))
 
     def in_site(link: re.Match) -> str:

@@ -1,6 +1,7 @@
 """Files that convert.py finds in `input`: photos of every format by their content, and what is not used, by name."""
 
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ from photo_room import SIZE, make_photos
 from PIL import Image, ImageOps
 
 import convert
+from scene.images.decode import picture_size
 from splatting.sfm.images import prepare_images
 from splatting.sfm.inputs import sort_inputs
 from splatting.sfm.layout import Layout, image_names
@@ -149,6 +151,27 @@ def test_photos_that_can_not_be_read_stop_unless_they_are_left_out(tmp_path, hei
     assert {"4.NEF", "5.tif", "6.heic", "7.hif", "8.jpg", "9.png"} < found.unused.keys()
 
 
+@pytest.mark.parametrize("skip", [False, True])
+def test_photos_of_a_kind_that_no_copying_repairs_get_the_true_reason(tmp_path, skip):
+    _fill(tmp_path)
+    Image.new("1", (50_000, 4_000)).save(tmp_path / "4.png")
+    Image.new("1", (50_000, 4_000)).save(tmp_path / "5.jfif", "PNG")
+    Image.new("F", (9, 9)).save(tmp_path / "6.tif")
+    with pytest.raises(UserError, match=r"4.png has more than \d+,\d+,\d+ pixels; make it smaller"):  # of a training
+        picture_size(tmp_path / "4.png")
+    found = {"too large to be read: make it smaller": ["4.png", "5.jfif"]}
+    found |= {"floating-point pixels: save it with 8 or 16 bits": ["6.tif"]}
+    if skip:
+        (tmp_path / "7.jpg").write_bytes(b"<html>")
+        found |= {"a web page, likely from a wrong address: download it again": ["7.jpg"]}
+        unused = sort_inputs(tmp_path, skip_unreadable=True).unused
+        assert {reason: [name for name in unused if unused[name] == reason] for reason in found} == found
+    else:
+        listed = "; ".join(f"{', '.join(names)} ({reason})" for reason, names in found.items())
+        with pytest.raises(UserError, match=f"^3 photos in .* cannot be read: {re.escape(listed)}; follow these hints"):
+            sort_inputs(tmp_path)
+
+
 def test_links_to_folders_are_not_passed_over(tmp_path):
     """Their photos are not looked for, which may be most of the capture."""
     _fill(tmp_path / "input")
@@ -168,7 +191,7 @@ def test_without_the_reader_of_heic_the_message_has_the_line_that_installs_it(tm
         _save(tmp_path / name, "HEIF")
     monkeypatch.delitem(Image.OPEN, "HEIF")
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    with pytest.raises(UserError, match=r'1 photos .*: 6.heic \(HEIC: .*pip install "\.\[heic\]"`, or export as JPEG'):
+    with pytest.raises(UserError, match=r"1 photos .*: 6.heic \(HEIC: .*pip install '\.\[heic\]'`, or export as JPEG"):
         sort_inputs(tmp_path)
     assert sort_inputs(tmp_path, skip_unreadable=True).photos == ["1.jpg", "2.jpg", "3.jpg"]
 

@@ -129,10 +129,10 @@ def test_every_flag_in_prose_is_known():
     assert {(page, flag) for page, flag in shown - removed if flag not in known} == set()
 
 
-def test_links_of_the_readme_resolve():
-    """No page of the site."""
-    links = re.findall(r"\]\((?!\w+:)([^()\s#]+)", _prose(ROOT / "README.md"))
-    assert links and [link for link in links if not (ROOT / link).exists()] == []
+def test_links_resolve_in_the_repository():
+    """The site checks its own."""
+    links = [(page, link) for page in PAGES for link in re.findall(r"\]\((?!\w+:)([^()\s#]+)", _prose(page))]
+    assert links and [(_name(page), link) for page, link in links if not (page.parent / link).exists()] == []
 
 
 def test_figures_of_the_readme_stand_in_the_results():

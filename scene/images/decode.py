@@ -113,6 +113,8 @@ def pixels_of(image: Image.Image, size: tuple[int, int], opaque: bool = False) -
 def _unreadable(path: Path, error: Exception) -> UserError:
     if other := not_the_file(path):
         return UserError(f"{path} is {other}; download it again or take it out of the scene")
+    if isinstance(error, Image.DecompressionBombError):
+        return UserError(f"{path} has more than {2 * Image.MAX_IMAGE_PIXELS:,} pixels; make it smaller")
     return UserError(
         f"cannot read {path} ({str(error) or type(error).__name__}); replace it or take it out of the scene"
     )

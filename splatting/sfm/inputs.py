@@ -13,7 +13,7 @@ from PIL import Image
 from scene.images.decode import picture_size
 from splatting.files.image_files import SUFFIXES, UNREADABLE, open_image
 from splatting.files.listing import some
-from splatting.files.plain_files import plain
+from splatting.files.plain_files import not_the_file, plain
 from utils.system_utils import UserError
 
 _HEAD = 1 << 16  # bytes that hold the colours of a HEIC or AVIF file
@@ -42,10 +42,12 @@ _VIDEO_STARTS = (b"\x1a\x45\xdf\xa3", b"\x00\x00\x01\xba")  # Matroska and WebM;
 # Formats whose files often lie beside a JPEG of the same shot.
 _OFTEN_DOUBLE = ("HEIF", "AVIF", "RAW")
 _TRANSFER_HDR = (16, 18)  # PQ and HLG, of ITU-T H.273
-_INSTALL = 'HEIC: `pip install pillow-heif` or `pip install ".[heic]"`, or export as JPEG'
+_INSTALL = "HEIC: `pip install '.[heic]'`, or export as JPEG"
 _DEVELOP = "RAW: export as JPEG or TIFF"
 _HDR = "HDR picture: export as SDR"
 _DAMAGED = "damaged: copy it again"
+_HUGE = "too large to be read: make it smaller"
+_FLOAT = "floating-point pixels: save it with 8 or 16 bits"
 _LINK = "a link to a folder or to nothing: copy the photos themselves"
 
 
@@ -148,10 +150,12 @@ def _is_whole(path: Path) -> bool:
 
 
 def _picture_kind(path: Path, thorough: bool) -> _Kind:
-    suffix, expected = path.suffix.lower(), _Kind("unknown", _DAMAGED if thorough else "")
+    suffix = path.suffix.lower()
     try:
         with open_image(path) as image:
             kind = image.format
+            if image.mode == "F":
+                return _Kind("unknown", _FLOAT)
             if kind == "TIFF" and _DNG_VERSION in image.tag_v2:
                 return _Kind("RAW", _DEVELOP)
             if thorough:
@@ -160,10 +164,13 @@ def _picture_kind(path: Path, thorough: bool) -> _Kind:
             return _Kind("", "no picture")
         if thorough:
             picture_size(path)
-    except (*UNREADABLE, UserError, MemoryError):
+    except (Image.DecompressionBombError, MemoryError):
+        return _Kind("unknown", _HUGE)
+    except (*UNREADABLE, UserError):
         # Without `thorough`, the photos' own check says what is wrong with files that should be photos.
         if suffix in SUFFIXES:
-            return expected
+            other = not_the_file(path)
+            return _Kind("unknown", (f"{other}: download it again" if other else _DAMAGED) if thorough else "")
         return _Kind("HEIF", _DAMAGED) if suffix in _HEIF_SUFFIXES else _Kind("", "no picture")
     return _Kind("", "GIF, the format of animations") if kind == "GIF" else _Kind(kind, "")
 

@@ -56,7 +56,7 @@ def find_decoder() -> Any:
         import imageio_ffmpeg
     except ImportError as error:
         raise UserError(
-            "--video needs the package imageio-ffmpeg; `pip install imageio-ffmpeg`, or put frames of the video into "
+            "--video needs the package imageio-ffmpeg; `pip install '.[video]'`, or put frames of the video into "
             "the folder input yourself"
         ) from error
     # It warns of every turned video, as phones make them; the frames are upright all the same.
