@@ -2,13 +2,15 @@
 
 import argparse
 import json
+import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from gaussians import pipeline
 from html_scene import balls
-from small_splats import written
+from small_splats import splats, written
 
 import export
 import view
@@ -17,7 +19,10 @@ from scene.splats.reading import read_splats
 from scene.with_splats import model_of
 from splatting.camera_paths import without_scene
 from splatting.camera_paths.without_scene import COUNT, WithoutScene, circle, have_moved, recorded_cameras
+from splatting.exports import sog
 from splatting.exports.reading import read_any
+from splatting.exports.sog import write_sog
+from splatting.host import progress
 from splatting.viewer.views import SceneCameras
 from utils.camera_utils import camera_to_JSON
 from utils.system_utils import UserError
@@ -138,9 +143,28 @@ def test_a_sog_needs_its_program(tmp_path, monkeypatch):
     monkeypatch.setattr("shutil.which", lambda *_, **__: None)
     with pytest.raises(UserError, match="a.sog needs splat-transform; install Node"):
         read_any(tmp_path / "a.sog")
-    program = tmp_path / "program"
-    program.write_text("#!/bin/sh\necho no model >&2; exit 1\n")
+    _stand_in(tmp_path, monkeypatch, "echo Reading; echo ✗ Error: no model >&2; echo failed in 1 s; exit 1")
+    with pytest.raises(UserError, match=r"a.sog is not read by .*program .Error: no model.; save or download it again"):
+        read_any(tmp_path / "a.sog")
+
+
+def _stand_in(folder: Path, monkeypatch, script: str) -> None:
+    """A program in the place of splat-transform. It gets its output as its last argument."""
+    program = folder / "program"
+    program.write_text(f"#!/bin/sh\n{script}\n")
     program.chmod(0o755)
     monkeypatch.setattr("shutil.which", lambda *_, **__: str(program))
-    with pytest.raises(UserError, match=r"a.sog is not read by .*program .no model.; save or download it again"):
-        read_any(tmp_path / "a.sog")
+
+
+def test_the_time_of_a_sog_is_told_and_its_progress_shown(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(progress, "INTERVAL", 0.0)
+    monkeypatch.setattr(sog, "_LOOK", 0.01)
+    _stand_in(tmp_path, monkeypatch, 'printf "k-means [###"; sleep 0.1; for file; do :; done; echo PK > "$file"')
+    with pytest.raises(zipfile.BadZipFile):
+        write_sog(tmp_path / "a.sog", splats(7000, 1))
+    said = capsys.readouterr().err
+    assert said.startswith("splat-transform takes about 1 min for the SH bands of 7,000 Gaussians, as it compares")
+    assert "splat-transform: 00:00, k-means [###\n" in said
+    with pytest.raises(zipfile.BadZipFile):
+        write_sog(tmp_path / "a.sog", splats(7000, 0))
+    assert " min " not in capsys.readouterr().err

@@ -1,13 +1,12 @@
 """Reading a model in any format: also those that other programs read for us."""
 
 import os
-import subprocess
 from pathlib import Path
 
 from scene.splats.reading import READABLE
 from scene.splats.splats import Splats
 from scene.with_splats import splats_in
-from splatting.exports.sog import find_splat_transform
+from splatting.exports.sog import fault_of, find_splat_transform
 from utils.system_utils import UserError, temporary_folder
 
 ANY = f"{READABLE}, or .sog through splat-transform"
@@ -20,9 +19,6 @@ def read_any(path: str | os.PathLike) -> Splats:
     program = find_splat_transform(path)
     with temporary_folder() as folder:
         model = folder / "model.ply"
-        command = [program, "--quiet", os.path.abspath(path), str(model)]  # which is neither an option nor an address
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode or not model.is_file():
-            said = (done.stderr or done.stdout).strip().splitlines() or ["it said nothing"]
-            raise UserError(f"{path} is not read by {program} ({said[-1]}); save or download it again")
+        if fault := fault_of([program, os.path.abspath(path), str(model)], model):
+            raise UserError(f"{path} is not read by {program} ({fault}); save or download it again")
         return splats_in(model)

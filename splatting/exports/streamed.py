@@ -11,7 +11,7 @@ from scene.splats.ply import write_plain_ply
 from scene.splats.splats import Splats
 from splatting.exports.beside import PLACE, with_folder
 from splatting.exports.levels import Views, joined, octree, table
-from splatting.exports.sog import PROGRAM, find_splat_transform, run_program
+from splatting.exports.sog import PROGRAM, find_splat_transform, run_program, tell_if_slow
 from utils.system_utils import UserError, temporary_folder
 
 
@@ -23,6 +23,7 @@ def write_lod_meta(path: str | os.PathLike, splats: Splats, around: Views) -> st
     program, path = find_splat_transform(path), Path(path)
     if not len(splats):
         raise UserError(f"{path} would have no splats, which {PROGRAM} does not write; choose another format")
+    tell_if_slow(len(splats), splats.sh_degree)
     root = octree(splats)
     with temporary_folder() as models, with_folder(path, "sog-") as folder:
         inputs = []
