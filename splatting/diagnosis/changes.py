@@ -1,12 +1,10 @@
 """Changes of a model or its photos since the training: each that is usual is undone, and tried on the views."""
 
 from collections.abc import Callable, Iterator
-from itertools import permutations, product
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from arguments import read_model_json
@@ -17,12 +15,11 @@ from scene.gaussians.attributes import Rows
 from scene.readers.point_cloud import read_point_cloud
 from scene.scene import Scene
 from splatting.diagnosis import Line
-from splatting.diagnosis.photos import CLEARLY, FITS, other_focal_length, others_photos
+from splatting.diagnosis.photos import CLEARLY, FITS, other_focal_length, strange_photos
 from splatting.evaluation.model_folder import curve_of
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
 from splatting.parts import tools
-from utils.general_utils import build_rotation
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.system_utils import UserError
 
@@ -77,8 +74,8 @@ def what_changed(scene: Scene, views: list[Camera], scored: ScoredViews, now: fl
     explains = best >= now + CLEARLY and best >= least
     if explains or (then is not None and best >= max(then - NEAR, now + 1)):
         return Line(f"{change.text}: without that it is {best:.1f} dB", change.remedy)
-    if swapped := others_photos(scene, scored):
-        return swapped
+    if strange := strange_photos(scene, scored):
+        return strange
     if then is None or now > then - LOST:
         return None
     remedy = "restore the model and the photos of that training (its scene is in cfg_args), or train again"
@@ -105,7 +102,7 @@ def _score(views: list[Camera], gaussians: GaussianModel, scored: ScoredViews) -
 def _changes(scene: Scene) -> Iterator[Change]:
     rows, folder = scene.gaussians.rows(), scene.model_path
     yield Change(
-        "red and blue are swapped", "the program that wrote the PLY takes colours as BGR; swap f_dc and f_rest back",
+        "red and blue are strange", "the program that wrote the PLY takes colours as BGR; swap f_dc and f_rest back",
         lambda rows: rows | {name: rows[name].flip(-1) for name in ("f_dc", "f_rest")},
     )  # fmt: skip
     yield Change(
@@ -124,7 +121,6 @@ def _changes(scene: Scene) -> Iterator[Change]:
         )  # fmt: skip
     yield from map(_scaled, _factors(rows["xyz"], Path(folder)))
     yield from map(_placed, _factors(rows["xyz"], Path(folder)))
-    yield from map(_turned, _axes())
 
 
 def _factors(means: Tensor, folder: Path) -> list[float]:
@@ -150,28 +146,3 @@ def _placed(factor: float) -> Change:
         f"the positions were scaled by {factor:.3g}, but not the sizes", f"scale the positions by {1 / factor:.3g}",
         lambda rows: rows | {"xyz": rows["xyz"] / factor},
     )  # fmt: skip
-
-
-def _axes() -> Iterator[Tensor]:
-    """The matrices (3, 3) that permute and flip axes, but the identity."""
-    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        if order != (0, 1, 2) or -1.0 in signs:
-            yield torch.diag(torch.tensor(signs))[list(order)]
-
-
-def _turned(back: Tensor) -> Change:
-    """back: the matrix that undoes the change. View dependence would have to be turned with it, so it is left out."""
-    names = ["xyz"[int(row.abs().argmax())] for row in back.T]  # of what became x, y, z
-    signs = ["-" if float(row.sum()) < 0 else "" for row in back.T]
-    axes = ", ".join(f"{sign}{name}" for sign, name in zip(signs, names, strict=True))
-
-    def undo(rows: Rows) -> Rows:
-        turn = back.to(rows["xyz"])
-        turned = turn @ build_rotation(rows["rotation"])
-        turned = turned * torch.tensor([1.0, 1.0, float(turn.det())]).to(turned)  # a mirrored axis is the same ellipse
-        x, y, z, w = Rotation.from_matrix(turned.cpu().double().numpy()).as_quat().T
-        quaternions = torch.stack([torch.from_numpy(part) for part in (w, x, y, z)], dim=1).to(rows["rotation"])
-        plain = torch.zeros_like(rows["f_rest"])
-        return rows | {"xyz": rows["xyz"] @ turn.T, "rotation": quaternions, "f_rest": plain}
-
-    return Change(f"the axes were changed: x, y, z are {axes}", "use the axes of the cameras (COLMAP's)", undo)

@@ -1,13 +1,18 @@
-"""Colours of the points beside those of the photos: a geometric cause is tried first, then exchanged photos."""
+"""Colours of the points beside those of the photos: whether cameras, points and photos fit together.
+
+A photo fits its camera if it shows the colours of the camera's points better than most other photos do. That needs no
+threshold of colour, and holds for any exposure.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from scene.dataset_readers import CameraInfo, SceneInfo
-from scene.readers.tracks import projected
+from scene.readers.tracks import Track, projected
 from splatting.diagnosis import Line
 from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import open_image
@@ -17,6 +22,12 @@ from utils.graphics_utils import BasicPointCloud
 _SAMPLE = 5000  # most points
 _FEWEST = 10  # points in a photo, and in all
 _GREY = 0.02  # spread of colours, below which they tell nothing
+_RANDOM = 0.9  # difference of neighbours' colours by that of any two points, above which they are random
+_FEW = 8  # photos, of which chance may say anything
+_OTHERS = 24  # photos that a photo is compared with
+_BETTER = 0.9  # share of these, than which a photo has to fit better
+_TOGETHER, _APART = 0.75, 0.5  # share of photos that fit, above which all fit together, and below which they do not
+_SAME = 1e-4  # extents between a point and itself
 _CAMERAS = 16  # that geometric causes are tried on
 _PHOTOS, _SMALL = 400, 200  # most photos that are compared, and their size in pixels
 _SUSPECTS = 24  # photos that fit their cameras worst
@@ -34,8 +45,11 @@ class _Photos(NamedTuple):
     cloud: BasicPointCloud
 
 
-def check_colors(info: SceneInfo) -> Iterator[Line]:
-    """The likeliest cause, if photos have other colours than the points that they should show."""
+def check_colors(info: SceneInfo, tracks: Sequence[Track | None] = ()) -> Iterator[Line]:
+    """What does not fit together, if photos have other colours than the points that they should show.
+
+    tracks: of the cameras, which fit them.
+    """
     step = max(1, len(info.point_cloud.points) // _SAMPLE)
     cloud = BasicPointCloud(*(values[::step] for values in info.point_cloud))
     if len(cloud.points) < _FEWEST or cloud.colors.std(axis=0).max() < _GREY:
@@ -45,8 +59,45 @@ def check_colors(info: SceneInfo) -> Iterator[Line]:
     photos = _Photos(cameras, [_pixels(camera) for camera in cameras], cloud)
     if wrong := [*_geometric(photos)]:
         yield wrong[0]
-    else:
-        yield from _exchanged(photos)
+    elif (fit := _fitting(photos)) is None:
+        return
+    elif fit.mean() < _APART and not _are_random(cloud):
+        text = f"{(~fit).sum()} of {len(fit)} photos show the points of their camera no better than other photos do"
+        yield Line(*_apart(info, [track.points for track in tracks if track], text))
+    elif fit.mean() > _TOGETHER:
+        yield from _strange(photos)
+
+
+def _are_random(cloud: BasicPointCloud) -> bool:
+    """Whether colours are those of a cloud that is made up, as for scenes without points."""
+    neighbours = KDTree(cloud.points).query(cloud.points, k=2)[1][:, 1]
+    others = np.random.default_rng(0).permutation(len(neighbours))
+    near, far = (np.abs(cloud.colors - cloud.colors[chosen]).mean() for chosen in (neighbours, others))
+    return bool(near > _RANDOM * far)
+
+
+def _fitting(photos: _Photos) -> np.ndarray | None:
+    """Of each photo whether it fits its camera, but for cameras that see few points; None of too few to tell."""
+    count, fit = len(photos.cameras), []
+    for n, camera in enumerate(photos.cameras):
+        others = [k for k in np.linspace(0, count - 1, min(count, _OTHERS)).astype(int) if k != n]
+        own, *errors = _errors(camera, [photos.pixels[k] for k in (n, *others)], photos.cloud)
+        if np.isfinite(own):
+            fit.append(np.mean(own < np.array(errors)) >= _BETTER)
+    return np.array(fit) if len(fit) >= _FEW else None
+
+
+def _apart(info: SceneInfo, seen: Sequence[np.ndarray], text: str) -> tuple[str, str]:
+    """Which of the three do not fit, and the remedy. seen: points of tracks, which fit the cameras."""
+    if not seen:
+        remedy = "check that all are of one reconstruction: axes and unit of the points, names of the photos"
+        return f"cameras and points, or cameras and photos, do not fit together: {text}", remedy
+    away = KDTree(info.point_cloud.points).query(np.concatenate(seen)[:: max(1, sum(map(len, seen)) // _SAMPLE)])[0]
+    if np.median(away) > _SAME * (info.extent or 1.0):
+        remedy = "start from the points of the cameras' own reconstruction, in its axes and unit"
+        return f"cameras and points do not fit together: {text}", remedy
+    remedy = "restore the photos that the cameras were computed from, under their names, or name their folder by -i"
+    return f"cameras and photos do not fit together: {text}", remedy
 
 
 def _pixels(camera: CameraInfo) -> np.ndarray:
@@ -78,9 +129,12 @@ def _geometric(photos: _Photos) -> Iterator[Line]:
     focal = {k: some_of._replace(cameras=[_refocused(c, k) for c in some_of.cameras]) for k in _FOCAL}
     units = {k: some_of._replace(cloud=some_of.cloud._replace(points=k * some_of.cloud.points)) for k in UNITS}
     given = _own(some_of)
-    found = [(name, k, _own(other)) for name, tried in (("f", focal), ("u", units)) for k, other in tried.items()]
-    name, factor, errors = min(found, key=lambda one: np.median(one[2]))
-    if not (errors < _CLEARLY * given).mean() >= _MOST:
+    found = [
+        (name, k, _own(other), other) for name, tried in (("f", focal), ("u", units)) for k, other in tried.items()
+    ]
+    name, factor, errors, other = min(found, key=lambda one: np.median(one[2]))
+    fit = _fitting(other)
+    if not (errors < _CLEARLY * given).mean() >= _MOST or (fit is not None and fit.mean() < _TOGETHER):
         return
     if name == "f":
         text = f"photos fit the points with focal lengths about {factor:g} times as long"
@@ -101,22 +155,19 @@ def _own(photos: _Photos) -> np.ndarray:
     return np.array([_errors(camera, [pixels], photos.cloud)[0] for camera, pixels in pairs])
 
 
-def _exchanged(photos: _Photos) -> Iterator[Line]:
-    """Photos that show clearly more of what another camera should see than its photo does, and than of their own."""
+def _strange(photos: _Photos) -> Iterator[Line]:
+    """Photos of whose camera another photo shows clearly more, and clearly more than of its own camera."""
     own = _own(photos)
     suspects = np.argsort(np.where(np.isfinite(own), -own, 0))[:_SUSPECTS]
     shapes = np.array([camera.width / camera.height for camera in photos.cameras])
-    pairs: set[tuple[int, int]] = set()  # a photo, and the camera that it fits
-    for camera in suspects:
-        errors = _errors(photos.cameras[camera], photos.pixels, photos.cloud)
-        errors[~np.isclose(shapes, shapes[camera], rtol=0.02)] = np.inf
+    found = []
+    for n in suspects:
+        errors = _errors(photos.cameras[n], photos.pixels, photos.cloud)
+        errors[~np.isclose(shapes, shapes[n], rtol=0.02)] = np.inf
         best = int(errors.argmin())
-        if errors[best] < _CLEARLY * min(own[camera], own[best]):
-            pairs.add((best, camera))
-            back = _errors(photos.cameras[best], [photos.pixels[camera]], photos.cloud)[0]
-            pairs |= {(int(camera), best)} if back < own[best] else set()
-    if pairs:
-        shown = [[photos.cameras[n].image_name for n in pair] for pair in sorted(pairs)]
-        names = [f"{photo} shows what {camera} should" for photo, camera in shown]
-        text = f"photos have each other's names ({some(names)})"
-        yield Line(text, "restore the names that the cameras were reconstructed with")
+        if errors[best] < _CLEARLY * min(own[n], own[best]):
+            found.append(photos.cameras[n].image_name)
+    if found:
+        count = f"{len(found)} of {len(own)} photos"
+        text = f"cameras and photos do not fit together: {count} do not show their points ({some(sorted(found))})"
+        yield Line(text, "restore the photos that these cameras were computed from, under their names")

@@ -114,7 +114,7 @@ def check_cloud(info: SceneInfo) -> Iterator[Line]:
 
 
 def check_geometry(source: str, info: SceneInfo) -> Iterator[Line]:
-    """Lenses and poses beside the tracks, then colours: wrong lenses or poses would look like exchanged photos."""
+    """Lenses and poses beside the tracks, then colours: wrong lenses or poses would look like wrong photos."""
     views = info.train_cameras
     try:
         tracks = read_tracks(source, views, info.offset)
@@ -122,7 +122,7 @@ def check_geometry(source: str, info: SceneInfo) -> Iterator[Line]:
         yield from_error(error)
         tracks = [None] * len(views)
     lines = [*check_focal(views, tracks)] or [*check_poses(views, tracks, info.extent)]
-    yield from lines or check_colors(info)
+    yield from lines or check_colors(info, tracks)
 
 
 def check_focal(views: Sequence[CameraInfo], tracks: Sequence[Track | None]) -> Iterator[Line]:

@@ -23,7 +23,7 @@ from splatting.diagnosis import Line, from_error
 from splatting.diagnosis.changes import FITS as BAD_PSNR
 from splatting.diagnosis.changes import LOST, NEAR, of_scene, recorded_psnr, what_changed
 from splatting.diagnosis.dataset import check_dataset
-from splatting.diagnosis.photos import others_photos
+from splatting.diagnosis.photos import strange_photos
 from splatting.evaluation.model_folder import closing_lines, curve_of
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
@@ -225,8 +225,8 @@ def _renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) 
     changed = None
     if not good or (then is not None and means.psnr < then - NEAR):
         changed = what_changed(scene, views, _scored(scene, options), means.psnr, then)
-    elif swapped := others_photos(scene, _scored(scene, options)):  # a few of them leave a good mean
-        return swapped, True
+    elif strange := strange_photos(scene, _scored(scene, options)):  # a few of them leave a good mean
+        return strange, True
     if good and changed is None:
         width = max(view.image_width for view in views)
         return Line(f"{len(views)} training views rendered {width} pixels wide: PSNR {means.psnr:.1f} dB"), False

@@ -1,4 +1,4 @@
-"""Photos that do not belong to their cameras: of another focal length, or with each other's names."""
+"""Photos that do not belong to their cameras: of another focal length, or of another view."""
 
 import torch
 from torch import Tensor
@@ -67,8 +67,8 @@ def _scaled(image: Tensor, factor: float, across: float, down: float) -> tuple[T
 
 
 @torch.no_grad()
-def others_photos(scene: Scene, scored: ScoredViews) -> Line | None:
-    """Line if photos have each other's names.
+def strange_photos(scene: Scene, scored: ScoredViews) -> Line | None:
+    """Line if photos show other views than those of their cameras.
 
     Such a view fits another photo clearly better than its own, and its own photo fits another view clearly better.
     """
@@ -82,15 +82,15 @@ def others_photos(scene: Scene, scored: ScoredViews) -> Line | None:
     found = []
     for place in sorted(range(len(views)), key=own.__getitem__)[:_SUSPECTS]:
         row = [_psnr(images[place], photo) for photo in photos]
-        best = max(row)
-        if best < max(FITS, own[place] + CLEARLY):
+        if max(row) < max(FITS, own[place] + CLEARLY):
             continue
         if max(_psnr(image, photos[place]) for image in images) >= own[place] + CLEARLY:
-            found.append(f"{views[row.index(best)].image_name} shows what {views[place].image_name} should")
+            found.append(views[place].image_name)
     if not found:
         return None
-    text = f"the photos have each other's names: {some(sorted(found))}"
-    return Line(text, "restore the names that the cameras were reconstructed with")
+    count = f"at least {len(found)} of {len(views)} photos"
+    text = f"cameras and photos do not fit together: {count} show another view ({some(sorted(found))})"
+    return Line(text, "restore the photos that these cameras were computed from, under their names")
 
 
 def _psnr(image: Tensor, photo: Tensor) -> float:

@@ -64,7 +64,8 @@ def run_program(program: str, inputs: Sequence[str], output: Path, path: str | o
     # Without a GPU, as its results differ from machine to machine.
     options = [os.environ.get("NODE_OPTIONS", ""), f"--import=data:text/javascript,{quote(_SEEDED)}"]
     environment = {**os.environ, "NODE_OPTIONS": " ".join(options).strip()}
-    if fault := fault_of([program, "--overwrite", "--gpu", "cpu", *inputs, os.path.abspath(output)], output, environment):
+    command = [program, "--overwrite", "--gpu", "cpu", *inputs, os.path.abspath(output)]
+    if fault := fault_of(command, output, environment):
         raise UserError(f"{PROGRAM} could not write {path} ({fault}); choose another format, or update it")
 
 
