@@ -16,7 +16,7 @@ from synthetic import BROWN, as_text, edit_json, make_blender_scene, make_colmap
 
 from scene import Scene
 from scene.check import Finding, findings, tell
-from scene.check.photos import of_photos
+from scene.check.photos import of_damage, of_photos
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.copies import places_of
@@ -30,6 +30,8 @@ from splatting.demo.make_scene import write_scene
 from splatting.demo.objects import demo_scene
 from splatting.demo.tracer import FISHEYE, PANORAMA, ring_views
 from splatting.diagnosis.dataset import check_dataset, check_geometry
+from splatting.sfm.images import check_images
+from splatting.sfm.layout import Layout
 from splatting.training.checks import check_scene
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
@@ -109,6 +111,60 @@ def test_rounded_coordinates_of_maps(kept, step, part):
 def test_photos(info, severe, text):
     (one,) = of_photos(info, 16)
     assert text in str(one) and one.severe == severe
+
+
+def _shown(top: int, left: int, color: int = 0, black: int = 0) -> np.ndarray:
+    """A photo with bars over the top and the left side, and black places."""
+    photo = RANDOM.integers(30, 256, (48, 64, 3)).astype(np.uint8)
+    photo[:top], photo[:, :left], photo[20 : 20 + black] = color, color, 0
+    return photo
+
+
+@pytest.mark.parametrize(
+    ("photos", "text"),
+    [
+        ([_shown(6, 0)] * 4, "the photos have bars of one colour, which train as a part of the scene: 12% at the top;"),
+        ([*[_shown(6, 16, 255)] * 5, _shown(0, 0)], "12% at the top, 25% at the left; give masks that are black there"),
+        ([_shown(6, 0), _shown(9, 0), _shown(7, 0)], ""),  # what stands before a background
+        ([_shown(6, 0, black=28), _shown(6, 0), _shown(0, 0)], ""),
+        ([np.where(np.abs(np.indices((48, 64)) - 30).max(0)[..., None] < 9, COLORS, 0).astype(np.uint8)] * 4, ""),
+    ],
+)
+def test_bars_that_most_photos_have(photos, text):
+    found = "\n".join(str(one) for one in of_photos(_with_photos(*photos), 16))
+    assert text in found and ("bars" in found) == bool(text)
+
+
+def _damaged(content: bytes, zeros: bool) -> bytes:
+    """A JPEG that lacks a tenth from its middle, or has zeros there."""
+    start, count = len(content) // 2, len(content) // 10
+    return content[:start] + bytes(count if zeros else 0) + content[start + count :]
+
+
+@pytest.mark.parametrize("zeros", [False, True])
+def test_jpegs_with_a_damaged_middle_are_named(sound, tmp_path, capsys, zeros):
+    """By a training, the doctor, and convert.py before it copies them. A background that all have is no damage."""
+    info, views = read(sound), []
+    smooth = Image.fromarray(RANDOM.integers(0, 256, (18, 24, 3)).astype(np.uint8)).resize((384, 288))
+    for n, view in enumerate(info.train_cameras[:8]):
+        path = tmp_path / "input" / f"{n}.jpg"
+        path.parent.mkdir(exist_ok=True)
+        smooth.rotate(45 * n).crop((60, 40, 324, 248)).save(path, quality=90, optimize=True)
+        views.append(replace(view, image_path=path, image_name=path.name))
+    info = info._replace(train_cameras=views)
+    assert [*of_damage(info, 16)] == []
+    for path in (tmp_path / "input" / "2.jpg", tmp_path / "input" / "5.jpg"):
+        path.write_bytes(_damaged(path.read_bytes(), zeros))
+    (found,) = of_damage(info, 16)
+    assert str(found).startswith("2 of the 8 JPEG photos that were looked at are likely damaged in the middle")
+    assert "(2.jpg, 5.jpg); copy them again" in str(found)
+    check_images(Layout(tmp_path), [view.image_name for view in views], None)
+    assert f"warning: {found}" in capsys.readouterr().err
+    for view in views:
+        grey = Image.new("RGB", (264, 208), (90, 90, 90))
+        grey.paste(smooth, (-200, 0))
+        grey.save(view.image_path)
+    assert [*of_damage(info, 16)] == []
 
 
 def test_sound_photos_are_passed():

@@ -7,7 +7,7 @@ import sys
 from scene.check.cameras import of_cameras
 from scene.check.duplicates import of_duplicates
 from scene.check.findings import Finding
-from scene.check.photos import of_photos
+from scene.check.photos import of_damage, of_photos
 from scene.check.points import of_points
 from scene.readers.info import SceneInfo, as_camera_info
 from utils.system_utils import UserError
@@ -25,7 +25,8 @@ def findings(info: SceneInfo, most: int = LOOKED_AT, halves: bool = False, alpha
     """
     train, test = ([*map(as_camera_info, views)] for views in (info.train_cameras, info.test_cameras))
     info = info._replace(train_cameras=train, test_cameras=test)
-    found = [*of_cameras(info), *of_photos(info, most, alpha), *of_points(info), *of_duplicates(info, halves)]
+    of_files = *of_photos(info, most, alpha), *of_damage(info, most), *of_duplicates(info, halves)
+    found = [*of_cameras(info), *of_files, *of_points(info)]
     return sorted(found, key=lambda one: not one.severe)
 
 

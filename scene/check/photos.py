@@ -1,4 +1,4 @@
-"""Faults of photos: invisible ones, nearly one value, a part of the range, masks that leave out everything."""
+"""Faults of photos: invisible ones, nearly one value, a part of the range, bars, masks that leave out everything."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image
 
 from scene.check.findings import Finding
+from scene.images.damage import equal_share, said_of
 from scene.images.decode import picture_size
 from scene.images.masks import Mask
 from scene.readers.info import SceneInfo
@@ -23,10 +24,15 @@ NARROW = 1 / 16  # of the range, which 12 bits in 16 use; less is hardly more th
 _PIXELS = 200  # a side, of what is looked at
 _MOST_DECODED = 25_000_000  # pixels of all photos; a JPEG is decoded at an eighth of its size
 _JPEG = 1 / 6  # cost of its pixels
+_LOOKED_THROUGH = 4_000_000  # pixels that are looked through for damage, for each photo that is decoded
 _FEWEST = 3  # photos
 _VISIBLE = 26  # of 255, an alpha that shows something
 _OPAQUE = 230
 _SOME = 0.001  # share of the pixels that has to be seen
+_BAR = 0.01  # of a side, of a bar along an edge
+_EQUAL = 12 / 255  # difference of colours in a bar
+_ENDS = 2  # pixels between a bar and what is beside it, as it may be blurred
+_WITH_BARS = 0.8  # share of the photos that have to have the same bars
 _PARTLY = 0.5  # share of visible pixels; edges, hair and smoke have less
 
 
@@ -34,7 +40,8 @@ class Look(NamedTuple):
     """What a small photo shows: per channel, the range (2, 3) of the pixels that count, of full scale 1.
 
     alpha: (K,) of 255, None where all is opaque. kept: share of the pixels that the mask keeps. seen: share that is
-    visible and kept. values: different values of a channel, at most. sixteen: a grey photo of 16 bits.
+    visible and kept. values: different values of a channel, at most. sixteen: a grey photo of 16 bits. bars (4,): at
+    the top, right, bottom and left, of the height or width.
     """
 
     name: str
@@ -44,6 +51,7 @@ class Look(NamedTuple):
     seen: float
     values: int
     sixteen: bool
+    bars: np.ndarray
 
     @property
     def width(self) -> float:
@@ -65,6 +73,20 @@ def of_photos(info: SceneInfo, most: int, alpha: bool = True) -> Iterator[Findin
     shown = [look for look in looks if look.seen > _SOME]
     yield from _alpha(shown)
     yield from _ranges(shown)
+    yield from _bars(shown)
+
+
+def of_damage(info: SceneInfo, most: int) -> Iterator[Finding]:
+    """Damaged photos, among some in a random order; among all of a few small ones."""
+    views, left, shares = info.train_cameras, most * _LOOKED_THROUGH, {}
+    for number in np.random.default_rng(0).permutation(len(views)):
+        path = getattr(views[number], "image_path", None)  # readers of others may have photos elsewhere
+        shares[views[number].image_name], pixels = equal_share(Path(path)) if path else (None, 0)
+        left -= pixels
+        if left < 0:
+            break
+    if said := said_of(shares):
+        yield Finding(*said)
 
 
 def hints(info: SceneInfo, smallest: tuple[int, int], white_background: bool) -> Iterator[Finding]:
@@ -131,8 +153,22 @@ def _look(view: Any, has_alpha: bool) -> tuple[Look, float]:
         float(seen.mean()),
         max(len(np.unique(colors[:, channel])) for channel in range(3)),
         sixteen,
+        np.array([_bar(np.rot90(pixels[..., :3], turn), np.rot90(seen, turn)) for turn in range(4)]),
     )
     return look, cost
+
+
+def _bar(pixels: np.ndarray, seen: np.ndarray) -> float:
+    """Height of a bar of one colour over the top of pixels (h, w, 3) in [0, 1], as a part; 0 if there is none.
+
+    It ends with a row that has another colour over most of its width, which what stands before a background has not.
+    """
+    same = np.abs(pixels - np.median(pixels[0], axis=0)).max(2) <= _EQUAL
+    whole = same.mean(1) > 1 - 2 * _SOME
+    height = len(whole) if whole.all() else int(whole.argmin())
+    beside = min(height + _ENDS, len(same) - 1)
+    ends = height < len(same) and same[beside].mean() < 0.5
+    return height / len(same) if ends and height and seen[:height].mean() > 0.5 else 0.0
 
 
 def _decoded(path: Path) -> tuple[np.ndarray, bool, float]:
@@ -228,6 +264,19 @@ def _ranges(looks: Sequence[Look]) -> Iterator[Finding]:
     elif all(look.values <= 2 and look.alpha is None for look in looks):
         text = "the photos have only two values, as masks have"
         yield Finding(text, "name the folder of the photos with -i")
+
+
+def _bars(looks: Sequence[Look]) -> Iterator[Finding]:
+    """Bars along the edges of most photos that are equally wide, as of a film's format in another."""
+    if len(looks) < _FEWEST:
+        return
+    bars = np.array([look.bars for look in looks])
+    widths = np.median(bars, axis=0)
+    alike = (np.abs(bars - widths) <= 1.5 / _PIXELS).mean(0) >= _WITH_BARS
+    places = zip(("top", "right", "bottom", "left"), widths, alike, strict=True)
+    if found := [f"{width:.0%} at the {place}" for place, width, same in places if same and width >= _BAR]:
+        text = f"the photos have bars of one colour, which train as a part of the scene: {', '.join(found)}"
+        yield Finding(text, "give masks that are black there (--masks), or crop photos and cameras")
 
 
 def _narrow(low: float, high: float, sixteen: bool) -> Finding:

@@ -3,12 +3,14 @@
 import contextlib
 import os
 import shutil
+import sys
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from PIL import Image, ImageOps
 from tqdm.contrib.concurrent import thread_map
 
+from scene.images.damage import equal_share, said_of
 from scene.images.decode import picture_size
 from scene.images.masks import Mask, mask_names
 from scene.images.side_files import SideFiles
@@ -62,8 +64,9 @@ def prepared_names(layout: Layout, names: Sequence[str]) -> dict[str, str]:
 
 
 def check_images(layout: Layout, names: Sequence[str], masks: Path | None) -> None:
-    """Raise a UserError that names every photo and mask that is broken or does not fit; decode no intact one."""
+    """Raise a UserError that names every photo and mask that is broken or does not fit, and warn of damaged JPEGs."""
     with_mask = find_masks(names, masks, layout.input) if masks else {}
+    equal: dict[str, float | None] = {}
 
     def check(name: str) -> None:
         try:
@@ -72,8 +75,11 @@ def check_images(layout: Layout, names: Sequence[str], masks: Path | None) -> No
             raise UserError(f"{error}, {_OR_WITHOUT}") from error
         if name in with_mask:
             _check_mask(with_mask[name], name, size)
+        equal[name], _ = equal_share(layout.input / name)
 
     _in_threads(check, names, "Checking photos", f"replace or remove them, {_OR_WITHOUT}")
+    if said := said_of(equal):
+        print(f"warning: {'; '.join(said)}", file=sys.stderr)
 
 
 def find_masks(names: Sequence[str], folder: Path, photos: Path) -> dict[str, Path]:
