@@ -28,8 +28,7 @@ MAY = {
     "splatting.host.programs.find_program": "the one place that looks for programs",
     "splatting.host.machine._output": FOUND,
     "splatting.diagnosis.environment._nvidia_gpu": FOUND,
-    "splatting.exports.reading.read_any": FOUND,
-    "splatting.exports.sog.run_program": FOUND,
+    "splatting.exports.sog.fault_of": FOUND,
     "splatting.exports.vendor._output": FOUND,  # npm, and what it installs by a record of the repository
     "splatting.camera_paths.video.write_video": FOUND,
     "splatting.sfm.colmap._output": FOUND,
