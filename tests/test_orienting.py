@@ -10,11 +10,12 @@ import pytest
 from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 
-from scene.images.place import _down, read_place
+from scene.images.place import _down, _gps, read_place
 from splatting.camera_paths.poses import facing
 from splatting.files.similarity import Similarity, read_orientation
+from splatting.sfm.georeference import level_up
 from splatting.sfm.layout import Layout
-from splatting.sfm.orienting import level_up, orient, said_of
+from splatting.sfm.orienting import orient, said_of
 from splatting.sfm.stages import Stage, StageRecord, orient_stage
 from utils.system_utils import UserError
 
@@ -35,10 +36,28 @@ def ring(rolls=()) -> tuple[np.ndarray, np.ndarray]:
     return turns, places
 
 
-def gps_of(places: np.ndarray) -> np.ndarray:
+def flight(pattern: str, size: float, count: int, pitch: float) -> tuple[np.ndarray, np.ndarray]:
+    """Turns (N,3,3) and places (N,3), metres, of a flight over a square of that size, as a gimbal holds the camera.
+
+    pattern: of headings. pitch: degrees below the horizon.
+    """
+    rng, side, number = np.random.default_rng(0), int(np.ceil(np.sqrt(count))), np.arange(count)
+    row = number // side
+    places = size * np.column_stack([number % side, 0 * row, row]) / max(side - 1, 1)
+    places[:, 1] = rng.normal(-60, 1, count)
+    places[:, 2] *= pattern != "line"
+    headings = {"alternating": 180 * (row % 2), "cross": 90 * (number % 2) + 180 * (row % 2)}.get(pattern, 0 * row)
+    headings = 360 * number / count + 180 if pattern == "around" else headings
+    if pattern == "around":
+        places[:, ::2] = size / 2 * np.stack([np.sin(angle := 2 * np.pi * number / count), np.cos(angle)], axis=1)
+    turned = rng.normal(0, (2, 1, 1), (count, 3)) + np.column_stack([headings, np.full(count, -pitch), 0 * row])
+    return Rotation.from_euler("YXZ", turned, degrees=True).as_matrix(), places
+
+
+def gps_of(places: np.ndarray, at: tuple[float, float, float] = PLACE) -> np.ndarray:
     """Latitudes, longitudes and heights (N,3) of places (N,3) in the level frame."""
     earth = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
-    return earth.enu_to_ellipsoid(places[:, [0, 2, 1]] * [1, 1, -1], *PLACE)
+    return earth.enu_to_ellipsoid(places[:, [0, 2, 1]] * [1, 1, -1], *at)
 
 
 def apple_note(device: np.ndarray) -> bytes:
@@ -55,7 +74,7 @@ def exif_of(gps: np.ndarray | None, note: bytes | None = None, orientation: int 
     if gps is not None:
         degrees = [(abs(value), 0.0, 0.0) for value in gps[:2]]
         tags = {1: "S" if gps[0] < 0 else "N", 2: degrees[0], 3: "W" if gps[1] < 0 else "E", 4: degrees[1]}
-        exif[ExifTags.IFD.GPSInfo] = tags | {5: b"\0", 6: float(gps[2])}
+        exif[ExifTags.IFD.GPSInfo] = tags | ({5: b"\0", 6: float(gps[2])} if np.isfinite(gps[2]) else {})
     if note is not None:
         exif[ExifTags.IFD.Exif] = {ExifTags.Base.MakerNote: note}
     return exif
@@ -117,7 +136,64 @@ def test_gps_gives_metres_and_north(tmp_path, lost):
     here = gps_of(middle[None])[0]
     found = similarity.place
     np.testing.assert_allclose(found[:2], here[:2], atol=2e-5)  # degrees, 2 m
-    assert found[2] == pytest.approx(here[2], abs=2) and "m by GPS" in said_of(layout)[0]
+    assert found[2] == pytest.approx(here[2], abs=2) and "by GPS of" in said_of(layout)[0]
+
+
+def _told(gps: np.ndarray, how: str) -> list[np.ndarray | None]:
+    """What is told of GPS (N,3) in a way."""
+    if how in ("no heights", "one height"):
+        gps[:, 2] = np.nan if how == "no heights" else 120.0
+    if how == "an outlier":
+        gps[3] += [0.002, -0.001, 90]
+    return [None if how == "no" or (how == "half" and number % 2) else one for number, one in enumerate(gps)]
+
+
+FLIGHTS = [  # pattern, size (m), photos, pitch, GPS, its noise (m), place, whether the vertical is known
+    ("one way", 300, 64, 90, "all", (1, 5), PLACE, True),
+    ("one way", 300, 64, 60, "all", (3, 3), PLACE, True),
+    ("one way", 300, 100, 90, "an outlier", (3, 5), PLACE, True),
+    ("one way", 100, 30, 90, "all", (1, 0.3), PLACE, True),
+    ("one way", 50, 28, 90, "all", (1, 5), PLACE, False),
+    ("one way", 300, 64, 90, "no heights", (1, 0), PLACE, False),
+    ("one way", 300, 64, 90, "one height", (1, 0), PLACE, False),
+    ("one way", 300, 100, 60, "no", (1, 0), PLACE, False),
+    ("alternating", 50, 28, 90, "all", (1, 5), PLACE, True),
+    ("alternating", 300, 28, 90, "half", (2, 5), PLACE, True),
+    ("alternating", 300, 28, 70, "no heights", (3, 5), PLACE, True),
+    ("alternating", 300, 28, 70, "no", (3, 5), PLACE, True),
+    ("alternating", 300, 28, 90, "no", (3, 5), PLACE, False),
+    ("cross", 50, 28, 90, "one height", (1, 5), PLACE, True),
+    ("cross", 300, 28, 90, "all", (3, 5), (89.9995, 10.0, 20.0), True),
+    ("cross", 300, 28, 45, "all", (3, 5), (-20.0, 180.0, 20.0), True),
+    ("cross", 300, 28, 90, "no", (3, 5), PLACE, False),
+    ("around", 100, 40, 30, "half", (1, 5), PLACE, True),
+    ("line", 300, 36, 90, "all", (1, 5), PLACE, False),
+    ("one way", 300, 3, 90, "all", (1, 5), PLACE, False),
+]
+
+
+@pytest.mark.parametrize(("pattern", "size", "count", "pitch", "how", "noise", "at", "known"), FLIGHTS)
+def test_flights_are_level_and_in_metres_or_say_that_they_are_not(
+    tmp_path, pattern, size, count, pitch, how, noise, at, known
+):
+    turns, places = flight(pattern, size, count, pitch)
+    told = places + np.random.default_rng(1).normal(size=places.shape) * [noise[0], noise[1], noise[0]]
+    exifs = [exif_of(gps) for gps in _told(gps_of(told, at), how)]
+    similarity, record = oriented(layout := converted(tmp_path, turns, places, exifs))
+    off = np.degrees(np.arccos(min(similarity.rotation[1] @ TILT[:, 1], 1)))
+    scaled = similarity.scale * UNIT - 1
+    print(f"{pattern}, {size} m, {count} photos, pitch {pitch}, GPS {how} {noise}: "
+          f"{f'{off:.2f} degrees' if record['vertical'] else 'not known'}, "
+          f"{f'{scaled:+.2%}' if record['unit'] == 'metre' else 'no scale'}; {said_of(layout)[0]}")  # fmt: skip
+    assert (record["vertical"] is not None, similarity.upright) == (known, known)
+    assert (off < 1) if known else "not known" in said_of(layout)[0] and not similarity.place
+    assert (record["unit"] == "metre") == (how != "no")
+    assert how == "no" or abs(scaled) < max(0.01, 2 * record["scale_error"])
+    if known and how != "no":
+        there = similarity.points(UNIT * places @ TILT.T + SHIFT)
+        earth = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+        east_north = earth.ellipsoid_to_enu(gps_of(places, at), *similarity.place)[:, :2]
+        np.testing.assert_allclose(there[:, ::2], east_north, atol=4)
 
 
 @pytest.mark.parametrize("case", ["two photos", "one place", "noise"])
@@ -145,6 +221,24 @@ def test_gravity_of_a_phone_comes_before_horizons(tmp_path, orientation):
     similarity, record = oriented(layout)
     np.testing.assert_allclose(similarity.rotation @ TILT @ [0, 1, 0], [0, 1, 0], atol=1e-5)
     assert record["vertical"] == "gravity of 12 photos"
+
+
+@pytest.mark.parametrize(
+    ("tags", "place"),
+    [
+        ({1: "s", 2: (47.0, 30.0, 36.0), 3: "W ", 4: (8.0, 30.0, 0.0), 5: b"\1", 6: 5.0}, (-47.51, -8.5, -5)),
+        ({1: "South", 2: (47.0, 30.6), 3: b"West\0", 4: 8.5, 5: 1, 6: -5.0}, (-47.51, -8.5, -5)),
+        ({1: "N", 2: (47.0, 30.6, np.nan), 3: "east", 4: (8.5,), 6: 5.0}, (47.51, 8.5, 5)),  # NaN: of 0/0
+        ({2: (-47.0, 30.6), 3: "?", 4: (8.5, np.nan, np.nan), 5: b"\0", 6: np.nan}, (-47.51, 8.5, np.nan)),
+        ({1: "S", 2: (-47.0, 30.6), 3: "E", 4: (8.5,)}, (-47.51, 8.5, np.nan)),
+        ({1: "N", 2: (np.nan, 0.0, 0.0), 3: "E", 4: (8.5,)}, None),
+        ({1: "N", 2: (47.0, np.nan, 36.0), 3: "E", 4: (8.5,)}, None),
+        ({1: "N", 2: (), 3: "E", 4: (1.0, 2.0, 3.0, 4.0)}, None),
+    ],
+)
+def test_gps_as_programs_write_it(tags, place):
+    found = _gps(tags)
+    assert found is None if place is None else found == pytest.approx(place, nan_ok=True)
 
 
 def test_an_upright_phone_tells_down():

@@ -14,13 +14,14 @@ from splatting.files.image_files import UNREADABLE, open_image
 _APPLE = b"Apple iOS\0"
 _ACCELERATION = 8  # tag of Apple's notes: three signed rationals (ExifTool, "Apple Tags", AccelerationVector)
 _SIGNED_RATIONAL = 10
+_BELOW = ("\x01", "\x03", "1", "3")  # references of an altitude below the sea, or below the ellipsoid (EXIF 3.0)
 # What turns (right, down) of the stored pixels to those of the upright photo, by EXIF orientation.
 _TURNED = {1: (1, 0, 0, 1), 3: (-1, 0, 0, -1), 6: (0, -1, 1, 0), 8: (0, 1, -1, 0)}
 
 
 class PhotoPlace(NamedTuple):
-    """gps: latitude and longitude in degrees, height in metres, or None. down: (3,) of length 1 in the axes of the
-    upright photo's camera (x right, y down, z forward), or None."""
+    """gps: latitude and longitude in degrees, height in metres (NaN: unknown), or None. down: (3,) of length 1 in the
+    axes of the upright photo's camera (x right, y down, z forward), or None."""
 
     gps: tuple[float, float, float] | None = None
     down: np.ndarray | None = None
@@ -42,19 +43,36 @@ def read_place(photo: Path) -> PhotoPlace:
 def _gps(tags: Mapping[int, Any]) -> tuple[float, float, float] | None:
     tag = ExifTags.GPS
     try:
-        latitude = _degrees(tags[tag.GPSLatitude], tags.get(tag.GPSLatitudeRef, "N") == "S")
-        longitude = _degrees(tags[tag.GPSLongitude], tags.get(tag.GPSLongitudeRef, "E") == "W")
-        below = tags.get(tag.GPSAltitudeRef, b"\0") in (1, b"\1")
-        height = float(tags.get(tag.GPSAltitude, 0.0)) * (-1 if below else 1)
-    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        latitude = _degrees(tags[tag.GPSLatitude], tags.get(tag.GPSLatitudeRef, ""), "NS")
+        longitude = _degrees(tags[tag.GPSLongitude], tags.get(tag.GPSLongitudeRef, ""), "EW")
+        height = float(tags.get(tag.GPSAltitude, math.nan))  # NaN also of 0/0
+    except (KeyError, TypeError, ValueError):
         return None
-    sound = abs(latitude) <= 90 and abs(longitude) <= 180 and math.isfinite(height)
-    return (latitude, longitude, height) if sound and (latitude or longitude) else None
+    below = _text(tags.get(tag.GPSAltitudeRef)) in _BELOW
+    sound = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude or longitude)
+    return (latitude, longitude, -abs(height) if below else height) if sound else None
 
 
-def _degrees(parts: tuple[Any, Any, Any], negative: bool) -> float:
-    degrees, minutes, seconds = map(float, parts)
-    return (degrees + minutes / 60 + seconds / 3600) * (-1 if negative else 1)
+def _degrees(parts: Any, reference: Any, letters: str) -> float:
+    """Degrees of one to three parts: degrees, minutes, seconds. ValueError if they are damaged.
+
+    letters: what the reference begins with where they are positive, and negative. If it has neither, the sign counts.
+    """
+    values = [*map(float, parts if isinstance(parts, tuple) else [parts])]
+    while len(values) > 1 and math.isnan(values[-1]):  # 0/0, as of seconds that minutes tell
+        values.pop()
+    if not 1 <= len(values) <= 3 or not all(map(math.isfinite, values)):
+        raise ValueError(f"{parts} are no degrees")
+    angle = sum(abs(value) / 60**place for place, value in enumerate(values))
+    letter = _text(reference)[:1]
+    negative = letter == letters[1] if letter and letter in letters else values[0] < 0
+    return -angle if negative else angle
+
+
+def _text(value: Any) -> str:
+    """A reference, which some programs write as bytes, as a number, or with blanks, as text."""
+    text = value.decode("latin-1") if isinstance(value, bytes) else str(value)
+    return text.strip(" \0").upper()
 
 
 def _down(note: bytes, orientation: Any) -> np.ndarray | None:

@@ -30,11 +30,15 @@ def check_upright(args: argparse.Namespace) -> None:
     """UserError for --upright of a model that does not say where it is upright, or beside its contrary."""
     if args.upright and args.no_upright:
         raise UserError("--upright and --no_upright contradict each other; leave one out")
-    if args.upright and ENTRY not in _record(args):
+    if not args.upright:
+        return
+    if (record := _record(args).get(ENTRY)) is None:
         raise UserError(
             "--upright needs a model folder (-m) of a scene that was oriented; run convert.py --orient on it, or leave "
             "--upright out"
         )
+    if not Similarity.of(record, f"orientation of {args.model_path}").upright:
+        raise UserError("--upright: convert.py --orient found no vertical of this scene; leave --upright out")
 
 
 def oriented_later(args: argparse.Namespace) -> bool:
@@ -123,4 +127,4 @@ def moved_around(around: Any, similarity: Similarity) -> Any:
     if not cameras:
         return around
     make_moved = make and (lambda _: MovedPath(make(poses_of(cameras)), similarity))
-    return around._replace(cameras=moved_cameras(cameras, similarity), make_path=make_moved, upright=True)
+    return around._replace(cameras=moved_cameras(cameras, similarity), make_path=make_moved, upright=similarity.upright)

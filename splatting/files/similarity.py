@@ -21,13 +21,15 @@ class Similarity:
     """A point x (3,) of the scene's world becomes scale * rotation @ x + translation, float64.
 
     There y is down, as in a usual capture. rotation: (3,3). place: latitude and longitude (degrees) and height (metres)
-    of the origin, where x is east and z north, in metres; empty: unknown.
+    of the origin, where x is east and z north, in metres; empty: unknown. upright: the vertical is known; else only the
+    scale changes.
     """
 
     rotation: np.ndarray
     scale: float
     translation: np.ndarray
     place: tuple[float, ...] = ()
+    upright: bool = True
 
     @classmethod
     def of(cls, record: Any, where: str) -> "Similarity":
@@ -46,7 +48,7 @@ class Similarity:
                 f"{where} has no rotation, scale and translation of a similarity that a scene may have; run convert.py "
                 "--orient again"
             ) from error
-        return cls(rotation, scale, translation, place)
+        return cls(rotation, scale, translation, place, record.get("vertical", "") is not None)
 
     def from_local(self, offset: np.ndarray) -> "Similarity":
         """The similarity for coordinates from which an offset (3,) of the world was subtracted."""

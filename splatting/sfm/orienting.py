@@ -1,64 +1,42 @@
 """Where a converted scene is upright, and how large a metre is in it (convert.py --orient).
 
-The vertical is that of gravity in photos' EXIF data, else that of the cameras' horizons. GPS places in EXIF data give
-the metre and the north. In the frame that results, y is down; with GPS, x is east and z is north.
+The vertical is that of gravity in photos' EXIF data, else that of the photos' horizons and GPS, if they tell it. GPS
+gives the metre and the north. In the frame that results, y is down; with GPS, x is east and z is north.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from scene.images.place import PhotoPlace, read_place
 from scene.readers.colmap import read_model
 from splatting.files.json_files import write_json
-from splatting.files.similarity import read_orientation
+from splatting.files.similarity import PLACE, read_orientation
+from splatting.sfm.georeference import Cameras, Fit, fit, is_level
 from splatting.sfm.layout import Layout
 
 FEWEST = 3  # photos with a GPS place
-_GPS_ERROR = 5.0  # metres; that of a phone under open sky
-_NOISE = 0.3  # largest mean error of places, as a share of their mean distance from the middle
-_PAIRS = 2000  # of photos, whose similarity is tried
-_MEAN_UP = 0.01  # weight of the mean up beside the horizons
-_ROUNDS = 20
-_ROLL = 0.05  # radians; a usual roll of a camera that is held level
-_AGREE = np.cos(np.radians(30))  # of gravity with the cameras' own up
-
-
-class Georeference(NamedTuple):
-    """Of GPS. scale: metres for a unit. heading: complex, of length 1, by which levelled x + i z turns to east and
-    north. error: mean of the places, metres. origin: latitude and longitude (degrees), height (m) of the middle."""
-
-    scale: float
-    heading: complex
-    error: float
-    used: int
-    origin: tuple[float, float, float]
+_SIZE = 0.1  # standard error of the scale, above which GPS does not tell it
+_AGREE = np.cos(np.radians(30))  # of gravity in a photo with that in most others, and with the vertical of horizons
 
 
 def orient(layout: Layout) -> None:
-    """Write the similarity of a converted scene, `layout.orientation`."""
+    """Write the similarity of a converted scene, `layout.orientation`; where no vertical is known, only the scale."""
     images = sorted(read_model(layout.sparse / "0").images, key=lambda image: image.name)
-    to_camera = np.stack([image.qvec2rotmat() for image in images])
-    turns = to_camera.transpose(0, 2, 1)
+    turns = np.stack([image.qvec2rotmat().T for image in images])
     centers = np.stack([-turn @ image.tvec for turn, image in zip(turns, images, strict=True)])
-    places = [read_place(_photo(layout, image.name)) for image in images]
-    level, said = level_up(turns), f"the horizons of {len(images)} photos"
-    if (measured := _measured_up(turns, level, places)) is not None:
-        level, said = measured
-    rotation = _upright(level)
-    middle = np.median(centers, axis=0)
-    gps = georeference((centers - middle) @ rotation.T, places)
-    scale = 1.0
-    record: dict[str, Any] = {"vertical": said, "unit": "scene"}
-    if gps:
-        c, s = gps.heading.real, gps.heading.imag
-        rotation = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]) @ rotation
-        scale = gps.scale
-        latitude, longitude, height = gps.origin
-        record |= {"unit": "metre", "gps_photos": gps.used, "gps_error": gps.error}
-        record |= {"latitude": latitude, "longitude": longitude, "height": height}
+    photos = [read_place(_photo(layout, image.name)) for image in images]
+    middle, (reference, places) = np.median(centers, axis=0), _places(photos)
+    cameras = Cameras(turns, centers - middle, places)
+    vertical, found = _vertical(cameras, photos)
+    record: dict[str, Any] = {"unit": "scene", "gps_seen": int(np.isfinite(places[:, 0]).sum())} | vertical
+    rotation, scale = found.rotation if vertical["vertical"] else np.eye(3), 1.0
+    if _is_metric(found, cameras):
+        scale = found.scale
+        record |= {"unit": "metre", "scale_error": found.size, "gps_photos": int(found.fits.sum())}
+        record |= {"gps_error": _error(found, cameras)} | (_origin(found, reference) if vertical["vertical"] else {})
     translation = -scale * rotation @ middle
     record |= {"rotation": rotation.tolist(), "scale": scale, "translation": translation.tolist()}
     write_json(layout.orientation, record)
@@ -68,113 +46,99 @@ def said_of(layout: Layout) -> list[str]:
     """A line on what `orient` found; none if it was not asked for."""
     if (record := read_orientation(layout.scene)) is None:
         return []
-    turn = np.degrees(np.arccos(np.clip(record["rotation"][1][1], -1, 1)))
-    if record["unit"] == "metre":
-        error, used = record["gps_error"], record["gps_photos"]
-        metric = f"a unit is {record['scale']:.4g} m by GPS of {used} photos, which fit to {error:.2g} m"
+    if record["vertical"] is None:
+        level = "upright: not known, as neither the photos' horizons nor GPS tell it; photos that face several ways do"
     else:
-        metric = f"no scale: fewer than {FEWEST} photos with GPS, or their places are too near to each other"
-    return [f"upright: tilted by {turn:.1f} degrees, by {record['vertical']}; {metric}"]
+        turn = np.degrees(np.arccos(np.clip(record["rotation"][1][1], -1, 1)))
+        error = record.get("vertical_error")
+        level = f"upright: tilted by {turn:.1f} degrees{f' (to {error:.1f})' if error else ''}, by {record['vertical']}"
+    if record["unit"] == "metre":
+        error = f" (to {record['scale_error']:.1%})" if "scale_error" in record else ""
+        used = f"GPS of {record['gps_photos']} photos, which fit to {record['gps_error']:.2g} m"
+        return [f"{level}; a unit is {record['scale']:.4g} m{error} by {used}"]
+    if (seen := record.get("gps_seen", 0)) < FEWEST:
+        return [f"{level}; no scale: {seen or 'no'} photos have GPS, and it needs {FEWEST}"]
+    return [f"{level}; no scale: GPS of {seen} photos is too near to each other, or does not fit the poses"]
 
 
-def level_up(turns: np.ndarray) -> np.ndarray:
-    """The direction (3,), of length 1, that is up for most cameras: the one in which their rolls are least.
+def _vertical(cameras: Cameras, photos: Sequence[PhotoPlace]) -> tuple[dict[str, Any], Fit]:
+    """What is recorded of the vertical, and the fit to it.
 
-    turns: (N,3,3), from camera to world axes. A level camera has its x axis at right angles to up. So up is the
-    eigenvector of the least eigenvalue of the weighted mean of x x^T. Weights are Cauchy's, 1 / (1 + (roll / _ROLL)^2),
-    so that photos held aside hardly count. Where cameras face one way, their mean up decides.
+    GPS takes part where neither gravity nor horizons tell it: heights of phones are away together, by many metres.
     """
-    across, ups = turns[:, :, 0], -turns[:, :, 1]
-    weights = np.ones(len(turns))
-    for _ in range(_ROUNDS):
-        mean = weights @ ups
-        mean = mean / max(float(np.linalg.norm(mean)), 1e-9)
-        matrix = (weights[:, None] * across).T @ across / weights.sum() + _MEAN_UP * (np.eye(3) - np.outer(mean, mean))
-        up = np.linalg.eigh(matrix)[1][:, 0]
-        up = up if up @ mean >= 0 else -up
-        weights = 1 / (1 + (across @ up / _ROLL) ** 2)
-    return up
+    level = fit(cameras._replace(places=np.full_like(cameras.places, np.nan)))
+    if measured := _measured_up(cameras.turns, level, photos):
+        up, text = measured
+        return {"vertical": text}, fit(cameras, up)
+    if is_level(level):
+        error, up = float(np.degrees(level.tilt)), -level.rotation[1]
+        return {"vertical": f"the horizons of {len(photos)} photos", "vertical_error": error}, fit(cameras, up)
+    found = fit(cameras)
+    if not (_is_metric(found, cameras) and is_level(found)):
+        return {"vertical": None}, found
+    horizons = f"the horizons of {len(photos)} photos and " if found.by_level < 2 * found.tilt else ""
+    text = f"{horizons}GPS of {found.fits.sum()} photos"
+    return {"vertical": text, "vertical_error": float(np.degrees(found.tilt))}, found
 
 
-def _measured_up(turns: np.ndarray, level: np.ndarray, places: Sequence[PhotoPlace]) -> tuple[np.ndarray, str] | None:
-    """Up by gravity of the photos that have it, and what is said of it; None if none has, or it contradicts most."""
-    having = [number for number, place in enumerate(places) if place.down is not None]
+def _is_metric(found: Fit, cameras: Cameras) -> bool:
+    """Whether GPS tells the scale: of photos enough, of which most fit."""
+    return found.size < _SIZE and found.fits.sum() >= max(FEWEST, np.isfinite(cameras.places[:, 0]).sum() / 2)
+
+
+def _places(photos: Sequence[PhotoPlace]) -> tuple[np.ndarray, np.ndarray]:
+    """A place on Earth (degrees, degrees, m) amid the photos, and theirs (N,3), metres east, down and north of it.
+
+    NaN where unknown. Heights that are all equal count as unknown: GPS does not measure such.
+    """
+    gps = np.array([photo.gps or (np.nan,) * 3 for photo in photos])
+    here = np.isfinite(gps[:, 0])
+    places, heights = np.full_like(gps, np.nan), gps[np.isfinite(gps[:, 2]), 2]
+    if not here.any():
+        return np.zeros(3), places
+    filled = np.where(np.isfinite(gps[here]), gps[here], np.median(heights) if len(heights) else 0.0)
+    earth = _earth()
+    # Not the median of degrees, which is far away from photos around a pole or at a longitude of 180 degrees.
+    reference = earth.ecef_to_ellipsoid(np.median(earth.ellipsoid_to_ecef(filled), axis=0)[None])[0]
+    places[here] = earth.ellipsoid_to_enu(filled, *reference)[:, [0, 2, 1]] * [1, -1, 1]
+    places[np.isnan(gps[:, 2]) | (len(set(heights)) < 2), 1] = np.nan
+    return reference, places
+
+
+def _earth() -> Any:
+    import pycolmap
+
+    return pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+
+
+def _error(found: Fit, cameras: Cameras) -> float:
+    """By how much the places that fit are away from their GPS along the ground, mean, in metres."""
+    away = found.scale * cameras.centers @ found.rotation.T + found.shift - cameras.places
+    return float(np.hypot(away[found.fits, 0], away[found.fits, 2]).mean())
+
+
+def _origin(found: Fit, reference: np.ndarray) -> dict[str, float]:
+    """Where on Earth the middle of the photos is."""
+    east, down, north = found.shift
+    place = _earth().enu_to_ellipsoid(np.array([[east, north, -down]]), *reference)[0]
+    return dict(zip(PLACE, place.tolist(), strict=True))
+
+
+def _measured_up(turns: np.ndarray, level: Fit, photos: Sequence[PhotoPlace]) -> tuple[np.ndarray, str] | None:
+    """Up by gravity of the photos that have it, and what is said of it.
+
+    None if none has, or if most contradict each other, or the known vertical of all.
+    """
+    having = [number for number, photo in enumerate(photos) if photo.down is not None]
     if not having:
         return None
-    ups = np.stack([-turns[number] @ places[number].down for number in having])
-    ups = ups[ups @ level > _AGREE]
+    ups = np.stack([-turns[number] @ photos[number].down for number in having])
+    most = -level.rotation[1] if is_level(level) else np.median(ups, axis=0)
+    ups = ups[ups @ most > _AGREE * np.linalg.norm(most)]
     if 2 * len(ups) <= len(having):
         return None
     up = np.median(ups, axis=0)
     return up / np.linalg.norm(up), f"gravity of {len(ups)} photos"
-
-
-def _upright(up: np.ndarray) -> np.ndarray:
-    """The least rotation (3,3) that takes a direction to -y."""
-    from scipy.spatial.transform import Rotation
-
-    axis, cosine = np.cross(up, [0.0, -1.0, 0.0]), -float(up[1])
-    sine = float(np.linalg.norm(axis))
-    axis = axis / sine if sine > 1e-9 else np.array([0.0, 0.0, 1.0])
-    return Rotation.from_rotvec(axis * np.arctan2(sine, cosine)).as_matrix()
-
-
-def georeference(levelled: np.ndarray, places: Sequence[PhotoPlace]) -> Georeference | None:
-    """Scale and north of levelled camera centres (N,3), y down, by the horizontal places that GPS gives the photos.
-
-    Places that do not fit are left out. None if fewer than FEWEST are left, or than half of them, or if
-    they are so near to each other that their errors decide.
-    """
-    import pycolmap
-
-    having = [number for number, place in enumerate(places) if place.gps is not None]
-    if len(having) < FEWEST:
-        return None
-    gps = np.array([places[number].gps for number in having])
-    reference = np.median(gps, axis=0)
-    earth = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
-    east_north_up = earth.ellipsoid_to_enu(gps, *reference)
-    own = levelled[having, 0] + 1j * levelled[having, 2]
-    true = east_north_up[:, 0] + 1j * east_north_up[:, 1]
-    kept = _consensus(own, true)
-    if len(kept) < max(FEWEST, len(having) / 2):
-        return None
-    own, true = own[kept], true[kept]
-    own_middle, true_middle = own.mean(), true.mean()
-    size = float((np.abs(own - own_middle) ** 2).sum())
-    if size == 0:
-        return None
-    factor = (np.conj(own - own_middle) @ (true - true_middle)) / size  # least squares for true = factor * own
-    error, spread = (
-        float(np.abs(values).mean())
-        for values in (true - true_middle - factor * (own - own_middle), true - true_middle)
-    )
-    if abs(factor) == 0 or spread < _GPS_ERROR or error > _NOISE * spread:
-        return None
-    middle = true_middle - factor * own_middle
-    height = np.median(east_north_up[kept, 2] + abs(factor) * levelled[having][kept, 1])
-    origin = earth.enu_to_ellipsoid(np.array([[middle.real, middle.imag, height]]), *reference)[0]
-    return Georeference(abs(factor), factor / abs(factor), error, len(kept), tuple(origin.tolist()))
-
-
-def _consensus(own: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Indices of the most places that one similarity of the plane takes to within _GPS_ERROR of their GPS.
-
-    own, true: (N,) complex. Similarities true = a own + b are tried that two photos determine. pycolmap's robust
-    alignment finds none where heights are equal, as they are without altitudes.
-    """
-    first, second = np.triu_indices(len(own), 1)
-    if len(first) > _PAIRS:
-        chosen = np.random.default_rng(0).choice(len(first), _PAIRS, replace=False)
-        first, second = first[chosen], second[chosen]
-    apart = own[second] - own[first]
-    known = np.abs(apart) > 1e-9 * np.abs(own).max()
-    best = np.zeros(0, int)
-    for i, j in zip(first[known], second[known], strict=True):
-        factor = (true[j] - true[i]) / (own[j] - own[i])
-        near = np.flatnonzero(np.abs(true - true[i] - factor * (own - own[i])) <= _GPS_ERROR)
-        best = near if len(near) > len(best) else best
-    return best
 
 
 def _photo(layout: Layout, name: str) -> Path:
