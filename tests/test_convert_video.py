@@ -12,6 +12,7 @@ import pycolmap
 import pytest
 from photo_room import make_photos
 from PIL import Image, ImageFilter
+from scipy.ndimage import gaussian_filter
 from skimage.metrics import structural_similarity
 
 import convert
@@ -332,6 +333,34 @@ def test_a_turned_video_gives_upright_frames_without_a_warning(ffmpeg, room, tmp
     taken = np.asarray(Image.open(_frames(layout)[0]).convert("L")).astype(float)
     expected = np.rot90(np.asarray(Image.fromarray(room[0]).convert("L")))
     assert np.abs(taken - expected).mean() < 4 < 20 < np.abs(taken - expected[::-1, ::-1]).mean()  # of 0 to 255
+
+
+@pytest.mark.parametrize(("order", "coded", "name"), [
+    ("top", ["-c:v", "mpeg2video", "-flags", "+ilme+ildct"], "a.mpg"), ("bottom", ["-c:v", "ffv1"], "a.mkv"),
+    ("top", ["-c:v", "mjpeg", "-field_order", "tt", "-pix_fmt", "yuvj420p"], "a.mov"),  # does not mark its frames
+])  # fmt: skip
+def test_interlaced_frames_are_not_combed_and_their_pixels_become_square(ffmpeg, room, tmp_path, order, coded, name):
+    image = gaussian_filter(room[0].astype(np.float32), (3, 3, 0))  # bwdif rounds fine patterns
+    moved = np.stack([np.roll(image, 6 * number, axis=1) for number in range(16)]).astype(np.uint8)
+    woven = f"tinterlace=interleave_{order},setsar=4/3"
+    _write(ffmpeg, tmp_path / name, moved, "-vf", woven, "-q:v", "2", *coded)
+    layout = _extract(tmp_path / "scene", tmp_path / name, 10)
+    frames = [np.asarray(Image.open(path)) for path in _frames(layout)]
+    assert len(frames) == 8 and {frame.shape for frame in frames} == {(180, 320, 3)}
+    stretched = [np.asarray(Image.fromarray(frame).resize((320, 180))) for frame in moved]
+    assert _places(np.stack(stretched), frames) == list(range(0, 16, 2))
+    errors = [np.abs(frame.astype(np.float32) - own).mean() for frame, own in zip(frames, stretched[::2], strict=True)]
+    assert max(errors) < 6
+    (line,) = video_module.video_lines(layout)
+    assert "interlaced, so" in line and line.endswith("not square, so 240 x 180 became 320 x 180")
+
+
+@pytest.mark.parametrize(("said", "parity"), [
+    ("yuv420p(tv, top first)", "tff"), ("yuv420p(tv, bt709, bottom first)", "bff"), ("yuv420p(tv, progressive)", None),
+    ("yuv420p(top coded first (swapped))", "auto"), ("yuv420p(tv", "auto"), ("yuv420p", None),
+])  # fmt: skip
+def test_which_field_is_first(said, parity):
+    assert video_module._of_fields(said) == ([f"bwdif=mode=send_frame:parity={parity}:deint=all"] if parity else [])
 
 
 def test_a_video_that_was_cut_short_is_said(ffmpeg, room, tmp_path, capsys):

@@ -37,6 +37,8 @@ _SIDE = 48  # of the small pictures that are compared
 _STEP = 4  # sharpness is computed on every 4th row and column
 _WHOLE = 0.9  # of the length that a file tells of itself; sound often ends a little after the picture
 _EVERY_FRAME = ["-fps_mode", "passthrough"]  # else frames are doubled or dropped where their times are uneven
+# Pixels that are not square, as of DV, are stretched along the side that they are short along; others stay as they are.
+_SQUARE = "scale=w=round(iw*max(1\\,sar)):h=round(ih*max(1\\,1/sar))"
 _HDR = {"arib-std-b67": "HLG", "smpte2084": "PQ"}  # ffmpeg's names of the transfer functions of ITU-R BT.2100
 # agamma=0: zscale's approximation of HLG leaves out that its gamma is that of the luminance, and saturates colours.
 # BT.2408: white of an SDR picture is shown at 203 cd/m2, and both functions reach 1000, which is 4.93 times that. Up to
@@ -121,7 +123,8 @@ def video_lines(layout: Layout) -> list[str]:
         if taken < entry["asked"]:
             all_taken = taken == entry["frames"]
             text += f", not {entry['asked']}, since " + ("it has no more" if all_taken else "the others hardly differ")
-        lines.append(text + (f"; {entry['hdr']} was brought to SDR" if entry["hdr"] else ""))
+        made = [f"{entry['hdr']} was brought to SDR"] if entry["hdr"] else []
+        lines.append("; ".join([text, *made, *entry.get("made", ())]))
     return lines
 
 
@@ -143,10 +146,13 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int) -> Non
     decoder = find_decoder()
     try:
         sharp, small = [], []
+        header = next(decoder.read_frames(_address(video), input_params=_ONE_FILE))
+        colours = header["pix_fmt"]
+        fields = _of_fields(colours)
+        options = ["-vf", ",".join([*fields, _SQUARE]), *_EVERY_FRAME]
         grey = {"pix_fmt": "gray", "bits_per_pixel": 8}
-        reader = decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=_EVERY_FRAME, **grey)
-        header = next(reader)
-        colours, (width, height) = header["pix_fmt"], header["size"]
+        reader = decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=options, **grey)
+        width, height = next(reader)["size"]
         expected = round(header["duration"] * header["fps"]) or None
         for data in Bar(reader, total=expected, desc=f"Reading {video.name}", unit="frame"):
             frame = np.frombuffer(data, np.uint8).reshape(height, width)
@@ -162,8 +168,12 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int) -> Non
         paths = [folder / f"frame_{number + 1:05d}.jpg" for number in range(len(chosen))]
         names = [path.relative_to(layout.input).as_posix() for path in paths]
         entry = {"video": video.name, "frames": len(small), "asked": count, "names": names, "hdr": hdr}
+        stored = "{} x {}".format(*header["size"])
+        entry["made"] = ["it is interlaced, so one of two fields makes each frame"] if fields else []
+        if (width, height) != tuple(header["size"]):
+            entry["made"].append(f"its pixels are not square, so {stored} became {width} x {height}")
         write_json(layout.frames, [*_record(layout), entry])
-        for path, frame in zip(paths, _read(decoder, video, chosen, filters), strict=True):
+        for path, frame in zip(paths, _read(decoder, video, chosen, fields, filters), strict=True):
             write_picture(path, Image.fromarray(frame), quality=JPEG_QUALITY, subsampling=0)
     except (OSError, RuntimeError, ValueError, StopIteration) as error:
         reason = str(error).strip().splitlines()
@@ -268,9 +278,23 @@ def _any(numbers: Sequence[int]) -> str:
     return f"({_any(numbers[:half])}+{_any(numbers[half:])})" if half else rf"eq(n\,{numbers[0]})"
 
 
-def _read(decoder: Any, video: Path, numbers: Sequence[int], filters: Sequence[str]) -> Iterator[np.ndarray]:
-    """Yield the frames (H, W, 3) uint8 of these numbers."""
-    options = ["-vf", ",".join([f"select={_any(numbers)}", *filters]), *_EVERY_FRAME, "-frames:v", str(len(numbers))]
+def _of_fields(colours: str) -> list[str]:
+    """ffmpeg's filter that makes frames of the fields of an interlaced video; none of any other video."""
+    found = re.search(r"\b(top|bottom) (coded )?first\b", colours)
+    # A header "(tv, top coded first (swapped))" ends at its comma here.
+    if not found and colours.count("(") == colours.count(")"):
+        return []
+    # Programs disagree on what "swapped" is, so the frames tell it. Those of MJPEG tell nothing, and are all taken.
+    parity = "auto" if not found or found[2] else {"top": "tff", "bottom": "bff"}[found[1]]
+    return [f"bwdif=mode=send_frame:parity={parity}:deint=all"]
+
+
+def _read(
+    decoder: Any, video: Path, numbers: Sequence[int], before: Sequence[str], filters: Sequence[str]
+) -> Iterator[np.ndarray]:
+    """Yield the frames (H, W, 3) uint8 of these numbers. before: filters that need the frames around them."""
+    chain = ",".join([*before, f"select={_any(numbers)}", _SQUARE, *filters])
+    options = ["-vf", chain, *_EVERY_FRAME, "-frames:v", str(len(numbers))]
     reader = decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=options)
     width, height = next(reader)["size"]
     for data in reader:

@@ -116,6 +116,12 @@ def test_pages_and_meshes_are_upright_by_default_and_others_on_request(tmp_path)
     check_upright(_args(tmp_path, upright=True))
     with pytest.raises(UserError, match="contradict"):
         check_upright(_args(tmp_path, True, True))
+    unknown = record | {"vertical": None, "rotation": np.eye(3).tolist()}
+    (tmp_path / "model.json").write_text(json.dumps({"similarity": unknown}))
+    with pytest.raises(UserError, match="found no vertical"):
+        check_upright(_args(tmp_path, upright=True))
+    found = Similarity.of(unknown, "it")
+    assert not moved_around(around(), found).upright and moved_around(around(), SOME).upright
 
 
 @pytest.mark.parametrize(
