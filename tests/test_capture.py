@@ -6,11 +6,13 @@ import re
 import numpy as np
 import pytest
 from PIL import Image, ImageFilter
+from scipy.ndimage import gaussian_filter
 
 import train
 from scene.check.photos import left_out
-from splatting.sfm.capture import findings, lines_of, looks_of, neighbours_of, unusable
+from splatting.sfm.capture import compared, findings, lines_of, looks_of, neighbours_of, unusable
 from splatting.sfm.capture_page import from_above, write_page
+from splatting.sfm.layout import Layout
 
 NAMES = ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
 
@@ -68,6 +70,39 @@ def test_a_sound_capture_has_nothing_to_photograph_again(folder):
     photos = {name: photo for name, photo in _survey()["photos"].items() if name in looks}
     found = findings(_report(3, 3), photos, looks)
     assert found == {"weakly_connected": [], "blurred": [], "brightness_spread_stops": 0.0, "again": []}
+
+
+def test_what_photos_show_does_not_count(tmp_path):
+    """A camera of one exposure passes from what is bright and rich to what is dark and plain. b is blurred, e lit."""
+    rng, layout, width = np.random.default_rng(0), Layout(tmp_path), 1000
+    shade = np.linspace(1, 0.2, width)[None, :, None]
+    wall = gaussian_filter(rng.normal(size=(120, width, 3)), (1, 1, 0)) * 200 * shade**2 + 200 * shade
+    names = [f"{letter}.jpg" for letter in "abcdefgh"]
+    places = np.column_stack([rng.uniform(2, width - 2, 2000), rng.uniform(2, 118, 2000)])
+    lines = []
+    (layout.sparse / "0").mkdir(parents=True)
+    layout.images.mkdir()
+    for number, name in enumerate(names):
+        view = wall[:, 100 * number :][:, :300]
+        view = gaussian_filter(view, (4, 4, 0)) if name == "b.jpg" else view
+        view = view * 4 ** (1 / 2.2) if name == "e.jpg" else view
+        Image.fromarray(view.clip(0, 255).astype(np.uint8)).save(layout.images / name, quality=97)
+        seen = places - (100 * number, 0)
+        ids = np.flatnonzero((seen[:, 0] > 0) & (seen[:, 0] < 300))
+        lines += [f"{number + 1} 1 0 0 0 0 0 0 1 {name}", " ".join(f"{seen[i, 0]} {seen[i, 1]} {i}" for i in ids)]
+    (layout.sparse / "0" / "cameras.txt").write_text("1 PINHOLE 300 120 300 300 150 60\n")
+    (layout.sparse / "0" / "images.txt").write_text("\n".join(lines) + "\n")
+    (layout.sparse / "0" / "points3D.txt").write_text("")
+    photos = {name: {"shared": {other: 99 for other in names if other != name}} for name in names}
+    alone = findings(_report(8, 8), photos, looks_of(layout.images, names))
+    found = findings(_report(8, 8), photos, compared(looks_of(layout.images, names), layout))
+    assert alone["brightness_spread_stops"] > 1 and "g.jpg" in alone["blurred"]
+    assert found["blurred"] == ["b.jpg"]
+    assert found["brightness_spread_stops"] == pytest.approx(np.std([0] * 7 + [2]), abs=0.15)
+    (layout.sparse / "0" / "images.txt").write_text("\n\n".join(lines[::2]) + "\n\n")
+    found = findings(_report(8, 8), photos, compared(looks_of(layout.images, names), layout))
+    assert found["brightness_spread_stops"] is None and not found["again"]
+    assert len(lines_of(_report(8, 8) | found)) == 2
 
 
 def _page(folder, names, survey, **report) -> str:

@@ -10,12 +10,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 from tqdm.contrib.concurrent import thread_map
 
+from scene.images.exposures import EXPOSURES, exposures, levels
+from scene.readers.colmap import read_model
 from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import open_image
 from splatting.files.listing import some
 from splatting.host.machine import threads
+from splatting.sfm.layout import Layout
 from splatting.sfm.mapping import is_wrong
 from splatting.sfm.video import sharpness
 
@@ -23,7 +27,7 @@ LEAST = 0.6  # share of the photos, below which too few are placed
 _SHARED = 30  # points that a photo shares with another one that is near
 FEW = 2  # such neighbours, with which a photo is weakly connected
 _BLURRED = 0.3  # of the median sharpness
-_SPREAD = 0.5  # stops; photos of one exposure differ by less
+_TEXTURE, _OUTLIER = 9, 3.0  # pixels around a point that tell sharpness, and what is no sharpness (logarithm to 2)
 _EXPOSURES = "--appearance ppisp"  # of train.py, for photos that differ by more
 _WIDTH = 640  # pixels at which photos are compared, as sharpness depends on it
 
@@ -43,12 +47,57 @@ def looks_of(folder: Path, names: Sequence[str]) -> dict[str, Look]:
 
 
 def _look(path: Path) -> Look:
+    pixels = _small(path)
+    light = (pixels.astype(np.float32).mean() / 255) ** 2.2  # about the inverse of sRGB's curve
+    return Look(sharpness(pixels), math.log2(max(float(light), 1e-4)))
+
+
+def compared(looks: Mapping[str, Look], layout: Layout) -> dict[str, Look]:
+    """Looks of photos, those of the placed ones by the points that they share with others.
+
+    A photo of a dark wall is neither blurred nor of another exposure. One that shares few points is taken as sharp, and
+    its brightness as unknown, NaN.
+    """
+    model = read_model(layout.sparse / "0", with_2d_points=True)
+    images = [image for image in model.images if image.name in looks]
+    sizes = [(model.cameras[image.camera_id].width, model.cameras[image.camera_id].height) for image in images]
+    seen = thread_map(
+        lambda image, size: _at_points(layout.images / image.name, image.xys / size, image.point3D_ids),
+        images, sizes, max_workers=threads(), desc="Comparing photos", dynamic_ncols=True,
+    )  # fmt: skip
+    middle = Look(*np.median(list(looks.values()), axis=0)) if looks else Look(1, 0)
+    enough = [number for number, (points, _, _) in enumerate(seen) if len(points) >= _SHARED]
+    found = {image.name: Look(middle.sharpness, math.nan) for image in images}
+    if len(enough) > 1:
+        points, colors, textures = zip(*(seen[number] for number in enough), strict=True)
+        sharper, brighter = levels(textures, points, _OUTLIER), exposures(colors, points)
+        sharper, brighter = sharper - np.median(sharper), brighter - np.median(brighter)
+        for number, sharp, bright in zip(enough, sharper, brighter, strict=True):
+            found[images[number].name] = Look(middle.sharpness * 2**sharp, middle.brightness + bright)
+    return {**looks, **found}
+
+
+def _at_points(path: Path, places: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of the points (K,) that a photo shows their numbers, colours (K,3), and logarithms of contrast (K,).
+
+    places: (K,2), in parts of the photo's width and height. numbers: negative where there is no point.
+    """
+    pixels = _small(path)
+    size = pixels.shape[1::-1]
+    places = (places * size).astype(int)
+    inside = (numbers >= 0) & (places >= 0).all(1) & (places < size).all(1)
+    column, row = places[inside].T
+    grey = pixels.mean(2, dtype=np.float32) + 1
+    steps = sum(np.square(change) for change in np.gradient(grey))
+    contrast = (uniform_filter(steps, _TEXTURE) + 1)[row, column] / uniform_filter(grey, _TEXTURE)[row, column] ** 2
+    return numbers[inside], pixels[row, column] / 255, np.log2(contrast)
+
+
+def _small(path: Path) -> np.ndarray:
     with open_image(path) as image:
         small = in_srgb(image).convert("RGB")
         small.thumbnail((_WIDTH, _WIDTH))
-        pixels = np.asarray(small)
-    light = (pixels.astype(np.float32).mean() / 255) ** 2.2  # about the inverse of sRGB's curve
-    return Look(sharpness(pixels), math.log2(max(float(light), 1e-4)))
+        return np.asarray(small)
 
 
 def neighbours_of(photos: Mapping[str, Mapping[str, Any]]) -> dict[str, list[str]]:
@@ -64,26 +113,26 @@ def findings(
 ) -> dict[str, Any]:
     """What a capture is worth, for convert_report.json.
 
-    report: the content of that file so far. photos: of capture.json. looks: of all photos. Returns `weakly_connected`
-    and `blurred`, names of photos; `brightness_spread_stops`, of the placed ones, which train; and `again`, a line for
-    each thing to photograph again.
+    report: the content of that file so far. photos: of capture.json. looks: of all photos, `compared`. Returns
+    `weakly_connected` and `blurred`, names of photos; `brightness_spread_stops`, of the placed ones, which train, or
+    None; and `again`, a line for each thing to photograph again.
     """
     neighbours = neighbours_of(photos)
     against = {name for found in report.get("tried", [])[:1] for name in found.get("against", ())}
     weak = sorted(name for name, others in neighbours.items() if len(others) < min(FEW, len(photos) - 1))
     middle = float(np.median([look.sharpness for look in looks.values()])) if looks else 0.0
     blurred = sorted(name for name, look in looks.items() if look.sharpness < _BLURRED * middle)
-    bright = [look.brightness for name, look in looks.items() if name in photos]
-    spread = float(np.std(bright)) if bright else 0.0
+    bright = [look.brightness for name, look in looks.items() if name in photos and math.isfinite(look.brightness)]
+    spread = round(float(np.std(bright)), 3) if bright else None
     return {
         "weakly_connected": weak,
         "blurred": blurred,
-        "brightness_spread_stops": round(spread, 3),
+        "brightness_spread_stops": spread,
         "again": _again(sorted(set(report["left_out"]) - against), weak, blurred, spread),
     }
 
 
-def _again(left_out: list[str], weak: list[str], blurred: list[str], spread: float) -> list[str]:
+def _again(left_out: list[str], weak: list[str], blurred: list[str], spread: float | None) -> list[str]:
     lines = []
     if left_out:
         lines.append(
@@ -94,7 +143,7 @@ def _again(left_out: list[str], weak: list[str], blurred: list[str], spread: flo
         lines.append(f"around {some(weak)}: fewer than {FEW} other photos share points with each; take more there")
     if blurred:
         lines.append(f"{some(blurred)}: blurred; hold the camera still, or add light")
-    if spread > _SPREAD:
+    if spread and spread > EXPOSURES:
         lines.append(
             f"with a fixed exposure, if you can: the photos' brightness differs by {spread:.1f} stops; train these "
             f"with {_EXPOSURES}"
@@ -110,10 +159,9 @@ def lines_of(report: Mapping[str, Any]) -> list[str]:
         few = f"{len(weak)} of {report['registered']} photos weakly connected ({some(weak)})"
         lines.append(f"overlap: {few if weak else 'no photo is weakly connected'}")
     soft = f"{len(blurred)} of {report['photos']} photos blurred ({some(blurred)})"
-    lines += [
-        f"blur: {soft if blurred else 'no photo is blurred'}",
-        f"brightness: the photos differ by {report['brightness_spread_stops']:.2f} stops",
-    ]
+    lines.append(f"blur: {soft if blurred else 'no photo is blurred'}")
+    if (spread := report["brightness_spread_stops"]) is not None:
+        lines.append(f"brightness: the photos differ by {spread:.2f} stops")
     lines += [f"photograph again {line}" for line in report["again"]]
     return lines
 

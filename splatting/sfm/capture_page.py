@@ -18,7 +18,16 @@ from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.json_files import read_json, write_json
 from splatting.host.machine import threads
-from splatting.sfm.capture import Look, findings, lines_of, looks_of, neighbours_of, training_options, unusable
+from splatting.sfm.capture import (
+    Look,
+    compared,
+    findings,
+    lines_of,
+    looks_of,
+    neighbours_of,
+    training_options,
+    unusable,
+)
 from splatting.sfm.layout import Layout, image_names
 from splatting.sfm.mapping import is_wrong, name_of
 from splatting.sfm.report import summary
@@ -39,7 +48,7 @@ def capture_stage(layout: Layout, names: Sequence[str], seconds: Callable[[], di
 
     def work() -> None:
         survey, root = read_json(layout.capture), layout.prepared if layout.prepared.is_dir() else layout.input
-        looks = looks_of(root, image_names(root))
+        looks = compared(looks_of(root, image_names(root)), layout)
         report = read_json(layout.report)
         report |= {"seconds": seconds()} | findings(report, survey["photos"], looks)
         report["unusable"] = unusable(report)
@@ -84,7 +93,8 @@ def _lines(report: _Data) -> list[tuple[str, bool]]:
 def _photos(report: _Data, placed: _Data, looks: Mapping[str, Look], names: Sequence[str]) -> list[dict[str, Any]]:
     """Of each photo its name, problems and facts by title, those with problems first; `row` numbers them."""
     neighbours, against = neighbours_of(placed), set((report.get("tried") or [{}])[0].get("against", ()))
-    sharpness, brightness = np.median(list(looks.values()), axis=0) if looks else (1, 0)
+    sharpness = np.median([look.sharpness for look in looks.values()] or [1])
+    brightness = np.median([look.brightness for look in looks.values() if np.isfinite(look.brightness)] or [0])
     problems = {
         "left out: its matches contradict the others": against,
         "not placed": set(names) - set(placed) - against,
@@ -99,6 +109,7 @@ def _photos(report: _Data, placed: _Data, looks: Mapping[str, Look], names: Sequ
             facts = {"matching photos": report["left_out"].get(name, {}).get("partners", 0)}
         if look := looks.get(name):
             facts["sharpness"] = f"{look.sharpness / max(sharpness, 1e-9):.0%}"
+        if look and np.isfinite(look.brightness):
             facts["brightness"] = f"{round(look.brightness - brightness, 1) + 0:+.1f}"  # 0 is added as it ends -0.0
         found = [problem for problem, of in problems.items() if name in of]
         photos.append({"name": name, "problems": found, "facts": facts, "thumbnail": None})
