@@ -2,6 +2,7 @@
 
 import contextlib
 import sqlite3
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -61,6 +62,19 @@ def test_photos_that_look_alike_are_found(database):
     places = nowhere.copy()
     places[[0, 55]] = 0.5
     assert (0, 55) in {pairing.ordered(*pair) for pair in first_pairs(alike, places)}
+
+
+def test_gps_tells_who_is_near_beyond_180_degrees_and_at_a_pole():
+    world = pycolmap.PosePriorCoordinateSystem.WGS84
+    given = [(10.0, 179.9999, 5.0), (10.0, -179.9999, np.nan), (89.9999, 0.0, 0.0), (89.9999, 180.0, 0.0)]
+    priors = [
+        pycolmap.PosePrior(corr_data_id=pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, 1), number),
+                           position=np.array(place), coordinate_system=world)
+        for number, place in enumerate(given, 1)
+    ]  # fmt: skip
+    places = pairing.gps_places(SimpleNamespace(read_all_pose_priors=lambda: priors), [1, 2, 3, 4])
+    away = np.linalg.norm(places[::2] - places[1::2], axis=1)
+    assert 20 < away[0] < 25 and 20 < away[1] < 25  # metres
 
 
 def test_few_photos_are_all_matched(database):

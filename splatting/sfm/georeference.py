@@ -22,6 +22,7 @@ _STEADIEST = 0.026  # radians; headings that differ by less tell nothing
 _STEADY = 0.035  # radians; pitches of a gimbal differ by less, those by hand by more
 _WORTH = 1  # photos that the usual noise is worth beside the measured one
 _TAIL = 4  # degrees of freedom of Student's t, which noise of GPS has
+_WORST = 4  # times the usual noise; more is of places that are wrong
 _FAR = 5.0  # standard deviations, from which a place does not fit
 _ROUNDS, _PAIRS = 40, 500  # of pairs of photos, where there are many
 _APART = 30  # photos, whose rolls are the errors of different moments; of more, the mean is no better
@@ -217,6 +218,7 @@ def _gps_rows(
     east[:, 1], east[:, 2], east[:, 3], east[:, 4] = own[:, 2], -lift, own[:, 0], 1
     down[:, 0], down[:, 2], down[:, 3], down[:, 5] = -own[:, 2], own[:, 0], own[:, 1], 1
     north[:, 0], north[:, 1], north[:, 3], north[:, 6] = lift, -own[:, 0], own[:, 2], 1
+    flat, high = min(flat, (_WORST * GPS_ERROR) ** 2), min(high, (_WORST * HEIGHT_ERROR) ** 2)
     rows = [_Rows(east, x, weights / flat), _Rows(down, y, known / high), _Rows(north, z, weights / flat)]
     return rows, (float(np.sqrt(flat)), float(np.sqrt(high))), away
 

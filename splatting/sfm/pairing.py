@@ -97,15 +97,15 @@ def likeness(database: pycolmap.Database, numbers: list[int]) -> np.ndarray:
 
 
 def gps_places(database: pycolmap.Database, numbers: list[int]) -> np.ndarray:
-    """Places (N, 3) by EXIF, in equal units across and along; NaN where they are not known."""
+    """Places (N, 3) by EXIF, in metres from the middle of the Earth; NaN where they are not known."""
+    earth = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
     places = np.full((len(numbers), 3), np.nan)
     order = {number: place for place, number in enumerate(numbers)}
     for prior in database.read_all_pose_priors():
         place = order.get(prior.corr_data_id.id)
         if place is not None and prior.coordinate_system == pycolmap.PosePriorCoordinateSystem.WGS84:
-            latitude, longitude, height = np.asarray(prior.position, float)
-            across = longitude * np.cos(np.radians(latitude))
-            places[place] = latitude, across, 0.0 if np.isnan(height) else height / 111_000  # metres of a degree
+            known = np.nan_to_num(np.asarray(prior.position, float).reshape(1, 3), nan=0.0)  # a height may be missing
+            places[place] = earth.ellipsoid_to_ecef(known)[0]
     return places
 
 
