@@ -17,6 +17,7 @@ import numpy as np
 
 GPS_ERROR, HEIGHT_ERROR = 3.0, 5.0  # metres along an axis, of usual GPS
 ROLL = 0.05  # radians; a usual one of a camera that is held level
+_COMMON = 0.02  # radians; a usual roll that all photos have in common
 _HELD_ASIDE = 0.1  # sine; a photo with a larger roll or pitch hardly counts
 _STEADIEST = 0.026  # radians; headings that differ by less tell nothing
 _STEADY = 0.035  # radians; pitches of a gimbal differ by less, those by hand by more
@@ -153,10 +154,11 @@ def _refined(cameras: Cameras, rotation: np.ndarray, measured: bool = False) -> 
 
     rotation, scale, shift = _started(cameras, rotation)
     common, deviations = np.zeros(2), (GPS_ERROR, HEIGHT_ERROR)
-    free = np.array([_UNKNOWN] * 7 + [1 / ROLL**2, _UNKNOWN])  # weights of the unknowns without evidence
+    free = np.full(9, _UNKNOWN)  # weights of the unknowns without evidence
     for _ in range(_ROUNDS):
         level = [] if measured else _level_rows(rotation @ cameras.turns, common)
         gps, deviations, away = _gps_rows(cameras, rotation, scale, shift, deviations)
+        free[7] = 1 / (_COMMON**2 + common[0] ** 2)  # Cauchy's, as a mount may be crooked
         alone = sum((rows.matrix for rows in level), np.diag(free))
         matrix = sum((rows.matrix for rows in gps), alone)
         matrix[TILT, TILT] += 1e8 * measured  # stays
