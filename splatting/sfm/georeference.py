@@ -59,8 +59,8 @@ class Fit(NamedTuple):
 
 
 def is_level(found: Fit) -> bool:
-    """Whether the vertical is known: to half a degree, or as well as photos held by hand tell it."""
-    return found.tilt <= np.radians(0.5) or (np.isfinite(found.tilt) and found.by_level <= np.radians(4))
+    """Whether the vertical is known: to a degree by two standard errors, or as well as photos held by hand tell it."""
+    return found.tilt <= np.radians(0.45) or (np.isfinite(found.tilt) and found.by_level <= np.radians(4))
 
 
 def fit(cameras: Cameras, up: np.ndarray | None = None) -> Fit:

@@ -47,7 +47,9 @@ def said_of(layout: Layout) -> list[str]:
     if (record := read_orientation(layout.scene)) is None:
         return []
     if record["vertical"] is None:
-        level = "upright: not known, as neither the photos' horizons nor GPS tell it; photos that face several ways do"
+        level = (
+            "upright: not known, as neither the photos' horizons nor GPS tell it; add photos to several sides, or GPS"
+        )
     else:
         turn = np.degrees(np.arccos(np.clip(record["rotation"][1][1], -1, 1)))
         error = record.get("vertical_error")
@@ -57,7 +59,7 @@ def said_of(layout: Layout) -> list[str]:
         used = f"GPS of {record['gps_photos']} photos, which fit to {record['gps_error']:.2g} m"
         return [f"{level}; a unit is {record['scale']:.4g} m{error} by {used}"]
     if (seen := record.get("gps_seen", 0)) < FEWEST:
-        return [f"{level}; no scale: {seen or 'no'} photos have GPS, and it needs {FEWEST}"]
+        return [f"{level}; no scale: it needs {FEWEST} photos with GPS, and has {seen}"]
     return [f"{level}; no scale: GPS of {seen} photos is too near to each other, or does not fit the poses"]
 
 
