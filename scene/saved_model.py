@@ -25,7 +25,7 @@ _CHECKPOINT = re.compile(r"chkpnt(\d+)\.pth")
 def saves_in(folder: Path) -> dict[int, Path]:
     """Saved iterations of a model folder: their PLY, or their checkpoint where there is none."""
     matches = [(_CHECKPOINT.fullmatch(path.name), path) for path in sorted(folder.glob("chkpnt*.pth"))]
-    saves = {int(match[1]): path for match, path in matches if match}
+    saves = {int(match[1]): path for match, path in matches if match and path.is_file()}
     plys = ((n, saved_ply(folder, n)) for n in saved_iterations(folder / "point_cloud"))
     return saves | {n: path for n, path in plys if path.is_file()}
 

@@ -126,7 +126,7 @@ class Sleeping:
                 {"awake": captured["awake"][blocks], "taken": taken, "terms": captured["terms"].view(_TERMS)}
                 | {"rows": [values[before : before + own] for values in captured["rows"]]}
             )
-        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
             raise UserError(
                 f"the state of sleeping blocks in the checkpoint does not fit ({error}); use another checkpoint"
             ) from error

@@ -213,6 +213,7 @@ def test_parts_that_do_not_fit_end_in_a_sentence(tmp_path):
         "opacity of the checkpoint": (_changed(good, 6, good[6][:, 0]), 1),
         r"xyz of 1 of 4 Gaussians in the checkpoint .*Gaussian 2\)": (_changed(good, 1, nan), 1),
         "is not the state of an optimiser": (_changed(good, 10, 5), 1),
+        "not the state of an optimiser": (_with_state(good, lambda s: s["param_groups"][0].update(params=[{}])), 1),
         "exp_avg or exp_avg_sq of xyz is missing": (_with_state(good, lambda s: s["state"][0].pop("exp_avg")), 1),
         "exp_avg and f_dc differ": (_with_state(good, lambda s: s["state"][1].update(exp_avg=torch.zeros(3))), 1),
         "step of xyz": (_with_state(good, lambda s: s["state"][0].update(step="x")), 1),

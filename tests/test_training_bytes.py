@@ -5,6 +5,7 @@ Features have no such tests of their own: an option that has a part in steps or 
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,24 @@ from diff_gaussian_rasterization import ops
 from processes import in_ranks
 from rasterizer_tools import GPU_MARKS
 from step_ways import Rerun, fused_iterations, take_as  # noqa: F401  (a fixture)
-from trainings import ITERATIONS, OPTIONS, differences, plain_training, shared_scene, trained, whole_result
+from trainings import (
+    ITERATIONS,
+    OPTIONS,
+    PART_OPTIONS,
+    differences,
+    plain_training,
+    shared_scene,
+    trained,
+    whole_result,
+)
 
+import train
 from scene import sleeping
 from scene.readers.point_cloud import write_point_cloud
 from splatting.distributed.ranks import ranks
+from splatting.parts import PARTS, part_class, strategies
 from splatting.training.steps.graphs import Graphs
+from utils.system_utils import UserError
 
 Result = dict[str, bytes | list]
 EVERY = pytest.mark.parametrize("name", OPTIONS)
@@ -102,6 +115,44 @@ def test_resumed(scene, tmp_path, once, plain, name):
     """By fast steps, from a checkpoint of plain ones."""
     start = "--start_checkpoint", plain_training(once, name) / "chkpnt33.pth"
     assert not differences(trained(scene, tmp_path, *OPTIONS[name], *start), plain(name))
+
+
+def _goes_together(*names: str) -> bool:
+    """Whether a training may have these parts, of which one strategy."""
+    if len({*names} & {*strategies()}) > 1:
+        return False
+    words = [str(word) for name in names for word in PART_OPTIONS[name]]
+    try:
+        train.parse(["-s", "scene", *words])
+    except UserError:
+        return False
+    return True
+
+
+def _covering(pairs: set[frozenset[str]]) -> Iterator[list[str]]:
+    """Few sets of parts, of which one at least has both parts of each pair."""
+    left, names = {*pairs}, [*PART_OPTIONS]
+    while left:
+        chosen = sorted(min(left, key=sorted))
+        for name in sorted(names, key=lambda name: -sum(name in pair for pair in left)):
+            if all(frozenset((name, one)) in pairs for one in chosen):
+                chosen.append(name)
+        left -= {frozenset(pair) for pair in combinations(chosen, 2)}
+        yield chosen
+
+
+def test_pairs_of_parts_resumed(scene, tmp_path):
+    begin = {name for name in PARTS if {"begin", "state"} & {*vars(part_class(name))}}
+    # tests/parts has the first; the others keep nothing.
+    assert begin - {"more_photos", "remote_viewer", "last_save", "sleep"} <= PART_OPTIONS.keys()
+    pairs = {frozenset(pair) for pair in combinations(PART_OPTIONS, 2) if _goes_together(*pair)}
+    assert len(pairs) > 90
+    for names in _covering(pairs):
+        out = tmp_path / "+".join(names)
+        words = [word for name in names for word in PART_OPTIONS[name]]
+        whole = trained(scene, out, *words, "--checkpoint_iterations", 33, ITERATIONS)
+        resumed = trained(scene, out / "on", *words, "--start_checkpoint", out / "chkpnt33.pth")
+        assert not differences(resumed, whole), names
 
 
 @pytest.mark.parametrize("name", ["together", "sparse", "mcmc idle", "budget"])

@@ -62,6 +62,24 @@ OPTIONS = {
     "budget errors": (*BUDGET, "--train_test_exp"),
 }
 
+PART_OPTIONS = {  # that begin with something of a checkpoint, or of the scene
+    "coarse_to_fine": ("--resolution_schedule", "pyramid"),
+    "time_budget": ("--schedule", ITERATIONS),
+    "exposure": ("--train_test_exp",),
+    "refine_poses": ("--refine_poses",),
+    "depth_maps": ("-d", "depths", "--depth_l1_weight_init", 1.0),
+    "keep_best": ("--keep_best",),
+    "robust_mask": ("--robust_mask", 0.3),
+    "region": OPTIONS["region"],
+    "adc": ("--strategy", "adc", "--absgrad", "--absgrad_threshold", 2e-4, "--max_num_splats", 400),
+    "mcmc": MCMC,
+    "budget": BUDGET,
+    "sky": ("--sky", "auto"),
+    "sparse_depth": ("--sparse_depth", 0.5),
+    "ppisp": ("--appearance", "ppisp"),
+    "filter_3d": ("--filter_3d",),
+}
+
 
 def narrow_scene(folder: Path, model: str = "PINHOLE", distortion: tuple[float, ...] = ()) -> Path:
     """Make a COLMAP scene of which a view sees a part, with a mask and an inverse depth map for each photo."""

@@ -226,7 +226,7 @@ class GaussianAdam(torch.optim.Adam):
         own = self.state_dict()["param_groups"]
         try:
             state, groups = dict(state_dict["state"]), list(state_dict["param_groups"])
-            found = [(group.get("name"), list(group["params"])) for group in groups]
+            found = [(group.get("name"), [*dict.fromkeys(group["params"])]) for group in groups]
         except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
             raise ValueError("it is not the state of an optimiser") from error
         if [(name, len(keys)) for name, keys in found] != [(g.get("name"), len(g["params"])) for g in own]:

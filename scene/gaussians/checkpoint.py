@@ -26,7 +26,7 @@ _LARGEST = 1e15  # extent; learning rates are multiples of it
 _OPTIMIZER = 10  # which entry its state dict is
 _ENTRIES = 12  # the reference's; the values of further attributes may follow
 EXPOSURES, WRITTEN_BY = "exposures", "version"  # keys in the optimiser's state dict
-_NO_EXTRA = {WRITTEN_BY, "state", "param_groups"}
+_NO_EXTRA = {WRITTEN_BY, EXPOSURES, "state", "param_groups"}
 
 
 class State(NamedTuple):
@@ -153,7 +153,7 @@ def _exposures_in(entries: Sequence[Any]) -> dict[str, Any] | None:
     found = next((entry for entry in entries[_ENTRIES:] if isinstance(entry, dict)), None)
     optimizer = entries[_OPTIMIZER]
     found = optimizer.get(EXPOSURES, found) if isinstance(optimizer, dict) else found
-    return found if isinstance(found, dict) else None
+    return found if isinstance(found, dict) and isinstance(found.get("kind", ""), str) else None
 
 
 def unpack(entries: Sequence[Any], table: dict[str, Attribute], max_sh_degree: int) -> State:

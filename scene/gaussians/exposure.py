@@ -123,8 +123,8 @@ class Exposures:
         """Take the state of `capture()`, after training_setup. UserError for a state that does not fit."""
         if state.get("names") != self.names:
             raise UserError(
-                "the checkpoint's exposures are of other photos than this run's; give the scene and the options "
-                "--eval and --appearance that it was trained with"
+                "the checkpoint's exposures are of other photos than this run's, which cannot be added; give the scene "
+                "and the options --eval and --appearance that it was trained with"
             )
         self.take_values(state)
         self.check_finite("the checkpoint", "use another checkpoint")

@@ -278,6 +278,14 @@ def photo_names(cam_infos: Sequence[Any]) -> list[str]:
     return exposure_names(cam_infos) if all(hasattr(c, "image_path") for c in cam_infos) else list(dict.fromkeys(names))
 
 
+def places(names: Any, among: Sequence[str]) -> list[int] | None:
+    """Places of names, as of an earlier training's photos, among others; None if they are not all there, each once."""
+    rows = {name: row for row, name in enumerate(among)}
+    if not isinstance(names, list) or not all(isinstance(name, str) and name in rows for name in names):
+        return None
+    return [rows[name] for name in names] if len({*names}) == len(names) else None
+
+
 def names_of_photos(info: SceneInfo) -> dict[str, str]:
     """`exposure_names` of the training views by the paths of their photos."""
     return dict(zip([view.image_path for view in info.train_cameras], exposure_names(info.train_cameras), strict=True))

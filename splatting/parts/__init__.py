@@ -145,6 +145,7 @@ def tools(name: str) -> list[Callable]:
     advise_trained(scene, views): as advise, by a short training. examine(scene, views, options): notes of doctor.py.
     drawn(rows, states): rows of a checkpoint as its PLY would have them. for_wrong_poses(best),
     for_few_iterations(count): remedies.
+    continues(opt): whether the same options train a finished training further, None: --iterations says so.
     remarks(lines): lines of a training that reports show. against_overfitting(record): an option to try, or None.
     pictures(model): files in a model folder that reports show, where they are there.
     summary_writer(folder): TensorBoard's, as `train.prepare_output_and_logger` returns it, or None.

@@ -39,6 +39,7 @@ class Iteration:
     changes: bool  # rows of the Gaussians, the SH degree, the size of views or the 3D filter change in this iteration
     started: float  # seconds of training before it
     span: range  # steps of the schedule that it stands for (training/schedule.py); of the last, all that are left
+    rests: bool = False  # it was the last one, before the training was continued
     terms: dict[str, Term] = field(default_factory=dict)  # that parts add to the loss, weights included
     captured: bool = True  # a captured step may record the terms
     wants_depth: bool = False  # its loss needs the rendered depth
@@ -47,6 +48,11 @@ class Iteration:
     record: dict[str, float] | None = None  # what train_log.json gets of this iteration; None: no record
     scored_at: float | None = None  # seconds of training when the curve scored it, for all records of the same score
     stopping: type[KeyboardInterrupt] | KeyboardInterrupt | None = None  # raised once the step is complete
+
+    @property
+    def steps(self) -> bool:
+        """Whether it takes a step."""
+        return not (self.last or self.rests)
 
     def takes(self, planned: Collection[int]) -> bool:
         """Whether what is planned for an iteration of the schedule is to be done in it."""

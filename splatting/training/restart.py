@@ -4,6 +4,7 @@ import os
 import re
 import time
 from pathlib import Path
+from zipfile import is_zipfile
 
 from splatting.host import torchrun
 from splatting.host.clock import seconds_since_start
@@ -24,7 +25,7 @@ def resumed(start: str | None, folder: str, iterations: int) -> str | None:
 
 
 def newest_checkpoint(folder: str, below: float = float("inf"), since: float | None = None) -> str | None:
-    """The newest checkpoint of an iteration under `below`; of equally new ones, that of the highest.
+    """The newest whole checkpoint of an iteration under `below`; of equally new ones, that of the highest.
 
     since: when it was written, in seconds since 1970. None: since torchrun began, so that it is of its processes, over
     all restarts, and of no earlier training in the folder.
@@ -33,10 +34,10 @@ def newest_checkpoint(folder: str, below: float = float("inf"), since: float | N
     found = {}
     for path in Path(folder).glob("chkpnt*.pth"):
         match = _CHECKPOINT.fullmatch(path.name)
-        number = int(match[1] or 0) if match else 0
-        written = path.stat()
-        if match and number < below and written.st_mtime >= began:
-            found[written.st_mtime_ns, number] = path
+        if match and is_zipfile(path) and (number := int(match[1] or 0)) < below:
+            written = path.stat()
+            if written.st_mtime >= began:
+                found[written.st_mtime_ns, number] = path
     return str(found[max(found)]) if found else None
 
 

@@ -194,7 +194,7 @@ class Run(Stepping):
     def begin(self) -> None:
         """Write the inputs into the output folder, print the memory estimate, start or continue the log."""
         folder, start = self.scene.model_path, self.start
-        if not start or not (Path(folder) / "cameras.json").exists():
+        if not earlier_runs.lies_in(start, folder) or not (Path(folder) / "cameras.json").exists():
             self.scene.write_inputs()
         if self.group.first:
             remove_traces(folder, self.parts)

@@ -28,7 +28,8 @@ class Schedule:
     length: of the schedule, in iterations. ends: the last iteration of the run, None: not known yet. megapixels: of a
     view. sizes: the schedule of the views' sizes that is in force; levels: of that. strategy: the one in force
     (--strategy). paced: whether iterations stand for more or fewer than themselves. by_clock: whether that follows the
-    seconds that pass. seconds: that the run may take, 0: any number.
+    seconds that pass. seconds: that the run may take, 0: any number. until: the seconds of training that end a run by
+    the clock. more: the option that continues a run that is over.
     """
 
     megapixels = 1.0
@@ -37,7 +38,8 @@ class Schedule:
     strategy = ""
     paced = False
     by_clock = False
-    seconds = 0.0
+    seconds = until = 0.0
+    more = "more --iterations"
 
     def __init__(self, length: int) -> None:
         self.length = length
@@ -54,6 +56,14 @@ class Schedule:
     def schedule_step(self, iteration: int) -> int:
         """How far the schedule is in an iteration that was reached, 0 to `length`."""
         return iteration
+
+    def rests(self, iteration: int) -> bool:
+        """Whether a training ended with an iteration, so that it took no step, and was continued later."""
+        return False
+
+    def step_before(self, iteration: int) -> int:
+        """From which `schedule_step` the iterations after this one go on."""
+        return self.schedule_step(iteration)
 
     def span(self, iteration: int) -> range:
         """Iterations of the schedule that an iteration stands for; none where the run is slower than its schedule.

@@ -71,6 +71,7 @@ class Stepping:
             step = Iteration(
                 iteration,
                 last=last,
+                rests=schedule.rests(iteration),
                 camera=camera,
                 background=self._background(iteration),
                 changes=self._changes(iteration),

@@ -98,9 +98,14 @@ def test_a_resumed_training_knows_the_best_so_far(kept, scene, tmp_path):
     train_on(scene, tmp_path / "plain", *WORDS)
     with pytest.raises(UserError, match="was trained on the photos that --keep_best holds out"):
         train_on(scene, tmp_path / "no", *WORDS, "--keep_best", start[0], tmp_path / "plain" / "chkpnt200.pth")
-    for wrong, words in ((torch.zeros(2, 2), "xyz of the checkpoint has the shape"), (torch.zeros(2, 3), "is damaged")):
+    for wrong, words in (
+        ({"rows": {"xyz": torch.zeros(2, 2)}}, "xyz of the checkpoint has the shape"),
+        ({"rows": {"xyz": torch.zeros(2, 3)}}, "is damaged"),
+        *(({name: torch.tensor([1, 2])}, "is damaged") for name in ("iteration", "psnr", "degree")),
+    ):
         state = torch.load(start[1], weights_only=False)
-        state[0][10]["keep_best"]["rows"]["xyz"] = wrong
+        best = state[0][10]["keep_best"]
+        best |= wrong | {"rows": best["rows"] | wrong.get("rows", {})}
         torch.save(state, tmp_path / "chkpnt200.pth")
         with pytest.raises(UserError, match=words):
             train_on(scene, tmp_path / "no", *WORDS, "--keep_best", start[0], tmp_path / "chkpnt200.pth")

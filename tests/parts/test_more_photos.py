@@ -1,5 +1,6 @@
 """Checkpoints that are resumed with more photos than they were trained on."""
 
+import json
 import shutil
 import sys
 from pathlib import Path
@@ -91,6 +92,49 @@ def test_new_photos_train_more_often_at_first(scenes, first, tmp_path, monkeypat
     assert len({*names[10:27]}) > 13 and len(names) == 40
     old = [name for name in _names(whole) if name not in new]
     assert {*names[1:10:2]} <= {*old}
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (("--refine_poses",), "corrects 17 of 17 poses"),
+        (("--robust_mask", 0.3, "--sparse_depth", 0.5), "2 photos are new"),
+        (("--keep_best",), "leave --keep_best out, or start a new training"),
+        (("--train_test_exp",), "of other photos than this run's, which cannot be added; give the scene"),
+        (("--appearance", "ppisp"), "of other photos than this run's, which cannot be added; give the scene"),
+    ],
+)
+def test_options_that_keep_something_of_each_photo(scenes, tmp_path, more, said, capfd):
+    """And what may be added trains to the same bytes after a stop."""
+    train_on(scenes[1], tmp_path / "a", *WORDS, "--iterations", 20, *more)
+    words = *WORDS, "--iterations", 50, *more, "--checkpoint_iterations", 30, "--start_checkpoint"
+    if "cannot" in said or "leave" in said:
+        with pytest.raises(UserError, match=said):
+            train_on(scenes[0], tmp_path / "b", *words, tmp_path / "a/chkpnt20.pth")
+        return
+    whole = train_on(scenes[0], tmp_path / "b", *words, tmp_path / "a/chkpnt20.pth")
+    assert said in capfd.readouterr().out
+    assert train_on(scenes[0], tmp_path / "c", *words, tmp_path / "b/chkpnt30.pth") == whole
+
+
+def test_a_training_by_the_clock_gets_photos(scenes, tmp_path, monkeypatch, capfd):
+    train_on(scenes[1], tmp_path / "a", *WORDS, "--iterations", 300, "--schedule", 30)
+    names = _seen(monkeypatch)
+    words = *WORDS, "--iterations", 300, "--time_budget", 0.5, "--start_checkpoint", tmp_path / "a/chkpnt30.pth"
+    train_on(scenes[0], tmp_path / "b", *words)
+    assert "2 photos are new; until iteration 38 every second one" in capfd.readouterr().out and names[0] in scenes[2]
+
+
+def test_a_folder_with_an_older_model_gets_the_new_photos(scenes, first, tmp_path, capfd):
+    """Of the same scene, which has more photos now."""
+    scene, out = tmp_path / "scene", tmp_path / "out"
+    shutil.copytree(scenes[1], scene)
+    train_on(scene, out, *WORDS, "--iterations", 20)
+    shutil.copytree(scenes[0], scene, dirs_exist_ok=True)
+    train_on(scene, out, *WORDS, "--start_checkpoint", first, "--iterations", 60)
+    assert len(json.loads((out / "cameras.json").read_text())) == 17
+    train_on(scene, out, *WORDS, "--resume", "--iterations", 80)
+    assert f"Resuming {out} at iteration 60" in capfd.readouterr().out
 
 
 def test_resumed_to_the_same_bytes(scenes, first, tmp_path, monkeypatch):

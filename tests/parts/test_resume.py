@@ -1,5 +1,6 @@
 """Trainings that --resume continues, and what a finished one leaves."""
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -61,17 +62,17 @@ def test_resumed_to_the_same_bytes_by_the_same_command(colmap_scene, tmp_path, m
             _train(colmap_scene, out, 40, "--resume")
         assert _checkpoints(out) == ({REPLACED} if newest else set())
         assert newest is None or load_checkpoint(out / REPLACED)[1] == newest
-        assert finished(out) == 0
+        assert finished(out) is None
     assert _train(colmap_scene, out, 40, "--resume") == whole
-    assert _checkpoints(out) == {"chkpnt40.pth"} and finished(out) == 40
-    said = rf"^Last checkpoint: {out}/chkpnt40.pth \(1.\d+ MB\); the same command with --resume"
+    assert _checkpoints(out) == {"chkpnt40.pth"} and finished(out).iteration == 40
+    said = rf"^Last checkpoint: {out}/chkpnt40.pth \(1.\d+ MB\); --resume with more --iterations cont"
     assert re.search(said, capfd.readouterr().out, re.MULTILINE)
     before = (out / "cfg_args").stat().st_mtime_ns
     for name in (".train.lock", REPLACED):  # as of a training that was killed between its note and its end
         (out / name).touch()
     assert _train(colmap_scene, out, 40, "--resume") == whole and (out / "cfg_args").stat().st_mtime_ns == before
     assert _checkpoints(out) == {"chkpnt40.pth"} and not (out / ".train.lock").exists()
-    assert "has a finished training of --iterations 40; give more to continue it" in capfd.readouterr().out
+    assert "has a finished training of 40 iterations; more --iterations continues it" in capfd.readouterr().out
 
 
 def test_a_model_alone_is_no_end(colmap_scene, tmp_path, monkeypatch):
@@ -79,21 +80,21 @@ def test_a_model_alone_is_no_end(colmap_scene, tmp_path, monkeypatch):
     with monkeypatch.context() as patch, pytest.raises(Killed):
         _killed(patch, 12)
         _train(colmap_scene, tmp_path, 12, "--resume")
-    assert _checkpoints(tmp_path) == {"chkpnt12.pth"} and finished(tmp_path) == 0
+    assert _checkpoints(tmp_path) == {"chkpnt12.pth"} and finished(tmp_path) is None
     _train(colmap_scene, tmp_path, 12, "--resume")
-    assert finished(tmp_path) == 12
+    assert finished(tmp_path).iteration == 12
 
 
 def test_more_iterations_continue_a_finished_training(colmap_scene, tmp_path, capfd):
     _train(colmap_scene, tmp_path, 12)
     _train(colmap_scene, tmp_path, 20, "--resume")
     assert f"Resuming {tmp_path} at iteration 12" in (said := capfd.readouterr()).out
-    assert _checkpoints(tmp_path) == {"chkpnt12.pth", "chkpnt20.pth"} and finished(tmp_path) == 20
+    assert _checkpoints(tmp_path) == {"chkpnt12.pth", "chkpnt20.pth"} and finished(tmp_path).iteration == 20
     assert "starts over" not in said.err
     _train(colmap_scene, tmp_path, 20)
     assert (
-        f"warning: {tmp_path} holds a training that was finished, of --iterations 20, and this one starts over; "
-        "--resume with more --iterations continues the old one from its last checkpoint" in capfd.readouterr().err
+        f"warning: {tmp_path} has a finished training of 20 iterations, and this one starts over; --resume with more "
+        "--iterations would continue it" in capfd.readouterr().err
     )
 
 
@@ -101,11 +102,12 @@ def test_a_finished_training_without_its_last_checkpoint_is_not_said_to_continue
     """Whose checkpoint of another iteration, as of Ctrl-C, is not its end."""
     _train(colmap_scene, tmp_path, 12, "--no_last_checkpoint", "--checkpoint_iterations", 5)
     _train(colmap_scene, tmp_path, 12, "--resume")
-    said = "of --iterations 12; it left no checkpoint of its end to continue; leave --resume out to start over"
-    assert said in capfd.readouterr().out
+    assert "has a finished training of 12 iterations and no checkpoint of its end" in capfd.readouterr().out
+    for more in ((20,), (12, "--time_budget", 1)):
+        with pytest.raises(UserError, match="of 12 iterations, which left no checkpoint to continue; leave --resume"):
+            _train(colmap_scene, tmp_path, *more, "--resume")
     _train(colmap_scene, tmp_path, 20)
-    said = capfd.readouterr().err
-    assert "of --iterations 12, and this one starts over; the old one left no checkpoint of its end" in said
+    assert "of 12 iterations, and this one starts over\n" in capfd.readouterr().err
 
 
 def test_no_last_checkpoint(colmap_scene, tmp_path, capfd):
@@ -115,9 +117,25 @@ def test_no_last_checkpoint(colmap_scene, tmp_path, capfd):
     assert launch_options().no_last_checkpoint  # as a call of the reference's `training` leaves none
 
 
-def test_a_training_by_the_clock_leaves_no_checkpoint(colmap_scene, tmp_path):
-    _train(colmap_scene, tmp_path, 12, "--schedule", 12)
-    assert _checkpoints(tmp_path) == set()
+def test_a_training_of_another_length_leaves_a_checkpoint_that_seconds_continue(colmap_scene, tmp_path, capfd):
+    words = *WORDS, "--iterations", 20
+    train_on(colmap_scene, tmp_path, *words, "--schedule", 12)
+    assert _checkpoints(tmp_path) == {"chkpnt12.pth"} and finished(tmp_path).iteration == 12
+    train_on(colmap_scene, tmp_path, *words, "--schedule", 12, "--resume")
+    assert "of 12 iterations; --time_budget SECONDS continues it" in capfd.readouterr().out
+    with pytest.raises(UserError, match="of 12 iterations; give --resume with --time_budget SECONDS to continue it"):
+        _train(colmap_scene, tmp_path, 40, "--resume")
+
+
+def test_the_newest_whole_checkpoint_is_resumed(colmap_scene, tmp_path, capfd):
+    """Not a folder, a link to nothing, or half a file."""
+    _train(colmap_scene, tmp_path, 20, "--checkpoint_iterations", 8, "--no_last_checkpoint")
+    (tmp_path / "model.json").write_text(json.dumps(read_model_json(tmp_path) | {"finished": None}))
+    (tmp_path / "chkpnt9.pth").mkdir()
+    (tmp_path / "chkpnt10.pth").symlink_to(tmp_path / "nothing")
+    (tmp_path / "chkpnt11.pth").write_bytes((tmp_path / "chkpnt8.pth").read_bytes()[:-999])
+    _train(colmap_scene, tmp_path, 20, "--resume")
+    assert f"Resuming {tmp_path} at iteration 8" in capfd.readouterr().out
 
 
 def test_a_training_that_starts_over_removes_what_another_would_resume(colmap_scene, tmp_path):
@@ -130,7 +148,7 @@ def test_a_full_disk_ends_no_training(colmap_scene, tmp_path, capfd):
     (tmp_path / "chkpnt12.pth").mkdir()  # which cannot be replaced by a file
     _train(colmap_scene, tmp_path, 12)
     assert f"warning: cannot write {tmp_path / 'chkpnt12.pth'}" in capfd.readouterr().err
-    assert finished(tmp_path) == 12
+    assert finished(tmp_path).iteration == 12
 
 
 def test_resume_needs_a_folder(colmap_scene):

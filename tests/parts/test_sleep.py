@@ -432,7 +432,7 @@ def test_rays_have_the_bytes_of_a_training_in_which_nothing_sleeps(scene, tmp_pa
     assert looked["ply"] == resumed["ply"] == awake["ply"]
 
 
-@pytest.mark.parametrize("what", ["rows", "taken", "terms"])
+@pytest.mark.parametrize("what", ["rows", "taken", "terms", "awake"])
 def test_damaged_sleep_is_refused(scene, tmp_path, cut, what):
     capture, iteration = load_checkpoint(cut / "chkpnt33.pth")
     asleep = extra_state(capture).get("sleep")
@@ -440,6 +440,8 @@ def test_damaged_sleep_is_refused(scene, tmp_path, cut, what):
         asleep["rows"].pop()
     elif what == "taken":
         asleep["taken"] -= 2**30
+    elif what == "awake":
+        asleep["awake"] = torch.tensor(0.5)
     else:
         asleep["terms"] = asleep["terms"][:5]
     save_checkpoint(tmp_path / "bad.pth", capture, iteration)

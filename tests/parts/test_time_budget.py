@@ -330,6 +330,11 @@ def _train(scene: Path, out: Path, *more: object) -> dict[int, bytes]:
     return train_on(scene, out, "--disable_viewer", *OPTIONS, *more)
 
 
+def _checkpoints(out: Path) -> list[Path]:
+    """Those of a folder, the last one at the end."""
+    return sorted(out.glob("chkpnt*.pth"), key=lambda path: int(path.stem[6:]))
+
+
 def _stored(out: Path, name: str) -> str:
     return json.loads((out / "model.json").read_text())[name]
 
@@ -348,7 +353,7 @@ def test_a_budgeted_training_replays_and_resumes_to_the_byte(colmap_scene, tmp_p
     assert record["seconds"] == pytest.approx(20.0, rel=0.03) and len(saved) == 2 and record["iteration"] == max(saved)
     said = r"\d+ iterations in (19|20)\.\d s \(budget 20 s, [\d.]+ s with start, scores and saves\)"
     assert re.match(said, record["lines"][0])
-    (checkpoint,) = clocked.glob("chkpnt*.pth")
+    checkpoint, _ = _checkpoints(clocked)
     (clocked / "schedule.json").rename(tmp_path / "schedule.json")  # of which a checkpoint needs nothing
     monkeypatch.undo()  # the clock of this machine has no say below
     assert _train(colmap_scene, replayed, *every, "--schedule", tmp_path / "schedule.json") == saved
@@ -381,7 +386,7 @@ def test_a_short_training_by_the_clock_begins_with_smaller_views_and_replays(
     assert trained("again", *repeats) == short
     names = [_stored(tmp_path / name, "resolution_schedule") for name in ("short", "whole", "again")]
     assert names == ["pyramid", "none", "pyramid"]
-    (checkpoint,) = (tmp_path / "short").glob("chkpnt*.pth")
+    checkpoint, _ = _checkpoints(tmp_path / "short")
     trained("resumed", *repeats, "--resolution_schedule", "pyramid", "--start_checkpoint", checkpoint)
     assert "--resolution_schedule" not in capsys.readouterr().err  # as that is its name
 
@@ -416,7 +421,7 @@ def test_a_checkpoint_finds_its_place_or_is_refused(colmap_scene, tmp_path, monk
     first = json.loads((clocked / "schedule.json").read_text())["blocks"][0]
     assert first["last"] == 30 and first["step"] == 1 / 60  # half of the schedule is done
     assert max(saved) in (79, 80, 81)
-    (checkpoint,) = clocked.glob("chkpnt*.pth")
+    checkpoint, _ = _checkpoints(clocked)
     for reason, more in (
         ("so --iterations 60 leaves nothing to do", ("--iterations", 60)),
         ("was written for --iterations 60, not 61", ("--iterations", 61, "--time_budget", 9)),
@@ -449,15 +454,54 @@ def test_a_decided_run_goes_through_rates_degrees_and_windows(colmap_scene, tmp_
     assert [t for t in range(1, 40) if degrees[t] > degrees[t - 1]] == [13, 24, 32]  # after 1000, 2000 and 3000
 
 
-def test_a_checkpoint_comes_with_its_schedule_and_the_last_one_is_the_end(colmap_scene, tmp_path, monkeypatch):
+def test_a_checkpoint_comes_with_its_schedule(colmap_scene, tmp_path, monkeypatch):
     _timed(monkeypatch, lambda t: 0.1)
-    with monkeypatch.context() as killed:
-        killed.setattr(part_class("time_budget"), "ended", lambda *_: None)  # as if the process were killed before
-        _train(colmap_scene, tmp_path, "--time_budget", 4, "--checkpoint_iterations", 3000)
-    (checkpoint,) = tmp_path.glob("chkpnt*.pth")
+    monkeypatch.setattr(part_class("time_budget"), "ended", lambda *_: None)  # as if the process were killed before
+    _train(colmap_scene, tmp_path, "--time_budget", 4)
+    (checkpoint,) = _checkpoints(tmp_path)
     assert read_schedule(tmp_path / "schedule.json").ended == int(checkpoint.stem[6:])
-    with pytest.raises(UserError, match="and its schedule ends at .*; there is nothing left to"):
-        _train(colmap_scene, tmp_path / "on", "--time_budget", 4, "--start_checkpoint", checkpoint)
+
+
+def test_a_finished_training_gets_more_seconds_and_its_schedule_repeats_all(
+    colmap_scene, tmp_path, monkeypatch, capsys
+):
+    """Twice, and stopped between. Its rates are low from the start, and fall again."""
+    out, every = tmp_path / "out", ("--random_background", "--iterations", 3000)
+    rates = _noted(monkeypatch, lambda run, at: (at.iteration, run.schedule.rate_factor(at.iteration)))
+    with monkeypatch.context() as timed:
+        _timed(timed, lambda t: 0.1)
+        first = max(_train(colmap_scene, out, *every, "--time_budget", 4))
+        assert f"chkpnt{first}.pth" in (said := capsys.readouterr().out) and "--resume with --time_budget" in said
+        again = *every, "--resume", "--time_budget"
+        second = max(_train(colmap_scene, out, *again, 3, "--checkpoint_iterations", 2800))
+        assert second - first in (29, 30, 31) and _last_record(out)["seconds"] == pytest.approx(7, abs=0.11)
+        assert "(budget 7 s, " in capsys.readouterr().out
+        found = dict(rates)
+        assert max(found[t] for t in range(first + 1, second)) < 0.4 * found[20] and found[second] <= found[first]
+        middle = _checkpoints(out)[1]
+        assert first < int(middle.stem[6:]) < second
+        on = _train(colmap_scene, tmp_path / "on", *again[:-2], "--start_checkpoint", middle, "--time_budget", 3)
+        assert max(on) in range(second - 2, second + 3)  # what is left of the 3 seconds
+        capsys.readouterr()
+        third = max(saved := _train(colmap_scene, out, *again, 2))
+        assert third - second in (19, 20, 21)
+    repeated = _train(colmap_scene, tmp_path / "b", *every, "--schedule", out / "schedule.json")
+    assert repeated[third] == saved[third]
+    with pytest.raises(UserError, match="there is nothing left to train"):
+        _train(colmap_scene, tmp_path / "c", *every, "--schedule", out / "schedule.json", "--start_checkpoint",
+               out / f"chkpnt{third}.pth")  # fmt: skip
+    assert read_schedule(tmp_path / "b" / "schedule.json") == read_schedule(out / "schedule.json")
+    assert [one.after for one in read_schedule(out / "schedule.json").continued] == [first, second]
+
+
+def test_seconds_continue_a_steady_training(colmap_scene, tmp_path, monkeypatch, capsys):
+    """From its end, and from a stop: as many, besides those that it took."""
+    _timed(monkeypatch, lambda t: 0.1)
+    _train(colmap_scene, tmp_path, "--iterations", 30, "--checkpoint_iterations", 15)
+    for start, said in ((30, ""), (15, "was trained without --time_budget; it is iteration 15 of")):
+        start_at = "--start_checkpoint", tmp_path / f"chkpnt{start}.pth"
+        saved = _train(colmap_scene, tmp_path / str(start), "--iterations", 30, *start_at, "--time_budget", 2)
+        assert said in capsys.readouterr().err and max(saved) - start in (19, 20, 21)
 
 
 def test_a_steady_run_goes_on_from_a_checkpoint_of_a_budget_and_removes_the_schedule(
@@ -467,7 +511,7 @@ def test_a_steady_run_goes_on_from_a_checkpoint_of_a_budget_and_removes_the_sche
     out, path = tmp_path / "out", tmp_path / "out" / "schedule.json"
     _timed(monkeypatch, lambda t: 0.1)
     whole = _train(colmap_scene, out, "--iterations", 60, "--checkpoint_iterations", 20, 40, "--time_budget", 5)
-    before, (early, late) = read_schedule(path), sorted(out.glob("chkpnt*.pth"), key=lambda c: int(c.stem[6:]))
+    before, (early, late, _) = read_schedule(path), _checkpoints(out)
     on = int(late.stem[6:])
     assert before.ended == max(whole) > on
     more = "--iterations", on + 20, "--checkpoint_iterations", on + 10, "--start_checkpoint"
@@ -496,7 +540,7 @@ def test_a_time_budget_takes_the_strategy_that_is_best_in_it(colmap_scene, tmp_p
     assert _stored(tmp_path / "a", "strategy") == read_schedule(tmp_path / "a" / "schedule.json").strategy == "budget"
     repeated = _train(colmap_scene, tmp_path / "b", "--schedule", tmp_path / "a" / "schedule.json")
     assert list(repeated.values()) == [first[max(first)]]
-    (checkpoint,) = (tmp_path / "a").glob("chkpnt*.pth")
+    checkpoint, _ = _checkpoints(tmp_path / "a")
     _train(colmap_scene, tmp_path / "c", *words, "--start_checkpoint", checkpoint)
     assert _stored(tmp_path / "b", "strategy") == _stored(tmp_path / "c", "strategy") == "budget"
     _train(colmap_scene, tmp_path / "d", "--iterations", 20)
@@ -553,7 +597,7 @@ def test_the_clock_ends_growth_at_the_pace_of_whole_views_and_removes_nothing(si
     fits = 25 * 20.0 / (0.005 + counts[-1] * 1e-6)  # at the pace of whole views with so many
     assert counts[-1] == pytest.approx(fits, rel=0.12)
     (said,) = capsys.readouterr().err.splitlines()
-    assert said.startswith("at this speed, --time_budget 20 would allow ") and said.endswith(", not 50,000")
+    assert re.fullmatch("--time_budget 20 is enough to train about [0-9,]+ Gaussians, not 50,000, as it has .*", said)
 
 
 def test_a_strategy_of_a_damaged_file_is_none():

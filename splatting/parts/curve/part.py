@@ -66,7 +66,7 @@ class Curve(Part):
         if self._recorder is None:
             return False
         run = self._run
-        first = run.schedule.schedule_step(run.first_iteration)
+        first = run.schedule.step_before(run.first_iteration)
         self._due = self._recorder.due(at.span, first, run.clock.seconds, run.schedule.expected)
         return self._due
 

@@ -69,14 +69,14 @@ class BestModel:
                 "the checkpoint was trained on the photos that --keep_best holds out; leave --keep_best out, or start "
                 "a new training"
             )
-        if not state.get("iteration") or state.get("psnr") == math.inf:  # as version 0.1 kept it
-            return
+        found, psnr, degree = (state.get(name) for name in ("iteration", "psnr", "degree"))
         try:
-            self.iteration, self.psnr = int(state["iteration"]), float(state["psnr"])
-            self._degree = int(state["degree"])
+            if not found or psnr == math.inf:  # as version 0.1 kept it
+                return
+            self.iteration, self.psnr, self._degree = int(found), float(psnr), int(degree)
             self._rows = {name: state["rows"][name].cpu() for name in gaussians.rows()}
             check_rows(self._rows, gaussians._attributes, gaussians.max_sh_degree)
             if len({*map(len, self._rows.values())}) > 1 or not 0 <= self._degree <= gaussians.max_sh_degree:
                 raise ValueError("its rows or its SH degree do not fit")
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, OverflowError) as error:
             raise UserError(f"the checkpoint's best model is damaged ({error}); give another checkpoint") from error

@@ -54,7 +54,8 @@ def lines(it: TrimReport) -> list[str]:
 def _gaussians(it: TrimReport) -> str:
     if it.keep_unseen:
         return "No Gaussian was left out (--keep_unseen)"
-    found = f"Of {it.gaussians:,} Gaussians, {it.unseen:,} invisible ones were left out{_share(it, it.unseen)}"
+    found = f"{it.unseen:,} invisible Gaussians of {it.gaussians:,} were left out{_share(it, it.unseen)}"
+    found = found if it.unseen else "No Gaussian was left out"
     searched = f"{it.views} views were searched in {it.seconds:.1f} s"
     how = {
         TOO_LONG: f"only opacities were compared: a search takes {it.views} views, more than a {ITERATIONS_PER_VIEW}th "

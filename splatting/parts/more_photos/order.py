@@ -16,14 +16,15 @@ class Added(NamedTuple):
     names: list[str]
 
     @classmethod
-    def at(cls, since: int, last: int, names: Collection[str], views: Sequence[Camera]) -> "Added":
+    def at(cls, since: int, last: int | None, names: Collection[str], views: Sequence[Camera]) -> "Added":
         """Until the new ones have trained as often as the others on average, at most half of what is left to `last`.
 
-        views: all that train.
+        last: None where a clock decides it. views: all that train.
         """
         new = sum(view.image_name in names for view in views)
         visits = since / max(len(views) - new, 1)
-        return cls(since, since + min(int(2 * new * visits), (last - since) // 2), sorted(names))
+        count = int(2 * new * visits)
+        return cls(since, since + (count if last is None else min(count, (last - since) // 2)), sorted(names))
 
     @classmethod
     def restored(cls, state: Any) -> "Added":

@@ -35,7 +35,7 @@ class MorePhotos(Part):
         if found:
             self._refuse_folder(run)
             run.grown = True
-            added = Added.at(run.first_iteration, run.opt.iterations, found, run.views.cameras)
+            added = Added.at(run.first_iteration, run.schedule.ends, found, run.views.cameras)
             print(f"{len(found)} photos are new; until iteration {added.until} every second one trains on one of them")
         else:
             added = None if state is None else Added.restored(state)

@@ -48,6 +48,10 @@ class RefinePoses(Part):
             self.poses.restore(state)
         fill(run, "on_host", self.poses, self)
 
+    def ready(self, run: Any) -> None:
+        """Only now cameras leave where they were when a new training began, as other parts have measured them."""
+        self.poses.place()
+
     def records(self) -> dict[str, float]:
         return self.poses.corrections()
 

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from scene.cameras import Camera
+from scene.readers.info import places
 from scene.readers.tracks import read_tracks
 from scene.reprojection import moved_pose, twist_gradient
 from scene.scene import Scene
@@ -133,17 +134,22 @@ class PoseRefinement:
         return {"names": self._names} | {name: torch.from_numpy(array.copy()) for name, array in self.arrays.items()}
 
     def restore(self, state: dict[str, Any] | None) -> None:
-        """Take the state of `captured()`. UserError for one that does not fit, or None."""
-        shapes = {name: getattr(state.get(name), "shape", None) for name in _STATE} if isinstance(state, dict) else {}
-        fits = shapes == {name: array.shape for name, array in self.arrays.items()} and state["names"] == self._names
-        if not fits:
-            raise UserError("the checkpoint has no refined poses of this run's views; leave --refine_poses out")
+        """Take the state of `captured()`, for `place`; views that it does not have stay at the dataset's poses.
+
+        UserError for one that does not fit, or None.
+        """
+        rows = places(state.get("names"), self._names) if isinstance(state, dict) else None
+        shapes = {name: (len(rows or []), *array.shape[1:]) for name, array in self.arrays.items()}
+        if not rows or any(getattr(state.get(name), "shape", None) != shape for name, shape in shapes.items()):
+            raise UserError(
+                "the checkpoint has no refined poses of this run's views; give the scene and the options that it was "
+                "trained with, or more photos"
+            )
         if "lenses" in state:
             raise UserError("the checkpoint has refined lenses, which are not supported any more; train from the start")
         for name, array in self.arrays.items():
-            array[:] = state[name].numpy()
+            array[rows] = state[name].numpy()
         self._move(range(len(self._cameras)))
-        self.place()
 
     @property
     def _names(self) -> list[str]:

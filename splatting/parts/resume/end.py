@@ -4,29 +4,32 @@ import contextlib
 import os
 import shlex
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from arguments import add_to_model_json
 from splatting.files.json_files import MODEL_JSON, read_model_json
+from splatting.training.schedule import STEADY
 from utils.system_utils import UserError
 
-FINISHED = "finished"  # entry of model.json: --iterations of the training that has ended
+FINISHED, MORE = "finished", "continued_by"  # entries of model.json: the last iteration, and the option for more
 
 
-def finished(folder: str | os.PathLike) -> int:
-    """The --iterations of the training that has reached its end in a model folder, 0 if none has."""
+class End(NamedTuple):
+    """The end of a training: its last iteration, the option that continues it, and the checkpoint that it leaves."""
+
+    iteration: int
+    more: str
+    checkpoint: Path
+
+
+def finished(folder: str | os.PathLike) -> End | None:
+    """The end of the training in a model folder, None if it has not reached it. The checkpoint may not be there."""
     with contextlib.suppress(UserError, OSError):  # a broken file notes nothing
-        found = read_model_json(folder).get(FINISHED)
-        return found if type(found) is int and found > 0 else 0
-    return 0
-
-
-def continues(folder: str | os.PathLike, iterations: int) -> bool:
-    """Whether the finished training of so many --iterations left the checkpoint of its end, as none by the clock does.
-
-    Checkpoints of earlier iterations, as of Ctrl-C, repeat what the training then did.
-    """
-    return (Path(folder) / f"chkpnt{iterations}.pth").is_file()
+        note = read_model_json(folder)
+        found = note.get(FINISHED)
+        if type(found) is int and found > 0:
+            return End(found, str(note.get(MORE, STEADY.more)), Path(folder) / f"chkpnt{found}.pth")
+    return None
 
 
 def note_finished(run: Any) -> None:
@@ -34,13 +37,10 @@ def note_finished(run: Any) -> None:
     folder = Path(run.scene.model_path)
     if not (folder / MODEL_JSON).is_file():  # the folder was removed meanwhile, which is told of
         return
-    add_to_model_json(folder, **{FINISHED: run.opt.iterations})
+    add_to_model_json(folder, **{FINISHED: run.schedule.ends, MORE: run.schedule.more})
 
 
-def checkpoint_line(path: Path) -> str:
+def checkpoint_line(path: Path, more: str) -> str:
     """How to continue a training from its last checkpoint."""
     size = f"{path.stat().st_size / 1e6:.3g} MB"
-    return (
-        f"Last checkpoint: {shlex.quote(str(path))} ({size}); the same command with --resume and more --iterations "
-        "continues this training"
-    )
+    return f"Last checkpoint: {shlex.quote(str(path))} ({size}); --resume with {more} continues this training"

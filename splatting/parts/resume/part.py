@@ -31,8 +31,8 @@ class Resume(Part):
         Option("resume", False, origin="ours", topic=MOST_NEEDED,
             help="resume in -m, or start there, and write checkpoints for the next --resume"),
         Option("no_last_checkpoint", False, origin="ours", called=True, topic="output",
-            help="leave no checkpoint at the end. It has 720 MB for a million Gaussians, and is what --resume with "
-                 "more --iterations continues"),
+            help="leave no checkpoint at the end. It has 720 MB for a million Gaussians, and --resume continues it "
+                 "with more --iterations or seconds"),
     ))
     # fmt: on
 
@@ -42,14 +42,14 @@ class Resume(Part):
 
     def ready(self, run: Any) -> None:
         """Say what this training does to that of its folder, once nothing can refuse it."""
-        from splatting.parts.resume.end import continues, finished
+        from splatting.parts.resume.end import finished
 
         folder = run.dataset.model_path
         if run.start is None and run.group.first and (there := finished(folder)):
-            instead = "--resume with more --iterations continues the old one from its last checkpoint"
+            instead = f"; --resume with {there.more} would continue it" if there.checkpoint.is_file() else ""
             print(
-                f"warning: {folder} holds a training that was finished, of --iterations {there}, and this one starts "
-                f"over; {instead if continues(folder, there) else 'the old one left no checkpoint of its end'}",
+                f"warning: {folder} has a finished training of {there.iteration:,} iterations, and this one starts "
+                f"over{instead}",
                 file=sys.stderr,
             )
 
@@ -75,9 +75,9 @@ class Resume(Part):
         return seconds >= self._before + LEAST and wanted <= SHARE * seconds
 
     def _leaves(self, at: "Iteration") -> bool:
-        """Whether the iteration is the last, and leaves a checkpoint. A training by the clock cannot be continued."""
-        launch, wanted = self._run.launch, not self._run.schedule.paced
-        return at.last and wanted and not launch.no_last_checkpoint and not at.takes(launch.checkpoint_iterations)
+        """Whether the iteration is the last, and leaves a checkpoint."""
+        launch = self._run.launch
+        return at.last and not launch.no_last_checkpoint and not at.takes(launch.checkpoint_iterations)
 
     def stepped(self, at: "Iteration") -> None:
         if at.stopping:
@@ -99,8 +99,8 @@ class Resume(Part):
 
         from splatting.parts.resume.end import checkpoint_line
 
-        if self._run.group.first and not self._run.schedule.paced and last.is_file():
-            tqdm.write(checkpoint_line(last), file=sys.stdout)
+        if self._run.group.first and last.is_file():
+            tqdm.write(checkpoint_line(last, self._run.schedule.more), file=sys.stdout)
 
     def _save(self, at: "Iteration", name: str = "") -> None:
         """Write a checkpoint. A disk that is full is told, and ends nothing: nobody has asked for this file."""

@@ -1,33 +1,53 @@
 """Where a training begins that --resume is given to."""
 
 import argparse
+import math
 from pathlib import Path
 
-from splatting.parts.resume.end import continues, finished
+from splatting.parts import tools
+from splatting.parts.resume.end import finished
 from splatting.training.output_folder import folder_of, own_folder
 from splatting.training.restart import REPLACED, newest_checkpoint
+from splatting.training.schedule import STEADY
 from utils.system_utils import UserError
 
 
 def prepare(dataset: argparse.Namespace, opt: argparse.Namespace, launch: argparse.Namespace) -> bool:
     """Let --resume name the checkpoint to start with. Returns whether there is anything to train.
 
-    UserError without a folder.
+    UserError without a folder, and for a finished training that cannot be continued so.
     """
     if not getattr(launch, "resume", False):
         return True
     folder = dataset.model_path or folder_of(launch.start_checkpoint)
     if not folder:
         raise UserError("--resume needs -m, the folder whose training it resumes or starts")
-    done = finished(folder)
-    if done >= opt.iterations:
+    asked = next((found for ask in tools("continues") if (found := ask(opt)) is not None), None)
+    if end := finished(folder):
+        launch.start_checkpoint = str(end.checkpoint)
+        return _goes_on(folder, asked, opt.iterations)
+    most = opt.iterations if asked is None else math.inf
+    launch.start_checkpoint = newest_checkpoint(folder, most, since=0) or launch.start_checkpoint
+    return True
+
+
+def _goes_on(folder: str, asked: bool | None, iterations: int) -> bool:
+    """Whether options continue the finished training of a folder. UserError where they would, and it cannot be.
+
+    asked: whether they do, None: by --iterations.
+    """
+    end = finished(folder)
+    there = f"{folder} has a finished training of {end.iteration:,} iterations"
+    by_number = end.more == STEADY.more
+    if asked is False or (asked is None and by_number and end.iteration >= iterations):
         with own_folder(folder):  # which removes what a training leaves that was killed after its note
             (Path(folder) / REPLACED).unlink(missing_ok=True)
-        if continues(folder, done):
-            what = "give more to continue it"
-        else:
-            what = "it left no checkpoint of its end to continue; leave --resume out to start over"
-        print(f"{folder} has a finished training of --iterations {done}; {what}")
+        print(
+            f"{there}; {end.more} continues it" if end.checkpoint.is_file() else f"{there} and no checkpoint of its end"
+        )
         return False
-    launch.start_checkpoint = newest_checkpoint(folder, opt.iterations, since=0) or launch.start_checkpoint
+    if not end.checkpoint.is_file():
+        raise UserError(f"{there}, which left no checkpoint to continue; leave --resume out to start over")
+    if asked is None and not by_number:
+        raise UserError(f"{there}; give --resume with {end.more} to continue it, or leave --resume out to start over")
     return True

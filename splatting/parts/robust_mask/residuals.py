@@ -19,6 +19,7 @@ from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, interpolate, ma
 from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
+from scene.readers.info import places
 from utils.image_utils import as_float
 from utils.system_utils import UserError
 
@@ -118,12 +119,15 @@ class Residuals:
         return {"names": [camera.image_name for camera in self.cameras], **state}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Take the state of `captured()`. UserError for one that does not fit."""
-        fits = isinstance(state, dict) and state.get("names") == [camera.image_name for camera in self.cameras]
-        if not fits or any(getattr(state.get(name), "shape", None) != getattr(self, name).shape for name in _STATE):
+        """Take the state of `captured()`, which may lack photos. UserError for one that does not fit."""
+        names = [camera.image_name for camera in self.cameras]
+        rows = places(state.get("names"), names) if isinstance(state, dict) else None
+        shapes = {name: (len(rows or []), *getattr(self, name).shape[1:]) for name in _STATE}
+        if not rows or any(getattr(state.get(name), "shape", None) != shape for name, shape in shapes.items()):
             raise UserError("the checkpoint has residuals of other photos; resume it with its own scene and options")
         for name in _STATE:
-            getattr(self, name).copy_(state[name])
+            mine = getattr(self, name)
+            mine[rows] = state[name].to(mine)
 
 
 @torch.no_grad()

@@ -22,6 +22,7 @@ _LAST = 1.5  # blocks; if no more are left, they are one
 _MOST_SHARE = 2  # times the part of the schedule that an iteration does where no seconds are lost
 _TOLD = 1.02  # times the budget, from which on a run says that it takes longer
 AN_ITERATION = 25  # Gaussians for each iteration, at most, where the clock sets the number of iterations
+AGAIN = 0.9  # part of the schedule at which one that is over goes on: rates are low there, and fall once more
 
 
 class Block(NamedTuple):
@@ -33,22 +34,32 @@ class Block(NamedTuple):
     seconds: float  # of training before the block
 
 
+class Continued(NamedTuple):
+    """A training that was over, and was given more time."""
+
+    after: int  # its last iteration then, which took no step
+    seconds: float  # more
+
+
 class Decided(NamedTuple):
     """What a run decided, as schedule.json and checkpoints keep it (schedule_file.py)."""
 
     iterations: int  # of its schedule
     blocks: list[Block]
     ended: int | None  # the last iteration, None if the run has not ended
-    time_budget: float  # seconds
+    time_budget: float  # seconds, without those of `continued`
     sizes: str = "none"  # of views
     levels: Levels = ()
     strategy: str = ""  # that trained; empty in files of older versions
+    continued: tuple[Continued, ...] = ()
+    begun: float | None = None  # seconds of training before those that now pass; None: as many as there are
 
 
 class DecidedSchedule(Schedule):
     """A schedule that was decided by an earlier run."""
 
     paced = True
+    more = "--time_budget SECONDS"
     _told = False
 
     def __init__(self, decided: Decided) -> None:
@@ -57,7 +68,8 @@ class DecidedSchedule(Schedule):
         self.blocks = list(decided.blocks)
         self.ends = decided.ended
         self.sizes, self.levels, self.strategy = decided.sizes, decided.levels, decided.strategy
-        self.seconds = decided.time_budget
+        self.seconds, self.begun = decided.time_budget, decided.begun
+        self._rests = {one.after for one in decided.continued}
 
     def progress(self, iteration: int) -> float:
         """Part of the schedule that is done after an iteration, 0 to 1."""
@@ -69,9 +81,15 @@ class DecidedSchedule(Schedule):
     def schedule_step(self, iteration: int) -> int:
         if iteration <= 0:
             return 0
-        # The end of the schedule is only reached in the last iteration.
-        most = self.length if self.is_last(iteration) else self.length - 1
+        # The end of the schedule is only reached in a last iteration.
+        most = self.length if self.is_last(iteration) or self.rests(iteration) else self.length - 1
         return min(int(self.length * self.progress(iteration) + _ROUNDING), most)
+
+    def rests(self, iteration: int) -> bool:
+        return iteration in self._rests
+
+    def step_before(self, iteration: int) -> int:
+        return int(AGAIN * self.length) if self.rests(iteration) else self.schedule_step(iteration)
 
     def stride(self, iteration: int) -> float:
         return self._block(iteration)[1].step * self.length
@@ -111,8 +129,8 @@ class DecidedSchedule(Schedule):
             self._told = True
             aimed = f", not {aim:,}" if aim else ""
             tqdm.write(
-                f"at this speed, --time_budget {self.seconds:g} would allow {iterations:,} iterations with views of "
-                f"full size, which train about {trained:,} Gaussians, {AN_ITERATION} for each{aimed}",
+                f"--time_budget {self.seconds:g} is enough to train about {trained:,} Gaussians{aimed}, as it has "
+                f"about {iterations:,} iterations",
                 file=sys.stderr,
             )
 
@@ -134,7 +152,7 @@ class DecidedSchedule(Schedule):
     @property
     def decided(self) -> Decided:
         """All that is decided by now, also of iterations to come."""
-        decided = {"sizes": self.sizes, "levels": self.levels, "strategy": self.strategy}
+        decided = {"sizes": self.sizes, "levels": self.levels, "strategy": self.strategy, "begun": self.begun}
         return self._decided._replace(blocks=self.blocks, ended=self.ends, **decided)
 
     def up_to(self, iteration: int) -> Decided:
@@ -159,7 +177,8 @@ class TimeBudget(DecidedSchedule):
     left, at the speed of the blocks before it. So seconds that were lost, by a slow start or by another program, are
     taken from all that is left. Where so many were lost that iterations would do more than _MOST_SHARE times their
     usual part, the run takes longer than its budget. Seconds are those of training, with those of the runs that this
-    one resumes, whose blocks are in the schedule. share: gives all processes the seconds of one.
+    one resumes, whose blocks are in the schedule. One that was over goes on at AGAIN, for as many seconds more. share:
+    gives all processes the seconds of one.
     """
 
     by_clock = True
@@ -167,6 +186,7 @@ class TimeBudget(DecidedSchedule):
     def __init__(self, decided: Decided, share: Callable[[float], float] = lambda seconds: seconds) -> None:
         super().__init__(decided)
         self._share = share
+        self._limit = decided.continued[-1].seconds if decided.continued else decided.time_budget
         self._open = self.sizes != "none" and not self.levels
         self._asked = self.sizes == "pyramid"
         self.sizes = "none" if self.sizes == "auto" else self.sizes
@@ -194,11 +214,17 @@ class TimeBudget(DecidedSchedule):
     def expected(self) -> float | None:
         return self._expected if self.ends is None else float(self.ends)
 
+    @property
+    def until(self) -> float:
+        return (self.begun or 0.0) + self._limit
+
     def reach(self, iteration: int, seconds: float) -> None:
         if not self.blocks or iteration > self.blocks[-1].last:
-            seconds = self._share(seconds)
+            seconds = round(self._share(seconds), 6)
+            if self.begun is None:
+                self.begun = seconds
             self._measure(seconds)
-            if self._open and self._measured > 2 and seconds > _KNOWN * self.seconds:
+            if self._open and self._measured > 2 and seconds - self.begun > _KNOWN * self._limit:
                 self._choose_sizes(iteration - 1, seconds)
             self._decide(seconds)
 
@@ -221,7 +247,7 @@ class TimeBudget(DecidedSchedule):
         """
         self._open = False
         now = (self.schedule_step(done) + 0.5) / self.length
-        possible = done + max(self.seconds - seconds, 0.0) / self._speed
+        possible = done + max(self.until - seconds, 0.0) / self._speed
         short = self.megapixels * self.length / possible >= SHORT and now < PYRAMID[1][0]
         if short or self._asked:
             self.sizes = "pyramid"
@@ -231,8 +257,8 @@ class TimeBudget(DecidedSchedule):
     def _decide(self, seconds: float) -> None:
         """Add the block that comes next."""
         before = self.blocks[-1].last if self.blocks else 0
-        done = self.progress(before)
-        iterations = self._iterations(seconds, 1.0 - done)
+        done = AGAIN if self.rests(before) else self.progress(before)
+        iterations = self._iterations(seconds - self.begun, (1.0 - done) / (1.0 - AGAIN if self._rests else 1.0))
         self._expected = before + iterations if self._speeds else None
         count, final = self._count(iterations)
         if final:
@@ -242,29 +268,32 @@ class TimeBudget(DecidedSchedule):
             step = min(1.0 / self.length, (1.0 - done) / 2)
         else:
             step = (1.0 - done) * min(1.0 / iterations, 0.5 / count)
-        self.blocks.append(Block(before + count, done, step, round(seconds, 6)))
+        self.blocks.append(Block(before + count, done, step, seconds))
         if final and self._measured <= 1:
             tqdm.write(
-                f"warning: --time_budget {self.seconds:g} is too short for {self.ends + 1} iterations, so training "
+                f"warning: --time_budget {self._limit:g} is too short for {self.ends + 1} iterations, so training "
                 f"ends with iteration {self.ends}; give more seconds, or lower --resolution (-r)",
                 file=sys.stderr,
             )
 
     def _iterations(self, seconds: float, undone: float) -> float:
-        """Iterations that the run has yet to take, infinite where no speed is known. undone: part of the schedule."""
-        left = max(self.seconds - seconds, 0.0)
+        """Iterations that the run has yet to take, infinite where no speed is known.
+
+        seconds: of its limit, that have passed. undone: part of what it is to do of the schedule.
+        """
+        left = max(self._limit - seconds, 0.0)
         if self._speed is None:
             return math.inf if left else 0.0
         if not self._speeds:
             return left / self._speed
-        if not self._is_late_told and seconds + undone * self.seconds / _MOST_SHARE > _TOLD * self.seconds:
+        if not self._is_late_told and seconds + undone * self._limit / _MOST_SHARE > _TOLD * self._limit:
             self._is_late_told = True
             tqdm.write(
-                f"warning: training will take about {seconds + undone * self.seconds / _MOST_SHARE:.0f} s, more than "
-                f"--time_budget {self.seconds:g}, because some iterations were slow",
+                f"warning: training will take about {seconds + undone * self._limit / _MOST_SHARE:.0f} s, more than "
+                f"--time_budget {self._limit:g}, because some iterations were slow",
                 file=sys.stderr,
             )
-        usual = statistics.median_low(self._speeds) / self.seconds  # part of the schedule, of an iteration
+        usual = statistics.median_low(self._speeds) / self._limit  # part of that, of an iteration
         return max(left / self._speed, math.ceil(undone / (_MOST_SHARE * usual)))
 
     def _count(self, iterations: float) -> tuple[int, bool]:
@@ -276,7 +305,7 @@ class TimeBudget(DecidedSchedule):
         if self._measured == 1:
             return 1, iterations < 0.5
         previous = self.blocks[-1].last - self._last(len(self.blocks) - 1)
-        block = max(1.0, min(_MOST_GROWTH * previous, PART * self.seconds / self._speed))
+        block = max(1.0, min(_MOST_GROWTH * previous, PART * self._limit / self._speed))
         if iterations < _LAST * block:
             return max(1, int(iterations + 0.5)), True
         return int(block), False

@@ -13,7 +13,7 @@ from typing import Any
 
 from splatting.files.json_files import read_json, write_json
 from splatting.parts import strategies
-from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule, TimeBudget
+from splatting.parts.time_budget.paced import Block, Continued, Decided, DecidedSchedule, TimeBudget
 from splatting.training.schedule import PYRAMID
 from utils.system_utils import UserError
 
@@ -25,7 +25,8 @@ _BROKEN = ValueError, TypeError, KeyError, AttributeError, IndexError, OverflowE
 
 def table_of(decided: Decided) -> dict[str, Any]:
     """A schedule as plain values, for a file or a checkpoint."""
-    table = decided._asdict() | {"blocks": [block._asdict() for block in decided.blocks]}
+    lists = {name: [one._asdict() for one in getattr(decided, name)] for name in ("blocks", "continued")}
+    table = decided._asdict() | lists
     return {_SIZES if name == "sizes" else name: value for name, value in table.items()}
 
 
@@ -55,9 +56,13 @@ def _decided(content: Any) -> Decided:
     length, ended = _whole(content["iterations"], 1), content["ended"]
     blocks = [_block(one) for one in content["blocks"]]
     lasts, starts = [0, *(block.last for block in blocks)], [block.start for block in blocks]
+    continued = [
+        Continued(_whole(one["after"], 1), _number(one["seconds"], 0.0)) for one in content.get("continued", ())
+    ]
+    falls = {before for before, one, next in zip(lasts[1:], starts, starts[1:], strict=False) if next < one}
     if sorted(set(lasts)) != lasts or not blocks:
         raise ValueError("its blocks do not follow each other")
-    if starts != sorted(starts):
+    if falls - {one.after for one in continued}:
         raise ValueError("its progress does not ascend")
     if ended is not None and _whole(ended, 1) != lasts[-1]:
         raise ValueError("its last block does not end with its last iteration")
@@ -66,7 +71,8 @@ def _decided(content: Any) -> Decided:
         raise ValueError("its levels do not ascend")
     if (strategy := content.get("strategy", "")) not in ("", *strategies()):
         raise ValueError(f"{strategy!r} is no strategy")
-    named = str(content[_SIZES]), levels, strategy
+    begun = content.get("begun", 0.0)
+    named = str(content[_SIZES]), levels, strategy, (*continued,), None if begun is None else _number(begun, 0.0)
     decided = Decided(length, blocks, ended, _number(content["time_budget"], 0.0), *named)
     if max(map(DecidedSchedule(decided).progress, lasts)) > 1 + 1e-6:
         raise ValueError("its progress goes beyond its end")
@@ -112,7 +118,18 @@ def schedule_of(
     if not first_iteration:
         return TimeBudget(Decided(opt.iterations, [], None, opt.time_budget, sizes), share)
     found = _resumed(before, checkpoint, opt, sizes, first_iteration)
-    return TimeBudget(found._replace(time_budget=opt.time_budget), share)
+    return TimeBudget(_with_seconds(found, opt.time_budget), share)
+
+
+def _with_seconds(found: Decided, seconds: float) -> Decided:
+    """A schedule that is resumed with a limit of seconds, or with so many more if it was over."""
+    *earlier, last = found.continued or [None]
+    if found.ended is not None:
+        more = *found.continued, Continued(found.ended, seconds)
+        return found._replace(continued=more, ended=None, begun=None)
+    if last:
+        return found._replace(continued=(*earlier, last._replace(seconds=seconds)))
+    return found._replace(time_budget=seconds)
 
 
 def _even(count: int, opt: argparse.Namespace, sizes: str) -> Decided:
@@ -144,10 +161,12 @@ def _fitting(found: Decided, path: Path | str, opt: argparse.Namespace) -> Decid
 def _resumed(before: Any, checkpoint: str, opt: argparse.Namespace, sizes: str, first_iteration: int) -> Decided:
     """The schedule so far of the runs that are resumed; one block if their checkpoint has none."""
     if before is None:
-        told = f"{checkpoint} was trained without --time_budget; it is iteration {first_iteration} of the schedule"
-        print(told, file=sys.stderr)
-        step = 1.0 / max(opt.iterations, first_iteration + 1)
-        return Decided(opt.iterations, [Block(first_iteration, 0.0, step, 0.0)], None, 0.0, sizes)
+        over = first_iteration if first_iteration >= opt.iterations else None
+        if not over:
+            told = f"{checkpoint} was trained without --time_budget; it is iteration {first_iteration} of the schedule"
+            print(told, file=sys.stderr)
+        block = Block(first_iteration, 0.0, 1.0 / max(opt.iterations, first_iteration), 0.0)
+        return Decided(opt.iterations, [block], over, 0.0, sizes)
     try:
         found = DecidedSchedule(_decided(before)).up_to(first_iteration)
     except _BROKEN as error:

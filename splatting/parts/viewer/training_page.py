@@ -125,7 +125,7 @@ class TrainingPage:
         """Seconds of training to go; None: not known."""
         run = self._run
         if run.schedule.by_clock:
-            return max(0.0, run.schedule.seconds - run.log.seconds_before - run.clock.seconds)
+            return max(0.0, run.schedule.until - run.log.seconds_before - run.clock.seconds)
         if run.schedule.expected is None or not speed:
             return None
         return max(0.0, run.schedule.expected - iteration) / speed

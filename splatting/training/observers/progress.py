@@ -29,7 +29,7 @@ class ProgressBar(Part):
         titles = {title: self._terms[name] for part in run.parts for name, title in part.shown.items()}
         self._shown = {"Loss": run.losses} | titles
         self._updated, self._done = -math.inf, run.first_iteration
-        first = run.schedule.schedule_step(run.first_iteration)
+        first = run.schedule.step_before(run.first_iteration)
         form = {"bar_format": BY_CLOCK} if run.schedule.by_clock else {}
         self._bar = Bar(initial=first, total=run.schedule.length, desc="Training progress", dynamic_ncols=True, **form)
 
@@ -63,7 +63,7 @@ class ProgressBar(Part):
             return
         # With those before a resume, as the budget.
         seconds, whole = run.log.seconds_before + seconds, run.log.wall_seconds_before + wall_seconds()
-        budget = f"budget {run.schedule.seconds:g} s, {whole:.1f} s with start, scores and saves"
+        budget = f"budget {run.schedule.until:.4g} s, {whole:.1f} s with start, scores and saves"
         run.log.tell(f"{_iterations(self._done)} in {seconds:.1f} s ({budget})")
 
 

@@ -77,7 +77,7 @@ class CapturedStep(FusedStep):
         return lost
 
     def _is_queued(self, at: Iteration) -> bool:
-        return not (at.due or at.last) and self._fuses(at)
+        return at.steps and not at.due and self._fuses(at)
 
     def _knows_model(self) -> bool:
         knows = super()._knows_model()

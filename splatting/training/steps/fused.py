@@ -42,7 +42,7 @@ class FusedStep(PlainStep):
                 observers.measured(at, losses)
                 self.advance(at, drawn, gradients)
                 del drawn, gradients  # what changes rows needs their memory
-                if self.camera_gradient is not None and not at.last:
+                if self.camera_gradient is not None and at.steps:
                     self._run.step_on_host(at, self.camera_gradient)
                 return self.follow(at)
         super().take(at, observers)
@@ -67,7 +67,7 @@ class FusedStep(PlainStep):
         run = self._run
         if run.on_host and now is None:
             run.on_host.place(at.camera)
-        whole = at.changes or at.last  # all blocks wake, as in a plain step
+        whole = at.changes or not at.steps  # all blocks wake, as in a plain step
         if whole and run.sleeping:
             run.sleeping.flush()
         applied, objective = run.gaussians.exposures.applied, run.objective
@@ -102,9 +102,9 @@ class FusedStep(PlainStep):
     def advance(self, at: Iteration, drawn: Drawn, gradients: Gradients) -> None:
         """Take the step of the Gaussians, as far as they take one, and add the view to the statistics."""
         gaussians, density = self._run.gaussians, self._run.density
-        adam, steps, observes = self._adam, not at.last, density.observes(at.iteration)
-        if at.last or at.changes:
-            left_out = gaussians._attributes if at.last else density.replaced(at.iteration)
+        adam, steps, observes = self._adam, at.steps, density.observes(at.iteration)
+        if not at.steps or at.changes:
+            left_out = density.replaced(at.iteration) if at.steps else gaussians._attributes
             steps = len(left_out) < len(gaussians._attributes)
             adam = FusedAdam(gaussians, density.penalty, left_out)
         if steps or observes or self.camera_gradient is not None:
@@ -115,6 +115,6 @@ class FusedStep(PlainStep):
         run = self._run
         if at.changes:
             run.density.before_step(at)
-        if not at.last:  # as in the reference, the last iteration takes no step
+        if at.steps:  # as in the reference, the last iteration takes no step
             run.gaussians.exposures.step()
             run.after_step(at)

@@ -175,7 +175,7 @@ class Graphs:
             captured=True,
             wants_depth=False,
             changes=False,
-            last=False,
+            steps=True,
         )
         self._run.add_terms(placeholder)
         with self._capacity(None):

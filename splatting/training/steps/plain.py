@@ -43,7 +43,7 @@ class RefinedView(OneView):
 
     def collect(self, at: Iteration, package: Package, losses: Losses) -> tuple[Package, Losses]:
         run = self._run
-        if not at.last:
+        if at.steps:
             color, depth = (None if plane is None else plane.grad for plane in self._planes)
             drawn = draw(at.camera, run.gaussians, run.pipe, at.background, depth is not None)
             run.step_on_host(at, drawn.camera_gradient(color, in_world_units(depth, run.gaussians)))
@@ -80,14 +80,14 @@ class PlainStep:
             run.gaussians.penalise(run.density.penalty)
         observers.measured(at, losses)
         run.density.after_backward(at, package)
-        if not at.last:  # as in the reference, the last iteration takes no step
+        if at.steps:  # as in the reference, the last iteration takes no step
             run.gaussians.step(package["radii"])
             run.after_step(at)
 
     def _wake(self, at: Iteration) -> None:
         """Wake the blocks that the step concerns: all, where rows change or nothing follows."""
         run = self._run
-        if at.changes or at.last:
+        if at.changes or not at.steps:
             run.sleeping.flush()
         else:
             wake(run.sleeping, at.camera, run.gaussians, run.pipe, at.background)
