@@ -57,7 +57,7 @@ def test_the_same_command_overwrites_and_says_so(colmap_scene, tmp_path, capfd):
     assert _train(tmp_path / "link", out, "--save_iterations", 2, iterations=3) == first
     said = capfd.readouterr().err
     (warning,) = _warnings(said)
-    assert "holds a training that was finished, of --iterations 3, and this one starts over" in warning
+    assert "has a finished training of 3 iterations, and this one starts over; --resume with more --iterat" in warning
     assert "train_log" not in said
 
 
