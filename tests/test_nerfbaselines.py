@@ -82,10 +82,12 @@ def trained(method, steps, **more):
     return made, told
 
 
-def test_a_training_that_is_saved_and_resumed_ends_as_one_that_was_not(method, tmp_path):
-    whole, told = trained(method, 40)
-    assert set(told[-1]) == {"loss", "num_gaussians"} and whole.get_info()["hparams"]["white_background"]
-    half, _ = trained(method, 20)
+@pytest.mark.parametrize("more", [{}, {"schedule": 20}])
+def test_a_training_that_is_saved_and_resumed_ends_as_one_that_was_not(method, tmp_path, more):
+    whole, told = trained(method, 40, **more)
+    assert {*[*filter(None, told)][-1]} == {"loss", "num_gaussians"}
+    assert whole.get_info()["hparams"]["white_background"]
+    half, _ = trained(method, 20, **more)
     half.save(tmp_path / "half")
     resumed = method.GaussianSplatting(checkpoint=str(tmp_path / "half"), train_dataset=dataset())
     assert resumed.get_info()["loaded_step"] == 20

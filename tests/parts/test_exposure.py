@@ -17,10 +17,11 @@ import render
 import train
 from scene.dataset_readers import CameraInfo, read_scene
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.checkpoint import EXPOSURES, load_checkpoint, save_checkpoint
+from scene.gaussians.checkpoint import EXPOSURES, WRITTEN_BY, extra_state, load_checkpoint, save_checkpoint
 from scene.gaussians.exposure import Exposures, apply_exposure, read_exposures
 from scene.readers.info import exposure_names
 from splatting.evaluation.error_curve import read_curve
+from splatting.parts import states_in
 from splatting.parts.exposure.half_images import train_on_all
 from utils.general_utils import get_expon_lr_func
 from utils.loss_utils import inverse_depth_loss, l1_loss, photometric_loss, ssim
@@ -351,3 +352,8 @@ def test_what_is_scored_does_not_train(colmap_scene, tmp_path):
         pixels[:, :32] = 255 - pixels[:, :32]
         Image.fromarray(pixels).save(path)
     assert _train(colmap_scene, tmp_path / "c", iterations=40).read_bytes() != plain.read_bytes()
+
+
+@pytest.mark.parametrize("damaged", [[{}], 5, {"kind": []}])
+def test_what_is_no_state_of_exposures_is_none(damaged):
+    assert states_in(extra_state((*[None] * 10, {WRITTEN_BY: "1", EXPOSURES: damaged}, 1.0))) == {}
