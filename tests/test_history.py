@@ -70,7 +70,7 @@ def test_iterations_that_stay_are_warned_of(colmap_scene, tmp_path, capfd):
     capfd.readouterr()
     _train(colmap_scene, out, "--save_iterations", 1, 30000, "--checkpoint_iterations", 3, iterations=4)
     warning, finished = _warnings(capfd.readouterr().err)
-    assert "of --iterations 5, and this one starts over" in finished
+    assert "of 5 iterations, and this one starts over" in finished
     assert "keeps iteration 3, 5, 30000 of an earlier training; this one starts over" in warning
     # Files that a resumed run saved before do not belong to another training.
     _train(colmap_scene, out, "--start_checkpoint", out / "chkpnt3.pth", iterations=6)

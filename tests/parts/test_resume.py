@@ -110,6 +110,19 @@ def test_a_finished_training_without_its_last_checkpoint_is_not_said_to_continue
     assert "of 12 iterations, and this one starts over\n" in capfd.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("content", "said"), [(None, "has a model, and no checkpoint to continue"), ("{", "model.json")]
+)
+def test_a_model_of_which_nobody_knows_that_it_is_unfinished_is_not_replaced(colmap_scene, tmp_path, content, said):
+    """As of the reference, or with a damaged file."""
+    _train(colmap_scene, tmp_path, 5, "--no_last_checkpoint")
+    (tmp_path / "model.json").unlink()
+    if content:
+        (tmp_path / "model.json").write_text(content)
+    with pytest.raises(UserError, match=said):
+        _train(colmap_scene, tmp_path, 9, "--resume")
+
+
 def test_no_last_checkpoint(colmap_scene, tmp_path, capfd):
     _train(colmap_scene, tmp_path, 12, "--no_last_checkpoint")
     assert _checkpoints(tmp_path) == set() and read_model_json(tmp_path)["finished"] == 12

@@ -196,6 +196,8 @@ def _with_block(index: int, **values: object) -> dict:
         (_with_block(1, start=-0.1), "-0.1 is no number from 0 on"),
         (_with_block(0, start=0.3), "its progress does not ascend"),
         (_with_block(1, step=0.2), "its progress goes beyond its end"),
+        (_with_block(0, start=0.3) | {"continued": [{"after": 3, "seconds": 1.0}]}, "its progress does not ascend"),
+        (GOOD | {"continued": [{"after": 2}]}, "'seconds' is missing"),
         (GOOD | {"ended": 9}, "its last block does not end with its last iteration"),
         (json.dumps(GOOD).replace("5.0", "NaN"), "nan is no number"),
         (GOOD | {"time_budget": 10**400}, "is not a valid schedule.json"),

@@ -193,7 +193,7 @@ def test_a_pause_needs_a_page(colmap_scene, tmp_path):
 def test_time_to_go_is_that_of_the_clock_or_of_the_speed():
     def page(**schedule: object) -> SimpleNamespace:
         run = SimpleNamespace(
-            schedule=SimpleNamespace(by_clock=False, expected=None, seconds=0.0) ,
+            schedule=SimpleNamespace(by_clock=False, expected=None) ,
             log=SimpleNamespace(seconds_before=5.0), clock=SimpleNamespace(seconds=12.0),
         )  # fmt: skip
         vars(run.schedule).update(schedule)
@@ -202,7 +202,7 @@ def test_time_to_go_is_that_of_the_clock_or_of_the_speed():
     left = observed.TrainingPage._left
     assert left(page(expected=1000), 400, 20.0) == 30 and left(page(expected=1000), 400, None) is None
     assert left(page(), 400, 20.0) is None
-    assert left(page(by_clock=True, seconds=60.0), 400, None) == 43
+    assert left(page(by_clock=True, until=60.0), 400, None) == 43
     said = [training_tab.duration(seconds) for seconds in (0.4, 59.6, 200, 7500)]
     assert said == ["0 s", "1 min 0 s", "3 min 20 s", "2 h 5 min"]
 

@@ -4,8 +4,10 @@ import argparse
 import math
 from pathlib import Path
 
+from scene.saved_model import saves_in
+from splatting.files.json_files import read_model_json
 from splatting.parts import tools
-from splatting.parts.resume.end import finished
+from splatting.parts.resume.end import End, finished
 from splatting.training.output_folder import folder_of, own_folder
 from splatting.training.restart import REPLACED, newest_checkpoint
 from splatting.training.schedule import STEADY
@@ -25,21 +27,19 @@ def prepare(dataset: argparse.Namespace, opt: argparse.Namespace, launch: argpar
     asked = next((found for ask in tools("continues") if (found := ask(opt)) is not None), None)
     if end := finished(folder):
         launch.start_checkpoint = str(end.checkpoint)
-        return _goes_on(folder, asked, opt.iterations)
+        return _goes_on(folder, end, end.iteration < opt.iterations if asked is None else asked, asked is None)
     most = opt.iterations if asked is None else math.inf
     launch.start_checkpoint = newest_checkpoint(folder, most, since=0) or launch.start_checkpoint
+    if not launch.start_checkpoint and saves_in(Path(folder)) and not read_model_json(folder):
+        raise UserError(f"{folder} has a model, and no checkpoint to continue; leave --resume out to start over")
     return True
 
 
-def _goes_on(folder: str, asked: bool | None, iterations: int) -> bool:
-    """Whether options continue the finished training of a folder. UserError where they would, and it cannot be.
-
-    asked: whether they do, None: by --iterations.
-    """
-    end = finished(folder)
+def _goes_on(folder: str, end: End, asked: bool, by_iterations: bool) -> bool:
+    """Whether the finished training of a folder goes on, as asked. UserError if it cannot, or not by --iterations."""
     there = f"{folder} has a finished training of {end.iteration:,} iterations"
-    by_number = end.more == STEADY.more
-    if asked is False or (asked is None and by_number and end.iteration >= iterations):
+    wrong = by_iterations and end.more != STEADY.more
+    if not asked and not wrong:
         with own_folder(folder):  # which removes what a training leaves that was killed after its note
             (Path(folder) / REPLACED).unlink(missing_ok=True)
         print(
@@ -48,6 +48,6 @@ def _goes_on(folder: str, asked: bool | None, iterations: int) -> bool:
         return False
     if not end.checkpoint.is_file():
         raise UserError(f"{there}, which left no checkpoint to continue; leave --resume out to start over")
-    if asked is None and not by_number:
+    if wrong:
         raise UserError(f"{there}; give --resume with {end.more} to continue it, or leave --resume out to start over")
     return True

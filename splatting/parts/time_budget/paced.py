@@ -221,7 +221,7 @@ class TimeBudget(DecidedSchedule):
     def reach(self, iteration: int, seconds: float) -> None:
         if not self.blocks or iteration > self.blocks[-1].last:
             seconds = round(self._share(seconds), 6)
-            if self.begun is None:
+            if self.begun is None or seconds < self.begun:  # the log of those before may be lost
                 self.begun = seconds
             self._measure(seconds)
             if self._open and self._measured > 2 and seconds - self.begun > _KNOWN * self._limit:

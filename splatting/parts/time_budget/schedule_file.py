@@ -59,7 +59,7 @@ def _decided(content: Any) -> Decided:
     continued = [
         Continued(_whole(one["after"], 1), _number(one["seconds"], 0.0)) for one in content.get("continued", ())
     ]
-    falls = {before for before, one, next in zip(lasts[1:], starts, starts[1:], strict=False) if next < one}
+    falls = {last for last, now, then in zip(lasts[1:], starts, starts[1:], strict=False) if then < now}
     if sorted(set(lasts)) != lasts or not blocks:
         raise ValueError("its blocks do not follow each other")
     if falls - {one.after for one in continued}:
