@@ -257,6 +257,7 @@ def test_an_interrupt_beyond_the_iterations_is_resumed(evaluate):
     given = ("attic brick", "--", "--time_budget", "20")
     with pytest.raises(KeyboardInterrupt):
         evaluate(*given)
+    (evaluate.out / "attic" / "chkpnt42.pth").symlink_to("nothing")
     assert [run["finished"] for run in evaluate(*given)["runs"]] == [True, True]
     checkpoint = evaluate.out / "attic" / "chkpnt41.pth"
     assert evaluate.calls("train")[1][-2:] == ["--start_checkpoint", str(checkpoint)]

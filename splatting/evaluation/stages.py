@@ -118,7 +118,7 @@ def _trained(run: Run, record: Record) -> bool:
 
 def _checkpoints(run: Run) -> dict[str, list[int]]:
     """Return the names of checkpoints in the model folder before the last iteration, each with its `_stamp`."""
-    found = [path for path in run.model.glob("chkpnt*.pth") if re.fullmatch(r"\d+", path.stem[6:])]
+    found = [path for path in run.model.glob("chkpnt*.pth") if re.fullmatch(r"\d+", path.stem[6:]) and path.is_file()]
     return {path.name: _stamp(path) for path in found if _iteration_of(path.name) < (run.iterations or math.inf)}
 
 
