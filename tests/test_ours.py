@@ -62,7 +62,7 @@ MAY = {
     "splatting.parts.remove_traces": MODEL,
     "splatting.parts.resume.part.opened": MODEL,
     "splatting.parts.resume.part.ended": MODEL,
-    "splatting.parts.resume.tools.prepare": MODEL,
+    "splatting.parts.resume.tools._goes_on": MODEL,
     "splatting.parts.robust_mask.written.write_masks": MODEL,
     "splatting.sfm.adding.forget_base": WORK,
     "splatting.sfm.adding.keep_base": WORK,
