@@ -29,12 +29,11 @@ from splatting.evaluation import plan, stages
 from splatting.evaluation.child import Finished, Slot, run_child, share
 from splatting.evaluation.configs import check_options, read_configs, shipped
 from splatting.evaluation.error_curve import peers_of
-from splatting.evaluation.model_folder import trained_iterations
 from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.report import make_report, write_report
 from splatting.evaluation.results import read_earlier, read_run
 from splatting.evaluation.stages import Failure, StageFailed
-from splatting.evaluation.tables import MAIN, Table, gains_table, reached_legend, reached_table, result_tables
+from splatting.evaluation.tables import MAIN, Table, gains_table, result_tables
 from splatting.files.folders import locked
 from splatting.files.listing import markdown_table
 from splatting.host.machine import facts_asked
@@ -72,7 +71,6 @@ def _parser() -> OptionParser:
         help="any COLMAP, Blender or nerfstudio folders; Blender scenes get train.py's -w, as in published "
         "tables")  # fmt: skip
     add("--output_path", type=Path, default=Path("./eval"), metavar="DIR", help="models and report (default: ./eval)")
-    add("--dry", **flag, help="check the scenes and options, print what would run, and end")
     add("--skip_training", **flag, help="use the models in the output folder, whatever made them")
     add("--skip_rendering", **flag, help="use the existing renders")
     add("--skip_metrics", **flag, help="use the existing scores")
@@ -83,9 +81,8 @@ def _parser() -> OptionParser:
     add("--seeds", type=int, nargs="+", default=[], metavar="N",
         help="train with each of these seeds and report mean and standard deviation (default: once)")  # fmt: skip
     add("--configs", type=Path, metavar="FILE",
-        help='train with each option set of a JSON file, {"name": ["--sh_degree", "1"], ...}, and report the '
-        f"seconds that each takes to a given error; {' or '.join(shipped())} names a file that comes with this program "
-        "(default: once)")  # fmt: skip
+        help='train with each option set of a JSON file, {"name": ["--sh_degree", "1"], ...}, and compare them; '
+        f"{' or '.join(shipped())} names a file that comes with this program (default: once)")  # fmt: skip
     add("--peer", nargs=2, action="append", default=[], metavar=("NAME", "FILE"),
         help="draw another program's error against time beside ours, from a CSV file with the columns seconds and "
         "test_psnr (`python -m splatting.evaluation.peer_curve` makes it); with several "
@@ -150,16 +147,6 @@ def _parse_for_training(words: Sequence[str]) -> tuple[Namespace, ...]:
     import train  # imported here because scoring existing models may happen on a machine without the extensions
 
     return train.parse(words)
-
-
-def _rehearse(runs: Sequence[Run], args: Namespace) -> None:
-    """Print what would be carried out; UserError for what would fail."""
-    from splatting.diagnosis.rehearsal import rehearse  # imports the extensions
-
-    for run in runs:
-        if args.skip_training and not trained_iterations(run.model):
-            raise UserError(f"{run.model} has no saved iteration; train it first")
-    rehearse(runs, _parse_for_training, not args.skip_training)
 
 
 def _visible(gpus: Sequence[int]) -> list[str]:
@@ -243,9 +230,6 @@ def _report(
         print(f"\n{table.title}\n{_text(table)}" if table.title else _text(table))
     for scene, found in report["gains"].items():
         print(f"\n{scene}: gain in test PSNR over {found['default']} on the same seeds\n{_text(gains_table(found))}")
-    for scene, found in report["reached"].items():
-        print(f"\n{scene}: seconds of training to reach a test PSNR\n{_text(reached_table(found))}")
-        print(reached_legend(found))
     print(f"\nreport: {output / 'report.html'}")
     return scored
 
@@ -262,9 +246,6 @@ def main(argv: Sequence[str] | None = None, start: Start = run_child) -> None:
     runs = _plan(args, words[end + 1 :])
     peers = peers_of(args.peer, list(dict.fromkeys(run.scene.name for run in runs)))
     gpus, output = _visible(args.gpus), args.output_path.resolve()
-    if args.dry:
-        _rehearse(runs, args)
-        return
     mkdir_p(output)
     failures: dict[Run, Failure] = {}
     busy = "full_eval.py (process {process}), or a training that it started,"

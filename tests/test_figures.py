@@ -1,4 +1,4 @@
-"""Figures of error against time and of fronts: what is drawn, where, and by which marks it is told apart."""
+"""Figures of error against time: what is drawn, where, and by which marks it is told apart."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from splatting.evaluation.error_curve import COLUMNS
-from splatting.evaluation.figures import draw_curve, draw_curves, draw_fronts, draw_poses
+from splatting.evaluation.figures import draw_curve, draw_curves, draw_poses
 
 NAMES = ("seconds", "test_psnr", "test_ssim", "train_psnr", "train_ssim", "subset")
 
@@ -79,13 +79,10 @@ def test_the_figures_of_a_scene_can_be_read_at_half_their_size(tmp_path, drawn):
         assert not legend.get_window_extent().overlaps(axes.get_window_extent())
         assert all(figure.bbox.contains(*corner) for corner in legend.get_window_extent().get_points())
         said = legend.get_title().get_text()
-        assert said == "all 7 test views\nPareto front of the lines"
+        assert said == "all 7 test views"
         inches = figure.get_figwidth()
         letters = 358 / inches / 72 * min(text.get_fontsize() for text in legend.get_texts())
         assert letters > 8.5  # pixels where the window is 390 wide
-    front = next(line for line in drawn[0].axes[0].lines if line.get_label() == "Pareto front")
-    assert front.get_xydata().tolist() == [[0.3, 21.0], [2.8, 21.0], [2.8, 29.0], [3.3, 29.0], [3.3, 29.5]]
-    assert front.get_markevery() == 2  # corners are not marked
     assert draw_curves(tmp_path, "attic", runs_of({"base": []})) == []
 
 
@@ -96,13 +93,13 @@ def test_one_option_set_has_its_training_views(tmp_path, drawn):
     one, two = drawn[0].axes[0], drawn[2].axes[0]
     twice = runs_of({"a": rows, "b": rows}) + runs_of({"a": rows})
     draw_curves(tmp_path, "attic", twice)
-    assert drawn[4].legends[0].get_title().get_text().endswith("\na line for each seed; Pareto front of the lines")
+    assert drawn[4].legends[0].get_title().get_text().endswith("\na line for each seed")
     assert points(one, "training views") == [[[0.3, 36.0], [2.0, 37.0]]] and hollow(one) == [[[2.0, 20.0]]]
     assert not points(two, "training views") and len(hollow(two)) == 2
 
 
 def test_lines_are_of_the_views_on_which_all_runs_compare(tmp_path, drawn):
-    """The front goes through no other point, and other programs, which score all views, are told from them."""
+    """Other programs, which score all views, are told from them."""
     whole = curve((9.0, 50.0, 0.99))
     curves = [curve((t, p, 0.8, None, None, n), (9.0, p + 1, 0.9, None, None, n)) for t, p, n in
               ((1.0, 20.0, 2), (2.0, 22.0, 2), (3.0, 24.0, 4))]  # fmt: skip
@@ -114,21 +111,19 @@ def test_lines_are_of_the_views_on_which_all_runs_compare(tmp_path, drawn):
     assert drawn[4].legends[0].get_title().get_text().startswith("2 of ")
     same, mixed = drawn[0].axes[0], drawn[2].axes[0]
     assert points(same, "b") == [[[2.0, 22.0], [9.0, 23.0]]] and hollow(same) == [[[9.0, 50.0]]] * 2
-    assert points(same, "Pareto front") == [[[1.0, 20.0], [2.0, 20.0], [2.0, 22.0], [9.0, 22.0], [9.0, 23.0]]]
     said = [figure.legends[0].get_title().get_text().splitlines()[0] for figure in drawn[:4:2]]
     assert said == ["2 of 7 test views; hollow and other programs: all of them", "all 7 test views"]
     assert [points(mixed, name) for name in "abc"] == [[[[9.0, 50.0]]]] * 3 and not hollow(mixed)
 
 
-def test_other_programs_and_sets_that_stand_apart_are_drawn_and_in_no_front(tmp_path, drawn):
+def test_other_programs_and_sets_that_stand_apart_are_drawn(tmp_path, drawn):
     rows = curve((1.0, 20.0, 0.6), (9.0, 25.0, 0.8))
     best = {"apart": True, "config": "best", "curve": curve((0.2, 50.0, 0.9)), "views": {"test": 7}}
-    peer = {"name": "other", "curve": curve((0.5, 40.0))}  # would be the whole front
+    peer = {"name": "other", "curve": curve((0.5, 40.0))}
     assert draw_curves(tmp_path, "attic", [*runs_of({"base": rows, "sh1": rows}), best], [peer])
     (left,), (right,) = (figure.axes for figure in drawn)
     assert points(left, "other (another program)") == [[[0.5, 40.0]]]
     assert points(left, "best (other ground truth)") == [[[0.2, 50.0]]]
-    assert points(left, "Pareto front") == [[[1.0, 20.0], [9.0, 20.0], [9.0, 25.0]]]
     assert left.get_xlabel().endswith("(other programs: as they count)")
     assert not points(right, "other (another program)")  # it has no SSIM
 
@@ -139,24 +134,3 @@ def test_corrections_of_poses_have_a_line_for_each_run(tmp_path, drawn):
     (axes,) = drawn[0].axes
     assert points(axes, "a") == [[[1.0, 0.0], [3.0, 0.2]]] and points(axes, "b") == [[[1.0, 0.2], [3.0, 0.2]]]
     assert len(axes.lines) == 3 and not draw_poses(tmp_path, "attic", [{"config": None, "poses": []}])
-
-
-def test_fronts_have_a_point_and_a_bar_for_each_set(tmp_path, drawn):
-    def spread(mean: float) -> dict:
-        return {"mean": mean, "std": 0.1, "values": []}
-
-    ends = {"adc": (31.2, 40, 300, 3), "fast": (32.2, 20, 500, 5), "small": (30.4, 50, 70, 0.7)}
-    names = ("PSNR", "seconds", "gaussians", "ply_mb")
-    found = {"sets": {one: dict(zip(names, map(spread, values), strict=True)) for one, values in ends.items()}}
-    assert len(draw_fronts(tmp_path, "attic", found, ["apart", *ends])) == 3
-    seconds, gaussians, megabytes = (figure.axes[0] for figure in drawn)
-    for point in found["sets"].values():
-        point["gaussians"] = spread(1000)
-    files = draw_fronts(tmp_path, "attic", found, list(ends))  # which points of one number would hide
-    assert [file.stem for file in files] == ["attic_front_seconds", "attic_front_ply_mb"]
-    assert megabytes.get_xlabel() == "megabytes of the PLY"
-    assert [bar.lines[0].get_xydata().tolist()[0] for bar in seconds.containers] == [[40, 31.2], [20, 32.2], [50, 30.4]]
-    assert [bar.lines[0].get_color() for bar in seconds.containers] == ["C1", "C2", "C3"]  # as in the other figure
-    assert all(len(bar.lines[2]) == 2 for bar in seconds.containers)  # of both numbers
-    for axes, costs in ((seconds, [20]), (gaussians, [70, 300, 500])):
-        assert [x for x, _ in points(axes, "Pareto front")[0][::2]] == costs

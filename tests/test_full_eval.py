@@ -30,7 +30,7 @@ from splatting.evaluation import report as report_module
 from splatting.evaluation import stages
 from splatting.evaluation.child import Finished, Slot, run_child, share
 from splatting.evaluation.configs import check_options
-from splatting.evaluation.figures import draw_curves, draw_fronts
+from splatting.evaluation.figures import draw_curves
 from splatting.evaluation.model_folder import SCHEDULE, shorter_ends_there
 from splatting.evaluation.plan import DATASETS, Run, SceneEntry, dataset_scenes, photos_of
 from splatting.evaluation.renders import GAIN, GAP, HEADER, ComparedViews
@@ -51,14 +51,12 @@ BASE_AND_SH1 = '{"base": [], "sh1": ["--sh_degree", 1]}'
 def _stand_ins(monkeypatch):
     monkeypatch.setattr(full_eval, "facts_asked", lambda: MACHINE)
     monkeypatch.setattr(report_module, "draw_curves", lambda *_: [])  # half a second each; see `figures`
-    monkeypatch.setattr(report_module, "draw_fronts", lambda *_: [])
 
 
 @pytest.fixture
 def figures(monkeypatch):
     """Draw the figures of the curves, for tests that need them."""
     monkeypatch.setattr(report_module, "draw_curves", draw_curves)
-    monkeypatch.setattr(report_module, "draw_fronts", draw_fronts)
 
 
 @dataclasses.dataclass
@@ -133,7 +131,7 @@ def test_commands_of_a_plain_scene(figures, evaluate):
     }  # fmt: skip
     assert first["views"] == {"test": 2, "train": 7} and first["test_sizes"] == [[120, 80]]
     assert first["worst_views"][0] == {"PSNR": 22.0, "file": "00001.png", "picture": "photo_1.jpg"}
-    assert first["machine"] == MACHINE and report["published"] == [] and report["reached"] == {}
+    assert first["machine"] == MACHINE and report["published"] == []
     assert (evaluate.out / "timing.txt").read_text().startswith("scenes: 0.0")
     for name in ("attic_psnr.png", "attic_ssim.png", "attic_worst_views.png"):
         with Image.open(evaluate.out / "figures" / name) as image:
@@ -423,15 +421,11 @@ def test_seeds_and_option_sets(figures, evaluate, tmp_path, capsys, monkeypatch)
     models = [f"attic/{name}/seed_{seed}" for name in ("base", "sh1") for seed in (0, 2)]
     assert [run["model"] for run in report["runs"]] == models and report["warnings"] == []
     assert [row["PSNR"]["values"] for row in report["summary"]] == [[23.0, 23.2], [21.0, 21.2]]
-    assert report["reached"]["attic"]["default"] == "base" and report["fronts"]["attic"]["sets"].keys() == {
-        "base",
-        "sh1",
-    }
+    assert report["gains"]["attic"]["default"] == "base" and report["gains"]["attic"]["sets"].keys() == {"sh1"}
     said, text = capsys.readouterr().out, evaluate.text("md")
-    assert "attic: seconds of training to reach a test PSNR" in said and "23.10 ± 0.14" in said
-    for part in ("Seconds of training to reach a test PSNR", "Pareto front"):
-        assert f"### {part}" in text
-    for name in ("attic_front_seconds", "attic_psnr", "attic_worst_views"):
+    assert "attic: gain in test PSNR over base" in said and "23.10 ± 0.14" in said
+    assert "### Gain over base on the same seeds" in text
+    for name in ("attic_psnr", "attic_worst_views"):
         assert f"(figures/{name}.png)" in text and (evaluate.out / "figures" / f"{name}.png").is_file()
 
 
@@ -516,7 +510,7 @@ def test_option_sets_of_another_ground_truth_stand_apart(evaluate, tmp_path):
     assert [run["apart"] for run in report["runs"]] == [False, True, False]
     views = [re.findall(r'alt="(\w+)"', part) for part in evaluate.text("html").split("<summary>Pictures of all")[1:]]
     assert views == [["photo", *["render", "error"] * 2] * 2, ["photo", "render", "error"] * 2]
-    assert "Left out of rankings and the Pareto front: best." in report["warnings"][0]
+    assert "Left out of comparisons: best." in report["warnings"][0]
     first, second = evaluate.text("md").split("Scored on other ground truth", 1)
     assert " base |" in first and " best |" not in first and " best |" in second
 
@@ -636,31 +630,6 @@ def test_each_model_becomes_a_page_that_the_report_links(evaluate):
     assert evaluate(*given)["runs"][0]["page"] is None, "the link of a page that is gone"
     evaluate(*given, "--html_models")
     assert len(evaluate.calls("export")) == 3
-
-
-def test_a_rehearsal_tells_what_would_run_and_writes_nothing(colmap_scene, tmp_path, capsys):
-    evaluate = Evaluation(tmp_path, tmp_path / "out")
-    both, given = ("--seeds", 0, 1), ("--configs", "advice", "--", "-r", 2, "--keep_best")
-
-    def told(*more: object) -> list[str]:
-        capsys.readouterr()
-        full_eval.main(evaluate.words("colmap_scene", "--dry", *more))
-        return [re.sub(r" +", " ", line) for line in capsys.readouterr().out.splitlines()][2:]
-
-    rows = told(*both, *given)
-    assert rows[0] == "| colmap_scene | plain | 0 | 12, 3 | 48x32 | 40 | to train |" and len(rows) == 4
-    assert not evaluate.out.exists() and not evaluate.calls()
-    evaluate("colmap_scene", "--seeds", 0, *given)
-    before, calls = folder_state(evaluate.out), evaluate.calls()
-    assert [row.split(" | ")[-1] for row in told(*both, *given)] == ["finished |", "to train |"] * 2
-    assert folder_state(evaluate.out) == before and evaluate.calls() == calls
-    (tmp_path / "sets.json").write_text('{"seeded": ["--seed", "5", "-r", "2", "--keep_best"]}')
-    with pytest.raises(UserError, match="--keep_best does not work with --train_test_exp"):
-        told("--configs", tmp_path / "sets.json", "--", "--train_test_exp")
-    photo = min((colmap_scene / "images").rglob("*.png"))
-    photo.unlink()
-    with pytest.raises(UserError, match=f"colmap_scene, plain, seed 0: .*{photo.name}"):
-        told(*both, *given)
 
 
 @pytest.mark.slow

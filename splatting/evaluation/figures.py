@@ -1,4 +1,4 @@
-"""Figures of error against time: error_vs_time.png of a training, those of a report, and Pareto fronts.
+"""Figures of error against time: error_vs_time.png of a training, and those of a report.
 
 `python -m splatting.evaluation.figures CSV PNG TITLE TEST_VIEWS TRAIN_VIEWS` draws a training's curve for
 curve_recorder.py. It imports matplotlib, waits for a line on its standard input, draws, and prints what went wrong;
@@ -16,7 +16,6 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatting.evaluation.comparison import COSTS, pareto_front
 from splatting.evaluation.error_curve import SUBSET, Row, best_test, common_subset, read_curve, rows_on, whole_sets
 from splatting.files.listing import as_utf8
 from utils.system_utils import atomic_write
@@ -27,12 +26,10 @@ if TYPE_CHECKING:
 
 COLORS = {"test": "#0072B2", "train": "#D55E00"}  # told apart by the colour-blind (Okabe and Ito)
 STYLES = ("-", "-.", ":")
-MARKERS = "osD"  # with ten colours they tell thirty sets apart
 PEER_MARKERS = "xs^vDP*"
-LABELS = {"seconds": "seconds of training", "gaussians": "Gaussians trained", "ply_mb": "megabytes of the PLY"}
+SECONDS = "seconds of training"
 PANEL, DPI, FONT = (5.6, 4.2), 140, 12  # of a report's figure: inches, and letters to be read at half the size, too
 HOLLOW = {"linestyle": ":", "linewidth": 1, "markerfacecolor": "white", "zorder": 3}  # whole sets beside a subset
-DIFFER = 1.02  # times the lowest mean of a cost; where none has more, their points hide each other
 LEGEND = 72  # letters in a line of a legend
 
 Value = Callable[[Row, str], float | None]
@@ -174,9 +171,8 @@ def draw_curves(
     """Draw a scene's test PSNR and 1 - SSIM against seconds of training; return the files, none if no run has a curve.
 
     Each option set has a colour and each seed a line, which the legend says. Lines are of the views on which all runs
-    compare; if these are a subset, hollow points beside them score all. With several option sets, the Pareto front of
-    the lines' points is marked, without runs that stand apart. With one, the training views are drawn too, dashed.
-    peers: curves of other programs, in grey; they are no part of the front.
+    compare; if these are a subset, hollow points beside them score all. With one option set, the training views are
+    drawn too, dashed. peers: curves of other programs, in grey.
     """
     runs = [run for run in runs if any(row["test_psnr"] is not None for row in run["curve"])]
     several = len({run["config"] for run in runs}) > 1
@@ -184,24 +180,18 @@ def draw_curves(
     subset = common_subset(run["curve"] for run in runs if not run["apart"])
     said = _views_text(subset, counts.pop() if len(counts) == 1 else None)
     said += "" if subset is None else f"; hollow{' and other programs' if peers else ''}: all of them"
-    more = ["a line for each seed"] * (len(runs) > len({run["config"] for run in runs}))
-    said = "\n".join([said, "; ".join([*more, "Pareto front of the lines"])] if several else [said, *more])
+    said += "\na line for each seed" if len(runs) > len({run["config"] for run in runs}) else ""
 
-    def draw(axes: Axes, value: Value, sign: int) -> str:
-        ours = _draw_runs(axes, runs, value, several, subset)
-        if several and ours:
-            draw_front(axes, ours, sign)
+    def draw(axes: Axes, value: Value) -> str:
+        _draw_runs(axes, runs, value, several, subset)
         _draw_peers(axes, peers, value)
         return said
 
-    x = LABELS["seconds"] + (" (other programs: as they count)" if peers else "")
-    panels = {
-        "psnr": (psnr, "PSNR of the test views (dB)", -1),
-        "ssim": (dissimilarity, "1 - SSIM of the test views", 1),
-    }
+    x = SECONDS + (" (other programs: as they count)" if peers else "")
+    panels = {"psnr": (psnr, "PSNR of the test views (dB)"), "ssim": (dissimilarity, "1 - SSIM of the test views")}
     return [
-        _panel(folder / f"{scene}_{name}.png", scene, name != "psnr", (x, y), partial(draw, value=value, sign=sign))
-        for name, (value, y, sign) in (panels.items() if runs else ())
+        _panel(folder / f"{scene}_{name}.png", scene, name != "psnr", (x, y), partial(draw, value=value))
+        for name, (value, y) in (panels.items() if runs else ())
     ]
 
 
@@ -217,16 +207,13 @@ def draw_poses(folder: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list
             points = [(seconds, degrees) for seconds, degrees, _ in run["poses"]]
             _draw(axes, points, None if again else run["config"] or "training views", **style)
 
-    labels = LABELS["seconds"], "mean turn of the training views (degrees)"
+    labels = SECONDS, "mean turn of the training views (degrees)"
     return [_panel(folder / f"{scene}_poses.png", scene, False, labels, draw)] if shown else []
 
 
-def _draw_runs(
-    axes: Axes, runs: Sequence[dict[str, Any]], value: Value, several: bool, subset: int | None
-) -> list[Point]:
-    """Draw a line for each run; return the points of those that do not stand apart."""
+def _draw_runs(axes: Axes, runs: Sequence[dict[str, Any]], value: Value, several: bool, subset: int | None) -> None:
+    """Draw a line for each run."""
     configs = list(dict.fromkeys(run["config"] for run in runs))
-    every: list[Point] = []
     for run in runs:
         index = configs.index(run["config"])
         first = run is next(other for other in runs if other["config"] == run["config"])
@@ -234,17 +221,14 @@ def _draw_runs(
         name += " (other ground truth)" if run["apart"] else ""
         style = {"color": f"C{index % 10}", "linestyle": STYLES[index // 10 % len(STYLES)], "linewidth": 1.2}
         style |= {"marker": "o", "markersize": 3.5, "alpha": 0.4 if run["apart"] else 1.0}
-        found = _points(run["curve"], value, "test", subset)
-        _draw(axes, found, name if first else None, **style)
+        _draw(axes, _points(run["curve"], value, "test", subset), name if first else None, **style)
         if subset is not None:
             _draw(axes, _points(run["curve"], value, "test", None), None, **style | HOLLOW)
-        every += [] if run["apart"] else found
         if not several:
             dashed = style | {"marker": "", "linestyle": "--", "alpha": 0.6}
             of_train = _points(run["curve"], value, "train", subset)
             if len(of_train) > 1:
                 _draw(axes, of_train, "training views" if first else None, **dashed)
-    return every
 
 
 def _draw_peers(axes: Axes, peers: Sequence[dict[str, Any]], value: Value) -> None:
@@ -255,45 +239,6 @@ def _draw_peers(axes: Axes, peers: Sequence[dict[str, Any]], value: Value) -> No
             axes, points, f"{name} (another program)", color="0.35", linestyle="--",
             marker=PEER_MARKERS[index % len(PEER_MARKERS)], markersize=5, linewidth=1.2,
         )  # fmt: skip
-
-
-def draw_front(axes: Axes, points: Sequence[Point], sign: int) -> None:
-    """Mark the Pareto front. sign: 1 if a lower number is better, -1 if a higher one is.
-
-    Between each two points lies a corner, unmarked.
-    """
-    front = [points[i] for i in pareto_front([(seconds, sign * number) for seconds, number in points])]
-    corners = [(after[0], before[1]) for before, after in zip(front, front[1:], strict=False)]
-    stairs = [point for pair in zip(front, corners, strict=False) for point in pair] + front[-1:]
-    _draw(
-        axes, stairs, "Pareto front", color="0.8", linewidth=4, marker="o", markersize=10, markevery=2, zorder=0,
-        solid_joinstyle="round",
-    )  # fmt: skip
-
-
-def draw_fronts(folder: Path, scene: str, found: Mapping[str, Any], names: Sequence[str]) -> list[Path]:
-    """Draw PSNR against each cost that sets differ in, where each option set ended; return the files.
-
-    found: the scene's `fronts` in report.json. names: all option sets of the scene, which colours follow, so that they
-    are those of the curves. A point is the mean over the seeds, a bar the standard deviation; the front goes
-    through the means.
-    """
-
-    def draw(axes: Axes, cost: str) -> None:
-        for name, point in found["sets"].items():
-            index, x, y = names.index(name), point[cost], point["PSNR"]
-            axes.errorbar(
-                x["mean"], y["mean"], xerr=x["std"], yerr=y["std"], label=as_utf8(name), color=f"C{index % 10}",
-                marker=MARKERS[index // 10 % len(MARKERS)], markersize=5, linewidth=1, capsize=2,
-            )  # fmt: skip
-        draw_front(axes, [(point[cost]["mean"], point["PSNR"]["mean"]) for point in found["sets"].values()], -1)
-
-    y = "PSNR of the test views (dB)"
-    return [
-        _panel(folder / f"{scene}_front_{cost}.png", scene, False, (LABELS[cost], y), partial(draw, cost=cost))
-        for cost in COSTS
-        if max(means := [point[cost]["mean"] for point in found["sets"].values()]) > DIFFER * min(means)
-    ]
 
 
 def main() -> None:

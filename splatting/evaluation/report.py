@@ -17,8 +17,7 @@ import jinja2
 from markupsafe import Markup
 
 from splatting.evaluation import comparison, tables
-from splatting.evaluation.comparison import Sets
-from splatting.evaluation.figures import draw_curves, draw_fronts, draw_poses
+from splatting.evaluation.figures import draw_curves, draw_poses
 from splatting.evaluation.gains import gains
 from splatting.evaluation.renders import GAIN, ComparedViews
 from splatting.files.image_files import open_image
@@ -38,7 +37,7 @@ _MEANT = re.compile(r"[\\`*\[\]<>&]")  # characters that begin or end Markdown's
 _ENTITIES = {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
 
 Run = dict[str, Any]
-Pictures = Mapping[str, Mapping[str, Any]]  # by scene: paths of `curves`, `poses`, `masked`, `fronts`; `views`
+Pictures = Mapping[str, Mapping[str, Any]]  # by scene: paths of `curves`, `poses`, `masked`; `views`
 
 
 def make_report(
@@ -58,7 +57,6 @@ def make_report(
     means = comparison.dataset_means(rows)
     return {
         "dataset_means": means,
-        "fronts": _of_scenes(runs, comparison.fronts),
         "gains": gains(runs),
         "manifest": {
             "command": list(command),
@@ -68,19 +66,9 @@ def make_report(
         },
         "peers": list(peers),
         "published": comparison.compare(runs, rows, means),
-        "reached": _of_scenes(runs, comparison.reached),
         "runs": runs,
         "summary": rows,
         "warnings": _warnings(runs, rows),
-    }
-
-
-def _of_scenes(runs: Sequence[Run], of_sets: Callable[[Sets], Any]) -> dict[str, Any]:
-    """Return what a function says of the option sets of each scene that can be compared, if it says anything."""
-    return {
-        scene: found
-        for scene in comparison.grouped(runs, "scene")
-        if (found := of_sets(comparison.comparable_sets(runs, scene)))
     }
 
 
@@ -92,7 +80,7 @@ def _warnings(runs: Sequence[Run], rows: Sequence[dict[str, Any]]) -> list[str]:
             apart = dict.fromkeys(run["config"] or "-" for run in members if run["apart"])
             lines.append(
                 f"{scene}: the runs were scored on different ground truth (size, split, background or masks), so their "
-                "scores and curves cannot be compared. Left out of rankings and the Pareto front: "
+                "scores and curves cannot be compared. Left out of comparisons: "
                 f"{', '.join(apart)}."
             )
         if shares := comparison.uneven_shares(members):
@@ -125,12 +113,10 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
     pictures, folder = {}, output / "figures"
     for scene, members in runs.items():
         peers = [peer for peer in report["peers"] if peer["scene"] == scene]
-        names, found = list(dict.fromkeys(run["config"] for run in members)), report["fronts"].get(scene)
         pictures[scene] = {
             "curves": _figures(draw_curves, folder, scene, members, peers),
             "poses": _figures(draw_poses, folder, scene, members),
             "masked": [path for run in members for path in _of_parts(output / run["model"])],
-            "fronts": _figures(draw_fronts, folder, scene, found, names) if found else [],
             "views": _views(output, scene, members, each),
         }
     texts = {f"report.{kind}": render(kind, report, pictures, output) for kind in ("md", "html")}

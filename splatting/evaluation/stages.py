@@ -93,14 +93,6 @@ def _remove_stop(run: Run, iteration: int) -> None:
         (run.model / f"chkpnt{iteration}.pth").unlink(missing_ok=True)
 
 
-def state(run: Run, trains: bool = True) -> str:
-    """Say in a few words what is left to do for a run. trains: False if its model counts as trained."""
-    record = Record(run.model)
-    if not trains or _trained(run, record):
-        return "finished" if record.stage("metrics") else "to render and score"
-    return "to resume" if record.stage("train_interrupted") else "to train"
-
-
 def _sum(before: dict[str, Any], done: Finished) -> dict[str, float | None]:
     """Return the seconds of a training with those of its parts before; CPU seconds None if not known."""
     parts = {

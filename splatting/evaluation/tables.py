@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from splatting.evaluation.comparison import COMPARED, COSTS, OTHER_SCORES, SCORES
+from splatting.evaluation.comparison import COMPARED, OTHER_SCORES, SCORES
 
 QUANTITIES = {  # heading and digits
     **{"PSNR": ("PSNR (dB)", 2), "SSIM": ("SSIM", 4), "LPIPS": ("LPIPS", 4), "DISTS": ("DISTS", 4)},
@@ -146,45 +145,6 @@ def _beside(values: Mapping[str, float] | None, digits: int, compares: bool) -> 
     return f"{both}, {values['difference']:+,.{digits}f}" if compares else both
 
 
-def reached_table(found: Mapping[str, Any]) -> Table:
-    """Table of a scene's `reached`: a row for each option set, a column for each level, highest first."""
-    default = found["default"]
-    columns = {"options": lambda one: one[0]}
-    for index, level in enumerate(found["levels"]):
-        head = f"{default}'s end" if level["of_default"] else f"{level['psnr']:.1f} dB"
-        columns[head] = lambda one, i=index: _cell(one[1][i], one[0] == default)
-    return table(columns, list(found["sets"].items()))
-
-
-def _cell(cell: Mapping[str, Any], is_default: bool) -> str:
-    """Format a cell of `reached`; that of another set has its part of the default's seconds, too."""
-    seconds, known = cell["seconds"], [x for x in cell["seconds"]["values"] if x is not None]
-    if not cell["reached"] and not cell["at_end"]:
-        return "not reached"
-    if not known:
-        return "not known"
-    digits, most = 2 if known[0] < 10 else 1, "at most " if cell["at_most"] else ""
-    if seconds["mean"] is None:
-        return f"{most}{number(statistics.fmean(known), digits)} s, {len(known)} of {len(seconds['values'])} seeds"
-    part = "" if is_default or cell["ratio"] is None else f" ({100 * cell['ratio']:.0f} %)"
-    return f"{most}{spread_cell(seconds, digits)} s{part}"
-
-
-def reached_legend(found: Mapping[str, Any]) -> str:
-    """What is said below `reached_table`, in a line: which views the PSNR is of, and what marks in cells mean."""
-    subset, views, default = found["subset"], found["views"], found["default"]
-    some = "all." if subset is None else f"{subset} of {views}, the same at all points."
-    some += "" if subset is None else f" All {views} decide whether a run ends as well as {default}."
-    texts = [cell for row in reached_table(found).rows for cell in row[1:]]
-    parts = {
-        " %)": f"In brackets: the part of {default}'s seconds.",
-        "at most": "At most: how much earlier is not known.",
-        " seeds": "1 of 2 seeds: the mean of those that got there.",
-    }
-    said = [text for mark, text in parts.items() if any(mark in cell for cell in texts)]
-    return " ".join([f"PSNR of the test views: {some}", *said])
-
-
 def gains_table(found: Mapping[str, Any]) -> Table:
     """Table of a scene's gains: a row for each option set but the one that others are compared with."""
     columns = {
@@ -194,20 +154,6 @@ def gains_table(found: Mapping[str, Any]) -> Table:
         "verdict": lambda one: one[1]["verdict"],
     }
     return table(columns, list(found["sets"].items()))
-
-
-def front_table(found: Mapping[str, Any]) -> Table:
-    """Table of a scene's `fronts`: for each option set and cost, whether the set is on the Pareto front."""
-    columns = {"options": lambda name: name} | {
-        QUANTITIES[cost][0]: lambda name, cost=cost: _on_front(found["beaten"][cost][name]) for cost in COSTS
-    }
-    return table(columns, list(found["sets"]))
-
-
-def _on_front(beaten: Mapping[str, Any] | None) -> str:
-    if beaten is None:
-        return "on the Pareto front"
-    return f"perhaps beaten by {beaten['by']}" if beaten["clearly"] is False else f"beaten by {beaten['by']}"
 
 
 def runs_table(runs: Sequence[Mapping[str, Any]]) -> Table:
