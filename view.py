@@ -30,7 +30,7 @@ from splatting.exports.cleaning import OPTION as CLEAN_OPTION
 from splatting.exports.cleaning import check_clean, clean_scene
 from splatting.exports.reading import ANY, read_any
 from splatting.viewer.page import Page, serve
-from splatting.viewer.server import HOST_OPTION, PORT, checked_address
+from splatting.viewer.server import PORT, check_port
 from splatting.viewer.untrained import untrained
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, run_cli
@@ -76,7 +76,6 @@ def main() -> None:
     pipeline_params = PipelineParams(parser, sentinel=True)
     parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to show (default: -1, the last)")
     parser.add_argument("--port", type=int, default=PORT, help=f"port of the page, 0: any (default: {PORT})")
-    HOST_OPTION.add_to(parser, sentinel=False)
     parser.add_argument("--clean", **CLEAN_OPTION, help="let the tab View show what export.py --clean leaves out "
         "(default: off; 0.05 without a number)")  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="print nothing to stdout (default: off)")
@@ -90,7 +89,7 @@ def main() -> None:
     before = bool(args.source_path) and not (args.file or args.model_path)
     args = args if args.file or before else get_combined_args(parser)
     options, pipeline = model_params.extract(args), pipeline_params.extract(args)
-    place = checked_address(args.viewer_host, args.port)
+    check_port(args.port)
     safe_state(args.quiet)
     if args.file:
         scene = of_file(args.file, pipeline)
@@ -101,7 +100,9 @@ def main() -> None:
         scene = of_folder(options, args)
     if len(scene.gaussians) == 0:
         raise UserError(f"{scene.loaded_iter} of {scene.model_path} has no Gaussians; choose another model")
-    page = Page(place, scene, pipeline, options.white_background, scene.halves, kept(scene, args, pipeline, options))
+    page = Page(
+        args.port, scene, pipeline, options.white_background, scene.halves, kept(scene, args, pipeline, options)
+    )
     if before:
         page.before_training()
     try:

@@ -36,8 +36,6 @@ KNOWN = {  # words in files that are options of a part, and mean something else 
     ("train_test_exp", "full_eval.py"),
     ("viewer", "splatting/evaluation/configs.py"),  # nobody would close its page
     ("viewer", "splatting/exports/vendor.py"),  # a folder
-    ("viewer_host", "view.py"),  # which serves the same page
-    ("viewer_host", "splatting/viewer/server.py"),
     ("port", "view.py"),
     *((option, "gaussian_renderer/network_gui.py") for option in ("port", "disable_viewer", "viewer")),  # its sentence
     *(

@@ -1,18 +1,12 @@
-"""The viewer's server: who may connect and send what, what a request can reach, and the page over a websocket."""
+"""The viewer's server: who may connect, what a request can reach, and the page over a websocket."""
 
 import contextlib
 import http.client
 import math
-import re
-import secrets
-import select
 import socket
 import sys
-import threading
-import time
 import warnings
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,29 +20,26 @@ import msgspec  # noqa: E402
 from viser_client import Client, get  # noqa: E402
 from waiting import LIMIT, wait_for  # noqa: E402
 from websockets.asyncio.server import serve as serve_websockets  # noqa: E402
-from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
-from websockets.sync.client import connect  # noqa: E402
+from websockets.exceptions import InvalidStatus  # noqa: E402
 
 from scene import Scene  # noqa: E402
 from splatting.camera_paths.without_scene import WithoutScene, circle  # noqa: E402
-from splatting.viewer import auth, watchers  # noqa: E402
 from splatting.viewer import server as servers  # noqa: E402
-from splatting.viewer.auth import Auth, is_accepted  # noqa: E402
+from splatting.viewer import watchers  # noqa: E402
 from splatting.viewer.page import Page, answer  # noqa: E402
-from splatting.viewer.server import Address  # noqa: E402
 from splatting.viewer.tabs import first_box  # noqa: E402
 from splatting.viewer.views import GOES, WHOLE, Settings  # noqa: E402
 from utils.graphics_utils import camera_center  # noqa: E402
 from utils.system_utils import UserError  # noqa: E402
 
-ANY = Address("127.0.0.1", 0)
+ANY = 0
 
 
 class Served:
     """A server for a block. port, url: where it listens."""
 
-    def __init__(self, host: str = "127.0.0.1", port: int = 0) -> None:
-        self.server, self.url = servers.serve(Address(host, port), "test")
+    def __init__(self, port: int = ANY) -> None:
+        self.server, self.url = servers.serve(port, "test")
         self.port = self.server.get_port()
 
     def __enter__(self) -> "Served":
@@ -82,24 +73,6 @@ def local():
         yield served
 
 
-@pytest.fixture(scope="module")
-def public():
-    """A server on all addresses, which needs a token."""
-    with Served("0.0.0.0") as served:
-        yield served
-
-
-def test_the_page_is_served_and_may_ask_nobody_else(local):
-    status, headers, body = get(local.port, "/")
-    assert status == 200 and b"<html" in body
-    policy = headers["Content-Security-Policy"]
-    own = rf"(ws|wss)://127\.0\.0\.1:{local.port}"
-    sources = {word for part in policy.split(";") for word in part.split()[1:]}
-    outside = {word for word in sources if not re.fullmatch(rf"'[a-z-]+'|data:|blob:|{own}", word)}
-    assert "default-src 'self'" in policy and not outside
-    assert headers["Referrer-Policy"] == "no-referrer"
-
-
 @pytest.mark.parametrize(
     "path",
     [
@@ -118,227 +91,59 @@ def test_no_request_reads_a_file_but_the_page(local, path):
     assert b"root:" not in body and b"import " not in body[:2000]
 
 
-def test_nobody_else_than_this_machine_is_served_on_loopback(local):
+def test_other_sites_that_a_browser_has_open_reach_nothing(local):
+    """Not by a websocket from their own origin, nor through a name of theirs that leads to 127.0.0.1."""
     port = local.port
     for host, status in (
-        (f"127.0.0.1:{port}", 200), ("localhost:9999", 200), ("[::1]:1", 200), ("evil.example", 403),
-        (f"evil.example:{port}", 403), ("127.0.0.1.evil.example", 403), ("", 403), ("[", 403), (":80", 403),
-        ("127.0.0.1:x", 403), ("127.0.0.1:99999", 403), ("localhost@evil.example", 403),
-        ("127.0.0.1 evil.example", 403),
+        (f"127.0.0.1:{port}", 200), ("localhost:9999", 200), ("[::1]:1", 200), ("localhost", 200),
+        ("evil.example", 403), (f"evil.example:{port}", 403), ("127.0.0.1.evil.example", 403), ("", 403), ("[", 403),
+        (":80", 403), ("127.0.0.1:x", 403), ("localhost@evil.example", 403), ("127.0.0.1 evil.example", 403),
     ):  # fmt: skip
         assert get(port, "/", Host=host)[0] == status, host
-
-
-def test_pages_of_other_origins_open_no_websocket(local):
     for origin in (local.url.rstrip("/"), None):
         with Client(local.url, origin) as client:
             assert client.messages()
-    for origin in ("http://evil.example", "null", "http://127.0.0.1:1"):
+    for origin in ("http://evil.example", f"http://evil.example:{port}", "null", "http://127.0.0.1:1"):
         with pytest.raises(InvalidStatus, match="403"):
             Client(local.url, origin)
-
-
-def test_other_addresses_need_the_token(public, capfd):
-    port, token = public.port, public.url.split("token=")[1]
-    url = f"http://127.0.0.1:{port}/"
-    for path in ("/", "/?token=", f"/?token={token[:-1]}", f"/?token={token}x", f"/{token}", "/index.html?token=1"):
-        status, headers, body = get(port, path)
-        assert status == 403 and token.encode() not in body and headers["Set-Cookie"] is None, path
-    for cookie in ("", f"viewer_token_{port}=no", f"viewer_token_1={token}", f"other={token}", "a;b=;;"):
-        with pytest.raises(InvalidStatus, match="403"):
-            Client(url, headers={"Cookie": cookie})
-    status, headers, _ = get(port, f"/?token={token}")
-    assert status == 200
-    cookie = headers["Set-Cookie"]
-    assert "HttpOnly" in cookie and "SameSite=Strict" in cookie
-    with Client(url, headers={"Cookie": cookie.split(";")[0]}) as client:
-        assert client.messages()
-    # Browsers send a cookie of this host to all its ports, whichever port the page that asks comes from.
-    with pytest.raises(InvalidStatus, match="403"):
-        Client(url, "http://127.0.0.1:1", headers={"Cookie": cookie.split(";")[0]})
-
-
-def test_only_other_addresses_than_loopback_have_a_token():
-    assert not any(Auth(host).token for host in ("127.0.0.1", "127.3.2.1", "::1", "localhost"))
-    assert all(Auth(host).token for host in ("0.0.0.0", "::", "", "192.168.0.1", "127.0.0.1.evil.example"))
 
 
 def test_a_taken_port_is_passed_over_and_told(capfd):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with Served(port=port) as served:
+        with Served(port) as served:
             assert served.port > port
-    assert f":{served.port}/ (port {port} is taken)" in capfd.readouterr().err
+    assert capfd.readouterr().err == f"viewer: http://127.0.0.1:{served.port}/ (port {port} is taken)\n"
     with contextlib.ExitStack() as taking:
         with contextlib.suppress(OSError):  # another program may have it already
             taking.enter_context(socket.create_server(("127.0.0.1", 65535)))
         with pytest.raises(UserError, match="port 65535 .* taken"):
-            servers.checked_address("127.0.0.1", 65535)
-
-
-@pytest.mark.parametrize(
-    ("host", "port", "reason"),
-    [
-        ("no.such.host.invalid", 8080, "cannot listen at no.such.host.invalid"),
-        ("198.51.100.7", 8080, "cannot listen at 198.51.100.7"),
-        ("127.0.0.1", 70000, "between 0 .any. and 65535, got 70000"),
-    ],
-)
-def test_an_address_that_cannot_be_listened_at_is_refused_at_once(host, port, reason):
-    with pytest.raises(UserError, match=reason):
-        servers.checked_address(host, port)
+            servers.check_port(65535)
+    with pytest.raises(UserError, match="between 0 .any. and 65535, got 70000"):
+        servers.check_port(70_000)
 
 
 def test_without_viser_a_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     assert f'"viewer": ["{servers.VISER}"]' in (Path(__file__).parents[1] / "setup.py").read_text()
     with pytest.raises(UserError, match=f"pip install {servers.VISER}"):
-        servers.checked_address("127.0.0.1", 8080)
-    assert servers.checked_address("127.0.0.1", None) is None
+        servers.check_port(8080)
+    servers.check_port(None)
 
 
 def test_a_server_that_asks_no_gate_does_not_stay(monkeypatch):
     stopped = []
-    monkeypatch.setattr("splatting.viewer.auth.Auth.in_front_of_viser", lambda self: threading.Lock())
+    monkeypatch.setattr(servers, "_guarded", lambda title: contextlib.nullcontext([]))
     monkeypatch.setattr(servers, "stop", lambda server, stop=servers.stop: (stopped.append(server), stop(server)))
     with pytest.raises(UserError, match="cannot be guarded"):
         servers.serve(ANY, "test")
     assert len(stopped) == 1
 
 
-VALUES = {
-    "text": "a", "number": 1.0, "whole": 1, "switch": False, "vector": (0.0, 0.0, 0.0), "nested": ((0, 1), (2, 3)),
-}  # fmt: skip
-CAMERA = {
-    "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0.5, 0], "fov": 0.8, "near": 0.01, "far": 9,
-    "image_height": 64, "image_width": 96, "look_at": [0, 0, 0], "up_direction": [0, -1, 0],
-}  # fmt: skip
 CLICK = {
     "type": "SceneNodeClickMessage", "name": "/cameras", "instance_index": None, "ray_origin": [0, 0, 0],
     "ray_direction": [0, 0, 1], "screen_pos": [0.5, 0.5], "modifier": None, "owner": "",
 }  # fmt: skip
-
-
-def _control(uuid: str) -> SimpleNamespace | None:
-    return SimpleNamespace(value=VALUES[uuid], disabled=False) if uuid in VALUES else None
-
-
-def _update(uuid: object, value: object, **more: object) -> dict[str, object]:
-    return {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value} | more}
-
-
-@pytest.mark.parametrize(
-    "message",
-    [
-        CAMERA, CLICK, _update("text", "b"), _update("number", 2), _update("whole", 3), _update("switch", True),
-        _update("vector", [1, 2.5, 3]), _update("whole", -(2**53)), _update("nested", [[1, 2], [2**53, 4]]),
-    ],
-)  # fmt: skip
-def test_what_a_browser_sends_is_heard(message):
-    assert is_accepted(msgspec.msgpack.encode(message), _control)
-
-
-@pytest.mark.parametrize(
-    "message",
-    [
-        *[CAMERA | wrong for wrong in (
-            {"position": [0.0, 0.0]}, {"position": "abc"}, {"position": [math.nan] * 3}, {"position": [1e300, 0, 0]},
-            {"fov": None}, {"image_width": math.inf}, {"more": 1}, {"up_direction": [0, 1e-200, 0]},
-        )],
-        CLICK | {"name": 5}, CLICK | {"ray_origin": []},
-        *[_update(uuid, value) for uuid, value in (
-            ("text", 1), ("number", "1"), ("number", math.nan), ("number", True), ("number", 1e300), ("whole", [1]),
-            ("whole", 2**53 + 1), ("switch", 1), ("vector", []), ("vector", [1] * 4), ("vector", "123"), ("vector", 1),
-            ("vector", [1, 2, math.nan]), ("none", 1), (5, 1), ("nested", [[1, 2], [1e300, 4]]), ("nested", [1, 2]),
-        )],
-        _update("number", 1, removed=True), _update("number", 1) | {"updates": {"update_cb": [5]}},
-        {"type": "ShareUrlRequest"}, {"type": 5}, {"type": "FileTransferStartUpload"}, {}, [], 5,
-    ],
-)  # fmt: skip
-def test_nothing_else_is_heard(message):
-    assert not is_accepted(msgspec.msgpack.encode(message), _control)
-
-
-def test_what_is_no_message_is_not_heard_and_what_only_shows_something_takes_no_value():
-    for raw in (b"", b"\xff" * 10, "text", b"\x80", b"\x91" * 60_000, b"a" * 100):
-        assert not is_accepted(raw, _control), raw[:20]
-    message = msgspec.msgpack.encode(_update("text", "b"))
-    assert not is_accepted(message, lambda uuid: SimpleNamespace(value="a", disabled=True))
-
-
-def test_no_message_takes_a_control_from_the_program_or_opens_a_tunnel(local, monkeypatch, capfd):
-    opened = []
-    monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *_: opened.append(1))
-    heard, shown = local.server.gui.add_checkbox("heard", False), local.server.gui.add_text("n", "0", disabled=True)
-    with Client(local.url) as client:
-        client.look()
-        for update in ({"update_cb": [5]}, {"sync_cb": 5}, {"gui_api": 5}, {"removed": True}, {"uuid": 5}):
-            client.send("GuiUpdateMessage", uuid=shown._impl.uuid, updates=update)
-        client.send("ShareUrlRequest")
-        client._socket.send("text")
-        client._socket.send(b"\xff")
-        client.look((0.0, 0.0))
-        _set(client, heard, True)
-        wait_for(lambda: heard.value)
-    shown.value = "17"
-    assert shown.value == "17" and not opened
-    said = capfd.readouterr()
-    assert "Traceback" not in said.err and "warn" not in said.err.lower()
-
-
-def test_a_long_message_ends_its_connection(local):
-    protocol = f"viser-v{viser.__version__}"
-    with connect(local.url.replace("http", "ws"), subprotocols=[protocol], compression=None) as one:
-        one.send(b"a" * (auth.LARGEST + 1))
-        with pytest.raises(ConnectionClosed, match="1009"):
-            while True:
-                one.recv(LIMIT)
-
-
-def test_many_connections_leave_the_process_its_files_and_others_their_answers(local, monkeypatch):
-    """Each takes a file descriptor, and a training without one cannot save. An open page stays."""
-    monkeypatch.setattr(auth, "MOST", 4)
-    with Client(local.url) as page:
-        page.look()
-        silent = [socket.create_connection(("127.0.0.1", local.port), LIMIT) for _ in range(12)]
-        wait_for(lambda: len(select.select(silent, [], [], 0)[0]) >= 9)  # nothing but an end can have come
-        for _ in range(5):
-            assert get(local.port)[0] == 200
-        page.look((0.0, 0.0, -5.0))
-        wait_for(lambda: [c for c in local.server.get_clients().values() if c.camera.position[2] == -5.0])
-        for one in silent:
-            one.close()
-
-
-@pytest.mark.parametrize("pings", [True, False], ids=["pings", "is silent"])
-def test_a_browser_that_does_not_read_is_let_go(local, monkeypatch, capfd, caplog, pings):
-    """Answers to its pings pile up without a limit of websockets, and the ping that would miss it waits behind them."""
-    monkeypatch.setattr(auth, "PATIENCE", LIMIT if pings else 0.5)
-    monkeypatch.setattr(auth, "UNREAD", (1 << 18) if pings else (1 << 30))
-    with socket.socket() as one:
-        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        one.settimeout(LIMIT)
-        one.connect(("127.0.0.1", local.port))
-        one.sendall(_opening(local.port))
-        shown = local.server.gui.add_text("much", secrets.token_hex(0 if pings else 4 << 20))
-        frames = 2000 * (b"\x89\xfd" + bytes(4 + 125)) if pings else b"\x8a\x80" + bytes(4)  # pings, or a pong
-        with pytest.raises(ConnectionError):
-            for _ in range(10_000):
-                one.sendall(frames)
-                time.sleep(0 if pings else 0.01)
-        shown.remove()
-    assert get(local.port)[0] == 200
-    assert capfd.readouterr().err == "" and not caplog.records
-
-
-def test_nonsense_is_refused_without_a_word(local, capfd):
-    for raw in (b"\r\n\r\n", b"\x16\x03\x01" * 50 + b"\n", b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n", b""):
-        with socket.create_connection(("127.0.0.1", local.port), LIMIT) as one:
-            one.sendall(raw)
-            one.shutdown(socket.SHUT_WR)
-            one.recv(1000)
-    assert get(local.port)[0] == 200
-    assert capfd.readouterr().err == ""
 
 
 def _opening(port: int) -> bytes:
@@ -483,26 +288,6 @@ def test_names_that_are_not_utf8_are_shown(page):
         sent, texts = "", (r"a\udcff", r"train 0: b\udcff.png")
         while not all(repr(text) in sent for text in texts):
             sent += repr(client.messages())
-
-
-@pytest.mark.parametrize(
-    ("host", "address"),
-    [("127.0.0.1", r"127\.0\.0\.1:PORT/"), ("::1", r"\[::1\]:PORT/"), ("0.0.0.0", r".+:PORT/\?token=.{40,}")],
-)
-def test_one_line_says_where_the_page_is_and_another_warns_of_a_network(host, address, capfd):
-    try:
-        socket.create_server((host, 0), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
-    except OSError:
-        pytest.skip(f"this machine has no {host}")
-    served = [Served(host) for _ in range(2)]
-    said = capfd.readouterr()
-    assert not said.out and served[0].url.split("=")[-1] != served[1].url.split("=")[-1]
-    for one in served:
-        servers.stop(one.server)
-        assert re.fullmatch("http://" + address.replace("PORT", str(one.port)), one.url)
-        assert f"viewer: {one.url}\n" in said.err
-    assert said.err.count("every machine that reaches 0.0.0.0") == 2 * ("token" in address)
-    assert said.err.count("\n") == (4 if "token" in address else 2)
 
 
 def test_each_browser_reads_the_scale_of_its_own_frame(page):

@@ -18,13 +18,13 @@ _PATIENCE = 60.0  # seconds, as a busy machine may keep the server from its work
 
 
 class Client:
-    """Connects to http://HOST:PORT/ as the page's client does. headers: further ones of the handshake."""
+    """Connects to http://HOST:PORT/ as the page's client does."""
 
-    def __init__(self, url: str, origin: str | None = None, headers: dict[str, str] | None = None) -> None:
+    def __init__(self, url: str, origin: str | None = None) -> None:
         protocol = f"viser-v{viser.__version__}"
         self._socket = connect(
-            url.replace("http:", "ws:").split("?")[0],
-            subprotocols=[protocol], origin=origin, additional_headers=headers, max_size=None, compression=None,
+            url.replace("http:", "ws:"),
+            subprotocols=[protocol], origin=origin, max_size=None, compression=None,
             open_timeout=_PATIENCE, close_timeout=0.2,
         )  # fmt: skip
 

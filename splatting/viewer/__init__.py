@@ -2,7 +2,7 @@
 
 views, frames, legend        a frame: what the controls ask for, from which camera, its image, and what its colours mean
 watchers                     when to draw: cameras of the browsers, share of time
-server, auth                 where the page listens, who may connect, and what a browser may send
+server                       where the page listens, and who may ask for it
 page                         the page, and what it writes
 tabs, path_tab, training_tab its controls; frusta: the scene's cameras as a browser draws them
 """

@@ -23,7 +23,6 @@ from splatting.viewer import server as servers
 from splatting.viewer.frames import LONGEST, Frames, inside
 from splatting.viewer.legend import Legend
 from splatting.viewer.path_tab import PathTab
-from splatting.viewer.server import Address
 from splatting.viewer.tabs import ImagesTab, ViewTab, serialized
 from splatting.viewer.training_tab import Requests
 from splatting.viewer.views import SceneCameras, Settings, Vector, pose_of, window_of
@@ -49,7 +48,7 @@ class Page:
 
     def __init__(
         self,
-        address: Address,
+        port: int,
         scene: Scene,
         pipe: argparse.Namespace,
         white: bool,
@@ -58,7 +57,7 @@ class Page:
     ) -> None:
         """Start to listen. UserError if that cannot be done. white: the background at first, else black.
 
-        kept: (N,) bool, what cleaning leaves of the model, if that is known.
+        port: 0 for any that is free. kept: (N,) bool, what cleaning leaves of the model, if that is known.
         """
         gaussians, folder = scene.gaussians, Path(scene.model_path)
         self._gaussians, self._antialiasing = gaussians, pipe.antialiasing
@@ -71,7 +70,7 @@ class Page:
         self._legends: dict[int, viser.GuiHtmlHandle] = {}
         of_file = isinstance(scene.loaded_iter, str)  # its name
         name = scene.loaded_iter if of_file else folder.resolve().name
-        self.server, self.url = servers.serve(address, as_utf8(name))
+        self.server, self.url = servers.serve(port, as_utf8(name))
         gui = self.server.gui
         self.iteration = gui.add_text("Iteration", str(scene.loaded_iter or 0), disabled=True, visible=not of_file)
         self.count = gui.add_text("Gaussians", f"{len(gaussians):,}", disabled=True)

@@ -95,7 +95,6 @@ def _type(tab, label: str, text: str) -> None:
 
 
 def test_every_kind_of_control_is_heard(tab, training):
-    """The server drops what does not have the form of this viser's messages."""
     address, scene = training
     _open(tab, address)
     tab.get_by_role("tab", name="Path").click()

@@ -345,7 +345,7 @@ def test_points_of_some_test_views_are_called_so():
     assert len(tab.curve.data[0]) == 3 and not tab.note.visible
 
 
-def test_a_wrong_address_is_refused_before_a_file_is_written(colmap_scene, tmp_path):
-    with pytest.raises(UserError, match="cannot listen"):
-        _train(colmap_scene, tmp_path / "out", "--viewer_host", "no.such.host.invalid")
+def test_a_wrong_port_is_refused_before_a_file_is_written(colmap_scene, tmp_path):
+    with pytest.raises(UserError, match="between 0"):
+        _train(colmap_scene, tmp_path / "out", "--viewer", "70000", viewer=False)
     assert not (tmp_path / "out").exists()

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatting.training.option import MOST_NEEDED, Option
 from splatting.training.part import Error, Needs, Options, Part
-from splatting.viewer.server import HOST_OPTION, PORT
+from splatting.viewer.server import PORT, check_port
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
@@ -29,7 +29,6 @@ class Viewer(Part):
         _Port("viewer", None, origin="ours", topic=MOST_NEEDED,
             help=f"serve a web page that shows and controls the training, at this port or {PORT}; it stays open "
                  "afterwards (default: no page)"),
-        HOST_OPTION,
         Option("paused", False, origin="ours", topic="viewers",
             help="with --viewer: wait after the first iteration until the page lets the training go on"),
     ))
@@ -42,16 +41,14 @@ class Viewer(Part):
         return getattr(given, "viewer", None) is not None or getattr(given, "paused", False)
 
     def check(self, run: Any, state: Any) -> None:
-        from splatting.viewer.server import checked_address
-
         if run.launch.viewer is None:
             raise UserError("--paused needs --viewer, whose page lets the training go on")
-        self._address = checked_address(run.launch.viewer_host, run.launch.viewer)
+        check_port(run.launch.viewer)
 
     def opened(self, run: Any) -> None:
         from splatting.parts.viewer.training_page import TrainingPage
 
-        self._page = TrainingPage(run, self._address)
+        self._page = TrainingPage(run)
         run.resources.callback(self._page.close)
 
     def due(self, at: "Iteration") -> bool:

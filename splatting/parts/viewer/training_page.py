@@ -13,7 +13,6 @@ from splatting.training.iteration import Iteration
 from splatting.training.part import Error
 from splatting.training.run import Run
 from splatting.viewer.page import Page, serve
-from splatting.viewer.server import Address
 from splatting.viewer.training_tab import TrainingTab
 from splatting.viewer.watchers import MOVING, STILL, Budget, Wish
 from utils.system_utils import UserError
@@ -28,10 +27,10 @@ class TrainingPage:
     While nobody watches it asks one variable in each iteration. The time it takes is not that of training.
     """
 
-    def __init__(self, run: Run, address: Address) -> None:
+    def __init__(self, run: Run) -> None:
         """Start the page. UserError as from `Page`."""
         self._run = run
-        self._page = Page(address, run.scene, run.pipe, run.dataset.white_background, run.scene.halves)
+        self._page = Page(run.launch.viewer, run.scene, run.pipe, run.dataset.white_background, run.scene.halves)
         self._requests = self._page.requests
         if run.counts:
             self._page.frames.masks = run.counts.counted
