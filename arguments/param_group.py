@@ -6,7 +6,6 @@ import re
 from collections.abc import Collection
 from typing import Any, ClassVar, NoReturn
 
-from arguments.removed import REMOVED
 from splatting.training.option import Option
 
 _FOLDERS = {"-s": "scene", "-m": "model", "--scenes": "scene"}
@@ -37,8 +36,6 @@ class OptionParser(argparse.ArgumentParser):
             flags = "; a flag such as --eval takes no value" if word.lower() in _TRUTHS else ""
             return f"{word} belongs to no option; {named}quote names with spaces{flags}"
         name = word.partition("=")[0]
-        if remedy := REMOVED.get(name.removeprefix("--")):
-            return f"{name} was removed; {remedy}"
         near = difflib.get_close_matches(name, self._option_string_actions, 1)
         near = near or [flag for flag in _FOLDERS if name == flag[1:3] and flag in self._option_string_actions]
         return f"there is no option {word}" + (f"; did you mean {near[0]}?" if near else "")

@@ -23,8 +23,6 @@ from arguments import (
     write_cfg_args,
     write_model_json,
 )
-from arguments.removed import REMOVED
-from splatting.training.launch import launch_options
 from splatting.training.option import MOST_NEEDED, TOPICS
 from utils.system_utils import UserError
 
@@ -408,12 +406,3 @@ def test_a_mistyped_option_gets_one_line(capsys, words, said):
     (line,) = capsys.readouterr().err.splitlines()
     assert ended.value.code == 2 and line.startswith(f"error: {said}")
     assert line.endswith(" --help-all lists all options)")
-
-
-@pytest.mark.parametrize("name", REMOVED)
-def test_an_option_that_is_gone_is_refused_with_what_to_do(capsys, name):
-    assert name not in {option.name for option in OPTIONS} | vars(launch_options()).keys()
-    with pytest.raises(SystemExit) as ended:
-        train.parse(["-s", "x", f"--{name}", "1"])
-    assert ended.value.code == 2
-    assert capsys.readouterr().err.startswith(f"error: --{name} was removed; {REMOVED[name]} (")
