@@ -25,7 +25,7 @@ from benchmarks.harness.measuring import GpuTime, short_name
 from benchmarks.kernels import rasterizer
 from benchmarks.parallel import kernels as kernels_of_steps
 from benchmarks.parallel import steps, workload
-from benchmarks.scenes import made, scores, step_profile
+from benchmarks.scenes import made, scores
 from benchmarks.scenes.thinned import thinned
 from scene.dataset_readers import read_scene
 from scene.point_depths import HELD_OUT
@@ -185,14 +185,6 @@ def test_tables_of_a_gpu_have_stages_memory_and_others(monkeypatch, capsys):
         ["S", "+ backward", "0.820", "1.875", "1.16", "2.47", "0.71"],
         ["S", "step", "0.820", "1.875", "1.21", "2.95", "0.68"],
     ]
-
-
-def test_the_profile_of_a_step_adds_up_kernels_by_name():
-    kernels = {"void gs::blend_kernel<true>(int)": 3.0, "void gs::blend_kernel<false>(int)": 2.0}
-    kernels["Memcpy HtoD (Pinned -> Device)"] = 4.0
-    run = {"kernels": kernels, "counts": dict.fromkeys(kernels, 1.5)}
-    assert step_profile.by_name(run)["blend_kernel"] == (5.0, 3.0)
-    assert step_profile.kernels_of(run) == 5.0  # a copy from the host runs beside the kernels
 
 
 @pytest.mark.parametrize("name", ["XL", "city"])

@@ -27,7 +27,6 @@ DEVICE = {
     "accuracy": "benchmarks.accuracy.oracle",
     "train": "full_eval.py",
 }
-FORWARDING = ["benchmarks.scenes.step_profile"]  # unknown words go to train.py
 FOREIGN = {"--eval_steps", "--save_steps", "--nnodes", "--shutdown_timeout", "--set"}  # flags of other programs
 
 
@@ -111,7 +110,7 @@ def test_every_benchmark_is_shown_and_shows_how_it_is_run():
 def test_every_flag_shown_is_known(program):
     unknown = []
     for page, _, words in (command for command in COMMANDS if command[1] == program):
-        known = _flags(program) | (_flags("train.py") if program in FORWARDING else frozenset())
+        known = _flags(program)
         for word in words:
             if word == "--":  # another program gets what follows
                 known = _flags("render.py" if program == "benchmarks.scenes.scores" else "train.py")

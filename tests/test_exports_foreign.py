@@ -3,18 +3,31 @@
 They come from npm: `npm ci --ignore-scripts` in tests/foreign installs the versions of its lock file.
 """
 
+import argparse
 import json
 import shutil
+import struct
 import subprocess
+import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from small_splats import cube, moved, splats, written
+from torch import Tensor
 
-from benchmarks.exports.sizes import decibels, orbit, read_back, read_by_splat_transform, renders
-from scene.splats.splats import Splats, half_turned, with_sh_degree
+from arguments import PipelineParams
+from gaussian_renderer import render
+from gaussian_renderer.free_view import free_view
+from scene.cameras import MiniCam
+from scene.splats.reading import read_splats
+from scene.splats.splats import Splats, half_turned, logits, with_sh_degree
+from scene.with_splats import model_of
+from splatting.camera_paths.poses import facing, keyframe
+from splatting.exports.scene_formats import PRIM
+from utils.system_utils import compute_device
 
 pytestmark = pytest.mark.slow
 FOREIGN = Path(__file__).parent / "foreign"
@@ -30,6 +43,85 @@ def foreign_programs(monkeypatch: pytest.MonkeyPatch) -> None:
     if not (FOREIGN / "node_modules").is_dir():
         pytest.skip("no programs to read exports with; run npm ci --ignore-scripts in tests/foreign")
     monkeypatch.setenv("PATH", str(FOREIGN / "node_modules/.bin"), prepend=":")
+
+
+def read_back(path: Path) -> Splats:
+    """The splats of a file that export.py wrote, in the axes of the model."""
+    readers = {".glb": _read_glb, ".usdz": _read_usdz, ".sog": read_by_splat_transform}
+    return readers.get(path.suffix, read_splats)(path)
+
+
+def read_by_splat_transform(path: Path) -> Splats:
+    """The splats of a file as PlayCanvas' program reads them, which writes them as PLY."""
+    with tempfile.TemporaryDirectory() as folder:
+        model = Path(folder) / "model.ply"
+        subprocess.run(["splat-transform", "--quiet", str(path), str(model)], check=True, capture_output=True)
+        return read_splats(model)
+
+
+def _read_glb(path: Path) -> Splats:
+    content = path.read_bytes()
+    (length,) = struct.unpack_from("<I", content, 12)
+    document, binary = json.loads(content[20 : 20 + length]), content[28 + length :]
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    values = {}
+    for name, index in attributes.items():
+        accessor = document["accessors"][index]
+        if accessor["componentType"] == 5126:
+            view = document["bufferViews"][accessor["bufferView"]]
+            flat = np.frombuffer(binary, "<f4", view["byteLength"] // 4, view["byteOffset"])
+            values[name.split(":")[-1]] = flat.reshape(accessor["count"], -1).copy()
+    names = sorted((name for name in values if name.startswith("SH_")), key=lambda name: name.split("_")[2::2])
+    sh = np.stack([values[name] for name in names], axis=1)
+    rotations = np.roll(values["ROTATION"], 1, axis=1)
+    return Splats(values["POSITION"], np.log(values["SCALE"]), rotations, logits(values["OPACITY"][:, 0], 1e-7), sh)
+
+
+def _read_usdz(path: Path) -> Splats:
+    from pxr import Usd
+
+    stage = Usd.Stage.Open(str(path))  # a prim does not keep its stage alive
+    prim = stage.GetPrimAtPath(PRIM)
+
+    def value(name: str) -> np.ndarray:
+        return np.array(prim.GetAttribute(name).Get(), dtype=np.float32)
+
+    turns = prim.GetAttribute("orientations").Get()
+    rotations = np.array([[turn.GetReal(), *turn.GetImaginary()] for turn in turns], dtype=np.float32)
+    sh = value("radiance:sphericalHarmonicsCoefficients").reshape(len(turns), -1, 3)
+    return Splats(value("positions"), np.log(value("scales")), rotations, logits(value("opacities"), 1e-7), sh)
+
+
+_FOV = 0.9  # radians, in both directions
+_UP = 0.3  # height of the cameras, in distances from the middle
+
+
+def orbit(means: np.ndarray, count: int, side: int) -> list[MiniCam]:
+    """Square views of `side` pixels on a circle around the middle of positions (N, 3), looking at it, -y up.
+
+    The circle's radius is 2.5 times the median distance from the middle.
+    """
+    middle = np.median(means, axis=0).astype(np.float64)
+    radius = 2.5 * float(np.median(np.linalg.norm(means - middle, axis=1))) + 1e-6
+    views = []
+    for angle in np.arange(count) * 2 * np.pi / count + 0.3:
+        offset = np.array([np.sin(angle), -_UP, np.cos(angle)])
+        pose = keyframe(0.0, middle + radius * offset, facing(-offset, np.array([0.0, -1.0, 0.0])), 0.0)
+        views.append(free_view(side, side, _FOV, pose.position, pose.wxyz, compute_device()))
+    return views
+
+
+@torch.no_grad()
+def renders(splats: Splats, cameras: list[MiniCam]) -> Tensor:
+    """Images (V, 3, H, W) of the splats over black, with the render mode that they say."""
+    pipe = PipelineParams(argparse.ArgumentParser()).extract(argparse.Namespace(antialiasing=splats.antialiasing))
+    gaussians, black = model_of(splats), torch.zeros(3, device=compute_device())
+    return torch.stack([render(camera, gaussians, pipe, black)["render"] for camera in cameras])
+
+
+def decibels(one: Tensor, other: Tensor) -> float:
+    """PSNR between images in [0, 1]; infinite if they are equal."""
+    return float(-10 * (one - other).double().square().mean().log10())
 
 
 def _scene(degree: int, antialiasing: bool = False) -> Splats:

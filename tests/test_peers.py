@@ -1,6 +1,5 @@
 """Curves of other programs: the CSV, its making from hand-made outputs of theirs, and how a report shows them."""
 
-import argparse
 import json
 import sys
 from pathlib import Path
@@ -13,9 +12,7 @@ from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianR
 
 import metrics
 import render
-from benchmarks.peers import curve, figure, gaussian_splatting_training, gsplat_training, timed
-from scene.dataset_readers import read_scene
-from scene.gaussian_model import GaussianModel
+from benchmarks.peers import curve, figure, gsplat_training
 from splatting.evaluation import peer_curve
 from splatting.evaluation.error_curve import COLUMNS, PEER_COLUMNS, peers_of, read_peer, write_curve, write_peer
 from splatting.evaluation.peer_curve import read_scalars
@@ -295,33 +292,6 @@ def test_gsplat_trains_on_our_scenes_and_is_scored_as_we_are(strategy, colmap_sc
     with pytest.raises(UserError, match="name a new folder"):
         monkeypatch.setattr(sys, "argv", ["gsplat_training", *words])
         gsplat_training.main()
-
-
-def test_gaussian_splatting_of_pypi_trains_on_training_photos_alone(colmap_scene, tmp_path, monkeypatch):
-    model, seen, steps = GaussianModel(3), [], []
-
-    def prepare_training(degree, source, device, mode, **options):
-        assert (degree, device, mode, options) == (3, "cpu", "densify", {"load_mask": False, "load_depth": False})
-        scene = read_scene(source, "images", hold_out=False)
-        model.create_from_pcd(scene.point_cloud, scene.extent)
-        seen.extend(camera.image_name for camera in scene.train_cameras)
-        return seen, model, SimpleNamespace(step=steps.append)
-
-    module = SimpleNamespace(prepare_training=prepare_training)
-    monkeypatch.setitem(sys.modules, "gaussian_splatting", SimpleNamespace(train=module))
-    monkeypatch.setitem(sys.modules, "gaussian_splatting.train", module)
-    words = ["peer", "-s", str(colmap_scene), "-m", str(tmp_path / "m"), "--eval", "--iterations", "40"]
-    monkeypatch.setattr(sys, "argv", words)
-    timed.train(argparse.ArgumentParser(), gaussian_splatting_training.start)
-    assert seen == [camera.image_name for camera in read_scene(colmap_scene, "images", hold_out=True).train_cameras]
-    assert len(steps) == 40 and set(steps) <= set(seen)
-    monkeypatch.setattr(sys, "argv", ["curve", "-m", str(tmp_path / "m")])
-    curve.main()
-    (last,) = read_peer(tmp_path / "m" / curve.CURVE)
-    assert (last["iteration"], last["gaussians"]) == (40, len(model))
-    monkeypatch.setattr(sys, "argv", [*words[:4], str(tmp_path / "other"), "-w"])
-    with pytest.raises(UserError, match="black background alone"):
-        timed.train(argparse.ArgumentParser(), gaussian_splatting_training.start)
 
 
 PUBLISHED = (
