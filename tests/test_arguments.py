@@ -395,8 +395,8 @@ def test_abbreviations_of_the_reference_mean_the_same_in_spite_of_our_options(ca
         ),
         (
             ["--time_budget", "5m"],
-            "argument --time_budget: takes a number without a unit (seconds of training, without scoring and saving), "
-            "got '5m'",
+            "argument --time_budget: takes a number without a unit (seconds to train, without scores and saves, "
+            "or more if a finished run is resumed), got '5m'",
         ),
     ],
 )

@@ -34,6 +34,7 @@ from splatting.evaluation.figures import draw_curves
 from splatting.evaluation.model_folder import SCHEDULE, shorter_ends_there
 from splatting.evaluation.plan import DATASETS, Run, SceneEntry, dataset_scenes, photos_of
 from splatting.evaluation.renders import GAIN, GAP, HEADER, ComparedViews
+from splatting.files.folders import locked
 from splatting.host.interrupt import DeferredInterrupt
 from utils import lpips_utils
 from utils.system_utils import Terminated, UserError
@@ -321,6 +322,21 @@ def test_a_second_one_is_refused_while_the_first_or_its_training_lives(evaluate)
 
     wait_for(released)
     assert reports[0]["runs"][0]["finished"]  # the remains of the first run do not block it
+
+
+def test_a_lock_is_waited_for_that_outlives_its_program_for_a_moment(tmp_path):
+    """As that of a killed program, whose child had not begun its own work yet."""
+    program = (
+        "import fcntl, sys, time; file = open(sys.argv[1], 'a+'); fcntl.flock(file, fcntl.LOCK_EX); "
+        "file.write(sys.argv[2]); file.flush(); print(flush=True); time.sleep(0.5)"
+    )
+    with subprocess.Popen([sys.executable, "-c", ""]) as dead:
+        dead.wait()
+    holder = [sys.executable, "-c", program, str(tmp_path / ".train.lock"), str(dead.pid)]
+    with subprocess.Popen(holder, stdout=subprocess.PIPE) as child:
+        child.stdout.readline()
+        with locked(tmp_path, "train.py", "process {process}", "-m"):
+            pass
 
 
 def test_a_training_that_ends_by_itself(evaluate):

@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import os
 import re
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TextIO
@@ -13,6 +14,7 @@ from typing import TextIO
 from splatting.host.errors import UserError
 
 _TEMPORARY = re.compile(r"\..*\.(\d+)\.tmp(\.[^.]*)?")  # as `utils.system_utils.atomic_write` names them
+_LINGER = 2.0  # seconds in which children of a killed program may still have its lock, before they begin their own work
 
 
 @contextlib.contextmanager
@@ -45,6 +47,7 @@ def locked(folder: Path, program: str, busy: str, option: str, inherited: bool =
 
 def _acquired(stack: contextlib.ExitStack, path: Path, busy: str, option: str) -> TextIO | None:
     """The locked file, which `stack` closes; None where files cannot be locked."""
+    latest = time.monotonic() + _LINGER
     while True:
         try:
             file = stack.enter_context(path.open("a+", encoding="utf-8"))
@@ -55,6 +58,10 @@ def _acquired(stack: contextlib.ExitStack, path: Path, busy: str, option: str) -
         except BlockingIOError as error:
             file.seek(0)
             process = file.read().strip() or "not known"
+            if process.isdigit() and not _runs(int(process)) and time.monotonic() < latest:
+                file.close()
+                time.sleep(0.05)
+                continue
             raise UserError(
                 f"{busy.format(process=process)} is running in {path.parent}; wait for it, stop it, or choose another "
                 f"{option}"
