@@ -11,7 +11,7 @@ from synthetic import folder_state
 from test_arguments import MODEL
 
 import train
-from arguments import read_model_json, write_cfg_args
+from arguments import add_to_model_json, read_model_json, write_cfg_args
 from splatting.evaluation.error_curve import COLUMNS, read_curve, write_curve
 from splatting.training.earlier_runs import check_folder, continue_records
 from utils.system_utils import UserError
@@ -212,11 +212,14 @@ def test_a_resumed_curve_of_other_views_is_told(whole, colmap_scene, tmp_path, c
         assert warning.endswith("; the earlier points of its curve are of those other views") == told
 
 
-def test_photos_that_were_trained_on_are_not_held_out_by_resuming(colmap_scene, tmp_path, capfd):
+def test_a_training_that_cannot_go_on_rightly_is_not_resumed(colmap_scene, tmp_path, capfd):
     out = tmp_path / "out"
     _train(colmap_scene, out, "--checkpoint_iterations", 2, iterations=3)
     with pytest.raises(UserError, match="was trained on all photos, so --eval has no unseen photos to hold out"):
         _train(colmap_scene, tmp_path / "new", "--eval", "--start_checkpoint", out / "chkpnt2.pth", iterations=3)
+    add_to_model_json(out, options={"region": "auto"})
+    with pytest.raises(UserError, match="chkpnt2.pth was trained with --region, which this code does not have"):
+        _train(colmap_scene, tmp_path / "new", "--start_checkpoint", out / "chkpnt2.pth", iterations=3)
     assert not (tmp_path / "new").exists()
 
 

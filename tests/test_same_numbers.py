@@ -51,7 +51,7 @@ OTHERS = {
     *("absgrad", "absgrad_threshold", "split", "mcmc_until_iter", "mcmc_growth", "mcmc_min_opacity"),
     *("mcmc_noise", "mcmc_opacity_reg", "mcmc_scale_reg"),
     *("mcmc_init_opacity", "mcmc_init_scale", "opacity_decay"),
-    *("prune_opacity", "time_budget", "schedule", "region"),
+    *("prune_opacity", "time_budget", "schedule"),
 }
 
 

@@ -45,7 +45,7 @@ RESUMED = (  # each has a state of its own
 LOOKS = ("--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44, "--checkpoint_iterations", 21, ITERATIONS)
 # Whose steps are queued one call after the other.
 WITHOUT_GRAPHS = ("depth", "masks", "together", "poses, no graph", "points")
-WITHOUT_GRAPHS += "robust mask", "region", "points and poses"
+WITHOUT_GRAPHS += "robust mask", "points and poses"
 KINDS = {"degree 0": 1, "two phases": 5, "appearance": 5, "exposure": 8, "budget errors": 7}  # half images count, too
 KINDS["exposure and sizes"] = 9
 
@@ -192,7 +192,7 @@ def _all(scene: Path, folder: Path, kinds: list[tuple[str, tuple[str, ...]]]) ->
 def test_ranks(scene, tmp_path, plain):
     """With all that a kind may have of its own: terms, optimisers, strategies, cameras, and images of one tile."""
     names = "default", "sparse", "appearance", "long axis", "tiny", "together", "mcmc", "filter", "budget errors"
-    kinds = [(name, ()) for name in (*names, "poses", "poses, no graph", "region")]
+    kinds = [(name, ()) for name in (*names, "poses", "poses, no graph")]
     kinds += [("exposure", ("--plain_step",)), ("poses", ("--plain_step",))]
     found = in_ranks(2, _all, scene, tmp_path, kinds)[0]
     for (name, more), result in zip(kinds, found, strict=True):

@@ -104,13 +104,8 @@ def random_in_frusta(cameras: list[CameraInfo]) -> BasicPointCloud:
 
 def _focus_distance(cameras: list[CameraInfo]) -> float:
     extent = scene_extent(cameras)
-    focus = focus_of(cameras)
+    focus = nearest_to_axes(np.array([c.center for c in cameras]), np.array([c.R[:, 2] for c in cameras]))
     return focus[1] if focus and focus[1] > 0.1 * extent else extent
-
-
-def focus_of(cameras: list[CameraInfo]) -> tuple[np.ndarray, float] | None:
-    """The point (3,) that cameras look at, and their distance from it: `nearest_to_axes`."""
-    return nearest_to_axes(np.array([c.center for c in cameras]), np.array([c.R[:, 2] for c in cameras]))
 
 
 def nearest_to_axes(centers: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, float] | None:

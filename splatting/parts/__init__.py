@@ -23,7 +23,6 @@ PARTS = (
     "curve",  # its scores are those of the model that is saved in the same iteration
     "keep_best",  # after maps are found: its views have none
     "robust_mask",
-    "region",
     "adc",  # the first strategy is the default
     "mcmc",  # before budget: where a time is given, the first that is best in it is taken
     "budget",

@@ -66,7 +66,7 @@ def report_changes(checkpoint: str, now: argparse.Namespace, grown: bool = False
     """Warn if the run that wrote a checkpoint had other options than this run, `now`.
 
     now: all options. Those that the checkpoint's folder does not record are not compared. UserError for another scene,
-    unless it is the same that has grown, and for --eval after a training on all photos.
+    unless it is the same that has grown, for --eval after a training on all photos, and for an option that is gone.
     """
     folder = Path(checkpoint).parent
     then = _options_of(folder)
@@ -75,6 +75,11 @@ def report_changes(checkpoint: str, now: argparse.Namespace, grown: bool = False
         raise UserError(
             f"{checkpoint} is of another scene, {trained_on}; resume it with that one, or start from its model with "
             "--init_ply"
+        )
+    if gone := sorted(then.keys() - {option.name for option in OPTIONS}):
+        raise UserError(
+            f"{checkpoint} was trained with --{gone[0]}, which this code does not have; use the code that wrote it, or "
+            "start a new training from its PLY by --init_ply"
         )
     changed = _changed(then, now)
     if "eval" in changed and now.eval:
