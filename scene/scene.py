@@ -38,10 +38,10 @@ class Scene:
     `create_gaussians` and `write_inputs`; -1 loads the last saved iteration, N that one. start: False leaves all of
     this to the caller. shuffle: mix the order of the views (always the same way). resolution_scales: factors by which
     views are made smaller, one list of cameras each. train_cameras, test_cameras: these lists by scale, which may be
-    replaced. validation_cameras: the same of views that neither train nor test. info: the dataset as read.
-    cameras_extent: E in world units, from the training views. images: the store of the decoded photos. ranks: processes
-    that divide them (ImageStore). parts: of a training, None: those that args ask for. halves: only right halves of
-    views are scored, as by ScoredViews. given_test_views: the held-out views as read, before parts changed the dataset.
+    replaced. info: the dataset as read. cameras_extent: E in world units, from the training views. images: the store of
+    the decoded photos. ranks: processes that divide them (ImageStore). parts: of a training, None: those that args ask
+    for. halves: only right halves of views are scored, as by ScoredViews. given_test_views: the held-out views as read,
+    before parts changed the dataset.
     """
 
     def __init__(
@@ -68,10 +68,9 @@ class Scene:
         device = compute_device()
         place = image_device(args.data_device, device, warn=True)
         self.images = ImageStore(getattr(args, "images_to_load", None) or 0, place, device, ranks)
-        lists = (self.info.train_cameras, False), (self.info.test_cameras, True), (self.info.validation_cameras, True)
-        self.train_cameras, self.test_cameras, self.validation_cameras = (
-            {scale: self._cameras(args, scale, shuffle, *views) for scale in resolution_scales} if asked else {}
-            for asked, views in zip((True, True, self.info.validation_cameras), lists, strict=True)
+        self.train_cameras, self.test_cameras = (
+            {scale: self._cameras(args, scale, shuffle, views, test) for scale in resolution_scales}
+            for views, test in ((self.info.train_cameras, False), (self.info.test_cameras, True))
         )
         self._plan_images()
 
@@ -174,8 +173,8 @@ class Scene:
         else:
             colors = np.round(info.point_cloud.colors * 255).astype(np.uint8)
             write_point_cloud(folder / "input.ply", info.point_cloud.points, colors)
-        views = [*info.test_cameras, *info.train_cameras, *info.validation_cameras]
-        entries = [_named("camera_to_JSON")(i, camera) for i, camera in enumerate(views)]
+        views = enumerate([*info.test_cameras, *info.train_cameras])
+        entries = [_named("camera_to_JSON")(i, camera) for i, camera in views]
         with atomic_write(folder / "cameras.json") as path:
             path.write_text(json.dumps(entries, allow_nan=False), encoding="utf-8")
 
@@ -195,8 +194,8 @@ class Scene:
         return cameras
 
     def _plan_images(self) -> None:
-        others = chain(*self.test_cameras.values(), *self.validation_cameras.values())
-        self.images.plan(self._pictures(chain(*self.train_cameras.values())), self._pictures(others))
+        trained, tested = (self._pictures(chain(*of.values())) for of in (self.train_cameras, self.test_cameras))
+        self.images.plan(trained, tested)
 
     def _pictures(self, cameras: Iterable[Camera]) -> list[Picture]:
         """Those of our cameras; cameras of other classes have none."""

@@ -51,8 +51,7 @@ def train(words: list[str], _: dict[str, str]) -> None:
     makes it fail, `full` makes it fail and leave a checkpoint, `slow` makes it wait for a signal.
     """
     args = _parsed(words, iterations=30000, sh_degree=3, seed=0, time_budget=0.0, start_checkpoint=None,
-                   save_iterations=[7000, 30000], sparse_depth=0.0,
-                   keep_best=False)  # fmt: skip
+                   save_iterations=[7000, 30000], sparse_depth=0.0)  # fmt: skip
     end = args.iterations + (3 + 3 * args.seed if args.time_budget else 0)
     _note(args, "train", words)
     args.m.mkdir(parents=True, exist_ok=True)
@@ -76,7 +75,7 @@ def train(words: list[str], _: dict[str, str]) -> None:
     (args.m / "stand_in.json").write_text(json.dumps({"psnr": best}))
     (args.m / "cameras.json").write_text(json.dumps([{"img_name": f"photo_{i}.jpg"} for i in range(9)]))
     log = []
-    for t in sorted({*args.save_iterations, *([end // 4] if args.keep_best else []), end}):
+    for t in sorted({*args.save_iterations, end}):
         if t <= end:
             _save(args.m, t, args.sh_degree)
             log.append({"iteration": t, "seconds": t * slowness / 10})

@@ -38,7 +38,7 @@ def test_photos_of_a_point_from_twice_as_far_have_twice_the_depth_in_focal_lengt
 def test_advice_on_a_given_option_or_against_one_is_not_taken(tmp_path, monkeypatch, capsys):
     found = [Advice("", "--sky auto"), Advice("", "--appearance ppisp --x 1"), Advice("", "--refine_poses")]
     monkeypatch.setattr(advice, "advise", lambda *_, **__: found)
-    args = argparse.Namespace(keep_best=False, train_test_exp=False, projection="ray", strategy="adc", advise=True)
+    args = argparse.Namespace(train_test_exp=False, projection="ray", strategy="adc", advise=True)
     dataset = argparse.Namespace(model_path=str(tmp_path))
     assert advice.asked_options(dataset, args, ["--app=none", "-r", "2"]) == ["--sky", "auto"]
     said = capsys.readouterr().out

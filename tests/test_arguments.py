@@ -281,7 +281,7 @@ def test_model_json_has_what_is_stored_there_with_sorted_keys(tmp_path):
     write_cfg_args(tmp_path, argparse.Namespace())
     del record["options"]
     defaults = {"masks": "", "mask_meaning": "auto", "lenses": "auto", "refine_poses": False,
-                "appearance": "none", "keep_best": False}  # fmt: skip
+                "appearance": "none"}  # fmt: skip
     assert read_stored_options(tmp_path) == {**MODEL, **record, **defaults}
 
 

@@ -122,13 +122,13 @@ def test_options_that_need_files_are_refused(method):
 
 @pytest.mark.parametrize(
     "given",
-    [("keep_best", True), ("keep_best", "true"), ("options", "auto"), ("advise", True),
+    [("keep_unseen", True), ("keep_unseen", "true"), ("options", "auto"), ("advise", True),
      ("resolution", 4), ("viewer", 8080), ("checkpoint_iterations", 7), ("start_checkpoint", "chkpnt7.pth")],
 )  # fmt: skip
 def test_options_that_nothing_would_follow_are_refused(method, given):
     with pytest.raises(method.UserError, match=f"--{given[0]} {given[1]} has no effect in NerfBaselines"):
         method.words_of(dict([given]))
-    assert method.words_of({"keep_best": "False", "options": "given", "resolution": 1})
+    assert method.words_of({"keep_unseen": "False", "options": "given", "resolution": 1})
 
 
 def test_every_launch_option_is_known_to_work_or_refused(method):

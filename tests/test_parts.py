@@ -14,7 +14,7 @@ import pytest
 from forks import fork
 from synthetic import make_colmap_scene
 
-from splatting.parts import PARTS, part_class, strategies, tools
+from splatting.parts import PARTS, part_class, states_in, strategies, tools
 from splatting.training.part import Part, fill, overrides
 from utils.system_utils import UserError
 
@@ -179,6 +179,12 @@ def test_without_a_part_a_training_has_the_bytes_of_one_with_the_part_off(name, 
     whole = once(f"of_all_parts_by_{other}", lambda folder: _trained(scene, folder, name, "none"))
     ply = whole / "point_cloud/iteration_20/point_cloud.ply"
     assert _trained(scene, tmp_path / "out", name, name) == ply.read_bytes()
+
+
+@pytest.mark.parametrize("key", ["keep_best", "best"])
+def test_a_state_of_no_part_is_refused_by_its_name(key):
+    with pytest.raises(UserError, match="the checkpoint has a state of keep_best, which this code does not have"):
+        states_in({key: {}})
 
 
 def test_hooks_that_are_not_overridden_are_not_called():

@@ -180,7 +180,7 @@ class SceneInfo(_LikeNamedTuple):
 
     nerf_normalization: "radius", the extent E in world units, and "translate" (3,), minus the cameras' centre.
     is_nerf_synthetic: a Blender scene. offset (3,) float64: the world's coordinates of the frame's origin
-    (scene/readers/world_offset.py); zero by default. validation_cameras: views that neither train nor test.
+    (scene/readers/world_offset.py); zero by default.
     """
 
     point_cloud: BasicPointCloud | None
@@ -191,7 +191,6 @@ class SceneInfo(_LikeNamedTuple):
     is_nerf_synthetic: bool = False
     _: KW_ONLY
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    validation_cameras: Sequence[CameraInfo] = ()
 
     def _replace(self, **changes: Any) -> "SceneInfo":
         """A copy with some fields changed."""

@@ -219,7 +219,6 @@ def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
 
     return {
         "cpu_known": known("cpu_seconds"),
-        "kept": {run["model"]: x for run in runs for of in tools("remarks") for x in of(run["lines"] or ())},
         "left_out": any(row["gaussians"]["mean"] != row["gaussians_saved"]["mean"] for row in rows),
         "machines": sorted({one_line(run["machine"]) for run in runs if run["machine"]}),
         "mipnerf360": any(run["group"] == "mipnerf360" for run in runs),

@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from arguments.stored import read_model_json
 from scene.readers.info import HOLD
 from scene.saved_iterations import saved_ply
 from splatting.evaluation import model_folder as folder_of
@@ -102,12 +101,11 @@ def _views(model: Path, last: int) -> dict[str, Any]:
     """
     truth = model / "test" / f"ours_{last}" / "gt"
     held_out, cameras = view_names(truth), folder_of.json_or_none(model / "cameras.json")
-    untrained = len(held_out) + len(read_model_json(model).get("kept_best", {}).get("views", ()))
     scores = folder_of.load_scores(model, f"ours_{last}")[1]["PSNR"]
     return {
         "split": _split(cameras, len(held_out)),
         "test_sizes": [list(size) for size in sorted({image_size(truth / name) for name in held_out})],
-        "views": {"test": len(scores), "train": len(cameras) - untrained if isinstance(cameras, list) else None},
+        "views": {"test": len(scores), "train": len(cameras) - len(held_out) if isinstance(cameras, list) else None},
         "worst_views": worst_views(model, scores),
     }
 

@@ -5,7 +5,7 @@ from itertools import pairwise
 from typing import Any
 
 from splatting.evaluation.error_curve import Row, best_test, whole_sets
-from splatting.parts import part_class, strategies, tools
+from splatting.parts import part_class, strategies
 
 # Entries of the log's last record: options of the training.
 CAP, PLANNED, STRATEGY = "max_num_splats", "iterations_planned", "strategy"
@@ -49,7 +49,7 @@ def what_to_try(rows: Sequence[Row], records: Sequence[Mapping[str, Any]]) -> li
     last = records[-1] if records else {}
     strategy = last.get(STRATEGY, "adc")
     # More Gaussians are no remedy for overfitting. Without growth, a cap that is far away is none either.
-    first = _overfitting(rows, strategy, last) or _at_cap(rows, scored, last.get(CAP))
+    first = _overfitting(rows, strategy) or _at_cap(rows, scored, last.get(CAP))
     first = first or _never_grew(rows, strategy) or _many(rows, last.get(BUDGET))
     ended_by_itself = last.get(PLANNED) not in (None, last.get("iteration"))
     return [sentence for sentence in (first, None if ended_by_itself else _late(rows, scored)) if sentence]
@@ -65,7 +65,7 @@ def gain_since_peak(rows: Sequence[Row]) -> float | None:
     return None if gained < CLEAR else gained
 
 
-def _overfitting(rows: Sequence[Row], strategy: str, last: Mapping[str, Any]) -> str | None:
+def _overfitting(rows: Sequence[Row], strategy: str) -> str | None:
     """Test views lose while training views gain."""
     if (gained := gain_since_peak(rows)) is None:
         return None
@@ -73,8 +73,6 @@ def _overfitting(rows: Sequence[Row], strategy: str, last: Mapping[str, Any]) ->
     half = max(1, int((rows[-1]["gaussians"] or 0) / 2))
     fewer = f" (--max_num_splats {half}, half as many as now)" if half > 1 else ""
     others = {"adc": "--strategy mcmc or budget with ", "budget": "--strategy mcmc, "}.get(strategy, "")
-    parts = [option for remedy in tools("against_overfitting") if (option := remedy(last))]
-    others = "".join(f"{option}, " for option in parts) + others
     return _OVERFITS.format(at=best["iteration"], lost=lost, gained=gained, others=others, fewer=fewer)
 
 

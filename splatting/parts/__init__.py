@@ -21,7 +21,6 @@ PARTS = (
     "refine_poses",  # its cameras stand right before anything asks where they are
     "depth_maps",
     "curve",  # its scores are those of the model that is saved in the same iteration
-    "keep_best",  # after maps are found: its views have none
     "robust_mask",
     "adc",  # the first strategy is the default
     "mcmc",  # before budget: where a time is given, the first that is best in it is taken
@@ -30,7 +29,7 @@ PARTS = (
     "sparse_depth",  # the order of the terms of the loss is in the bytes of the model
     "ppisp",
     "filter_3d",  # after all that moves rows
-    "last_save",  # after keep_best, which may choose another model
+    "last_save",
     "spill",  # after all that moves rows, and before sleep, which pays where rows lie on the host
     "sleep",  # after all that decides whether every step concerns all rows
     "upright",  # only keeps a record
@@ -78,7 +77,7 @@ EXPOSURES = "exposures"  # the model's own key of what an appearance has trained
 # Of states in checkpoints of version 0.2 and before.
 _OLD_KEYS = {
     "asleep": "sleep",
-    "best": "keep_best",
+    "best": "keep_best",  # which is gone, and refused by this name
     "poses": "refine_poses",
     "residuals": "robust_mask",
     "schedule": "time_budget",
@@ -118,14 +117,9 @@ def check_together(parts: Collection[Part], given: argparse.Namespace, several: 
             raise UserError(f"{option} needs a training of one process; {remedy}")
         for other, reason in part.against.items():
             name, _, value = other.partition("=")
-            _, _, need = name.partition(".")
-            if need:
-                found = [one.asked_by(given) for one in parts if one is not part and getattr(one.needs, need)]
-            else:
-                there = getattr(given, name, None)
-                found = [f"--{name}{value and ' '}{value}"] if (str(there) == value if value else there) else []
-            if found:
-                raise UserError(f"{option} does not work with {found[0]}, {reason}")
+            there = getattr(given, name, None)
+            if str(there) == value if value else there:
+                raise UserError(f"{option} does not work with --{name}{value and ' '}{value}, {reason}")
 
 
 def remove_traces(folder: str | os.PathLike, parts: Collection[Part]) -> None:
@@ -145,7 +139,6 @@ def tools(name: str) -> list[Callable]:
     drawn(rows, states): rows of a checkpoint as its PLY would have them. for_wrong_poses(best),
     for_few_iterations(count): remedies.
     continues(opt): whether the same options train a finished training further, None: --iterations says so.
-    remarks(lines): lines of a training that reports show. against_overfitting(record): an option to try, or None.
     pictures(model): files in a model folder that reports show, where they are there.
     summary_writer(folder): TensorBoard's, as `train.prepare_output_and_logger` returns it, or None.
     prepare(dataset, opt, launch): may name the checkpoint to start with; False: nothing is left to train.

@@ -15,7 +15,7 @@ MOST_NEEDED, NUMBERS = "most needed", "the method's numbers"
 TOPICS = {
     MOST_NEEDED: "options that most trainings need",
     "data": "photos, start points, masks, depth maps, background",
-    "quality and speed": "schedules, SH degree, aliasing, validation, sky",
+    "quality and speed": "schedules, SH degree, aliasing, sky",
     "photos that vary": "different exposure or white balance, passers-by",
     "cameras": "lenses, panoramas, wrong poses",
     "output": "when to score and save, and what is saved",

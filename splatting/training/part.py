@@ -86,7 +86,6 @@ class Needs:
     replay: a step that is taken twice gives the same; if not, the host does not run ahead of a GPU.
     ranks: it works with several processes.
     files: it reads files of the scene besides photos.
-    photos: it trains something of the photos, which a copy of the Gaussians alone would not have.
     bright: renders must not turn dark, so strategies reset no opacities unless they are told how often.
     """
 
@@ -97,7 +96,6 @@ class Needs:
     replay: bool = True
     ranks: bool = True
     files: bool = False
-    photos: bool = False
     bright: bool = False
 
 
@@ -110,8 +108,7 @@ class Part:
     active: whether it takes part; `begin` may clear it where a scene has no use for the part, which then has no hooks.
     joins: whether its state in a checkpoint brings the part in where no option asks for it.
     needs: what it asks of the steps.
-    against: what it does not work with, and the rest of a sentence: why, and what to do. It is `option`,
-        `option=value`, or `needs.NAME`: other parts that need that.
+    against: what it does not work with, `option` or `option=value`, and the rest of a sentence: why, and what to do.
     reads_model: whether it reads the model in iterations that are due for it; sleeping blocks then catch up first.
     shown: terms whose running mean the progress bar shows, and what it calls them.
     waits: whether it may let the training wait. It is told last, when all else of an iteration is done and written.
@@ -216,9 +213,9 @@ class Part:
         """Entries of model.json."""
         return {}
 
-    def final(self, model: Any, iteration: int) -> tuple[Any, int]:
-        """The model of the last save and its iteration, in place of the trained one."""
-        return model, iteration
+    def final(self, model: Any, iteration: int) -> Any:
+        """The model of the last save, in place of the trained one."""
+        return model
 
     def due(self, at: "Iteration") -> bool:
         """Whether this iteration reads the model or a loss, or writes something. Asked once, when it begins.
@@ -283,7 +280,6 @@ class Appearance(Part):
     kind, summary: the value of the option, and what it does, for the help. flag: a further option that asks for it.
     """
 
-    needs = Needs(photos=True)
     kind: ClassVar[str] = ""
     summary: ClassVar[str] = ""
     flag: ClassVar[str] = ""

@@ -44,7 +44,7 @@ class Run(Stepping):
     (seconds of training). lost: steps that an error has taken back. interrupt: a signal that asks the loop to stop; an
     observer that waits has to look at it. resources: what parts have open, closed when the training is over, however it
     ends. report: `training_report`, or what replaces it; writer: its first argument. joules: what the clock reads
-    (host/energy.py). checkpoints: writes them, while the loop runs. final_iteration: that of the last save's model.
+    (host/energy.py). checkpoints: writes them, while the loop runs.
     grown: whether the scene has more photos than the checkpoint was trained on.
     """
 
@@ -52,8 +52,6 @@ class Run(Stepping):
     report: Any = None
     joules: Callable[[], float] | None = None
     checkpoints: Any = None
-    final_iteration: int | None = None
-    last_iteration: int | None = None
     grown = False
 
     def __init__(
@@ -92,7 +90,7 @@ class Run(Stepping):
         self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
         self._begin_model(capture, first, states)
         check_views(self.pipe, self.scene.getTrainCameras(), self.sizes.smallest)
-        check_views(self.pipe, [*self.scene.getTestCameras(), *self.scene.validation_cameras.get(1.0, ())])
+        check_views(self.pipe, self.scene.getTestCameras())
         self._check_records()
         self.density = density_control(self, self._choose_strategy(states))
         self.objective = Objective(self)
@@ -214,9 +212,9 @@ class Run(Stepping):
 
     def save_last(self, iteration: int) -> None:
         """Save the model that parts make of the trained one, and what they keep in model.json."""
-        model, self.final_iteration, self.last_iteration = self.gaussians, iteration, iteration
+        model = self.gaussians
         for final in self.each("final"):
-            model, self.final_iteration = final(model, self.final_iteration)
+            model = final(model, iteration)
         scene = self.scene
         scene.save(iteration, model)
         write_cfg_args(scene.model_path, argparse.Namespace(**vars(self.dataset) | {"sh_degree": model.max_sh_degree}))

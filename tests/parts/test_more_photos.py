@@ -99,7 +99,6 @@ def test_new_photos_train_more_often_at_first(scenes, first, tmp_path, monkeypat
     [
         (("--refine_poses",), "corrects 17 of 17 poses"),
         (("--robust_mask", 0.3, "--sparse_depth", 0.5), "2 photos are new"),
-        (("--keep_best",), "leave --keep_best out, or start a new training"),
         (("--train_test_exp",), "of other photos than this run's, which cannot be added; give the scene"),
         (("--appearance", "ppisp"), "of other photos than this run's, which cannot be added; give the scene"),
     ],

@@ -46,11 +46,12 @@ class LastSave(Part):
             launch = self._run.launch
             self._scored = at.scored_at is not None or self._run.opt.iterations in launch.test_iterations
 
-    def final(self, model: Any, iteration: int) -> tuple[Any, int]:
+    def final(self, model: Any, iteration: int) -> Any:
         from splatting.parts.last_save.trim_report import trimmed
 
-        final, self._report = trimmed(self._run, model, self._scored, self._run.last_iteration)
-        return final, iteration
+        self._iteration = iteration
+        final, self._report = trimmed(self._run, model, self._scored, iteration)
+        return final
 
     def facts(self) -> dict[str, Any]:
         return {} if self._report is None else {"left_out": vars(self._report)}
@@ -64,5 +65,5 @@ class LastSave(Part):
             from splatting.parts.last_save.trim_report import lines, saved_line
 
             run = self._run
-            run.log.tell(saved_line(self._report, saved_ply(run.scene.model_path, run.last_iteration).parent))
+            run.log.tell(saved_line(self._report, saved_ply(run.scene.model_path, self._iteration).parent))
             run.log.keep(*lines(self._report))

@@ -23,7 +23,7 @@ def new_photos(run: Any) -> list[str]:
     if not run.start or not (before := _views_of(Path(run.start).parent)):
         return []
     info = run.scene.info
-    views = {view.image_name: view for view in (*info.test_cameras, *info.train_cameras, *info.validation_cameras)}
+    views = {view.image_name: view for view in (*info.test_cameras, *info.train_cameras)}
     new, known = sorted(views.keys() - before.keys()), sorted(views.keys() & before.keys())
     if not new or not known:
         return []

@@ -82,8 +82,7 @@ class Summary(Part):
     def measured(self, step: Iteration, losses: Losses) -> None:
         self._iteration = step.iteration
         if step.last:
-            saved = self._run.final_iteration or step.iteration
-            scored = [row["test_psnr"] for row in whole_sets(self._run.rows) if row["iteration"] == saved]
+            scored = [row["test_psnr"] for row in whole_sets(self._run.rows) if row["iteration"] == step.iteration]
             self._psnr = scored[0] if scored else None
 
     def ended(self, error: Error) -> None:
