@@ -29,7 +29,8 @@ load, scored A saved model is loaded, and its test views are to be scored or ren
 What only one part can give is a slot of the run or of the model, with a neutral default that the part replaces in
 `begin`, or earlier; a second one that does so is refused by `fill`:
 
-model.drawn  what raw opacities and scales are drawn as, and its chain backward; model.columns keeps values per row
+model.drawn  what raw opacities and scales are drawn as, and its chain backward; model.columns keeps values per row.
+             Then every step concerns all rows, and none may sleep.
 model.exposures what photos make of renders, trained with the Gaussians (scene/gaussians/exposure.py)
 model.pinned which Gaussians density control leaves where they are, and as large as they are
 model.room   where rows lie: on the device, or a part of them on the host (scene/gaussians/room.py)
@@ -37,7 +38,8 @@ run.schedule which steps of the schedule an iteration stands for
 run.views    the view of an iteration
 run.sizes    the size of a view in an iteration
 run.sleeping which blocks of rows take a step (scene/sleeping.py)
-run.counts   which pixels of a view count in its loss
+run.counts   which pixels of a view count in its loss. It may learn by renders, so no step is taken twice, and the host
+             does not run ahead of a GPU.
 run.on_host  takes the steps of cameras, by the gradients of their numbers, on the host: `place`, `step`, `independent`
 """
 
@@ -81,9 +83,6 @@ class Needs:
     depth: steps that have terms of the part render depth.
     captured: a captured step may record its terms, which depend on the render and on the view's photo alone. It tells
         of no terms then, so `measured` finds none in `losses.terms`.
-    camera_gradient: steps compute the gradient of the camera's numbers, for the slot run.on_host.
-    all_rows: every step concerns all rows, so that none may sleep.
-    replay: a step that is taken twice gives the same; if not, the host does not run ahead of a GPU.
     ranks: it works with several processes.
     files: it reads files of the scene besides photos.
     bright: renders must not turn dark, so strategies reset no opacities unless they are told how often.
@@ -91,9 +90,6 @@ class Needs:
 
     depth: bool = False
     captured: bool = False
-    camera_gradient: bool = False
-    all_rows: bool = False
-    replay: bool = True
     ranks: bool = True
     files: bool = False
     bright: bool = False

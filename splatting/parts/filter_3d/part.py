@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from splatting.training.option import Option
-from splatting.training.part import Needs, Options, Part, fill
+from splatting.training.part import Options, Part, fill
 
 if TYPE_CHECKING:
     from splatting.training.iteration import Iteration
@@ -23,7 +23,6 @@ class Filter3d(Part):
                  "views from other distances look right. The PLY contains the filter; best with --antialiasing"),
     ))
     # fmt: on
-    needs = Needs(all_rows=True)
 
     def begin(self, run: Any, state: Any) -> None:
         self._run, self._state = run, state

@@ -27,7 +27,7 @@ class RefinePoses(Part):
                  "the tracks of a COLMAP scene"),
     ))
     # fmt: on
-    needs = Needs(camera_gradient=True, files=True)
+    needs = Needs(files=True)
     against = {"projection=ray": "which has no gradients of poses; leave one of them out"}
 
     @classmethod

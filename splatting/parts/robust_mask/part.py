@@ -27,7 +27,7 @@ class RobustMask(Part):
                  "passers-by; 0: off"),
     ))
     # fmt: on
-    needs = Needs(replay=False, ranks=False)
+    needs = Needs(ranks=False)
 
     def begin(self, run: Any, state: Any) -> None:
         from splatting.parts.robust_mask.residuals import Residuals

@@ -40,7 +40,7 @@ class Sleep(Part):
 
         run, density = self._run, self._run.density
         dense = type(run.gaussians.optimizer) is GaussianAdam and FusedAdam.takes(run.gaussians)
-        alone = not (density.queues or any(density.penalty) or any(part.needs.all_rows for part in run.parts))
+        alone = not (density.queues or any(density.penalty) or run.gaussians.drawn is not None)
         if not (dense and alone and run.is_standard):
             return False
         return run.group.anyone(run.gaussians.room.limit > 0) or share_of(run.scene, run.device) < sleeping.MOST_SHARE

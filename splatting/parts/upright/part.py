@@ -11,7 +11,6 @@ class Upright(Part):
     """Takes part where the scene has such a record. The training itself does not change."""
 
     name = "upright"
-    reads_model = False
     _record: dict[str, Any] | None = None
 
     @classmethod

@@ -14,5 +14,5 @@ def step_taker(run: Run) -> PlainStep:
     if not FusedStep.suits(run):
         return PlainStep(run)
     exchanges = run.gaussians.shards.ranks.several  # numbers, in each step
-    runs_ahead = run.device.type == "cuda" and not exchanges and all(part.needs.replay for part in run.parts)
+    runs_ahead = run.device.type == "cuda" and not exchanges and run.counts is None
     return CapturedStep(run) if runs_ahead else FusedStep(run)
