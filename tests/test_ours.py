@@ -59,7 +59,7 @@ MAY = {
     "render.render_sets": MODEL,
     "splatting.evaluation.error_curve.continue_curve": MODEL,
     "splatting.evaluation.stages._remove_stop": MODEL,
-    "splatting.parts.remove_traces": MODEL,
+    "splatting.training.run.begin": MODEL,
     "splatting.parts.resume.part.opened": MODEL,
     "splatting.parts.resume.part.ended": MODEL,
     "splatting.parts.resume.tools._goes_on": MODEL,

@@ -12,12 +12,10 @@ from splatting.evaluation.error_curve import NAME as CURVE
 from splatting.evaluation.error_curve import Row, read_curve
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
-from splatting.files.json_files import read_json
+from splatting.files.json_files import SCHEDULE, read_json
 from splatting.files.plain_files import plain
 from splatting.parts import PARTS, part_class
 from utils.system_utils import UserError, saved_iterations
-
-SCHEDULE = "schedule.json"  # of a training whose iterations followed the clock
 
 
 def json_or_none(path: Path) -> Any | None:

@@ -1,11 +1,9 @@
 """The registry of the parts of a training (splatting/training/part.py is their manual): their one order."""
 
 import argparse
-import os
 from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import cache
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 from splatting.training.option import Option
@@ -120,13 +118,6 @@ def check_together(parts: Collection[Part], given: argparse.Namespace, several: 
             there = getattr(given, name, None)
             if str(there) == value if value else there:
                 raise UserError(f"{option} does not work with --{name}{value and ' '}{value}, {reason}")
-
-
-def remove_traces(folder: str | os.PathLike, parts: Collection[Part]) -> None:
-    """Remove files that parts of an earlier training wrote into a model folder, and this one does not have."""
-    for name in {*PARTS} - {part.name for part in parts}:
-        for trace in part_class(name).traces:
-            (Path(folder) / trace).unlink(missing_ok=True)
 
 
 def tools(name: str) -> list[Callable]:

@@ -110,7 +110,6 @@ class Part:
     waits: whether it may let the training wait. It is told last, when all else of an iteration is done and written.
     own_end: whether its options let a training end before or after --iterations.
     tools: functions that it has for other commands, in tools.py of its folder (`tools` of splatting/parts/__init__.py).
-    traces: files that the part writes into a model folder, and a training without it removes; never what may be input.
     """
 
     name: ClassVar[str] = ""
@@ -125,7 +124,6 @@ class Part:
     waits: ClassVar[bool] = False
     own_end: ClassVar[bool] = False
     tools: ClassVar[tuple[str, ...]] = ()
-    traces: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def wanted(cls, given: argparse.Namespace) -> bool:

@@ -21,8 +21,9 @@ from scene.with_splats import scene_with, start_from
 from splatting.distributed.consistency import agree_on_scene
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch
+from splatting.files.json_files import SCHEDULE
 from splatting.host.interrupt import DeferredInterrupt
-from splatting.parts import check_together, chosen, in_order, part_class, remove_traces, states_in, strategy_part
+from splatting.parts import check_together, chosen, in_order, part_class, states_in, strategy_part
 from splatting.training import checks, earlier_runs
 from splatting.training.density import density_control
 from splatting.training.iteration import ViewOrder
@@ -194,8 +195,8 @@ class Run(Stepping):
         folder, start = self.scene.model_path, self.start
         if not earlier_runs.lies_in(start, folder) or not (Path(folder) / "cameras.json").exists():
             self.scene.write_inputs()
-        if self.group.first:
-            remove_traces(folder, self.parts)
+        if self.group.first and not self.schedule.paced:
+            (Path(folder) / SCHEDULE).unlink(missing_ok=True)
         wants = self.density.max_gaussians, self.density.absolute_gradients
         announce_memory(self.scene, self.gaussians, *wants, self.group.size)
         self.log, self.rows = earlier_runs.continue_records(folder, start, self.first_iteration)

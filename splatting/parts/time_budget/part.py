@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from splatting.files.json_files import SCHEDULE
 from splatting.training.option import MOST_NEEDED, Option, within
 from splatting.training.part import Error, Options, Part, fill
 
@@ -11,8 +12,6 @@ if TYPE_CHECKING:
 
     from scene.scene import Scene
     from splatting.training.iteration import Iteration
-
-_FILE = "schedule.json"
 
 
 class TimeBudget(Part):
@@ -32,7 +31,6 @@ class TimeBudget(Part):
                  "number: fit the whole schedule of --iterations into this many iterations"),
     ))
     # fmt: on
-    traces = (_FILE,)
     _iteration = 0  # of a run; a scene without one saves no schedule
     own_end = True
 
@@ -80,7 +78,7 @@ class TimeBudget(Part):
         from splatting.parts.time_budget.schedule_file import write_schedule
 
         if self._iteration:
-            write_schedule(Path(scene.model_path) / _FILE, self._run.schedule.up_to(self._iteration))
+            write_schedule(Path(scene.model_path) / SCHEDULE, self._run.schedule.up_to(self._iteration))
 
     def ended(self, error: Error) -> None:
         """Also by an error whose rescue has saved a checkpoint."""

@@ -11,13 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from splatting.files.json_files import read_json, write_json
+from splatting.files.json_files import SCHEDULE, read_json, write_json
 from splatting.parts import strategies
 from splatting.parts.time_budget.paced import Block, Continued, Decided, DecidedSchedule, TimeBudget
 from splatting.training.schedule import PYRAMID
 from utils.system_utils import UserError
 
-NAME = "schedule.json"
 _SIZES = "resolution_schedule"  # key of the sizes of views
 _MOST = 2**31 - 1  # iterations, as of --iterations
 _BROKEN = ValueError, TypeError, KeyError, AttributeError, IndexError, OverflowError, RecursionError
@@ -37,13 +36,13 @@ def write_schedule(path: Path, decided: Decided) -> None:
 
 def read_schedule(path: Path) -> Decided:
     """The schedule of a file. UserError if it is missing or broken."""
-    remedy = f"name the {NAME} of a run with --time_budget"
+    remedy = f"name the {SCHEDULE} of a run with --time_budget"
     try:
         return _decided(read_json(path))
     except OSError as error:
         raise UserError(f"cannot read {path} ({error.strerror}); {remedy}") from error
     except _BROKEN as error:
-        raise UserError(f"{path} is not a valid {NAME} ({_reason(error)}); {remedy}") from error
+        raise UserError(f"{path} is not a valid {SCHEDULE} ({_reason(error)}); {remedy}") from error
 
 
 def _reason(error: Exception) -> str:
@@ -144,7 +143,7 @@ def _even(count: int, opt: argparse.Namespace, sizes: str) -> Decided:
 def _recorded(path: Path, opt: argparse.Namespace) -> Decided:
     found = _fitting(read_schedule(path), path, opt)
     if found.ended is None:
-        raise UserError(f"{path}: run not finished; resume it, or give the {NAME} of a finished run")
+        raise UserError(f"{path}: run not finished; resume it, or give the {SCHEDULE} of a finished run")
     return found
 
 
