@@ -41,6 +41,7 @@ from splatting.exports.cleaning import check_clean, clean_scene, write_compariso
 from splatting.exports.formats import FORMATS, Around, Format, format_of
 from splatting.exports.reading import ANY, read_any
 from splatting.exports.upright import add_upright_options, check_upright, oriented_later, placed
+from splatting.files.json_files import read_model_json
 from splatting.files.ours import refuse_foreign
 from splatting.parts import tools
 from utils.general_utils import safe_state
@@ -110,6 +111,15 @@ def thin_out(
     return thinned
 
 
+def sky_of(model: str | None, means: np.ndarray) -> np.ndarray:
+    """(N,) bool: which Gaussians with centres (N, 3) are the sky of a model. UserError for a folder without one."""
+    facts = read_model_json(Path(model)) if model else {}
+    found = [mask for beside in tools("beside") if (mask := beside(facts, torch.from_numpy(means))) is not None]
+    if not found:
+        raise UserError("--no_sky needs a model folder (-m) that was trained with a sky; leave it out")
+    return found[0].numpy()
+
+
 def cleaned(scene: Scene, most: float, pipe: argparse.Namespace, options: argparse.Namespace, to: str) -> np.ndarray:
     """(N,) bool: what the training views need, to within `most` dB each; print what goes, and write a picture of it."""
     cleaning, views = clean_scene(scene, most, pipe, options.white_background)
@@ -145,9 +155,8 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
         _check_views(args, make_path, scene.getTrainCameras())
     degree = used_sh_degree(splats) if args.typed_sh_degree is None else min(args.typed_sh_degree, splats.sh_degree)
     keep = choose(splats, args.crop, args.min_opacity)
-    for left_out in tools("left_out"):
-        if (found := left_out(args, torch.from_numpy(splats.means))) is not None:
-            keep &= ~found.numpy()
+    if args.no_sky:
+        keep &= ~sky_of(args.model_path, splats.means)
     if args.clean:
         keep &= cleaned(scene, args.clean, pipe, options, args.to)
     if args.max_splats:
@@ -245,8 +254,7 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
     add("--crop", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
         help="keep the Gaussians with a centre in this box, in the frame of the model (default: keep all)")  # fmt: skip
     add("--min_opacity", type=float, default=0.0, help="leave fainter Gaussians out, 0 to 1 (default: 0)")
-    for add_options in tools("add_export_options"):
-        add_options(add)
+    add("--no_sky", action="store_true", help="leave out the sky that training has added (default: keep it)")
     add("--clean", **CLEAN_OPTION, help="leave out floaters and what else the training views do not need, while none "
         "loses more than this (default: off; 0.05 without a number)")  # fmt: skip
     add("--max_splats", type=int, default=0, metavar="N",

@@ -125,7 +125,6 @@ def tools(name: str) -> list[Callable]:
 
     advise(scene, tracks): texts on a scene, and options of train.py that they speak for.
     beside(facts, means): which Gaussians of a model are not of the scene itself. facts: of model.json.
-    add_export_options(add), left_out(args, means): options of export.py, and which Gaussians these leave out.
     advise_trained(scene, views): as advise, by a short training. examine(scene, views, options): notes of doctor.py.
     drawn(rows, states): rows of a checkpoint as its PLY would have them. for_wrong_poses(best),
     for_few_iterations(count): remedies.

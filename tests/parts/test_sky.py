@@ -1,6 +1,5 @@
 """A sky (--sky): where it is found, that it stays there, and trainings with it."""
 
-import argparse
 import math
 import sys
 from pathlib import Path
@@ -26,7 +25,6 @@ from splatting.diagnosis.model import check_model
 from splatting.files.json_files import read_model_json
 from splatting.parts.sky.directions import FEWEST
 from splatting.parts.sky.shell import Shell, find_sky
-from splatting.parts.sky.tools import left_out
 from splatting.parts.time_budget.paced import Block, Decided
 from splatting.parts.time_budget.schedule_file import write_schedule
 from utils.system_utils import UserError
@@ -145,7 +143,7 @@ def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path):
     with pytest.raises(UserError, match="--sky does not work with --strategy mcmc, which relocates large Gaussians"):
         train.main(["-s", str(scene), "-m", str(tmp_path), "--sky", "auto", "--strategy", "mcmc"])
     with pytest.raises(UserError, match="--no_sky needs a model folder"):
-        left_out(argparse.Namespace(no_sky=True, model_path=str(tmp_path)), torch.zeros(1, 3))
+        export.sky_of(str(tmp_path), np.zeros((1, 3)))
     file = tmp_path / "schedule.json"
     write_schedule(file, Decided(100, [Block(9, 0.0, 1 / 9, 0.0)], 9, 9.0, strategy="mcmc"))
     words = ["-s", str(scene), "-m", str(tmp_path), "--iterations", "100", "--schedule", str(file)]

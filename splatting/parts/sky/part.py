@@ -13,7 +13,7 @@ class Sky(Part):
     """Adds the sky's Gaussians at the start, holds them on their sphere, and asks that nothing stays before them."""
 
     name = "sky"
-    tools = "advise", "beside", "add_export_options", "left_out"
+    tools = "advise", "beside"
     # fmt: off
     options = Options(optimisation=(
         Option("sky", "off", origin="ours", check=one_of("off", "auto"), topic="quality and speed",
