@@ -35,7 +35,7 @@ def test_an_option_a_term_a_state_and_a_line(colmap_scene, tmp_path):
     plain, whole, resumed = (tmp_path / name for name in ("plain", "whole", "resumed"))
     assert _train(colmap_scene, "-m", plain).status == 0
     done = _train(colmap_scene, "-m", whole, "--grey", 5, "--checkpoint_iterations", 20)
-    assert done.status == 0 and "Grey=" in done.stderr and _ply(whole) != _ply(plain), done.stderr
+    assert done.status == 0 and "Grey Loss=" in done.stderr and _ply(whole) != _ply(plain), done.stderr
     (said,) = [line.partition(" [")[0] for line in done.stdout.splitlines() if line.startswith("--grey: ")]
     last = float(said.split()[-4])
     checkpoint = whole / "chkpnt20.pth"

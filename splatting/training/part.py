@@ -106,7 +106,6 @@ class Part:
     needs: what it asks of the steps.
     against: what it does not work with, `option` or `option=value`, and the rest of a sentence: why, and what to do.
     reads_model: whether it reads the model in iterations that are due for it; sleeping blocks then catch up first.
-    shown: terms whose running mean the progress bar shows, and what it calls them.
     waits: whether it may let the training wait. It is told last, when all else of an iteration is done and written.
     own_end: whether its options let a training end before or after --iterations.
     tools: functions that it has for other commands, in tools.py of its folder (`tools` of splatting/parts/__init__.py).
@@ -120,7 +119,6 @@ class Part:
     needs: ClassVar[Needs] = Needs()
     against: ClassVar[dict[str, str]] = {}
     reads_model: ClassVar[bool] = True
-    shown: ClassVar[dict[str, str]] = {}
     waits: ClassVar[bool] = False
     own_end: ClassVar[bool] = False
     tools: ClassVar[tuple[str, ...]] = ()

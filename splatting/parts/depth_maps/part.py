@@ -33,7 +33,6 @@ class DepthMaps(Part):
     )
     # fmt: on
     needs = Needs(depth=True, files=True)
-    shown = {"depth": "Depth Loss"}
 
     @classmethod
     def follows_length(cls, given: "argparse.Namespace") -> bool:

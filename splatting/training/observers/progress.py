@@ -19,15 +19,13 @@ BAR_SECONDS = 0.2  # between updates, at least: each reads the losses, and so wa
 
 
 class ProgressBar(Part):
-    """Shows running means. At the end of a training it says how long that took."""
+    """Shows running means of the loss and of what parts add to it. At the end it says how long the training took."""
 
     reads_model = False
 
     def __init__(self, run: Run) -> None:
         self._run = run
-        self._terms = {name: LossWatch() for part in run.parts for name in part.shown}
-        titles = {title: self._terms[name] for part in run.parts for name, title in part.shown.items()}
-        self._shown = {"Loss": run.losses} | titles
+        self._shown = {"Loss": run.losses}
         self._updated, self._done = -math.inf, run.first_iteration
         first = run.schedule.step_before(run.first_iteration)
         form = {"bar_format": BY_CLOCK} if run.schedule.by_clock else {}
@@ -38,8 +36,8 @@ class ProgressBar(Part):
         return step.last or shown
 
     def measured(self, step: Iteration, losses: Losses) -> None:
-        for name in self._terms.keys() & losses.terms.keys():
-            self._terms[name].add(step.iteration, losses.terms[name])
+        for name, term in losses.terms.items():
+            self._shown.setdefault(f"{name.capitalize()} Loss", LossWatch()).add(step.iteration, term)
         if not step.due:
             return
         for loss in self._shown.values():

@@ -19,7 +19,6 @@ class Grey(Part):
             help="weight of the spread of colours in renders, which draws them towards grey; 0: off"),
     ))
     # fmt: on
-    shown = {"grey": "Grey"}  # in the progress bar
 
     def begin(self, run: Any, state: Any) -> None:
         from splatting.training.objective import LossWatch
