@@ -1,4 +1,4 @@
-"""Messages for rendering and training that run out of memory: what was needed, what is free, and a remedy."""
+"""The message for rendering or training that runs out of memory: what was needed, what is free, and a remedy."""
 
 import contextlib
 from collections.abc import Iterator, Sequence
@@ -11,21 +11,24 @@ from utils.system_utils import UserError
 
 @contextlib.contextmanager
 def memory_errors_explained(
-    gaussians: GaussianModel, cameras: Sequence[Camera | MiniCam], remedy: str = "lower --resolution (-r)"
+    gaussians: GaussianModel,
+    cameras: Sequence[Camera | MiniCam],
+    remedy: str = "lower --resolution (-r)",
+    what: str = "rendering",
 ) -> Iterator[None]:
-    """Replace an out-of-memory error by a UserError while these views are rendered. remedy: what makes them smaller."""
+    """Replace an out-of-memory error by a UserError while these views are rendered. remedy: what takes less memory."""
     try:
         yield
     except Exception as error:
         if not is_out_of_memory(error):
             raise
         raise UserError(
-            f"rendering ran out of memory ({situation(error, gaussians, cameras)}); {remedy}, or free memory "
-            "that other programs use"
+            f"{what} ran out of memory ({_situation(error, gaussians, cameras)}); {remedy}, or free memory that other "
+            "programs use"
         ) from error
 
 
-def situation(error: BaseException, gaussians: GaussianModel, cameras: Sequence[Camera | MiniCam]) -> str:
+def _situation(error: BaseException, gaussians: GaussianModel, cameras: Sequence[Camera | MiniCam]) -> str:
     """The memory asked for and free, the number of Gaussians, and the size of the largest view."""
     parts = [shortage(error, gaussians.get_xyz.device), f"{len(gaussians):,} Gaussians"]
     if cameras:

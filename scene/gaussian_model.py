@@ -87,16 +87,6 @@ class GaussianModel(ReferenceNames, GaussianParameters):
     reset_opacity = adc.reset_opacity
     penalise = penalty.penalise
 
-    def drop_broken_statistics(self) -> None:
-        """Restart the statistics of Gaussians whose sum of gradients is not finite."""
-        self.statistics.drop_broken()
-
-    def take_from_optimizer(self) -> None:
-        """Adopt the rows that densification had reached when memory ran out, so that they can be saved."""
-        self._take({group.get("name"): group["params"][0] for group in self.optimizer.param_groups})
-        if not self.statistics.fit(len(self)):
-            self._zero_statistics()
-
     # Exposures
 
     @cached_property
@@ -184,25 +174,16 @@ class GaussianModel(ReferenceNames, GaussianParameters):
         if guard := getattr(self.optimizer, "guard", None):
             guard.watch(iteration, loss)
 
-    def check_steps(self) -> None:
-        """UserError if a guard has held steps back, so that the model is older than its iteration number."""
-        guard = getattr(self.optimizer, "guard", None)
-        if guard and (iteration := guard.stopped_in()):
-            raise UserError(f"the loss or a step of iteration {iteration} was not finite; lower the learning rates")
-
-    def take_marks(self) -> list[tuple[str, list[int] | list[str], int]]:
-        """Values whose step a guard held back: name of the tensor, its rows or photos, and number of all rows."""
-        rows_of = self.shards.together(self.optimizer.take_marks(), self._attributes)
-        marks = [(name, rows.tolist(), self.gaussian_count) for name, rows in rows_of.items()]
-        for name, rows in self.exposures.optimizer.take_marks().items():
-            owners = self.exposures.rows_named(name)
-            marks.append((name, [owners[row] for row in rows.tolist()], len(owners)))
-        return marks
-
     def rewind(self, steps: int) -> None:
-        """Reduce the step counters by the steps that a guard held back."""
+        """Reduce the step counters by steps that were counted and not taken."""
         self.optimizer.rewind(steps)
         self.exposures.optimizer.rewind(steps)
+
+    def drop_held_steps(self, steps: int) -> None:
+        """Forget the steps that a guard held back: so many in all values, and one in those that it has marked."""
+        self.rewind(steps)
+        self.optimizer.drop_marks()
+        self.exposures.optimizer.drop_marks()
 
     def oneupSHdegree(self) -> None:
         """Raise the active SH degree by one, up to the maximum."""

@@ -70,15 +70,12 @@ class Sleeping:
         """Whether all blocks wake after a step."""
         return iteration % REST == 0
 
-    def flush(self, guarded: bool = True) -> None:
-        """Let all blocks take the steps that they have missed. The next step may leave them asleep.
-
-        guarded: unless the optimiser's guard has stopped its steps.
-        """
+    def flush(self) -> None:
+        """Let all blocks take the steps that they have missed. The next step may leave them asleep."""
         if self._asleep is not None:
             self._put_back(self._asleep)
             self._asleep = None
-        self._wake(self._anywhere(), True, guarded=guarded)
+        self._wake(self._anywhere(), True)
         self._is_whole = True
 
     def rows(self) -> Tensor:
@@ -167,8 +164,8 @@ class Sleeping:
         shapes = means, opacities, scales, rotations, None, None
         return Scene(*shapes, sh_dc, sh_rest, matrix, matrix, center, (1.0, 1.0, 1.0), (16, 16, 0, False, True))
 
-    def _wake(self, scene: Scene, every: bool, now: Tensor | None = None, guarded: bool = True) -> Tensor | None:
+    def _wake(self, scene: Scene, every: bool, now: Tensor | None = None) -> Tensor | None:
         averages, steps, _, guard, attributes, rates, constants, columns, _, iteration = self._adam.arguments(False)
         sleep = [self.awake, self._taken, self._terms]
-        step = averages, steps, guard if guarded else [], attributes, rates, constants, columns, iteration, now
+        step = averages, steps, guard, attributes, rates, constants, columns, iteration, now
         return OPERATORS.wake_(*scene.lists, sleep, every, *step)

@@ -39,13 +39,12 @@ class Immediate:
         self.drain = self.discard = self.wait = self._report
         self.throttle = lambda: self._report(AHEAD - 1)
         self.add = lambda at, _: self._pending.append(at)
-        self.abort = lambda: 0
+        self.abort = lambda: None
 
     def _report(self, most: int = 0) -> None:
         while len(self._pending) > most:
             at = self._pending.popleft()
             self._steps._run.set_rates(at)  # as a replay would
-            self._steps.finished(at)
 
     def capacity(self, at: object) -> AbstractContextManager:
         return nullcontext()

@@ -2,14 +2,11 @@
 
 import copy
 import weakref
-from itertools import chain, repeat
-from unittest.mock import DEFAULT, Mock
 
 import pytest
 import torch
-from gaussians import model, moments, options, parameters, take_steps
+from gaussians import model, options, take_steps
 
-from scene.gaussians import table
 from scene.gaussians.adam import GaussianAdam
 
 
@@ -132,41 +129,6 @@ def test_groups_are_the_references():
     }  # fmt: skip
     assert [(group["name"], group["lr"]) for group in optimizer.param_groups][:6] == list(rates.items())
     assert all(group["eps"] == 1e-15 and group["betas"] == (0.9, 0.999) for group in optimizer.param_groups)
-
-
-def _failing(function, call: int):
-    """Wrap `function` so that one call raises."""
-    return Mock(wraps=function, side_effect=chain(repeat(DEFAULT, call - 1), [MemoryError], repeat(DEFAULT)))
-
-
-@pytest.mark.parametrize("call", [1, 2, 3, 9, 18])
-def test_where_memory_fails_rows_are_appended_to_none_and_kept_in_all(monkeypatch, call):
-    """Six groups with two moments each are 18 tensors; memory runs out at one of them."""
-    monkeypatch.setattr(table, "_CHUNK", 7)
-    gaussians = model(40)
-    take_steps(gaussians, 2)
-    before, state = parameters(gaussians), moments(gaussians)
-    rows = {name: values[:5] for name, values in before.items()}
-    with monkeypatch.context() as patch, pytest.raises(MemoryError):
-        patch.setattr(torch, "cat", _failing(torch.cat, call))
-        gaussians.cat_tensors_to_optimizer(rows)
-    gaussians.take_from_optimizer()
-    _assert_rows(gaussians, before, state, torch.arange(40))
-
-    mask = torch.randperm(40, generator=torch.Generator().manual_seed(0)) < 30
-    with monkeypatch.context() as patch, pytest.raises(MemoryError):
-        patch.setattr(torch, "index_select", _failing(torch.index_select, call))
-        gaussians._prune_optimizer(mask)
-    gaussians.take_from_optimizer()
-    _assert_rows(gaussians, before, state, torch.arange(40)[mask])
-    assert [len(values) for values in (gaussians.denom, gaussians.max_radii2D)] == [30, 30]
-
-
-def _assert_rows(gaussians, before: dict, state: dict, rows: torch.Tensor) -> None:
-    for name, values in parameters(gaussians).items():
-        assert torch.equal(values, before[name][rows]), name
-        for key in ("exp_avg", "exp_avg_sq"):
-            assert torch.equal(moments(gaussians)[name][key], state[name][key][rows]), (name, key)
 
 
 def test_while_rows_change_no_more_than_one_tensor_is_there_twice():

@@ -66,7 +66,7 @@ def _tensors(path: Path) -> list[torch.Tensor]:
     [
         ("kill 0 7", ""),
         ("bug 1 7", "ValueError: no such thing"),
-        ("memory 1 7", "with --start_checkpoint {out}/chkpnt5.pth"),
+        ("memory 1 7", "training ran out of memory ("),
         ("hang 1 7", "error: another rank has ended, or did not answer"),
     ],
     ids=["kill", "bug", "memory", "hang"],
@@ -92,7 +92,7 @@ def test_no_rank_goes_on_after_one_has_stopped(colmap_scene, tmp_path):
     """Rank 0 has no fault of its own: what it saves is the model after the iteration in which the other stopped."""
     done = launch_fault(colmap_scene, tmp_path, "overflow 1 7")
     (line,) = done.errors
-    assert line.startswith("error: xyz of 1 of 300 (131) had no finite step in iteration 7 (view "), line
+    assert line.startswith("error: a step of iteration 7 (view "), line
     assert sorted(path.name for path in (tmp_path / "out").glob("chkpnt*")) == ["chkpnt5.pth", "chkpnt7.pth"]
     _train(colmap_scene, tmp_path / "one", "--no_curve", "--checkpoint_iterations", "7")
     # The parameters; statistics of density control go on until the fault is noticed, as with one process.

@@ -97,8 +97,8 @@ def test_a_hook_that_is_not_overridden_costs_nothing(monkeypatch):
     assert step.due is False
 
 
-def test_the_guards_stand_where_they_must(colmap_scene, tmp_path, monkeypatch):
-    """The order is meant: checks, writers, the guard of a changing model, checkpoints, and last what may wait."""
+def test_observers_stand_where_they_must(colmap_scene, tmp_path, monkeypatch):
+    """The order is meant: checks, writers, checkpoints, and last what may wait."""
     names = []
 
     def observers(*given) -> list[Part]:
@@ -107,8 +107,8 @@ def test_the_guards_stand_where_they_must(colmap_scene, tmp_path, monkeypatch):
         return listed
 
     _train(colmap_scene, tmp_path, monkeypatch, observers, "--eval")
-    assert names[0] == "DivergenceWatch" and names[-4:] == ["MemoryGuard", "Checkpoints", "Resume", "RemoteViewer"]
-    between = ["Curve", "Tensorboard", "Scores", "Saves", "Records", "MemoryGuard"]
+    assert names[0] == "DivergenceWatch" and names[-3:] == ["Checkpoints", "Resume", "RemoteViewer"]
+    between = ["Curve", "Tensorboard", "Scores", "Saves", "Records", "Checkpoints"]
     assert [name for name in names if name in between] == between
 
 

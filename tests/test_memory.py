@@ -8,20 +8,17 @@ from unittest.mock import DEFAULT, Mock
 
 import pytest
 import torch
-from gaussians import model, needs_59_values, needs_fused_step, options
+from gaussians import model, needs_59_values, options
 
 import render
 import train
 from gaussian_renderer import scored_views
-from scene.gaussian_model import GaussianModel
-from scene.gaussians.checkpoint import load_checkpoint
 from scene.images import decode
 from splatting.host import memory
 from splatting.host.memory import free_memory, gib, is_out_of_memory, shortage
 from splatting.training import disk_space, memory_estimate
 from splatting.training.memory_estimate import training_bytes
-from splatting.training.steps import fused
-from splatting.training.steps.graphs import Graphs
+from splatting.training.steps import plain
 from utils.system_utils import UserError, run_cli
 
 ROOT = Path(__file__).parents[1]
@@ -122,63 +119,22 @@ def _failing(function, call: int, error: Exception):
     return Mock(wraps=function, side_effect=chain(repeat(DEFAULT, call - 1), [error], repeat(DEFAULT)))
 
 
-@needs_fused_step
-def test_the_state_before_is_saved_and_goes_on_to_the_same_end(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("splatting.training.stepping.SH_INTERVAL", 5)  # the failing iteration raises the degree
-    with monkeypatch.context() as patch:
-        patch.setattr(fused, "draw", _failing(fused.draw, 5, ON_A_GPU))
-        with pytest.raises(UserError, match="training ran out of memory in iteration 5") as caught:
-            _train(colmap_scene, tmp_path / "cut")
-    text = str(caught.value)
-    for part in ("20.0 GiB asked for, ", "images of 24 x 16", "after iteration 4 is saved", "chkpnt4.pth",
-                 "--max_num_splats", "-r", "--images_to_load", "--sh_degree"):  # fmt: skip
-        assert part in text and "\n" not in text, part
-    capture, iteration = load_checkpoint(tmp_path / "cut" / "chkpnt4.pth")
-    assert iteration == 4 and capture[0] == 0 and f"{len(capture[1])} Gaussians" in text
-    resumed = _train(colmap_scene, tmp_path / "cut", "--start_checkpoint", tmp_path / "cut" / "chkpnt4.pth")
-    assert resumed == _train(colmap_scene, tmp_path / "whole")
+def test_a_training_says_what_did_not_fit(colmap_scene, tmp_path, monkeypatch):
+    """A full GPU in a step, and photos that are too large for the host."""
+    said = r"training ran out of memory \(%s.* free on the CPU; 300 Gaussians; images of 24 x 16\); lower .*resume"
+    for of, name, error, words in (
+        (plain, "render", ON_A_GPU, "20.0 GiB asked for, "),
+        (decode, "_to_rgb_or_rgba", MemoryError(), r"not enough memory for .*[vV]\d\d.png at 24 x 16 pixels"),
+    ):
+        with monkeypatch.context() as patch, pytest.raises(UserError, match=said % words):
+            patch.setattr(of, name, _failing(getattr(of, name), 3, error))
+            _train(colmap_scene, tmp_path, "--plain_step", "--images_to_load", 1)
 
 
-def test_a_picture_that_does_not_fit_saves_too(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(decode, "_to_rgb_or_rgba", _failing(decode._to_rgb_or_rgba, 5, MemoryError()))
-    with pytest.raises(UserError, match=r"for .*[vV]\d\d.png at 24 x 16 pixels.*chkpnt4.pth"):
-        _train(colmap_scene, tmp_path, "--images_to_load", 1)
-    assert load_checkpoint(tmp_path / "chkpnt4.pth")[1] == 4
-
-
-@pytest.mark.parametrize(("of", "name", "call", "count"), [(torch, "cat", 7, 300), (torch, "index_select", 12, 600)])
-def test_a_densification_cut_short_is_saved_whole(colmap_scene, tmp_path, monkeypatch, of, name, call, count):
-    """Clone 4 of 300 Gaussians and split 296 in two. tests/test_gaussian_optimizer.py: wherever memory fails."""
-    densify = GaussianModel.densify_and_prune
-
-    def lacking(*args: object, **kwargs: object) -> None:
-        with monkeypatch.context() as patch:
-            patch.setattr(of, name, _failing(getattr(of, name), call, ON_A_GPU))
-            densify(*args, **kwargs)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(GaussianModel, "densify_and_prune", lacking)
-        with pytest.raises(UserError, match="in iteration 3 .*may be incomplete, is saved: .*chkpnt3.pth"):
-            _train(colmap_scene, tmp_path)
-    capture, iteration = load_checkpoint(tmp_path / "chkpnt3.pth")
-    assert iteration == 3 and len(capture[1]) == count
-    _train(colmap_scene, tmp_path, "--start_checkpoint", tmp_path / "chkpnt3.pth")
-
-
-@needs_fused_step
-@pytest.mark.parametrize(
-    ("call", "error", "kind", "said"),
-    [
-        (1, ON_A_GPU, UserError, "in iteration 1 .*nothing was trained yet"),
-        (3, RuntimeError("shapes differ"), RuntimeError, "shapes differ"),
-    ],
-)
-def test_nothing_is_saved_where_nothing_was_trained_or_for_other_errors(
-    colmap_scene, tmp_path, monkeypatch, call, error, kind, said
-):
-    monkeypatch.setattr(fused, "draw", _failing(fused.draw, call, error))
-    with pytest.raises(kind, match=said):
-        _train(colmap_scene, tmp_path)
+def test_other_errors_of_a_training_stay_what_they_are(colmap_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(plain, "render", _failing(plain.render, 3, RuntimeError("shapes differ")))
+    with pytest.raises(RuntimeError, match="shapes differ"):
+        _train(colmap_scene, tmp_path, "--plain_step")
     assert not list(tmp_path.glob("*.pth"))
 
 
@@ -248,17 +204,3 @@ def test_the_estimate_counts_what_training_keeps():
     assert training_bytes(gaussians, 50, 0) - 50 * memory_estimate.PER_GAUSSIAN == counted
     more = training_bytes(gaussians, 50, 0, absolute=True) - training_bytes(gaussians, 50, 0)
     assert more == 50 * memory_estimate.PER_ABSOLUTE >= 50 * (4 + 8)  # a length, and a row of two values at least
-
-
-# Images and processes
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU")
-def test_a_full_gpu_saves_the_model(colmap_scene, tmp_path, monkeypatch):
-    error = _raised(lambda: torch.empty(1 << 50, dtype=torch.uint8, device="cuda"))
-    monkeypatch.setattr(fused, "draw", _failing(fused.draw, 4, error))
-    monkeypatch.setattr(Graphs, "launch", lambda *_: None)  # a captured step calls nothing
-    with pytest.raises(UserError, match="GiB asked for, .* GiB free on the GPU.*chkpnt3.pth"):
-        _train(colmap_scene, tmp_path)
-    assert load_checkpoint(tmp_path / "chkpnt3.pth")[1] == 3

@@ -1,7 +1,6 @@
 """The ways to take a step of training: the fast ones give the bytes of the plain one."""
 
 import gc
-import re
 import signal
 import subprocess
 import sys
@@ -239,30 +238,6 @@ def test_a_step_that_waits_for_the_gpu_is_not_captured_and_random_numbers_are_th
     del held
     torch.cuda.empty_cache()  # gives nothing back while torch believes that it captures
     assert torch.cuda.memory_reserved() <= reserved - 2**28
-
-
-@pytest.mark.parametrize("_", GPU)
-@pytest.mark.parametrize("replayed", [0, 1, 3])
-def test_memory_that_runs_out_in_a_replay_leaves_the_last_whole_step(scene, tmp_path, monkeypatch, replayed, _):
-    """After so many steps of a queue that overflowed were replayed."""
-    wanted = trained(scene, tmp_path / "whole", *GROWING)
-    replay, left = CapturedStep.replay, [replayed]
-
-    def again(self, at, first):
-        if at.iteration > 40 and left[0] == 0:
-            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.")
-        left[0] -= at.iteration > 40
-        replay(self, at, first)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(speculative, "_with_spare", lambda count, *_: count)  # so that many steps overflow
-        patch.setattr(CapturedStep, "replay", again)
-        with pytest.raises(UserError, match="the model after iteration .* is saved") as caught:
-            trained(scene, tmp_path / "out", *GROWING)
-    saved = int(re.search(r"after iteration (\d+) is saved", str(caught.value))[1])
-    assert 40 <= saved < ITERATIONS
-    start = "--start_checkpoint", tmp_path / f"out/chkpnt{saved}.pth"
-    assert not differences(trained(scene, tmp_path / "out", *GROWING, *start), wanted)
 
 
 @pytest.mark.parametrize("_", GPU)

@@ -40,7 +40,7 @@ class WorkloadRun(Run):
         words = ["-s", ".", "--iterations", str(steps), "--densify_from_iter", "10000", *_STILL * still]
         words += ["--strategy", "adc", "--gpu_memory", str(gpu_memory)]
         self.launch, self.dataset, self.opt, self.pipe = train.parse(words)
-        self.lost = self.first_iteration = 0
+        self.first_iteration = 0
         self.interrupt, self.device = DeferredInterrupt(), compute_device()
         self.schedule = Schedule(self.opt.iterations)
         images = SimpleNamespace(ahead=0, keep_on=torch.device("cpu"), planned_bytes=0)

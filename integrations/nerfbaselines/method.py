@@ -27,7 +27,6 @@ from splatting.training.iteration import Iteration
 from splatting.training.loop import training_steps
 from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.observers.mask_watch import MaskWatch
-from splatting.training.observers.memory_guard import MemoryGuard
 from splatting.training.part import Part
 from splatting.training.run import Run
 from train import parse
@@ -121,7 +120,7 @@ class GaussianSplatting(Method):
             self._run = run = Run(*self._options, launch)
         run.begin()
         self._watch = DivergenceWatch(run)
-        guards = [self._watch, MaskWatch(run.scene.getTrainCameras()), _Losses(), MemoryGuard(run)]
+        guards = [self._watch, MaskWatch(run.scene.getTrainCameras()), _Losses()]
         self._steps = training_steps(run, guards)
         self._pause = ExitStack()
         for opened in (self._pause, self._steps):  # neither can be closed any more once Python is being torn down
@@ -167,7 +166,7 @@ class GaussianSplatting(Method):
                 if self._at.last:
                     next(self._steps, None)
         except UserError:
-            self._removal.detach()  # the message names what was rescued there
+            self._removal.detach()  # the message may name a checkpoint there
             raise
         self._pause.enter_context(self._run.clock.paused("between steps"))
         return told
@@ -178,7 +177,7 @@ class GaussianSplatting(Method):
             return nullcontext()
         if self._at is not None:
             self._taker.drain()
-            self._watch.look(self._at.iteration, stepped=not self._at.last)
+            self._watch.look(self._at.iteration)
         return self._run.flushed_view()
 
     @torch.no_grad()

@@ -24,7 +24,7 @@ class StepGuard:
     """Stops all optimisers at the first iteration whose loss or whose step is not finite.
 
     In that iteration, a value whose gradient or step is not finite keeps its value. Its exp_avg becomes NaN as a
-    mark, which GaussianAdam.take_marks removes. All other values take their step. In later iterations no value does.
+    mark, which GaussianAdam.drop_marks removes. All other values take their step. In later iterations no value does.
     The flag `stopped` stays on the device, and only `stopped_in` waits for it.
     """
 
@@ -178,22 +178,14 @@ class GaussianAdam(torch.optim.Adam):
             for param in group["params"]:
                 param.grad = None
 
-    def take_marks(self) -> dict[str, Tensor]:
-        """Rows (n,), by group, of the values whose step a guard held back; their averages restart at zero."""
-        rows = {}
+    def drop_marks(self) -> None:
+        """Restart the mean gradient of the values whose step a guard held back."""
         for group in self._groups()[0]:
-            state = self.state.get(group["params"][0])
-            if not state:
-                continue
-            marked = state["exp_avg"].isnan()
-            if marked.any():
-                rows[group["name"]] = marked.reshape(len(marked), -1).any(dim=1).nonzero().reshape(-1)
-                for moment in ("exp_avg", "exp_avg_sq"):
-                    state[moment].masked_fill_(marked, 0.0)
-        return rows
+            if state := self.state.get(group["params"][0]):
+                state["exp_avg"].nan_to_num_(0.0)
 
     def rewind(self, steps: int) -> None:
-        """Reduce the step counters by the steps that a guard held back."""
+        """Reduce the step counters by steps that were counted and not taken."""
         for group in self._groups()[0]:
             if state := self.state.get(group["params"][0]):
                 state["step"] = (state["step"] - steps).clamp_min(0)

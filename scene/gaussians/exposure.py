@@ -111,10 +111,6 @@ class Exposures:
             self.optimizer.step()
             self.optimizer.zero_grad(set_to_none=True)
 
-    def rows_named(self, name: str) -> list[str]:
-        """What the rows of a group of the optimiser belong to."""
-        return self.names
-
     def capture(self) -> dict[str, Any]:
         """State that a resumed training needs, as plain values."""
         return {"names": self.names, "values": self.values.detach(), "optimizer": self.optimizer.state_dict()}

@@ -41,19 +41,9 @@ class Statistics:
         self.xyz_gradient_accum += torch.where(seen[:, None], length, 0.0)
         self.denom += seen[:, None]
 
-    def drop_broken(self) -> None:
-        """Restart the sum and count of Gaussians whose sum of gradients is not finite."""
-        broken = ~self.xyz_gradient_accum.isfinite()
-        self.xyz_gradient_accum[broken] = 0.0
-        self.denom[broken] = 0.0
-
     def to(self, device: torch.device | str) -> "Statistics":
         """The same statistics on a device."""
         return Statistics(*(getattr(self, name).to(device) for name in NAMES))
-
-    def fit(self, count: int) -> bool:
-        """Whether there is a row for each of `count` Gaussians in every tensor."""
-        return all(len(getattr(self, name)) == count for name in NAMES)
 
 
 NAMES = tuple(field.name for field in fields(Statistics))

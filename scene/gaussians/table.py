@@ -11,8 +11,6 @@ from scene.gaussians.spilled import empty_beside, placed, room_for
 from scene.gaussians.statistics import PER_ROW
 from splatting.host.memory import is_out_of_memory
 
-_CHUNK = 1 << 16  # rows moved at a time when memory is too short for all of them
-
 Group = dict[str, Any]  # a parameter group of a torch optimiser: `params`, options, and maybe `name`
 States = MutableMapping[Tensor, dict[str, Any]]  # an optimiser's state by parameter
 Change = Callable[[Tensor], Tensor]  # of the rows (N, ...) of any tensor
@@ -40,30 +38,17 @@ class GaussianTable:
         ]
 
     def select(self, indices: Tensor, count: int) -> dict[str, nn.Parameter]:
-        """Keep the rows (n,) int64, ascending, of the parameters that have `count`. Returns these by name.
-
-        When memory runs out, the rows are moved within their own memory, and the error is raised afterwards.
-        """
-        errors = []
+        """Keep the rows (n,) int64, ascending, of the parameters that have `count`. Returns these by name."""
 
         def keep(values: Tensor, name: str, _: bool) -> Tensor:
-            try:
-                return torch.index_select(values, 0, indices, out=room_for(self._model, name, values, len(indices)))
-            except (MemoryError, RuntimeError) as error:
-                if not is_out_of_memory(error):
-                    raise
-                errors.append(error)
-                return _move_up(values, indices)
+            return torch.index_select(values, 0, indices, out=room_for(self._model, name, values, len(indices)))
 
-        params = self._map(self.row_groups(count), keep)
-        if errors:
-            raise errors[0]
-        return params
+        return self._map(self.row_groups(count), keep)
 
     def append(self, rows: Rows) -> dict[str, nn.Parameter]:
         """Append `rows[name]` (n, ...) to each parameter, with averages of zero. Returns the parameters by name.
 
-        ValueError for a parameter without rows. When memory runs out, none keeps any of the new rows.
+        ValueError for a parameter without rows.
         """
         bare = self._model.optimizer is None
         groups = [*self.optimised, *(group for group in self.others if bare or group["name"] in rows)]
@@ -81,15 +66,10 @@ class GaussianTable:
             new = values.new_zeros(len(new), *values.shape[1:]) if is_state else new
             return torch.cat((values, new.detach()), out=room_for(self._model, name, values, len(values) + len(new)))
 
-        try:
-            params = self._map(groups, grow)
-            for name, values in self._columns.items():
-                self._columns[name] = torch.cat((values, values.new_zeros(len(rows["xyz"]), *values.shape[1:])))
-            return params
-        except (MemoryError, RuntimeError) as error:
-            if is_out_of_memory(error):
-                self._map(groups, lambda values, *_: values[:count])
-            raise
+        params = self._map(groups, grow)
+        for name, values in self._columns.items():
+            self._columns[name] = torch.cat((values, values.new_zeros(len(rows["xyz"]), *values.shape[1:])))
+        return params
 
     def permute(self, order: Tensor) -> None:
         """Put the rows, with the statistics, into an order (N,) int64: row i becomes what row order[i] was."""
@@ -171,22 +151,13 @@ class GaussianTable:
         if state is not None:
             self.states[param] = state
             for key, mean in state.items():
-                # Longer than the parameter: appended just before memory ran out, and now to be cut again.
-                if torch.is_tensor(mean) and mean.dim() == dims and len(mean) >= rows:
+                if torch.is_tensor(mean) and mean.dim() == dims and len(mean) == rows:
                     state[key] = change(mean)
         return param
 
 
 def _with_rows(groups: Iterable[Group], count: int) -> list[Group]:
     return [g for g in groups if len(g["params"]) == 1 and g["params"][0].dim() and len(g["params"][0]) == count]
-
-
-def _move_up(values: Tensor, indices: Tensor) -> Tensor:
-    """values[indices] for ascending indices, in the memory of `values` itself."""
-    for start in range(0, len(indices), _CHUNK):
-        part = indices[start : start + _CHUNK]
-        values[start : start + len(part)] = values.index_select(0, part)  # later parts read rows further down
-    return values[: len(indices)]
 
 
 def _permuted(values: Tensor, order: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """Rows of Gaussians that ranks share: which rows a rank holds, and how they are divided again after a change."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import wraps
 from itertools import pairwise
@@ -65,10 +65,6 @@ class Shards:
     def items(self, indices: Tensor) -> Tensor:
         """Indices (n,) among all rows, of those of this rank."""
         return indices
-
-    def together(self, found: dict[str, Tensor], names: Iterable[str]) -> dict[str, Tensor]:
-        """Indices (n,) among all rows that any rank has found, by some of the names; of those without any nothing."""
-        return found
 
     def marked(self, mask: Tensor) -> int:
         """How many values of all masks (N,) bool are true."""
@@ -186,11 +182,6 @@ class Divided(Shards):
 
     def items(self, indices: Tensor) -> Tensor:
         return indices + self.first
-
-    def together(self, found: dict[str, Tensor], names: Iterable[str]) -> dict[str, Tensor]:
-        none = torch.empty(0, dtype=torch.int64, device=compute_device())
-        every = {name: self.ranks.gather(self.items(found.get(name, none))) for name in names}
-        return {name: rows for name, rows in every.items() if len(rows)}
 
     def send_draws(self, rows: dict[str, Tensor], draws: Tensor, counts: Tensor) -> dict[str, Tensor]:
         moves = Redistribution(self.ranks, draws, [0, *counts.cumsum(0).tolist()])

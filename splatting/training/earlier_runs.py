@@ -104,7 +104,7 @@ def continue_records(model_path: str, checkpoint: str | None, first_iteration: i
     if checkpoint and (Path(checkpoint).parent / training_log.NAME).is_file():
         before = Path(checkpoint).parent
     log, rows = TrainingLog(model_path, first_iteration, before), continue_curve(model_path, first_iteration, before)
-    if rows:  # after a rescue the curve has rows beyond the log's last record
+    if rows:  # the log may be lost, or end before them
         log.not_before(rows[-1])
     elif checkpoint and not log.records:
         print(

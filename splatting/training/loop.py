@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 
 import torch
 
+from gaussian_renderer.memory_errors import memory_errors_explained
 from splatting.training.announcer import Announcer
 from splatting.training.iteration import Iteration
 from splatting.training.part import Part
@@ -11,6 +12,8 @@ from splatting.training.run import Run
 from splatting.training.step_agreement import StepAgreement
 from splatting.training.steps import step_taker
 from splatting.training.steps.plain import PlainStep
+
+_REMEDY = "lower --resolution (-r), --max_num_splats or --images_to_load, and resume from the last checkpoint"
 
 
 def run_training(run: Run, observers: Sequence[Part]) -> None:
@@ -33,7 +36,8 @@ def training_steps(run: Run, observers: Sequence[Part]) -> Iterator[tuple[Iterat
     at = None
     try:
         # Backward runs on this thread: waking autograd's worker costs time in every iteration.
-        with run.interrupt, announcer, torch.autograd.set_multithreading_enabled(False):
+        explained = memory_errors_explained(run.gaussians, run.views.cameras, _REMEDY, "training")
+        with explained, run.interrupt, announcer, torch.autograd.set_multithreading_enabled(False):
             try:
                 for at in run.iterations():
                     announcer.begins(at)
@@ -47,8 +51,8 @@ def training_steps(run: Run, observers: Sequence[Part]) -> Iterator[tuple[Iterat
                     if at.stopping:
                         raise at.stopping
                     yield at, step
-            except BaseException:  # leave the model as it was between two steps
-                run.lost = step.abort()
+            except BaseException:
+                step.abort()
                 raise
     except KeyboardInterrupt:
         if at is not None and at.stopping:

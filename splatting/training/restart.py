@@ -1,4 +1,4 @@
-"""Checkpoints of the training that torchrun has started: where a restarted one goes on, and what a fault leaves."""
+"""Checkpoints of the training that torchrun has started: where a restarted one goes on."""
 
 import os
 import re
@@ -39,11 +39,3 @@ def newest_checkpoint(folder: str, below: float = float("inf"), since: float | N
             if written.st_mtime >= began:
                 found[written.st_mtime_ns, number] = path
     return str(found[max(found)]) if found else None
-
-
-def what_stands(folder: str, start: str | None) -> str:
-    """Words about the last checkpoint, for an end that cannot save one. start: the one that the training began with."""
-    newest = newest_checkpoint(folder) or start
-    if newest is None:
-        return "no checkpoint was saved; start again, with --checkpoint_iterations"
-    return f"the last checkpoint is complete: resume with --start_checkpoint {newest}"

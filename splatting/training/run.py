@@ -42,7 +42,7 @@ class Run(Stepping):
 
     dataset, opt, pipe, launch: the options; group: the processes that train together; start: a chkpntN.pth that is
     resumed, or None. From `begin` on: log, rows (of the curve so far), losses (running mean of the total) and clock
-    (seconds of training). lost: steps that an error has taken back. interrupt: a signal that asks the loop to stop; an
+    (seconds of training). interrupt: a signal that asks the loop to stop; an
     observer that waits has to look at it. resources: what parts have open, closed when the training is over, however it
     ends. report: `training_report`, or what replaces it; writer: its first argument. joules: what the clock reads
     (host/energy.py). checkpoints: writes them, while the loop runs.
@@ -71,7 +71,7 @@ class Run(Stepping):
         dataset = self.dataset = earlier_runs.resolve_lenses(dataset, self.start)
         if opt.strategy == "auto" and self.start:
             opt.strategy = earlier_runs.strategy_of(self.start)
-        self.lost, self.resources = 0, ExitStack()
+        self.resources = ExitStack()
         self.interrupt, self.device = DeferredInterrupt(), compute_device()
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
         capture, self.first_iteration = self._read_start()

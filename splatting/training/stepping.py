@@ -155,10 +155,10 @@ class Stepping:
         """Within it, others may read the model."""
         return nullcontext() if self.sleeping is None else self.sleeping.flushed_view()
 
-    def stop_skipping(self, guarded: bool = True) -> None:
-        """Let all blocks take the steps that they have missed, and sleep no more. guarded: of `Sleeping.flush`."""
+    def stop_skipping(self) -> None:
+        """Let all blocks take the steps that they have missed, and sleep no more."""
         if self.sleeping is not None:
-            self.sleeping.flush(guarded)
+            self.sleeping.flush()
         self.sleeping = None
 
     def render_options(self, step: Iteration) -> dict[str, bool]:

@@ -57,7 +57,6 @@ class BudgetControl(DensityControl):
     def after_step(self, step: Iteration) -> None:
         if not self.changes(step.iteration):
             return
-        self._gaussians.check_steps()  # before rows change, so that an error finds the rows of the step
         grows = self._grows(step.iteration)
         aim = now = self._gaussians.gaussian_count
         if grows:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatting.files.json_files import SCHEDULE
 from splatting.training.option import MOST_NEEDED, Option, within
-from splatting.training.part import Error, Options, Part, fill
+from splatting.training.part import Options, Part, fill
 
 if TYPE_CHECKING:
     import argparse
@@ -79,7 +79,3 @@ class TimeBudget(Part):
 
         if self._iteration:
             write_schedule(Path(scene.model_path) / SCHEDULE, self._run.schedule.up_to(self._iteration))
-
-    def ended(self, error: Error) -> None:
-        """Also by an error whose rescue has saved a checkpoint."""
-        self.save(self._run.scene)

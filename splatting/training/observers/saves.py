@@ -1,6 +1,7 @@
 """Saves of the model as PLY, and checkpoints that a training can be resumed from."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from tqdm import tqdm
@@ -8,7 +9,6 @@ from tqdm import tqdm
 from scene.gaussians.checkpoint import save_checkpoint
 from splatting.training.disk_space import little_space
 from splatting.training.iteration import Iteration, Losses
-from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.output_folder import view_command
 from splatting.training.part import Part
 from splatting.training.run import Run
@@ -43,9 +43,10 @@ class Saves(Part):
 class Checkpoints(Part):
     """Writes chkpntN.pth when planned, and when a signal stops the training, which also saves the PLY."""
 
-    def __init__(self, run: Run, watch: DivergenceWatch) -> None:
+    def __init__(self, run: Run, look: Callable[[int], None]) -> None:
+        """look: refuses what must not be saved (`DivergenceWatch.look`)."""
         self._run = run
-        self._watch = watch
+        self._look = look
 
     def due(self, step: Iteration) -> bool:
         return step.takes(self._run.launch.checkpoint_iterations)
@@ -60,20 +61,29 @@ class Checkpoints(Part):
         name: of the file, chkpntN.pth if it is empty.
         """
         run = self._run
-        self._watch.look(step.iteration, stepped=not step.last)
-        seconds = run.clock.seconds
-        with run.clock.paused("saving"):
-            run.gaussians.check_finite(step.iteration)
-            tqdm.write(f"[ITER {step.iteration}] Saving Checkpoint", file=sys.stdout)
-            path = Path(run.scene.model_path) / (name or f"chkpnt{step.iteration}.pth")
-            run.scene.save_beside()
-            save_checkpoint(path, run.checkpoint_state(), step.iteration)
-            numbers = {"gaussians": run.gaussians.gaussian_count, "loss": run.losses.mean}
-            run.log.add(step.iteration, seconds, run.clock.joules, **numbers)
-            if step.stopping:
-                run.scene.save(step.iteration)
+        self._look(step.iteration)
+        path = write_checkpoint(run, step.iteration, name, with_ply=bool(step.stopping))
         if step.stopping:
             look = f"Look at the model: {view_command(run.scene.model_path, step.iteration)}"
             early = ", before its learning rates fell" if run.schedule.by_clock else ""
             resume = f"Resume by the same command with --start_checkpoint {path}"
             tqdm.write(f"Stopped at iteration {step.iteration}{early}\n{look}\n{resume}", file=sys.stderr)
+
+
+def write_checkpoint(run: Run, iteration: int, name: str = "", with_ply: bool = False) -> Path:
+    """Write a checkpoint of the model, and its PLY, and note it in the log. Returns the checkpoint's path.
+
+    Every rank must call it. name: of the file, chkpntN.pth if it is empty.
+    """
+    seconds = run.clock.seconds
+    with run.clock.paused("saving"):
+        run.gaussians.check_finite(iteration)
+        tqdm.write(f"[ITER {iteration}] Saving Checkpoint", file=sys.stdout)
+        path = Path(run.scene.model_path) / (name or f"chkpnt{iteration}.pth")
+        run.scene.save_beside()
+        save_checkpoint(path, run.checkpoint_state(), iteration)
+        numbers = {"gaussians": run.gaussians.gaussian_count, "loss": run.losses.mean}
+        run.log.add(iteration, seconds, run.clock.joules, **numbers)
+        if with_ply:
+            run.scene.save(iteration)
+    return path

@@ -2,7 +2,6 @@
 
 from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.observers.mask_watch import MaskWatch
-from splatting.training.observers.memory_guard import MemoryGuard
 from splatting.training.observers.progress import ProgressBar, Summary
 from splatting.training.observers.records import Records
 from splatting.training.observers.report import Scores, training_report
@@ -16,7 +15,7 @@ def standard_observers(run: Run) -> list[Part]:
     if run.report is not training_report:
         run.stop_skipping()  # it may read or change the model in every iteration
     watch = DivergenceWatch(run)
-    run.checkpoints = Checkpoints(run, watch)
+    run.checkpoints = Checkpoints(run, watch.look)
     return [
         watch,  # first: observers that write rely on all losses so far being finite
         *([ProgressBar(run)] if run.group.first else []),  # reads the losses that the watch has checked
@@ -26,7 +25,6 @@ def standard_observers(run: Run) -> list[Part]:
         Saves(run),  # before the model changes
         Records(run),  # after all that add to the iteration's record
         Summary(run),  # after all that say something at the end
-        MemoryGuard(run),  # from `measured` to `stepped` the model changes; otherwise it is whole
         run.checkpoints,  # writes the whole state after the step
         *(part for part in run.parts if part.waits),
     ]

@@ -22,10 +22,7 @@ from splatting.training.steps.speculative import AHEAD, Speculation
 
 
 class CapturedStep(FusedStep):
-    """Takes steps as `FusedStep` does, but does not wait for the GPU unless something reads or changes the model.
-
-    An error leaves the model as it was after the last step that was done.
-    """
+    """Takes steps as `FusedStep` does, but does not wait for the GPU unless something reads or changes the model."""
 
     def __init__(self, run: Run) -> None:
         super().__init__(run)
@@ -68,13 +65,8 @@ class CapturedStep(FusedStep):
         if self._run.on_host:
             self._run.on_host.place()
 
-    def abort(self) -> int:
-        lost = self._ahead.abort()
-        self._step_on_host(sum(not one.done for one in self._fetched.values()))
-        self._fetched.clear()
-        if self._run.on_host:
-            self._run.on_host.place()
-        return lost
+    def abort(self) -> None:
+        self._ahead.abort()
 
     def _is_queued(self, at: Iteration) -> bool:
         return at.steps and not at.due and self._fuses(at)
@@ -131,11 +123,6 @@ class CapturedStep(FusedStep):
 
     # What speculation asks for, of steps that are done or overflowed
 
-    def finished(self, at: Iteration) -> None:
-        """Note that the GPU takes that step of the Gaussians for good."""
-        if self._rows is not None:
-            self._fetched[at.iteration].done = True
-
     def replay(self, at: Iteration, first: Losses) -> None:
         """Queue a step once more, with the same values, which go into the losses that observers hold (`first`)."""
         self._run.set_rates(at)
@@ -148,7 +135,7 @@ class CapturedStep(FusedStep):
                 old.detach().copy_(new)
 
     def rewind(self, steps: int) -> None:
-        """Take back what the host has counted for steps that will be replayed, or that an error has ended."""
+        """Take back what the host has counted for steps that will be replayed."""
         self._run.gaussians.rewind(steps)
         if steps and self._run.sleeping:
             self._run.sleeping.stepped()  # a rest may be among the steps
@@ -160,4 +147,3 @@ class _Fetched:
     uid: int
     gradient: Tensor  # (CAMERA_NUMBERS,) on the host, once it is copied
     copied: torch.cuda.Event | None
-    done: bool = False

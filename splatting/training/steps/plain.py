@@ -54,8 +54,8 @@ class PlainStep:
     """Renders a view, compares it with its photo, follows the gradient, controls density, steps the optimisers.
 
     A faster step is a subclass, and falls back on this one. Where steps are queued on a GPU, `throttle` waits until
-    another may be, `drain` until all are done, and `abort` takes back those that cannot be done after an error, and
-    returns their number. A plain step leaves nothing pending.
+    another may be, `drain` until all are done, and `abort`, after an error, until the GPU has stopped. A plain step
+    leaves nothing pending.
     """
 
     def __init__(self, run: Run) -> None:
@@ -119,5 +119,5 @@ class PlainStep:
     def drain(self) -> None:
         pass
 
-    def abort(self) -> int:
-        return 0
+    def abort(self) -> None:
+        pass

@@ -35,9 +35,6 @@ class Replayed(Protocol):
     def measure(self, at: Iteration) -> object:
         """Render a view, and compute the losses and their gradients."""
 
-    def finished(self, at: Iteration) -> None:
-        """The GPU has taken a step for good."""
-
     def replay(self, at: Iteration, first: Losses) -> None:
         """Take a step once more; its losses go into `first`."""
 
@@ -60,7 +57,6 @@ Capacity = tuple[int, int, int, int]  # of instances, slots, gradient rows and b
 class _Pending:
     at: Iteration
     losses: Losses
-    counted: bool = True  # whether the host counts the step among those that it has queued
 
 
 class Speculation:
@@ -99,15 +95,9 @@ class Speculation:
         """Wait until all steps are done."""
         self._collect(0)
 
-    def abort(self) -> int:
-        """Drop the steps that overflowed, after an error. Returns their number; they changed nothing."""
+    def abort(self) -> None:
+        """Wait, after an error, until the GPU writes no more into memory that is given back."""
         self._stream.synchronize()
-        while self._pending and (report := self._report()) and not report[4]:
-            self._finish(report)
-        lost = len(self._pending)
-        self._steps.rewind(sum(pending.counted for pending in self._pending))
-        self._pending.clear()
-        return lost
 
     @contextmanager
     def capacity(self, at: Iteration | None) -> Iterator[None]:
@@ -140,7 +130,6 @@ class Speculation:
         at = self._pending.popleft().at
         self._needed[_view(at)] = tuple(report[:4])
         self._done += 1
-        self._steps.finished(at)
 
     def _collect(self, most: int) -> None:
         """Take back the reports that are there, and wait until at most so many steps are pending."""
@@ -161,8 +150,6 @@ class Speculation:
         self._words[0] = 0
         self._numbers[(self._done + 1) % _REPORTS][5] = 0  # the halted step's report will come once more
         self._steps.rewind(len(self._pending))
-        for pending in self._pending:
-            pending.counted = False
         instances, slots, rows, blocks, _ = report
         if instances > _MOST:
             self._steps.measure(self._pending[0].at)  # raises an error: its lists are too long for any capacity
@@ -173,7 +160,6 @@ class Speculation:
         self._needed[view] = instances, slots, rows or instances, blocks
         for pending in self._pending:
             self._steps.replay(pending.at, pending.losses)
-            pending.counted = True
 
 
 def _with_spare(count: int, least: int = _LEAST) -> int:
