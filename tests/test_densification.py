@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
-from scene.gaussians.long_axis import long_axis_children
 from splatting.parts import part_class
 from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
 from splatting.training.adaptive_density import AdaptiveDensityControl
@@ -97,8 +96,8 @@ class TakingNorms(Replacing):
 
 
 @pytest.mark.parametrize("client", [Replacing, TakingNorms])
-@pytest.mark.parametrize(("screen", "long_axis"), [(None, False), (20, False), (20, True)])
-def test_clones_and_splits_at_once_give_the_bytes_of_one_after_the_other(screen, long_axis, client):
+@pytest.mark.parametrize("screen", [None, 20])
+def test_clones_and_splits_at_once_give_the_bytes_of_one_after_the_other(screen, client):
     generator, models = torch.Generator().manual_seed(7), []
     scales = (LIMIT * 20 ** (2 * torch.rand(300, generator=generator) - 1)).tolist()  # up to twice what is pruned
     gradients = (2 * THRESHOLD * torch.rand(300, generator=generator)).tolist()
@@ -107,7 +106,7 @@ def test_clones_and_splits_at_once_give_the_bytes_of_one_after_the_other(screen,
         gaussians.__class__ = kind
         with torch.no_grad():
             gaussians._opacity[::7] = -6.0
-        _densify(gaussians, screen=screen, seed=3, iteration=700, long_axis=long_axis)
+        _densify(gaussians, screen=screen, seed=3, iteration=700)
         models.append(gaussians)
     ours, theirs = models
     assert theirs.cloned > 20 and len(ours) == len(theirs) != 300
@@ -115,27 +114,6 @@ def test_clones_and_splits_at_once_give_the_bytes_of_one_after_the_other(screen,
         assert torch.equal(value, parameters(theirs)[name]), name
         for key, average in moments(ours)[name].items():
             assert torch.equal(average, moments(theirs)[name][key]), (name, key)
-
-
-def test_a_split_along_the_longest_axis_has_two_children():
-    with pytest.raises(ValueError, match="makes 2 children, not 3"):
-        _toy([LIMIT * 3], [1.0]).densify_and_split(torch.ones(1), 0.5, EXTENT, 3, long_axis=True)
-
-
-def test_children_along_the_longest_axis_are_told_from_clones():
-    """Clones stay copies; both children take the place of their parent, by the rule of scene/gaussians/long_axis.py."""
-    results = []
-    for seed in (1, 2):
-        gaussians = _toy([LIMIT / 2] * 3 + [LIMIT * 3] * 3, [1.0, 0.0, 1.0, 1.0, 0.0, 1.0], opacity=0.9)
-        before = parameters(gaussians)
-        _densify(gaussians, long_axis=True, seed=seed)
-        results.append(parameters(gaussians))
-    wanted = {name: value[[0, 1, 2, 4, 0, 2, 3, 5, 3, 5]] for name, value in before.items()}
-    rows = (before[name][[3, 5]] for name in ("xyz", "scaling", "rotation", "opacity"))
-    for name, value in long_axis_children(*rows).items():
-        wanted[name][6:] = value
-    for name, value in wanted.items():
-        assert torch.equal(results[0][name], value) and torch.equal(results[1][name], value), name
 
 
 def test_reset_lowers_opacities_to_a_hundredth():

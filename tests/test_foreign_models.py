@@ -168,8 +168,7 @@ def test_replaced_activations_are_what_is_rendered():
     torch.testing.assert_close(_image(gaussians), wanted, **CLOSE)
 
 
-@pytest.mark.parametrize("long_axis", [False, True])
-def test_density_control_follows_replaced_activations(long_axis):
+def test_density_control_follows_replaced_activations():
     """The same scales and opacities by other activations give the same Gaussians."""
     plain, other = model(60), model(60)
 
@@ -184,7 +183,7 @@ def test_density_control_follows_replaced_activations(long_axis):
         plain._opacity[0], other._opacity[0] = -9.0, -4.5
     for gaussians in (plain, other):
         gaussians.xyz_gradient_accum, gaussians.denom = torch.arange(60.0)[:, None], torch.ones(60, 1)
-        gaussians.densify_and_prune(30.0, 0.005, 20.0, 20, seed=4, iteration=1, long_axis=long_axis)
+        gaussians.densify_and_prune(30.0, 0.005, 20.0, 20, seed=4, iteration=1)
     assert len(plain) == len(other) > 60
     for name in ("get_xyz", "get_scaling", "get_opacity"):
         torch.testing.assert_close(getattr(other, name), getattr(plain, name), rtol=1e-4, atol=1e-5)

@@ -28,8 +28,6 @@ KNOWN = {  # words in files that are options of a part, and mean something else 
     ("no_curve", "integrations/nerfbaselines/method.py"),
     ("no_curve", "splatting/diagnosis/advice.py"),  # of a short training
     ("schedule", "scene/gaussian_model.py"),  # that of exposures' learning rate
-    ("split", "splatting/evaluation/tables.py"),  # of photos into training and test views
-    ("split", "splatting/evaluation/results.py"),
     ("train_test_exp", "utils/camera_utils.py"),  # what functions of the reference take
     *((f"exposure_lr_{end}", "scene/gaussians/exposure.py") for end in ("init", "final", "delay_steps", "delay_mult")),
     *((f"exposure_lr_{end}", "full_eval.py") for end in ("init", "final", "delay_steps", "delay_mult")),  # commands

@@ -191,7 +191,7 @@ def _all(scene: Path, folder: Path, kinds: list[tuple[str, tuple[str, ...]]]) ->
 
 def test_ranks(scene, tmp_path, plain):
     """With all that a kind may have of its own: terms, optimisers, strategies, cameras, and images of one tile."""
-    names = "default", "sparse", "appearance", "long axis", "tiny", "together", "mcmc", "filter", "budget errors"
+    names = "default", "sparse", "appearance", "tiny", "together", "mcmc", "filter", "budget errors"
     kinds = [(name, ()) for name in (*names, "poses", "poses, no graph")]
     kinds += [("exposure", ("--plain_step",)), ("poses", ("--plain_step",))]
     found = in_ranks(2, _all, scene, tmp_path, kinds)[0]

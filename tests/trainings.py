@@ -36,7 +36,6 @@ OPTIONS = {
     "degree 0": ("--sh_degree", 0),
     "rays": ("--projection", "ray"),
     "absgrad": ("--absgrad", "--absgrad_threshold", 2e-4, "--max_num_splats", 400),
-    "long axis": ("--split", "long_axis", "--percent_dense", 0.001),  # so that some are split
     "white": ("-w", "--antialiasing"),
     "two phases": ("--densify_until_iter", 30),  # so that two phases have steps to capture
     "tiny": ("-r", 8),  # images of one tile

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from scene.gaussians import density_rules as rules
 from scene.gaussians.attributes import Rows
-from scene.gaussians.long_axis import long_axis_children
 from scene.gaussians.parameters import GaussianParameters
 from scene.gaussians.statistics import PER_ROW
 from splatting.distributed.rows import changes_rows
@@ -52,15 +51,13 @@ def densify_and_prune(
     seed: int | None = None,
     iteration: int = 0,
     max_splats: int = 0,
-    long_axis: bool = False,
 ) -> None:
     """Clone small and split large Gaussians with a mean gradient >= max_grad, then remove useless ones.
 
     min_opacity: a Gaussian below it is removed. extent: of the scene, world units. max_screen_size: pixels; unless
     None, Gaussians wider than that or than a tenth of the extent are removed; none that is pinned is so for its width.
     radii: (N,) pixels of this view, `tmp_radii` until the end. seed and iteration decide the positions of split
-    children; without a seed, torch's generator draws one. max_splats > 0 bounds the number of Gaussians. long_axis:
-    split along the longest axis (scene/gaussians/long_axis.py) instead, without random numbers.
+    children; without a seed, torch's generator draws one. max_splats > 0 bounds the number of Gaussians.
     """
     if radii is not None:
         gaussians.tmp_radii = radii
@@ -71,8 +68,6 @@ def densify_and_prune(
         room = max_splats - gaussians.gaussian_count
         gradient = rules.limit_growth(gradient, max_grad, room, gaussians.shards)
     how = {} if seed is None else {"seed": seed, "iteration": iteration}
-    if long_axis:  # said only then, as a client's own densify_and_split may not know it
-        how["long_axis"] = True
     split = None
     if _grows_by_own_steps(gaussians):
         split = _clone_and_split(gaussians, gradient, max_grad, extent, **how)
@@ -104,7 +99,7 @@ def _clone_and_split(
 ) -> Tensor:
     """Append what densify_and_clone and densify_and_split append, in their order, with one copy of all tensors.
 
-    how: seed, iteration and long_axis. Returns the mask (N,) of those that were split; they are left to be removed.
+    how: seed and iteration. Returns the mask (N,) of those that were split; they are left to be removed.
     """
     high = grads >= grad_threshold
     small = rules.is_small(gaussians.log_scales(), gaussians.percent_dense * scene_extent)
@@ -135,15 +130,12 @@ def densify_and_split(
     *,
     seed: int | None = None,
     iteration: int = 0,
-    long_axis: bool = False,
 ) -> None:
     """Replace each Gaussian with gradient >= threshold and scale > percent_dense * extent by N smaller ones.
 
-    grads: (n,) or (n, 1) for the first n Gaussians; those appended since (fresh clones) have gradient 0. seed,
-    iteration, long_axis: as in densify_and_prune; ValueError for long_axis unless N is 2.
+    grads: (n,) or (n, 1) for the first n Gaussians; those appended since (fresh clones) have gradient 0. seed
+    and iteration as in densify_and_prune.
     """
-    if long_axis and N != 2:
-        raise ValueError(f"a split along the longest axis makes 2 children, not {N}")
     before = len(gaussians)
     large = ~rules.is_small(gaussians.log_scales(), gaussians.percent_dense * scene_extent)
     grads = grads.reshape(-1)
@@ -152,7 +144,7 @@ def densify_and_split(
     parents = large.nonzero().reshape(-1)
     origins = parents.repeat(N)
     rows = gaussians.rows_at(origins)
-    _make_children(gaussians, rows, parents, N, seed, iteration, long_axis)
+    _make_children(gaussians, rows, parents, N, seed, iteration)
     append_rows(gaussians, rows, *[parents] * N)
     gaussians.prune_points(torch.cat((large, large.new_zeros(len(gaussians) - before))))
 
@@ -164,25 +156,19 @@ def _make_children(
     count: int = 2,
     seed: int | None = None,
     iteration: int = 0,
-    long_axis: bool = False,
 ) -> None:
     """Move and shrink the last rows, which are `count` copies of those of the `parents` (n,), one after another."""
     first = len(rows["xyz"]) - count * len(parents)
     xyz, rotation = (rows[name][first : first + len(parents)] for name in ("xyz", "rotation"))
     shapes = xyz, gaussians.log_scales().index_select(0, parents), rotation
-    if long_axis:
-        children = long_axis_children(*shapes, gaussians.opacity_logits().index_select(0, parents))
-        positions, scales = children["xyz"], children["scaling"]
-        rows["opacity"][first:] = gaussians.raw_opacity(children["opacity"])
-    else:
-        if seed is None:
-            seed = gaussians.shards.ranks.shared(int(torch.randint(2**62, ())))
-        items = gaussians.shards.items(parents)
-        sampled = [
-            rules.split_children(*shapes, items, child, count=count, seed=seed, iteration=iteration)
-            for child in range(count)
-        ]
-        positions, scales = (torch.cat(parts) for parts in zip(*sampled, strict=True))
+    if seed is None:
+        seed = gaussians.shards.ranks.shared(int(torch.randint(2**62, ())))
+    items = gaussians.shards.items(parents)
+    sampled = [
+        rules.split_children(*shapes, items, child, count=count, seed=seed, iteration=iteration)
+        for child in range(count)
+    ]
+    positions, scales = (torch.cat(parts) for parts in zip(*sampled, strict=True))
     rows["xyz"][first:], rows["scaling"][first:] = positions, gaussians.raw_scaling(scales)
 
 

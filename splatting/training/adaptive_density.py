@@ -23,7 +23,7 @@ class AdaptiveDensityControl(DensityControl):
 
     extent: of the scene, world units; sizes are judged by it. threshold: of a Gaussian's mean screen-space gradient,
     per NDC unit, from which on it is cloned or split; with absolute_threshold, of its pixels' absolute gradients (Ye et
-    al. 2024, AbsGS). long_axis: splits are along the longest axis (scene/gaussians/long_axis.py).
+    al. 2024, AbsGS).
     """
 
     fusable = True
@@ -36,7 +36,6 @@ class AdaptiveDensityControl(DensityControl):
         white_background: bool,
         extent: float,
         absolute_threshold: float | None = None,
-        long_axis: bool = False,
     ) -> None:
         self._gaussians = gaussians
         self._opt = opt
@@ -44,7 +43,6 @@ class AdaptiveDensityControl(DensityControl):
         self._extent = extent
         self.absolute_gradients = absolute_threshold is not None
         self.threshold = absolute_threshold if self.absolute_gradients else opt.densify_grad_threshold
-        self._long_axis = long_axis
         self.ends = opt.densify_until_iter
         self.max_gaussians = opt.max_num_splats
 
@@ -118,7 +116,6 @@ class AdaptiveDensityControl(DensityControl):
             seed=self._opt.seed,
             iteration=iteration,
             max_splats=self.count_limit(iteration, self._gaussians.gaussian_count, self.max_gaussians),
-            long_axis=self._long_axis,
         )
         refuse_empty(iteration, self._gaussians.gaussian_count == 0, "raise --opacity_reset_interval")
         sort_rows(self._gaussians)

@@ -3,7 +3,7 @@
 import argparse
 from typing import Any
 
-from splatting.training.option import Option, above, one_of
+from splatting.training.option import Option, above
 from splatting.training.part import Options, Strategy
 
 
@@ -20,9 +20,6 @@ class Adc(Strategy):
         Option("absgrad_threshold", 0.0008, origin="ours, as gsplat recommends", check=above(0),
             help="adc: absolute screen-space gradient (per NDC unit) that makes a Gaussian clone or split, with "
                  "--absgrad; lower: more Gaussians"),
-        Option("split", "sample", origin="ours", check=one_of("sample", "long_axis"),
-            help="adc: where the two children of a split Gaussian are. sample: at random, as by its density, each 1.6 "
-                 "times smaller; long_axis: on both sides along its longest axis, which keeps its mean and covariance"),
     ))
     # fmt: on
 
@@ -33,5 +30,4 @@ class Adc(Strategy):
     def control(self, run: Any) -> Any:
         from splatting.training.adaptive_density import AdaptiveDensityControl
 
-        threshold = run.opt.absgrad_threshold if run.opt.absgrad else None
-        return AdaptiveDensityControl.of_run(run, threshold, long_axis=run.opt.split == "long_axis")
+        return AdaptiveDensityControl.of_run(run, run.opt.absgrad_threshold if run.opt.absgrad else None)
