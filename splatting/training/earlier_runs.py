@@ -78,8 +78,8 @@ def report_changes(checkpoint: str, now: argparse.Namespace, grown: bool = False
         )
     if gone := sorted(then.keys() - {option.name for option in OPTIONS}):
         raise UserError(
-            f"{checkpoint} was trained with --{gone[0]}, which this code does not have; use the code that wrote it, or "
-            "start a new training from its PLY by --init_ply"
+            f"{checkpoint} was trained with {_typed(gone[0], then[gone[0]])}, which this code does not have; use "
+            "the code that wrote it, or start a new training from its PLY by --init_ply"
         )
     changed = _changed(then, now)
     if "eval" in changed and now.eval:
