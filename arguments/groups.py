@@ -161,6 +161,13 @@ class OptimizationParams(OptionTable):
         Option("densify_grad_threshold", 0.0002, origin="paper", check=above(0),
             help="screen-space gradient (per NDC unit) that makes a Gaussian clone or split; lower: more Gaussians"),
         *options_of("optimisation"),
+        Option("keep_unseen", False, origin="ours", topic="output",
+            help="save invisible Gaussians, too. Without this the last save leaves out those that no training view "
+                 "and no view between neighbours needs; training views stay the same, views from elsewhere may change"),
+        Option("prune_sh", -1.0, origin="ours", topic="output",
+            check=lambda value: None if value == -1 or value >= 0 else "at least 0, or -1",
+            help="in the last save, drop the highest SH bands that change no colour (0 to 1) by more than this; 0: "
+                 "drop bands that are zero throughout, -1: drop none. The sh_degree in cfg_args follows"),
         Option("random_background", False, topic="data",
             help="a new random background in every step, so that no Gaussian imitates a fixed one"),
         Option("optimizer_type", "default", check=one_of("default", "sparse_adam"), stored=MODEL_JSON,

@@ -30,7 +30,7 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.readers.point_cloud import write_point_cloud
 from splatting.diagnosis.model import check_model
-from splatting.parts.last_save.trim_report import TrimReport, lines, saved_line
+from splatting.training.trim_report import TrimReport, lines, saved_line
 from utils.system_utils import UserError
 
 ITERATIONS = 12

@@ -42,8 +42,8 @@ _OF_FILES += tuple(part.switch or part.name for part in _PARTS if part.needs.fil
 # Options that nothing follows here, with the value that is the case. Our other observers score, save and show.
 _FIXED = dict.fromkeys(
     ("advise", "detect_anomaly",
-     "start_checkpoint", "source_path", "model_path", "images", "invert_masks",
-     *(name for part in _PARTS if part.waits or part.final is not Part.final for name in part.options.by_name))
+     "start_checkpoint", "source_path", "model_path", "images", "invert_masks", "keep_unseen", "prune_sh",
+     *(name for part in _PARTS if part.waits for name in part.options.by_name))
     , "",
 ) | {"options": "given", "resolution": "1", "mask_meaning": "auto", "disable_viewer": "true"}  # fmt: skip
 _LISTS = ("test_iterations", "save_iterations", "checkpoint_iterations")

@@ -27,7 +27,6 @@ PARTS = (
     "sparse_depth",  # the order of the terms of the loss is in the bytes of the model
     "ppisp",
     "filter_3d",  # after all that moves rows
-    "last_save",
     "spill",  # after all that moves rows, and before sleep, which pays where rows lie on the host
     "sleep",  # after all that decides whether every step concerns all rows
     "upright",  # only keeps a record

@@ -23,7 +23,6 @@ records      A record of the log is written, or a point of the curve.
 state        A checkpoint is written. It keeps the state by the part's name, and gives it back to `begin`.
 facts        model.json is written, when the training begins and with the last save.
 save         A PLY or a checkpoint is written: own files beside it. Scenes that are made without a run call it, too.
-final        The last save is written: it may be of another model.
 load, scored A saved model is loaded, and its test views are to be scored or rendered, in a training or without one.
 
 What only one part can give is a slot of the run or of the model, with a neutral default that the part replaces in
@@ -204,10 +203,6 @@ class Part:
     def facts(self) -> dict[str, Any]:
         """Entries of model.json."""
         return {}
-
-    def final(self, model: Any, iteration: int) -> Any:
-        """The model of the last save, in place of the trained one."""
-        return model
 
     def due(self, at: "Iteration") -> bool:
         """Whether this iteration reads the model or a loss, or writes something. Asked once, when it begins.

@@ -34,6 +34,7 @@ from splatting.training.restart import resumed
 from splatting.training.schedule import Schedule
 from splatting.training.stepping import Stepping
 from splatting.training.strategy_warnings import warnings_of
+from splatting.training.trim_report import TrimReport, trimmed
 from utils.system_utils import UserError, compute_device
 
 
@@ -211,12 +212,13 @@ class Run(Stepping):
         states = {part.name: part.state() for part in self.parts}
         return with_extra_state(state, {key: found for key, found in states.items() if found is not None})
 
-    def save_last(self, iteration: int) -> None:
-        """Save the model that parts make of the trained one, and what they keep in model.json."""
-        model = self.gaussians
-        for final in self.each("final"):
-            model = final(model, iteration)
-        scene = self.scene
+    def save_last(self, iteration: int, scored: bool) -> TrimReport:
+        """Save the model without what it does not need, and what parts keep in model.json. Returns what is left out.
+
+        scored: as for `trimmed`.
+        """
+        (model, left_out), scene = trimmed(self, scored, iteration), self.scene
         scene.save(iteration, model)
         write_cfg_args(scene.model_path, argparse.Namespace(**vars(self.dataset) | {"sh_degree": model.max_sh_degree}))
-        add_to_model_json(scene.model_path, **self.facts)
+        add_to_model_json(scene.model_path, **self.facts, left_out=vars(left_out))
+        return left_out

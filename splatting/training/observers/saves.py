@@ -7,18 +7,21 @@ from pathlib import Path
 from tqdm import tqdm
 
 from scene.gaussians.checkpoint import save_checkpoint
+from scene.saved_iterations import saved_ply
 from splatting.training.disk_space import little_space
 from splatting.training.iteration import Iteration, Losses
 from splatting.training.output_folder import view_command
-from splatting.training.part import Part
+from splatting.training.part import Error, Part
 from splatting.training.run import Run
+from splatting.training.trim_report import TrimReport, lines, saved_line
 
 
 class Saves(Part):
-    """Saves the PLY when planned. The last save is of the model that parts make of the trained one (`final`)."""
+    """Saves the PLY when planned. The last save leaves out what the model does not need, and says so at the end."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
+        self._left_out: TrimReport | None = None
 
     def due(self, step: Iteration) -> bool:
         return step.takes(self._run.launch.save_iterations)
@@ -32,12 +35,22 @@ class Saves(Part):
             run.gaussians.check_finite(step.iteration)
             tqdm.write(f"[ITER {step.iteration}] Saving Gaussians", file=sys.stdout)
             if step.last:
-                run.save_last(step.iteration)
+                # Then the test photos are in memory, and scoring them once more costs little.
+                scored = step.scored_at is not None or run.opt.iterations in run.launch.test_iterations
+                self._left_out = run.save_last(step.iteration, scored)
+                step.record |= {"gaussians_left_out": self._left_out.unseen}
                 return
             count = run.gaussians.gaussian_count
             if run.group.first and (text := little_space(run, count, count, step.iteration)):
                 tqdm.write(f"warning: {text}", file=sys.stderr)
             run.scene.save(step.iteration)
+
+    def ended(self, error: Error) -> None:
+        if error is None and self._left_out is not None:
+            run = self._run
+            folder = saved_ply(run.scene.model_path, self._left_out.iterations).parent
+            run.log.tell(saved_line(self._left_out, folder))
+            run.log.keep(*lines(self._left_out))
 
 
 class Checkpoints(Part):

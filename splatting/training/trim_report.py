@@ -100,13 +100,13 @@ def _pictures(it: TrimReport) -> str:
     )
 
 
-def trimmed(run: Any, trained: GaussianModel, scored: bool, iteration: int) -> tuple[GaussianModel, TrimReport]:
-    """A finished model without what it does not need, and the facts.
+def trimmed(run: Any, scored: bool, iteration: int) -> tuple[GaussianModel, TrimReport]:
+    """The model of a run without what it does not need, and the facts.
 
     scored: whether to compute the change in PSNR, which is cheap if the test photos are in memory. iteration: the last.
     """
-    scene, opt, halves = run.scene, run.opt, run.scene.halves
-    scene.gaussians.optimizer.zero_grad(set_to_none=True)  # room for the trimmed copy
+    scene, trained, opt, halves = run.scene, run.gaussians, run.opt, run.scene.halves
+    trained.optimizer.zero_grad(set_to_none=True)  # room for the trimmed copy
     final, search = trim(trained, scene.getTrainCameras(), run.pipe, opt.keep_unseen, opt.prune_sh, iteration)
     change, test = {}, scene.getTestCameras()
     if test and (search.unseen > search.faint or search.cut_bounds[final.max_sh_degree] > 0):
