@@ -233,15 +233,3 @@ def test_a_checkpoint_of_another_scene_is_refused_and_one_of_a_moved_scene_told(
     _train(moved, whole, *start, iterations=40)
     (warning,) = _warnings(capfd.readouterr().err)
     assert f"trained with --source_path {colmap_scene}, this run has --source_path {moved}" in warning
-
-
-@pytest.mark.parametrize("gone", [{"options": {"split": "long_axis"}}])
-def test_a_training_with_an_option_that_is_gone_is_refused_by_name(colmap_scene, tmp_path, gone):
-    out = tmp_path / "out"
-    _train(colmap_scene, out, "--checkpoint_iterations", 2, iterations=3)
-    add_to_model_json(out, **gone)
-    before = folder_state(out)
-    ((name, value),) = gone.get("options", gone).items()
-    with pytest.raises(UserError, match=rf"chkpnt2.pth was trained with --{name} {value}, which this code does not"):
-        _train(colmap_scene, out, "--start_checkpoint", out / "chkpnt2.pth", iterations=4)
-    assert folder_state(out) == before
