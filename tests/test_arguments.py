@@ -57,7 +57,7 @@ ABSURD = {
     "prune_sh": "-0.5 nan",
     "mcmc_growth": "-0.1 1.1", "mcmc_min_opacity": "0 1", "mcmc_noise": "-1 inf 1e300",
     "mcmc_opacity_reg": "-0.01",
-    "mcmc_scale_reg": "-0.01", "mcmc_init_opacity": "1", "mcmc_init_scale": "-0.1", "resolution_schedule": "fine",
+    "mcmc_scale_reg": "-0.01", "mcmc_init_opacity": "1", "mcmc_init_scale": "-0.1",
     "time_budget": "-1 inf 1e300", "gpu_memory": "-1 nan 1e300",
     "exposure_lr_init": "-0.1", "exposure_lr_delay_steps": "-1",
     "exposure_lr_delay_mult": "1.5", "depth_l1_weight_final": "-1",
@@ -275,7 +275,6 @@ def test_model_json_has_what_is_stored_there_with_sorted_keys(tmp_path):
     assert list(record) == sorted(record) and record.pop("version")
     assert record == {
         "antialiasing": True, "invert_masks": True, "optimizer_type": "default", "projection": "ewa",
-        "resolution_schedule": "auto",
         "seed": 7, "strategy": "auto", "options": {"lambda_dssim": 0.5},
     }  # fmt: skip
     write_cfg_args(tmp_path, argparse.Namespace())

@@ -364,7 +364,7 @@ def test_a_training_that_ends_by_itself(evaluate):
     ("words", "last"),
     [
         ("", 30_000),
-        ("--iterations 40 --time_budget 0.0 --resolution_schedule pyramid", 40),
+        ("--iterations 40 --time_budget 0.0", 40),
         ("--iterations 40 --time_budget 0.5", None),
         ("--time_budget=20", None),
         ("--schedule schedule.json", None),

@@ -217,9 +217,13 @@ def test_a_training_that_cannot_go_on_rightly_is_not_resumed(colmap_scene, tmp_p
     _train(colmap_scene, out, "--checkpoint_iterations", 2, iterations=3)
     with pytest.raises(UserError, match="was trained on all photos, so --eval has no unseen photos to hold out"):
         _train(colmap_scene, tmp_path / "new", "--eval", "--start_checkpoint", out / "chkpnt2.pth", iterations=3)
-    add_to_model_json(out, options={"region": "auto"})
-    with pytest.raises(UserError, match="chkpnt2.pth was trained with --region .*, which this code does not have"):
-        _train(colmap_scene, tmp_path / "new", "--start_checkpoint", out / "chkpnt2.pth", iterations=3)
+    for gone, said in (
+        ({"resolution_schedule": "pyramid"}, "--resolution_schedule pyramid"),
+        ({"options": {"region": "auto"}}, "--region auto"),
+    ):
+        add_to_model_json(out, **gone)
+        with pytest.raises(UserError, match=f"chkpnt2.pth was trained with {said}, which this code does not have"):
+            _train(colmap_scene, tmp_path / "new", "--start_checkpoint", out / "chkpnt2.pth", iterations=3)
     assert not (tmp_path / "new").exists()
 
 

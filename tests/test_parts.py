@@ -23,7 +23,6 @@ FOLDER = ROOT / "splatting" / "parts"
 ROOMS = ("arguments", "gaussian_renderer", "integrations", "splatting", "scene", "utils")
 NAMESPACES = ("args", "opt", "options", "dataset", "given", "launch", "pipe")  # what options are read from
 KNOWN = {  # words in files that are options of a part, and mean something else there or have to stay
-    ("resolution_schedule", "splatting/parts/time_budget/schedule_file.py"),  # a key of schedule.json
     ("time_budget", "integrations/nerfbaselines/spec.py"),  # a set of options, as a user gives it
     ("no_curve", "integrations/nerfbaselines/method.py"),
     ("no_curve", "splatting/diagnosis/advice.py"),  # of a short training

@@ -28,7 +28,7 @@ SETS = {
     "ppisp": ("--appearance", "ppisp", "--sparse_depth", 0.5),
     "native": ("--lenses", "native", "--filter_3d", "--antialiasing", "--optimizer_type", "sparse_adam"),
     "undistorted": ("--lenses", "undistort", "--masks", "masks"),
-    "poses": ("--refine_poses", "--resolution_schedule", "pyramid", "--init_type", "random"),
+    "poses": ("--refine_poses", "--init_type", "random"),
     "passers-by": ("--robust_mask", 0.2, "--sky", "auto", "--strategy", "budget", "--images_to_load", 5),
     "in PyTorch": ("--convert_SHs_python", "--compute_cov3D_python", "--strategy", "mcmc", "-i", "images/."),
     "RGBA": ("--random_background",),

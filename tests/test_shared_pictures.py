@@ -11,6 +11,7 @@ import torch
 from parts.test_depth_maps import scene  # noqa: F401  (a fixture)
 from PIL import Image
 from processes import in_ranks
+from trainings import PYRAMID
 
 import train
 from scene.images.store import ImageStore
@@ -23,12 +24,13 @@ LENGTH = (
     *("--iterations", 30, "--densify_from_iter", 5, "--densification_interval", 10, "--densify_grad_threshold", 5e-5),
     *("--disable_viewer", "--quiet", "--no_curve", "--test_iterations", 20, "-r", 96),
 )
+SMALLER = *PYRAMID, "--iterations", 60
 TRAININGS = {
     "masks": ("--masks", "masks", "-d", "depths", "--eval"),
     "alpha": ("--masks", "masks", "--mask_meaning", "transparent", "--random_background"),
     "limit": ("--masks", "masks", "-d", "depths", "--images_to_load", 4),
-    "smaller": ("--masks", "masks", "-d", "depths", "--resolution_schedule", "pyramid"),
-    "smaller, limit": ("--resolution_schedule", "pyramid", "--images_to_load", 3),
+    "smaller": ("--masks", "masks", "-d", "depths", *SMALLER),
+    "smaller, limit": (*SMALLER, "--images_to_load", 3),
     "exposures": ("--train_test_exp", "--eval"),
 }
 

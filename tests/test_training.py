@@ -148,7 +148,6 @@ def test_refusals_before_anything_is_written(colmap_scene, tmp_path):
         "absent": ["-s", tmp_path / "absent"],
         "sh_degree": ["--start_checkpoint", checkpoint, "--sh_degree", 1],
         "no points": ["--init_pcd_path", empty],
-        "--resolution_schedule must be auto or none or pyramid": ["--resolution_schedule", "fine"],
     }
     for words, options in cases.items():
         with pytest.raises(UserError, match=re.escape(words)):

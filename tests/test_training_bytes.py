@@ -47,7 +47,7 @@ LOOKS = ("--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44, "--chec
 WITHOUT_GRAPHS = ("depth", "masks", "together", "poses, no graph", "points")
 WITHOUT_GRAPHS += "robust mask", "points and poses"
 KINDS = {"degree 0": 1, "two phases": 5, "appearance": 5, "exposure": 8, "budget errors": 7}  # half images count, too
-KINDS["exposure and sizes"] = 9
+KINDS |= {"exposure and sizes": 9, "poses": 5}
 
 
 @pytest.fixture(scope="module")

@@ -24,6 +24,7 @@ Once = Callable[[str, Callable[[Path], object]], Path]
 ITERATIONS = 60
 LEARNT = "poses.json", "exposure.json", "appearance.json"
 MCMC = ("--strategy", "mcmc", "--mcmc_noise", 5e4, "--mcmc_init_opacity", 0.03, "--mcmc_min_opacity", 0.024)
+PYRAMID = "--schedule", Path(__file__).parent / "pyramid_60.json"  # small views at first
 BUDGET = ("--strategy", "budget", "--max_num_splats", 500, "--densify_until_iter", 50)
 OPTIONS = {
     "default": (),
@@ -31,7 +32,7 @@ OPTIONS = {
     "exposure": ("--train_test_exp", "--antialiasing"),
     "appearance": ("--appearance", "ppisp", "--antialiasing"),
     "depth": ("-d", "depths", "--depth_l1_weight_init", 1.0),
-    "points": ("--sparse_depth", 0.5, "--masks", "masks", "--resolution_schedule", "pyramid"),
+    "points": ("--sparse_depth", 0.5, "--masks", "masks", *PYRAMID),
     "masks": ("--masks", "masks"),
     "degree 0": ("--sh_degree", 0),
     "rays": ("--projection", "ray"),
@@ -54,15 +55,14 @@ OPTIONS = {
     "sky": ("--sky", "auto", "--densify_grad_threshold", 1e-5),
     "robust mask": ("--robust_mask", 0.3, "--opacity_reset_interval", 3000),
     "points and poses": ("--sparse_depth", 0.5, "--refine_poses"),
-    "poses": ("--refine_poses", "--resolution_schedule", "pyramid"),
+    "poses": ("--refine_poses", *PYRAMID),
     "poses, no graph": ("--refine_poses", "--train_test_exp", "-d", "depths", "--depth_l1_weight_init", 1),
-    "exposure and sizes": ("--train_test_exp", "--resolution_schedule", "pyramid", "-r", 1),
+    "exposure and sizes": ("--train_test_exp", *PYRAMID, "-r", 1),
     "budget errors": (*BUDGET, "--train_test_exp"),
 }
 
 PART_OPTIONS = {  # that begin with something of a checkpoint, or of the scene
-    "coarse_to_fine": ("--resolution_schedule", "pyramid"),
-    "time_budget": ("--schedule", ITERATIONS),
+    "time_budget": PYRAMID,
     "exposure": ("--train_test_exp",),
     "refine_poses": ("--refine_poses",),
     "depth_maps": ("-d", "depths", "--depth_l1_weight_init", 1.0),

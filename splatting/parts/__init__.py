@@ -13,8 +13,7 @@ from utils.system_utils import UserError
 # Names of folders, with the reason for the place, where there is one.
 PARTS = (
     "more_photos",  # refuses a scene before anything trains on it
-    "coarse_to_fine",  # says which sizes of views are asked for
-    "time_budget",  # decides on them
+    "time_budget",
     "exposure",  # adds training views before anything moves them
     "refine_poses",  # its cameras stand right before anything asks where they are
     "depth_maps",

@@ -13,8 +13,9 @@ from scene.saved_model import saves_in
 from splatting.evaluation import training_log
 from splatting.evaluation.error_curve import NAME as CURVE
 from splatting.evaluation.error_curve import Row, continue_curve
+from splatting.evaluation.model_folder import SCHEDULE
 from splatting.evaluation.training_log import TrainingLog
-from splatting.files.json_files import ENLARGEMENT, read_model_json
+from splatting.files.json_files import ENLARGEMENT, SCHEDULE, read_model_json
 from utils.system_utils import UserError
 
 
@@ -76,10 +77,14 @@ def report_changes(checkpoint: str, now: argparse.Namespace, grown: bool = False
             f"{checkpoint} is of another scene, {trained_on}; resume it with that one, or start from its model with "
             "--init_ply"
         )
-    if gone := sorted(then.keys() - {option.name for option in OPTIONS}):
+    gone = {name: value for name, value in then.items() if name not in {option.name for option in OPTIONS}}
+    # Views that were smaller at first; a schedule.json keeps their sizes.
+    if not (folder / SCHEDULE).is_file() and read_model_json(folder).get("resolution_schedule") == "pyramid":
+        gone["resolution_schedule"] = "pyramid"
+    if gone:
         raise UserError(
-            f"{checkpoint} was trained with {_typed(gone[0], then[gone[0]])}, which this code does not have; use "
-            "the code that wrote it, or start a new training from its PLY by --init_ply"
+            f"{checkpoint} was trained with {_typed(*min(gone.items()))}, which this code does not have; use the code "
+            "that wrote it, or start a new training from its PLY by --init_ply"
         )
     changed = _changed(then, now)
     if "eval" in changed and now.eval:

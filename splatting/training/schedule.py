@@ -6,7 +6,6 @@ through the whole schedule: by the clock, or as a file says (splatting/parts/tim
 """
 
 import math
-from bisect import bisect_right
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,24 +16,17 @@ LONGER = 2.0  # times the root of the stride
 MOST_RATE = 8.0  # about the best for 1,300 iterations in place of 30,000 (docs/inside/notebook.md)
 SETTLING = 0.7  # part of the schedule from which on steps get shorter
 LEAST_RATE = 0.1  # part of a rate that is left at the end
-Levels = Sequence[tuple[float, float]]  # part of the schedule that is done (0 to 1), and factor of sizes from then on
-
-PYRAMID: Levels = ((0.0, 4.0), (0.1, 2.0), (0.25, 1.0))
 
 
 class Schedule:
     """The steady schedule: each iteration stands for itself.
 
-    length: of the schedule, in iterations. ends: the last iteration of the run, None: not known yet. megapixels: of a
-    view. sizes: the schedule of the views' sizes that is in force; levels: of that. strategy: the one in force
-    (--strategy). paced: whether iterations stand for more or fewer than themselves. by_clock: whether that follows the
-    seconds that pass. seconds: that the run may take, 0: any number. until: the seconds of training that end a run by
-    the clock. more: the option that continues a run that is over.
+    length: of the schedule, in iterations. ends: the last iteration of the run, None: not known yet. strategy: the one
+    in force (--strategy). paced: whether iterations stand for more or fewer than themselves. by_clock: whether that
+    follows the seconds that pass. seconds: that the run may take, 0: any number. until: the seconds of training that
+    end a run by the clock. more: the option that continues a run that is over.
     """
 
-    megapixels = 1.0
-    sizes = "none"
-    levels: Levels = ()
     strategy = ""
     paced = False
     by_clock = False
@@ -75,16 +67,6 @@ class Schedule:
     def stride(self, iteration: int) -> float:
         """Iterations of the schedule that one of the run stands for, at that place."""
         return 1.0
-
-    @property
-    def possible_levels(self) -> Levels:
-        """Those that may come into force."""
-        return self.levels
-
-    def factor_at(self, schedule_step: float) -> float:
-        """Factor of the views' sizes at an iteration of the schedule."""
-        index = bisect_right(self.levels, schedule_step, key=lambda level: level[0] * self.length) - 1
-        return self.levels[index][1] if index >= 0 else 1.0
 
     def rate_factor(self, iteration: int) -> float | None:
         """Factor of the learning rates that have no schedule. None: they are left as they are."""

@@ -15,10 +15,10 @@ from trainings import before_steps, train_on
 
 from scene.gaussians import density_rules as rules
 from splatting.evaluation.training_log import Stopwatch
-from splatting.parts import part_class, strategy_part
-from splatting.parts.coarse_to_fine.sizes import Sizes
+from splatting.parts import strategy_part
 from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule, TimeBudget
 from splatting.parts.time_budget.schedule_file import read_schedule, schedule_of, write_schedule
+from splatting.parts.time_budget.sizes import Sizes
 from splatting.training.density import DensityControl
 from splatting.training.iteration import Iteration
 from splatting.training.observers.progress import ProgressBar
@@ -381,16 +381,17 @@ def test_a_short_training_by_the_clock_begins_with_smaller_views_and_replays(
     _timed(monkeypatch, lambda t: 0.04)
     monkeypatch.setattr(f"{TimeBudget.__module__}.SHORT", 0.01)  # for photos this small
     short = trained("short", "--time_budget", 4, "--checkpoint_iterations", 600)
-    whole = trained("whole", "--time_budget", 4, "--resolution_schedule", "none")
+    with monkeypatch.context() as patch:
+        patch.setattr(f"{TimeBudget.__module__}.SHORT", math.inf)
+        whole = trained("whole", "--time_budget", 4)
     assert short.keys() == whole.keys() and short != whole  # by a clock that sizes do not move
     monkeypatch.undo()
     repeats = "--schedule", tmp_path / "short" / "schedule.json"
     assert trained("again", *repeats) == short
-    names = [_stored(tmp_path / name, "resolution_schedule") for name in ("short", "whole", "again")]
+    names = [read_schedule(tmp_path / name / "schedule.json").sizes for name in ("short", "whole", "again")]
     assert names == ["pyramid", "none", "pyramid"]
     checkpoint, _ = _checkpoints(tmp_path / "short")
-    trained("resumed", *repeats, "--resolution_schedule", "pyramid", "--start_checkpoint", checkpoint)
-    assert "--resolution_schedule" not in capsys.readouterr().err  # as that is its name
+    assert max(trained("resumed", *repeats, "--start_checkpoint", checkpoint).items()) == max(short.items())
 
 
 def test_what_contradicts_itself_is_refused(colmap_scene, tmp_path):
@@ -405,7 +406,6 @@ def test_what_contradicts_itself_is_refused(colmap_scene, tmp_path):
     refused("was written for --iterations 100")
     more = "--iterations", 100
     refused("--time_budget and --schedule both set the schedule", *more, "--time_budget", 3)
-    refused("already sets --resolution_schedule none; leave that", *more, "--resolution_schedule", "pyramid")
     path.write_text(json.dumps(GOOD | {"ended": None}))
     refused("run not finished; resume it", *more)
     path.write_text("{}")
@@ -427,14 +427,12 @@ def test_a_checkpoint_finds_its_place_or_is_refused(colmap_scene, tmp_path, monk
     for reason, more in (
         ("so --iterations 60 leaves nothing to do", ("--iterations", 60)),
         ("was written for --iterations 60, not 61", ("--iterations", 61, "--time_budget", 9)),
-        ("sets --resolution_schedule none; leave", ("--iterations", 60, "--time_budget", 9, "--resolution_schedule",
-                                                     "pyramid")),
-    ):  # fmt: skip
+    ):
         with pytest.raises(UserError, match=reason):
             _train(colmap_scene, tmp_path / "out", "--start_checkpoint", checkpoint, *more)
     for broken in ({}, {"blocks": []}, GOOD):  # the last ends before the checkpoint
         with pytest.raises(UserError, match=r"^the schedule in a.pth is broken \(.*\); give another one$"):
-            schedule_of(options(time_budget=9.0), "auto", "a.pth", 30, before=broken)
+            schedule_of(options(time_budget=9.0), "a.pth", 30, before=broken)
 
 
 def test_a_decided_run_goes_through_rates_degrees_and_windows(colmap_scene, tmp_path, monkeypatch):
@@ -458,7 +456,6 @@ def test_a_decided_run_goes_through_rates_degrees_and_windows(colmap_scene, tmp_
 
 def test_a_checkpoint_comes_with_its_schedule(colmap_scene, tmp_path, monkeypatch):
     _timed(monkeypatch, lambda t: 0.1)
-    monkeypatch.setattr(part_class("time_budget"), "ended", lambda *_: None)  # as if the process were killed before
     _train(colmap_scene, tmp_path, "--time_budget", 4)
     (checkpoint,) = _checkpoints(tmp_path)
     assert read_schedule(tmp_path / "schedule.json").ended == int(checkpoint.stem[6:])
@@ -581,7 +578,8 @@ def test_the_clock_ends_growth_at_the_pace_of_whole_views_and_removes_nothing(si
 
     A program that slows all down late in the run leaves the Gaussians there.
     """
-    schedule = TimeBudget(Decided(30_000, [], None, 20.0, sizes))
+    schedule = TimeBudget(Decided(30_000, [], None, 20.0, "auto"))
+    schedule.megapixels = 100.0 if sizes == "pyramid" else 1e-3
     control = DensityControl()
     control.schedule, control.max_gaussians, counts = schedule, 50_000, [14_000]
 
@@ -611,7 +609,7 @@ def test_a_strategy_of_a_damaged_file_is_none():
 def test_a_number_of_iterations_goes_through_the_whole_schedule(tmp_path):
     """In equal parts, and with no limit of Gaussians, as no clock sets their number."""
     opt = options(schedule="1000", strategy="budget", iterations=30_000)
-    schedule = schedule_of(opt, "auto", None, 0)
+    schedule = schedule_of(opt, None, 0)
     steps = [schedule.schedule_step(t) for t in range(1001)]
     assert steps[::500] == [0, 15_000, 30_000] and schedule.is_last(1000)
     assert (
@@ -625,4 +623,4 @@ def test_a_number_of_iterations_goes_through_the_whole_schedule(tmp_path):
         ({"time_budget": 9.0}, "leave one of them out"),
     ):
         with pytest.raises(UserError, match=reason):
-            schedule_of(options(**{"schedule": "7"} | words), "auto", None, 0)
+            schedule_of(options(**{"schedule": "7"} | words), None, 0)

@@ -3,14 +3,14 @@
 import math
 import statistics
 import sys
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
 from splatting.parts import part_class, strategies
-from splatting.training.schedule import PYRAMID, USUAL, Levels, Schedule, longer_steps
+from splatting.training.schedule import USUAL, Schedule, longer_steps
 
 _PACE = 5  # blocks that tell the pace of a run
 _ROUNDING = 1e-6  # iterations of the schedule; progress is a float, and just below a whole number counts as that
@@ -23,6 +23,11 @@ _MOST_SHARE = 2  # times the part of the schedule that an iteration does where n
 _TOLD = 1.02  # times the budget, from which on a run says that it takes longer
 AN_ITERATION = 25  # Gaussians for each iteration, at most, where the clock sets the number of iterations
 AGAIN = 0.9  # part of the schedule at which one that is over goes on: rates are low there, and fall once more
+
+Levels = Sequence[tuple[float, float]]  # part of the schedule that is done (0 to 1), and factor of sizes from then on
+
+PYRAMID: Levels = ((0.0, 4.0), (0.1, 2.0), (0.25, 1.0))
+AUTO = "auto"  # sizes that are not decided yet
 
 
 class Block(NamedTuple):
@@ -56,8 +61,12 @@ class Decided(NamedTuple):
 
 
 class DecidedSchedule(Schedule):
-    """A schedule that was decided by an earlier run."""
+    """A schedule that was decided by an earlier run.
 
+    sizes: the name of `levels`, by which views are smaller at first. megapixels: of a view.
+    """
+
+    megapixels = 1.0
     paced = True
     more = "--time_budget SECONDS"
     _told = False
@@ -93,6 +102,16 @@ class DecidedSchedule(Schedule):
 
     def stride(self, iteration: int) -> float:
         return self._block(iteration)[1].step * self.length
+
+    @property
+    def possible_levels(self) -> Levels:
+        """Those that may come into force."""
+        return self.levels
+
+    def factor_at(self, schedule_step: float) -> float:
+        """Factor of the views' sizes at an iteration of the schedule."""
+        index = bisect_right(self.levels, schedule_step, key=lambda level: level[0] * self.length) - 1
+        return self.levels[index][1] if index >= 0 else 1.0
 
     def possible(self, iteration: int) -> float:
         """Iterations that fit into the budget at the pace of its end, as far as a block before this iteration tells it.
@@ -187,9 +206,8 @@ class TimeBudget(DecidedSchedule):
         super().__init__(decided)
         self._share = share
         self._limit = decided.continued[-1].seconds if decided.continued else decided.time_budget
-        self._open = self.sizes != "none" and not self.levels
-        self._asked = self.sizes == "pyramid"
-        self.sizes = "none" if self.sizes == "auto" else self.sizes
+        self._open = self.sizes == AUTO
+        self.sizes = "none" if self._open else self.sizes
         self._speed: float | None = None  # seconds of an iteration
         self._speeds: list[float] = []  # of the last three blocks
         self._measured = 0  # blocks of this run
@@ -241,15 +259,14 @@ class TimeBudget(DecidedSchedule):
             self._speeds = [*self._speeds[-2:], speed]
 
     def _choose_sizes(self, done: int, seconds: float) -> None:
-        """Take smaller views if asked to, or if few pixels can be trained: from the next one on, as is recorded.
+        """Take smaller views if few pixels can be trained: from the next one on, as is recorded.
 
         The first views are never smaller, as they tell the pace of the end.
         """
         self._open = False
         now = (self.schedule_step(done) + 0.5) / self.length
         possible = done + max(self.until - seconds, 0.0) / self._speed
-        short = self.megapixels * self.length / possible >= SHORT and now < PYRAMID[1][0]
-        if short or self._asked:
+        if self.megapixels * self.length / possible >= SHORT and now < PYRAMID[1][0]:
             self.sizes = "pyramid"
             begun = [factor for start, factor in PYRAMID if start <= now][-1]
             self.levels = ((now, begun), *(level for level in PYRAMID if level[0] > now))

@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 
 
 class TimeBudget(Part):
-    """Lets each iteration stand for a part of the schedule, and keeps in schedule.json for which."""
+    """Lets each iteration stand for a part of the schedule, and keeps in schedule.json for which.
+
+    Where the time is short for the size of the photos, views are smaller at first.
+    """
 
     name = "time_budget"
     tools = "for_few_iterations", "continues"
@@ -49,7 +52,7 @@ class TimeBudget(Part):
         from splatting.parts.time_budget.schedule_file import schedule_of
 
         self._run = run
-        schedule = schedule_of(run.opt, run.schedule.sizes, run.start, run.first_iteration, run.group.shared, state)
+        schedule = schedule_of(run.opt, run.start, run.first_iteration, run.group.shared, state)
         fill(run, "schedule", schedule, self)
         self._end_in_time(run.opt)
 
@@ -64,6 +67,16 @@ class TimeBudget(Part):
         for name, part in {part_class(strategy).until for strategy in strategies()}:
             if getattr(opt, name) >= opt.iterations:
                 setattr(opt, name, int(part * opt.iterations))
+
+    def begin(self, run: Any, state: Any) -> None:
+        from splatting.parts.time_budget.sizes import Sizes
+
+        run.schedule.megapixels = run.scene.training_pixels()[0] / len(run.scene.getTrainCameras()) / 1e6
+        fill(run, "sizes", Sizes(run.schedule, run.scene.images), self)
+
+    def changes(self, iteration: int) -> bool:
+        before, now = map(self._run.schedule.schedule_step, (iteration - 1, iteration))
+        return self._run.sizes.factor_at(before) != self._run.sizes.factor_at(now)
 
     def measured(self, at: "Iteration", losses: object) -> None:
         self._iteration = at.iteration

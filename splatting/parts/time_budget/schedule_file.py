@@ -13,8 +13,7 @@ from typing import Any
 
 from splatting.files.json_files import SCHEDULE, read_json, write_json
 from splatting.parts import strategies
-from splatting.parts.time_budget.paced import Block, Continued, Decided, DecidedSchedule, TimeBudget
-from splatting.training.schedule import PYRAMID
+from splatting.parts.time_budget.paced import AUTO, Block, Continued, Decided, DecidedSchedule, TimeBudget
 from utils.system_utils import UserError
 
 _SIZES = "resolution_schedule"  # key of the sizes of views
@@ -97,7 +96,6 @@ def _number(value: Any, least: float) -> float:
 
 def schedule_of(
     opt: argparse.Namespace,
-    sizes: str,
     checkpoint: str | None,
     first_iteration: int,
     share: Callable[[float], float] = lambda seconds: seconds,
@@ -105,18 +103,18 @@ def schedule_of(
 ) -> DecidedSchedule:
     """The schedule of a run. UserError for one that this run cannot follow.
 
-    sizes: of views that are asked for. checkpoint: a chkpntN.pth that is resumed, or None. first_iteration: its N, or
-    0. share: gives all processes the seconds of one. before: the table in the checkpoint, None: it has none.
+    checkpoint: a chkpntN.pth that is resumed, or None. first_iteration: its N, or 0. share: gives all processes the
+    seconds of one. before: the table in the checkpoint, None: it has none.
     """
     if opt.schedule and opt.time_budget:
         raise UserError("--time_budget and --schedule both set the schedule; leave one of them out")
     if opt.schedule.isdecimal() and not Path(opt.schedule).exists():
-        return DecidedSchedule(_even(int(opt.schedule), opt, sizes))
+        return DecidedSchedule(_even(int(opt.schedule), opt))
     if opt.schedule:
         return DecidedSchedule(_recorded(Path(opt.schedule), opt))
     if not first_iteration:
-        return TimeBudget(Decided(opt.iterations, [], None, opt.time_budget, sizes), share)
-    found = _resumed(before, checkpoint, opt, sizes, first_iteration)
+        return TimeBudget(Decided(opt.iterations, [], None, opt.time_budget, AUTO), share)
+    found = _resumed(before, checkpoint, opt, first_iteration)
     return TimeBudget(_with_seconds(found, opt.time_budget), share)
 
 
@@ -131,13 +129,11 @@ def _with_seconds(found: Decided, seconds: float) -> Decided:
     return found._replace(time_budget=seconds)
 
 
-def _even(count: int, opt: argparse.Namespace, sizes: str) -> Decided:
+def _even(count: int, opt: argparse.Namespace) -> Decided:
     """The schedule that so many iterations go through in equal parts, with no budget of seconds."""
     if not 1 <= count <= _MOST:
         raise UserError(f"--schedule must name iterations between 1 and {_MOST}, or a file, got {count}")
-    sizes = "none" if sizes == "auto" else sizes
-    levels = PYRAMID if sizes == "pyramid" else ()
-    return Decided(opt.iterations, [Block(count, 0.0, 1 / count, 0.0)], count, 0.0, sizes, levels)
+    return Decided(opt.iterations, [Block(count, 0.0, 1 / count, 0.0)], count, 0.0)
 
 
 def _recorded(path: Path, opt: argparse.Namespace) -> Decided:
@@ -157,7 +153,7 @@ def _fitting(found: Decided, path: Path | str, opt: argparse.Namespace) -> Decid
     return found
 
 
-def _resumed(before: Any, checkpoint: str, opt: argparse.Namespace, sizes: str, first_iteration: int) -> Decided:
+def _resumed(before: Any, checkpoint: str, opt: argparse.Namespace, first_iteration: int) -> Decided:
     """The schedule so far of the runs that are resumed; one block if their checkpoint has none."""
     if before is None:
         over = first_iteration if first_iteration >= opt.iterations else None
@@ -165,7 +161,7 @@ def _resumed(before: Any, checkpoint: str, opt: argparse.Namespace, sizes: str, 
             told = f"{checkpoint} was trained without --time_budget; it is iteration {first_iteration} of the schedule"
             print(told, file=sys.stderr)
         block = Block(first_iteration, 0.0, 1.0 / max(opt.iterations, first_iteration), 0.0)
-        return Decided(opt.iterations, [block], over, 0.0, sizes)
+        return Decided(opt.iterations, [block], over, 0.0, AUTO)
     try:
         found = DecidedSchedule(_decided(before)).up_to(first_iteration)
     except _BROKEN as error:

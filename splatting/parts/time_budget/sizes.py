@@ -1,11 +1,11 @@
-"""Coarse to fine: views that are smaller at first, by how far the schedule is (--resolution_schedule)."""
+"""Coarse to fine: views that are smaller at first, by how far the schedule is."""
 
 import torch
 
 from scene.images.store import GPU_SHARE, ImageStore
 from scene.view import View
 from splatting.host.memory import free_memory
-from splatting.training.schedule import Schedule
+from splatting.parts.time_budget.paced import DecidedSchedule
 
 LEAST = 32  # pixels of the shorter side; a picture is not made smaller than that
 
@@ -19,7 +19,7 @@ class Sizes:
     size. factor: of the last view.
     """
 
-    def __init__(self, schedule: Schedule, images: ImageStore) -> None:
+    def __init__(self, schedule: DecidedSchedule, images: ImageStore) -> None:
         self.factor = 1.0
         self._schedule = schedule
         self._images = images

@@ -8,6 +8,7 @@ import pytest
 import torch
 from gaussians import pipeline
 from PIL import Image
+from trainings import PYRAMID as SMALL_AT_FIRST
 from trainings import before_steps, train_on
 
 from arguments import ModelParams
@@ -18,8 +19,8 @@ from scene.gaussian_model import GaussianModel
 from scene.images.sizes import shrink_mask, shrink_photo, shrink_values
 from scene.images.store import InMemory
 from scene.readers.info import CameraInfo
-from splatting.parts.coarse_to_fine.sizes import Sizes, smaller
-from splatting.training.schedule import PYRAMID, Schedule
+from splatting.parts.time_budget.paced import PYRAMID, Block, Decided, DecidedSchedule
+from splatting.parts.time_budget.sizes import Sizes, smaller
 
 
 def _scene(folder: Path, out: Path, **options: object) -> tuple[Scene, GaussianModel]:
@@ -30,11 +31,10 @@ def _scene(folder: Path, out: Path, **options: object) -> tuple[Scene, GaussianM
     return Scene(args, gaussians, shuffle=False), gaussians
 
 
-def _schedule(length: int) -> Schedule:
-    """A steady schedule with smaller views at first."""
-    schedule = Schedule(length)
-    schedule.levels = PYRAMID
-    return schedule
+def _schedule(length: int) -> DecidedSchedule:
+    """A schedule with smaller views at first."""
+    block = Block(length, 0.0, 1 / length, 0.0)
+    return DecidedSchedule(Decided(length, [block], length, 0.0, "pyramid", PYRAMID))
 
 
 def _slow_average(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -168,10 +168,8 @@ def _train(scene: Path, out: Path, *more: object) -> dict[int, bytes]:
 def test_a_coarse_to_fine_training_begins_with_small_views(colmap_scene, tmp_path, monkeypatch):
     sizes = []
     before_steps(monkeypatch, lambda step: sizes.append((step.iteration, step.camera.image_width)))
-    coarse = "--resolution_schedule", "pyramid"
-    saved = _train(colmap_scene, tmp_path / "a", *coarse)
+    saved = _train(colmap_scene, tmp_path / "a", *SMALL_AT_FIRST)
     widths = [width for _, width in sizes]
     assert set(widths) == {48, 96} and widths == sorted(widths)
-    assert _train(colmap_scene, tmp_path / "few", *coarse, "--images_to_load", 4) == saved
-    assert _train(colmap_scene, tmp_path / "none") != saved
-    assert not (tmp_path / "a" / "schedule.json").exists()
+    assert _train(colmap_scene, tmp_path / "few", *SMALL_AT_FIRST, "--images_to_load", 4) == saved
+    assert _train(colmap_scene, tmp_path / "none", "--schedule", 60) != saved
