@@ -13,7 +13,6 @@ from scene.saved_model import saves_in
 from splatting.evaluation import training_log
 from splatting.evaluation.error_curve import NAME as CURVE
 from splatting.evaluation.error_curve import Row, continue_curve
-from splatting.evaluation.model_folder import SCHEDULE
 from splatting.evaluation.training_log import TrainingLog
 from splatting.files.json_files import ENLARGEMENT, SCHEDULE, read_model_json
 from utils.system_utils import UserError
