@@ -192,6 +192,8 @@ def stand_ins(args: argparse.Namespace, options: argparse.Namespace) -> Callable
 
 
 def _refuse_to_replace_a_model(file: Path, source: str | None) -> None:
+    if file.is_dir():
+        raise UserError(f"--to {file} is a folder; give the name of a file")
     saved = file.absolute().parent.parent.name == "point_cloud"
     saved |= file.name == "input.ply" and (file.parent / "cfg_args").is_file()
     if saved and file.exists() or (source and file.exists() and file.samefile(source)):

@@ -185,6 +185,11 @@ def test_names_are_neither_options_nor_addresses(ffmpeg, room, tmp_path, monkeyp
     assert _frames(_extract(tmp_path / "scene", Path(name), 2))
 
 
+def test_pictures_in_one_file_are_a_video(ffmpeg, room, tmp_path):
+    _write(ffmpeg, tmp_path / "a.apng", room[:2])
+    assert len(_frames(_extract(tmp_path / "scene", tmp_path / "a.apng", 2))) == 2
+
+
 @pytest.mark.parametrize(
     "text",
     [

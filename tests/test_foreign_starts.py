@@ -150,6 +150,10 @@ def test_parts_of_a_checkpoint_and_other_checkpoints_are_told(tmp_path, capsys):
     read_splats(path)
     said = "warning: .*_rank1.pt has a part of the Gaussians; all are in ckpt_6_rank0.pt to ckpt_6_rank1.pt"
     assert re.search(said, capsys.readouterr().err)
+    values = torch.load(path)["splats"]
+    torch.save({"splats": values | {"shN": torch.zeros(5, 24, 3)}}, tmp_path / "e.pt")
+    assert read_splats(tmp_path / "e.pt").sh_degree == 3
+    assert "e.pt are left out; models have at most degree 3" in capsys.readouterr().err
     for content in ({"model": torch.zeros(3)}, {"splats": {"means": torch.zeros(3, 3)}}, torch.zeros(4), [1, 2]):
         torch.save(content, tmp_path / "a.pt")
         with pytest.raises(UserError, match="is a checkpoint without Gaussians of gsplat or nerfstudio; export"):
@@ -243,6 +247,9 @@ def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
         with pytest.raises(UserError, match="would overwrite a trained model or its input; choose another file"):
             export.export(*_export_options(*words, "--to", at))
         assert Path(at).read_bytes() == before
+    (tmp_path / "folder.ply").mkdir()
+    with pytest.raises(UserError, match="folder.ply is a folder; give the name of a file"):
+        export.export(*_export_options("-m", out, "--to", tmp_path / "folder.ply"))
     for _ in range(2):  # an earlier export in the model's folder is replaced
         export.export(*_export_options("-m", out, "--to", out / "model.ply"))
 

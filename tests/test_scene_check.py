@@ -21,6 +21,7 @@ from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.copies import places_of
 from scene.gaussians.start import start_rows
+from scene.images.damage import said_of
 from scene.images.decode import decode
 from scene.images.masks import MaskOptions
 from scene.readers.depth_maps import with_depth_maps
@@ -165,6 +166,14 @@ def test_jpegs_with_a_damaged_middle_are_named(sound, tmp_path, capsys, zeros):
         grey.paste(smooth, (-200, 0))
         grey.save(view.image_path)
     assert [*of_damage(info, 16)] == []
+
+
+@pytest.mark.parametrize(
+    ("usual", "most", "damaged"), [(0, 0.016, False), (0, 0.04, True), (0.011, 0.081, False), (0.011, 0.4, True)]
+)
+def test_grey_photos_and_those_of_a_low_quality_are_not_damaged(usual, most, damaged):
+    """Sound ones have so large shares of equal blocks: scenes of real photos, saved as grey, or in quality 30."""
+    assert bool(said_of(dict.fromkeys("abcdefg", usual) | {"h": most})) == damaged
 
 
 def test_sound_photos_are_passed():

@@ -6,6 +6,7 @@ exactly equal, in long runs, which photos have none of.
 
 from collections.abc import Mapping
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 
@@ -13,7 +14,8 @@ from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.listing import some
 
 _RUN = 16  # blocks
-_SHARE = 0.01  # of the blocks; sound photos have 0.0075 at most, and a file that lost a fifteenth 0.04
+_SHARE = 0.02  # of the blocks; sound photos have 0.0075 at most, grey ones 0.016, a file that lost a fifteenth 0.04
+_USUAL = 8  # times the photos' median; sound ones of a low quality have 0.12 and 7.5 times that
 _CLIPPED = 8  # of 255, from black and white, which photos have much of
 _FEW = 0.25  # of the photos; where more have it, it is a background
 
@@ -21,7 +23,8 @@ _FEW = 0.25  # of the photos; where more have it, it is a background
 def said_of(shares: Mapping[str, float | None]) -> tuple[str, str] | None:
     """Which photos are likely damaged, by their `equal_share`, and the remedy; None if none is."""
     known = {name: share for name, share in shares.items() if share is not None}
-    damaged = sorted(name for name, share in known.items() if share > _SHARE)
+    least = max(_SHARE, _USUAL * median(known.values() or [0]))
+    damaged = sorted(name for name, share in known.items() if share > least)
     if not 0 < len(damaged) <= _FEW * len(known):
         return None
     text = f"{len(damaged)} of the {len(known)} JPEG photos that were looked at are likely damaged in the middle"

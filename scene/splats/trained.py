@@ -16,6 +16,7 @@ from utils.system_utils import UserError
 
 _OTHERS = {"features_dc": "sh0", "features_rest": "shN"}  # nerfstudio's names, and gsplat's
 _SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3)}
+_MOST_BANDS = 15  # of shN
 
 
 def read_trained(path: str | os.PathLike) -> Splats:
@@ -34,9 +35,11 @@ def read_trained(path: str | os.PathLike) -> Splats:
     say_once(f"{path} is of {program}: it fits the cameras of a scene if its training did not normalize the world")
     if len(rank := sorted(Path(path).parent.glob(f"{Path(path).stem.rpartition('_rank')[0]}_rank*.pt"))) > 1:
         say_once(f"warning: {path} has a part of the Gaussians; all are in {rank[0].name} to {rank[-1].name}")
+    if values["shN"].shape[1] > _MOST_BANDS:
+        say_once(f"warning: SH bands of degree 4 of {path} are left out; models have at most degree 3")
     if program == "nerfstudio" and not values["shN"].shape[1]:  # it has colours instead then
         values["sh0"] = RGB2SH(values["sh0"].sigmoid())
-    sh = torch.cat([values["sh0"], values["shN"][:, :15]], dim=1)
+    sh = torch.cat([values["sh0"], values["shN"][:, :_MOST_BANDS]], dim=1)
     parts = (values["means"], values["scales"], values["quats"], values["opacities"], sh)
     return Splats(*(x.contiguous().numpy() for x in parts))
 

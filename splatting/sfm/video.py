@@ -26,7 +26,8 @@ from utils.system_utils import UserError, mkdir_p
 # ffmpeg goes by a file's content, and a text can be a list of other files or addresses. These formats are one file.
 _ONE_FILE = [
     *("-protocol_whitelist", "file", "-format_whitelist"),
-    "mov,matroska,avi,mpegts,mpeg,mpegvideo,asf,flv,ogg,mxf,gif,yuv4mpegpipe,h264,hevc,mjpeg,dv,ivf,obu,nut,rm",
+    "mov,matroska,avi,mpegts,mpeg,mpegvideo,asf,flv,ogg,mxf,gif,apng,yuv4mpegpipe,h264,hevc,mjpeg,jpeg_pipe,dv,ivf,obu,nut,"
+    "rm",
 ]
 PATTERN = "frame_[0-9][0-9][0-9][0-9][0-9].jpg"  # of a video's frames
 _NAME = re.compile(r"([^/.][^/]*/)?frame_\d{5,}\.jpg")  # below `input`, which a record of others may not leave
