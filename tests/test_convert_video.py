@@ -361,11 +361,15 @@ def test_interlaced_frames_are_not_combed_and_their_pixels_become_square(ffmpeg,
 
 
 @pytest.mark.parametrize(("said", "parity"), [
+    ("dvvideo,yuv420p", "auto"), ("dvvideo,yuv411p(bottom first)", "bff"),
     ("yuv420p(tv, top first)", "tff"), ("yuv420p(tv, bt709, bottom first)", "bff"), ("yuv420p(tv, progressive)", None),
     ("yuv420p(top coded first (swapped))", "auto"), ("yuv420p(tv", "auto"), ("yuv420p", None),
 ])  # fmt: skip
 def test_which_field_is_first(said, parity):
-    assert video_module._of_fields(said) == ([f"bwdif=mode=send_frame:parity={parity}:deint=all"] if parity else [])
+    codec, comma, colours = said.rpartition("dvvideo,")
+    assert video_module._of_fields(colours, codec + comma) == (
+        [f"bwdif=mode=send_frame:parity={parity}:deint=all"] if parity else []
+    )
 
 
 def test_a_video_that_was_cut_short_is_said(ffmpeg, room, tmp_path, capsys):

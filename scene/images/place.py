@@ -45,12 +45,20 @@ def _gps(tags: Mapping[int, Any]) -> tuple[float, float, float] | None:
     try:
         latitude = _degrees(tags[tag.GPSLatitude], tags.get(tag.GPSLatitudeRef, ""), "NS")
         longitude = _degrees(tags[tag.GPSLongitude], tags.get(tag.GPSLongitudeRef, ""), "EW")
-        height = float(tags.get(tag.GPSAltitude, math.nan))  # NaN also of 0/0
     except (KeyError, TypeError, ValueError):
         return None
-    below = _text(tags.get(tag.GPSAltitudeRef)) in _BELOW
+    height, below = _metres(tags.get(tag.GPSAltitude)), _text(tags.get(tag.GPSAltitudeRef)) in _BELOW
     sound = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude or longitude)
     return (latitude, longitude, -abs(height) if below else height) if sound else None
+
+
+def _metres(value: Any) -> float:
+    """A height, NaN if it is missing or damaged."""
+    try:
+        height = float(value[0] if isinstance(value, tuple) else value)
+    except (TypeError, ValueError, LookupError):
+        return math.nan
+    return height if math.isfinite(height) else math.nan
 
 
 def _degrees(parts: Any, reference: Any, letters: str) -> float:
@@ -65,14 +73,14 @@ def _degrees(parts: Any, reference: Any, letters: str) -> float:
         raise ValueError(f"{parts} are no degrees")
     angle = sum(abs(value) / 60**place for place, value in enumerate(values))
     letter = _text(reference)[:1]
-    negative = letter == letters[1] if letter and letter in letters else values[0] < 0
+    negative = letter == letters[1] if letter and letter in letters else min(values) < 0
     return -angle if negative else angle
 
 
 def _text(value: Any) -> str:
     """A reference, which some programs write as bytes, as a number, or with blanks, as text."""
     text = value.decode("latin-1") if isinstance(value, bytes) else str(value)
-    return text.strip(" \0").upper()
+    return text.strip("\0\t\r\n ").upper()
 
 
 def _down(note: bytes, orientation: Any) -> np.ndarray | None:

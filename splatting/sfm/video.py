@@ -149,7 +149,7 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int) -> Non
         sharp, small = [], []
         header = next(decoder.read_frames(_address(video), input_params=_ONE_FILE))
         colours = header["pix_fmt"]
-        fields = _of_fields(colours)
+        fields = _of_fields(colours, header.get("codec", ""))
         options = ["-vf", ",".join([*fields, _SQUARE]), *_EVERY_FRAME]
         grey = {"pix_fmt": "gray", "bits_per_pixel": 8}
         reader = decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=options, **grey)
@@ -279,12 +279,12 @@ def _any(numbers: Sequence[int]) -> str:
     return f"({_any(numbers[:half])}+{_any(numbers[half:])})" if half else rf"eq(n\,{numbers[0]})"
 
 
-def _of_fields(colours: str) -> list[str]:
+def _of_fields(colours: str, codec: str = "") -> list[str]:
     """ffmpeg's filter that makes frames of the fields of an interlaced video; none of any other video."""
     found = re.search(r"\b(top|bottom) (coded )?first\b", colours)
     # A header "(tv, top coded first (swapped))" ends at its comma here.
-    if not found and colours.count("(") == colours.count(")"):
-        return []
+    if not found and colours.count("(") == colours.count(")") and not codec.startswith("dvvideo"):
+        return []  # in files of DV, only the frames tell it
     # Programs disagree on what "swapped" is, so the frames tell it. Those of MJPEG tell nothing, and are all taken.
     parity = "auto" if not found or found[2] else {"top": "tff", "bottom": "bff"}[found[1]]
     return [f"bwdif=mode=send_frame:parity={parity}:deint=all"]
