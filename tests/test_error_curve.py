@@ -349,6 +349,7 @@ class TestDrawer:
         drawer = CurveDrawer(folder, VIEWS)
         drawer.begin()
         drawer.draw()
+        drawer.draw()  # again, as where a schedule goes on after an end
         assert drawer.finish() is None
         with Image.open(folder / "error_vs_time.png") as image:
             assert min(image.size) > 400

@@ -98,6 +98,9 @@ class CurveDrawer:
 
     def draw(self) -> None:
         """Draw what the file has now."""
+        if self._process is not None and self._process.stdin.closed:  # drawn where a repeated training went on
+            self.abandon()
+            self._process = None
         self.begin()
         if self._process is not None:
             with contextlib.suppress(OSError):  # it has ended, and `finish` says so
