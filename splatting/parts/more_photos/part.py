@@ -51,8 +51,8 @@ class MorePhotos(Part):
 
         if lies_in(run.start, run.dataset.model_path):
             raise UserError(
-                f"{run.dataset.source_path} has photos that {run.start} was not trained on; name another folder by -m "
-                "than the checkpoint's, which keeps the model without them"
+                f"{run.dataset.source_path} has photos that {run.start} was not trained on; give --start_checkpoint "
+                f"{run.start} and name another folder by -m, as this one keeps the model without them"
             )
 
     def state(self) -> dict[str, Any]:
