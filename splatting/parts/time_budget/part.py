@@ -24,12 +24,13 @@ class TimeBudget(Part):
     tools = "for_few_iterations", "continues"
     # fmt: off
     options = Options(optimisation=(
-        Option("time_budget", 0.0, origin="ours", check=within(0, 31_536_000), topic=MOST_NEEDED,  # a year
+        Option("time_budget", 0.0, origin="ours", compared=False, topic=MOST_NEEDED,
+            check=within(0, 31_536_000),  # a year
             help="seconds to train, without scores and saves, or more if a finished run is resumed; 0: no "
                  "limit. The schedule of --iterations is fitted into them, with at most 25 Gaussians for each "
                  "iteration. --strategy auto then means budget, or mcmc for at most 50 photos on a GPU with 0.25 "
                  "s or more for each"),
-        Option("schedule", "", origin="ours", topic="quality and speed",
+        Option("schedule", "", origin="ours", compared=False, topic="quality and speed",
             help="schedule.json of a run with --time_budget: repeat its schedule, independent of the clock. Or a "
                  "number: fit the whole schedule of --iterations into this many iterations"),
     ))
