@@ -235,6 +235,8 @@ def test_gravity_of_a_phone_comes_before_horizons(tmp_path, orientation):
         ({2: 47.51, 4: 8.5, 6: np.inf}, (47.51, 8.5, np.nan)),
         ({1: "N", 2: (np.nan, 0.0, 0.0), 3: "E", 4: (8.5,)}, None),
         ({1: "N", 2: (47.0, np.nan, 36.0), 3: "E", 4: (8.5,)}, None),
+        ({1: "N", 2: 47.51, 3: "E", 4: 351.5}, (47.51, -8.5, np.nan)),
+        ({1: "N", 2: 47.51, 3: "O", 4: 8.5}, None),  # east of Germans, west of Italians
         ({1: "N", 2: (), 3: "E", 4: (1.0, 2.0, 3.0, 4.0)}, None),
     ],
 )

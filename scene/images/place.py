@@ -47,6 +47,8 @@ def _gps(tags: Mapping[int, Any]) -> tuple[float, float, float] | None:
         longitude = _degrees(tags[tag.GPSLongitude], tags.get(tag.GPSLongitudeRef, ""), "EW")
     except (KeyError, TypeError, ValueError):
         return None
+    if 180 < longitude <= 360:  # counted to the east alone
+        longitude -= 360
     height, below = _metres(tags.get(tag.GPSAltitude)), _text(tags.get(tag.GPSAltitudeRef)) in _BELOW
     sound = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude or longitude)
     return (latitude, longitude, -abs(height) if below else height) if sound else None
@@ -64,7 +66,8 @@ def _metres(value: Any) -> float:
 def _degrees(parts: Any, reference: Any, letters: str) -> float:
     """Degrees of one to three parts: degrees, minutes, seconds. ValueError if they are damaged.
 
-    letters: what the reference begins with where they are positive, and negative. If it has neither, the sign counts.
+    letters: what the reference begins with where they are positive, and negative. Without one, the sign counts; another
+    letter is damage, as O is east in some languages and west in others.
     """
     values = [*map(float, parts if isinstance(parts, tuple) else [parts])]
     while len(values) > 1 and math.isnan(values[-1]):  # 0/0, as of seconds that minutes tell
@@ -73,6 +76,8 @@ def _degrees(parts: Any, reference: Any, letters: str) -> float:
         raise ValueError(f"{parts} are no degrees")
     angle = sum(abs(value) / 60**place for place, value in enumerate(values))
     letter = _text(reference)[:1]
+    if letter.isalpha() and letter not in letters:
+        raise ValueError(f"{reference} is no direction")
     negative = letter == letters[1] if letter and letter in letters else min(values) < 0
     return -angle if negative else angle
 
