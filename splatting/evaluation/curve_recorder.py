@@ -221,7 +221,7 @@ class CurveRecorder:
         With the last one, it is being drawn from then on until `finish`. trained: iteration of the run, where that is
         another one.
         """
-        # The peaks of log and curve, because after a rescue the curve has rows beyond the log's last record.
+        # The peaks of log and curve, because after an error the curve may have rows beyond the log's last record.
         peaks = [self._log.peak_memory_mib(), *(row["peak_memory_mib"] for row in self.rows[-1:])]
         row = dict.fromkeys(COLUMNS) | {
             "iteration": iteration if trained is None else trained,
