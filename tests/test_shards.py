@@ -80,7 +80,7 @@ def _adc(gaussians: GaussianModel, *further: int, rule: tuple = (), **changes: o
 
 def _limited(gaussians: GaussianModel) -> None:
     _adc(gaussians, max_num_splats=gaussians.gaussian_count + 7)
-    _adc(gaussians, 900, max_num_splats=gaussians.gaussian_count + 5, rule=(options().absgrad_threshold, True))
+    _adc(gaussians, 900, max_num_splats=gaussians.gaussian_count + 5, rule=(options().absgrad_threshold,))
 
 
 def _by_hand(gaussians: GaussianModel) -> None:

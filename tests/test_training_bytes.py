@@ -146,7 +146,7 @@ def test_pairs_of_parts_resumed(scene, tmp_path):
     # tests/parts has the first; the others keep nothing.
     assert begin - {"more_photos", "remote_viewer", "sleep"} <= PART_OPTIONS.keys()
     pairs = {frozenset(pair) for pair in combinations(PART_OPTIONS, 2) if _goes_together(*pair)}
-    assert len(pairs) > 70
+    assert len(pairs) > 55
     for names in _covering(pairs):
         out = tmp_path / "+".join(names)
         words = [word for name in names for word in PART_OPTIONS[name]]
