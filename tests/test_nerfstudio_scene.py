@@ -16,6 +16,7 @@ from synthetic import FakeGaussians, edit_json, folder_state, make_nerfstudio_sc
 from scene import Scene
 from scene.dataset_readers import read_scene
 from scene.images.lens import Lens
+from scene.readers.transforms import read_poses
 from scene.readers.transforms_lens import lens_of
 from utils.system_utils import UserError
 
@@ -241,8 +242,8 @@ def test_masks_of_frames(scene):
 
 
 @pytest.mark.parametrize("native", [False, True])
-def test_the_circle_of_a_fisheye_is_a_mask(scene, native):
-    """Of each photo, also beside a mask of its own, whose black half stays masked."""
+def test_the_circle_of_a_fisheye_is_a_mask(scene, native, capsys):
+    """Of each photo, also beside a mask of its own, whose black half stays masked. Who reads poses alone says so."""
     grey = np.full((64, 96), 255, np.uint8)
     grey[:, :48] = 0
     Image.fromarray(grey).save(scene / "mask.png")
@@ -264,6 +265,9 @@ def test_the_circle_of_a_fisheye_is_a_mask(scene, native):
         assert one.sum() == pytest.approx(np.pi * 24**2, rel=0.08) and one[12:50, 40:56].all()
         assert not native or one.sum() == (np.hypot(*(np.mgrid[-31.5:32, -47.5:48])) <= 24).sum()
     assert without.mask is None or without.mask.decode((96, 64)).all()
+    assert "not used" not in capsys.readouterr().err
+    read_poses(scene / "transforms.json")
+    assert "transforms.json that are not used: fisheye_crop_radius, mask_path\n" in capsys.readouterr().err
     _edit(scene, lambda content: content.update(fisheye_crop_radius=-3))
     with pytest.raises(UserError, match="fisheye_crop_radius in .*transforms.json must be .* above 0, got -3"):
         read(scene)

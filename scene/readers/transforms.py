@@ -34,6 +34,7 @@ from utils.system_utils import UserError
 
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 _READ = {"file_path", "transform_matrix", "mask_path", "ply_file_path", "frames", "test_frames", *SPLITS, *FIELDS}
+_MASKS = ("mask_path", "fisheye_crop_radius")
 _ESCAPED = {8: "\\b", 9: "\\t", 10: "\\n", 12: "\\f", 13: "\\r"}  # what a lone backslash in a path made of its letter
 _SAME = 1e-6  # of poses, which decimals may have rounded
 
@@ -74,8 +75,12 @@ def read_blender(
 
 
 def read_poses(path: Path) -> list[Posed]:
-    """The poses and lenses of a camera file, without a look at its photos. UserError for what cannot be used."""
+    """The poses and lenses of a camera file, without a look at its photos. UserError for what cannot be used.
+
+    A message names the masks that the file gives, which nobody reads here.
+    """
     content = _read(path)
+    say_unread(path, "transforms", {name for one in (content, *content["frames"]) for name in _MASKS if one.get(name)})
     frames = enumerate(content["frames"], start=1)
     return [
         Posed(str(frame["file_path"]), *_pose(path, number, frame), partial(_lens, path, content, frame))
