@@ -62,7 +62,7 @@ MAY = {
     "splatting.training.run.begin": MODEL,
     "splatting.parts.resume.part.opened": MODEL,
     "splatting.parts.resume.part.ended": MODEL,
-    "splatting.parts.resume.tools._goes_on": MODEL,
+    "splatting.parts.resume.tools._continued": MODEL,
     "splatting.parts.robust_mask.written.write_masks": MODEL,
     "splatting.sfm.adding.forget_base": WORK,
     "splatting.sfm.adding.keep_base": WORK,

@@ -157,7 +157,7 @@ def test_jpegs_with_a_damaged_middle_are_named(sound, tmp_path, capsys, zeros):
     for path in (tmp_path / "input" / "2.jpg", tmp_path / "input" / "5.jpg"):
         path.write_bytes(_damaged(path.read_bytes(), zeros))
     (found,) = of_damage(info, 16)
-    assert str(found).startswith("2 of the 8 JPEG photos that were looked at are likely damaged in the middle")
+    assert str(found).startswith("2 of the 8 JPEG photos that were checked are likely damaged in the middle")
     assert "(2.jpg, 5.jpg); copy them again" in str(found)
     check_images(Layout(tmp_path), [view.image_name for view in views], None)
     assert f"warning: {found}" in capsys.readouterr().err

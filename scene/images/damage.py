@@ -27,7 +27,7 @@ def said_of(shares: Mapping[str, float | None]) -> tuple[str, str] | None:
     damaged = sorted(name for name, share in known.items() if share > least)
     if not 0 < len(damaged) <= _FEW * len(known):
         return None
-    text = f"{len(damaged)} of the {len(known)} JPEG photos that were looked at are likely damaged in the middle"
+    text = f"{len(damaged)} of the {len(known)} JPEG photos that were checked are likely damaged in the middle"
     text += f", as parts of them are of exactly one colour ({some(damaged)})"
     return text, "copy them again, or take them out of the scene"
 

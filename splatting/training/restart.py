@@ -1,4 +1,4 @@
-"""Checkpoints of the training that torchrun has started: where a restarted one goes on."""
+"""Checkpoints of the training that torchrun has started: where a restarted one continues."""
 
 import os
 import re

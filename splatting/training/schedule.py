@@ -54,7 +54,7 @@ class Schedule:
         return False
 
     def step_before(self, iteration: int) -> int:
-        """From which `schedule_step` the iterations after this one go on."""
+        """From which `schedule_step` the iterations after this one continue."""
         return self.schedule_step(iteration)
 
     def span(self, iteration: int) -> range:

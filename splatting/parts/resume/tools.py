@@ -27,7 +27,7 @@ def prepare(dataset: argparse.Namespace, opt: argparse.Namespace, launch: argpar
     asked = next((found for ask in tools("continues") if (found := ask(opt)) is not None), None)
     if end := finished(folder):
         launch.start_checkpoint = str(end.checkpoint)
-        return _goes_on(folder, end, end.iteration < opt.iterations if asked is None else asked, asked is None)
+        return _continued(folder, end, end.iteration < opt.iterations if asked is None else asked, asked is None)
     most = opt.iterations if asked is None else math.inf
     launch.start_checkpoint = newest_checkpoint(folder, most, since=0) or launch.start_checkpoint
     if not launch.start_checkpoint and saves_in(Path(folder)) and not read_model_json(folder):
@@ -35,8 +35,8 @@ def prepare(dataset: argparse.Namespace, opt: argparse.Namespace, launch: argpar
     return True
 
 
-def _goes_on(folder: str, end: End, asked: bool, by_iterations: bool) -> bool:
-    """Whether the finished training of a folder goes on, as asked. UserError if it cannot, or not by --iterations."""
+def _continued(folder: str, end: End, asked: bool, by_iterations: bool) -> bool:
+    """Whether to continue the finished training of a folder. UserError if it cannot be, or not by --iterations."""
     there = f"{folder} has a finished training of {end.iteration:,} iterations"
     wrong = by_iterations and end.more != STEADY.more
     if not asked and not wrong:

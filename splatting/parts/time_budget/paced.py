@@ -22,7 +22,7 @@ _LAST = 1.5  # blocks; if no more are left, they are one
 _MOST_SHARE = 2  # times the part of the schedule that an iteration does where no seconds are lost
 _TOLD = 1.02  # times the budget, from which on a run says that it takes longer
 AN_ITERATION = 25  # Gaussians for each iteration, at most, where the clock sets the number of iterations
-AGAIN = 0.9  # part of the schedule at which one that is over goes on: rates are low there, and fall once more
+AGAIN = 0.9  # part of the schedule at which one that is over continues: rates are low there, and fall once more
 
 Levels = Sequence[tuple[float, float]]  # part of the schedule that is done (0 to 1), and factor of sizes from then on
 
@@ -196,8 +196,9 @@ class TimeBudget(DecidedSchedule):
     left, at the speed of the blocks before it. So seconds that were lost, by a slow start or by another program, are
     taken from all that is left. Where so many were lost that iterations would do more than _MOST_SHARE times their
     usual part, the run takes longer than its budget. Seconds are those of training, with those of the runs that this
-    one resumes, whose blocks are in the schedule. One that was over goes on at AGAIN, for as many seconds more. share:
-    gives all processes the seconds of one.
+    one resumes, whose blocks are in the schedule. One that was over continues at AGAIN, for as many seconds more.
+
+    share: gives all processes the seconds of one.
     """
 
     by_clock = True
