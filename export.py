@@ -43,7 +43,7 @@ from splatting.exports.reading import ANY, read_any
 from splatting.exports.upright import add_upright_options, check_upright, oriented_later, placed
 from splatting.files.json_files import read_model_json
 from splatting.files.ours import refuse_foreign
-from splatting.parts import tools
+from splatting.registry import tools
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, compute_device, run_cli
 

@@ -35,7 +35,7 @@ from splatting.evaluation.results import read_earlier, read_run
 from splatting.evaluation.stages import Failure, StageFailed
 from splatting.evaluation.tables import MAIN, Table, gains_table, result_tables
 from splatting.files.folders import locked
-from splatting.files.listing import markdown_table
+from splatting.host.listing import markdown_table
 from splatting.host.machine import facts_asked
 from utils.system_utils import UserError, mkdir_p, run_cli
 

@@ -17,9 +17,9 @@ import torch
 
 from arguments import write_cfg_args, write_model_json
 from scene.readers.scene_folder import is_scene
-from splatting.distributed.consistency import agree_on_options
 from splatting.host.energy import joules_counter, nvml_name
-from splatting.parts import check_together, chosen, tools
+from splatting.registry import check_together, chosen, tools
+from splatting.training.consistency import agree_on_options
 from splatting.training.earlier_runs import resolve_lenses
 from splatting.training.launch import launch_options, training_parser
 from splatting.training.loop import run_training

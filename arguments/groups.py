@@ -6,8 +6,8 @@ from collections.abc import Collection
 
 from arguments.param_group import GroupParams, OptionTable
 from splatting.files.json_files import MODEL_JSON
-from splatting.parts import appearances, options_of, part_class, strategies
-from splatting.training.option import CFG_ARGS, MOST_NEEDED, Option, above, at_least, in_places, one_of, within
+from splatting.option import CFG_ARGS, MOST_NEEDED, Option, above, at_least, in_places, one_of, within
+from splatting.registry import appearances, options_of, part_class, strategies
 from utils.system_utils import UserError
 
 

@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection
 from typing import Any, ClassVar, NoReturn
 
-from splatting.training.option import Option
+from splatting.option import Option
 
 _FOLDERS = {"-s": "scene", "-m": "model", "--scenes": "scene"}
 _TRUTHS = ("true", "false", "yes", "no", "on", "off", "1", "0")

@@ -14,7 +14,7 @@ from splatting.files import json_files
 from splatting.files.json_files import ENLARGEMENT, MODEL_JSON, OFFSET
 from splatting.files.plain_files import plain_text
 from splatting.host.machine import VERSION
-from splatting.training.option import CFG_ARGS, Value
+from splatting.option import CFG_ARGS, Value
 from utils.system_utils import UserError, atomic_write
 
 _IN_CFG_ARGS = {option.name: option.default for option in OPTIONS if option.stored == CFG_ARGS}

@@ -16,19 +16,19 @@ from diff_gaussian_rasterization.scene import Drawing, Scene, scene_arguments
 from diff_gaussian_rasterization.scene import draw as rasterize_scene
 from torch import Tensor
 
-from scene.cameras import Camera, MiniCam
-from scene.fused_adam import FusedAdam
-from scene.gaussian_model import GaussianModel
-from scene.gaussians.exposure import apply_exposure
-from scene.gaussians.parameters import GaussianParameters
-from scene.sleeping import Sleeping
-from splatting.distributed.rendering.sharded import (
+from gaussian_renderer.over_ranks.sharded import (
     DividedDrawn,
     KnownBands,
     draw_divided,
     gradient_of_colors,
     rasterizer_of,
 )
+from scene.cameras import Camera, MiniCam
+from scene.fused_adam import FusedAdam
+from scene.gaussian_model import GaussianModel
+from scene.gaussians.exposure import apply_exposure
+from scene.gaussians.parameters import GaussianParameters
+from scene.sleeping import Sleeping
 from utils.general_utils import check_flags
 from utils.sh_utils import eval_sh
 

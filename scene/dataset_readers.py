@@ -11,11 +11,7 @@ from scene.images.masks import NO_MASKS, MaskOptions
 from scene.readers.colmap import read_colmap
 from scene.readers.info import HOLD, CameraInfo, SceneInfo, scene_extent
 from scene.readers.point_cloud import fetchPly, storePly
-from scene.readers.scene_folder import BLENDER, COLMAP, NERFSTUDIO, kind_of
-from scene.readers.start_cloud import SFM, StartOptions
-from scene.readers.transforms import read_blender, read_nerfstudio
-from scene.readers.world_offset import local, world_offset
-from splatting.compat.readers import (
+from scene.readers.reference import (
     getNerfppNorm,
     readCamerasFromTransforms,
     readColmapCameras,
@@ -23,6 +19,10 @@ from splatting.compat.readers import (
     readNerfstudioInfo,
     readNerfSyntheticInfo,
 )
+from scene.readers.scene_folder import BLENDER, COLMAP, NERFSTUDIO, kind_of
+from scene.readers.start_cloud import SFM, StartOptions
+from scene.readers.transforms import read_blender, read_nerfstudio
+from scene.readers.world_offset import local, world_offset
 from utils.graphics_utils import BasicPointCloud, focal2fov, fov2focal
 
 # For other code to call, or to replace: Scene then calls what stands here in place of our readers.

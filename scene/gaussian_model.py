@@ -15,10 +15,10 @@ from scene.gaussians.attributes import INITIAL_OPACITY
 from scene.gaussians.exposure import Exposures, read_exposures, read_pretrained
 from scene.gaussians.finite import check_finite
 from scene.gaussians.parameters import GaussianParameters, raw_rows
+from scene.gaussians.reference_names import ReferenceNames
 from scene.gaussians.start import start_rows
 from scene.gaussians.table import trainable
 from scene.readers.info import photo_names
-from splatting.compat.model_names import ReferenceNames
 from splatting.host.machine import compute_device
 from utils.general_utils import get_expon_lr_func, inverse_sigmoid
 from utils.graphics_utils import BasicPointCloud

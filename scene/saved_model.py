@@ -16,7 +16,7 @@ from scene.gaussians.morton import sort_scattered
 from scene.gaussians.ply import read_ply
 from scene.saved_iterations import saved_ply
 from scene.scene import Scene
-from splatting.parts import states_in, tools
+from splatting.registry import states_in, tools
 from utils.system_utils import UserError, saved_iterations
 
 _CHECKPOINT = re.compile(r"chkpnt(\d+)\.pth")

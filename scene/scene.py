@@ -19,15 +19,15 @@ from scene.images.store import ImageStore, Picture, image_device
 from scene.readers.enlargement import enlargement
 from scene.readers.info import CameraInfo, SceneInfo, photo_size
 from scene.readers.point_cloud import write_point_cloud
+from scene.readers.reference import scene_by
 from scene.readers.scene_folder import kind_of
+from scene.reference_models import SceneGaussians, call_of_either_form
 from scene.saved_iterations import find_iteration, saved_ply
-from splatting.compat.models import SceneGaussians, call_of_either_form
-from splatting.compat.readers import scene_by
 from splatting.distributed.ranks import ALONE, Ranks
 from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json
 from splatting.host.machine import compute_device
-from splatting.parts import chosen
-from splatting.training.part import Part
+from splatting.part import Part
+from splatting.registry import chosen
 from utils.system_utils import UserError, atomic_write
 
 

@@ -43,7 +43,7 @@ class View:
     depth_has_gaps: whether an inverse depth of 0 is unknown, and not far away.
     """
 
-    has_dataset_pictures = True  # whether no other code has assigned or changed them (splatting/compat/camera.py)
+    has_dataset_pictures = True  # whether no other code has assigned or changed them (scene/cameras.py)
 
     def __init__(
         self, info: CameraInfo, size: Size, uid: int, columns: slice | None = None, data_device: str = "cuda"

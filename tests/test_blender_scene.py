@@ -14,7 +14,7 @@ from synthetic import FakeGaussians, edit_json, folder_state, options_of, read
 
 from scene import Scene
 from scene.readers.point_cloud import write_point_cloud
-from splatting.compat.readers import readNerfSyntheticInfo
+from scene.readers.reference import readNerfSyntheticInfo
 from utils.system_utils import UserError
 
 _read = partial(read, hold_out=True)

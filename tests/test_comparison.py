@@ -23,7 +23,7 @@ from splatting.evaluation.configs import read_configs, shipped
 from splatting.evaluation.plan import DATASETS
 from splatting.evaluation.report import make_report, render
 from splatting.evaluation.tables import result_tables
-from splatting.files.listing import markdown_table
+from splatting.host.listing import markdown_table
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]

@@ -12,8 +12,9 @@ from forks import Done, fork
 ROOT = Path(__file__).resolve().parents[1]
 WITH_EXAMPLE = """
 import sys
-import splatting.parts as registry
-registry.__path__.append("tests/parts/example")
+import splatting.parts
+import splatting.registry as registry
+splatting.parts.__path__.append("tests/parts/example")
 registry.PARTS = (*registry.PARTS, "patient", "grey")
 import train
 scene, *words = sys.argv[1:]

@@ -6,9 +6,9 @@ from diff_gaussian_rasterization.fakes import ABSOLUTE_VALUES, MOMENT_VALUES, RA
 from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, moved_by_a_word, ops
 from torch import Tensor
 
+from gaussian_renderer.over_ranks.bands import Bands
+from gaussian_renderer.over_ranks.exchange import Sent, return_rows, send_splats
 from splatting.distributed.ranks import ALONE, Ranks
-from splatting.distributed.rendering.bands import Bands
-from splatting.distributed.rendering.exchange import Sent, return_rows, send_splats
 from splatting.host.read_later import read_later
 
 LARGE = 20_000  # more than a thread of the CPU takes at once, and no multiple of anything

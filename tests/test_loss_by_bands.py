@@ -10,10 +10,10 @@ from processes import in_ranks
 from rasterizer_tools import BOTH_AND_GPU, GPU_MARKS
 from torch import Tensor
 
+from gaussian_renderer.over_ranks import bands
+from gaussian_renderer.over_ranks.band import surroundings, whole_image
+from gaussian_renderer.over_ranks.bands import Bands, KnownBands, find_bands, row_processed, row_widths
 from splatting.distributed.ranks import Ranks, ranks
-from splatting.distributed.rendering import bands
-from splatting.distributed.rendering.band import surroundings, whole_image
-from splatting.distributed.rendering.bands import Bands, KnownBands, find_bands, row_processed, row_widths
 
 # Height, width, and the rows of tiles where bands begin and the last one ends.
 CASES = [

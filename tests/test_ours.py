@@ -50,7 +50,7 @@ MAY = {
     "splatting.exports.streamed.write_lod_meta": OWN,
     "splatting.demo.make_scene.make_scene": OWN,  # and an empty folder
     "integrations.nerfbaselines.method._begin": OWN,
-    "utils.system_utils.atomic_write": OWN,
+    "splatting.files.writing.atomic_write": OWN,
     "splatting.files.folders.locked": OWN,
     "splatting.files.folders.remove_temporary_files": "files with names of atomic_write, whose process has ended",
     "splatting.files.image_files.remove_leftovers": "numbered renders in a model folder",

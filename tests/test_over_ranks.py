@@ -15,9 +15,9 @@ from rasterizer_tools import leaves, ops, scene_arguments
 from torch import Tensor
 
 from benchmarks.workloads.splat_scenes import settings
+from gaussian_renderer.over_ranks.band import decisive_in, draw_view
+from gaussian_renderer.over_ranks.rasterize import rasterize_over
 from splatting.distributed.ranks import ranks
-from splatting.distributed.rendering.band import decisive_in, draw_view
-from splatting.distributed.rendering.rasterize import rasterize_over
 
 SIZES = [2, 3]
 CAMERA = "viewmatrix", "campos"

@@ -1,4 +1,4 @@
-"""Rules of parts (splatting/training/part.py): nobody names one outside of its folder, and each can be deleted."""
+"""Rules of parts (splatting/part.py): nobody names one outside of its folder, and each can be deleted."""
 
 import argparse
 import ast
@@ -14,8 +14,8 @@ import pytest
 from forks import fork
 from synthetic import make_colmap_scene
 
-from splatting.parts import PARTS, part_class, states_in, strategies, tools
-from splatting.training.part import Part, fill, overrides
+from splatting.part import Part, fill, overrides
+from splatting.registry import PARTS, part_class, states_in, strategies, tools
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -27,6 +27,7 @@ KNOWN = {  # words in files that are options of a part, and mean something else 
     ("no_curve", "integrations/nerfbaselines/method.py"),
     ("no_curve", "splatting/diagnosis/advice.py"),  # of a short training
     ("schedule", "scene/gaussian_model.py"),  # that of exposures' learning rate
+    ("schedule", "scene/gaussians/reference_names.py"),
     ("train_test_exp", "utils/camera_utils.py"),  # what functions of the reference take
     *((f"exposure_lr_{end}", "scene/gaussians/exposure.py") for end in ("init", "final", "delay_steps", "delay_mult")),
     *((f"exposure_lr_{end}", "full_eval.py") for end in ("init", "final", "delay_steps", "delay_mult")),  # commands
@@ -52,11 +53,11 @@ def _options(name: str) -> set[str]:
 def _files(name: str) -> Iterator[Path]:
     """All Python files of the project that may not know a part: those outside of its folder, but the registry.
 
-    splatting/compat has the reference's functions, whose parameters have names of its options.
+    The reference's functions have parameters with names of its options.
     """
     found = [*(path for room in ROOMS for path in (ROOT / room).rglob("*.py")), *(ROOT / f"{c}.py" for c in COMMANDS)]
-    known = FOLDER / name, ROOT / "splatting" / "compat"
-    yield from (path for path in found if not {*known} & {*path.parents} and path != FOLDER / "__init__.py")
+    known = ROOT / "splatting" / "registry.py", ROOT / "scene" / "readers" / "reference.py"
+    yield from (path for path in found if FOLDER / name not in path.parents and path not in known)
 
 
 @cache
@@ -94,9 +95,7 @@ def test_nobody_names_a_part_outside_of_its_folder(name):
 
 def test_what_declares_parts_imports_nothing_heavy():
     """As every command reads it for its options."""
-    code = (
-        "import sys; from splatting.parts import PARTS, part_class; list(map(part_class, PARTS)); print(*sys.modules)"
-    )
+    code = "import sys, splatting.registry as r; list(map(r.part_class, r.PARTS)); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert not {"torch", "numpy", "scene", "arguments"} & {*done.stdout.split()}
 
@@ -112,7 +111,7 @@ def test_parts_declare_their_tools():
 # A program in which a part is not there: neither its line of the registry nor its folder.
 WITHOUT = """
 import sys
-import splatting.parts as registry
+import splatting.registry as registry
 name, *words = sys.argv[1:]
 registry.PARTS = tuple(other for other in registry.PARTS if other != name)
 sys.modules[f"splatting.parts.{name}"] = None

@@ -29,7 +29,7 @@ import train
 from scene import sleeping
 from scene.readers.point_cloud import write_point_cloud
 from splatting.distributed.ranks import ranks
-from splatting.parts import PARTS, part_class, strategies
+from splatting.registry import PARTS, part_class, strategies
 from splatting.training.steps.graphs import Graphs
 from utils.system_utils import UserError
 

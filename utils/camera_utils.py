@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from scene.cameras import Camera
 from scene.images.decode import picture_size, pixels_of
 from scene.images.masks import TRANSPARENT, Mask, add_alpha
 from scene.images.sizes import training_size
 from scene.images.store import InMemory, Size
 from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, DepthMap, depth_fit
 from scene.readers.info import CameraInfo, photo_size
-from splatting.compat.camera import Camera
-from splatting.compat.models import call_of_either_form
+from scene.reference_models import call_of_either_form
 from utils.graphics_utils import camera_center, fov2focal, rigid_pose
 from utils.image_utils import half
 

@@ -9,11 +9,11 @@ from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile, record_function
 
 from benchmarks.harness.measuring import short_name
-from splatting.distributed.rendering import band
+from gaussian_renderer.over_ranks import band
+from splatting.part import Part
 from splatting.training.iteration import Iteration
-from splatting.training.part import Part
 
-_PACKING = "send_splats", "return_rows"  # of splatting/distributed/rendering/exchange.py, as band.py calls them
+_PACKING = "send_splats", "return_rows"  # of gaussian_renderer/over_ranks/exchange.py, as band.py calls them
 SUMS = "all kernels", "messages", "packing"
 _SHOWN = 0.05  # ms of a kernel
 

@@ -41,10 +41,10 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.spilled import bytes_of
 from splatting.distributed.ranks import ranks
 from splatting.host.memory import peak_memory_mib
+from splatting.part import Part
 from splatting.training.iteration import Iteration
 from splatting.training.loop import run_training
 from splatting.training.observers.divergence import DivergenceWatch
-from splatting.training.part import Part
 from utils.system_utils import UserError, compute_device, run_cli
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -22,12 +22,12 @@ from scene.saved_iterations import saved_ply
 from scene.saved_model import find_save, read_model
 from splatting.evaluation import training_log
 from splatting.files.json_files import read_json, write_json
-from splatting.parts import PARTS, appearances, part_class
+from splatting.part import Part
+from splatting.registry import PARTS, appearances, part_class
 from splatting.training.iteration import Iteration
 from splatting.training.loop import training_steps
 from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.observers.mask_watch import MaskWatch
-from splatting.training.part import Part
 from splatting.training.run import Run
 from train import parse
 from utils.system_utils import UserError, compute_device

@@ -17,7 +17,7 @@ from scene.readers.info import (
     standing_apart,
     turned,
 )
-from splatting.files.listing import some
+from splatting.host.listing import some
 
 OPENING = (10.0, 150.0)  # degrees, of a pinhole; outside, the focal length is doubtful
 _FISHEYE = (10.0, 359.0)  # degrees, of a fisheye: its focal length times the angle is the photo's size

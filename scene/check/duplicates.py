@@ -10,7 +10,7 @@ import numpy as np
 
 from scene.check.findings import Finding
 from scene.readers.info import CameraInfo, SceneInfo
-from splatting.files.listing import some
+from splatting.host.listing import some
 
 _PART = 1 << 16  # bytes at the ends and in the middle that are compared first
 _SAME_PLACE, _SAME_TURN = 0.02, 0.02  # extents, and radians: a pose that was found twice

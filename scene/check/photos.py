@@ -16,7 +16,7 @@ from scene.readers.info import SceneInfo
 from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.json_files import read_json
-from splatting.files.listing import some
+from splatting.host.listing import some
 from utils.system_utils import UserError
 
 SMALL = 32  # pixels; a smaller side has few more than SSIM's window

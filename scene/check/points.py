@@ -8,7 +8,7 @@ from scene.check.findings import Finding
 from scene.gaussians.copies import places_of
 from scene.readers.info import SceneInfo, camera_centers
 from scene.readers.tracks import projected
-from splatting.files.listing import some
+from splatting.host.listing import some
 
 FAR_POINT = 100.0  # extents from the cameras; a sky is some tens away
 FAR_SHARE = 0.01

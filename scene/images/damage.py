@@ -11,7 +11,7 @@ from statistics import median
 import numpy as np
 
 from splatting.files.image_files import UNREADABLE, open_image
-from splatting.files.listing import some
+from splatting.host.listing import some
 
 _RUN = 16  # blocks
 _SHARE = 0.02  # of the blocks; sound photos have 0.0075 at most, grey ones 0.016, a file that lost a fifteenth 0.04

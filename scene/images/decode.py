@@ -12,8 +12,8 @@ from torch import Tensor
 
 from splatting.files.color_profiles import has_other_colors, in_srgb
 from splatting.files.image_files import UNREADABLE, eight_bits, open_image, sixteen_bits
-from splatting.files.listing import some
 from splatting.files.plain_files import not_the_file
+from splatting.host.listing import some
 from utils.system_utils import UserError
 
 _TAIL = 4096

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from scene.images.decode import picture_size
 from splatting.files.image_files import SUFFIXES
-from splatting.files.listing import some
+from splatting.host.listing import some
 from utils.system_utils import UserError
 
 

@@ -24,8 +24,8 @@ from scene.readers.colmap import find_model
 from scene.readers.info import CameraInfo, SceneInfo
 from scene.readers.undistortion import undistorted_folder
 from splatting.files.image_files import UNREADABLE, open_image
-from splatting.files.listing import some
 from splatting.files.plain_files import plain, plain_text
+from splatting.host.listing import some
 from splatting.host.machine import threads
 from utils.system_utils import UserError
 

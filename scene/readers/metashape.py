@@ -20,9 +20,9 @@ import numpy as np
 from scene.images.find import FileIndex
 from scene.images.lens import PANORAMA
 from splatting.files.image_files import SUFFIXES
-from splatting.files.listing import some
 from splatting.files.plain_files import MOST, plain
 from splatting.files.unread import say_unread
+from splatting.host.listing import some
 from utils.system_utils import UserError
 
 _HEAD = 1024  # bytes in which the file says what it is

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from scene.readers.metashape import cameras_xml
 from scene.readers.phone_scans import polycam_capture, record3d_capture
-from splatting.files.listing import some
+from splatting.host.listing import some
 from splatting.host.start import typed_command
 from utils.system_utils import UserError
 

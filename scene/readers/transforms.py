@@ -28,8 +28,8 @@ from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, rand
 from scene.readers.transforms_lens import FIELDS, circle_of, lens_of
 from splatting.files.image_files import SUFFIXES
 from splatting.files.json_files import read_json
-from splatting.files.listing import some
 from splatting.files.unread import say_unread
+from splatting.host.listing import some
 from utils.system_utils import UserError
 
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")

@@ -18,8 +18,8 @@ from scene.images.lens import undistortion
 from scene.readers.info import CameraInfo, are_exchanged
 from splatting.files.folders import cache_folder, remove_temporary_files
 from splatting.files.image_files import UNREADABLE, open_image
-from splatting.files.listing import some
 from splatting.files.plain_files import plain
+from splatting.host.listing import some
 from splatting.host.machine import threads
 from utils.system_utils import UserError, atomic_write, mkdir_p
 

@@ -26,7 +26,7 @@ from splatting.diagnosis import Line
 from splatting.diagnosis.model import load_scored
 from splatting.distributed.ranks import ranks
 from splatting.files.json_files import write_json
-from splatting.parts import check_together, chosen, options_of, tools
+from splatting.registry import check_together, chosen, options_of, tools
 from utils.system_utils import UserError, mkdir_p
 
 ADVICE = "advice.json"  # what train.py --advise writes: texts, and options that the scene asks for

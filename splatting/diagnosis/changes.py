@@ -19,7 +19,7 @@ from splatting.diagnosis.photos import CLEARLY, FITS, other_focal_length, strang
 from splatting.evaluation.model_folder import curve_of
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
-from splatting.parts import tools
+from splatting.registry import tools
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.system_utils import UserError
 

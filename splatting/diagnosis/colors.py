@@ -16,7 +16,7 @@ from scene.readers.tracks import Track, projected
 from splatting.diagnosis import Line
 from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import open_image
-from splatting.files.listing import some
+from splatting.host.listing import some
 from utils.graphics_utils import BasicPointCloud
 
 _SAMPLE = 5000  # most points

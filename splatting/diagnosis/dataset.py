@@ -19,8 +19,8 @@ from scene.readers.tracks import Track, rays_to, read_tracks
 from splatting.diagnosis import Line, from_error
 from splatting.diagnosis.colors import UNITS, check_colors
 from splatting.files.json_files import read_json
-from splatting.files.listing import some
-from splatting.parts import tools
+from splatting.host.listing import some
+from splatting.registry import tools
 from utils.system_utils import UserError
 
 # Learning rates and size limits are fractions of the extent, but depths below 0.2 are culled and float32 is used.

@@ -9,7 +9,7 @@ from scene.cameras import Camera
 from scene.readers.info import CameraInfo
 from scene.scene import Scene
 from splatting.diagnosis import Line
-from splatting.files.listing import some
+from splatting.host.listing import some
 from utils.image_utils import as_float, psnr
 
 MOST_PHOTOS = 300  # that are compared with each other

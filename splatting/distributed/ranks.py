@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
-from splatting.files.listing import some
 from splatting.host.errors import UserError
+from splatting.host.listing import some
 
 if TYPE_CHECKING:
     import torch

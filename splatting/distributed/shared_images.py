@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from splatting.distributed.ranks import Ranks
+from splatting.host.errors import UserError
 from splatting.host.memory import is_out_of_memory
-from utils.system_utils import UserError
 
 
 def divided(

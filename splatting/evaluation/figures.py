@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatting.evaluation.error_curve import SUBSET, Row, best_test, common_subset, read_curve, rows_on, whole_sets
-from splatting.files.listing import as_utf8
+from splatting.host.listing import as_utf8
 from utils.system_utils import atomic_write
 
 if TYPE_CHECKING:

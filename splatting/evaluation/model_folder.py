@@ -14,7 +14,7 @@ from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
 from splatting.files.json_files import SCHEDULE, read_json
 from splatting.files.plain_files import plain
-from splatting.parts import PARTS, part_class
+from splatting.registry import PARTS, part_class
 from utils.system_utils import UserError, saved_iterations
 
 

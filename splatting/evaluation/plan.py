@@ -14,7 +14,7 @@ from typing import Any
 
 from arguments import OptimizationParams
 from splatting.files.json_files import read_json, write_json
-from splatting.parts import PARTS, part_class
+from splatting.registry import PARTS, part_class
 from utils.system_utils import UserError
 
 _OUTDOOR = ("-i", "images_4")

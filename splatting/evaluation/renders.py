@@ -17,7 +17,7 @@ from scene.saved_iterations import saved_ply
 from splatting.evaluation.comparison import SCORES
 from splatting.evaluation.model_folder import json_or_none, load_scores
 from splatting.files.image_files import UNREADABLE, open_render
-from splatting.files.listing import as_utf8
+from splatting.host.listing import as_utf8
 from utils.system_utils import UserError, atomic_write
 
 if TYPE_CHECKING:

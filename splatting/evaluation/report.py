@@ -22,9 +22,9 @@ from splatting.evaluation.gains import gains
 from splatting.evaluation.renders import GAIN, ComparedViews
 from splatting.files.image_files import open_image
 from splatting.files.json_files import write_json
-from splatting.files.listing import markdown_table
+from splatting.host.listing import markdown_table
 from splatting.host.machine import one_line
-from splatting.parts import tools
+from splatting.registry import tools
 from utils.system_utils import UserError, atomic_write
 
 TITLE = "3D Gaussian Splatting: evaluation"

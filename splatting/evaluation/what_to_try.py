@@ -5,7 +5,7 @@ from itertools import pairwise
 from typing import Any
 
 from splatting.evaluation.error_curve import Row, best_test, whole_sets
-from splatting.parts import part_class, strategies
+from splatting.registry import part_class, strategies
 
 # Entries of the log's last record: options of the training.
 CAP, PLANNED, STRATEGY = "max_num_splats", "iterations_planned", "strategy"

@@ -16,7 +16,7 @@ from scene.splats.splats import Splats, selected
 from scene.with_splats import model_of
 from splatting.exports.grouping import groups_of
 from splatting.exports.merging import covariances, merged
-from splatting.files.listing import markdown_table
+from splatting.host.listing import markdown_table
 from splatting.host.progress import Bar
 from utils.image_utils import as_float, mean_psnr, pixels_that_count
 from utils.system_utils import compute_device

@@ -17,8 +17,8 @@ from scene.splats.splats import Splats
 from scene.with_splats import model_of
 from splatting.camera_paths.poses import Poses, focus_point, opening, poses_of
 from splatting.files.image_files import to_bytes
-from splatting.files.listing import some
 from splatting.files.ours import write_picture
+from splatting.host.listing import some
 from utils.system_utils import UserError
 
 LEAST = 0.5  # of a photo's height that is shown, however wide the window is

@@ -13,7 +13,7 @@ from typing import TextIO
 
 from splatting.host.errors import UserError
 
-_TEMPORARY = re.compile(r"\..*\.(\d+)\.tmp(\.[^.]*)?")  # as `utils.system_utils.atomic_write` names them
+_TEMPORARY = re.compile(r"\..*\.(\d+)\.tmp(\.[^.]*)?")  # as `atomic_write` names them
 _LINGER = 2.0  # seconds in which children of a killed program may still have its lock, before they begin their own work
 
 

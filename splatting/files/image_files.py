@@ -16,7 +16,8 @@ import numpy as np
 from PIL import Image, PngImagePlugin
 
 from splatting.files.plain_files import plain
-from utils.system_utils import UserError, atomic_write
+from splatting.files.writing import atomic_write
+from splatting.host.errors import UserError
 
 if TYPE_CHECKING:
     import torch

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from splatting.files.plain_files import plain_text
-from utils.system_utils import UserError, atomic_write
+from splatting.files.writing import atomic_write
+from splatting.host.errors import UserError
 
 _BACKSLASH = re.compile(r'\\(?:[\\"/]|u[0-9a-fA-F]{4})?')  # with what it escapes in a text that has lone ones
 MODEL_JSON = "model.json"

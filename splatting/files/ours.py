@@ -13,8 +13,8 @@ from pathlib import Path
 
 from PIL import Image
 
+from splatting.files.writing import atomic_write
 from splatting.host.errors import UserError
-from utils.system_utils import atomic_write
 
 _DIGITS = 12  # of a folder's digest
 _MARK = b"3D Gaussian Splatting, sha256 "

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from splatting.files.json_files import LARGEST_OFFSET, read_json
-from utils.system_utils import UserError
+from splatting.host.errors import UserError
 
 FILE = "orientation.json"  # of convert.py --orient, in a scene's folder
 PLACE = "latitude", "longitude", "height"  # of the record, where GPS is known

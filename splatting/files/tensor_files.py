@@ -18,7 +18,7 @@ import torch
 
 from splatting.files.plain_files import plain
 from splatting.files.plain_pickle import MOST_BYTES, Machine, plain_dict
-from utils.system_utils import UserError
+from splatting.host.errors import UserError
 
 _MAGIC, _PROTOCOL = 0x1950A86A20F9469CFC6C, 1001  # of the format before torch 1.6
 _ZIP = b"PK\x03\x04"

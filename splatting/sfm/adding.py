@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from splatting.files.listing import some
+from splatting.host.listing import some
 from splatting.sfm.colmap import copy_database, names_in
 from splatting.sfm.images import prepared_names
 from splatting.sfm.inputs import PHOTO_SUFFIXES

@@ -8,7 +8,7 @@ from tqdm.contrib.concurrent import thread_map
 
 from scene.images.decode import picture_size
 from scene.images.exif import Lens, read_lens
-from splatting.files.listing import some
+from splatting.host.listing import some
 from splatting.host.machine import threads
 
 MODES = ("per_lens", "per_folder", "per_photo", "shared")

@@ -17,7 +17,7 @@ from scene.images.exposures import EXPOSURES, exposures, levels
 from scene.readers.colmap import read_model
 from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import open_image
-from splatting.files.listing import some
+from splatting.host.listing import some
 from splatting.host.machine import threads
 from splatting.sfm.layout import Layout
 from splatting.sfm.mapping import is_wrong

@@ -12,8 +12,8 @@ from PIL import Image
 
 from scene.images.decode import picture_size
 from splatting.files.image_files import SUFFIXES, UNREADABLE, open_image
-from splatting.files.listing import some
 from splatting.files.plain_files import not_the_file, plain
+from splatting.host.listing import some
 from utils.system_utils import UserError
 
 _HEAD = 1 << 16  # bytes that hold the colours of a HEIC or AVIF file

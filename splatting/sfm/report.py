@@ -5,7 +5,7 @@ from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 from splatting.files.json_files import read_json, write_json
-from splatting.files.listing import some
+from splatting.host.listing import some
 from splatting.sfm.layout import Layout
 from splatting.sfm.mapping import is_wrong
 from utils.system_utils import UserError
@@ -159,7 +159,7 @@ def advice_at_poses(model: Model, images: Sequence[str]) -> list[str]:
         lines.append(f"{text}; add their poses, or omit --poses")
     if model.points < FEWEST_POINTS or _is_large(model):
         # Imported here: it loads torch, which no other conversion needs.
-        from splatting.parts import tools
+        from splatting.registry import tools
 
         remedies = "; ".join((remedy, *(remedy_of(True) for remedy_of in tools("for_wrong_poses"))))
         lines.append(f"the photos fit the given poses badly ({fit}); {remedies}")

@@ -4,8 +4,8 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from types import TracebackType
 
+from splatting.part import Error, Part, overrides
 from splatting.training.iteration import Iteration, Losses
-from splatting.training.part import Error, Part, overrides
 
 
 class Announcer:

@@ -10,8 +10,8 @@ from scene.cameras import Camera
 from scene.gaussians.penalty import NO_PENALTY
 from scene.readers.start_cloud import RANDOM_POINTS
 from scene.scene import Scene
+from splatting.part import Strategy
 from splatting.training.iteration import Iteration
-from splatting.training.part import Strategy
 from splatting.training.schedule import STEADY, Schedule
 from utils.system_utils import UserError
 

@@ -5,8 +5,8 @@ from typing import Any
 
 from arguments import ModelParams, OptimizationParams, PipelineParams, TopicParser
 from arguments.param_group import OptionTable
-from splatting.parts import options_of
-from splatting.training.option import MOST_NEEDED
+from splatting.option import MOST_NEEDED
+from splatting.registry import options_of
 
 
 def training_parser() -> tuple[TopicParser, tuple[OptionTable, ...]]:

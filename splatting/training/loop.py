@@ -5,9 +5,9 @@ from collections.abc import Iterator, Sequence
 import torch
 
 from gaussian_renderer.memory_errors import memory_errors_explained
+from splatting.part import Part
 from splatting.training.announcer import Announcer
 from splatting.training.iteration import Iteration
-from splatting.training.part import Part
 from splatting.training.run import Run
 from splatting.training.step_agreement import StepAgreement
 from splatting.training.steps import step_taker

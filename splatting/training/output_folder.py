@@ -11,7 +11,7 @@ from pathlib import Path
 from scene.saved_model import saves_in
 from splatting.distributed.ranks import ranks
 from splatting.files.folders import locked, remove_temporary_files
-from splatting.files.listing import some
+from splatting.host.listing import some
 from splatting.host.start import typed_command
 from utils.system_utils import atomic_write, mkdir_p
 

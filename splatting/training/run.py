@@ -18,18 +18,18 @@ from scene.gaussians.morton import sort_rows
 from scene.scene import Scene
 from scene.splats.splats import Splats
 from scene.with_splats import scene_with, start_from
-from splatting.distributed.consistency import agree_on_scene
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch
 from splatting.files.json_files import SCHEDULE
 from splatting.host.interrupt import DeferredInterrupt
-from splatting.parts import check_together, chosen, in_order, part_class, states_in, strategy_part
+from splatting.part import Strategy
+from splatting.registry import check_together, chosen, in_order, part_class, states_in, strategy_part
 from splatting.training import checks, earlier_runs
+from splatting.training.consistency import agree_on_scene
 from splatting.training.density import density_control
 from splatting.training.iteration import ViewOrder
 from splatting.training.memory_estimate import announce_memory
 from splatting.training.objective import LossWatch, Objective
-from splatting.training.part import Strategy
 from splatting.training.restart import resumed
 from splatting.training.schedule import Schedule
 from splatting.training.stepping import Stepping

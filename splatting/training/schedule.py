@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from splatting.parts import strategies
+from splatting.registry import strategies
 
 USUAL = 30_000  # iterations that the default learning rates are for
 LONGER = 2.0  # times the root of the stride

@@ -1,8 +1,8 @@
 """Agreement of the processes of a training in each iteration, without an exchange of its own."""
 
 from splatting.host.interrupt import Terminated
+from splatting.part import Part
 from splatting.training.iteration import Iteration, Losses
-from splatting.training.part import Part
 from splatting.training.run import Run
 
 _SIGNALS = (None, KeyboardInterrupt, Terminated)

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from splatting.deterministic.counter_rng import Stream, uniform
 from splatting.host.clock import seconds_since_start
+from splatting.part import Part, overrides
 from splatting.training.iteration import Iteration, OwnSize
-from splatting.training.part import Part, overrides
 
 
 def bias_correction(step: int, beta1: float = 0.9, beta2: float = 0.999) -> float:
@@ -31,7 +31,7 @@ class Stepping:
     """The part of a run that its steps need.
 
     scene, gaussians, views (by iteration), objective, density, schedule; opt, pipe, launch: options; parts, and the
-    slots that they fill (splatting/training/part.py); background: (3,) of the scene; first_iteration: done before this
+    slots that they fill (splatting/part.py); background: (3,) of the scene; first_iteration: done before this
     run. first_done: seconds from the process's start to the end of its first iteration; None: the system does not say.
     """
 

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from scene.gaussians import density_rules as rules
-from splatting.files.listing import some
-from splatting.parts import part_class, strategies, tools
+from splatting.host.listing import some
+from splatting.registry import part_class, strategies, tools
 from splatting.training.density import DensityControl
 from splatting.training.disk_space import little_space
 from splatting.training.memory_estimate import expected_count

@@ -16,8 +16,8 @@ from scene.scene import Scene
 from scene.splats.ply import write_plain_ply
 from scene.splats.splats import drawable, selected, tidy
 from scene.with_splats import splats_of
-from splatting.files.listing import as_utf8
 from splatting.host.interrupt import DeferredInterrupt
+from splatting.host.listing import as_utf8
 from splatting.host.start import typed_command
 from splatting.viewer import server as servers
 from splatting.viewer.frames import LONGEST, Frames, inside

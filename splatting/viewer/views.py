@@ -11,7 +11,7 @@ import numpy as np
 from gaussian_renderer.free_view import rotation_matrix
 from scene.cameras import Camera
 from splatting.camera_paths.poses import opening
-from splatting.files.listing import as_utf8
+from splatting.host.listing import as_utf8
 from utils.graphics_utils import camera_center
 
 if TYPE_CHECKING:

@@ -25,9 +25,9 @@ import train
 from gaussian_renderer import network_gui, network_transfer, render
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
+from splatting.part import Part
 from splatting.parts.remote_viewer.serving import Serving
 from splatting.training.launch import launch_options
-from splatting.training.part import Part
 from utils.system_utils import UserError
 
 ITERATIONS = 60

@@ -31,10 +31,10 @@ from scene import sleeping
 from scene.gaussians import spilled
 from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
 from splatting.distributed.ranks import ranks
-from splatting.parts import part_class
 from splatting.parts.spill import gpu_memory, torch_limit
 from splatting.parts.spill.announcement import sentences
 from splatting.parts.spill.gpu_memory import GpuMemory, resident_rows, spillable_bytes
+from splatting.registry import part_class
 from splatting.training import memory_estimate, run
 from splatting.training.memory_estimate import training_bytes
 from utils.system_utils import UserError

@@ -3,8 +3,8 @@
 import argparse
 from typing import Any
 
-from splatting.training.option import Option, above
-from splatting.training.part import Options, Strategy
+from splatting.option import Option, above
+from splatting.part import Options, Strategy
 
 
 class Adc(Strategy):

@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from splatting.training.option import Option, within
-from splatting.training.part import Options, Strategy
+from splatting.option import Option, within
+from splatting.part import Options, Strategy
 
 
 class Budget(Strategy):

@@ -2,8 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
-from splatting.training.option import CFG_ARGS, Option, at_least
-from splatting.training.part import Needs, Options, Part
+from splatting.option import CFG_ARGS, Option, at_least
+from splatting.part import Needs, Options, Part
 
 if TYPE_CHECKING:
     import argparse

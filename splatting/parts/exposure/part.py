@@ -4,8 +4,8 @@ import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from splatting.training.option import CFG_ARGS, Option, at_least, within
-from splatting.training.part import Appearance, Options
+from splatting.option import CFG_ARGS, Option, at_least, within
+from splatting.part import Appearance, Options
 
 if TYPE_CHECKING:
     from scene.cameras import Camera
@@ -71,11 +71,11 @@ class Exposure(Appearance):
             print(f"{run.start} has no exposures; all photos start without a correction")
 
     def save(self, scene: "Scene") -> None:
-        from splatting.compat.models import save_exposures
+        from scene.reference_models import save_exposures
 
         save_exposures(scene.gaussians, scene.model_path)
 
     def load(self, scene: "Scene", args: argparse.Namespace) -> None:
-        from splatting.compat.models import load_exposures
+        from scene.reference_models import load_exposures
 
         load_exposures(scene)

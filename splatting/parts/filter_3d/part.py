@@ -2,8 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
-from splatting.training.option import Option
-from splatting.training.part import Options, Part, fill
+from splatting.option import Option
+from splatting.part import Options, Part, fill
 
 if TYPE_CHECKING:
     from splatting.training.iteration import Iteration

@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from splatting.training.option import Option, at_least, within
-from splatting.training.part import Options, Strategy
+from splatting.option import Option, at_least, within
+from splatting.part import Options, Strategy
 
 _PAPER = "ours, from the MCMC paper"
 _RELEASED = "ours, from the release of the MCMC paper"

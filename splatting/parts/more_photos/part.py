@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from splatting.training.part import Options, Part, fill
+from splatting.part import Options, Part, fill
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import numpy as np
 
 from scene.readers.info import HOLD
 from splatting.files.json_files import read_json
-from splatting.files.listing import some
+from splatting.host.listing import some
 from utils.camera_utils import camera_to_JSON
 from utils.system_utils import UserError
 

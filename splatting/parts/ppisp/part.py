@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from splatting.training.part import Appearance, Needs, Scored, fill
+from splatting.part import Appearance, Needs, Scored, fill
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:

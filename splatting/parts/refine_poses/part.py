@@ -4,8 +4,8 @@ import copy
 from typing import TYPE_CHECKING, Any
 
 from splatting.files.json_files import MODEL_JSON
-from splatting.training.option import Option
-from splatting.training.part import Needs, Options, Part, Scored, fill
+from splatting.option import Option
+from splatting.part import Needs, Options, Part, Scored, fill
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:

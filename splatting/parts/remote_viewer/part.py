@@ -2,8 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
-from splatting.training.option import Option
-from splatting.training.part import Error, Options, Part
+from splatting.option import Option
+from splatting.part import Error, Options, Part
 
 if TYPE_CHECKING:
     import argparse

@@ -9,8 +9,8 @@ from gaussian_renderer import network_gui, render
 from gaussian_renderer.network_message import Request
 from gaussian_renderer.network_transfer import ViewerLost
 from scene.gaussian_model import GaussianModel
+from splatting.part import Error
 from splatting.training.iteration import Iteration, Losses
-from splatting.training.part import Error
 from splatting.training.run import Run
 from utils.system_utils import first_line
 

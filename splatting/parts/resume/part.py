@@ -5,8 +5,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatting.training.option import MOST_NEEDED, Option
-from splatting.training.part import Error, Options, Part
+from splatting.option import MOST_NEEDED, Option
+from splatting.part import Error, Options, Part
 
 if TYPE_CHECKING:
     import argparse

@@ -2,8 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
-from splatting.training.option import Option, within
-from splatting.training.part import Error, Needs, Options, Part, fill
+from splatting.option import Option, within
+from splatting.part import Error, Needs, Options, Part, fill
 
 if TYPE_CHECKING:
     from torch import Tensor

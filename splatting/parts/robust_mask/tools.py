@@ -7,7 +7,7 @@ from pathlib import Path
 from arguments import read_training_options
 from gaussian_renderer.scored_views import ScoredViews
 from scene.scene import Scene
-from splatting.files.listing import some
+from splatting.host.listing import some
 from splatting.parts.robust_mask.residuals import FEW, MASKED, MOST_PHOTOS, odd_share, residuals_of
 from splatting.parts.robust_mask.written import PICTURE
 

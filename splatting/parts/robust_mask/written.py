@@ -11,7 +11,7 @@ from torch import Tensor
 from scene.images.side_files import names_below
 from splatting.evaluation.renders import WIDEST, WORST, sheet
 from splatting.files.image_files import dimmed, to_bytes
-from splatting.files.listing import some
+from splatting.host.listing import some
 from splatting.parts.robust_mask.residuals import Residuals
 from utils.image_utils import as_float
 from utils.system_utils import atomic_write

@@ -2,8 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
-from splatting.training.option import Option, one_of
-from splatting.training.part import Needs, Options, Part, fill
+from splatting.option import Option, one_of
+from splatting.part import Needs, Options, Part, fill
 
 if TYPE_CHECKING:
     from splatting.training.iteration import Iteration, Term

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from splatting.training.part import Part, fill
+from splatting.part import Part, fill
 
 if TYPE_CHECKING:
     import argparse

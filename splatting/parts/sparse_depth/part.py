@@ -5,8 +5,8 @@ Sparse points as supervision of depth: Deng et al. 2022 (DS-NeRF), section 3. No
 
 from typing import TYPE_CHECKING, Any
 
-from splatting.training.option import Option, at_least
-from splatting.training.part import Needs, Options, Part
+from splatting.option import Option, at_least
+from splatting.part import Needs, Options, Part
 
 if TYPE_CHECKING:
     from splatting.training.iteration import Iteration, Term

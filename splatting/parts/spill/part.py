@@ -6,8 +6,8 @@ the part gives the model its room in `check`, while the model is empty, not in `
 
 from typing import TYPE_CHECKING, Any
 
-from splatting.training.option import Option, within
-from splatting.training.part import Error, Options, Part, fill
+from splatting.option import Option, within
+from splatting.part import Error, Options, Part, fill
 
 if TYPE_CHECKING:
     import argparse
@@ -36,9 +36,9 @@ class Spill(Part):
         return True
 
     def check(self, run: Any, state: Any) -> None:
-        from splatting.parts import part_class, strategies
         from splatting.parts.spill.gpu_memory import GpuMemory
         from splatting.parts.spill.torch_limit import release_torch
+        from splatting.registry import part_class, strategies
 
         release_torch()  # from the limit of a training that was refused after this
         self._model = run.gaussians

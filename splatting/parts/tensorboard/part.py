@@ -2,8 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
+from splatting.part import Part
 from splatting.parts.tensorboard import events
-from splatting.training.part import Part
 
 if TYPE_CHECKING:
     import argparse

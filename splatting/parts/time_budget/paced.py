@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
-from splatting.parts import part_class, strategies
+from splatting.registry import part_class, strategies
 from splatting.training.schedule import USUAL, Schedule, longer_steps
 
 _PACE = 5  # blocks that tell the pace of a run

@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatting.files.json_files import SCHEDULE
-from splatting.training.option import MOST_NEEDED, Option, within
-from splatting.training.part import Options, Part, fill
+from splatting.option import MOST_NEEDED, Option, within
+from splatting.part import Options, Part, fill
 
 if TYPE_CHECKING:
     import argparse
@@ -63,7 +63,7 @@ class TimeBudget(Part):
 
         A run by the clock has few iterations, and needs the last ones for what it has.
         """
-        from splatting.parts import part_class, strategies
+        from splatting.registry import part_class, strategies
 
         for name, part in {part_class(strategy).until for strategy in strategies()}:
             if getattr(opt, name) >= opt.iterations:

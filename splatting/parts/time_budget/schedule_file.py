@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from splatting.files.json_files import SCHEDULE, read_json, write_json
-from splatting.parts import strategies
 from splatting.parts.time_budget.paced import AUTO, Block, Continued, Decided, DecidedSchedule, TimeBudget
+from splatting.registry import strategies
 from utils.system_utils import UserError
 
 _SIZES = "resolution_schedule"  # key of the sizes of views

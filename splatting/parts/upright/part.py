@@ -4,7 +4,7 @@ import argparse
 import os
 from typing import Any
 
-from splatting.training.part import Part
+from splatting.part import Part
 
 
 class Upright(Part):

@@ -3,8 +3,8 @@
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from splatting.training.option import MOST_NEEDED, Option
-from splatting.training.part import Error, Needs, Options, Part
+from splatting.option import MOST_NEEDED, Option
+from splatting.part import Error, Needs, Options, Part
 from splatting.viewer.server import PORT, check_port
 from utils.system_utils import UserError
 

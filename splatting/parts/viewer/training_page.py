@@ -8,9 +8,9 @@ from tqdm import tqdm
 from scene.saved_iterations import saved_ply
 from scene.saved_model import read_model
 from splatting.evaluation.error_curve import common_subset, rows_on
-from splatting.files.listing import as_utf8
+from splatting.host.listing import as_utf8
+from splatting.part import Error
 from splatting.training.iteration import Iteration
-from splatting.training.part import Error
 from splatting.training.run import Run
 from splatting.viewer.page import Page, serve
 from splatting.viewer.training_tab import TrainingTab

@@ -7,9 +7,9 @@ from collections import deque
 from tqdm import tqdm
 
 from scene.gaussians.adam import StepGuard
+from splatting.part import Error, Part
 from splatting.training.iteration import Iteration, Losses
 from splatting.training.observers.saves import write_checkpoint
-from splatting.training.part import Error, Part
 from splatting.training.run import Run
 from utils.system_utils import UserError
 

@@ -8,9 +8,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from scene.cameras import Camera
-from splatting.files.listing import some
+from splatting.host.listing import some
+from splatting.part import Part
 from splatting.training.iteration import Iteration, Losses
-from splatting.training.part import Part
 from utils.system_utils import UserError
 
 _ENOUGH = 100  # if so many views have no pixel that counts, and no view has one, the masks are wrong

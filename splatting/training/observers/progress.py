@@ -6,10 +6,10 @@ import time
 from splatting.evaluation.error_curve import whole_sets
 from splatting.host.clock import wall_seconds
 from splatting.host.progress import Bar
+from splatting.part import Error, Part
 from splatting.training.iteration import Iteration, Losses
 from splatting.training.objective import LossWatch
 from splatting.training.output_folder import view_command
-from splatting.training.part import Error, Part
 from splatting.training.run import Run
 
 # Without a rate: that of the schedule is not that of iterations.

@@ -1,9 +1,9 @@
 """Records of train_log.json, and what it notes at the end of a training."""
 
 from splatting.evaluation.what_to_try import BUDGET, CAP, PLANNED, STRATEGY, what_to_try
+from splatting.part import Error, Part, overrides
 from splatting.training.density import default_budget
 from splatting.training.iteration import Iteration, Losses
-from splatting.training.part import Error, Part, overrides
 from splatting.training.run import Run
 
 

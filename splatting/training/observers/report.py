@@ -13,9 +13,9 @@ from gaussian_renderer.scored_views import ScoredViews, beside_test, shown_as_tr
 from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from splatting.parts import tools
+from splatting.part import Part
+from splatting.registry import tools
 from splatting.training.iteration import Iteration, Losses
-from splatting.training.part import Part
 from splatting.training.run import Run
 from utils.image_utils import as_float, mean_psnr, mse, pixels_that_count, psnr
 from utils.loss_utils import l1_loss

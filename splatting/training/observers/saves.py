@@ -8,10 +8,10 @@ from tqdm import tqdm
 
 from scene.gaussians.checkpoint import save_checkpoint
 from scene.saved_iterations import saved_ply
+from splatting.part import Error, Part
 from splatting.training.disk_space import little_space
 from splatting.training.iteration import Iteration, Losses
 from splatting.training.output_folder import view_command
-from splatting.training.part import Error, Part
 from splatting.training.run import Run
 from splatting.training.trim_report import TrimReport, lines, saved_line
 

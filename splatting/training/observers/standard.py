@@ -1,12 +1,12 @@
 """The observers of a training, in their order."""
 
+from splatting.part import Part
 from splatting.training.observers.divergence import DivergenceWatch
 from splatting.training.observers.mask_watch import MaskWatch
 from splatting.training.observers.progress import ProgressBar, Summary
 from splatting.training.observers.records import Records
 from splatting.training.observers.report import Scores, training_report
 from splatting.training.observers.saves import Checkpoints, Saves
-from splatting.training.part import Part
 from splatting.training.run import Run
 
 

@@ -2,8 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
-from splatting.training.option import Option, at_least
-from splatting.training.part import Error, Options, Part
+from splatting.option import Option, at_least
+from splatting.part import Error, Options, Part
 
 if TYPE_CHECKING:
     from splatting.training.iteration import Iteration, Losses, Term

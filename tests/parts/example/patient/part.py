@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from splatting.training.option import Option, at_least
-from splatting.training.part import Options, Strategy
+from splatting.option import Option, at_least
+from splatting.part import Options, Strategy
 
 
 class Patient(Strategy):

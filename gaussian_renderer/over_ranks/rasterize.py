@@ -12,8 +12,8 @@ from diff_gaussian_rasterization.ops import Rasterized, gradients_of
 from diff_gaussian_rasterization.scene import Scene, scene_arguments
 from torch import Tensor
 
+from gaussian_renderer.over_ranks.band import camera_gradient, draw_view, gradient_rows, whole_image
 from splatting.distributed.ranks import Ranks
-from splatting.distributed.rendering.band import camera_gradient, draw_view, gradient_rows, whole_image
 
 
 def rasterize_over(

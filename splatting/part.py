@@ -1,6 +1,6 @@
 """The manual of parts: what a feature adds to a training, in one class, which lies in one folder.
 
-A part is a subclass of `Part` in splatting/parts/NAME/part.py, and a line in splatting/parts/__init__.py. The place of
+A part is a subclass of `Part` in splatting/parts/NAME/part.py, and a line in splatting/registry.py. The place of
 that line is the part's in the one order of all hooks. Outside of its folder nobody names it. Hooks are optional; those
 that a class does not override cost nothing. This module and every part.py import nothing heavy, as `train.py --help`
 reads them: the method itself lies in further modules of the folder, which hooks import.
@@ -47,13 +47,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
-from splatting.training.option import Option
-from utils.system_utils import UserError
+from splatting.host.errors import UserError
 
 if TYPE_CHECKING:
     from gaussian_renderer.scored_views import ScoredViews
     from scene.cameras import Camera
     from scene.readers.info import CameraInfo, SceneInfo
+    from splatting.option import Option
     from splatting.training.iteration import Iteration, Losses, Term
 
 Error: TypeAlias = BaseException | None
@@ -64,13 +64,13 @@ Scored: TypeAlias = "tuple[ScoredViews | None, Sequence[Camera]]"  # how, None: 
 class Options:
     """Options of a part, by the group that they belong to."""
 
-    model: tuple[Option, ...] = ()
-    pipeline: tuple[Option, ...] = ()
-    optimisation: tuple[Option, ...] = ()
-    launch: tuple[Option, ...] = ()
+    model: "tuple[Option, ...]" = ()
+    pipeline: "tuple[Option, ...]" = ()
+    optimisation: "tuple[Option, ...]" = ()
+    launch: "tuple[Option, ...]" = ()
 
     @property
-    def by_name(self) -> dict[str, Option]:
+    def by_name(self) -> "dict[str, Option]":
         """All of them."""
         return {option.name: option for group in vars(self).values() for option in group}
 
@@ -107,7 +107,7 @@ class Part:
     reads_model: whether it reads the model in iterations that are due for it; sleeping blocks then catch up first.
     waits: whether it may let the training wait. It is told last, when all else of an iteration is done and written.
     own_end: whether its options let a training end before or after --iterations.
-    tools: functions that it has for other commands, in tools.py of its folder (`tools` of splatting/parts/__init__.py).
+    tools: functions that it has for other commands, in tools.py of its folder (`tools` of splatting/registry.py).
     """
 
     name: ClassVar[str] = ""

@@ -9,9 +9,9 @@ from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.scene import Drawing, Scene
 from torch import Tensor
 
+from gaussian_renderer.over_ranks.bands import Bands, find_bands, tile_rows
+from gaussian_renderer.over_ranks.exchange import Sent, return_rows, send_splats
 from splatting.distributed.ranks import Ranks
-from splatting.distributed.rendering.bands import Bands, find_bands, tile_rows
-from splatting.distributed.rendering.exchange import Sent, return_rows, send_splats
 
 
 class Band(NamedTuple):

@@ -9,10 +9,7 @@ from diff_gaussian_rasterization.ops import Rasterized, gradients_of
 from diff_gaussian_rasterization.scene import GRADIENTS, Scene
 from torch import Tensor
 
-from scene.cameras import Camera, MiniCam
-from scene.fused_adam import FusedAdam
-from splatting.distributed.ranks import ALONE, Ranks
-from splatting.distributed.rendering.band import (
+from gaussian_renderer.over_ranks.band import (
     View,
     camera_gradient,
     decisive_in,
@@ -21,8 +18,11 @@ from splatting.distributed.rendering.band import (
     surroundings,
     whole_image,
 )
-from splatting.distributed.rendering.bands import KnownBands as KnownBands
-from splatting.distributed.rendering.rasterize import rasterize_over
+from gaussian_renderer.over_ranks.bands import KnownBands as KnownBands
+from gaussian_renderer.over_ranks.rasterize import rasterize_over
+from scene.cameras import Camera, MiniCam
+from scene.fused_adam import FusedAdam
+from splatting.distributed.ranks import ALONE, Ranks
 
 _ONLY_COLORS = [name == "colors" for name in GRADIENTS]
 
