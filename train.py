@@ -17,16 +17,13 @@ import torch
 
 from arguments import write_cfg_args, write_model_json
 from scene.readers.scene_folder import is_scene
-from splatting.host.energy import joules_counter, nvml_name
 from splatting.registry import check_together, chosen, tools
-from splatting.training.consistency import agree_on_options
-from splatting.training.earlier_runs import resolve_lenses
+from splatting.training.agreement import agree_on_options
+from splatting.training.folder import folder_of, new_folder, own_folder, records_kept, resolve_lenses
 from splatting.training.launch import launch_options, training_parser
-from splatting.training.loop import run_training
-from splatting.training.observers.report import training_report
-from splatting.training.observers.standard import standard_observers
-from splatting.training.output_folder import folder_of, new_folder, own_folder, records_kept
+from splatting.training.loop import run_training, standard_observers
 from splatting.training.run import Run
+from splatting.training.scores import training_report
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, mkdir_p, run_cli
 
@@ -50,10 +47,8 @@ def train(
         print(f"Resuming {dataset.model_path} at iteration {run.first_iteration}")
     # Write nothing before every input check has passed: a mistyped option must not overwrite a finished model.
     with own_folder(folder := dataset.model_path), records_kept(folder), run.resources:
-        run.writer = prepare_output_and_logger(run.options, **run.entries) if run.group.first else None
-        run.report = training_report
-        run.joules = joules_counter(run.group.everyone(nvml_name(run.device)))
-        run.begin()
+        writer = prepare_output_and_logger(run.options, **run.entries) if run.group.first else None
+        run.begin(writer, training_report)
         run_training(run, standard_observers(run))
 
 

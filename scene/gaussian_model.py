@@ -165,6 +165,11 @@ class GaussianModel(ReferenceNames, GaussianParameters):
         self.optimizer.zero_grad(set_to_none=True)
         self.exposures.step()
 
+    def drop_gradients(self) -> None:
+        """Take no step by the gradients that there are."""
+        self.optimizer.zero_grad(set_to_none=True)
+        self.exposures.optimizer.zero_grad(set_to_none=True)
+
     def guard_steps(self, guard: StepGuard) -> None:
         """Let a guard hold back the steps of all optimisers; training_setup makes unguarded ones."""
         self.optimizer.guard = self.exposures.optimizer.guard = guard

@@ -15,7 +15,7 @@ ready        Model and optimiser exist.
 opened       The log is open, and files may be written. What must be closed goes into run.resources, an ExitStack.
 terms        In each iteration, before its step: what it adds to the loss.
 begins, due, measured, stepped, ended
-             What observers see. The core's own (splatting/training/observers) are parts without a name.
+             What observers see. The core's own (splatting/training/loop.py) are parts without a name.
 changes      Asked in each iteration: whether rows, sizes or what is drawn will change in it.
 after_step   The optimiser has taken its step.
 after_change The same, where rows, the SH degree or sizes have changed.
@@ -39,6 +39,7 @@ run.sizes    the size of a view in an iteration
 run.sleeping which blocks of rows take a step (scene/sleeping.py)
 run.counts   which pixels of a view count in its loss. It may learn by renders, so no step is taken twice, and the host
              does not run ahead of a GPU.
+run.grown    whether the scene has more photos than the checkpoint was trained on
 run.on_host  takes the steps of cameras, by the gradients of their numbers, on the host: `place`, `step`, `independent`
 """
 
@@ -53,8 +54,10 @@ if TYPE_CHECKING:
     from gaussian_renderer.scored_views import ScoredViews
     from scene.cameras import Camera
     from scene.readers.info import CameraInfo, SceneInfo
+    from scene.scene import Scene
     from splatting.option import Option
     from splatting.training.iteration import Iteration, Losses, Term
+    from splatting.training.run import Run
 
 Error: TypeAlias = BaseException | None
 Scored: TypeAlias = "tuple[ScoredViews | None, Sequence[Camera]]"  # how, None: as all others; and which views
@@ -146,23 +149,23 @@ class Part:
         """Whether, by these options, steps depend on --iterations: a shorter training does not begin a longer one."""
         return False
 
-    def check(self, run: Any, state: Any) -> None:
+    def check(self, run: "Run", state: Any) -> None:
         """Refuse what cannot be trained (UserError). Nothing is written yet. state: as for `begin`."""
 
     def dataset(self, info: "SceneInfo", args: argparse.Namespace, fresh: bool) -> "SceneInfo":
         """The dataset with other views or points. args: the model options. fresh: it is read for a new training."""
         return info
 
-    def cameras(self, scene: Any, cameras: "Sequence[tuple[Camera, CameraInfo]]", held_out: bool) -> None:
+    def cameras(self, scene: "Scene", cameras: "Sequence[tuple[Camera, CameraInfo]]", held_out: bool) -> None:
         """Cameras of the scene's training views, or of those that are held out, with the records they are made of."""
 
-    def begin(self, run: Any, state: Any) -> None:
+    def begin(self, run: "Run", state: Any) -> None:
         """Take part in a training. state: its entry of the checkpoint; None: a new training, or one that had none."""
 
-    def ready(self, run: Any) -> None:
+    def ready(self, run: "Run") -> None:
         """The model has its rows and its optimiser."""
 
-    def opened(self, run: Any) -> None:
+    def opened(self, run: "Run") -> None:
         """The log is open, and files may be written."""
 
     def terms(self, at: "Iteration") -> "dict[str, Term]":
@@ -187,13 +190,13 @@ class Part:
         """Numbers for a record of the log, asked once all parts are told of the iteration's losses."""
         return {}
 
-    def save(self, scene: Any) -> None:
+    def save(self, scene: "Scene") -> None:
         """Write own files into the model folder of a scene, beside a PLY or a checkpoint."""
 
-    def load(self, scene: Any, args: argparse.Namespace) -> None:
+    def load(self, scene: "Scene", args: argparse.Namespace) -> None:
         """Read own files of the model folder, once its Gaussians are loaded. args: the model options."""
 
-    def scored(self, scene: Any, pipe: argparse.Namespace, background: Any) -> "dict[str, Scored]":
+    def scored(self, scene: "Scene", pipe: argparse.Namespace, background: Any) -> "dict[str, Scored]":
         """Further sets of test views, by what is put behind the name of the set."""
         return {}
 
@@ -247,7 +250,7 @@ class Strategy(Part):
         return f"--strategy {cls.name}"
 
     @classmethod
-    def best_in(cls, seconds: float, run: Any) -> bool:
+    def best_in(cls, seconds: float, run: "Run") -> bool:
         """Whether it is the best one for a run that takes so many seconds. The first that says so is taken."""
         return False
 
@@ -256,7 +259,7 @@ class Strategy(Part):
         """Whether, by these options, its statistics take the lengths of absolute gradients, which need memory."""
         return False
 
-    def control(self, run: Any) -> Any:
+    def control(self, run: "Run") -> Any:
         """The hooks by which it acts on a run (splatting.training.density.DensityControl)."""
         raise NotImplementedError
 

@@ -11,9 +11,9 @@ from gaussian_renderer import Drawn
 from scene.sleeping import Sleeping
 from splatting.training.steps import captured, graphs
 from splatting.training.steps.captured import CapturedStep
+from splatting.training.steps.faster import FasterSteps
 from splatting.training.steps.fused import FusedStep
 from splatting.training.steps.graphs import Graphs
-from splatting.training.steps.plain import PlainStep
 from splatting.training.steps.speculative import AHEAD
 
 
@@ -94,7 +94,8 @@ def take_as(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     monkeypatch.setattr(graphs, "Recorder", Rerun)
 
     def choose(way: str) -> None:
-        monkeypatch.setattr("splatting.training.loop.step_taker", WAYS.get(way, PlainStep))
+        chosen = WAYS.get(way, lambda _: FasterSteps())
+        monkeypatch.setattr("splatting.training.loop.faster_steps", chosen)
         if way == "queued":
             monkeypatch.setattr(Graphs, "_is_usual", lambda *_: False)
 

@@ -16,8 +16,8 @@ from scene import Scene
 from scene.gaussian_model import GaussianModel
 from splatting.distributed.ranks import Ranks, refuse_differences, using
 from splatting.host import machine, torchrun
-from splatting.training.consistency import agree_on_options, agree_on_scene
-from splatting.training.restart import newest_checkpoint
+from splatting.training.agreement import agree_on_options, agree_on_scene
+from splatting.training.folder import newest_checkpoint
 from splatting.training.strategy_warnings import faster_alone
 from utils.system_utils import UserError, atomic_write, run_cli
 

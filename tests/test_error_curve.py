@@ -41,7 +41,7 @@ from splatting.evaluation.training_log import TrainingLog
 from splatting.evaluation.what_to_try import peak_advice
 from splatting.host import clock, memory
 from splatting.training import objective
-from splatting.training.observers.report import Scores
+from splatting.training.scores import Scores
 from utils.loss_utils import ssim
 from utils.system_utils import UserError
 

@@ -13,7 +13,7 @@ from test_arguments import MODEL
 import train
 from arguments import add_to_model_json, read_model_json, write_cfg_args
 from splatting.evaluation.error_curve import COLUMNS, read_curve, write_curve
-from splatting.training.earlier_runs import check_folder, continue_records
+from splatting.training.folder import check_folder, continue_records
 from utils.system_utils import UserError
 
 CURVE, LOG = "error_vs_time.csv", "train_log.json"

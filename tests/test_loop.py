@@ -13,9 +13,8 @@ import train
 from splatting.evaluation.training_log import TrainingLog
 from splatting.part import Part
 from splatting.training import adaptive_density as adc
-from splatting.training.announcer import Announcer
 from splatting.training.density import DensityControl
-from splatting.training.observers.standard import standard_observers
+from splatting.training.loop import Announcer, standard_observers
 
 ITERATIONS = 24
 

@@ -10,13 +10,12 @@ from pathlib import Path
 import pytest
 
 from splatting.files.folders import locked, remove_temporary_files
-from splatting.training.earlier_runs import check_folder
-from splatting.training.output_folder import folder_of, own_folder, records_kept
+from splatting.training.folder import check_folder, folder_of, own_folder, records_kept
 from utils.system_utils import UserError, atomic_write
 
 ROOT = Path(__file__).parents[1]
 HOLD = (
-    "import sys, time; from splatting.training.output_folder import own_folder\n"
+    "import sys, time; from splatting.training.folder import own_folder\n"
     "with own_folder(sys.argv[1]):\n"
     "    print('held', flush=True); time.sleep(600)"
 )

@@ -17,7 +17,7 @@ from scene import Scene
 from scene.gaussians.adam import GaussianAdam, undecorated
 from scene.images import store
 from splatting.host import start
-from splatting.training import stepping
+from splatting.training import run
 
 ROOT = Path(__file__).parents[1]
 UNUSED = ("torch._dynamo", "torch._inductor", "torch.onnx", "matplotlib")
@@ -125,7 +125,7 @@ def test_the_last_record_says_where_the_time_went(colmap_scene, tmp_path):
 
 
 def test_a_system_that_does_not_tell_when_a_process_started(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(stepping, "seconds_since_start", lambda: None)
+    monkeypatch.setattr(run, "seconds_since_start", lambda: None)
     record = _train(colmap_scene, tmp_path / "out", iterations=1)
     assert record["first_iteration_seconds"] is None and record["wall_seconds"] > 0
     assert record["scoring_seconds"] >= 0 and record["saving_seconds"] > 0

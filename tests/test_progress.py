@@ -8,8 +8,8 @@ import pytest
 from tqdm import tqdm
 
 from splatting.host.progress import Bar
+from splatting.training.log import ProgressBar
 from splatting.training.objective import LossWatch
-from splatting.training.observers.progress import ProgressBar
 from splatting.training.schedule import Schedule
 
 

@@ -13,14 +13,14 @@ from rasterizer_tools import GPU_MARKS
 from step_ways import Immediate, Rerun, fused_iterations, take_as  # noqa: F401  (a fixture)
 from trainings import ITERATIONS, OPTIONS, differences, leaves, shared_scene, trained
 
-from splatting.training import run
+from splatting.training import loop, run
 from splatting.training.iteration import Iteration, Losses
 from splatting.training.objective import Objective
-from splatting.training.steps import captured, speculative, step_taker
+from splatting.training.steps import captured, faster_steps, speculative
 from splatting.training.steps.captured import CapturedStep
+from splatting.training.steps.faster import FasterSteps
 from splatting.training.steps.fused import FusedStep
 from splatting.training.steps.graphs import Graphs
-from splatting.training.steps.plain import PlainStep
 from splatting.training.steps.recorder import Recorder
 from utils.system_utils import UserError
 
@@ -86,7 +86,7 @@ def test_losses_that_are_kept_keep_no_image(scene, tmp_path, monkeypatch):
 
 def test_what_may_want_gradients_takes_the_plain_step(scene, tmp_path, monkeypatch):
     taken = []
-    monkeypatch.setattr("splatting.training.loop.step_taker", lambda run: (taken.append(step_taker(run)), taken[-1])[1])
+    monkeypatch.setattr(loop, "faster_steps", lambda run: (taken.append(faster_steps(run)), taken[-1])[1])
 
     class WithFurtherTerm(Objective):
         pass
@@ -98,7 +98,7 @@ def test_what_may_want_gradients_takes_the_plain_step(scene, tmp_path, monkeypat
     monkeypatch.setattr(run, "Objective", WithFurtherTerm)
     trained(scene, tmp_path / "c")
     fast = CapturedStep if torch.cuda.is_available() else FusedStep
-    assert [type(one) for one in taken] == [fast, *[PlainStep] * 4]
+    assert [type(one) for one in taken] == [fast, *[FasterSteps] * 4]
 
 
 def test_debug_takes_the_plain_step(scene, tmp_path, monkeypatch):

@@ -20,7 +20,7 @@ from scene.gaussians.checkpoint import load_checkpoint
 from scene.readers.point_cloud import write_point_cloud
 from scene.saved_model import read_model
 from splatting.evaluation.training_log import Stopwatch, TrainingLog
-from splatting.training import stepping
+from splatting.training import run
 from splatting.training.iteration import ViewOrder
 from utils.system_utils import UserError
 
@@ -99,8 +99,8 @@ def test_learning_and_what_is_said(colmap_scene, tmp_path, capfd):
 
 @pytest.mark.parametrize("degree", [0, 2, 3])
 def test_sh_degree_rises_every_interval_up_to_its_maximum(colmap_scene, tmp_path, monkeypatch, degree):
-    assert stepping.SH_INTERVAL == 1000
-    monkeypatch.setattr("splatting.training.stepping.SH_INTERVAL", 2)
+    assert run.SH_INTERVAL == 1000
+    monkeypatch.setattr("splatting.training.run.SH_INTERVAL", 2)
     every = range(1, 9)
     _train(colmap_scene, tmp_path, "--sh_degree", degree, "--checkpoint_iterations", *every, iterations=8)
     active = [load_checkpoint(tmp_path / f"chkpnt{t}.pth")[0][0] for t in every]

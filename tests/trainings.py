@@ -16,9 +16,9 @@ from scene import sleeping
 from scene.readers.point_cloud import write_point_cloud
 from splatting.parts.filter_3d import part as filter_3d
 from splatting.parts.robust_mask import residuals
-from splatting.training import loop, run, stepping
+from splatting.training import loop, run
 from splatting.training.iteration import Iteration
-from splatting.training.steps.plain import PlainStep
+from splatting.training.steps import FasterSteps
 
 Once = Callable[[str, Callable[[Path], object]], Path]
 ITERATIONS = 60
@@ -120,7 +120,7 @@ def trained(scene: Path, out: Path, *options: object) -> dict[str, bytes | list]
     words += ["--opacity_reset_interval", 30, "--test_iterations", -1, "--checkpoint_iterations", ITERATIONS]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stdout", sys.stdout)  # training stamps it
-        patch.setattr(stepping, "SH_INTERVAL", 12)  # between the iterations that change rows
+        patch.setattr(run, "SH_INTERVAL", 12)  # between the iterations that change rows
         patch.setattr(filter_3d, "INTERVAL", 15)
         patch.setattr(residuals.Residuals, "early", 0)  # renders are far from the photos
         patch.setattr(residuals, "_FACTOR", 1.2)
@@ -151,15 +151,15 @@ def plain_training(once: Once, name: str) -> Path:
 
 def before_steps(monkeypatch: pytest.MonkeyPatch, act: Callable[[Iteration], None]) -> None:
     """Let act(step) be called before each step of a training is taken."""
-    chosen = loop.step_taker
+    chosen = loop.faster_steps
 
-    def taker(of: run.Run) -> PlainStep:
+    def taker(of: run.Run) -> FasterSteps:
         taken = chosen(of)
         take = taken.take
-        taken.take = lambda step, tell: (act(step), take(step, tell))
+        taken.take = lambda step, tell: (act(step), take(step, tell))[1]
         return taken
 
-    monkeypatch.setattr(loop, "step_taker", taker)
+    monkeypatch.setattr(loop, "faster_steps", taker)
 
 
 def leaves(value: object) -> list:

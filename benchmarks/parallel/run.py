@@ -20,6 +20,7 @@ from splatting.training.iteration import ViewOrder
 from splatting.training.objective import LossWatch, Objective
 from splatting.training.run import Run
 from splatting.training.schedule import Schedule
+from splatting.training.watch import DivergenceWatch
 from utils.system_utils import compute_device
 
 _EXTENT = 5.0  # world units
@@ -45,6 +46,7 @@ class WorkloadRun(Run):
         self.schedule = Schedule(self.opt.iterations)
         images = SimpleNamespace(ahead=0, keep_on=torch.device("cpu"), planned_bytes=0)
         self.gaussians = GaussianModel(3)
+        self._fill_slots()
         self._cameras = cameras = workload.cameras()
         info = SimpleNamespace(point_cloud=None)
         self.scene = SimpleNamespace(
@@ -58,7 +60,9 @@ class WorkloadRun(Run):
         self._begin(workload)
         self.views = ViewOrder(cameras, self.opt.seed)
         self.background = torch.zeros(3, device=self.device)
-        self.objective = Objective(self)
+        self.objective, self.losses = Objective(self), LossWatch()
+        self.log, self.rows, self.first_done = SimpleNamespace(seconds_before=0.0), [], None
+        self.watch = DivergenceWatch(self)
         self.density = density_control(self, strategy_part("adc"))
         if sleep:
             sort_rows(self.gaussians)
@@ -84,5 +88,4 @@ class WorkloadRun(Run):
             room.settle(self.gaussians)
             seen = share_seen(self.gaussians.get_xyz.detach(), self._cameras)
             print("".join(f"{said}\n" for said in sentences(room, len(self.gaussians), seen, True)), end="")
-        self.log, self.rows = SimpleNamespace(seconds_before=0.0), []
-        self.losses, self.clock = LossWatch(), Stopwatch()
+        self.clock = Stopwatch()

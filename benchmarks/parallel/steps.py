@@ -44,7 +44,6 @@ from splatting.host.memory import peak_memory_mib
 from splatting.part import Part
 from splatting.training.iteration import Iteration
 from splatting.training.loop import run_training
-from splatting.training.observers.divergence import DivergenceWatch
 from utils.system_utils import UserError, compute_device, run_cli
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -110,7 +109,7 @@ def measure(case: dict[str, Any]) -> dict[str, Any]:
     timing = Timing(device, case["warm_up"], timed)
     profiled = [Kernels(timed + 1, _BLOCK)] * case["kernels"]
     run.begin()
-    run_training(run, [DivergenceWatch(run), timing, *profiled])
+    run_training(run, [run.watch, timing, *profiled])
     near, far = bytes_of()
     peaks = timing.peak_mib, peak_memory_mib(device) or 0.0
     own = {"ms": timing.milliseconds} | dict(zip(("peak", "last"), (mib + near / 2**20 for mib in peaks), strict=True))

@@ -26,9 +26,8 @@ from splatting.part import Part
 from splatting.registry import PARTS, appearances, part_class
 from splatting.training.iteration import Iteration
 from splatting.training.loop import training_steps
-from splatting.training.observers.divergence import DivergenceWatch
-from splatting.training.observers.mask_watch import MaskWatch
 from splatting.training.run import Run
+from splatting.training.watch import MaskWatch
 from train import parse
 from utils.system_utils import UserError, compute_device
 
@@ -119,8 +118,7 @@ class GaussianSplatting(Method):
         with in_place_of_files(info, folder / "scene") as model.source_path:
             self._run = run = Run(*self._options, launch)
         run.begin()
-        self._watch = DivergenceWatch(run)
-        guards = [self._watch, MaskWatch(run.scene.getTrainCameras()), _Losses()]
+        guards = [run.watch, MaskWatch(run.scene.getTrainCameras()), _Losses()]
         self._steps = training_steps(run, guards)
         self._pause = ExitStack()
         for opened in (self._pause, self._steps):  # neither can be closed any more once Python is being torn down
@@ -177,7 +175,7 @@ class GaussianSplatting(Method):
             return nullcontext()
         if self._at is not None:
             self._taker.drain()
-            self._watch.look(self._at.iteration)
+            self._run.watch.look(self._at.iteration)
         return self._run.flushed_view()
 
     @torch.no_grad()

@@ -73,14 +73,14 @@ class TrainingLog:
     so far; `gaussians`; `loss`, a running mean; and for each set tested `<set>_l1`, `<set>_psnr`. Seconds, joules and
     memory include the runs that were resumed. The last record also has
     `gaussians_left_out`, those that the last save does not have, the costs of the curve (curve_recorder.py), the
-    seconds of this process by what they were spent on (training/observers/records.py), `iterations_planned`,
+    seconds of this process by what they were spent on (training/log.py), `iterations_planned`,
     `strategy`, and `max_num_splats` or `default_budget` (what_to_try.py), and `lines`, what training said at its end.
 
     first_iteration, seconds_before, wall_seconds_before: done by the runs that this one resumes.
     """
 
     def __init__(
-        self, model_path: str | os.PathLike, first_iteration: int, before: str | os.PathLike | None = None
+        self, model_path: str | os.PathLike, first_iteration: int = 0, before: str | os.PathLike | None = None
     ) -> None:
         """Keep the records of an existing log up to `first_iteration`, where a run resumes.
 

@@ -7,7 +7,7 @@ import argparse
 import copy
 import sys
 from collections.abc import Collection
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
@@ -16,6 +16,9 @@ from scene.gaussians import density_rules as rules
 from scene.gaussians.morton import sort_rows
 from splatting.training.density import DensityControl, refuse_empty
 from splatting.training.iteration import Iteration
+
+if TYPE_CHECKING:
+    from splatting.training.run import Run
 
 
 class AdaptiveDensityControl(DensityControl):
@@ -47,7 +50,7 @@ class AdaptiveDensityControl(DensityControl):
         self.max_gaussians = opt.max_num_splats
 
     @classmethod
-    def of_run(cls, run: Any, *more: Any, **options: Any) -> "AdaptiveDensityControl":
+    def of_run(cls, run: "Run", *more: Any, **options: Any) -> "AdaptiveDensityControl":
         """For a run; more, options: as for the class.
 
         Where a part needs bright renders, opacities are reset at an interval that is given, or never.

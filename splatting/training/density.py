@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from torch import Tensor
 
@@ -14,6 +14,9 @@ from splatting.part import Strategy
 from splatting.training.iteration import Iteration
 from splatting.training.schedule import STEADY, Schedule
 from utils.system_utils import UserError
+
+if TYPE_CHECKING:
+    from splatting.training.run import Run
 
 PIXELS = 64  # training pixels of all views for each Gaussian of the default budget
 FEWEST, MOST = 100_000, 1_000_000  # Gaussians of the default budget
@@ -112,7 +115,7 @@ class DensityControl:
         """Called after the optimiser's step, so not in the last iteration, which takes none."""
 
 
-def density_control(run: Any, strategy: Strategy) -> DensityControl:
+def density_control(run: "Run", strategy: Strategy) -> DensityControl:
     """The control of a strategy, for the model, the scene and the schedule of a run."""
     control = strategy.control(run)
     control.random, control.schedule = is_random(run.scene), run.schedule

@@ -1,6 +1,6 @@
 """The loss of a render: photometric, and what parts add to it."""
 
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from fused_ssim import photometric_loss_by_bands
@@ -8,6 +8,9 @@ from torch import Tensor
 
 from splatting.training.iteration import Iteration, Losses, Term
 from utils.loss_utils import photometric_loss
+
+if TYPE_CHECKING:
+    from splatting.training.run import Run
 
 
 class Objective:
@@ -19,7 +22,7 @@ class Objective:
 
     fusable: ClassVar[bool] = True
 
-    def __init__(self, run: Any) -> None:
+    def __init__(self, run: "Run") -> None:
         """run: of splatting/training/run.py."""
         self._run = run
 

@@ -2,13 +2,16 @@
 
 import argparse
 import copy
+import math
 import sys
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from arguments import add_to_model_json, write_cfg_args
 from gaussian_renderer.rays import check_views
@@ -16,45 +19,49 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import extra_state, load_checkpoint, with_extra_state
 from scene.gaussians.morton import sort_rows
 from scene.scene import Scene
+from scene.sleeping import Sleeping
 from scene.splats.splats import Splats
 from scene.with_splats import scene_with, start_from
+from splatting.deterministic.counter_rng import Stream, uniform
 from splatting.distributed.ranks import ranks
-from splatting.evaluation.training_log import Stopwatch
+from splatting.evaluation.error_curve import Row
+from splatting.evaluation.training_log import Stopwatch, TrainingLog
 from splatting.files.json_files import SCHEDULE
+from splatting.host.clock import seconds_since_start
+from splatting.host.energy import joules_counter, nvml_name
 from splatting.host.interrupt import DeferredInterrupt
-from splatting.part import Strategy
+from splatting.part import Part, Strategy, overrides
 from splatting.registry import check_together, chosen, in_order, part_class, states_in, strategy_part
-from splatting.training import checks, earlier_runs
-from splatting.training.consistency import agree_on_scene
+from splatting.training import checks, folder
+from splatting.training.agreement import agree_on_scene
 from splatting.training.density import density_control
-from splatting.training.iteration import ViewOrder
+from splatting.training.iteration import Iteration, OwnSize, ViewOrder
 from splatting.training.memory_estimate import announce_memory
 from splatting.training.objective import LossWatch, Objective
-from splatting.training.restart import resumed
+from splatting.training.save import Checkpoints
 from splatting.training.schedule import Schedule
-from splatting.training.stepping import Stepping
 from splatting.training.strategy_warnings import warnings_of
 from splatting.training.trim_report import TrimReport, trimmed
+from splatting.training.watch import DivergenceWatch
 from utils.system_utils import UserError, compute_device
 
+SH_INTERVAL = 1000  # iterations between raises of the active SH degree
 
-class Run(Stepping):
-    """The objects that the loop and its observers share, besides those of `Stepping`.
 
-    dataset, opt, pipe, launch: the options; group: the processes that train together; start: a chkpntN.pth that is
-    resumed, or None. From `begin` on: log, rows (of the curve so far), losses (running mean of the total) and clock
-    (seconds of training). interrupt: a signal that asks the loop to stop; an
-    observer that waits has to look at it. resources: what parts have open, closed when the training is over, however it
-    ends. report: `training_report`, or what replaces it; writer: its first argument. joules: what the clock reads
-    (host/energy.py). checkpoints: writes them, while the loop runs.
-    grown: whether the scene has more photos than the checkpoint was trained on.
+class Run:
+    """The objects that the loop and its observers share, and what they ask of them in each iteration.
+
+    Options: dataset, opt, pipe, launch. Made by them: scene, gaussians, views (by iteration), objective, density,
+    schedule, background (3,), parts in their order. group: the processes that train together. start: a chkpntN.pth that
+    is resumed, or None; first_iteration: done before this run.
+    sleeping, sizes, counts, on_host, grown: slots that parts fill (splatting/part.py).
+    interrupt: a signal that asks the loop to stop; an observer that waits has to check it. resources: what parts have
+    open, closed when the training is over, however it ends. warnings: what was warned of.
+    log, rows (of the curve so far), losses (running mean of the total), clock (seconds of training): `begin` starts
+    them, or continues those of the run that is resumed. watch: ends a training that diverges. checkpoints: writes them.
+    writer, report: of `begin`. first_done: seconds from the process's start to the end of its first iteration; None:
+    the system does not say.
     """
-
-    writer: Any = None
-    report: Any = None
-    joules: Callable[[], float] | None = None
-    checkpoints: Any = None
-    grown = False
 
     def __init__(
         self, dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, launch: argparse.Namespace
@@ -67,21 +74,22 @@ class Run(Stepping):
         self.opt, self.pipe, self.launch = opt, pipe, launch
         self.group = ranks()
         checks.check_alone(getattr(pipe, "projection", "ewa"), self.group.several)
-        self.start = self.group.shared(resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
+        self.start = self.group.shared(folder.resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
         checks.check_lenses(dataset)  # before auto becomes native
-        dataset = self.dataset = earlier_runs.resolve_lenses(dataset, self.start)
+        dataset = self.dataset = folder.resolve_lenses(dataset, self.start)
         if opt.strategy == "auto" and self.start:
-            opt.strategy = earlier_runs.strategy_of(self.start)
+            opt.strategy = folder.strategy_of(self.start)
         self.resources = ExitStack()
         self.interrupt, self.device = DeferredInterrupt(), compute_device()
         self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
         capture, self.first_iteration = self._read_start()
         self.schedule = Schedule(opt.iterations)
+        self._fill_slots()
         states = self._choose_parts(capture)
         if self.schedule.is_over(self.first_iteration):
             raise UserError(self.schedule.nothing_left(self.start, self.first_iteration))
         self.scene, first = self._read_scene()
-        self.gaussians.enlargement = earlier_runs.enlargement_of(self.start, self.gaussians.enlargement)
+        self.gaussians.enlargement = folder.enlargement_of(self.start, self.gaussians.enlargement)
         checks.check_scene(self.scene, dataset, bool(self.start))
         agree_on_scene(self.scene, self.start)  # before an image is shared
         count = len(capture[1] if capture else self.scene.info.point_cloud.points if first is None else first)
@@ -103,6 +111,24 @@ class Run(Stepping):
             ready(self)
         if capture is None and first is None:
             self.density.started()
+        self._prepare_records()
+
+    def _fill_slots(self) -> None:
+        """What parts may replace."""
+        self.parts: Sequence[Part] = ()
+        self._hooks: dict[str, list[Callable]] = {}
+        self.sleeping: Sleeping | None = None
+        self.sizes: Any = OwnSize()
+        self.counts = self.on_host = None
+        self.grown = False
+
+    def _prepare_records(self) -> None:
+        """Those of a new training, which `begin` opens or continues."""
+        self.log, self.clock, self.losses = TrainingLog(self.scene.model_path), Stopwatch(), LossWatch()
+        self.rows: list[Row] = []
+        self.watch, self.checkpoints = DivergenceWatch(self), Checkpoints(self)
+        self.writer = self.report = None
+        self.first_done: float | None = None
 
     def _choose_parts(self, capture: tuple | None) -> dict[str, Any]:
         """Choose the parts by the options and by a checkpoint, and let them check both. Returns the states by name."""
@@ -167,9 +193,9 @@ class Run(Stepping):
         """Compare this run with those before it, in its folder and beside its checkpoint."""
         start = self.start
         saves = [self.schedule.known(one) for one in (self.launch.save_iterations, self.launch.checkpoint_iterations)]
-        earlier_runs.check_folder(self.options, saves[0], start, self.first_iteration, saves[1])
+        folder.check_folder(self.options, saves[0], start, self.first_iteration, saves[1])
         if start:
-            earlier_runs.report_changes(start, self.options, self.grown)
+            folder.report_changes(start, self.options, self.grown)
 
     @property
     def _all_options(self) -> argparse.Namespace:
@@ -191,18 +217,22 @@ class Run(Stepping):
         """What parts keep in model.json."""
         return {name: fact for facts in self.each("facts") for name, fact in facts().items()}
 
-    def begin(self) -> None:
-        """Write the inputs into the output folder, print the memory estimate, start or continue the log."""
-        folder, start = self.scene.model_path, self.start
-        if not earlier_runs.lies_in(start, folder) or not (Path(folder) / "cameras.json").exists():
+    def begin(self, writer: Any = None, report: Callable | None = None) -> None:
+        """Write the inputs into the output folder, print the memory estimate, and start the clock.
+
+        report: `training_report`, or what replaces it; writer: its first argument.
+        """
+        self.writer, self.report = writer, report
+        to, start = self.scene.model_path, self.start
+        if not folder.lies_in(start, to) or not (Path(to) / "cameras.json").exists():
             self.scene.write_inputs()
         if self.group.first and not self.schedule.paced:
-            (Path(folder) / SCHEDULE).unlink(missing_ok=True)
+            (Path(to) / SCHEDULE).unlink(missing_ok=True)
         wants = self.density.max_gaussians, self.density.absolute_gradients
         announce_memory(self.scene, self.gaussians, *wants, self.group.size)
-        self.log, self.rows = earlier_runs.continue_records(folder, start, self.first_iteration)
-        self.losses = LossWatch(self.log.loss)
-        self.clock = Stopwatch(self.joules)
+        self.log, self.rows = folder.continue_records(to, start, self.first_iteration)
+        self.losses.mean = self.log.loss
+        self.clock = Stopwatch(joules_counter(self.group.everyone(nvml_name(self.device))))
         for opened in self.each("opened"):
             opened(self)
 
@@ -222,3 +252,138 @@ class Run(Stepping):
         write_cfg_args(scene.model_path, argparse.Namespace(**vars(self.dataset) | {"sh_degree": model.max_sh_degree}))
         add_to_model_json(scene.model_path, **self.facts, left_out=vars(left_out))
         return left_out
+
+    # What an iteration asks
+
+    def each(self, hook: str) -> list[Callable]:
+        """The bound hooks of this name."""
+        if hook not in self._hooks:
+            self._hooks[hook] = overrides(self.parts, hook)
+        return self._hooks[hook]
+
+    @property
+    def is_standard(self) -> bool:
+        """Whether loss and density control need gradients of the image alone, and the kernels compute all the rest.
+
+        What an objective or a strategy says of itself is not inherited; subclasses opt in.
+        """
+        own = all(vars(type(one)).get("fusable", False) for one in (self.objective, self.density))
+        return own and not (self.pipe.compute_cov3D_python or self.pipe.convert_SHs_python)
+
+    def iterations(self) -> Iterator[Iteration]:
+        """The iterations of this run."""
+        for iteration in count(self.first_iteration + 1):
+            seconds, schedule = self.clock.seconds, self.schedule
+            schedule.reach(iteration, self.log.seconds_before + seconds)
+            camera = self.sizes.view(self.views[iteration], schedule.schedule_step(iteration))
+            span, last = schedule.span(iteration), schedule.is_last(iteration)
+            step = Iteration(
+                iteration,
+                last=last,
+                rests=schedule.rests(iteration),
+                camera=camera,
+                background=self._background(iteration),
+                changes=self._changes(iteration),
+                started=seconds,
+                span=range(span.start, schedule.length + 1) if last else span,
+            )
+            self.add_terms(step)
+            yield step
+            if iteration == self.first_iteration + 1:
+                self.first_done = seconds_since_start()
+            if step.last:
+                return
+
+    def add_terms(self, step: Iteration) -> None:
+        """Add what parts add to the loss of a step."""
+        for terms in self.each("terms"):
+            if found := terms(step):
+                step.terms |= found
+                step.wants_depth |= terms.__self__.needs.depth
+                step.captured &= terms.__self__.needs.captured
+
+    def _changes(self, iteration: int) -> bool:
+        changes = any(changes(iteration) for changes in self.each("changes"))
+        return self.density.changes(iteration) or self._raises_degree(iteration) > 0 or changes
+
+    def _raises_degree(self, iteration: int) -> int:
+        """How often the SH degree is raised in an iteration."""
+        before, now = (self.schedule.schedule_step(t) // SH_INTERVAL for t in (iteration - 1, iteration))
+        return now - before
+
+    def _background(self, iteration: int) -> Tensor:
+        if not self.opt.random_background:
+            return self.background
+        draws = uniform(self.opt.seed, Stream.BACKGROUND, iteration, torch.zeros(1, dtype=torch.int64))
+        return draws[0, :3].to(self.device)
+
+    def prepare(self, step: Iteration) -> None:
+        """Set learning rates and SH degree, and begin to decode the photos of the next views."""
+        self.set_rates(step)
+        for _ in range(self._raises_degree(step.iteration)):
+            self.gaussians.oneupSHdegree()
+            self.gaussians.limit_columns()
+        if step.iteration - 1 == self.launch.debug_from:
+            self.pipe.debug = True
+        self.decode_ahead(step.iteration)
+
+    def set_rates(self, step: Iteration) -> None:
+        """Set the learning rates of a step, which may be one that is repeated."""
+        self.gaussians.exposures.held = self.density.recovers(step.iteration)
+        self.gaussians.update_learning_rate(self.schedule.schedule_step(step.iteration))
+        factor = self.schedule.rate_factor(step.iteration)
+        if factor is None:
+            factor = self.density.rate_factor(step.iteration)
+        if factor is not None:
+            sparse = self.opt.optimizer_type == "sparse_adam"
+            self.gaussians.scale_rates(factor * (bias_correction(step.iteration) if sparse else 1.0))
+
+    def decode_ahead(self, iteration: int) -> None:
+        """Begin to decode the photos of an iteration and of those that follow it."""
+        ahead = self.scene.images.ahead
+        if (last := self.schedule.ends) is not None:
+            ahead = min(ahead, last - iteration + 1)
+        self.scene.prefetch(list(filter(self.sizes.needs, self.views.coming(iteration, ahead))))
+
+    def step_on_host(self, step: Iteration, gradient: Tensor) -> None:
+        """Take the step of the view's camera. gradient (numbers,): of the loss by the camera's numbers."""
+        at = self.schedule.schedule_step(step.iteration)
+        self.on_host.step(step.camera.uid, gradient.cpu().numpy(), at)
+        self.on_host.place()
+
+    def after_step(self, step: Iteration) -> None:
+        """What follows the optimiser's step."""
+        self.density.after_step(step)
+        for after_step in self.each("after_step"):
+            after_step(step)
+        if step.changes:
+            for after_change in self.each("after_change"):
+                after_change(step)
+
+    def flushed_view(self) -> AbstractContextManager:
+        """Within it, others may read the model."""
+        return nullcontext() if self.sleeping is None else self.sleeping.flushed_view()
+
+    def stop_skipping(self) -> None:
+        """Let all blocks take the steps that they have missed, and sleep no more."""
+        if self.sleeping is not None:
+            self.sleeping.flush()
+        self.sleeping = None
+
+    def render_options(self, step: Iteration) -> dict[str, bool]:
+        """Options of `render` that make it compute what this step's loss needs, and no more."""
+        return {
+            "want_depth": step.wants_depth,
+            "want_visibility": False,
+            "want_inactive_bands": False,
+            "want_absolute_gradient": self.density.absolute_gradients and self.density.observes(step.iteration),
+            "clamp": False,
+        }
+
+
+def bias_correction(step: int, beta1: float = 0.9, beta2: float = 0.999) -> float:
+    """Factor of a step of Adam whose averages began at zero (Kingma and Ba 2015, Section 2), from 1/6 up to 1.
+
+    Sparse Adam leaves it out, as the reference's. Steps that are long already would then be six times as long.
+    """
+    return math.sqrt(1 - beta2**step) / (1 - beta1**step)

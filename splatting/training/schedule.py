@@ -7,9 +7,12 @@ through the whole schedule: by the clock, or as a file says (splatting/parts/tim
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 from splatting.registry import strategies
+
+if TYPE_CHECKING:
+    from splatting.training.run import Run
 
 USUAL = 30_000  # iterations that the default learning rates are for
 LONGER = 2.0  # times the root of the stride
@@ -84,7 +87,7 @@ class Schedule:
         """How many Gaussians there may be after an iteration (DensityControl.count_limit)."""
         return limit
 
-    def best_strategy(self, run: Any) -> str:
+    def best_strategy(self, run: "Run") -> str:
         """The strategy of a new run that names none: the first in the registry."""
         return strategies()[0]
 

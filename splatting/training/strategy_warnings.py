@@ -2,21 +2,24 @@
 
 import argparse
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING
 
 from scene.gaussians import density_rules as rules
 from splatting.host.listing import some
 from splatting.registry import part_class, strategies, tools
 from splatting.training.density import DensityControl
-from splatting.training.disk_space import little_space
 from splatting.training.memory_estimate import expected_count
+from splatting.training.save import little_space
 from splatting.training.schedule import USUAL
+
+if TYPE_CHECKING:
+    from splatting.training.run import Run
 
 # Milliseconds of a step at 1600x1060 on an H100: of any, and of a million Gaussians (docs/results/several_gpus.md).
 STEP_ALONE, STEP_SHARED = (0.9, 1.25), (2.8, 0.87)
 
 
-def warnings_of(run: Any, given: argparse.Namespace) -> Iterator[str]:
+def warnings_of(run: "Run", given: argparse.Namespace) -> Iterator[str]:
     """Warnings before a run (splatting/training/run.py). given: the optimisation options as they were given."""
     density, opt, count, done = run.density, run.opt, run.gaussians.gaussian_count, run.first_iteration
     expected = expected_count(density.max_gaussians, count)

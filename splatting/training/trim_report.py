@@ -3,11 +3,14 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import FEW, ITERATIONS_PER_VIEW, TOO_LONG, WORTH, change_on_views, trim
 from scene.gaussian_model import GaussianModel
+
+if TYPE_CHECKING:
+    from splatting.training.run import Run
 
 MB = 1e6
 
@@ -100,7 +103,7 @@ def _pictures(it: TrimReport) -> str:
     )
 
 
-def trimmed(run: Any, scored: bool, iteration: int) -> tuple[GaussianModel, TrimReport]:
+def trimmed(run: "Run", scored: bool, iteration: int) -> tuple[GaussianModel, TrimReport]:
     """The model of a run without what it does not need, and the facts.
 
     scored: whether to compute the change in PSNR, which is cheap if the test photos are in memory. iteration: the last.

@@ -12,9 +12,8 @@ from scene.gaussians.checkpoint import load_checkpoint
 from splatting.files.json_files import read_model_json
 from splatting.parts.resume import part as resume
 from splatting.parts.resume.end import finished
+from splatting.training.folder import REPLACED, new_folder
 from splatting.training.launch import launch_options
-from splatting.training.output_folder import new_folder
-from splatting.training.restart import REPLACED
 from utils.system_utils import UserError
 
 WORDS = ("-r", 24, "--no_curve", "--disable_viewer", "--test_iterations", -1)

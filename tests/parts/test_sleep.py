@@ -29,8 +29,8 @@ from scene.sleeping import BLOCK, REST, Sleeping
 from splatting.distributed.ranks import ranks
 from splatting.training import run as runs
 from splatting.training.iteration import Iteration
+from splatting.training.log import ProgressBar
 from splatting.training.objective import Objective
-from splatting.training.observers.progress import ProgressBar
 from splatting.training.steps import captured, fused, graphs
 from utils.system_utils import UserError
 

@@ -16,8 +16,8 @@ from splatting.evaluation.peer_curve import read_scalars
 from splatting.parts.tensorboard import events
 from splatting.parts.tensorboard.event_writer import EventWriter
 from splatting.parts.tensorboard.part import Tensorboard
+from splatting.training import log as progress
 from splatting.training.iteration import Iteration, Losses
-from splatting.training.observers import progress
 
 
 def _train(scene: Path, out: Path, *more: str) -> None:

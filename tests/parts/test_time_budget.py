@@ -21,7 +21,7 @@ from splatting.parts.time_budget.sizes import Sizes
 from splatting.registry import strategy_part
 from splatting.training.density import DensityControl
 from splatting.training.iteration import Iteration
-from splatting.training.observers.progress import ProgressBar
+from splatting.training.log import ProgressBar
 from splatting.training.run import Run
 from splatting.training.schedule import Schedule, longer_steps
 from utils.system_utils import UserError

@@ -34,7 +34,7 @@ class MorePhotos(Part):
         found = new_photos(run)
         if found:
             self._refuse_folder(run)
-            run.grown = True
+            fill(run, "grown", True, self)
             added = Added.at(run.first_iteration, run.schedule.ends, found, run.views.cameras)
             print(f"{len(found)} photos are new; until iteration {added.until} every second one trains on one of them")
         else:
@@ -47,7 +47,7 @@ class MorePhotos(Part):
     @staticmethod
     def _refuse_folder(run: Any) -> None:
         """The folder keeps which photos its checkpoints have seen, so it may not get others."""
-        from splatting.training.earlier_runs import lies_in
+        from splatting.training.folder import lies_in
 
         if lies_in(run.start, run.dataset.model_path):
             raise UserError(

@@ -54,7 +54,7 @@ class Resume(Part):
             )
 
     def opened(self, run: Any) -> None:
-        from splatting.training.restart import REPLACED
+        from splatting.training.folder import REPLACED
 
         self._run, self._file = run, Path(run.scene.model_path) / REPLACED
         self._before = self._spent = 0.0  # seconds of training at the last checkpoint, seconds of writing so far

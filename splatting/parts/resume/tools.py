@@ -8,8 +8,7 @@ from scene.saved_model import saves_in
 from splatting.files.json_files import read_model_json
 from splatting.parts.resume.end import End, finished
 from splatting.registry import tools
-from splatting.training.output_folder import folder_of, own_folder
-from splatting.training.restart import REPLACED, newest_checkpoint
+from splatting.training.folder import REPLACED, folder_of, newest_checkpoint, own_folder
 from splatting.training.schedule import STEADY
 from utils.system_utils import UserError
 

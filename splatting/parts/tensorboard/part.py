@@ -22,7 +22,7 @@ class Tensorboard(Part):
         return True
 
     def opened(self, run: Any) -> None:
-        from splatting.training.observers.report import training_report
+        from splatting.training.scores import training_report
 
         self._run = run
         self._writes = run.writer is not None and run.report is training_report

@@ -12,12 +12,11 @@ import torch
 from torch import Tensor
 
 from scene.fused_adam import CAMERA_NUMBERS
-from splatting.training.announcer import Announcer
 from splatting.training.iteration import Iteration, Losses
 from splatting.training.run import Run
+from splatting.training.steps.faster import Tell
 from splatting.training.steps.fused import FusedStep
 from splatting.training.steps.graphs import ROWS, Graphs
-from splatting.training.steps.plain import PlainStep
 from splatting.training.steps.speculative import AHEAD, Speculation
 
 
@@ -32,21 +31,22 @@ class CapturedStep(FusedStep):
         self._rows = torch.zeros(ROWS, CAMERA_NUMBERS, dtype=torch.float64, pin_memory=pinned) if run.on_host else None
         self._fetched: dict[int, _Fetched] = {}  # by iteration: of cameras that have yet to step
 
-    def take(self, at: Iteration, observers: Announcer) -> None:
+    def take(self, at: Iteration, tell: Tell) -> bool:
         """Queue a step, unless something is due in it."""
         run = self._run
         if not self._is_queued(at):
             self.drain()  # nothing is pending, unless --debug_from has just come into force
             run.set_rates(at)
-            return super().take(at, observers)
+            return super().take(at, tell)
         losses = self._queue(at)
         if losses is None:
             self._ahead.discard()
             self._step_on_host(0)
             run.set_rates(at)
-            return PlainStep.take(self, at, observers)
+            return False
         self._ahead.add(at, losses)
-        return observers.measured(at, losses)
+        tell.measured(at, losses)
+        return True
 
     def throttle(self, at: Iteration) -> None:
         if self._is_queued(at):

@@ -5,23 +5,22 @@ from torch import Tensor
 
 from gaussian_renderer import Drawn, KnownBands, draw, exposed, in_world_units
 from scene.fused_adam import CAMERA_NUMBERS, FusedAdam
-from splatting.training.announcer import Announcer
 from splatting.training.iteration import Iteration, Losses
 from splatting.training.run import Run
-from splatting.training.steps.plain import PlainStep
+from splatting.training.steps.faster import FasterSteps, Tell
 
 Gradients = tuple[Tensor, Tensor | None]  # of image and depth
 Measured = tuple[Drawn, Losses, Gradients]
 
 
-class FusedStep(PlainStep):
-    """Fused backward and optimiser, byte-equal to `PlainStep`; falls back to it if anything else reads gradients.
+class FusedStep(FasterSteps):
+    """Fused backward and optimiser, byte-equal to the plain step, which is taken if anything else reads gradients.
 
     Autograd differentiates the loss by the image alone, so any loss of image and depth will do, and exposures.
     """
 
     def __init__(self, run: Run) -> None:
-        super().__init__(run)
+        self._run = run
         pose = torch.zeros(CAMERA_NUMBERS, dtype=torch.float64, device=run.device) if run.on_host else None
         self.camera_gradient = pose  # of the last step
         self._adam = FusedAdam(run.gaussians, run.density.penalty)
@@ -34,18 +33,19 @@ class FusedStep(PlainStep):
         """Whether nobody else needs gradients. Foreign objectives and density controls may, and some options do."""
         return run.is_standard and not (run.launch.plain_step or torch.is_anomaly_enabled())
 
-    def take(self, at: Iteration, observers: Announcer) -> None:
-        """Take a step; the observers are told once the loss is known."""
-        if self._fuses(at):
-            drawn, losses, gradients = self.measure(at)
-            if not self.drops_parameter_terms():
-                observers.measured(at, losses)
-                self.advance(at, drawn, gradients)
-                del drawn, gradients  # what changes rows needs their memory
-                if self.camera_gradient is not None and at.steps:
-                    self._run.step_on_host(at, self.camera_gradient)
-                return self.follow(at)
-        super().take(at, observers)
+    def take(self, at: Iteration, tell: Tell) -> bool:
+        if not self._fuses(at):
+            return False
+        drawn, losses, gradients = self.measure(at)
+        if self.drops_parameter_terms():
+            return False
+        tell.measured(at, losses)
+        self.advance(at, drawn, gradients)
+        del drawn, gradients  # what changes rows needs their memory
+        if self.camera_gradient is not None and at.steps:
+            self._run.step_on_host(at, self.camera_gradient)
+        self.follow(at)
+        return True
 
     def _fuses(self, at: Iteration) -> bool:
         """Whether the step of this iteration can be fused."""
@@ -96,7 +96,7 @@ class FusedStep(PlainStep):
         params = [gaussians.raw(name) for name in gaussians._attributes]
         self._has_parameter_terms = any([param.grad is not None for param in params])
         if self._has_parameter_terms:
-            self._drop_gradients()
+            gaussians.drop_gradients()
         return self._has_parameter_terms
 
     def advance(self, at: Iteration, drawn: Drawn, gradients: Gradients) -> None:

@@ -1,21 +1,136 @@
-"""Traces of earlier runs, in the folder of a training and beside its checkpoint: what they allow, and what goes on."""
+"""The folder of a training: its name, keeping it, its checkpoints, and what earlier runs in it allow."""
 
 import argparse
 import contextlib
 import copy
 import os
+import re
+import shlex
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
+from itertools import count
 from pathlib import Path
+from zipfile import is_zipfile
 
 from arguments import OPTIONS, VIEW_OPTIONS, other_scene, read_training_options
 from scene.saved_model import saves_in
+from splatting.distributed.ranks import ranks
 from splatting.evaluation import training_log
 from splatting.evaluation.error_curve import NAME as CURVE
 from splatting.evaluation.error_curve import Row, continue_curve
 from splatting.evaluation.training_log import TrainingLog
+from splatting.files.folders import locked, remove_temporary_files
 from splatting.files.json_files import ENLARGEMENT, SCHEDULE, read_model_json
-from utils.system_utils import UserError
+from splatting.host import torchrun
+from splatting.host.clock import seconds_since_start
+from splatting.host.listing import some
+from splatting.host.start import typed_command
+from utils.system_utils import UserError, atomic_write, mkdir_p
+
+_RECORDS = ("cfg_args", "model.json", "cameras.json", "train_log.json", "error_vs_time.csv", "schedule.json")
+_INPUTS = ("cfg_args", "model.json", "cameras.json", "input.ply")
+
+
+def new_folder(scene: str = "") -> str:
+    """Name of a folder under ./output: OAR_JOB_ID as in the reference, else a new one after the folder of the scene."""
+    if job := os.environ.get("OAR_JOB_ID"):
+        return os.path.join("./output/", ranks().shared(job)[:10])
+    name = os.path.join("./output/", os.path.basename(os.path.realpath(scene)) or "model")
+    names = (f"{name}_{number}" if number > 1 else name for number in count(1))
+    return ranks().shared(next(new for new in names if not os.path.exists(new)))
+
+
+def folder_of(checkpoint: str | None) -> str | None:
+    """The model folder that a checkpoint lies in, where a resumed training goes on unless another one is named."""
+    folder = Path(checkpoint or "").parent
+    return str(folder) if checkpoint and (folder / "cfg_args").is_file() else None
+
+
+def view_command(model_path: str, iteration: int | None = None) -> str:
+    """The command that shows a model; iteration: None, the newest one."""
+    older = iteration is not None and max(saves_in(Path(model_path)), default=iteration) > iteration
+    which = f" --iteration {iteration}" if older else ""
+    return f"{typed_command('view.py')} -m {shlex.quote(model_path)}{which}"
+
+
+@contextlib.contextmanager
+def records_kept(model_path: str) -> Iterator[None]:
+    """Put the records of a saved model back, if an error ends a training of its folder before that has saved another.
+
+    A photo that cannot be read, for one, is found when it is needed. Of several ranks, the first does so for all.
+    """
+    folder = Path(model_path)
+    saves = _stamps(folder) if ranks().first else {}
+    kept = {name: (folder / name).read_bytes() for name in _RECORDS if saves and (folder / name).is_file()}
+    try:
+        yield
+    except BaseException:
+        if kept and _stamps(folder) == saves:
+            for name, content in kept.items():
+                with atomic_write(folder / name) as temporary:
+                    temporary.write_bytes(content)
+        raise
+
+
+def _stamps(folder: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in saves_in(folder).values()}
+
+
+@contextlib.contextmanager
+def own_folder(model_path: str) -> Iterator[None]:
+    """Make the folder and keep it for this training. UserError if another train.py is at work in it.
+
+    Temporary files of killed runs are removed first. A message says if files of the run are missing at the end, as
+    when the folder was removed meanwhile. Of several ranks, the first does so for all.
+    """
+    if not ranks().first:
+        yield
+        return
+    folder = Path(model_path)
+    mkdir_p(folder)
+    with locked(folder, "train.py", "another train.py (process {process})", "-m"):
+        remove_temporary_files(folder)
+        yield
+        missing = [name for name in _INPUTS if not (folder / name).exists()]
+        if missing not in ([], ["input.ply"]):  # a run that is resumed may have begun without the latter
+            print(
+                f"warning: {some(missing)} in {folder} were removed during training; the model is saved, but other "
+                "programs may need them",
+                file=sys.stderr,
+            )
+
+
+REPLACED = "chkpnt_resume.pth"  # one that is replaced while the training goes on, never of its last iteration
+_CHECKPOINT = re.compile(r"chkpnt(\d+)\.pth|" + re.escape(REPLACED))
+
+
+def resumed(start: str | None, folder: str, iterations: int) -> str | None:
+    """The checkpoint to begin with: `start`, or after a restart (--max-restarts) the newest one of this training.
+
+    folder: of the output. A checkpoint that leaves nothing to do is none.
+    """
+    newest = newest_checkpoint(folder, iterations) if torchrun.restarts() else None
+    if newest:
+        print(f"Restarted by torchrun: resuming {newest}")
+    return newest or start
+
+
+def newest_checkpoint(folder: str, below: float = float("inf"), since: float | None = None) -> str | None:
+    """The newest whole checkpoint of an iteration under `below`; of equally new ones, that of the highest.
+
+    since: when it was written, in seconds since 1970. None: since torchrun began, so that it is of its processes, over
+    all restarts, and of no earlier training in the folder.
+    """
+    began = time.time() - (seconds_since_start(os.getppid()) or float("inf")) if since is None else since
+    found = {}
+    for path in Path(folder).glob("chkpnt*.pth"):
+        match = _CHECKPOINT.fullmatch(path.name)
+        if match and is_zipfile(path) and (number := int(match[1] or 0)) < below:
+            written = path.stat()
+            if written.st_mtime >= began:
+                found[written.st_mtime_ns, number] = path
+    return str(found[max(found)]) if found else None
 
 
 def check_folder(

@@ -1,16 +1,21 @@
-"""What a user reads while a training runs, and at its end."""
+"""What a training says: the progress bar, train_log.json, and what is printed and noted at its end."""
 
 import math
 import time
+from typing import TYPE_CHECKING
 
 from splatting.evaluation.error_curve import whole_sets
+from splatting.evaluation.what_to_try import BUDGET, CAP, PLANNED, STRATEGY, what_to_try
 from splatting.host.clock import wall_seconds
 from splatting.host.progress import Bar
-from splatting.part import Error, Part
+from splatting.part import Error, Part, overrides
+from splatting.training.density import default_budget
+from splatting.training.folder import view_command
 from splatting.training.iteration import Iteration, Losses
 from splatting.training.objective import LossWatch
-from splatting.training.output_folder import view_command
-from splatting.training.run import Run
+
+if TYPE_CHECKING:
+    from splatting.training.run import Run
 
 # Without a rate: that of the schedule is not that of iterations.
 BY_CLOCK = "{l_bar}{bar}| [{elapsed}<{remaining}{postfix}]"
@@ -23,7 +28,7 @@ class ProgressBar(Part):
 
     reads_model = False
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: "Run") -> None:
         self._run = run
         self._shown = {"Loss": run.losses}
         self._updated, self._done = -math.inf, run.first_iteration
@@ -72,7 +77,7 @@ def _iterations(count: int) -> str:
 class Summary(Part):
     """Says at the end what the model is worth, and how to look at it."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: "Run") -> None:
         self._run = run
         self._psnr: float | None = None
         self._iteration = run.first_iteration
@@ -89,3 +94,47 @@ class Summary(Part):
         run = self._run
         scored = "" if self._psnr is None else f"Test PSNR {self._psnr:.2f} dB (as metrics.py). "
         print(f"{scored}Look at the model: {view_command(run.scene.model_path, self._iteration)}")
+
+
+class Records(Part):
+    """Writes what other observers have put into the step's record, once all of it is there.
+
+    What parts add is also recorded at points of the curve.
+    """
+
+    def __init__(self, run: "Run") -> None:
+        self._run = run
+        self._seconds = 0.0
+
+    def measured(self, step: Iteration, losses: Losses) -> None:
+        run = self._run
+        if step.record is None and step.scored_at is None:
+            return
+        added = {name: number for add in overrides(run.parts, "records") for name, number in add().items()}
+        if step.record is None and not added:
+            return
+        self._seconds = seconds = run.clock.seconds if step.scored_at is None else step.scored_at
+        with run.clock.paused("saving"):
+            values = (step.record or {}) | added
+            values |= {"gaussians": run.gaussians.gaussian_count, "loss": run.losses.mean}
+            run.log.add(step.iteration, seconds, run.clock.joules, **values)
+
+    def ended(self, error: Error) -> None:
+        """Note how the training was planned, what to try next, and the seconds of this process by their purpose."""
+        if error is not None:
+            return
+        run, log, opt = self._run, self._run.log, self._run.opt
+        options = {PLANNED: opt.iterations, STRATEGY: opt.strategy}
+        if not run.density.grows_to:
+            budget = default_budget(run.scene.getTrainCameras())
+            options |= {CAP: opt.max_num_splats} if opt.max_num_splats else {BUDGET: budget}
+        log.note(**options)
+        log.keep(*run.warnings)
+        log.advise(*what_to_try(run.rows, log.records))
+        first, spent = run.first_done, run.clock.spent
+        seconds = max(self._seconds, log.records[-1]["seconds"] - log.seconds_before)  # perhaps of a later checkpoint
+        parts = {"training": seconds, "scoring": 0.0, "saving": 0.0} | spent
+        log.note(
+            first_iteration_seconds=None if first is None else round(first, 3),
+            **{f"{part}_seconds": round(seconds, 3) for part, seconds in parts.items()},
+        )

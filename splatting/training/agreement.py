@@ -1,4 +1,4 @@
-"""Agreement of the ranks of a training before it begins: on code, options, scene and checkpoint."""
+"""Agreement of the processes of a training: before it begins, and in each iteration."""
 
 import argparse
 import hashlib
@@ -7,8 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from scene.cameras import Camera
+from scene.gaussians.adam import StepGuard
 from scene.scene import Scene
-from splatting.distributed.ranks import ranks, refuse_differences
+from splatting.distributed.ranks import Ranks, ranks, refuse_differences
+from splatting.host.interrupt import DeferredInterrupt, Terminated
+from splatting.part import Part
+from splatting.training.iteration import Iteration, Losses
 
 _ROOT = Path(__file__).resolve().parents[2]
 _ROOMS = ("arguments", "gaussian_renderer", "splatting", "scene", "utils")
@@ -54,3 +58,38 @@ def _digest(cameras: Sequence[Camera]) -> str:
         digest.update(f"{camera.image_name} {size} {kinds} {getattr(camera, 'lens', None)}\n".encode())
         digest.update(camera.full_proj_transform.cpu().numpy().tobytes())
     return digest.hexdigest()
+
+
+_SIGNALS = (None, KeyboardInterrupt, Terminated)
+
+
+class StepAgreement(Part):
+    """Shares whether an iteration is due, which signal asks to stop, and where the guard has stopped the optimisers.
+
+    These go with the numbers that they exchange to render the iteration's view (`agree`), and are known when its
+    losses are. A signal counts for the iteration that begins after it, on all, whichever has got it.
+    """
+
+    def __init__(self, group: Ranks, interrupt: DeferredInterrupt, guard: StepGuard | None) -> None:
+        """interrupt: of this process. guard: that of its optimisers, if they have one."""
+        self._group, self._interrupt = group, interrupt
+        if group.several:
+            group.flag = None if guard is None else guard.stopped
+        self._asked: type[KeyboardInterrupt] | None = None
+
+    def begins(self, step: Iteration) -> None:
+        self._group.post(int(step.due), _SIGNALS.index(self._interrupt.requested))
+
+    def measured(self, step: Iteration, losses: Losses) -> None:
+        due, signal = self._group.heard()
+        step.due = bool(due)
+        self._asked = _SIGNALS[signal]
+
+    @property
+    def stopping(self) -> type[KeyboardInterrupt] | None:
+        """What asks to stop after this iteration."""
+        return self._asked if self._group.several else self._interrupt.requested
+
+    def wait(self) -> None:
+        """Wait until the first has written what it writes: torchrun ends all once one has ended."""
+        self._group.anyone(False)

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -16,9 +16,11 @@ from scene.gaussian_model import GaussianModel
 from splatting.part import Part
 from splatting.registry import tools
 from splatting.training.iteration import Iteration, Losses
-from splatting.training.run import Run
 from utils.image_utils import as_float, mean_psnr, mse, pixels_that_count, psnr
 from utils.loss_utils import l1_loss
+
+if TYPE_CHECKING:
+    from splatting.training.run import Run
 
 SHOWN = 5  # views of a set whose images a writer gets
 
@@ -26,7 +28,7 @@ SHOWN = 5  # views of a set whose images a writer gets
 class Scores(Part):
     """Calls the run's report: `training_report` in testing iterations, what replaces it in all of them."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: "Run") -> None:
         self._run = run
         self._planned = run.launch.test_iterations
 

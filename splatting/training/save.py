@@ -1,25 +1,29 @@
-"""Saves of the model as PLY, and checkpoints that a training can be resumed from."""
+"""Saves of the model as PLY, checkpoints that a training can be resumed from, and the space that they need."""
 
+import math
+import shutil
 import sys
-from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
 from scene.gaussians.checkpoint import save_checkpoint
 from scene.saved_iterations import saved_ply
 from splatting.part import Error, Part
-from splatting.training.disk_space import little_space
+from splatting.training.folder import view_command
 from splatting.training.iteration import Iteration, Losses
-from splatting.training.output_folder import view_command
-from splatting.training.run import Run
 from splatting.training.trim_report import TrimReport, lines, saved_line
+from utils.system_utils import UserError
+
+if TYPE_CHECKING:
+    from splatting.training.run import Run
 
 
 class Saves(Part):
     """Saves the PLY when planned. The last save leaves out what the model does not need, and says so at the end."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: "Run") -> None:
         self._run = run
         self._left_out: TrimReport | None = None
 
@@ -56,10 +60,8 @@ class Saves(Part):
 class Checkpoints(Part):
     """Writes chkpntN.pth when planned, and when a signal stops the training, which also saves the PLY."""
 
-    def __init__(self, run: Run, look: Callable[[int], None]) -> None:
-        """look: refuses what must not be saved (`DivergenceWatch.look`)."""
+    def __init__(self, run: "Run") -> None:
         self._run = run
-        self._look = look
 
     def due(self, step: Iteration) -> bool:
         return step.takes(self._run.launch.checkpoint_iterations)
@@ -74,7 +76,7 @@ class Checkpoints(Part):
         name: of the file, chkpntN.pth if it is empty.
         """
         run = self._run
-        self._look(step.iteration)
+        run.watch.look(step.iteration)
         path = write_checkpoint(run, step.iteration, name, with_ply=bool(step.stopping))
         if step.stopping:
             look = f"Look at the model: {view_command(run.scene.model_path, step.iteration)}"
@@ -83,7 +85,7 @@ class Checkpoints(Part):
             tqdm.write(f"Stopped at iteration {step.iteration}{early}\n{look}\n{resume}", file=sys.stderr)
 
 
-def write_checkpoint(run: Run, iteration: int, name: str = "", with_ply: bool = False) -> Path:
+def write_checkpoint(run: "Run", iteration: int, name: str = "", with_ply: bool = False) -> Path:
     """Write a checkpoint of the model, and its PLY, and note it in the log. Returns the checkpoint's path.
 
     Every rank must call it. name: of the file, chkpntN.pth if it is empty.
@@ -100,3 +102,36 @@ def write_checkpoint(run: Run, iteration: int, name: str = "", with_ply: bool = 
         if with_ply:
             run.scene.save(iteration)
     return path
+
+
+_OF_PLY = 3  # numbers of a Gaussian besides its own: normals, which are 0
+_OF_CHECKPOINT = 3  # the same: statistics of density control. Its own come with Adam's two averages
+
+
+def little_space(run: "Run", sure: int, later: int, first: int) -> str | None:
+    """What to say if the saves from iteration `first` on do not fit with `later` Gaussians, before they are written.
+
+    sure: Gaussians that there are at least. UserError if not even one PLY of so many fits.
+    """
+    folder = Path(run.scene.model_path).absolute()
+    free = shutil.disk_usage(next(place for place in (folder, *folder.parents) if place.exists())).free
+    values = sum(math.prod(attribute.shape) for attribute in run.gaussians._attributes.values())
+    ply, checkpoint = 4 * (values + _OF_PLY), 4 * (3 * values + _OF_CHECKPOINT)
+    if free < ply * sure:
+        raise UserError(
+            f"the disk of {folder} has {_mb(free)} free, and a model of {sure:,} Gaussians takes {_mb(ply * sure)}; "
+            "free space there, or name another folder by -m"
+        )
+    planned = [run.schedule.known(one) for one in (run.launch.save_iterations, run.launch.checkpoint_iterations)]
+    saves, checkpoints = (len({n for n in one if n >= first}) for one in planned)
+    needed = later * (ply * max(saves, 1) + checkpoint * checkpoints)
+    if free >= needed:
+        return None
+    return (
+        f"the disk of {folder} has {_mb(free)} free, and the saves to come take about {_mb(needed)} if there are "
+        f"{later:,} Gaussians; free space there in time"
+    )
+
+
+def _mb(count: float) -> str:
+    return f"{count / 1e6:,.1f} MB"
