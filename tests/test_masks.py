@@ -456,11 +456,11 @@ def test_views_that_count_are_looked_at_once(capsys):
     watch = MaskWatch(views)
     for one in (*views[:3], views[0]):
         watch.add(one, one.counted_pixels)
-        watch.look(last=False)
+        watch.check(last=False)
     assert capsys.readouterr().err == ""
     watch.add(views[3], views[3].counted_pixels)
-    watch.look(last=False)
-    watch.look(last=True)
+    watch.check(last=False)
+    watch.check(last=True)
     said = capsys.readouterr().err
     assert said.count("warning") == 1 and "2 of 4 views" in said and "(v0, v3)" in said
 
@@ -469,10 +469,10 @@ def test_views_that_count_are_looked_at_once(capsys):
     watch = MaskWatch(views)
     for one in views[:99]:
         watch.add(one, one.counted_pixels)
-    watch.look(last=False)
+    watch.check(last=False)
     watch.add(views[99], views[99].counted_pixels)
     with pytest.raises(UserError, match="all 100 views"):
-        watch.look(last=False)
+        watch.check(last=False)
 
 
 def test_scores_are_those_of_the_definition():

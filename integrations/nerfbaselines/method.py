@@ -175,7 +175,7 @@ class GaussianSplatting(Method):
             return nullcontext()
         if self._at is not None:
             self._taker.drain()
-            self._run.watch.look(self._at.iteration)
+            self._run.watch.check(self._at.iteration)
         return self._run.flushed_view()
 
     @torch.no_grad()

@@ -76,7 +76,7 @@ class Checkpoints(Part):
         name: of the file, chkpntN.pth if it is empty.
         """
         run = self._run
-        run.watch.look(step.iteration)
+        run.watch.check(step.iteration)
         path = write_checkpoint(run, step.iteration, name, with_ply=bool(step.stopping))
         if step.stopping:
             look = f"Look at the model: {view_command(run.scene.model_path, step.iteration)}"

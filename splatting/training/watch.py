@@ -45,9 +45,9 @@ class DivergenceWatch(Part):
         self._losses.add(step.iteration, losses.total)
         self._guard.watch(step.iteration, losses.total)
         if step.due:
-            self.look(step.iteration)
+            self.check(step.iteration)
 
-    def look(self, iteration: int) -> None:
+    def check(self, iteration: int) -> None:
         """Save the model with a checkpoint, and raise UserError, if a loss or a step was not finite.
 
         Call it in every iteration that writes a file, changes the number of Gaussians, zeroes Adam's averages, or
@@ -101,7 +101,7 @@ _BLACK = "masks must be white where photos count; correct the masks, or leave th
 
 
 class MaskWatch(Part):
-    """Adds up, without waiting for a GPU, how much of each view counts. Only `look` waits for it, while views are new.
+    """Adds up, without waiting for a GPU, how much of each view counts. Only `check` waits for it, while views are new.
 
     views: those that train. This check decodes no mask ahead, so training on thousands of photos starts in seconds.
     """
@@ -117,7 +117,7 @@ class MaskWatch(Part):
     def measured(self, step: Iteration, losses: Losses) -> None:
         self.add(step.camera, losses.mask)
         if step.due:
-            self.look(step.last)
+            self.check(step.last)
 
     def add(self, view: Camera, mask: Tensor | None) -> None:
         """Note the share of pixels that count in a view seen for the first time."""
@@ -130,7 +130,7 @@ class MaskWatch(Part):
             part = mask if view.columns is None else mask[..., view.columns]
             self._new.append((view.image_name, part.float().mean()))
 
-    def look(self, last: bool) -> None:
+    def check(self, last: bool) -> None:
         """After all views were seen, or in the last iteration, name those with hardly any pixel that counts.
 
         UserError if no pixel counts in any view, or in any of the first hundred.
