@@ -24,7 +24,7 @@ from scene.check.photos import hints
 from scene.images.decode import decode
 from scene.images.masks import IGNORE, TRANSPARENT, Mask, MaskOptions, find_masks
 from scene.images.side_files import names_below
-from scene.readers.pinholes import _check_mask
+from scene.readers.photos import _check_mask
 from splatting.training.watch import MaskWatch
 from utils.image_utils import pixels_that_count
 from utils.loss_utils import photometric_loss

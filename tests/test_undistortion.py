@@ -19,8 +19,7 @@ from scene.images.decode import picture_size
 from scene.images.lens import WIDEST, Lens, pinhole_of, shown_pixels, undistortion
 from scene.images.masks import TRANSPARENT, Mask
 from scene.readers.info import CameraInfo
-from scene.readers.pinholes import camera_info
-from scene.readers.undistortion import undistort
+from scene.readers.photos import camera_info, undistort
 from utils.system_utils import UserError
 
 WIDTH, HEIGHT, FOCAL = 200, 150, 150.0

@@ -12,7 +12,7 @@ from PIL import Image
 from scene.dataset_readers import sceneLoadTypeCallbacks
 from scene.images.lens import Lens
 from scene.readers.info import CameraInfo, SceneInfo
-from scene.readers.pinholes import camera_info
+from scene.readers.photos import camera_info
 from scene.readers.point_cloud import color_fractions
 from scene.readers.scene_folder import COLMAP
 from scene.readers.start_cloud import StartCloud, StartOptions, random_in_cube, random_in_frusta, scene_info

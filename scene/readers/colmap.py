@@ -13,7 +13,7 @@ from scene.images.find import find_images
 from scene.images.lens import Lens
 from scene.images.masks import NO_MASKS, Mask, MaskOptions, find_masks
 from scene.readers.info import CameraInfo, Posed, SceneInfo, split_by_order
-from scene.readers.pinholes import camera_info, finished
+from scene.readers.photos import camera_info, finished
 from scene.readers.point_cloud import check_finite, read_point_cloud
 from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, random_in_frusta, scene_info
 from splatting.files.unread import say_unread

@@ -22,7 +22,7 @@ from scene.images.decode import picture_size
 from scene.images.side_files import SideFiles
 from scene.readers.colmap import find_model
 from scene.readers.info import CameraInfo, SceneInfo
-from scene.readers.undistortion import undistorted_folder
+from scene.readers.photos import undistorted_folder
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.plain_files import plain, plain_text
 from splatting.host.listing import some

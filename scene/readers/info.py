@@ -90,11 +90,11 @@ class CameraInfo(_LikeNamedTuple):
     fx, fy, cx, cy: pixels of that image, pixel centres at .5. Either FovX and FovY or fx and fy must be given; the
     others follow from them. Where they disagree, fx and fy count. The principal point is the middle by default.
     file_size: (width, height) of the photo, None: not read yet. lens: of a photo that has to be undistorted first, else
-    None (scene/readers/pinholes.py). native: the lens of a photo that is taken as it is; fx, fy, cx and cy are then
+    None (scene/readers/photos.py). native: the lens of a photo that is taken as it is; fx, fy, cx and cy are then
     those of its axis. mask: of the photo's shape, None if all pixels count. ignore_alpha: transparent pixels of the
     photo do not count. opaque: the photo's alpha is dropped. depth: inverse depth of a training view that has a map
     (scene/readers/depth_maps.py). lying: the photo's own file, where image_path is its upright copy
-    (scene/readers/turned.py). image: the photo in memory, which readers leave out: a PIL image, as the 2023 release
+    (scene/readers/photos.py). image: the photo in memory, which readers leave out: a PIL image, as the 2023 release
     gave it, or pixels at training size.
     """
 

@@ -19,7 +19,7 @@ from scene.colmap_loader import Camera, Image
 from scene.readers.colmap import colmap_camera, read_colmap
 from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, with_depth_maps, with_map
 from scene.readers.info import HOLD, CameraInfo, SceneInfo, camera_centers, normalization
-from scene.readers.pinholes import finished
+from scene.readers.photos import finished
 from scene.readers.point_cloud import fetchPly, write_point_cloud
 from scene.readers.scene_folder import BLENDER, COLMAP
 from scene.readers.transforms import read_blender, read_frames, read_nerfstudio

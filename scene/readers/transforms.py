@@ -21,7 +21,7 @@ from scene.images.side_files import identity
 from scene.readers.info import CameraInfo, Posed, SceneInfo, held_out, split_by_order
 from scene.readers.metashape import read_metashape
 from scene.readers.phone_scans import read_polycam, read_record3d
-from scene.readers.pinholes import camera_info, finished
+from scene.readers.photos import camera_info, finished
 from scene.readers.point_cloud import read_point_cloud
 from scene.readers.scene_folder import camera_file
 from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, random_in_cube, random_in_frusta, scene_info
