@@ -13,13 +13,12 @@ from typing import Any
 import numpy as np
 
 from scene.cameras import Camera
-from scene.dataset_readers import read_scene, replaced_reader
+from scene.dataset_readers import read_scene, replaced_reader, scene_by
 from scene.images.masks import MaskOptions, check_masks
 from scene.images.store import ImageStore, Picture, image_device
 from scene.readers.enlargement import enlargement
 from scene.readers.info import CameraInfo, SceneInfo, photo_size
 from scene.readers.point_cloud import write_point_cloud
-from scene.readers.reference import scene_by
 from scene.readers.scene_folder import kind_of
 from scene.reference_models import SceneGaussians, call_of_either_form
 from scene.saved_iterations import find_iteration, saved_ply

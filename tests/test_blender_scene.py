@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from synthetic import FakeGaussians, edit_json, folder_state, options_of, read
 
 from scene import Scene
+from scene.dataset_readers import readNerfSyntheticInfo
 from scene.readers.point_cloud import write_point_cloud
-from scene.readers.reference import readNerfSyntheticInfo
 from utils.system_utils import UserError
 
 _read = partial(read, hold_out=True)
