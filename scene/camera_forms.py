@@ -1,7 +1,9 @@
-"""The arguments of the reference's Camera, in the form of either release."""
+"""What other code gives in the form of either release of the reference: arguments of a Camera, records, functions."""
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,9 +11,10 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from scene.images.decode import pixels_of
+from scene.images.decode import picture_size, pixels_of
+from scene.images.masks import TRANSPARENT, Mask, add_alpha
 from scene.images.store import InMemory, Size
-from scene.readers.depth_maps import depth_fit, fitted
+from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, DepthMap, depth_fit, fitted
 from scene.readers.info import CameraInfo
 from utils.general_utils import check_flags
 from utils.image_utils import half
@@ -97,3 +100,38 @@ def _of_2023(
 
 
 SIGNATURE = inspect.signature(_of_2024).replace(return_annotation=inspect.Signature.empty)
+
+
+def of_record(record: Any, size: Size, is_nerf_synthetic: bool) -> CameraInfo:
+    """CameraInfo of any record with the reference's fields, whose photo and depth map are ready for training at a size.
+
+    A PIL image that it holds is resized. A file that `depth_path` names is a depth map with Blender's unit if the scene
+    is_nerf_synthetic, else with COLMAP's. UserError if that file is missing.
+    """
+    if type(record) is not CameraInfo:
+        names = {field.name for field in fields(CameraInfo)} - {"fx", "fy", "lens"}
+        values = {name: getattr(record, name) for name in names if hasattr(record, name)}
+        values |= {name: float(values[name]) for name in ("cx", "cy") if values.get(name) is not None}
+        if not isinstance(values.get("mask"), Mask):
+            values["mask"] = None  # an attribute of other code by that name
+        record = CameraInfo(**values)
+    if record.image is not None:
+        pixels, mask = pixels_of(record.image, size), record.mask
+        if mask and mask.meaning == TRANSPARENT:
+            pixels, mask = add_alpha(pixels, mask.decode(size)), None
+        record = replace(record, image=InMemory(pixels), mask=mask)
+    if record.depth_path and record.depth is None:
+        path, fit = Path(record.depth_path), depth_fit(record.depth_params)
+        picture_size(path)  # so that a missing file is named now
+        unit = BLENDER_UNIT if is_nerf_synthetic else COLMAP_UNIT
+        record = replace(record, depth=DepthMap(path, unit, fit.scale, fit.offset))
+    return record
+
+
+def call_of_either_form(function: Callable, newer: tuple, older: tuple) -> Any:
+    """Call a function that other code may have replaced by one of 2023, which takes fewer arguments."""
+    try:
+        inspect.signature(function).bind(*newer)
+    except TypeError:
+        return function(*older)
+    return function(*newer)

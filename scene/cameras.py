@@ -1,19 +1,27 @@
-"""Views by the reference's names: `Camera`, which has a photo and may be changed, and `MiniCam`, which has none."""
+"""Views by the reference's names: `Camera`, which has a photo and may be changed, and `MiniCam`, which has none.
 
+`utils.camera_utils` has the functions that make cameras, too; other code may replace them there (`replaced`).
+"""
+
+import argparse
 import copy
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from scene.camera_forms import NOT_MOVED, SIGNATURE, of_either_form
+from scene.camera_forms import NOT_MOVED, SIGNATURE, call_of_either_form, of_either_form, of_record
+from scene.images.sizes import training_size
 from scene.images.store import InMemory
-from scene.readers.info import CameraInfo
+from scene.readers.info import CameraInfo, photo_size
 from scene.view import ZFAR, ZNEAR, View
+from utils.graphics_utils import camera_center, fov2focal, rigid_pose
+from utils.image_utils import half
 
-__all__ = ["ZFAR", "ZNEAR", "Camera", "MiniCam"]
+__all__ = ["ZFAR", "ZNEAR", "Camera", "MiniCam", "cameraList_from_camInfos", "camera_to_JSON", "loadCam"]
 
 _OF_TARGET = frozenset(("original_image", "alpha_mask"))
 _OF_EACH_COPY = ("_assigned", "_made", "_parameters", "_buffers", "_modules")
@@ -232,3 +240,64 @@ class MiniCam:
         # On the CPU: for 16 numbers, a GPU would have to load a library of solvers, which takes a second.
         center = torch.inverse(world_view_transform.cpu())[3, :3]
         self.camera_center = center.to(world_view_transform.device)
+
+
+def replaced(name: str) -> Callable[..., Any] | None:
+    """What other code has put in the place of a function below, in utils.camera_utils or in this package; else None."""
+    modules = (vars(sys.modules[module]) for module in (__package__, "utils.camera_utils") if module in sys.modules)
+    theirs = (module[name] for module in modules if module.get(name, globals()[name]) is not globals()[name])
+    return next(theirs, None)
+
+
+def loadCam(
+    args: argparse.Namespace,
+    id: int,
+    cam_info: CameraInfo,
+    resolution_scale: float,
+    is_nerf_synthetic: bool = False,
+    is_test_dataset: bool = False,
+) -> Camera:
+    """Camera at training size (args.resolution, divided by resolution_scale), whose photo is decoded on first use.
+
+    args: resolution, data_device and train_test_exp count. id: uid of the camera. cam_info: a CameraInfo, or any record
+    with the reference's fields. is_nerf_synthetic: depth maps named by `depth_path` have Blender's unit.
+    is_test_dataset: the view is in the test list. UserError for a photo or depth map that cannot be read.
+    """
+    size = training_size(*photo_size(cam_info), args.resolution, resolution_scale)
+    halved = getattr(args, "train_test_exp", False) and getattr(cam_info, "is_test", False)
+    columns = half(size[0], is_test_dataset) if halved else None
+    return Camera(of_record(cam_info, size, is_nerf_synthetic), size, id, columns, data_device=args.data_device)
+
+
+def cameraList_from_camInfos(
+    cam_infos: Sequence[CameraInfo],
+    resolution_scale: float,
+    args: argparse.Namespace,
+    is_nerf_synthetic: bool = False,
+    is_test_dataset: bool = False,
+) -> list[Camera]:
+    """`loadCam` of each view, or what other code has put in its place; their uids count from 0."""
+    load, of_2024 = replaced("loadCam") or loadCam, (is_nerf_synthetic, is_test_dataset)
+    older = [(args, uid, info, resolution_scale) for uid, info in enumerate(cam_infos)]
+    return [call_of_either_form(load, (*arguments, *of_2024), arguments) for arguments in older]
+
+
+def camera_to_JSON(id: int, camera: CameraInfo) -> dict[str, object]:
+    """Entry of `cameras.json`, keys in the order that viewers expect: camera-to-world pose, full-size intrinsics.
+
+    camera: any object with R, T, FovX, FovY, width, height and image_name; its fx and fy count if it has them.
+    """
+    focal = {"fy": ("FovY", "height"), "fx": ("FovX", "width")}
+    R, T = rigid_pose(camera.R, camera.T, camera.image_name)
+    return {
+        "id": id,
+        "img_name": camera.image_name,
+        "width": camera.width,
+        "height": camera.height,
+        "position": camera_center(R, T).tolist(),
+        "rotation": [row.tolist() for row in np.asarray(R)],
+        **{
+            name: getattr(camera, name, None) or fov2focal(getattr(camera, fov), getattr(camera, size))
+            for name, (fov, size) in focal.items()
+        },
+    }

@@ -2,17 +2,18 @@
 
 import argparse
 import json
+import os
 import random
 import shutil
-import sys
 from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from scene.cameras import Camera
+from scene.camera_forms import call_of_either_form
+from scene.cameras import Camera, camera_to_JSON, cameraList_from_camInfos, replaced
 from scene.dataset_readers import read_scene, replaced_reader, scene_by
 from scene.images.masks import MaskOptions, check_masks
 from scene.images.store import ImageStore, Picture, image_device
@@ -20,14 +21,31 @@ from scene.readers.enlargement import enlargement
 from scene.readers.info import CameraInfo, SceneInfo, photo_size
 from scene.readers.point_cloud import write_point_cloud
 from scene.readers.scene_folder import kind_of
-from scene.reference_models import SceneGaussians, call_of_either_form
 from scene.saved_iterations import find_iteration, saved_ply
 from splatting.distributed.ranks import ALONE, Ranks
 from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json
 from splatting.host.machine import compute_device
 from splatting.part import Part
 from splatting.registry import chosen
+from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError, atomic_write
+
+
+class SceneGaussians(Protocol):
+    """The part of GaussianModel that a scene needs, or the reference's class of that name.
+
+    A scene sets `world_offset` and `enlargement`, and calls `load_exposures(folder, cam_infos)` and
+    `save_exposures(folder)` with train_test_exp if there are such methods. Else it calls `load_ply(path, True)`, and
+    writes exposure.json from `exposure_mapping` and `get_exposure_from_name(name)`, as the reference does.
+    """
+
+    def create_from_pcd(
+        self, pcd: BasicPointCloud, cam_infos: Sequence[CameraInfo], spatial_lr_scale: float
+    ) -> None: ...
+
+    def load_ply(self, path: str) -> None: ...
+
+    def save_ply(self, path: str) -> None: ...
 
 
 class Scene:
@@ -172,8 +190,8 @@ class Scene:
         else:
             colors = np.round(info.point_cloud.colors * 255).astype(np.uint8)
             write_point_cloud(folder / "input.ply", info.point_cloud.points, colors)
-        views = enumerate([*info.test_cameras, *info.train_cameras])
-        entries = [_named("camera_to_JSON")(i, camera) for i, camera in views]
+        entry = replaced("camera_to_JSON") or camera_to_JSON
+        entries = [entry(i, camera) for i, camera in enumerate([*info.test_cameras, *info.train_cameras])]
         with atomic_write(folder / "cameras.json") as path:
             path.write_text(json.dumps(entries, allow_nan=False), encoding="utf-8")
 
@@ -181,7 +199,8 @@ class Scene:
         self, args: argparse.Namespace, scale: float, shuffle: bool, views: Sequence[CameraInfo], test: bool
     ) -> list[Camera]:
         """Cameras of views, which are held out (test) or train, in the same order at every scale."""
-        cameras = list(_named("cameraList_from_camInfos")(views, scale, args, self.info.is_nerf_synthetic, test))
+        cameras_of = replaced("cameraList_from_camInfos") or cameraList_from_camInfos
+        cameras = list(cameras_of(views, scale, args, self.info.is_nerf_synthetic, test))
         ours = [(camera, view) for camera, view in zip(cameras, views, strict=False) if isinstance(camera, Camera)]
         for camera, _ in ours:
             camera.images = self.images
@@ -199,11 +218,6 @@ class Scene:
     def _pictures(self, cameras: Iterable[Camera]) -> list[Picture]:
         """Those of our cameras; cameras of other classes have none."""
         return [p for camera in cameras if getattr(camera, "images", None) is self.images for p in camera.undecoded]
-
-
-def _named(name: str) -> Any:
-    """A name of the package, as code of others may replace it there or in utils.camera_utils."""
-    return getattr(sys.modules[__package__], name)
 
 
 def _given(args: argparse.Namespace, **names: str) -> dict[str, Any]:
@@ -225,3 +239,21 @@ def _refuse_dataset_folder(args: argparse.Namespace) -> None:
         raise UserError(
             f"a model in {args.model_path} would overwrite the scene's {found[0]}; name another folder with -m"
         )
+
+
+def load_exposures(scene: Any) -> None:
+    """Load the exposures of a scene's training views, whose PLY is loaded; the reference's model reads both at once."""
+    if load := getattr(scene.gaussians, "load_exposures", None):
+        load(scene.model_path, scene.info.train_cameras)
+    else:
+        scene.gaussians.load_ply(str(saved_ply(scene.model_path, scene.loaded_iter)), True)
+
+
+def save_exposures(gaussians: SceneGaussians, folder: str | os.PathLike) -> None:
+    """Write exposure.json into a model folder, also for a model that cannot do so itself."""
+    if save := getattr(gaussians, "save_exposures", None):
+        save(folder)
+    elif names := list(getattr(gaussians, "exposure_mapping", ())):
+        table = {name: gaussians.get_exposure_from_name(name).tolist() for name in names}
+        with atomic_write(Path(folder) / "exposure.json") as path:
+            path.write_text(json.dumps(table, indent=2), encoding="utf-8")

@@ -28,7 +28,7 @@ KNOWN = {  # words in files that are options of a part, and mean something else 
     ("no_curve", "splatting/diagnosis/advice.py"),  # of a short training
     ("schedule", "scene/gaussian_model.py"),  # that of exposures' learning rate
     ("schedule", "scene/gaussians/reference_names.py"),
-    ("train_test_exp", "utils/camera_utils.py"),  # what functions of the reference take
+    ("train_test_exp", "scene/cameras.py"),  # what functions of the reference take
     *((f"exposure_lr_{end}", "scene/gaussians/exposure.py") for end in ("init", "final", "delay_steps", "delay_mult")),
     *((f"exposure_lr_{end}", "full_eval.py") for end in ("init", "final", "delay_steps", "delay_mult")),  # commands
     ("train_test_exp", "full_eval.py"),

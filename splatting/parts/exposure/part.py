@@ -71,11 +71,11 @@ class Exposure(Appearance):
             print(f"{run.start} has no exposures; all photos start without a correction")
 
     def save(self, scene: "Scene") -> None:
-        from scene.reference_models import save_exposures
+        from scene.scene import save_exposures
 
         save_exposures(scene.gaussians, scene.model_path)
 
     def load(self, scene: "Scene", args: argparse.Namespace) -> None:
-        from scene.reference_models import load_exposures
+        from scene.scene import load_exposures
 
         load_exposures(scene)
