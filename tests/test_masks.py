@@ -22,8 +22,8 @@ import train
 from scene import Scene
 from scene.check.photos import hints
 from scene.images.decode import decode
+from scene.images.find import names_below
 from scene.images.masks import IGNORE, TRANSPARENT, Mask, MaskOptions, find_masks
-from scene.images.side_files import names_below
 from scene.readers.photos import _check_mask
 from splatting.training.watch import MaskWatch
 from utils.image_utils import pixels_that_count

@@ -10,7 +10,7 @@ import pytest
 from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 
-from scene.images.place import _down, _gps, read_place
+from scene.images.exif import _down, _gps, read_place
 from splatting.camera_paths.poses import facing
 from splatting.files.similarity import Similarity, read_orientation
 from splatting.sfm.georeference import level_up

@@ -1,12 +1,22 @@
-"""The lens that took a photo, as the photo's EXIF data tell it."""
+"""What a photo's EXIF data tell: the lens that took it, where it was taken, and which way was down."""
 
 import math
+import struct
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from PIL import ExifTags
 
 from splatting.files.image_files import UNREADABLE, open_image
+
+_APPLE = b"Apple iOS\0"
+_ACCELERATION = 8  # tag of Apple's notes: three signed rationals (ExifTool, "Apple Tags", AccelerationVector)
+_SIGNED_RATIONAL = 10
+_BELOW = ("\x01", "\x03", "1", "3")  # references of an altitude below the sea, or below the ellipsoid (EXIF 3.0)
+# What turns (right, down) of the stored pixels to those of the upright photo, by EXIF orientation.
+_UPRIGHT = {1: (1, 0, 0, 1), 3: (-1, 0, 0, -1), 6: (0, -1, 1, 0), 8: (0, 1, -1, 0)}
 
 
 class Lens(NamedTuple):
@@ -76,3 +86,110 @@ def _number(value: Any) -> float:
     except (TypeError, ValueError, ArithmeticError):
         return 0.0
     return round(number, 2) if math.isfinite(number) and number > 0 else 0.0
+
+
+class PhotoPlace(NamedTuple):
+    """gps: latitude and longitude in degrees, height in metres (NaN: unknown), or None. down: (3,) of length 1 in the
+    axes of the upright photo's camera (x right, y down, z forward), or None."""
+
+    gps: tuple[float, float, float] | None = None
+    down: np.ndarray | None = None
+
+
+def read_place(photo: Path) -> PhotoPlace:
+    """Read both from a photo's header; what is missing or damaged is None."""
+    try:
+        with open_image(photo) as image:
+            exif = image.getexif()
+            gps, more = exif.get_ifd(ExifTags.IFD.GPSInfo), exif.get_ifd(ExifTags.IFD.Exif)
+    except UNREADABLE:
+        return PhotoPlace()
+    note = more.get(ExifTags.Base.MakerNote)
+    down = _down(note, exif.get(ExifTags.Base.Orientation, 1)) if isinstance(note, bytes) else None
+    return PhotoPlace(_gps(gps), down)
+
+
+def _gps(tags: Mapping[int, Any]) -> tuple[float, float, float] | None:
+    tag = ExifTags.GPS
+    try:
+        latitude = _degrees(tags[tag.GPSLatitude], tags.get(tag.GPSLatitudeRef, ""), "NS")
+        longitude = _degrees(tags[tag.GPSLongitude], tags.get(tag.GPSLongitudeRef, ""), "EW")
+    except (KeyError, TypeError, ValueError):
+        return None
+    if 180 < longitude <= 360:  # counted to the east alone
+        longitude -= 360
+    height, below = _metres(tags.get(tag.GPSAltitude)), _reference(tags.get(tag.GPSAltitudeRef)) in _BELOW
+    sound = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude or longitude)
+    return (latitude, longitude, -abs(height) if below else height) if sound else None
+
+
+def _metres(value: Any) -> float:
+    """A height, NaN if it is missing or damaged."""
+    try:
+        height = float(value[0] if isinstance(value, tuple) else value)
+    except (TypeError, ValueError, LookupError):
+        return math.nan
+    return height if math.isfinite(height) else math.nan
+
+
+def _degrees(parts: Any, reference: Any, letters: str) -> float:
+    """Degrees of one to three parts: degrees, minutes, seconds. ValueError if they are damaged.
+
+    letters: what the reference begins with where they are positive, and negative. Without one, the sign counts; another
+    letter is damage, as O is east in some languages and west in others.
+    """
+    values = [*map(float, parts if isinstance(parts, tuple) else [parts])]
+    while len(values) > 1 and math.isnan(values[-1]):  # 0/0, as of seconds that minutes tell
+        values.pop()
+    if not 1 <= len(values) <= 3 or not all(map(math.isfinite, values)):
+        raise ValueError(f"{parts} are no degrees")
+    angle = sum(abs(value) / 60**place for place, value in enumerate(values))
+    letter = _reference(reference)[:1]
+    if letter.isalpha() and letter not in letters:
+        raise ValueError(f"{reference} is no direction")
+    negative = letter == letters[1] if letter and letter in letters else min(values) < 0
+    return -angle if negative else angle
+
+
+def _reference(value: Any) -> str:
+    """A reference, which some programs write as bytes, as a number, or with blanks, as text."""
+    text = value.decode("latin-1") if isinstance(value, bytes) else str(value)
+    return text.strip("\0\t\r\n ").upper()
+
+
+def _down(note: bytes, orientation: Any) -> np.ndarray | None:
+    """Down by an Apple note: acceleration in the device's axes, x right, y to its top, z out of its screen.
+
+    A phone that lies on its back has (0, 0, -1). Its rear camera's stored pixels have their right at the device's
+    bottom, and their lower side at its left.
+    """
+    vector = _acceleration(note)
+    if vector is None or orientation not in _UPRIGHT:
+        return None
+    length = float(np.linalg.norm(vector))
+    if not 0.8 < length < 1.2:  # shaken, or damaged
+        return None
+    x, y, z = vector / length
+    right, low = -y, -x
+    a, b, c, d = _UPRIGHT[orientation]
+    return np.array([a * right + b * low, c * right + d * low, -z])
+
+
+def _acceleration(note: bytes) -> np.ndarray | None:
+    """The vector (3,) of an Apple note, a big-endian directory whose offsets count from its first byte."""
+    if not note.startswith(_APPLE) or note[12:14] != b"MM":
+        return None
+    try:
+        for entry in range(*_entries(note)):
+            tag, kind, count, offset = struct.unpack_from(">HHII", note, entry)
+            if (tag, kind, count) == (_ACCELERATION, _SIGNED_RATIONAL, 3):
+                values = np.array(struct.unpack_from(">6i", note, offset), np.float64).reshape(3, 2)
+                return values[:, 0] / values[:, 1] if values[:, 1].all() else None
+    except struct.error:
+        pass
+    return None
+
+
+def _entries(note: bytes) -> tuple[int, int, int]:
+    (count,) = struct.unpack_from(">H", note, 14)
+    return 16, 16 + 12 * count, 12

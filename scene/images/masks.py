@@ -19,7 +19,7 @@ from PIL import Image, ImageFilter
 from torch import Tensor
 
 from scene.images.decode import decode, grey_values, may_be_transparent, picture_size
-from scene.images.side_files import SideFiles
+from scene.images.find import SideFiles
 from splatting.files.image_files import SUFFIXES
 from splatting.host.listing import some
 from utils.system_utils import UserError

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from scene.images.decode import picture_size
-from scene.images.side_files import SideFiles
+from scene.images.find import SideFiles
 from scene.readers.colmap import find_model
 from scene.readers.info import CameraInfo, SceneInfo
 from scene.readers.photos import undistorted_folder

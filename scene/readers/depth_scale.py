@@ -7,7 +7,7 @@ import numpy as np
 from diff_gaussian_rasterization.lens import MODELS
 
 from scene.colmap_loader import Camera, Image, Points, qvec2rotmat
-from scene.images.side_files import SideFiles
+from scene.images.find import SideFiles
 from scene.readers.colmap import AGAIN, ColmapModel, find_model, read_model_of_kind
 from scene.readers.depth_maps import METRIC, PARAMS, SCALE, STEP, Metric, inverses, map_names, read_values, sample
 from splatting.host.progress import Bar

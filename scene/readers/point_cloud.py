@@ -1,8 +1,17 @@
-"""Coloured point clouds in files: PLY, npz and text are read, PLY is written."""
+"""Coloured point clouds in files: PLY, npz and text are read, PLY is written.
+
+Text has its columns by the names of a header, else by their number. A header is a first line of names, also behind //
+or #, as CloudCompare writes it; a count of points may stand before or behind it (.pts). Without a header the columns
+are x y z and red green blue; with one more, an intensity before the colours in files with a count, else any value
+behind them; with three more, normals before or behind the colours. Numbers are split by spaces, tabs, commas or
+semicolons; with semicolons a comma is a decimal point.
+"""
 
 import io
 import os
+import re
 import sys
+import warnings
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -11,8 +20,7 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from scene.readers.point_text import read_text
-from splatting.files.plain_files import check_packed_rows
+from splatting.files.plain_files import check_packed_rows, encoding_of
 from splatting.files.ply_header import read_elements
 from utils.graphics_utils import BasicPointCloud
 from utils.sh_utils import SH2RGB
@@ -29,6 +37,8 @@ _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
 _SH = ("f_dc_0", "f_dc_1", "f_dc_2")
 _COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"), _SH)
+_TEXT_COLORS = (("r", "g", "b"), ("rf", "gf", "bf"), ("red", "green", "blue"))
+_UNIT = 0.01  # departure of a normal's length from 1 in rounded files of text
 _GREY = 127 / 255
 
 
@@ -41,7 +51,7 @@ def read_point_cloud(path: Path) -> BasicPointCloud:
     """Points (float64) with colours (float32) and normals (0 where missing) of a file, whose content decides its kind.
 
     PLY: x y z and red green blue by their usual names. npz: `points` or `xyz` (N,3), `colors` or `rgb` (N,3). Text: as
-    in scene/readers/point_text.py. Colours range to 255, or of floats to 1 if none is above 1, or of integers to 65,535
+    the header of this module says. Colours range to 255, or of floats to 1 if none is above 1, or of integers to 65,535
     if one is above 255. Points without colours are grey, and a message says so.
     UserError for a file that is missing, of another kind, or has points that are not finite.
     """
@@ -73,7 +83,7 @@ def _read(path: Path) -> BasicPointCloud:
     if is_ply(path) or path.suffix.lower() == ".ply":
         points, colors, normals = _read_ply(path)
     else:
-        points, colors = _read_npz(path) if _begins_with(path, b"PK") else read_text(path)
+        points, colors = _read_npz(path) if _begins_with(path, b"PK") else _read_text(path)
         normals = np.zeros_like(points, dtype=np.float32)
     check_finite(points, path)
     if colors is None:
@@ -173,6 +183,69 @@ def _read_array(arrays: np.lib.npyio.NpzFile, name: str, size: int) -> np.ndarra
         raise ValueError(_NEEDS)
     check_packed_rows(shape[0], size)
     return arrays[name]
+
+
+def _read_text(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Points and colours (N,3) float64 as the file has them; None where it has no colours. UserError for other text."""
+    try:
+        lines = path.read_text(encoding=encoding_of(path), errors="replace").splitlines()
+        first, header, counted = _text_header(lines)
+        lines = lines[first:]
+        if any(";" in line for line in lines[:1]):
+            lines = [line.replace(",", ".").replace(";", " ") for line in lines]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # about an empty file
+            table = np.loadtxt([line.replace(",", " ") for line in lines], dtype=np.float64, ndmin=2)
+        if not table.size:
+            raise ValueError("no numbers")
+        points, colors = _columns_of_text(table, header, counted or path.suffix.lower() == ".pts")
+    except (ValueError, OSError, MemoryError) as error:
+        raise UserError(
+            f"{path} is neither PLY nor npz, and not text with x y z or x y z red green blue a line ({error}); export "
+            "the point cloud again"
+        ) from error
+    return table[:, points], None if colors is None else table[:, colors]
+
+
+def _text_header(lines: list[str]) -> tuple[int, list[str], bool]:
+    """The index of the first line of numbers, the names of columns before it, and whether a count of points is."""
+    header, counted = [], False
+    for index, line in enumerate(lines):
+        words = re.split(r"[\s,;]+", line.strip().lstrip("/#").strip().lower())
+        if line.lstrip()[:1].isalpha() or line.lstrip().startswith(("#", "//", '"')):
+            words = [word.strip('"').removeprefix("diffuse_") for word in words]
+            header = words if set(words) >= set(_POSITION) else header
+        elif len(words) == 1 and words[0].isdecimal() and not counted:
+            counted = True
+        elif words != [""]:
+            return index, header, counted
+    return len(lines), header, counted
+
+
+def _columns_of_text(table: np.ndarray, header: list[str], counted: bool) -> tuple[list[int], list[int] | slice | None]:
+    """The columns of positions, and those of colours, None without any. ValueError for an unknown number of them."""
+    count = table.shape[1]
+    if len(header) == count:
+        named = next((names for names in _TEXT_COLORS if set(header) >= set(names)), None)
+        return [header.index(name) for name in _POSITION], named and [header.index(name) for name in named]
+    behind, last = slice(3, 6), slice(count - 3, count)
+    if count in (3, 4) or (count == 6 and _are_normals(table[:, behind])):
+        return [0, 1, 2], None
+    if count == 6:
+        return [0, 1, 2], behind
+    if count == 9:
+        return [0, 1, 2], last if _are_normals(table[:, behind]) else behind
+    if count == 7:
+        return [0, 1, 2], last if counted or not _are_colors(table[:, behind]) else behind
+    raise ValueError(f"{count} columns, whose first line does not name them")
+
+
+def _are_normals(values: np.ndarray) -> bool:
+    return bool((np.abs(np.linalg.norm(values, axis=1) - 1) < _UNIT).all() and (values % 1).any() and values.min() < 0)
+
+
+def _are_colors(values: np.ndarray) -> bool:
+    return bool(values.min() >= 0 and (values.max() <= 1 or (values.max() <= 255 and not (values % 1).any())))
 
 
 def check_finite(points: np.ndarray, path: Path) -> None:

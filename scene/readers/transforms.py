@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from scene.images.decode import picture_sizes
-from scene.images.find import FileIndex, find_images, find_listed
+from scene.images.find import FileIndex, find_images, find_listed, identity
 from scene.images.lens import Lens
 from scene.images.masks import NO_MASKS, Mask, MaskOptions, find_masks
-from scene.images.side_files import identity
 from scene.readers.info import CameraInfo, Posed, SceneInfo, held_out, split_by_order
 from scene.readers.metashape import read_metashape
 from scene.readers.phone_scans import read_polycam, read_record3d

@@ -12,8 +12,8 @@ from tqdm.contrib.concurrent import thread_map
 
 from scene.images.damage import equal_share, said_of
 from scene.images.decode import picture_size
+from scene.images.find import SideFiles
 from scene.images.masks import Mask, mask_names
-from scene.images.side_files import SideFiles
 from splatting.files.color_profiles import has_other_colors, in_srgb
 from splatting.files.image_files import SUFFIXES, UNREADABLE, open_image
 from splatting.host.machine import threads

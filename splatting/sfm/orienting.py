@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from scene.images.place import PhotoPlace, read_place
+from scene.images.exif import PhotoPlace, read_place
 from scene.readers.colmap import read_model
 from splatting.files.json_files import write_json
 from splatting.files.similarity import PLACE, read_orientation

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from scene.images.side_files import names_below
+from scene.images.find import names_below
 from splatting.evaluation.renders import WIDEST, WORST, sheet
 from splatting.files.image_files import dimmed, to_bytes
 from splatting.host.listing import some
