@@ -21,13 +21,21 @@ from scene.colmap_loader import Camera, Image
 from scene.images.masks import NO_MASKS, MaskOptions
 from scene.readers.colmap import colmap_camera, read_colmap
 from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, with_depth_maps, with_map
-from scene.readers.info import HOLD, CameraInfo, SceneInfo, camera_centers, normalization, scene_extent
+from scene.readers.info import (
+    HOLD,
+    CameraInfo,
+    SceneInfo,
+    camera_centers,
+    local,
+    normalization,
+    scene_extent,
+    world_offset,
+)
 from scene.readers.photos import finished
 from scene.readers.point_cloud import fetchPly, storePly, write_point_cloud
 from scene.readers.scene_folder import BLENDER, COLMAP, NERFSTUDIO, kind_of
 from scene.readers.start_cloud import SFM, StartOptions
 from scene.readers.transforms import read_blender, read_frames, read_nerfstudio
-from scene.readers.world_offset import local, world_offset
 from splatting.files.folders import cache_folder
 from splatting.files.image_files import SUFFIXES
 from splatting.files.plain_files import plain_text
@@ -59,7 +67,7 @@ def read_scene(
     images: folder of the photos (COLMAP only). hold_out: keep a test set apart, else all views train.
     init_pcd_path: points, or a file of them, to start from instead of the dataset's own. Without one, init_type
     decides: "sfm" (the dataset's points) or "random". want_cloud: False reads no points, for a model that exists
-    already. offset: (3,) of that model's frame (scene/readers/world_offset.py); None: computed for this scene.
+    already. offset: (3,) of that model's frame (scene/readers/info.py); None: computed for this scene.
     kind: of the folder (`kind_of`), where it is known.
     native: take photos of distorting lenses as they are, where the rasterizer knows the camera model. Others are
     undistorted into the user's cache folder; nothing else is written.

@@ -3,7 +3,7 @@
 python -m scene.export_world MODEL OUT.ply [--iteration N]
 
 Meant for scenes whose coordinates are much larger than their extent: they are trained in a local frame
-(scene/readers/world_offset.py). CloudCompare and plyfile read the doubles; programs that read x, y, z as float lose the
+(scene/readers/info.py). CloudCompare and plyfile read the doubles; programs that read x, y, z as float lose the
 decimals again.
 """
 

@@ -25,8 +25,7 @@ from scene.images.damage import said_of
 from scene.images.decode import decode
 from scene.images.masks import MaskOptions
 from scene.readers.depth_maps import with_depth_maps
-from scene.readers.info import CameraInfo, SceneInfo, exposure_names
-from scene.readers.world_offset import local, world_offset
+from scene.readers.info import CameraInfo, SceneInfo, exposure_names, local, world_offset
 from splatting.demo.make_scene import write_scene
 from splatting.demo.objects import demo_scene
 from splatting.demo.tracer import FISHEYE, PANORAMA, ring_views

@@ -18,7 +18,7 @@ _SCALED = 1e6  # largest scale, and 1 over the smallest; beyond lie damaged file
 class BasicPointCloud(NamedTuple):
     """Coloured points: points (N,3), world units; colors (N,3) float32 in [0,1]; normals (N,3) float32.
 
-    Points are float64 in the world, and float32 in the frame of the training (scene/readers/world_offset.py).
+    Points are float64 in the world, and float32 in the frame of the training (scene/readers/info.py).
     """
 
     points: np.ndarray

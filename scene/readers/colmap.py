@@ -77,20 +77,23 @@ def colmap_camera(
     photo: Image, camera: Camera, path: Path, mask: Mask | None = None, ignore_alpha: bool = False, native: bool = False
 ) -> CameraInfo:
     """The view of a photo that COLMAP registered. native: as for `camera_info`."""
-    _, R, T, lens = _posed(photo, camera)
-    return camera_info(camera.id, photo.name, path, lens((0, 0)), R, T, mask, ignore_alpha, native)
+    return camera_info(camera.id, photo.name, path, _lens(camera), *_pose(photo), mask, ignore_alpha, native)
 
 
 def read_poses(folder: Path) -> list[Posed]:
     """The poses and lenses of a model's photos, whose points may be missing. UserError where it cannot be read."""
     model = read_model(folder)
-    return [_posed(photo, model.cameras[photo.camera_id]) for photo in model.images]
+    lenses = {number: _lens(camera) for number, camera in model.cameras.items()}
+    return [Posed(photo.name, *_pose(photo), lambda _, lens=lenses[photo.camera_id]: lens) for photo in model.images]
 
 
-def _posed(photo: Image, camera: Camera) -> Posed:
-    lens = Lens(camera.model, tuple(map(float, camera.params)), camera.width, camera.height)
-    rotation, translation = qvec2rotmat(photo.qvec).T.copy(), np.asarray(photo.tvec, dtype=np.float64)
-    return Posed(photo.name, rotation, translation, lambda _: lens)
+def _lens(camera: Camera) -> Lens:
+    return Lens(camera.model, tuple(map(float, camera.params)), camera.width, camera.height)
+
+
+def _pose(photo: Image) -> tuple[np.ndarray, np.ndarray]:
+    """Camera-to-world rotation (3,3) and world-to-camera translation (3,)."""
+    return qvec2rotmat(photo.qvec).T.copy(), np.asarray(photo.tvec, dtype=np.float64)
 
 
 def _own_cloud(model_folder: Path, model: ColmapModel) -> StartCloud | None:

@@ -1,4 +1,9 @@
-"""Plain records that readers of datasets return. Nothing here decodes photos, uses a GPU or writes a file."""
+"""Plain records that readers of datasets return, and the size and frame of a scene.
+
+Nothing here decodes photos, uses a GPU or writes a file. float32 has steps of 0.06 at 1e6: a scene whose coordinates
+are large compared with its extent, as in map projections (UTM), is trained as world minus an offset, which is computed
+and subtracted in double.
+"""
 
 import math
 import os
@@ -23,6 +28,9 @@ NEAREST = 0.2  # depth from which Gaussians are drawn (the rasterizer's rule)
 APART = 10.0  # median distances from the cameras' median, beyond which a camera stands apart
 NARROW = 1e-2  # of the depth; with a smaller E, removing Gaussians wider than 0.1 E would leave only pixel-sized ones
 ROUNDING = 1e-9  # distances below this part of the scene are rounding errors
+# Extents from the origin. There a step of float32 is a hundred-thousandth of the extent, many times the moves of
+# positions in the last iterations (1.6e-6 extents and less).
+FARTHEST = 100.0
 
 
 class _LikeNamedTuple:
@@ -180,7 +188,7 @@ class SceneInfo(_LikeNamedTuple):
 
     nerf_normalization: "radius", the extent E in world units, and "translate" (3,), minus the cameras' centre.
     is_nerf_synthetic: a Blender scene. offset (3,) float64: the world's coordinates of the frame's origin
-    (scene/readers/world_offset.py); zero by default.
+    (`world_offset`); zero by default.
     """
 
     point_cloud: BasicPointCloud | None
@@ -327,3 +335,39 @@ def standing_apart(centers: np.ndarray) -> np.ndarray:
     median = float(np.median(distances))
     # If most cameras are in one place, up to rounding, the others are no mistake.
     return distances > (APART * median if median > ROUNDING * distances.max() else np.inf)
+
+
+def world_offset(info: SceneInfo) -> np.ndarray:
+    """Offset (3,) float64: round decimal numbers near a scene that is far from its origin, else zero."""
+    cameras = info.train_cameras + info.test_cameras
+    middle = np.median([camera.center for camera in cameras], axis=0)
+    return origin_near(middle, scene_extent(cameras, None if info.point_cloud is None else info.point_cloud.points))
+
+
+def origin_near(middle: np.ndarray, extent: float) -> np.ndarray:
+    """Round decimal numbers (3,) near the middle of something of an extent, zero if that is not far away."""
+    if np.abs(middle).max() <= FARTHEST * extent:
+        return np.zeros(3)
+    step = 10.0 ** np.ceil(np.log10(10 * extent))
+    return np.round(middle / step) * step
+
+
+def local(info: SceneInfo, offset: np.ndarray) -> SceneInfo:
+    """The scene in the frame whose origin is `offset` (3,) of the world; its points become float32."""
+    moved = bool(np.any(offset))
+    train, test = info.train_cameras, info.test_cameras
+    if moved:
+        train, test = ([_moved(camera, offset) for camera in cameras] for cameras in (train, test))
+    cloud, points = info.point_cloud, None
+    if cloud is not None:
+        with np.errstate(over="ignore"):  # the points become infinite, which start_rows refuses
+            points = (cloud.points - offset if moved else cloud.points).astype(np.float32)
+        cloud = BasicPointCloud(points, cloud.colors, cloud.normals)
+    size = normalization(train, points)
+    return replace(
+        info, point_cloud=cloud, train_cameras=train, test_cameras=test, nerf_normalization=size, offset=offset
+    )
+
+
+def _moved(camera: CameraInfo, offset: np.ndarray) -> CameraInfo:
+    return replace(camera, T=camera.T + camera.R.T @ offset)

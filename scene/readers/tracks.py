@@ -45,7 +45,7 @@ class Track(NamedTuple):
 def read_tracks(scene: str | os.PathLike, views: Sequence[CameraInfo], offset: np.ndarray) -> list[Track | None]:
     """The tracks of views; None for a view of fewer than FEWEST points, and in scenes that are not COLMAP's.
 
-    offset (3,): of the training's frame (scene/readers/world_offset.py). UserError where the model cannot be read.
+    offset (3,): of the training's frame (scene/readers/info.py). UserError where the model cannot be read.
     """
     if kind_of(scene) != COLMAP:
         return [None] * len(views)

@@ -23,7 +23,7 @@ from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
 from scene.gaussians.ply import frame_comments, read_ply, read_vertices, write_ply
-from scene.readers.world_offset import origin_near
+from scene.readers.info import origin_near
 from scene.splats.packing import morton_order, pack, smallest_three, spread, unpack, whole_quaternions
 from scene.splats.splats import Splats, base_colors, logits, opacities, selected
 from splatting.files.json_files import LARGEST_OFFSET
