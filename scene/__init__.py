@@ -33,8 +33,6 @@ _HOMES = {
     "SceneGaussians": "scene.scene",
     "cameraList_from_camInfos": "utils.camera_utils",
     "camera_to_JSON": "utils.camera_utils",
-    "find_iteration": "scene.saved_iterations",
-    "saved_ply": "scene.saved_iterations",
     "sceneLoadTypeCallbacks": "scene.dataset_readers",
     "searchForMaxIteration": "utils.system_utils",
 }

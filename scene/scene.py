@@ -89,10 +89,14 @@ class Scene:
             {scale: self._cameras(args, scale, shuffle, views, test) for scale in resolution_scales}
             for views, test in ((self.info.train_cameras, False), (self.info.test_cameras, True))
         )
-        self._plan_images()
+        trained, tested = (self._pictures(chain(*of.values())) for of in (self.train_cameras, self.test_cameras))
+        self.images.plan(trained, tested)
 
         gaussians.world_offset = tuple(self.info.offset.tolist())
-        gaussians.enlargement = self._enlargement()
+        if self.loaded_iter is None:
+            gaussians.enlargement = enlargement(self.info)
+        else:
+            gaussians.enlargement = read_model_json(self.model_path).get(ENLARGEMENT, 1.0)
         if not start:
             return
         if self.loaded_iter is not None:
@@ -104,38 +108,28 @@ class Scene:
             self.write_inputs()
 
     def _read(self, args: argparse.Namespace) -> SceneInfo:
-        """The dataset as the options want it."""
+        """The dataset as the options and the parts want it."""
         fresh = self.loaded_iter is None
         if fresh:
             _refuse_dataset_folder(args)
         kind = kind_of(args.source_path)
         if read := replaced_reader(kind):
-            return self._changed(scene_by(read, kind, args), args, fresh)
-        masks = MaskOptions(**_given(args, folder="masks", invert="invert_masks", meaning="mask_meaning"))
-        info = read_scene(
-            args.source_path,
-            args.images,
-            args.eval,
-            want_cloud=fresh,
-            masks=masks,
-            offset=None if fresh else read_model_json(self.model_path).get(OFFSET, (0, 0, 0)),
-            kind=kind,
-            native=getattr(args, "lenses", "") == "native",
-            **_given(args, init_pcd_path="init_pcd_path", init_type="init_type"),
-        )
-        if fresh:
-            views = info.train_cameras + info.test_cameras
-            check_masks([(view.image_path, view.mask) for view in views], masks)
-        return self._changed(info, args, fresh)
-
-    def _enlargement(self) -> float:
-        """Of the dataset, or of the model that exists already."""
-        if self.loaded_iter is None:
-            return enlargement(self.info)
-        return read_model_json(self.model_path).get(ENLARGEMENT, 1.0)
-
-    def _changed(self, info: SceneInfo, args: argparse.Namespace, fresh: bool) -> SceneInfo:
-        """The dataset as the parts want it."""
+            info = scene_by(read, kind, args)
+        else:
+            masks = MaskOptions(**_given(args, folder="masks", invert="invert_masks", meaning="mask_meaning"))
+            info = read_scene(
+                args.source_path,
+                args.images,
+                args.eval,
+                want_cloud=fresh,
+                masks=masks,
+                offset=None if fresh else read_model_json(self.model_path).get(OFFSET, (0, 0, 0)),
+                kind=kind,
+                native=getattr(args, "lenses", "") == "native",
+                **_given(args, init_pcd_path="init_pcd_path", init_type="init_type"),
+            )
+            if fresh:
+                check_masks([(view.image_path, view.mask) for view in info.train_cameras + info.test_cameras], masks)
         self.given_test_views = info.test_cameras
         for part in self.parts:
             info = part.dataset(info, args, fresh)
@@ -210,10 +204,6 @@ class Scene:
             # A generator of its own: a resumed run must get the same order, whatever drew random numbers before.
             random.Random(0).shuffle(cameras)
         return cameras
-
-    def _plan_images(self) -> None:
-        trained, tested = (self._pictures(chain(*of.values())) for of in (self.train_cameras, self.test_cameras))
-        self.images.plan(trained, tested)
 
     def _pictures(self, cameras: Iterable[Camera]) -> list[Picture]:
         """Those of our cameras; cameras of other classes have none."""
