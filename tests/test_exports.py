@@ -32,6 +32,7 @@ from scene.splats.splats import (
     half_turned,
     logits,
     opacities,
+    rotated,
     selected,
     tidy,
     used_sh_degree,
@@ -39,7 +40,6 @@ from scene.splats.splats import (
     within_box,
 )
 from scene.splats.spz import packed_spz_2
-from scene.splats.turning import turned
 from scene.with_splats import model_of, splats_of
 from splatting.exports import scene_formats
 from splatting.exports.formats import FORMATS, format_of
@@ -220,7 +220,7 @@ def test_usdz_has_the_schema_and_stands_upright(tmp_path, degree):
 def test_half_a_turn_is_one_about_x():
     """Turns keep how a model looks: test_html_export.py."""
     some = splats(30)
-    half, turn = half_turned(some), turned(some, np.diag([1.0, -1.0, -1.0]))
+    half, turn = half_turned(some), rotated(some, np.diag([1.0, -1.0, -1.0]))
     for name in ("means", "sh"):
         np.testing.assert_allclose(getattr(half, name), getattr(turn, name), atol=1e-5)
     axes = [np.stack([rotation_matrix(wxyz) for wxyz in one.rotations]) for one in (half, turn)]

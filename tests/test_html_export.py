@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
 from scene.splats.ply import read_compressed_ply
-from scene.splats.turning import turned
+from scene.splats.splats import rotated
 from scene.with_splats import model_of
 from splatting.camera_paths.generated import Ellipse
 from splatting.camera_paths.keyframes import CameraPath, Keyframe, KeyframePath
@@ -166,9 +166,9 @@ def test_a_turned_model_looks_the_same_from_a_turned_camera():
     pose = poses_of([camera])
     wxyz = np.roll(Rotation.from_matrix(turn @ pose.turns[0]).as_quat(), 1)
     other = free_view(*SIZE, math.radians(FOV), turn @ pose.positions[0], wxyz, "cpu")
-    before, after = rendered(splats, camera), rendered(turned(splats, turn), other)
+    before, after = rendered(splats, camera), rendered(rotated(splats, turn), other)
     assert before.max() > 0.5 and 10 * math.log10(1 / np.square(before - after).mean()) > 80
-    wrong = rendered(replace(turned(splats, turn), sh=splats.sh), other)
+    wrong = rendered(replace(rotated(splats, turn), sh=splats.sh), other)
     assert 10 * math.log10(1 / np.square(before - wrong).mean()) < 40
 
 

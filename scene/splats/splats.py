@@ -1,14 +1,17 @@
-"""A model's values as every format takes them, and choices among them."""
+"""A model's values as every format takes them, choices among them, and the same in worlds of other axes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
-from utils.sh_utils import C0
+from utils.sh_utils import C0, sh_basis
 from utils.system_utils import UserError
 
 _LARGEST = 80.0  # of a logarithm of a scale; exp(89) is infinite in float32
+_DIRECTIONS = 64  # more than the 25 coefficients that they determine
+_AXES = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
 # Sign of each SH coefficient under y -> -y, z -> -z: each basis function is a polynomial of x y z, in the order of
 # utils/sh_utils.py.
 SH_SIGNS = np.float32(
@@ -111,6 +114,42 @@ def half_turned(splats: Splats) -> Splats:
         rotations=splats.rotations * np.float32([1, 1, -1, -1]),
         sh=splats.sh * SH_SIGNS[: splats.sh.shape[1], None],
     )
+
+
+def from_axes(splats: Splats, axes: str) -> Splats:
+    """Splats whose x, y and z point as three letters say: right, left, down, up, forward (F) or back; in our axes.
+
+    A world of left-handed axes is a mirror image of ours. A Gaussian keeps its shape if all is mirrored at its middle,
+    which changes the sign of odd SH bands; what is left is a rotation.
+    """
+    turn = np.array([_AXES[axis] for axis in axes], np.float64).T
+    if np.linalg.det(turn) < 0:
+        odd = np.floor(np.sqrt(np.arange(splats.sh.shape[1]))) % 2 == 1
+        splats = replace(splats, means=-splats.means, sh=np.where(odd[:, None], -splats.sh, splats.sh))
+        turn = -turn
+    return rotated(splats, turn)
+
+
+def rotated(splats: Splats, turn: np.ndarray) -> Splats:
+    """The same Gaussians in a world that is rotated (3,3); its offset is not kept."""
+    from scipy.spatial.transform import Rotation  # it takes a while to import
+
+    rotation = Rotation.from_matrix(turn) * Rotation.from_quat(splats.rotations, scalar_first=True)
+    return replace(
+        splats,
+        means=(splats.means @ turn.T).astype(np.float32),
+        rotations=rotation.as_quat(scalar_first=True).astype(np.float32),
+        sh=np.einsum("jk,nkc->njc", _sh_turn(splats.sh_degree, turn).astype(np.float32), splats.sh),
+        world_offset=(0.0, 0.0, 0.0),
+    )
+
+
+def _sh_turn(degree: int, turn: np.ndarray) -> np.ndarray:
+    """The matrix (K,K) of SH coefficients: the new function at a direction d is the old one at turn^T d."""
+    directions = torch.randn(_DIRECTIONS, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    directions = torch.nn.functional.normalize(directions)
+    new, old = sh_basis(degree, directions), sh_basis(degree, directions @ torch.from_numpy(turn))
+    return torch.linalg.lstsq(new, old).solution.numpy()
 
 
 def base_colors(splats: Splats) -> np.ndarray:

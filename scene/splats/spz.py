@@ -25,8 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from scene.splats.packing import morton_order, smallest_three, spread, to_bytes, whole_quaternions
-from scene.splats.splats import Splats, half_turned, logits, opacities, selected
-from scene.splats.turning import from_axes
+from scene.splats.splats import Splats, from_axes, half_turned, logits, opacities, selected
 from splatting.files.plain_files import check_packed_rows
 from splatting.files.unread import say_unread
 from utils.system_utils import UserError, atomic_write

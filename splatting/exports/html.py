@@ -19,8 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from scene.cameras import Camera
 from scene.splats.ply import packed_ply
-from scene.splats.splats import Splats
-from scene.splats.turning import turned
+from scene.splats.splats import Splats, rotated
 from splatting.camera_paths.keyframes import TimedPath
 from splatting.camera_paths.poses import Poses, focus_point, poses_of
 from splatting.exports.vendor import FOLDER, RECORD, VIEWER
@@ -86,7 +85,7 @@ def write_html(
         background=", ".join(f"{255 * value:.0f}" for value in background),
         css=(FOLDER / "viewer.css").read_text(encoding="utf-8"),
         licence=(FOLDER / "LICENSE").read_text(encoding="utf-8"),
-        model=_packed_model(turned(splats, turn)),
+        model=_packed_model(rotated(splats, turn)),
         # No text in the JSON may end the script element that it stands in.
         picture=picture,
         page=json.dumps(page, allow_nan=False).replace("<", "\\u003c"),

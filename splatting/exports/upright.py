@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from scene.cameras import Camera
-from scene.splats.splats import Splats
-from scene.splats.turning import turned
+from scene.splats.splats import Splats, rotated
 from splatting.camera_paths.keyframes import Keyframe, TimedPath
 from splatting.camera_paths.poses import keyframe, poses_of
 from splatting.files.json_files import OFFSET, read_model_json
@@ -75,7 +74,7 @@ def moved_splats(splats: Splats, similarity: Similarity) -> Splats:
     """
     enlargement = 2.0 ** np.ceil(np.log2(splats.enlargement / similarity.scale))
     return replace(
-        turned(splats, similarity.rotation),
+        rotated(splats, similarity.rotation),
         means=similarity.points(splats.means).astype(np.float32),
         log_scales=splats.log_scales + np.float32(np.log(similarity.scale)),
         enlargement=max(1.0, float(enlargement)),

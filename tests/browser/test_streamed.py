@@ -41,7 +41,7 @@ def address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     poses = html.poses_of(cameras())
     turn = html.turn_upright(html.up_of(poses))
     streamed.write_lod_meta(
-        tmp_path / "lod-meta.json", html.turned(balls(0), turn), Around((), (0, 0, 0), pipeline(), None, None)
+        tmp_path / "lod-meta.json", html.rotated(balls(0), turn), Around((), (0, 0, 0), pipeline(), None, None)
     )
     settings = html.settings(poses, [str(k) for k in range(len(poses))], turn, None, (0.2, 0.4, 0.3), 3.0)
     (tmp_path / "settings.json").write_text(json.dumps(settings))
