@@ -62,14 +62,14 @@ def points_of(
     view: has the dataset's pose and lens, so that a resumed training, where they may have moved, has the same points.
     held_out: those that are never trained on, in place of the others. enlargement: of the model where it is drawn.
     """
-    seen = track.points @ view.R + view.T
+    local = track.points @ view.R + view.T
     if camera.lens is None:
         scale = camera.image_width / view.width, camera.image_height / view.height
         places = (track.rays * (view.fx, view.fy) + (view.cx, view.cy)) * scale
     else:
         places = track.places * (camera.image_width, camera.image_height)
     by_distance = camera.lens is not None and camera.lens.chart != "perspective"
-    depths = np.linalg.norm(seen, axis=1) if by_distance else seen[:, 2]
+    depths = np.linalg.norm(local, axis=1) if by_distance else local[:, 2]
     columns = range(camera.image_width)[camera.columns or slice(None)]
     x, y = np.floor(places).T
     trust = (track.lengths - 1) / (1 + track.errors**2)

@@ -23,13 +23,13 @@ def sampling_rate(points: Tensor, view: Any, enlargement: float = 1.0) -> Tensor
         x, y, z, _ = _transformed(points, view.world_view_transform)
         depth = (x * x + y * y + z * z).sqrt()
         field = min(lens.field(view.image_width, view.image_height), math.pi)
-        seen, focal = z >= math.cos(field) * depth, max(lens.focal)
+        inside, focal = z >= math.cos(field) * depth, max(lens.focal)
     else:
         x, y, _, depth = _transformed(points, view.full_proj_transform)
-        seen = (x.abs() < depth) & (y.abs() < depth)
+        inside = (x.abs() < depth) & (y.abs() < depth)
         sides = (view.image_width, view.FoVx), (view.image_height, view.FoVy)
         focal = max(side / (2 * math.tan(angle / 2)) for side, angle in sides)
-    return torch.where(seen & (depth > NEAREST / enlargement), focal / depth, 0.0)
+    return torch.where(inside & (depth > NEAREST / enlargement), focal / depth, 0.0)
 
 
 def _transformed(points: Tensor, matrix: Tensor) -> list[Tensor]:

@@ -16,7 +16,7 @@ from synthetic import BROWN, FakeGaussians, folder_state, make_colmap_scene, opt
 
 from scene import Scene
 from scene.images.decode import picture_size
-from scene.images.lens import WIDEST, Lens, pinhole_of, shown_pixels, undistortion
+from scene.images.lens import WIDEST, Lens, pinhole_of, undistortion, visible_pixels
 from scene.images.masks import TRANSPARENT, Mask
 from scene.readers.info import CameraInfo
 from scene.readers.photos import camera_info, undistort
@@ -93,7 +93,7 @@ def test_lenses_too_wide_for_a_pinhole_show_their_middle(model):
     if model == "RADIAL":  # its polynomial decreases again far out
         lens = lens._replace(params=(*lens.params[:-2], 0.05, -0.02))
     plan = undistortion(lens, WIDTH, HEIGHT)
-    shown = shown_pixels(lens, WIDTH, HEIGHT)
+    shown = visible_pixels(lens, WIDTH, HEIGHT)
     assert plan.widest == pytest.approx(WIDEST)
     assert plan.pinhole.width / 2 / plan.pinhole.fx == pytest.approx(np.tan(np.radians(WIDEST)), rel=0.02)
     rays = colmap_camera(lens)  # the reference: pixels that count project back to where they were

@@ -22,12 +22,12 @@ _FEW = 0.25  # of the photos; where more have it, it is a background
 
 def said_of(shares: Mapping[str, float | None]) -> tuple[str, str] | None:
     """Which photos are likely damaged, by their `equal_share`, and the remedy; None if none is."""
-    known = {name: share for name, share in shares.items() if share is not None}
-    least = max(_SHARE, _USUAL * median(known.values() or [0]))
-    damaged = sorted(name for name, share in known.items() if share > least)
-    if not 0 < len(damaged) <= _FEW * len(known):
+    measured = {name: share for name, share in shares.items() if share is not None}
+    least = max(_SHARE, _USUAL * median(measured.values() or [0]))
+    damaged = sorted(name for name, share in measured.items() if share > least)
+    if not 0 < len(damaged) <= _FEW * len(measured):
         return None
-    text = f"{len(damaged)} of the {len(known)} JPEG photos that were checked are likely damaged in the middle"
+    text = f"{len(damaged)} of the {len(measured)} JPEG photos that were checked are likely damaged in the middle"
     text += f", as parts of them are of exactly one colour ({some(damaged)})"
     return text, "copy them again, or take them out of the scene"
 

@@ -43,9 +43,9 @@ def _fitted(
     Points are eliminated (Triggs et al. 2000, section 6.1). To fit both by turns would take as many rounds as a walk
     has photos.
     """
-    seen = sparse.coo_array((weight, (photo, point)), (photos, point.max(initial=0) + 1)).tocsr()
-    of_point, of_photo = (np.maximum(seen.sum(axis), 1e-9) for axis in (0, 1))
-    matrix = sparse.diags_array((1 + 1e-9) * of_photo) - seen / of_point @ seen.T  # singular else: their sum is free
+    pairs = sparse.coo_array((weight, (photo, point)), (photos, point.max(initial=0) + 1)).tocsr()
+    of_point, of_photo = (np.maximum(pairs.sum(axis), 1e-9) for axis in (0, 1))
+    matrix = sparse.diags_array((1 + 1e-9) * of_photo) - pairs / of_point @ pairs.T  # singular else: their sum is free
     mean = np.bincount(point, weight * values) / of_point
     vector = np.bincount(photo, weight * (values - mean[point]), photos)
     level = spsolve(matrix.tocsc(), vector)

@@ -147,10 +147,10 @@ def _is_plausible(lens: Lens, focal: float) -> bool:
     r = np.linspace(0, min(_STRETCH * inner / focal, math.pi if fisheye else math.inf), 4097)
     over, under = (np.polyval([*terms[::-1], 1.0], r * r) for terms in (native.radial, native.divisor))
     aside = math.hypot(*(3 * p + s for p, s in zip(native.tangential[::-1], native.prism, strict=True)))
-    shown = r * over / under
-    rises = np.diff(shown) > 2 * aside * r[1:] * r[1]  # where tangential and prism terms take most of the slope
+    radius = r * over / under
+    rises = np.diff(radius) > 2 * aside * r[1:] * r[1]  # where tangential and prism terms take most of the slope
     end = len(rises) if rises.all() else int(rises.argmin())
-    reached = shown[: end + 1] * focal >= inner
+    reached = radius[: end + 1] * focal >= inner
     if not reached.any():
         return fisheye and r[end] >= _WIDE
     return bool(r[reached.argmax()] * focal * _STRETCH > inner)
@@ -190,14 +190,14 @@ def undistortion(lens: Lens, width: int, height: int) -> Undistortion:
 
 
 @functools.lru_cache(maxsize=4)  # few: they are large, and photos of one lens mostly follow each other
-def shown_pixels(lens: Lens, width: int, height: int) -> np.ndarray:
+def visible_pixels(lens: Lens, width: int, height: int) -> np.ndarray:
     """Pixels of the undistorted image that the photo, width x height pixels large, shows: (height, width) bool."""
     pycolmap = import_pycolmap()
     plan = undistortion(lens, width, height)
     white = pycolmap.Bitmap.from_array(np.full((height, width), 255, np.uint8))
-    shown, result = pycolmap.undistort_image(plan.options, white, plan.camera)
-    shown = shown.to_array() == 255
-    return shown if plan.widest is None else shown & _seen_once(plan.camera, result)
+    visible, result = pycolmap.undistort_image(plan.options, white, plan.camera)
+    visible = visible.to_array() == 255
+    return visible if plan.widest is None else visible & _visible_once(plan.camera, result)
 
 
 def _border_can_be_projected(camera: Any) -> bool:
@@ -215,7 +215,7 @@ def _round_trip(camera: Any, pixels: np.ndarray) -> np.ndarray:
     return np.nan_to_num(distance, nan=np.inf)
 
 
-def _seen_once(camera: Any, pinhole: Any) -> np.ndarray:
+def _visible_once(camera: Any, pinhole: Any) -> np.ndarray:
     """Pixels of the pinhole whose rays the photo really shows: (height, width) bool.
 
     Far from the centre a distortion polynomial turns back, and would show parts of the photo a second time.

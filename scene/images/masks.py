@@ -31,7 +31,7 @@ NONE = "none"
 _TAGS = ".mask", "_mask"  # of RealityScan and Metashape, behind a photo's name with or without its suffix
 _FEW_VALUES = 8  # of booleans and labels
 _DARK = 32  # least brightness of grey; what compression adds to black is darker
-_REACH = ImageFilter.MinFilter(5)  # bicubic resizing mixes pixels up to 2 pixels of the coarser size apart
+_SPREAD = ImageFilter.MinFilter(5)  # bicubic resizing mixes pixels up to 2 pixels of the coarser size apart
 
 
 @dataclass(frozen=True)
@@ -95,9 +95,9 @@ class Mask:
             return torch.from_numpy(np.array(image))[None]
         kept = Image.fromarray(np.where(grey >= 128, 255, 0).astype(np.uint8))
         if size[0] > kept.width:
-            kept = kept.filter(_REACH).resize(size, Image.Resampling.BOX)
+            kept = kept.filter(_SPREAD).resize(size, Image.Resampling.BOX)
         elif size != kept.size:
-            kept = kept.resize(size, Image.Resampling.BOX).filter(_REACH)
+            kept = kept.resize(size, Image.Resampling.BOX).filter(_SPREAD)
         return torch.from_numpy(np.where(np.asarray(kept) == 255, np.uint8(255), np.uint8(0)))[None]
 
     def _grey(self) -> np.ndarray:

@@ -91,7 +91,7 @@ class ImageStore:
         self._awaited: set[Key] = set()  # planned for training, and not decoded yet
         self._shared: dict[Key, SharedImage] = {}
         self._workers = threads()
-        self._room_for_floats = True
+        self._floats_fit = True
         self._threads: ThreadPoolExecutor | None = None
         self._copies: DeviceCopies | None = None
 
@@ -112,7 +112,7 @@ class ImageStore:
             self.limit = 0
         if self.keep_on.type == "cuda":
             free = free_memory(self.keep_on)
-            self._room_for_floats = 4 * self.planned_bytes <= GPU_SHARE * free
+            self._floats_fit = 4 * self.planned_bytes <= GPU_SHARE * free
             if self.planned_bytes > GPU_SHARE * free:
                 self.keep_on = torch.device("cpu")
         if self.device.type == "cuda" and self.keep_on.type == "cpu":
@@ -134,7 +134,7 @@ class ImageStore:
     @property
     def keeps_floats(self) -> bool:
         """Whether images may also be kept as float32, four times as large, on the device of --data_device."""
-        return not self.limit and self._room_for_floats and not self.ranks.several
+        return not self.limit and self._floats_fit and not self.ranks.several
 
     def get(self, source: Source, size: Size) -> Tensor:
         """Image (3 or 4,H,W) uint8 of a photo, or the tensor that another source decodes to, on the store's device.
@@ -181,7 +181,7 @@ class ImageStore:
         # The other images are now in front. They are dropped first, and there are enough of them.
         for key in keys:
             if key not in self._kept:
-                self._make_room()
+                self._drop_oldest()
                 self._threads = self._threads or ThreadPoolExecutor(self._workers, thread_name_prefix="decode")
                 self._kept[key] = self._threads.submit(self._decode, key)
         if self._copies:
@@ -201,7 +201,7 @@ class ImageStore:
         """Keep an image on `keep_on` once a thread has decoded it; if none is at it, decode it here."""
         future = self._kept.pop(key, None)
         if future is None:
-            self._make_room()
+            self._drop_oldest()
         picture = future.result() if future else self._decode(key)
         self._kept[key] = picture = picture.to(self.keep_on, non_blocking=True)
         self._awaited.discard(key)
@@ -216,7 +216,7 @@ class ImageStore:
         # Only copies from pinned memory to a GPU are asynchronous.
         return picture.pin_memory() if "cuda" in (self.keep_on.type, self.device.type) else picture
 
-    def _make_room(self) -> None:
+    def _drop_oldest(self) -> None:
         while self.limit and len(self._kept) >= self.limit:
             _, oldest = self._kept.popitem(last=False)
             if isinstance(oldest, Future) and not oldest.cancel():

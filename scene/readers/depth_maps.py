@@ -107,10 +107,10 @@ def inverses(distances: np.ndarray) -> np.ndarray:
 
     NaN also below NEAREST_PART of the median distance, as one such pixel would outweigh all others.
     """
-    known = np.isfinite(distances) & (distances > LEAST)
-    if known.any():
-        known &= distances >= NEAREST_PART * np.median(distances[known])
-    return np.where(known, 1 / np.where(known, distances, 1.0), np.nan)
+    sound = np.isfinite(distances) & (distances > LEAST)
+    if sound.any():
+        sound &= distances >= NEAREST_PART * np.median(distances[sound])
+    return np.where(sound, 1 / np.where(sound, distances, 1.0), np.nan)
 
 
 class DepthFit(NamedTuple):

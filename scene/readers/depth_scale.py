@@ -64,8 +64,8 @@ def make_metric_scale(scene: Path, depths: Path, metric: Metric, model_type: str
             depth = metric._replace(scale=None).map_of(path)
             camera, values = model.cameras[image.camera_id], inverses(read_values(depth.path) / depth.unit)
             pixels, z = sightings(image, model.points, camera, f"{folder} as .{model_type}")
-            seen, z = _samples(pixels, z, (camera.width, camera.height), values)
-            found.append((seen * z)[np.isfinite(seen)])
+            values, z = _samples(pixels, z, (camera.width, camera.height), values)
+            found.append((values * z)[np.isfinite(values)])
     ratios = np.concatenate(found) if found else np.zeros(0)
     if len(ratios) < MIN_POINTS:
         raise UserError(
@@ -106,15 +106,15 @@ def sightings(image: Image, points: Points, camera: Camera, model: str) -> tuple
     The depth is z, and of a fisheye or a panorama the distance from the camera, as renders have it. UserError, naming
     the model, for a point that is not among them.
     """
-    seen = image.point3D_ids >= 0
-    ids = image.point3D_ids[seen]
+    has_point = image.point3D_ids >= 0
+    ids = image.point3D_ids[has_point]
     places = np.searchsorted(points.ids, ids)
     if (places == np.searchsorted(points.ids, ids, side="right")).any():
         raise UserError(f"the photo {image.name} in {model} sees a point that is not in points3D; {AGAIN}")
     turn, shift = qvec2rotmat(image.qvec), image.tvec
     if camera.model in MODELS and MODELS[camera.model][0] != "perspective":
-        return image.xys[seen], np.linalg.norm(points.xyz[places] @ turn.T + shift, axis=1)
-    return image.xys[seen], points.xyz[places] @ turn[2] + shift[2]
+        return image.xys[has_point], np.linalg.norm(points.xyz[places] @ turn.T + shift, axis=1)
+    return image.xys[has_point], points.xyz[places] @ turn[2] + shift[2]
 
 
 def fit_image(pixels: np.ndarray, z: np.ndarray, size: tuple[int, int], depth: np.ndarray) -> tuple[float, float]:

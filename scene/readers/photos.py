@@ -27,8 +27,8 @@ from scene.images.lens import (
     Undistortion,
     import_pycolmap,
     pinhole_of,
-    shown_pixels,
     undistortion,
+    visible_pixels,
 )
 from scene.images.masks import TRANSPARENT, Mask
 from scene.readers.info import CameraInfo, are_exchanged, turned
@@ -340,15 +340,15 @@ def _make(photo: CameraInfo, path: Path) -> None:
             pixels = np.dstack([pixels[..., :3], np.round(own / 255.0 * mask[..., None]).astype(np.uint8)])
         else:
             counts &= mask == 255
-    shown = shown_pixels(photo.lens, *photo.file_size)
+    visible = visible_pixels(photo.lens, *photo.file_size)
     if not counts.all():
         # Interpolation mixes neighbours: a pixel counts only if all that contribute to it count.
-        shown = shown & (_warp(np.where(counts, 255, 0).astype(np.uint8), plan) == 255)
+        visible = visible & (_warp(np.where(counts, 255, 0).astype(np.uint8), plan) == 255)
     mask_path = _mask_path(path)
-    has_mask = not shown.all()
+    has_mask = not visible.all()
     if has_mask:
         with atomic_write(mask_path, every_rank=True) as temporary:
-            Image.fromarray(np.where(shown, 255, 0).astype(np.uint8)).save(temporary)
+            Image.fromarray(np.where(visible, 255, 0).astype(np.uint8)).save(temporary)
     text = PngInfo()
     text.add_text(_HAS_MASK, "yes" if has_mask else "no")
     # Written after the mask, so that a file never lacks its mask.

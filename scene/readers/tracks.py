@@ -64,18 +64,18 @@ def read_tracks(scene: str | os.PathLike, views: Sequence[CameraInfo], offset: n
         place = np.minimum(np.searchsorted(points.ids, photo.point3D_ids), len(points.ids) - 1)
         camera, angular = cameras[photo.camera_id], view.native is not None and view.native.chart == "equidistant"
         rays = _angles(camera, photo.xys) if angular else _rays(camera, photo.xys, view)
-        known = points.ids[place] == photo.point3D_ids
+        has_point = points.ids[place] == photo.point3D_ids
         places, longest = photo.xys / (camera.width, camera.height), max(camera.width, camera.height)
         errors, local = points.errors[place], (points.xyz[place] - offset) @ view.R + view.T
         if fisheyes:  # COLMAP gives 1e154 pixels, or a part of that, to a point that one shows beyond 90 degrees
             own = view.fx * np.linalg.norm(rays - rays_to(local, angular), axis=1)
             errors = np.where(np.abs(errors) <= longest, errors, own)
-        shown, near = np.isfinite(rays).all(1), (np.abs(places - 0.5) < _FAR).all(1)
+        visible, near = np.isfinite(rays).all(1), (np.abs(places - 0.5) < _FAR).all(1)
         sound = near & (np.abs(errors) <= longest)
-        dropped += int((known & ~sound & (shown | ~near)).sum())
-        seen = known & sound & shown
-        place, places, errors = place[seen], places[seen], errors[seen]
-        track = Track(points.xyz[place] - offset, rays[seen], places, errors, lengths[place], place, angular)
+        dropped += int((has_point & ~sound & (visible | ~near)).sum())
+        taken = has_point & sound & visible
+        place, places, errors = place[taken], places[taken], errors[taken]
+        track = Track(points.xyz[place] - offset, rays[taken], places, errors, lengths[place], place, angular)
         found.append(track if len(place) >= FEWEST else None)
     if dropped:
         fault = "lie far outside of their photo, or have a reprojection error that is larger than it or no number"
@@ -107,8 +107,8 @@ def _rays(camera: Camera, places: np.ndarray, view: CameraInfo) -> np.ndarray:
     if camera.model in PERSPECTIVE:
         return rays
     x, y = (rays * (view.fx, view.fy) + (view.cx, view.cy)).T
-    shown = (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)
-    return np.where(shown[:, None], rays, np.nan)
+    visible = (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)
+    return np.where(visible[:, None], rays, np.nan)
 
 
 def projected(camera: CameraInfo, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

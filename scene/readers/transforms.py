@@ -348,8 +348,8 @@ def _own_split(
     if not (any(lists[1:]) or tests):
         return None
     photos = [identity(path.parent / camera.image_name) for camera in cameras]
-    known = set(photos)
-    without = [name for files in lists for name, file in files.items() if identity(file) not in known]
+    of_frames = set(photos)
+    without = [name for files in lists for name, file in files.items() if identity(file) not in of_frames]
     if without:
         said = f"{len(without)} entries of the lists of training and test photos in {path} match no photo of its frames"
         print(f"{said}: {some(without)}", file=sys.stderr)

@@ -90,9 +90,9 @@ def _of_colmap(model: str, terms: Sequence[float], file: Path) -> tuple[str, tup
     if model == _ARIA:
         return "RAD_TAN_THIN_PRISM_FISHEYE", tuple(terms)
     if model not in (*_BROWN, *_FISHEYE):
-        known = ", ".join((*_BROWN, *_FISHEYE, _ARIA, PANORAMA))
+        models = ", ".join((*_BROWN, *_FISHEYE, _ARIA, PANORAMA))
         raise UserError(
-            f"the camera_model {model} in {file} cannot be used, only {known}; convert the photos to one of these"
+            f"the camera_model {model} in {file} cannot be used, only {models}; convert the photos to one of these"
         )
     if model != "FULL_OPENCV" and any((k4 if model in _BROWN else 0.0, k5, k6)):
         # OpenCV divides by 1 + k4 r^2 + ..., nerfstudio adds k4 r^8, and the file does not say which one is meant.

@@ -253,8 +253,8 @@ def read_compressed_ply(path: str | os.PathLike) -> Splats:
     sh = np.concatenate([((rgb - 0.5) / C0).astype(np.float32)[:, None], rest], axis=1)
     values = (x.astype(np.float32) for x in (means, log_scales, rotations, logits(rgba[:, 3], 1 / 255), sh))
     whole = Splats(*values, says_antialiasing(path), stored_offset(path), stored_enlargement(path))
-    shown = np.any([vertex[name] for name in _VISIBLE], axis=0)
-    return whole if shown.all() else selected(whole, shown)
+    visible = np.any([vertex[name] for name in _VISIBLE], axis=0)
+    return whole if visible.all() else selected(whole, visible)
 
 
 def _between(chunks: np.ndarray, group: str, chunk_of: np.ndarray, parts: np.ndarray) -> np.ndarray:

@@ -97,8 +97,8 @@ def choose(splats: Splats, crop: Sequence[float] | None, min_opacity: float) -> 
 def tidy(splats: Splats) -> Splats:
     """The splats with values that every format can hold: rotations of length 1, logs of finite scales of at most 80."""
     lengths = np.linalg.norm(splats.rotations, axis=1, keepdims=True)
-    known = lengths > 1e-12
-    rotations = np.where(known, splats.rotations / np.where(known, lengths, 1), np.float32([1, 0, 0, 0]))
+    sound = lengths > 1e-12
+    rotations = np.where(sound, splats.rotations / np.where(sound, lengths, 1), np.float32([1, 0, 0, 0]))
     scales = np.where(np.isposinf(splats.log_scales), np.inf, np.clip(splats.log_scales, -_LARGEST, _LARGEST))
     return replace(splats, rotations=rotations.astype(np.float32), log_scales=scales.astype(np.float32))
 

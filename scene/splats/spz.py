@@ -193,8 +193,8 @@ def _header(content: bytes, versions: tuple[int, ...], size: int) -> _Header:
     magic, *fields = _HEADER.unpack_from(content)
     header = _Header(*fields)
     if magic != MAGIC or header.version not in versions:
-        known = f"no version that this program knows: {header.version}"
-        raise ValueError(known if magic == MAGIC else "no magic number")
+        fault = f"no version that this program knows: {header.version}"
+        raise ValueError(fault if magic == MAGIC else "no magic number")
     if header.degree > 4:
         raise ValueError(f"SH bands of degree {header.degree}, of at most 4")
     check_packed_rows(header.count, size)
