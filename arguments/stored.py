@@ -85,7 +85,7 @@ def write_model_json(
     args: options; of those that belong here all are written that it has, but model options only where they differ from
     their default. The entry `options` has all others that differ from theirs. world_offset: world coordinates of
     the origin of the model's frame (scene/readers/info.py); zero writes no entry. enlargement: of the model
-    where it is drawn (scene/readers/enlargement.py); 1 writes no entry. more: further entries, which win.
+    where it is drawn (scene/readers/tracks.py); 1 writes no entry. more: further entries, which win.
     """
     record: dict[str, Any] = {"version": VERSION}
     for name, default in _IN_MODEL_JSON.items():

@@ -17,10 +17,10 @@ from scene.cameras import Camera, camera_to_JSON, cameraList_from_camInfos, repl
 from scene.dataset_readers import read_scene, replaced_reader, scene_by
 from scene.images.masks import MaskOptions, check_masks
 from scene.images.store import ImageStore, Picture, image_device
-from scene.readers.enlargement import enlargement
 from scene.readers.info import CameraInfo, SceneInfo, photo_size
 from scene.readers.point_cloud import write_point_cloud
 from scene.readers.scene_folder import kind_of
+from scene.readers.tracks import enlargement
 from scene.saved_iterations import find_iteration, saved_ply
 from splatting.distributed.ranks import ALONE, Ranks
 from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json

@@ -23,8 +23,8 @@ from scene import Scene
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.poses import moved
-from scene.readers.enlargement import enlargement
 from scene.readers.info import NEAREST
+from scene.readers.tracks import enlargement
 from scene.reprojection import twist_gradient
 from scene.splats.reading import read_splats
 from scene.with_splats import load_file, splats_of

@@ -48,7 +48,7 @@ class GaussianParameters:
     `_xyz` (N,3) world; `_features_dc` (N,1,3), `_features_rest` (N,K,3), K = (D+1)^2 - 1; `_scaling` (N,3) log;
     `_rotation` (N,4) wxyz, any length; `_opacity` (N,1) logit. world_offset: the world's coordinates of the origin
     (scene/readers/info.py), kept in the PLY, as is enlargement: the factor by which the model and its cameras
-    are enlarged where they are drawn (scene/readers/enlargement.py). Activations are attributes, which
+    are enlarged where they are drawn (scene/readers/tracks.py). Activations are attributes, which
     `setup_functions` sets.
     The tensors become parameters when rows are taken; an empty model has plain ones, as in the reference. shards: where
     these rows are among those of all ranks, if several have a part of the model each. room: where rows lie.

@@ -32,7 +32,7 @@ class Splats:
     sh (N,K,3), the bands in the reference's order, K = (degree + 1)^2. Axes are those of COLMAP's world: of a usual
     capture x is right, y down, z forward. antialiasing: whether they were trained with --antialiasing. world_offset:
     the world's coordinates of the origin of the means. enlargement: of the model where it is drawn, 1 where a file does
-    not say (scene/readers/enlargement.py). place: latitude and longitude (degrees) and height (metres) of the origin of
+    not say (scene/readers/tracks.py). place: latitude and longitude (degrees) and height (metres) of the origin of
     means whose x is east, y down and z north, in metres; empty: unknown.
     """
 

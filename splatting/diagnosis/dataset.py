@@ -13,9 +13,8 @@ from scene.check import findings
 from scene.dataset_readers import CameraInfo, SceneInfo, read_scene
 from scene.images.exif import read_lens
 from scene.pose_errors import ADJUSTED, COMPARED, pose_errors, poses_differ
-from scene.readers.enlargement import enlargement
 from scene.readers.info import NEAREST
-from scene.readers.tracks import Track, rays_to, read_tracks
+from scene.readers.tracks import Track, enlargement, rays_to, read_tracks
 from splatting.diagnosis import Line, from_error
 from splatting.diagnosis.colors import UNITS, check_colors
 from splatting.files.json_files import read_json

@@ -17,7 +17,7 @@ _BACKSLASH = re.compile(r'\\(?:[\\"/]|u[0-9a-fA-F]{4})?')  # with what it escape
 MODEL_JSON = "model.json"
 SCHEDULE = "schedule.json"  # of a training whose iterations stand for more or fewer than themselves
 OFFSET = "world_offset"  # (3,) world coordinates of the origin of the model's frame (scene/readers/info.py)
-ENLARGEMENT = "enlargement"  # of the model where it is drawn (scene/readers/enlargement.py)
+ENLARGEMENT = "enlargement"  # of the model where it is drawn (scene/readers/tracks.py)
 LARGEST_OFFSET = 1e15  # beyond, the steps of doubles are larger than 0.1
 
 
