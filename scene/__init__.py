@@ -8,7 +8,7 @@ gaussians/                   parameters of the Gaussians: start, optimiser, dens
 dataset_readers, readers/    a folder's dataset as CameraInfos: COLMAP, Blender, nerfstudio; points, depth maps
 colmap_loader                COLMAP's files as records
 images/                      image files: finding, lenses, masks, decoding, keeping
-saved_iterations, saved_model  the saves in a model folder, and loading one with its scene
+saved_model                  the saves in a model folder, and loading one with its scene
 splats/, with_splats         Gaussians of any tool's file, with a scene: a start of a training (--init_ply), or shown
 export_world                 a command: a model in the world's coordinates
 

@@ -14,9 +14,8 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from scene.gaussians.ply import read_vertices
-from scene.saved_iterations import find_iteration, saved_ply
 from splatting.files.json_files import OFFSET, read_model_json
-from utils.system_utils import UserError, atomic_write, run_cli
+from utils.system_utils import UserError, atomic_write, find_iteration, run_cli, saved_ply
 
 _AXES = ("x", "y", "z")
 

@@ -14,10 +14,9 @@ from scene.gaussians.checkpoint import extra_state, load_checkpoint, unpack
 from scene.gaussians.finite import warn_of_undrawn
 from scene.gaussians.morton import sort_scattered
 from scene.gaussians.ply import read_ply
-from scene.saved_iterations import saved_ply
 from scene.scene import Scene
 from splatting.registry import states_in, tools
-from utils.system_utils import UserError, saved_iterations
+from utils.system_utils import UserError, saved_iterations, saved_ply
 
 _CHECKPOINT = re.compile(r"chkpnt(\d+)\.pth")
 

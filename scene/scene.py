@@ -21,14 +21,13 @@ from scene.readers.info import CameraInfo, SceneInfo, photo_size
 from scene.readers.point_cloud import write_point_cloud
 from scene.readers.scene_folder import kind_of
 from scene.readers.tracks import enlargement
-from scene.saved_iterations import find_iteration, saved_ply
 from splatting.distributed.ranks import ALONE, Ranks
 from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json
 from splatting.host.machine import compute_device
 from splatting.part import Part
 from splatting.registry import chosen
 from utils.graphics_utils import BasicPointCloud
-from utils.system_utils import UserError, atomic_write
+from utils.system_utils import UserError, atomic_write, find_iteration, saved_ply
 
 
 class SceneGaussians(Protocol):

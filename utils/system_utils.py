@@ -19,10 +19,12 @@ __all__ = [
     "UserError",
     "atomic_write",
     "compute_device",
+    "find_iteration",
     "first_line",
     "mkdir_p",
     "run_cli",
     "saved_iterations",
+    "saved_ply",
     "searchForMaxIteration",
     "temporary_folder",
     "writes_files",
@@ -125,3 +127,20 @@ def searchForMaxIteration(folder: str | os.PathLike) -> int:
     if not iterations:
         raise UserError(f"no saved iteration in {folder} (looked for folders iteration_N); train the model first")
     return iterations[-1]
+
+
+def saved_ply(model_path: str | os.PathLike, iteration: int | str) -> Path:
+    """The PLY of an iteration in a model folder."""
+    return Path(model_path) / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
+
+
+def find_iteration(model_path: str | os.PathLike, iteration: int) -> int:
+    """The iteration, -1: the last one saved. UserError if a model folder has no save of it."""
+    folder = Path(model_path) / "point_cloud"
+    last = searchForMaxIteration(folder)
+    if iteration == -1:
+        return last
+    if not saved_ply(model_path, iteration).is_file():
+        saved = ", ".join(map(str, saved_iterations(folder)))
+        raise UserError(f"iteration {iteration} was never saved in {folder}; give one of {saved}")
+    return iteration

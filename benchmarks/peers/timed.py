@@ -17,10 +17,9 @@ from arguments import ModelParams, write_cfg_args
 from benchmarks.harness.measuring import describe
 from benchmarks.peers.curve import SECONDS
 from scene.gaussian_model import GaussianModel
-from scene.saved_iterations import saved_ply
 from scene.scene import Scene
 from splatting.evaluation.error_curve import Row, write_peer
-from utils.system_utils import UserError, compute_device, mkdir_p
+from utils.system_utils import UserError, compute_device, mkdir_p, saved_ply
 
 DEGREE = 3  # of SH
 # Not at multiples of 100, where density control has just changed the model, which scores low for some iterations.

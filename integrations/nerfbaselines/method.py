@@ -18,7 +18,6 @@ from integrations.nerfbaselines.datasets import has_white_background, in_place_o
 from scene.cameras import Camera
 from scene.gaussians.checkpoint import save_checkpoint
 from scene.readers.start_cloud import StartOptions
-from scene.saved_iterations import saved_ply
 from scene.saved_model import find_save, read_model
 from splatting.evaluation import training_log
 from splatting.files.json_files import read_json, write_json
@@ -29,7 +28,7 @@ from splatting.training.loop import training_steps
 from splatting.training.run import Run
 from splatting.training.watch import MaskWatch
 from train import parse
-from utils.system_utils import UserError, compute_device
+from utils.system_utils import UserError, compute_device, saved_ply
 
 RECORD = "nerfbaselines.json"  # in a checkpoint: its step, and the options that were given
 INTERVAL = 100  # iterations between losses that are told: reading one waits for the GPU

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from arguments.stored import read_model_json, read_stored_options
-from scene.saved_iterations import saved_ply
 from splatting.evaluation.error_curve import NAME as CURVE
 from splatting.evaluation.error_curve import Row, read_curve
 from splatting.evaluation.training_log import NAME as LOG
@@ -15,7 +14,7 @@ from splatting.evaluation.training_log import read_log
 from splatting.files.json_files import SCHEDULE, read_json
 from splatting.files.plain_files import plain
 from splatting.registry import PARTS, part_class
-from utils.system_utils import UserError, saved_iterations
+from utils.system_utils import UserError, saved_iterations, saved_ply
 
 
 def json_or_none(path: Path) -> Any | None:

@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from scene.saved_iterations import saved_ply
 from splatting.evaluation.comparison import SCORES
 from splatting.evaluation.model_folder import json_or_none, load_scores
 from splatting.files.image_files import UNREADABLE, open_render
 from splatting.host.listing import as_utf8
-from utils.system_utils import UserError, atomic_write
+from utils.system_utils import UserError, atomic_write, saved_ply
 
 if TYPE_CHECKING:
     import torch

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from scene.readers.info import HOLD
-from scene.saved_iterations import saved_ply
 from splatting.evaluation import model_folder as folder_of
 from splatting.evaluation.comparison import BESIDE, SCORES
 from splatting.evaluation.error_curve import Row
@@ -19,7 +18,7 @@ from splatting.evaluation.stages import Failure, page_file
 from splatting.evaluation.training_log import DEGREES, PERCENT
 from splatting.evaluation.what_to_try import gain_since_peak, peak
 from splatting.files.json_files import read_json
-from utils.system_utils import UserError
+from utils.system_utils import UserError, saved_ply
 
 REPORT = "report.json"
 MB = 1e6  # bytes

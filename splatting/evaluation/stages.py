@@ -16,13 +16,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from scene.saved_iterations import saved_ply
 from splatting.evaluation.child import Finished
 from splatting.evaluation.model_folder import load_scores, logged, trained_iterations
 from splatting.evaluation.plan import Record, Run
 from splatting.evaluation.renders import TIMES, ground_truth_digest, view_names
 from utils.lpips_utils import TOLD
-from utils.system_utils import UserError, mkdir_p
+from utils.system_utils import UserError, mkdir_p, saved_ply
 
 _ROOT = Path(__file__).resolve().parents[2]
 Child = Callable[..., Finished]

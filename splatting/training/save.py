@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from scene.gaussians.checkpoint import save_checkpoint
-from scene.saved_iterations import saved_ply
 from splatting.part import Error, Part
 from splatting.training.folder import view_command
 from splatting.training.iteration import Iteration, Losses
 from splatting.training.trim_report import TrimReport, lines, saved_line
-from utils.system_utils import UserError
+from utils.system_utils import UserError, saved_ply
 
 if TYPE_CHECKING:
     from splatting.training.run import Run

@@ -5,7 +5,6 @@ import time
 
 from tqdm import tqdm
 
-from scene.saved_iterations import saved_ply
 from scene.saved_model import read_model
 from splatting.evaluation.error_curve import common_subset, rows_on
 from splatting.host.listing import as_utf8
@@ -15,7 +14,7 @@ from splatting.training.run import Run
 from splatting.viewer.page import Page, serve
 from splatting.viewer.training_tab import TrainingTab
 from splatting.viewer.watchers import MOVING, STILL, Budget, Wish
-from utils.system_utils import UserError
+from utils.system_utils import UserError, saved_ply
 
 _NUMBERS_EVERY = 0.5  # seconds
 _WAIT = 0.2  # seconds until a paused training notices a signal
