@@ -32,7 +32,7 @@ model.drawn  what raw opacities and scales are drawn as, and its chain backward;
              Then every step concerns all rows, and none may sleep.
 model.exposures what photos make of renders, trained with the Gaussians (scene/gaussians/exposure.py)
 model.pinned which Gaussians density control leaves where they are, and as large as they are
-model.room   where rows lie: on the device, or a part of them on the host (scene/gaussians/room.py)
+model.room   where rows lie: on the device, or a part of them on the host (scene/gaussians/spilled.py)
 run.schedule which steps of the schedule an iteration stands for
 run.views    the view of an iteration
 run.sizes    the size of a view in an iteration

@@ -14,8 +14,7 @@ from torch import Tensor, nn
 from scene.gaussians.attributes import Attribute, Rows, attributes
 from scene.gaussians.finite import warn_of_undrawn
 from scene.gaussians.ply import FLAT, column_names, frame_comments, read_ply, row_bytes, write_ply
-from scene.gaussians.room import Room
-from scene.gaussians.spilled import is_spilled, room_for, to_host
+from scene.gaussians.spilled import Room, is_spilled, room_for, to_host
 from scene.gaussians.statistics import NAMES, Statistics
 from scene.gaussians.table import GaussianTable
 from splatting.distributed.ranks import Ranks

@@ -1,7 +1,8 @@
-"""Spilled tensors: of a GPU, with their first rows in its memory and the others in the host's.
+"""Where the rows of a model lie: on the device that computes, or a part of them on the host (`Room`).
 
-Both lie in one range of addresses, so kernels and copies take such a tensor for any other (csrc/torch/spilled.cpp of
-the rasterizer). On the CPU there are none.
+A spilled tensor is one of a GPU, with its first rows in its memory and the others in the host's. Both lie in one range
+of addresses, so kernels and copies take such a tensor for any other (csrc/torch/spilled.cpp of the rasterizer). On the
+CPU there are none.
 """
 
 from typing import Any
@@ -12,6 +13,30 @@ from diff_gaussian_rasterization.backend import OPERATORS
 from torch import Tensor
 
 from splatting.distributed.rows import PIECE
+
+
+class Room:
+    """What the slot `model.room` provides: all rows stay on the device. A part may divide them between it and the host.
+
+    limit: bytes of the device that all which is trained may take; 0: all.
+    """
+
+    limit = 0
+
+    def expect(self, count: int, scene: Any) -> None:
+        """Take note of a number of this process's Gaussians that will come. scene: whose photos take memory, too."""
+
+    def empty_rows(self, like: Tensor, rows: int) -> Tensor | None:
+        """An uninitialised tensor for so many rows of f_rest; None: wherever torch puts it."""
+        return None
+
+    def host_bytes(self, count: int) -> int:
+        """Bytes of so many Gaussians that lie on the host instead of the device."""
+        return 0
+
+    def remedy(self, count: int, lacking: float) -> str:
+        """What to do where so many Gaussians lack so many bytes: the beginning of a sentence, or nothing."""
+        return ""
 
 
 def room_for(model: Any, name: str | None, like: Tensor, rows: int) -> Tensor | None:

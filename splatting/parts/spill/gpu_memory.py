@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.room import Room
-from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
+from scene.gaussians.spilled import Room, bytes_of, empty_rows, is_spilled
 from scene.scene import Scene
 from splatting.host.memory import free_memory
 from splatting.parts.spill.torch_limit import CAN_SPILL, limit_torch
