@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,10 @@ from PIL import Image
 from torch import Tensor
 
 from scene.images.decode import picture_size, pixels_of
-from scene.images.masks import TRANSPARENT, Mask, add_alpha
+from scene.images.masks import TRANSPARENT, add_alpha
 from scene.images.store import InMemory, Size
 from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, DepthMap, depth_fit, fitted
-from scene.readers.info import CameraInfo
+from scene.readers.info import CameraInfo, as_camera_info
 from utils.general_utils import check_flags
 from utils.image_utils import half
 
@@ -108,13 +108,7 @@ def of_record(record: Any, size: Size, is_nerf_synthetic: bool) -> CameraInfo:
     A PIL image that it holds is resized. A file that `depth_path` names is a depth map with Blender's unit if the scene
     is_nerf_synthetic, else with COLMAP's. UserError if that file is missing.
     """
-    if type(record) is not CameraInfo:
-        names = {field.name for field in fields(CameraInfo)} - {"fx", "fy", "lens"}
-        values = {name: getattr(record, name) for name in names if hasattr(record, name)}
-        values |= {name: float(values[name]) for name in ("cx", "cy") if values.get(name) is not None}
-        if not isinstance(values.get("mask"), Mask):
-            values["mask"] = None  # an attribute of other code by that name
-        record = CameraInfo(**values)
+    record = as_camera_info(record)
     if record.image is not None:
         pixels, mask = pixels_of(record.image, size), record.mask
         if mask and mask.meaning == TRANSPARENT:

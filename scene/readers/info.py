@@ -172,10 +172,15 @@ class CameraInfo(_LikeNamedTuple):
 
 
 def as_camera_info(view: Any) -> CameraInfo:
-    """A record of a reader of other code, with what follows from its fields."""
-    if isinstance(view, CameraInfo):
+    """A record of other code with the reference's fields, and what follows from them."""
+    if type(view) is CameraInfo:
         return view
-    return CameraInfo(**{one.name: getattr(view, one.name) for one in fields(CameraInfo) if hasattr(view, one.name)})
+    names = {one.name for one in fields(CameraInfo)} - {"fx", "fy", "lens"}
+    values = {name: getattr(view, name) for name in names if hasattr(view, name)}
+    values |= {name: float(values[name]) for name in ("cx", "cy") if values.get(name) is not None}
+    if not isinstance(values.get("mask"), Mask):
+        values["mask"] = None  # an attribute of other code by that name
+    return CameraInfo(**values)
 
 
 _SAME_ANGLE = 1e-9  # relative; FovX, turned into fx and back, differs by rounding
