@@ -2,7 +2,7 @@
 
 scene                        Scene: the views of a dataset and the Gaussians that belong to them
 view                         View: matrices and photo of a view
-cameras                      the reference's names for views: Camera, a View that may be changed, and MiniCam
+cameras, camera_forms        the reference's names for views: Camera, a View that may be changed, and MiniCam
 gaussian_model               GaussianModel, built of the modules in gaussians/
 gaussians/                   parameters of the Gaussians: start, optimiser, density control, exposures, PLY, checkpoint
 dataset_readers, readers/    a folder's dataset as CameraInfos: COLMAP, Blender, nerfstudio; points, depth maps

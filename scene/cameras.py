@@ -244,9 +244,8 @@ class MiniCam:
 
 def replaced(name: str) -> Callable[..., Any] | None:
     """What other code has put in the place of a function below, in utils.camera_utils or in this package; else None."""
-    modules = (vars(sys.modules[module]) for module in (__package__, "utils.camera_utils") if module in sys.modules)
-    theirs = (module[name] for module in modules if module.get(name, globals()[name]) is not globals()[name])
-    return next(theirs, None)
+    ours, modules = globals()[name], filter(None, map(sys.modules.get, (__package__, "utils.camera_utils")))
+    return next((own for module in modules if (own := vars(module).get(name, ours)) is not ours), None)
 
 
 def loadCam(
