@@ -121,8 +121,8 @@ class FusedAdam:
         return (*defaults["betas"], defaults["eps"])
 
     def _statistics(self) -> tuple[Tensor, Tensor, Tensor]:
-        seen = self._gaussians.statistics
-        return seen.max_radii2D, seen.xyz_gradient_accum, seen.denom
+        statistics = self._gaussians.statistics
+        return statistics.max_radii2D, statistics.xyz_gradient_accum, statistics.denom
 
     def _stepping(self) -> Iterator["_Stepping"]:
         """The attributes that step, in the operator's order."""

@@ -38,7 +38,7 @@ def _transformed(points: Tensor, matrix: Tensor) -> list[Tensor]:
     return [x * a + y * b + z * c + d for a, b, c, d in matrix.T.tolist()]
 
 
-def share_seen(points: Tensor, cameras: Sequence[View], enlargement: float = 1.0) -> float:
+def share_in_view(points: Tensor, cameras: Sequence[View], enlargement: float = 1.0) -> float:
     """The share of points (N, 3) that a camera sees, on the mean of up to 32 cameras. Distortion is left out."""
     views = cameras[:: -(-len(cameras) // 32)]
     return sum(float((sampling_rate(points, view, enlargement) > 0).float().mean()) for view in views) / len(views)
@@ -50,4 +50,4 @@ def share_of(scene: Scene, device: torch.device) -> float:
     if cloud is None or not len(cloud.points):
         return 1.0
     points = torch.as_tensor(cloud.points, dtype=torch.float32, device=device)
-    return share_seen(points, scene.getTrainCameras(), scene.gaussians.enlargement)
+    return share_in_view(points, scene.getTrainCameras(), scene.gaussians.enlargement)

@@ -85,5 +85,5 @@ def load_saved(options: argparse.Namespace, iteration: int, sh_degree: int | Non
     sort_scattered(gaussians)
     scene = Scene(options, gaussians, load_iteration=iteration, shuffle=False, start=False)
     print(f"Loading trained model at iteration {iteration}" + (f" from {path}" if path.suffix == ".pth" else ""))
-    scene.load_beside(options)
+    scene.load_parts(options)
     return scene

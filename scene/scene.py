@@ -101,7 +101,7 @@ class Scene:
         if self.loaded_iter is not None:
             print(f"Loading trained model at iteration {self.loaded_iter}")
             gaussians.load_ply(str(saved_ply(self.model_path, self.loaded_iter)))
-            self.load_beside(args)
+            self.load_parts(args)
         else:
             self.create_gaussians()
             self.write_inputs()
@@ -151,15 +151,15 @@ class Scene:
 
         gaussians: written in place of the scene's own; what parts write is always of the scene.
         """
-        self.save_beside()
+        self.save_parts()
         (self.gaussians if gaussians is None else gaussians).save_ply(str(saved_ply(self.model_path, iteration)))
 
-    def save_beside(self) -> None:
+    def save_parts(self) -> None:
         """Write the files of parts into the model folder."""
         for part in self.parts:
             part.save(self)
 
-    def load_beside(self, args: argparse.Namespace) -> None:
+    def load_parts(self, args: argparse.Namespace) -> None:
         """Read the files of parts in the model folder. args: the model options."""
         for part in self.parts:
             part.load(self, args)

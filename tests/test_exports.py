@@ -29,7 +29,7 @@ from scene.splats.reading import read_splats
 from scene.splats.splats import (
     Splats,
     drawable,
-    half_turned,
+    half_rotated,
     logits,
     opacities,
     rotated,
@@ -220,13 +220,13 @@ def test_usdz_has_the_schema_and_stands_upright(tmp_path, degree):
 def test_half_a_turn_is_one_about_x():
     """Turns keep how a model looks: test_html_export.py."""
     some = splats(30)
-    half, turn = half_turned(some), rotated(some, np.diag([1.0, -1.0, -1.0]))
+    half, turn = half_rotated(some), rotated(some, np.diag([1.0, -1.0, -1.0]))
     for name in ("means", "sh"):
         np.testing.assert_allclose(getattr(half, name), getattr(turn, name), atol=1e-5)
     axes = [np.stack([rotation_matrix(wxyz) for wxyz in one.rotations]) for one in (half, turn)]
     spreads = [x * np.exp(some.log_scales)[:, None] @ x.transpose(0, 2, 1) for x in axes]
     np.testing.assert_allclose(*spreads, atol=1e-6)
-    np.testing.assert_array_equal(half_turned(half).sh, some.sh)
+    np.testing.assert_array_equal(half_rotated(half).sh, some.sh)
 
 
 def test_spz_of_version_2_is_read(tmp_path):
@@ -281,7 +281,7 @@ TOLD = {"R": [1, 0, 0], "L": [-1, 0, 0], "D": [0, 1, 0], "U": [0, -1, 0], "F": [
 )
 def test_axes_that_an_spz_declares_are_its_axes(tmp_path, version, number, axes):
     """Positions, shapes and colours by direction, of the values in the file."""
-    plain = half_turned(read_splats(_with_records(tmp_path, version, b"", 0)))  # as it is in the file
+    plain = half_rotated(read_splats(_with_records(tmp_path, version, b"", 0)))  # as it is in the file
     read = read_splats(_with_records(tmp_path, version, struct.pack("<III", 0xADBE0003, 4, number)))
     turn = np.array([TOLD[letter] for letter in axes]).T
     np.testing.assert_allclose(read.means, plain.means @ turn.T, atol=1e-6)

@@ -23,7 +23,7 @@ from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
 from scene.splats.reading import read_splats
-from scene.splats.splats import Splats, half_turned, logits, with_sh_degree
+from scene.splats.splats import Splats, half_rotated, logits, with_sh_degree
 from scene.with_splats import model_of
 from splatting.camera_paths.poses import facing, keyframe
 from splatting.exports.scene_formats import PRIM
@@ -146,7 +146,7 @@ def test_splat_transform_reads_what_we_wrote(tmp_path, ending, degree):
     path = written(tmp_path, ending, some)
     read = read_by_splat_transform(path)
     if ending == ".spz":
-        read = half_turned(read)  # this program does not convert between the axes of SPZ and PLY
+        read = half_rotated(read)  # this program does not convert between the axes of SPZ and PLY
     if ending == ".splat":
         some = with_sh_degree(some, 0)
     else:
@@ -200,14 +200,14 @@ def test_we_read_what_splat_transform_writes(tmp_path, ending, options):
     subprocess.run(["splat-transform", "--quiet", *options, plain, packed], check=True, capture_output=True)
     read = read_back(packed)
     assert read.antialiasing and read.sh_degree == 2
-    assert _loss(some, half_turned(read) if ending == ".spz" else read) >= COMPRESSED
+    assert _loss(some, half_rotated(read) if ending == ".spz" else read) >= COMPRESSED
 
 
 @pytest.mark.parametrize("ending", [".compressed.ply", ".spz"])
 def test_splat_transform_finds_the_others_of_a_far_gaussian_where_they_are(tmp_path, ending):
     some = cube(1e6)
     read = read_by_splat_transform(written(tmp_path, ending, some))
-    assert moved(some, half_turned(read) if ending == ".spz" else read).max() < 0.002
+    assert moved(some, half_rotated(read) if ending == ".spz" else read).max() < 0.002
 
 
 @pytest.mark.parametrize("ending", [".glb", ".usdz"])

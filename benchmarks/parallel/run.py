@@ -8,7 +8,7 @@ import train
 from benchmarks.parallel.workload import Workload
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.morton import sort_rows
-from scene.sampling_rate import share_seen
+from scene.sampling_rate import share_in_view
 from scene.sleeping import Sleeping
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch
@@ -86,6 +86,6 @@ class WorkloadRun(Run):
         room = self.gaussians.room
         if room.host_bytes(len(self.gaussians)):
             room.settle(self.gaussians)
-            seen = share_seen(self.gaussians.get_xyz.detach(), self._cameras)
+            seen = share_in_view(self.gaussians.get_xyz.detach(), self._cameras)
             print("".join(f"{said}\n" for said in sentences(room, len(self.gaussians), seen, True)), end="")
         self.clock = Stopwatch()

@@ -13,7 +13,7 @@ from diff_gaussian_rasterization.optim import adam_, sparse_adam_
 from torch import Tensor
 from torch.optim.optimizer import _global_optimizer_post_hooks, _global_optimizer_pre_hooks
 
-from scene.gaussians.spilled import beside, zeros_beside
+from scene.gaussians.spilled import spilled_as, zeros_spilled_as
 from scene.gaussians.table import Group
 
 # Options of a group that the kernel takes from the optimiser's defaults, or does not know.
@@ -156,8 +156,8 @@ class GaussianAdam(torch.optim.Adam):
 
     def _kind(self, param: Tensor) -> tuple[torch.dtype, torch.device] | None:
         """Dtype and device of a parameter, None for one of a dtype or layout that the kernel does not take."""
-        known = param.dtype == torch.float32 or (param.dtype == torch.float64 and not param.is_cuda)
-        fits = known and param.dim() > 0 and (self._any_strides or param.is_contiguous())
+        by_kernel = param.dtype == torch.float32 or (param.dtype == torch.float64 and not param.is_cuda)
+        fits = by_kernel and param.dim() > 0 and (self._any_strides or param.is_contiguous())
         return (param.dtype, param.device) if fits else None
 
     def _step_by_torch(self, groups: list[Group]) -> None:
@@ -203,7 +203,7 @@ class GaussianAdam(torch.optim.Adam):
         state = self.state[param]
         if not state:
             state["step"] = torch.zeros((), dtype=torch.float32)
-            state["exp_avg"], state["exp_avg_sq"] = (zeros_beside(param.detach()) for _ in range(2))
+            state["exp_avg"], state["exp_avg_sq"] = (zeros_spilled_as(param.detach()) for _ in range(2))
         for key in ("exp_avg", "exp_avg_sq"):
             if not state[key].is_contiguous():  # as a state may be that was loaded
                 state[key] = state[key].contiguous()
@@ -297,7 +297,7 @@ def _fitting(entry: Any, param: Tensor, name: str | None) -> dict[str, Tensor]:
     if not (math.isfinite(step) and step >= 0):
         raise ValueError(f"step of {name} is {step}")
     averages = {
-        key: beside(param, value)
+        key: spilled_as(param, value)
         for key, value in entry.items()
         if torch.is_tensor(value) and value.shape == param.shape
     }

@@ -65,8 +65,8 @@ def densify_and_prune(
         getattr(gaussians, attribute.field).grad = None
     gradient = rules.mean_gradient(gaussians.xyz_gradient_accum, gaussians.denom)
     if max_splats > 0:
-        room = max_splats - gaussians.gaussian_count
-        gradient = rules.limit_growth(gradient, max_grad, room, gaussians.shards)
+        most = max_splats - gaussians.gaussian_count
+        gradient = rules.limit_growth(gradient, max_grad, most, gaussians.shards)
     how = {} if seed is None else {"seed": seed, "iteration": iteration}
     split = None
     if _grows_by_own_steps(gaussians):

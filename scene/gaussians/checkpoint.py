@@ -249,9 +249,9 @@ def _checked(content: Any) -> tuple[tuple, int]:
     if not isinstance(capture, tuple | list) or len(capture) < _ENTRIES:
         raise ValueError(f"the state has fewer than {_ENTRIES} entries")
     if type(iteration) is not int or not 0 <= iteration < 2**31:
-        raise ValueError(f"the iteration is {_shown(iteration)}")
+        raise ValueError(f"the iteration is {_in_short(iteration)}")
     if type(capture[0]) is not int or not 0 <= capture[0] <= 3:
-        raise ValueError(f"the active SH degree is {_shown(capture[0])}")
+        raise ValueError(f"the active SH degree is {_in_short(capture[0])}")
     per_gaussian = (*capture[1:10], *(entry for entry in capture[_ENTRIES:] if not isinstance(entry, dict)))
     if not all(torch.is_tensor(t) and t.dim() > 0 and t.dtype == torch.float32 for t in per_gaussian):
         raise ValueError("a per-Gaussian value is not a float32 tensor")
@@ -264,11 +264,11 @@ def _checked(content: Any) -> tuple[tuple, int]:
         raise ValueError("the statistics of density control have wrong shapes")
     extent = capture[11]
     if not isinstance(extent, Real) or isinstance(extent, bool) or not 0 <= extent < _LARGEST:
-        raise ValueError(f"the extent of the scene is {_shown(extent)}")
+        raise ValueError(f"the extent of the scene is {_in_short(extent)}")
     return tuple(capture), iteration
 
 
-def _shown(value: Any) -> str:
+def _in_short(value: Any) -> str:
     """A number, or the type of anything else: what a stranger's file says is never printed."""
     return str(value)[:40] if type(value) in (int, float) else f"a {type(value).__name__}"
 

@@ -32,8 +32,8 @@ def sort_scattered(gaussians: GaussianParameters) -> None:
     A model that was sorted in its training keeps its order: its neighbours are some fifty times nearer to each other.
     """
     means, half = gaussians.raw("xyz"), len(gaussians) // 2
-    beside, across = (torch.linalg.norm(means.roll(rows, 0) - means, dim=1) for rows in (1, half))
-    if half and beside.nanmedian() > _SCATTERED * across.nanmedian():
+    adjacent, across = (torch.linalg.norm(means.roll(rows, 0) - means, dim=1) for rows in (1, half))
+    if half and adjacent.nanmedian() > _SCATTERED * across.nanmedian():
         sort_rows(gaussians)
 
 

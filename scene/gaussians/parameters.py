@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from scene.gaussians.attributes import Attribute, Rows, attributes
 from scene.gaussians.finite import warn_of_undrawn
 from scene.gaussians.ply import FLAT, column_names, frame_comments, read_ply, row_bytes, write_ply
-from scene.gaussians.spilled import Room, is_spilled, room_for, to_host
+from scene.gaussians.spilled import Room, empty_for, is_spilled, to_host
 from scene.gaussians.statistics import NAMES, Statistics
 from scene.gaussians.table import GaussianTable
 from splatting.distributed.ranks import Ranks
@@ -323,7 +323,7 @@ class GaussianParameters:
         params = {}
         for name in self._attributes:
             like = rows[name][:0].to(device)
-            room = room_for(self, name, like, len(rows[name]))
+            room = empty_for(self, name, like, len(rows[name]))
             params[name] = nn.Parameter(rows[name].to(device) if room is None else room.copy_(rows[name].detach()))
         self._take(params)
         self.columns, self.drawn = {}, None

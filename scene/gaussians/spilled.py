@@ -39,7 +39,7 @@ class Room:
         return ""
 
 
-def room_for(model: Any, name: str | None, like: Tensor, rows: int) -> Tensor | None:
+def empty_for(model: Any, name: str | None, like: Tensor, rows: int) -> Tensor | None:
     """An uninitialised tensor for so many rows of a model's attribute; None: wherever torch puts it.
 
     like: (..., *shape of a row) on the device that computes. The model's `room` decides, if it has one.
@@ -50,7 +50,7 @@ def room_for(model: Any, name: str | None, like: Tensor, rows: int) -> Tensor | 
 
 def placed(model: Any, name: str | None, values: Tensor) -> Tensor:
     """Values of an attribute where the model keeps them: a copy, unless they lie there."""
-    room = None if is_spilled(values) else room_for(model, name, values, len(values))
+    room = None if is_spilled(values) else empty_for(model, name, values, len(values))
     return values if room is None else room.copy_(values)
 
 
@@ -77,20 +77,20 @@ def is_spilled(values: Tensor) -> bool:
     return values.dtype in (torch.float32, torch.float64) and any(bytes_of(values))
 
 
-def empty_beside(old: Tensor) -> Tensor | None:
+def empty_spilled_as(old: Tensor) -> Tensor | None:
     """An uninitialised tensor that is spilled as another one is; None if that is not."""
     return empty_rows(old, len(old), bytes_of(old)[0]) if is_spilled(old) else None
 
 
-def beside(old: Tensor, new: Tensor) -> Tensor:
+def spilled_as(old: Tensor, new: Tensor) -> Tensor:
     """Values that belong to others of the same shape: a copy that is spilled as these are, else the same tensor."""
-    room = empty_beside(old)
+    room = empty_spilled_as(old)
     return new if room is None else room.copy_(new)
 
 
-def zeros_beside(old: Tensor) -> Tensor:
+def zeros_spilled_as(old: Tensor) -> Tensor:
     """Zeros like a tensor, spilled as that is."""
-    room = empty_beside(old)
+    room = empty_spilled_as(old)
     return torch.zeros_like(old) if room is None else room.zero_()
 
 

@@ -31,15 +31,15 @@ class Statistics:
         """
         observe_(self.max_radii2D, self.xyz_gradient_accum, self.denom, radii, gradient)
 
-    def add_gradient(self, gradient: Tensor, seen: Tensor) -> None:
-        """Add a view without its radii: gradient (N, 3) per NDC unit, seen: indices (n,) or (n, 1), or a mask (N,)."""
+    def add_gradient(self, gradient: Tensor, visible: Tensor) -> None:
+        """Add a view without its radii: gradient (N, 3) per NDC unit; visible: indices (n,), (n, 1), or a mask (N,)."""
         x, y = gradient[:, 0], gradient[:, 1]
         length = (x * x + y * y).sqrt()[:, None]
-        if seen.dtype != torch.bool:
+        if visible.dtype != torch.bool:
             none = torch.zeros(len(gradient), dtype=torch.bool, device=length.device)
-            seen = none.index_fill_(0, seen.reshape(-1), True)
-        self.xyz_gradient_accum += torch.where(seen[:, None], length, 0.0)
-        self.denom += seen[:, None]
+            visible = none.index_fill_(0, visible.reshape(-1), True)
+        self.xyz_gradient_accum += torch.where(visible[:, None], length, 0.0)
+        self.denom += visible[:, None]
 
     def to(self, device: torch.device | str) -> "Statistics":
         """The same statistics on a device."""

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from scene.gaussians.attributes import Rows
-from scene.gaussians.spilled import empty_beside, placed, room_for
+from scene.gaussians.spilled import empty_for, empty_spilled_as, placed
 from scene.gaussians.statistics import PER_ROW
 from splatting.host.memory import is_out_of_memory
 
@@ -41,7 +41,7 @@ class GaussianTable:
         """Keep the rows (n,) int64, ascending, of the parameters that have `count`. Returns these by name."""
 
         def keep(values: Tensor, name: str, _: bool) -> Tensor:
-            return torch.index_select(values, 0, indices, out=room_for(self._model, name, values, len(indices)))
+            return torch.index_select(values, 0, indices, out=empty_for(self._model, name, values, len(indices)))
 
         return self._map(self.row_groups(count), keep)
 
@@ -64,7 +64,7 @@ class GaussianTable:
         def grow(values: Tensor, name: str, is_state: bool) -> Tensor:
             new = rows[name]
             new = values.new_zeros(len(new), *values.shape[1:]) if is_state else new
-            return torch.cat((values, new.detach()), out=room_for(self._model, name, values, len(values) + len(new)))
+            return torch.cat((values, new.detach()), out=empty_for(self._model, name, values, len(values) + len(new)))
 
         params = self._map(groups, grow)
         for name, values in self._columns.items():
@@ -163,7 +163,7 @@ def _with_rows(groups: Iterable[Group], count: int) -> list[Group]:
 def _permuted(values: Tensor, order: Tensor) -> Tensor:
     """values[order]; column by column in the memory of `values` itself where there is too little for all of them."""
     try:
-        return torch.index_select(values, 0, order, out=empty_beside(values))
+        return torch.index_select(values, 0, order, out=empty_spilled_as(values))
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise

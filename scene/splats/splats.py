@@ -103,7 +103,7 @@ def tidy(splats: Splats) -> Splats:
     return replace(splats, rotations=rotations.astype(np.float32), log_scales=scales.astype(np.float32))
 
 
-def half_turned(splats: Splats) -> Splats:
+def half_rotated(splats: Splats) -> Splats:
     """The splats turned by half a turn about x, from COLMAP's axes to OpenGL's (x right, y up, z back), or back.
 
     The turn is a rotation, so shapes and colours stay the same.

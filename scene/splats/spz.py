@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from scene.splats.packing import morton_order, smallest_three, spread, to_bytes, whole_quaternions
-from scene.splats.splats import Splats, from_axes, half_turned, logits, opacities, selected
+from scene.splats.splats import Splats, from_axes, half_rotated, logits, opacities, selected
 from splatting.files.plain_files import check_packed_rows
 from splatting.files.unread import say_unread
 from utils.system_utils import UserError, atomic_write
@@ -64,7 +64,7 @@ def write_spz(path: str | os.PathLike, splats: Splats) -> None:
     zstandard = find_zstandard(path)
     splats = _drawn_in(splats)
     warn_of_sizes([splats])
-    splats = half_turned(selected(splats, morton_order(splats.means)))
+    splats = half_rotated(selected(splats, morton_order(splats.means)))
     bits, streams = _streams(splats, _rotation_codes(splats.rotations))
     compressor = zstandard.ZstdCompressor(level=_LEVEL, write_checksum=True)
     packed = [compressor.compress(stream) for stream in streams]
@@ -76,7 +76,7 @@ def write_spz(path: str | os.PathLike, splats: Splats) -> None:
 
 def packed_spz_2(splats: Splats) -> bytes:
     """A whole file of version 2, in which the splats keep their order. UserError for positions that it cannot hold."""
-    splats = half_turned(splats)
+    splats = half_rotated(splats)
     bits, streams = _streams(splats, _three_bytes(splats.rotations))
     return gzip.compress(_packed_header(2, splats, bits, 0) + b"".join(streams), mtime=0)
 
@@ -282,7 +282,7 @@ def _splats(parts: list[bytes], header: _Header, axes: str) -> Splats:
     values = (means, scales / 16.0 - 10, _read_rotations(rotations), logits(alpha[:, 0] / 255.0, 1 / 255), sh)
     values = (x.astype(np.float32, copy=False) for x in values)
     splats = Splats(*values, bool(header.flags & _ANTIALIASED))
-    return half_turned(splats) if axes == "RUB" else from_axes(splats, axes)
+    return half_rotated(splats) if axes == "RUB" else from_axes(splats, axes)
 
 
 def _read_rotations(table: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ from types import ModuleType
 import numpy as np
 
 from scene.splats.packing import rgba_bytes
-from scene.splats.splats import Splats, half_turned, opacities
+from scene.splats.splats import Splats, half_rotated, opacities
 from scene.splats.spz import packed_spz_2
 from utils.system_utils import UserError, atomic_write, temporary_folder
 
@@ -52,7 +52,7 @@ def write_compressed_glb(path: str | os.PathLike, splats: Splats) -> None:
     """Write a compressed GLB of one splat or more, whole or not at all. UserError for what it cannot hold."""
     packed = packed_spz_2(splats)
     elsewhere = f"{EXTENSION}:OPACITY", f"{EXTENSION}:SH_DEGREE_0_COEF_0"
-    attributes = {name: x for name, x in _attributes(half_turned(splats)).items() if name not in elsewhere}
+    attributes = {name: x for name, x in _attributes(half_rotated(splats)).items() if name not in elsewhere}
     document = _document(attributes, [len(packed)], splats.antialiasing)
     document["extensionsUsed"] = document["extensionsRequired"] = [EXTENSION, COMPRESSION]
     (primitive,) = document["meshes"][0]["primitives"]

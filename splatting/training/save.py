@@ -94,7 +94,7 @@ def write_checkpoint(run: "Run", iteration: int, name: str = "", with_ply: bool 
         run.gaussians.check_finite(iteration)
         tqdm.write(f"[ITER {iteration}] Saving Checkpoint", file=sys.stdout)
         path = Path(run.scene.model_path) / (name or f"chkpnt{iteration}.pth")
-        run.scene.save_beside()
+        run.scene.save_parts()
         save_checkpoint(path, run.checkpoint_state(), iteration)
         numbers = {"gaussians": run.gaussians.gaussian_count, "loss": run.losses.mean}
         run.log.add(iteration, seconds, run.clock.joules, **numbers)

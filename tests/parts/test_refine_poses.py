@@ -424,7 +424,7 @@ def test_files_with_refined_lenses_are_refused(tmp_path):
     scene, poses = _refinement(tmp_path)
     with pytest.raises(UserError, match="the checkpoint has refined lenses, .*; train from the start"):
         poses.restore(poses.captured() | {"lenses": {}})
-    scene.save_beside()
+    scene.save_parts()
     table = json.loads((tmp_path / "out" / NAME).read_text())
     table["train"][0]["lens"] = [1.0, 1.0, 0.5, 0.5]
     (tmp_path / "out" / NAME).write_text(json.dumps(table))
