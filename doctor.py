@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from arguments import OptionParser
-from splatting.diagnosis import Line, environment
+from splatting.findings import Finding, environment
 
 
 def diagnose(source: str | None, images: str | None, model: str | None, iteration: int) -> int:
@@ -23,7 +23,7 @@ def diagnose(source: str | None, images: str | None, model: str | None, iteratio
     photos, None: `images`, and for a model the one that it was trained on.
     """
     lines = environment.check_packages()
-    complete = not any(line.finding for line in lines)
+    complete = not any(one.is_problem for one in lines)
     if complete:
         import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 
@@ -43,23 +43,23 @@ def diagnose(source: str | None, images: str | None, model: str | None, iteratio
                 continue
             raise UserError(f"no folder {folder or repr(folder)}; pass an existing folder as {option}")
     if source is not None:
-        from splatting.diagnosis.advice import check_options
-        from splatting.diagnosis.dataset import check_dataset
+        from splatting.findings.advice import check_options
+        from splatting.findings.scene import check_dataset
 
         names = source, images or "images"
         problems += _show(f"dataset {source}", [*check_dataset(*names), *check_options(*names, model)])
     if model is not None:
-        from splatting.diagnosis.model import check_model
+        from splatting.findings.model import check_model
 
         problems += _show(f"model {model}", check_model(model, iteration, source, images))
     return problems
 
 
-def _show(title: str, lines: list[Line]) -> int:
+def _show(title: str, found: list[Finding]) -> int:
     print(f"{title}:")
-    for line in lines:
-        print(f"  {line}")
-    return sum(line.finding for line in lines)
+    for one in found:
+        print(f"  {one.line}")
+    return sum(one.is_problem for one in found)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

@@ -108,7 +108,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
         convert_first(dataset.source_path)
     if args.advise or args.options == "auto":
-        from splatting.diagnosis.advice import asked_options  # which no other training needs
+        from splatting.findings.advice import asked_options  # which no other training needs
 
         given = sys.argv[1:] if argv is None else argv
         words = asked_options(resolve_lenses(dataset, None), args, given)

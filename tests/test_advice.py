@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from scene.readers.tracks import Track
-from splatting.diagnosis import advice
-from splatting.diagnosis.advice import Advice
 from splatting.files.json_files import write_json
+from splatting.findings import advice, note
 from train import parse
 from utils.system_utils import UserError
 
@@ -36,7 +35,7 @@ def test_photos_of_a_point_from_twice_as_far_have_twice_the_depth_in_focal_lengt
 
 
 def test_advice_on_a_given_option_or_against_one_is_not_taken(tmp_path, monkeypatch, capsys):
-    found = [Advice("", "--sky auto"), Advice("", "--appearance ppisp --x 1"), Advice("", "--refine_poses")]
+    found = [note("", "--sky auto"), note("", "--appearance ppisp --x 1"), note("", "--refine_poses")]
     monkeypatch.setattr(advice, "advise", lambda *_, **__: found)
     args = argparse.Namespace(train_test_exp=False, projection="ray", strategy="adc", advise=True)
     dataset = argparse.Namespace(model_path=str(tmp_path))
@@ -82,7 +81,7 @@ def test_a_short_training_that_fails_says_why_and_one_that_is_interrupted_leaves
 
 
 def test_a_model_is_not_told_to_take_what_it_was_trained_with(tmp_path, monkeypatch):
-    monkeypatch.setattr(advice, "advise", lambda *_, **__: [Advice("far", "--sky auto")])
+    monkeypatch.setattr(advice, "advise", lambda *_, **__: [note("far", "--sky auto")])
     assert len(advice.check_options("scene", "images", str(tmp_path / "none"))) == 1
     (tmp_path / "cfg_args").write_text("Namespace()")
     write_json(tmp_path / "model.json", {"options": {"sky": "auto"}})

@@ -21,7 +21,7 @@ from scene.agreement import (
     share_behind,
     verdict,
 )
-from splatting.diagnosis.dataset import check_agreement
+from splatting.findings.tracks import check_agreement
 from splatting.sfm import mapping
 from utils.system_utils import UserError
 
@@ -108,7 +108,7 @@ def test_the_doctor_names_a_model_whose_tracks_contradict_each_other(tmp_path):
         (tmp_path / name).mkdir()
         _room(moved).write(str(tmp_path / name))
         (line,) = check_agreement(tmp_path / name)
-        assert line.finding == (name == "wrong")
+        assert line.is_problem == (name == "wrong")
         assert f"the tracks of {8 if moved else COUNT} of {COUNT} photos agree with each other" in line.text
     assert not [*check_agreement(tmp_path / "nothing")]
 

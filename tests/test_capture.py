@@ -9,7 +9,7 @@ from PIL import Image, ImageFilter
 from scipy.ndimage import gaussian_filter
 
 import train
-from scene.check.photos import left_out
+from splatting.findings.photos import left_out
 from splatting.sfm.capture import compared, findings, lines_of, looks_of, neighbours_of, unusable
 from splatting.sfm.capture_page import from_above, write_page
 from splatting.sfm.layout import Layout

@@ -15,7 +15,7 @@ import convert
 import train
 from scene.dataset_readers import read_scene
 from scene.images.exif import Lens, read_lens
-from splatting.diagnosis.dataset import check_lenses
+from splatting.findings.cameras import check_lenses
 from splatting.sfm import cameras
 from splatting.sfm.layout import Layout
 
@@ -234,7 +234,7 @@ def test_the_doctor_compares_cameras_with_exif(colmap_scene):
         small(path, made, (view.width, view.height))
     (line,) = check_lenses(str(colmap_scene), views)
     said = "17 photos share one camera, but their EXIF data tell several focal lengths: 4 mm (12), 6 mm (5)"
-    assert line.finding and line.text == said and "--cameras per_lens" in line.remedy
+    assert line.is_problem and line.text == said and "--cameras per_lens" in line.remedy
     halves = [view._replace(fx=view.fx * (1 + (number >= 12))) for number, view in enumerate(views)]
     assert not [*check_lenses(str(colmap_scene), halves)]
 

@@ -17,32 +17,31 @@ from PIL import Image
 from synthetic import HEIGHT, WIDTH
 
 import doctor
-import splatting.diagnosis.model
+import splatting.findings.model
 from arguments import ModelParams, read_cfg_args, write_cfg_args, write_model_json
 from benchmarks.scenes.poses import disturbed
 from gaussian_renderer import render
-from scene.check import findings
-from scene.check.cameras import of_cameras
-from scene.check.points import of_points
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
-from splatting.diagnosis import Line, environment
-from splatting.diagnosis.dataset import check_cloud, check_dataset, check_extent
-from splatting.diagnosis.model import check_model
+from splatting.findings import Finding, environment, fine
+from splatting.findings.cameras import check_extent, of_cameras
+from splatting.findings.model import check_model
+from splatting.findings.points import check_cloud, of_points
+from splatting.findings.scene import check_dataset, findings
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 
 
-def problems(lines: list[Line]) -> list[str]:
-    return [str(line) for line in lines if line.finding]
+def problems(lines: list[Finding]) -> list[str]:
+    return [line.line for line in lines if line.is_problem]
 
 
 @pytest.fixture
 def healthy(monkeypatch: pytest.MonkeyPatch) -> None:
     """Simulate an environment without problems, whatever is installed."""
-    monkeypatch.setattr(environment, "check_packages", lambda: [Line("packages")])
-    monkeypatch.setattr(environment, "check_build", lambda: [Line("build")])
+    monkeypatch.setattr(environment, "check_packages", lambda: [fine("packages")])
+    monkeypatch.setattr(environment, "check_build", lambda: [fine("build")])
 
 
 def exit_status(*argv: str) -> int:
@@ -80,7 +79,7 @@ def test_pycolmap_is_missed_only_where_it_has_a_wheel(monkeypatch, system, machi
     monkeypatch.setattr(environment.sys, "platform", system)
     monkeypatch.setattr(environment.platform, "machine", lambda: machine)
     monkeypatch.setattr(environment, "_version", lambda name: None if name == "pycolmap" else "1.0")
-    assert [line.finding for line in environment.check_packages()] == [missed]
+    assert [line.is_problem for line in environment.check_packages()] == [missed]
 
 
 def test_extensions_that_do_not_fit(monkeypatch, tmp_path):
@@ -91,7 +90,7 @@ def test_extensions_that_do_not_fit(monkeypatch, tmp_path):
 
     def check(version: str = "0.1.0") -> str:
         (tmp_path / "version.txt").write_text(f"{version}\n")
-        return str(environment._check_extension("simple-knn"))
+        return environment._check_extension("simple-knn").line
 
     monkeypatch.setattr(environment, "ROOT", tmp_path)
     monkeypatch.setattr(environment, "_version", versions.get)
@@ -105,12 +104,12 @@ def test_extensions_that_do_not_fit(monkeypatch, tmp_path):
 
 def test_the_rasterizer_is_tried(monkeypatch):
     line = environment._check_rasterizer(torch)
-    assert not line.finding and "agrees with its float64 oracle" in line.text
+    assert not line.is_problem and "agrees with its float64 oracle" in line.text
     right = diff_gaussian_rasterization.rasterize
     wrong = lambda **k: (drawn := right(**k))._replace(color=drawn.color + 1e-4)  # noqa: E731
     monkeypatch.setattr(diff_gaussian_rasterization, "rasterize", wrong)
     line = environment._check_rasterizer(torch)
-    assert line.finding and "differs from its float64 oracle by 1.0e-04" in line.text
+    assert line.is_problem and "differs from its float64 oracle by 1.0e-04" in line.text
 
 
 def test_a_gpu_that_is_not_used(monkeypatch):
@@ -187,11 +186,11 @@ def test_points_and_cameras_that_do_not_meet(info):
 def test_what_readers_say_becomes_a_line(colmap_scene, tmp_path):
     (picture, *_) = sorted((colmap_scene / "images" / "left").iterdir())
     Image.new("RGB", (96, 70)).save(picture)
-    first = str(check_dataset(str(colmap_scene), "images")[0])
+    first = check_dataset(str(colmap_scene), "images")[0].line
     assert first.startswith("note    1 of 17 photos do not have the aspect ratio of their camera")
     picture.unlink()
     (line,) = check_dataset(str(colmap_scene), "images")
-    assert line.finding and "are missing" in line.text and "-i" in line.remedy
+    assert line.is_problem and "are missing" in line.text and "-i" in line.remedy
 
 
 def test_poses_that_tracks_correct(colmap_scene, tmp_path):
@@ -316,7 +315,7 @@ def _mask(scene: Path, mask: np.ndarray) -> None:
 
 def test_a_model_of_the_other_background(model, colmap_scene, monkeypatch):
     """The photos have alpha, and are transparent where they are black."""
-    monkeypatch.setattr(splatting.diagnosis.model, "_WIDTH", WIDTH)
+    monkeypatch.setattr(splatting.findings.model, "_WIDTH", WIDTH)
     folder = Path(model(_half_black))
     _photograph(folder, lambda x: np.dstack([x, np.where(x.max(axis=2) > 4, 255, 0).astype(np.uint8)]))
     assert problems(check_model(str(folder), -1)) == []
@@ -345,14 +344,14 @@ def test_models_that_have_not_converged(model, monkeypatch):
     assert "shortly after opacities were reset" in str(problems(check_model(model(iteration=6100), 6100)))
     late = model(iteration=20000)
     assert "the model does not fit these photos" in str(problems(check_model(late, -1)))  # one colour would fit better
-    monkeypatch.setattr(splatting.diagnosis.model, "BEGUN", 30_000)
+    monkeypatch.setattr(splatting.findings.model, "BEGUN", 30_000)
     assert "the dataset has problems (only 17 photos)" in str(problems(check_model(late, -1)))
 
 
 @pytest.mark.parametrize("halves", [False, True])
 def test_only_what_is_scored_is_looked_at(model, colmap_scene, monkeypatch, halves):
     """Photos whose right halves are a model's own renders, and whose left halves are nonsense."""
-    monkeypatch.setattr(splatting.diagnosis.model, "_WIDTH", WIDTH)
+    monkeypatch.setattr(splatting.findings.model, "_WIDTH", WIDTH)
     folder = Path(model(filled(opacity=3)))
     if halves:
         _options(folder, train_test_exp=True)

@@ -15,16 +15,17 @@ from PIL import Image
 from synthetic import as_text
 from trainings import train_on
 
-import splatting.diagnosis.model
+import splatting.findings.model
 from scene.dataset_readers import read_scene
 from scene.gaussians.attributes import Rows
 from scene.gaussians.ply import write_ply
 from scene.readers.point_cloud import storePly
 from scene.saved_model import read_model
 from splatting.demo.make_scene import make_scene
-from splatting.diagnosis.dataset import check_dataset
-from splatting.diagnosis.model import check_model
 from splatting.files.json_files import read_model_json, write_json
+from splatting.findings import Severity
+from splatting.findings.model import check_model
+from splatting.findings.scene import check_dataset
 
 N = 400
 
@@ -64,7 +65,7 @@ def _edit(folder: Path, change: Callable[[Rows], Rows]) -> None:
 
 def _problems(folder: Path, scene: Path | None = None) -> list[str]:
     lines = check_model(str(folder), -1, scene and str(scene))
-    return [f"{line.text} -> {line.remedy}" for line in lines if line.finding and "only 24 photos" not in line.text]
+    return [f"{line.text} -> {line.remedy}" for line in lines if line.is_problem and "only 24 photos" not in line.text]
 
 
 def _times(positions: float, sizes: float) -> Callable[[Rows], Rows]:
@@ -101,7 +102,7 @@ def test_a_photo_that_somebody_walked_into_is_named(trained, scene, tmp_path):
     Image.fromarray(pixels).save(photo)
     for folder, named in ((scene, []), (other, [photo.name])):
         lines = check_model(str(trained), -1, str(folder))
-        found = [line.text for line in lines if line.note and "passers-by" in line.text]
+        found = [line.text for line in lines if line.severity == Severity.NOTE and "passers-by" in line.text]
         assert ["most in " + name + ";" in text for text, name in zip(found, named, strict=True)] == [True] * len(named)
 
 
@@ -189,7 +190,7 @@ def test_opacities_that_were_reset_too_late(folder, monkeypatch):
     records[-1]["lines"] = [said, *records[-1].get("lines", [])]
     log.write_text(json.dumps(records))
     assert _problems(folder) == []  # they did recover
-    monkeypatch.setattr(splatting.diagnosis.model, "UNRECOVERED", 1.0)
+    monkeypatch.setattr(splatting.findings.model, "UNRECOVERED", 1.0)
     assert _problems(folder) == [said.removeprefix("warning: ").replace("; ", " -> ")]
 
 
@@ -275,5 +276,5 @@ def test_a_sky_does_not_make_a_model_broken(folder):
 
     _edit(folder, add)
     lines = check_model(str(folder), -1)
-    assert not [line for line in lines if line.finding and "too large" in line.text]
+    assert not [line for line in lines if line.is_problem and "too large" in line.text]
     assert not [line for line in lines if "larger than the extent" in line.text]

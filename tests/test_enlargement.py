@@ -28,8 +28,8 @@ from scene.readers.tracks import enlargement
 from scene.reprojection import twist_gradient
 from scene.splats.reading import read_splats
 from scene.with_splats import load_file, splats_of
-from splatting.diagnosis.dataset import check_dataset
-from splatting.diagnosis.model import check_model
+from splatting.findings.model import check_model
+from splatting.findings.scene import check_dataset
 from splatting.parts.mcmc.control import MarkovChain
 from splatting.training.schedule import Schedule
 from utils.graphics_utils import world_to_camera
@@ -193,8 +193,8 @@ def test_doctor_finds_no_fault_in_the_unit(scenes, tmp_path):
         str(line.text) for line in [*check_dataset(str(scenes[1]), "images"), *check_model(str(tmp_path / "out"), -1)]
     ]
     assert any("on are drawn" in text for text in said)
-    plain = [line.text for line in check_dataset(str(scenes[0]), "images") if line.finding]
-    assert [line.text for line in check_dataset(str(scenes[1]), "images") if line.finding] == plain
+    plain = [line.text for line in check_dataset(str(scenes[0]), "images") if line.is_problem]
+    assert [line.text for line in check_dataset(str(scenes[1]), "images") if line.is_problem] == plain
 
 
 def test_gradients_of_poses_and_depths(scenes):

@@ -20,11 +20,11 @@ import metrics
 import render
 import train
 from scene import Scene
-from scene.check.photos import hints
 from scene.images.decode import decode
 from scene.images.find import names_below
 from scene.images.masks import IGNORE, TRANSPARENT, Mask, MaskOptions, find_masks
 from scene.readers.photos import _check_mask
+from splatting.findings.photos import hints
 from splatting.training.watch import MaskWatch
 from utils.image_utils import pixels_that_count
 from utils.loss_utils import photometric_loss

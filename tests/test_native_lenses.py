@@ -21,7 +21,7 @@ from scene import Scene
 from scene.images.lens import Lens, pinhole_of
 from scene.readers.start_cloud import random_in_frusta
 from splatting.camera_paths.poses import poses_of
-from splatting.diagnosis.dataset import check_dataset
+from splatting.findings.scene import check_dataset
 from utils.system_utils import UserError
 
 PANORAMA = ("EQUIRECTANGULAR", (WIDTH, HEIGHT))

@@ -27,7 +27,7 @@ WORK = "a reserved name in `distorted`, or in a scene that convert.py has made; 
 MAY = {
     "splatting.host.programs.find_program": "the one place that looks for programs",
     "splatting.host.machine._output": FOUND,
-    "splatting.diagnosis.environment._nvidia_gpu": FOUND,
+    "splatting.findings.environment._nvidia_gpu": FOUND,
     "splatting.exports.sog.fault_of": FOUND,
     "splatting.exports.vendor._output": FOUND,  # npm, and what it installs by a record of the repository
     "splatting.camera_paths.video.write_video": FOUND,
@@ -36,7 +36,7 @@ MAY = {
     "splatting.sfm.video._warn_if_cut": "runs the ffmpeg that imageio-ffmpeg finds, without relative entries of PATH",
     "splatting.sfm.video._filters": "the same",
     "splatting.host.machine.facts_asked": SELF,
-    "splatting.diagnosis.advice._trained": SELF,
+    "splatting.findings.advice._trained": SELF,
     "splatting.evaluation.child.run_child": SELF,
     "splatting.evaluation.curve_recorder.begin": SELF,
     # Also that of BuildModules, which empties setuptools' build folder of modules.

@@ -25,7 +25,7 @@ NAMESPACES = ("args", "opt", "options", "dataset", "given", "launch", "pipe")  #
 KNOWN = {  # words in files that are options of a part, and mean something else there or have to stay
     ("time_budget", "integrations/nerfbaselines/spec.py"),  # a set of options, as a user gives it
     ("no_curve", "integrations/nerfbaselines/method.py"),
-    ("no_curve", "splatting/diagnosis/advice.py"),  # of a short training
+    ("no_curve", "splatting/findings/advice.py"),  # of a short training
     ("schedule", "scene/gaussian_model.py"),  # that of exposures' learning rate
     ("schedule", "scene/gaussians/reference_names.py"),
     ("train_test_exp", "scene/cameras.py"),  # what functions of the reference take
@@ -39,7 +39,7 @@ KNOWN = {  # words in files that are options of a part, and mean something else 
     *(
         (option, f"splatting/{of}.py")  # of own trainings
         for option in ("disable_viewer", "no_last_checkpoint")
-        for of in ("evaluation/stages", "diagnosis/advice")
+        for of in ("evaluation/stages", "findings/advice")
     ),
     ("disable_viewer", "integrations/nerfbaselines/method.py"),
 }

@@ -1,4 +1,4 @@
-"""scene/check: each fault of photos, cameras and points is named, and nothing is said of sound scenes."""
+"""splatting/findings: each fault of photos, cameras and points is named, and nothing is said of sound scenes."""
 
 import argparse
 import re
@@ -15,13 +15,10 @@ from PIL import Image
 from synthetic import BROWN, as_text, edit_json, make_blender_scene, make_colmap_scene, options_of, read
 
 from scene import Scene
-from scene.check import Finding, findings, tell
-from scene.check.photos import of_damage, of_photos
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.copies import places_of
 from scene.gaussians.start import start_rows
-from scene.images.damage import said_of
 from scene.images.decode import decode
 from scene.images.masks import MaskOptions
 from scene.readers.depth_maps import with_depth_maps
@@ -29,7 +26,10 @@ from scene.readers.info import CameraInfo, SceneInfo, exposure_names, local, wor
 from splatting.demo.make_scene import write_scene
 from splatting.demo.objects import demo_scene
 from splatting.demo.tracer import FISHEYE, PANORAMA, ring_views
-from splatting.diagnosis.dataset import check_dataset, check_geometry
+from splatting.findings import Finding, Severity
+from splatting.findings.photo_files import damaged, of_damage
+from splatting.findings.photos import of_photos
+from splatting.findings.scene import check_dataset, check_geometry, findings, tell
 from splatting.sfm.images import check_images
 from splatting.sfm.layout import Layout
 from splatting.training.checks import check_scene
@@ -110,7 +110,7 @@ def test_rounded_coordinates_of_maps(kept, step, part):
 )  # fmt: skip
 def test_photos(info, severe, text):
     (one,) = of_photos(info, 16)
-    assert text in str(one) and one.severe == severe
+    assert text in str(one) and (one.severity == Severity.HOPELESS) == severe
 
 
 def _shown(top: int, left: int, color: int = 0, black: int = 0) -> np.ndarray:
@@ -168,11 +168,11 @@ def test_jpegs_with_a_damaged_middle_are_named(sound, tmp_path, capsys, zeros):
 
 
 @pytest.mark.parametrize(
-    ("usual", "most", "damaged"), [(0, 0.016, False), (0, 0.04, True), (0.011, 0.081, False), (0.011, 0.4, True)]
+    ("usual", "most", "named"), [(0, 0.016, False), (0, 0.04, True), (0.011, 0.081, False), (0.011, 0.4, True)]
 )
-def test_grey_photos_and_those_of_a_low_quality_are_not_damaged(usual, most, damaged):
+def test_grey_photos_and_those_of_a_low_quality_are_not_damaged(usual, most, named):
     """Sound ones have so large shares of equal blocks: scenes of real photos, saved as grey, or in quality 30."""
-    assert bool(said_of(dict.fromkeys("abcdefg", usual) | {"h": most})) == damaged
+    assert any(damaged(dict.fromkeys("abcdefg", usual) | {"h": most})) == named
 
 
 def test_sound_photos_are_passed():
@@ -378,7 +378,7 @@ def test_what_a_training_prints(capsys):
     lines = capsys.readouterr().err.splitlines()
     assert lines == [*(f"warning: fault {n}; repair it" for n in range(5)), "2 more: python doctor.py -s garden"]
     with pytest.raises(UserError, match="fault; repair it"):
-        tell([Finding("fault", "repair it", severe=True), *found], "garden")
+        tell([Finding("fault", "repair it", Severity.HOPELESS), *found], "garden")
 
 
 def test_a_resumed_training_is_not_told_again(sound, tmp_path, capsys):
@@ -436,7 +436,7 @@ def test_a_geometric_cause_is_named_before_colours(sound, tmp_path, change, text
     if not tracks:
         _without_tracks(scene)
         text = text.replace("0.769", "about 0.75")
-    lines = "\n".join(line.text for line in check_dataset(str(scene), "images") if line.finding)
+    lines = "\n".join(line.text for line in check_dataset(str(scene), "images") if line.is_problem)
     assert text in lines and "fit together" not in lines
 
 

@@ -29,7 +29,7 @@ from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.readers.point_cloud import write_point_cloud
-from splatting.diagnosis.model import check_model
+from splatting.findings.model import check_model
 from splatting.training.trim_report import TrimReport, lines, saved_line
 from utils.system_utils import UserError
 

@@ -14,7 +14,7 @@ from gaussians import model, take_steps
 
 from arguments import VERSION, write_model_json
 from scene.gaussians.checkpoint import WRITTEN_BY, save_checkpoint
-from splatting.diagnosis.environment import EXTENSIONS
+from splatting.findings.environment import EXTENSIONS
 from splatting.host.machine import VERSION as WRITTEN
 
 ROOT = Path(__file__).resolve().parents[1]

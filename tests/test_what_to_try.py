@@ -9,10 +9,11 @@ import pytest
 
 import train
 from arguments import OptimizationParams
-from splatting.diagnosis.model import check_training
 from splatting.evaluation.error_curve import COLUMNS, NAME, Row, write_curve
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.what_to_try import what_to_try
+from splatting.findings import Severity
+from splatting.findings.model import check_training
 
 COUNTS = (1000, 1500, 4000, 8000)
 
@@ -103,7 +104,7 @@ def test_doctor_repeats_it(tmp_path):
     assert check_training(tmp_path) == []
     write_curve(tmp_path / NAME, _curve([20.0, 24.0, 23.0, 22.5], RISING))
     (line,) = check_training(tmp_path)
-    assert line.note and not line.finding and line.text.startswith("From iteration 4000")
+    assert line.severity == Severity.NOTE and line.text.startswith("From iteration 4000")
     write_curve(tmp_path / NAME, _curve(RISING, RISING))
     assert check_training(tmp_path) == []
     (tmp_path / LOG).write_text(json.dumps([{"iteration": 8000, "seconds": 80.0, "max_num_splats": 8000}]))

@@ -10,12 +10,12 @@ from pathlib import Path
 from PIL import Image, ImageOps
 from tqdm.contrib.concurrent import thread_map
 
-from scene.images.damage import equal_share, said_of
 from scene.images.decode import picture_size
 from scene.images.find import SideFiles
 from scene.images.masks import Mask, mask_names
 from splatting.files.color_profiles import has_other_colors, in_srgb
 from splatting.files.image_files import SUFFIXES, UNREADABLE, open_image
+from splatting.findings.photo_files import damaged, equal_share
 from splatting.host.machine import threads
 from splatting.sfm.layout import Layout, image_names
 from utils.system_utils import UserError
@@ -78,8 +78,8 @@ def check_images(layout: Layout, names: Sequence[str], masks: Path | None) -> No
         equal[name], _ = equal_share(layout.input / name)
 
     _in_threads(check, names, "Checking photos", f"replace or remove them, {_OR_WITHOUT}")
-    if said := said_of(equal):
-        print(f"warning: {'; '.join(said)}", file=sys.stderr)
+    for found in damaged(equal):
+        print(f"warning: {found}", file=sys.stderr)
 
 
 def find_masks(names: Sequence[str], folder: Path, photos: Path) -> dict[str, Path]:

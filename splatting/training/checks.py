@@ -3,10 +3,10 @@
 import argparse
 import sys
 
-from scene.check import of_options, tell
-from scene.check.photos import already_undistorted, hints, left_out
 from scene.readers.info import NEAREST
 from scene.scene import Scene
+from splatting.findings.photos import already_undistorted, hints, left_out
+from splatting.findings.scene import of_options, tell
 from utils.system_utils import UserError
 
 

@@ -29,9 +29,9 @@ from scene.scene import Scene
 from splatting.demo.make_scene import write_scene
 from splatting.demo.objects import demo_scene
 from splatting.demo.tracer import FISHEYE, ring_views
-from splatting.diagnosis.model import load_scored
 from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.results import read_run
+from splatting.findings.model import load_scored
 from splatting.parts.refine_poses import bounded_adam, refinement, tracked_poses
 from splatting.parts.refine_poses.bounded_adam import BoundedAdam
 from splatting.parts.refine_poses.pose_file import NAME, with_poses

@@ -21,8 +21,8 @@ from scene.splats.reading import read_splats
 from splatting.demo.make_scene import Things, write_scene
 from splatting.demo.objects import Box, Thing, demo_scene
 from splatting.demo.tracer import ring_views, shade, trace
-from splatting.diagnosis.model import check_model
 from splatting.files.json_files import read_model_json
+from splatting.findings.model import check_model
 from splatting.parts.sky.directions import FEWEST
 from splatting.parts.sky.shell import Shell, find_sky
 from splatting.parts.time_budget.paced import Block, Decided

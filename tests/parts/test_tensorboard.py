@@ -11,8 +11,8 @@ import torch
 from PIL import Image
 
 import train
-from splatting.diagnosis import environment
 from splatting.evaluation.peer_curve import read_scalars
+from splatting.findings import environment
 from splatting.parts.tensorboard import events
 from splatting.parts.tensorboard.event_writer import EventWriter
 from splatting.parts.tensorboard.part import Tensorboard

@@ -1,4 +1,7 @@
-"""Changes of a model or its photos since the training: each that is usual is undone, and tried on the views."""
+"""What has changed since a training: the model, the cameras, or photos, which then show other views than theirs.
+
+Each change that is usual is undone, and tried on the views. What explains them is told; else, what does not fit.
+"""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -6,23 +9,32 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from arguments import read_model_json
 from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import Rows
+from scene.readers.info import CameraInfo
 from scene.readers.point_cloud import read_point_cloud
 from scene.scene import Scene
-from splatting.diagnosis import Line
-from splatting.diagnosis.photos import CLEARLY, FITS, other_focal_length, strange_photos
 from splatting.evaluation.model_folder import curve_of
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
+from splatting.findings import Finding
+from splatting.host.listing import some
 from splatting.registry import tools
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.system_utils import UserError
 
+MOST_PHOTOS = 300  # that are compared with each other
+FITS = 18.0  # dB of training views; models that converge reach 22 and more
+CLEARLY = 3.0  # dB that undoing a change has to gain, unless it comes to what was recorded
+_SUSPECTS = 12  # views whose photos are looked for among all, those that fit worst
+_WIDEST, _STEP, _FINE = 2.5, 1.16, 1.03  # factors of focal lengths: the largest, between two, and between two at last
+_NO_FACTOR = 1.08  # a smaller one is told by no image of 200 pixels
+_INSIDE = 0.2  # of a photo that a changed focal length has to leave
 NEAR = 1.5  # dB between the record and a score of small renders
 LOST = 6.0  # dB below the record, from which on something has changed
 _SCALES = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
@@ -58,7 +70,9 @@ def recorded_psnr(model: Path, iteration: int) -> float | None:
     return next((score for score in found if score is not None), None)
 
 
-def what_changed(scene: Scene, views: list[Camera], scored: ScoredViews, now: float, then: float | None) -> Line | None:
+def what_changed(
+    scene: Scene, views: list[Camera], scored: ScoredViews, now: float, then: float | None
+) -> Finding | None:
     """The change that explains why views have the PSNR `now`; None if none of the usual ones does.
 
     then: their PSNR in training, None if it is not known.
@@ -73,13 +87,13 @@ def what_changed(scene: Scene, views: list[Camera], scored: ScoredViews, now: fl
     best = _score(views, _with(scene.gaussians, change.undo), scored)
     explains = best >= now + CLEARLY and best >= least
     if explains or (then is not None and best >= max(then - NEAR, now + 1)):
-        return Line(f"{change.text}: without that it is {best:.1f} dB", change.remedy)
+        return Finding(f"{change.text}: without that it is {best:.1f} dB", change.remedy)
     if strange := strange_photos(scene, scored):
         return strange
     if then is None or now > then - LOST:
         return None
     remedy = "restore the model and the photos of that training (its scene is in cfg_args), or train again"
-    return Line(f"it was {then:.1f} dB in training, so the model or the photos are not those of then", remedy)
+    return Finding(f"it was {then:.1f} dB in training, so the model or the photos are not those of then", remedy)
 
 
 def _with(gaussians: GaussianModel, undo: Callable[[Rows], Rows]) -> GaussianModel:
@@ -102,10 +116,6 @@ def _score(views: list[Camera], gaussians: GaussianModel, scored: ScoredViews) -
 def _changes(scene: Scene) -> Iterator[Change]:
     rows, folder = scene.gaussians.rows(), scene.model_path
     yield Change(
-        "red and blue are strange", "the program that wrote the PLY takes colours as BGR; swap f_dc and f_rest back",
-        lambda rows: rows | {name: rows[name].flip(-1) for name in ("f_dc", "f_rest")},
-    )  # fmt: skip
-    yield Change(
         "the quaternions begin with x", "write them as w x y z",
         lambda rows: rows | {"rotation": rows["rotation"].roll(1, dims=1)},
     )  # fmt: skip
@@ -119,7 +129,7 @@ def _changes(scene: Scene) -> Iterator[Change]:
             "the scales are no logarithms", "write natural logarithms, as train.py does",
             lambda rows: rows | {"scaling": rows["scaling"].log()},
         )  # fmt: skip
-    yield from map(_scaled, _factors(rows["xyz"], Path(folder)))
+    yield from map(_rescaled, _factors(rows["xyz"], Path(folder)))
     yield from map(_placed, _factors(rows["xyz"], Path(folder)))
 
 
@@ -133,7 +143,7 @@ def _factors(means: Tensor, folder: Path) -> list[float]:
     return [*_SCALES, spreads[0] / spreads[1]] if min(spreads) > 0 else list(_SCALES)
 
 
-def _scaled(factor: float) -> Change:
+def _rescaled(factor: float) -> Change:
     shift = torch.tensor(factor).log()
     return Change(
         f"the model was scaled by {factor:.3g}", f"scale it by {1 / factor:.3g}, or the scene as the model was",
@@ -146,3 +156,80 @@ def _placed(factor: float) -> Change:
         f"the positions were scaled by {factor:.3g}, but not the sizes", f"scale the positions by {1 / factor:.3g}",
         lambda rows: rows | {"xyz": rows["xyz"] / factor},
     )  # fmt: skip
+
+
+@torch.no_grad()
+def other_focal_length(scene: Scene, views: list[Camera], scored: ScoredViews, least: float) -> Finding | None:
+    """Whether views would fit with another focal length, to `least` dB at least.
+
+    That of a pinhole scales its image around the principal point, so no view is rendered again.
+    """
+    infos = scene.info.train_cameras
+    views = [view for view in views if infos[view.uid].native is None]
+    views = views[:: -(-len(views) // _TRIED) or 1]
+    pairs = [(scored.image(view, scene.gaussians), as_float(scored.target(view)), infos[view.uid]) for view in views]
+    if not pairs:
+        return None
+    steps = range(-6, 7)
+    factor = max((_STEP**step for step in steps if _STEP**step < _WIDEST), key=lambda one: _gain(pairs, one)[0])
+    factor = max((factor * _FINE**step for step in steps[3:-3]), key=lambda one: _gain(pairs, one)[0])
+    gain, score = _gain(pairs, factor)
+    if gain < CLEARLY or score < least or 1 / _NO_FACTOR < factor < _NO_FACTOR:
+        return None
+    text = f"the cameras have {factor:.2g} times the focal length of these photos: without that it is {score:.1f} dB"
+    return Finding(
+        text, "restore the cameras or the photos of the training, as other sizes or crops need other cameras"
+    )
+
+
+def _gain(pairs: list[tuple[Tensor, Tensor, CameraInfo]], factor: float) -> tuple[float, float]:
+    """What undoing a factor of the focal length gains (dB), and the PSNR with it, where both images show something."""
+    before, after = [], []
+    for image, photo, view in pairs:
+        scaled, inside = _scaled(image, factor, 2 * view.cx / view.width - 1, 2 * view.cy / view.height - 1)
+        if float(inside.float().mean()) < _INSIDE:
+            return float("-inf"), 0.0
+        before.append(float(psnr(image[:, inside], photo[:, inside]).mean()))
+        after.append(float(psnr(scaled[:, inside], photo[:, inside]).mean()))
+    before, after = (sum(values) / len(values) for values in (before, after))
+    return after - before, after
+
+
+def _scaled(image: Tensor, factor: float, across: float, down: float) -> tuple[Tensor, Tensor]:
+    """An image (3, H, W) made smaller by a factor around a place, in [-1, 1]; and where it has pixels (H, W)."""
+    y, x = ((torch.arange(side, device=image.device) * 2 + 1) / side - 1 for side in image.shape[1:])
+    y, x = down + factor * (y - down), across + factor * (x - across)
+    grid = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], dim=-1)
+    scaled = grid_sample(image[None], grid[None].to(image), padding_mode="border", align_corners=False)[0]
+    return scaled, (grid.abs() <= 1).all(-1)
+
+
+@torch.no_grad()
+def strange_photos(scene: Scene, scored: ScoredViews) -> Finding | None:
+    """Whether photos show other views than those of their cameras.
+
+    Such a view fits another photo clearly better than its own, and its own photo fits another view clearly better.
+    """
+    views = [view for view in scene.getTrainCameras() if view.columns is None]
+    size = views and (views[0].image_height, views[0].image_width)
+    views = [view for view in views if (view.image_height, view.image_width) == size]
+    views = views[:: -(-len(views) // MOST_PHOTOS) or 1]
+    images = [scored.image(view, scene.gaussians) for view in views]
+    photos = [as_float(scored.target(view)) for view in views]
+    own = [_psnr(*pair) for pair in zip(images, photos, strict=True)]
+    found = []
+    for place in sorted(range(len(views)), key=own.__getitem__)[:_SUSPECTS]:
+        row = [_psnr(images[place], photo) for photo in photos]
+        if max(row) < max(FITS, own[place] + CLEARLY):
+            continue
+        if max(_psnr(image, photos[place]) for image in images) >= own[place] + CLEARLY:
+            found.append(views[place].image_name)
+    if not found:
+        return None
+    count = f"at least {len(found)} of {len(views)} photos"
+    text = f"cameras and photos do not fit together: {count} show another view ({some(sorted(found))})"
+    return Finding(text, "restore the photos that these cameras were computed from, under their names")
+
+
+def _psnr(image: Tensor, photo: Tensor) -> float:
+    return float(psnr(image, photo).mean())

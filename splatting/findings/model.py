@@ -19,15 +19,14 @@ from scene.gaussian_model import GaussianModel
 from scene.images.sizes import training_size
 from scene.readers.info import NEAREST, CameraInfo, photo_size
 from scene.saved_model import load_saved
-from splatting.diagnosis import Line, from_error
-from splatting.diagnosis.changes import FITS as BAD_PSNR
-from splatting.diagnosis.changes import LOST, NEAR, of_scene, recorded_psnr, what_changed
-from splatting.diagnosis.dataset import check_dataset
-from splatting.diagnosis.photos import strange_photos
 from splatting.evaluation.model_folder import closing_lines, curve_of
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
 from splatting.evaluation.what_to_try import what_to_try
+from splatting.findings import Finding, fine, from_error, note
+from splatting.findings.changes import FITS as BAD_PSNR
+from splatting.findings.changes import LOST, NEAR, of_scene, recorded_psnr, strange_photos, what_changed
+from splatting.findings.scene import check_dataset
 from splatting.registry import options_of, tools
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.system_utils import UserError, compute_device
@@ -53,8 +52,8 @@ _WIDTH = 200  # pixels of a view, or fewer where it was trained smaller
 _RESET_SAID = "warning: opacities are reset"  # the beginning of what training/strategy_warnings.py:late_reset says
 
 
-def check_model(model_path: str, iteration: int, source: str | None = None, images: str | None = None) -> list[Line]:
-    """Lines about the model that train.py wrote into a folder; iteration -1: the last one saved.
+def check_model(model_path: str, iteration: int, source: str | None = None, images: str | None = None) -> list[Finding]:
+    """What to say of the model that train.py wrote into a folder; iteration -1: the last one saved.
 
     source, images: scene folder and its folder of photos, None: those that the model was trained on.
     """
@@ -68,22 +67,22 @@ def check_model(model_path: str, iteration: int, source: str | None = None, imag
     gaussians, extent = scene.gaussians, scene.cameras_extent
     name = f"iteration {scene.loaded_iter}"
     if not len(gaussians):
-        return [Line(f"{name} has no Gaussians, so renders show the background", "train it again")]
-    lines = [Line(f"{name}, {len(gaussians)} Gaussians of SH degree {gaussians.max_sh_degree}")]
+        return [Finding(f"{name} has no Gaussians, so renders show the background", "train it again")]
+    lines = [fine(f"{name}, {len(gaussians)} Gaussians of SH degree {gaussians.max_sh_degree}")]
     own_rows = of_scene(scene)
     if wrong := [*_not_finite(gaussians)] or [*_wrong_sizes(own_rows, extent)]:
         return [*lines, *wrong]
     shapes, (renders, changed) = [_opacities(own_rows), _sizes(scene)], _renders(scene, options, stored)
-    if renders.finding and stored != own and _fits(model_path, own, scene.loaded_iter):
+    if renders.is_problem and stored != own and _fits(model_path, own, scene.loaded_iter):
         other_scene = stored["source_path"] != own["source_path"]
         what, name, option = ("scene", "source_path", "-s") if other_scene else ("photos", "images", "-i")
         said = f"the model fits the {what} that it was trained on, but not {stored[name]}"
-        renders = Line(said, f"give {option} {own[name]}")
+        renders = Finding(said, f"give {option} {own[name]}")
         changed = True
     if changed:  # which explains all else, and the training has no say in it
-        return [*lines, *(line for line in shapes if not line.finding), renders]
-    reset = [] if renders.finding else _late_reset(scene)
-    odd = [] if renders.finding else _notes(scene, options)
+        return [*lines, *(line for line in shapes if not line.is_problem), renders]
+    reset = [] if renders.is_problem else _late_reset(scene)
+    odd = [] if renders.is_problem else _notes(scene, options)
     return [*lines, *shapes, renders, *odd, *reset, *check_training(Path(model_path))]
 
 
@@ -93,16 +92,16 @@ def _fits(model_path: str, stored: dict[str, Any], iteration: int) -> bool:
         options, scene = _load(model_path, stored, iteration)
     except UserError:
         return False
-    return not _renders(scene, options, stored)[0].finding
+    return not _renders(scene, options, stored)[0].is_problem
 
 
-def check_training(model: Path) -> list[Line]:
+def check_training(model: Path) -> list[Finding]:
     """Notes on what the log and the curve of the training suggest to try; none where it has written none."""
     try:
         said = what_to_try(curve_of(model), read_log(model / LOG))
     except UserError as error:
         return [from_error(error)]
-    return [Line(sentence, note=True) for sentence in said]
+    return [note(sentence) for sentence in said]
 
 
 def _load(model_path: str, stored: dict[str, Any], iteration: int) -> tuple[argparse.Namespace, Scene]:
@@ -129,7 +128,7 @@ def _trained_width(view: CameraInfo, resolution: int) -> int:
     return size[0] if resolution == -1 else training_size(*size, resolution)[0]
 
 
-def _not_finite(gaussians: GaussianModel) -> Iterator[Line]:
+def _not_finite(gaussians: GaussianModel) -> Iterator[Finding]:
     """NaN and infinities among the parameters."""
     shapes = gaussians.raw_geometry()
     raw = {
@@ -142,20 +141,20 @@ def _not_finite(gaussians: GaussianModel) -> Iterator[Line]:
     for name, values in raw.items():
         if bad := int((~torch.isfinite(values)).flatten(1).any(dim=1).sum()):
             text = f"{bad} of {len(values)} Gaussians have a {name} that is not finite"
-            yield Line(text, "resume from an earlier checkpoint, or train again, with lower learning rates")
+            yield Finding(text, "resume from an earlier checkpoint, or train again, with lower learning rates")
 
 
-def _wrong_sizes(gaussians: GaussianModel, extent: float) -> Iterator[Line]:
+def _wrong_sizes(gaussians: GaussianModel, extent: float) -> Iterator[Finding]:
     """Sizes that are all far too small or too large for the cameras."""
     median = float(gaussians.get_scaling.detach().max(dim=1).values.median()) / extent
     low, high = SIZES
     if not low <= median <= high:
         text = f"the Gaussians are too {'small' if median < low else 'large'} for these cameras"
         remedy = "check what wrote or changed the PLY: scales are natural logarithms, in the units of the cameras"
-        yield Line(f"{text}: their median size is {median:.2g} extents", remedy)
+        yield Finding(f"{text}: their median size is {median:.2g} extents", remedy)
 
 
-def _wrong_values(gaussians: GaussianModel, extent: float) -> Iterator[Line]:
+def _wrong_values(gaussians: GaussianModel, extent: float) -> Iterator[Finding]:
     """Positions in other units than the cameras', and opacities as a reset leaves them, with no training after it."""
     points, opacity = gaussians.get_xyz.detach(), gaussians.get_opacity.detach()
     spread = float((points - points.median(dim=0).values).norm(dim=1).median()) / extent
@@ -163,18 +162,18 @@ def _wrong_values(gaussians: GaussianModel, extent: float) -> Iterator[Line]:
         remedy = (
             "check whether the model belongs to this dataset (-s), and what scaled the PLY: both need the same units"
         )
-        yield Line(f"the positions of the Gaussians spread over {spread:.2g} extents of the cameras", remedy)
+        yield Finding(f"the positions of the Gaussians spread over {spread:.2g} extents of the cameras", remedy)
     share = float(((opacity >= RESET[0]) & (opacity <= RESET[1])).float().mean())
     if share >= RESET_SHARE:
         text = f"{share:.0%} of the opacities are near 0.01, as a reset leaves them, and nothing was trained after it"
         remedy = "check an earlier iteration, or train some 1000 iterations beyond the reset (--opacity_reset_interval)"
-        yield Line(text, remedy)
+        yield Finding(text, remedy)
 
 
-def _notes(scene: Scene, options: argparse.Namespace) -> Iterator[Line]:
+def _notes(scene: Scene, options: argparse.Namespace) -> Iterator[Finding]:
     """What parts of a training say of a trained model."""
     for examine in tools("examine"):
-        yield from (Line(text, note=True) for text in examine(scene, _scored(scene, options), options))
+        yield from (note(text) for text in examine(scene, _scored(scene, options), options))
 
 
 def load_scored(model_path: str) -> tuple[Scene, ScoredViews]:
@@ -183,43 +182,43 @@ def load_scored(model_path: str) -> tuple[Scene, ScoredViews]:
     return scene, _scored(scene, options)
 
 
-def _late_reset(scene: Scene) -> Iterator[Line]:
+def _late_reset(scene: Scene) -> Iterator[Finding]:
     """What training said at its start of a reset, if the opacities have not recovered from it."""
     faint = float(of_scene(scene).get_opacity.detach().median()) < UNRECOVERED
     said = closing_lines(Path(scene.model_path)) if faint else []
     yield from (from_error(UserError(line.partition(": ")[2])) for line in said if line.startswith(_RESET_SAID))
 
 
-def _opacities(gaussians: GaussianModel) -> Line:
+def _opacities(gaussians: GaussianModel) -> Finding:
     opacity = gaussians.get_opacity.detach().flatten().cpu().numpy()
     parts = zip(BINS, BINS[1:], np.histogram(opacity, bins=BINS)[0] / len(opacity), strict=False)
     shares = ", ".join(f"{low:g}-{high:g} {share:.0%}" for low, high, share in parts)
-    return Line(f"opacities: {shares}; median {np.median(opacity):.2f}")
+    return fine(f"opacities: {shares}; median {np.median(opacity):.2f}")
 
 
-def _sizes(scene: Scene) -> Line:
+def _sizes(scene: Scene) -> Finding:
     """Sizes against the extent of the cameras, but of what a part has put beside the scene."""
     extent = scene.cameras_extent
     largest = of_scene(scene).get_scaling.detach().max(dim=1).values.cpu().numpy()
     huge = float((largest > HUGE * extent).mean())
     if huge <= HUGE_SHARE:
-        return Line(f"sizes: median {np.median(largest) / extent:.2g}, largest {largest.max() / extent:.2g} extents")
+        return fine(f"sizes: median {np.median(largest) / extent:.2g}, largest {largest.max() / extent:.2g} extents")
     text = f"{huge:.1%} of the Gaussians are larger than the extent of the cameras ({extent:.3g})"
-    return Line(text, "remove far points from the start cloud, and check the poses")
+    return Finding(text, "remove far points from the start cloud, and check the poses")
 
 
-def _renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) -> tuple[Line, bool]:
-    """Line about a few training views, rendered small: close to their photos, or else the likeliest reason.
+def _renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) -> tuple[Finding, bool]:
+    """What to say of a few training views, rendered small: close to their photos, or else the likeliest reason.
 
     And whether that is a change since the training.
     """
     views = _looked_at(scene)
     means = _means(views, scene, options)
     if means is None:
-        return Line("no pixel of the inspected training views counts", "check --masks and --invert_masks"), False
+        return Finding("no pixel of the inspected training views counts", "check --masks and --invert_masks"), False
     black = means.render < BLACK
     if black and means.photo < BLACK:
-        return Line("the photos themselves are black", "inspect them; if they are transparent, train with -w"), False
+        return Finding("the photos themselves are black", "inspect them; if they are transparent, train with -w"), False
     then = recorded_psnr(Path(scene.model_path), scene.loaded_iter)
     good = not black and means.psnr >= max(BAD_PSNR, (then or 0.0) - LOST)
     changed = None
@@ -229,13 +228,13 @@ def _renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) 
         return strange, True
     if good and changed is None:
         width = max(view.image_width for view in views)
-        return Line(f"{len(views)} training views rendered {width} pixels wide: PSNR {means.psnr:.1f} dB"), False
+        return fine(f"{len(views)} training views rendered {width} pixels wide: PSNR {means.psnr:.1f} dB"), False
     text = "renders of the training views are black"
     text = text if black else f"training views have a PSNR of only {means.psnr:.1f} dB"
     wrong = _other_background(scene, options, stored, means.psnr)
     wrong = wrong or changed or next(_wrong_values(of_scene(scene), scene.cameras_extent), None)
     wrong = wrong or next(_late_reset(scene), None)
-    wrong = wrong or (_why_black(scene, views, means) if black else Line("", _why_bad(scene, stored, means)))
+    wrong = wrong or (_why_black(scene, views, means) if black else Finding("", _why_bad(scene, stored, means)))
     return wrong._replace(text=f"{text}: {wrong.text}" if wrong.text else text), wrong is changed
 
 
@@ -264,8 +263,10 @@ def _means(cameras: list[Camera], scene: Scene, options: argparse.Namespace) -> 
     return Means(*(float(np.mean(values)) for values in zip(*measured, strict=True))) if measured else None
 
 
-def _other_background(scene: Scene, options: argparse.Namespace, stored: dict[str, Any], score: float) -> Line | None:
-    """Line if photos and renders agree over the other background, black or white; None if not."""
+def _other_background(
+    scene: Scene, options: argparse.Namespace, stored: dict[str, Any], score: float
+) -> Finding | None:
+    """Whether photos and renders agree over the other background, black or white; None if not."""
     white = not options.white_background
     other_options, other = _load(scene.model_path, stored | {"white_background": white}, scene.loaded_iter)
     means = _means(_looked_at(other), other, other_options)
@@ -273,7 +274,7 @@ def _other_background(scene: Scene, options: argparse.Namespace, stored: dict[st
         return None
     name = "white" if white else "black"
     remedy = f"the model was trained on {name}: set white_background={white} in {scene.model_path}/cfg_args"
-    return Line(f"over {name} it is {means.psnr:.1f} dB", remedy + ("" if white else ", and render without -w"))
+    return Finding(f"over {name} it is {means.psnr:.1f} dB", remedy + ("" if white else ", and render without -w"))
 
 
 def _pipe(scene: Scene) -> argparse.Namespace:
@@ -305,21 +306,21 @@ def _measure(camera: Camera, scene: Scene, options: argparse.Namespace) -> tuple
     return float(image.mean()), float(target.mean()), 1 - float(silhouette["render"].mean()), drawn, *ratios
 
 
-def _why_black(scene: Scene, cameras: list[Camera], means: Means) -> Line:
+def _why_black(scene: Scene, cameras: list[Camera], means: Means) -> Finding:
     gaussians = of_scene(scene)
     if means.drawn < 0.01:
         depths = torch.cat([_depths(camera, gaussians.get_xyz) for camera in cameras])
         nearest = NEAREST / gaussians.enlargement
         if float(((depths > 0) & (depths < nearest)).float().mean()) > 0.5:
             text = f"most Gaussians are nearer than {nearest:g} and never drawn"
-            return Line(text, "scale cameras and points of the scene by 10 or more and train again")
+            return Finding(text, "scale cameras and points of the scene by 10 or more and train again")
         remedy = "check the poses (x right, y down, z forward) and whether the model belongs to this dataset"
-        return Line("no Gaussian is in view, because the cameras face away", remedy)
+        return Finding("no Gaussian is in view, because the cameras face away", remedy)
     if means.coverage < 0.1 or float(gaussians.get_opacity.detach().median()) < FAINT:
         remedy = "check the poses, and lower --opacity_lr; in a PLY of another program opacities must be logits"
-        return Line("the Gaussians are almost transparent", remedy)
+        return Finding("the Gaussians are almost transparent", remedy)
     remedy = "check whether the training photos are black (transparent ones need -w), and check --feature_lr"
-    return Line("the Gaussians themselves are black", remedy)
+    return Finding("the Gaussians themselves are black", remedy)
 
 
 def _depths(camera: Camera, points: torch.Tensor) -> torch.Tensor:
@@ -331,7 +332,7 @@ def _why_bad(scene: Scene, stored: dict[str, Any], means: Means) -> str:
     faint = float(of_scene(scene).get_opacity.detach().median()) < UNRECOVERED
     if faint and RESET_INTERVAL <= iteration < 15_000 and iteration % RESET_INTERVAL < 500:
         return "this iteration is shortly after opacities were reset; check a later one"
-    if (sizes := _sizes(scene)).finding:
+    if (sizes := _sizes(scene)).is_problem:
         return sizes.remedy
     if means.psnr < means.plain and iteration >= BEGUN:
         return (
@@ -341,7 +342,7 @@ def _why_bad(scene: Scene, stored: dict[str, Any], means: Means) -> str:
     if iteration < FEW_ITERATIONS:
         return f"train longer, {FEW_ITERATIONS} iterations at least"
     dataset = check_dataset(stored.get("source_path", ""), stored.get("images", "images"))
-    if problem := next((line for line in dataset if line.finding), None):
+    if problem := next((line for line in dataset if line.is_problem), None):
         return f"the dataset has problems ({problem.text}): {problem.remedy}"
     if len(scene.gaussians) < FEW_GAUSSIANS:
         return f"there are only {len(scene.gaussians)} Gaussians; lower --densify_grad_threshold, or give more points"

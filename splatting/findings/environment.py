@@ -12,7 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from splatting.diagnosis import Line
+from splatting.findings import Finding, fine
 from splatting.host.programs import find_program
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -23,19 +23,19 @@ _INSTALL = "pip install -r requirements.txt"
 _TOLERANCE = 1e-5
 
 
-def check_packages() -> list[Line]:
+def check_packages() -> list[Finding]:
     """Packages of requirements.txt: whether they are installed, in any version."""
     versions = {name: _version(name) for name in _required()}
     if missing := [name for name, found in versions.items() if not found]:
-        return [Line(f"packages are missing: {', '.join(missing)}", f"run `{_INSTALL}`")]
+        return [Finding(f"packages are missing: {', '.join(missing)}", f"run `{_INSTALL}`")]
     found = ", ".join(f"{name} {version}" for name, version in versions.items())
-    lines = [Line(f"Python {platform.python_version()}, {found}")]
+    lines = [fine(f"Python {platform.python_version()}, {found}")]
     if not _version("tensorboard"):
-        lines.append(Line("no TensorBoard, so trainings write no event files (pip install tensorboard brings it)"))
+        lines.append(fine("no TensorBoard, so trainings write no event files (pip install tensorboard brings it)"))
     return lines
 
 
-def check_build() -> list[Line]:
+def check_build() -> list[Finding]:
     """torch and its CUDA, the extensions and their versions; torch must be installed."""
     import torch
 
@@ -73,22 +73,22 @@ def _version(name: str) -> str | None:
         return None
 
 
-def _check_gpu(torch) -> Line:
+def _check_gpu(torch) -> Finding:
     if torch.cuda.is_available():
         from splatting.host.machine import OLDEST_GPU
 
         name, found = torch.cuda.get_device_name(), torch.cuda.get_device_capability()
         remedy = f"use a GPU of {OLDEST_GPU[0]}.{OLDEST_GPU[1]} or newer, or set CUDA_VISIBLE_DEVICES= to use the CPU"
         text = f"GPU {name}, compute capability {found[0]}.{found[1]}, CUDA {torch.version.cuda} of torch"
-        return Line(text, remedy if found < OLDEST_GPU else "")
+        return Finding(text, remedy) if found < OLDEST_GPU else fine(text)
     if not (gpu := _nvidia_gpu()):
-        return Line("no NVIDIA GPU; everything runs on the CPU")
+        return fine("no NVIDIA GPU; everything runs on the CPU")
     if torch.version.cuda is None:
-        return Line(
+        return Finding(
             f"{gpu} is there, but torch {torch.__version__} has no CUDA", f"install torch with CUDA: {_INSTALL}"
         )
     remedy = "update the driver, and check whether CUDA_VISIBLE_DEVICES hides it"
-    return Line(f"{gpu} is there, but torch (CUDA {torch.version.cuda}) cannot use it", remedy)
+    return Finding(f"{gpu} is there, but torch (CUDA {torch.version.cuda}) cannot use it", remedy)
 
 
 def _nvidia_gpu() -> str:
@@ -103,31 +103,31 @@ def _nvidia_gpu() -> str:
     return done.stdout.split("(UUID")[0].strip() if done.returncode == 0 else ""
 
 
-def _check_extension(name: str) -> Line:
+def _check_extension(name: str) -> Finding:
     package = _package(name)
     extension, again = f"the extension {name}", f"run `pip install ./submodules/{name}`"
     installed = _version(name) or _version(WHOLE)
     if installed is None:
-        return Line(f"{extension} is not installed", again)
+        return Finding(f"{extension} is not installed", again)
     expected = (ROOT / "version.txt").read_text(encoding="utf-8").strip()
     if installed.partition("+")[0] != expected:
-        return Line(f"{extension} is version {installed}, but this code is {expected}", again)
+        return Finding(f"{extension} is version {installed}, but this code is {expected}", again)
     try:
         folder = Path(importlib.import_module(package).__file__).parent
     except ImportError as error:
-        return Line(f"{extension} does not load ({error})", again)
+        return Finding(f"{extension} does not load ({error})", again)
     sources = ROOT / "submodules" / name / package
     paths = [path.relative_to(sources) for path in sorted(sources.rglob("*.py"))]
     if stale := [str(path) for path in paths if _differ(sources / path, folder / path)]:
-        return Line(f"{extension} was installed from other sources than these ({', '.join(stale)})", again)
-    return Line(f"extension {name} {installed}")
+        return Finding(f"{extension} was installed from other sources than these ({', '.join(stale)})", again)
+    return fine(f"extension {name} {installed}")
 
 
 def _differ(source: Path, installed: Path) -> bool:
     return not installed.is_file() or source.read_bytes() != installed.read_bytes()
 
 
-def _check_rasterizer(torch) -> Line:
+def _check_rasterizer(torch) -> Finding:
     """One splat against the float64 oracle, on every device that training could use."""
     import diff_gaussian_rasterization as rasterizer
     from diff_gaussian_rasterization import reference
@@ -139,7 +139,7 @@ def _check_rasterizer(torch) -> Line:
     if torch.cuda.is_available() and device.type != "cuda":
         every = " ".join(f"./submodules/{name}" for name in EXTENSIONS)
         remedy = f"set CUDA_HOME to a CUDA toolkit of torch's version and run `{again} {every}`"
-        return Line("the rasterizer was built without CUDA, so the GPU is not used", remedy)
+        return Finding("the rasterizer was built without CUDA, so the GPU is not used", remedy)
     projection = getProjectionMatrix(0.01, 100.0, 2 * math.atan(0.75), 2 * math.atan(0.5)).T.contiguous()
     settings = rasterizer.GaussianRasterizationSettings(
         image_height=20, image_width=30, tanfovx=0.75, tanfovy=0.5, bg=torch.tensor([0.1, 0.2, 0.3]),
@@ -160,9 +160,11 @@ def _check_rasterizer(torch) -> Line:
     try:
         ours = rasterizer.rasterize(**moved, settings=settings._replace(**tensors)).color.cpu()
     except RuntimeError as error:
-        return Line(f"the rasterizer fails on {device} ({str(error).splitlines()[0]})", f"install it again: {again} .")
+        return Finding(
+            f"the rasterizer fails on {device} ({str(error).splitlines()[0]})", f"install it again: {again} ."
+        )
     error = float((ours - oracle.color).abs().max())
     if not error < _TOLERANCE:
         remedy = f"install it again: {again} ./submodules/diff-gaussian-rasterization"
-        return Line(f"the rasterizer on {device} differs from its float64 oracle by {error:.1e}", remedy)
-    return Line(f"rasterizer on {device} agrees with its float64 oracle to {error:.0e}")
+        return Finding(f"the rasterizer on {device} differs from its float64 oracle by {error:.1e}", remedy)
+    return fine(f"rasterizer on {device} agrees with its float64 oracle to {error:.0e}")

@@ -1,14 +1,17 @@
-"""Faults of cameras: sides of photos, opening angles, principal points, places, rounded coordinates."""
+"""Cameras: sides of photos, opening angles, principal points, shared lenses, places, scale, rounded coordinates."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
-from scene.check.findings import Finding
+from scene.images.exif import read_lens
+from scene.readers.enlargement import enlargement
 from scene.readers.info import (
     APART,
     NARROW,
+    NEAREST,
     CameraInfo,
     SceneInfo,
     are_exchanged,
@@ -17,8 +20,11 @@ from scene.readers.info import (
     standing_apart,
     turned,
 )
+from splatting.findings import Finding, Severity, fine
 from splatting.host.listing import some
 
+# Learning rates and size limits are fractions of the extent, but depths below 0.2 are culled and float32 is used.
+EXTENT = (1e-3, 1e4)  # photos of 4.8 score the same within seeds at 0.0048 and 4,800
 OPENING = (10.0, 150.0)  # degrees, of a pinhole; outside, the focal length is doubtful
 _FISHEYE = (10.0, 359.0)  # degrees, of a fisheye: its focal length times the angle is the photo's size
 _EDGE = 0.02  # of a side: a principal point so near to an edge
@@ -28,17 +34,23 @@ _STEP = 1e-3  # of the extent: half a pixel or more in photos that are not small
 _OFF = 0.02  # steps from a rounded number, which arithmetic leaves
 _NEARLY_ALL = 0.99
 _SAMPLE = 5000  # points
+_LONGER = 0.03  # difference of focal lengths that counts
 
 
 def of_cameras(info: SceneInfo) -> Iterator[Finding]:
     """What is wrong with the cameras."""
+    yield from of_lenses(info)
+    yield from _exchanged([*info.train_cameras, *info.test_cameras])
+    yield from _places(info)
+
+
+def of_lenses(info: SceneInfo) -> Iterator[Finding]:
+    """What also explains that points do not fit the photos."""
     views = [*info.train_cameras, *info.test_cameras]
     yield from _rounded(info, views)
-    yield from _exchanged(views)
     pinholes = [view for view in views if _chart(view) != "equirectangular"]
     yield from _angles(pinholes)
     yield from _principal_points(pinholes)
-    yield from _places(info)
 
 
 def _chart(view: CameraInfo) -> str:
@@ -61,7 +73,7 @@ def _rounded(info: SceneInfo, views: Sequence[CameraInfo]) -> Iterator[Finding]:
     if told := [f"the {what} to steps of {step:.2g}" for what, step in steps.items() if step]:
         text = f"coordinates are rounded: {', '.join(told)}, in a scene with an extent of {info.extent:.3g}"
         remedy = "export them with more digits, or subtract the coordinates of a place in the scene before"
-        yield Finding(text, remedy, of_lens=True)
+        yield Finding(text, remedy)
 
 
 def _step(values: np.ndarray, least: float) -> float | None:
@@ -86,7 +98,7 @@ def _exchanged(views: Sequence[CameraInfo]) -> Iterator[Finding]:
     if wrong:
         (view, size), names = wrong[0], [view.image_name for view, _ in wrong]
         text, remedy = turned(names, len(views), size, (view.width, view.height))
-        yield Finding(text, remedy, severe=True)
+        yield Finding(text, remedy, Severity.HOPELESS)
 
 
 def opening(view: CameraInfo) -> tuple[float, float]:
@@ -113,12 +125,12 @@ def _angles(views: Sequence[CameraInfo]) -> Iterator[Finding]:
         view, angle = examples[unit]
         example = f"{view.image_name}: {angle:.1f} degrees, a focal length of {view.fx:.4g} pixels"
         remedy = f"give focal lengths in pixels (these may be in {unit}), or check the size of the photos"
-        yield Finding(f"{count} cameras have odd opening angles ({example})", remedy, of_lens=True)
+        yield Finding(f"{count} cameras have odd opening angles ({example})", remedy)
     flat = [v for v in views if not 1 / _ASPECT <= v.fx / v.fy <= _ASPECT]
     if flat:
         example = f"{flat[0].image_name}: {flat[0].fx:.4g} and {flat[0].fy:.4g} pixels"
         text = f"{len(flat)} cameras have focal lengths in x and y that differ more than twofold ({example})"
-        yield Finding(text, "check the focal lengths and the size of the photos", of_lens=True)
+        yield Finding(text, "check the focal lengths and the size of the photos")
 
 
 def _principal_points(views: Sequence[CameraInfo]) -> Iterator[Finding]:
@@ -133,7 +145,7 @@ def _principal_points(views: Sequence[CameraInfo]) -> Iterator[Finding]:
         view = odd[0]
         at = f"{view.image_name}: {view.cx:.4g}, {view.cy:.4g} of {view.width} x {view.height}"
         text = f"{len(odd)} cameras have their principal point in a corner or at an edge of the photo ({at})"
-        yield Finding(text, "give cx and cy in pixels of a photo of that size, or leave them out", of_lens=True)
+        yield Finding(text, "give cx and cy in pixels of a photo of that size, or leave them out")
 
 
 def _places(info: SceneInfo) -> Iterator[Finding]:
@@ -154,3 +166,35 @@ def _places(info: SceneInfo) -> Iterator[Finding]:
             f"camera ({some(names)})"
         )
         yield Finding(text, f"check their poses; the scene's extent, {info.extent or 0:.3g}, leaves them out")
+
+
+def check_lenses(source: str, views: Sequence[CameraInfo]) -> Iterator[Finding]:
+    """Photos that share a camera although their EXIF data tell different focal lengths."""
+    shared: dict[tuple, Counter[float]] = {}
+    for view in views:
+        # Programs that undistort photos keep few EXIF data: convert.py has the photos themselves in `input`.
+        lens = read_lens(view.image_path)
+        lens = lens if lens.length else read_lens(Path(source, "input", view.image_name))
+        key = view.width, view.height, view.fx, view.fy, view.cx, view.cy
+        shared.setdefault(key, Counter())[lens.length] += 1
+    for lengths in shared.values():
+        found = sorted(length for length in lengths if length)
+        if found and found[-1] > (1 + _LONGER) * found[0]:
+            listed = some([f"{length:g} mm ({lengths[length]})" for length in found])
+            yield Finding(
+                f"{lengths.total()} photos share one camera, but their EXIF data tell several focal lengths: {listed}",
+                "convert them again with convert.py --cameras per_lens, or let the program that made the cameras "
+                "give each lens its own",
+            )
+
+
+def check_extent(info: SceneInfo) -> Iterator[Finding]:
+    """Scale of the scene."""
+    low, high = EXTENT
+    if low <= info.extent <= high:
+        factor = enlargement(info)
+        near = f", so depths from {NEAREST / factor:.2g} on are drawn" if factor != 1 else ""
+        yield fine(f"extent {info.extent:.3g}{near}")
+    else:
+        remedy = f"scale cameras and points by {10.0 ** round(np.log10(5 / info.extent)):g}"
+        yield Finding(f"the extent is {info.extent:.3g}, outside {low:g} to {high:g}", remedy)

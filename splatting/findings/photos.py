@@ -1,6 +1,7 @@
 """Faults of photos: invisible ones, nearly one value, a part of the range, bars, masks that leave out everything."""
 
 import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,23 +9,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image
 
-from scene.check.findings import Finding
-from scene.images.damage import equal_share, said_of
 from scene.images.decode import picture_size
 from scene.images.masks import Mask
-from scene.readers.info import SceneInfo
+from scene.readers.info import CameraInfo, SceneInfo
 from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.json_files import read_json
+from splatting.findings import Finding, Severity, fine
 from splatting.host.listing import some
 from utils.system_utils import UserError
 
+FEWEST_VIEWS = 20
+_WIDE = 1600  # pixels
 SMALL = 32  # pixels; a smaller side has few more than SSIM's window
 NARROW = 1 / 16  # of the range, which 12 bits in 16 use; less is hardly more than one value
 _PIXELS = 200  # a side, of what is looked at
 _MOST_DECODED = 25_000_000  # pixels of all photos; a JPEG is decoded at an eighth of its size
 _JPEG = 1 / 6  # cost of its pixels
-_LOOKED_THROUGH = 4_000_000  # pixels that are looked through for damage, for each photo that is decoded
 _FEWEST = 3  # photos
 _VISIBLE = 26  # of 255, an alpha that shows something
 _OPAQUE = 230
@@ -64,6 +65,18 @@ class Look(NamedTuple):
         return self.alpha is None or (self.alpha >= _VISIBLE).mean() > _SOME
 
 
+def check_views(cameras: list[CameraInfo]) -> Iterator[Finding]:
+    """Number and sizes of the photos."""
+    sizes = Counter(camera.file_size for camera in cameras)
+    listed = ", ".join(f"{w} x {h} ({n})" for (w, h), n in sizes.most_common(3))
+    listed += f" and {len(sizes) - 3} more sizes" if len(sizes) > 3 else ""
+    yield fine(f"{len(cameras)} photos, none missing and all readable: {listed}")
+    if len(cameras) < FEWEST_VIEWS:
+        yield Finding(f"only {len(cameras)} photos", f"take {FEWEST_VIEWS} or more; new views will look bad with fewer")
+    if wide := sum(n for (width, _), n in sizes.items() if width > _WIDE):
+        yield fine(f"{wide} photos are wider than {_WIDE} pixels and train at that width unless -r 1 is given")
+
+
 def of_photos(info: SceneInfo, most: int, alpha: bool = True) -> Iterator[Finding]:
     """What is wrong with the photos, of which at most `most` are decoded. alpha: whether it counts."""
     looks = _looks(info.train_cameras, most, alpha)
@@ -74,19 +87,6 @@ def of_photos(info: SceneInfo, most: int, alpha: bool = True) -> Iterator[Findin
     yield from _alpha(shown)
     yield from _ranges(shown)
     yield from _bars(shown)
-
-
-def of_damage(info: SceneInfo, most: int) -> Iterator[Finding]:
-    """Damaged photos, among some in a random order; among all of a few small ones."""
-    views, left, shares = info.train_cameras, most * _LOOKED_THROUGH, {}
-    for number in np.random.default_rng(0).permutation(len(views)):
-        path = getattr(views[number], "image_path", None)  # readers of others may have photos elsewhere
-        shares[views[number].image_name], pixels = equal_share(Path(path)) if path else (None, 0)
-        left -= pixels
-        if left < 0:
-            break
-    if said := said_of(shares):
-        yield Finding(*said)
 
 
 def hints(info: SceneInfo, smallest: tuple[int, int], white_background: bool) -> Iterator[Finding]:
@@ -222,18 +222,19 @@ def _hidden(looks: Sequence[Look]) -> Iterator[Finding]:
     invisible = [look for look in looks if not look.is_visible]
     both = [look for look in looks if look.seen <= _SOME and look.kept > _SOME and look.is_visible]
     nothing = len({id(look) for look in (*masked, *invisible, *both)}) == len(looks)
+    severity = Severity.HOPELESS if nothing else Severity.PROBLEM
     if invisible:
         highest = max(float(look.alpha.max()) for look in invisible)
         text = f"{_of(invisible, looks)} are invisible, as their alpha is at most {highest:.0f} of 255"
         text += "" if nothing else f" ({_names(invisible)})"
-        yield Finding(text, "save them without alpha, or leave their alpha out by --mask_meaning none", nothing)
+        yield Finding(text, "save them without alpha, or leave their alpha out by --mask_meaning none", severity)
     if masked:
         text = f"the masks of {_of(masked, looks)} leave out every pixel"
         text += "" if nothing else f" ({_names(masked)})"
-        yield Finding(text, "draw what counts in white; --invert_masks is for masks of what is left out", nothing)
+        yield Finding(text, "draw what counts in white; --invert_masks is for masks of what is left out", severity)
     if both:
         text = f"masks and alpha together leave out every pixel of {_of(both, looks)} ({_names(both)})"
-        yield Finding(text, "check what masks and alpha mean (--mask_meaning, --invert_masks)", nothing)
+        yield Finding(text, "check what masks and alpha mean (--mask_meaning, --invert_masks)", severity)
 
 
 def _alpha(looks: Sequence[Look]) -> Iterator[Finding]:

@@ -12,20 +12,19 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from arguments import ModelParams, read_training_options
-from scene.check import of_options, tell
 from scene.gaussian_model import GaussianModel
 from scene.readers.info import CameraInfo
 from scene.readers.tracks import Track, read_tracks
 from scene.scene import Scene
-from splatting.diagnosis import Line
-from splatting.diagnosis.model import load_scored
 from splatting.distributed.ranks import ranks
 from splatting.files.json_files import write_json
+from splatting.findings import Finding, note
+from splatting.findings.model import load_scored
+from splatting.findings.scene import of_options, tell
 from splatting.registry import check_together, chosen, options_of, tools
 from utils.system_utils import UserError, mkdir_p
 
@@ -41,17 +40,7 @@ _ITERATIONS = 1000  # of the short training
 ROOT = Path(__file__).resolve().parents[2]
 
 
-class Advice(NamedTuple):
-    """A number of a scene, and the options that it asks for; none, if it asks for nothing."""
-
-    text: str
-    options: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.text}; try {self.options}" if self.options else self.text
-
-
-def advise(dataset: argparse.Namespace, trains: bool = True, warns: bool = False) -> list[Advice]:
+def advise(dataset: argparse.Namespace, trains: bool = True, warns: bool = False) -> list[Finding]:
     """Advice on a scene. dataset: the model options. trains: ask by a short training, too.
 
     warns: print what the check of the scene finds, too. UserError as from Scene, and where the scene cannot be trained.
@@ -65,7 +54,7 @@ def advise(dataset: argparse.Namespace, trains: bool = True, warns: bool = False
         tell(of_options(scene.info, dataset, scene.halves), dataset.source_path, quiet=not warns)
     tracks = read_tracks(dataset.source_path, scene.info.train_cameras, scene.info.offset)
     found = [*_of_tracks(scene, tracks)] if any(tracks) else []
-    found += [Advice(*one) for advise_part in tools("advise") for one in advise_part(scene, tracks)]
+    found += [note(*one) for advise_part in tools("advise") for one in advise_part(scene, tracks)]
     return [*found, *_of_short_training(dataset)] if trains else found
 
 
@@ -85,14 +74,16 @@ def asked_options(dataset: argparse.Namespace, args: argparse.Namespace, given: 
     print(*found, sep="\n")
     found = [_taken(advice, args, given) for advice in found]
     if written:
-        write_json(Path(dataset.model_path) / ADVICE, [advice._asdict() for advice in found])
+        write_json(
+            Path(dataset.model_path) / ADVICE, [{"text": advice.text, "options": advice.options} for advice in found]
+        )
     words = " ".join(advice.options for advice in found).split()
     print(f"{GUIDE} says what each option does, gains and costs")
     print(f"recommended options for this scene, besides those given: {' '.join(words) or 'none'}")
     return words
 
 
-def _taken(advice: Advice, args: argparse.Namespace, given: Sequence[str]) -> Advice:
+def _taken(advice: Finding, args: argparse.Namespace, given: Sequence[str]) -> Finding:
     """The advice, without its options where one of them is given, or where they do not go with given ones."""
     words = advice.options.split()
     against = None
@@ -108,7 +99,7 @@ def _taken(advice: Advice, args: argparse.Namespace, given: Sequence[str]) -> Ad
     return advice._replace(options="") if against or advice.options.startswith(names) else advice
 
 
-def check_options(source: str, images: str, model: str | None = None) -> list[Line]:
+def check_options(source: str, images: str, model: str | None = None) -> list[Finding]:
     """Notes of doctor.py on options that a scene asks for; none where it cannot be read.
 
     images: as train.py's -i. model: folder of a model; what it was trained with is not asked for.
@@ -120,8 +111,7 @@ def check_options(source: str, images: str, model: str | None = None) -> list[Li
         found = advise(dataset, trains=False)
     except UserError:
         return []
-    found = [advice for advice in found if advice.options and advice.options.split()[0] not in then]
-    return [Line(str(advice), note=True) for advice in found]
+    return [advice for advice in found if advice.options and advice.options.split()[0] not in then]
 
 
 def _trained_with(model: str) -> list[str]:
@@ -132,11 +122,11 @@ def _trained_with(model: str) -> list[str]:
         return []
 
 
-def _of_tracks(scene: Scene, tracks: list[Track | None]) -> Iterator[Advice]:
+def _of_tracks(scene: Scene, tracks: list[Track | None]) -> Iterator[Finding]:
     """What the tracks of structure from motion say."""
     ratio = distances(scene.info.train_cameras, tracks)
     text = f"the farthest photo of a point is {ratio:.1f} times as far away as the nearest (median)"
-    yield Advice(text, "--antialiasing" if ratio > DISTANCES else "")
+    yield note(text, "--antialiasing" if ratio > DISTANCES else "")
 
 
 def distances(views: list[CameraInfo], tracks: list[Track | None]) -> float:
@@ -174,11 +164,11 @@ def _trained(line: list[str]) -> None:
         raise UserError(said.strip().rpartition("\n")[2].removeprefix("error: ") or "the short training failed")
 
 
-def _of_short_training(dataset: argparse.Namespace) -> Iterator[Advice]:
+def _of_short_training(dataset: argparse.Namespace) -> Iterator[Finding]:
     """What a short training of small photos leaves over."""
     with tempfile.TemporaryDirectory() as folder:
         own = ["-m", folder, "-r", _WIDTH, "--iterations", _ITERATIONS, "--quiet", "--no_curve", "--disable_viewer"]
         own += ["--no_last_checkpoint"]
         _trained([sys.executable, str(ROOT / "train.py"), *map(str, own), *_data_words(dataset)])
         scene, views = load_scored(folder)
-        yield from (Advice(*one) for advise_part in tools("advise_trained") for one in advise_part(scene, views))
+        yield from (note(*one) for advise_part in tools("advise_trained") for one in advise_part(scene, views))

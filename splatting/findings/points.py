@@ -1,21 +1,36 @@
-"""Faults of the points that a training starts from: in no photo, far away, several in one place."""
+"""Points that a training starts from: few, in no photo, far away, several in one place, of other colours than photos.
+
+A photo fits its camera if it shows the colours of the camera's points better than most other photos do. That needs no
+threshold of colour, and holds for any exposure.
+"""
 
 from collections.abc import Iterator
 
 import numpy as np
 
-from scene.check.findings import Finding
 from scene.gaussians.copies import places_of
 from scene.readers.info import SceneInfo, camera_centers
 from scene.readers.tracks import projected
+from splatting.findings import Finding, fine
 from splatting.host.listing import some
 
+FEWEST_POINTS = 1000
 FAR_POINT = 100.0  # extents from the cameras; a sky is some tens away
 FAR_SHARE = 0.01
 FEWEST_IN_VIEW = 10  # points of the cloud in a photo
 _UNSEEN = 0.5
 _SAMPLE = 5000  # most points tested against the views,
 _TESTS = 1_000_000  # and most tests
+
+
+def check_cloud(info: SceneInfo) -> Iterator[Finding]:
+    """Number of points."""
+    text = f"{len(info.point_cloud.points)} points to start from"
+    if len(info.point_cloud.points) < FEWEST_POINTS:
+        more = "start from more points (--init_pcd_path), or reconstruct with more photos or features"
+        yield Finding(f"only {text}; {FEWEST_POINTS} or more are good", more)
+    else:
+        yield fine(text)
 
 
 def of_points(info: SceneInfo) -> Iterator[Finding]:

@@ -13,9 +13,10 @@ from scipy.spatial import KDTree
 
 from scene.dataset_readers import CameraInfo, SceneInfo
 from scene.readers.tracks import Track, projected
-from splatting.diagnosis import Line
 from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import open_image
+from splatting.findings import Finding
+from splatting.findings.tracks import UNITS
 from splatting.host.listing import some
 from utils.graphics_utils import BasicPointCloud
 
@@ -34,7 +35,6 @@ _SUSPECTS = 24  # photos that fit their cameras worst
 _CLEARLY = 0.8  # error with another cause or photo, as a part of the given one's
 _MOST = 0.75  # share of the cameras that a geometric cause makes better
 _FOCAL = (0.5, 0.6, 0.75, 0.87, 1.15, 1.33, 1.7, 2.0)
-UNITS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
 
 
 class _Photos(NamedTuple):
@@ -45,7 +45,7 @@ class _Photos(NamedTuple):
     cloud: BasicPointCloud
 
 
-def check_colors(info: SceneInfo, tracks: Sequence[Track | None] = ()) -> Iterator[Line]:
+def check_colors(info: SceneInfo, tracks: Sequence[Track | None] = ()) -> Iterator[Finding]:
     """What does not fit together, if photos have other colours than the points that they should show.
 
     tracks: of the cameras, which fit them.
@@ -63,7 +63,7 @@ def check_colors(info: SceneInfo, tracks: Sequence[Track | None] = ()) -> Iterat
         return
     elif fit.mean() < _APART and not _are_random(cloud):
         text = f"{(~fit).sum()} of {len(fit)} photos show the points of their camera no better than other photos do"
-        yield Line(*_apart(info, [track.points for track in tracks if track], text))
+        yield Finding(*_apart(info, [track.points for track in tracks if track], text))
     elif fit.mean() > _TOGETHER:
         yield from _strange(photos)
 
@@ -122,7 +122,7 @@ def _errors(camera: CameraInfo, photos: Sequence[np.ndarray], cloud: BasicPointC
     return np.array(errors)
 
 
-def _geometric(photos: _Photos) -> Iterator[Line]:
+def _geometric(photos: _Photos) -> Iterator[Finding]:
     """Another focal length, or another unit of the points, with which most photos fit clearly better."""
     step = -(-len(photos.cameras) // _CAMERAS)
     some_of = _Photos(photos.cameras[::step], photos.pixels[::step], photos.cloud)
@@ -138,10 +138,10 @@ def _geometric(photos: _Photos) -> Iterator[Line]:
         return
     if name == "f":
         text = f"photos fit the points with focal lengths about {factor:g} times as long"
-        yield Line(text, "check the focal lengths and the size of the photos that they belong to")
+        yield Finding(text, "check the focal lengths and the size of the photos that they belong to")
     else:
         text = f"photos fit the points if those are scaled by {factor:g}: cameras and points have different units"
-        yield Line(text, f"scale the points by {factor:g}")
+        yield Finding(text, f"scale the points by {factor:g}")
 
 
 def _refocused(camera: CameraInfo, factor: float) -> CameraInfo:
@@ -155,7 +155,7 @@ def _own(photos: _Photos) -> np.ndarray:
     return np.array([_errors(camera, [pixels], photos.cloud)[0] for camera, pixels in pairs])
 
 
-def _strange(photos: _Photos) -> Iterator[Line]:
+def _strange(photos: _Photos) -> Iterator[Finding]:
     """Photos of whose camera another photo shows clearly more, and clearly more than of its own camera."""
     own = _own(photos)
     suspects = np.argsort(np.where(np.isfinite(own), -own, 0))[:_SUSPECTS]
@@ -170,4 +170,4 @@ def _strange(photos: _Photos) -> Iterator[Line]:
     if found:
         count = f"{len(found)} of {len(own)} photos"
         text = f"cameras and photos do not fit together: {count} do not show their points ({some(sorted(found))})"
-        yield Line(text, "restore the photos that these cameras were computed from, under their names")
+        yield Finding(text, "restore the photos that these cameras were computed from, under their names")

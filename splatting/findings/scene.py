@@ -1,0 +1,110 @@
+"""A scene, before a training and for doctor.py: its photos, cameras and points, in the order in which they explain."""
+
+import argparse
+import contextlib
+import io
+import os
+import sys
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+
+from scene.dataset_readers import SceneInfo, read_scene
+from scene.readers.info import as_camera_info
+from scene.readers.tracks import read_tracks
+from splatting.files.json_files import read_json
+from splatting.findings import Finding, Severity, fine, from_error, note
+from splatting.findings.cameras import check_extent, check_lenses, of_cameras, of_lenses
+from splatting.findings.colors import check_colors
+from splatting.findings.photo_files import of_damage, of_duplicates
+from splatting.findings.photos import check_views, of_photos
+from splatting.findings.points import check_cloud, of_points
+from splatting.findings.tracks import check_agreement, check_focal, check_poses
+from utils.system_utils import UserError
+
+LOOKED_AT = 16  # photos that a training decodes, small,
+MOST_PHOTOS = 100  # and the doctor
+REGISTERED = 0.9  # share of the photos
+_LINES = 5  # most findings that a training prints
+
+
+def findings(info: SceneInfo, most: int = LOOKED_AT, halves: bool = False, alpha: bool = True) -> list[Finding]:
+    """Faults of the records that readers return, the worst first; none if nothing is wrong.
+
+    most: photos that are decoded. halves: test views train, too, with their left halves.
+    alpha: that of photos counts (--mask_meaning).
+    """
+    train, test = ([*map(as_camera_info, views)] for views in (info.train_cameras, info.test_cameras))
+    info = info._replace(train_cameras=train, test_cameras=test)
+    of_files = *of_photos(info, most, alpha), *of_damage(info, most), *of_duplicates(info, halves)
+    found = [*of_cameras(info), *of_files, *of_points(info)]
+    return sorted(found, key=lambda one: -one.severity)
+
+
+def of_options(info: SceneInfo, options: argparse.Namespace, halves: bool) -> list[Finding]:
+    """`findings` with the model options of a training; code written for the reference lacks those that we added."""
+    alpha = getattr(options, "mask_meaning", "") != "none"
+    return findings(info, halves=halves, alpha=alpha)
+
+
+def tell(found: list[Finding], source: str | os.PathLike, quiet: bool = False) -> None:
+    """Raise the first finding as a UserError if it is hopeless; print a few as warnings. quiet: print none."""
+    if found and found[0].severity == Severity.HOPELESS:
+        raise UserError(str(found[0]))
+    if quiet:
+        return
+    for one in found[:_LINES]:
+        print(f"warning: {one}", file=sys.stderr)
+    if len(found) > _LINES:
+        print(f"{len(found) - _LINES} more: python doctor.py -s {source}", file=sys.stderr)
+
+
+def check_dataset(source: str, images: str) -> list[Finding]:
+    """What doctor.py says of the scene in a folder. images: as train.py's -i."""
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            info = read_scene(source, images, hold_out=False, native=True)
+    except UserError as error:
+        return [*_notes(said.getvalue()), from_error(error)]
+    views = info.train_cameras
+    checks = [check_views(views), check_lenses(source, views), check_extent(info), check_cloud(info)]
+    checks += [findings(info, MOST_PHOTOS)]
+    if not any(of_lenses(info)):  # else poses and colours have that cause
+        checks += [check_geometry(source, info), check_agreement(Path(source) / "sparse" / "0")]
+    return [*_notes(said.getvalue()), *chain(*checks, _check_registered(Path(source) / "convert_report.json"))]
+
+
+def check_geometry(source: str, info: SceneInfo) -> Iterator[Finding]:
+    """Lenses and poses beside the tracks, then colours: wrong lenses or poses would look like wrong photos."""
+    views = info.train_cameras
+    try:
+        tracks = read_tracks(source, views, info.offset)
+    except UserError as error:
+        yield from_error(error)
+        tracks = [None] * len(views)
+    lines = [*check_focal(views, tracks)] or [*check_poses(views, tracks, info.extent)]
+    yield from lines or check_colors(info, tracks)
+
+
+def _check_registered(path: Path) -> Iterator[Finding]:
+    """What is in convert.py's report, if it made the scene."""
+    if not path.is_file():
+        return
+    try:
+        report = read_json(path)
+        placed, photos = int(report["registered"]), int(report["photos"])
+        advice = [str(line) for line in report["advice"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        yield Finding(f"{path} is damaged", "remove it, or run convert.py again")
+        return
+    text = f"{placed} of {photos} photos were placed by convert.py"
+    remedy = advice[0].rpartition("; ")[2] if advice else "take more photos that overlap"
+    few = photos and placed / photos < REGISTERED
+    yield Finding(f"only {text}", remedy) if few else fine(text)
+
+
+def _notes(said: str) -> list[Finding]:
+    """The messages that the readers printed, without progress bars."""
+    texts = [text.strip() for text in said.replace("\r", "\n").splitlines() if text.strip() and "%|" not in text]
+    return [note(text) for text in texts]
