@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
+from splatting.findings.training import late_reset
 from splatting.part import Needs
 from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
 from splatting.registry import part_class
 from splatting.training.adaptive_density import AdaptiveDensityControl
 from splatting.training.schedule import Schedule
-from splatting.training.strategy_warnings import late_reset
 from utils.general_utils import build_rotation
 
 EXTENT = 2.0

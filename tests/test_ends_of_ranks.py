@@ -15,10 +15,10 @@ from arguments import ModelParams
 from scene import Scene
 from scene.gaussian_model import GaussianModel
 from splatting.distributed.ranks import Ranks, refuse_differences, using
+from splatting.findings.training import faster_alone
 from splatting.host import machine, torchrun
 from splatting.training.agreement import agree_on_options, agree_on_scene
 from splatting.training.folder import newest_checkpoint
-from splatting.training.strategy_warnings import faster_alone
 from utils.system_utils import UserError, atomic_write, run_cli
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -136,7 +136,7 @@ def test_a_training_of_one_process_loads_nothing_of_several(colmap_scene, tmp_pa
 
 
 def test_a_scene_that_one_gpu_trains_faster_gets_a_sentence_with_the_estimate():
-    said = faster_alone(2, True, 1_000_000)
+    said = str(faster_alone(2, True, 1_000_000))
     assert "1,000,000 Gaussians takes about 2.1 ms on one GPU and 3.7 ms on two" in said and "without torchrun" in said
     for alone in ((1, True, 1_000_000), (2, False, 1_000_000), (2, True, 20_000_000)):
         assert faster_alone(*alone) is None

@@ -32,13 +32,13 @@ from splatting.evaluation.error_curve import (
     best_test,
     common_subset,
     continue_curve,
+    peak_advice,
     read_curve,
     rows_on,
     whole_sets,
     write_curve,
 )
 from splatting.evaluation.training_log import TrainingLog
-from splatting.evaluation.what_to_try import peak_advice
 from splatting.host import clock, memory
 from splatting.training import objective
 from splatting.training.scores import Scores

@@ -14,11 +14,11 @@ import render
 import train
 from gaussian_renderer import scored_views
 from scene.images import decode
+from splatting.files.plain_files import plain
+from splatting.findings import resources
+from splatting.findings.resources import training_bytes
 from splatting.host import memory
 from splatting.host.memory import free_memory, gib, is_out_of_memory, shortage
-from splatting.training import disk_space, memory_estimate
-from splatting.training.memory_estimate import training_bytes
-from splatting.training.steps import plain
 from utils.system_utils import UserError, run_cli
 
 ROOT = Path(__file__).parents[1]
@@ -55,7 +55,7 @@ def test_a_disk_without_space_is_told_before_the_training(colmap_scene, tmp_path
     words = ["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "-r", "48", "--disable_viewer", "--iterations", "3"]
     words += ["--save_iterations", "2", "--test_iterations", "-1"]
     free = Mock(return_value=Mock(free=50_000))
-    monkeypatch.setattr(disk_space.shutil, "disk_usage", free)
+    monkeypatch.setattr(resources.shutil, "disk_usage", free)
     said = "the disk of .*out has 0.1 MB free, and a model of 300 Gaussians takes 0.1 MB; free space there, or name"
     with pytest.raises(UserError, match=said):
         train.main(words)
@@ -164,8 +164,8 @@ def test_every_command_ends_in_a_sentence(capsys):
 @needs_59_values
 def test_the_estimate_and_its_warnings(colmap_scene, tmp_path, monkeypatch, capfd):
     free = 1 << 24
-    monkeypatch.setattr(memory_estimate, "free_memory", lambda _: free)
-    at_start = 300 * (4 * (3 * 59 + 45) + memory_estimate.PER_GAUSSIAN) + 24 * 16 * memory_estimate.PER_PIXEL
+    monkeypatch.setattr(resources, "free_memory", lambda _: free)
+    at_start = 300 * (4 * (3 * 59 + 45) + resources.PER_GAUSSIAN) + 24 * 16 * resources.PER_PIXEL
     pictures, many = 17 * 4 * 24 * 16, ("--max_num_splats", 2_000_000_000)
 
     def said(*more: object) -> tuple[str, str]:
@@ -184,7 +184,7 @@ def test_the_estimate_and_its_warnings(colmap_scene, tmp_path, monkeypatch, capf
     free = pictures + at_start
     assert "6,000 Gaussians" in said()[1] and not said("--max_num_splats", 300)[1]
     with monkeypatch.context() as patch:
-        patch.setattr(memory_estimate, "local_size", lambda: 2)  # processes that share what is free
+        patch.setattr(resources, "local_size", lambda: 2)  # processes that share what is free
         line, warning = said("--max_num_splats", 300)
     assert f"of {gib(free // 2)}" in line and "for 300 Gaussians; set --images_to_load" in warning
     free = 1 << 40
@@ -201,6 +201,6 @@ def test_the_estimate_counts_what_training_keeps():
     tensors.append(max(tensors, key=torch.numel))
     tensors += [value for state in gaussians.optimizer.state.values() for value in state.values() if value.dim()]
     counted = sum(tensor.untyped_storage().nbytes() for tensor in tensors)
-    assert training_bytes(gaussians, 50, 0) - 50 * memory_estimate.PER_GAUSSIAN == counted
+    assert training_bytes(gaussians, 50, 0) - 50 * resources.PER_GAUSSIAN == counted
     more = training_bytes(gaussians, 50, 0, absolute=True) - training_bytes(gaussians, 50, 0)
-    assert more == 50 * memory_estimate.PER_ABSOLUTE >= 50 * (4 + 8)  # a length, and a row of two values at least
+    assert more == 50 * resources.PER_ABSOLUTE >= 50 * (4 + 8)  # a length, and a row of two values at least

@@ -29,10 +29,9 @@ from splatting.demo.tracer import FISHEYE, PANORAMA, ring_views
 from splatting.findings import Finding, Severity
 from splatting.findings.photo_files import damaged, of_damage
 from splatting.findings.photos import of_photos
-from splatting.findings.scene import check_dataset, check_geometry, findings, tell
+from splatting.findings.scene import check_dataset, check_geometry, check_scene, findings, tell
 from splatting.sfm.images import check_images
 from splatting.sfm.layout import Layout
-from splatting.training.checks import check_scene
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 

@@ -17,7 +17,7 @@ import train
 from scene.images.store import ImageStore
 from splatting.distributed.ranks import ranks
 from splatting.distributed.shared_images import holders
-from splatting.training import memory_estimate
+from splatting.findings import resources
 from utils.system_utils import UserError
 
 LENGTH = (
@@ -45,8 +45,8 @@ def _train(scene: Path, folder: Path, *options: object) -> tuple[str, Counter, s
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ImageStore, "_decode", counted)
-        patch.setattr(memory_estimate, "print", said.append, raising=False)
-        patch.setattr(memory_estimate, "LITTLE", 0.0)  # the line is printed, however little that is
+        patch.setattr(resources, "print", said.append, raising=False)
+        patch.setattr(resources, "LITTLE", 0.0)  # the line is printed, however little that is
         train.main(["-s", str(scene), "-m", str(folder), *map(str, (*LENGTH, *options))])
     models = folder.glob("point_cloud/*/point_cloud.ply")
     return "".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in models), decoded, said[0]

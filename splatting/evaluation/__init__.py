@@ -3,7 +3,6 @@
 Within a training:
 training_log, error_curve   its records; its curve, and curves of other programs
 curve_recorder, figures     scoring of the curve's points; drawings of it, which the report uses, too
-what_to_try                 advice from both
 
 From runs to the report:
 plan, configs               scene folders, options, model folders and their records; sets/ has option sets to use

@@ -12,9 +12,17 @@ from typing import TypeVar
 import torch
 from tqdm import tqdm
 
-from splatting.evaluation.error_curve import COLUMNS, FIGURE, NAME, SUBSET, Row, write_curve
+from splatting.evaluation.error_curve import (
+    COLUMNS,
+    FIGURE,
+    NAME,
+    SUBSET,
+    Row,
+    gain_since_peak,
+    peak_advice,
+    write_curve,
+)
 from splatting.evaluation.training_log import TrainingLog
-from splatting.evaluation.what_to_try import gain_since_peak, peak_advice
 from splatting.host.clock import running_seconds, wall_seconds
 from splatting.host.machine import cores
 from utils.system_utils import UserError, writes_files

@@ -6,7 +6,7 @@ import math
 import os
 import sys
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,8 @@ COLUMNS = (*_OLDEST, SUBSET)
 _ESTIMATED = "estimated"  # a column of older files: rows that tell of whole sets what only a part of them says
 PEER_COLUMNS = (*COSTS, *SCORES[:3], "test_lpips", *SCORES[3:])
 PEER_REQUIRED = ("seconds", "test_psnr")
+FITTED = 18.0  # dB of training views; below, nothing is called overfitting
+CLEAR = 0.1  # dB between two points; those of a settled training differed by up to 0.07
 
 Row = dict[str, float | None]
 
@@ -143,6 +145,42 @@ def best_test(rows: Iterable[Row]) -> Row | None:
     """The whole-set row with the highest PSNR of the test views, the first of equals; None if no row has one."""
     scored = [row for row in whole_sets(rows) if row["test_psnr"] is not None]
     return max(scored, key=lambda row: row["test_psnr"], default=None)
+
+
+def gain_since_peak(rows: Sequence[Row]) -> float | None:
+    """PSNR that training views gained while test views lost (`peak`); None if either is not CLEAR."""
+    found, end = peak(rows), whole_sets(rows)
+    # What does not fit the training views cannot overfit.
+    if found is None or found[0]["train_psnr"] is None or (end[-1]["train_psnr"] or 0.0) < FITTED:
+        return None
+    gained = end[-1]["train_psnr"] - found[0]["train_psnr"]
+    return None if gained < CLEAR else gained
+
+
+def peak(rows: Sequence[Row]) -> tuple[Row, float] | None:
+    """The whole-set row with the best test views, and how much PSNR was lost since; None if that is not CLEAR."""
+    rows = whole_sets(rows)
+    best = best_test(rows)
+    if best is None or rows[-1]["test_psnr"] is None:
+        return None
+    lost = best["test_psnr"] - rows[-1]["test_psnr"]
+    return None if lost < CLEAR else (best, lost)
+
+
+def peak_advice(rows: Sequence[Row], saved: Container[int], steady: bool = True) -> str | None:
+    """A line that names the iteration with the best test views; None unless they were clearly worse in the last row.
+
+    saved: iterations whose PLY this training has written, before the iteration's step, so that it is the model that was
+    scored. steady: whether another training has the same iterations, which one by the clock has not.
+    """
+    if (found := peak(rows)) is None:
+        return None
+    best, lost = found
+    at = best["iteration"]
+    line = f"Best test PSNR {best['test_psnr']:.2f} dB at iteration {at} ({lost:.2f} above the end)"
+    if at in saved:
+        return f"{line}. It is saved: render.py --iteration {at}"
+    return f"{line}. Keep it: --save_iterations {at}" if steady else line
 
 
 def read_peer(path: Path, required: Sequence[str] = PEER_REQUIRED) -> list[Row]:

@@ -11,12 +11,11 @@ from typing import Any
 from scene.readers.info import HOLD
 from splatting.evaluation import model_folder as folder_of
 from splatting.evaluation.comparison import BESIDE, SCORES
-from splatting.evaluation.error_curve import Row
+from splatting.evaluation.error_curve import Row, gain_since_peak, peak
 from splatting.evaluation.plan import Record, Run, SceneEntry, is_model, photos_of
 from splatting.evaluation.renders import TIMES, image_size, view_names, worst_views
 from splatting.evaluation.stages import Failure, page_file
 from splatting.evaluation.training_log import DEGREES, PERCENT
-from splatting.evaluation.what_to_try import gain_since_peak, peak
 from splatting.files.json_files import read_json
 from utils.system_utils import UserError, saved_ply
 

@@ -74,7 +74,7 @@ class TrainingLog:
     memory include the runs that were resumed. The last record also has
     `gaussians_left_out`, those that the last save does not have, the costs of the curve (curve_recorder.py), the
     seconds of this process by what they were spent on (training/log.py), `iterations_planned`,
-    `strategy`, and `max_num_splats` or `default_budget` (what_to_try.py), and `lines`, what training said at its end.
+    `strategy`, and `max_num_splats` or `default_budget` (findings/training.py), and `lines`, said at its end.
 
     first_iteration, seconds_before, wall_seconds_before: done by the runs that this one resumes.
     """

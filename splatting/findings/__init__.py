@@ -5,6 +5,7 @@ photos, photo_files  what photos show; photos that are there twice, or are damag
 cameras, points      where they stand, and what no camera or cloud has
 tracks, colors       whether cameras, points and photos fit together
 scene                all of these in their order, for doctor.py and before a training
+training, resources  before a training and after it; memory and disk
 model, changes       a trained model; what has changed since its training
 advice               options that a scene's own data ask for
 """
@@ -39,7 +40,7 @@ class Finding(NamedTuple):
     def line(self) -> str:
         """As doctor.py prints it."""
         if self.is_problem:
-            return f"PROBLEM {self.text} -> {self.remedy}"
+            return f"PROBLEM {self.text}" + (f" -> {self.remedy}" if self.remedy else "")
         return f"{'note' if self.severity else 'ok':8}{self}"
 
     def __str__(self) -> str:

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from scene.images.exif import read_lens
-from scene.readers.enlargement import enlargement
 from scene.readers.info import (
     APART,
     NARROW,
@@ -20,6 +19,7 @@ from scene.readers.info import (
     standing_apart,
     turned,
 )
+from scene.readers.tracks import enlargement
 from splatting.findings import Finding, Severity, fine
 from splatting.host.listing import some
 

@@ -22,11 +22,11 @@ from scene.saved_model import load_saved
 from splatting.evaluation.model_folder import closing_lines, curve_of
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
-from splatting.evaluation.what_to_try import what_to_try
 from splatting.findings import Finding, fine, from_error, note
 from splatting.findings.changes import FITS as BAD_PSNR
 from splatting.findings.changes import LOST, NEAR, of_scene, recorded_psnr, strange_photos, what_changed
 from splatting.findings.scene import check_dataset
+from splatting.findings.training import LATE_RESET, what_to_try
 from splatting.registry import options_of, tools
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.system_utils import UserError, compute_device
@@ -49,7 +49,6 @@ FEW_GAUSSIANS = 2000
 _CLEARLY = 3.0  # dB
 _VIEWS = 4
 _WIDTH = 200  # pixels of a view, or fewer where it was trained smaller
-_RESET_SAID = "warning: opacities are reset"  # the beginning of what training/strategy_warnings.py:late_reset says
 
 
 def check_model(model_path: str, iteration: int, source: str | None = None, images: str | None = None) -> list[Finding]:
@@ -98,10 +97,9 @@ def _fits(model_path: str, stored: dict[str, Any], iteration: int) -> bool:
 def check_training(model: Path) -> list[Finding]:
     """Notes on what the log and the curve of the training suggest to try; none where it has written none."""
     try:
-        said = what_to_try(curve_of(model), read_log(model / LOG))
+        return what_to_try(curve_of(model), read_log(model / LOG))
     except UserError as error:
         return [from_error(error)]
-    return [note(sentence) for sentence in said]
 
 
 def _load(model_path: str, stored: dict[str, Any], iteration: int) -> tuple[argparse.Namespace, Scene]:
@@ -185,8 +183,9 @@ def load_scored(model_path: str) -> tuple[Scene, ScoredViews]:
 def _late_reset(scene: Scene) -> Iterator[Finding]:
     """What training said at its start of a reset, if the opacities have not recovered from it."""
     faint = float(of_scene(scene).get_opacity.detach().median()) < UNRECOVERED
-    said = closing_lines(Path(scene.model_path)) if faint else []
-    yield from (from_error(UserError(line.partition(": ")[2])) for line in said if line.startswith(_RESET_SAID))
+    lines = closing_lines(Path(scene.model_path)) if faint else []
+    said = [line.removeprefix("warning: ") for line in lines]
+    yield from (from_error(UserError(text)) for text in said if text.startswith(LATE_RESET))
 
 
 def _opacities(gaussians: GaussianModel) -> Finding:

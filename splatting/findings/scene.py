@@ -10,14 +10,15 @@ from itertools import chain
 from pathlib import Path
 
 from scene.dataset_readers import SceneInfo, read_scene
-from scene.readers.info import as_camera_info
+from scene.readers.info import NEAREST, as_camera_info
 from scene.readers.tracks import read_tracks
+from scene.scene import Scene
 from splatting.files.json_files import read_json
 from splatting.findings import Finding, Severity, fine, from_error, note
 from splatting.findings.cameras import check_extent, check_lenses, of_cameras, of_lenses
 from splatting.findings.colors import check_colors
 from splatting.findings.photo_files import of_damage, of_duplicates
-from splatting.findings.photos import check_views, of_photos
+from splatting.findings.photos import check_views, hints, left_out, of_photos
 from splatting.findings.points import check_cloud, of_points
 from splatting.findings.tracks import check_agreement, check_focal, check_poses
 from utils.system_utils import UserError
@@ -57,6 +58,31 @@ def tell(found: list[Finding], source: str | os.PathLike, quiet: bool = False) -
         print(f"warning: {one}", file=sys.stderr)
     if len(found) > _LINES:
         print(f"{len(found) - _LINES} more: python doctor.py -s {source}", file=sys.stderr)
+
+
+def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> None:
+    """Refuse a scene that cannot be trained (UserError), warn of its faults, and say where its frame is another.
+
+    A resumed training goes on with what its start was told of.
+    """
+    info, views = scene.info, scene.getTrainCameras()
+    if text := left_out(options.source_path):
+        print(text)
+    if not resumed:
+        smallest = min((view.image_width, view.image_height) for view in views)
+        found = [*of_options(info, options, scene.halves), *hints(info, smallest, options.white_background)]
+        tell(found, options.source_path)
+    if info.offset.any():
+        print(
+            f"the scene's coordinates are large compared with its extent, so {tuple(info.offset.tolist())} is "
+            "subtracted from them (world_offset in model.json); to write the model in the scene's own coordinates, use "
+            "python -m scene.export_world"
+        )
+    if (factor := scene.gaussians.enlargement) != 1:
+        print(
+            f"much of the scene is nearer than {NEAREST} units, so depths from {NEAREST / factor:.2g} on are drawn; "
+            "files keep the scene's unit"
+        )
 
 
 def check_dataset(source: str, images: str) -> list[Finding]:

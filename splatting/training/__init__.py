@@ -9,8 +9,6 @@ steps/                 faster forms of a step, to the same bytes: fused, capture
 log, scores, save, watch
                        what watches every training: records, scores, saves and checkpoints, refusals
 folder                 the folder of a training, and what earlier runs in it allow
-checks, strategy_warnings, memory_estimate
-                       before: what is refused or warned of, and how much memory a training needs
 launch                 options of train.py besides the three groups
 agreement              several processes: what they share before and in each iteration
 """

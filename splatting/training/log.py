@@ -5,7 +5,7 @@ import time
 from typing import TYPE_CHECKING
 
 from splatting.evaluation.error_curve import whole_sets
-from splatting.evaluation.what_to_try import BUDGET, CAP, PLANNED, STRATEGY, what_to_try
+from splatting.findings.training import BUDGET, CAP, PLANNED, STRATEGY, what_to_try
 from splatting.host.clock import wall_seconds
 from splatting.host.progress import Bar
 from splatting.part import Error, Part, overrides
@@ -130,7 +130,7 @@ class Records(Part):
             options |= {CAP: opt.max_num_splats} if opt.max_num_splats else {BUDGET: budget}
         log.note(**options)
         log.keep(*run.warnings)
-        log.advise(*what_to_try(run.rows, log.records))
+        log.advise(*map(str, what_to_try(run.rows, log.records)))
         first, spent = run.first_done, run.clock.spent
         seconds = max(self._seconds, log.records[-1]["seconds"] - log.seconds_before)  # perhaps of a later checkpoint
         parts = {"training": seconds, "scoring": 0.0, "saving": 0.0} | spent

@@ -27,20 +27,21 @@ from splatting.distributed.ranks import ranks
 from splatting.evaluation.error_curve import Row
 from splatting.evaluation.training_log import Stopwatch, TrainingLog
 from splatting.files.json_files import SCHEDULE
+from splatting.findings.resources import announce_memory
+from splatting.findings.scene import check_scene
+from splatting.findings.training import check_alone, check_native, warnings_of
 from splatting.host.clock import seconds_since_start
 from splatting.host.energy import joules_counter, nvml_name
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.part import Part, Strategy, overrides
 from splatting.registry import check_together, chosen, in_order, part_class, states_in, strategy_part
-from splatting.training import checks, folder
+from splatting.training import folder
 from splatting.training.agreement import agree_on_scene
 from splatting.training.density import density_control
 from splatting.training.iteration import Iteration, OwnSize, ViewOrder
-from splatting.training.memory_estimate import announce_memory
 from splatting.training.objective import LossWatch, Objective
 from splatting.training.save import Checkpoints
 from splatting.training.schedule import Schedule
-from splatting.training.strategy_warnings import warnings_of
 from splatting.training.trim_report import TrimReport, trimmed
 from splatting.training.watch import DivergenceWatch
 from utils.system_utils import UserError, compute_device
@@ -73,9 +74,9 @@ class Run:
         given, opt = opt, copy.copy(opt)  # of which the strategy, and windows by the clock, are decided here
         self.opt, self.pipe, self.launch = opt, pipe, launch
         self.group = ranks()
-        checks.check_alone(getattr(pipe, "projection", "ewa"), self.group.several)
+        check_alone(getattr(pipe, "projection", "ewa"), self.group.several)
         self.start = self.group.shared(folder.resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
-        checks.check_lenses(dataset)  # before auto becomes native
+        check_native(dataset)  # before auto becomes native
         dataset = self.dataset = folder.resolve_lenses(dataset, self.start)
         if opt.strategy == "auto" and self.start:
             opt.strategy = folder.strategy_of(self.start)
@@ -90,7 +91,7 @@ class Run:
             raise UserError(self.schedule.nothing_left(self.start, self.first_iteration))
         self.scene, first = self._read_scene()
         self.gaussians.enlargement = folder.enlargement_of(self.start, self.gaussians.enlargement)
-        checks.check_scene(self.scene, dataset, bool(self.start))
+        check_scene(self.scene, dataset, bool(self.start))
         agree_on_scene(self.scene, self.start)  # before an image is shared
         count = len(capture[1] if capture else self.scene.info.point_cloud.points if first is None else first)
         self.gaussians.divide(self.group)

@@ -31,6 +31,7 @@ class Schedule:
     """
 
     strategy = ""
+    usual = USUAL
     paced = False
     by_clock = False
     seconds = until = 0.0

@@ -31,12 +31,13 @@ from scene import sleeping
 from scene.gaussians import spilled
 from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
 from splatting.distributed.ranks import ranks
+from splatting.findings import resources
+from splatting.findings.resources import training_bytes
 from splatting.parts.spill import gpu_memory, torch_limit
 from splatting.parts.spill.announcement import sentences
 from splatting.parts.spill.gpu_memory import GpuMemory, resident_rows, spillable_bytes
 from splatting.registry import part_class
-from splatting.training import memory_estimate, run
-from splatting.training.memory_estimate import training_bytes
+from splatting.training import run
 from utils.system_utils import UserError
 
 SPILL = ("--gpu_memory", 1)
@@ -78,15 +79,15 @@ def _memory(monkeypatch: pytest.MonkeyPatch, limit: float, photos: int = 0) -> G
 @needs_59_values
 def test_the_share_follows_the_number_of_gaussians(monkeypatch):
     gaussians, count, pixels = model(1), 10**6, 1000
-    assert training_bytes(gaussians, count, 0) == count * (12 * 59 + 4 * 45 + memory_estimate.PER_GAUSSIAN)
+    assert training_bytes(gaussians, count, 0) == count * (12 * 59 + 4 * 45 + resources.PER_GAUSSIAN)
     assert spillable_bytes(gaussians, count) == count * 12 * 45
     memory = _memory(monkeypatch, 1, photos=2**27)
     shares = [memory.resident_rows(count) / count for count in range(10**5, 4 * 10**6, 10**5)]
     assert shares[0] == 1 and shares[-1] == 0 and shares == sorted(shares, reverse=True)
     count = 1_200_000
     near = memory.resident_rows(count)
-    fixed = pixels * memory_estimate.PER_PIXEL + 2**27 + gpu_memory._LEAST_SPARE
-    others = count * (12 * 14 + memory_estimate.PER_GAUSSIAN + gpu_memory._WHOLE_STEP) + fixed
+    fixed = pixels * resources.PER_PIXEL + 2**27 + gpu_memory._LEAST_SPARE
+    others = count * (12 * 14 + resources.PER_GAUSSIAN + gpu_memory._WHOLE_STEP) + fixed
     assert abs(near - resident_rows(2**30, count, others, count * 540)) <= 1 and 0 < near < count
     # Where the copy that a change needs does not fit, all rows may stay, but as spilled ones.
     whole = next(count for count in range(10**5, 10**7, 10**4) if memory._spills(count))
@@ -290,7 +291,7 @@ def test_blocks_sleep_wherever_they_can(scene, tmp_path, monkeypatch, options, s
 
 def test_it_is_told_before_what_the_host_has_to_hold(scene, tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(GpuMemory, "host_bytes", lambda self, count: count * 10**6)
-    monkeypatch.setattr(memory_estimate, "free_memory", lambda device: 10**10)
+    monkeypatch.setattr(resources, "free_memory", lambda device: 10**10)
     monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
     train_on(scene, tmp_path, "--iterations", 2, "--disable_viewer", "--init_pcd_path", scene / "points.ply", *SPILL)
     out, err = capfd.readouterr()

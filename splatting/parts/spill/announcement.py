@@ -6,9 +6,9 @@ import torch
 
 from scene import sleeping
 from scene.sampling_rate import share_of
+from splatting.findings.resources import REMEDY, announce_device, expected_count, warn_of
 from splatting.host.memory import gib
 from splatting.parts.spill.gpu_memory import GpuMemory
-from splatting.training.memory_estimate import REMEDY, announce_device, expected_count, warn_of
 
 _BUS = 40e9  # bytes a second that kernels read or write in the host's memory
 _SLOW = 10.0  # milliseconds a step, from which on the bus is named

@@ -8,9 +8,9 @@ from torch import Tensor
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.spilled import Room, bytes_of, empty_rows, is_spilled
 from scene.scene import Scene
+from splatting.findings.resources import PER_PIXEL, largest_view, photo_bytes, training_bytes
 from splatting.host.memory import free_memory
 from splatting.parts.spill.torch_limit import CAN_SPILL, limit_torch
-from splatting.training.memory_estimate import PER_PIXEL, largest_view, photo_bytes, training_bytes
 
 _USABLE = 0.95  # of a GPU's free memory, where nobody has given a limit; torch cannot fill what it holds
 _PAGE = 2 << 20  # bytes; a spilled tensor has whole pages in each memory

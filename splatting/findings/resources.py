@@ -1,15 +1,20 @@
-"""Estimate of the memory that a training needs, printed before it starts if that is much of what is free."""
+"""Memory and disk that a training needs, said before it starts where that is much of what is free."""
 
 import math
+import shutil
 import sys
+from pathlib import Path
+from typing import Any
 
 import torch
 
 from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.images.store import ImageStore
+from splatting.findings import Finding
 from splatting.host.memory import free_memory, gib
 from splatting.host.torchrun import local_size
+from utils.system_utils import UserError
 
 # Bytes besides the parameters and Adam's two averages. 106 and 57 were fitted to the peak memory of
 # forward and backward in docs/results/kernels.md (100 thousand to 6 million Gaussians, within 4 %). The rest are the
@@ -21,9 +26,9 @@ PER_PIXEL = 57 + 72
 PER_ABSOLUTE = 4 + 106 // 5
 GROWTH = 20  # photo scenes grow 10- to 100-fold in 7,000 iterations (docs/results/training.md), random points 2-fold
 REMEDY = "--images_to_load, or lower --resolution (-r) or --sh_degree"
-
-
 LITTLE = 0.1  # of what is free, of which nobody has to know
+_OF_PLY = 3  # numbers of a Gaussian besides its own: normals, which are 0
+_OF_CHECKPOINT = 3  # the same: statistics of density control. Its own come with Adam's two averages
 
 
 def expected_count(max_splats: int, now: int) -> int:
@@ -117,3 +122,30 @@ def largest_view(scene: Scene) -> int:
 
 def _keeps(images: ImageStore, device: torch.device) -> bool:
     return images.keep_on.type == device.type and (images.keep_on.index or 0) == (device.index or 0)
+
+
+def little_space(run: Any, sure: int, later: int, first: int) -> Finding | None:
+    """What to say if the saves from iteration `first` on do not fit with `later` Gaussians, before they are written.
+
+    sure: Gaussians that there are at least. UserError if not even one PLY of so many fits.
+    """
+    folder = Path(run.scene.model_path).absolute()
+    free = shutil.disk_usage(next(place for place in (folder, *folder.parents) if place.exists())).free
+    values = sum(math.prod(attribute.shape) for attribute in run.gaussians._attributes.values())
+    ply, checkpoint = 4 * (values + _OF_PLY), 4 * (3 * values + _OF_CHECKPOINT)
+    if free < ply * sure:
+        raise UserError(
+            f"the disk of {folder} has {_mb(free)} free, and a model of {sure:,} Gaussians takes {_mb(ply * sure)}; "
+            "free space there, or name another folder by -m"
+        )
+    planned = [run.schedule.known(one) for one in (run.launch.save_iterations, run.launch.checkpoint_iterations)]
+    saves, checkpoints = (len({n for n in one if n >= first}) for one in planned)
+    needed = later * (ply * max(saves, 1) + checkpoint * checkpoints)
+    if free >= needed:
+        return None
+    text = f"the disk of {folder} has {_mb(free)} free, and the saves to come take about {_mb(needed)}"
+    return Finding(f"{text} if there are {later:,} Gaussians", "free space there in time")
+
+
+def _mb(count: float) -> str:
+    return f"{count / 1e6:,.1f} MB"
