@@ -20,12 +20,12 @@ from pathlib import Path
 
 from arguments import OptionParser
 from scene.readers.scene_folder import is_apart
+from splatting.findings.capture import lines_of, training_options, unusable
 from splatting.host import torchrun
 from splatting.host.start import typed_command
 from splatting.sfm import stages
 from splatting.sfm.adding import added_line, forget_base, keep_base
 from splatting.sfm.cameras import MODES
-from splatting.sfm.capture import lines_of, training_options, unusable
 from splatting.sfm.capture_page import capture_stage
 from splatting.sfm.colmap import ADDING, GIVEN, LENS_MODELS, Program, Pycolmap, Settings, is_native
 from splatting.sfm.images import link

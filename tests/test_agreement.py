@@ -21,6 +21,7 @@ from scene.agreement import (
     share_behind,
     verdict,
 )
+from splatting.findings.capture import is_wrong
 from splatting.findings.tracks import check_agreement
 from splatting.sfm import mapping
 from utils.system_utils import UserError
@@ -240,7 +241,7 @@ def test_mapping_that_fails_in_every_way_says_why(tmp_path, monkeypatch):
 
 def test_when_a_model_is_called_wrong():
     right = {"pairs": 90, "contradicting": 0.05, "agreeing": 40, "photos": 42, "bound": 42}
-    assert mapping.agrees(right) and not mapping.is_wrong(right)
-    assert not mapping.agrees(right | {"agreeing": 30}) and not mapping.is_wrong(right | {"agreeing": 30})
-    assert mapping.is_wrong(right | {"agreeing": 20}) and mapping.is_wrong(right | {"contradicting": 0.3})
-    assert not mapping.is_wrong({"pairs": 0}) and not mapping.agrees({})  # nothing to judge by
+    assert mapping.agrees(right) and not is_wrong(right)
+    assert not mapping.agrees(right | {"agreeing": 30}) and not is_wrong(right | {"agreeing": 30})
+    assert is_wrong(right | {"agreeing": 20}) and is_wrong(right | {"contradicting": 0.3})
+    assert not is_wrong({"pairs": 0}) and not mapping.agrees({})  # nothing to judge by

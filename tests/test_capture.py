@@ -9,8 +9,8 @@ from PIL import Image, ImageFilter
 from scipy.ndimage import gaussian_filter
 
 import train
-from splatting.findings.photos import left_out
-from splatting.sfm.capture import compared, findings, lines_of, looks_of, neighbours_of, unusable
+from splatting.findings.capture import left_out, lines_of, neighbours_of, unusable, worth
+from splatting.sfm.capture import compared, looks_of
 from splatting.sfm.capture_page import from_above, write_page
 from splatting.sfm.layout import Layout
 
@@ -47,7 +47,7 @@ def test_what_is_weak_blurred_and_darker_is_named(folder):
     looks = looks_of(folder, NAMES)
     assert looks["a.jpg"].brightness - looks["d.jpg"].brightness == pytest.approx(2.0, abs=0.1)
     assert neighbours_of(_survey()["photos"])["d.jpg"] == []
-    found = findings(_report(4, 5, "e.jpg"), _survey()["photos"], looks)
+    found = worth(_report(4, 5, "e.jpg"), _survey()["photos"], looks)
     assert (found["weakly_connected"], found["blurred"]) == (["d.jpg"], ["b.jpg"])
     assert found["brightness_spread_stops"] == pytest.approx(np.std([0, 0, 0, 2]), abs=0.05)
     assert [line.split(":")[0] for line in found["again"]] == [
@@ -61,14 +61,14 @@ def test_what_is_weak_blurred_and_darker_is_named(folder):
 def test_the_brightness_of_photos_that_are_not_placed_does_not_count(folder):
     """Such as a screenshot among the photos, whose brightness would call for --appearance ppisp."""
     photos = {name: photo for name, photo in _survey()["photos"].items() if name != "d.jpg"}
-    found = findings(_report(3, 4, "d.jpg"), photos, looks_of(folder, NAMES))
+    found = worth(_report(3, 4, "d.jpg"), photos, looks_of(folder, NAMES))
     assert found["brightness_spread_stops"] < 0.05 and found["blurred"] == ["b.jpg"]
 
 
 def test_a_sound_capture_has_nothing_to_photograph_again(folder):
     looks = {name: looks_of(folder, ["a.jpg"])["a.jpg"] for name in NAMES[:3]}
     photos = {name: photo for name, photo in _survey()["photos"].items() if name in looks}
-    found = findings(_report(3, 3), photos, looks)
+    found = worth(_report(3, 3), photos, looks)
     assert found == {"weakly_connected": [], "blurred": [], "brightness_spread_stops": 0.0, "again": []}
 
 
@@ -94,13 +94,13 @@ def test_what_photos_show_does_not_count(tmp_path):
     (layout.sparse / "0" / "images.txt").write_text("\n".join(lines) + "\n")
     (layout.sparse / "0" / "points3D.txt").write_text("")
     photos = {name: {"shared": {other: 99 for other in names if other != name}} for name in names}
-    alone = findings(_report(8, 8), photos, looks_of(layout.images, names))
-    found = findings(_report(8, 8), photos, compared(looks_of(layout.images, names), layout))
+    alone = worth(_report(8, 8), photos, looks_of(layout.images, names))
+    found = worth(_report(8, 8), photos, compared(looks_of(layout.images, names), layout))
     assert alone["brightness_spread_stops"] > 1 and "g.jpg" in alone["blurred"]
     assert found["blurred"] == ["b.jpg"]
     assert found["brightness_spread_stops"] == pytest.approx(np.std([0] * 7 + [2]), abs=0.15)
     (layout.sparse / "0" / "images.txt").write_text("\n\n".join(lines[::2]) + "\n\n")
-    found = findings(_report(8, 8), photos, compared(looks_of(layout.images, names), layout))
+    found = worth(_report(8, 8), photos, compared(looks_of(layout.images, names), layout))
     assert found["brightness_spread_stops"] is None and not found["again"]
     assert len(lines_of(_report(8, 8) | found)) == 2
 
@@ -108,7 +108,7 @@ def test_what_photos_show_does_not_count(tmp_path):
 def _page(folder, names, survey, **report) -> str:
     looks = looks_of(folder, NAMES)
     report = _report(len(survey["photos"]), len(names), *sorted(set(names) - set(survey["photos"]))) | report
-    report |= findings(report, survey["photos"], looks)
+    report |= worth(report, survey["photos"], looks)
     write_page(folder / "capture.html", report, survey, looks, names, folder)
     return (folder / "capture.html").read_text(encoding="utf-8")
 

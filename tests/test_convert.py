@@ -27,8 +27,9 @@ from waiting import LIMIT, wait_for
 import convert
 from scene.dataset_readers import read_scene
 from scene.readers.tracks import read_tracks
+from splatting.findings.capture import of_model, worth
 from splatting.sfm import colmap, programs, report
-from splatting.sfm.capture import Look, findings
+from splatting.sfm.capture import Look
 from splatting.sfm.colmap import LENS_MODELS, Program, Pycolmap, Settings
 from splatting.sfm.images import check_images, find_masks, prepare_images
 from splatting.sfm.layout import Layout
@@ -162,7 +163,7 @@ def test_the_command_that_trains_can_be_copied(copy, monkeypatch, capsys, placed
     """It ends the output, unless too few photos are placed."""
     looks = {name: Look(1.0, stops * (-1) ** number) for number, name in enumerate(NAMES)}
     photos = {name: {"shared": {other: 100 for other in NAMES if other != name}} for name in NAMES}
-    found = findings(json.loads((copy / "convert_report.json").read_text()), photos, looks)
+    found = worth(json.loads((copy / "convert_report.json").read_text()), photos, looks)
     inputs = convert.report_inputs
     monkeypatch.setattr(convert, "report_inputs", lambda *a, **k: inputs(*a, **k) | found | {"registered": placed})
     with pytest.raises(SystemExit, match="3") if more is None else contextlib.nullcontext():
@@ -714,10 +715,10 @@ def _model(registered: int, points: int = 5000, track: float = 5.0, error: float
 def test_poses_that_no_pair_judged_are_not_called_right():
     photos = [f"{i:03d}" for i in range(40)]
     words = [_model(40)], photos, dict.fromkeys(photos, 3), "auto", 0
-    (line,) = report.advice(*words, tried=[{"way": "global", "photos": 40, "pairs": 0}])
+    (line,) = map(str, of_model(*words, tried=[{"way": "global", "photos": 40, "pairs": 0}]))
     assert line.startswith("the poses could not be judged")
     judged = {"way": "global", "photos": 40, "pairs": 90, "agreeing": 40, "contradicting": 0.02}
-    assert report.advice(*words, tried=[judged]) == []
+    assert [*of_model(*words, tried=[judged])] == []
 
 
 @pytest.mark.parametrize(
@@ -740,5 +741,5 @@ def test_poses_that_no_pair_judged_are_not_called_right():
 )
 def test_advice(models, said):
     photos = [f"{i:03d}" for i in range(40)]
-    lines = report.advice(models, photos, dict.fromkeys(photos[:39], 3), "sequential", 8192)
+    lines = [*map(str, of_model(models, photos, dict.fromkeys(photos[:39], 3), "sequential", 8192))]
     assert [bool(re.search(expected, line)) for line, expected in zip(lines, said, strict=True)] == [True] * len(said)

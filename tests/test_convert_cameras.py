@@ -16,6 +16,7 @@ import train
 from scene.dataset_readers import read_scene
 from scene.images.exif import Lens, read_lens
 from splatting.findings.cameras import check_lenses
+from splatting.findings.capture import of_shared_cameras
 from splatting.sfm import cameras
 from splatting.sfm.layout import Layout
 
@@ -183,6 +184,10 @@ def survey(*factors: float, gain: float = 0.5) -> list[dict]:
     return [{"photos": {f"{number}.jpg": [factor, 0.8, 0.8 * gain] for number, factor in enumerate(factors)}}]
 
 
+def _advice(*words) -> list[str]:
+    return [*map(str, of_shared_cameras(*words))]
+
+
 @pytest.mark.parametrize(
     ("found", "said"),
     [
@@ -198,9 +203,9 @@ def survey(*factors: float, gain: float = 0.5) -> list[dict]:
 )
 def test_photos_of_another_focal_length_are_named(found, said):
     found[0]["photos"]["few points.jpg"] = []
-    lines = cameras.advice(found, {}, "shared")
+    lines = _advice(found, {}, "shared")
     if said:
-        (line,) = cameras.advice(found, {"0.jpg": Lens(film=26), "1.jpg": Lens(film=52)}, "shared")
+        (line,) = _advice(found, {"0.jpg": Lens(film=26), "1.jpg": Lens(film=52)}, "shared")
         assert line.endswith("convert again with --cameras per_lens")
     assert len(lines) == (said is not None) and (not said or re.search(said.replace("of 10", "of 11"), lines[0]))
 
@@ -209,7 +214,7 @@ def test_photos_of_another_focal_length_are_named(found, said):
     ("mode", "known", "count"), [("per_lens", 2, 1), ("per_lens", 3, 0), ("per_lens", 0, 0), ("shared", 2, 0)]
 )
 def test_photos_without_exif_among_others_are_named(mode, known, count):
-    lines = cameras.advice([], {f"{number}.jpg": Lens(film=26.0 * (number < known)) for number in range(3)}, mode)
+    lines = _advice([], {f"{number}.jpg": Lens(film=26.0 * (number < known)) for number in range(3)}, mode)
     assert [line.startswith("the EXIF data of 1 of 3 photos name no lens (2.jpg), and") for line in lines] == [
         True
     ] * count
@@ -218,10 +223,10 @@ def test_photos_without_exif_among_others_are_named(mode, known, count):
 def test_frames_of_videos_need_no_exif():
     known = {"0.jpg": Lens(film=26.0), "1.jpg": Lens(), "frame_00001.jpg": Lens(), "frame_00002.jpg": Lens()}
     frames = {"frame_00001.jpg", "frame_00002.jpg"}
-    (line,) = cameras.advice([], known, "per_lens", frames)
+    (line,) = _advice([], known, "per_lens", frames)
     assert line.startswith("the EXIF data of 1 of 2 photos name no lens (1.jpg), and")
-    assert cameras.advice([], known, "per_lens", {*frames, "1.jpg"}) == []
-    assert cameras.advice([], known, "per_lens", {*frames, "0.jpg"}) == []  # of photos none is known
+    assert _advice([], known, "per_lens", {*frames, "1.jpg"}) == []
+    assert _advice([], known, "per_lens", {*frames, "0.jpg"}) == []  # of photos none is known
 
 
 def test_the_doctor_compares_cameras_with_exif(colmap_scene):

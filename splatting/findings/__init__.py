@@ -5,6 +5,7 @@ photos, photo_files  what photos show; photos that are there twice, or are damag
 cameras, points      where they stand, and what no camera or cloud has
 tracks, colors       whether cameras, points and photos fit together
 scene                all of these in their order, for doctor.py and before a training
+capture              photos and poses of a conversion, and what to photograph again
 training, resources  before a training and after it; memory and disk
 model, changes       a trained model; what has changed since its training
 advice               options that a scene's own data ask for

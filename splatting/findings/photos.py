@@ -1,6 +1,5 @@
 """Faults of photos: invisible ones, nearly one value, a part of the range, bars, masks that leave out everything."""
 
-import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,7 +13,6 @@ from scene.images.masks import Mask
 from scene.readers.info import CameraInfo, SceneInfo
 from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import UNREADABLE, open_image
-from splatting.files.json_files import read_json
 from splatting.findings import Finding, Severity, fine
 from splatting.host.listing import some
 from utils.system_utils import UserError
@@ -291,24 +289,3 @@ def _narrow(low: float, high: float, sixteen: bool) -> Finding:
         return Finding(text, f"multiply their values by {factor:g}")
     factor = 0.9 / max(high - low, 1 / scale)
     return Finding(text, f"stretch these values over the whole range, about {factor:.3g}-fold")
-
-
-def left_out(source: str | os.PathLike) -> str | None:
-    """What convert.py could not place of the photos of a scene that it made; None: nothing, or another made it."""
-    try:
-        report = read_json(Path(source) / "convert_report.json")
-        placed, count = int(report["registered"]), int(report["photos"])
-        if text := report.get("unusable"):
-            return f"convert.py says of this scene: {text}"
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return None
-    share = f"{placed} of {count} photos ({placed / max(count, 1):.0%})"
-    return f"this scene has {share} of its capture; capture.html in it says what is missing" if placed < count else None
-
-
-def already_undistorted(source: str | os.PathLike) -> bool:
-    """Whether convert.py made a scene of undistorted photos."""
-    try:
-        return read_json(Path(source) / "convert_report.json")["lenses"] == "undistort"
-    except (OSError, ValueError, KeyError, TypeError):
-        return False

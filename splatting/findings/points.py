@@ -14,7 +14,7 @@ from scene.readers.tracks import projected
 from splatting.findings import Finding, fine
 from splatting.host.listing import some
 
-FEWEST_POINTS = 1000
+FEWEST_POINTS = 1000  # with fewer, density control has to find the scene by itself
 FAR_POINT = 100.0  # extents from the cameras; a sky is some tens away
 FAR_SHARE = 0.01
 FEWEST_IN_VIEW = 10  # points of the cloud in a photo

@@ -13,19 +13,18 @@ from scene.dataset_readers import SceneInfo, read_scene
 from scene.readers.info import NEAREST, as_camera_info
 from scene.readers.tracks import read_tracks
 from scene.scene import Scene
-from splatting.files.json_files import read_json
-from splatting.findings import Finding, Severity, fine, from_error, note
+from splatting.findings import Finding, Severity, from_error, note
 from splatting.findings.cameras import check_extent, check_lenses, of_cameras, of_lenses
+from splatting.findings.capture import check_conversion, left_out
 from splatting.findings.colors import check_colors
 from splatting.findings.photo_files import of_damage, of_duplicates
-from splatting.findings.photos import check_views, hints, left_out, of_photos
+from splatting.findings.photos import check_views, hints, of_photos
 from splatting.findings.points import check_cloud, of_points
 from splatting.findings.tracks import check_agreement, check_focal, check_poses
 from utils.system_utils import UserError
 
 LOOKED_AT = 16  # photos that a training decodes, small,
 MOST_PHOTOS = 100  # and the doctor
-REGISTERED = 0.9  # share of the photos
 _LINES = 5  # most findings that a training prints
 
 
@@ -98,7 +97,7 @@ def check_dataset(source: str, images: str) -> list[Finding]:
     checks += [findings(info, MOST_PHOTOS)]
     if not any(of_lenses(info)):  # else poses and colours have that cause
         checks += [check_geometry(source, info), check_agreement(Path(source) / "sparse" / "0")]
-    return [*_notes(said.getvalue()), *chain(*checks, _check_registered(Path(source) / "convert_report.json"))]
+    return [*_notes(said.getvalue()), *chain(*checks, check_conversion(source))]
 
 
 def check_geometry(source: str, info: SceneInfo) -> Iterator[Finding]:
@@ -111,23 +110,6 @@ def check_geometry(source: str, info: SceneInfo) -> Iterator[Finding]:
         tracks = [None] * len(views)
     lines = [*check_focal(views, tracks)] or [*check_poses(views, tracks, info.extent)]
     yield from lines or check_colors(info, tracks)
-
-
-def _check_registered(path: Path) -> Iterator[Finding]:
-    """What is in convert.py's report, if it made the scene."""
-    if not path.is_file():
-        return
-    try:
-        report = read_json(path)
-        placed, photos = int(report["registered"]), int(report["photos"])
-        advice = [str(line) for line in report["advice"]]
-    except (OSError, ValueError, KeyError, TypeError):
-        yield Finding(f"{path} is damaged", "remove it, or run convert.py again")
-        return
-    text = f"{placed} of {photos} photos were placed by convert.py"
-    remedy = advice[0].rpartition("; ")[2] if advice else "take more photos that overlap"
-    few = photos and placed / photos < REGISTERED
-    yield Finding(f"only {text}", remedy) if few else fine(text)
 
 
 def _notes(said: str) -> list[Finding]:

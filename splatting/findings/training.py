@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from scene.gaussians import density_rules as rules
 from splatting.evaluation.error_curve import CLEAR, Row, gain_since_peak, peak, whole_sets
 from splatting.findings import Finding, Severity
-from splatting.findings.photos import already_undistorted
+from splatting.findings.capture import already_undistorted
 from splatting.findings.resources import expected_count, little_space
 from splatting.host.listing import some
 from splatting.registry import part_class, strategies, tools

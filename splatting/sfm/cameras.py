@@ -1,6 +1,6 @@
 """Photos that share a camera in the reconstruction: those of one size and lens, unless the user says otherwise."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -8,16 +8,10 @@ from tqdm.contrib.concurrent import thread_map
 
 from scene.images.decode import picture_size
 from scene.images.exif import Lens, read_lens
-from splatting.host.listing import some
 from splatting.host.machine import threads
 
 MODES = ("per_lens", "per_folder", "per_photo", "shared")
-OTHER_LENS = 0.02  # difference of a photo's own focal length from its camera's; those of one lens have 0.017 at most
-BETTER = 0.9  # of its error, that a photo of another lens falls below with a focal length of its own
-_MANY = 0.05  # share of a camera's photos: a few may be wrong for other reasons
-_FEWEST = 3
 _MOST_LISTED = 12
-_BY_HAND = "--cameras per_photo, or put the photos of each lens into a sub-folder and use --cameras per_folder"
 
 
 class Group(NamedTuple):
@@ -79,39 +73,6 @@ def described(cameras: Sequence[dict[str, Any]], known: dict[str, Lens]) -> list
         used = dict.fromkeys(str(known.get(name, Lens())) for name in names)
         found.append({**camera, "lenses": [*used], "photos": names, "registered": len(names)})
     return found
-
-
-def advice(
-    cameras: Sequence[dict[str, Any]], known: dict[str, Lens], mode: str, frames: Collection[str] = ()
-) -> list[str]:
-    """Return a line for each camera whose photos seem to come through several lenses, and one for missing EXIF data.
-
-    frames: of videos, which never have EXIF data.
-    """
-    lines = []
-    for camera in cameras:
-        fits = {name: fit for name, fit in camera["photos"].items() if fit}
-        other = [name for name, fit in fits.items() if _is_other(*fit)]
-        if len(other) >= max(_FEWEST, _MANY * len(fits)):
-            factors = sorted(fits[name][0] for name in other)
-            several = len({known.get(name) for name in camera["photos"]}) > 1
-            lines.append(
-                f"{len(other)} of {len(camera['photos'])} photos that share a camera ({some(other)}) fit better with "
-                f"{factors[0]:.2f} to {factors[-1]:.2f} times its focal length, as photos through several lenses, or "
-                f"zoomed or cropped ones do; convert again with " + ("--cameras per_lens" if several else _BY_HAND)
-            )
-    photos = [name for name in known if name not in frames]
-    silent = [name for name in photos if not known[name].known]
-    if mode == "per_lens" and 0 < len(silent) < len(photos):
-        lines.append(
-            f"the EXIF data of {len(silent)} of {len(photos)} photos name no lens ({some(silent)}), and those of one "
-            f"size and folder share a camera; if they came through several lenses, use {_BY_HAND}"
-        )
-    return lines
-
-
-def _is_other(factor: float, error: float, own_error: float) -> bool:
-    return abs(factor - 1) > OTHER_LENS and own_error < BETTER * error
 
 
 def _all(read: Callable[[Path], Any], folder: Path, names: Sequence[str]) -> list[Any]:

@@ -17,19 +17,11 @@ from tqdm.contrib.concurrent import thread_map
 from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.json_files import read_json, write_json
+from splatting.findings.capture import is_wrong, lines_of, neighbours_of, training_options, unusable, worth
 from splatting.host.machine import threads
-from splatting.sfm.capture import (
-    Look,
-    compared,
-    findings,
-    lines_of,
-    looks_of,
-    neighbours_of,
-    training_options,
-    unusable,
-)
+from splatting.sfm.capture import Look, compared, looks_of
 from splatting.sfm.layout import Layout, image_names
-from splatting.sfm.mapping import is_wrong, name_of
+from splatting.sfm.mapping import name_of
 from splatting.sfm.report import summary
 from splatting.sfm.stages import Stage
 from utils.system_utils import atomic_write
@@ -50,7 +42,7 @@ def capture_stage(layout: Layout, names: Sequence[str], seconds: Callable[[], di
         survey, root = read_json(layout.capture), layout.prepared if layout.prepared.is_dir() else layout.input
         looks = compared(looks_of(root, image_names(root)), layout)
         report = read_json(layout.report)
-        report |= {"seconds": seconds()} | findings(report, survey["photos"], looks)
+        report |= {"seconds": seconds()} | worth(report, survey["photos"], looks)
         report["unusable"] = unusable(report)
         write_json(layout.report, report)
         write_page(layout.page, report, survey, looks, sorted({*looks, *survey["photos"]}), root)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from splatting.files.json_files import read_json, write_json
+from splatting.findings.capture import CONTRADICTING, is_wrong
 from splatting.sfm.colmap import (
     ADDING,
     ALL_PAIRS,
@@ -26,8 +27,6 @@ from splatting.sfm.colmap import (
 from utils.system_utils import UserError
 
 AGREEING = 0.9  # share of the photos that pairs bind, which agree in a model that is kept at once
-CONTRADICTING = 0.1  # share of the matches; right models had 0.09 at most, wrong ones 0.04 to 0.97
-SOUND = 0.6  # share of a model's photos that have to agree, or it is called wrong
 _NAMES = {
     "simple": "global mapping, at first without distortion",
     "free": "incremental mapping without given focal lengths",
@@ -81,13 +80,6 @@ def agrees(found: Mapping[str, Any]) -> bool:
     """Whether a judged model is kept without another try."""
     many = found.get("agreeing", 0) >= AGREEING * found.get("bound", 0) > 0
     return many and found["contradicting"] <= CONTRADICTING
-
-
-def is_wrong(found: Mapping[str, Any]) -> bool:
-    """Whether a judged model is to be called wrong, although it is the best. One without pairs cannot be judged."""
-    if not found.get("pairs"):
-        return False
-    return found["contradicting"] > CONTRADICTING or found["agreeing"] < SOUND * found["photos"]
 
 
 def _tried(

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from splatting.files.json_files import read_json, write_json
+from splatting.findings.capture import of_given_poses, of_model, of_shared_cameras, refuse_nothing
 from splatting.sfm import cameras, colmap, images, report, video
 from splatting.sfm.adding import base_state
 from splatting.sfm.colmap import Backend, Settings, worker_command
@@ -230,12 +231,12 @@ def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, 
         models = report.read_survey(layout, tried)
         names = image_names(root)
         matches = colmap.partners(layout.database)
-        report.refuse_nothing(models, names, matches, settings.matcher)
+        refuse_nothing(models, names, matches, settings.matcher)
         chosen, limit = models[0], settings.max_num_features
         at_limit = limit if colmap.most_features(layout.database) >= limit else 0
         lenses = cameras.lenses(root, names)
         given = settings.mapper == colmap.GIVEN
-        lines = report.advice_at_poses(chosen, names) if given else []  # UserError before anything is replaced
+        found = [*of_given_poses(chosen, names)] if given else []  # UserError before anything is replaced
         native = colmap.is_native(settings.lenses, {camera["model"] for camera in chosen.cameras})
         paths = {"model": layout.models / chosen.folder, "images": root, "out": layout.undistorted}
         job = {name: str(path) for name, path in (paths | {"capture": layout.capture}).items()}
@@ -254,8 +255,8 @@ def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, 
         # Patches could lie where masks leave photos out.
         more = 0 if layout.masks.is_dir() else add_points(layout.undistorted, shared, settings.no_gpu)
         if not given:
-            lines += report.advice(models, names, matches, settings.matcher, at_limit, tried, more)
-            lines += cameras.advice(chosen.cameras, lenses, settings.cameras, video.taken_frames(layout))
+            found += of_model(models, names, matches, settings.matcher, at_limit, tried, more)
+            found += of_shared_cameras(chosen.cameras, lenses, settings.cameras, video.taken_frames(layout))
         later = [path for name, paths in _written_by(layout).items() if record.begun(name) for path in paths]
         _remove(layout.images, layout.sparse, layout.report, *later)
         mkdir_p(layout.sparse)
@@ -264,7 +265,8 @@ def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, 
         _remove(layout.undistorted)
         kept = "native" if native else "undistort"
         described = cameras.described(chosen.cameras, lenses)
-        made_of = {**made, "advice": lines, "cameras": described, "lenses": kept, "more_points": more, "tried": tried}
+        made_of = {**made, "advice": [*map(str, found)], "cameras": described, "lenses": kept}
+        made_of |= {"more_points": more, "tried": tried}
         report.write_report(layout.report, models, names, matches, **made_of)
 
     return Stage("undistortion", [made_from, settings.lenses], lambda: _remove(layout.undistorted), work)
