@@ -22,7 +22,7 @@ from scene.agreement import (
     verdict,
 )
 from splatting.findings.capture import is_wrong
-from splatting.findings.tracks import check_agreement
+from splatting.findings.fit import check_agreement
 from splatting.sfm import mapping
 from utils.system_utils import UserError
 

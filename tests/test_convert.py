@@ -27,9 +27,8 @@ from waiting import LIMIT, wait_for
 import convert
 from scene.dataset_readers import read_scene
 from scene.readers.tracks import read_tracks
-from splatting.findings.capture import of_model, worth
+from splatting.findings.capture import Look, of_model, worth
 from splatting.sfm import colmap, programs, report
-from splatting.sfm.capture import Look
 from splatting.sfm.colmap import LENS_MODELS, Program, Pycolmap, Settings
 from splatting.sfm.images import check_images, find_masks, prepare_images
 from splatting.sfm.layout import Layout

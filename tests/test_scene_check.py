@@ -27,9 +27,10 @@ from splatting.demo.make_scene import write_scene
 from splatting.demo.objects import demo_scene
 from splatting.demo.tracer import FISHEYE, PANORAMA, ring_views
 from splatting.findings import Finding, Severity
+from splatting.findings.fit import check_geometry
 from splatting.findings.photo_files import damaged, of_damage
 from splatting.findings.photos import of_photos
-from splatting.findings.scene import check_dataset, check_geometry, check_scene, findings, tell
+from splatting.findings.scene import check_dataset, check_scene, findings, tell
 from splatting.sfm.images import check_images
 from splatting.sfm.layout import Layout
 from utils.graphics_utils import BasicPointCloud

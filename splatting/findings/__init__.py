@@ -3,7 +3,7 @@
 environment          packages, GPU, extensions (imports nothing heavy)
 photos, photo_files  what photos show; photos that are there twice, or are damaged
 cameras, points      where they stand, and what no camera or cloud has
-tracks, colors       whether cameras, points and photos fit together
+fit                  whether cameras, points and photos fit together
 scene                all of these in their order, for doctor.py and before a training
 capture              photos and poses of a conversion, and what to photograph again
 training, resources  before a training and after it; memory and disk

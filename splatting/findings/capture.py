@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -21,7 +21,6 @@ from splatting.registry import tools
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
-    from splatting.sfm.capture import Look
     from splatting.sfm.report import Model
 
 REPORT = "convert_report.json"
@@ -41,6 +40,13 @@ _BLURRED = 0.3  # of the median sharpness
 _EXPOSURES = "--appearance ppisp"  # of train.py, for photos that differ by more
 _BY_HAND = "--cameras per_photo, or put the photos of each lens into a sub-folder and use --cameras per_folder"
 _OVERLAPPING = "each overlapping the one before by 60 to 80 %"
+
+
+class Look(NamedTuple):
+    """A photo's sharpness (mean squared difference of neighbours) and brightness (stops)."""
+
+    sharpness: float
+    brightness: float
 
 
 def refuse_nothing(models: "Sequence[Model]", images: Sequence[str], partners: dict[str, int], matcher: str) -> None:
@@ -185,7 +191,7 @@ def neighbours_of(photos: Mapping[str, Mapping[str, Any]]) -> dict[str, list[str
 
 
 def worth(
-    report: Mapping[str, Any], photos: Mapping[str, Mapping[str, Any]], looks: "Mapping[str, Look]"
+    report: Mapping[str, Any], photos: Mapping[str, Mapping[str, Any]], looks: Mapping[str, Look]
 ) -> dict[str, Any]:
     """What a capture is worth, for convert_report.json.
 

@@ -1,6 +1,6 @@
-"""What has changed since a training: the model, the cameras, or photos, which then show other views than theirs.
+"""What has changed since a training: the model, or photos, which then show other views than those of their cameras.
 
-Each change that is usual is undone, and tried on the views. What explains them is told; else, what does not fit.
+Each usual change of a model is undone, and tried on the views. Where none explains them, what does not fit is told.
 """
 
 from collections.abc import Callable, Iterator
@@ -9,14 +9,12 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from arguments import read_model_json
 from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import Rows
-from scene.readers.info import CameraInfo
 from scene.readers.point_cloud import read_point_cloud
 from scene.scene import Scene
 from splatting.evaluation.model_folder import curve_of
@@ -32,9 +30,6 @@ MOST_PHOTOS = 300  # that are compared with each other
 FITS = 18.0  # dB of training views; models that converge reach 22 and more
 CLEARLY = 3.0  # dB that undoing a change has to gain, unless it comes to what was recorded
 _SUSPECTS = 12  # views whose photos are looked for among all, those that fit worst
-_WIDEST, _STEP, _FINE = 2.5, 1.16, 1.03  # factors of focal lengths: the largest, between two, and between two at last
-_NO_FACTOR = 1.08  # a smaller one is told by no image of 200 pixels
-_INSIDE = 0.2  # of a photo that a changed focal length has to leave
 NEAR = 1.5  # dB between the record and a score of small renders
 LOST = 6.0  # dB below the record, from which on something has changed
 _SCALES = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
@@ -78,9 +73,6 @@ def what_changed(
     then: their PSNR in training, None if it is not known.
     """
     least = FITS if then is None else min(FITS, then - NEAR)
-    # Where the geometry is wrong, another colour may fit better by chance.
-    if geometric := other_focal_length(scene, views, scored, least):
-        return geometric
     few = views[:: -(-len(views) // _TRIED) or 1]
     tried = {change: _score(few, _with(scene.gaussians, change.undo), scored) for change in _changes(scene)}
     change = max(tried, key=lambda one: tried[one])
@@ -156,52 +148,6 @@ def _placed(factor: float) -> Change:
         f"the positions were scaled by {factor:.3g}, but not the sizes", f"scale the positions by {1 / factor:.3g}",
         lambda rows: rows | {"xyz": rows["xyz"] / factor},
     )  # fmt: skip
-
-
-@torch.no_grad()
-def other_focal_length(scene: Scene, views: list[Camera], scored: ScoredViews, least: float) -> Finding | None:
-    """Whether views would fit with another focal length, to `least` dB at least.
-
-    That of a pinhole scales its image around the principal point, so no view is rendered again.
-    """
-    infos = scene.info.train_cameras
-    views = [view for view in views if infos[view.uid].native is None]
-    views = views[:: -(-len(views) // _TRIED) or 1]
-    pairs = [(scored.image(view, scene.gaussians), as_float(scored.target(view)), infos[view.uid]) for view in views]
-    if not pairs:
-        return None
-    steps = range(-6, 7)
-    factor = max((_STEP**step for step in steps if _STEP**step < _WIDEST), key=lambda one: _gain(pairs, one)[0])
-    factor = max((factor * _FINE**step for step in steps[3:-3]), key=lambda one: _gain(pairs, one)[0])
-    gain, score = _gain(pairs, factor)
-    if gain < CLEARLY or score < least or 1 / _NO_FACTOR < factor < _NO_FACTOR:
-        return None
-    text = f"the cameras have {factor:.2g} times the focal length of these photos: without that it is {score:.1f} dB"
-    return Finding(
-        text, "restore the cameras or the photos of the training, as other sizes or crops need other cameras"
-    )
-
-
-def _gain(pairs: list[tuple[Tensor, Tensor, CameraInfo]], factor: float) -> tuple[float, float]:
-    """What undoing a factor of the focal length gains (dB), and the PSNR with it, where both images show something."""
-    before, after = [], []
-    for image, photo, view in pairs:
-        scaled, inside = _scaled(image, factor, 2 * view.cx / view.width - 1, 2 * view.cy / view.height - 1)
-        if float(inside.float().mean()) < _INSIDE:
-            return float("-inf"), 0.0
-        before.append(float(psnr(image[:, inside], photo[:, inside]).mean()))
-        after.append(float(psnr(scaled[:, inside], photo[:, inside]).mean()))
-    before, after = (sum(values) / len(values) for values in (before, after))
-    return after - before, after
-
-
-def _scaled(image: Tensor, factor: float, across: float, down: float) -> tuple[Tensor, Tensor]:
-    """An image (3, H, W) made smaller by a factor around a place, in [-1, 1]; and where it has pixels (H, W)."""
-    y, x = ((torch.arange(side, device=image.device) * 2 + 1) / side - 1 for side in image.shape[1:])
-    y, x = down + factor * (y - down), across + factor * (x - across)
-    grid = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], dim=-1)
-    scaled = grid_sample(image[None], grid[None].to(image), padding_mode="border", align_corners=False)[0]
-    return scaled, (grid.abs() <= 1).all(-1)
 
 
 @torch.no_grad()

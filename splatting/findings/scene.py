@@ -5,22 +5,19 @@ import contextlib
 import io
 import os
 import sys
-from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
 from scene.dataset_readers import SceneInfo, read_scene
 from scene.readers.info import NEAREST, as_camera_info
-from scene.readers.tracks import read_tracks
 from scene.scene import Scene
 from splatting.findings import Finding, Severity, from_error, note
 from splatting.findings.cameras import check_extent, check_lenses, of_cameras, of_lenses
 from splatting.findings.capture import check_conversion, left_out
-from splatting.findings.colors import check_colors
+from splatting.findings.fit import check_agreement, check_geometry
 from splatting.findings.photo_files import of_damage, of_duplicates
 from splatting.findings.photos import check_views, hints, of_photos
 from splatting.findings.points import check_cloud, of_points
-from splatting.findings.tracks import check_agreement, check_focal, check_poses
 from utils.system_utils import UserError
 
 LOOKED_AT = 16  # photos that a training decodes, small,
@@ -98,18 +95,6 @@ def check_dataset(source: str, images: str) -> list[Finding]:
     if not any(of_lenses(info)):  # else poses and colours have that cause
         checks += [check_geometry(source, info), check_agreement(Path(source) / "sparse" / "0")]
     return [*_notes(said.getvalue()), *chain(*checks, check_conversion(source))]
-
-
-def check_geometry(source: str, info: SceneInfo) -> Iterator[Finding]:
-    """Lenses and poses beside the tracks, then colours: wrong lenses or poses would look like wrong photos."""
-    views = info.train_cameras
-    try:
-        tracks = read_tracks(source, views, info.offset)
-    except UserError as error:
-        yield from_error(error)
-        tracks = [None] * len(views)
-    lines = [*check_focal(views, tracks)] or [*check_poses(views, tracks, info.extent)]
-    yield from lines or check_colors(info, tracks)
 
 
 def _notes(said: str) -> list[Finding]:

@@ -7,7 +7,6 @@ capture.json, which worker.py writes of the chosen model: of each placed photo b
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import uniform_filter
@@ -17,20 +16,13 @@ from scene.images.exposures import exposures, levels
 from scene.readers.colmap import read_model
 from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import open_image
-from splatting.findings.capture import SHARED
+from splatting.findings.capture import SHARED, Look
 from splatting.host.machine import threads
 from splatting.sfm.layout import Layout
 from splatting.sfm.video import sharpness
 
 _TEXTURE, _OUTLIER = 9, 3.0  # pixels around a point that tell sharpness, and what is no sharpness (logarithm to 2)
 _WIDTH = 640  # pixels at which photos are compared, as sharpness depends on it
-
-
-class Look(NamedTuple):
-    """A photo's sharpness (mean squared difference of neighbours) and brightness (stops)."""
-
-    sharpness: float
-    brightness: float
 
 
 def looks_of(folder: Path, names: Sequence[str]) -> dict[str, Look]:

@@ -17,9 +17,9 @@ from tqdm.contrib.concurrent import thread_map
 from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.json_files import read_json, write_json
-from splatting.findings.capture import is_wrong, lines_of, neighbours_of, training_options, unusable, worth
+from splatting.findings.capture import Look, is_wrong, lines_of, neighbours_of, training_options, unusable, worth
 from splatting.host.machine import threads
-from splatting.sfm.capture import Look, compared, looks_of
+from splatting.sfm.capture import compared, looks_of
 from splatting.sfm.layout import Layout, image_names
 from splatting.sfm.mapping import name_of
 from splatting.sfm.report import summary

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 from scene.readers.tracks import Track
 from scene.scene import Scene
-from splatting.findings.tracks import pose_errors, poses_differ
+from splatting.findings.fit import pose_errors, poses_differ
 
 
 def advise(scene: Scene, tracks: Sequence[Track | None]) -> Iterator[tuple[str, str]]:
