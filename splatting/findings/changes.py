@@ -3,9 +3,10 @@
 Each usual change of a model is undone, and tried on the views. Where none explains them, what does not fit is told.
 """
 
+import math
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -36,12 +37,7 @@ _SCALES = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
 _TRIED = 2  # views that changes are tried on
 
 
-class Change(NamedTuple):
-    """A change, how to repair it, and what undoes it in raw rows."""
-
-    text: str
-    remedy: str
-    undo: Callable[[Rows], Rows]
+_Undo = Callable[[Rows], Rows]  # of raw rows
 
 
 def of_scene(scene: Scene) -> GaussianModel:
@@ -74,12 +70,12 @@ def what_changed(
     """
     least = FITS if then is None else min(FITS, then - NEAR)
     few = views[:: -(-len(views) // _TRIED) or 1]
-    tried = {change: _score(few, _with(scene.gaussians, change.undo), scored) for change in _changes(scene)}
-    change = max(tried, key=lambda one: tried[one])
-    best = _score(views, _with(scene.gaussians, change.undo), scored)
+    tried = {pair: _score(few, _with(scene.gaussians, pair[1]), scored) for pair in _changes(scene)}
+    change, undo = max(tried, key=lambda pair: tried[pair])
+    best = _score(views, _with(scene.gaussians, undo), scored)
     explains = best >= now + CLEARLY and best >= least
     if explains or (then is not None and best >= max(then - NEAR, now + 1)):
-        return Finding(f"{change.text}: without that it is {best:.1f} dB", change.remedy)
+        return change._replace(text=f"{change.text}: without that it is {best:.1f} dB")
     if strange := strange_photos(scene, scored):
         return strange
     if then is None or now > then - LOST:
@@ -88,7 +84,7 @@ def what_changed(
     return Finding(f"it was {then:.1f} dB in training, so the model or the photos are not those of then", remedy)
 
 
-def _with(gaussians: GaussianModel, undo: Callable[[Rows], Rows]) -> GaussianModel:
+def _with(gaussians: GaussianModel, undo: _Undo) -> GaussianModel:
     changed = gaussians.part(slice(None), gaussians.max_sh_degree)
     changed.set_rows(undo(dict(changed.rows())))
     return changed
@@ -105,24 +101,28 @@ def _score(views: list[Camera], gaussians: GaussianModel, scored: ScoredViews) -
     return sum(values) / max(len(values), 1)
 
 
-def _changes(scene: Scene) -> Iterator[Change]:
+def _changes(scene: Scene) -> Iterator[tuple[Finding, _Undo]]:
     rows, folder = scene.gaussians.rows(), scene.model_path
-    yield Change(
-        "the quaternions begin with x", "write them as w x y z",
+    yield (
+        Finding("the quaternions begin with x", "write them as w x y z"),
         lambda rows: rows | {"rotation": rows["rotation"].roll(1, dims=1)},
-    )  # fmt: skip
+    )
     if bool(((rows["opacity"] >= 0) & (rows["opacity"] <= 1)).all()):
-        yield Change(
-            "the opacities are not logits", "write logits, as train.py does",
+        yield (
+            Finding("the opacities are not logits", "write logits, as train.py does"),
             lambda rows: rows | {"opacity": rows["opacity"].clamp(1e-6, 1 - 1e-6).logit()},
-        )  # fmt: skip
+        )
     if bool((rows["scaling"] > 0).all()):
-        yield Change(
-            "the scales are no logarithms", "write natural logarithms, as train.py does",
+        yield (
+            Finding("the scales are no logarithms", "write natural logarithms, as train.py does"),
             lambda rows: rows | {"scaling": rows["scaling"].log()},
-        )  # fmt: skip
-    yield from map(_rescaled, _factors(rows["xyz"], Path(folder)))
-    yield from map(_placed, _factors(rows["xyz"], Path(folder)))
+        )
+    for factor in (factors := _factors(rows["xyz"], Path(folder))):
+        remedy = f"scale it by {1 / factor:.3g}, or the scene as the model was"
+        yield Finding(f"the model was scaled by {factor:.3g}", remedy), partial(_rescaled, factor, True)
+    for factor in factors:
+        text = f"the positions were scaled by {factor:.3g}, but not the sizes"
+        yield Finding(text, f"scale the positions by {1 / factor:.3g}"), partial(_rescaled, factor, False)
 
 
 def _factors(means: Tensor, folder: Path) -> list[float]:
@@ -135,19 +135,9 @@ def _factors(means: Tensor, folder: Path) -> list[float]:
     return [*_SCALES, spreads[0] / spreads[1]] if min(spreads) > 0 else list(_SCALES)
 
 
-def _rescaled(factor: float) -> Change:
-    shift = torch.tensor(factor).log()
-    return Change(
-        f"the model was scaled by {factor:.3g}", f"scale it by {1 / factor:.3g}, or the scene as the model was",
-        lambda rows: rows | {"xyz": rows["xyz"] / factor, "scaling": rows["scaling"] - shift.to(rows["scaling"])},
-    )  # fmt: skip
-
-
-def _placed(factor: float) -> Change:
-    return Change(
-        f"the positions were scaled by {factor:.3g}, but not the sizes", f"scale the positions by {1 / factor:.3g}",
-        lambda rows: rows | {"xyz": rows["xyz"] / factor},
-    )  # fmt: skip
+def _rescaled(factor: float, sizes: bool, rows: Rows) -> Rows:
+    scaling = rows["scaling"] - (math.log(factor) if sizes else 0.0)
+    return rows | {"xyz": rows["xyz"] / factor, "scaling": scaling}
 
 
 @torch.no_grad()
