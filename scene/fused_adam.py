@@ -27,7 +27,7 @@ class FusedAdam:
 
     def __init__(self, gaussians: GaussianModel, penalty: Penalty = NO_PENALTY, left_out: Collection[str] = ()) -> None:
         self._gaussians = gaussians
-        self._penalty = penalty
+        self._penalty = penalty or NO_PENALTY
         self._left_out = left_out
 
     @staticmethod

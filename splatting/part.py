@@ -44,7 +44,8 @@ run.on_host  takes the steps of cameras, by the gradients of their numbers, on t
 """
 
 import argparse
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
@@ -177,11 +178,14 @@ class Part:
         return {}
 
     def changes(self, iteration: int) -> bool:
-        """Whether something changes in an iteration besides its step, so that every loss so far is checked first."""
+        """Whether something changes in an iteration besides its step, such as the Gaussians' rows.
+
+        If so, every loss so far is checked first, because a change cannot be undone.
+        """
         return False
 
     def after_step(self, at: "Iteration") -> None:
-        """The optimiser has taken the iteration's step."""
+        """The optimiser has taken the iteration's step, so not in the last iteration, which takes none."""
 
     def after_change(self, at: "Iteration") -> None:
         """Rows, the SH degree or sizes of views have changed, after `after_step`."""
@@ -229,17 +233,40 @@ class Part:
 
 
 class Strategy(Part):
-    """A part of which each training has one: how many Gaussians there are, and where (--strategy NAME).
+    """A part of which each training has one, `run.density`: how many Gaussians there are, and where (--strategy NAME).
 
     It joins a run once it is chosen, which may be late: `check` and `begin` are called then, when the model has its
     optimiser, and all hooks after them.
     summary: of what it does, for the help. until: the option of the step at which it ends, and the part of the schedule
-    that this is by default. removes: whether it removes Gaussians down to a given number.
+    that this is by default. removes: whether it removes Gaussians down to a given number. grows_to: whether it is meant
+    to reach max_gaussians; not where nobody has given a number, with default_is_limit. clamps: whether the loss takes
+    renders clamped to [0, 1], as the reference's does; then Gaussians brighter than white cost nothing before a white
+    background. fusable: whether it needs no gradient besides the statistics. Steps are then taken by
+    training/steps/fused.py, which does not call `after_backward`. It asks `observes`, and in iterations that `changes`
+    names it asks `replaced` and calls `before_step`. It counts only where the class itself says so: a subclass may want
+    more. queues: whether `after_step` queues operators that change the model; it queues nothing else, unless the
+    iteration is one that `changes` names.
+
+    Of a run, set in `begin`: max_gaussians: how many it lets there be, 0: any number. ends: the iteration of the
+    schedule from which it changes no rows. penalty: a part of the loss besides the objective, of which steps add the
+    gradients (scene/gaussians/penalty.py); no loss that is told has it. absolute_gradients: whether the statistics take
+    the lengths of absolute gradients (Ye et al. 2024). schedule: tells how far it is in an iteration
+    (training/schedule.py). Rules that are windows of the schedule ask it; rules that count steps take the iteration.
     """
 
     summary: ClassVar[str] = ""
     until: ClassVar[tuple[str, float]] = "densify_until_iter", 1 / 2
     removes: ClassVar[bool] = False
+    grows_to: ClassVar[bool] = True
+    default_is_limit: ClassVar[bool] = False
+    clamps: ClassVar[bool] = True
+    fusable: ClassVar[bool] = False
+    queues: ClassVar[bool] = False
+    max_gaussians = 0
+    ends = math.inf
+    penalty: Any = ()
+    absolute_gradients = False
+    schedule: Any = None
 
     @classmethod
     def wanted(cls, given: argparse.Namespace) -> bool:
@@ -255,13 +282,56 @@ class Strategy(Part):
         return False
 
     @classmethod
-    def absolute_gradients(cls, opt: argparse.Namespace) -> bool:
-        """Whether, by these options, its statistics take the lengths of absolute gradients, which need memory."""
+    def takes_absolute(cls, opt: argparse.Namespace) -> bool:
+        """Whether, by these options, its statistics take absolute gradients, which need memory."""
         return False
 
-    def control(self, run: "Run") -> Any:
-        """The hooks by which it acts on a run (splatting.training.density.DensityControl)."""
-        raise NotImplementedError
+    def begin(self, run: "Run", state: Any) -> None:
+        self.schedule = run.schedule
+
+    def started(self) -> None:
+        """Called before the first iteration of a model that was made from points, not read from a file."""
+
+    def observes(self, iteration: int) -> bool:
+        """Whether the view of this iteration counts in the Gaussians' statistics, where the step is fused."""
+        return False
+
+    def recovers(self, iteration: int) -> bool:
+        """Whether opacities were reset so recently that renders are not like photos."""
+        return False
+
+    def resets(self, iteration: int) -> bool:
+        """Whether all opacities are reset in this iteration."""
+        return False
+
+    def replaced(self, iteration: int) -> Collection[str]:
+        """Attributes that `before_step` will give other values or rows, so that they take no step in this iteration.
+
+        Asked, where the step is fused, before anything of the iteration changes the model. Every rank must call it.
+        """
+        return ()
+
+    def projected_count(self, count: int, first: int, last: int) -> int:
+        """The most that `count` Gaussians can become from iteration `first` to `last`, both known to the schedule.
+
+        `max_gaussians` where the strategy has no number to reach.
+        """
+        return self.max_gaussians
+
+    def too_slow(self) -> str:
+        """Why it may not reach its number of Gaussians in time, and what to do."""
+        return "they at most double each time; lower --densification_interval"
+
+    def rate_factor(self, iteration: int) -> float | None:
+        """Factor of the learning rates that have no schedule, where the run's schedule has none. None: 1."""
+        return None
+
+    def after_backward(self, at: "Iteration", package: dict[str, Any]) -> None:
+        """Called with the gradients computed, before the optimiser's step. package: the result of `render`."""
+        self.before_step(at)
+
+    def before_step(self, at: "Iteration") -> None:
+        """Change what `replaced` tells of, once the view counts in the statistics."""
 
 
 class Appearance(Part):

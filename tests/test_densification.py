@@ -9,14 +9,13 @@ import torch
 from gaussians import model, moments, options, parameters, take_steps
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from strategies import begun
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from splatting.findings.training import late_reset
 from splatting.part import Needs
 from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
-from splatting.registry import part_class
-from splatting.training.adaptive_density import AdaptiveDensityControl
 from splatting.training.schedule import Schedule
 from utils.general_utils import build_rotation
 
@@ -254,29 +253,27 @@ LEFT_OUT = [
 
 @pytest.mark.parametrize(("changes", "white", "kept"), LEFT_OUT)
 def test_a_reset_with_less_than_half_an_interval_to_go_is_left_out(changes, white, kept):
-    control = AdaptiveDensityControl(model(4), options(**changes), white, 1.0)
-    control.schedule = Schedule(changes["iterations"])
+    opt = options(**changes)
+    control = begun("adc", model(4), opt, Schedule(opt.iterations), white=white)
     every = range(1, changes["iterations"])
     assert [t for t in every if control.resets(t)] == kept
-    regular = [t for t in kept if t != control._opt.densify_from_iter]
+    regular = [t for t in kept if t != opt.densify_from_iter]
     assert [t for t in every if control.recovers(t) and not control.recovers(t - 1)] == regular
     left = changes["iterations"] - kept[-1] if kept else rules.RECOVERY
-    assert (late_reset(control, control._opt, 0) is None) == (left >= rules.RECOVERY)
+    assert (late_reset(control, opt, 0) is None) == (left >= rules.RECOVERY)
 
 
 def test_a_run_by_the_clock_recovers_from_no_reset_that_it_leaves_out():
     """3,000 steps in 300 iterations: too few for a reset."""
-    control = AdaptiveDensityControl(model(4), options(), True, 1.0)
-    control.schedule = DecidedSchedule(Decided(30_000, [Block(3000, 0.0, 1 / 3000, 0.0)], 3000, 9.0))
+    schedule = DecidedSchedule(Decided(30_000, [Block(3000, 0.0, 1 / 3000, 0.0)], 3000, 9.0))
+    control = begun("adc", model(4), schedule=schedule, white=True)
     assert not any(control.resets(t) or control.recovers(t) for t in range(1, 3000))
 
 
 @pytest.mark.parametrize(("bright", "interval", "resets"), [(False, 3000, 5), (True, 3000, 0), (True, 2500, 6)])
 def test_a_part_may_want_no_resets(bright, interval, resets):
     parts = [SimpleNamespace(needs=Needs(bright=bright))]
-    run = SimpleNamespace(gaussians=model(4), parts=parts, opt=options(opacity_reset_interval=interval))
-    run.dataset, run.scene = SimpleNamespace(white_background=True), SimpleNamespace(cameras_extent=1.0)
-    control = part_class("adc")().control(run)
-    control.schedule = Schedule(30_000)
+    opt = options(opacity_reset_interval=interval)
+    control = begun("adc", model(4), opt, Schedule(30_000), white=True, parts=parts)
     assert sum(control.resets(t) for t in range(1, 30_000)) == resets
-    assert run.opt.opacity_reset_interval == interval
+    assert opt.opacity_reset_interval == interval

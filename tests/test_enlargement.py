@@ -12,6 +12,7 @@ import torch
 from PIL import Image
 from plyfile import PlyData
 from scaled_scene import scaled_scene
+from strategies import begun
 from synthetic import make_colmap_scene
 
 import render
@@ -30,7 +31,6 @@ from scene.splats.reading import read_splats
 from scene.with_splats import load_file, splats_of
 from splatting.findings.model import check_model
 from splatting.findings.scene import check_dataset
-from splatting.parts.mcmc.control import MarkovChain
 from splatting.training.schedule import Schedule
 from utils.graphics_utils import world_to_camera
 
@@ -114,8 +114,7 @@ def test_noise_and_penalty_of_mcmc(scenes, tmp_path):
         gaussians.create_from_pcd(cloud.point_cloud, cloud.train_cameras, cloud.extent)
         gaussians.training_setup(opt)
         gaussians._opacity.data.fill_(-5)
-        before, control = gaussians._xyz.detach().clone(), MarkovChain(gaussians, opt)
-        control.schedule = Schedule(opt.iterations)
+        before, control = gaussians._xyz.detach().clone(), begun("mcmc", gaussians, opt, Schedule(opt.iterations))
         control.after_step(SimpleNamespace(iteration=1, changes=False))
         moves.append((gaussians._xyz.detach() - before) / cloud.extent)
         penalties.append(control.penalty.scale * gaussians.get_scaling.mean().item())

@@ -11,9 +11,7 @@ import torch
 
 import train
 from splatting.evaluation.training_log import TrainingLog
-from splatting.part import Part
-from splatting.training import adaptive_density as adc
-from splatting.training.density import DensityControl
+from splatting.part import Part, Strategy
 from splatting.training.loop import Announcer, standard_observers
 
 ITERATIONS = 24
@@ -114,12 +112,12 @@ def test_observers_stand_where_they_must(colmap_scene, tmp_path, monkeypatch):
 def test_another_strategy_is_another_object(colmap_scene, tmp_path, monkeypatch):
     calls = []
 
-    class Strategy(DensityControl):
-        @classmethod
-        def of_run(cls, run, *_, **__) -> "Strategy":
-            control = cls()
-            control._gaussians = run.gaussians
-            return control
+    class Other(Strategy):
+        name = "adc"
+
+        def begin(self, run, state) -> None:
+            super().begin(run, state)
+            self._gaussians = run.gaussians
 
         def changes(self, iteration: int) -> bool:
             return iteration == 3
@@ -132,7 +130,7 @@ def test_another_strategy_is_another_object(colmap_scene, tmp_path, monkeypatch)
             assert self._gaussians.get_xyz.grad is None
             calls.append(("after_step", step.iteration))
 
-    monkeypatch.setattr(adc, "AdaptiveDensityControl", Strategy)
+    monkeypatch.setattr("splatting.training.run.strategy_part", lambda name: Other())
     told = []
     _train(colmap_scene, tmp_path, monkeypatch, lambda *_: [Recorder(told)])
     steps = range(1, ITERATIONS + 1)

@@ -12,6 +12,7 @@ import pytest
 import torch
 from gaussians import cloud, options
 from processes import in_ranks
+from strategies import begun
 from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
@@ -19,9 +20,6 @@ from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
 from scene.gaussians.density_rules import logit
 from scene.gaussians.sh_bands import cut_bounds
 from splatting.distributed.ranks import ranks
-from splatting.parts.budget.control import BudgetControl
-from splatting.parts.mcmc.control import MarkovChain
-from splatting.training.adaptive_density import AdaptiveDensityControl
 from utils.system_utils import UserError
 
 EXTENT, THRESHOLD = 2.0, 2e-4
@@ -73,14 +71,13 @@ def _train(gaussians: GaussianModel, density: object, iterations: tuple[int, ...
         density.after_step(step)
 
 
-def _adc(gaussians: GaussianModel, *further: int, rule: tuple = (), **changes: object) -> None:
-    density = AdaptiveDensityControl(gaussians, options(**changes), False, EXTENT, *rule)
-    _train(gaussians, density, further or ITERATIONS)
+def _adc(gaussians: GaussianModel, *further: int, **changes: object) -> None:
+    _train(gaussians, begun("adc", gaussians, options(**changes), extent=EXTENT), further or ITERATIONS)
 
 
 def _limited(gaussians: GaussianModel) -> None:
     _adc(gaussians, max_num_splats=gaussians.gaussian_count + 7)
-    _adc(gaussians, 900, max_num_splats=gaussians.gaussian_count + 5, rule=(options().absgrad_threshold,))
+    _adc(gaussians, 900, max_num_splats=gaussians.gaussian_count + 5, absgrad=True)
 
 
 def _by_hand(gaussians: GaussianModel) -> None:
@@ -107,7 +104,7 @@ def _emptied(gaussians: GaussianModel) -> None:
 
 def _mcmc(gaussians: GaussianModel, **changes: object) -> None:
     changes = {"mcmc_min_opacity": 0.02, "mcmc_noise": 1e4, "mcmc_growth": 0.2} | changes
-    density = MarkovChain(gaussians, options(strategy="mcmc", **changes))
+    density = begun("mcmc", gaussians, options(strategy="mcmc", **changes))
     if "max_num_splats" not in changes:
         density.started()
     _train(gaussians, density, (501, 600, 700))
@@ -126,8 +123,7 @@ def _mcmc_at_one_end(gaussians: GaussianModel) -> None:
 
 def _budget(gaussians: GaussianModel) -> None:
     opt = options(strategy="budget", max_num_splats=2 * gaussians.gaussian_count, opacity_decay=0.9, prune_opacity=0.05)
-    scene = SimpleNamespace(getTrainCameras=list)
-    density = BudgetControl(SimpleNamespace(gaussians=gaussians, opt=opt, scene=scene, pipe=None))
+    density = begun("budget", gaussians, opt)
     scores = "scores"
     density._scores = lambda *_: _random(gaussians, scores).double().clamp_min(0.0)
     _train(gaussians, density)

@@ -15,7 +15,6 @@ from splatting.evaluation.training_log import Stopwatch
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.parts.spill.announcement import sentences
 from splatting.registry import part_class, strategy_part
-from splatting.training.density import density_control
 from splatting.training.iteration import ViewOrder
 from splatting.training.objective import LossWatch, Objective
 from splatting.training.run import Run
@@ -63,7 +62,9 @@ class WorkloadRun(Run):
         self.objective, self.losses = Objective(self), LossWatch()
         self.log, self.rows, self.first_done = SimpleNamespace(seconds_before=0.0), [], None
         self.watch = DivergenceWatch(self)
-        self.density = density_control(self, strategy_part("adc"))
+        self.density = strategy_part("adc")
+        self.density.begin(self, None)
+        self.parts = [*self.parts, self.density]
         if sleep:
             sort_rows(self.gaussians)
             self.sleeping = Sleeping(self.gaussians)

@@ -11,6 +11,7 @@ from scene.gaussians.attributes import Rows
 from scene.gaussians.parameters import GaussianParameters
 from scene.gaussians.statistics import PER_ROW
 from splatting.distributed.rows import changes_rows
+from utils.system_utils import UserError
 
 _STANDARD = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")  # the order of densification_postfix
 
@@ -244,6 +245,15 @@ def remove_useless(gaussians: GaussianParameters, min_opacity: float, most: int)
     if over > 0:
         remove[gaussians.shards.lowest(opacity, over)] = True
     gaussians.prune_points(remove)
+
+
+def refuse_empty(iteration: int, is_empty: bool, remedy: str, what: str = "after the densification of") -> None:
+    """UserError if density control has left no Gaussian."""
+    if is_empty:
+        raise UserError(
+            f"no Gaussian was left {what} iteration {iteration}: the views do not agree with the points, or show "
+            f"nothing but the background; check the scene, or {remedy}"
+        )
 
 
 def reset_opacity(gaussians: GaussianParameters) -> None:

@@ -5,7 +5,8 @@ Sizes and opacities are compared as logarithms and logits: the last bits of an e
 
 import argparse
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
@@ -23,6 +24,14 @@ USUAL_RESETS = 3000  # iterations from one reset to the next, the default of --o
 FEW_DENSIFICATIONS = 20  # a run that takes fewer steps than its schedule still has so many
 MIN_OPACITY = 0.005  # a Gaussian below it is removed
 MAX_SCREEN_SIZE = 20  # pixels
+PIXELS = 64  # training pixels of all views for each Gaussian of the default budget
+FEWEST, MOST = 100_000, 1_000_000  # Gaussians of the default budget
+
+
+def default_budget(cameras: Sequence[Any]) -> int:
+    """The number of Gaussians to reach where --max_num_splats is 0: one for PIXELS pixels, from FEWEST to MOST."""
+    pixels = sum(camera.image_width * camera.image_height for camera in cameras)
+    return min(max(pixels // PIXELS, FEWEST), MOST)
 
 
 class Actions(NamedTuple):

@@ -16,7 +16,7 @@ from splatting.registry import part_class, strategies, tools
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
-    from splatting.training.density import DensityControl
+    from splatting.part import Strategy
 
 # Entries of the log's last record: options of the training.
 CAP, PLANNED, STRATEGY = "max_num_splats", "iterations_planned", "strategy"
@@ -80,7 +80,7 @@ def without_effect(opt: argparse.Namespace, strategy: str) -> Finding | None:
     return Finding(f"--strategy {strategy} ignores {some(given)}") if given else None
 
 
-def late_reset(density: "DensityControl", opt: argparse.Namespace, done: int) -> Finding | None:
+def late_reset(density: "Strategy", opt: argparse.Namespace, done: int) -> Finding | None:
     """What to say if a strategy resets opacities so late that the model cannot recover.
 
     done: iterations before this run, which may have been the reset. A run with a time budget leaves such resets out.
@@ -99,7 +99,7 @@ def late_reset(density: "DensityControl", opt: argparse.Namespace, done: int) ->
     return Finding(f"{LATE_RESET} in iteration {due[-1]}, and {left}", remedy)
 
 
-def another_number(density: "DensityControl", opt: argparse.Namespace, count: int, first: int) -> Finding | None:
+def another_number(density: "Strategy", opt: argparse.Namespace, count: int, first: int) -> Finding | None:
     """What to say if a strategy cannot reach its number of Gaussians in time.
 
     count: of Gaussians, now; first: the next iteration. Not known of a run with a time budget.

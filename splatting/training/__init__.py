@@ -3,7 +3,6 @@
 loop                   an iteration from top to bottom, and what happens beside it
 run, iteration         what the loop gets: a run made from the options, and what each iteration needs
 objective              the loss
-density                the hooks of density control; the strategies are parts (splatting/part.py)
 schedule               the steps of the schedule that an iteration stands for
 steps/                 faster forms of a step, to the same bytes: fused, captured
 log, scores, save, watch

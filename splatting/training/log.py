@@ -4,12 +4,12 @@ import math
 import time
 from typing import TYPE_CHECKING
 
+from scene.gaussians.density_rules import default_budget
 from splatting.evaluation.error_curve import whole_sets
 from splatting.findings.training import BUDGET, CAP, PLANNED, STRATEGY, what_to_try
 from splatting.host.clock import wall_seconds
 from splatting.host.progress import Bar
 from splatting.part import Error, Part, overrides
-from splatting.training.density import default_budget
 from splatting.training.folder import view_command
 from splatting.training.iteration import Iteration, Losses
 from splatting.training.objective import LossWatch

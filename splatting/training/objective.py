@@ -16,8 +16,7 @@ if TYPE_CHECKING:
 class Objective:
     """`(1 - lambda_dssim) L1 + lambda_dssim (1 - SSIM)` (Kerbl et al. 2023, Eq. 7), and what parts add.
 
-    Strategies say whether renders are compared clamped to [0, 1] (DensityControl.clamps). fusable: as that of
-    DensityControl.
+    Strategies say whether renders are compared clamped to [0, 1] (Strategy.clamps). fusable: as that of Strategy.
     """
 
     fusable: ClassVar[bool] = True

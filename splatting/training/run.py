@@ -37,7 +37,6 @@ from splatting.part import Part, Strategy, overrides
 from splatting.registry import check_together, chosen, in_order, part_class, states_in, strategy_part
 from splatting.training import folder
 from splatting.training.agreement import agree_on_scene
-from splatting.training.density import density_control
 from splatting.training.iteration import Iteration, OwnSize, ViewOrder
 from splatting.training.objective import LossWatch, Objective
 from splatting.training.save import Checkpoints
@@ -103,7 +102,7 @@ class Run:
         check_views(self.pipe, self.scene.getTrainCameras(), self.sizes.smallest)
         check_views(self.pipe, self.scene.getTestCameras())
         self._check_records()
-        self.density = density_control(self, self._choose_strategy(states))
+        self.density = self._choose_strategy(states)
         self.objective = Objective(self)
         self.warnings = [f"warning: {text}" for text in warnings_of(self, given)]
         for text in self.warnings:
@@ -305,7 +304,7 @@ class Run:
 
     def _changes(self, iteration: int) -> bool:
         changes = any(changes(iteration) for changes in self.each("changes"))
-        return self.density.changes(iteration) or self._raises_degree(iteration) > 0 or changes
+        return self._raises_degree(iteration) > 0 or changes
 
     def _raises_degree(self, iteration: int) -> int:
         """How often the SH degree is raised in an iteration."""
@@ -354,7 +353,6 @@ class Run:
 
     def after_step(self, step: Iteration) -> None:
         """What follows the optimiser's step."""
-        self.density.after_step(step)
         for after_step in self.each("after_step"):
             after_step(step)
         if step.changes:

@@ -84,8 +84,11 @@ class Schedule:
         """Whether nothing is left to do after an iteration."""
         return self.ends is not None and iteration >= self.ends
 
-    def count_limit(self, iteration: int, count: int, limit: int, random: bool, aim: int) -> int:
-        """How many Gaussians there may be after an iteration (DensityControl.count_limit)."""
+    def count_limit(self, iteration: int, count: int, limit: int, aim: int) -> int:
+        """How many Gaussians there may be after an iteration, 0: any number.
+
+        count: that are there. limit: as an option has it, 0: none. aim: how many a strategy is to reach.
+        """
         return limit
 
     def best_strategy(self, run: "Run") -> str:

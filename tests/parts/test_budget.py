@@ -14,25 +14,25 @@ from diff_gaussian_rasterization.reference import render as oracle
 from gaussians import model, moments, options, parameters, pipeline, take_steps
 from PIL import Image
 from scipy import stats
+from strategies import begun
 
 import train
 from gaussian_renderer import model_inputs, rasterizer_settings
 from scene.cameras import MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adc import remove_useless
-from scene.gaussians.exposure import Exposures
+from scene.gaussians.density_rules import default_budget
 from scene.gaussians.long_axis import long_axis_children
 from scene.saved_model import read_model
 from splatting.deterministic.counter_rng import Stream
 from splatting.distributed.rows import WHOLE
 from splatting.findings.training import another_number
-from splatting.parts.budget import control as budget
+from splatting.part import Strategy
 from splatting.parts.budget.error_scores import error_map, error_scores
+from splatting.parts.budget.part import Budget
 from splatting.parts.budget.rules import fade, split_in_two
-from splatting.parts.mcmc.control import MarkovChain
 from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
-from splatting.training.adaptive_density import AdaptiveDensityControl
-from splatting.training.density import default_budget
+from splatting.registry import part_class
 from splatting.training.objective import Objective
 from splatting.training.schedule import STEADY, Schedule
 from utils.graphics_utils import getProjectionMatrix
@@ -167,14 +167,11 @@ def test_pairs_are_drawn_as_often_as_one_after_the_other():
     assert best_only < draws  # not the highest scores alone
 
 
-def _control(schedule: Schedule = STEADY, **changes: object) -> budget.BudgetControl:
-    """The control of a run with four large views."""
-    run = SimpleNamespace(opt=options(), pipe=None, gaussians=SimpleNamespace(shards=WHOLE, exposures=Exposures()))
-    vars(run.opt).update(changes)
-    run.scene = SimpleNamespace(getTrainCameras=lambda: [SimpleNamespace(image_width=6400, image_height=1000)] * 4)
-    control = budget.BudgetControl(run)
-    control.schedule = schedule
-    return control
+def _control(schedule: Schedule = STEADY, strategy: str = "budget", **changes: object) -> Strategy:
+    """The strategy of a run with four large views."""
+    opt, views = options(strategy=strategy), [SimpleNamespace(image_width=6400, image_height=1000)] * 4
+    vars(opt).update(changes)
+    return begun(strategy, opt=opt, schedule=schedule, cameras=views)
 
 
 def test_draws_of_nothing_of_all_and_of_broken_weights():
@@ -264,25 +261,23 @@ def _train(scene: Path, out: Path, *more: object, iterations: int = 160) -> Path
 @pytest.fixture
 def counts(monkeypatch) -> list[tuple[int, int]]:
     """Iteration and number of Gaussians after each densification."""
-    found, after_step = [], budget.BudgetControl.after_step
+    found, after_step = [], Budget.after_step
 
     def note(control, step) -> None:
         after_step(control, step)
         if control.changes(step.iteration):
             found.append((step.iteration, len(control._gaussians)))
 
-    monkeypatch.setattr(budget.BudgetControl, "after_step", note)
+    monkeypatch.setattr(Budget, "after_step", note)
     return found
 
 
-@pytest.mark.parametrize(
-    ("strategy", "clamped"), [(AdaptiveDensityControl, True), (budget.BudgetControl, False), (MarkovChain, False)]
-)
+@pytest.mark.parametrize(("strategy", "clamped"), [("adc", True), ("budget", False), ("mcmc", False)])
 def test_the_loss_sees_what_is_brighter_than_white(strategy, clamped):
     """Unlike the reference's. Else Gaussians brighter than a white background float before it, and hide test views."""
     bright = torch.full((3, HEIGHT, WIDTH), 1.5, requires_grad=True)
     step = SimpleNamespace(camera=View(), background=GREY, terms={})
-    run = SimpleNamespace(opt=options(), density=strategy, counts=None, gaussians=model(1))
+    run = SimpleNamespace(opt=options(), density=part_class(strategy), counts=None, gaussians=model(1))
     Objective(run)({"render": bright}, step).total.backward()
     assert bool(bright.grad.any()) != clamped
 
@@ -379,11 +374,6 @@ REACH = [
 def test_a_number_out_of_reach_is_told(strategy, number, changes, first, said):
     """Of 300 Gaussians, in 160 iterations."""
     control = _control(Schedule(160), strategy=strategy, max_num_splats=number, **changes)
-    if strategy == "mcmc":
-        control = MarkovChain(None, control._opt)
-    if strategy == "adc":
-        control = AdaptiveDensityControl(None, control._opt, False, 1.0)
-    control.schedule = Schedule(160)
     told = another_number(control, control._opt, 300, first)
     assert told is None if said is None else said in str(told)
 

@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 import torch
 from gaussians import model, options
+from strategies import begun
 from trainings import MCMC, train_on
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.saved_model import read_model
-from splatting.parts.mcmc import control
-from splatting.parts.mcmc.control import MarkovChain
+from splatting.parts.mcmc import rules
 from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
 from utils.system_utils import UserError
 
@@ -32,15 +32,16 @@ def test_every_part_has_an_effect(colmap_scene, tmp_path, name):
 
 
 def test_gaussians_are_moved(colmap_scene, tmp_path, monkeypatch):
-    moved, relocate = [], control.relocate
-    monkeypatch.setattr(control, "relocate", lambda *x, **named: moved.append(relocate(*x, **named)) or moved[-1])
+    moved, relocate = [], rules.relocate
+    monkeypatch.setattr(rules, "relocate", lambda *x, **named: moved.append(relocate(*x, **named)) or moved[-1])
     _train(colmap_scene, tmp_path, *MCMC[2:])
     assert len(moved) == 5 and moved[1] and any(moved[2:])
 
 
 @pytest.mark.parametrize(("growth", "count", "grown"), [(0.05, 5, 6), (0.05, 40, 42), (0.0, 5, 5), (1.0, 30, 45)])
 def test_a_few_gaussians_grow_at_least_by_one(growth, count, grown):
-    assert MarkovChain(None, options(max_num_splats=45, mcmc_growth=growth)).projected_count(count, 600, 601) == grown
+    control = begun("mcmc", opt=options(max_num_splats=45, mcmc_growth=growth))
+    assert control.projected_count(count, 600, 601) == grown
 
 
 def test_growth_ends_at_the_limit(colmap_scene, tmp_path):
@@ -58,10 +59,10 @@ def test_a_random_start_larger_than_the_clock_can_train_loses_the_faintest(strid
     gaussians = model(200)
     with torch.no_grad():
         gaussians._opacity[:, 0] = torch.linspace(2.0, -2.0, 200)
-    control, kept = MarkovChain(gaussians, options()), gaussians._xyz.detach().clone()
-    control.schedule = DecidedSchedule(Decided(60, [Block(30, 0.0, stride / 60, 0.0)], None, 9.0))
-    control.random = random
-    control._relocate(1)
+    kept = gaussians._xyz.detach().clone()
+    schedule = DecidedSchedule(Decided(60, [Block(30, 0.0, stride / 60, 0.0)], None, 9.0))
+    schedule.random = random
+    begun("mcmc", gaussians, schedule=schedule)._relocate(1)
     left = 25 * 6 if random and stride == 10.0 else 200
     assert len(gaussians) == left and torch.equal(gaussians._xyz, kept[:left])
 

@@ -19,7 +19,6 @@ from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule, T
 from splatting.parts.time_budget.schedule_file import read_schedule, schedule_of, write_schedule
 from splatting.parts.time_budget.sizes import Sizes
 from splatting.registry import strategy_part
-from splatting.training.density import DensityControl
 from splatting.training.iteration import Iteration
 from splatting.training.log import ProgressBar
 from splatting.training.run import Run
@@ -581,20 +580,18 @@ def test_the_clock_ends_growth_at_the_pace_of_whole_views_and_removes_nothing(si
     """
     schedule = TimeBudget(Decided(30_000, [], None, 20.0, "auto"))
     schedule.megapixels = 100.0 if sizes == "pyramid" else 1e-3
-    control = DensityControl()
-    control.schedule, control.max_gaussians, counts = schedule, 50_000, [14_000]
+    counts = [14_000]
 
     def cost(iteration: int, step: int) -> float:
         if step // 1000 > schedule.schedule_step(iteration - 1) // 1000 and step < 15_000:
-            counts.append(
-                max(counts[-1], min(int(1.05 * counts[-1]) + 1, control.count_limit(iteration, counts[-1], 50_000)))
-            )
-            assert control.count_limit(iteration, counts[-1], 50_000) >= counts[-1]
+            most = schedule.count_limit(iteration, counts[-1], 50_000, 50_000)
+            counts.append(max(counts[-1], min(int(1.05 * counts[-1]) + 1, most)))
+            assert schedule.count_limit(iteration, counts[-1], 50_000, 50_000) >= counts[-1]
         pixels = Sizes(schedule, None).factor_at(step) ** -2
         return (0.005 + counts[-1] * 1e-6) * (0.2 + 0.8 * pixels) * (3 if step > 13_000 else 1)
 
     _run(schedule, cost)
-    assert schedule.sizes == sizes and control.count_limit(10, 9, 7) == 7
+    assert schedule.sizes == sizes and schedule.count_limit(10, 9, 7, 50_000) == 7
     fits = 25 * 20.0 / (0.005 + counts[-1] * 1e-6)  # at the pace of whole views with so many
     assert counts[-1] == pytest.approx(fits, rel=0.12)
     (said,) = capsys.readouterr().err.splitlines()
@@ -613,10 +610,7 @@ def test_a_number_of_iterations_goes_through_the_whole_schedule(tmp_path):
     schedule = schedule_of(opt, None, 0)
     steps = [schedule.schedule_step(t) for t in range(1001)]
     assert steps[::500] == [0, 15_000, 30_000] and schedule.is_last(1000)
-    assert (
-        DensityControl.count_limit(SimpleNamespace(schedule=schedule, random=False, max_gaussians=0), 100, 10, 90_000)
-        == 90_000
-    )
+    assert schedule.count_limit(100, 10, 90_000, 0) == 90_000
     write_schedule(tmp_path / "schedule.json", schedule.up_to(1000))
     assert read_schedule(tmp_path / "schedule.json").blocks == schedule.blocks
     for words, reason in (

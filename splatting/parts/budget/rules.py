@@ -9,15 +9,6 @@ from splatting.deterministic.portable_math import exp, log
 from splatting.distributed.rows import changes_rows
 
 
-def count_after(now: int, budget: int, remaining: int) -> int:
-    """The number of Gaussians after a densification that `remaining` others follow.
-
-    They approach the budget in equal parts. Computed from the number `now` before this one, so that it needs no state,
-    and a run that fell behind catches up.
-    """
-    return budget - round((budget - now) * (remaining / (remaining + 1)))
-
-
 @torch.no_grad()
 @changes_rows
 def split_in_two(gaussians: GaussianParameters, parents: Tensor) -> None:

@@ -42,7 +42,7 @@ class Spill(Part):
 
         release_torch()  # from the limit of a training that was refused after this
         self._model = run.gaussians
-        absolute = any(part_class(name).absolute_gradients(run.opt) for name in strategies())
+        absolute = any(part_class(name).takes_absolute(run.opt) for name in strategies())
         fill(self._model, "room", GpuMemory(run.opt.gpu_memory, self._model, absolute, run.device), self)
 
     def ready(self, run: Any) -> None:

@@ -63,10 +63,12 @@ class Decided(NamedTuple):
 class DecidedSchedule(Schedule):
     """A schedule that was decided by an earlier run.
 
-    sizes: the name of `levels`, by which views are smaller at first. megapixels: of a view.
+    sizes: the name of `levels`, by which views are smaller at first. megapixels: of a view. random: whether the model
+    began as random points, of which those may be removed that the run cannot train.
     """
 
     megapixels = 1.0
+    random = False
     paced = True
     more = "--time_budget SECONDS"
     _told = False
@@ -128,18 +130,15 @@ class DecidedSchedule(Schedule):
         speed = statistics.median(speeds[-_PACE:]) if speeds else 0.0
         return self.seconds / speed if speed > 0 else 1 / present.step
 
-    def count_limit(self, iteration: int, count: int, limit: int, random: bool, aim: int) -> int:
-        """Not more than so few iterations can train, but the `count` that are there all stay, except of a random start.
-
-        aim: what the strategy is to reach.
-        """
+    def count_limit(self, iteration: int, count: int, limit: int, aim: int) -> int:
+        """Not more than so few iterations can train, but all that are there stay, except of a random start."""
         if not self.seconds or (possible := self.possible(iteration)) >= self.length:
             return limit
         trained = max(int(AN_ITERATION * possible), 1)
         if limit and trained >= limit:
             return limit
         self._tell(int(possible), trained, aim)
-        most = trained if random else max(trained, count)
+        most = trained if self.random else max(trained, count)
         return min(limit, most) if limit else most
 
     def _tell(self, iterations: int, trained: int, aim: int) -> None:

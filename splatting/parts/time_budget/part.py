@@ -72,6 +72,7 @@ class TimeBudget(Part):
     def begin(self, run: Any, state: Any) -> None:
         from splatting.parts.time_budget.sizes import Sizes
 
+        run.schedule.random = _is_random(run.scene)
         run.schedule.megapixels = run.scene.training_pixels()[0] / len(run.scene.getTrainCameras()) / 1e6
         fill(run, "sizes", Sizes(run.schedule, run.scene.images), self)
 
@@ -93,3 +94,13 @@ class TimeBudget(Part):
 
         if self._iteration:
             write_schedule(Path(scene.model_path) / SCHEDULE, self._run.schedule.up_to(self._iteration))
+
+
+def _is_random(scene: "Scene") -> bool:
+    """Whether a scene has no points but random ones."""
+    from scene.readers.start_cloud import RANDOM_POINTS
+
+    cloud = scene.info.point_cloud
+    if cloud is None or scene.info.ply_path is not None or len(cloud.points) != RANDOM_POINTS:
+        return False
+    return bool((cloud.colors == cloud.colors[0]).all())
