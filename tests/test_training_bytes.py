@@ -4,29 +4,32 @@ Features have no such tests of their own: an option that has a part in steps or 
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from diff_gaussian_rasterization import ops
 from processes import in_ranks
 from rasterizer_tools import GPU_MARKS
 from step_ways import Rerun, fused_iterations, take_as  # noqa: F401  (a fixture)
 from trainings import (
+    EDGES,
     ITERATIONS,
     OPTIONS,
     PART_OPTIONS,
     differences,
+    leaves,
     plain_training,
     shared_scene,
+    sleep,
     trained,
+    trained_as,
     whole_result,
 )
 
 import train
-from scene import sleeping
 from scene.readers.point_cloud import write_point_cloud
 from splatting.distributed.ranks import ranks
 from splatting.registry import PARTS, part_class, strategies
@@ -36,15 +39,19 @@ from utils.system_utils import UserError
 Result = dict[str, bytes | list]
 EVERY = pytest.mark.parametrize("name", OPTIONS)
 # Captured steps are those of all. These have every term, every optimiser, and every way to change rows.
-COVERING = "together", "appearance", "sparse", "filter", "budget", "points and poses"
-RESUMED = (  # each has a state of its own
-    *("default", "sparse", "absgrad", "exposure", "appearance", "points", "poses", "points and poses", "sky"),
-    *("exposure and sizes", "mcmc sparse", "filter", "filter and adc", "filter and budget"),
-    *("budget", "robust mask"),
+COVERING = (
+    "together",
+    "appearance",
+    "sparse",
+    "filter and budget",
+    "points and poses",
+    "asleep, together",
+    "asleep, budget",
 )
-LOOKS = ("--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44, "--checkpoint_iterations", 21, ITERATIONS)
+LOOKS = ("--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44)
+LOOKS += "--checkpoint_iterations", *EDGES, ITERATIONS
 # Whose steps are queued one call after the other.
-WITHOUT_GRAPHS = ("depth", "masks", "together", "poses, no graph", "points")
+WITHOUT_GRAPHS = ("depth", "together", "poses, no graph", "points")
 WITHOUT_GRAPHS += "robust mask", "points and poses"
 KINDS = {"degree 0": 1, "two phases": 5, "appearance": 5, "exposure": 8, "budget errors": 7}  # half images count, too
 KINDS |= {"exposure and sizes": 9, "poses": 5}
@@ -55,20 +62,6 @@ def scene(once) -> Path:
     return shared_scene(once)
 
 
-@contextmanager
-def _awake() -> Iterator[None]:
-    """No block sleeps; tests/parts/test_sleep.py has those that do."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sleeping, "MOST_SHARE", 0.0)
-        yield
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _awake_here() -> Iterator[None]:
-    with _awake():
-        yield
-
-
 @pytest.fixture(scope="module")
 def plain(once) -> Callable[[str], Result]:
     return lambda name: whole_result(plain_training(once, name), ITERATIONS)
@@ -76,7 +69,7 @@ def plain(once) -> Callable[[str], Result]:
 
 @pytest.mark.slow
 def test_each_training_is_another(scene, tmp_path, plain):
-    results = [plain(name)["ply"] for name in OPTIONS] + [trained(scene, tmp_path, "--seed", 6)["ply"]]
+    results = [plain(name)["ply"] for name in OPTIONS] + [trained_as("default", scene, tmp_path, "--seed", 6)["ply"]]
     assert len(set(results)) == len(OPTIONS) + 1
 
 
@@ -91,30 +84,23 @@ def test_fast_steps(scene, tmp_path, monkeypatch, take_as, plain, way, name):  #
     monkeypatch.setattr(ops, "gradients_of", lambda *_: pytest.fail("autograd has asked for gradients"))
     fused, find, kinds = fused_iterations(monkeypatch), Graphs._graph_for, []
     monkeypatch.setattr(Graphs, "_graph_for", lambda self, at: (find(self, at), kinds.append({*self._graphs}))[0])
-    assert not differences(trained(scene, tmp_path, *OPTIONS[name]), expected)
+    assert not differences(trained_as(name, scene, tmp_path), expected)
     assert fused == [*range(1, ITERATIONS + 1)]
     launches = sum(made.launches for made in Rerun.made)
-    if way != "captured" or name in WITHOUT_GRAPHS:
+    if way != "captured" or name.removeprefix("asleep, ") in WITHOUT_GRAPHS:
         assert launches == 0
         return
     assert launches > 40
     assert Rerun.made[0].records >= 3  # tensors that density control has replaced are captured anew
     assert all(len({kind[-3:] for kind in known}) <= 1 for known in kinds)  # graphs of another phase go
-    assert len(set().union(*kinds)) == KINDS.get(name, 4)  # four SH degrees
+    assert len(set().union(*kinds)) == KINDS.get(name.removeprefix("asleep, "), 4)  # four SH degrees
 
 
 @EVERY
 @pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
 def test_steps_of_a_gpu(scene, tmp_path, name, _):
-    expected = trained(scene, tmp_path / "plain", "--plain_step", *OPTIONS[name])
-    assert not differences(trained(scene, tmp_path / "captured", *OPTIONS[name]), expected)
-
-
-@pytest.mark.parametrize("name", RESUMED)
-def test_resumed(scene, tmp_path, once, plain, name):
-    """By fast steps, from a checkpoint of plain ones."""
-    start = "--start_checkpoint", plain_training(once, name) / "chkpnt33.pth"
-    assert not differences(trained(scene, tmp_path, *OPTIONS[name], *start), plain(name))
+    expected = trained_as(name, scene, tmp_path / "plain", "--plain_step")
+    assert not differences(trained_as(name, scene, tmp_path / "captured"), expected)
 
 
 def _goes_together(*names: str) -> bool:
@@ -143,58 +129,70 @@ def _covering(pairs: set[frozenset[str]]) -> Iterator[list[str]]:
 
 def test_pairs_of_parts_resumed(scene, tmp_path):
     begin = {name for name in PARTS if {"begin", "state"} & {*vars(part_class(name))}}
-    # tests/parts has the first; the others keep nothing.
+    # tests/parts has the first; the second keeps nothing, and test_resumed has the last.
     assert begin - {"more_photos", "remote_viewer", "sleep"} <= PART_OPTIONS.keys()
     pairs = {frozenset(pair) for pair in combinations(PART_OPTIONS, 2) if _goes_together(*pair)}
     assert len(pairs) > 55
     for names in _covering(pairs):
         out = tmp_path / "+".join(names)
         words = [word for name in names for word in PART_OPTIONS[name]]
-        whole = trained(scene, out, *words, "--checkpoint_iterations", 33, ITERATIONS)
-        resumed = trained(scene, out / "on", *words, "--start_checkpoint", out / "chkpnt33.pth")
+        with sleep(0.0):
+            whole = trained(scene, out, *words, "--checkpoint_iterations", 33, ITERATIONS)
+            resumed = trained(scene, out / "on", *words, "--start_checkpoint", out / "chkpnt33.pth")
         assert not differences(resumed, whole), names
 
 
-@pytest.mark.parametrize("name", ["together", "sparse", "mcmc idle", "budget"])
-def test_resumed_beside_a_change(scene, tmp_path, plain, name):
-    """Before and after rows change, opacities are reset, and in the last iteration, where rows may change, too."""
-    edges = 19, 20, 29, 30, 59
-    trained(scene, tmp_path / "a", *OPTIONS[name], "--checkpoint_iterations", *edges, ITERATIONS)
+RESUMED = {  # other names change rows as these do, and test_pairs_of_parts_resumed has the states of parts
+    **{"together": (19, 20, 29, 30, 59), "sparse": (20, 33), "mcmc idle": (20, 59), "mcmc sparse": (33,)},
+    **{"budget": (19, 20, 59), "exposure and sizes": (33,), "asleep, default": (19, 20, 33, 42, 59)},
+}
+
+
+@pytest.mark.parametrize(("name", "edges"), RESUMED.items())
+def test_resumed(scene, tmp_path, once, plain, name, edges):
+    """By fast steps, from checkpoints of plain ones."""
     for edge in edges:
-        start = "--start_checkpoint", tmp_path / "a" / f"chkpnt{edge}.pth"
-        assert not differences(trained(scene, tmp_path / str(edge), *OPTIONS[name], *start), plain(name)), edge
+        start = "--start_checkpoint", plain_training(once, name) / f"chkpnt{edge}.pth"
+        assert not differences(trained_as(name, scene, tmp_path / str(edge), *start), plain(name)), edge
 
 
-@pytest.mark.parametrize("way", [(), ("--plain_step",)])
-def test_scores_and_saves_between_change_nothing(scene, tmp_path, plain, way):
-    assert not differences(trained(scene, tmp_path, *way, *LOOKS), plain("default"))
-    between = trained(scene, tmp_path / "plain", "--plain_step", "--save_iterations", 9, 44)
-    assert not differences(between, plain("default"))
+@pytest.mark.parametrize("name", ["default", "asleep, default"])
+def test_scores_saves_and_checkpoints_between_change_nothing(scene, tmp_path, once, plain, name):
+    """And they are those of plain steps."""
+    fast, plain_out = tmp_path / "fast", tmp_path / "plain"
+    assert not differences(trained_as(name, scene, fast, *LOOKS), plain(name))
+    assert not differences(trained_as(name, scene, plain_out, "--plain_step", *LOOKS), plain(name))
     for iteration in (9, 44):
         ply = f"point_cloud/iteration_{iteration}/point_cloud.ply"
-        assert (tmp_path / ply).read_bytes() == (tmp_path / "plain" / ply).read_bytes()
+        assert (fast / ply).read_bytes() == (plain_out / ply).read_bytes()
+    for iteration in EDGES:
+        there = [folder / f"chkpnt{iteration}.pth" for folder in (fast, plain_out, plain_training(once, name))]
+        found = [leaves(torch.load(path, weights_only=False)) for path in there]
+        assert found[0] == found[1] == found[2], iteration
 
 
 def _all(scene: Path, folder: Path, kinds: list[tuple[str, tuple[str, ...]]]) -> list[Result]:
     """All trainings in the same processes; results of the first rank."""
     results = []
-    with _awake():
-        for name, more in kinds:
-            out = folder / "_".join([name, *more])
-            try:
-                results.append(trained(scene, out, *OPTIONS[name], *more))
-            except FileNotFoundError:
-                if ranks().first:
-                    raise
+    for number, (name, more) in enumerate(kinds):
+        try:
+            results.append(trained_as(name, scene, folder / str(number), *more))
+        except FileNotFoundError:
+            if ranks().first:
+                raise
     return results
 
 
-def test_ranks(scene, tmp_path, plain):
+@pytest.mark.parametrize("size", [2, 3])
+def test_ranks(scene, tmp_path, once, plain, size):
     """With all that a kind may have of its own: terms, optimisers, strategies, cameras, and images of one tile."""
-    names = "default", "sparse", "appearance", "tiny", "together", "mcmc", "filter", "budget errors"
-    kinds = [(name, ()) for name in (*names, "poses", "poses, no graph")]
+    names = "default", "sparse", "appearance", "tiny", "together", "mcmc", "filter and budget", "poses"
+    kinds = [(name, ()) for name in (*names, "poses, no graph", "asleep, together", "asleep, budget")]
     kinds += [("exposure", ("--plain_step",)), ("poses", ("--plain_step",))]
-    found = in_ranks(2, _all, scene, tmp_path, kinds)[0]
+    start = plain_training(once, "asleep, default") / "chkpnt33.pth"
+    if size == 3:
+        kinds = [("asleep, default", ()), ("asleep, default", ("--start_checkpoint", start))]
+    found = in_ranks(size, _all, scene, tmp_path, kinds)[0]
     for (name, more), result in zip(kinds, found, strict=True):
         assert not differences(result, plain(name)), (name, more)
 
@@ -210,6 +208,7 @@ def test_any_number_of_threads(scene, tmp_path, threads, strategy):
     results = []
     for number in (1, 2):
         threads(number)
-        results.append(trained(scene, tmp_path / str(number), *more))
+        with sleep(0.0):
+            results.append(trained(scene, tmp_path / str(number), *more))
     assert not differences(*results)
     assert len(results[0]["ply"]) > count * 4 * 14

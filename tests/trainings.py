@@ -2,7 +2,8 @@
 
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from synthetic import FOCAL, make_colmap_scene
 import train
 from scene import sleeping
 from scene.readers.point_cloud import write_point_cloud
+from scene.sleeping import Sleeping
 from splatting.parts.filter_3d import part as filter_3d
 from splatting.parts.robust_mask import residuals
 from splatting.training import loop, run
@@ -22,6 +24,7 @@ from splatting.training.steps import FasterSteps
 
 Once = Callable[[str, Callable[[Path], object]], Path]
 ITERATIONS = 60
+EDGES = 19, 20, 29, 30, 33, 42, 59  # before and after changes of rows, a reset, and rests; before the last iteration
 LEARNT = "poses.json", "exposure.json", "appearance.json"
 MCMC = ("--strategy", "mcmc", "--mcmc_noise", 5e4, "--mcmc_init_opacity", 0.03, "--mcmc_min_opacity", 0.024)
 PYRAMID = "--schedule", Path(__file__).parent / "pyramid_60.json"  # small views at first
@@ -33,11 +36,9 @@ OPTIONS = {
     "appearance": ("--appearance", "ppisp", "--antialiasing"),
     "depth": ("-d", "depths", "--depth_l1_weight_init", 1.0),
     "points": ("--sparse_depth", 0.5, "--masks", "masks", *PYRAMID),
-    "masks": ("--masks", "masks"),
     "degree 0": ("--sh_degree", 0),
     "rays": ("--projection", "ray"),
     "absgrad": ("--absgrad", "--absgrad_threshold", 2e-4, "--max_num_splats", 400),
-    "white": ("-w", "--antialiasing"),
     "two phases": ("--densify_until_iter", 30),  # so that two phases have steps to capture
     "tiny": ("-r", 8),  # images of one tile
     "together": (  # rows and opacities change in the same iterations
@@ -45,10 +46,8 @@ OPTIONS = {
         *("-d", "depths", "--depth_l1_weight_init", 1.0, "--masks", "masks"),
     ),
     "mcmc": MCMC,
-    "mcmc moves": (*MCMC, "--mcmc_growth", 0),
     "mcmc idle": ("--strategy", "mcmc", "--mcmc_growth", 0, "--mcmc_min_opacity", 1e-6),
     "mcmc sparse": (*MCMC, "--optimizer_type", "sparse_adam", "--antialiasing"),
-    "filter": (*MCMC, "--filter_3d", "--antialiasing"),
     "filter and adc": ("--filter_3d", "--antialiasing"),
     "filter and budget": ("--filter_3d", "--antialiasing", *BUDGET),
     "budget": BUDGET,
@@ -60,6 +59,8 @@ OPTIONS = {
     "exposure and sizes": ("--train_test_exp", *PYRAMID, "-r", 1),
     "budget errors": (*BUDGET, "--train_test_exp"),
 }
+ASLEEP = "default", "poses", "together", "budget", "degree 0", "rays"
+OPTIONS |= {f"asleep, {name}": OPTIONS[name] for name in ASLEEP}  # whose blocks sleep: see trained_as
 
 PART_OPTIONS = {  # that begin with something of a checkpoint, or of the scene
     "time_budget": PYRAMID,
@@ -129,24 +130,48 @@ def trained(scene: Path, out: Path, *options: object) -> dict[str, bytes | list]
     return whole_result(out, ITERATIONS)
 
 
+@contextmanager
+def sleep(most_share: float) -> Iterator[list[float]]:
+    """Let blocks sleep where views see no more of the points, and rest every 7 iterations.
+
+    Yields a list that gets the share that is awake, step by step.
+    """
+    shares, wake = [], Sleeping.wake
+
+    def noted(self: Sleeping, *arguments: object) -> torch.Tensor:
+        awake = wake(self, *arguments)
+        shares.append(float(self.awake.float().mean()))
+        return awake
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sleeping, "REST", 7)
+        patch.setattr(sleeping, "MOST_SHARE", most_share)
+        patch.setattr(Sleeping, "wake", noted)
+        yield shares
+
+
+def trained_as(name: str, scene: Path, out: Path, *more: object) -> dict[str, bytes | list]:
+    """`trained` on shared_scene with the options of a name: from clusters of which most sleep, or with none asleep."""
+    asleep = name.startswith("asleep")
+    points = ("--init_pcd_path", scene / "points.ply") if asleep else ()
+    with sleep(2.0 if asleep else 0.0) as shares:
+        result = trained(scene, out, *OPTIONS[name], *points, *more)
+    if asleep and "--start_checkpoint" not in more:
+        assert (min(shares) < 0.9) == ("rays" not in name)  # every view wakes all for these
+    return result
+
+
 def shared_scene(once: Once) -> Path:
-    """A scene that narrow_scene has made for all workers; see conftest.once."""
-    return once("narrow_scene", narrow_scene)
+    """A scene of narrow_scene with clusters, made for all workers; see conftest.once."""
+    return once("narrow_scene", lambda folder: with_clusters(narrow_scene(folder), 1000, 30, 200))
 
 
 def plain_training(once: Once, name: str) -> Path:
-    """The output folder of a training by plain steps with the options of a name, for all workers.
-
-    It has a checkpoint of iteration 33, too. No block sleeps.
-    """
-
-    def make(out: Path) -> None:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(sleeping, "MOST_SHARE", 0.0)
-            words = "--plain_step", "--checkpoint_iterations", 33, ITERATIONS
-            trained(shared_scene(once), out, *words, *OPTIONS[name])
-
-    return once(f"plain/{name}", make)
+    """The output folder of trained_as by plain steps, for all workers. It has the checkpoints of EDGES, too."""
+    words = "--plain_step", "--checkpoint_iterations", *EDGES, ITERATIONS
+    if name == "asleep, degree 0":  # a checkpoint while blocks sleep gives f_rest, which has no values, a state of none
+        words = words[:1]
+    return once(f"plain/{name}", lambda out: trained_as(name, shared_scene(once), out, *words))
 
 
 def before_steps(monkeypatch: pytest.MonkeyPatch, act: Callable[[Iteration], None]) -> None:

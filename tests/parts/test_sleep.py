@@ -1,9 +1,12 @@
-"""Blocks of Gaussians that sleep: what they miss, that no view shows them, and trainings in which they do."""
+"""Blocks of Gaussians that sleep: what they miss, and that no view shows them.
+
+tests/test_training_bytes.py has the bytes of trainings in which they do.
+"""
 
 import math
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +18,21 @@ from diff_gaussian_rasterization.optim import adam_
 from diff_gaussian_rasterization.scene import Scene
 from gaussians import needs_fused_step
 from processes import in_ranks
-from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, GPU_MARKS
+from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU
 from step_ways import Immediate, take_as  # noqa: F401  (a fixture)
-from trainings import ITERATIONS, OPTIONS, Once, differences, narrow_scene, trained, whole_result, with_clusters
+from trainings import (
+    ITERATIONS,
+    OPTIONS,
+    before_steps,
+    differences,
+    narrow_scene,
+    plain_training,
+    shared_scene,
+    sleep,
+    trained,
+    whole_result,
+    with_clusters,
+)
 
 import train
 from scene import sleeping
@@ -31,17 +46,13 @@ from splatting.training import run as runs
 from splatting.training.iteration import Iteration
 from splatting.training.log import ProgressBar
 from splatting.training.objective import Objective
-from splatting.training.steps import captured, fused, graphs
+from splatting.training.steps import captured
 from utils.system_utils import UserError
 
 BETAS, EPS = (0.9, 0.999), 1e-15
 MOST_RATIO = 0.1 / math.sqrt(0.001 * (1 - 0.81 / 0.999))  # of |m| / sqrt(v) (csrc/math/sleep.h)
 SCENES, STEPS = 6, (5, 60)  # of random blocks; 1000, or 1 and (7000, 7001), to measure the rounding
 VIEWS = 12  # random ones of each lens; 1000 for a thorough test
-COVERING = "together", "poses", "budget", "absgrad"  # the steps of other names are captured alone
-NAMES = ("default", "poses", "white", "masks", "exposure", "depth", "absgrad", "together", "budget", "degree 0", "rays")
-CHECKPOINTS = 42, 33, 19, 20, 30, 59
-WITH_RAYS = "default", "depth", "together"  # or all that sleep and have rays: those of OPTIONS without MCMC and poses
 
 
 class Blocks:
@@ -270,154 +281,48 @@ def test_steps_with_sleep_are_those_of_dense_adam_in_double():
 
 @pytest.fixture(scope="module")
 def scene(once) -> Path:
-    """Of a room of clusters, of which a view sees a part."""
-    return once("sleeping/scene", lambda folder: with_clusters(narrow_scene(folder), 1000, 30, 200))
+    return shared_scene(once)
+
+
+@pytest.fixture(autouse=True)
+def shares() -> Iterator[list[float]]:
+    with sleep(2.0) as found:
+        yield found
 
 
 def _trained(scene: Path, out: Path, *options: object) -> dict:
     return trained(scene, out, "--init_pcd_path", scene / "points.ply", *options)
 
 
-@pytest.fixture(autouse=True)
-def shares(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    return _sleeps(monkeypatch)
-
-
-def _sleeps(patch: pytest.MonkeyPatch) -> list[float]:
-    """Let blocks sleep. The share that is awake, step by step; all rest every 7 iterations."""
-    found, wake = [], Sleeping.wake
-
-    def noted(self: Sleeping, *arguments: object) -> torch.Tensor:
-        awake = wake(self, *arguments)
-        found.append(float(self.awake.float().mean()))
-        return awake
-
-    patch.setattr(sleeping, "REST", 7)  # also between changes of rows
-    patch.setattr(sleeping, "MOST_SHARE", 2.0)
-    patch.setattr(Sleeping, "wake", noted)
-    return found
-
-
-def _once(once: Once, scene: Path, name: str, *options: object) -> Path:
-    """The output folder of a training in which blocks sleep, made for all workers."""
-
-    def make(out: Path) -> None:
-        with pytest.MonkeyPatch.context() as patch:
-            _sleeps(patch)
-            _trained(scene, out, *options)
-
-    return once(f"sleeping/{name}", make)
-
-
 @pytest.fixture(scope="module")
-def plain(scene: Path, once) -> Callable[[str], dict]:
-    """What plain steps leave with the options of a name."""
-    return lambda name: whole_result(_once(once, scene, name, "--plain_step", *OPTIONS[name]), ITERATIONS)
-
-
-@pytest.fixture(scope="module")
-def cut(scene: Path, once) -> Path:
-    """The folder of a training with checkpoints: after a rest, while some sleep, and beside changes."""
-    return _once(once, scene, "cut", "--checkpoint_iterations", *CHECKPOINTS, ITERATIONS)
-
-
-@pytest.mark.parametrize(
-    ("way", "name"),
-    [*(("captured", name) for name in NAMES), *((way, name) for way in ("fused", "queued") for name in COVERING)],
-)
-def test_fast_steps(scene, tmp_path, take_as, plain, shares, way, name):  # noqa: F811
-    expected = plain(name)
-    shares.clear()
-    take_as(way)
-    assert not differences(_trained(scene, tmp_path, *OPTIONS[name]), expected)
-    assert (min(shares) < 0.9) == (name != "rays")  # every view wakes all for them
+def plain(once) -> Path:
+    """The folder of a training by plain steps."""
+    return plain_training(once, "asleep, default")
 
 
 def test_fast_steps_with_a_lens(tmp_path, take_as, shares):  # noqa: F811
     scene = with_clusters(narrow_scene(tmp_path / "scene", "OPENCV", (-0.2, 0.05, 0.001, -0.002)), 1000, 30, 200)
     expected = _trained(scene, tmp_path / "plain", "--plain_step")
-    assert min(shares) < 0.9
-    shares.clear()
     take_as("captured")
     assert not differences(_trained(scene, tmp_path / "fast"), expected) and min(shares) < 0.9
 
 
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
-def test_steps_of_a_gpu(scene, tmp_path, name, _):
-    expected = _trained(scene, tmp_path / "plain", "--plain_step", *OPTIONS[name])
-    assert not differences(_trained(scene, tmp_path / "captured", *OPTIONS[name]), expected)
-
-
-def _in_rank(scene: Path, folder: Path, kinds: list[tuple[str, ...]]) -> tuple[list[dict], float]:
-    """Results of trainings in the same processes, those of the first rank, and the smallest share awake."""
-    results: list[dict] = []
-    with pytest.MonkeyPatch.context() as patch:
-        found = _sleeps(patch)
-        for number, (name, *more) in enumerate(kinds):
-            out = folder / str(number)
-            try:
-                results.append(_trained(scene, out, *OPTIONS[name], *more))
-            except FileNotFoundError:  # only the first rank writes
-                if ranks().first:
-                    raise
-        return results if ranks().first else [], min(found)
-
-
-@pytest.mark.parametrize("size", [2, 3])
-def test_ranks(scene, tmp_path, cut, plain, size):
-    kinds: list[tuple] = [("default", "--checkpoint_iterations", 33, ITERATIONS), ("white", "--plain_step")]
-    if size == 2:
-        kinds += [("exposure",), ("absgrad",), ("budget",)]
-        kinds += [("default", "--start_checkpoint", cut / "chkpnt33.pth")]
-    found = in_ranks(size, _in_rank, scene, tmp_path, kinds)
-    assert all(share < 0.9 for _, share in found)
-    for (name, *_), result in zip(kinds, found[0][0], strict=True):
-        assert not differences(result, plain(name)), name
-    start = "--start_checkpoint", tmp_path / "0/chkpnt33.pth"
-    assert not differences(_trained(scene, tmp_path / "resumed", *start), plain("default"))
+def _in_rank(scene: Path, out: Path, *options: object) -> dict:
+    with sleep(2.0):
+        try:
+            return _trained(scene, out, *options)
+        except FileNotFoundError:  # only the first rank writes
+            if ranks().first:
+                raise
+    return {}
 
 
 def test_a_rank_without_rows(scene, tmp_path):
     few = tmp_path / "few.ply"
     write_point_cloud(few, 0.7 * np.random.default_rng(0).normal(size=(100, 3)), np.full((100, 3), 128))
-    (result,), _ = in_ranks(2, _in_rank, scene, tmp_path, [("default", "--init_pcd_path", few)])[0]
-    assert not differences(result, _trained(scene, tmp_path / "alone", "--init_pcd_path", few))
-
-
-@pytest.mark.parametrize("name", ["default", "rays"])
-@pytest.mark.parametrize("way", [(), ("--plain_step",)])
-def test_scores_and_saves_between_change_nothing(scene, tmp_path, once, plain, way, name):
-    way, looks = (*way, *OPTIONS[name]), ("--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44)
-    assert not differences(_trained(scene, tmp_path, *way, *looks), plain(name))
-    words = "--plain_step", *OPTIONS[name], "--save_iterations", 9, 44
-    saved = _once(once, scene, f"{name}, saved", *words)
-    for iteration in (9, 44):
-        ply = f"point_cloud/iteration_{iteration}/point_cloud.ply"
-        assert (tmp_path / ply).read_bytes() == (saved / ply).read_bytes()
-
-
-def test_checkpoints_between_change_nothing(cut, plain):
-    assert not differences(whole_result(cut, ITERATIONS), plain("default"))
-
-
-@pytest.mark.parametrize("iteration", CHECKPOINTS)
-def test_resumed(scene, tmp_path, cut, plain, iteration):
-    checkpoint = cut / f"chkpnt{iteration}.pth"
-    assert not differences(_trained(scene, tmp_path / "b", "--start_checkpoint", checkpoint), plain("default"))
-    capture, _ = load_checkpoint(checkpoint)
-    asleep = extra_state(capture).get("sleep")
-    assert (asleep is None) == (iteration in (20, 30, 42))
-
-
-def test_a_checkpoint_from_within_a_step_resumes(scene, tmp_path, cut, plain):
-    """As where memory has run out: the blocks that the step concerns are awake for it already."""
-    capture, iteration = load_checkpoint(cut / "chkpnt33.pth")
-    asleep = extra_state(capture).get("sleep")
-    asleep["taken"] += asleep["awake"].int()
-    save_checkpoint(tmp_path / "within.pth", capture, iteration)
-    start = "--start_checkpoint", tmp_path / "within.pth"
-    assert not differences(_trained(scene, tmp_path / "b", *start), plain("default"))
+    words = "--init_pcd_path", few
+    result, _ = in_ranks(2, _in_rank, scene, tmp_path / "ranks", *words)
+    assert not differences(result, _trained(scene, tmp_path / "alone", *words))
 
 
 def test_rays_have_the_bytes_of_a_training_in_which_nothing_sleeps(scene, tmp_path, monkeypatch):
@@ -431,59 +336,42 @@ def test_rays_have_the_bytes_of_a_training_in_which_nothing_sleeps(scene, tmp_pa
     assert looked["ply"] == resumed["ply"] == awake["ply"]
 
 
-@pytest.mark.parametrize("what", ["rows", "taken", "terms", "awake"])
-def test_damaged_sleep_is_refused(scene, tmp_path, cut, what):
-    capture, iteration = load_checkpoint(cut / "chkpnt33.pth")
-    asleep = extra_state(capture).get("sleep")
-    if what == "rows":
-        asleep["rows"].pop()
-    elif what == "taken":
-        asleep["taken"] -= 2**30
-    elif what == "awake":
-        asleep["awake"] = torch.tensor(0.5)
-    else:
-        asleep["terms"] = asleep["terms"][:5]
-    save_checkpoint(tmp_path / "bad.pth", capture, iteration)
-    with pytest.raises(UserError, match="of sleeping blocks in the checkpoint does not fit"):
-        _trained(scene, tmp_path / "b", "--start_checkpoint", tmp_path / "bad.pth")
+DAMAGE = {
+    "rows": lambda asleep: asleep["rows"].pop(),
+    "taken": lambda asleep: asleep["taken"].sub_(2**30),
+    "awake": lambda asleep: asleep.update(awake=torch.tensor(0.5)),
+    "terms": lambda asleep: asleep.update(terms=asleep["terms"][:5]),
+}
+
+
+def test_a_checkpoint_from_within_a_step_resumes_and_a_damaged_one_is_refused(scene, tmp_path, plain):
+    """From within a step, as where memory has run out: the blocks that the step concerns are awake for it already."""
+    start = "--start_checkpoint", tmp_path / "changed.pth"
+
+    def save(change: Callable[[dict], object]) -> None:
+        capture, iteration = load_checkpoint(plain / "chkpnt33.pth")
+        change(extra_state(capture).get("sleep"))
+        save_checkpoint(start[1], capture, iteration)
+
+    save(lambda asleep: asleep["taken"].add_(asleep["awake"].int()))
+    assert not differences(_trained(scene, tmp_path / "b", *start), whole_result(plain, ITERATIONS))
+    for change in DAMAGE.values():
+        save(change)
+        with pytest.raises(UserError, match="of sleeping blocks in the checkpoint does not fit"):
+            _trained(scene, tmp_path / "c", *start)
 
 
 @needs_fused_step
-def test_interrupted(scene, tmp_path, plain, monkeypatch):
-    draw, calls = fused.draw, []
-
-    def interrupted(*args: object, **named: object) -> object:
-        calls.append(1)
-        if len(calls) == 37:
-            os.kill(os.getpid(), signal.SIGINT)
-        return draw(*args, **named)
-
-    monkeypatch.setattr(fused, "draw", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+@pytest.mark.parametrize("way", ["fused", "captured"])
+def test_interrupted(scene, tmp_path, plain, monkeypatch, take_as, way):  # noqa: F811
+    """Some iterations after all blocks have rested; of captured steps no Python has run since."""
+    take_as(way)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        before_steps(patch, lambda step: os.kill(os.getpid(), signal.SIGINT) if step.iteration == 37 else None)
         _trained(scene, tmp_path / "cut")
-    (checkpoint,) = (tmp_path / "cut").glob("chkpnt*.pth")
-    assert extra_state(load_checkpoint(checkpoint)[0]).get("sleep")
-    assert not differences(_trained(scene, tmp_path / "whole", "--start_checkpoint", checkpoint), plain("default"))
-
-
-def test_captured_steps_that_are_stopped_resume_to_the_same_bytes(scene, tmp_path, plain, take_as, monkeypatch):  # noqa: F811
-    """Some iterations after all blocks have rested, no Python of theirs has run."""
-    expected = plain("default")
-    take_as("captured")
-    launch = graphs.Graphs.launch
-
-    def interrupted(self: graphs.Graphs, at: Iteration) -> object:
-        if at.iteration == 37:
-            os.kill(os.getpid(), signal.SIGINT)
-        return launch(self, at)
-
-    monkeypatch.setattr(graphs.Graphs, "launch", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        _trained(scene, tmp_path / "cut")
-    monkeypatch.setattr(graphs.Graphs, "launch", launch)
     start = "--start_checkpoint", tmp_path / "cut/chkpnt37.pth"
     assert extra_state(load_checkpoint(start[1])[0]).get("sleep")
-    assert not differences(_trained(scene, tmp_path / "whole", *start), expected)
+    assert not differences(_trained(scene, tmp_path / "whole", *start), whole_result(plain, ITERATIONS))
 
 
 @pytest.mark.parametrize("way", [(), ("--plain_step",)])
@@ -545,13 +433,12 @@ def test_a_term_ends_no_sleep_before_the_queued_steps_are_done(scene, tmp_path, 
     assert done and ends and all(ends)
 
 
-def test_a_replaced_report_may_change_the_model(scene, tmp_path, monkeypatch, shares):
-    monkeypatch.setattr(train, "training_report", lambda *_: {})
-    _trained(scene, tmp_path)
-    assert not shares
-
-
-def test_a_model_with_activations_of_its_own_does_not_sleep(scene, tmp_path, monkeypatch, shares):
+def test_no_block_sleeps_where_a_report_may_change_the_model_or_it_has_activations_of_its_own(
+    scene, tmp_path, monkeypatch, shares
+):
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "training_report", lambda *_: {})
+        _trained(scene, tmp_path / "report")
     begin = GaussianModel.__init__
 
     def own(self: GaussianModel, *arguments: object) -> None:
@@ -559,7 +446,7 @@ def test_a_model_with_activations_of_its_own_does_not_sleep(scene, tmp_path, mon
         self.scaling_activation = lambda values: torch.exp(values)
 
     monkeypatch.setattr(GaussianModel, "__init__", own)
-    _trained(scene, tmp_path)
+    _trained(scene, tmp_path / "own")
     assert not shares
 
 
@@ -569,12 +456,6 @@ def test_the_progress_bar_does_not_wake_blocks(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(ProgressBar, "due", lambda self, step: True)
     _trained(scene, tmp_path)
     assert len(looks) < 4
-
-
-def test_where_views_see_most_points_no_block_sleeps(scene, tmp_path, monkeypatch, shares):
-    monkeypatch.setattr(sleeping, "MOST_SHARE", 0.0)
-    _trained(scene, tmp_path)
-    assert not shares
 
 
 def test_a_model_that_is_saved_between_is_as_if_no_block_had_slept(scene, tmp_path, monkeypatch):

@@ -1,11 +1,9 @@
 """--gpu_memory: a part of f_rest and its averages in the host's memory changes no byte, and keeps the limit."""
 
 import gc
-import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,8 +19,11 @@ from trainings import (
     before_steps,
     differences,
     narrow_scene,
+    plain_training,
+    shared_scene,
     train_on,
     trained,
+    trained_as,
     whole_result,
     with_clusters,
 )
@@ -43,8 +44,6 @@ from utils.system_utils import UserError
 SPILL = ("--gpu_memory", 1)
 ON_A_GPU = pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
 PAGE = 2 << 20
-KINDS = {name: OPTIONS[name] for name in ("default", "sparse", "absgrad", "budget", "degree 0")}
-KINDS["mcmc"] = "--strategy", "mcmc"
 
 
 # The policy
@@ -118,19 +117,6 @@ def test_a_limit_begins_where_the_gpu_has_too_little(monkeypatch):
     assert there.limit == 0 and there.remedy(1000, 1) == ""
 
 
-def test_a_limit_is_at_most_what_is_free(monkeypatch):
-    assert _memory(monkeypatch, 1).limit == 2**30
-    assert _memory(monkeypatch, 4).limit == int(gpu_memory._USABLE * 2**31)
-
-
-def test_a_slow_bus_is_told_of_before(monkeypatch):
-    memory = _memory(monkeypatch, 1)
-    spilled = memory.host_bytes(2_000_000)
-    first, second = sentences(memory, 2_000_000, 0.8, False)
-    assert first.endswith("the saved files are the same up to rounding")
-    assert f"about {2e3 * 0.8 * spilled / 40e9:.0f} ms a step, which updates 80% of" in second
-
-
 def test_torch_gets_the_limit_without_the_near_parts(monkeypatch):
     found, total, living, freed = [], 4 * 2**30, 100, []
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: SimpleNamespace(total_memory=total))
@@ -182,23 +168,7 @@ def test_the_cpu_has_one_memory():
 
 @pytest.fixture(scope="module")
 def scene(once) -> Path:
-    return once("spill/scene", lambda folder: with_clusters(narrow_scene(folder), 1000, 20, 50))
-
-
-def _trained(scene: Path, out: Path, *options: object) -> dict:
-    return trained(scene, out, "--init_pcd_path", scene / "points.ply", *options)
-
-
-@pytest.fixture(scope="module")
-def usual(scene: Path, once) -> Callable[[str], dict]:
-    """What a training leaves with the options of a name and nothing spilled; blocks sleep."""
-
-    def train(name: str, out: Path) -> None:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(sleeping, "MOST_SHARE", 2.0)
-            _trained(scene, out, *KINDS[name])
-
-    return lambda name: whole_result(once(f"spill/{name}", partial(train, name)), ITERATIONS)
+    return shared_scene(once)
 
 
 @contextmanager
@@ -247,45 +217,45 @@ def _check_rows(patch: pytest.MonkeyPatch) -> list[int]:
     return counts
 
 
-@pytest.mark.parametrize("name", KINDS)
-def test_spilled_rows_are_trained_as_any_others(scene, tmp_path, monkeypatch, usual, name):
-    expected = usual(name)
-    with _half_spilled(monkeypatch) as made:
-        counts = _check_rows(monkeypatch)
-        assert not differences(_trained(scene, tmp_path, *SPILL, *KINDS[name]), expected)
-    assert {*counts} <= {*made} and len({*counts}) > 1
-
-
-@pytest.mark.parametrize(("first", "then"), [((), SPILL), (SPILL, ())])
-def test_resumed(scene, tmp_path, monkeypatch, usual, first, then):
-    expected = usual("default")
-    monkeypatch.setattr(sleeping, "MOST_SHARE", 2.0)
-    _trained(scene, tmp_path / "a", *first, "--checkpoint_iterations", 33, ITERATIONS)
-    start = "--start_checkpoint", tmp_path / "a" / "chkpnt33.pth"
-    assert not differences(_trained(scene, tmp_path / "b", *then, *start), expected)
+@pytest.mark.parametrize("name", ["asleep, default", "asleep, together", "asleep, budget", "sparse", "mcmc"])
+def test_spilled_rows_are_trained_as_any_others(scene, tmp_path, monkeypatch, once, name):
+    """Resumed, too: with spilled rows by a training without, and the other way round."""
+    expected = whole_result(plain_training(once, name), ITERATIONS)
+    with monkeypatch.context() as patch, _half_spilled(patch) as made:
+        counts = _check_rows(patch)
+        words = *SPILL, "--checkpoint_iterations", 33, ITERATIONS
+        assert not differences(trained_as(name, scene, tmp_path / "a", *words), expected)
+        assert {*counts} <= {*made} and len({*counts}) > 1
+        if name == "asleep, default":
+            start = "--start_checkpoint", plain_training(once, name) / "chkpnt33.pth"
+            assert not differences(trained_as(name, scene, tmp_path / "b", *SPILL, *start), expected)
+    if name == "asleep, default":
+        start = "--start_checkpoint", tmp_path / "a/chkpnt33.pth"
+        assert not differences(trained_as(name, scene, tmp_path / "c", *start), expected)
 
 
 def _in_ranks(scene: Path, folder: Path) -> dict | None:
     with pytest.MonkeyPatch.context() as patch, _half_spilled(patch):
         _check_rows(patch)
         try:
-            return _trained(scene, folder / "ranks", *SPILL)
+            return trained_as("asleep, default", scene, folder / "ranks", *SPILL)
         except FileNotFoundError:  # only the first rank writes
             if ranks().first:
                 raise
     return None
 
 
-def test_ranks(scene, tmp_path, usual):
-    assert not differences(in_ranks(2, _in_ranks, scene, tmp_path)[0], usual("default"))
+def test_ranks(scene, tmp_path, once):
+    expected = whole_result(plain_training(once, "asleep, default"), ITERATIONS)
+    assert not differences(in_ranks(2, _in_ranks, scene, tmp_path)[0], expected)
 
 
-@pytest.mark.parametrize(("options", "sleeps"), [((), False), (SPILL, True), ((*SPILL, *KINDS["mcmc"]), False)])
+@pytest.mark.parametrize(("options", "sleeps"), [((), False), (SPILL, True), ((*SPILL, "--strategy", "mcmc"), False)])
 def test_blocks_sleep_wherever_they_can(scene, tmp_path, monkeypatch, options, sleeps):
     monkeypatch.setattr(sleeping, "MOST_SHARE", 0.0)
     found, begin = [], run.Run.begin
     monkeypatch.setattr(run.Run, "begin", lambda self: (found.append(self.sleeping is not None), begin(self)))
-    _trained(scene, tmp_path, *options)
+    trained(scene, tmp_path, *options)
     assert found == [sleeps]
 
 
@@ -293,17 +263,9 @@ def test_it_is_told_before_what_the_host_has_to_hold(scene, tmp_path, monkeypatc
     monkeypatch.setattr(GpuMemory, "host_bytes", lambda self, count: count * 10**6)
     monkeypatch.setattr(resources, "free_memory", lambda device: 10**10)
     monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
-    train_on(scene, tmp_path, "--iterations", 2, "--disable_viewer", "--init_pcd_path", scene / "points.ply", *SPILL)
+    train_on(scene, tmp_path, "--iterations", 2, "--disable_viewer", *SPILL)
     out, err = capfd.readouterr()
-    assert re.search(r"CPU memory: about \S+ GiB of 9.31 GiB: \S+ GiB of 40,000 Gaussians", out)
-    assert "are kept in the host's memory, as all of them need more than 1.00 GiB of the GPU's; the saved files" in out
-    assert re.search(r"about \d+ ms a step", out)
-    assert "the memory of the CPU seems too small for 40,000 Gaussians; set a lower --max_num_splats" in err
-
-
-def test_what_cannot_be_is_refused(scene, tmp_path):
-    with pytest.raises(UserError, match="--gpu_memory must be between 0 and 1000000"):
-        _trained(scene, tmp_path, "--gpu_memory", -1)
+    assert "are kept in the host's memory" in out and "the memory of the CPU seems too small for" in err
 
 
 # On a GPU
@@ -358,14 +320,16 @@ def test_memory_is_given_back(_):
 def test_both_memories_give_the_bytes_of_one(tmp_path, monkeypatch, name, _):
     """With as many rows as pages need, more of them by density control, and half of them on the host."""
     scene = with_clusters(narrow_scene(tmp_path / "scene"), 40_000, 20, 2000)
-    more = ("--max_num_splats", 90_000) if name in ("budget", "mcmc") else ()
+    more = ("--strategy", "mcmc") if name == "mcmc" else OPTIONS[name]
+    more += ("--max_num_splats", 90_000) if name in ("budget", "mcmc") else ()
+    more += "--init_pcd_path", scene / "points.ply"
     monkeypatch.setattr(sleeping, "MOST_SHARE", 2.0)
-    expected = _trained(scene, tmp_path / "usual", *KINDS[name], *more)
+    expected = trained(scene, tmp_path / "usual", *more)
     gc.collect()
     before = bytes_of()
     with _half_spilled(monkeypatch):
         counts = _check_rows(monkeypatch)
-        assert not differences(_trained(scene, tmp_path / "spilled", *SPILL, *KINDS[name], *more), expected)
+        assert not differences(trained(scene, tmp_path / "spilled", *SPILL, *more), expected)
     gc.collect()
     assert len({*counts}) > 1 and bytes_of() == before
 
@@ -385,6 +349,6 @@ def test_a_tight_limit_is_kept(tmp_path, monkeypatch, _):
         return made
 
     monkeypatch.setattr(GpuMemory, "empty_rows", noted)
-    _trained(scene, tmp_path / "out", "--gpu_memory", 0.7)
+    trained(scene, tmp_path / "out", "--init_pcd_path", scene / "points.ply", "--gpu_memory", 0.7)
     assert all(near > 0 and far > 0 for near, far in shares)
     assert max(peaks) <= 0.7 * 2**30 and torch.cuda.max_memory_reserved() <= 0.7 * 2**30
