@@ -108,22 +108,24 @@ def test_parts_declare_their_tools():
         assert there == {*part_class(name).tools}, name
 
 
-# A program in which a part is not there: neither its line of the registry nor its folder.
+# A program in which some parts are not there: neither their lines of the registry nor their folders.
 WITHOUT = """
 import sys
 import splatting.registry as registry
-name, *words = sys.argv[1:]
-registry.PARTS = tuple(other for other in registry.PARTS if other != name)
-sys.modules[f"splatting.parts.{name}"] = None
+hidden, *words = sys.argv[1:]
+hidden = hidden.split(",")
+registry.PARTS = tuple(name for name in registry.PARTS if name not in hidden)
+sys.modules |= {f"splatting.parts.{name}": None for name in hidden}
 """
 IMPORTED = """
 from importlib import import_module
 from pathlib import Path
+left_out = "integrations", *(f"splatting.parts.{name}" for name in hidden)
 for room in words:
     paths = Path(room).rglob("*.py") if Path(room).is_dir() else [Path(room)]
     for path in sorted(paths):
         module = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
-        if not module.startswith((f"splatting.parts.{name}", "integrations")) and not module.endswith("__main__"):
+        if not module.endswith("__main__") and not module.startswith(left_out):
             import_module(module)
 from arguments import OPTIONS
 from splatting.training.launch import launch_options
@@ -131,21 +133,25 @@ print(*(option.name for option in OPTIONS), *vars(launch_options()))
 """
 
 
-@pytest.mark.parametrize("name", PARTS)
-def test_without_a_part_all_else_imports_and_lacks_its_options_alone(name):
-    words = [name, *ROOMS, *(f"{command}.py" for command in COMMANDS)]
-    done = fork(WITHOUT + IMPORTED, *words)
+def _halves() -> list[list[str]]:
+    """Halves of the parts, so that for any two of them one half lacks the first and has the second."""
+    digits = range((len(PARTS) - 1).bit_length())
+    return [[name for n, name in enumerate(PARTS) if n >> digit & 1 == bit] for digit in digits for bit in (0, 1)]
+
+
+@pytest.mark.parametrize("hidden", _halves())
+def test_without_half_of_the_parts_all_else_imports_and_lacks_their_options_alone(hidden):
+    done = fork(WITHOUT + IMPORTED, ",".join(hidden), *ROOMS, *(f"{command}.py" for command in COMMANDS))
     assert done.status == 0, done.stderr
-    every = {option for other in PARTS for option in _options(other)}
-    there = {*done.stdout.split()}
-    assert not there & _options(name) and every - _options(name) <= there
+    there, gone = {*done.stdout.split()}, {option for name in hidden for option in _options(name)}
+    assert not there & gone and {option for name in PARTS for option in _options(name)} - gone <= there
 
 
 TRAINED = """
 import doctor, export, render, train
 scene, out, strategy = words
 short = ["--strategy", strategy, "--iterations", "20", "--test_iterations", "20", "--eval", "-r", "48"]
-train.main(["-s", scene, "-m", out, *([] if name == "remote_viewer" else ["--disable_viewer"]), *short])
+train.main(["-s", scene, "-m", out, *([] if "remote_viewer" in hidden else ["--disable_viewer"]), *short])
 for command, line in ((render, ["-m", out]), (doctor, ["-m", out]), (export, ["-m", out, "--to", out + "/a.ply"])):
     sys.argv = [command.__name__, *line]
     try:
