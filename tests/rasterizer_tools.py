@@ -26,6 +26,7 @@ GPU_MARKS = (
         not (torch.cuda.is_available() and has_cuda_kernels()), reason="needs a GPU and a build with CUDA"
     ),
 )
+PLANES = ("color", "inverse_depth", "transmittance")
 _PLACES = {"float64": ("cpu", torch.float64), "float32": ("cpu", torch.float32), "cuda": ("cuda", torch.float32)}
 
 
@@ -126,6 +127,39 @@ def loss_of(out: NamedTuple, keep: Tensor | None = None) -> Tensor:
         weights = weights if keep is None else weights * keep
         loss = loss + (weights.to(plane.device) * plane.double()).sum()
     return loss
+
+
+class Evaluated(NamedTuple):
+    """Planes and gradients by name, the pixels (H, W) that count, and the radii."""
+
+    named: dict[str, Tensor]
+    keep: Tensor
+    radii: Tensor
+
+
+def evaluate(
+    parameters: dict[str, Tensor],
+    camera: GaussianRasterizationSettings,
+    keep: Tensor | None = None,
+    device: str = "cpu",
+    **options,
+) -> Evaluated:
+    """Renders in the camera's dtype. keep: pixels that count; None, of the oracle: those that are near no cut-off."""
+    inputs = {name: t.to(camera.bg.dtype) for name, t in parameters.items()}
+
+    def loss(out):
+        return loss_of(out, ~out.near_cut if keep is None else keep)
+
+    found = gradients(inputs, camera, device, loss, **options)
+    counted = ~found["near_cut"] if keep is None else keep
+    named = {name: found[name] * counted for name in PLANES} | {n: t for n, t in found.items() if n.startswith("d ")}
+    return Evaluated(named, counted, found["radii"])
+
+
+def errors_above(got: Evaluated, wanted: Evaluated, bound: float) -> dict[str, float]:
+    """The largest errors, by name, that are not within a bound."""
+    errors = {name: error(got.named[name], t).largest for name, t in wanted.named.items()}
+    return {name: largest for name, largest in errors.items() if not largest <= bound}
 
 
 def activated(parameters: dict[str, Tensor]) -> dict[str, Tensor]:

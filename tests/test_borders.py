@@ -10,8 +10,7 @@ import math
 import pytest
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, reference
-from rasterizer_tools import BOTH_AND_GPU, error, on_device, ops, scene_arguments
-from test_rays import evaluate
+from rasterizer_tools import BOTH_AND_GPU, Evaluated, errors_above, evaluate, on_device, ops, scene_arguments
 from torch import Tensor
 
 from benchmarks.workloads.splat_scenes import settings
@@ -64,11 +63,11 @@ def _oracle(kind: str, size: tuple[int, int], turn: int, projection: str):
     return parameters, at, _evaluated(parameters, _view(size, torch.float64, projection), function=reference.render)
 
 
-def _evaluated(parameters: dict[str, Tensor], view: GaussianRasterizationSettings, *place, **options):
-    """As `evaluate`, with the gradients of means times depth: else those of far Gaussians would not count."""
-    named, *rest = evaluate(parameters, view, *place, **options)
-    named["d means"] = named["d means"] * parameters["means"][:, 2:]
-    return named, *rest
+def _evaluated(parameters: dict[str, Tensor], view: GaussianRasterizationSettings, *place, **options) -> Evaluated:
+    """With the gradients of means times depth: else those of far Gaussians would not count."""
+    found = evaluate(parameters, view, *place, **options)
+    found.named["d means"] *= parameters["means"][:, 2:]
+    return found
 
 
 @BOTH_AND_GPU
@@ -79,14 +78,13 @@ def test_means_on_borders_agree_with_the_oracle(device, dtype, kind, size, proje
     size = SIZES[size]
     view = _view(size, dtype, projection)
     for turn in range(len(_places(size[1]))):
-        parameters, at, (wanted, keep, radii) = _oracle(kind, size, turn, projection)
+        parameters, at, wanted = _oracle(kind, size, turn, projection)
         rows = {name: t.to(device, dtype) for name, t in parameters.items()}
         splats, _, _, counts, _ = (t.cpu() for t in ops.project(*scene_arguments(rows, on_device(view, device))))
         listed = counts > 0
         assert torch.equal(splats[listed, :2].double(), at[listed])
-        assert keep.double().mean() > 0.99
-        got, _, found = _evaluated(parameters, view, keep, device)
-        errors = {name: error(got[name], wanted[name]).largest for name in wanted}
-        assert {name: e for name, e in errors.items() if not e <= BOUNDS[dtype]} == {}
+        assert wanted.keep.double().mean() > 0.99
+        got = _evaluated(parameters, view, wanted.keep, device)
+        assert errors_above(got, wanted, BOUNDS[dtype]) == {}
         if dtype == torch.float64:
-            assert torch.equal(found, radii)
+            assert torch.equal(got.radii, wanted.radii)

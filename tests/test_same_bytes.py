@@ -41,7 +41,13 @@ def _rasterize(device: str, dtype: torch.dtype) -> Callable[[], Results]:
     scene = ordinary(9000, 203, 117) if device == "cpu" else frustum(20_000, 333, 222, 3.0, seed=5)
     parameters = {name: t.to(dtype) for name, t in scene.parameters.items()}
     camera = scene.settings(dtype, antialiasing=True)
-    return lambda: list(gradients(parameters, camera, device).values())
+    camera.viewmatrix.requires_grad_()
+
+    def everything() -> Results:
+        camera.viewmatrix.grad = None
+        return [*gradients(parameters, camera, device).values(), camera.viewmatrix.grad]
+
+    return everything
 
 
 def _absolute_gradients(device: str, dtype: torch.dtype) -> Callable[[], Results]:

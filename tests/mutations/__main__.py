@@ -21,7 +21,7 @@ from mutations.private_copy import EMULATED, ROOT, PrivateCopy  # noqa: E402
 # Fast tests of what the faults are in, cheapest and most general first: the first one that fails is reported.
 FILES = (
     *("test_rasterizer_rules", "test_rasterizer_oracle", "test_rasterizer_gradients", "test_rasterizer_tiles"),
-    *("test_absolute_gradients", "test_rasterizer_adam", "parts/test_filter_3d", "test_rays", "test_borders"),
+    *("test_absolute_gradients", "test_rasterizer_adam", "parts/test_filter_3d", "test_borders"),
 )
 TRAINING = ("--eval", "-r", "4", "--iterations", "500", "--test_iterations", "500", "--densify_from_iter", "100")
 SEEDS = range(3)
