@@ -3,7 +3,6 @@
 The judge outside of the repository is gsplat 1.5.3's own PyTorch code: its projection and harmonics agree to 1e-13.
 """
 
-import itertools
 import math
 import sys
 from types import ModuleType
@@ -103,12 +102,10 @@ def composited(given: Inputs, mode: str, antialiased: bool, eps2d: float) -> tup
     return torch.stack(images), torch.stack(alphas)
 
 
-@pytest.mark.parametrize(
-    ("mode", "antialiased", "form"),
-    list(itertools.product(MODES, (False, True), ((3, None), (7, None), (37, None), (3, 2)))),
-)
-def test_images_and_gradients_are_those_of_plain_compositing(mode, antialiased, form):
-    for seed, eps2d in enumerate((0.3, 0.05)):
+@pytest.mark.parametrize("form", [(3, None), (7, None), (37, None), (3, 2)], ids=str)
+@pytest.mark.parametrize("mode", MODES)
+def test_images_and_gradients_are_those_of_plain_compositing(mode, form):
+    for seed, (eps2d, antialiased) in enumerate([(0.3, form[0] == 7), (0.05, form[0] != 7)]):
         given = Inputs(seed, *form)
         expected = composited(given, mode, antialiased, eps2d)
         options = {"rasterize_mode": "antialiased" if antialiased else "classic", "eps2d": eps2d}
@@ -173,12 +170,23 @@ def test_sparse_gradients_have_the_rows_that_are_shown():
         assert torch.equal(sparse.coalesce().indices()[0], meta["gaussian_ids"].unique()) and sparse._nnz() < 200
 
 
-def test_four_numbers_of_an_intrinsic_matrix_count():
-    given = Inputs(5)
+def test_what_is_not_read_changes_nothing():
+    """The other numbers of an intrinsic matrix, bands above the degree 3, sizes as tensors, and autocast."""
+    given = Inputs(5, degree=3)
     image = given.draw()[0]
     given.Ks = given.Ks.clone()
     given.Ks[:, 0, 1], given.Ks[:, 2] = 7.0, torch.tensor([0.1, 0.2, 3.0])
-    assert torch.equal(given.draw()[0], image)
+    given.colors = torch.cat([given.colors, torch.ones(60, 9, 3, dtype=DOUBLE)], 1)
+    again, _, meta = given.draw(width=torch.tensor(float(WIDTH)), height=torch.tensor(HEIGHT))
+    assert torch.equal(again, image) and type(meta["width"]) is int
+    given.backgrounds = given.backgrounds[:1].expand(CAMERAS, 3)
+    assert torch.equal(given.draw(backgrounds=given.backgrounds[0])[0], given.draw()[0])
+    for name in (*NAMES, "backgrounds"):
+        setattr(given, name, getattr(given, name).detach().float())
+    given.Ks = given.Ks.float()
+    image = given.draw(render_mode="RGB+D")[0]
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(image, given.draw(render_mode="RGB+D")[0])
 
 
 def test_leading_batches_and_colours_of_each_camera():
@@ -230,22 +238,6 @@ def test_only_what_a_gradient_is_wanted_of_gets_one():
     assert not (image.requires_grad or alpha.requires_grad or meta["means2d"].requires_grad)
     given.backgrounds.requires_grad_()
     assert given.draw()[0].requires_grad
-
-
-def test_autocast_changes_nothing():
-    given = Inputs(0)
-    for name in (*NAMES, "backgrounds"):
-        setattr(given, name, getattr(given, name).detach().float())
-    image = given.draw(render_mode="RGB+D")[0]
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        assert torch.equal(image, given.draw(render_mode="RGB+D")[0])
-
-
-def test_bands_above_the_highest_degree_are_not_read():
-    given = Inputs(0, degree=3)
-    image = given.draw()[0]
-    given.colors = torch.cat([given.colors, torch.ones(60, 9, 3, dtype=DOUBLE)], 1)
-    assert torch.equal(image, given.draw()[0])
 
 
 def test_covariances_in_place_of_scales():
@@ -304,47 +296,26 @@ def test_an_orthographic_image_does_not_depend_on_depth(dtype):
         ({"camera_model": "ftheta"}, "camera_model must be one of pinhole, fisheye, ortho, got 'ftheta'"),
         ({"eps2d": 1.5}, "eps2d must be 0 to 1 px.2, got 1.5"),
         ({"render_mode": "N"}, "render_mode must be one of RGB, D"),
-        ({"rasterize_mode": "sharp"}, "rasterize_mode must be"),
         ({"backgrounds": torch.zeros(1, 3, dtype=DOUBLE)}, r"backgrounds must be \(2, 3\), got \(1, 3\)"),
-        ({"backgrounds": torch.zeros(2, 5, dtype=DOUBLE)}, "the background must have 3 values, or one for all, got 5"),
         ({"viewmats": torch.eye(4, dtype=DOUBLE)}, r"viewmats must be \(1, 4, 4\), got \(4, 4\)"),
         (
             {"viewmats": torch.eye(4).repeat(CAMERAS, 1, 1)},
             "viewmats must be torch.float64 like means, got torch.float32",
         ),
         ({"viewmats": torch.zeros(0, 4, 4)}, r"there must be an image to render, got batches and cameras \(0,\)"),
-        ({"absgrad": True, "render_mode": "RGB+D"}, None),
+        ({"means": [[0.0, 0, 1]]}, "means must be a tensor, got list"),
         ({"width": 0}, "width must be a whole number of 1 or more, got 0"),
-        ({"height": -4}, "height must be a whole number of 1 or more, got -4"),
-        ({"width": 16.0}, "width must be a whole number of 1 or more, got 16.0"),
         ({"height": torch.tensor(16.5)}, r"height must be a whole number of 1 or more, got tensor\(16.5"),
         ({"tile_size": 0}, "tile_size must be a whole number of 1 or more, got 0"),
         ({"sh_degree": 2.0}, "sh_degree must be a whole number of 0 or more, got 2.0"),
         ({"means": torch.zeros(3)}, r"means must be \(..., N, 3\), got \(3,\)"),
         ({"colors": None}, r"colors must be \(..., N, D\), got None"),
         ({"backgrounds": torch.zeros(3, dtype=DOUBLE), "packed": False}, r"backgrounds must be \(2, 3\), got \(3,\)"),
-        ({"backgrounds": torch.tensor(0.5)}, r"backgrounds must be \(2,\), got \(\)"),
     ],
 )
 def test_what_is_not_there_is_refused_by_name(options, words):
-    if words is None:
-        assert Inputs(0).draw(**options)[0].shape[-1] == 4
-        return
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises((ValueError, TypeError), match=words):
         Inputs(0).draw(**options)
-
-
-def test_sizes_may_be_tensors_and_packed_images_share_a_background():
-    given = Inputs(0)
-    given.backgrounds = given.backgrounds[:1].expand(CAMERAS, 3)
-    sizes = {"width": torch.tensor(float(WIDTH)), "height": torch.tensor(HEIGHT)}
-    image, _, meta = given.draw(backgrounds=given.backgrounds[0], **sizes)
-    assert torch.equal(image, given.draw()[0]) and type(meta["width"]) is int
-
-
-def test_lists_are_refused_by_name():
-    with pytest.raises(TypeError, match="means must be a tensor, got list"):
-        Inputs(0).draw(means=[[0.0, 0, 1]])
 
 
 def test_strategies_before_1_5_get_one_radius(monkeypatch):

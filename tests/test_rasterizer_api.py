@@ -1,21 +1,13 @@
 """The public interface (CONTRACT.md 6.1): arguments, results, exceptions and their messages."""
 
-import inspect
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 import torch
 from diff_gaussian_rasterization import (
     GaussianRasterizationSettings,
     GaussianRasterizer,
-    Gaussians,
     cpu_deep_copy_tuple,
-    decisive,
-    rasterize,
     rasterize_gaussians,
-    reference,
 )
 from diff_gaussian_rasterization.scene import draw
 from rasterizer_tools import activated, few, keywords, leaves, render, scene_arguments
@@ -64,11 +56,6 @@ def test_shapes_that_the_reference_takes_give_the_same_image(name, shape):
         assert torch.equal(got, wanted)
 
 
-def test_the_compiled_modules_stand_in_is_an_attribute():
-    code = "import diff_gaussian_rasterization as d; d._C.rasterize_gaussians"
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
-
-
 def test_settings_are_the_references_tuple():
     assert GaussianRasterizationSettings._fields[:13] == tuple(NAMES.split())
     # Our fields follow and have defaults, so that the reference's 13 stay valid by position and by name. The last of
@@ -112,21 +99,19 @@ def test_three_results():
     assert all(image.is_contiguous() and image.dtype == torch.float32 for image in (color, inverse_depth))
     assert radii.shape == (3,) and radii.dtype == torch.int32 and not radii.requires_grad
     assert call(splats, camera._replace(inverse_depth=False))[2] is None
+    out = render(splats, camera, raw=False)  # the function
+    assert all(torch.equal(*pair) for pair in zip(result, (out.color, out.radii, out.inverse_depth), strict=True))
     # By place, in the reference's order.
     sh = torch.cat([splats["sh_dc"], splats["sh_rest"]], 1)
     places = (splats["means"], torch.zeros(3, 3), splats["opacities"], sh, None, splats["scales"], splats["rotations"])
     assert torch.equal(GaussianRasterizer(camera)(*places, None)[0], color)
-
-
-def test_the_class_and_the_function_agree():
-    splats, camera = scene()
-    color, radii, inverse_depth = call(splats, camera)
-    out = render(splats, camera, raw=False)
-    assert torch.equal(color, out.color) and torch.equal(radii, out.radii)
-    assert torch.equal(inverse_depth, out.inverse_depth)
-    raw = render(few(3, dtype=torch.float32)[0], camera)
-    # Parameters activated outside in float32, or inside.
-    torch.testing.assert_close(raw.color, out.color, rtol=0, atol=2e-6)
+    # Parameters activated outside in float32, or inside; a power of two changes no bit of a normalised quaternion.
+    raw, _ = few(3, dtype=torch.float32)
+    images = [render(raw | {"rotations": factor * raw["rotations"]}, camera).color for factor in (1, 4)]
+    torch.testing.assert_close(images[0], color, rtol=0, atol=2e-6)
+    assert torch.equal(*images)
+    longer = splats | {"rotations": splats["rotations"] * 1.2}  # these are taken as they are
+    assert not torch.equal(call(longer, camera)[0], color)
 
 
 def test_exactly_one_of_each_pair_of_alternatives():
@@ -159,50 +144,27 @@ def test_no_gaussians_give_the_background(degree):
         assert t.grad.shape == none[name].shape
 
 
-def test_mark_visible():
-    camera = scene()[1]._replace(viewmatrix=torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 1]]))
-    positions = torch.tensor([[0.0, 0, 0], [0, 0, -0.5], [0, 0, -0.9], [99.0, 99, 0], [0, 0, float("nan")]])
-    visible = GaussianRasterizer(camera).markVisible(positions)
-    assert visible.dtype == torch.bool and visible.tolist() == [True, True, False, True, False]
-    assert GaussianRasterizer(camera).markVisible(positions[:0]).shape == (0,)
-
-
-def test_quaternions_are_not_normalised_without_raw():
-    splats, camera = scene(1)
-    double = splats | {"rotations": splats["rotations"] * 1.2}
-    assert not torch.equal(call(double, camera)[0], call(splats, camera)[0])
-    raw, _ = few(1, dtype=torch.float32)
-    # Scaling by a power of two changes no bit of the normalised quaternion.
-    assert torch.equal(render(raw | {"rotations": 4 * raw["rotations"]}, camera).color, render(raw, camera).color)
-
-
 def test_coefficients_beyond_the_degree_are_ignored():
     splats, camera = scene()
     for degree in (0, 1, 2):
-        active = (degree + 1) ** 2 - 1
-        inputs = leaves(splats)
-        out = render(inputs, camera._replace(sh_degree=degree), raw=False)
-        few_bands = splats | {"sh_rest": splats["sh_rest"][:, :active]}
-        assert torch.equal(out.color, render(few_bands, camera._replace(sh_degree=degree), raw=False).color)
-        spoilt = splats | {"sh_rest": splats["sh_rest"].clone()}
-        spoilt["sh_rest"][:, active:] = 0
-        torch.testing.assert_close(out.color, render(spoilt, camera, raw=False).color, rtol=0, atol=1e-6)
-        spoilt["sh_rest"][:, active:] = float("nan")
-        assert torch.equal(out.color, render(spoilt, camera._replace(sh_degree=degree), raw=False).color)
-        out.color.square().sum().backward()
+        active, lower = (degree + 1) ** 2 - 1, camera._replace(sh_degree=degree)
+        images, inputs = [], leaves(splats)
+        inputs["sh_rest"].data[:, active:] = float("nan")
+        for rest in (inputs["sh_rest"], splats["sh_rest"][:, :active]):
+            images.append(render(inputs | {"sh_rest": rest}, lower, raw=False).color)
+        assert torch.equal(*images)
+        zeros = torch.nn.functional.pad(splats["sh_rest"][:, :active], (0, 0, 0, 15 - active))
+        higher = render(splats | {"sh_rest": zeros}, camera, raw=False).color
+        torch.testing.assert_close(images[0], higher, rtol=0, atol=1e-6)
+        images[0].square().sum().backward()
         gradient = inputs["sh_rest"].grad
         assert gradient.shape == (3, 15, 3)
         assert gradient[:, :active].all() and not gradient[:, active:].any()
-
-
-def test_opacities_may_be_a_column_or_a_row():
-    splats, camera = scene()
-    row = splats | {"opacities": splats["opacities"][:, 0].clone().requires_grad_()}
-    column = splats | {"opacities": splats["opacities"].clone().requires_grad_()}
-    for s in (row, column):
-        render(s, camera, raw=False).color.sum().backward()
-    assert row["opacities"].grad.shape == (3,)
-    assert torch.equal(row["opacities"].grad, column["opacities"].grad[:, 0])
+    shs = torch.randn(len(splats["means"]), 25, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    color, wanted = (call(splats, camera._replace(sh_degree=degree), shs=shs)[0] for degree in (4, 3))
+    assert torch.equal(color, wanted)
+    color.sum().backward()
+    assert shs.grad[:, :16].any() and not shs.grad[:, 16:].any()
 
 
 def test_strided_inputs_give_the_same_bits():
@@ -221,15 +183,6 @@ def test_strided_inputs_give_the_same_bits():
     plain = leaves(splats)
     render(plain, camera, raw=False).color.sum().backward()
     assert torch.equal(inputs["means"].grad, plain["means"].grad)
-
-
-def test_a_degree_above_3_counts_as_3():
-    splats, camera = scene()
-    shs = torch.randn(len(splats["means"]), 25, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    color, wanted = (call(splats, camera._replace(sh_degree=degree), shs=shs)[0] for degree in (4, 3))
-    assert torch.equal(color, wanted)
-    color.sum().backward()
-    assert shs.grad[:, :16].any() and not shs.grad[:, 16:].any()
 
 
 def test_the_band_of_degree_0_may_come_apart():
@@ -331,34 +284,16 @@ def test_copies_of_a_tuple_lie_on_the_cpu():
     assert torch.equal(copied[0], tensor) and copied[0].data_ptr() != tensor.data_ptr()
 
 
-@pytest.mark.parametrize("function", [rasterize, decisive, reference.render])
-def test_signatures_list_every_input(function):
-    parameters = inspect.signature(function).parameters
-    assert all(parameter.kind is not parameter.VAR_KEYWORD for parameter in parameters.values())
-    for name in Gaussians._fields:
-        assert name in parameters
-    for name, default in Gaussians._field_defaults.items():
-        assert parameters[name].kind is inspect.Parameter.KEYWORD_ONLY and parameters[name].default is default
-    splats, camera = scene()
-    with pytest.raises(TypeError, match="no_such_input"):
-        render(splats | {"no_such_input": None}, camera, raw=False)
-
-
-@pytest.mark.parametrize("grad", [True, False])
 @pytest.mark.parametrize("as_other", [torch.Tensor.numpy, torch.Tensor.tolist], ids=["array", "list"])
-def test_other_types_than_tensors_are_named(as_other, grad):
+def test_other_types_than_tensors_are_named(as_other):
     splats, camera = scene()
-    kind = "numpy.ndarray" if as_other is torch.Tensor.numpy else "list"
     calls = [(name, lambda n, v: render(splats | {n: v}, camera, torch.zeros(3, 3), raw=False)) for name in splats]
     calls += [(n, lambda n, v: render(splats, camera._replace(**{n: v}), raw=False)) for n in ("viewmatrix", "bg")]
     calls += [(name, lambda n, v: call(splats, camera, **{n: v})) for name in ("means3D", "means2D", "opacities")]
     calls += [("sh", lambda _, v: call(splats, camera, shs=v))]
     for name, function in calls:
-        refused = pytest.raises(TypeError, match=f"^{name} must be a tensor, got {kind}")
-        with torch.set_grad_enabled(grad), refused:
+        with pytest.raises(TypeError, match=f"^{name} must be a tensor, got (numpy.ndarray|list)"):
             function(name, as_other(torch.zeros(3, 3)))
-    with pytest.raises(TypeError, match=f"^means must be a tensor, got {kind}: convert"):
-        decisive(as_other(splats["means"]), splats["opacities"], camera)
 
 
 def test_one_gradient_alone_is_that_among_all():
@@ -369,6 +304,9 @@ def test_one_gradient_alone_is_that_among_all():
         inputs = splats | {name: splats[name].clone().requires_grad_()}
         render(inputs, camera, raw=False).color.sum().backward()
         assert torch.equal(inputs[name].grad, everything[name].grad)
+    row = splats["opacities"][:, 0].clone().requires_grad_()
+    render(splats | {"opacities": row}, camera, raw=False).color.sum().backward()
+    assert torch.equal(row.grad, everything["opacities"].grad[:, 0])
     grad = torch.func.grad(lambda t: render(splats | {"means": t}, camera, raw=False).color.sum())(splats["means"])
     assert torch.equal(grad, everything["means"].grad)
 
@@ -406,68 +344,54 @@ def test_a_backward_that_has_nothing_to_go_on_says_what_is_wrong():
         (debugged.sum() * float("inf")).backward()
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "error", "message"),
-    [
-        ("means", torch.zeros(3, 2), ValueError, r"means must be \(N, 3\), got \(3, 2\)"),
-        ("means", torch.zeros(3, 3, dtype=torch.float16), TypeError, "float32 or float64.*float16"),
-        ("means", torch.zeros(3, 3, dtype=torch.int64), TypeError, "float32 or float64.*int64"),
-        ("opacities", torch.zeros(2, 1), ValueError, r"opacities must be \(3, 1\).*got \(2, 1\)"),
-        ("scales", torch.zeros(3, 1), ValueError, r"scales must be \(3, 3\) \(activated.*\), got \(3, 1\)"),
-        ("rotations", torch.zeros(3, 3), ValueError, r"rotations must be \(3, 4\), got \(3, 3\)"),
-        ("sh_dc", torch.zeros(3, 3), ValueError, r"sh_dc must be \(3, 1, 3\), got \(3, 3\)"),
-        ("sh_rest", torch.zeros(3, 8, 3), ValueError, r"15 or more, 3\) for sh_degree 3, got \(3, 8, 3\)"),
-        ("sh_rest", torch.zeros(2, 15, 3), ValueError, r"sh_rest must be \(3"),
-        ("sh_dc", torch.zeros(3, 1, 3, dtype=torch.float64), TypeError, "sh_dc must be torch.float32.*float64"),
-        ("scales", None, ValueError, "give scales and rotations, or cov3d"),
-        ("sh_rest", None, ValueError, "give sh_dc and sh_rest, or colors"),
-        ("colors", torch.zeros(3, 3), ValueError, "give sh_dc and sh_rest, or colors"),
-        ("cov3d", torch.zeros(3, 6), ValueError, "give scales and rotations, or cov3d"),
-        ("opacities", None, TypeError, "opacities must be a tensor, got None"),
-    ],
-)
-def test_wrong_inputs_are_named(name, value, error, message):
+WRONG = [
+    ("means", torch.zeros(3, 2), r"means must be \(N, 3\), got \(3, 2\)"),
+    ("means", torch.zeros(3, 3, dtype=torch.float16), "float32 or float64.*float16"),
+    ("opacities", torch.zeros(2, 1), r"opacities must be \(3, 1\).*got \(2, 1\)"),
+    ("scales", torch.zeros(3, 1), r"scales must be \(3, 3\) \(activated.*\), got \(3, 1\)"),
+    ("rotations", torch.zeros(3, 3), r"rotations must be \(3, 4\), got \(3, 3\)"),
+    ("sh_dc", torch.zeros(3, 3), r"sh_dc must be \(3, 1, 3\), got \(3, 3\)"),
+    ("sh_rest", torch.zeros(3, 8, 3), r"15 or more, 3\) for sh_degree 3, got \(3, 8, 3\)"),
+    ("sh_rest", torch.zeros(2, 15, 3), r"sh_rest must be \(3"),
+    ("sh_dc", torch.zeros(3, 1, 3, dtype=torch.float64), "sh_dc must be torch.float32.*float64"),
+    ("scales", None, "give scales and rotations, or cov3d"),
+    ("sh_rest", None, "give sh_dc and sh_rest, or colors"),
+    ("colors", torch.zeros(3, 3), "give sh_dc and sh_rest, or colors"),
+    ("cov3d", torch.zeros(3, 6), "give scales and rotations, or cov3d"),
+    ("opacities", None, "opacities must be a tensor, got None"),
+    ("sh_degree", -1, "sh_degree must be 0 to 3, got -1"),
+    ("image_width", 0, "image size 0x7 is out of range"),
+    ("image_height", -1, "image size 18x-1 is out of range"),
+    ("viewmatrix", torch.eye(3), r"view must be \(4, 4\), got \(3, 3\)"),
+    ("projmatrix", torch.eye(4).bfloat16(), "projection must be float32 or float64, got torch.bfloat16"),
+    ("viewmatrix", None, "view must be a tensor, got None"),
+    ("campos", torch.zeros(3, dtype=torch.int64), "center must be float32 or float64, got torch.int64"),
+    ("bg", torch.zeros(1), r"background must be \(3,\), got \(1,\)"),
+    ("bg", torch.zeros(3).half(), "background must be float32 or float64, got torch.float16"),
+    ("tanfovx", -1.0, "tan_x must be the tangent of half an angle of view, got -1"),
+    ("tanfovy", float("nan"), "tan_y must be the tangent of half an angle of view, got nan"),
+    ("tanfovx", float("inf"), "tan_x must be the tangent"),
+    ("scale_modifier", float("nan"), "scale_modifier must be finite, got nan"),
+    *(("shs", shs, r"shs must be \(N, K, 3\), got ") for shs in (torch.zeros(()), torch.zeros(3), torch.zeros(3, 3))),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "message"), WRONG)
+def test_wrong_inputs_and_settings_are_named(name, value, message):
     splats, camera = scene()
-    with pytest.raises(error, match=message):
-        render(splats | {name: value}, camera, torch.zeros(3, 3), raw=False)
-    if name == "scales":
-        with pytest.raises(error, match="logarithms" if value is not None else message):
+    with pytest.raises((ValueError, TypeError, RuntimeError), match=message):
+        if name == "shs":
+            call(splats, camera, shs=value)
+        elif name in camera._fields:
+            render(splats, camera._replace(**{name: value}), raw=False)
+        else:
+            render(splats | {name: value}, camera, torch.zeros(3, 3), raw=False)
+    if name == "scales" and value is not None:
+        with pytest.raises(ValueError, match="logarithms"):
             render(few(dtype=torch.float32)[0] | {name: value}, camera, torch.zeros(3, 3))
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"sh_degree": -1}, "sh_degree must be 0 to 3, got -1"),
-        ({"image_width": 0}, "image size 0x7 is out of range"),
-        ({"image_height": -1}, "image size 18x-1 is out of range"),
-        ({"viewmatrix": torch.eye(3)}, r"view must be \(4, 4\), got \(3, 3\)"),
-        ({"projmatrix": torch.eye(4).bfloat16()}, "projection must be float32 or float64, got torch.bfloat16"),
-        ({"viewmatrix": None}, "view must be a tensor, got None"),
-        ({"campos": torch.zeros(3, dtype=torch.int64)}, "center must be float32 or float64, got torch.int64"),
-        ({"bg": torch.zeros(1)}, r"background must be \(3,\), got \(1,\)"),
-        ({"bg": torch.zeros(3).half()}, "background must be float32 or float64, got torch.float16"),
-        ({"tanfovx": -1.0}, "tan_x must be the tangent of half an angle of view, got -1"),
-        ({"tanfovy": float("nan")}, "tan_y must be the tangent of half an angle of view, got nan"),
-        ({"tanfovx": float("inf")}, "tan_x must be the tangent"),
-        ({"scale_modifier": float("nan")}, "scale_modifier must be finite, got nan"),
-    ],
-)
-def test_wrong_settings_are_named(changes, message):
-    splats, camera = scene()
-    with pytest.raises((ValueError, TypeError, RuntimeError), match=message):
-        render(splats, camera._replace(**changes), raw=False)
-
-
-@pytest.mark.parametrize("shs", [torch.zeros(()), torch.zeros(3), torch.zeros(3, 3)])
-def test_coefficients_of_another_rank_are_named(shs):
-    splats, camera = scene()
-    with pytest.raises(ValueError, match=r"shs must be \(N, K, 3\), got "):
-        call(splats, camera, shs=shs)
-
-
-@pytest.mark.parametrize(("backend", "fullgraph"), [("eager", False), ("aot_eager", True)])
-def test_torch_compile_gives_the_same_gradients(backend, fullgraph, recwarn):
+def test_torch_compile_gives_the_same_gradients(recwarn):
     splats, camera = scene()
 
     def loss(**inputs: torch.Tensor) -> torch.Tensor:
@@ -476,7 +400,7 @@ def test_torch_compile_gives_the_same_gradients(backend, fullgraph, recwarn):
     expected, compiled = leaves(splats), leaves(splats)
     loss(**expected).backward()
     torch._dynamo.reset()
-    torch.compile(loss, backend=backend, fullgraph=fullgraph)(**compiled).backward()
+    torch.compile(loss, backend="aot_eager", fullgraph=True)(**compiled).backward()
     assert not any("Dynamo" in str(warning.message) for warning in recwarn)
     for name, values in expected.items():
         assert torch.equal(compiled[name].grad, values.grad), name

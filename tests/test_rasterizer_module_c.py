@@ -1,5 +1,7 @@
 """diff_gaussian_rasterization._C: the functions of the reference's compiled module, against the public ones."""
 
+import itertools
+
 import pytest
 import torch
 from diff_gaussian_rasterization import _C, GaussianRasterizer, optim
@@ -35,29 +37,12 @@ def scene(colors: bool, covariances: bool, device: str = "cpu", **changes):
 
 def forward_arguments(inputs, camera) -> tuple:
     """In the order of the 2024 release."""
-    tensors = {name: values.detach() for name, values in inputs.items()}
-    return (
-        camera.bg,
-        tensors["means3D"],
-        tensors.get("colors_precomp", EMPTY),
-        tensors["opacities"],
-        tensors.get("scales", EMPTY),
-        tensors.get("rotations", EMPTY),
-        camera.scale_modifier,
-        tensors.get("cov3D_precomp", EMPTY),
-        camera.viewmatrix,
-        camera.projmatrix,
-        camera.tanfovx,
-        camera.tanfovy,
-        camera.image_height,
-        camera.image_width,
-        tensors.get("shs", EMPTY),
-        camera.sh_degree,
-        camera.campos,
-        camera.prefiltered,
-        camera.antialiasing,
-        camera.debug,
-    )
+    of = {name: values.detach() for name, values in inputs.items()}.get
+    shape = of("scales", EMPTY), of("rotations", EMPTY), camera.scale_modifier, of("cov3D_precomp", EMPTY)
+    matrices = camera.viewmatrix, camera.projmatrix, camera.tanfovx, camera.tanfovy
+    size, rest = (camera.image_height, camera.image_width), (camera.prefiltered, camera.antialiasing, camera.debug)
+    colors, harmonics = (of("colors_precomp", EMPTY), of("opacities")), (camera.sh_degree, camera.campos)
+    return camera.bg, of("means3D"), *colors, *shape, *matrices, *size, of("shs", EMPTY), *harmonics, *rest
 
 
 def backward(given: tuple, count: int, radii: Tensor, buffers: list, *gradients: Tensor) -> tuple:
@@ -67,8 +52,7 @@ def backward(given: tuple, count: int, radii: Tensor, buffers: list, *gradients:
 
 
 @CPU_AND_GPU
-@pytest.mark.parametrize("antialiasing", [False, True])
-@pytest.mark.parametrize(("colors", "covariances"), [(False, False), (True, True), (False, True)])
+@pytest.mark.parametrize(("colors", "covariances", "antialiasing"), list(itertools.product((False, True), repeat=3)))
 def test_forward_and_backward_are_those_of_the_class(colors, covariances, antialiasing, device):
     inputs, camera = scene(colors, covariances, device, antialiasing=antialiasing)
     wanted = GaussianRasterizer(camera)(**inputs)
@@ -135,11 +119,15 @@ def test_buffers_of_another_rendering_are_refused():
             backward(given, count, radii, wrong, color, depth)
 
 
-def test_mark_visible_takes_both_matrices():
-    inputs, camera = scene(False, False)
-    visible = _C.mark_visible(inputs["means3D"], camera.viewmatrix, camera.projmatrix)
-    assert torch.equal(visible, GaussianRasterizer(camera).markVisible(inputs["means3D"]))
-    assert visible.any() and visible.dtype == torch.bool
+def test_mark_visible():
+    view = torch.eye(4)
+    view[3, 2] = 1.0
+    camera = scene(False, False)[1]._replace(viewmatrix=view)
+    positions = torch.tensor([[0.0, 0, 0], [0, 0, -0.5], [0, 0, -0.9], [99.0, 99, 0], [0, 0, float("nan")]])
+    visible = GaussianRasterizer(camera).markVisible(positions)
+    assert visible.dtype == torch.bool and visible.tolist() == [True, True, False, True, False]
+    assert GaussianRasterizer(camera).markVisible(positions[:0]).shape == (0,)
+    assert torch.equal(_C.mark_visible(positions, view, camera.projmatrix), visible)
 
 
 def test_a_step_of_adam():
