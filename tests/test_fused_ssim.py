@@ -10,9 +10,7 @@ from torch import Tensor
 
 EPS = {torch.float32: 2**-24, torch.float64: 2**-53}
 LARGEST_SLOPE = 2 / 0.03**2  # of SSIM over a covariance; multiplies an error of the inputs or of the oracle
-both_dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 on_a_gpu = pytest.mark.parametrize("device", [pytest.param("cuda", marks=GPU_MARKS)])
-both_paddings = pytest.mark.parametrize("padding", allowed_padding)
 
 
 def image_pair(name: str, shape: tuple[int, ...] = (3, 40, 47), dtype: torch.dtype = torch.float64) -> list[Tensor]:
@@ -103,7 +101,7 @@ def test_agrees_with_the_cpu(shape: tuple[int, ...], as_bytes: bool, device: str
         assert (results[2] - wanted[2]).abs().max() <= 40 * EPS[torch.float32] * wanted[2].abs().max()
 
 
-@pytest.mark.parametrize("name", ["noise", "unrelated", "salt on white"])
+@pytest.mark.parametrize("name", ["noise", "salt on white"])
 def test_agrees_with_scikit_image(name: str) -> None:
     img1, img2 = image_pair(name)
     wanted, full = structural_similarity(
@@ -135,15 +133,6 @@ def test_l1_gradient_is_torchs(device: str) -> None:
     # We round 1/n once from double; torch computes it in float.
     torch.testing.assert_close(gradients[0], gradients[1], rtol=2 * EPS[torch.float32], atol=0)
     assert not gradients[0][:, 3:9].any()
-
-
-def test_gradients_of_both_add_up() -> None:
-    img1, img2 = image_pair("noise")
-    x = img1.clone().requires_grad_()
-    l1, ssim = fused_l1_ssim(x, img2)
-    both = torch.autograd.grad(0.8 * l1 + 0.2 * (1 - ssim), x, retain_graph=True)[0]
-    one, other = (torch.autograd.grad(y, x, retain_graph=True)[0] for y in (l1, ssim))
-    torch.testing.assert_close(both, 0.8 * one - 0.2 * other, rtol=0, atol=1e-15 * float(both.abs().max()))
 
 
 def loss_in_parts(image: Tensor, target: Tensor, weight: float, clamp: bool = True) -> tuple[Tensor, Tensor]:
@@ -200,20 +189,13 @@ def test_photometric_loss_keeps_nothing_it_does_not_need() -> None:
     assert trained == loss and trained_l1 == l1
 
 
-def test_a_nan_shows_in_the_photometric_loss() -> None:
-    image, target = out_of_range(torch.float32)
-    image[1, 20, 20] = float("nan")
-    assert fused_photometric_loss(image, target, 0.2)[0].isnan()
-
-
-@both_dtypes
-@both_paddings
-def test_bytes_are_their_value_over_255(padding: str, dtype: torch.dtype) -> None:
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_bytes_are_their_value_over_255(dtype: torch.dtype) -> None:
     img1 = image_pair("noise", (3, 16, 17), dtype)[0].requires_grad_()
     bytes2 = (torch.arange(img1.numel()) % 256).to(torch.uint8).reshape(img1.shape)  # every value
     results = []
     for img2 in (bytes2, bytes2.to(dtype) / 255):
-        l1, ssim = fused_l1_ssim(img1, img2, padding)
+        l1, ssim = fused_l1_ssim(img1, img2)
         results.append([l1, ssim, torch.autograd.grad(l1 + ssim, img1)[0]])
     for one, other in zip(*results, strict=True):
         assert torch.equal(one, other)
@@ -289,29 +271,27 @@ def test_does_not_wait_for_the_gpu(device: str) -> None:
 def test_a_pixel_that_is_not_finite_shows(value: float, device: str) -> None:
     img1, img2 = image_pair("noise", dtype=torch.float32)
     img1[1, 39, 46] = value
-    l1, ssim = fused_l1_ssim(img1.to(device), img2.to(device))
+    img1, img2 = img1.to(device), img2.to(device)
+    l1, ssim = fused_l1_ssim(img1, img2)
     assert not l1.isfinite() and ssim.isnan()
+    assert not fused_photometric_loss(img1, img2, 0.2, False)[0].isfinite()
+    assert fused_photometric_loss(img1, img2, 0.2)[0].isnan() == (value != value)  # the clamp makes 1 of infinity
 
 
-def test_only_img1_has_a_gradient_and_only_when_wanted() -> None:
-    img1, img2 = image_pair("noise")
+@CPU_AND_GPU
+def test_only_img1_has_a_gradient_and_only_when_wanted(device: str) -> None:
+    img1, img2 = (image.to(device) for image in image_pair("noise", (3, 201, 300), torch.float32))
+    plain = [fused_l1_ssim(img1, img2, padding) for padding in allowed_padding]
+    assert plain[0][1] != plain[1][1]
+    assert torch.ops.fused_ssim.l1_ssim(img1, img2, False, False)[2].numel() == 0
     img1.requires_grad_(), img2.requires_grad_()
+    assert [fused_l1_ssim(img1, img2, padding) for padding in allowed_padding] == plain
     assert not fused_ssim(img1, img2, train=False).requires_grad
     with torch.no_grad():
         assert not fused_ssim(img1, img2).requires_grad
     assert not fused_ssim(img1.detach(), img2).requires_grad
     fused_ssim(img1, img2).backward()
     assert img1.grad is not None and img2.grad is None
-
-
-@CPU_AND_GPU
-def test_the_value_is_the_same_with_and_without_a_gradient(device: str) -> None:
-    img1, img2 = (image.to(device) for image in image_pair("noise", (3, 201, 300), torch.float32))
-    for padding in ("same", "valid"):
-        plain = fused_l1_ssim(img1, img2, padding)
-        trained = fused_l1_ssim(img1.clone().requires_grad_(), img2, padding)
-        assert plain[0] == trained[0] and plain[1] == trained[1]
-    assert torch.ops.fused_ssim.l1_ssim(img1, img2, False, False)[2].numel() == 0
 
 
 IMAGE = torch.zeros(3, 20, 20)
@@ -352,17 +332,9 @@ def test_messages_of_a_gpu(device: str) -> None:
             torch.ops.fused_ssim.l1_ssim_vjp(image, image, maps, gradient, gradient)
 
 
-def test_the_paddings_have_a_name() -> None:
-    assert allowed_padding == ["same", "valid"]
-    pair = image_pair("noise")
-    assert len({fused_ssim(*pair, padding).item() for padding in allowed_padding}) == 2
-
-
 _LOSSES = {
     "both means": lambda one, two: sum(fused_l1_ssim(one, two)),
-    "fused_ssim": lambda one, two: fused_ssim(one, two),
     "photometric": lambda one, two: fused_photometric_loss(one, two, 0.2)[0],
-    "operator": lambda one, two: torch.ops.fused_ssim.photometric(one, two, 0.2, True)[0],
 }
 
 
