@@ -2,12 +2,10 @@
 
 import platform
 import shutil
-import subprocess
-import sys
 import time
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
-import numpy as np
 import pytest
 import simple_knn
 import torch
@@ -83,14 +81,6 @@ def test_small_clouds_agree_with_all_pairs(count: int, dtype: torch.dtype, devic
     torch.testing.assert_close(distances(points, device).double(), mean_distance2(points), rtol=RTOL[dtype], atol=0)
 
 
-@CPU_AND_GPU
-def test_tiny_clouds_by_hand(device: str) -> None:
-    points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 3, 0], [0, 0, 0]])
-    for count, wanted in ((1, [0]), (2, [1, 1]), (3, [5, 5.5, 9.5])):
-        assert distances(points[:count], device).tolist() == wanted
-    torch.testing.assert_close(distances(points, device), torch.tensor([10 / 3, 4, 28 / 3, 10 / 3]))
-
-
 @given(
     st.lists(
         st.tuples(*[st.sampled_from([0.0, 1.0, -2.0, 0.5, 1e-3, 7e4, float("nan"), float("inf")])] * 3), max_size=40
@@ -125,21 +115,14 @@ def test_overflow_stays_finite(device: str) -> None:
 
 
 @CPU_AND_GPU
-def test_order_of_points_does_not_matter(device: str) -> None:
+def test_order_and_strides_of_points_do_not_matter(device: str) -> None:
     points = torch.cat([cloud("normal"), cloud("duplicates"), cloud("outliers")]).to(device)
     wanted = distCUDA2(points)
     for seed in range(10 if device == "cuda" else 1):
         order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed)).to(device)
         assert torch.equal(distCUDA2(points), wanted)
         assert torch.equal(distCUDA2(points[order]), wanted[order])
-
-
-@CPU_AND_GPU
-def test_not_contiguous(device: str) -> None:
-    points = cloud("normal").to(device)
-    wanted = distCUDA2(points)
-    assert torch.equal(distCUDA2(points.T.contiguous().T), wanted)
-    assert torch.equal(distCUDA2(torch.cat([points, points], 1)[:, :3]), wanted)
+    assert torch.equal(distCUDA2(points.T.contiguous().T), wanted)  # of any strides
 
 
 def test_large_cloud_is_not_quadratic() -> None:
@@ -183,10 +166,6 @@ def test_runs_on_the_current_stream(device: str) -> None:
     assert torch.equal(got, wanted)
 
 
-def test_has_no_gradient() -> None:
-    assert not distCUDA2(torch.zeros(4, 3, requires_grad=True)).requires_grad
-
-
 @CPU_AND_GPU
 def test_messages(device: str) -> None:
     for shape, shown in (((5, 2), r"\(5, 2\)"), ((3,), r"\(3,\)")):
@@ -202,20 +181,14 @@ def test_messages(device: str) -> None:
         torch.ops.simple_knn.mean_distance2(torch.zeros(5, 3, device=device, dtype=torch.float16))
 
 
-def test_numpy_double_reference_is_itself_right() -> None:
-    points = cloud("normal")[:100]
-    np.testing.assert_allclose(mean_distance2(points), by_scipy(points), rtol=1e-14)
-
-
 @pytest.mark.parametrize(("library", "what"), [(None, "is not built"), (b"not a library", "does not fit torch 2")])
 def test_unusable_library_ends_in_the_remedy(library: bytes | None, what: str, tmp_path: Path) -> None:
-    package = tmp_path / "simple_knn"
-    package.mkdir()
-    for name in ("__init__.py", "backend.py", "ops.py", "_C.py"):
-        shutil.copy(Path(simple_knn.__file__).with_name(name), package)
+    shutil.copy(Path(simple_knn.__file__).with_name("backend.py"), tmp_path)
     if library:
-        (package / "_backend.so").write_bytes(library)
-    done = subprocess.run([sys.executable, "-c", "import simple_knn._C"], cwd=tmp_path, capture_output=True, text=True)
-    last = done.stderr.splitlines()[-1]
-    assert last.startswith(f"ImportError: simple_knn {what}")
-    assert last.endswith("run `pip install ./submodules/simple-knn` in the repository")
+        (tmp_path / "_backend.so").write_bytes(library)
+    found = spec_from_file_location("simple_knn.backend", tmp_path / "backend.py")
+    with pytest.raises(ImportError) as error:
+        found.loader.exec_module(module_from_spec(found))
+    said = str(error.value)
+    assert said.startswith(f"simple_knn {what}")
+    assert said.endswith("run `pip install ./submodules/simple-knn` in the repository")

@@ -1,56 +1,18 @@
-"""Sparse Adam: the kernel against the formula in double, and the Gaussians of a model that take a step."""
+"""Sparse Adam: the Gaussians of a model that take a step, and the class that the package has for other programs."""
+
+import io
 
 import pytest
 import torch
-from diff_gaussian_rasterization.optim import sparse_adam_
+from diff_gaussian_rasterization import SparseGaussianAdam
 from gaussians import GROUPS, model, moments, options, parameters, take_steps
+from torch import Tensor
 
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.adam import SparseGaussianAdam as OfTheModel
 
-RATE, BETAS, EPS = 0.01, (0.9, 0.999), 1e-15
-
-
-def _formula(value, gradient, mean, square, seen) -> None:
-    """Do one step in double on the rows seen, with Adam's moments and no bias correction."""
-    mean[seen] = BETAS[0] * mean[seen] + (1 - BETAS[0]) * gradient[seen]
-    square[seen] = BETAS[1] * square[seen] + (1 - BETAS[1]) * gradient[seen] ** 2
-    value[seen] -= RATE * mean[seen] / (square[seen].sqrt() + EPS)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
-@pytest.mark.parametrize("shape", [(300, 3), (300, 1), (300, 15, 3)])
-def test_it_is_the_formula_and_leaves_unseen_rows_alone(shape, dtype):
-    generator = torch.Generator().manual_seed(0)
-    start = torch.randn(shape, generator=generator, dtype=torch.float64).to(dtype)
-    ours = [start.clone(), torch.zeros_like(start), torch.zeros_like(start)]
-    exact = [t.double() for t in ours]
-    never = torch.arange(300) % 7 == 0
-    for _ in range(20):
-        gradient = torch.randn(shape, generator=generator, dtype=torch.float64).to(dtype)
-        seen = (torch.rand(300, generator=generator) < 0.5) & ~never
-        before = [t.clone() for t in ours]
-        sparse_adam_(ours[0], gradient, *ours[1:], seen, RATE, *BETAS, EPS)
-        _formula(exact[0], gradient.double(), *exact[1:], seen)
-        for old, new in zip(before, ours, strict=True):
-            assert torch.equal(old[~seen], new[~seen])
-    assert torch.equal(ours[0][never], start[never]) and (ours[0] - start).abs().max() > 5 * RATE
-    unit = torch.finfo(dtype).eps
-    # Twenty steps of up to 0.1, each exact to some units of values of 4. Uncorrected m / sqrt(v) is at first up to 3.2.
-    torch.testing.assert_close(ours[0].double(), exact[0], rtol=0, atol=40 * unit * (4 + 20 * 3.2 * RATE))
-    for got, wanted in zip(ours[1:], exact[1:], strict=True):
-        torch.testing.assert_close(got.double(), wanted, rtol=0, atol=40 * unit * wanted.abs().max().item())
-
-
-@pytest.mark.parametrize("columns", [0, 9])
-def test_columns_left_out_are_not_touched(columns):
-    generator = torch.Generator().manual_seed(1)
-    state = [torch.randn(50, 45, generator=generator), torch.zeros(50, 45), torch.zeros(50, 45)]
-    before = [t.clone() for t in state]
-    gradient, seen = torch.randn(50, 45, generator=generator), torch.arange(50) % 2 == 0
-    sparse_adam_(state[0], gradient, *state[1:], seen, RATE, *BETAS, EPS, columns)
-    for old, new in zip(before, state, strict=True):
-        assert torch.equal(old[:, columns:], new[:, columns:]) and torch.equal(old[~seen], new[~seen])
-        assert columns == 0 or (old[seen, :columns] != new[seen, :columns]).all()
+RATES = {"xyz": 0.01, "f_dc": 0.0025, "f_rest": 0.000125}
+SHAPES = {"xyz": (40, 3), "f_dc": (40, 1, 3), "f_rest": (40, 15, 3)}
 
 
 def _give_gradients(gaussians: GaussianModel, seed: int) -> None:
@@ -89,3 +51,91 @@ def test_density_control_and_checkpoints_are_the_dense_optimisers():
     dense.restore(gaussians.capture(), options())
     take_steps(dense, 1)
     assert moments(dense)["xyz"]["step"] == 2
+
+
+def groups() -> list[dict]:
+    generator = torch.Generator().manual_seed(0)
+    return [
+        {"params": [torch.nn.Parameter(torch.randn(shape, generator=generator))], "lr": RATES[name], "name": name}
+        for name, shape in SHAPES.items()
+    ]
+
+
+def give_gradients(optimizer: torch.optim.Optimizer, seed: int) -> Tensor:
+    """Sets gradients and returns the rows that are visible."""
+    generator = torch.Generator().manual_seed(seed)
+    for group in optimizer.param_groups:
+        group["params"][0].grad = torch.randn(group["params"][0].shape, generator=generator)
+    return torch.rand(40, generator=generator) < 0.5
+
+
+def values(optimizer: torch.optim.Optimizer) -> list[Tensor]:
+    params = [group["params"][0] for group in optimizer.param_groups]
+    return [t.detach().clone() for p in params for t in (p, *optimizer.state[p].values())]
+
+
+def column_major(tensor: Tensor) -> Tensor:
+    return tensor.mT.contiguous().mT
+
+
+@pytest.mark.parametrize("kind", [SparseGaussianAdam, OfTheModel])
+@pytest.mark.parametrize("what", ["nothing", "parameters", "gradients", "visible", "loaded averages"])
+def test_steps_are_those_of_the_models_optimiser_whatever_the_strides(kind, what):
+    plain, odd = OfTheModel(groups()), kind(groups(), lr=0.0, eps=1e-15) if kind is not OfTheModel else kind(groups())
+    start, params = values(plain), [group["params"][0] for group in odd.param_groups]
+    if what == "parameters":  # of (N, 3) points, as the reference's reader makes them; before or after the first step
+        for param in params:
+            param.data = column_major(param.data)
+    for seed in range(3):
+        visible = give_gradients(plain, seed)
+        give_gradients(odd, seed)
+        if what == "gradients":
+            for param in params:
+                param.grad = column_major(param.grad)
+        elif what == "loaded averages" and seed:
+            state = odd.state_dict()
+            for of_one in state["state"].values():
+                of_one |= {name: column_major(of_one[name]) for name in ("exp_avg", "exp_avg_sq")}
+            odd.load_state_dict(state)
+        plain.step(visible)
+        count = (len(visible),) if kind is SparseGaussianAdam and seed else ()
+        odd.step(torch.stack([visible] * 2, 1)[:, 0] if what == "visible" else visible, *count)
+        for got, wanted in zip(values(odd), values(plain), strict=True):
+            assert torch.equal(got, wanted)
+    assert not torch.equal(start[0], values(odd)[0])
+    assert all(param is group["params"][0] for param, group in zip(params, odd.param_groups, strict=True))
+
+
+def test_it_is_an_adam_of_torch():
+    optimizer = SparseGaussianAdam(groups(), 0.0, 1e-15)
+    assert isinstance(optimizer, torch.optim.Adam)
+    assert [group["lr"] for group in optimizer.param_groups] == list(RATES.values())
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.5)
+    visible = give_gradients(optimizer, 0)
+    optimizer.step(visible)
+    schedule.step()
+    assert optimizer.param_groups[0]["lr"] == pytest.approx(RATES["xyz"] / 2)
+    file = io.BytesIO()
+    torch.save(optimizer.state_dict(), file)
+    file.seek(0)
+    again = SparseGaussianAdam(groups(), 0.0, 1e-15)
+    again.load_state_dict(torch.load(file, weights_only=True))
+    for group, other in zip(again.param_groups, optimizer.param_groups, strict=True):
+        other_state = optimizer.state[other["params"][0]]
+        for name, value in again.state[group["params"][0]].items():
+            assert torch.equal(value, other_state[name])
+
+
+def test_parameters_without_a_gradient_keep_their_values():
+    optimizer = SparseGaussianAdam(groups(), 0.0, 1e-15)
+    optimizer.step(give_gradients(optimizer, 0))
+    before = values(optimizer)
+    optimizer.zero_grad(set_to_none=True)
+    optimizer.step(torch.ones(7, dtype=torch.bool), 7)  # rows of before a densification; nobody reads them
+    assert all(torch.equal(*pair) for pair in zip(values(optimizer), before, strict=True))
+
+
+def test_several_parameters_in_a_group_are_refused():
+    params = [torch.nn.Parameter(torch.zeros(4, 3)) for _ in range(2)]
+    with pytest.raises(ValueError, match="one parameter in each group, got 2"):
+        SparseGaussianAdam(params, lr=0.1, eps=1e-15).step(torch.ones(4, dtype=torch.bool))
