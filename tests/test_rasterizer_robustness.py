@@ -1,18 +1,22 @@
-"""Poison in one Gaussian: nothing crashes, no other Gaussian changes, and values not finite get zero gradients."""
+"""Poison in one Gaussian: nothing crashes, no other Gaussian changes, and values not finite get zero gradients.
+
+`python -m tests.fuzz` draws poison at random, in several places at once.
+"""
 
 import math
 
 import pytest
 import torch
-from rasterizer_tools import CPU_AND_GPU, activated, gradients, pick
+from rasterizer_tools import CPU_AND_GPU, activated, gradients, pick, render
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import ordinary, settings
+from benchmarks.workloads.splat_scenes import KINDS, ordinary, settings
 
 N, VICTIM, SIZE = 40, 17, (75, 53)
 NOT_FINITE = [math.nan, math.inf, -math.inf]
 # Values near thresholds, values whose squares or cubes overflow float, and values that vanish in it.
-EXTREME = [3.4e38, -3.4e38, 1e20, -1e20, 1e10, -1e10, 1e-20, 1e-38, 1e-45, 0.0, 0.2, 16.0, 1e4, 30.0, -50.0, 50.0]
+EXTREME = [3.4e38, -3.4e38, 1e20, -1e20, 1e10, -1e10, 1e-20, 1e-38, -1e-45, 0.0, 1 / 255, 0.2, 0.99, 1.3, 16.0, 1e4]
+EXTREME += [1e7, 30.0, -50.0, 50.0, 88.0, -104.0]
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +80,21 @@ def test_extreme_finite_values_leave_everything_finite(raw, name, camera, device
         for whole_row in (False, True):
             for key, t in gradients(poisoned(parameters, name, value, whole_row), camera, device, raw=raw).items():
                 assert t.isfinite().all(), (key, value)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_weights_sum_to_one_and_the_order_of_gaussians_does_not_matter(kind):
+    parameters = {name: t.float() for name, t in KINDS[kind](N, *SIZE).parameters.items()}
+    parameters["means"][::7, 2] = torch.tensor([1e-20, 3.4e38, -1e20, 0.2, math.nan, math.inf])[: -(-N // 7)]
+    black = settings(*SIZE, torch.float32, bg=torch.zeros(3))
+    order = torch.randperm(N, generator=torch.Generator().manual_seed(0))
+    got, permuted = (gradients(p, black) for p in (parameters, pick(parameters, order)))
+    for name, t in permuted.items():
+        assert torch.equal(t, got[name][order] if len(t) == N else got[name]), name
+    white = {name: t for name, t in parameters.items() if not name.startswith("sh")} | {"colors": torch.ones(N, 3)}
+    out = render(white, black)
+    assert out.color.min() >= 0  # and the sums of rounded products are 1
+    torch.testing.assert_close(out.color + out.transmittance, torch.ones(3, *SIZE[::-1]), rtol=0, atol=3e-6)
 
 
 # Powers of two, whose products are exact; their squares exceed float32's range.

@@ -9,10 +9,9 @@ import torch
 from diff_gaussian_rasterization import reference
 from rasterizer_tools import gradients, leaves, one_splat, render
 
-from benchmarks.accuracy import stability, stability_figure
+from benchmarks.accuracy import stability
 from benchmarks.accuracy.runs import CPU_FLOAT, TEXTBOOK, kernels
 from benchmarks.accuracy.stability import Judged, beyond
-from benchmarks.accuracy.stability_figure import SWEEPS
 from benchmarks.workloads.splat_scenes import settings
 from benchmarks.workloads.stability_cases import CASES, Case, long_needles
 
@@ -76,7 +75,7 @@ def test_the_oracle_itself_on_needles_a_million_pixels_long():
     torch.testing.assert_close(inputs["scales"].grad[0], slopes, rtol=0, atol=1e-8 * float(slopes.abs().max()))
 
 
-@pytest.mark.parametrize("scale", [1e-10, 1e-14, 1e-18, 1e-25])
+@pytest.mark.parametrize("scale", [1e-10, 1e-25])
 def test_the_oracle_itself_on_tiny_scales(scale):
     """Far below the dilation, alpha at a pixel hangs on the covariance C linearly: dC = 2 s (J R)(J R)^T ds."""
     parameters = one_splat(0.02, -0.01, scale=scale, opacity=0.9)
@@ -138,29 +137,14 @@ def test_at_most_2350_splats_blend_on_a_pixel():
     assert 2000 < blended <= 2350
 
 
-def test_the_benchmark_prints_its_tables_and_a_verdict(monkeypatch, capsys):
+def test_the_benchmark_prints_its_verdict_which_fails_where_a_bound_is_passed(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["stability.py", "--only", "17 x 31"])
     stability.main()
-    printed = capsys.readouterr().out
-    assert "CPU float64: largest error" in printed and "17 x 31 px" in printed
-    assert "\nVerdict: stable. All 1 cases are finite and within their bounds on CPU float32, CPU" in printed
-
-
-@pytest.mark.parametrize("only", ["edge-on", "no such case"])
-def test_the_verdict_fails_where_a_bound_is_passed_or_nothing_was_shown(monkeypatch, capsys, only):
-    """Here the textbook's formulas stand in for ours."""
-    textbook_as_ours = CPU_FLOAT._replace(render=TEXTBOOK.render)
-    monkeypatch.setattr(stability, "kernels", lambda: [textbook_as_ours])
-    monkeypatch.setattr(sys, "argv", ["stability.py", "--only", only])
-    with pytest.raises(SystemExit) as stopped:
-        stability.main()
-    assert stopped.value.code == 1 and "\nVerdict: NOT STABLE. Of " in capsys.readouterr().out
-
-
-def test_the_figure_draws_every_backend(tmp_path, monkeypatch):
-    (needles,) = (sweep._replace(values=(100,)) for sweep in SWEEPS if sweep.name == "length of needles, px")
-    (point,) = stability_figure.measure(needles)
-    assert point["CPU float64"]["gradients"] < point["CPU float32"]["gradients"]
-    assert point["CPU float32"]["image"] < point["textbook float32"]["image"]
-    stability_figure.draw(tmp_path / "a.png", {needles.name: [point]}, "a machine")
-    assert (tmp_path / "a.png").stat().st_size > 10_000
+    assert "\nVerdict: stable. All 1 cases are finite and within their bounds on CPU" in capsys.readouterr().out
+    # The textbook's formulas stand in for ours.
+    monkeypatch.setattr(stability, "kernels", lambda: [CPU_FLOAT._replace(render=TEXTBOOK.render)])
+    for only in ("edge-on", "no such case"):
+        monkeypatch.setattr(sys, "argv", ["stability.py", "--only", only])
+        with pytest.raises(SystemExit) as stopped:
+            stability.main()
+        assert stopped.value.code == 1 and "\nVerdict: NOT STABLE. Of " in capsys.readouterr().out
