@@ -82,11 +82,3 @@ def test_portable_functions_agree_with_numpy():
     # NumPy's argument, up to 2 pi, is rounded by 2^-53 of itself: 7e-16 of the angle.
     assert np.abs(cos.numpy() - np.cos(angle)).max() < 2e-15
     assert np.abs(sin.numpy() - np.sin(angle)).max() < 2e-15
-
-
-def test_bits_do_not_depend_on_the_number_of_threads(threads):
-    items = torch.arange(100_003)
-    threads(1)
-    one = normal(0, Stream.SPLIT, 600, items)
-    threads(2)
-    assert torch.equal(one, normal(0, Stream.SPLIT, 600, items))

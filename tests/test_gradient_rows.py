@@ -109,17 +109,19 @@ def scene_of(kind: str, device: str, dtype: torch.dtype) -> tuple[dict[str, Tens
 
 
 SCENES = pytest.mark.parametrize("kind", ["empty", "one", "behind", "giants", "many", "rays"])
-DEPTH = pytest.mark.parametrize("depth", [False, True])
-ABSOLUTE = pytest.mark.parametrize("absolute", [False, True])
 BOTH = pytest.mark.parametrize(("depth", "absolute"), [(False, True), (True, False)])
 
 
 @BOTH_AND_GPU
 @SCENES
-@DEPTH
-def test_single_steps_of_the_forward_are_rasterize_to_the_bit(kind, depth, device, dtype):
+@pytest.mark.parametrize("depth", [False, True])
+def test_single_steps_of_the_forward_are_rasterize_to_the_bit_and_bands_have_its_pixels(kind, depth, device, dtype):
     raw, camera = scene_of(kind, device, dtype)
     forward = Forward.of(raw, camera, depth)
+    for top, bottom in ((0, 1), (1, 4), (4, 5), (2, 2)):
+        _, blended = forward.blend_band(top, bottom)
+        for got, whole in zip(blended[:4], forward.blended[:4], strict=True):
+            assert same_bits(got[..., 16 * top : 16 * bottom, :], whole[..., 16 * top : 16 * bottom, :])
     out = draw(forward.scene, camera.bg, depth)
     color, transmittance, inverse_depth, radii, splats, tile_counts, *lists, last, layers = out
     seen = tile_counts > 0  # the other rows are undefined
@@ -136,9 +138,12 @@ def test_single_steps_of_the_forward_are_rasterize_to_the_bit(kind, depth, devic
 @BOTH_AND_GPU
 @SCENES
 @BOTH
-def test_rows_give_the_gradients_of_the_lists(kind, depth, absolute, device, dtype):
+def test_rows_give_the_gradients_of_the_lists_and_bands_the_rows_of_the_image(kind, depth, absolute, device, dtype):
     forward = Forward.of(*scene_of(kind, device, dtype), depth)
     rows = forward.rows(absolute)
+    for cuts in ([0, 1, 2, 3, 4, 5], [0, 2, 5], [0, 0, 4, 5, 5]):
+        bands = forward.rows_of_bands(cuts, absolute)
+        assert same_bits(bands.rows, rows.rows) and same_bits(bands.counts, rows.counts)
     values = (14 if kind == "rays" else 10) + 2 * absolute
     assert rows.rows.shape == (int(rows.counts.sum()), values) and rows.counts.dtype == torch.int32
     assert not rows.counts[forward.projected[3] == 0].any()
@@ -152,7 +157,7 @@ def test_rows_give_the_gradients_of_the_lists(kind, depth, absolute, device, dty
 
 @BOTH_AND_GPU
 @SCENES
-@ABSOLUTE
+@pytest.mark.parametrize("absolute", [False, True])
 def test_gradients_are_added_to_those_of_another_view(kind, absolute, device, dtype):
     forward = Forward.of(*scene_of(kind, device, dtype), True)
     rows, seen = forward.rows(absolute), forward.projected[3] > 0
@@ -176,56 +181,26 @@ def test_gradients_are_added_to_those_of_another_view(kind, absolute, device, dt
 
 
 @BOTH_AND_GPU
-def test_gradients_without_bands_of_sh_are_added(device, dtype):
+@pytest.mark.parametrize("given", [False, True], ids=["no bands of SH", "covariances and colours"])
+def test_gradients_of_other_parameters_are_added(given, device, dtype):
     raw, camera = scene_of("many", device, dtype)
-    forward = Forward.of(raw | {"sh_rest": raw["sh_rest"][:, :0]}, camera._replace(sh_degree=0), False)
+    parameters, camera = raw | {"sh_rest": raw["sh_rest"][:, :0]}, camera._replace(sh_degree=0)
+    if given:
+        generator, count = torch.Generator().manual_seed(4), len(raw["means"])
+        covariances = torch.zeros(count, 6)
+        covariances[:, [0, 3, 5]] = 0.01 + 0.05 * torch.rand(count, 3, generator=generator)
+        colors = torch.rand(count, 3, generator=generator)
+        shape = {"opacities": torch.full((count, 1), 0.6), "cov3d": covariances, "colors": colors}
+        parameters = {"means": raw["means"]} | {name: t.to(device, dtype) for name, t in shape.items()}
+    forward = Forward.of(parameters, camera, False, activated=given)
     rows = forward.rows(False)
-    sums = [gradient.clone() for gradient in forward.rows_vjp(rows, False)]
-    forward.add_rows_vjp(rows, sums, False)
-    assert sums[-1].shape == (300, 0, 3)
-    for twice, once in zip(sums, forward.rows_vjp(rows, False), strict=True):
-        torch.testing.assert_close(twice, 2 * once, rtol=1e-5, atol=1e-6)
-
-
-@BOTH_AND_GPU
-def test_gradients_of_covariances_and_colors_are_added(device, dtype):
-    raw, camera = scene_of("many", device, dtype)
-    count = len(raw["means"])
-    generator = torch.Generator().manual_seed(4)
-    covariances = torch.zeros(count, 6, dtype=dtype)
-    covariances[:, [0, 3, 5]] = 0.01 + 0.05 * torch.rand(count, 3, generator=generator, dtype=dtype)
-    colors = torch.rand(count, 3, generator=generator).to(device, dtype)
-    given = {"opacities": torch.full((count, 1), 0.6), "cov3d": covariances, "means": raw["means"], "colors": colors}
-    forward = Forward.of({name: t.to(device, dtype) for name, t in given.items()}, camera, False, activated=True)
-    rows = forward.rows(False)
-    found = forward.rows_vjp(rows, False, [name in ("means", "cov3d", "colors") for name in GRADIENTS])
+    found = forward.rows_vjp(rows, False, [name in ("means2d", *parameters) for name in GRADIENTS])
     sums = [gradient.clone() for gradient in found]
     forward.add_rows_vjp(rows, sums, False)
+    assert given or sums[-1].shape == (300, 0, 3)
     for twice, once in zip(sums, found, strict=True):
         torch.testing.assert_close(twice, 2 * once, rtol=1e-5, atol=1e-6)
-    assert all(found[place].count_nonzero() > 100 for place in (1, 5, 6))
-
-
-@BOTH_AND_GPU
-@SCENES
-@BOTH
-def test_bands_give_the_rows_of_the_image(kind, depth, absolute, device, dtype):
-    forward = Forward.of(*scene_of(kind, device, dtype), depth)
-    whole = forward.rows(absolute)
-    for cuts in ([0, 1, 2, 3, 4, 5], [0, 2, 5], [0, 0, 4, 5, 5]):
-        bands = forward.rows_of_bands(cuts, absolute)
-        assert same_bits(bands.rows, whole.rows) and same_bits(bands.counts, whole.counts)
-
-
-@BOTH_AND_GPU
-@SCENES
-@DEPTH
-def test_a_band_has_the_pixels_of_the_image(kind, depth, device, dtype):
-    forward = Forward.of(*scene_of(kind, device, dtype), depth)
-    for top, bottom in ((0, 1), (1, 4), (4, 5), (2, 2)):
-        _, blended = forward.blend_band(top, bottom)
-        for got, whole in zip(blended[:4], forward.blended[:4], strict=True):
-            assert same_bits(got[..., 16 * top : 16 * bottom, :], whole[..., 16 * top : 16 * bottom, :])
+    assert all(found[GRADIENTS.index(name)].count_nonzero() > 100 for name in parameters if name != "sh_rest")
 
 
 @CPU_AND_GPU

@@ -18,9 +18,7 @@ from splatting.distributed.ranks import Ranks, ranks
 # Height, width, and the rows of tiles where bands begin and the last one ends.
 CASES = [
     (70, 33, [0, 1, 1, 3, 5]),
-    (16, 9, [0, 1]),
     (97, 600, [0, 0, 4, 7]),  # a row has two parts whose sums are taken apart
-    (40, 20, [0, 1, 2, 3]),  # the last band has 8 rows of pixels
     (33, 1, [0, 2, 3, 3]),  # the last band has one row
     (5, 130, [0, 0, 1]),
     pytest.param(960, 538, [0, 30, 60], marks=GPU_MARKS),  # a band by itself is small
@@ -80,7 +78,7 @@ def test_bands_have_the_loss_and_the_gradient_of_the_whole_image(height, width, 
         check_bands(height, borders, images, clamp)
 
 
-@pytest.mark.parametrize("rows", [(0, 20), (8, 40), (16, 0), (0, 48), (-16, 16)])
+@pytest.mark.parametrize("rows", [(8, 40), (16, 0), (0, 48), (-16, 16)])
 def test_a_band_begins_and_ends_between_tiles(rows):
     with pytest.raises(ValueError, match=f"multiples of {BAND_ROWS} rows or with the image, got {rows[0]} and"):
         photometric_loss_by_bands(*image_pair(40, 20, torch.float32, True), 0.2, rows, torch.clone)

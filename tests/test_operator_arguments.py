@@ -33,33 +33,18 @@ RASTERIZER = (
     "rasterize_vjp",
     "rasterize_vjp of rows",
     "blend_rows",
-    "blend_channels",
-    "channel_rows",
     "describe",
-    "camera_vjp",
-    "sum_runs",
 )
+RASTERIZER += ("blend_channels", "channel_rows", "camera_vjp", "sum_runs")
+OTHER_KINDS = ("float16", "int64", "int32", "bool", "complex64", "sparse", "a number")
+OTHER_RANKS, OTHER_COLUMNS = ("one more axis", "is a scalar"), ("no columns", "one column more")
 # Tensors that may be None.
-NEEDLESS = (
-    "means2d",
-    "grad_transmittance",
-    "grad_inverse_depth",
-    "stopped",
-    "words",
-    "of",
-    "planes[1]",
-    "planes[2]",
-    "places",
-)
-
-
-@pytest.fixture(scope="module")
-def outcomes() -> dict[tuple[str, str], str]:
-    """Errors by operator and change; made in another process, because a crash would end this one."""
-    done = subprocess.run([sys.executable, "-c", REPORT], cwd=ROOT, capture_output=True, text=True)
-    lines = [line.split("|") for line in done.stdout.splitlines()]
-    assert done.returncode == 0, f"status {done.returncode} in the change after {lines[-1] if lines else 'none'}"
-    return {(name, words): outcome for name, words, outcome in lines}
+NEEDLESS = ("means2d", "grad_transmittance", "grad_inverse_depth", "stopped", "words", "of", "planes[1]", "planes[2]")
+NEEDLESS += ("places",)
+# Tensors that may be of float64 beside others of float32, or that the dtype is taken from.
+DOUBLE = ("view", "projection", "center", "background", "grad_color", "grad_transmittance", "grad_inverse_depth")
+DOUBLE += ("splats", "rows", "image", "points", "like", "of", "camera[0]", "camera[1]", "camera[2]")
+DOUBLE += ("planes[0]", "planes[1]", "planes[2]")
 
 
 @cache
@@ -76,34 +61,27 @@ def _argument(name: str, words: str) -> str:
     )
 
 
-@pytest.mark.slow
-def test_there_are_as_many_as_operators(outcomes):
+def test_every_changed_tensor_of_another_kind_is_an_error():
+    """In another process, because a crash would end this one."""
+    done = subprocess.run([sys.executable, "-c", REPORT], cwd=ROOT, capture_output=True, text=True)
+    lines = [line.split("|") for line in done.stdout.splitlines()]
+    assert done.returncode == 0, f"status {done.returncode} in the change after {lines[-1] if lines else 'none'}"
     registered = {name for name in torch._C._dispatch_get_all_op_names() if "::" in name}
     ours = {name for name in registered if name.startswith(("diff_gaussian", "fused_ssim", "simple_knn"))}
-    assert {name.partition("::")[2] for name in ours} == {name.partition(" ")[0] for name, _ in outcomes}
-    assert len(outcomes) > 1500
-
-
-def test_none_is_an_error(outcomes):
-    for (name, words), outcome in outcomes.items():
-        if words.endswith(" is None") and _argument(name, words) not in NEEDLESS:
+    assert {name.partition("::")[2] for name in ours} == {name.partition(" ")[0] for name, *_ in lines}
+    assert len(lines) > 1500
+    for name, words, outcome in lines:
+        if words.endswith("shorter"):
+            continue
+        argument = _argument(name, words)
+        no_columns = argument in ("slots", "instances", "layers")
+        if words.endswith(OTHER_KINDS) or (words.endswith("float64") and argument not in DOUBLE):
+            assert outcome.endswith("Error"), (name, words)
+        elif words.endswith(" is None") and argument not in NEEDLESS:
             assert outcome.endswith("Error"), (name, words)
             if name in RASTERIZER and "[" not in words:  # of a list torch itself refuses it
                 assert outcome in ("TypeError", "ValueError"), (name, words, outcome)
-
-
-def test_other_dtypes_and_layouts_are_errors(outcomes):
-    wrong = ("float16", "int64", "int32", "bool", "complex64", "sparse", "a number")
-    for (name, words), outcome in outcomes.items():
-        if words.endswith(wrong):
-            assert outcome.endswith("Error"), (name, words)
-
-
-def test_other_ranks_are_errors(outcomes):
-    for (name, words), outcome in outcomes.items():
-        if name in RASTERIZER and words.endswith(("one more axis", "is a scalar", "no columns", "one column more")):
-            if _argument(name, words) in ("slots", "instances", "layers") and not words.endswith(("axis", "scalar")):
-                continue  # they have no columns
+        elif name in RASTERIZER and words.endswith(OTHER_RANKS if no_columns else (*OTHER_RANKS, *OTHER_COLUMNS)):
             assert outcome in ("ValueError", "RuntimeError"), (name, words, outcome)
 
 
@@ -170,7 +148,6 @@ OF_VISIBLE = r"visible must be \(3\) bool on cpu, got"
 WRONG = {
     "adam_": [
         (RuntimeError, OF_PARAMETER, {"gradients": lambda t: [t[0], t[1].T]}),
-        (RuntimeError, OF_PARAMETER, {"gradients": lambda t: [t[0].double(), t[1]]}),
         (RuntimeError, "must be contiguous", {"values": lambda t: [_transposed(t[0]), t[1]]}),
         (RuntimeError, "columns must be at most 3, got 4", {"columns": [4, -1]}),
         (RuntimeError, "for each of the 2 parameters, got 1", {"rates": [0.1]}),
@@ -179,29 +156,21 @@ WRONG = {
     "adam_ of visible rows": [
         (RuntimeError, "for each of the 1 parameters, got 2", {"steps": [torch.tensor(1.0), torch.tensor(1.0)]}),
         (RuntimeError, OF_VISIBLE, {"visible": torch.ones(4, dtype=torch.bool)}),
-        (RuntimeError, OF_VISIBLE, {"visible": torch.ones(3)}),
-        (RuntimeError, OF_VISIBLE, {"visible": torch.ones(3, 1, dtype=torch.bool)}),
-        (RuntimeError, OF_PARAMETER, {"gradients": lambda t: [t[0][:, :2]]}),
-        (RuntimeError, "columns must be at most 3, got 4", {"columns": [4]}),
     ],
     "observe_": [
         (RuntimeError, "statistics must be 3 float32 on cpu, got .2", {"max_radii": torch.zeros(2)}),
         (RuntimeError, "statistics must be contiguous", {"max_radii": torch.zeros(6)[::2]}),
-        (RuntimeError, "radii must be int32, got torch.float32", {"radii": torch.ones(3)}),
-        (RuntimeError, rf"{OF_GRADIENT}\(3, 2\) torch.float32", {"gradient": torch.ones(3, 2)}),
         (RuntimeError, rf"{OF_GRADIENT}\(2,\)", {"gradient": torch.ones(2)}),
     ],
     "list_records": [
         (ValueError, "tile_counts must be", {"tile_counts": lambda t: t[1:]}),
         (ValueError, r"limits must be \(2, -1", {"limits": lambda t: t[0]}),
-        (TypeError, "limits must be torch.int32", {"limits": Tensor.long}),
         (RuntimeError, "a room of 2147483648 is not from 0 to 2", {"room": 2**31}),
     ],
     "list_records with counts": [
         (TypeError, "counts, splats and depths must be given together", {"depths": None}),
         (ValueError, r"counts must be \(3, 2\)", {"counts": lambda t: t[:, :1]}),
         (ValueError, r"depths must be \(3,\)", {"depths": lambda t: t[1:]}),
-        (TypeError, "depths must be torch.float32", {"depths": Tensor.double}),
     ],
     "sum_runs": [
         (ValueError, r"rows must be \(R, 10\) or \(R, 12\), got \(5, 11\)", _sums((5,), (1,), values=11)),
@@ -224,15 +193,12 @@ WRONG = {
     "rasterize_vjp of rows": [
         (ValueError, r"rows must be \(-1, 12\)", {"absolute": True}),
         (ValueError, r"rows must be \(-1, 10\)", {"source": _changed(2, lambda t: t[:, :9])}),
-        (TypeError, "rows must be torch.float32", {"source": _changed(2, Tensor.double)}),
         (ValueError, r"counts must be \(3,\)", {"source": _changed(3, lambda t: t[1:])}),
-        (TypeError, "counts must be torch.int32", {"source": _changed(3, Tensor.long)}),
         (
             ValueError,
             "counts add up to 7, but there are 6 rows",
             {"source": _changed(3, lambda t: t + _integers(0, 1, 0))},
         ),
-        (ValueError, "there are 5 rows", {"source": _changed(2, lambda t: t[1:])}),
         *((ValueError, f"got {count} of splat 0", _unseen(count)) for count in (1, -1)),
         (ValueError, "or splats, tile_counts, rows and counts, got 3 tensors", {"source": lambda t: t[:3]}),
     ],
@@ -246,24 +212,20 @@ WRONG = {
         (ValueError, "blocks of raw Gaussians sleep", {"options": lambda t: [*t[:4], False]}),
         (ValueError, "give awake, taken and terms", {"sleep": lambda t: t[:2]}),
         (ValueError, r"awake must be \(1,\)", {"sleep": _changed(0, lambda t: t.repeat(2))}),
-        (TypeError, "taken must be torch.int32", {"sleep": _changed(1, Tensor.long)}),
         (ValueError, r"terms must be \(128, 8\)", {"sleep": _changed(2, lambda t: t[1:])}),
     ],
     "apply_gradients_ to sums": [
         (ValueError, "sums must have 9 tensors, got 8", {"sums": lambda t: t[:8]}),
         (ValueError, r"the sum of means must be \(3, 3\)", {"sums": _changed(1, lambda t: t[1:])}),
-        (TypeError, "the sum of sh_rest must be torch.float32", {"sums": _changed(8, Tensor.double)}),
         (ValueError, "the sum of means must be contiguous", {"sums": _changed(1, _transposed)}),
     ],
     "apply_gradients_": [
         (RuntimeError, "for each of the 6 attributes, got 5", {"rates": [0.1] * 5}),
         (RuntimeError, "two for each of the 6 attributes, got 11", {"averages": lambda t: t[1:]}),
         (RuntimeError, "different numbers from 0 to 5", {"attributes": [0, 1, 2, 3, 4, 4]}),
-        (RuntimeError, "different numbers from 0 to 5", {"attributes": [0, 1, 2, 3, 4, 6]}),
         (RuntimeError, "columns must be at most 45, got 46", {"columns": [-1] * 5 + [46]}),
         (ValueError, "constants must have 5 entries, got 3", {"constants": [0.9, 0.99, 1e-8]}),
         (RuntimeError, OF_PARAMETER, {"averages": lambda t: [*t[:5], t[0], *t[6:]]}),
-        (RuntimeError, OF_PARAMETER, {"averages": _changed(11, Tensor.double)}),
         (RuntimeError, "must be contiguous", {"gaussians": _changed(0, _transposed)}),
         (RuntimeError, "must be contiguous", {"averages": _changed(0, _transposed)}),
         (RuntimeError, "step counter must be one float32 on the CPU", {"steps": _changed(5, torch.ones(2))}),
@@ -271,11 +233,9 @@ WRONG = {
         (RuntimeError, "statistics must be contiguous", {"statistics": _changed(2, torch.ones(6)[::2])}),
         (RuntimeError, "max_radii, gradient_sums and views, or none", {"statistics": lambda t: t[:2]}),
         (ValueError, r"the camera's gradient must be \(34,\)", {"statistics": lambda t: [*t, torch.ones(25).double()]}),
-        (TypeError, "the camera's gradient must be torch.float64", {"statistics": [torch.ones(34)]}),
         (RuntimeError, "stopped must be one int64", {"guard": lambda t: [t[0], t[0]]}),
         (RuntimeError, "stopped must be one int64", {"guard": _changed(1, torch.zeros(1))}),
         (RuntimeError, "count from 1", {"iteration": 0}),
-        (TypeError, "radii must be", {"radii": torch.ones(3)}),
         (ValueError, "radii must be", {"radii": _integers(1, 1)}),
         (ValueError, "tile_counts must be", {"source": _changed(1, _integers(1, 1))}),
         (ValueError, "now must be contiguous", {"now": torch.zeros(46, dtype=torch.int64)[::2]}),
@@ -304,20 +264,16 @@ WRONG = {
     ],
     "displace_": [
         (ValueError, "give logits, or items", {"items": torch.arange(3)}),
-        (TypeError, r"means must be torch.float32 on cpu, got torch.float64", {"means": Tensor.double}),
         (ValueError, r"logits must be \(3, 1\).*got \(3,\)", {"logits": lambda t: t[:, 0]}),
         (ValueError, "means must be contiguous", {"means": _transposed}),
         (ValueError, "steepness from 0 to 10000, got 1 and 10001", {"gate": [1.0, 10001.0, 0.1]}),
         (ValueError, "a gate goes with logits", {"gate": []}),
     ],
     "displace_ to children": [
-        (TypeError, "items must be torch.int64 on cpu, got torch.int32", {"items": Tensor.int}),
-        (TypeError, "means must be torch.float32 on cpu, got torch.float64", {"means": Tensor.double}),
         (ValueError, r"rotations must be \(3, 4\).*got \(3, 3\)", {"rotations": lambda t: t[:, :3]}),
         (ValueError, r"items must be \(3,\).*got \(1, 3\)", {"items": lambda t: t[None]}),
     ],
     "penalise_": [
-        (TypeError, "log_scales must be torch.float32 on cpu, got torch.float64", {"log_scales": Tensor.double}),
         (ValueError, r"log_scale_gradients must be \(3, 3\).*got \(3, 1\)", {"log_scale_gradients": torch.ones(3, 1)}),
         (ValueError, "gradients must be contiguous", {"log_scale_gradients": _transposed}),
     ],

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from diff_gaussian_rasterization.optim import adam_, observe_, sparse_adam_
-from rasterizer_tools import GPU_MARKS, gradients, loss_of, scene_arguments
+from rasterizer_tools import GPU_MARKS, gradients, scene_arguments
 
 from benchmarks.workloads.splat_scenes import SplatScene, frustum
 
@@ -11,10 +11,10 @@ pytestmark = [*GPU_MARKS]
 OPS = torch.ops.diff_gaussian_rasterization
 
 
-def run(scene: SplatScene, device: str, dtype: torch.dtype = torch.float32, keep=None, **changes) -> dict:
-    """All planes, the radii and all gradients of a weighted sum of the planes; keep: the pixels that count."""
+def run(scene: SplatScene, device: str, dtype: torch.dtype = torch.float32) -> dict:
+    """All planes, the radii and all gradients of a weighted sum of the planes."""
     parameters = {name: t.float().to(dtype) for name, t in scene.parameters.items()}
-    return gradients(parameters, scene.settings(dtype, **changes), device, lambda out: loss_of(out, keep))
+    return gradients(parameters, scene.settings(dtype), device)
 
 
 def test_other_stream():

@@ -73,6 +73,9 @@ def test_depth_unless_it_is_not_wanted(camera):
         gaussians._xyz.zero_()
         gaussians._scaling.fill_(math.log(0.5))
         gaussians._opacity.fill_(0.0)
+    background = torch.tensor([0.1, 0.5, 0.9])
+    empty = render(camera, GaussianModel(3), pipeline(), background)["render"]
+    assert torch.equal(empty, background[:, None, None].expand(3, HEIGHT, WIDTH))
     depth = render(camera, gaussians, pipeline(), BLACK)["depth"]
     assert depth.requires_grad  # test_rasterizer_gradients.py has its derivative
     assert render(camera, gaussians, pipeline(), BLACK, want_depth=False)["depth"] is None
@@ -146,22 +149,23 @@ def test_screen_points_are_zeros_with_a_gradient_of_their_own_in_every_render(ca
     assert gradients[0].any() and torch.equal(2 * gradients[0], gradients[1])
 
 
-@pytest.mark.parametrize("name", ["convert_SHs_python", "compute_cov3D_python"])
-def test_flags_of_the_pipeline_are_checked(camera, name):
-    options = pipeline()
-    setattr(options, name, "no")
-    with pytest.raises(TypeError, match=f"{name} must be True or False, got 'no'"):
-        render(camera, model(3), options, BLACK)
+@pytest.mark.parametrize(
+    "name", ["separate_sh", "use_trained_exp", "clamp", "convert_SHs_python", "compute_cov3D_python"]
+)
+def test_flags_of_a_call_and_of_the_pipeline_are_checked(camera, name):
+    def draw(flag: object) -> None:
+        of_pipe = name.endswith("python")
+        options = pipeline()
+        if of_pipe:
+            setattr(options, name, flag)
+        render(camera, model(3), options, BLACK, **{} if of_pipe else {name: flag})
 
-
-@pytest.mark.parametrize("name", ["separate_sh", "use_trained_exp", "clamp"])
-def test_flags_of_a_call_are_checked(camera, name):
     for flag in (1, np.True_, torch.tensor(True)):
         if not (name == "separate_sh" and torch.is_tensor(flag)):  # which is override_color in 2023's form
-            render(camera, model(3), pipeline(), BLACK, **{name: flag})
+            draw(flag)
     for wrong in ("no", 2, []):
         with pytest.raises(TypeError, match=f"{name} must be True or False, got"):
-            render(camera, model(3), pipeline(), BLACK, **{name: wrong})
+            draw(wrong)
 
 
 def test_values_outside_are_clamped_and_get_no_gradient(camera):
@@ -179,8 +183,7 @@ def test_values_outside_are_clamped_and_get_no_gradient(camera):
     assert whole.max() > 1 and torch.equal(whole.clamp(0, 1), image)
 
 
-@pytest.mark.parametrize("antialiasing", [False, True])
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize(("degree", "antialiasing"), [(0, True), (1, False), (3, True)])
 def test_the_raw_path_equals_the_plain_one(camera, degree, antialiasing):
     """Activations, SH and covariances in the kernels give the image and gradients of the model's own in PyTorch."""
     weights = torch.randn(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
@@ -220,12 +223,6 @@ def test_inactive_bands_are_not_read(camera):
     assert torch.equal(image, again)
     image.sum().backward()
     assert gaussians._features_rest.grad[:, :3].any() and not gaussians._features_rest.grad[:, 3:].any()
-
-
-def test_an_empty_model_shows_the_background(camera):
-    background = torch.tensor([0.1, 0.5, 0.9])
-    image = render(camera, GaussianModel(3), pipeline(), background)["render"]
-    assert torch.equal(image, background[:, None, None].expand(3, HEIGHT, WIDTH))
 
 
 def test_exposure_maps_row_vectors_before_the_clamp(camera):
