@@ -1,5 +1,11 @@
 """Errors of compiled operators: torch's stable interface has one type for all, and the packages raise what is meant."""
 
+import importlib.util
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
 import pytest
 import torch
 from diff_gaussian_rasterization.backend import OPERATORS
@@ -33,3 +39,14 @@ def test_too_little_memory_has_the_type_that_torch_has_for_it():
     image = one.expand(HUGE, HUGE), one.expand(HUGE, HUGE)  # two PiB, of which four bytes are there
     with pytest.raises(torch.OutOfMemoryError, match="allocate"):
         SSIM.photometric(*image, 0.2, False)
+
+
+@pytest.mark.skipif(shutil.which("nm") is None, reason="needs nm of the binary utilities")
+@pytest.mark.parametrize("package", ["diff_gaussian_rasterization", "fused_ssim", "simple_knn"])
+def test_a_library_uses_torch_through_its_stable_interface_alone(package):
+    library = Path(importlib.util.find_spec(package).origin).with_name("_backend.so")
+    symbols = subprocess.run(["nm", "-D", str(library)], capture_output=True, text=True, check=True).stdout
+    names = [line.split()[-1].partition("@")[0] for line in symbols.splitlines()]
+    assert "torch_library_impl" in names
+    forbidden = re.compile(r"_Z.*N[VK]*(3c10|2at|5torch|8pybind11)\d|_?Py[A-Z_]")
+    assert [name for name in names if forbidden.match(name)] == []

@@ -61,6 +61,14 @@ gs::Lens<T> fisheye(T focal, T x, T y) {
   return {gs::Chart::kEquidistant, 4, 1, 2, 5 * focal, 50, focal, focal, focal, x, y, {}, {}, {}, {}};
 }
 
+// A lens with all kinds of distortion.
+inline gs::Lens<float> distorted(gs::Chart chart, float focal, float x, float y) {
+  gs::Lens<float> lens = {chart, 4, 1, 2, 200, 50, 4 * focal / 3, focal, focal + 1, x, y, {-0.05f, 0.01f}, {}, {}, {}};
+  lens.radial[2] = 0.001f, lens.radial[3] = 0.0001f, lens.divisor[0] = 0.02f;
+  lens.tangential[0] = 0.003f, lens.tangential[1] = 0.002f;
+  return lens;
+}
+
 template <class T>
 struct Result {
   std::vector<T> color, transmittance, depth, gradient, absolute;

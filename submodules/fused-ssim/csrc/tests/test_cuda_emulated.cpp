@@ -150,12 +150,13 @@ int main() {
   // Sizes around the ends of tiles and of the threads' groups.
   for (const int64_t height : {2, 8, 9, 16, 17})
     for (const int64_t width : {4, 115, 116, 117}) check<float>(1, height, width, false, false, 1);
+  // And of tiles of the CPU, which are 32 rows by 512 columns.
+  check<float>(1, 33, 513, true, false, 1);
   check<float>(3, 1, 1, false);
   check<uint8_t>(3, 5, 130, false);
   check<uint8_t>(3, 37, 110, false, true);
   check_bands(3, 37, 130, {0, 16, 37});
   check_bands(1, 70, 9, {0, 0, 16, 32, 48, 48, 70, 70});
-  check_bands(2, 10, 5, {0, 10});
   check_bands(64, 70, 125, {0, 16, 48, 70});  // blocks of two tiles
   // So many tiles that a block takes two, and that those of the backward are higher.
   check<uint8_t>(342, 17, 2, false, false, 1);
