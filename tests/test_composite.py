@@ -2,15 +2,11 @@
 
 import itertools
 
-import pytest
 import torch
 from fused_ssim import composite
-from torch import Tensor, library
+from rasterizer_tools import CPU_AND_GPU
+from torch import Tensor
 
-GPU = pytest.param(
-    "cuda",
-    marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no NVIDIA GPU")],
-)
 BACKGROUND = torch.tensor([0.2, 0.0, 1.0])
 
 
@@ -26,7 +22,7 @@ def in_torch(picture: Tensor, background: Tensor) -> Tensor:
     return scaled[:3] * scaled[3:] + background[:, None, None] * (1 - scaled[3:])
 
 
-@pytest.mark.parametrize("device", ["cpu", GPU])
+@CPU_AND_GPU
 def test_every_value_is_torchs_to_the_bit(device: str) -> None:
     """Both devices give the bits of torch on the CPU, which rounds each operation, and are close to float64."""
     picture = every_pair()
@@ -38,7 +34,7 @@ def test_every_value_is_torchs_to_the_bit(device: str) -> None:
     assert torch.equal(got[:, :, 255], picture[:3, :, 255] / 255)
 
 
-@pytest.mark.parametrize("device", ["cpu", GPU])
+@CPU_AND_GPU
 def test_sizes_and_strides(device: str) -> None:
     for height, width in itertools.product((0, 1, 7), (1, 300)):
         picture = torch.full((4, height, width), 128, dtype=torch.uint8)
@@ -47,18 +43,3 @@ def test_sizes_and_strides(device: str) -> None:
         turned = picture.permute(1, 2, 0).contiguous().permute(2, 0, 1)  # strides as in Pillow's memory
         for same in (picture, turned):
             assert torch.equal(composite(same.to(device), BACKGROUND.to(device)).cpu(), wanted)
-
-
-@pytest.mark.parametrize("device", ["cpu", GPU])
-def test_opcheck(device: str) -> None:
-    picture = every_pair()[:, :3, :5].to(device)
-    library.opcheck(torch.ops.fused_ssim.composite, (picture, BACKGROUND.to(device)))
-
-
-def test_what_does_not_fit_is_named() -> None:
-    with pytest.raises(RuntimeError, match=r"picture must be \(4, H, W\) uint8, got .3, 2, 2. torch.uint8"):
-        composite(torch.zeros(3, 2, 2, dtype=torch.uint8), BACKGROUND)
-    with pytest.raises(RuntimeError, match=r"picture must be \(4, H, W\) uint8, got .4, 2, 2. torch.float32"):
-        composite(torch.zeros(4, 2, 2), BACKGROUND)
-    with pytest.raises(RuntimeError, match="background must be 3 float32, got .4,. torch.float32"):
-        composite(torch.zeros(4, 2, 2, dtype=torch.uint8), torch.zeros(4))

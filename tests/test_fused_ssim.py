@@ -294,28 +294,6 @@ def test_only_img1_has_a_gradient_and_only_when_wanted(device: str) -> None:
     assert img1.grad is not None and img2.grad is None
 
 
-IMAGE = torch.zeros(3, 20, 20)
-
-
-@pytest.mark.parametrize(
-    ("img1", "img2", "padding", "error", "words"),
-    [
-        (IMAGE, torch.zeros(3, 20, 21), "same", ValueError, r"\(3, 20, 20\) and img2 \(3, 20, 21\)"),
-        (IMAGE.byte(), IMAGE, "same", TypeError, "img1 must be float32 or float64, got torch.uint8"),
-        (IMAGE.half(), IMAGE.half(), "same", TypeError, "got torch.float16"),
-        (IMAGE, IMAGE.double(), "same", TypeError, "img2 must be torch.float32 like img1, or uint8"),
-        (IMAGE, IMAGE, "full", ValueError, '"same" or "valid", got \'full\''),
-        (IMAGE[:, :10], IMAGE[:, :10], "valid", ValueError, r"at least 11 x 11 pixels, got img1 \(3, 10, 20\)"),
-        (IMAGE[:, :0], IMAGE[:, :0], "same", ValueError, "at least one pixel"),
-        (IMAGE[0, 0], IMAGE[0, 0], "same", ValueError, r"must be \(..., H, W\)"),
-        (IMAGE, IMAGE.to("meta"), "same", ValueError, "same device, got img1 on cpu and img2 on meta"),
-    ],
-)
-def test_messages(img1: Tensor, img2: Tensor, padding: str, error: type[Exception], words: str) -> None:
-    with pytest.raises(error, match=words):
-        fused_ssim(img1, img2, padding)
-
-
 @on_a_gpu
 def test_messages_of_a_gpu(device: str) -> None:
     image = torch.zeros(3, 20, 20, device=device)

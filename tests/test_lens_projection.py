@@ -93,18 +93,3 @@ def test_the_field_ends_where_the_distortion_turns_back():
     beyond = torch.tensor([[1.0, 0.0, 1.0]], dtype=torch.float64) - camera.viewmatrix[3, :3]
     means = beyond @ torch.linalg.inv(camera.viewmatrix[:3, :3])
     assert projected(camera, gaussians(strong, camera, 1) | {"means": means})[3].item() == 0
-
-
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        ({"focal": (math.nan, 60.0)}, "finite numbers and focal lengths above 0"),
-        ({"focal": (0.0, 60.0)}, "finite numbers and focal lengths above 0"),
-        ({"chart": "fisheye"}, "chart 'fisheye' is none of perspective, equidistant, equirectangular"),
-    ],
-)
-def test_a_lens_that_is_none_is_named(wrong, said):
-    camera = view_through(PANORAMA, torch.float64)
-    values = gaussians(PANORAMA, camera, 3)
-    with pytest.raises(ValueError, match=said):
-        projected(camera._replace(lens=PANORAMA._replace(**wrong)), values)

@@ -23,26 +23,6 @@ from gaussian_renderer import rasterizer_settings
 SMALL = Lens("equidistant", (9.0, 9.0), (8.5, 3.0))
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"projection": "affine"}, "projection must be 'ewa' or 'ray', got 'affine'"),
-        (
-            {"projection": "ray", "lens": Lens("equirectangular", (9.0, 9.0), (8.5, 3.0), radial=(0.1, 0, 0, 0))},
-            "panoramas without distortion",
-        ),
-        (
-            {"projection": "ray", "lens": SMALL._replace(focal=(6.0, 9.0))},
-            "needs tiles of 16 pixels to span under 150 degrees",
-        ),
-    ],
-)
-def test_other_projections_and_lenses_are_refused(options, words):
-    parameters, arguments = few()
-    with pytest.raises(ValueError, match=words):
-        render(parameters, settings(**arguments, **options))
-
-
 def test_cameras_get_no_gradients_on_rays():
     parameters, arguments = few()
     view = settings(**arguments, projection="ray")

@@ -3,8 +3,6 @@
 
 #include "backend_run.h"
 #include "gs/check_threads.h"
-#include "rows_run.h"
-#include "step_run.h"
 
 namespace {
 
@@ -56,55 +54,10 @@ void test_poison() {
       }
 }
 
-// Rows give the bits of the lists.
-void test_rows() {
-  for (Parameters<float>& p : scenes_for_rows())
-    for (const bool depth : {false, true})
-      check_rows(gs::three_threads(), scene_of(p, {40, 70}, false), depth, false,
-                 [](const Rendered& r, const KeptRows* rows, float* lengths) {
-                   std::vector<float> moments(kGradientValues * r.scene.count, NAN);
-                   gs::BlendGradient<float> g = r.backward;
-                   g.moments = moments.data(), g.absolute = lengths;
-                   if (rows)
-                     sum_rows(gs::three_threads(), rows->given(r),
-                              gs::RowSums<float>{r.splats.data(), r.scene.image, moments.data(), lengths});
-                   else
-                     blend_vjp(gs::three_threads(), r.input, g);
-                   return moments;
-                 });
-}
-
-// Steps taken inside the backward give the bits of steps from gradients in memory: several iterations, the last ones
-// after a step that was not finite.
-void test_gaussian_step() {
-  for (const int64_t count : {0, 1, 130, 700})
-    for (const StepCase& how : kStepCases) {
-      if (count < 130 && (&how - kStepCases) % 3) continue;
-      const Stepping start{Parameters<float>(count)};
-      Stepping plain = start, fused = start;
-      for (int64_t iteration = 1; iteration <= 3; ++iteration) {
-        const float gradient = iteration == 2 ? how.gradient : 1;
-        const auto r = render_with(gs::three_threads(), scene_of(plain.values, {40, 24}, count == 130), gradient);
-        blend_vjp(gs::three_threads(), r->input, r->backward);
-        step_plainly(gs::three_threads(), plain, how, *r, iteration, [&](const gs::SceneGradient<float>& g) {
-          project_vjp(gs::serial_executor(), r->scene, r->tile_counts.data(), r->moments.data(), g);
-        });
-        r->scene = scene_of(fused.values, r->scene.image, r->scene.antialiasing);  // has the values of before that step
-        project_vjp_step(gs::three_threads(), r->scene, r->tile_counts.data(), r->moments.data(),
-                         gaussian_step(fused, how, *r, iteration));
-        CHECK(fused.bytes() == plain.bytes());
-      }
-      CHECK(count < 130 || (fused.stopped == 2) == (how.guarded && std::isnan(how.gradient)));
-      CHECK(count < 130 || fused.values.means != start.values.means);
-    }
-}
-
 }  // namespace
 
 int main() {
   test_threads_and_sizes<float>(), test_threads_and_sizes<double>();
   test_poison();
-  test_rows();
-  test_gaussian_step();
   return gs::finish_tests("rasterizer backend");
 }
