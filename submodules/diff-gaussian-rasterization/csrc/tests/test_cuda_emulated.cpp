@@ -7,6 +7,7 @@
 #include "channels_run.h"
 #include "emulated_queue.h"
 #include "exchange_run.h"
+#include "front_first.cuh"
 #include "gs/check_shared.h"
 #include "gs/gpu_forms.h"
 #include "long_lists.h"
