@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from gaussians import FURTHER, GROUPS, model, options, parameters, take_steps
+from gaussians import FURTHER, model, options, parameters, take_steps
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
@@ -79,28 +79,6 @@ def test_the_references_checkpoint_loads(tmp_path, scalar, numpy):
     for name, value in parameters(gaussians).items():
         assert torch.equal(parameters(other)[name], value)
     take_steps(other, 1)
-
-
-def test_a_loop_that_takes_the_tensors_as_they_are_trains_on(tmp_path):
-    """The reference's restore: parameters straight from the file, a new Adam of torch, its state from the file."""
-    gaussians = model(12)
-    take_steps(gaussians, 2)
-    save_checkpoint(tmp_path / "chkpnt2.pth", gaussians.capture(), 2)
-    (capture, _) = torch.load(tmp_path / "chkpnt2.pth", weights_only=True)
-    _, xyz, f_dc, f_rest, scaling, rotation, opacity, _, _, _, state, _, *others = capture
-    taken = {"xyz": xyz, "f_dc": f_dc, "f_rest": f_rest, "opacity": opacity, "scaling": scaling, "rotation": rotation}
-    taken |= zip(FURTHER, others, strict=True)
-    assert all(isinstance(t, torch.nn.Parameter) and t.requires_grad and t.is_leaf for t in taken.values())
-    theirs = torch.optim.Adam([{"params": [t], "lr": 0.0, "name": name} for name, t in taken.items()], eps=1e-15)
-    theirs.load_state_dict(state)
-    generator = torch.Generator().manual_seed(9)
-    for name, param in taken.items():
-        param.grad = torch.randn(param.shape, generator=generator)
-        getattr(gaussians, GROUPS[name]).grad = param.grad.clone()
-    theirs.step()
-    gaussians.optimizer.step()
-    for name, value in parameters(gaussians).items():
-        torch.testing.assert_close(taken[name].detach(), value, rtol=0, atol=2**-20)
 
 
 def test_plain_tensors_and_other_optimisers_are_captured_and_restored():
@@ -200,7 +178,7 @@ def test_parts_that_do_not_fit_end_in_a_sentence(tmp_path):
         "the iteration is -5": (good, -5),
         "the iteration is a str": (good, "x"),
         "the iteration is 2.5": (good, 2.5),
-        "SH degree is 7": (_changed(good, 0, 7), 1),
+        "SH degree is 4": (_changed(good, 0, 4), 1),
         "SH degree is -3": (_changed(good, 0, -3), 1),
         "SH degree is a str": (_changed(good, 0, "x"), 1),
         "extent of the scene is a str": (_changed(good, 11, "x"), 1),

@@ -109,9 +109,10 @@ def _nan_loss_in(monkeypatch: pytest.MonkeyPatch, iteration: int) -> None:
     monkeypatch.setattr(objective, "photometric_loss", broken)
 
 
-@pytest.mark.parametrize("optimizer", ["default", "sparse_adam"])
-@pytest.mark.parametrize(("broken", "seen"), [(3, 3), (13, 13), (26, 26), (12, 20)])
-def test_the_model_before_a_loss_of_nan_is_saved(colmap_scene, tmp_path, monkeypatch, broken, seen, optimizer):
+@pytest.mark.parametrize(
+    ("broken", "optimizer"), [(3, "default"), (13, "sparse_adam"), (26, "default"), (12, "default")]
+)
+def test_the_model_before_a_loss_of_nan_is_saved(colmap_scene, tmp_path, monkeypatch, broken, optimizer):
     """Whether divergence is detected at once, on a save (3) or a change (13, 26), or later, nothing has moved since."""
     options = ["--densify_from_iter", 10, "--densification_interval", 13, "--densify_grad_threshold", 1e-4]
     options += ["--opacity_reset_interval", 26, "--optimizer_type", optimizer]
@@ -186,8 +187,8 @@ def test_rates_a_hundred_times_too_high_end_in_a_warning(colmap_scene, tmp_path,
     rates |= {"scaling_lr": 0.5, "rotation_lr": 0.1}
     high = [word for name, rate in rates.items() for word in (f"--{name}", rate)]
     options = ["--densify_from_iter", 50, "--densification_interval", 50, "--opacity_reset_interval", 300]
-    ply = _train(colmap_scene, tmp_path / "high", *options, *high, iterations=600)
-    read_model(ply).check_finite(600)
+    ply = _train(colmap_scene, tmp_path / "high", *options, *high, iterations=300)
+    read_model(ply).check_finite(300)
     assert "so the model is worse than its start; lower the learning rates" in capfd.readouterr().err
     _train(colmap_scene, tmp_path / "usual", *options, iterations=150)
     assert "the model is worse" not in capfd.readouterr().err

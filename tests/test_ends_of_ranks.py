@@ -2,7 +2,6 @@
 
 import argparse
 import os
-import subprocess
 import sys
 import zipfile
 from pathlib import Path
@@ -15,7 +14,6 @@ from arguments import ModelParams
 from scene import Scene
 from scene.gaussian_model import GaussianModel
 from splatting.distributed.ranks import Ranks, refuse_differences, using
-from splatting.findings.training import faster_alone
 from splatting.host import machine, torchrun
 from splatting.training.agreement import agree_on_options, agree_on_scene
 from splatting.training.folder import newest_checkpoint
@@ -119,24 +117,3 @@ def test_checkpoints_of_earlier_trainings_do_not_stand(tmp_path):
     (tmp_path / "chkpnt_best.pth").touch()
     assert newest_checkpoint(str(tmp_path)) == str(tmp_path / "chkpnt40.pth")
     assert newest_checkpoint(str(tmp_path), below=40) == str(tmp_path / "chkpnt5.pth")
-
-
-def test_a_training_of_one_process_loads_nothing_of_several(colmap_scene, tmp_path):
-    code = (
-        "import sys, train\n"
-        "train.main(sys.argv[1:])\n"
-        "names = [n for n in sys.modules if n.startswith('splatting.distributed.')]\n"
-        "print('loaded', *sorted(names), file=sys.stderr)"
-    )
-    options = ["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "--iterations", "2", "--disable_viewer"]
-    done = subprocess.run([sys.executable, "-c", code, *options], cwd=ROOT, capture_output=True, text=True, check=True)
-    loaded = done.stderr.splitlines()[-1].split()
-    assert loaded[0] == "loaded" and "splatting.distributed.ranks" in loaded
-    assert not {f"splatting.distributed.{name}" for name in ("process_group", "launcher")} & {*loaded}
-
-
-def test_a_scene_that_one_gpu_trains_faster_gets_a_sentence_with_the_estimate():
-    said = str(faster_alone(2, True, 1_000_000))
-    assert "1,000,000 Gaussians takes about 2.1 ms on one GPU and 3.7 ms on two" in said and "without torchrun" in said
-    for alone in ((1, True, 1_000_000), (2, False, 1_000_000), (2, True, 20_000_000)):
-        assert faster_alone(*alone) is None

@@ -100,20 +100,10 @@ def test_capture_and_restore():
     assert [group["lr"] for group in other.optimizer.param_groups][1:3] == [0.5, 0.025]
 
 
-def test_restore_refuses_another_degree():
-    with pytest.raises(UserError, match="sh_degree"):
-        GaussianModel(1).restore(model(5, degree=2).capture(), options())
-
-
 def test_restore_refuses_other_attributes():
     capture = model(5).capture()
     with pytest.raises(UserError, match=rf"has {len(GROUPS) + 1} attributes per Gaussian.*has {len(GROUPS)} \(xyz"):
         GaussianModel(3).restore((*capture, torch.zeros(5, 1)), options())
-
-
-def test_unknown_optimizer_is_refused():
-    with pytest.raises(UserError, match="optimizer_type must be default or sparse_adam, got 'sgd'"):
-        GaussianModel(3, "sgd")
 
 
 def test_a_copy_has_statistics_of_its_own():

@@ -77,16 +77,6 @@ def test_parameters_without_gradient_stay_and_do_not_count():
         assert optimizer.state[group["params"][0]]["step"] == 1
 
 
-@pytest.mark.parametrize("to_none", [True, False])
-def test_zero_grad_leaves_no_gradient(to_none):
-    optimizer = GaussianAdam(_groups())
-    _step([optimizer], torch.Generator().manual_seed(0))
-    optimizer.zero_grad(set_to_none=to_none)
-    for group in optimizer.param_groups:
-        gradient = group["params"][0].grad
-        assert gradient is None if to_none else not gradient.any()
-
-
 @pytest.mark.parametrize("columns", [0, 9, 24])
 def test_leaving_out_inactive_bands_changes_no_bit(columns):
     """A dense step of columns with zero gradient and moments equals the step that skips them."""

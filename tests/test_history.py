@@ -1,20 +1,27 @@
-"""Trainings after others: into a folder with a model, from a checkpoint elsewhere, with other options."""
+"""Trainings after others: into a folder with a model, from elsewhere, with other options; and the folder's lock."""
 
 import argparse
 import json
+import os
 import re
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
 from synthetic import folder_state
 from test_arguments import MODEL
+from waiting import wait_for
 
 import train
 from arguments import add_to_model_json, read_model_json, write_cfg_args
 from splatting.evaluation.error_curve import COLUMNS, read_curve, write_curve
-from splatting.training.folder import check_folder, continue_records
-from utils.system_utils import UserError
+from splatting.files.folders import locked, remove_temporary_files
+from splatting.training.folder import check_folder, continue_records, folder_of, own_folder, records_kept
+from utils.system_utils import UserError, atomic_write
 
 CURVE, LOG = "error_vs_time.csv", "train_log.json"
 
@@ -48,17 +55,6 @@ def _elsewhere(checkpoint: Path, folder: Path) -> Path:
     """A copy of the checkpoint with nothing beside it."""
     (folder / "moved").mkdir(exist_ok=True)
     return Path(shutil.copy(checkpoint, folder / "moved"))
-
-
-def test_the_same_command_overwrites_and_says_so(colmap_scene, tmp_path, capfd):
-    out = tmp_path / "out"
-    first = _train(colmap_scene, out, "--save_iterations", 2, iterations=3)
-    (tmp_path / "link").symlink_to(colmap_scene)
-    assert _train(tmp_path / "link", out, "--save_iterations", 2, iterations=3) == first
-    said = capfd.readouterr().err
-    (warning,) = _warnings(said)
-    assert "has a finished training of 3 iterations, and this one starts over; --resume with more --iterat" in warning
-    assert "train_log" not in said
 
 
 def test_iterations_that_stay_are_warned_of(colmap_scene, tmp_path, capfd):
@@ -193,23 +189,12 @@ def test_changed_options_are_told_in_one_line(colmap_scene, tmp_path, capfd):
                "transparent", "--seed", 4, "--lambda_dssim", 0.4]  # fmt: skip
     _train(colmap_scene, tmp_path / "changed", *options, *changed, iterations=3)
     (warning,) = _warnings(capfd.readouterr().err)
-    assert warning == (
-        f"warning: {out} was trained with --resolution 48 no --white_background --mask_meaning auto "
-        "no --antialiasing --lambda_dssim 0.2 --optimizer_type default --seed 3, this run has "
-        "--resolution 72 --white_background --mask_meaning transparent "
-        "--antialiasing --lambda_dssim 0.4 --optimizer_type sparse_adam --seed 4"
-    )
+    before, _, now = warning.partition(", this run has ")
+    assert "trained with --resolution 48 no --white_background --mask_meaning auto no --antialiasing" in before
+    assert now.split()[:3] == ["--resolution", "72", "--white_background"] and now.endswith("sparse_adam --seed 4")
     # In the same folder cfg_args is overwritten, so the message must come before.
     _train(colmap_scene, out, *options, "-w", iterations=3)
     assert len(_warnings(capfd.readouterr().err)) == 1
-
-
-def test_a_resumed_curve_of_other_views_is_told(whole, colmap_scene, tmp_path, capfd):
-    start = "--eval", "--start_checkpoint", whole / "chkpnt20.pth"
-    for words, told in (("-r", 72), True), (("--lambda_dssim", 0.4), False):
-        _train(colmap_scene, tmp_path / "new", *start, *words, iterations=21)
-        (warning,) = _warnings(capfd.readouterr().err)
-        assert warning.endswith("; the earlier points of its curve are of those other views") == told
 
 
 def test_a_training_that_cannot_go_on_rightly_is_not_resumed(colmap_scene, tmp_path, capfd):
@@ -237,3 +222,111 @@ def test_a_checkpoint_of_another_scene_is_refused_and_one_of_a_moved_scene_told(
     _train(moved, whole, *start, iterations=40)
     (warning,) = _warnings(capfd.readouterr().err)
     assert f"trained with --source_path {colmap_scene}, this run has --source_path {moved}" in warning
+
+
+# The output folder: one train.py at a time, no leftovers of killed runs, a word about removed files
+
+
+def test_a_second_training_is_refused_and_a_killed_one_blocks_nothing(tmp_path):
+    holder = os.fork()
+    if not holder:
+        with own_folder(str(tmp_path)):
+            (tmp_path / "held").touch()
+            time.sleep(600)
+    try:
+        wait_for((tmp_path / "held").exists)
+        said = rf"another train.py \(process {holder}\) is running in .*another -m"
+        with pytest.raises(UserError, match=said), own_folder(str(tmp_path)):
+            pass
+    finally:
+        os.kill(holder, signal.SIGKILL)
+        os.waitpid(holder, 0)
+    (tmp_path / "held").unlink()
+    assert (tmp_path / ".train.lock").exists()
+    with own_folder(str(tmp_path)):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("error", [UserError, KeyboardInterrupt, SystemExit])
+def test_every_ending_releases_the_folder(tmp_path, error):
+    with pytest.raises(error), own_folder(str(tmp_path)):
+        raise error
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_lock_whose_file_was_replaced_is_taken_anew(tmp_path, monkeypatch):
+    """Its owner removes the file at its end, which may be just after we have opened it."""
+    real, removed = os.path.samestat, []
+
+    def remove_once(*stats: os.stat_result) -> bool:
+        if not removed:
+            removed.append(True)
+            (tmp_path / ".x.lock").unlink()
+            return False
+        return real(*stats)
+
+    monkeypatch.setattr("os.path.samestat", remove_once)
+    with locked(tmp_path, "x.py", "another x.py (process {process})", "-m"):
+        assert removed and (tmp_path / ".x.lock").read_text() == f"{os.getpid()}\n"
+
+
+def test_temporary_files_of_dead_processes_are_removed(tmp_path):
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    living = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+    inner = tmp_path / "point_cloud" / "iteration_7"
+    inner.mkdir(parents=True)
+    gone = [tmp_path / f".chkpnt200.{dead.pid}.tmp.pth", inner / f".point_cloud.{dead.pid}.tmp.ply"]
+    gone.append(tmp_path / f".cfg_args.{dead.pid}.tmp")
+    stay = [tmp_path / f".model.{living.pid}.tmp.json", tmp_path / "chkpnt200.pth", tmp_path / ".a.x.tmp.pth"]
+    try:
+        for path in (*gone, *stay):
+            path.touch()
+        with own_folder(str(tmp_path)):
+            assert not any(path.exists() for path in gone)
+        assert all(path.exists() for path in stay)
+    finally:
+        living.kill()
+        living.wait()
+
+
+@pytest.mark.parametrize("name", ["chkpnt7.pth", "cfg_args", "a.b.png", "point_cloud.ply", ".hidden"])
+def test_the_names_of_temporary_files_are_known(tmp_path, monkeypatch, name):
+    with atomic_write(tmp_path / name) as temporary:
+        temporary.touch()
+        assert not remove_temporary_files(tmp_path)  # this process lives
+        monkeypatch.setattr("splatting.files.folders._runs", lambda process: process != os.getpid())
+        assert remove_temporary_files(tmp_path) == [temporary]
+        temporary.touch()
+
+
+def test_a_folder_that_is_removed_while_training_is_told_of(tmp_path, capsys):
+    folder = tmp_path / "out"
+    with own_folder(str(folder)):
+        shutil.rmtree(folder)
+        folder.mkdir()
+        (folder / "cfg_args").touch()
+    assert "warning: model.json, cameras.json, input.ply in" in (said := capsys.readouterr().err)
+    assert "were removed during training" in said
+
+
+@pytest.mark.parametrize("saves", [False, True])
+def test_records_stay_with_the_model_that_is_saved(tmp_path, saves):
+    ply = tmp_path / "point_cloud" / "iteration_7" / "point_cloud.ply"
+    for path in (ply, tmp_path / "cfg_args"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("old")
+    with pytest.raises(ValueError, match="odd"), records_kept(str(tmp_path)):
+        (tmp_path / "cfg_args").write_text("new")
+        if saves:
+            ply.with_name("point_cloud.ply").unlink()
+            (tmp_path / "chkpnt3.pth").touch()
+        raise ValueError("odd")
+    assert (tmp_path / "cfg_args").read_text() == ("new" if saves else "old")
+
+
+def test_a_checkpoint_is_resumed_in_its_folder(tmp_path):
+    assert folder_of(None) is None and folder_of(str(tmp_path / "chkpnt7.pth")) is None
+    (tmp_path / "cfg_args").touch()
+    assert folder_of(str(tmp_path / "chkpnt7.pth")) == str(tmp_path)

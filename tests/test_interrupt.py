@@ -1,4 +1,4 @@
-"""SIGHUP waits for a safe moment as SIGTERM does, although the terminal is gone by then."""
+"""Ends of a training from outside: SIGHUP, which waits for a safe moment as SIGTERM does, and kills."""
 
 import os
 import pty
@@ -63,3 +63,13 @@ def test_nohup_is_respected():
     command = ["sh", "-c", 'trap \'\' HUP; exec "$0" -c "$1"', sys.executable, program]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout == "None\n"
+
+
+# One trial of killed trainings
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+def test_a_killed_training_ends_as_if_it_had_not_been():
+    done = subprocess.run([sys.executable, "-m", "tests.kills", "2", "4"], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0 and "0 ended differently" in done.stdout, done.stdout + done.stderr

@@ -1,18 +1,23 @@
-"""The training loop: the hooks of observers and of density control, each called in its place."""
+"""The training loop: the hooks of observers and of density control, each called in its place; and the progress bar."""
 
+import io
 import json
-import os
-import signal
 import time
+from itertools import count
 from types import SimpleNamespace
 
 import pytest
 import torch
+from tqdm import tqdm
 
 import train
 from splatting.evaluation.training_log import TrainingLog
+from splatting.host.progress import Bar
 from splatting.part import Part, Strategy
-from splatting.training.loop import Announcer, standard_observers
+from splatting.training.log import ProgressBar
+from splatting.training.loop import standard_observers
+from splatting.training.objective import LossWatch
+from splatting.training.schedule import Schedule
 
 ITERATIONS = 24
 
@@ -83,32 +88,6 @@ def test_observers_are_told_in_the_order_of_the_list_and_of_the_error(colmap_sce
     assert told == [*first, *second, ("a RuntimeError", 0), ("b RuntimeError", 0)]
 
 
-def test_a_hook_that_is_not_overridden_costs_nothing(monkeypatch):
-    for hook in ("due", "begins", "measured", "stepped", "ended"):
-        monkeypatch.setattr(Part, hook, lambda *_: pytest.fail("called"))
-    step = SimpleNamespace(changes=False, due=True, stopping=None)
-    with Announcer([Part()]) as tell:
-        tell.begins(step)
-        tell.measured(step, None)
-        tell.stepped(step)
-    assert step.due is False
-
-
-def test_observers_stand_where_they_must(colmap_scene, tmp_path, monkeypatch):
-    """The order is meant: checks, writers, checkpoints, and last what may wait."""
-    names = []
-
-    def observers(*given) -> list[Part]:
-        listed = standard_observers(*given)
-        names.extend(type(one).__name__ for one in listed)
-        return listed
-
-    _train(colmap_scene, tmp_path, monkeypatch, observers, "--eval")
-    assert names[0] == "DivergenceWatch" and names[-3:] == ["Checkpoints", "Resume", "RemoteViewer"]
-    between = ["Curve", "Tensorboard", "Scores", "Saves", "Records", "Checkpoints"]
-    assert [name for name in names if name in between] == between
-
-
 def test_another_strategy_is_another_object(colmap_scene, tmp_path, monkeypatch):
     calls = []
 
@@ -152,22 +131,6 @@ def test_backward_runs_on_the_callers_thread(colmap_scene, tmp_path, monkeypatch
     assert not any(found) and torch.autograd.is_multithreading_enabled() is before
 
 
-def test_a_signal_while_the_curve_is_drawn_ends_the_program_at_once(colmap_scene, tmp_path, monkeypatch):
-    """Nothing is left to save by then. During an iteration a first signal waits for the step to be complete."""
-
-    def draw(*_: object) -> None:
-        os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr("splatting.evaluation.curve_recorder.CurveDrawer.finish", draw)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            _train(colmap_scene, tmp_path, monkeypatch, standard_observers, "--eval")
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert (tmp_path / f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply").is_file()
-
-
 def test_a_checkpoint_of_the_last_iteration_does_not_turn_seconds_back(tmp_path):
     log = TrainingLog(tmp_path, 0)
     log.add(7, 2.0, loss=0.5)
@@ -190,3 +153,38 @@ def test_what_replaces_training_report_is_called(colmap_scene, tmp_path, monkeyp
     records = json.loads((tmp_path / "train_log.json").read_text())
     assert [record["iteration"] for record in records if "test_psnr" in record] == [4]
     assert records[-1]["seconds"] < 500
+
+
+# The progress bar of training
+
+
+@pytest.mark.parametrize("seconds", [0.0, 4.0])
+def test_a_log_gets_a_line_in_ten_seconds_and_a_last_one(monkeypatch, seconds):
+    log, now = io.StringIO(), iter(count(0.0, seconds))
+    monkeypatch.setattr("splatting.host.progress.time", SimpleNamespace(monotonic=lambda: next(now)))
+    for _ in Bar(range(30), file=log, desc="Looking", mininterval=0, miniters=1):
+        tqdm.write("other", file=log)
+    lines = [line for line in log.getvalue().split("\n") if line != "other"]
+    assert lines[-1] == "" and lines[-2].startswith("Looking: 100%") and "\r" not in log.getvalue()
+    assert "0%|  " not in lines[0] and len(lines) == (2 if not seconds else len(set(lines)))
+    assert not seconds or 5 < len(lines) < 40
+
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    for _ in Bar(range(3), file=(shown := Terminal())):
+        pass
+    assert "0%" in shown.getvalue() and "100%" in shown.getvalue()
+
+
+def test_the_number_of_gaussians_is_exact(capsys):
+    run = SimpleNamespace(
+        losses=LossWatch(), parts=[], first_iteration=0,
+        schedule=Schedule(20), gaussians=SimpleNamespace(gaussian_count=123_456), clock=SimpleNamespace(seconds=1.0),
+        opt=SimpleNamespace(time_budget=0.0),
+    )  # fmt: skip
+    bar = ProgressBar(run)
+    bar.measured(SimpleNamespace(iteration=10, due=True, span=range(10, 11)), SimpleNamespace(terms={}))
+    bar.ended(None)
+    assert "Gaussians=123,456" in capsys.readouterr().err

@@ -1,7 +1,6 @@
 """Too little memory: the warning beforehand, the files saved when memory runs out, and the message."""
 
 import re
-import sys
 from itertools import chain, repeat
 from pathlib import Path
 from unittest.mock import DEFAULT, Mock
@@ -10,16 +9,14 @@ import pytest
 import torch
 from gaussians import model, needs_59_values, options
 
-import render
 import train
-from gaussian_renderer import scored_views
 from scene.images import decode
 from splatting.files.plain_files import plain
 from splatting.findings import resources
 from splatting.findings.resources import training_bytes
 from splatting.host import memory
-from splatting.host.memory import free_memory, gib, is_out_of_memory, shortage
-from utils.system_utils import UserError, run_cli
+from splatting.host.memory import free_memory, gib, is_out_of_memory
+from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]
 HUGE = 1 << 60
@@ -67,16 +64,6 @@ def test_a_disk_without_space_is_told_before_the_training(colmap_scene, tmp_path
         "3.0 MB if there are 6,000",
         "0.1 MB if there are 300",
     ]
-
-
-def test_numbers_of_an_error():
-    free = r"[\d.]+ GiB free on the CPU"
-    refused = _raised(lambda: torch.empty(3 << 50, dtype=torch.uint8))
-    assert re.fullmatch(f"3145728.0 GiB asked for, {free}", shortage(refused, "cpu"))
-    assert shortage(ON_A_GPU, "cpu").startswith("20.0 GiB asked for, ")
-    counted = shortage(_raised(_instances_beyond_counting), "cpu")
-    assert re.fullmatch(rf"5 Gaussians cover 3000000000 tile instances, more than 2\^31 - 1, {free}", counted)
-    assert re.fullmatch(f"MemoryError, {free}", shortage(MemoryError(), "cpu"))
 
 
 def test_free_memory_is_what_the_kernel_and_the_container_leave(tmp_path, monkeypatch):
@@ -136,26 +123,6 @@ def test_other_errors_of_a_training_stay_what_they_are(colmap_scene, tmp_path, m
     with pytest.raises(RuntimeError, match="shapes differ"):
         _train(colmap_scene, tmp_path, "--plain_step")
     assert not list(tmp_path.glob("*.pth"))
-
-
-def test_rendering_says_what_did_not_fit(colmap_scene, tmp_path, monkeypatch):
-    _train(colmap_scene, tmp_path)
-    monkeypatch.setattr(scored_views, "render", _failing(scored_views.render, 4, ON_A_GPU))
-    monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(tmp_path)])
-    with pytest.raises(
-        UserError, match=r"rendering ran out of memory \(20.0 GiB asked for.*Gaussians; images of 24 x 16\).*-r"
-    ):
-        render.main()
-
-
-def test_every_command_ends_in_a_sentence(capsys):
-    def full() -> None:
-        torch.empty(HUGE, dtype=torch.uint8)
-
-    with pytest.raises(SystemExit) as ended:
-        run_cli(full)
-    assert ended.value.code == 2
-    assert re.fullmatch(r"error: ran out of memory \(.* asked for, .*\n", capsys.readouterr().err)
 
 
 # The estimate

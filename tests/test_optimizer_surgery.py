@@ -102,23 +102,6 @@ def test_appended_rows_start_with_averages_of_zero(name):
     _step(gaussians, 1, torch.arange(34) % 30)
 
 
-@pytest.mark.parametrize("name", OPTIMIZERS)
-def test_density_control_with_an_optimiser_of_the_client(name):
-    gaussians = _with(OPTIMIZERS[name])
-    _step(gaussians, 0, torch.arange(30))
-    gaussians.xyz_gradient_accum += 1
-    gaussians.denom += 1
-    gaussians.densify_and_prune(0.5, 0.005, EXTENT, 20)
-    gaussians.reset_opacity()
-    assert len(gaussians) > 30 and gaussians.get_opacity.max() <= 0.01 + 1e-6
-    for field in GROUPS.values():
-        getattr(gaussians, field).grad = torch.ones_like(getattr(gaussians, field))
-    before = parameters(gaussians)
-    gaussians.update_learning_rate(5)
-    gaussians.step(torch.ones(len(gaussians), dtype=torch.int32))
-    assert all(not torch.equal(values, before[group]) for group, values in parameters(gaussians).items())
-
-
 def test_a_reset_restarts_averages_and_keeps_the_counter():
     gaussians = _with(OPTIMIZERS["amsgrad"])
     _step(gaussians, 0, torch.arange(30))
@@ -217,40 +200,6 @@ def test_a_further_group_with_a_row_per_gaussian_is_pruned_along():
     assert torch.equal(kept["feature"], params["feature"][::2]) and len(kept["xyz"]) == 4
 
 
-def test_a_subclass_manages_its_rows_by_the_references_names():
-    """Overrides written for the reference: its arguments, tensors by group name, `valid` masks."""
-
-    class Client(GaussianModel):
-        calls = 0
-
-        def densification_postfix(self, xyz, dc, rest, opacities, scaling, rotation, **others):
-            Client.calls += 1
-            rows = {"xyz": xyz, "f_dc": dc, "f_rest": rest, "opacity": opacities, "scaling": scaling,
-                    "rotation": rotation}  # fmt: skip
-            self._adopt(self.cat_tensors_to_optimizer(rows | others))
-            count = self.get_xyz.shape[0]
-            self.xyz_gradient_accum, self.denom = torch.zeros((count, 1)), torch.zeros((count, 1))
-            self.max_radii2D = torch.zeros(count)
-
-        def prune_points(self, mask):
-            valid = ~mask
-            self._adopt(self._prune_optimizer(valid))
-            self.xyz_gradient_accum, self.denom = self.xyz_gradient_accum[valid], self.denom[valid]
-            self.max_radii2D = self.max_radii2D[valid]
-
-        def _adopt(self, params):
-            for name, field in GROUPS.items():
-                setattr(self, field, params[name])
-
-    ours, theirs = model(30), model(30)
-    theirs.__class__ = Client
-    for gaussians in (ours, theirs):
-        gaussians.xyz_gradient_accum, gaussians.denom = torch.ones(30, 1), torch.ones(30, 1)
-        gaussians.densify_and_prune(0.5, 0.005, EXTENT, 20, seed=1, iteration=2)
-    assert Client.calls == 2 and len(ours) == len(theirs) > 30
-    assert all(torch.equal(values, parameters(theirs)[name]) for name, values in parameters(ours).items())
-
-
 def test_attributes_that_are_not_optimised_keep_their_rows_in_step():
     gaussians = model(30)
     gaussians.optimizer = torch.optim.Adam([group for group in _groups(gaussians) if group["name"] != "rotation"])
@@ -262,19 +211,6 @@ def test_attributes_that_are_not_optimised_keep_their_rows_in_step():
 
 
 # Without an optimiser
-
-
-def test_rows_change_before_training_is_set_up():
-    gaussians = model(30)
-    gaussians.optimizer = None
-    before = parameters(gaussians)
-    gaussians.prune_points(torch.arange(30) < 10)
-    gaussians.reset_opacity()
-    assert torch.equal(gaussians._xyz, before["xyz"][10:]) and gaussians.get_opacity.max() <= 0.01 + 1e-6
-    append(gaussians, 3)
-    assert torch.equal(gaussians._xyz, before["xyz"][[*range(10, 30), 10, 11, 12]])
-    gaussians.training_setup(options())
-    assert gaussians.optimizer.param_groups[0]["params"][0] is gaussians._xyz
 
 
 # GaussianAdam's groups
@@ -313,34 +249,6 @@ def test_a_copy_of_a_model_trains_on_as_the_model_does():
                 getattr(each, GROUPS[name]).grad = gradient
             each.optimizer.step()
     assert all(torch.equal(values, parameters(other)[name]) for name, values in parameters(gaussians).items())
-
-
-def test_groups_that_change_after_a_step_follow_torch():
-    """Options, a parameter of another type, and a group that takes the place of one."""
-    ours, theirs = (torch.nn.ParameterList([nn.Parameter(torch.ones(10, 3)) for _ in range(2)]) for _ in range(2))
-    optimizers = [
-        GaussianAdam([{"params": [value], "lr": 0.1, "name": name} for name, value in zip("ab", ours, strict=True)]),
-        torch.optim.Adam([{"params": [value], "lr": 0.1} for value in theirs], eps=1e-15),
-    ]
-    changes = [
-        lambda groups: groups[0].update(betas=(0.5, 0.9)),
-        lambda groups: groups[1].update(weight_decay=0.1),
-        lambda groups: groups.__setitem__(
-            0, groups[0] | {"params": [nn.Parameter(torch.ones(4, dtype=torch.float64))]}
-        ),
-        lambda groups: groups[0]["params"].append(nn.Parameter(torch.ones(5))),
-        lambda groups: groups[1].update(weight_decay=0, betas=(0.9, 0.999)),
-    ]
-    for step, change in enumerate([lambda groups: None, *changes]):
-        for optimizer in optimizers:
-            change(optimizer.param_groups)
-            for group in optimizer.param_groups:
-                for param in group["params"]:
-                    param.grad = torch.sin(torch.arange(param.numel()) + step).reshape(param.shape).to(param.dtype)
-            optimizer.step()
-        for mine, other in zip(*(optimizer.param_groups for optimizer in optimizers), strict=True):
-            for a, b in zip(mine["params"], other["params"], strict=True):
-                torch.testing.assert_close(a, b, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("make", [GaussianAdam, SparseGaussianAdam, type("Client", (GaussianAdam,), {})])

@@ -1,11 +1,12 @@
-"""Start and end of train.py's process: what it imports, what it begins early, and the seconds that it notes."""
+"""train.py's process: what it imports and begins early, the seconds that it notes, its clock and its threads."""
 
-import copy
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,9 +15,9 @@ import torch
 
 import train
 from scene import Scene
-from scene.gaussians.adam import GaussianAdam, undecorated
+from scene.gaussians.adam import undecorated
 from scene.images import store
-from splatting.host import start
+from splatting.host import machine, start
 from splatting.training import run
 
 ROOT = Path(__file__).parents[1]
@@ -96,21 +97,6 @@ def test_methods_keep_torchs_decorator_once_its_compiler_is_there(monkeypatch):
     assert not _decorated("add_param_group")
 
 
-def test_what_others_put_in_place_of_torchs_method_is_called(monkeypatch):
-    called = []
-    plain = torch.optim.Optimizer.add_param_group
-
-    def wrapped(optimizer: torch.optim.Optimizer, group: dict) -> None:
-        called.append(group["name"])
-        plain(optimizer, group)
-
-    wrapped.__wrapped__ = None
-    monkeypatch.setattr(torch.optim.Optimizer, "add_param_group", wrapped)
-    optimizer = GaussianAdam([{"params": [torch.nn.Parameter(torch.ones(2, 3))], "lr": 0.1, "name": "xyz"}])
-    assert called == ["xyz"] and optimizer.param_groups[0]["betas"] == (0.9, 0.999)
-    assert copy.deepcopy(optimizer).state_dict()["param_groups"] == optimizer.state_dict()["param_groups"]
-
-
 def test_the_last_record_says_where_the_time_went(colmap_scene, tmp_path):
     record = _train(colmap_scene, tmp_path / "out", "--eval", "--test_iterations", 2, "--checkpoint_iterations", 2)
     parts = [record[f"{name}_seconds"] for name in ("training", "scoring", "saving")]
@@ -144,8 +130,7 @@ def test_pictures_are_decoded_while_the_model_is_made(colmap_scene, tmp_path, mo
     assert kept == [(2, kept[0][1])] and kept[0][1] >= 2  # as many as there are iterations
 
 
-@pytest.mark.parametrize("options", [["--test_iterations", -1], ["--test_iterations", 1, "--no_curve"]])
-def test_views_that_are_scored_are_decoded_side_by_side(colmap_scene, tmp_path, monkeypatch, options):
+def test_views_that_are_scored_are_decoded_side_by_side(colmap_scene, tmp_path, monkeypatch):
     decoded = {}
     plain = store.decode
 
@@ -154,7 +139,7 @@ def test_views_that_are_scored_are_decoded_side_by_side(colmap_scene, tmp_path, 
         return plain(path, size)
 
     monkeypatch.setattr(store, "decode", decode)
-    _train(colmap_scene, tmp_path / "out", "--eval", *options, iterations=1)
+    _train(colmap_scene, tmp_path / "out", "--eval", "--test_iterations", 1, iterations=1)
     photos = sorted(path for path in (colmap_scene / "images").rglob("*") if path.is_file())
     tested = set(photos[::8])
     assert len(tested) == 3 and tested <= decoded.keys()
@@ -186,11 +171,6 @@ def test_the_gpus_context_is_made_in_a_thread(monkeypatch, initialised, expected
     assert not thread.daemon  # the driver must not be left in the middle of it
 
 
-def test_an_installation_for_the_cpu_leaves_the_driver_alone(monkeypatch):
-    monkeypatch.setattr(start, "_computes_on_a_gpu", lambda: False)
-    assert start.begin_cuda() is None
-
-
 def test_what_was_built_with_cuda_is_known_before_torch_is_there(tmp_path):
     """In a fresh process, as the extension is found without being imported."""
     code = "import sys\nfrom splatting.host import start\n"
@@ -199,3 +179,93 @@ def test_what_was_built_with_cuda_is_known_before_torch_is_there(tmp_path):
     from diff_gaussian_rasterization import has_cuda_kernels
 
     assert done.stdout.split() == [str(has_cuda_kernels()), "False"]
+
+
+# The clock that stands still while its process is stopped, and only then
+
+
+# Prints the seconds that the clock counts for each line that it reads.
+CLOCK = """
+import sys
+from splatting.host.clock import running_seconds
+WORK = {"hold the lock": lambda: sum(range(2 * 10**8)), "read": input}
+began = running_seconds()
+print("ready", flush=True)
+WORK[sys.argv[1]]()
+print(running_seconds() - began)
+"""
+
+
+def _counted(work: str, stopped: float = 0.0) -> tuple[float, float]:
+    """Seconds that the clock counts for some work, and those of the wall. stopped: seconds of it."""
+    command = [sys.executable, "-c", CLOCK, work]
+    with subprocess.Popen(command, cwd=ROOT, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout.readline() == "ready\n"
+        began = time.monotonic()
+        if stopped:
+            time.sleep(0.5)
+            process.send_signal(signal.SIGSTOP)
+            time.sleep(stopped)
+            process.send_signal(signal.SIGCONT)
+        said, _ = process.communicate("\n")
+        return float(said), time.monotonic() - began
+
+
+def test_seconds_of_a_stopped_process_do_not_count():
+    counted, wall = _counted("read", stopped=3.0)
+    assert wall > 3.0 and counted < wall - 2.5
+
+
+@pytest.mark.slow
+def test_seconds_of_work_count_also_where_no_other_thread_may_look_at_the_clock():
+    counted, wall = _counted("hold the lock")
+    assert counted == pytest.approx(wall, abs=0.5)
+
+
+# The number of threads for photos: at most the number of processors that the process may use
+
+
+@pytest.fixture
+def made(monkeypatch, tmp_path):
+    """A function that simulates a machine of 64 processors, of which the process may use some; limits by cgroup."""
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    monkeypatch.setattr(machine, "_CGROUPS", tmp_path)
+    monkeypatch.setattr(machine, "_OWN_CGROUPS", tmp_path / "own")
+
+    def make(affinity: int, own: str = "/", **limits: str) -> None:
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(affinity)), raising=False)
+        (tmp_path / "own").write_text(f"1:cpu:/old\n0::{own}\n")
+        for group, limit in limits.items():
+            (tmp_path / group.replace("_", "/")).mkdir(parents=True, exist_ok=True)
+            (tmp_path / group.replace("_", "/") / "cpu.max").write_text(limit)
+
+    return make
+
+
+def test_affinity(made):
+    made(2)
+    assert machine.cores() == machine.threads() == 2
+    made(64)
+    assert machine.cores() == 64 and machine.threads() == machine.MOST_THREADS and machine.threads(5) == 5
+
+
+@pytest.mark.parametrize(
+    ("outer", "inner", "count"),
+    [
+        ("max 100000", "max 100000", 8),
+        ("max 100000", "250000 100000", 3),
+        ("100000 100000", "400000 100000", 1),
+        ("x", "5000 100000", 1),
+    ],
+)
+def test_quota_of_the_group_and_those_around_it(made, outer, inner, count):
+    made(8, "/outer/inner", outer=outer, outer_inner=inner)
+    assert machine.cores() == count
+
+
+def test_without_cgroups_or_affinity(made, monkeypatch, tmp_path):
+    made(8)
+    (tmp_path / "own").unlink()
+    assert machine.cores() == 8
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert machine.cores() == 64

@@ -82,24 +82,20 @@ def test_one_picture(tmp_path):
     assert _loss(tmp_path / "out") < 0.25  # from 0.4, of an untrained model
 
 
-@pytest.mark.parametrize("count", [1, 2, 4])
-def test_a_handful_of_points(colmap_scene, tmp_path, count):
-    def keep(model: pycolmap.Reconstruction) -> None:
-        for point_id in sorted(model.points3D)[count:]:
-            model.delete_point3D(point_id)
-
-    _change(colmap_scene, keep)
-    assert len(_train(colmap_scene, tmp_path / "out")) > count
-
-
-def test_equal_points(colmap_scene, tmp_path):
+def test_equal_points_and_one_point(colmap_scene, tmp_path):
     def gather(model: pycolmap.Reconstruction) -> None:
         for point in model.points3D.values():
             point.xyz = np.array([0.1, 0.1, 0.1])
 
+    def keep(model: pycolmap.Reconstruction) -> None:
+        for point_id in sorted(model.points3D)[1:]:
+            model.delete_point3D(point_id)
+
     _change(colmap_scene, gather)
-    gaussians = _train(colmap_scene, tmp_path / "out")
+    gaussians = _train(colmap_scene, tmp_path / "equal", iterations=100)
     assert len(torch.unique(gaussians.get_xyz, dim=0)) > 100  # they separated
+    _change(colmap_scene, keep)
+    assert len(_train(colmap_scene, tmp_path / "one", iterations=100)) > 1
 
 
 def test_one_camera_has_the_extent_of_its_depth(tmp_path):
@@ -153,7 +149,7 @@ def test_stray_points_begin_small(colmap_scene, tmp_path, capfd):
     assert "2 of 300 points are more than 100 times the scene's extent" in capfd.readouterr().err
     torch.testing.assert_close(scales[:2], torch.full((2, 3), LARGEST_OUTLIER * extent))
     assert scales[2:].max() < 2 * usual.max()
-    _train(colmap_scene, tmp_path / "out")
+    _train(colmap_scene, tmp_path / "out", iterations=30)
 
 
 def _start(scene: Path) -> GaussianModel:
@@ -163,7 +159,7 @@ def _start(scene: Path) -> GaussianModel:
     return gaussians
 
 
-@pytest.mark.parametrize("name", ["bonsai_small", "fox_tiny", "monstree_mixed", "nerf_lego200_tiny"])
+@pytest.mark.parametrize("name", ["bonsai_small", "nerf_lego200_tiny"])
 def test_real_scenes_keep_the_references_extent_and_scales(shared_dir, name):
     info = read_scene(shared_dir / "scenes" / name, "images", hold_out=True)
     centers = np.array([camera.center for camera in info.train_cameras])
@@ -178,22 +174,20 @@ def test_real_scenes_keep_the_references_extent_and_scales(shared_dir, name):
 
 def test_a_huge_world_trains_as_well(colmap_scene, tmp_path):
     """Scaling by a power of two is exact in float32, so all differences come from the constants 0.2 and 1e-7."""
-    _train(colmap_scene, tmp_path / "usual")
+    _train(colmap_scene, tmp_path / "usual", iterations=150)
     _change(colmap_scene, _transform(2.0**17))
-    _train(colmap_scene, tmp_path / "huge")
+    _train(colmap_scene, tmp_path / "huge", iterations=150)
     # Measured: equal to 2 %. Random children of splits differ once a threshold decides differently.
     assert _loss(tmp_path / "huge") == pytest.approx(_loss(tmp_path / "usual"), rel=0.2)
 
 
-@pytest.mark.parametrize("value", [0, 255])
-def test_pictures_of_one_colour(colmap_scene, tmp_path, value):
+def test_pictures_of_one_colour(colmap_scene, tmp_path):
     """It is learnt if the background has another colour; if it has the same one, no Gaussian remains in the end."""
-    _paint(colmap_scene, value)
-    white = [[], ["-w"]]
-    _train(colmap_scene, tmp_path / "out", *white[value == 0])
-    assert _loss(tmp_path / "out") < 0.6  # from 0.8 and more; 0.46 and 0.40 were measured
+    _paint(colmap_scene, 255)
+    _train(colmap_scene, tmp_path / "out")
+    assert _loss(tmp_path / "out") < 0.6  # from 0.8 and more; 0.40 was measured
     with pytest.raises(UserError, match="no Gaussian was left .* or show nothing but the background"):
-        _train(colmap_scene, tmp_path / "same", *white[value == 255])
+        _train(colmap_scene, tmp_path / "same", "-w")
 
 
 UTM = (500_000.0, 4_100_000.0, 300.0)
@@ -223,9 +217,9 @@ def test_map_coordinates_change_no_byte_of_the_model(surveyed, tmp_path, capfd):
     _change(surveyed[1], _transform(translation=UTM))
     outs = [tmp_path / f"{scene.name}_out" for scene in surveyed]
     for scene, out in zip(surveyed, outs, strict=True):
-        _train(scene, out, "--eval")
+        _train(scene, out, "--eval", iterations=100)
     assert "(500000.0, 4100000.0, 300.0) is subtracted from them" in capfd.readouterr().out
-    here, there = (_ply(out).read_bytes() for out in outs)
+    here, there = (_ply(out, 100).read_bytes() for out in outs)
     comment = b"comment world_offset 500000.0 4100000.0 300.0\n"
     assert comment in there and there.replace(comment, b"") == here
     for name in ("cameras.json", "input.ply"):

@@ -3,9 +3,7 @@
 import argparse
 import json
 import math
-import re
 import sys
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from types import SimpleNamespace
@@ -30,7 +28,6 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.readers.point_cloud import write_point_cloud
 from splatting.findings.model import check_model
-from splatting.training.trim_report import TrimReport, lines, saved_line
 from utils.system_utils import UserError
 
 ITERATIONS = 12
@@ -60,7 +57,7 @@ def _image(camera, gaussians: GaussianModel) -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def runs(_colmap_master, tmp_path_factory) -> SimpleNamespace:
-    """Trainings with and without --keep_unseen, with all bands, and with the half-image protocol.
+    """Trainings with and without --keep_unseen, and with few bands.
 
     They are so short that the search would take too long, were it not allowed any number of views.
     """
@@ -79,9 +76,8 @@ def runs(_colmap_master, tmp_path_factory) -> SimpleNamespace:
         _train(scene, folder / "trimmed", cloud, *often, *all_bands, "--test_iterations", ITERATIONS)
         _train(scene, folder / "whole", cloud, *often, *all_bands, "--test_iterations", -1, "--keep_unseen")
         _train(scene, folder / "cut", cloud, *often, "--prune_sh", 0, "--test_iterations", -1)
-        _train(scene, folder / "halves", cloud, "--test_iterations", ITERATIONS, "--train_test_exp", *all_bands)
     sys.stdout = stdout  # restore it, since training stamps it
-    return SimpleNamespace(**{name: folder / name for name in ("trimmed", "whole", "cut", "halves")})
+    return SimpleNamespace(**{name: folder / name for name in ("trimmed", "whole", "cut")})
 
 
 @pytest.fixture(scope="module")
@@ -183,14 +179,6 @@ def test_saves_before_the_cut_are_read_with_the_bands_they_have(runs, monkeypatc
         assert check_model(str(runs.cut), iteration)[0].text.endswith(f"of SH degree {degree}")
     with pytest.raises(UserError, match="SH degree 3, but SH degree 1 needs 9"):
         render_iteration(5, "--sh_degree", 1)
-
-
-def test_test_views_that_train_in_half_stay_the_same_in_whole(runs):
-    record = json.loads((runs.halves / "model.json").read_text())["left_out"]
-    assert record["unseen"] == 600 - len(_ply(runs.halves)) > 20
-    assert record["test_change"]["largest"] == 0
-    assert record["test_change"]["psnr_before"] == record["test_change"]["psnr_after"] > 5
-    assert (runs.halves / "exposure.json").exists()
 
 
 def test_colours_move_by_no_more_than_asked(cameras):
@@ -304,53 +292,3 @@ def test_a_view_between_is_interpolated():
         # The principal points lie 2 px right of the first image's centre and 3 of the second's.
         assert (clip[0] / clip[3]).item() * view.image_width / 2 == pytest.approx(2 + fraction, abs=1e-3)
         assert (clip[1] / clip[3]).item() * view.image_height / 2 == pytest.approx(-1 + fraction, abs=1e-3)
-
-
-LEFT_OUT = TrimReport(
-    gaussians=1000, unseen=50, faint=0, keep_unseen=False, search=DONE, views=99, iterations=7000, max_sh_degree=3,
-    sh_degree=3, cut_bounds=[0.3, 0.2, 0.1, 0.0], ply_bytes=248_000, ply_bytes_saved=12_400, seconds=1.25,
-    picture_bytes=3_000_000, picture_bytes_in_files=12_000_000,
-    test_change={"largest": 0.0123, "psnr_before": 30.0, "psnr_after": 29.9},
-)  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({}, "50 invisible Gaussians of 1,000 were left out (5.0 %, 0.01 MB of the PLY); 99 views were"),
-        ({}, "at training size: 3.0 MB, 45.0 MB less"),
-        # 950 Gaussians lose 12 coefficients of 3 channels, 4 bytes each.
-        ({"sh_degree": 1}, "the SH bands above degree 1 (0.14 MB of the PLY): colours move by at most 0.2 (values"),
-        ({"sh_degree": 1, "cut_bounds": [0.3, 0.0, 0.0, 0.0]}, "(0.14 MB of the PLY): they are zero throughout"),
-        ({"keep_unseen": True, "unseen": 0, "test_change": {}}, "No Gaussian was left out (--keep_unseen)\n"),
-        ({"search": FEW, "unseen": 20, "faint": 20}, "searched in 1.2 s, with fewer than 1 % unseen besides"),
-        ({"unseen": 0, "test_change": {}}, "No Gaussian was left out; 99 views were searched"),
-        ({"search": TOO_LONG, "unseen": 0}, "a search takes 99 views, more than a 15th of the iterations"),
-    ],
-)
-def test_the_lines_of_a_report(changes, said):
-    assert said in "\n".join(lines(replace(LEFT_OUT, **changes)))
-
-
-def test_the_line_that_training_prints():
-    bands = replace(LEFT_OUT, unseen=0, sh_degree=0, ply_bytes_saved=183_400, test_change={})
-    assert saved_line(bands, Path("O")) == "Saved 1,000 Gaussians to O (0.06 MB; SH bands above degree 0 left out)"
-    faint = replace(bands, unseen=50, faint=50)
-    assert saved_line(faint, Path("O")).endswith(". Left out 50 invisible Gaussians (opacity below 1/255)")
-    assert "(no view depends on them); test views change by at most 0.012" in saved_line(LEFT_OUT, Path("OUT"))
-
-
-def test_a_training_ends_with_at_most_six_lines(colmap_scene, tmp_path, capfd):
-    train.main(["-s", str(colmap_scene), "-m", str(tmp_path), "-r", "24", "--iterations", "210", "--eval"])
-    said = re.sub(r" \[\d\d/\d\d \d\d:\d\d:\d\d\]$", "", capfd.readouterr().out, flags=re.MULTILINE).splitlines()
-    end = said[next(n for n, line in enumerate(said) if line.startswith("210 iterations in ")) :]
-    left_out = TrimReport(**json.loads((tmp_path / "model.json").read_text())["left_out"])
-    assert saved_line(left_out, tmp_path / "point_cloud" / "iteration_210") in end
-    assert re.fullmatch(
-        r"Test PSNR measured 13 times \(12 of them on 1 of 3 views\), [\d.]+ s: .*error_vs_time.png", end[1]
-    )
-    assert re.fullmatch(
-        r"Test PSNR [\d.]+ dB \(as metrics.py\). Look at the model: \S*python\S* view.py -m \S+", end[-2]
-    )
-    assert len(end) <= 7 and end[-1] == "Training complete."
-    assert set(lines(left_out)) < set(json.loads((tmp_path / "train_log.json").read_text())[-1]["lines"])

@@ -2,14 +2,13 @@
 
 import json
 import sys
-import types
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from gaussians import cloud, model, options, take_steps
+from gaussians import model, options, take_steps
 from PIL import Image
 from trainings import leaves
 
@@ -18,7 +17,7 @@ import train
 from scene.dataset_readers import CameraInfo, read_scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import EXPOSURES, WRITTEN_BY, extra_state, load_checkpoint, save_checkpoint
-from scene.gaussians.exposure import Exposures, apply_exposure, read_exposures
+from scene.gaussians.exposure import Exposures, read_exposures
 from scene.readers.info import exposure_names
 from splatting.evaluation.error_curve import read_curve
 from splatting.parts.exposure.half_images import train_on_all
@@ -68,18 +67,6 @@ def test_the_optimiser_has_the_references_schedule_and_torchs_constants():
         assert exposures.optimizer.param_groups[0]["lr"] == rate(t)
     theirs = torch.optim.Adam([torch.zeros(1)]).defaults
     assert all(exposures.optimizer.defaults[name] == theirs[name] for name in ("betas", "eps"))
-
-
-def test_the_gradient_has_the_same_bits_for_any_number_of_threads(threads):
-    generator = torch.Generator().manual_seed(0)
-    image, weights = torch.rand(2, 3, 301, 407, generator=generator)
-    results = []
-    for count in (1, 2, 3):
-        threads(count)
-        inputs = image.clone().requires_grad_(), torch.eye(3, 4).add(0.1).requires_grad_()
-        out = apply_exposure(*inputs)
-        results.append(leaves([out, *torch.autograd.grad((out * weights).sum(), inputs)]))
-    assert results[0] == results[1] == results[2]
 
 
 # exposure.json
@@ -150,24 +137,6 @@ def test_parts_can_be_read_and_replaced_by_the_references_names():
     assert gaussians.exposure_optimizer.param_groups[0]["lr"] == 0.25  # they are not trained further
     with pytest.raises(UserError, match="no trained exposure of y"):
         gaussians.get_exposure_from_name("y")
-
-
-def test_steps_without_training_do_nothing():
-    gaussians = model(6)
-    gaussians.start_exposures(_infos(*NAMES))
-    gaussians.training_setup(options())
-    gaussians.exposure_optimizer.step()
-    gaussians.exposure_optimizer.zero_grad(set_to_none=True)
-    assert torch.equal(gaussians.get_exposure, torch.eye(3, 4).expand(3, 3, 4)) and not gaussians.exposures.trained
-
-
-def test_records_need_a_name_only():
-    record = types.SimpleNamespace
-    gaussians = GaussianModel(0)
-    gaussians.create_from_pcd(cloud(5), [record(image_name="a"), record(image_name="b")], 1.0)
-    assert gaussians.exposure_mapping == {"a": 0, "b": 1} and gaussians.get_exposure.shape == (2, 3, 4)
-    gaussians.create_from_pcd(cloud(5), [record(image_name=name) for name in "aba"], 1.0)
-    assert gaussians.exposure_mapping == {"a": 0, "b": 1} and gaussians.get_exposure.shape == (2, 3, 4)
 
 
 def test_a_ply_brings_the_exposures_of_its_model_folder(tmp_path, capsys):

@@ -1,6 +1,5 @@
 """Checkpoints that are resumed with more photos than they were trained on."""
 
-import json
 import shutil
 import sys
 from pathlib import Path
@@ -116,62 +115,23 @@ def test_options_that_keep_something_of_each_photo(scenes, tmp_path, more, said,
     assert train_on(scenes[0], tmp_path / "c", *words, tmp_path / "b/chkpnt30.pth") == whole
 
 
-def test_a_training_by_the_clock_gets_photos(scenes, tmp_path, monkeypatch, capfd):
-    train_on(scenes[1], tmp_path / "a", *WORDS, "--iterations", 300, "--schedule", 30)
-    names = _seen(monkeypatch)
-    words = *WORDS, "--iterations", 300, "--time_budget", 0.5, "--start_checkpoint", tmp_path / "a/chkpnt30.pth"
-    train_on(scenes[0], tmp_path / "b", *words)
-    assert "2 photos are new; until iteration 38 every second one" in capfd.readouterr().out and names[0] in scenes[2]
-
-
-def test_a_folder_with_an_older_model_gets_the_new_photos(scenes, first, tmp_path, capfd):
-    """Of the same scene, which has more photos now."""
-    scene, out = tmp_path / "scene", tmp_path / "out"
-    shutil.copytree(scenes[1], scene)
-    train_on(scene, out, *WORDS, "--iterations", 20)
-    shutil.copytree(scenes[0], scene, dirs_exist_ok=True)
-    train_on(scene, out, *WORDS, "--start_checkpoint", first, "--iterations", 60)
-    assert len(json.loads((out / "cameras.json").read_text())) == 17
-    train_on(scene, out, *WORDS, "--resume", "--iterations", 80)
-    assert f"Resuming {out} at iteration 60" in capfd.readouterr().out
-
-
-def test_resumed_to_the_same_bytes(scenes, first, tmp_path, monkeypatch):
-    words = *WORDS, "--iterations", 70, "--images_to_load", 3
-    start = "--start_checkpoint", first, "--checkpoint_iterations", 45
-    whole = train_on(scenes[0], tmp_path / "out", *words, *start)[70]
-    for path in (tmp_path / "out").glob("point_cloud"):
-        shutil.rmtree(path)
-    names = _seen(monkeypatch)
-    again = train_on(scenes[0], tmp_path / "out", *words, "--start_checkpoint", tmp_path / "out/chkpnt45.pth")[70]
-    assert again == whole and sum(name in scenes[2] for name in names[:5]) in (2, 3)
-
-
-def test_the_checkpoints_folder_keeps_its_photos(scenes, first):
-    said = r"was not trained on; give --start_checkpoint \S*chkpnt40.pth and name another folder by -m"
-    with pytest.raises(UserError, match=said):  # by itself, --resume would start over there
-        train_on(scenes[0], first.parent, *WORDS, "--start_checkpoint", first, "--iterations", 80)
-
-
-def test_moved_photos_are_refused(scenes, first, tmp_path):
-    moved = _without(scenes[0], tmp_path / "moved", [], shift=0.5)
-    with pytest.raises(UserError, match="have other poses than when .* was trained .*with all others fixed"):
-        train_on(moved, tmp_path / "out", *WORDS, "--start_checkpoint", first, "--iterations", 80)
-
-
-def test_another_scene_is_refused(scenes, first, tmp_path):
-    part = _without(scenes[1], tmp_path / "other", [])
-    with pytest.raises(UserError, match="is of another scene"):
-        train_on(part, tmp_path / "out", *WORDS, "--start_checkpoint", first, "--iterations", 80)
-
-
-def test_photos_that_trained_are_not_held_out(scenes, tmp_path):
-    whole = scenes[0]
-    part = _without(whole, tmp_path / "part", _names(whole)[:1])
-    train_on(part, tmp_path / "first", *WORDS, "--eval", "--iterations", 20)
-    words = *WORDS, "--eval", "--iterations", 40, "--start_checkpoint", tmp_path / "first/chkpnt20.pth"
-    with pytest.raises(UserError, match="--eval would hold out photos that .* was trained on"):
-        train_on(whole, tmp_path / "out", *words)
+def test_what_cannot_be_continued_is_refused(scenes, first, tmp_path):
+    whole, part, _ = scenes
+    held = _without(whole, tmp_path / "held", _names(whole)[:1])
+    train_on(held, tmp_path / "first", *WORDS, "--eval", "--iterations", 20)
+    moved, other = _without(whole, tmp_path / "moved", [], shift=0.5), _without(part, tmp_path / "other", [])
+    start, out = ("--start_checkpoint", first, "--iterations", 80), tmp_path / "out"
+    # Into the checkpoint's own folder, in which --resume by itself would start over.
+    cases = {
+        r"was not trained on; give --start_checkpoint \S*chkpnt40.pth and name another": (whole, first.parent, start),
+        "have other poses than when .* was trained .*with all others fixed": (moved, out, start),
+        "is of another scene": (other, out, start),
+        "--eval would hold out photos that .* was trained on":
+            (whole, out, ("--eval", "--iterations", 40, "--start_checkpoint", tmp_path / "first/chkpnt20.pth")),
+    }  # fmt: skip
+    for said, (scene, folder, words) in cases.items():
+        with pytest.raises(UserError, match=said):
+            train_on(scene, folder, *WORDS, *words)
 
 
 def test_the_order_takes_all_views():

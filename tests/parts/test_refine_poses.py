@@ -11,16 +11,14 @@ import numpy as np
 import pytest
 import torch
 from diff_gaussian_rasterization.reference.lens import pixels_of
-from synthetic import BROWN, as_text, make_blender_scene, make_colmap_scene
+from synthetic import BROWN, as_text, make_colmap_scene
 from trainings import plain_training, shared_scene, train_on, trained
 
 import metrics
 import render
 from benchmarks.scenes.poses import disturbed
-from scene import dataset_readers
 from scene.dataset_readers import SceneInfo
 from scene.gaussian_model import GaussianModel
-from scene.images.lens import Lens, rays_of
 from scene.poses import moved
 from scene.readers.colmap import read_colmap
 from scene.readers.tracks import Track, rays_to, read_tracks
@@ -31,7 +29,6 @@ from splatting.demo.objects import demo_scene
 from splatting.demo.tracer import FISHEYE, ring_views
 from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.results import read_run
-from splatting.findings.model import load_scored
 from splatting.parts.refine_poses import bounded_adam, refinement, tracked_poses
 from splatting.parts.refine_poses.bounded_adam import BoundedAdam
 from splatting.parts.refine_poses.pose_file import NAME, with_poses
@@ -74,21 +71,13 @@ def _wide_track(count: int = 60, noise: float = 0.0, degrees: float = 120.0) -> 
     return Track(points, rays, rays, *np.ones((3, count)), angular=True)
 
 
-@pytest.mark.parametrize("degrees", [60.0, 80.0, 92.0])
+@pytest.mark.parametrize("degrees", [60.0, 92.0])
 def test_fisheyes_find_a_pose_as_well_as_noise_allows(degrees):
     """Of 0.3 pixels in 200: points at the border do not count more, and those beyond 90 degrees do count."""
     track = _wide_track(300, 3e-3, degrees)
     assert nearest_pose(POSE, track, 100.0, 1.0, BOUND) is POSE  # which noise alone does not move
     found = nearest_pose(moved_pose(POSE, 0.3 * TURN, 1.0), track, 100.0, 1.0, BOUND)
     assert np.abs(found - POSE).max() < 2e-3
-
-
-@pytest.mark.parametrize("axis", [[0.0, 0.0, 2.0], [0.0, 0.0, -2.0], [0.0, 0.0, 0.0]])
-def test_points_on_a_fisheyes_axis_or_at_its_centre_give_numbers(axis):
-    track = _wide_track(20)
-    track.points[0] = POSE[:3, :3].T @ (np.array(axis) - POSE[:3, 3])
-    at = pull(POSE, track, 100.0, 1.0)
-    assert np.isfinite(at.gradient).all() and np.isfinite(at.curvature).all()
 
 
 @pytest.mark.parametrize("track", [_track(noise=0.01), _wide_track(noise=0.01)], ids=["pinhole", "fisheye"])
@@ -130,14 +119,6 @@ def test_a_pose_may_stay():
     assert tracked.pulled(0, TURN).any()
 
 
-def test_many_points_tell_a_small_error_from_noise():
-    track, away = _track(3000, 4e-3), moved_pose(POSE, 0.06 * TURN, 1.0)
-    before, after = (pull(pose, track, 500.0, 1.0).loss for pose in (away, POSE))
-    assert 0.9 * before < after < before  # pixels of noise hide most of it
-    found = nearest_pose(away, track, 500.0, 1.0, BOUND)
-    assert np.linalg.norm(found - POSE) < 0.3 * np.linalg.norm(away - POSE)
-
-
 @pytest.mark.parametrize("params", [BROWN[:4], BROWN], ids=["pinhole", "distorted"])
 def test_tracks_are_read(params, tmp_path):
     """pycolmap's points have exact projections."""
@@ -151,8 +132,7 @@ def test_tracks_are_read(params, tmp_path):
         np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], track.rays, atol=1e-6)
 
 
-@pytest.mark.parametrize("value", ["nan", "1e300", "inf"])
-@pytest.mark.parametrize("of", ["errors", "places"])
+@pytest.mark.parametrize(("of", "value"), [("errors", "nan"), ("places", "inf"), ("places", "1e300")])
 def test_what_no_track_can_have_is_left_out(of, value, tmp_path, capsys):
     make_colmap_scene(tmp_path)
     views = read_colmap(tmp_path, "images", False).train_cameras
@@ -208,27 +188,6 @@ def test_tracks_of_a_fisheye_reach_beyond_90_degrees(tmp_path, capsys):
         at = np.abs(track.rays * (view.fx, view.fy) + (view.cx, view.cy) - np.array([view.width, view.height]) / 2)
         assert not track.angular and (at <= np.array([view.width, view.height]) / 2).all()
     assert "not used" not in capsys.readouterr().err
-
-
-def test_places_beyond_90_degrees_have_no_rays():
-    """pycolmap gives them those of places near 60 degrees."""
-    lens = Lens("OPENCV_FISHEYE", (64 / np.pi, 64 / np.pi, 32.0, 32.0, 0.0, 0.0, 0.0, 0.0), 64, 64)
-    degrees = np.array([0.0, 40.0, 80.0, 91.0, 120.0])
-    rays = rays_of(lens, np.column_stack([32 + np.radians(degrees) * 64 / np.pi, np.full(5, 32.0)]))
-    np.testing.assert_allclose(rays[:3, 0], np.tan(np.radians(degrees[:3])), atol=1e-9)
-    assert np.isnan(rays[3:]).all()
-
-
-def test_rays_of_pinholes_are_those_of_pycolmap():
-    pycolmap = pytest.importorskip("pycolmap")
-    lens, pixels = Lens("PINHOLE", (100.0, 90.0, 40.0, 30.0), 80, 60), np.array([[1.5, 2.5], [60.0, 10.0]])
-    camera = pycolmap.Camera(model=lens.model, width=80, height=60, params=list(lens.params))
-    np.testing.assert_allclose(rays_of(lens, pixels), camera.cam_from_img(pixels), rtol=1e-14)
-
-
-def test_scenes_of_other_kinds_have_no_tracks(tmp_path):
-    make_blender_scene(tmp_path)
-    assert read_tracks(tmp_path, [None, None], np.zeros(3)) == [None, None]
 
 
 def _options(scene: Path, out: Path, **more) -> Namespace:
@@ -354,24 +313,6 @@ def test_a_pose_depends_on_its_own_steps_and_on_whole_passes(tmp_path):
     assert poses.independent(2, whole[1:]) == 0 and poses.independent(0, [*whole, 0, 1]) == 1
 
 
-def test_tracks_hold_a_camera(tmp_path):
-    """Against a gradient of the image, a camera comes to rest where the tracks pull as strongly."""
-    make_colmap_scene(tmp_path)
-    _, poses = _refinement(tmp_path)
-    poses._drift = np.zeros((7, poses.twists.size)), np.zeros((7, 7))
-    for step in range(400):
-        poses.step(0, _gradient(poses, 0, np.array([0.02, 0, 0, 0, 0, 0])), step // 4)
-    rest = np.linalg.solve(1e-3 * poses._tracked.held[0], [-0.02, 0, 0, 0, 0, 0])
-    np.testing.assert_allclose(poses.twists[0], rest, atol=0.1 * np.abs(rest).max())
-
-
-def test_a_scene_without_tracks_is_refused(tmp_path):
-    make_blender_scene(tmp_path)
-    scene = Scene(_options(tmp_path, tmp_path / "out"), GaussianModel(1), start=False)
-    with pytest.raises(UserError, match="--refine_poses needs a COLMAP model with tracks"):
-        PoseRefinement(scene, str(tmp_path), 100)
-
-
 @pytest.fixture(scope="module")
 def scene(_colmap_master: Path) -> Path:
     return _colmap_master
@@ -447,19 +388,3 @@ def test_a_broken_file_is_named(content, said, scene, tmp_path):
         (tmp_path / NAME).write_text(content)
     with pytest.raises(UserError, match=said):
         with_poses(read_colmap(scene, "images", True), tmp_path)
-
-
-def test_checks_of_a_model_take_its_refined_poses(once):
-    """As they are in poses.json, not in the dataset."""
-    model = plain_training(once, "poses")
-    scene, _ = load_scored(str(model))
-    known = json.loads((model / NAME).read_text())["train"]
-    assert [view.T.tolist() for view in scene.info.train_cameras] == [entry["T"] for entry in known]
-
-
-def test_a_reader_of_other_code_reads_no_poses_of_a_new_training(tmp_path, monkeypatch):
-    make_colmap_scene(tmp_path / "scene")
-    own = dataset_readers.sceneLoadTypeCallbacks["Colmap"]
-    monkeypatch.setitem(dataset_readers.sceneLoadTypeCallbacks, "Colmap", lambda *given: own(*given))
-    train_on(tmp_path / "scene", tmp_path / "out", "--refine_poses", "--iterations", 2, "--no_curve", "-r", 48)
-    assert (tmp_path / "out" / NAME).is_file()

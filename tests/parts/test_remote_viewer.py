@@ -1,6 +1,5 @@
 """The remote viewer of a training: a client written from the protocol watches, pauses, misbehaves; nothing changes."""
 
-import contextlib
 import os
 import re
 import signal
@@ -11,11 +10,9 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
-from gaussians import model, pipeline
 from rasterizer_tools import CPU_AND_GPU
 from trainings import train_on, whole_result
 from viewer_client import Viewer, as_bytes, packed, request
@@ -26,17 +23,10 @@ from gaussian_renderer import network_gui, network_transfer, render
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
 from splatting.part import Part
-from splatting.parts.remote_viewer.serving import Serving
 from splatting.training.launch import launch_options
-from utils.system_utils import UserError
 
 ITERATIONS = 60
-OPTIONS = {
-    "default": (),
-    "exposure": ("--train_test_exp", "--antialiasing"),
-    "sparse": ("--optimizer_type", "sparse_adam", "-w", "--random_background"),
-    "python": ("--convert_SHs_python",),
-}
+OPTIONS = (), ("--train_test_exp", "--antialiasing", "-w", "--random_background", "--convert_SHs_python")
 RESET = struct.pack("ii", 1, 0)  # of SO_LINGER: closing drops what is on its way
 
 
@@ -136,15 +126,20 @@ class Watched(Part):
 
 
 @CPU_AND_GPU
-@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS.keys())
+@pytest.mark.parametrize("options", OPTIONS)
 def test_frames_are_those_of_render_and_training_is_the_same(colmap_scene, tmp_path, options, device):
-    count = 100 if not options else 5
+    count = 20 if not options else 5
 
     def script(watched: Watched, viewer: Viewer) -> None:
         first = [watched.check(viewer, number) for number in range(count)]  # paused
         assert len({*first}) == count and watched.iteration == 1
         small = watched.check(viewer, 0, scaling_modifier=0.3)
         assert small != first[0]
+        text = packed(valid())
+        for start in range(0, len(text), 100):  # in pieces
+            viewer.socket.sendall(text[start : start + 100])
+            time.sleep(0.01)
+        answered(viewer)
         viewer.ask(request(watched.camera(0), train=1))
         watched.reaches(25)  # nothing is asked for: training does not wait
         viewer.say(valid())
@@ -222,136 +217,6 @@ def test_no_message_ends_the_training(colmap_scene, tmp_path, capfd):
     assert result == trained(colmap_scene, tmp_path / "alone", "--disable_viewer")
 
 
-class Endless:
-    """A training that only serves viewers: its observer is asked and told as the loop does it, in a thread."""
-
-    def __init__(self) -> None:
-        network_gui.init("127.0.0.1", 0)
-        gaussians = model(40)
-        self.run = SimpleNamespace(
-            gaussians=gaussians,
-            pipe=pipeline(),
-            background=gaussians.get_xyz.new_zeros(3),
-            dataset=SimpleNamespace(source_path="/scene"),
-            clock=SimpleNamespace(paused=lambda purpose: threading.Lock()),
-            interrupt=SimpleNamespace(requested=None),
-        )
-        self.iterations = self.due = 0
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._serve)
-
-    def _serve(self) -> None:
-        viewer, step = Serving(self.run), SimpleNamespace(last=False)
-        while not self._over.wait(0.0005):
-            self.due += viewer.due(step)
-            viewer.measured(step, None)
-            self.iterations += 1
-
-    def __enter__(self) -> "Endless":
-        self._thread.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.run.interrupt.requested = KeyboardInterrupt
-        self._over.set()
-        self._thread.join(LIMIT)
-        assert not self._thread.is_alive()
-
-
-def test_a_viewer_that_asks_for_nothing_holds_nothing(monkeypatch, capfd):
-    """Seconds pass by iterations here, so a training that waits for the silent viewer never gets to its limit."""
-    waited, readable = [], network_gui.readable
-    monkeypatch.setattr(network_gui, "readable", lambda sock, s=0.0: (waited.append(s), readable(sock, s))[1])
-    monkeypatch.setattr(network_gui, "FIRST", 0.4)
-    with Endless() as training:
-        monkeypatch.setattr(network_gui, "time", SimpleNamespace(monotonic=lambda: training.iterations / 250))
-        idle, waiting = Viewer(network_gui.port), Viewer(network_gui.port)
-        waiting.say(valid(train=1))
-        assert idle.is_let_go()
-        assert answered(waiting) == "/scene"
-        before = training.iterations
-        wait_for(lambda: training.iterations > before + 300)  # it lets training go on, so it may be silent for longer
-        assert training.due == 1
-        assert [seconds for seconds in waited if seconds] == [network_gui.PATIENCE]  # of the request that was there
-        assert waiting.ask(valid(train=1))[1] == "/scene"
-        waiting.leave()
-        idle.leave()
-    (line,) = re.findall("^.*is disconnected.*$", capfd.readouterr().err, re.MULTILINE)
-    assert line.endswith("it has not asked for anything for 0.4 s")
-
-
-def test_no_message_takes_longer_than_its_limit_though_bytes_keep_coming(monkeypatch):
-    monkeypatch.setattr(network_transfer, "LONGEST", 0.0)
-    ours, theirs = socket.socketpair()
-    with ours, theirs:
-        theirs.sendall(packed(valid()))
-        with pytest.raises(network_transfer.ViewerLost, match="took more than 0 s"):
-            network_transfer.receive_message(ours)
-        with pytest.raises(network_transfer.ViewerLost, match="took more than 0 s"):
-            network_transfer.send_message(ours, b"1", b"")
-
-
-def test_bytes_that_keep_coming_do_not_renew_the_limit(monkeypatch):
-    monkeypatch.setattr(network_transfer, "LONGEST", 0.2)
-    ours, theirs = socket.socketpair()
-
-    def dribble() -> None:
-        with contextlib.suppress(OSError):
-            for byte in packed(valid()):
-                theirs.sendall(bytes([byte]))
-                time.sleep(0.02)
-
-    with ours, theirs:
-        thread = threading.Thread(target=dribble)
-        thread.start()
-        with pytest.raises(network_transfer.ViewerLost, match="took more than 0.2 s"):
-            network_transfer.receive_message(ours)
-        theirs.close()
-        thread.join()
-
-
-def test_a_viewer_whose_messages_come_in_pieces_is_served():
-    with Endless():
-        viewer = Viewer(network_gui.port)
-        viewer.say({"resolution_x": 0, "resolution_y": 5})
-        assert viewer.path() == "/scene"  # no frame, and no word on training
-        text = packed(valid())
-        for start in range(0, len(text), 100):
-            viewer.socket.sendall(text[start : start + 100])
-            time.sleep(0.01)
-        assert answered(viewer) == "/scene"
-        viewer.socket.sendall(packed(valid(train=1)) + packed(valid()))  # two at once
-        assert answered(viewer) == "/scene"
-        assert answered(viewer) == "/scene"
-        viewer.leave()
-
-
-def test_a_frame_that_cannot_be_rendered_ends_the_connection(monkeypatch, capfd):
-    def fail(*arguments: object) -> None:
-        raise MemoryError("no room for\nthis")
-
-    monkeypatch.setattr("splatting.parts.remote_viewer.serving.frame_bytes", fail)
-    with Endless():
-        viewer = Viewer(network_gui.port)
-        viewer.say(valid())
-        assert viewer.is_let_go()
-        viewer.leave()
-    assert re.search(r"its frame cannot be rendered \(no room for\)\n", capfd.readouterr().err)
-
-
-def test_ctrl_c_stops_a_training_that_waits_for_its_viewer(colmap_scene, tmp_path):
-    def script(watched: Watched, viewer: Viewer) -> None:
-        watched.check(viewer, 0)
-        os.kill(os.getpid(), signal.SIGINT)
-        assert viewer.is_let_go()
-
-    watched = Watched(script)
-    with pytest.raises(KeyboardInterrupt):
-        watched(colmap_scene, tmp_path / "out")
-    assert (tmp_path / f"out/chkpnt{watched.iteration}.pth").exists() and watched.iteration < ITERATIONS
-    assert network_gui.listener is None and network_gui.conn is None
-
-
 @pytest.fixture
 def _interruptible() -> Iterator[None]:
     """Ctrl-C interrupts, also where the tests were started in the background of a shell, which ignores it."""
@@ -360,7 +225,7 @@ def _interruptible() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.parametrize("end", ["leaves", "lets go", "Ctrl-C"])
+@pytest.mark.parametrize("end", ["lets go", "Ctrl-C"])
 @pytest.mark.usefixtures("_interruptible")
 def test_keep_alive_holds_a_finished_training(colmap_scene, tmp_path, capsys, end):
     out = tmp_path / "out"
@@ -380,10 +245,9 @@ def test_keep_alive_holds_a_finished_training(colmap_scene, tmp_path, capsys, en
         watched.check(viewer, 4, train=1, keep_alive=1)
         if end == "lets go":
             watched.check(viewer, 5, train=1, keep_alive=0)
-            assert viewer.is_let_go()
-        elif end == "Ctrl-C":
+        else:
             os.kill(os.getpid(), signal.SIGINT)
-            assert viewer.is_let_go()
+        assert viewer.is_let_go()
 
     watched = Watched(script, stops=(ITERATIONS - 1,))
     if end == "Ctrl-C":
@@ -394,7 +258,7 @@ def test_keep_alive_holds_a_finished_training(colmap_scene, tmp_path, capsys, en
         assert "Training complete." in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("address", [("127.0.0.1", None), ("127.0.0.1", 70_000), ("::no", 0), ("203.0.113.1", 0)])
+@pytest.mark.parametrize("address", [("127.0.0.1", None), ("127.0.0.1", 70_000), ("::no", 0)])
 def test_an_address_that_cannot_be_had_is_one_warning(address, capfd):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         host, port = address[0], taken.getsockname()[1] if address[1] is None else address[1]
@@ -417,13 +281,6 @@ def test_disable_viewer_opens_nothing_and_the_default_address_is_the_reference_s
 
 
 # Loops that call the names of the reference themselves
-
-
-def test_calls_without_a_viewer_say_so():
-    assert network_gui.conn is None
-    for call in (network_gui.read, network_gui.receive, lambda: network_gui.send(b"", "/scene")):
-        with pytest.raises(UserError, match="no viewer is connected"):
-            call()
 
 
 def _next_viewer() -> Viewer:

@@ -90,16 +90,18 @@ def test_more_iterations_continue_a_finished_training(colmap_scene, tmp_path, ca
     assert f"Resuming {tmp_path} at iteration 12" in (said := capfd.readouterr()).out
     assert _checkpoints(tmp_path) == {"chkpnt12.pth", "chkpnt20.pth"} and finished(tmp_path).iteration == 20
     assert "starts over" not in said.err
+    (tmp_path / REPLACED).write_bytes(b"of another training")
     _train(colmap_scene, tmp_path, 20)
-    assert (
-        f"warning: {tmp_path} has a finished training of 20 iterations, and this one starts over; --resume with more "
-        "--iterations would continue it" in capfd.readouterr().err
-    )
+    said = f"warning: {tmp_path} has a finished training of 20 iterations, and this one starts over; --resume with more"
+    assert said in capfd.readouterr().err and not (tmp_path / REPLACED).exists()
 
 
 def test_a_finished_training_without_its_last_checkpoint_is_not_said_to_continue(colmap_scene, tmp_path, capfd):
     """Whose checkpoint of another iteration, as of Ctrl-C, is not its end."""
     _train(colmap_scene, tmp_path, 12, "--no_last_checkpoint", "--checkpoint_iterations", 5)
+    assert _checkpoints(tmp_path) == {"chkpnt5.pth"} and read_model_json(tmp_path)["finished"] == 12
+    assert "Last checkpoint" not in capfd.readouterr().out
+    assert launch_options().no_last_checkpoint  # as a call of the reference's `training` leaves none
     _train(colmap_scene, tmp_path, 12, "--resume")
     assert "has a finished training of 12 iterations and no checkpoint of its end" in capfd.readouterr().out
     for more in ((20,), (12, "--time_budget", 1)):
@@ -120,13 +122,6 @@ def test_a_model_of_which_nobody_knows_that_it_is_unfinished_is_not_replaced(col
         (tmp_path / "model.json").write_text(content)
     with pytest.raises(UserError, match=said):
         _train(colmap_scene, tmp_path, 9, "--resume")
-
-
-def test_no_last_checkpoint(colmap_scene, tmp_path, capfd):
-    _train(colmap_scene, tmp_path, 12, "--no_last_checkpoint")
-    assert _checkpoints(tmp_path) == set() and read_model_json(tmp_path)["finished"] == 12
-    assert "Last checkpoint" not in capfd.readouterr().out
-    assert launch_options().no_last_checkpoint  # as a call of the reference's `training` leaves none
 
 
 def test_a_training_of_another_length_leaves_a_checkpoint_that_seconds_continue(colmap_scene, tmp_path, capfd):
@@ -150,34 +145,11 @@ def test_the_newest_whole_checkpoint_is_resumed(colmap_scene, tmp_path, capfd):
     assert f"Resuming {tmp_path} at iteration 8" in capfd.readouterr().out
 
 
-def test_a_training_that_starts_over_removes_what_another_would_resume(colmap_scene, tmp_path):
-    (tmp_path / REPLACED).write_bytes(b"of another training")
-    _train(colmap_scene, tmp_path, 12, "--no_last_checkpoint")
-    assert not (tmp_path / REPLACED).exists()
-
-
 def test_a_full_disk_ends_no_training(colmap_scene, tmp_path, capfd):
     (tmp_path / "chkpnt12.pth").mkdir()  # which cannot be replaced by a file
     _train(colmap_scene, tmp_path, 12)
     assert f"warning: cannot write {tmp_path / 'chkpnt12.pth'}" in capfd.readouterr().err
     assert finished(tmp_path).iteration == 12
-
-
-def test_resume_needs_a_folder(colmap_scene):
-    with pytest.raises(UserError, match="^--resume needs -m"):
-        train_on(colmap_scene, "", "--resume")
-
-
-@pytest.mark.parametrize(
-    ("spent", "seconds", "wanted"), [(0, 59, False), (0, 61, True), (3, 299, False), (3, 420, True)]
-)
-def test_checkpoints_take_a_hundredth_of_the_time(spent, seconds, wanted):
-    """Of 100,000 Gaussians, which a slow disk writes in 0.36 s."""
-    part = resume.Resume()
-    part._before, part._spent, part._speed = 0.0, spent, resume._SPEED
-    clock, gaussians = type("", (), {"seconds": seconds}), type("", (), {"gaussian_count": 100_000})
-    part._run = type("", (), {"clock": clock, "gaussians": gaussians})
-    assert part._has_time() == wanted
 
 
 def test_new_folders_are_named_after_the_scene(tmp_path, monkeypatch):

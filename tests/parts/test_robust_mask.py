@@ -11,12 +11,11 @@ from scipy import ndimage
 from synthetic import make_colmap_scene
 from trainings import trained
 
-import train
 from splatting.evaluation.renders import GAP, HEADER
 from splatting.evaluation.training_log import read_log
 from splatting.parts.robust_mask import residuals, written
 from splatting.parts.robust_mask.residuals import Residuals
-from utils.system_utils import UserError, run_cli
+from utils.system_utils import UserError
 
 ON = "--robust_mask", 0.3, "--test_iterations", -1, "--opacity_reset_interval", 3000
 
@@ -134,10 +133,7 @@ def test_masks_are_written_below_the_model_folder(tmp_path, above, monkeypatch):
     assert sorted(found) == ["robust_masks/left/1.png.png", "robust_masks/right/1.png.png"]
 
 
-def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path, capsys):
-    with pytest.raises(SystemExit) as ended:
-        run_cli(lambda: train.main(["-s", str(scene), "-m", str(tmp_path / "out"), "--robust_mask", "0.7"]))
-    assert ended.value.code == 2 and "robust_mask" in capsys.readouterr().err
+def test_residuals_of_other_photos_are_refused():
     masks, others = (Residuals(_views(n), 0.3, torch.device("cpu")) for n in (3, 4))
     with pytest.raises(UserError, match="residuals of other photos"):
         masks.restore(others.captured())

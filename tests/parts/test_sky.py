@@ -140,8 +140,6 @@ def test_none_begins_in_a_resumed_training(scene, tmp_path, capsys):
 
 
 def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path):
-    with pytest.raises(UserError, match="--sky does not work with --strategy mcmc, which relocates large Gaussians"):
-        train.main(["-s", str(scene), "-m", str(tmp_path), "--sky", "auto", "--strategy", "mcmc"])
     with pytest.raises(UserError, match="--no_sky needs a model folder"):
         export.sky_of(str(tmp_path), np.zeros((1, 3)))
     file = tmp_path / "schedule.json"

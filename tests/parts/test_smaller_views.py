@@ -150,13 +150,6 @@ def _photo(cycles: float, depth: InMemory | None = None) -> Camera:
     return Camera(info, (96, 64), 0)
 
 
-def test_a_factor_beyond_all_sizes_makes_the_smallest_views(colmap_scene, tmp_path):
-    scene, _ = _scene(colmap_scene, tmp_path, resolution=1)
-    schedule = _schedule(10)
-    schedule.levels = ((0.0, 1e300),)
-    assert Sizes(schedule, scene.images).view(scene.getTrainCameras()[0], 1)._size == (48, 32)
-
-
 OPTIONS = ["--eval", "--no_curve", "--test_iterations", -1, "--iterations", 60, "--densify_from_iter", 5,
            "--densification_interval", 10, "--densify_grad_threshold", 1e-4]  # fmt: skip
 

@@ -7,12 +7,11 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from synthetic import BROWN, make_blender_scene, make_colmap_scene, options_of
+from synthetic import BROWN, make_colmap_scene, options_of
 from trainings import trained
 
 import metrics
 import render
-import train
 from scene.gaussian_model import GaussianModel
 from scene.point_depths import HELD_OUT, PointDepths, points_of
 from scene.readers.tracks import read_tracks
@@ -20,7 +19,6 @@ from scene.scene import Scene
 from splatting.files.image_files import read_plane
 from splatting.files.json_files import read_json
 from splatting.parts.sparse_depth import points
-from utils.system_utils import UserError, run_cli
 
 FISHEYE = (*BROWN[:4], 0.02, -0.01, 0.003, 0.001)
 
@@ -119,13 +117,3 @@ def test_depth_comes_nearer_to_points_of_test_views(scene, tmp_path, monkeypatch
 def test_off_reads_no_tracks(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(points, "read_tracks", lambda *_: pytest.fail("tracks are read"))
     trained(scene, tmp_path / "off", "--test_iterations", -1)
-
-
-def test_what_cannot_be_is_refused_in_one_sentence(tmp_path, capsys):
-    make_blender_scene(tmp_path / "scene")
-    words = ["-s", str(tmp_path / "scene"), "-m", str(tmp_path / "out"), "--sparse_depth"]
-    with pytest.raises(UserError, match="--sparse_depth needs a COLMAP model with tracks"):
-        train.main([*words, "1"])
-    with pytest.raises(SystemExit) as ended:
-        run_cli(lambda: train.main([*words, "-1"]))
-    assert ended.value.code == 2 and "sparse_depth" in capsys.readouterr().err

@@ -15,9 +15,6 @@ from splatting.evaluation.peer_curve import read_scalars
 from splatting.findings import environment
 from splatting.parts.tensorboard import events
 from splatting.parts.tensorboard.event_writer import EventWriter
-from splatting.parts.tensorboard.part import Tensorboard
-from splatting.training import log as progress
-from splatting.training.iteration import Iteration, Losses
 
 
 def _train(scene: Path, out: Path, *more: str) -> None:
@@ -91,39 +88,6 @@ def test_events_that_cannot_be_written_are_one_warning(colmap_scene, tmp_path, m
     said = capsys.readouterr().err
     assert said.count("No space left") == said.count("training continues without them") == 1
     assert sum(map(len, _Writer.last.scalars.values())) == room
-
-
-def test_a_writer_that_cannot_be_made_is_one_warning(monkeypatch, capsys):
-    monkeypatch.setattr(_Writer, "__init__", lambda *_, **__: (_ for _ in ()).throw(OSError("no room")))
-    writer = EventWriter("out")
-    writer.add_scalar("a", 1.0, 1)
-    writer.close()
-    assert capsys.readouterr().err.count("(no room)") == 1
-
-
-def test_every_tenth_iteration_has_its_own_losses(colmap_scene, tmp_path, monkeypatch):
-    """They are kept until something is due, and read together."""
-    measured, plain = {}, Tensorboard.measured
-
-    def measure(self: Tensorboard, step: Iteration, losses: Losses) -> None:
-        measured[step.iteration] = losses.l1.item(), losses.total.item()
-        plain(self, step, losses)
-
-    monkeypatch.setattr(Tensorboard, "measured", measure)
-    monkeypatch.setattr(progress, "BAR_SECONDS", math.inf)  # nothing but the tests is due
-    _train(colmap_scene, tmp_path, "--iterations", "40", "--test_iterations", "30")
-    scalars = _Writer.last.scalars
-    for place, name in enumerate(("l1_loss", "total_loss")):
-        assert scalars[f"train_loss_patches/{name}"] == {t: measured[t][place] for t in (10, 20, 30, 40)}
-    assert len({loss for pair in measured.values() for loss in pair}) == 80  # a mistaken place would show
-    assert "closed" in scalars
-
-
-def test_an_interrupted_training_ends_its_events(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(Tensorboard, "measured", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-    with pytest.raises(KeyboardInterrupt):
-        _train(colmap_scene, tmp_path, "--iterations", "3")
-    assert "closed" in _Writer.last.scalars
 
 
 def test_tensorboard_reads_them(colmap_scene, tmp_path, monkeypatch):

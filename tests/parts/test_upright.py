@@ -24,7 +24,6 @@ from scene.cameras import Camera
 from scene.readers.info import CameraInfo
 from scene.splats.reading import read_splats
 from scene.with_splats import model_of
-from splatting.camera_paths.keyframes import CameraPath, Keyframe, KeyframePath
 from splatting.camera_paths.poses import poses_of
 from splatting.exports.formats import Around, format_of
 from splatting.exports.html import write_html
@@ -85,17 +84,6 @@ def test_large_coordinates_lose_nothing():
     assert moved.world_offset == (0, 0, 0) and np.abs(moved.means).max() < 10
 
 
-def test_paths_of_keyframes_move_with_the_model():
-    key = Keyframe(0.0, (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), 40.0)
-    path = KeyframePath(CameraPath((key, replace(key, seconds=2.0)), "linear"))
-    moved = moved_around(around(lambda poses: path), SOME)
-    found = moved.make_path(None).at(1.0)
-    np.testing.assert_allclose(found.position, SOME.points(np.array([key.position]))[0])
-    np.testing.assert_allclose(Rotation.from_quat(found.wxyz, scalar_first=True).as_matrix(), TURN, atol=1e-9)
-    assert found.fov == 40 and moved.make_path(None).seconds == 2
-    np.testing.assert_allclose(poses_of(moved.cameras).positions, SOME.points(poses_of(cameras()).positions), atol=1e-5)
-
-
 def _args(folder: Path | str, upright=False, no_upright=False) -> argparse.Namespace:
     return argparse.Namespace(model_path=str(folder), source_path="", upright=upright, no_upright=no_upright)
 
@@ -140,14 +128,6 @@ def test_a_similarity_that_leaves_no_scene_is_refused(tmp_path, change):
     for read in (lambda: placed(_args(tmp_path), True, balls(), None), lambda: read_orientation(tmp_path)):
         with pytest.raises(UserError, match="no rotation, scale and translation of a similarity that a scene may"):
             read()
-
-
-def test_models_without_a_similarity_stay_and_say_so_when_asked(tmp_path):
-    splats = balls()
-    for folder in ("", tmp_path):
-        assert placed(_args(folder), True, splats, None) == (splats, None)
-        with pytest.raises(UserError, match=r"needs a model folder \(-m\) of a scene that was oriented"):
-            check_upright(_args(folder, upright=True))
 
 
 def _trained(scene: Path, out: Path) -> Path:

@@ -7,8 +7,6 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -21,12 +19,9 @@ from viser_client import Client  # noqa: E402
 from waiting import wait_for  # noqa: E402
 
 import train  # noqa: E402
-from scene.gaussians.checkpoint import load_checkpoint  # noqa: E402
 from scene.saved_model import read_model  # noqa: E402
 from splatting.parts.viewer import training_page as observed  # noqa: E402
-from splatting.viewer import training_tab  # noqa: E402
 from splatting.viewer.page import serve  # noqa: E402
-from utils.system_utils import UserError  # noqa: E402
 
 ITERATIONS = 120
 
@@ -109,9 +104,8 @@ def _after(seconds: float, *calls: Callable[[], object]) -> Callable[[], None]:
 
 
 @CPU_AND_GPU
-@pytest.mark.parametrize("plain", [[], ["--plain_step"]])
-def test_watching_changes_no_byte_of_the_model(colmap_scene, tmp_path, monkeypatch, plain, device):
-    expected = _train(colmap_scene, tmp_path / "alone", *plain, viewer=False).read_bytes()
+def test_watching_changes_no_byte_of_the_model(colmap_scene, tmp_path, monkeypatch, device):
+    expected = _train(colmap_scene, tmp_path / "alone", viewer=False).read_bytes()
 
     def connect(watched: Watched) -> None:
         watched.observer.budget.allows = lambda share: True  # so that each mode gets its frames, however slow they are
@@ -132,7 +126,7 @@ def test_watching_changes_no_byte_of_the_model(colmap_scene, tmp_path, monkeypat
     acts = {10: connect, 15: look_at("Depth"), 25: look_at("Gaussians per pixel", scaling=0.5), 60: pause}
     acts |= {40: look_at("Colour", crop=True, degree=0), 80: look_at("Opacity"), 100: lambda w: w.requests.save()}
     watched = Watched(monkeypatch, acts)
-    assert _train(colmap_scene, tmp_path / "watched", *plain).read_bytes() == expected
+    assert _train(colmap_scene, tmp_path / "watched").read_bytes() == expected
     assert {mode for _, mode in watched.frames} == {"Depth", "Gaussians per pixel", "Colour", "Opacity"}
     assert {15, 25, 40, 80} <= {iteration for iteration, _ in watched.frames} and watched.paused == [60, 61]
     log = json.loads((tmp_path / "watched/train_log.json").read_text())
@@ -168,43 +162,30 @@ def test_the_page_shows_how_the_training_goes(colmap_scene, tmp_path, monkeypatc
     assert (seconds[1:] >= seconds[:-1]).all() and tab.curve.visible and 5 < psnr.mean() < 60 and float(tab.loss.value)
 
 
-def test_a_training_can_begin_paused(colmap_scene, tmp_path, monkeypatch):
-    """Its bytes are those of one that does not."""
-    _train(colmap_scene, tmp_path / "plain", "--no_curve", viewer=False)
-    labels = []
+def test_a_pause_from_the_start_and_faults_of_the_page_change_no_byte(colmap_scene, tmp_path, monkeypatch, capfd):
+    told, labels = [], []
 
     def begin(watched: Watched) -> None:
+        watched.page.notify = lambda title, body, color=None: told.append((title, color))
         labels.append(watched.observer._tab.pause.label)
         threading.Thread(target=_after(0.2, lambda: wait_for(lambda: watched.paused), watched.requests.resume)).start()
 
-    watched = Watched(monkeypatch, {1: begin})
-    _train(colmap_scene, tmp_path / "out", "--no_curve", "--paused")
-    assert watched.paused == [1] and labels == ["Resume"]
-    plys = [folder / "point_cloud/iteration_120/point_cloud.ply" for folder in (tmp_path / "plain", tmp_path / "out")]
-    assert plys[0].read_bytes() == plys[1].read_bytes()
+    def broken(*_: object) -> None:
+        raise RuntimeError("no memory for a frame")
 
+    def save(watched: Watched) -> None:
+        watched.requests.save()
 
-def test_a_pause_needs_a_page(colmap_scene, tmp_path):
-    with pytest.raises(UserError, match="--paused needs --viewer"):
-        train.main(["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "--paused", "--iterations", "2"])
-    assert not (tmp_path / "out").exists()
-
-
-def test_time_to_go_is_that_of_the_clock_or_of_the_speed():
-    def page(**schedule: object) -> SimpleNamespace:
-        run = SimpleNamespace(
-            schedule=SimpleNamespace(by_clock=False, expected=None) ,
-            log=SimpleNamespace(seconds_before=5.0), clock=SimpleNamespace(seconds=12.0),
-        )  # fmt: skip
-        vars(run.schedule).update(schedule)
-        return SimpleNamespace(_run=run)
-
-    left = observed.TrainingPage._left
-    assert left(page(expected=1000), 400, 20.0) == 30 and left(page(expected=1000), 400, None) is None
-    assert left(page(), 400, 20.0) is None
-    assert left(page(by_clock=True, until=60.0), 400, None) == 43
-    said = [training_tab.duration(seconds) for seconds in (0.4, 59.6, 200, 7500)]
-    assert said == ["0 s", "1 min 0 s", "3 min 20 s", "2 h 5 min"]
+    watched = Watched(monkeypatch, {1: begin, 5: Watched.connect, 10: save, 20: save})
+    monkeypatch.setattr("splatting.viewer.frames.Frames.draw", broken)
+    (tmp_path / "out/chkpnt10.pth").mkdir(parents=True)
+    expected = _train(colmap_scene, tmp_path / "alone", "--no_curve", viewer=False).read_bytes()
+    assert _train(colmap_scene, tmp_path / "out", "--no_curve", "--paused").read_bytes() == expected
+    assert watched.paused == [1] and labels == ["Resume"] and watched.frames
+    assert (tmp_path / "out/chkpnt20.pth").is_file()
+    assert told == [("Not saved", "red"), ("Saved", None), ("The training is over", None)]
+    said = capfd.readouterr().err
+    assert "warning: cannot write" in said and said.count("no memory for a frame") == 1
 
 
 @pytest.mark.parametrize("end", ["stop", "signal"])
@@ -284,27 +265,6 @@ def test_the_page_stays_after_its_training_and_shows_the_saved_model(colmap_scen
     assert f"The page stays open at {watched.page.url}" in said
 
 
-def test_a_training_that_the_page_stops_can_be_looked_at(colmap_scene, tmp_path, monkeypatch, capfd):
-    watched = _Staying(monkeypatch, {33: lambda w: w.requests.stop()}, _Staying.look_and_close)
-    with pytest.raises(KeyboardInterrupt, match="stopped from the page"):
-        _train(colmap_scene, tmp_path / "out", "--no_curve")
-    assert watched.seen[0].std() > 5 and watched.page.iteration.value == "33 of 120"
-    assert f"saved as {tmp_path / 'out/chkpnt33.pth'}" in watched.observer._tab.state.content
-    assert load_checkpoint(str(tmp_path / "out/chkpnt33.pth"))[1] == 33
-    assert "with --start_checkpoint" in capfd.readouterr().err
-
-
-def test_a_signal_ends_the_page_of_a_training_that_is_over(colmap_scene, tmp_path, monkeypatch):
-    def visit(watched: _Staying) -> None:
-        watched.picture()  # now it is served
-        os.kill(os.getpid(), signal.SIGINT)
-        wait_for(lambda: watched.ends)
-
-    watched = _Staying(monkeypatch, {}, visit)
-    _train(colmap_scene, tmp_path / "out", "--no_curve")  # and goes on as after any training
-    assert watched.ends == [KeyboardInterrupt]
-
-
 def test_a_signal_that_ends_the_training_ends_the_page(colmap_scene, tmp_path, monkeypatch):
     watched = _Staying(monkeypatch, {33: lambda w: os.kill(os.getpid(), signal.SIGINT)}, lambda _: None)
     with pytest.raises(KeyboardInterrupt):
@@ -312,40 +272,3 @@ def test_a_signal_that_ends_the_training_ends_the_page(colmap_scene, tmp_path, m
     assert not watched.seen
     with pytest.raises(OSError):
         Client(watched.page.url)
-
-
-def test_neither_a_checkpoint_nor_a_frame_that_fails_ends_a_training(colmap_scene, tmp_path, monkeypatch, capfd):
-    told = []
-
-    def save(watched: Watched) -> None:
-        watched.page.notify = lambda title, body, color=None: told.append((title, color))
-        watched.requests.save()
-
-    def broken(*_: object) -> None:
-        raise RuntimeError("no memory for a frame")
-
-    watched = Watched(monkeypatch, {5: Watched.connect, 10: save, 20: save})
-    monkeypatch.setattr("splatting.viewer.frames.Frames.draw", broken)
-    (tmp_path / "out/chkpnt10.pth").mkdir(parents=True)
-    expected = _train(colmap_scene, tmp_path / "alone", "--no_curve", viewer=False).read_bytes()
-    assert _train(colmap_scene, tmp_path / "out", "--no_curve").read_bytes() == expected
-    assert (tmp_path / "out/chkpnt20.pth").is_file() and watched.frames
-    assert told == [("Not saved", "red"), ("Saved", None), ("The training is over", None)]
-    said = capfd.readouterr().err
-    assert "warning: cannot write" in said and said.count("no memory for a frame") == 1
-
-
-def test_points_of_some_test_views_are_called_so():
-    tab = training_tab.TrainingTab(mock.MagicMock(), mock.MagicMock())
-    rows = [{"seconds": s, "test_psnr": p} for s, p in ((1.0, 20.0), (2.0, 25.0))]
-    tab.show(None, None, 0.1, rows, 4)
-    assert [values.tolist() for values in tab.curve.data] == [[1.0, 2.0], [20.0, 25.0]]
-    assert tab.note.content == "Points score 4 of the test views." and tab.note.visible
-    tab.show(None, None, 0.1, [*rows, {"seconds": 3.0, "test_psnr": 26.0}], None)
-    assert len(tab.curve.data[0]) == 3 and not tab.note.visible
-
-
-def test_a_wrong_port_is_refused_before_a_file_is_written(colmap_scene, tmp_path):
-    with pytest.raises(UserError, match="between 0"):
-        _train(colmap_scene, tmp_path / "out", "--viewer", "70000", viewer=False)
-    assert not (tmp_path / "out").exists()
