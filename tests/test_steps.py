@@ -131,6 +131,12 @@ def of_image(losses: Losses, package: dict, *_: object) -> torch.Tensor:
     return losses.total + 0.1 * package["render"].square().mean()
 
 
+@pytest.fixture(scope="module")
+def without(once) -> dict:
+    """What a training without such a term leaves."""
+    return whole_result(plain_training(once, "default"), ITERATIONS)
+
+
 # Terms that somebody adds to our objective after so many of its calls, and how many steps are then not plain. The
 # objective is called in the first step, and in the second to capture it.
 TERMS = {
@@ -144,7 +150,7 @@ TERMS = {
 
 
 @pytest.mark.parametrize(("way", "late", "fused", "term"), TERMS.values(), ids=TERMS.keys())
-def test_a_term_that_was_added_is_not_lost(scene, tmp_path, once, monkeypatch, take_as, way, late, fused, term):  # noqa: F811
+def test_a_term_that_was_added_is_not_lost(scene, tmp_path, without, monkeypatch, take_as, way, late, fused, term):  # noqa: F811
     """Gradients past the image make the steps from there on plain; what asks for more than an image is not captured."""
     call, make, models, calls = Objective.__call__, run.GaussianModel, [], []
 
@@ -160,7 +166,7 @@ def test_a_term_that_was_added_is_not_lost(scene, tmp_path, once, monkeypatch, t
     take_as(way)
     taken = fused_iterations(monkeypatch)
     assert not differences(trained_as("default", scene, tmp_path / "fast"), plain)
-    assert plain != whole_result(plain_training(once, "default"), ITERATIONS)
+    assert plain != without
     assert len(taken) == fused
     assert bool(sum(made.launches for made in Rerun.made)) == (term is of_image)
 

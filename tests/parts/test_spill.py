@@ -263,7 +263,7 @@ def test_it_is_told_before_what_the_host_has_to_hold(scene, tmp_path, monkeypatc
     monkeypatch.setattr(GpuMemory, "host_bytes", lambda self, count: count * 10**6)
     monkeypatch.setattr(resources, "free_memory", lambda device: 10**10)
     monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
-    train_on(scene, tmp_path, "--iterations", 2, "--disable_viewer", *SPILL)
+    train_on(scene, tmp_path, "--iterations", 2, "--disable_viewer", "--init_pcd_path", scene / "points.ply", *SPILL)
     out, err = capfd.readouterr()
     assert "are kept in the host's memory" in out and "the memory of the CPU seems too small for" in err
 
