@@ -69,15 +69,6 @@ def test_position_learning_rate():
         assert gaussians.optimizer.param_groups[0]["lr"] == gaussians.position_learning_rate
 
 
-def test_sh_degree_rises_to_the_maximum_only():
-    gaussians = model(4, degree=2, active=False)
-    degrees = []
-    for _ in range(4):
-        degrees.append((gaussians.active_sh_degree, gaussians.active_sh_bands))
-        gaussians.oneupSHdegree()
-    assert degrees == [(0, 0), (1, 3), (2, 8), (2, 8)]
-
-
 def test_capture_and_restore():
     gaussians = model(30, extent=1.5, active=False)
     gaussians.oneupSHdegree()

@@ -11,7 +11,6 @@ import torch
 from tqdm import tqdm
 
 import train
-from splatting.evaluation.training_log import TrainingLog
 from splatting.host.progress import Bar
 from splatting.part import Part, Strategy
 from splatting.training.log import ProgressBar
@@ -129,13 +128,6 @@ def test_backward_runs_on_the_callers_thread(colmap_scene, tmp_path, monkeypatch
     before = torch.autograd.is_multithreading_enabled()
     _train(colmap_scene, tmp_path, monkeypatch, lambda *_: [Threads()])
     assert not any(found) and torch.autograd.is_multithreading_enabled() is before
-
-
-def test_a_checkpoint_of_the_last_iteration_does_not_turn_seconds_back(tmp_path):
-    log = TrainingLog(tmp_path, 0)
-    log.add(7, 2.0, loss=0.5)
-    log.add(7, 1.5, loss=0.25)
-    assert log.records[-1]["seconds"] == 2.0 and log.records[-1]["loss"] == 0.25
 
 
 def test_what_replaces_training_report_is_called(colmap_scene, tmp_path, monkeypatch):

@@ -7,7 +7,6 @@ import pytest
 import torch
 from gaussians import GROUPS, append, model, options, parameters
 from torch import Tensor, nn
-from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam, SparseGaussianAdam
@@ -249,28 +248,3 @@ def test_a_copy_of_a_model_trains_on_as_the_model_does():
                 getattr(each, GROUPS[name]).grad = gradient
             each.optimizer.step()
     assert all(torch.equal(values, parameters(other)[name]) for name, values in parameters(gaussians).items())
-
-
-@pytest.mark.parametrize("make", [GaussianAdam, SparseGaussianAdam, type("Client", (GaussianAdam,), {})])
-@pytest.mark.parametrize("beside", [False, True], ids=["by the kernel", "and by torch"])
-def test_step_hooks_are_called_once(make, beside):
-    torch.optim.Adam([nn.Parameter(torch.ones(1))])  # from now on, torch calls hooks in Adam's own step
-    param, weight = nn.Parameter(torch.ones(10, 3)), nn.Parameter(torch.tensor(1.0))
-    optimizer = make([{"params": [param], "lr": 0.1, "name": "xyz"}])
-    if beside:
-        optimizer.add_param_group({"params": [weight], "lr": 0.1})
-    param.grad, weight.grad = torch.ones(10, 3), torch.tensor(1.0)
-    told = []
-    handles = [
-        optimizer.register_step_pre_hook(lambda o, args, kwargs: told.append(("before", param[0, 0].item()))),
-        optimizer.register_step_post_hook(lambda o, args, kwargs: told.append(("after", param[0, 0].item()))),
-        register_optimizer_step_post_hook(lambda o, args, kwargs: told.append("all")),
-    ]
-    visible = [torch.ones(10, dtype=torch.bool)] if make is SparseGaussianAdam else []
-    optimizer.step(*visible)
-    after = param[0, 0].item()
-    assert told == [("before", 1.0), ("after", after), "all"] and after < 1 and (weight < 1) == beside
-    for handle in handles:
-        handle.remove()
-    optimizer.step(*visible)
-    assert len(told) == 3

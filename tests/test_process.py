@@ -16,9 +16,7 @@ import torch
 import train
 from scene import Scene
 from scene.gaussians.adam import undecorated
-from scene.images import store
 from splatting.host import machine, start
-from splatting.training import run
 
 ROOT = Path(__file__).parents[1]
 UNUSED = ("torch._dynamo", "torch._inductor", "torch.onnx", "matplotlib")
@@ -110,13 +108,6 @@ def test_the_last_record_says_where_the_time_went(colmap_scene, tmp_path):
     assert record["training_seconds"] < record["seconds"]  # the former are of this process alone
 
 
-def test_a_system_that_does_not_tell_when_a_process_started(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "seconds_since_start", lambda: None)
-    record = _train(colmap_scene, tmp_path / "out", iterations=1)
-    assert record["first_iteration_seconds"] is None and record["wall_seconds"] > 0
-    assert record["scoring_seconds"] >= 0 and record["saving_seconds"] > 0
-
-
 def test_pictures_are_decoded_while_the_model_is_made(colmap_scene, tmp_path, monkeypatch):
     kept = []
     plain = Scene.create_gaussians
@@ -128,22 +119,6 @@ def test_pictures_are_decoded_while_the_model_is_made(colmap_scene, tmp_path, mo
     monkeypatch.setattr(Scene, "create_gaussians", create)
     _train(colmap_scene, tmp_path / "out", iterations=2)
     assert kept == [(2, kept[0][1])] and kept[0][1] >= 2  # as many as there are iterations
-
-
-def test_views_that_are_scored_are_decoded_side_by_side(colmap_scene, tmp_path, monkeypatch):
-    decoded = {}
-    plain = store.decode
-
-    def decode(path: Path, size: tuple[int, int]) -> torch.Tensor:
-        decoded[path] = threading.current_thread().name
-        return plain(path, size)
-
-    monkeypatch.setattr(store, "decode", decode)
-    _train(colmap_scene, tmp_path / "out", "--eval", "--test_iterations", 1, iterations=1)
-    photos = sorted(path for path in (colmap_scene / "images").rglob("*") if path.is_file())
-    tested = set(photos[::8])
-    assert len(tested) == 3 and tested <= decoded.keys()
-    assert all(decoded[name].startswith("decode") for name in tested), decoded  # every 8th photo
 
 
 @pytest.mark.parametrize(

@@ -246,20 +246,6 @@ def test_maps_without_a_depth_are_named_and_left_out(blender_scene, empty, metri
         _depths(blender_scene, hold_out=True)
 
 
-@pytest.mark.parametrize(("shape", "suffix"), [((0, 40), ".npy"), ((1, 40), ".npy"), ((30, 1), ".png")])
-def test_maps_of_almost_no_pixels_are_refused(blender_scene, shape, suffix):
-    (blender_scene / "depths").mkdir()
-    for index in range(4):
-        size, stem = shape if index == 2 else (30, 40), blender_scene / "depths" / f"r_{index}"
-        if suffix == ".npy":
-            np.save(f"{stem}.npy", np.ones(size))
-        else:
-            _save(np.ones(size, np.uint16), stem.with_suffix(suffix))
-    said = f"map .*r_2{suffix} has only {shape[1]} x {shape[0]} pixels|r_2.npy has .* but its photo has another aspect"
-    with pytest.raises(UserError, match=said):
-        _depths(blender_scene, hold_out=True)
-
-
 def test_one_pixel_at_the_camera_does_not_outweigh_the_map():
     distances = np.full((30, 40), 4.0)
     distances[3, 4], distances[5, 6], distances[7, 8] = 1e-310, 1e-5, 1e-2

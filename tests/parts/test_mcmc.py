@@ -12,11 +12,9 @@ from torch import Tensor
 from trainings import MCMC, train_on
 
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.adc import remove_useless
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.saved_model import read_model
-from splatting.parts.budget.rules import fade, split_in_two
-from splatting.parts.mcmc.rules import MOST_PARTS, divided, draw, grow, relocate, start_as
+from splatting.parts.mcmc.rules import MOST_PARTS, divided, draw, grow, relocate
 from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
 from utils.system_utils import UserError
 
@@ -195,27 +193,3 @@ def test_growth_appends_parts():
     grow(gaussians, 7, **WHERE)
     assert len(gaussians) == 47
     _assert_parts(gaussians, 40, before, averages)
-
-
-def test_other_activations_are_followed():
-    """By the rules of both strategies."""
-    plain, own = _trained(), _trained()
-    with torch.no_grad():
-        own._opacity.sigmoid_()
-        own._scaling.exp_()
-    own.opacity_activation = own.inverse_opacity_activation = own.scaling_activation = torch.abs
-    own.scaling_inverse_activation = torch.abs
-    for gaussians in (plain, own):
-        relocate(gaussians, LEAST, **WHERE)
-        split_in_two(gaussians, torch.tensor([1, 4]))
-    least = float(plain.get_opacity.detach().sort(dim=0).values[2:4].mean())
-    for gaussians in (plain, own):
-        remove_useless(gaussians, least, 99)
-        fade(gaussians, 0.9)
-    assert len(own) == len(plain) < 42
-    for name in ("get_opacity", "get_scaling", "get_xyz"):
-        torch.testing.assert_close(getattr(own, name), getattr(plain, name))
-    for gaussians in (plain, own):
-        start_as(gaussians, 0.5, 0.1)
-        torch.testing.assert_close(gaussians.get_opacity, torch.full_like(own._opacity, 0.5))
-    torch.testing.assert_close(own.get_scaling, plain.get_scaling)

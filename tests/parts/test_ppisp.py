@@ -95,17 +95,6 @@ def test_gradients_are_those_of_differences():
             change.zero_()
 
 
-def test_the_neutral_appearance_changes_nothing_and_a_response_rises_between_its_ends():
-    image = torch.rand(3, 6, 9, generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(PhotoAppearance(NAMES, CAMERAS).shown(image, "a.png"), image, rtol=0, atol=1e-7)
-    steep, levels = _random(size=4.0), torch.linspace(0, 1, 500).expand(3, 1, -1)
-    for name in ("photos", "vignetting"):
-        steep.numbers[name].zero_()
-    curve = steep.shown(levels, "a.png")[:, 0]
-    assert (curve.diff(dim=1) > 0).all()
-    torch.testing.assert_close(curve[:, [0, -1]], torch.tensor([[0.0, 1.0]]).expand(3, 2), rtol=0, atol=1e-6)
-
-
 def test_photos_count_from_their_mean_after_every_step_and_nothing_is_learnt_while_held():
     appearance = _random()
     appearance.training_setup(options(iterations=10))

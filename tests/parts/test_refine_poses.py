@@ -360,19 +360,6 @@ def test_test_views_are_scored_with_given_poses_too(tmp_path, monkeypatch):
     assert [path.name for path in (out / "test").iterdir()] == ["ours_200"]
 
 
-def test_files_with_refined_lenses_are_refused(tmp_path):
-    make_colmap_scene(tmp_path)
-    scene, poses = _refinement(tmp_path)
-    with pytest.raises(UserError, match="the checkpoint has refined lenses, .*; train from the start"):
-        poses.restore(poses.captured() | {"lenses": {}})
-    scene.save_parts()
-    table = json.loads((tmp_path / "out" / NAME).read_text())
-    table["train"][0]["lens"] = [1.0, 1.0, 0.5, 0.5]
-    (tmp_path / "out" / NAME).write_text(json.dumps(table))
-    with pytest.raises(UserError, match="has refined lenses, .* write refine_poses=false into model.json"):
-        with_poses(scene.info, tmp_path / "out")
-
-
 @pytest.mark.parametrize(
     ("content", "said"),
     [

@@ -40,7 +40,7 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import extra_state, load_checkpoint, save_checkpoint
 from scene.readers.point_cloud import write_point_cloud
 from scene.saved_model import read_model
-from scene.sleeping import BLOCK, REST, Sleeping
+from scene.sleeping import BLOCK, REST
 from splatting.distributed.ranks import ranks
 from splatting.training import run as runs
 from splatting.training.iteration import Iteration
@@ -448,14 +448,6 @@ def test_no_block_sleeps_where_a_report_may_change_the_model_or_it_has_activatio
     monkeypatch.setattr(GaussianModel, "__init__", own)
     _trained(scene, tmp_path / "own")
     assert not shares
-
-
-def test_the_progress_bar_does_not_wake_blocks(scene, tmp_path, monkeypatch):
-    looks, look = [], Sleeping.flushed_view
-    monkeypatch.setattr(Sleeping, "flushed_view", lambda self: (looks.append(1), look(self))[1])
-    monkeypatch.setattr(ProgressBar, "due", lambda self, step: True)
-    _trained(scene, tmp_path)
-    assert len(looks) < 4
 
 
 def test_a_model_that_is_saved_between_is_as_if_no_block_had_slept(scene, tmp_path, monkeypatch):

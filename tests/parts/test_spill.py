@@ -1,7 +1,6 @@
 """--gpu_memory: a part of f_rest and its averages in the host's memory changes no byte, and keeps the limit."""
 
 import gc
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,7 +20,6 @@ from trainings import (
     narrow_scene,
     plain_training,
     shared_scene,
-    train_on,
     trained,
     trained_as,
     whole_result,
@@ -257,15 +255,6 @@ def test_blocks_sleep_wherever_they_can(scene, tmp_path, monkeypatch, options, s
     monkeypatch.setattr(run.Run, "begin", lambda self: (found.append(self.sleeping is not None), begin(self)))
     trained(scene, tmp_path, *options)
     assert found == [sleeps]
-
-
-def test_it_is_told_before_what_the_host_has_to_hold(scene, tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(GpuMemory, "host_bytes", lambda self, count: count * 10**6)
-    monkeypatch.setattr(resources, "free_memory", lambda device: 10**10)
-    monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
-    train_on(scene, tmp_path, "--iterations", 2, "--disable_viewer", "--init_pcd_path", scene / "points.ply", *SPILL)
-    out, err = capfd.readouterr()
-    assert "are kept in the host's memory" in out and "the memory of the CPU seems too small for" in err
 
 
 # On a GPU
