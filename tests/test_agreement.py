@@ -10,17 +10,7 @@ import pytest
 from photo_room import cam_to_world, camera_centers
 from scipy.optimize import minimize
 
-from scene.agreement import (
-    Pair,
-    angles,
-    consistent_groups,
-    joined,
-    judge,
-    own_angles,
-    pairs_by_tracks,
-    share_behind,
-    verdict,
-)
+from scene import agreement
 from splatting.findings.capture import is_wrong
 from splatting.findings.fit import check_agreement
 from splatting.sfm import mapping
@@ -68,7 +58,7 @@ def test_angles_are_the_least_by_which_both_rays_must_turn():
         )
         return second @ essential @ first
 
-    for one, other, found in zip(rays, seen, angles(essential, rays, seen), strict=True):
+    for one, other, found in zip(rays, seen, agreement.angles(essential, rays, seen), strict=True):
         met = {"type": "eq", "fun": turned, "args": (one, other)}
         best = minimize(lambda by: by @ by, np.full(6, 1e-4), constraints=[met], tol=1e-14)
         assert best.success and found == pytest.approx(np.sqrt(best.fun), rel=0.01)
@@ -78,29 +68,16 @@ def _unit(rows: np.ndarray) -> np.ndarray:
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
-def test_own_geometry_of_a_pair_is_found_beside_matches_that_are_off():
-    """A tenth of them by 4 pixels, as many as COLMAP's check lets pass; the others lie where they should."""
-    model = _room(noise=0.0)
-    pair = next(iter(pairs_by_tracks(model)))
-    assert pair.error < 1e-6 and pair.own_error < 1e-6
-    rng, rays = np.random.default_rng(0), []
-    for number in (1, 2):
-        seen = np.array([point.xy for point in model.images[number].points2D])
-        seen[:20] += rng.normal(scale=4, size=(20, 2))
-        rays.append(_unit(np.asarray(model.cameras[1].cam_ray_from_img(seen))))
-    assert np.median(own_angles(*rays)[20:]) * 700 < 0.3  # pixels
-
-
 def test_a_photo_in_a_wrong_place_is_named():
-    found = verdict([*pairs_by_tracks(_room())])
+    found = agreement.verdict([*agreement.pairs_by_tracks(_room())])
     assert (found["agreeing"], found["contradicting"], found["against"]) == (COUNT, 0, [])
-    found = verdict([*pairs_by_tracks(_room({5: np.array([0.1, -0.1, 0.2])}))])
+    found = agreement.verdict([*agreement.pairs_by_tracks(_room({5: np.array([0.1, -0.1, 0.2])}))])
     assert found["against"] == ["05.jpg"] and found["agreeing"] == COUNT - 1
 
 
 def test_a_part_in_a_wrong_place_is_named_although_it_agrees_with_itself():
     aside = dict.fromkeys(range(8, COUNT), np.array([0.3, 0.2, 0.4]))
-    found = verdict([*pairs_by_tracks(_room(aside))])
+    found = agreement.verdict([*agreement.pairs_by_tracks(_room(aside))])
     assert found["against"] == [f"{number:02d}.jpg" for number in range(8, COUNT)] and found["agreeing"] == 8
 
 
@@ -121,28 +98,24 @@ def test_an_order_that_is_turned_contradicts_though_its_epipolar_planes_fit():
         _unit(np.asarray(model.cameras[1].cam_ray_from_img(np.array([p.xy for p in i.points2D])))) for i in (one, other)
     ]
     moved = other.cam_from_world() * one.cam_from_world().inverse()
-    assert share_behind(moved.rotation.matrix(), moved.translation, *rays) == 0
-    assert share_behind(moved.rotation.matrix(), -moved.translation, *rays) == 1
+    assert agreement.share_behind(moved.rotation.matrix(), moved.translation, *rays) == 0
+    assert agreement.share_behind(moved.rotation.matrix(), -moved.translation, *rays) == 1
     assert _pair("a", "b")._replace(behind=0.9).contradicts and not _pair("a", "b")._replace(behind=0.5).contradicts
 
 
-def _pair(one: str, other: str, wrong: bool = False, matches: int = 50) -> Pair:
-    return Pair(one, other, matches, 9.0 if wrong else 0.1, 0.1, 800)
+def _pair(one: str, other: str, wrong: bool = False, matches: int = 50) -> agreement.Pair:
+    return agreement.Pair(one, other, matches, 9.0 if wrong else 0.1, 0.1, 800)
 
 
 def test_groups_are_those_between_which_pairs_contradict():
     chain = [_pair(a, b) for a, b in ("ab", "bc", "ac", "de", "ef", "df")]
-    groups = consistent_groups([*chain, _pair("c", "d", wrong=True), _pair("a", "f", matches=20)])
+    groups = agreement.consistent_groups([*chain, _pair("c", "d", wrong=True), _pair("a", "f", matches=20)])
     assert [sorted(group) for group in groups] == [[*"abc"], [*"def"]]
-    groups = consistent_groups([*chain, _pair("c", "d", wrong=True), _pair("a", "f", matches=60)])
+    groups = agreement.consistent_groups([*chain, _pair("c", "d", wrong=True), _pair("a", "f", matches=60)])
     assert [sorted(group) for group in groups] == [[*"abcdef"]]
     # Hundreds of matches of two photos that show nearly the same do not outvote several other pairs.
     voted = [_pair("a", "d", matches=900), *(_pair(a, b, wrong=True) for a, b in ("bd", "cd", "be"))]
-    assert len(consistent_groups([*chain, *voted])) == 2
-
-
-def test_the_largest_joined_set():
-    assert joined([(1, 2), (3, 4), (4, 5)]) == {3, 4, 5} and joined([]) == set()
+    assert len(agreement.consistent_groups([*chain, *voted])) == 2
 
 
 def test_pairs_of_a_database_judge_a_model(tmp_path):
@@ -166,7 +139,7 @@ def test_pairs_of_a_database_judge_a_model(tmp_path):
     database.close()
     wrong = _room({5: np.array([0.1, -0.1, 0.2])})
     wrong.deregister_frame(wrong.images[1].frame_id)
-    found = judge(wrong, path)
+    found = agreement.judge(wrong, path)
     assert (found["pairs"], found["agreeing"], found["bound"]) == (10 * 9 // 2, COUNT - 2, COUNT)
     assert found["against"] == ["05.jpg"]
 
@@ -177,15 +150,11 @@ def test_pairs_of_a_database_judge_a_model(tmp_path):
         (20, {"incremental": 20}, ["incremental"], "incremental"),
         (20, {"incremental": 12, "global": 19}, ["incremental", "global"], "global"),
         (90, {"global": 90}, ["global"], "global"),
-        (
-            90,
-            {"global": 50, "simple": 40, "incremental": 70, "free": 60},
-            ["global", "simple", "incremental", "free"],
-            "incremental",
-        ),
+        (90, {"global": 50, "simple": 40, "incremental": 70, "free": 60},
+         ["global", "simple", "incremental", "free"], "incremental"),
         (90, {"incremental": 89}, ["global", "simple", "incremental"], "incremental"),  # the first two fail
     ],
-)
+)  # fmt: skip
 def test_ways_are_tried_until_one_agrees(tmp_path, monkeypatch, capsys, count, agreeing, tried, kept):
     work, done = tmp_path / "distorted", []
     layout = SimpleNamespace(
@@ -221,22 +190,6 @@ def test_ways_are_tried_until_one_agrees(tmp_path, monkeypatch, capsys, count, a
     judged = json.loads(layout.judged.read_text())
     assert judged[0]["way"] == kept and len(judged) == len(tried)
     assert capsys.readouterr().out.count("; trying ") == len(tried) - 1
-
-
-def test_mapping_that_fails_in_every_way_says_why(tmp_path, monkeypatch):
-    def fail(*_: object) -> None:
-        raise UserError("no disk left")
-
-    monkeypatch.setattr(mapping, "copy_database", lambda *_: None)
-    layout = SimpleNamespace(
-        database=tmp_path / "a.db", calibrated=tmp_path / "b.db", tried=tmp_path / "tried", work=tmp_path
-    )
-    settings = SimpleNamespace(mapper="auto")
-    backend = SimpleNamespace(
-        layout=layout, settings=settings, ways=("global", "free"), calibration=lambda: [], mapping=lambda *_: []
-    )
-    with pytest.raises(UserError, match="no disk left"):
-        mapping.map_photos(backend, lambda *_: None, fail)
 
 
 def test_when_a_model_is_called_wrong():

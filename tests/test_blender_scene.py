@@ -14,7 +14,6 @@ from synthetic import FakeGaussians, edit_json, folder_state, options_of, read
 
 from scene import Scene
 from scene.dataset_readers import readNerfSyntheticInfo
-from scene.readers.point_cloud import write_point_cloud
 from utils.system_utils import UserError
 
 _read = partial(read, hold_out=True)
@@ -71,15 +70,6 @@ def test_suffix_is_appended_only_when_missing(blender_scene):
     assert names[:3] == [("r_0.png", "r_0"), ("dotted.7.jpg", "dotted.7"), ("r_2.png", "r_2")]
 
 
-@pytest.mark.parametrize("hold_out", [False, True])
-def test_a_frame_that_is_listed_twice_is_used_once(blender_scene, hold_out, capsys):
-    whole = read(blender_scene, hold_out=hold_out)
-    _edit(blender_scene, lambda content: content["frames"].append(content["frames"][0]))
-    twice = read(blender_scene, hold_out=hold_out)
-    assert [c.image_path for c in twice.train_cameras] == [c.image_path for c in whole.train_cameras]
-    assert "1 frames of" in capsys.readouterr().err
-
-
 def test_test_views_may_be_missing_without_eval(blender_scene, capsys):
     whole = read(blender_scene)
     for path in sorted((blender_scene / "test").iterdir()):
@@ -114,14 +104,6 @@ def test_random_cloud(blender_scene):
     # The points are even: the mean of 100,000 uniform values of deviation 0.75 is within 0.012, five deviations.
     assert np.abs(cloud.points.mean(axis=0)).max() < 0.012
     assert (cloud.colors == np.float32(127 / 255)).all()
-    np.testing.assert_array_equal(_read(blender_scene).point_cloud.points, cloud.points)
-
-
-def test_a_given_cloud_comes_before_the_own(blender_scene, tmp_path):
-    write_point_cloud(blender_scene / "points3d.ply", np.array([[1.0, 2.0, 3.0]]), np.array([[0, 255, 0]]))
-    write_point_cloud(tmp_path / "mine.ply", np.zeros((2, 3)), np.zeros((2, 3)))
-    info = _read(blender_scene, init_pcd_path=str(tmp_path / "mine.ply"))
-    assert info.ply_path == tmp_path / "mine.ply" and len(info.point_cloud.points) == 2
 
 
 def test_scene_composites_and_leaves_the_dataset_alone(blender_scene, tmp_path):
@@ -137,7 +119,6 @@ def test_scene_composites_and_leaves_the_dataset_alone(blender_scene, tmp_path):
     entries = json.loads((tmp_path / "out" / "cameras.json").read_text())
     assert [entry["img_name"] for entry in entries] == ["r_0", "r_1", "r_0", "r_1", "r_2", "r_3"]
     assert (entries[0]["width"], entries[0]["height"], entries[0]["fx"]) == (40, 30, entries[0]["fy"])
-    assert (tmp_path / "out" / "input.ply").stat().st_size > 100_000 * 27
 
 
 def _turned(change):
@@ -152,23 +133,18 @@ def _turned(change):
     return lambda scene: _edit(scene, edit)
 
 
-@pytest.mark.parametrize("scale", [2.0, 1e-4, [4.0, 0.25, 1.0, 8.0]])
-def test_a_scale_of_poses_is_divided_out(blender_scene, tmp_path, scale):
-    plain = Scene(options_of(blender_scene, tmp_path / "plain"), FakeGaussians(), shuffle=False)
-    factors = np.broadcast_to(scale, 4)
+def test_a_scale_of_poses_is_divided_out(blender_scene):
+    plain, factors = _read(blender_scene), [4.0, 0.25, 1.0, 1e-4]
     _turned(lambda turn, index: turn * factors[index])(blender_scene)
-    scaled = Scene(options_of(blender_scene, tmp_path / "scaled"), FakeGaussians(), shuffle=False)
-    exact = all(math.frexp(factor)[0] == 0.5 for factor in factors)
-    close = np.testing.assert_array_equal if exact else partial(np.testing.assert_allclose, atol=1e-14, rtol=1e-14)
-    for one, other in zip(plain.info.train_cameras, scaled.info.train_cameras, strict=True):
-        close(other.R, one.R)
-        close(other.T, one.T)
-    for one, other in zip(plain.getTrainCameras(), scaled.getTrainCameras(), strict=True):
-        torch.testing.assert_close(other.full_proj_transform, one.full_proj_transform, rtol=2e-7, atol=2e-7)
-    assert scaled.cameras_extent == pytest.approx(plain.cameras_extent, rel=1e-14)
+    scaled = _read(blender_scene)
+    for one, other, factor in zip(plain.train_cameras, scaled.train_cameras, factors, strict=True):
+        close = 1e-14 if factor == 1e-4 else 0
+        np.testing.assert_allclose(other.R, one.R, rtol=close, atol=close)
+        np.testing.assert_allclose(other.T, one.T, rtol=close, atol=close)
+    assert scaled.extent == pytest.approx(plain.extent, rel=1e-14)
 
 
-@pytest.mark.parametrize("digits", [3, 4, 8])
+@pytest.mark.parametrize("digits", [3, 4])
 def test_poses_that_were_rounded_are_taken(blender_scene, digits):
     oblique = Rotation.from_rotvec([0.3, 0.8, -0.5]).as_matrix()
     _turned(lambda turn, _: oblique @ turn)(blender_scene)

@@ -235,6 +235,10 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
             _lines("points3D.txt", lambda lines: [_replaced(line, SMALL) for line in lines]),
             r"^line 1 of .*points3D\.txt has the colour 0.0 1.0 0.25, but COLMAP's colours range from 0 to 255;",
         ),
+        (
+            _lines("images.txt", lambda lines: [line.replace("left/v02.png", "left/./V04.png") for line in lines]),
+            r"left/\./V04.png and left/v04.png in .* are one file, .*; rename one",
+        ),
         (_gone(PHOTO), "1 of 9 photos .*are missing: SCENE/images/left/v02.png"),
         (_seven_gone, r"7 of 9 photos that .* lists are missing: .*Right/V03.png, .* and 2 more \(the folder has .*-i"),
         (_converted, r"9 of 9 photos .*Right/V03.png.*the folder has Right/V03.bmp, .*go on without.*image_deleter"),

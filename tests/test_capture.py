@@ -1,4 +1,4 @@
-"""The report of a capture: what it finds, its page, and what train.py says of it."""
+"""The report of a capture: what it finds and advises, its page, and what train.py says of it."""
 
 import json
 import re
@@ -9,10 +9,12 @@ from PIL import Image, ImageFilter
 from scipy.ndimage import gaussian_filter
 
 import train
-from splatting.findings.capture import left_out, lines_of, neighbours_of, unusable, worth
+from splatting.findings.capture import left_out, lines_of, neighbours_of, of_model, unusable, worth
+from splatting.sfm import report
 from splatting.sfm.capture import compared, looks_of
-from splatting.sfm.capture_page import from_above, write_page
+from splatting.sfm.capture_page import write_page
 from splatting.sfm.layout import Layout
+from utils.system_utils import UserError
 
 NAMES = ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]
 
@@ -53,23 +55,10 @@ def test_what_is_weak_blurred_and_darker_is_named(folder):
     assert [line.split(":")[0] for line in found["again"]] == [
         "what e.jpg show, if it belongs to the scene", "around d.jpg", "b.jpg", "with a fixed exposure, if you can",
     ]  # fmt: skip
+    assert found["again"][-1].endswith("--appearance ppisp")
     assert lines_of(_report(4, 5, "e.jpg") | found)[:2] == [
         "overlap: 1 of 4 photos weakly connected (d.jpg)", "blur: 1 of 5 photos blurred (b.jpg)",
     ]  # fmt: skip
-
-
-def test_the_brightness_of_photos_that_are_not_placed_does_not_count(folder):
-    """Such as a screenshot among the photos, whose brightness would call for --appearance ppisp."""
-    photos = {name: photo for name, photo in _survey()["photos"].items() if name != "d.jpg"}
-    found = worth(_report(3, 4, "d.jpg"), photos, looks_of(folder, NAMES))
-    assert found["brightness_spread_stops"] < 0.05 and found["blurred"] == ["b.jpg"]
-
-
-def test_a_sound_capture_has_nothing_to_photograph_again(folder):
-    looks = {name: looks_of(folder, ["a.jpg"])["a.jpg"] for name in NAMES[:3]}
-    photos = {name: photo for name, photo in _survey()["photos"].items() if name in looks}
-    found = worth(_report(3, 3), photos, looks)
-    assert found == {"weakly_connected": [], "blurred": [], "brightness_spread_stops": 0.0, "again": []}
 
 
 def test_what_photos_show_does_not_count(tmp_path):
@@ -130,34 +119,6 @@ def test_the_page_shows_what_is_wrong_with_each_photo(folder):
     assert '<li class="problem">4 of 6 photos placed' in text and "<li>around d.jpg: fewer than 2 other" in text
 
 
-def test_a_page_of_many_photos_has_thumbnails_of_those_with_a_problem(folder):
-    survey = _survey()
-    survey["photos"] |= {f"{number:03d}.jpg": survey["photos"]["a.jpg"] for number in range(297)}
-    text = _page(folder, sorted(survey["photos"]), survey)
-    assert text.count("data:image/jpeg;base64,") == 2 and "only 2 photos with a problem have one" in text
-
-
-def test_the_page_shows_how_poses_were_judged_and_the_time_of_each_stage(folder):
-    text = _page(folder, NAMES, _survey())
-    assert "How the poses were judged" not in text and "<h2>Time</h2>" not in text
-    judged = {"photos": 4, "pairs": 6, "agreeing": 3, "bound": 4, "contradicting": 0.245, "error": 0.52}
-    tried = [{"way": "global", "seconds": 1.0, "own_error": 0.16} | judged, {"way": "incremental", "seconds": 2.0}]
-    text = _page(folder, NAMES, _survey(), tried=tried, seconds={"features": 2.04, "mapping": 61.0})
-    rows = [re.findall("<td>(.*?)</td>", row) for row in re.findall("<tr.*?</tr>", text, re.S)]
-    assert [row for row in rows if row] == [
-        ["global mapping (chosen)", "4", "3 of 4", "24.5%", "0.52", "0.16"],
-        ["incremental mapping", "0", "-", "-", "-", "-"],
-        ["mapping", "61.0"], ["features", "2.0"],
-    ]  # fmt: skip
-    assert '<p class="warning">no way of mapping found poses that agree' in text
-
-
-def test_the_picture_is_from_above_and_not_mirrored():
-    up = np.array([[0.0, -1.0, 0.1], [0.0, -1.0, -0.1]])
-    across, forth = from_above(up)
-    np.testing.assert_allclose(np.cross(across, forth), [0, -1, 0], atol=1e-12)  # towards who looks down
-
-
 @pytest.mark.parametrize(("placed", "said"), [(5, True), (6, False), (10, False)])
 def test_too_few_photos_are_said(placed, said):
     text = unusable(_report(placed, 10))
@@ -177,11 +138,52 @@ def test_a_training_says_what_its_scene_lacks(tmp_path):
 
 @pytest.mark.parametrize(
     ("given", "kept", "said"),
-    [("native", "undistort", True), ("native", "native", False), ("auto", "undistort", False), ("native", None, False)],
+    [("native", "undistort", True), ("native", "native", False), ("auto", "undistort", False)],
 )
 def test_a_training_says_that_native_lenses_come_too_late(colmap_scene, tmp_path, capsys, given, kept, said):
-    (colmap_scene / "convert_report.json").write_text(json.dumps(_report(17, 17) | ({"lenses": kept} if kept else {})))
+    (colmap_scene / "convert_report.json").write_text(json.dumps(_report(17, 17) | {"lenses": kept}))
     words = ["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "-r", "24", "--iterations", "1", "--quiet"]
     train.main([*words, "--lenses", given, "--no_curve", "--test_iterations", "-1"])
     text = "warning: --lenses native has no effect, since convert.py undistorted the photos of this scene; to train on"
     assert (text in capsys.readouterr().err) == said
+
+
+@pytest.mark.parametrize("name", ["../a.png", "/a.png", "deep/../../a.png"])
+def test_photos_of_a_model_stay_in_their_folder(tmp_path, name):
+    layout = Layout(tmp_path)
+    layout.work.mkdir()
+    model = report.Model("0", [name], 1, 1.0, 1.0, [])
+    layout.survey.write_text(json.dumps([model._asdict()]))
+    with pytest.raises(UserError, match="names a photo .*a.png, outside of the folder of its photos"):
+        report.read_survey(layout, [])
+
+
+def _model(registered: int, points: int = 5000, track: float = 5.0, error: float = 0.5, first: int = 0) -> report.Model:
+    return report.Model("0", [f"{i:03d}" for i in range(first, first + registered)], points, track, error, [])
+
+
+def test_poses_that_no_pair_judged_are_not_called_right():
+    photos = [f"{i:03d}" for i in range(40)]
+    words = [_model(40)], photos, dict.fromkeys(photos, 3), "auto", 0
+    (line,) = map(str, of_model(*words, tried=[{"way": "global", "photos": 40, "pairs": 0}]))
+    assert line.startswith("the poses could not be judged")
+    judged = {"way": "global", "photos": 40, "pairs": 90, "agreeing": 40, "contradicting": 0.02}
+    assert [*of_model(*words, tried=[judged])] == []
+
+
+@pytest.mark.parametrize(
+    ("models", "said"),
+    [
+        ([_model(40)], []),
+        ([_model(38)], [r"2 of 40 photos left out \(038, 039\), 1 of them without a match .*else; --matcher"]),
+        ([_model(25), _model(15, first=25)], ["15 of 40", r"form 2 unconnected parts \(25 photos are used, the oth"]),
+        ([_model(40), _model(12)], []),
+        ([_model(40, points=900)], ["only 900 points; .*1000; use larger .* photos, or --max_num_features 16384$"]),
+        ([_model(40, track=2.4)], ["in 2.4 photos on average, so the photos overlap little"]),
+        ([_model(40, error=2.0)], ["mean reprojection error is 2.0 pixels"]),
+    ],
+)
+def test_advice(models, said):
+    photos = [f"{i:03d}" for i in range(40)]
+    lines = [*map(str, of_model(models, photos, dict.fromkeys(photos[:39], 3), "sequential", 8192))]
+    assert [bool(re.search(expected, line)) for line, expected in zip(lines, said, strict=True)] == [True] * len(said)

@@ -1,35 +1,33 @@
-"""Files that convert.py finds in `input`: photos of every format by their content, and what is not used, by name."""
+"""Files that convert.py finds in `input`: photos of every format, what is not used, and photos that come later."""
 
-import json
-import re
+import contextlib
 import shutil
+import sqlite3
 import sys
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
-from photo_room import SIZE, make_photos
+from photo_room import camera_centers, make_photos
 from PIL import Image, ImageOps
 
 import convert
 from scene.images.decode import picture_size
+from splatting.sfm import stages
+from splatting.sfm.adding import keep_base
 from splatting.sfm.images import prepare_images
 from splatting.sfm.inputs import sort_inputs
 from splatting.sfm.layout import Layout, image_names
 from utils.system_utils import UserError
 
-# Names of files, the formats that Pillow writes for them, and their names for COLMAP.
+# Names of files, the formats that Pillow writes for them, and their names for COLMAP: two that meet stay apart.
 FORMATS = [
-    *[("a.jfif", "JPEG", "a.jfif.jpg"), ("b.jpe", "JPEG", "b.jpe.jpg"), ("c", "JPEG", "c.jpg"), ("d", "PNG", "d.png")],
-    *[("e.jp2", "JPEG2000", "e.jp2.png"), ("f.tga", "TGA", "f.tga.png"), ("g.AVIF", "AVIF", "g.AVIF.jpg")],
-    *[("h.HEIC", "HEIF", "h.HEIC.jpg"), ("i.hif", "HEIF", "i.hif.jpg"), ("j.jpg", "HEIF", "j.jpg")],
-    *[
-        ("k.png", "JPEG", "k.png"),
-        ("l.ppm", "PPM", "l.ppm.png"),
-        ("m", "TIFF", "m.tif"),
-        ("n.webp", "WEBP", "n.webp.png"),
-    ],
+    *[("a.jfif", "JPEG", "a.jfif.jpg"), ("b.jpe", "JPEG", "b.jpe.jpg"), ("c", "JPEG", "c.jpg.jpg")],
+    *[("c.jpg", "JPEG", "c.jpg"), ("d", "PNG", "d.png"), ("e.jp2", "JPEG2000", "e.jp2.png")],
+    *[("f.tga", "TGA", "f.tga.png"), ("g.AVIF", "AVIF", "g.AVIF.jpg"), ("h.HEIC", "HEIF", "h.HEIC.jpg")],
+    *[("i.hif", "HEIF", "i.hif.jpg"), ("j.jpg", "HEIF", "j.jpg"), ("k.png", "JPEG", "k.png")],
+    *[("l.ppm", "PPM", "l.ppm.png"), ("m", "TIFF", "m.tif"), ("n.webp", "WEBP", "n.webp.png")],
 ]
 FOCAL_MM, FOCAL_35 = 4.25, 26
 
@@ -67,7 +65,7 @@ def test_photos_of_every_format_reach_colmap(tmp_path, heif):
     found = sort_inputs(layout.input)
     assert (found.photos, found.unused) == ([name for name, *_ in FORMATS], {})
     prepare_images(layout, found.photos, None)
-    assert image_names(layout.prepared) == [name for *_, name in FORMATS]
+    assert image_names(layout.prepared) == sorted(name for *_, name in FORMATS)
     expected = np.asarray(_picture(), dtype=float)
     for *_, name in FORMATS:
         read = pycolmap.Bitmap.read(str(layout.prepared / name), True).to_array()
@@ -93,14 +91,6 @@ def test_exif_is_kept_and_the_orientation_applied_once(tmp_path, heif, name, fil
     # What COLMAP makes of it: the focal length in pixels of a 35 mm film.
     focal = pycolmap.Bitmap.read(str(written), True).exif_focal_length()
     assert focal == pytest.approx(FOCAL_35 / np.hypot(36, 24) * np.hypot(96, 64), rel=0.1)
-
-
-def test_names_that_meet_stay_apart(tmp_path):
-    layout = Layout(tmp_path)
-    for name in ("a", "a.jpg", "a.jpg.png"):
-        _save(layout.input / name, "JPEG")
-    prepare_images(layout, sort_inputs(layout.input).photos, None)
-    assert image_names(layout.prepared) == ["a.jpg", "a.jpg.jpg", "a.jpg.png"]
 
 
 def _fill(folder: Path) -> None:
@@ -140,49 +130,23 @@ def test_photos_that_can_not_be_read_stop_unless_they_are_left_out(tmp_path, hei
     picture.info["nclx_profile"] = {"color_primaries": 9, "transfer_characteristics": 16, "matrix_coefficients": 9}
     picture.info["nclx_profile"]["full_range_flag"] = 1
     picture.save(tmp_path / "7.hif", "HEIF", save_nclx_profile=True)
-    said = r"^4 photos in .* cannot be read: 4.NEF, 5.tif \(RAW: export as JPEG or TIFF\); 6.heic \(damaged: copy it "
-    said += r"again\); 7.hif \(HDR picture: export as SDR\); follow these hints, or pass --skip_unreadable"
+    (tmp_path / "day 2").symlink_to(tmp_path.parent)  # whose photos are not looked for
+    Image.new("1", (50_000, 4_000)).save(tmp_path / "a.png")
+    Image.new("1", (50_000, 4_000)).save(tmp_path / "b.jfif", "PNG")
+    Image.new("F", (9, 9)).save(tmp_path / "c.tif")
+    with pytest.raises(UserError, match=r"a.png has more than \d+,\d+,\d+ pixels; make it smaller"):  # of a training
+        picture_size(tmp_path / "a.png")
+    found = {"4.NEF": "RAW: ", "5.tif": "RAW: ", "6.heic": "damaged: ", "7.hif": "HDR picture: ", "a.png": "too large"}
+    found |= {"b.jfif": "too large", "c.tif": "floating-point pixels: ", "day 2": "a link to a folder or to nothing: "}
+    said = r"^8 photos in .* cannot be read: .*4.NEF, 5.tif \(RAW: .*; follow these hints, or pass --skip_unreadable"
     with pytest.raises(UserError, match=said):
         sort_inputs(tmp_path)
     (tmp_path / "8.jpg").write_bytes((tmp_path / "1.jpg").read_bytes()[:-60])
     (tmp_path / "9.png").write_bytes(b"<html>")
-    found = sort_inputs(tmp_path, skip_unreadable=True)
-    assert found.photos == ["1.jpg", "2.jpg", "3.jpg"]
-    assert {"4.NEF", "5.tif", "6.heic", "7.hif", "8.jpg", "9.png"} < found.unused.keys()
-
-
-@pytest.mark.parametrize("skip", [False, True])
-def test_photos_of_a_kind_that_no_copying_repairs_get_the_true_reason(tmp_path, skip):
-    _fill(tmp_path)
-    Image.new("1", (50_000, 4_000)).save(tmp_path / "4.png")
-    Image.new("1", (50_000, 4_000)).save(tmp_path / "5.jfif", "PNG")
-    Image.new("F", (9, 9)).save(tmp_path / "6.tif")
-    with pytest.raises(UserError, match=r"4.png has more than \d+,\d+,\d+ pixels; make it smaller"):  # of a training
-        picture_size(tmp_path / "4.png")
-    found = {"too large to be read: make it smaller": ["4.png", "5.jfif"]}
-    found |= {"floating-point pixels: save it with 8 or 16 bits": ["6.tif"]}
-    if skip:
-        (tmp_path / "7.jpg").write_bytes(b"<html>")
-        found |= {"a web page, likely from a wrong address: download it again": ["7.jpg"]}
-        unused = sort_inputs(tmp_path, skip_unreadable=True).unused
-        assert {reason: [name for name in unused if unused[name] == reason] for reason in found} == found
-    else:
-        listed = "; ".join(f"{', '.join(names)} ({reason})" for reason, names in found.items())
-        with pytest.raises(UserError, match=f"^3 photos in .* cannot be read: {re.escape(listed)}; follow these hints"):
-            sort_inputs(tmp_path)
-
-
-def test_links_to_folders_are_not_passed_over(tmp_path):
-    """Their photos are not looked for, which may be most of the capture."""
-    _fill(tmp_path / "input")
-    _save(tmp_path / "4.jpg", "JPEG")
-    for name, target in (("day 2", tmp_path), ("5.jpg", tmp_path / "gone.jpg"), ("4.jpg", tmp_path / "4.jpg")):
-        (tmp_path / "input" / name).symlink_to(target)
-    said = r"^2 photos in .* cannot be read: 5.jpg, day 2 \(a link to a folder or to nothing: copy .* hints, or pass"
-    with pytest.raises(UserError, match=said):
-        sort_inputs(tmp_path / "input")
-    found = sort_inputs(tmp_path / "input", skip_unreadable=True)
-    assert found.photos == ["1.jpg", "2.jpg", "3.jpg", "4.jpg"] and found.unused["day 2"].startswith("a link to")
+    found |= {"8.jpg": "", "9.png": "a web page"}
+    taken = sort_inputs(tmp_path, skip_unreadable=True)
+    assert taken.photos == ["1.jpg", "2.jpg", "3.jpg"]
+    assert all(taken.unused[name].startswith(reason) for name, reason in found.items())
 
 
 def test_without_the_reader_of_heic_the_message_has_the_line_that_installs_it(tmp_path, heif, monkeypatch):
@@ -196,22 +160,102 @@ def test_without_the_reader_of_heic_the_message_has_the_line_that_installs_it(tm
     assert sort_inputs(tmp_path, skip_unreadable=True).photos == ["1.jpg", "2.jpg", "3.jpg"]
 
 
+PLACES = 10
+LATER = ("photo_03.png", "photo_06.png")
+
+
+def _scenes(folder: Path) -> None:
+    """The photos of `all`, and a scene of those that are not LATER."""
+    make_photos(folder / "all", PLACES)
+    shutil.copytree(folder / "all", folder / "scene" / "input", ignore=shutil.ignore_patterns(*LATER))
+    convert.main(["-s", str(folder / "scene"), "--no_gpu"])
+
+
+@pytest.fixture
+def room(once, tmp_path: Path) -> Path:
+    """A copy, with `scene` and `all`."""
+    return Path(shutil.copytree(once("room to add to", _scenes), tmp_path / "copy", copy_function=shutil.copy2))
+
+
+def _run(scene: Path, *options: str) -> pycolmap.Reconstruction:
+    convert.main(["-s", str(scene), "--no_gpu", *options])
+    return pycolmap.Reconstruction(str(scene / "sparse" / "0"))
+
+
+def _poses(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
+    return {image.name: image.cam_from_world().matrix() for image in model.images.values()}
+
+
+def _put(room: Path, *names: str) -> None:
+    for name in names:
+        shutil.copy2(room / "all" / name, room / "scene" / "input")
+
+
 @pytest.mark.slow
-def test_a_folder_of_all_kinds_is_converted(tmp_path, heif, capsys):
-    make_photos(tmp_path / "plain", 6)
-    formats = ["JPEG", "HEIF", "AVIF", "JPEG2000", "TGA", "JPEG"]
-    names = ["a.jfif", "b.HEIC", "c.avif", "d.jp2", "e.tga", "f"]
-    (tmp_path / "input").mkdir()
-    for path, name, file_format in zip(sorted((tmp_path / "plain").iterdir()), names, formats, strict=True):
-        with Image.open(path) as image:
-            image.save(tmp_path / "input" / name, file_format, **({} if file_format == "TGA" else {"quality": 95}))
-    shutil.rmtree(tmp_path / "plain")
-    (tmp_path / "input" / "b.AAE").write_text("<plist/>")
-    convert.main(["-s", str(tmp_path), "--no_gpu"])
-    said = capsys.readouterr().out
-    assert "6 of 6 photos placed" in said and "not used: b.AAE (no picture)" in said
-    report = json.loads((tmp_path / "convert_report.json").read_text())
-    assert report["unused"] == {"b.AAE": "no picture"}
-    assert len(image_names(tmp_path / "images")) == 6
-    assert all(abs(np.subtract(Image.open(tmp_path / "images" / name).size, SIZE)).max() < 12
-               for name in image_names(tmp_path / "images"))  # fmt: skip
+def test_old_photos_keep_poses_and_bytes_and_new_ones_are_placed(room, monkeypatch, capsys):
+    """Also after an interruption, and beside a photo of another place."""
+    scene = room / "scene"
+    before = pycolmap.Reconstruction(str(scene / "sparse" / "0"))
+    pictures = {path.name: path.read_bytes() for path in (scene / "images").iterdir()}
+    _run(scene, "--orient")
+    _put(room, *LATER[:1])
+    _run(scene, "--add")
+    assert (scene / "orientation.json").is_file()  # asked for once
+    assert f"added: 1 of 1 new photos; the {PLACES - 2} before keep their poses" in capsys.readouterr().out
+    _put(room, *LATER[1:])
+    noise = np.random.default_rng(0).integers(0, 255, (180, 240, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(scene / "input" / "elsewhere.png")
+    with monkeypatch.context() as patch:
+        patch.setattr(stages.report, "read_survey", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            _run(scene, "--add")
+    model = _run(scene, "--add")
+    assert f"added: 1 of 2 new photos; the {PLACES - 1} before keep their poses" in capsys.readouterr().out
+    old, new = _poses(before), _poses(model)
+    assert sorted(new) == sorted([*old, *LATER])
+    assert max(np.abs(new[name] - pose).max() for name, pose in old.items()) < 1e-12
+    assert {path.name: path.read_bytes() for path in (scene / "images").iterdir() if path.name in old} == pictures
+    assert len(model.cameras) == 1 and model.cameras[1].params.tolist() == before.cameras[1].params.tolist()
+    at = camera_centers(PLACES)[[int(name[6:8]) for name in sorted(new)]]
+    found = np.array([model.find_image_with_name(name).projection_center() for name in sorted(new)])
+    fit = pycolmap.estimate_sim3d(found, at)
+    assert np.linalg.norm(fit * found - at, axis=1).max() < 0.04
+
+
+def test_what_cannot_be_added_is_said(room, tmp_path, capsys):
+    scene = room / "scene"
+    with pytest.raises(UserError, match="no new photos"):
+        _run(scene, "--add")
+    with pytest.raises(UserError, match="--poses does not go with --add"):
+        _run(scene, "--add", "--poses", str(scene / "sparse" / "0"))
+    shutil.copytree(room / "all", tmp_path / "other" / "input")
+    with pytest.raises(UserError, match="leave --add out"):
+        _run(tmp_path / "other", "--add")
+    _put(room, *LATER)
+    (scene / "input" / "photo_00.png").unlink()
+    with pytest.raises(UserError, match=r"lacks photo_00\.png; put them back"):
+        _run(scene, "--add")
+    (tmp_path / "masks").mkdir()
+    with pytest.raises(UserError, match="has a mask"):  # by the first stage
+        _run(scene, "--mask_path", str(tmp_path / "masks"))
+    assert "without --add, photos that were added before get new poses" in capsys.readouterr().err
+    assert not (scene / "distorted" / "base").exists()
+
+
+def test_photos_that_are_prepared_under_other_names_are_known(tmp_path):
+    """By files of kinds that COLMAP does not read, or without a suffix; the model is not asked."""
+    layout, names = Layout(tmp_path), ["a.webp", "b.jp2", "c", "d.avif", "e.png"]
+    layout.input.mkdir()
+    for name, kind in zip(names, ("WEBP", "JPEG2000", "TIFF", "AVIF", "PNG"), strict=True):
+        Image.new("RGB", (32, 24)).save(layout.input / name, kind)
+    prepare_images(layout, names, None)
+    with pytest.raises(UserError, match="has no new photos"):
+        keep_base(layout, True, names)
+    layout.base.mkdir()
+    with contextlib.closing(sqlite3.connect(layout.base_database)) as database:
+        database.execute("CREATE TABLE images (name TEXT)")
+        database.executemany("INSERT INTO images VALUES (?)", [(name,) for name in image_names(layout.prepared)])
+        database.commit()
+    keep_base(layout, False, [*names, "new.png"])
+    with pytest.raises(UserError, match=r"lacks a\.webp; put them back"):
+        keep_base(layout, False, names[1:])

@@ -18,15 +18,6 @@ from skimage.metrics import structural_similarity
 import convert
 from splatting.sfm import video as video_module
 from splatting.sfm.layout import Layout
-from splatting.sfm.video import (
-    choose_frames,
-    extract_videos,
-    frame_folders,
-    refuse_foreign_frames,
-    remove_frames,
-    sharpness,
-    small_picture,
-)
 from utils.system_utils import UserError
 
 
@@ -59,7 +50,7 @@ def _frames(layout: Layout) -> list[Path]:
 def _extract(scene: Path, video: Path, count: int) -> Layout:
     layout = Layout(scene)
     layout.work.mkdir(parents=True)
-    extract_videos(layout, [video], count)
+    video_module.extract_videos(layout, [video], count)
     return layout
 
 
@@ -68,8 +59,8 @@ def test_the_sharpest_frame_of_each_part_is_taken(tmp_path, monkeypatch):
     layout = _extract(tmp_path / "few", Path("any.mp4"), 3)
     assert [path.name for path in _frames(layout)] == [f"frame_0000{i}.jpg" for i in (1, 2, 3)]
     for index, path in enumerate(_frames(layout)):
-        expected = sharpness(np.asarray(_Decoder.frame(3 * index + 1).convert("L")))
-        assert sharpness(np.asarray(Image.open(path).convert("L"))) == pytest.approx(expected, rel=0.1)
+        expected = video_module.sharpness(np.asarray(_Decoder.frame(3 * index + 1).convert("L")))
+        assert video_module.sharpness(np.asarray(Image.open(path).convert("L"))) == pytest.approx(expected, rel=0.1)
     assert len(_frames(_extract(tmp_path / "all", Path("any.mp4"), 100))) == 9
 
 
@@ -126,37 +117,20 @@ def test_frames_go_by_what_they_are_not_by_what_a_record_says(tmp_path, monkeypa
     for name in ("../../frame_00004.jpg", str(tmp_path / "frame_00004.jpg"), ".hidden/frame_00004.jpg", "mine.jpg", 5):
         layout.frames.write_text(json.dumps([entry | {"names": [name]}]))
         with pytest.raises(UserError, match="frames.json is damaged; remove "):
-            remove_frames(layout)
+            video_module.remove_frames(layout)
     assert _frame_elsewhere.is_file()
     layout.frames.write_text(json.dumps([entry]))
     Image.open(frames[1]).rotate(90).save(frames[1])
     with pytest.raises(UserError, match="frame_00002.jpg has a name that frames of any.mp4 will get"):
-        refuse_foreign_frames(layout, [Path("any.mp4")])
-    remove_frames(layout)
+        video_module.refuse_foreign_frames(layout, [Path("any.mp4")])
+    video_module.remove_frames(layout)
     assert _frames(layout) == [frames[1]]
 
 
 def test_folders_of_frames_stay_in_the_input(tmp_path):
     layout = Layout(tmp_path)
-    folders = frame_folders(layout, [Path("a.mp4"), Path(".b.mp4"), Path("...mp4")])
+    folders = video_module.frame_folders(layout, [Path("a.mp4"), Path(".b.mp4"), Path("...mp4")])
     assert [folder.relative_to(layout.input).as_posix() for folder in folders] == ["a", "b", "video"]
-
-
-def test_frames_that_an_ended_run_left_out_are_said(tmp_path, monkeypatch, capsys):
-    layout, video = Layout(tmp_path / "scene"), tmp_path / "walk.mp4"
-    video.touch()
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", _Decoder())
-    words = ["-s", str(layout.scene), "--mask_path", str(tmp_path)]
-
-    def ended(*more: str) -> bool:
-        with pytest.raises(UserError, match="has a mask"):
-            convert.main([*words, *more])
-        return "warning: an earlier run ended before it had all frames" in capsys.readouterr().err
-
-    assert not ended("--video", str(video)) and not ended()
-    record = json.loads(layout.stages.read_text())
-    layout.stages.write_text(json.dumps(record | {"video": record["video"] | {"done": False}}))
-    assert ended() and not ended("--video", str(video)) and not ended()
 
 
 @pytest.fixture(scope="module")
@@ -183,11 +157,6 @@ def test_names_are_neither_options_nor_addresses(ffmpeg, room, tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     _write(ffmpeg, tmp_path / name, room[:2])
     assert _frames(_extract(tmp_path / "scene", Path(name), 2))
-
-
-def test_pictures_in_one_file_are_a_video(ffmpeg, room, tmp_path):
-    _write(ffmpeg, tmp_path / "a.apng", room[:2])
-    assert len(_frames(_extract(tmp_path / "scene", tmp_path / "a.apng", 2))) == 2
 
 
 @pytest.mark.parametrize(
@@ -233,8 +202,8 @@ def test_more_frames_than_one_sum_of_ffmpeg_holds(ffmpeg, tmp_path):
 
 def test_a_change_of_exposure_is_no_motion(room):
     frame = room[0].mean(axis=2)
-    brighter = [small_picture((frame * factor).astype(np.uint8)) for factor in np.linspace(0.5, 1, 20)]
-    assert choose_frames([1.0] * 20, np.stack(brighter), 20) == [0]
+    brighter = [video_module.small_picture((frame * factor).astype(np.uint8)) for factor in np.linspace(0.5, 1, 20)]
+    assert video_module.choose_frames([1.0] * 20, np.stack(brighter), 20) == [0]
 
 
 def _pq(light: np.ndarray) -> np.ndarray:
@@ -295,17 +264,6 @@ def test_hdr_frames_look_like_those_of_the_sdr_video(ffmpeg, room, tmp_path, tra
         assert (f"; {name} was brought to SDR" in line) == (kind == "hdr.mov")
 
 
-def test_lights_brighter_than_white_keep_their_order(ffmpeg, tmp_path):
-    steps = np.array([20, 100, 203, 400, 800], dtype=float)
-    frames = np.broadcast_to(np.repeat(steps, 32)[None, None, :, None], (2, 64, 160, 3))
-    _write_hdr(ffmpeg, tmp_path / "lamp.mov", frames, "smpte2084")
-    (path,) = _frames(_extract(tmp_path / "scene", tmp_path / "lamp.mov", 3))
-    shown = np.asarray(Image.open(path))[32, 16::32, 1].astype(int)
-    assert (np.diff(shown) > 0).all()
-    # Below nine tenths of white nothing is compressed. JPEG and 10 bits change a level or two.
-    assert shown[:2] == pytest.approx(255 * (steps[:2] / WHITE) ** (1 / 2.4), abs=2)
-
-
 def test_tags_that_are_missing(ffmpeg, room, tmp_path):
     _write_hdr(
         ffmpeg, tmp_path / "few.mov", _light(room[:1]), "smpte2084", "color_primaries=unknown:colorspace=unknown"
@@ -360,18 +318,6 @@ def test_interlaced_frames_are_not_combed_and_their_pixels_become_square(ffmpeg,
     assert "interlaced, so" in line and line.endswith("not square, so 240 x 180 became 320 x 180")
 
 
-@pytest.mark.parametrize(("said", "parity"), [
-    ("dvvideo,yuv420p", "auto"), ("dvvideo,yuv411p(bottom first)", "bff"),
-    ("yuv420p(tv, top first)", "tff"), ("yuv420p(tv, bt709, bottom first)", "bff"), ("yuv420p(tv, progressive)", None),
-    ("yuv420p(top coded first (swapped))", "auto"), ("yuv420p(tv", "auto"), ("yuv420p", None),
-])  # fmt: skip
-def test_which_field_is_first(said, parity):
-    codec, comma, colours = said.rpartition("dvvideo,")
-    assert video_module._of_fields(colours, codec + comma) == (
-        [f"bwdif=mode=send_frame:parity={parity}:deint=all"] if parity else []
-    )
-
-
 def test_a_video_that_was_cut_short_is_said(ffmpeg, room, tmp_path, capsys):
     """By its end, not by its number of frames: there may be fewer, farther apart, and nothing missing."""
     frames, quick = np.repeat(room[::2], 4, axis=0), ("-preset", "ultrafast", "-pix_fmt", "yuv420p")
@@ -384,12 +330,6 @@ def test_a_video_that_was_cut_short_is_said(ffmpeg, room, tmp_path, capsys):
         _extract(tmp_path / name, tmp_path / f"{name}.mkv", 3)
         warned = re.search(r"warning: cut.mkv ends after [01]\.\d of 1.1 seconds; if it was", capsys.readouterr().err)
         assert (warned is not None) == said
-
-
-def test_a_file_that_is_no_video(ffmpeg, tmp_path):
-    (tmp_path / "no.mp4").write_bytes(b"no video")
-    with pytest.raises(UserError, match="cannot read the video .*no.mp4"):
-        _extract(tmp_path / "scene", tmp_path / "no.mp4", 3)
 
 
 @pytest.mark.slow

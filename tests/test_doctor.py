@@ -27,8 +27,8 @@ from scene.saved_model import load_saved
 from splatting.findings import Finding, environment, fine
 from splatting.findings.cameras import check_extent, of_cameras
 from splatting.findings.model import check_model
-from splatting.findings.points import check_cloud, of_points
-from splatting.findings.scene import check_dataset, findings
+from splatting.findings.points import of_points
+from splatting.findings.scene import check_dataset
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 
@@ -54,7 +54,6 @@ def exit_status(*argv: str) -> int:
 
 def test_exit_statuses(healthy, colmap_scene, capsys):
     assert exit_status() == 0
-    assert capsys.readouterr().out.endswith("no problems found: ready\n")
     assert exit_status("-s", str(colmap_scene)) == 1
     out = capsys.readouterr().out
     assert "PROBLEM only 17 photos -> " in out and "PROBLEM only 300 points" in out and out.endswith("2 problems\n")
@@ -63,23 +62,6 @@ def test_exit_statuses(healthy, colmap_scene, capsys):
             doctor.main([option, folder])
     assert exit_status("-s", str(colmap_scene), "-m", "nowhere") == 1
     assert "no model in nowhere yet" in capsys.readouterr().out
-
-
-def test_missing_packages_end_it(monkeypatch, colmap_scene, capsys):
-    found = environment._version
-    monkeypatch.setattr(environment, "_version", lambda name: None if name == "plyfile" else found(name))
-    assert exit_status("-s", str(colmap_scene)) == 1
-    out = capsys.readouterr().out
-    assert "PROBLEM packages are missing: plyfile -> run `pip install -r requirements.txt`" in out
-    assert "photos" not in out
-
-
-@pytest.mark.parametrize(("system", "machine", "missed"), [("linux", "aarch64", False), ("darwin", "arm64", True)])
-def test_pycolmap_is_missed_only_where_it_has_a_wheel(monkeypatch, system, machine, missed):
-    monkeypatch.setattr(environment.sys, "platform", system)
-    monkeypatch.setattr(environment.platform, "machine", lambda: machine)
-    monkeypatch.setattr(environment, "_version", lambda name: None if name == "pycolmap" else "1.0")
-    assert [line.is_problem for line in environment.check_packages()] == [missed]
 
 
 def test_extensions_that_do_not_fit(monkeypatch, tmp_path):
@@ -103,8 +85,7 @@ def test_extensions_that_do_not_fit(monkeypatch, tmp_path):
 
 
 def test_the_rasterizer_is_tried(monkeypatch):
-    line = environment._check_rasterizer(torch)
-    assert not line.is_problem and "agrees with its float64 oracle" in line.text
+    assert not environment._check_rasterizer(torch).is_problem
     right = diff_gaussian_rasterization.rasterize
     wrong = lambda **k: (drawn := right(**k))._replace(color=drawn.color + 1e-4)  # noqa: E731
     monkeypatch.setattr(diff_gaussian_rasterization, "rasterize", wrong)
@@ -112,34 +93,18 @@ def test_the_rasterizer_is_tried(monkeypatch):
     assert line.is_problem and "differs from its float64 oracle by 1.0e-04" in line.text
 
 
-def test_a_gpu_that_is_not_used(monkeypatch):
-    monkeypatch.setattr(environment, "_nvidia_gpu", lambda: "GPU 0: H100")
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(torch.version, "cuda", None)
-    assert "H100 is there, but torch" in problems([environment._check_gpu(torch)])[0]
-    monkeypatch.setattr(torch.version, "cuda", "13.0")
-    assert "update the driver" in problems([environment._check_gpu(torch)])[0]
-
-
-@pytest.mark.parametrize(("capability", "served"), [((7, 0), False), ((7, 5), True), ((12, 0), True)])
-def test_a_gpu_that_is_too_old(monkeypatch, capability, served):
+def test_a_gpu_that_is_too_old(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "V100")
-    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: capability)
-    found = problems([environment._check_gpu(torch)])
-    assert not found if served else "use a GPU of 7.5 or newer" in found[0]
+    for capability, served in (((7, 0), False), ((7, 5), True), ((12, 0), True)):
+        monkeypatch.setattr(torch.cuda, "get_device_capability", lambda capability=capability: capability)
+        assert environment._check_gpu(torch).is_problem != served
 
 
 @pytest.fixture
 def info(colmap_scene):
     """The synthetic scene: cameras around a unit cube of points, all facing it."""
     return read_scene(colmap_scene, "images", hold_out=False)
-
-
-def test_the_synthetic_scene_is_sound(info):
-    assert problems(check_extent(info)) == findings(info) == []
-    (few,) = problems(check_cloud(info))
-    assert "only 300 points" in few
 
 
 def _with_cameras(info, change, extent: float | None = None):
@@ -325,23 +290,11 @@ def test_a_model_of_the_other_background(model, colmap_scene, monkeypatch):
     assert line.endswith("render without -w")
 
 
-def test_a_scene_too_small_to_be_drawn(model, colmap_scene):
-    import pycolmap
-
-    sparse = colmap_scene / "sparse" / "0"
-    reconstruction = pycolmap.Reconstruction(sparse)
-    reconstruction.transform(pycolmap.Sim3d(0.005, pycolmap.Rotation3d(), np.zeros(3)))
-    reconstruction.write_binary(str(sparse))
-    (line,) = problems(check_model(model(), -1))
-    assert "most Gaussians are nearer than 0.2 and never drawn -> scale cameras and points" in line
-
-
 @pytest.mark.slow
 def test_models_that_have_not_converged(model, monkeypatch):
     lines = check_model(model(), -1)
     assert "opacities: 0-0.01 0%, 0.01-0.05 0%, 0.05-0.2 100%" in lines[1].text
     assert any("PSNR of only" in text and "train longer, 3000 iterations" in text for text in problems(lines))
-    assert "shortly after opacities were reset" in str(problems(check_model(model(iteration=6100), 6100)))
     late = model(iteration=20000)
     assert "the model does not fit these photos" in str(problems(check_model(late, -1)))  # one colour would fit better
     monkeypatch.setattr(splatting.findings.model, "BEGUN", 30_000)
@@ -370,14 +323,6 @@ def test_only_what_is_scored_is_looked_at(model, colmap_scene, monkeypatch, halv
     if not halves:
         write_model_json(folder, argparse.Namespace(masks="masks", invert_masks=True), antialiasing=False, seed=0)
         assert any("PSNR of only" in text for text in problems(check_model(str(folder), -1)))
-
-
-def test_views_of_which_nothing_counts(model, colmap_scene):
-    folder = model(filled(opacity=3))
-    _mask(colmap_scene, np.zeros((HEIGHT, WIDTH), np.uint8))
-    write_model_json(folder, argparse.Namespace(masks="masks"), antialiasing=False, seed=0)
-    (said,) = problems(check_model(folder, -1))
-    assert "no pixel of the inspected training views counts -> check --masks" in said
 
 
 def test_folders_that_are_no_models(model, tmp_path):

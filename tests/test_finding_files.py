@@ -87,19 +87,6 @@ def test_photos_of_another_format_are_used_and_named(colmap_scene, capsys):
         read(colmap_scene)
 
 
-def test_a_text_model_that_is_newer_is_named(colmap_scene, capsys):
-    sparse = colmap_scene / "sparse" / "0"
-    pycolmap.Reconstruction(str(sparse)).write_text(str(sparse))
-    for path, time in [(path, 1000 + (path.name == "images.txt")) for path in sparse.iterdir()]:
-        os.utime(path, (time, time))
-    read(colmap_scene)
-    said = f"{sparse} has its model twice: the .bin files are used, although images.txt is newer; to use the .txt"
-    assert said in capsys.readouterr().err
-    os.utime(sparse / "images.txt", (1000, 1000))
-    read(colmap_scene)
-    assert capsys.readouterr().err == ""
-
-
 def test_the_largest_of_several_models(colmap_scene, capsys):
     whole = read(colmap_scene)
     assert capsys.readouterr().err == ""
@@ -163,11 +150,3 @@ def test_a_photo_in_postscript_is_never_run(colmap_scene, monkeypatch):
     monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *_, **__: pytest.fail("Ghostscript was started"))
     with pytest.raises(UserError, match="cannot read .*left/v02.png .*cannot identify image file"):
         read(colmap_scene)
-
-
-def test_photos_that_a_model_of_windows_names(tmp_path):
-    """Backslashes, and another letter case."""
-    (tmp_path / "left").mkdir()
-    (tmp_path / "left/IMG_1.JPG").touch()
-    for name in (r"left\IMG_1.JPG", r"LEFT\img_1.jpg"):
-        assert find_images(tmp_path, [name], "images.bin", "copy them") == [tmp_path / "left/IMG_1.JPG"]

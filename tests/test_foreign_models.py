@@ -5,15 +5,13 @@ import math
 
 import pytest
 import torch
-from gaussians import FURTHER, GROUPS, STANDARD, append, cloud, model, options, parameters, pipeline
+from gaussians import GROUPS, STANDARD, cloud, model, options, parameters, pipeline
 from torch import Tensor, nn
 
 from gaussian_renderer import GaussianModel, render
 from scene.cameras import MiniCam
-from scene.gaussians.attributes import attributes
 from utils.general_utils import inverse_sigmoid
 from utils.graphics_utils import getProjectionMatrix
-from utils.system_utils import UserError
 
 WIDTH, HEIGHT = 41, 27
 BLACK = torch.zeros(3)
@@ -37,31 +35,12 @@ def _image(pc: object, camera: MiniCam | None = None, pipe: object = OLD, **more
 # Cameras and pipes
 
 
-def test_a_view_may_have_matrices_of_doubles_and_a_row_as_its_centre():
-    gaussians = model(40)
-    for in_python in (False, True):
-        pipe = pipeline(convert_SHs_python=in_python)
-        wanted = _image(gaussians, pipe=pipe)
-        double, row = _camera(torch.float64), _camera()
-        row.camera_center = row.camera_center[None]
-        torch.testing.assert_close(_image(gaussians, double, pipe), wanted, **CLOSE)
-        assert torch.equal(_image(gaussians, row, pipe), wanted)
-
-
 def test_the_2023_release_has_no_antialiasing_and_the_colours_in_the_sixth_place():
     gaussians = model(40)
     colors = torch.rand(40, 3)
     old = render(_camera(), gaussians, OLD, BLACK, 0.7, colors)
     new = render(_camera(), gaussians, pipeline(), BLACK, 0.7, False, colors)
     assert torch.equal(old["render"], new["render"]) and old["depth"].shape == (1, HEIGHT, WIDTH)
-
-
-def test_points_on_the_screen_have_gradients_while_anything_trains():
-    gaussians = model(40)
-    gaussians._xyz.requires_grad_(False)
-    package = render(_camera(), gaussians, OLD, BLACK)
-    package["render"].sum().backward()
-    assert package["viewspace_points"].grad[:, :2].any()
 
 
 # Models
@@ -144,19 +123,6 @@ def test_overridden_getters_are_what_is_rendered(name, wrapped):
     assert (image - plain).abs().max() > 0.01
 
 
-def test_a_getter_replaced_in_the_class_is_seen_at_once(monkeypatch):
-    """Those of single bands count where the reference reads them."""
-    gaussians = model(40)
-    plain = _image(gaussians)
-    with monkeypatch.context() as patch:
-        patch.setattr(GaussianModel, "get_opacity", property(lambda self: 0.5 * torch.sigmoid(self._opacity)))
-        assert (_image(gaussians) - plain).abs().max() > 0.01
-    assert torch.equal(_image(gaussians), plain)
-    monkeypatch.setattr(GaussianModel, "get_features_dc", property(lambda self: torch.ones_like(self._features_dc)))
-    assert torch.equal(_image(gaussians), plain)
-    assert not torch.equal(_image(gaussians, separate_sh=True), plain)
-
-
 def test_replaced_activations_are_what_is_rendered():
     gaussians = model(40)
     wanted = _image(gaussians)
@@ -168,31 +134,6 @@ def test_replaced_activations_are_what_is_rendered():
     torch.testing.assert_close(_image(gaussians), wanted, **CLOSE)
 
 
-def test_density_control_follows_replaced_activations():
-    """The same scales and opacities by other activations give the same Gaussians."""
-    plain, other = model(60), model(60)
-
-    def activate(x: Tensor) -> Tensor:
-        return 0.5 + 0.5 * torch.tanh(x)
-
-    other.opacity_activation, other.inverse_opacity_activation = activate, lambda y: torch.atanh(2 * y - 1)
-    _own_activations(other)
-    with torch.no_grad():
-        other._scaling.copy_(other.scaling_inverse_activation(plain.get_scaling))
-        other._opacity.copy_(other.inverse_opacity_activation(plain.get_opacity))
-        plain._opacity[0], other._opacity[0] = -9.0, -4.5
-    for gaussians in (plain, other):
-        gaussians.xyz_gradient_accum, gaussians.denom = torch.arange(60.0)[:, None], torch.ones(60, 1)
-        gaussians.densify_and_prune(30.0, 0.005, 20.0, 20, seed=4, iteration=1)
-    assert len(plain) == len(other) > 60
-    for name in ("get_xyz", "get_scaling", "get_opacity"):
-        torch.testing.assert_close(getattr(other, name), getattr(plain, name), rtol=1e-4, atol=1e-5)
-    for gaussians in (plain, other):
-        gaussians.reset_opacity()
-        assert gaussians.get_opacity.max() < 0.0101
-    torch.testing.assert_close(other.get_opacity, plain.get_opacity, rtol=1e-3, atol=1e-6)
-
-
 def test_activations_have_the_references_names_and_forms():
     gaussians, x = model(10), torch.tensor([[0.3, 0.6]])
     assert gaussians.scaling_activation is torch.exp and gaussians.scaling_inverse_activation is torch.log
@@ -202,23 +143,6 @@ def test_activations_have_the_references_names_and_forms():
     assert torch.equal(packed, gaussians.get_covariance(1.5)) and packed.shape == (10, 6)
     gaussians.opacity_activation = torch.relu
     assert torch.equal(gaussians.get_opacity, torch.relu(gaussians._opacity)) and not gaussians.kernels_activate
-
-
-def test_statistics_are_plain_attributes():
-    gaussians = model(10)
-    gaussians.denom = torch.full((10, 1), 3.0)
-    assert gaussians.statistics.denom is gaussians.denom and "denom" in vars(gaussians)
-    del gaussians.xyz_gradient_accum
-    gaussians.prune_points(torch.arange(10) < 4)
-    assert len(gaussians) == len(gaussians.denom) == 6 and not hasattr(gaussians, "xyz_gradient_accum")
-
-    class Bare(GaussianModel):
-        def __init__(self) -> None:
-            self.max_radii2D = self.xyz_gradient_accum = self.denom = torch.empty(0)
-            self.exposure_mapping, self.tmp_radii = {"a": 0}, None
-
-    bare = Bare()
-    assert bare.statistics.denom is bare.denom and bare.exposure_mapping == {"a": 0}
 
 
 # Loops
@@ -292,24 +216,6 @@ def test_tensors_assigned_from_outside_train(change, tmp_path):
     assert torch.equal(again._features_rest, gaussians._features_rest)
 
 
-def test_the_degree_follows_what_is_assigned(tmp_path):
-    gaussians = model(6)
-    assert gaussians.construct_list_of_attributes()[:10] == [
-        "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "f_rest_0",
-    ]  # fmt: skip
-    every = len(gaussians.construct_list_of_attributes())
-    assert every == 62 + sum(len(attributes(0)[name].columns) for name in FURTHER)
-    gaussians._features_rest = nn.Parameter(gaussians._features_rest.detach()[:, :3].contiguous())
-    assert len(gaussians.construct_list_of_attributes()) == every - 36
-    gaussians.save_ply(tmp_path / "a.ply")
-    gaussians.max_sh_degree = 1
-    gaussians.load_ply(tmp_path / "a.ply")
-    assert gaussians._features_rest.shape == (6, 3, 3) and gaussians.active_sh_degree == 1
-    gaussians._features_rest = nn.Parameter(torch.zeros(6, 5, 3))
-    with pytest.raises(UserError, match="5 SH coefficients above band 0, those of no SH degree"):
-        gaussians.save_ply(tmp_path / "b.ply")
-
-
 # Density control
 
 
@@ -318,29 +224,6 @@ def _ready(count: int = 30) -> GaussianModel:
     gaussians = model(count)
     gaussians.xyz_gradient_accum, gaussians.denom = torch.arange(float(count))[:, None] % 2, torch.ones(count, 1)
     return gaussians
-
-
-@pytest.mark.parametrize("dtype", [torch.int32, torch.float32])
-def test_radii_follow_their_gaussians(dtype):
-    """A client's own order of the steps: each row keeps the radius of its origin, told by its rotation."""
-    gaussians = _ready()
-    with torch.no_grad():
-        gaussians._rotation[:, 0] = torch.arange(30.0) + 1
-        gaussians._scaling[::4] = -6.0
-        gaussians._scaling[1::4] = -6.0
-    gaussians.tmp_radii = (torch.arange(30) + 1).to(dtype)
-    grads = gaussians.xyz_gradient_accum / gaussians.denom
-    gaussians.densify_and_clone(grads, 0.5, 20.0)
-    assert len(gaussians) == 38 and torch.equal(gaussians.tmp_radii[30:], 1 + torch.arange(1, 30, 4).to(dtype))
-    gaussians.densify_and_split(grads, 0.5, 20.0)
-    assert len(gaussians) == 45
-    gaussians.prune_points(torch.arange(45) % 5 == 0)
-    assert gaussians.tmp_radii.dtype == dtype and len(gaussians.tmp_radii) == 36
-    assert torch.equal(gaussians._rotation[:, 0], gaussians.tmp_radii.float())
-    append(gaussians, 2)
-    assert gaussians.tmp_radii[36:].tolist() == [0, 0]
-    append(gaussians, 1, torch.tensor([5]))
-    assert gaussians.tmp_radii[38:].tolist() == [5]
 
 
 @pytest.mark.parametrize("radii", [None, torch.arange(30)])
@@ -360,23 +243,3 @@ def test_an_override_gets_as_many_arguments_as_there_are_values(radii):
     gaussians.densify_and_prune(0.5, 0.005, 20.0, 20, radii)
     count = len(STANDARD) + (radii is not None)
     assert seen == [count, "split", count] and gaussians.tmp_radii is None and len(gaussians) > 30
-
-
-def test_without_a_seed_torchs_generator_decides():
-    children = []
-    for seed in (5, None, 5):
-        if seed is not None:
-            torch.manual_seed(seed)
-        gaussians = _ready()
-        gaussians.densify_and_prune(0.5, 0.005, 20.0, None)
-        children.append(gaussians.get_xyz.detach())
-    assert torch.equal(children[0], children[2]) and children[0].shape == children[1].shape
-    assert not torch.equal(children[0], children[1])
-
-
-def test_three_children_are_smaller_than_two():
-    """Each of N has 1 / (0.8 N) of the scale, as in the reference."""
-    gaussians = _ready(2)
-    scaling = gaussians._scaling.detach().clone()
-    gaussians.densify_and_split(torch.ones(2, 1), 0.5, 0.0, N=3)
-    assert torch.equal(gaussians._scaling, torch.cat([scaling] * 3) - math.log(0.8 * 3))

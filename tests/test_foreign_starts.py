@@ -254,18 +254,6 @@ def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
         export.export(*_export_options("-m", out, "--to", out / "model.ply"))
 
 
-def test_a_file_is_thinned_out_by_the_views_of_a_model(tmp_path, colmap_scene, capsys):
-    out, file = tmp_path / "out", tmp_path / "theirs.ply"
-    format_of(file).write(file, splats(300, 1))
-    _train(colmap_scene, out)
-    capsys.readouterr()
-    box = "--crop", -1, -1, -1, 1, 1, 1
-    export.export(*_export_options("-m", out, "--ply", file, "--to", tmp_path / "a.splat", "--max_splats", 50, *box))
-    said = capsys.readouterr().out
-    assert "-> 50 Gaussians: no score, as photos show more than the crop; train.py --max_num_splats 50" in said
-    assert "50 of 300 Gaussians, SH degree 0," in said  # as .splat has no bands
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [

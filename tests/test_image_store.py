@@ -126,32 +126,6 @@ def test_what_comes_next_is_decoded_meanwhile(files, decodings):
     assert len(decodings.names) == 3 and threading.current_thread().name not in decodings.threads
 
 
-def test_a_coming_picture_that_is_there_is_not_dropped_for_another(files, decodings):
-    store = ImageStore(3)
-    store.plan(_pictures(files))
-    for number in (0, 1, 2):
-        store.get(files[number], SIZE)
-    store.prefetch(_pictures([files[0], files[3]]))  # 0 is unused for longest, but 1 must be dropped
-    for number in (0, 3, 2):
-        store.get(files[number], SIZE)
-    assert decodings.names == ["0", "1", "2", "3"]
-
-
-def test_no_threads_remain_when_all_is_there(files):
-    others = _decoders()  # decoders of earlier tests' stores that the garbage collector has not yet removed
-    store = ImageStore(0)
-    store.plan(_pictures(files))
-    for step, path in enumerate(files):
-        store.prefetch(_pictures(files[step : step + store.ahead]))
-        store.get(path, SIZE)
-    assert store.ahead == 0
-    wait_for(lambda: set(_decoders()) <= set(others))
-
-
-def _decoders() -> list[threading.Thread]:
-    return [thread for thread in threading.enumerate() if thread.name.startswith("decode")]
-
-
 def test_an_error_ahead_comes_at_the_view_that_needs_it(files):
     store = ImageStore(4)
     files[2].write_bytes(files[2].read_bytes()[:40])
@@ -178,13 +152,6 @@ def test_a_limit_that_all_fit_is_none(files):
     assert store.limit == 9 and store.planned_bytes == 9 * 4 * 6 * 4
 
 
-def test_bytes_are_those_of_the_largest_that_are_kept(tmp_path):
-    store = ImageStore(2)
-    sizes = [(10, 10), (30, 20), (5, 5)]
-    store.plan([(tmp_path / f"{number}.JPG", size) for number, size in enumerate(sizes)])
-    assert store.planned_bytes == 3 * (600 + 100)
-
-
 def test_a_gpu_keeps_what_fits_its_share(files, monkeypatch):
     """The rule alone: which device keeps, without one."""
     free = 4 * 10 * 4 * 6 * 4  # four times what ten RGBA pictures take
@@ -199,18 +166,6 @@ def test_a_gpu_keeps_what_fits_its_share(files, monkeypatch):
     store = ImageStore(0, "cpu", "cuda")
     store.plan(_pictures(files))
     assert store.keep_on.type == "cpu" and store.planned_bytes == 10 * 128  # pinned in powers of two
-
-
-def test_floats_are_kept_where_there_is_room_for_them(files, monkeypatch):
-    assert ImageStore(0).keeps_floats and not ImageStore(3).keeps_floats
-    assert ImageStore(0, "cpu", "cuda").keeps_floats  # where --data_device cpu wants them
-    share = 10 * 4 * 6 * 4 * 4  # of a GPU's free memory that ten RGBA pictures take if a quarter of it may be used
-    monkeypatch.setattr("scene.images.store.DeviceCopies", lambda device: object())
-    for free, kept in ((4 * share, True), (4 * share - 1, False)):
-        monkeypatch.setattr("scene.images.store.free_memory", lambda device, free=free: free)
-        store = ImageStore(0, "cuda", "cuda")
-        store.plan(_pictures(files))
-        assert store.keep_on.type == "cuda" and store.keeps_floats == kept
 
 
 @pytest.mark.gpu

@@ -10,13 +10,12 @@ import pytest
 from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 
-from scene.images.exif import _down, _gps, read_place
+from scene.images.exif import _gps, read_place
 from splatting.camera_paths.poses import facing
 from splatting.files.similarity import Similarity, read_orientation
 from splatting.sfm.georeference import level_up
 from splatting.sfm.layout import Layout
 from splatting.sfm.orienting import orient, said_of
-from splatting.sfm.stages import Stage, StageRecord, orient_stage
 from utils.system_utils import UserError
 
 TILT = Rotation.from_rotvec([0.5, 1.3, -0.4]).as_matrix()  # from the level frame (x east, y down, z north) to the world
@@ -182,9 +181,6 @@ def test_flights_are_level_and_in_metres_or_say_that_they_are_not(
     similarity, record = oriented(layout := converted(tmp_path, turns, places, exifs))
     off = np.degrees(np.arccos(min(similarity.rotation[1] @ TILT[:, 1], 1)))
     scaled = similarity.scale * UNIT - 1
-    print(f"{pattern}, {size} m, {count} photos, pitch {pitch}, GPS {how} {noise}: "
-          f"{f'{off:.2f} degrees' if record['vertical'] else 'not known'}, "
-          f"{f'{scaled:+.2%}' if record['unit'] == 'metre' else 'no scale'}; {said_of(layout)[0]}")  # fmt: skip
     assert (record["vertical"] is not None, similarity.upright) == (known, known)
     assert (off < 1) if known else "not known" in said_of(layout)[0] and not similarity.place
     assert (record["unit"] == "metre") == (how != "no")
@@ -243,23 +239,6 @@ def test_gravity_of_a_phone_comes_before_horizons(tmp_path, orientation):
 def test_gps_as_programs_write_it(tags, place):
     found = _gps(tags)
     assert found is None if place is None else found == pytest.approx(place, nan_ok=True)
-
-
-def test_an_upright_phone_tells_down():
-    """Held upright, iOS says (0, -1, 0), and stores the photo with orientation 6."""
-    np.testing.assert_allclose(_down(apple_note(np.array([0.0, -1, 0])), 6), [0, 1, 0], atol=1e-6)
-    assert _down(apple_note(np.array([0.0, -3, 0])), 6) is None and _down(b"Apple iOS\0\0\x01MM\0\x09", 6) is None
-
-
-def test_a_model_that_is_made_again_loses_its_orientation(tmp_path):
-    layout = converted(tmp_path, *ring())
-    layout.work.mkdir()
-    record, before = StageRecord(layout.stages), Stage("before", 1, lambda: None, lambda: None)
-    record.run([before, orient_stage(layout)])
-    assert record.run([before, orient_stage(layout)]) == ["before", "orient"] and layout.orientation.is_file()
-    with pytest.raises(ZeroDivisionError):
-        record.run([before._replace(made_from=2, work=lambda: 1 / 0), orient_stage(layout)])
-    assert not layout.orientation.exists()
 
 
 @pytest.mark.parametrize("change", [{"scale": -1}, {"rotation": [[1]]}, {"translation": [0, 0, None]}])

@@ -127,9 +127,7 @@ def test_programs_of_the_current_folder_are_not_found(trap, monkeypatch, path):
     "words",
     [
         ("export.py", "a.sog", "--to", "b.ply"),
-        ("export.py", "a.ply", "--to", "b.sog"),
         ("convert.py", "-s", "scene", "--colmap_executable", "colmap", "--video", "a.mp4"),
-        ("doctor.py",),
     ],
 )
 @pytest.mark.slow

@@ -1,18 +1,23 @@
-"""Which pairs of photos convert.py matches, and photos that train.py converts before it trains on them."""
+"""Steps of convert.py by themselves: pairs, smaller copies, points by patches, and what train.py converts first."""
 
 import contextlib
 import sqlite3
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
 import pytest
-from photo_room import make_photos
+import torch
+from photo_room import FOCAL, SIZE, cam_to_world, camera_centers, make_photos
+from PIL import Image
 
 import convert
 import train
-from splatting.sfm import pairing
+from splatting.sfm import pairing, reduced
+from splatting.sfm.dense_points import more_points
 from splatting.sfm.pairing import first_pairs, likeness, named_by_id, restore_names, rounds
+from splatting.sfm.reduced import enlarged, longest_side, reduce_photos
 from utils.system_utils import UserError
 
 PLACES, EACH = 10, 8  # photos of the same place look alike
@@ -77,11 +82,6 @@ def test_gps_tells_who_is_near_beyond_180_degrees_and_at_a_pole():
     assert 20 < away[0] < 25 and 20 < away[1] < 25  # metres
 
 
-def test_few_photos_are_all_matched(database):
-    (pairs,) = rounds(database, all_of=100)
-    assert len(pairs) == 80 * 79 // 2 and all(one < other for one, other in pairs)
-
-
 def test_photos_outside_the_largest_group_are_tried_with_all_of_it(database):
     """Each place is a group of its own here, so the photos of all but one are tried with that one's."""
     done: set[tuple[int, int]] = set()
@@ -96,12 +96,6 @@ def test_photos_outside_the_largest_group_are_tried_with_all_of_it(database):
         if number % PLACES == pairing.joined(pairing.bound_pairs(database)).pop() % PLACES
     }
     assert {pairing.ordered(one, other) for one in range(1, 81) for other in group if one != other} <= done
-
-
-def test_the_number_of_pairs_is_bound(database, monkeypatch):
-    monkeypatch.setattr(pairing, "_MOST", 1)
-    first, *more = rounds(database, all_of=10)
-    assert sum(map(len, more)) <= 80
 
 
 def test_names_may_contain_blanks(database):
@@ -133,7 +127,6 @@ def test_train_converts_photos_that_have_no_cameras(tmp_path, capsys):
     assert {path.name: path.read_bytes() for path in (tmp_path / "room").iterdir() if path.is_file()} == before | {
         name: (tmp_path / "room" / name).read_bytes() for name in ("capture.html", "convert_report.json")
     }
-    assert (tmp_path / "out" / "point_cloud" / "iteration_1" / "point_cloud.ply").is_file()
 
 
 def test_what_train_converts(tmp_path, monkeypatch):
@@ -158,3 +151,108 @@ def test_what_train_converts(tmp_path, monkeypatch):
     assert sorted(path.name for path in (tmp_path / "live" / "input").iterdir()) == ["a.HEIC", "b.HEIC"]
     with pytest.raises(UserError, match="is not a scene"):
         train.main(["-s", str(tmp_path / "none"), "-m", str(tmp_path / "out")])
+
+
+@pytest.mark.parametrize(("name", "mode"), [
+    ("a.jpg", "RGB"), ("b.JPG", "CMYK"), ("c.png", "RGBA"), ("deep/d e.png", "P"), ("f.png", "I;16"), ("g.tif", "L"),
+])  # fmt: skip
+def test_large_photos_are_made_smaller(tmp_path, name, mode):
+    photos, target, exif = tmp_path / "photos", tmp_path / "small", Image.Exif()
+    exif[0x0110], exif[0xA405] = "model", 26
+    (photos / name).parent.mkdir(parents=True)
+    ramp = np.tile(np.linspace(0, 1, 200), (100, 1))
+    deep = Image.fromarray((ramp * 65535).astype(np.uint16))
+    plain = Image.fromarray((ramp * 255).astype(np.uint8))
+    image = deep if mode == "I;16" else plain.convert("RGB").convert(mode)
+    image.save(photos / name, **({"exif": exif} if name.lower().endswith("jpg") else {}))
+    before = (photos / name).read_bytes()
+    reduce_photos(photos, target, [name], 50, None)
+    with Image.open(target / name) as small:
+        assert small.size == (50, 25)
+        if name == "a.jpg":
+            assert small.getexif()[0x0110] == "model"
+        seen = np.asarray(small.convert("L"), float)
+    # The ramp is still one, from dark to bright.
+    assert seen[:, :5].mean() < 40 and seen[:, -5:].mean() > 215 and (np.diff(seen.mean(0)) > -8).all()
+    assert (photos / name).read_bytes() == before
+
+
+def test_small_photos_are_linked_and_a_known_size_is_kept(tmp_path):
+    (tmp_path / "photos").mkdir()
+    Image.new("RGB", (104, 60), "red").save(tmp_path / "photos" / "a.png")
+    reduce_photos(tmp_path / "photos", tmp_path / "small", ["a.png"], 100, None)
+    assert (tmp_path / "small" / "a.png").samefile(tmp_path / "photos" / "a.png")
+    reduce_photos(tmp_path / "photos", tmp_path / "other", ["a.png"], 100, (52, 30))
+    assert Image.open(tmp_path / "other" / "a.png").size == (52, 30)
+    assert longest_side(reduced.FEW) > longest_side(reduced.FEW + 1)
+
+
+def test_a_model_is_brought_to_the_size_of_its_photos(tmp_path):
+    model, track = pycolmap.Reconstruction(), pycolmap.Track()
+    camera = pycolmap.Camera(model="OPENCV", width=100, height=60, params=[90, 91, 50, 30, 0.1, 0, 0, 0], camera_id=1)
+    model.add_camera_with_trivial_rig(camera)
+    point = np.array([0.2, -0.1, 2.0])
+    seen = np.asarray(camera.img_from_cam(point))
+    for number in (1, 2):
+        image = pycolmap.Image(name=f"{number}.png", keypoints=seen.reshape(1, 2), camera_id=1, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+        track.add_element(number, 0)
+        Image.new("RGB", (400, 240)).save(tmp_path / f"{number}.png")
+    model.add_point3D(point, track, np.zeros(3, np.uint8))
+    model.write(str(tmp_path))
+    found = enlarged(str(tmp_path), tmp_path)
+    assert (found.cameras[1].width, found.cameras[1].height) == (400, 240)
+    assert found.cameras[1].params == pytest.approx([360, 364, 200, 120, 0.1, 0, 0, 0])
+    for image in found.images.values():
+        assert image.points2D[0].xy == pytest.approx(4 * seen)
+        assert image.project_point(point) == pytest.approx(4 * seen)
+    assert found.compute_mean_reprojection_error() == pytest.approx(0, abs=1e-9)
+
+
+VIEWS = 6
+
+
+def _model(offset: np.ndarray) -> tuple[pycolmap.Reconstruction, dict[str, dict[str, int]]]:
+    """The cameras of make_photos with a few points on the walls, and which photos share points."""
+    model, rng = pycolmap.Reconstruction(), np.random.default_rng(0)
+    params = [FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2]
+    camera = pycolmap.Camera(model="PINHOLE", width=SIZE[0], height=SIZE[1], params=params, camera_id=1)
+    model.add_camera_with_trivial_rig(camera)
+    points = rng.uniform(0.1, 1.5, (60, 3))
+    points[np.arange(60), np.arange(60) % 3] = 0
+    tracks = [pycolmap.Track() for _ in points]
+    for number, center in enumerate(camera_centers(VIEWS)):
+        turn = cam_to_world(center).T
+        seen = np.asarray(camera.img_from_cam((turn @ (points - center).T).T))
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), -turn @ (center + offset))
+        image = pycolmap.Image(name=f"photo_{number:02d}.png", keypoints=seen, camera_id=1, image_id=number + 1)
+        model.add_image_with_trivial_frame(image, pose)
+        for place, track in enumerate(tracks):
+            track.add_element(number + 1, place)
+    for point, track in zip(points + offset, tracks, strict=True):
+        model.add_point3D(point, track, np.zeros(3, np.uint8))
+    names = [f"photo_{number:02d}.png" for number in range(VIEWS)]
+    return model, {name: {other: 60 for other in names if other != name} for name in names}
+
+
+@pytest.mark.parametrize("offset", [np.zeros(3), np.array([5e6, -3e5, 200.0])], ids=["near", "far"])
+def test_points_lie_on_the_walls(once, offset):
+    photos: Path = once("six photos of a room", lambda folder: make_photos(folder, VIEWS))
+    model, shared = _model(offset)
+    points, colors = more_points(model, photos, shared, torch.device("cpu"))
+    # The walls are the planes x = 0, y = 0 and z = 0, some 4 units away, where a pixel is 0.02 units.
+    off = np.abs(points - offset).min(axis=1)
+    assert len(points) > 500 and colors.shape == points.shape and colors.dtype == np.uint8
+    assert np.median(off) < 0.01 and np.percentile(off, 95) < 0.05
+    # A point is as bright as a photo is where it shows the point.
+    for image in (model.images[1], model.images[VIEWS]):
+        pixels = np.asarray(Image.open(photos / image.name))
+        x, y = np.array([image.project_point(point) for point in points[::20]]).astype(int).T
+        inside = (x >= 0) & (y >= 0) & (x < SIZE[0]) & (y < SIZE[1])
+        assert np.median(np.abs(pixels[y[inside], x[inside]].astype(float) - colors[::20][inside])) < 15
+
+
+def test_photos_that_share_nothing_give_no_points(once):
+    photos: Path = once("six photos of a room", lambda folder: make_photos(folder, VIEWS))
+    points, colors = more_points(_model(np.zeros(3))[0], photos, {}, torch.device("cpu"))
+    assert points.shape == colors.shape == (0, 3)

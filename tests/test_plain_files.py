@@ -1,6 +1,7 @@
-"""Refusals, in a sentence, of what a user or a dataset names that is no file, or a text without end."""
+"""Our own JSON files, and refusals, in a sentence, of what is no file, or a text without end."""
 
 import contextlib
+import json
 import os
 import signal
 from collections.abc import Iterator
@@ -20,12 +21,13 @@ from splatting.evaluation.configs import read_configs
 from splatting.evaluation.error_curve import read_curve, read_peer
 from splatting.evaluation.training_log import read_log
 from splatting.files.image_files import read_plane
+from splatting.files.json_files import read_json, write_json
 from splatting.files.plain_files import MOST
 from splatting.parts.time_budget.schedule_file import read_schedule
 from utils.lpips_utils import _load_state
 from utils.system_utils import UserError
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+needs_pipes = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
 TEXTS = {
     "cfg_args": lambda path: read_cfg_args(path.parent),
     "exposure.json": lambda path: read_pretrained(path.parent),
@@ -73,6 +75,7 @@ def _endless(path: Path, kind: str) -> Path:
     return path
 
 
+@needs_pipes
 @pytest.mark.parametrize("kind", ["pipe", "device"])
 @pytest.mark.parametrize("what", FILES)
 def test_what_is_no_file_is_refused_at_once(tmp_path, what, kind):
@@ -88,9 +91,30 @@ def test_a_text_of_any_size_is_not_read(tmp_path, what):
     assert "more than 256 MiB" in str(refused.value) or what == "cfg_args"
 
 
+@needs_pipes
 def test_records_of_a_model_are_no_pipes(tmp_path):
     """A model folder without them is one of another program."""
     for name in ("model.json", "train_log.json"):
         _endless(tmp_path / name, "pipe")
     with _soon():
         assert read_model_json(tmp_path) == {} and read_log(tmp_path / "train_log.json") == []
+
+
+def test_names_of_any_kind_come_back_and_stay_readable(tmp_path):
+    path = tmp_path / "new" / "a.json"
+    content = {"photos": ["Straße.jpg", "写真.jpg", os.fsdecode(b"\xff.jpg"), "\U0001f30d"], "a": 1}
+    write_json(path, content)
+    assert read_json(path) == content == json.loads(path.read_bytes())
+    text = path.read_text(encoding="utf-8")
+    assert "Straße.jpg" in text and "写真.jpg" in text and text.endswith("}\n")
+    assert text.index('"a"') < text.index('"photos"')
+    write_json(path, content, sort_keys=False)
+    assert list(read_json(path)) == ["photos", "a"]
+
+
+def test_no_nan_and_the_old_file_stays(tmp_path):
+    path = tmp_path / "a.json"
+    write_json(path, [1])
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(path, [float("nan")])
+    assert read_json(path) == [1] and os.listdir(tmp_path) == ["a.json"]

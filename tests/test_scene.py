@@ -19,11 +19,7 @@ import scene as scene_package
 import train
 from scene import Scene
 from scene.dataset_readers import read_scene, sceneLoadTypeCallbacks
-from scene.gaussian_model import GaussianModel
 from splatting.files.json_files import OFFSET
-from splatting.training import run
-from utils import camera_utils
-from utils.camera_utils import loadCam
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -58,15 +54,6 @@ def test_lists_of_cameras_may_be_replaced(colmap_scene, tmp_path):
     assert made.getTrainCameras() is few and made.getTestCameras() is others
 
 
-def test_replaced_training_views_train(colmap_scene, tmp_path):
-    options = options_of(colmap_scene, tmp_path / "out", eval=True, resolution=24)
-    made = Scene(options, GaussianModel(0), shuffle=False)
-    made.train_cameras = {1.0: made.train_cameras[1.0][:3]}
-    views = run.ViewOrder(made.getTrainCameras(), 0)
-    made.prefetch(views.coming(1, made.images.ahead))
-    assert {views[t].uid for t in range(1, 10)} == {0, 1, 2} and made.training_pixels()[0] == 3 * 24 * 16
-
-
 def test_a_readers_replacement_gets_the_references_arguments(colmap_scene, blender_scene, tmp_path, monkeypatch):
     calls = []
     known = read_scene(colmap_scene, "images", True)
@@ -85,23 +72,19 @@ def test_a_readers_replacement_gets_the_references_arguments(colmap_scene, blend
     monkeypatch.setitem(sceneLoadTypeCallbacks, "Blender", theirs)
     Scene(_args(blender_scene, tmp_path / "out", OF_2023, white_background=True), FakeGaussians(), start=False)
     assert calls[1:] == [(str(blender_scene), True, "", True)]
-    monkeypatch.undo()
-    assert len(Scene(_args(colmap_scene, tmp_path / "out"), FakeGaussians(), start=False).getTestCameras()) == 3
 
 
-_FIELDS = ("point_cloud", "train_cameras", "test_cameras", "nerf_normalization", "ply_path")
-TheirInfo2023 = namedtuple("TheirInfo2023", _FIELDS)
-TheirInfo2024 = namedtuple("TheirInfo2024", (*_FIELDS, "is_nerf_synthetic"))
+TheirInfo2023 = namedtuple(
+    "TheirInfo2023", ("point_cloud", "train_cameras", "test_cameras", "nerf_normalization", "ply_path")
+)
 
 
-@pytest.mark.parametrize("record", [TheirInfo2023, TheirInfo2024])
-def test_a_replaced_reader_may_return_records_of_its_own(colmap_scene, tmp_path, monkeypatch, record):
+def test_a_replaced_reader_may_return_records_of_its_own(colmap_scene, tmp_path, monkeypatch):
     known = read_scene(colmap_scene, "images", True)
     lists = [[CameraOf2024(*camera) for camera in part] for part in (known.train_cameras, known.test_cameras)]
     ply = tmp_path / "points.ply"
     ply.write_bytes(b"ply")
-    theirs = record(*(known.point_cloud, *lists, {"translate": np.zeros(3), "radius": 3.5}, str(ply), False)[
-        : len(record._fields)])  # fmt: skip
+    theirs = TheirInfo2023(known.point_cloud, *lists, {"translate": np.zeros(3), "radius": 3.5}, str(ply))
     monkeypatch.setitem(sceneLoadTypeCallbacks, "Colmap", lambda *_: theirs)
     made = Scene(_args(colmap_scene, tmp_path / "out"), FakeGaussians())
     assert made.cameras_extent == 3.5 and made.gaussians.world_offset == (0, 0, 0)
@@ -142,38 +125,6 @@ def test_a_foreign_model_is_saved_and_loaded_with_exposures(colmap_scene, tmp_pa
     assert table == {"a.png": torch.eye(3, 4).tolist()}
 
 
-class ModelOf2023(TheirModel):
-    def create_from_pcd(self, pcd, spatial_lr_scale) -> None:
-        self.start = len(pcd.points), spatial_lr_scale
-
-
-def test_functions_of_2023_get_the_arguments_that_they_take(colmap_scene, tmp_path, monkeypatch):
-    asked = []
-
-    def load(args, id, cam_info, resolution_scale):
-        asked.append(id)
-        return loadCam(args, id, cam_info, resolution_scale)
-
-    monkeypatch.setattr(camera_utils, "loadCam", load)
-    model = ModelOf2023()
-    made = Scene(_args(colmap_scene, tmp_path / "out"), model)
-    assert model.start[0] > 0 and model.start[1] == made.cameras_extent
-    assert asked == [*range(14), *range(3)]
-
-
-def test_a_reader_may_leave_the_extent_unknown(colmap_scene, tmp_path, monkeypatch):
-    read = sceneLoadTypeCallbacks["Colmap"]
-
-    def without(*args, **kwargs):
-        info = read(*args, **kwargs)
-        return info._replace(nerf_normalization={**info.nerf_normalization, "radius": None})
-
-    monkeypatch.setitem(sceneLoadTypeCallbacks, "Colmap", without)
-    model = GaussianModel(0)
-    made = Scene(_args(colmap_scene, tmp_path / "out"), model)
-    assert made.cameras_extent is None and model.spatial_lr_scale is None and len(model) > 0
-
-
 def _run(code: str, folder: Path) -> None:
     """Run code in a folder whose packages are found before ours."""
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -202,8 +153,6 @@ Scene(SimpleNamespace(**{values!r}), GaussianModel(3), load_iteration=-1)
     )
     (tmp_path / "arguments" / "__init__.py").write_text("raise ModuleNotFoundError('gone', name='arguments')")
     _run("import scene; assert not hasattr(scene, 'ModelParams') and scene.Scene", tmp_path)
-    (tmp_path / "arguments" / "__init__.py").write_text("")
-    _run("import scene; assert not hasattr(scene, 'ModelParams')", tmp_path)
 
 
 @pytest.mark.parametrize(

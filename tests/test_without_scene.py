@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -10,19 +9,15 @@ import pytest
 import torch
 from gaussians import pipeline
 from html_scene import balls
-from small_splats import splats, written
+from small_splats import written
 
 import export
 import view
 from gaussian_renderer import render
 from scene.splats.reading import read_splats
 from scene.with_splats import model_of
-from splatting.camera_paths import without_scene
-from splatting.camera_paths.without_scene import COUNT, WithoutScene, circle, have_moved, recorded_cameras
-from splatting.exports import sog
+from splatting.camera_paths.without_scene import COUNT, circle, have_moved, recorded_cameras
 from splatting.exports.reading import read_any
-from splatting.exports.sog import write_sog
-from splatting.host import progress
 from splatting.viewer.views import SceneCameras
 from utils.camera_utils import camera_to_JSON
 from utils.system_utils import UserError
@@ -98,14 +93,6 @@ def test_a_folder_whose_scene_is_gone_keeps_its_poses(tmp_path, capsys):
         view.kept(scene, argparse.Namespace(clean=0.05), pipeline(), options)
 
 
-def test_a_viewer_says_that_poses_have_moved(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(view, "load_saved", lambda *_: WithoutScene(None, "", 7, ()))
-    monkeypatch.setattr(without_scene, "have_moved", lambda *_: True)
-    options = argparse.Namespace(model_path=str(tmp_path), source_path=str(tmp_path))
-    assert view.of_folder(options, argparse.Namespace(iteration=-1, typed_sh_degree=None)).loaded_iter == 7
-    assert "warning: the scene's poses are not those that" in capsys.readouterr().err
-
-
 def test_a_page_of_a_folder_whose_scene_is_gone_has_its_poses(tmp_path, monkeypatch, capsys):
     (tmp_path / "point_cloud/iteration_7").mkdir(parents=True)
     written(tmp_path, ".ply", balls()).rename(tmp_path / "point_cloud/iteration_7/point_cloud.ply")
@@ -154,17 +141,3 @@ def _stand_in(folder: Path, monkeypatch, script: str) -> None:
     program.write_text(f"#!/bin/sh\n{script}\n")
     program.chmod(0o755)
     monkeypatch.setattr("shutil.which", lambda *_, **__: str(program))
-
-
-def test_the_time_of_a_sog_is_told_and_its_progress_shown(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(progress, "INTERVAL", 0.0)
-    monkeypatch.setattr(sog, "_LOOK", 0.01)
-    _stand_in(tmp_path, monkeypatch, 'printf "k-means [###"; sleep 0.1; for file; do :; done; echo PK > "$file"')
-    with pytest.raises(zipfile.BadZipFile):
-        write_sog(tmp_path / "a.sog", splats(7000, 1))
-    said = capsys.readouterr().err
-    assert said.startswith("splat-transform takes about 1 min for the SH bands of 7,000 Gaussians, as it compares")
-    assert "splat-transform: 00:00, k-means [###\n" in said
-    with pytest.raises(zipfile.BadZipFile):
-        write_sog(tmp_path / "a.sog", splats(7000, 0))
-    assert " min " not in capsys.readouterr().err

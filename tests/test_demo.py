@@ -1,5 +1,7 @@
-"""The demo's ray tracer and its COLMAP model, against closed forms and pycolmap."""
+"""The demo: its ray tracer and COLMAP model against closed forms and pycolmap; its report, table and sheet."""
 
+import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,16 +10,14 @@ import pytest
 from PIL import Image
 
 from splatting.demo import make_scene as maker
+from splatting.demo import report
 from splatting.demo.make_scene import make_scene
-from splatting.demo.objects import Box, Ground, Shape, Sphere, Torus, demo_scene
-from splatting.demo.tracer import CAMERAS, render_view, ring_views
+from splatting.demo.objects import Ground, Shape, Sphere, Torus, demo_scene
+from splatting.demo.tracer import CAMERAS, ring_views
+from splatting.evaluation.renders import GAIN, GAP, HEADER, contact_sheet
 from utils.system_utils import UserError
 
 VIEWS, WIDTH, HEIGHT, POINTS = 12, 80, 60, 600
-
-SPHERE = Sphere((0.2, -0.4, 0.3), 0.7)
-TORUS = Torus((-0.15, -0.62, 0.95), (0.35, -0.55, 0.75), 0.42, 0.16)
-BOX = Box((0.9, -0.4, 0.5), (0.3, 0.4, 0.2), 0.5)
 
 
 @pytest.fixture(scope="module")
@@ -57,43 +57,6 @@ def inside(shape: Shape, p: np.ndarray) -> np.ndarray:
     return (np.reshape(shape.half, (3, 1)) - np.abs(local)).min(axis=0)
 
 
-@pytest.mark.parametrize("shape", [SPHERE, TORUS, BOX, Ground(9.0), Sphere((0, 0, 0), 9.0, inside=True)])
-def test_hits_are_the_first_points_on_the_surface_and_normals_point_out(shape):
-    center = getattr(shape, "center", (0, -0.2, 0))
-    origin, direction = rays(500, center)
-    if isinstance(shape, Ground):
-        origin[1] = -np.abs(origin[1]) - 0.1
-    t = shape.intersect(origin.astype(np.float32), direction.astype(np.float32)).astype(np.float64)
-    hit = np.isfinite(t)
-    assert hit.sum() > 100
-    o, d, t = origin[:, hit], direction[:, hit], t[hit]
-    point = o + t * d
-    assert np.abs(inside(shape, point)).max() < 5e-4  # float32 at distances of 10, and the marching's 2e-4
-    for part in np.linspace(0.02, 0.98, 49):
-        assert inside(shape, o + part * t * d).max() < 1e-3
-    # A ray that misses is never inside the solid.
-    if not isinstance(shape, Ground):
-        for part in np.linspace(0, 6, 200):
-            assert inside(shape, origin[:, ~hit] + part * direction[:, ~hit]).max(initial=-1) < 3e-3
-
-    normal = shape.normal(point.astype(np.float32)).astype(np.float64)
-    assert np.allclose(np.linalg.norm(normal, axis=0), 1, atol=1e-5)
-    step = 1e-3
-    slope = inside(shape, point - step * normal) - inside(shape, point + step * normal)
-    # The change is 2 * step along the true normal; hits within a step of a box's edge have two normals.
-    assert np.quantile(slope, 0.02) > 1.98 * step
-
-
-def test_samples_average_what_a_pixel_covers():
-    view = ring_views(3, 24, 16, np.random.default_rng(0))[0]
-    things = demo_scene()
-    fine = render_view(things, view, samples=8).astype(float)
-    # Supersampling converges: more samples come nearer to the true mean.
-    errors = [np.abs(render_view(things, view, samples=n) - fine).mean() for n in (1, 3)]
-    assert errors[1] < 0.5 * errors[0]
-    assert errors[1] < 2.0  # of 255
-
-
 @pytest.mark.parametrize(("camera", "size"), [("fisheye", (80, 60)), ("panorama", (80, 40))])
 def test_wide_cameras_are_pycolmaps(tmp_path, camera, size):
     (view, *_) = ring_views(3, *size, np.random.default_rng(0), CAMERAS[camera])
@@ -126,15 +89,6 @@ def test_pycolmap_reads_a_valid_model(model, scene):
         assert picture.size == (WIDTH, HEIGHT)
 
 
-def test_points_project_near_their_observations(model):
-    # Expected noise per axis: position 0.004 * 72 px (focal length) and observation 0.3 px; the mean length is 0.52 px.
-    assert 0.3 < model.compute_mean_reprojection_error() < 0.8
-    for point in list(model.points3D.values())[::20]:
-        seen = [(model.images[element.image_id], element.point2D_idx) for element in point.track.elements]
-        errors = [np.linalg.norm(image.project_point(point.xyz) - image.points2D[index].xy) for image, index in seen]
-        assert np.mean(errors) == pytest.approx(point.error, rel=1e-6)
-
-
 def test_tracks_are_what_is_visible(model):
     """Nothing is between a camera and a point that it observes; something is in front of other points in the frame.
 
@@ -156,29 +110,6 @@ def test_tracks_are_what_is_visible(model):
     assert len(blocked[True]) > 2000 and len(blocked[False]) > 100
     assert np.mean(blocked[True]) < 0.02
     assert np.mean(blocked[False]) > 0.8
-
-
-def test_views_agree_on_colours_except_where_it_is_glossy(model, scene):
-    """A point has about the same colour in all views that see it; it would not if poses and photos disagreed."""
-    samples: dict[int, list[np.ndarray]] = {}
-    for image in model.images.values():
-        pixels = np.asarray(Image.open(scene / "images" / image.name), float)
-        for point2d in image.points2D:
-            x, y = np.clip(point2d.xy.astype(int), 0, (WIDTH - 1, HEIGHT - 1))
-            samples.setdefault(point2d.point3D_id, []).append(pixels[y, x])
-    spread = [np.std(values, axis=0).mean() for values in samples.values()]
-    assert np.median(spread) < 0.4 * np.concatenate(list(samples.values())).std(axis=0).mean()
-    # The model's colours come from positions without observation noise, so not from exactly these pixels.
-    errors = np.array([np.abs(np.mean(v, axis=0) - model.points3D[k].color) for k, v in samples.items()])
-    assert errors.max() < 70 and np.median(errors.mean(axis=1)) < 6
-
-
-def test_colour_depends_on_the_view_where_it_is_glossy():
-    things = demo_scene()
-    glossy = next(thing for thing in things if thing.mirror > 0.1)
-    matt = [thing if thing is not glossy else type(thing)(thing.shape, thing.texture) for thing in things]
-    view = ring_views(3, 60, 45, np.random.default_rng(0))[0]
-    assert (render_view(things, view, 1) != render_view(matt, view, 1)).any()
 
 
 def test_same_seed_same_bytes_and_another_seed_another_scene(tmp_path):
@@ -218,17 +149,79 @@ def test_a_scene_that_cannot_be_made_changes_nothing(tmp_path, monkeypatch, out,
     assert [file.name for file in tmp_path.iterdir()] == ["mine.txt"]
 
 
+RESULTS = {"ours_30": {"SSIM": 0.5, "PSNR": 20.0, "LPIPS": None}}
+PLY = "point_cloud/iteration_30/point_cloud.ply"
+PER_VIEW = {"ours_30": {"PSNR": {"00000.png": 19.0, "00001.png": 21.0}}}
+
+
+@pytest.fixture
+def trained(tmp_path: Path) -> Path:
+    """A model folder as train.py, render.py and metrics.py leave it."""
+    folder = tmp_path / "model"
+    ply = folder / PLY
+    ply.parent.mkdir(parents=True)
+    ply.write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 123\nend_header\n")
+    for side in ("renders", "gt"):
+        (folder / "test" / "ours_30" / side).mkdir(parents=True)
+        for name in PER_VIEW["ours_30"]["PSNR"]:
+            Image.fromarray(np.zeros((20, 30, 3), np.uint8)).save(folder / "test" / "ours_30" / side / name)
+    (folder / "cfg_args").write_text("Namespace(source_path='/data/garden')")
+    (folder / "results.json").write_text(json.dumps(RESULTS))
+    (folder / "per_view.json").write_text(json.dumps(PER_VIEW))
+    (folder / "train_log.json").write_text(json.dumps([{"iteration": 30, "seconds": 12.4, "gaussians": 123}]))
+    return folder
+
+
+@pytest.fixture
+def reported(trained, monkeypatch) -> Callable[[], None]:
+    monkeypatch.setattr("sys.argv", ["report", str(trained)])
+    return report.main
+
+
+@pytest.mark.filterwarnings("error::ResourceWarning")
+def test_table_and_sheet(reported, trained, capsys):
+    reported()
+    lines = capsys.readouterr().out.splitlines()
+    cells = lines[1].split()
+    assert cells == ["garden", "30", "12", "s", "123", "2", "20.00", "dB", "0.5000"]
+    assert lines[-2].endswith(f" {trained / 'contact_sheet.png'}") and lines[-1].endswith(f"view.py -m {trained}")
+    with Image.open(trained / "contact_sheet.png") as sheet:
+        assert sheet.width > 90
+
+
+@pytest.mark.parametrize("text", ["{broken", '[{"iteration": 30, "seconds": "x"}]'])
+def test_a_damaged_log_only_costs_the_time(reported, trained, capsys, text):
+    (trained / "train_log.json").write_text(text)
+    reported()
+    printed = capsys.readouterr()
+    assert "garden" in printed.out and "12 s" not in printed.out and "train_log.json cannot be read" in printed.err
+
+
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("name", "text", "sentence"),
     [
-        ("--views 0", "--views must be at least 3, got 0"),
-        ("--size 400 15", "--size must be at least 16, got 15"),
-        ("--points 0", "--points must be at least 1, got 0"),
-        ("--seed -1", "--seed must be at least 0, got -1"),
+        *((name, text, "no scores of ours_30; run render.py and metrics.py")
+          for name in ("results.json", "per_view.json")
+          for text in ("[]", "{", '{"ours_30": {"PSNR": {}}}', '{"ours_30": {"PSNR": "x", "SSIM": 1}}')),
+        (PLY, None, "cannot read .*point_cloud.ply"),
+        ("test/ours_30/gt/00001.png", None, "gt/00001.png is missing or damaged.*; run render.py"),
+        ("test/ours_30/gt/00001.png", "x", "gt/00001.png is missing or damaged.*; run render.py"),
     ],
-)
-def test_absurd_numbers_end_with_a_sentence(tmp_path, monkeypatch, words, said):
-    monkeypatch.setattr("sys.argv", ["make_scene", str(tmp_path / "out"), *words.split()])
-    with pytest.raises(UserError, match=f"^{said}$"):
-        maker.main()
-    assert not (tmp_path / "out").exists()
+)  # fmt: skip
+def test_missing_and_damaged_files_are_named(reported, trained, name, text, sentence):
+    (trained / name).unlink() if text is None else (trained / name).write_text(text)
+    with pytest.raises(UserError, match=sentence):
+        reported()
+    assert not (trained / "contact_sheet.png").exists()
+
+
+def test_contact_sheet_shows_truth_render_and_amplified_error():
+    truth = Image.new("RGB", (140, 30), (100, 100, 100))
+    render = Image.new("RGB", (140, 30), (110, 90, 100))
+    sheet = contact_sheet([("a", truth, render), ("b", truth, truth)])
+    assert sheet.size == (3 * (140 + GAP) + GAP, HEADER + 2 * (30 + GAP))
+    bottom = HEADER + 29  # below the label
+    assert sheet.getpixel((GAP + 139, bottom)) == (100, 100, 100)
+    assert sheet.getpixel((2 * GAP + 140 + 139, bottom)) == (110, 90, 100)
+    assert sheet.getpixel((3 * GAP + 280 + 139, bottom)) == (10 * GAIN, 10 * GAIN, 0)
+    assert sheet.getpixel((3 * GAP + 280 + 139, bottom + 30 + GAP)) == (0, 0, 0)
