@@ -4,9 +4,7 @@ import contextlib
 import gzip
 import json
 import struct
-import tempfile
 import tracemalloc
-import warnings
 import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
@@ -16,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from gaussians import model, pipeline
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData
 from scipy.spatial import KDTree, cKDTree
 from small_splats import COUNT, FAR, cube, empty_spz, extreme_splats, moved, splats, written
 
@@ -32,10 +30,8 @@ from scene.splats.splats import (
     half_rotated,
     logits,
     opacities,
-    rotated,
     selected,
     tidy,
-    used_sh_degree,
     with_sh_degree,
     within_box,
 )
@@ -93,15 +89,6 @@ def test_round_trips_lose_what_the_format_rounds(tmp_path, ending, degree):
         assert difference.max(initial=0) <= loss * 1.001 + 1e-6
 
 
-@pytest.mark.parametrize("ending", [".ply", ".compressed.ply"])
-def test_plys_keep_the_origin_of_a_scene_far_away(tmp_path, ending):
-    far = (500_000.25, 5_400_000.0, -7.0)
-    path = written(tmp_path, ending, replace(splats(20, 1), world_offset=far))
-    assert read_splats(path).world_offset == far
-    path.write_bytes(path.read_bytes().replace(b"500000.25", b"nan", 1))
-    assert read_splats(path).world_offset == (0.0, 0.0, 0.0)
-
-
 @pytest.mark.parametrize("count", [0, 1, 300])
 def test_a_ply_in_the_worlds_coordinates_keeps_its_decimals(tmp_path, count):
     some, far = splats(count, 1), np.array([500_000.0, 5_400_000.0, 200.0])
@@ -117,7 +104,7 @@ def test_a_ply_in_the_worlds_coordinates_keeps_its_decimals(tmp_path, count):
     np.testing.assert_array_equal(read_splats(tmp_path / "near.ply").means, (some.means + 1.0).astype(np.float32))
 
 
-@pytest.mark.parametrize("count", [0, 1, 257])
+@pytest.mark.parametrize("count", [0, 257])
 @pytest.mark.parametrize("ending", OURS)
 def test_the_same_splats_give_the_same_bytes(tmp_path, ending, count):
     one, other = (written(tmp_path, ending, splats(count, 2), name) for name in ("one", "other"))
@@ -173,15 +160,14 @@ def test_glb_says_what_its_numbers_mean(tmp_path):
 
 
 @pytest.mark.parametrize("ending", OURS)
-@pytest.mark.parametrize("share", [0.5, 0.999])
-def test_a_full_disk_is_said_and_leaves_nothing(tmp_path, ending, share):
-    """A limit on the size of files stands for a full disk, in the middle and at the end."""
+def test_a_full_disk_is_said_and_leaves_nothing(tmp_path, ending):
+    """A limit on the size of files stands for a full disk."""
     resource = pytest.importorskip("resource", reason="there are no limits on this system")
     whole = written(tmp_path, ending, some := splats(3000, 1))
     size = whole.stat().st_size
     whole.unlink()
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (int(share * size), before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(0.999 * size), before[1]))
     try:
         with pytest.raises(UserError, match=f"cannot write .*model{ending}.*free space"):
             written(tmp_path, ending, some)
@@ -190,9 +176,8 @@ def test_a_full_disk_is_said_and_leaves_nothing(tmp_path, ending, share):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("degree", [1, 3])
-def test_usdz_has_the_schema_and_stands_upright(tmp_path, degree):
-    path = written(tmp_path, ".usdz", some := splats(20, degree))
+def test_usdz_has_the_schema_and_stands_upright(tmp_path):
+    path = written(tmp_path, ".usdz", some := splats(20, 2))
     from pxr import Gf, Usd, UsdGeom, UsdValidation
 
     stage = Usd.Stage.Open(str(path))
@@ -211,48 +196,28 @@ def test_usdz_has_the_schema_and_stands_upright(tmp_path, degree):
     np.testing.assert_allclose(value("opacities"), opacities(some), rtol=1e-6)
     turn = prim.GetAttribute("orientations").Get()[3]
     np.testing.assert_array_equal([turn.GetReal(), *turn.GetImaginary()], some.rotations[3])
-    assert value("radiance:sphericalHarmonicsDegree") == degree
+    assert value("radiance:sphericalHarmonicsDegree") == 2
     np.testing.assert_array_equal(value("radiance:sphericalHarmonicsCoefficients").reshape(some.sh.shape), some.sh)
     low, high = np.asarray(UsdGeom.Boundable(prim).GetExtentAttr().Get())
     assert (low < some.means).all() and (some.means < high).all()
 
 
-def test_half_a_turn_is_one_about_x():
-    """Turns keep how a model looks: test_html_export.py."""
-    some = splats(30)
-    half, turn = half_rotated(some), rotated(some, np.diag([1.0, -1.0, -1.0]))
-    for name in ("means", "sh"):
-        np.testing.assert_allclose(getattr(half, name), getattr(turn, name), atol=1e-5)
-    axes = [np.stack([rotation_matrix(wxyz) for wxyz in one.rotations]) for one in (half, turn)]
-    spreads = [x * np.exp(some.log_scales)[:, None] @ x.transpose(0, 2, 1) for x in axes]
-    np.testing.assert_allclose(*spreads, atol=1e-6)
-    np.testing.assert_array_equal(half_rotated(half).sh, some.sh)
-
-
-def test_spz_of_version_2_is_read(tmp_path):
-    """Bytes by hand, of one splat: gzip, the real part of the quaternion left out, y up."""
-    header = struct.pack("<IIIBBBB", 0x5053474E, 2, 1, 0, 12, 1, 0)
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_older_spz_is_read(tmp_path, version):
+    """Bytes by hand, of one splat: gzip, a part of the quaternion left out, y up; first with 16-bit floats."""
+    header = struct.pack("<IIIBBBB", 0x5053474E, version, 1, 0, 12, version > 1, 0)
     position = b"".join((int(value * 4096) & 0xFFFFFF).to_bytes(3, "little") for value in (1.5, 2.0, -3.0))
-    turn = bytes([round(127.5 + 127.5 * value) for value in (0.6, 0.0, 0.0)])
-    body = position + bytes([128]) + bytes([255, 127, 0]) + bytes([160, 80, 0]) + turn
+    if version == 1:
+        position = np.float16([1.5, 2.0, -3.0]).tobytes()
+    turn = bytes([204, 127, 127]) if version < 3 else (3 << 30 | 434 << 20).to_bytes(4, "little")
+    body = position + bytes([128, 255, 127, 0, 160, 80, 0]) + turn
     (tmp_path / "a.spz").write_bytes(gzip.compress(header + body))
     read = read_splats(tmp_path / "a.spz")
     np.testing.assert_allclose(read.means, [[1.5, -2.0, 3.0]])
     np.testing.assert_allclose(read.log_scales, [[0.0, -5.0, -10.0]])
     np.testing.assert_allclose(read.rotations, [[0.8, 0.6, 0, 0]], atol=0.005)
     np.testing.assert_allclose(read.sh[0, 0], [0.5 / 0.15, 0, -0.5 / 0.15], atol=0.02)
-    assert read.antialiasing and abs(opacities(read)[0] - 128 / 255) < 1e-6
-
-
-def test_spz_of_version_1_is_read(tmp_path):
-    """As version 2, but for positions of 16-bit floats."""
-    header = struct.pack("<IIIBBBB", 0x5053474E, 1, 1, 0, 0, 0, 0)
-    body = np.float16([1.5, 2.0, -3.0]).tobytes() + bytes([128, 255, 127, 0, 160, 80, 0, 204, 127, 127])
-    (tmp_path / "a.spz").write_bytes(gzip.compress(header + body))
-    read = read_splats(tmp_path / "a.spz")
-    np.testing.assert_allclose(read.means, [[1.5, -2.0, 3.0]])
-    np.testing.assert_allclose(read.log_scales, [[0.0, -5.0, -10.0]])
-    np.testing.assert_allclose(read.rotations, [[0.8, 0.6, 0, 0]], atol=0.005)
+    assert read.antialiasing == (version > 1) and abs(opacities(read)[0] - 128 / 255) < 1e-6
 
 
 def _with_records(folder: Path, version: int, records: bytes, flags: int = 2) -> Path:
@@ -346,13 +311,6 @@ def test_models_and_splats_are_the_same_gaussians():
     assert model_of(splats(4, 1), 3).active_sh_degree == 1 and model_of(splats(4, 3), 1).max_sh_degree == 1
 
 
-@pytest.mark.parametrize("degree", range(4))
-def test_bands_of_zeros_are_not_used(degree):
-    some = splats(5, 3)
-    some.sh[:, (degree + 1) ** 2 :] = 0
-    assert used_sh_degree(some) == degree
-
-
 def test_selection():
     some = splats(50)
     inside = within_box(some, (-1, -1, -1, 1, 0, 1))
@@ -389,7 +347,7 @@ def test_unknown_endings_and_files_are_refused(tmp_path):
         read_splats(tmp_path / "a.bin")
 
 
-@pytest.mark.parametrize("x", [20, 1e3, -1e5, 1e30])
+@pytest.mark.parametrize("x", [20, -1e5, 1e30])
 def test_one_far_gaussian_leaves_the_others_of_a_compressed_ply(tmp_path, x):
     some, path = cube(x), written(tmp_path, ".compressed.ply", cube(x))
     read = read_splats(path)
@@ -400,23 +358,7 @@ def test_one_far_gaussian_leaves_the_others_of_a_compressed_ply(tmp_path, x):
     assert len(vertex) % CHUNK == 1 and (vertex["packed_color"] & 255 == 0).sum() == len(vertex) - COUNT
 
 
-def test_one_gaussian_of_another_colour_leaves_the_others(tmp_path):
-    some = cube(color=300)
-    read = read_splats(written(tmp_path, ".compressed.ply", some))
-    order = KDTree(some.means).query(read.means)[1]
-    assert np.abs(read.sh - some.sh[order]).max() < 0.02 and sorted(order) == list(range(COUNT))
-
-
-def test_far_gaussians_of_many_distances_keep_them(tmp_path):
-    some = cube()
-    some.means[:30] *= np.logspace(1, 30, 30)[:, None]
-    read = read_splats(written(tmp_path, ".compressed.ply", some))
-    assert len(read) == COUNT
-    for mean in some.means[:30]:
-        assert np.abs(read.means - mean).max(axis=1).min() < 0.02 * np.abs(mean).max()
-
-
-@pytest.mark.parametrize("x", [20, 500, 1e4, -1e6, 1e30])
+@pytest.mark.parametrize("x", [500, -1e6, 1e30])
 def test_one_far_gaussian_leaves_the_others_of_an_spz(tmp_path, capsys, x):
     """Beyond a thousand usual distances, here about 1, it is drawn in: seen from the middle it stays as it is."""
     some = cube(x)
@@ -444,12 +386,6 @@ def test_sizes_that_spz_cannot_hold_are_told(tmp_path, capsys, unit, cut):
     said = capsys.readouterr().err
     assert (f"lengths from 4.5e-05 to 379 units; {cut} of {COUNT} Gaussians" in said) == (cut > 0)
     assert bool(said) == (cut > 0)
-
-
-def test_positions_that_spz_cannot_hold_are_refused(tmp_path):
-    with pytest.raises(UserError, match=r"can hold positions to 8,388,607, not 1e\+07; leave the"):
-        written(tmp_path, ".spz", replace(cube(), means=cube().means + np.float32(1e7)))
-    assert not list(tmp_path.iterdir())
 
 
 @contextlib.contextmanager
@@ -489,26 +425,6 @@ def test_a_sky_of_most_splats_does_not_coarsen_the_others_in_a_compressed_ply(tm
 
 
 @pytest.mark.parametrize("version", [3, 4])
-def test_no_changed_byte_of_packed_spz_loads_another_model(tmp_path, version):
-    """Of the content; a change of the header of version 4 can pass, as that has no sum."""
-    pytest.importorskip("zstandard", reason="the extra [export] is not installed")
-    path = written(tmp_path, ".spz", splats(20, 1))
-    begin = 32 + 16 * 6
-    if version == 3:
-        widths = 9, 1, 3, 3, 4, 9
-        unpacked = struct.pack("<IIIBBBB", 0x5053474E, 3, 20, 1, 12, 0, 0) + bytes(range(1, 21)) * sum(widths)
-        path.write_bytes(gzip.compress(unpacked))
-        begin = 10
-    content, whole = path.read_bytes(), read_splats(path)
-    for place in range(begin, len(content), 7):
-        path.write_bytes(content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :])
-        try:
-            np.testing.assert_array_equal(read_splats(path).means, whole.means)
-        except UserError:
-            continue
-
-
-@pytest.mark.parametrize("version", [3, 4])
 @pytest.mark.parametrize(
     ("count", "degree", "said"),
     [
@@ -522,43 +438,3 @@ def test_spz_of_few_bytes_and_much_content_is_refused(tmp_path, version, count, 
     (tmp_path / "a.spz").write_bytes(empty_spz(version, count, degree))
     with _little_memory(), pytest.raises(UserError, match=f"not a complete SPZ file .{said}.*; save or download it"):
         read_splats(tmp_path / "a.spz")
-
-
-def test_splats_that_pack_well_are_read(tmp_path):
-    """A lattice of equal splats takes 2 bytes each."""
-    lattice = np.stack(np.meshgrid(*[np.arange(50.0)] * 3), axis=-1).reshape(-1, 3)
-    some = replace(selected(splats(1, 0), np.zeros(len(lattice), int)), means=lattice.astype(np.float32))
-    path = written(tmp_path, ".spz", some)
-    assert path.stat().st_size < 3 * len(some) and len(read_splats(path)) == len(some)
-    (tmp_path / "b.spz").write_bytes(empty_spz(3, 65_536))
-    assert len(read_splats(tmp_path / "b.spz")) == 65_536
-
-
-@pytest.mark.parametrize("ending", [".usdz", ".sog"])
-def test_without_a_temporary_folder_an_export_says_so(tmp_path, ending, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "absent"))
-    monkeypatch.setattr("shutil.which", lambda name, **_: f"/bin/{name}")
-    with pytest.raises(UserError, match=r"cannot make a temporary folder \(.*absent.*environment variable TMPDIR"):
-        written(tmp_path, ending, splats(5))
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("offset", [1e300, -1e16])
-def test_an_offset_too_large_is_refused_by_the_name_of_the_file(tmp_path, offset):
-    path = written(tmp_path, ".ply", replace(splats(5), world_offset=(0.0, offset, 0.0)), "mine")
-    with pytest.raises(UserError, match=r"mine.ply lies 1e\+\d+ from the origin of its world.*comment world_offset"):
-        read_splats(path)
-
-
-@pytest.mark.parametrize("value", [1e300, -1e300, np.inf, np.nan])
-@pytest.mark.parametrize("column", ["x", "f_dc_0", "opacity", "scale_0", "rot_0", "max_x", "max_scale_x", "max_r"])
-def test_numbers_that_float32_cannot_hold_are_read_without_warnings(tmp_path, column, value):
-    packed = column.startswith("max")
-    path = written(tmp_path, ".compressed.ply" if packed else ".ply", splats(300, 0))
-    first, *others = PlyData.read(path, mmap=False).elements
-    rows = first.data.astype([(name, "f8") for name in first.data.dtype.names])
-    rows[column][0] = value
-    PlyData([PlyElement.describe(rows, first.name), *others], byte_order="<").write(str(path))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert len(read_splats(path)) == 300

@@ -6,7 +6,6 @@ They come from npm: `npm ci --ignore-scripts` in tests/foreign installs the vers
 import argparse
 import json
 import shutil
-import struct
 import subprocess
 import tempfile
 import time
@@ -15,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from small_splats import cube, moved, splats, written
+from small_splats import splats, written
 from torch import Tensor
 
 from arguments import PipelineParams
@@ -23,10 +22,9 @@ from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
 from scene.splats.reading import read_splats
-from scene.splats.splats import Splats, half_rotated, logits, with_sh_degree
+from scene.splats.splats import Splats, half_rotated, with_sh_degree
 from scene.with_splats import model_of
 from splatting.camera_paths.poses import facing, keyframe
-from splatting.exports.scene_formats import PRIM
 from utils.system_utils import compute_device
 
 pytestmark = pytest.mark.slow
@@ -45,12 +43,6 @@ def foreign_programs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(FOREIGN / "node_modules/.bin"), prepend=":")
 
 
-def read_back(path: Path) -> Splats:
-    """The splats of a file that export.py wrote, in the axes of the model."""
-    readers = {".glb": _read_glb, ".usdz": _read_usdz, ".sog": read_by_splat_transform}
-    return readers.get(path.suffix, read_splats)(path)
-
-
 def read_by_splat_transform(path: Path) -> Splats:
     """The splats of a file as PlayCanvas' program reads them, which writes them as PLY."""
     with tempfile.TemporaryDirectory() as folder:
@@ -59,55 +51,15 @@ def read_by_splat_transform(path: Path) -> Splats:
         return read_splats(model)
 
 
-def _read_glb(path: Path) -> Splats:
-    content = path.read_bytes()
-    (length,) = struct.unpack_from("<I", content, 12)
-    document, binary = json.loads(content[20 : 20 + length]), content[28 + length :]
-    attributes = document["meshes"][0]["primitives"][0]["attributes"]
-    values = {}
-    for name, index in attributes.items():
-        accessor = document["accessors"][index]
-        if accessor["componentType"] == 5126:
-            view = document["bufferViews"][accessor["bufferView"]]
-            flat = np.frombuffer(binary, "<f4", view["byteLength"] // 4, view["byteOffset"])
-            values[name.split(":")[-1]] = flat.reshape(accessor["count"], -1).copy()
-    names = sorted((name for name in values if name.startswith("SH_")), key=lambda name: name.split("_")[2::2])
-    sh = np.stack([values[name] for name in names], axis=1)
-    rotations = np.roll(values["ROTATION"], 1, axis=1)
-    return Splats(values["POSITION"], np.log(values["SCALE"]), rotations, logits(values["OPACITY"][:, 0], 1e-7), sh)
-
-
-def _read_usdz(path: Path) -> Splats:
-    from pxr import Usd
-
-    stage = Usd.Stage.Open(str(path))  # a prim does not keep its stage alive
-    prim = stage.GetPrimAtPath(PRIM)
-
-    def value(name: str) -> np.ndarray:
-        return np.array(prim.GetAttribute(name).Get(), dtype=np.float32)
-
-    turns = prim.GetAttribute("orientations").Get()
-    rotations = np.array([[turn.GetReal(), *turn.GetImaginary()] for turn in turns], dtype=np.float32)
-    sh = value("radiance:sphericalHarmonicsCoefficients").reshape(len(turns), -1, 3)
-    return Splats(value("positions"), np.log(value("scales")), rotations, logits(value("opacities"), 1e-7), sh)
-
-
-_FOV = 0.9  # radians, in both directions
-_UP = 0.3  # height of the cameras, in distances from the middle
-
-
-def orbit(means: np.ndarray, count: int, side: int) -> list[MiniCam]:
-    """Square views of `side` pixels on a circle around the middle of positions (N, 3), looking at it, -y up.
-
-    The circle's radius is 2.5 times the median distance from the middle.
-    """
+def orbit(means: np.ndarray) -> list[MiniCam]:
+    """Five square views on a circle around the middle of positions (N, 3), looking at it, -y up."""
     middle = np.median(means, axis=0).astype(np.float64)
-    radius = 2.5 * float(np.median(np.linalg.norm(means - middle, axis=1))) + 1e-6
+    radius = 2.5 * float(np.median(np.linalg.norm(means - middle, axis=1)))
     views = []
-    for angle in np.arange(count) * 2 * np.pi / count + 0.3:
-        offset = np.array([np.sin(angle), -_UP, np.cos(angle)])
+    for angle in np.arange(5) * 2 * np.pi / 5 + 0.3:
+        offset = np.array([np.sin(angle), -0.3, np.cos(angle)])
         pose = keyframe(0.0, middle + radius * offset, facing(-offset, np.array([0.0, -1.0, 0.0])), 0.0)
-        views.append(free_view(side, side, _FOV, pose.position, pose.wxyz, compute_device()))
+        views.append(free_view(64, 64, 0.9, pose.position, pose.wxyz, compute_device()))
     return views
 
 
@@ -133,16 +85,16 @@ def _scene(degree: int, antialiasing: bool = False) -> Splats:
 
 def _loss(some: Splats, read: Splats) -> float:
     """PSNR of the renders from 5 views, of which none may be empty."""
-    cameras = orbit(some.means, 5, 64)
+    cameras = orbit(some.means)
     expected = renders(some, cameras)
     assert expected.flatten(1).std(dim=1).min() > 0.05
     return decibels(renders(Splats(**{**vars(read), "antialiasing": some.antialiasing}), cameras), expected)
 
 
-@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("ending", [".ply", ".compressed.ply", ".splat", ".spz", ".sog"])
 def test_splat_transform_reads_what_we_wrote(tmp_path, ending, degree):
-    some = _scene(degree, antialiasing=degree == 2)
+    some = _scene(degree, antialiasing=degree == 3)
     path = written(tmp_path, ending, some)
     read = read_by_splat_transform(path)
     if ending == ".spz":
@@ -155,7 +107,7 @@ def test_splat_transform_reads_what_we_wrote(tmp_path, ending, degree):
     least = FLOAT if ending == ".ply" else COMPRESSED
     assert _loss(some, read) >= least
     if ending != ".sog":
-        assert _loss(some, read_back(path)) >= least
+        assert _loss(some, read_splats(path)) >= least
 
 
 def test_a_sog_file_has_the_same_bytes_each_time(tmp_path, monkeypatch):
@@ -167,7 +119,7 @@ def test_a_sog_file_has_the_same_bytes_each_time(tmp_path, monkeypatch):
     assert written(tmp_path, ".sog", some).read_bytes() == first
 
 
-@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("degree", [0, 3])
 def test_adobes_spz_reads_what_we_wrote(tmp_path, degree):
     some = _scene(degree, antialiasing=True)
     path = written(tmp_path, ".spz", some)
@@ -184,7 +136,7 @@ def test_adobes_spz_reads_what_we_wrote(tmp_path, degree):
     rotations = np.roll(values("rotations", 4), 1, axis=1)
     theirs = Splats(values("positions", 3), values("scales", 3), rotations, values("alphas"), sh, True)
     assert _loss(some, theirs) >= COMPRESSED
-    ours = read_back(path)
+    ours = read_splats(path)
     np.testing.assert_allclose(ours.means, theirs.means, atol=1e-6)
     np.testing.assert_allclose(ours.log_scales, theirs.log_scales, atol=1e-6)
     np.testing.assert_allclose(ours.sh, theirs.sh, atol=1e-5)
@@ -198,22 +150,9 @@ def test_we_read_what_splat_transform_writes(tmp_path, ending, options):
     some = _scene(2, antialiasing=True)
     plain, packed = written(tmp_path, ".ply", some), tmp_path / f"theirs{ending}"
     subprocess.run(["splat-transform", "--quiet", *options, plain, packed], check=True, capture_output=True)
-    read = read_back(packed)
+    read = read_splats(packed)
     assert read.antialiasing and read.sh_degree == 2
     assert _loss(some, half_rotated(read) if ending == ".spz" else read) >= COMPRESSED
-
-
-@pytest.mark.parametrize("ending", [".compressed.ply", ".spz"])
-def test_splat_transform_finds_the_others_of_a_far_gaussian_where_they_are(tmp_path, ending):
-    some = cube(1e6)
-    read = read_by_splat_transform(written(tmp_path, ending, some))
-    assert moved(some, half_rotated(read) if ending == ".spz" else read).max() < 0.002
-
-
-@pytest.mark.parametrize("ending", [".glb", ".usdz"])
-def test_float_formats_lose_nothing(tmp_path, ending):
-    some = _scene(3)
-    assert _loss(some, read_back(written(tmp_path, ending, some))) >= FLOAT
 
 
 @pytest.mark.parametrize("count", [0, 1, 50])

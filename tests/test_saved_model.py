@@ -1,6 +1,5 @@
 """Models of a folder: the newest of its PLYs and checkpoints is loaded, and opened once."""
 
-import argparse
 import re
 import shutil
 import signal
@@ -14,10 +13,8 @@ from trainings import before_steps, train_on
 
 import export
 import render
-from arguments import ModelParams
-from scene.gaussians import ply
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint, with_extra_state
-from scene.saved_model import find_save, load_saved, read_model
+from scene.saved_model import find_save, read_model
 from splatting.evaluation.training_log import read_log
 from splatting.host.start import typed_command
 from splatting.parts.filter_3d.smoothing import Smoothing
@@ -93,15 +90,6 @@ def test_a_planned_checkpoint_alone_can_be_loaded(colmap_scene, tmp_path, monkey
     monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(tmp_path), "--quiet"])
     render.main()
     assert any((tmp_path / "test/ours_3/renders").rglob("*.png"))
-
-
-def test_a_ply_is_opened_once_to_be_rendered(colmap_scene, tmp_path, monkeypatch):
-    train_on(colmap_scene, tmp_path, *WORDS, "--iterations", 2)
-    opened, read = [], ply.read_elements
-    monkeypatch.setattr(ply, "read_elements", lambda path: (opened.append(path), read(path))[1])
-    options = argparse.Namespace(source_path=str(colmap_scene), model_path=str(tmp_path))
-    load_saved(ModelParams(argparse.ArgumentParser()).extract(options), -1)
-    assert len(opened) == 1
 
 
 def test_an_interrupted_training_can_be_looked_at(colmap_scene, tmp_path, monkeypatch, capfd):

@@ -60,27 +60,10 @@ def test_merging_keeps_the_moments_of_each_group():
     np.testing.assert_allclose(np.linalg.norm(one.rotations, axis=1), 1, atol=1e-6)
 
 
-def test_a_merged_gaussian_of_one_is_that_one():
-    some = splats(30)
-    one, spread = merged(some, np.arange(30))
-    np.testing.assert_allclose(_judged_covariances(one), _judged_covariances(some), rtol=1e-4, atol=1e-9)
-    np.testing.assert_allclose(opacities(one), np.minimum(opacities(some), 0.999), rtol=1e-4)
-    assert not spread.any()
-
-
 def test_areas_are_those_of_shadows():
     np.testing.assert_allclose(areas(np.array([[2.0, 2, 2]])), np.pi * 4)
     # A disc's shadows have half of its area in the mean.
     np.testing.assert_allclose(areas(np.array([[3.0, 3, 1e-9]])), np.pi * 9 / 2, rtol=0.012)
-
-
-def test_transparent_groups_and_copies_merge():
-    some = splats(8, 0)
-    some.opacity_logits[:4], some.log_scales[:4] = -np.inf, -80  # a footprint of 0
-    some.means[4:] = some.means[4]
-    one, spread = merged(some, np.array([0, 4]))
-    assert opacities(one)[0] < 1e-300 and np.isfinite(one.means).all() and spread[1] < 1e-12
-    np.testing.assert_allclose(one.means[0], some.means[:4].mean(axis=0), rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("count", [1, 4, 5, 63, 1000])
@@ -92,14 +75,6 @@ def test_groups_are_full_and_close(count):
     assert starts[0] == 0 and sizes.min() >= 1 and sizes.max() <= 4
     if count == 1000:
         assert merged(selected(some, order), starts)[1].mean() < merged(some, starts)[1].mean() / 2
-
-
-def test_groups_keep_colours_apart():
-    some = splats(64, 0)
-    some.means[1:] = 0
-    some.sh[::2], some.sh[1::2] = 3, -3
-    order, starts = groups_of(some, 4)
-    assert set(np.abs(merged(selected(some, order), starts)[0].sh[:, 0, 0]).round(4)) == {3}
 
 
 def test_every_gaussian_is_in_one_leaf_and_levels_shrink():
@@ -197,7 +172,7 @@ def test_tiles_of_cesium_have_spz_in_place_of_attributes(tmp_path, monkeypatch):
         assert cosines.min() > 0.9985  # 0.998 if each byte were rounded to the nearest
 
 
-@pytest.mark.parametrize("place", [(0, 0, 0), (47.25, 8.5, 410), (-33.9, 151.2, -20), (90, 0, 0), (45, 180, 8000)])
+@pytest.mark.parametrize("place", [(47.25, 8.5, 410), (-33.9, 151.2, -20), (90, 0, 0)])
 def test_places_on_the_globe_are_those_of_colmap(place):
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap has no wheel for this platform")
     earth = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
@@ -269,20 +244,6 @@ def test_only_a_folder_of_ours_goes_with_the_earlier_tileset(tmp_path, capsys):
     assert stays(folder, "was not written") and any(moved.iterdir())
 
 
-def test_exporting_again_repairs_tiles(tmp_path):
-    path = tmp_path / "tileset.json"
-    first = _written(path, splats(20, 0))
-    tile = tmp_path / first["root"]["content"]["uri"]
-    whole = tile.read_bytes()
-    (tile.parent / "mine.txt").touch()
-    for damage in (tile.unlink, lambda: tile.write_bytes(whole[:-1] + b"x"), lambda: path.write_text("{")):
-        damage()
-        assert _written(path, splats(20, 0)) == first and tile.read_bytes() == whole
-    (tmp_path / "usual").mkdir()
-    assert (tile.parent / "mine.txt").is_file()
-    assert tile.parent.stat().st_mode == (tmp_path / "usual").stat().st_mode  # so that a web server may read it
-
-
 def test_a_failed_tileset_leaves_the_earlier_one(tmp_path, monkeypatch):
     path = tmp_path / "tileset.json"
     _written(path, splats(20, 0))
@@ -291,15 +252,11 @@ def test_a_failed_tileset_leaves_the_earlier_one(tmp_path, monkeypatch):
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(tiles3d, "write_glb", full)
-    with pytest.raises(UserError, match="No space left"):
-        _written(path, splats(30, 0))
-    assert {entry.name for entry in tmp_path.rglob("*")} == before
-    monkeypatch.undo()
-    monkeypatch.setattr(tiles3d, "document", full)
-    with pytest.raises(UserError, match="No space left"):
-        _written(path, splats(30, 0))
-    assert {entry.name for entry in tmp_path.rglob("*")} == before
+    for name in ("write_glb", "document"):
+        with monkeypatch.context() as patch, pytest.raises(UserError, match="No space left"):
+            patch.setattr(tiles3d, name, full)
+            _written(path, splats(30, 0))
+        assert {entry.name for entry in tmp_path.rglob("*")} == before
 
 
 NEAR = selected(extreme_splats(), np.arange(7))  # SPZ cannot hold the last one
@@ -349,10 +306,3 @@ def test_streamed_sog_has_every_level(tmp_path, monkeypatch):
     np.testing.assert_allclose(np.sort(read.means, axis=0), np.sort(some.means, axis=0), atol=1e-3)
     assert _written(path, some) == content
     assert {entry.name for entry in path.parent.iterdir()} == {path.name, content["asset"]["extras"]["folder"]}
-
-
-def test_streamed_sog_needs_its_program(tmp_path, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(UserError, match="needs splat-transform; install Node"):
-        format_of("lod-meta.json").check("lod-meta.json")
