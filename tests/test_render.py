@@ -23,8 +23,8 @@ from scene.gaussians.attributes import attributes
 from scene.gaussians.ply import write_ply
 from scene.saved_model import load_saved
 from splatting.camera_paths import without_scene
-from splatting.evaluation.renders import INCOMPLETE, summarise_times
-from splatting.files.image_files import read_plane, to_bytes, write_plane
+from splatting.evaluation.renders import INCOMPLETE
+from splatting.files.image_files import read_plane, to_bytes
 from utils.system_utils import UserError
 
 render = pytest.importorskip("render", reason="the extensions are not built: make test")
@@ -158,28 +158,6 @@ def test_sets_by_the_references_arguments(folder, colmap_scene, monkeypatch, cap
     assert vars(dataset) == before
 
 
-def test_times_are_in_milliseconds_by_picture():
-    times = summarise_times([0.02, 0.05, 0.01], [(8, 6), (4, 3), (8, 6)], 7, True, torch.device("cpu"))
-    assert times["milliseconds"] == {"00000.png": 20.0, "00001.png": 50.0, "00002.png": 10.0}
-    assert (times["median_ms"], times["fps"], times["sizes"]) == (20.0, 50.0, [(4, 3), (8, 6)])
-    assert times["antialiasing"] and times["gaussians"] == 7 and times["threads"] == torch.get_num_threads()
-    assert times["device"] and times["torch"] == torch.__version__
-
-
-def test_times_on_disk_are_those_of_the_last_run(folder, run, colmap_scene):
-    files = [folder / name / "ours_7" / "render_times.json" for name in ("train", "test")]
-
-    def timed_views(held_out: bool) -> list[int]:
-        (folder / "cfg_args").write_text(FORMAT.format(str(colmap_scene), held_out, False))
-        run()
-        return [len(json.loads(file.read_text())["milliseconds"]) if file.exists() else 0 for file in files]
-
-    assert timed_views(held_out=True) == [14, 3]
-    text = files[1].read_text()
-    assert text == json.dumps(json.loads(text), indent=1, sort_keys=True) + "\n"
-    assert timed_views(held_out=False) == [17, 0]
-
-
 @pytest.mark.parametrize(("white", "words"), [(False, ["-w"]), (False, []), (True, []), (True, ["-w"])])
 def test_a_model_trained_on_black_is_not_rendered_on_white_without_a_word(
     folder, run, colmap_scene, capsys, white, words
@@ -216,21 +194,6 @@ def test_folders_are_named_after_options_that_are_not_the_models(folder, run, co
     run("--skip_train", *words)
     written = [path.name for path in (folder / "test").iterdir() if (path / "gt" / "00000.png").is_file()]
     assert f"ours_7{mark}" in written and method.exists() and ("ours_7" in written) == (not mark)
-
-
-def test_help_says_what_happens_without_an_option(monkeypatch, capsys):
-    monkeypatch.setattr("sys.argv", ["render.py", "-h"])
-    with pytest.raises(SystemExit):
-        render.main()
-    text = " ".join(capsys.readouterr().out.split())
-    for option, default in {
-        "--model_path TEXT, -m TEXT": "none, must be given",
-        "--sh_degree N": "that of the saved PLY",
-        "--white_background, -w": "that of the model",
-        "--debug": "off; reference",
-    }.items():
-        _, _, after = text.partition(f" {option} ")[2].partition("(default: ")
-        assert after.startswith(f"{default})"), option
 
 
 def _rasterized(view: Camera, gaussians: GaussianModel) -> dict[str, np.ndarray]:
@@ -272,14 +235,3 @@ def test_depth_and_alpha_are_written_on_request_as_the_rasterizer_drew_them(fold
                 # Half a step, and the rasterizer's roundings.
                 np.testing.assert_allclose(read_plane(file), expected, rtol=0, atol=0.5001 * scale + 1e-6 * largest)
                 assert largest > 0.1
-
-
-def test_planes_come_back_and_other_files_are_refused(tmp_path):
-    for values, largest in (([[0.0, 0.0]], None), ([[0.5, 2.0]], 1.0), ([[0.0, 0.25, 3.0]], None)):
-        write_plane(tmp_path / "a.png", np.array(values), largest)
-        np.testing.assert_allclose(read_plane(tmp_path / "a.png"), np.minimum(values, largest or 3.0), atol=3 / 65535)
-    Image.new("L", (2, 2)).save(tmp_path / "grey.png")
-    (tmp_path / "text.png").write_text("hello")
-    for name in ("grey", "text", "absent"):
-        with pytest.raises(UserError, match=f"{name}.png as a plane"):
-            read_plane(tmp_path / f"{name}.png")

@@ -1,7 +1,6 @@
 """render.py --path: the video, its frames, its memory, and every refusal."""
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -12,16 +11,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
-from gaussians import model, pipeline
+from gaussians import model
 from PIL import Image
-from synthetic import options_of
 
-from gaussian_renderer import render as draw
-from gaussian_renderer.free_view import free_view
-from splatting.camera_paths import render_path, video
+from splatting.camera_paths import render_path
 from splatting.camera_paths.keyframes import CameraPath, Keyframe
-from splatting.camera_paths.poses import poses_of
 from splatting.camera_paths.video import write_video
 from utils.system_utils import UserError
 
@@ -100,31 +94,6 @@ def test_the_video_of_a_file_shows_its_frames(run, tmp_path, capsys):
     assert not any((folder.parents[1] / name).exists() for name in ("train", "test"))
 
 
-def test_a_second_decoder_sees_neither_levels_nor_colours_shifted(tmp_path, monkeypatch):
-    """H.264 has a value of colour on the left one of two pixels, in the middle of two rows (its figure 6-1)."""
-    av = pytest.importorskip("av", reason="PyAV, a second decoder, is not installed")
-    monkeypatch.setattr(video, "CRF", 1)
-    columns, rows = np.meshgrid(np.arange(96), np.arange(64))
-    given = np.stack([2 * columns, 40 + 0 * rows, 3 * rows], axis=-1).astype(np.uint8)
-    write_video(tmp_path / "a.mp4", [given] * 12, 96, 64, 24)
-    with av.open(str(tmp_path / "a.mp4")) as container:
-        stream = container.streams.video[0]
-        assert (stream.average_rate, stream.frames, stream.duration * stream.time_base) == (24, 12, 0.5)
-        code = stream.codec_context
-        assert (code.name, code.pix_fmt) == ("h264", "yuv420p")
-        # Of ITU-T H.273: limited range, and BT.709 thrice.
-        assert (code.color_range, code.colorspace, code.color_primaries, code.color_trc) == (1, 1, 1, 1)
-        frames = list(container.decode(stream))
-    assert [frame.pts * stream.time_base * 24 for frame in frames] == list(range(12))
-    planes, share = frames[0].to_ndarray(format="yuv420p").astype(float), given / 255
-    luma = share @ [0.2126, 0.7152, 0.0722]
-    assert abs((planes[:64] - 16 - 219 * luma).mean()) < 0.1
-    for plane, channel, factor in zip(planes[64:].reshape(2, 32, 48), (2, 0), (1.8556, 1.5748), strict=True):
-        exact = 128 + 224 * (share[..., channel] - luma) / factor
-        left = (exact[::2, ::2] + exact[1::2, ::2]) / 2
-        assert abs((plane - left)[4:-4, 4:-4].mean()) < 0.1  # half a pixel would be 0.4
-
-
 @pytest.mark.parametrize(("name", "size", "count"), [("interpolate", None, 6), ("ellipse", (50, 34), 5)])
 def test_each_generated_path_has_its_name_size_and_length(run, name, size, count):
     folder = run("--path", name, "--seconds", "0.5", "--fps", "10", *(["--size", *size] if size else []))
@@ -148,20 +117,6 @@ def test_the_background_is_the_models_and_exposures_are_not_applied(run, out, tm
         assert (read(folder / "away" / "00000.png") == 255 * white).all()
 
 
-def test_the_lens_of_a_photo_is_ignored(run, out, _colmap_master):
-    """The scene's photos have principal points off centre. A path through a camera shows it centred."""
-    folder = run("--path", "interpolate", "--seconds", "0.5", "--fps", "4", "--frames")
-    scene = render.load_saved(options_of(_colmap_master, out, eval=True), 7)
-    first = scene.getTrainCameras()[0]
-    assert abs(first.cx - first.image_width / 2) > 1
-    pose = poses_of([first])
-    view = free_view(96, 64, first.FoVy, pose.positions[0], pose.quaternions[0], "cpu")
-    with torch.no_grad():
-        image = draw(view, scene.gaussians, pipeline(), torch.zeros(3))["render"]
-    shown = read(folder / "interpolate" / "00000.png").astype(float)
-    assert np.abs(shown - 255 * image.permute(1, 2, 0).numpy()).max() < 1.5
-
-
 def test_frames_of_an_earlier_run_are_removed_and_nothing_else(run, tmp_path):
     PATH.write(tmp_path / "a.json")
     folder = run("--path", tmp_path / "a.json", "--fps", 5, "--frames")
@@ -170,31 +125,6 @@ def test_frames_of_an_earlier_run_are_removed_and_nothing_else(run, tmp_path):
     assert written(folder) == ["a.mp4", "a/00000.png", "a/00001.png", "a/00002.png", "a/notes.png"]
     run("--path", tmp_path / "a.json", "--fps", 2)
     assert written(folder) == ["a.mp4", "a/notes.png"]
-
-
-def _resident() -> int:
-    """Bytes in memory of this process and of those that it started."""
-    tasks = Path("/proc/self/task").glob("*/children")
-    processes = ["self", *(child for task in tasks for child in task.read_text().split())]
-    pages = [int(Path(f"/proc/{process}/statm").read_text().split()[1]) for process in processes]
-    return sum(pages) * os.sysconf("SC_PAGE_SIZE")
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not list(Path("/proc/self/task").glob("*/children")), reason="/proc tells no memory of processes")
-def test_memory_does_not_grow_with_the_length(run, monkeypatch):
-    drawn, sizes = render_path.render, []
-
-    def watched(*args, **kwargs):
-        sizes.append(_resident() if len(sizes) in (150, 599) else 0)
-        return drawn(*args, **kwargs)
-
-    monkeypatch.setattr(render_path, "render", watched)
-    folder = run("--path", "ellipse", "--seconds", 20, "--size", 160, 120)
-    assert len(sizes) == 600
-    assert sizes[599] - sizes[150] < 8e6  # the frames between take 26 MB
-    known, frames = decoded(folder / "ellipse.mp4")
-    assert len(frames) == 600 and known["duration"] == 20
 
 
 # What is refused
@@ -267,25 +197,6 @@ def test_an_ffmpeg_that_dies_is_quoted_and_no_file_stays(run, out, tmp_path, mon
     assert written(out / "videos") == []
 
 
-def test_a_lack_of_memory_names_a_smaller_size(run, out, monkeypatch):
-    monkeypatch.setattr(render_path, "render", lambda *_, **__: (_ for _ in ()).throw(MemoryError()))
-    for words, size, remedy in (
-        ([], "96 x 64", r"lower --resolution \(-r\), or pass a smaller --size"),
-        (["--size", "64", "48"], "64 x 48", "pass a smaller --size"),
-    ):
-        with pytest.raises(UserError, match=rf"images of {size}\); {remedy}, or free memory that other programs use$"):
-            run("--path", "ellipse", *words)
-    assert written(out / "videos") == []
-
-
-def test_a_video_that_cannot_be_placed_is_refused(run, out):
-    (out / "videos" / "ours_7" / "ellipse.mp4").mkdir(parents=True)
-    with pytest.raises(UserError, match="^cannot write .*ellipse.mp4 .Is a directory.; free space"):
-        run("--path", "ellipse", "--seconds", "0.2")
-    (out / "videos" / "ours_7" / "ellipse.mp4").rmdir()
-    assert written(out / "videos") == []
-
-
 def test_an_interrupted_video_leaves_nothing(tmp_path, monkeypatch):
     started: list[subprocess.Popen] = []
     popen = subprocess.Popen
@@ -298,11 +209,3 @@ def test_an_interrupted_video_leaves_nothing(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         write_video(tmp_path / "a.mp4", frames(), 64, 48, 30)
     assert started[0].returncode is not None and list(tmp_path.iterdir()) == []
-
-
-def test_names_that_ffmpeg_would_take_for_something_else(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for name in ("-y.mp4", "a:b.mp4", "pipe:1.mp4", "%d.mp4", "ä ü.mp4"):
-        write_video(Path(name), patches(2), 64, 48, 30)
-        assert len(decoded(Path.cwd() / name)[1]) == 2
-    assert len(list(tmp_path.iterdir())) == 5

@@ -1,6 +1,5 @@
 """The viewer's frames, and when they are drawn: no server, no browser."""
 
-import asyncio
 import contextlib
 import math
 from dataclasses import replace
@@ -20,11 +19,11 @@ from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.splats.reading import read_splats
 from splatting.camera_paths.keyframes import read_camera_path
-from splatting.viewer import frusta, legend, path_tab, views
+from splatting.viewer import legend, path_tab, views
 from splatting.viewer.frames import LONGEST, Frame, Frames, inside, shown_part
-from splatting.viewer.page import used_degree, write_crop
+from splatting.viewer.page import write_crop
 from splatting.viewer.path_tab import PathTab
-from splatting.viewer.tabs import FileName, first_box
+from splatting.viewer.tabs import FileName
 from splatting.viewer.views import Pose, SceneCameras, Settings, canvas, fov_of_canvas, pose_of
 from splatting.viewer.watchers import MOVING, STILL, STILL_AFTER, Budget, Watchers
 from utils.graphics_utils import camera_center
@@ -85,6 +84,10 @@ def test_modes_show_what_they_say(gaussians):
     np.testing.assert_array_equal(drawn(gaussians, mode=views.OPACITY), white)
     depth = drawn(gaussians, mode=views.DEPTH)
     assert not depth[white[..., 0] < 127].any() and depth[white[..., 0] > 128].any(axis=1).all()
+    low = drawn(gaussians, sh_degree=0)
+    gaussians.active_sh_degree = 0
+    np.testing.assert_array_equal(low, rendered(gaussians))
+    gaussians.active_sh_degree = 3
     # Without an image of the scene there is no error to show.
     np.testing.assert_array_equal(drawn(gaussians, mode=views.ERROR), rendered(gaussians))
     # The count of a pixel is that of its tile's list up to the last one blended.
@@ -159,21 +162,6 @@ def test_what_cleaning_leaves_and_what_it_takes_are_drawn_apart(gaussians):
     assert shown_part(gaussians, PLAIN, kept) is gaussians
 
 
-def test_the_sh_degree_of_a_frame_is_not_that_of_the_model(gaussians):
-    low = shown_part(gaussians, replace(PLAIN, sh_degree=1))
-    assert low.active_sh_degree == 1 and gaussians.active_sh_degree == 3
-    assert shown_part(gaussians, replace(PLAIN, sh_degree=9)) is gaussians
-    plain = drawn(gaussians, sh_degree=0)
-    gaussians.active_sh_degree = 0
-    np.testing.assert_array_equal(plain, rendered(gaussians))
-
-
-def test_bands_without_a_coefficient_are_not_offered(gaussians):
-    for degree, bands in ((3, 15), (2, 7), (1, 3), (0, 0)):
-        gaussians._features_rest.data[:, bands:] = 0
-        assert used_degree(gaussians) == degree
-
-
 @pytest.mark.parametrize("size", [(300, 100), (96, 64), (60, 200)])
 def test_left_of_the_slider_is_the_scenes_image_and_right_of_it_the_render(gaussians, scene_cameras, size):
     name, camera = next(iter(scene_cameras.by_name.items()))
@@ -185,13 +173,6 @@ def test_left_of_the_slider_is_the_scenes_image_and_right_of_it_the_render(gauss
     np.testing.assert_array_equal(inner[:, :23], camera.target(BLACK).permute(1, 2, 0).numpy()[:, :23])
     np.testing.assert_array_equal(inner[:, 26:], rendered(gaussians, camera)[:, 26:])
     assert (inner[:, 23:25] == 255).all()  # the slider's line
-
-
-def test_a_slim_window_gets_no_more_pixels_than_others(gaussians, scene_cameras, monkeypatch):
-    monkeypatch.setattr("splatting.viewer.frames.LONGEST", 100)
-    name, camera = next(iter(scene_cameras.by_name.items()))
-    shown = drawn(gaussians, at(camera, 40, 400), scene_cameras, camera=name, comparison=views.SLIDER)
-    assert shown.shape == (100, 10, 3)
 
 
 def test_side_by_side_are_image_render_and_error(gaussians, scene_cameras):
@@ -302,26 +283,6 @@ def test_what_a_browser_sends_is_checked():
         assert 0.09 < pose.width / pose.height < 11
 
 
-def test_cameras_are_named_and_the_view_begins_upright(scene_cameras):
-    assert len(scene_cameras.by_name) == 17
-    assert {name.split()[0] for name in scene_cameras.by_name} == {"train", "test"}
-    assert math.isclose(np.linalg.norm(scene_cameras.up), 1)
-    for camera in scene_cameras.by_name.values():
-        up, place = np.asarray(scene_cameras.up_at(camera.R)), camera_center(camera.R, camera.T)
-        assert up @ -camera.R[:, 1] > 0 and abs(up @ camera.R[:, 0]) < 1e-9
-        assert (scene_cameras.target_of(place, camera.R) - place) @ camera.R[:, 2] > 0
-
-
-def test_the_crop_box_begins_around_most_gaussians():
-    positions = torch.randn(5000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 5.0, 0.1])
-    positions[0], positions[1] = 1e6, math.nan
-    low, high = (torch.tensor(corner) for corner in first_box(positions))
-    share = inside(positions, low.tolist(), high.tolist()).float().mean()
-    assert 0.85 < share < 0.95 and high.max() < 15
-    for nowhere in (torch.zeros(0, 3), torch.full((3, 3), math.nan)):
-        assert first_box(nowhere) == ((-1.0,) * 3, (1.0,) * 3)
-
-
 class Gui:
     """A stand-in for viser's controls."""
 
@@ -407,32 +368,6 @@ def test_keyframes_are_listed_gone_to_and_deleted_anywhere(recorded, monkeypatch
     assert len(recorded.keyframes) == 3
 
 
-def test_a_path_is_played_in_its_time_and_stopped(recorded, monkeypatch):
-    clock = SimpleNamespace(now=5.0)
-    monkeypatch.setattr(path_tab, "time", SimpleNamespace(perf_counter=lambda: clock.now))
-    monkeypatch.setattr(path_tab, "_BETWEEN", 0.0)
-    for x in (1.0, 3.0):
-        recorded.add(_client(position=[x, 0, 0]))
-    recorded.easing.value = "linear"
-
-    async def play(stopped_after: int) -> list[float]:
-        recorded.turn(client := _client())
-        places = []
-        while recorded.play.label == "Stop":
-            await asyncio.sleep(0)  # a step of the path
-            places.append(float(client.camera.position[0]))
-            clock.now += 0.5
-            if len(places) == stopped_after:
-                recorded.turn(client)
-        return places
-
-    assert sorted({*asyncio.run(play(stopped_after=99))}) == [1.0, 1.5, 2.0, 2.5, 3.0]
-    assert max(asyncio.run(play(stopped_after=3))) < 3.0 and recorded.play.label == "Play"
-    recorded.keyframes.pop()
-    with pytest.raises(UserError, match="at least 2 keyframes"):
-        asyncio.run(play(99))
-
-
 @pytest.mark.parametrize("name", ["", "..", "../a", "a/b", "a\\b", "/etc/x", "a.json", "a\0b", "ä", "a\n", "x" * 65])
 def test_no_name_leads_out_of_the_folder(server, tmp_path, name):
     file = FileName(server, tmp_path, "crop", ".ply")
@@ -442,17 +377,6 @@ def test_no_name_leads_out_of_the_folder(server, tmp_path, name):
         file.path()
     (tmp_path / "crop1.ply").touch()
     assert FileName(server, tmp_path, "crop", ".ply").path() == tmp_path / "crop2.ply"
-
-
-def test_the_next_file_gets_the_next_name_and_a_typed_name_stays(server, tmp_path):
-    file = FileName(server, tmp_path, "crop", ".ply")
-    file.path().touch()
-    assert file.replaced() == " (replaced)"
-    file.suggest()
-    assert file.path().name == "crop2.ply" and not file.replaced() and file.names() == ("crop1",)
-    file.field.value = "crop1"
-    file.suggest()
-    assert file.field.value == "crop1"
 
 
 def test_a_crop_is_written_as_any_program_reads_it(gaussians, tmp_path):
@@ -466,10 +390,3 @@ def test_a_crop_is_written_as_any_program_reads_it(gaussians, tmp_path):
     with pytest.raises(UserError, match="no Gaussians; move its corners"):
         write_crop(tmp_path / "b.ply", gaussians, ((9.0,) * 3, (8.0,) * 3), antialiasing=False)
     assert not (tmp_path / "b.ply").exists()
-
-
-def test_drawn_cameras_fade_near_the_browsers_own():
-    distances = np.array([0.0, 1.9, 3.0, 5.0, 7.0, 8.0, 1e9])
-    opacities = frusta.faded(distances)
-    assert opacities[:2].max() == 0 and opacities[-2:].min() == 1
-    assert (np.diff(opacities) >= 0).all() and len(set(opacities[1:6])) == 5

@@ -5,12 +5,10 @@ import http.client
 import math
 import socket
 import sys
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from gaussians import model, pipeline
 from synthetic import options_of
 
@@ -18,17 +16,15 @@ viser = pytest.importorskip("viser", reason="viser is not installed: pip install
 
 import msgspec  # noqa: E402
 from viser_client import Client, get  # noqa: E402
-from waiting import LIMIT, wait_for  # noqa: E402
-from websockets.asyncio.server import serve as serve_websockets  # noqa: E402
+from waiting import wait_for  # noqa: E402
 from websockets.exceptions import InvalidStatus  # noqa: E402
 
 from scene import Scene  # noqa: E402
-from splatting.camera_paths.without_scene import WithoutScene, circle  # noqa: E402
 from splatting.viewer import server as servers  # noqa: E402
 from splatting.viewer import watchers  # noqa: E402
 from splatting.viewer.page import Page, answer  # noqa: E402
 from splatting.viewer.tabs import first_box  # noqa: E402
-from splatting.viewer.views import GOES, WHOLE, Settings  # noqa: E402
+from splatting.viewer.views import Settings  # noqa: E402
 from utils.graphics_utils import camera_center  # noqa: E402
 from utils.system_utils import UserError  # noqa: E402
 
@@ -131,39 +127,10 @@ def test_without_viser_a_sentence_says_what_to_install(monkeypatch):
     servers.check_port(None)
 
 
-def test_a_server_that_asks_no_gate_does_not_stay(monkeypatch):
-    stopped = []
-    monkeypatch.setattr(servers, "_guarded", lambda title: contextlib.nullcontext([]))
-    monkeypatch.setattr(servers, "stop", lambda server, stop=servers.stop: (stopped.append(server), stop(server)))
-    with pytest.raises(UserError, match="cannot be guarded"):
-        servers.serve(ANY, "test")
-    assert len(stopped) == 1
-
-
 CLICK = {
     "type": "SceneNodeClickMessage", "name": "/cameras", "instance_index": None, "ray_origin": [0, 0, 0],
     "ray_direction": [0, 0, 1], "screen_pos": [0.5, 0.5], "modifier": None, "owner": "",
 }  # fmt: skip
-
-
-def _opening(port: int) -> bytes:
-    """A request for a websocket."""
-    asks = [
-        "GET / HTTP/1.1", f"Host: 127.0.0.1:{port}", "Upgrade: websocket", "Connection: Upgrade",
-        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", "Sec-WebSocket-Version: 13",
-        f"Sec-WebSocket-Protocol: viser-v{viser.__version__}", "", "",
-    ]  # fmt: skip
-    return "\r\n".join(asks).encode()
-
-
-def test_a_browser_that_answers_nothing_does_not_hold_the_end(monkeypatch):
-    monkeypatch.setitem(serve_websockets.__init__.__kwdefaults__, "close_timeout", 3600)  # not to be waited for
-    own = Served()
-    with socket.create_connection(("127.0.0.1", own.port), LIMIT) as one:
-        one.sendall(_opening(own.port))
-        assert b"101" in one.recv(100)
-        servers.stop(own.server)  # which itself waits for a thread that is held for seconds only
-        wait_for(lambda: not own.server._websock_server._server_thread.is_alive())
 
 
 @pytest.fixture(scope="module")
@@ -202,15 +169,6 @@ def test_each_browser_gets_pictures_of_its_own_camera(page, monkeypatch):
         assert _answered(page, one).shape == (40, 60, 3)  # coarse while it moves
 
 
-def test_settings_out_of_range_count_as_the_nearest(page):
-    with _restored(page):
-        page.view.scaling.value, page.view.background.value = 1e9, (999, -5, 0)
-        page.view.degree.value = 1.7  # as no page sends it; the rasterizer takes whole ones alone
-        settings = page.settings()
-        assert settings.scaling == 2.0 and settings.background == (1.0, 0.0, 0.0)
-        assert type(settings.sh_degree) is int and settings.sh_degree == 1
-
-
 @pytest.mark.parametrize(
     "wrong",
     [{"size": (0, 0)}, {"size": (-5, 1e18)}, {"position": (0.0, 0.0, 0.0)}, {"position": (1e18, 0.0, 0.0)}],
@@ -233,24 +191,6 @@ def test_a_browser_of_any_window_and_place_goes_to_a_camera(page, capfd, wrong):
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_a_crop_box_that_many_drag_is_drawn_once(page, capfd):
-    crop, ends = page.view.crop, page.view.box[0]
-    with Client(page.url) as one, Client(page.url) as other:
-        for client in (one, other):
-            client.look()
-        for step in range(200):
-            _set(one, crop, step % 2 == 0)
-            _set(other, ends, [-float(step + 1), -1.0])
-        wait_for(lambda: ends.value[0] == -200.0 and not crop.value)
-        _set(one, crop, True)
-        wait_for(lambda: page.view._edges is not None)
-        _set(one, crop, False)
-        # Updates that came before may still draw it in between.
-        shown = page.server.scene._handle_from_node_name
-        wait_for(lambda: not crop.value and page.view._edges is None and "/crop box" not in shown)
-    assert "rror" not in capfd.readouterr().err
-
-
 def test_a_frame_that_cannot_be_drawn_is_told_once_until_one_can_and_ends_nothing(page, monkeypatch, capfd):
     def broken(*_: object) -> None:
         raise OSError("no file a\udcff.png")
@@ -267,27 +207,6 @@ def test_a_frame_that_cannot_be_drawn_is_told_once_until_one_can_and_ends_nothin
             client.look((0.0, 0.0, -4.0), size=(60, 60))
             assert _answered(page, client).shape[2] == 3
             assert capfd.readouterr().err.count("could not draw a frame (no file") == 1, told
-
-
-def test_a_browser_that_leaves_while_its_frame_is_drawn_is_not_worth_a_word():
-    with warnings.catch_warnings(record=True) as heard:
-        warnings.simplefilter("always")
-        with Served() as served:
-            clients = served.server.get_clients
-            with Client(served.url) as client:
-                client.look()
-                wait_for(clients)
-                handle = next(iter(clients().values()))
-            wait_for(lambda: not clients())
-            handle.scene.set_background_image(np.zeros((2, 2, 3), np.uint8))
-    assert not heard
-
-
-def test_names_that_are_not_utf8_are_shown(page):
-    with Client(page.url) as client:
-        sent, texts = "", (r"a\udcff", r"train 0: b\udcff.png")
-        while not all(repr(text) in sent for text in texts):
-            sent += repr(client.messages())
 
 
 def test_each_browser_reads_the_scale_of_its_own_frame(page):
@@ -344,29 +263,6 @@ def test_reset_gives_the_view_its_first_values(page):
         _set(client, _button(page, "Reset"), True)
         wait_for(lambda: view.read() == first and not view.crop_file.field.visible)
     assert view.corners() == first_box(page._gaussians.get_xyz)
-
-
-def test_cleaning_is_shown_where_it_is_known(page, _colmap_master, tmp_path):
-    assert not page.view.cleaning.visible and page.frames.kept is None
-    scene = Scene(options_of(_colmap_master, tmp_path, eval=True), model(200), shuffle=False, start=False)
-    kept = torch.arange(200) > 20
-    own = Page(ANY, scene, pipeline(), False, False, kept)
-    try:
-        assert own.view.cleaning.visible and own.settings().cleaning == WHOLE
-        own.view.cleaning.value = GOES
-        assert own.settings().cleaning == GOES and own.frames.kept is kept
-    finally:
-        own.stop()
-
-
-def test_the_page_of_a_file_has_its_name(tmp_path):
-    gaussians = model(20)
-    around = circle(gaussians.get_xyz.detach().numpy())
-    own = Page(ANY, WithoutScene(gaussians, str(tmp_path), "fox.spz", around), pipeline(), False, False)
-    try:
-        assert b"<title>fox.spz</title>" in get(own.server.get_port())[2] and not own.iteration.visible
-    finally:
-        own.stop()
 
 
 def test_browsers_begin_at_the_chosen_camera_and_render_alone_leads_nowhere(page):

@@ -1,18 +1,15 @@
 """One-file HTML of a model in a real browser, opened from disk."""
 
-import dataclasses
 import html
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
 from html_scene import FOV, SIZE, balls, cameras
 from tab_pictures import BACKGROUND, SECONDS, expected, psnr, settled
 
 from gaussian_renderer.free_view import free_view
-from splatting.camera_paths.generated import Ellipse
 from splatting.camera_paths.poses import poses_of
 from splatting.exports.html import write_html
 from splatting.exports.page_start import narrowed
@@ -80,12 +77,6 @@ def test_a_frame_of_a_notebook_shows_the_page(tab, page, splats, tmp_path):
     assert link.get_attribute("href") and link.evaluate("e => getComputedStyle(e).display") == "none"
 
 
-def test_a_bookmark_shows_the_picture_of_its_camera(tab, page, splats):
-    show(tab, page)
-    tab.evaluate("viewer.selectAnnotation(3)")
-    assert psnr(settled(tab), expected(splats, cameras()[3])) > 33
-
-
 @pytest.mark.parametrize(("width", "height"), [(1280, 720), (390, 844)])
 def test_a_photo_fills_a_window_of_any_shape(browser, page, splats, width, height):
     """Nothing beside the photo is shown; on a phone the help, which covers the model, begins closed."""
@@ -105,31 +96,6 @@ def test_a_photo_fills_a_window_of_any_shape(browser, page, splats, width, heigh
 def placed(camera) -> tuple[list[float], list[float]]:
     poses = poses_of([camera])
     return poses.positions[0].tolist(), poses.quaternions[0].tolist()
-
-
-def test_the_animation_goes_along_the_path(tab, splats, tmp_path):
-    views = cameras(rolls=())
-    path = Ellipse(poses_of(views), 8.0)
-    write_html(tmp_path / "page.html", splats, views, lambda _: path, BACKGROUND)
-    show(tab, tmp_path / "page.html")
-    assert psnr(settled(tab), expected(splats, views[0])) > 33
-    place = "(({ x, y, z }) => [x, y, z])(viewer.app.root.findByName('camera').getPosition())"
-    tab.evaluate("viewer.state.animationPaused = true; viewer.seek(2)")
-    settled(tab)
-    quarter = tab.evaluate(place)
-    tab.evaluate("viewer.seek(6)")
-    settled(tab)
-    opposite = tab.evaluate(place)
-    across = np.linalg.norm(np.subtract(path.at(2.0).position, path.at(6.0).position))
-    assert math.dist(quarter, opposite) == pytest.approx(across, rel=0.01)
-
-
-def test_antialiasing_is_that_of_the_model(tab, splats, tmp_path):
-    small = dataclasses.replace(splats, log_scales=splats.log_scales - 3.2, antialiasing=True)
-    write_html(tmp_path / "page.html", small, cameras(), background=BACKGROUND)
-    show(tab, tmp_path / "page.html")
-    shown, other = settled(tab), dataclasses.replace(small, antialiasing=False)
-    assert psnr(shown, expected(small, cameras()[0])) > psnr(shown, expected(other, cameras()[0])) + 5
 
 
 def test_a_damaged_page_says_so(browser, page, tmp_path):

@@ -13,20 +13,6 @@ WINDOW = 1280, 720
 SIZES = (1280, 720), (390, 844)
 
 
-def test_a_scene_is_shown_before_its_training(tab, tmp_path):
-    make_colmap_scene(tmp_path / "attic")
-    with serving("view.py", "-s", tmp_path / "attic", "--port", 0) as (address, _):
-        for width, height in SIZES:
-            tab.set_viewport_size({"width": width, "height": height})
-            tab.goto(address)
-            tab.get_by_role("tab", name="Photos").click()
-            assert tab.title() == "attic"
-            assert labelled(tab, "Points").input_value() == "300"
-            assert tab.get_by_text("Iteration", exact=True).count() == 0
-            assert tab.get_by_role("checkbox", name="Draw cameras").is_checked()
-            tab.get_by_role("combobox", name="Compare").wait_for()
-
-
 def test_a_paused_training_says_its_length_and_ends_by_a_signal(tab, tmp_path):
     make_colmap_scene(tmp_path / "attic")
     words = "-s", tmp_path / "attic", "-m", tmp_path / "out", "--iterations", 7000, "--viewer", 0, "--paused"

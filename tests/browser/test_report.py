@@ -13,7 +13,7 @@ from report_runs import set_runs
 from splatting.evaluation.report import make_report, write_report
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Locator, Page
+    from playwright.sync_api import Page
 
 pytestmark = pytest.mark.browser
 WINDOW = 1280, 720
@@ -79,22 +79,6 @@ def test_each_scene_fills_a_screen_and_nothing_overflows(tab, report, width, hei
     assert len(figures) == 2 * 2 and min(figure.bounding_box()["width"] for figure in figures) > 330
 
 
-def test_a_table_that_is_too_wide_has_a_shadow_at_its_edge(tab, report):
-    tab.set_viewport_size({"width": 390, "height": 844})
-    tab.goto(report.as_uri())
-    wide = [it for it in tab.locator(".scroll:visible").all() if it.evaluate("it => it.scrollWidth > it.clientWidth")]
-    assert wide
-    for box in wide:
-        assert _edge(box) < 190  # grey
-        box.evaluate("it => { it.scrollLeft = it.scrollWidth; }")
-        assert _edge(box) > 240
-
-
-def _edge(box: "Locator") -> float:
-    """The median brightness of a table's last column of pixels but one."""
-    return float(np.median(np.asarray(Image.open(io.BytesIO(box.screenshot())).convert("L"))[:, -2]))
-
-
 def test_the_option_sets_lie_side_by_side_for_the_same_view(tab, report):
     show(tab, report)
     boxes = [
@@ -132,15 +116,3 @@ def test_the_slider_moves_between_photo_and_render(tab, report):
     assert colours(tab) == pytest.approx([0.6, 0.4], abs=0.07)
     slider.press("Home")
     assert colours(tab) == pytest.approx([0, 1], abs=0.03)
-
-
-def test_without_script_and_on_paper_the_pictures_lie_side_by_side(browser, tab, report):
-    context = browser.new_context(java_script_enabled=False, viewport={"width": WINDOW[0], "height": WINDOW[1]})
-    plain = context.new_page()
-    show(plain, report)
-    show(tab, report)
-    tab.emulate_media(media="print")
-    for page in (plain, tab):
-        photo, renders, _ = page.evaluate(SHARES)
-        assert photo > 3000 and renders == pytest.approx(3 * photo, rel=0.01) and colours(page)[1] > 0.9
-    context.close()
