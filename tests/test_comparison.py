@@ -1,17 +1,14 @@
 """Runs beside each other: spread, option sets, published tables, and the tables of them."""
 
 import json
-import re
 import statistics
 from pathlib import Path
 
 import pytest
-from PIL import Image
 from report_runs import run_of, set_runs
 
 import train
 from splatting.evaluation.comparison import (
-    comparable_sets,
     compare,
     default_set,
     published_tables,
@@ -21,9 +18,8 @@ from splatting.evaluation.comparison import (
 )
 from splatting.evaluation.configs import read_configs, shipped
 from splatting.evaluation.plan import DATASETS
-from splatting.evaluation.report import make_report, render
+from splatting.evaluation.report import make_report
 from splatting.evaluation.tables import result_tables
-from splatting.host.listing import markdown_table
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]
@@ -34,26 +30,6 @@ def test_spread():
     assert spread([1.0, 2.0, 4.0]) == {"mean": pytest.approx(7 / 3), "std": std, "values": [1.0, 2.0, 4.0]}
     assert spread([5.0])["std"] is None and spread([5.0])["mean"] == 5.0
     assert spread([5.0, None])["mean"] is None and spread([])["mean"] is None
-
-
-def test_a_failed_seed_is_left_out_and_named():
-    runs = [run_of(None, seed, (1, 1.0 + seed, 9), failure=[None, {"stage": "train"}][seed == 1]) for seed in range(3)]
-    (row,) = summarise(runs)
-    assert row["PSNR"] == {"mean": 2.0, "std": pytest.approx(2**0.5), "values": [1.0, 3.0]}
-    assert row["seeds"] == [0, 2] and row["failed_seeds"] == [1]
-
-
-def test_what_cannot_be_compared_is_left_out():
-    runs = set_runs()
-    assert comparable_sets(runs[:2], "attic") == {} == comparable_sets(runs, "cellar")  # one set alone
-    runs[2]["finished"] = False
-    runs[4]["apart"] = runs[5]["apart"] = True
-    assert {name: len(found) for name, found in comparable_sets(runs, "attic").items()} == {"adc": 2, "fast": 1}
-
-
-def test_unequal_shares_of_the_processors_are_told():
-    shares = [run | {"wall_seconds": 100, "cpu_seconds": 60 if run["config"] == "adc" else 90} for run in set_runs()]
-    assert "attic: the trainings got 60 to 90 % of a processor. Where" in make_report(["x"], shares)["warnings"][0]
 
 
 @pytest.mark.parametrize(
@@ -80,26 +56,6 @@ def test_a_set_that_stands_apart_is_told_why(change, why):
     assert "small" not in str(report["gains"])
     _, table = result_tables(report["summary"])
     assert f"attic, small: {why}." in table.title and "small" in [row[1] for row in table.rows]
-
-
-def test_seeds_of_different_ground_truth_are_told_so():
-    runs, why = set_runs(), "its seeds were scored on different ground truth"
-    runs[5]["ground_truth_sha256"] = "b" * 64
-    assert {run["why_apart"] for run in stand_apart(runs)[4:]} == {why}
-    other = runs[2] | {"ground_truth_sha256": "b" * 64}  # both ground truths have two runs, so that all stand apart
-    reasons = [run["why_apart"] for run in stand_apart([runs[4], runs[4] | {"seed": 2}, runs[5], other])]
-    assert reasons == [why] * 3 + ["the pixels of its test views differ, or which of them count"]
-
-
-def test_one_option_set_has_no_comparisons(tmp_path):
-    shown = {"attic": {"curves": [], "poses": [], "masked": [], "views": []}}
-    page = render("md", make_report(["x"], set_runs()[:2]), shown, tmp_path)
-    assert "### Gain over" not in page and "robust_mask" not in page
-    Image.new("RGB", (2, 2)).save(tmp_path / "masked.png")
-    shown["attic"]["masked"] = [tmp_path / "masked.png"]
-    page = render("html", make_report(["x"], set_runs()), shown, tmp_path)
-    assert re.search(r"<summary>What --robust_mask leaves out of photos</summary>\s*<figure>", page)
-    assert "<h3>Gain over adc on the same seeds</h3>" in page
 
 
 def test_seeds_that_end_by_themselves_share_a_row():
@@ -139,13 +95,6 @@ def test_synthetic_scenes_compare_at_full_size_over_white_only(change):
     assert bool(found) == (not change)
     if found:
         assert found[0]["numbers"] == {"PSNR": {"ours": 35.0, "published": 35.78, "difference": pytest.approx(-0.78)}}
-
-
-def test_markdown_keeps_columns_apart():
-    table = ["a", "b"], [["x|y", "1"], ["z", "22"]]
-    right = ["| a    |   b |", "| ---- | --: |", "| x\\|y |   1 |", "| z    |  22 |"]
-    left = ["| a    | b   |", "| ---- | --- |", "| x\\|y | 1   |", "| z    | 22  |"]
-    assert [markdown_table(*table).splitlines(), markdown_table(*table, right=False).splitlines()] == [right, left]
 
 
 def test_shipped_sets_are_options_of_training(tmp_path, monkeypatch):

@@ -7,15 +7,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import torch
-from report_runs import run_of
 
 import train
-from splatting.evaluation import comparison
 from splatting.evaluation.model_folder import training_joules
-from splatting.evaluation.tables import MAIN, means_table, result_tables
 from splatting.evaluation.training_log import Stopwatch, TrainingLog
-from splatting.host.energy import joules_counter, nvml_name
+from splatting.host.energy import joules_counter
 
 
 class NvmlError(Exception):
@@ -66,13 +62,6 @@ def test_without_nvml_or_its_answer_there_are_none(used, monkeypatch, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_nvml_knows_a_gpu_by_its_uuid(monkeypatch):
-    for properties, name in ((SimpleNamespace(uuid="1f2e"), "GPU-1f2e"), (SimpleNamespace(), None)):
-        monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device, found=properties: found)
-        assert nvml_name(torch.device("cuda")) == name
-    assert nvml_name(torch.device("cpu")) is None
-
-
 def test_a_stopwatch_counts_no_joules_of_pauses():
     meter = [100.0]
     clock = Stopwatch(lambda: meter[0])
@@ -110,7 +99,6 @@ def test_a_log_adds_those_of_the_runs_that_it_resumes(tmp_path):
 
 
 def test_a_training_writes_its_joules_where_they_are_known(colmap_scene, tmp_path, monkeypatch):
-    """No byte of the model depends on them."""
     words = ["-s", str(colmap_scene), "--iterations", "4", "--checkpoint_iterations", "2", "--disable_viewer", "--eval"]
     train.main([*words, "-m", str(tmp_path / "without")])
     assert _joules(tmp_path / "without") == [None, None]
@@ -120,24 +108,3 @@ def test_a_training_writes_its_joules_where_they_are_known(colmap_scene, tmp_pat
     train.main([*words, "-m", str(tmp_path / "with")])
     first, last = _joules(tmp_path / "with")
     assert 0 < first < last
-    plys = [tmp_path / name / "point_cloud/iteration_4/point_cloud.ply" for name in ("without", "with")]
-    assert plys[0].read_bytes() == plys[1].read_bytes()
-
-
-def test_reports_have_a_column_of_joules_where_a_training_has_them():
-    runs = [run_of("adc", seed, (10, 20.0, 100), (40, 31.0, 300)) for seed in (0, 1)]
-    head = "GPU energy (J)"
-
-    def cells() -> dict[str, str]:
-        (table,) = result_tables(comparison.summarise(comparison.stand_apart(runs)), MAIN)
-        return dict(zip(table.header, table.rows[0], strict=True))
-
-    assert head not in cells()
-    for run, joules in zip(runs, (19_000.0, 21_000.0), strict=True):
-        run["iterations"]["20"]["joules"] = joules
-    assert cells()[head] == "20,000 ± 1,414"
-    runs[0]["iterations"]["20"]["joules"] = None
-    assert head not in cells()
-
-    mean = dict.fromkeys(comparison.QUANTITIES) | {"config": None, "group": "deepblending", "iteration": 7}
-    assert head not in means_table([mean]).header and head in means_table([mean | {"joules": 5.0}]).header

@@ -16,21 +16,17 @@ from PIL import Image
 from plyfile import PlyData
 from skimage.metrics import peak_signal_noise_ratio
 
-import render
 import train
 from gaussian_renderer.scored_views import mean_scores
 from splatting.evaluation.curve_recorder import (
     CurveDrawer,
     CurveRecorder,
     curve_points,
-    drawn,
-    evenly_spread,
 )
 from splatting.evaluation.error_curve import (
     COLUMNS,
     Row,
     best_test,
-    common_subset,
     continue_curve,
     peak_advice,
     read_curve,
@@ -41,7 +37,6 @@ from splatting.evaluation.error_curve import (
 from splatting.evaluation.training_log import TrainingLog
 from splatting.host import clock, memory
 from splatting.training import objective
-from splatting.training.scores import Scores
 from utils.loss_utils import ssim
 from utils.system_utils import UserError
 
@@ -116,31 +111,6 @@ class TestFile:
         assert re.fullmatch(r"warning: .*error_vs_time.csv cannot be read .*\n", capsys.readouterr().err)
         assert not path.exists()
 
-    @pytest.mark.parametrize(
-        ("columns", "lines"),
-        [
-            ("", "3,0.3,0.4,7,,,20.25,,,,\n5,0.5,0.6,7,,,21.25,,,,\n"),
-            (",subset,estimated", "2,0.2,0.3,7,,,9.5,,,,,4,1\n3,0.3,0.4,7,,,20.25,,,,,,\n5,0.5,0.6,7,,,21.25,,,,,,\n"),
-            (",subset,estimated,test_depth", "3,0.3,0.4,7,,,20.25,,,,,,,0.1\n5,0.5,0.6,7,,,21.25,,,,,,,0.1\n"),
-        ],
-    )
-    def test_older_files_are_read_and_continued_without_their_estimates(self, tmp_path, columns, lines):
-        path = tmp_path / "error_vs_time.csv"
-        path.write_text(HEADER.replace(",subset", columns) + lines)
-        wanted = [_row(3, 20.25, gaussians=7, wall_seconds=0.4), _row(5, 21.25, gaussians=7, wall_seconds=0.6)]
-        assert read_curve(path) == wanted and whole_sets(wanted) == wanted
-        assert continue_curve(tmp_path, 4) == wanted[:1]
-        assert path.read_text() == HEADER + "3,0.3,0.4,7,,,20.25,,,,,\n"
-
-    def test_curves_compare_on_the_views_that_all_score_at_most_points(self):
-        part, whole = [_row(t, 10.0, subset=2) for t in (1, 2, 4)], [_row(t, 11.0) for t in (4, 8)]
-        other = [_row(t, 10.0, subset=4) for t in (1, 2, 4)]
-        assert common_subset([[*part, *whole], part + whole[:1]]) == 2
-        assert common_subset([[*part, *whole], [*other, *whole]]) is None  # other views
-        assert common_subset([[*part[:2], *whole]]) is common_subset([]) is common_subset([part, other]) is None
-        assert common_subset([part, [_row(1, None)], []]) == 2
-        assert rows_on(part + whole, 2) == part and rows_on(part + whole, None) == whole
-
     def test_what_a_run_goes_on_from(self, tmp_path):
         path, figure = tmp_path / "error_vs_time.csv", tmp_path / "error_vs_time.png"
         with pytest.raises(UserError, match="--eval"):
@@ -152,27 +122,6 @@ class TestFile:
         assert continue_curve(tmp_path, 5) == rows[:2]
         assert read_curve(path) == rows[:2] and not figure.exists()
         assert continue_curve(tmp_path, 0) == [] and not path.exists()
-
-
-def _pace(growth: float, iterations: int) -> Callable[[int], float]:
-    """Cost of an iteration: models grow, most of it in the first half; from random points they shrink."""
-    return lambda t: 1 + growth * min(1.0, 2 * t / iterations)
-
-
-@pytest.mark.parametrize("growth", [-0.75, 0.0, 30.0])
-@pytest.mark.parametrize("iterations", [200, 600, 2000, 30_000])
-class TestCosts:
-    """Of a view 0.46 iterations, as measured on a CPU."""
-
-    @pytest.mark.parametrize("views", [1, 7, 25, 200])
-    def test_twelve_points_within_five_percent(self, views, growth, iterations):
-        """views: of a set. The whole sets at the end, and a view of each set between, are taken at any cost."""
-        pace = _pace(growth, iterations)
-        points, size = curve_points(iterations, [-1, iterations], 2, views)
-        assert len(points) >= 12 and max(points) < iterations and 1 <= size <= views
-        whole, training = 0.46 * 2 * views * pace(iterations), sum(pace(t) for t in range(1, iterations + 1))
-        spent = sum(0.46 * 2 * pace(t) for t in points)
-        assert whole + size * spent < max(0.05 * training, 1.05 * (whole + spent))
 
 
 @pytest.mark.parametrize(("iterations", "views"), [(200, 4), (300, 8), (600, 8), (2000, 40)])
@@ -199,10 +148,6 @@ class TestPoints:
             points, found = curve_points(iterations, [-1, 40_000], 2, views, taken)
             assert (len(points), found) == (count, size)
             np.testing.assert_allclose(np.divide(sorted(points)[1:], sorted(points)[:-1]), ratio, rtol=1 / 117)
-
-    def test_a_short_training_has_no_points_between(self):
-        assert curve_points(199, [90], 2, 5) == curve_points(1, [], 2, 5) == (frozenset(), 1)
-        assert 100 not in curve_points(200, [100], 2, 5)[0]  # scored on all views
 
 
 class TestScores:
@@ -249,6 +194,10 @@ class TestScores:
         recorder.add(2, 2.0, 5)
         assert seen[3:] == [("scores", "a"), ("scores", "b")]  # loaded once
         assert recorder.rows[0]["test_psnr"] == recorder.rows[1]["train_psnr"] == 20.0
+        rows = (_row(1, 10.0, peak_memory_mib=1e6),)  # of an earlier part, which took more
+        recorder, _ = _recorder(tmp_path, 2, [1], {"test": ["a"], "train": ["b"]}, rows)
+        recorder.add(2, 2.0, 5)
+        assert recorder.rows[-1]["peak_memory_mib"] == 1e6
 
     def test_between_the_same_part_of_each_set_is_scored_and_stays_a_line_where_all_is(self, tmp_path):
         views = {"test": [10.0 + n for n in range(25)], "train": [50.0 + n for n in range(25)]}
@@ -266,12 +215,6 @@ class TestScores:
         assert {(row["test_psnr"], row["train_psnr"]) for row in whole_sets(rows)} == {(22.0, 62.0)}
         assert read_curve(tmp_path / "error_vs_time.csv") == rows
 
-    def test_where_whole_sets_fit_every_point_has_one_row(self, tmp_path):
-        recorder, _ = _recorder(tmp_path, 30_000, [], {"test": [10.0] * 6, "train": [20.0] * 6})
-        for iteration in (15_000, 30_000):
-            recorder.add(iteration, iteration / 10, 5)
-        assert [(row["iteration"], row["subset"]) for row in recorder.rows] == [(15_000, None), (30_000, None)]
-
     @pytest.mark.parametrize("taken", [60, 130, 400, 20_000])
     def test_by_the_clock_points_fit_the_iterations_that_there_will_be(self, tmp_path, taken):
         """12 points in at most 5 % of the training from 120 iterations on."""
@@ -279,14 +222,6 @@ class TestScores:
         between = sum(kind == "scores" for kind, _ in seen) - 12
         assert 0.5 * between <= 0.05 * taken or taken < 120
         assert len({row["iteration"] for row in recorder.rows}) >= (12 if taken >= 400 else 10 if taken == 130 else 1)
-
-    def test_by_the_clock_points_are_planned_again_and_score_the_same_views(self, tmp_path):
-        """The first iterations were slow; a resumed training has other points, too."""
-        recorder, _ = self._by_the_clock(tmp_path, 400, lambda step: 30.0 if step < 6 else 400.0)
-        assert len({row["iteration"] for row in recorder.rows}) >= 12
-        rows = (_row(1, 10.0, subset=2),)
-        recorder, _ = self._by_the_clock(tmp_path, 400, lambda _: 400.0, rows)
-        assert {row["subset"] for row in recorder.rows} == {2, None}
 
     @staticmethod
     def _by_the_clock(folder: Path, taken: int, expected: Callable[[int], float | None], rows: tuple[Row, ...] = ()):
@@ -298,14 +233,6 @@ class TestScores:
             if recorder.due(span, 0, step / 10, expected(step)):
                 recorder.add(recorder.point(span), step / 10, 5, step)
         return recorder, seen
-
-    def test_views_are_drawn_by_a_seed_of_their_own_or_evenly_spread(self):
-        torch.manual_seed(1)
-        views = list("abcdefghijklmnop")
-        assert drawn(views, 3) == drawn(views, 3) == sorted(drawn(views, 3)) != list("abc")
-        assert set(drawn(views, 3)) < set(drawn(views, 9))
-        assert drawn([1, 2], 5) == evenly_spread([1, 2], 5) == [1, 2] and drawn([], 5) == []
-        assert (evenly_spread(range(9), 3), evenly_spread(range(9), 1)) == ([0, 4, 8], [0])
 
 
 class TestPeak:
@@ -324,14 +251,6 @@ class TestPeak:
         assert best_test(rows)["iteration"] == 2000 and best_test([_row(1000, 30.0, subset=2)]) is None
         for rows in (list(self.ROWS[:2]), [_row(5, 20.09), _row(7, 20.0)], [_row(5, 20.0), _row(7, None)]):
             assert peak_advice(rows, ()) is None
-
-    def test_the_advice_gives_the_model_that_was_scored(self, colmap_scene, tmp_path):
-        options = "--densify_from_iter 5 --densification_interval 10 --densify_grad_threshold 1e-5 --no_curve"
-        options = [*options.split(), "--prune_sh", -1]
-        _train(colmap_scene, tmp_path / "long", *options, "--save_iterations", 20, iterations=40)
-        short = _train(colmap_scene, tmp_path / "short", *options, iterations=20)
-        assert (tmp_path / "long/point_cloud/iteration_20/point_cloud.ply").read_bytes() == short
-        assert PlyData.read(tmp_path / "short/point_cloud/iteration_20/point_cloud.ply")["vertex"].count > 300
 
 
 class TestDrawer:
@@ -370,32 +289,6 @@ class TestDrawer:
         drawer.draw()
         assert drawer.finish() == "the process that draws it ended with status -9"
 
-    def test_nothing_is_drawn_of_a_training_that_fails(self, folder):
-        drawer = CurveDrawer(folder, VIEWS)
-        drawer.abandon()  # none was started
-        drawer.begin()
-        drawer.abandon()
-        files = [str((folder / f"error_vs_time.{end}").resolve()) for end in ("csv", "png")]
-        command = [sys.executable, "-m", "splatting.evaluation.figures", *files, "x", "2", "2"]
-        done = subprocess.run(command, cwd=ROOT, input="", capture_output=True, text=True, check=True)
-        assert (done.stdout, done.stderr) == ("", "")  # its input has ended, as when the training was killed
-        assert [path.name for path in folder.iterdir()] == ["error_vs_time.csv"]
-
-    @pytest.mark.parametrize(("cores", "begun"), [(2, 100), (16, 80)])
-    def test_it_gets_ready_shortly_before_the_end(self, tmp_path, monkeypatch, cores, begun):
-        """Of 100 iterations, ten a second; not where it would take a core from training."""
-        monkeypatch.setattr("splatting.evaluation.curve_recorder.cores", lambda: cores)
-        said = []
-        monkeypatch.setattr(CurveDrawer, "begin", lambda _: said.append("begin"))
-        monkeypatch.setattr(CurveDrawer, "draw", lambda _: said.append("draw"))
-        recorder, _ = _recorder(tmp_path, 100, [], {"test": ["a"], "train": ["b"]})
-        first = None
-        for iteration in range(1, 101):
-            if recorder.due(range(iteration, iteration + 1), 0, iteration / 10):
-                recorder.add(iteration, iteration / 10, 5)
-            first = first or (iteration if said else None)
-        assert first == begun and said[-1] == "draw" and recorder.rows[-1]["subset"] is None
-
 
 class TestTraining:
     def test_no_bit_of_the_model_changes(self, colmap_scene, tmp_path, capfd):
@@ -414,44 +307,6 @@ class TestTraining:
         assert min(costs[f"curve_{part}_seconds"] for part in ("scoring", "writing", "drawing")) > 0
         assert costs["curve_loading_seconds"] >= 0  # for a few tiny photos it may round to 0
 
-    def test_a_row_tells_of_the_model_saved_at_its_iteration(self, colmap_scene, tmp_path, monkeypatch):
-        out, measured = tmp_path / "out", Scores.measured
-        monkeypatch.setattr(Scores, "measured", lambda *words: (time.sleep(0.005), measured(*words)))  # after the curve
-        _train(colmap_scene, out, "--save_iterations", 30, "--test_iterations", 30, iterations=60)
-        row = next(row for row in read_curve(out / "error_vs_time.csv") if row["iteration"] == 30)
-        monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(out), "--iteration", "30", "--quiet"])
-        render.main()
-        psnrs = {"test": [], "train": []}
-        for name, values in psnrs.items():
-            folder = out / name / "ours_30"
-            for file in sorted((folder / "gt").iterdir()):
-                with Image.open(file) as gt, Image.open(folder / "renders" / file.name) as ours:
-                    values.append(peak_signal_noise_ratio(np.asarray(gt), np.asarray(ours)))
-        train_views = [psnrs["train"][index] for index in evenly_spread(range(14), 3)]
-        # PNGs are rounded to 8 bits, which at 12 dB changes the error by 1e-6 of itself, in either direction.
-        assert row["test_psnr"] == pytest.approx(np.mean(psnrs["test"]), abs=0.01)
-        assert row["train_psnr"] == pytest.approx(np.mean(train_views), abs=0.01)
-        log = json.loads((out / "train_log.json").read_text())
-        assert row["gaussians"] == 300 and row["seconds"] == log[0]["seconds"]
-        assert row["peak_memory_mib"] > 0 and row["wall_seconds"] > row["seconds"]
-
-    @pytest.mark.slow
-    def test_peak_memory_is_that_of_all_parts(self, colmap_scene, tmp_path):
-        """The peak of an earlier part that took more, from its last row or its log, whichever is larger."""
-        out = tmp_path / "out"
-        _train(colmap_scene, out, "--test_iterations", 5, "--checkpoint_iterations", 5, iterations=6)
-        log = json.loads((out / "train_log.json").read_text())
-        rows = read_curve(out / "error_vs_time.csv")
-        own = rows[-1]["peak_memory_mib"]
-        assert log[-1]["peak_memory_mib"] >= own > 0
-        for of_log, of_row in ((own + 5e4, own), (own, own + 6e4)):
-            log[0]["peak_memory_mib"], rows[0]["peak_memory_mib"] = of_log, of_row
-            (out / "train_log.json").write_text(json.dumps(log))
-            write_curve(out / "error_vs_time.csv", rows)
-            _train(colmap_scene, out, "--start_checkpoint", out / "chkpnt5.pth", iterations=6)
-            assert read_curve(out / "error_vs_time.csv")[-1]["peak_memory_mib"] == max(of_log, of_row)
-        assert json.loads((out / "train_log.json").read_text())[-1]["peak_memory_mib"] < own + 5e4
-
     def test_an_interrupted_training_keeps_its_points_and_draws_nothing(self, colmap_scene, tmp_path, monkeypatch):
         plain, steps = objective.photometric_loss, iter(range(1, 20))
 
@@ -465,13 +320,6 @@ class TestTraining:
             _train(colmap_scene, tmp_path, "--test_iterations", 6, 8, iterations=20)
         assert _iterations(tmp_path) == [6] and not (tmp_path / "error_vs_time.png").exists()
 
-    @pytest.mark.parametrize("options", [["--eval", "--no_curve"], []], ids=["no curve", "no test views"])
-    def test_no_curve_leaves_none_of_an_earlier_training(self, colmap_scene, tmp_path, options):
-        for name in ("error_vs_time.csv", "error_vs_time.png"):
-            (tmp_path / name).write_text("of another model")
-        train.main(["-s", str(colmap_scene), "-m", str(tmp_path), "--iterations", "2", "-r", "32", *options])
-        assert not list(tmp_path.glob("error_vs_time*"))
-
     def test_neither_the_drawing_nor_the_file_can_stop_a_training(self, colmap_scene, tmp_path, monkeypatch, capfd):
         out = tmp_path / "out"
         (out / "error_vs_time.csv").mkdir(parents=True)
@@ -482,36 +330,6 @@ class TestTraining:
         monkeypatch.setattr(sys, "executable", "/nowhere/python")
         _train(colmap_scene, tmp_path / "other", iterations=2)
         assert "warning: no error_vs_time.png: no process can be started" in capfd.readouterr().err
-
-    def test_a_loss_that_is_not_finite_makes_no_point(self, colmap_scene, tmp_path, monkeypatch):
-        monkeypatch.setattr(objective, "photometric_loss", lambda image, *_: (image.sum() * torch.nan,) * 2)
-        with pytest.raises(UserError, match="the loss of iteration 1 .* is not finite"):
-            _train(colmap_scene, tmp_path / "out", "--test_iterations", 1, iterations=2)
-        assert not (tmp_path / "out" / "error_vs_time.csv").exists()
-
-
-PROCESS = """
-import sys, time
-time.sleep(0.5)
-import torch
-import train
-from splatting.host import clock, memory
-before = memory.peak_memory_mib(torch.device("cpu"))
-torch.ones(300 * 2**20, dtype=torch.uint8)
-print(clock.wall_seconds(), "matplotlib" in sys.modules, memory.peak_memory_mib(torch.device("cpu")) - before)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="this system does not tell when a process started")
-def test_what_a_process_has_used():
-    start = time.perf_counter()
-    done = subprocess.run([sys.executable, "-c", PROCESS], cwd=ROOT, capture_output=True, text=True, check=True)
-    elapsed = time.perf_counter() - start
-    seconds, drawn, grown = done.stdout.split()
-    assert 0.5 < float(seconds) < elapsed + 0.01  # the start is known to a clock tick
-    assert drawn == "False"  # training alone does not import matplotlib
-    assert 300 - 64 < float(grown) < 300 + 64  # libraries may hold some memory of their own in reserve
 
 
 def test_a_system_that_tells_nothing(monkeypatch):

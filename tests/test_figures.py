@@ -6,7 +6,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from splatting.evaluation.error_curve import COLUMNS
-from splatting.evaluation.figures import draw_curve, draw_curves, draw_poses
+from splatting.evaluation.figures import draw_curve, draw_curves
 
 NAMES = ("seconds", "test_psnr", "test_ssim", "train_psnr", "train_ssim", "subset")
 
@@ -59,13 +59,6 @@ def test_the_curve_of_a_training(tmp_path, drawn):
     assert points(drawn[1].axes[0], "all 7 test views") == [[[1, 15], [4, 14]]] and not hollow(drawn[1].axes[0])
 
 
-@pytest.mark.parametrize("rows", [(), ((1,),), ((1, 5.0),), ((1, 5.0, 1.0, None, 1.0),)])
-@pytest.mark.filterwarnings("error")
-def test_little_to_draw(tmp_path, rows):
-    draw_curve(tmp_path / "error_vs_time.png", curve(*rows), "", {"test": 1, "train": 1})
-    assert (tmp_path / "error_vs_time.png").stat().st_size > 1000
-
-
 def test_the_figures_of_a_scene_can_be_read_at_half_their_size(tmp_path, drawn):
     """Each panel is a file of its own; its legend covers no point, and names the views."""
     curves = {
@@ -86,18 +79,6 @@ def test_the_figures_of_a_scene_can_be_read_at_half_their_size(tmp_path, drawn):
     assert draw_curves(tmp_path, "attic", runs_of({"base": []})) == []
 
 
-def test_one_option_set_has_its_training_views(tmp_path, drawn):
-    rows = curve((0.3, 35.0, 0.9, 36.0, 0.9, 2), (2.0, 36.0, 0.95, 37.0, 0.9, 2), (2.0, 20.0, 0.8, 21.0, 0.8))
-    draw_curves(tmp_path, "attic", runs_of({None: rows}))
-    draw_curves(tmp_path, "attic", runs_of({"a": rows, "b": rows}))
-    one, two = drawn[0].axes[0], drawn[2].axes[0]
-    twice = runs_of({"a": rows, "b": rows}) + runs_of({"a": rows})
-    draw_curves(tmp_path, "attic", twice)
-    assert drawn[4].legends[0].get_title().get_text().endswith("\na line for each seed")
-    assert points(one, "training views") == [[[0.3, 36.0], [2.0, 37.0]]] and hollow(one) == [[[2.0, 20.0]]]
-    assert not points(two, "training views") and len(hollow(two)) == 2
-
-
 def test_lines_are_of_the_views_on_which_all_runs_compare(tmp_path, drawn):
     """Other programs, which score all views, are told from them."""
     whole = curve((9.0, 50.0, 0.99))
@@ -114,23 +95,3 @@ def test_lines_are_of_the_views_on_which_all_runs_compare(tmp_path, drawn):
     said = [figure.legends[0].get_title().get_text().splitlines()[0] for figure in drawn[:4:2]]
     assert said == ["2 of 7 test views; hollow and other programs: all of them", "all 7 test views"]
     assert [points(mixed, name) for name in "abc"] == [[[[9.0, 50.0]]]] * 3 and not hollow(mixed)
-
-
-def test_other_programs_and_sets_that_stand_apart_are_drawn(tmp_path, drawn):
-    rows = curve((1.0, 20.0, 0.6), (9.0, 25.0, 0.8))
-    best = {"apart": True, "config": "best", "curve": curve((0.2, 50.0, 0.9)), "views": {"test": 7}}
-    peer = {"name": "other", "curve": curve((0.5, 40.0))}
-    assert draw_curves(tmp_path, "attic", [*runs_of({"base": rows, "sh1": rows}), best], [peer])
-    (left,), (right,) = (figure.axes for figure in drawn)
-    assert points(left, "other (another program)") == [[[0.5, 40.0]]]
-    assert points(left, "best (other ground truth)") == [[[0.2, 50.0]]]
-    assert left.get_xlabel().endswith("(other programs: as they count)")
-    assert not points(right, "other (another program)")  # it has no SSIM
-
-
-def test_corrections_of_poses_have_a_line_for_each_run(tmp_path, drawn):
-    runs = [{"config": name, "poses": [[1.0, 0.1 * i, 2.0], [3.0, 0.2, 2.5]]} for i, name in enumerate("aab")]
-    assert draw_poses(tmp_path, "attic", [*runs, {"config": "c", "poses": []}]) == [tmp_path / "attic_poses.png"]
-    (axes,) = drawn[0].axes
-    assert points(axes, "a") == [[[1.0, 0.0], [3.0, 0.2]]] and points(axes, "b") == [[[1.0, 0.2], [3.0, 0.2]]]
-    assert len(axes.lines) == 3 and not draw_poses(tmp_path, "attic", [{"config": None, "poses": []}])

@@ -2,7 +2,6 @@
 
 import argparse
 import base64
-import contextlib
 import dataclasses
 import io
 import json
@@ -24,17 +23,13 @@ from synthetic import folder_state
 from waiting import LIMIT, wait_for
 
 import full_eval
-import train
 from arguments import write_cfg_args
 from splatting.evaluation import report as report_module
-from splatting.evaluation import stages
-from splatting.evaluation.child import Finished, Slot, run_child, share
-from splatting.evaluation.configs import check_options
+from splatting.evaluation.child import Finished, Slot, run_child
 from splatting.evaluation.figures import draw_curves
 from splatting.evaluation.model_folder import SCHEDULE, shorter_ends_there
-from splatting.evaluation.plan import DATASETS, Run, SceneEntry, dataset_scenes, photos_of
-from splatting.evaluation.renders import GAIN, GAP, HEADER, ComparedViews
-from splatting.files.folders import locked
+from splatting.evaluation.plan import DATASETS, dataset_scenes, photos_of
+from splatting.evaluation.renders import GAIN, ComparedViews
 from splatting.host.interrupt import DeferredInterrupt
 from utils import lpips_utils
 from utils.system_utils import Terminated, UserError
@@ -135,6 +130,7 @@ def test_commands_of_a_plain_scene(figures, evaluate):
     assert first["machine"] == MACHINE and report["published"] == []
     assert (evaluate.out / "timing.txt").read_text().startswith("scenes: 0.0")
     for name in ("attic_psnr.png", "attic_ssim.png", "attic_worst_views.png"):
+        assert f"(figures/{name})" in evaluate.text("md")
         with Image.open(evaluate.out / "figures" / name) as image:
             assert image.width > 300
 
@@ -169,12 +165,6 @@ def test_data_sets_get_the_options_of_the_paper(evaluate, tmp_path, capsys):
     assert "23.00, 27.41, -4.41" in evaluate.text("md") and "## Beside published numbers" in evaluate.text("md")
 
 
-def test_a_scene_whose_folder_went_away_fails(tmp_path):
-    gone = Run(SceneEntry("train", "tanksandtemples", tmp_path / "train"), None, None, tmp_path / "out", (), ())
-    with pytest.raises(stages.StageFailed, match="no such scene folder: .*train"):
-        stages.train(gone, {}, run)
-
-
 def test_a_second_call_does_nothing_again(evaluate):
     first, model = evaluate("attic"), evaluate.out / "attic"
     done = evaluate.calls()
@@ -190,13 +180,6 @@ def test_a_second_call_does_nothing_again(evaluate):
     (model / "point_cloud" / "iteration_40" / "point_cloud.ply").unlink()
     evaluate("attic")
     assert [words[0] for words in evaluate.calls()[len(done) + 1 :]] == ["train", "render"] and scorings() == 4
-
-
-def test_only_the_first_scoring_tries_a_download(evaluate):
-    """The stand-in scores no LPIPS, as metrics.py without weights."""
-    evaluate("attic brick")
-    tried = [json.loads((evaluate.out / name / "scored.txt").read_text())[0] for name in ("attic", "brick")]
-    assert tried == [None, "told"] and "LPIPS is missing: metrics.py found no weights" in evaluate.text("md")
 
 
 def test_weights_are_checked_first_and_give_dists(evaluate, tmp_path, monkeypatch):
@@ -222,15 +205,6 @@ def test_other_options_are_not_mixed_in(evaluate):
     assert evaluate.calls() == done
     (found,) = evaluate("attic", "--skip_training")["runs"]
     assert found["finished"] and (found["machine"], found["options"]) == ({}, None)
-
-
-def test_finished_models_without_any_data_set(evaluate):
-    """With --skip_training the reference fails; metrics alone need no data set."""
-    (evaluate.scenes / "attic").rename(evaluate.scenes / "garden")
-    evaluate("garden")
-    full_eval.main(["--skip_training", "--skip_rendering", "--output_path", str(evaluate.out)], run)
-    found = [(run["scene"], run["group"], run["finished"]) for run in evaluate.report["runs"]]
-    assert found == [("garden", "mipnerf360", True)]
 
 
 def test_a_failed_scene_is_told_and_the_others_go_on(evaluate, capsys):
@@ -263,9 +237,9 @@ def test_an_interrupt_beyond_the_iterations_is_resumed(evaluate):
     assert not checkpoint.exists() and list(evaluate.report["runs"][0]["iterations"]) == ["43"]
 
 
-def test_a_checkpoint_of_a_failure_is_not_resumed_but_that_of_an_interrupt_is(evaluate, capsys):
-    """A failure leaves a checkpoint at 9; an interrupt before it, one at 5 in the same folder."""
-    full, slow = (evaluate.scenes / "attic" / name for name in ("full", "slow"))
+def test_a_checkpoint_of_a_failure_is_not_resumed(evaluate, capsys):
+    """It is at iteration 9."""
+    full = evaluate.scenes / "attic" / "full"
     full.touch()
     evaluate.fails("attic")
     noted = evaluate.record("attic")["train_failed"]
@@ -274,18 +248,6 @@ def test_a_checkpoint_of_a_failure_is_not_resumed_but_that_of_an_interrupt_is(ev
     assert evaluate("attic")["runs"][0]["finished"]
     assert "--start_checkpoint" not in evaluate.calls("train")[1]
     assert "training from the start (chkpnt9.pth was left by a training that failed after" in capsys.readouterr().out
-
-    shutil.rmtree(evaluate.out)
-    slow.touch()
-    with pytest.raises(KeyboardInterrupt):
-        evaluate("attic")
-    full.touch()
-    evaluate.fails("attic")
-    full.unlink()
-    report = evaluate("attic")
-    checkpoint = str(evaluate.out / "attic" / "chkpnt5.pth")
-    assert evaluate.calls("train")[-1][-2:] == ["--start_checkpoint", checkpoint]
-    assert report["runs"][0]["cpu_seconds"] == 2  # of both parts
 
 
 def test_a_second_one_is_refused_while_the_first_or_its_training_lives(evaluate):
@@ -312,31 +274,6 @@ def test_a_second_one_is_refused_while_the_first_or_its_training_lives(evaluate)
     finally:
         process.kill()
         os.kill(trainer, signal.SIGKILL)
-    (evaluate.scenes / "attic" / "slow").unlink()
-    reports = []
-
-    def released() -> bool:
-        with contextlib.suppress(UserError):  # the system may take a moment to release the lock
-            reports.append(evaluate("attic"))
-        return bool(reports)
-
-    wait_for(released)
-    assert reports[0]["runs"][0]["finished"]  # the remains of the first run do not block it
-
-
-def test_a_lock_is_waited_for_that_outlives_its_program_for_a_moment(tmp_path):
-    """As that of a killed program, whose child had not begun its own work yet."""
-    program = (
-        "import fcntl, sys, time; file = open(sys.argv[1], 'a+'); fcntl.flock(file, fcntl.LOCK_EX); "
-        "file.write(sys.argv[2]); file.flush(); print(flush=True); time.sleep(0.5)"
-    )
-    with subprocess.Popen([sys.executable, "-c", ""]) as dead:
-        dead.wait()
-    holder = [sys.executable, "-c", program, str(tmp_path / ".train.lock"), str(dead.pid)]
-    with subprocess.Popen(holder, stdout=subprocess.PIPE) as child:
-        child.stdout.readline()
-        with locked(tmp_path, "train.py", "process {process}", "-m"):
-            pass
 
 
 def test_a_training_that_ends_by_itself(evaluate):
@@ -358,23 +295,6 @@ def test_a_training_that_ends_by_itself(evaluate):
     assert evaluate(*given)["runs"][0]["final_iteration"] == 43
     assert [words[0] for words in evaluate.calls()[len(done) :]] == ["train", "render"]
     assert "ours_99" not in [path.name for path in (evaluate.out / "attic" / "seed_0" / "test").iterdir()]
-
-
-@pytest.mark.parametrize(
-    ("words", "last"),
-    [
-        ("", 30_000),
-        ("--iterations 40 --time_budget 0.0", 40),
-        ("--iterations 40 --time_budget 0.5", None),
-        ("--time_budget=20", None),
-        ("--schedule schedule.json", None),
-        ("--iterations many", None),
-    ],
-)
-def test_the_last_iteration_as_far_as_options_tell_it(tmp_path, words, last):
-    run = Run(SceneEntry("attic", "scenes", None), None, None, tmp_path, tuple(words.split()), ())
-    assert run.iterations == last
-    assert dataclasses.replace(run, options=("--iterations", "40", "--schedule", "")).iterations == 40
 
 
 def test_what_a_model_folder_tells_beside_its_scores(evaluate, tmp_path):
@@ -407,8 +327,8 @@ def test_what_a_model_folder_tells_beside_its_scores(evaluate, tmp_path):
     assert not shorter_ends_there(tmp_path)
 
 
-def test_seeds_of_different_ground_truth(evaluate, tmp_path):
-    """A mask alone is another ground truth: a warning, no mean of the scores, blank pixels on the sheet."""
+def test_seeds_of_different_ground_truth(evaluate):
+    """A mask alone is another ground truth: a warning, no mean of the scores."""
     given = ("attic", "--seeds", 0, 1)
     assert evaluate(*given)["warnings"] == []
     model = evaluate.out / "attic" / "seed_1"
@@ -423,16 +343,10 @@ def test_seeds_of_different_ground_truth(evaluate, tmp_path):
     (row,) = report["summary"]
     assert not row["one_ground_truth"] and row["PSNR"] == {"mean": None, "std": None, "values": [23.0, 23.1]}
     assert row["seconds"]["mean"] == 16.0
-    view = report["runs"][1]
-    assert view["worst_views"][0]["file"] == "00001.png"
-    ComparedViews([view], evaluate.out).draw_worst(tmp_path / "sheet.png")
-    with Image.open(tmp_path / "sheet.png") as sheet:
-        # Compare the middle of each image: above the label, which is masked, and in the lower half, which is not.
-        masked, plain = ([sheet.getpixel((GAP + 60 + i * (120 + GAP), HEADER + y)) for i in range(3)] for y in (1, 60))
-    assert masked == [(255,) * 3, (255,) * 3, (0,) * 3] and plain == [(90,) * 3, (90,) * 3, (0,) * 3]
+    assert report["runs"][1]["worst_views"][0]["file"] == "00001.png"
 
 
-def test_seeds_and_option_sets(figures, evaluate, tmp_path, capsys, monkeypatch):
+def test_seeds_and_option_sets(evaluate, tmp_path, capsys):
     report = evaluate("attic", "--seeds", 0, 2, *option_sets(tmp_path))
     models = [f"attic/{name}/seed_{seed}" for name in ("base", "sh1") for seed in (0, 2)]
     assert [run["model"] for run in report["runs"]] == models and report["warnings"] == []
@@ -441,8 +355,7 @@ def test_seeds_and_option_sets(figures, evaluate, tmp_path, capsys, monkeypatch)
     said, text = capsys.readouterr().out, evaluate.text("md")
     assert "attic: gain in test PSNR over base" in said and "23.10 ± 0.14" in said
     assert "### Gain over base on the same seeds" in text
-    for name in ("attic_psnr", "attic_worst_views"):
-        assert f"(figures/{name}.png)" in text and (evaluate.out / "figures" / f"{name}.png").is_file()
+    assert "(figures/attic_worst_views.png)" in text
 
 
 @pytest.mark.parametrize(
@@ -461,6 +374,8 @@ def test_seeds_and_option_sets(figures, evaluate, tmp_path, capsys, monkeypatch)
         ("--scenes SCENES/attic --configs nowhere.json", "cannot read nowhere.json"),
         ("--scenes SCENES/attic -- --sh_degreee 2", "after --: there is no option --sh_degreee; did you"),
         ("--scenes SCENES/attic -- -h", "after --: -h trains nothing"),
+        ("--scenes SCENES/attic -- --adv", "after --: --advise trains nothing; give --options auto"),
+        ("--scenes SCENES/attic -- --viewer", "after --: --viewer waits for its page to be closed"),
         ("--scenes SCENES/attic SCENES/brick --output_path SCENES/brick/eval", "attic would lie in the scene folder"),
         ("--scenes SCENES/attic --output_path SCENES/attic --skip_training", "would lie in the scene folder"),
         ("-m360 SCENES/nowhere", "no such folder: .*nowhere; pass the folder that has bicycle, flowers"),
@@ -498,37 +413,6 @@ def test_refusals(evaluate, words, sentence):
 def test_refused_option_sets(evaluate, tmp_path, text, sentence):
     with pytest.raises(UserError, match=sentence):
         evaluate("attic", *option_sets(tmp_path, text))
-
-
-def test_damaged_files_do_not_cost_the_report(evaluate, capsys):
-    names, out = ("cloud", "curve", "fine", "picture", "scores"), evaluate.out
-    for name in names:
-        (evaluate.scenes / name / "sparse").mkdir(parents=True)
-    evaluate(" ".join(names))
-    (out / "cloud" / "point_cloud" / "iteration_40" / "point_cloud.ply").write_text("ply\n")
-    (out / "curve" / "error_vs_time.csv").write_text("x")
-    (out / "picture" / "test" / "ours_40" / "renders" / "00001.png").write_bytes(b"x")
-    (out / "scores" / "results.json").write_text("{")
-    report = evaluate(" ".join(names), "--skip_training", "--skip_rendering", "--skip_metrics")
-    assert [run["finished"] for run in report["runs"]] == [False, True, True, True, False]
-    assert report["runs"][0]["failure"]["stage"] == "report" and (out / "report.html").exists()
-    warnings = capsys.readouterr().err
-    assert "error_vs_time.csv cannot be read" in warnings and "no pictures of the test views of picture" in warnings
-
-
-def test_option_sets_of_another_ground_truth_stand_apart(evaluate, tmp_path):
-    sets = option_sets(tmp_path, '{"base": ["--sh_degree", 1], "best": [], "flat": ["--sh_degree", 0]}')
-    evaluate("attic", *sets)
-    model = evaluate.out / "attic" / "best"
-    Image.new("RGB", (120, 80)).save(model / "test" / "ours_40" / "gt" / "00000.png")
-    (model / "results.json").unlink()
-    report = evaluate("attic", *sets)
-    assert [run["apart"] for run in report["runs"]] == [False, True, False]
-    views = [re.findall(r'alt="(\w+)"', part) for part in evaluate.text("html").split("<summary>Pictures of all")[1:]]
-    assert views == [["photo", *["render", "error"] * 2] * 2, ["photo", "render", "error"] * 2]
-    assert "Left out of comparisons: best." in report["warnings"][0]
-    first, second = evaluate.text("md").split("Scored on other ground truth", 1)
-    assert " base |" in first and " best |" not in first and " best |" in second
 
 
 def test_a_call_that_scores_nothing_says_so_and_keeps_a_good_report(evaluate, capsys):
@@ -570,7 +454,7 @@ def test_a_second_call_whose_models_would_lie_in_those_of_the_first_is_refused(e
     assert folder_state(evaluate.out) == before
 
 
-def test_peers_are_shown_and_stay_in_the_report(figures, evaluate, tmp_path):
+def test_peers_are_shown_and_stay_in_the_report(evaluate, tmp_path):
     peer = tmp_path / "other.csv"
     peer.write_text("iteration,seconds,test_psnr,gaussians\n40,2.5,31.25,1234\n")
     evaluate("attic", "--peer", "other", peer, "--peer", "third", peer)
@@ -581,8 +465,8 @@ def test_peers_are_shown_and_stay_in_the_report(figures, evaluate, tmp_path):
     assert [(peer["name"], peer["curve"][-1]["seconds"]) for peer in again["peers"]] == [("other", 3), ("third", 2.5)]
 
 
-@pytest.mark.parametrize("name", ["<script>alert(1)<", "[x](javascript:alert(1))", "a\nb", "# a", "caf\udce9"])
-def test_names_stay_names_in_the_report(figures, evaluate, name):
+def test_names_stay_names_in_the_report(figures, evaluate):
+    name = "<script>alert(1)<\n# a[x](javascript:alert(1)) caf\udce9"
     (evaluate.scenes / name / "sparse").mkdir(parents=True)
     full_eval.main(
         ["--scenes", str(evaluate.scenes / name), "--output_path", str(evaluate.out), "--iterations", "40"], run
@@ -596,14 +480,6 @@ def test_names_stay_names_in_the_report(figures, evaluate, name):
     assert not any(line.startswith("# a") for line in text.splitlines())
     with Image.open(evaluate.out / "figures" / f"{name}_psnr.png") as image:
         assert image.width > 300
-
-
-def test_a_table_has_all_views_with_their_error_maps_the_worst_first(evaluate):
-    evaluate("attic")
-    (table,) = re.findall(r"<summary>Scores of all 2 test views.*?</details>", evaluate.text("html"), re.DOTALL)
-    map_of = '<a href="attic/test/ours_40/errors/%s">%s</a>'
-    cells = ["photo_1.jpg", map_of % ("00001.jpg", "22.00"), "photo_0.jpg", map_of % ("00000.jpg", "24.00")]
-    assert re.findall("<td>(.*?)</td>", table) == cells
 
 
 def test_each_test_view_has_photo_render_and_error_in_the_page(evaluate, monkeypatch):
@@ -642,10 +518,6 @@ def test_each_model_becomes_a_page_that_the_report_links(evaluate):
         assert (evaluate.out / page).is_file()
     evaluate(*given, "--html_models")
     assert evaluate.calls("export") == made, "a page was made twice"
-    (evaluate.out / pages[0]).unlink()
-    assert evaluate(*given)["runs"][0]["page"] is None, "the link of a page that is gone"
-    evaluate(*given, "--html_models")
-    assert len(evaluate.calls("export")) == 3
 
 
 @pytest.mark.slow
@@ -668,28 +540,19 @@ def test_for_real(colmap_scene, tmp_path):
     assert run["machine"]["packages"]["torch"] and run["machine"]["commit"]
 
 
-@pytest.mark.parametrize(("words", "said"), [
-    (["--advise"], "--advise trains nothing; give --options auto"), (["--adv"], "--advise trains nothing"),
-    (["--viewer"], "--viewer waits for its page to be closed; leave it out"),
-    (["--options", "auto"], ""),
-])  # fmt: skip
-def test_options_with_which_a_training_does_not_end_by_itself_are_refused(words, said):
-    with pytest.raises(UserError, match=f"^after --: {said}") if said else contextlib.nullcontext():
-        check_options(words, "after --", train.parse)
-
-
 @pytest.fixture
 def two_gpus(monkeypatch):
-    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 3)
 
 
-def test_runs_are_shared_among_gpus(evaluate, two_gpus, capsys):
-    """Four runs on two GPUs, one on each at a time; two fail."""
+def test_runs_are_shared_among_gpus(evaluate, two_gpus, capsys, monkeypatch):
+    """Four runs on two GPUs, those of the visible ones with these numbers, one on each at a time; two fail."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7,9")
     (evaluate.scenes / "attic" / "broken").touch()
     both, busy, given = threading.Barrier(2), [], ("attic brick", "--seeds", 0, 1)
 
     def start(command: list[str], say: str, slot: Slot, **environment: str) -> Finished:
-        assert slot.gpu not in busy
+        assert slot.gpu in {"5", "9"} - {*busy}
         busy.append(slot.gpu)
         if "attic" in " ".join(command):  # the first two, whose trainings fail together
             both.wait(LIMIT)
@@ -698,11 +561,11 @@ def test_runs_are_shared_among_gpus(evaluate, two_gpus, capsys):
         return done
 
     with pytest.raises(SystemExit):
-        full_eval.main(evaluate.words(*given, "--gpus", 0, 1), start)
+        full_eval.main(evaluate.words(*given, "--gpus", 0, 2), start)
     found = [(run["scene"], run["finished"], bool(run["failure"])) for run in evaluate.report["runs"]]
     assert found == [("attic", False, True)] * 2 + [("brick", True, False)] * 2
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("[")]
-    form = r"\[[1-4]/4\] (attic|brick), seed [01]: (on GPU [01]|finished in 0 s|FAILED \(train\): error: .*; fix it)"
+    form = r"\[[1-4]/4\] (attic|brick), seed [01]: (on GPU [59]|finished in 0 s|FAILED \(train\): error: .*; fix it)"
     assert len(lines) == 8 and all(re.fullmatch(form, line) for line in lines)
     (evaluate.scenes / "attic" / "broken").unlink()
     before = len(evaluate.calls("train"))
@@ -724,7 +587,7 @@ def _signal_once(started: list[Path], sent: signal.Signals = signal.SIGINT, time
 
 @pytest.mark.parametrize(
     ("gpus", "sent", "at_work"),
-    [((), signal.SIGINT, 1), ((), signal.SIGHUP, 1), (("--gpus", 0, 1), signal.SIGINT, 2)],
+    [((), signal.SIGHUP, 1), (("--gpus", 0, 1), signal.SIGINT, 2)],
 )
 def test_a_signal_reaches_all_trainings_and_the_next_call_resumes_them(evaluate, two_gpus, gpus, sent, at_work):
     names = ("attic", "brick", "cellar")
@@ -744,20 +607,6 @@ def test_a_signal_reaches_all_trainings_and_the_next_call_resumes_them(evaluate,
     assert all(run["finished"] for run in evaluate(" ".join(names), *gpus)["runs"])
     assert sum("--start_checkpoint" in words for words in evaluate.calls("train")) == at_work
     assert not (evaluate.out / "attic" / "chkpnt5.pth").exists()
-
-
-def test_a_second_signal_kills_children_that_do_not_end(tmp_path):
-    deaf = (
-        "import os, pathlib, signal, sys, time; signal.signal(signal.SIGINT, signal.SIG_IGN);"
-        "pathlib.Path(sys.argv[1]).write_text(str(os.getpid())); time.sleep(600)"
-    )
-    started = [tmp_path / name for name in "ab"]
-    _signal_once(started, times=2)
-    with pytest.raises(KeyboardInterrupt):
-        share(started, "01", lambda path, slot: run_child([sys.executable, "-c", deaf, str(path)], slot=slot))
-    for path in started:
-        with pytest.raises(ProcessLookupError):
-            os.kill(int(path.read_text()), 0)
 
 
 def test_a_child_has_its_gpu_its_own_seconds_and_its_own_session(capsys):
@@ -781,8 +630,3 @@ def test_a_gpu_that_is_not_there_is_refused(evaluate, monkeypatch, count, senten
     with pytest.raises(UserError, match=sentence):
         evaluate("attic", "--gpus", 0 if count == 0 else 1, 2)
     assert not evaluate.out.exists()
-
-
-def test_gpus_are_those_that_are_visible(monkeypatch, two_gpus):
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7")
-    assert full_eval._visible([1, 0, 1]) == ["7", "5", "7"]

@@ -15,7 +15,6 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import metrics
 from splatting.evaluation.renders import GAIN, INCOMPLETE
-from splatting.files import image_files
 from utils.system_utils import UserError, compute_device, run_cli
 
 FILES = ("results.json", "per_view.json", "metrics_info.json")
@@ -92,14 +91,10 @@ def test_psnr_is_scikit_images_from_one_error_over_channels():
     render = noisy(truth, 2)
     assert metrics.psnr(render, truth) == pytest.approx(peak_signal_noise_ratio(truth, render), abs=1e-9)
     assert metrics.psnr(truth, truth) is None
+    assert metrics.mean({"a": 20.0, "b": None, "c": 30.0}) == 25.0 and metrics.mean({"a": None}) is None
     black = np.zeros((4, 4, 3), np.uint8)
     render = black + np.array([51, 0, 0], np.uint8)  # 0.2 in one channel of three: mean squared error 0.04 / 3
     assert metrics.psnr(render, black) == pytest.approx(-10 * math.log10(0.04 / 3), abs=1e-9)
-
-
-def test_a_view_that_is_shown_exactly_is_no_part_of_the_mean():
-    assert metrics.mean({"a": 20.0, "b": None, "c": 30.0}) == 25.0
-    assert metrics.mean({"a": None}) is None and metrics.mean({}) is None
 
 
 def test_ssim_is_scikit_images_inside_and_zero_padded_at_the_border():
@@ -156,13 +151,6 @@ def test_files_by_contract_and_lpips_scored_before_is_kept(model, lpips, run, mo
     assert status == 0 and "kept" not in out
     scores = files_of(model)[0]["ours_30"]
     assert scores["LPIPS"] is None and "LPIPS_alex" not in scores and scores["PSNR"] > 0
-
-
-@pytest.mark.parametrize("content", ["{", "[]", '{"ours_30": {"PSNR": {}}}', '{"ours_30": {"LPIPS": {"a": 1.0}}}'])
-def test_earlier_scores_that_nobody_can_use_do_not_matter(model, run, content):
-    (model / "per_view.json").write_text(content)
-    status, out, _ = run("-m", model)
-    assert status == 0 and "kept" not in out
 
 
 def test_a_model_without_renders_is_named_and_the_others_are_scored(tmp_path, run):
@@ -225,19 +213,6 @@ def test_without_weights_or_package_lpips_is_null_and_says_what_to_do(tmp_path, 
     assert status == 0 and out.count("import of lpips halted; None in sys.modules; run pip install") == 3  # and DISTS
 
 
-def test_several_models_and_methods_and_alpha(tmp_path, run):
-    first, second = make_model(tmp_path / "a"), make_model(tmp_path / "b", "ours_7")
-    make_model(second, "another")
-    truth = second / "test" / "ours_7" / "gt" / "00000.png"
-    with Image.open(truth) as image:
-        image.putalpha(40)  # the first three channels count, whatever the alpha
-        image.save(truth)
-    status, out, _ = run("-m", first, second)
-    assert status == 0 and f"{second} ours_7 (2 views): SSIM" in out
-    one, two = files_of(first)[0], files_of(second)[0]
-    assert list(two) == ["another", "ours_7"] and one["ours_30"] == two["ours_7"] == two["another"]
-
-
 def emptied(model: Path, *folders: str) -> None:
     for file in model.glob("test/*/*/*.png"):
         file.unlink()
@@ -276,13 +251,3 @@ def test_what_cannot_be_scored_is_said_before_a_file_is_written(model, damage, w
     with pytest.raises(UserError, match=words):
         metrics.evaluate([model])
     assert not list(model.glob("*.json"))
-
-
-def test_images_beyond_pillows_limit_are_scored_and_absurd_ones_refused(run, model, monkeypatch):
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 56 * 40 // 3)
-    status, _, err = run("-m", model, "--lpips_net", "alex")
-    assert status == 0, err
-    assert Image.MAX_IMAGE_PIXELS == 56 * 40 // 3
-    monkeypatch.setattr(image_files, "MOST_PIXELS", 56 * 40 - 1)
-    status, _, err = run("-m", model)
-    assert status == 2 and "00000.png is missing or damaged" in err

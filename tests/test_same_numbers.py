@@ -24,22 +24,19 @@ SETS = {
     "ignored": ("--masks", "masks", "--random_background", "-w", "--sh_degree", 1),
     "transparent": ("--masks", "masks", "--invert_masks", "--mask_meaning", "transparent", "-w", "-r", 2),
     "halves": ("--train_test_exp", "--masks", "masks", "--antialiasing", "--projection", "ray"),
-    "affine": ("--appearance", "affine", "-d", "depths", "--prune_sh", 0),
-    "ppisp": ("--appearance", "ppisp", "--sparse_depth", 0.5),
-    "native": ("--lenses", "native", "--filter_3d", "--antialiasing", "--optimizer_type", "sparse_adam"),
-    "undistorted": ("--lenses", "undistort", "--masks", "masks"),
-    "poses": ("--refine_poses", "--init_type", "random"),
-    "passers-by": ("--robust_mask", 0.2, "--sky", "auto", "--strategy", "budget", "--images_to_load", 5),
+    "affine": (
+        *("--appearance", "affine", "-d", "depths", "--prune_sh", 0),
+        *("--lenses", "native", "--filter_3d", "--antialiasing", "--optimizer_type", "sparse_adam"),
+    ),
+    "ppisp": ("--appearance", "ppisp", "--sparse_depth", 0.5, "--lenses", "undistort", "--masks", "masks"),
+    "poses": (
+        *("--refine_poses", "--init_type", "random", "--robust_mask", 0.2, "--sky", "auto"),
+        *("--strategy", "budget", "--images_to_load", 5),
+    ),
     "in PyTorch": ("--convert_SHs_python", "--compute_cov3D_python", "--strategy", "mcmc", "-i", "images/."),
-    "RGBA": ("--random_background",),
     "RGBA on white": ("-w", "--mask_meaning", "ignore"),
 }
-OWN = {
-    "ignored": 20,
-    "undistorted": None,
-    "native": None,
-    "RGBA on white": None,
-}  # first columns that count; None: others
+OWN = {"ignored": 20, "ppisp": None, "affine": None, "RGBA on white": None}  # first columns that count; None: others
 # Options that change how well a model trains, or what is written, but not what is drawn or compared.
 OTHERS = {
     *("source_path", "model_path", "data_device", "eval", "init_pcd_path", "init_ply", "debug", "seed", "iterations"),
