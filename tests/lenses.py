@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from diff_gaussian_rasterization.lens import Lens as NativeLens
 
 from scene.images.lens import Lens, import_pycolmap
 from splatting.demo.tracer import View, normalize
@@ -66,3 +67,18 @@ class LensView(View):
         local = self.rotation @ (points - self.center.reshape(3, 1))
         x, y = colmap_camera(self.lens).img_from_cam(np.ascontiguousarray(local.T)).T
         return x, y, local[2]
+
+
+def opencv_pixels(lens: NativeLens, points: np.ndarray) -> np.ndarray:
+    """Where a lens of the rasterizer shows points (N,3) of the camera, by OpenCV's formulas: (N,2), centres at .5."""
+    across = points[:, :2] / points[:, 2:]
+    radius = np.linalg.norm(across, axis=1, keepdims=True)
+    if lens.chart == "equidistant":
+        across, radius = across * np.arctan(radius) / radius, np.arctan(radius)
+    over, under = (
+        sum(term * radius ** (2 * power) for power, term in enumerate((1.0, *terms)))
+        for terms in (lens.radial, lens.divisor)
+    )
+    (x, y), (p1, p2), r2 = across.T, lens.tangential, radius[:, 0] ** 2
+    aside = 2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return (across * over / under + np.column_stack(aside)) * lens.focal + np.array(lens.center) + 0.5

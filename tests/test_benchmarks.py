@@ -1,65 +1,28 @@
 """Benchmarks: every command on a tiny case, and what their tables and figures make of numbers."""
 
 import json
-import re
 import sys
 from collections import Counter
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import stand_ins
-import torch
 from pycolmap import Reconstruction
-from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 import full_eval
 import train
 from benchmarks.accuracy import oracle
 from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT
-from benchmarks.harness.calls import by_stage
-from benchmarks.harness.measuring import GpuTime, short_name
 from benchmarks.kernels import rasterizer
-from benchmarks.parallel import kernels as kernels_of_steps
-from benchmarks.parallel import steps, workload
-from benchmarks.scenes import made, scores
+from benchmarks.parallel import steps
+from benchmarks.scenes import scores
 from benchmarks.scenes.thinned import thinned
 from scene.dataset_readers import read_scene
 from scene.point_depths import HELD_OUT
-from splatting.demo.tracer import ring_views, trace
 from splatting.evaluation.configs import read_configs
-from splatting.files.image_files import write_plane
 from utils.system_utils import UserError
-
-
-def test_no_command_imports_the_benchmarks():
-    """They measure the project, which must run without them; of its rooms, test_house.py says so."""
-    commands = Path(__file__).parents[1].glob("*.py")
-    assert not [
-        path for path in commands if re.search(r"^\s*(from|import) benchmarks\b", path.read_text(), re.MULTILINE)
-    ]
-
-
-@pytest.mark.parametrize(
-    ("name", "short"),
-    [
-        ("void gs::cuda::(anonymous namespace)::blend_kernel<false, true>(gs::Input<float>, int)", "blend_kernel"),
-        ("void cub::X_900::detail::SortKernel<cub::P<(int)3, float>, (cub::Y)0>(unsigned int*)", "SortKernel"),
-        ("Memcpy DtoH (Device -> Pageable)", "Memcpy DtoH"),
-        ("Memset (Device)", "Memset"),
-    ],
-)
-def test_short_names(name, short):
-    assert short_name(name) == short
-
-
-def test_kernels_belong_to_the_stage_that_began():
-    names = ["fill", "project_kernel", "sort", "blend_kernel", "l1_ssim_kernel", "l1_ssim_vjp_kernel", "mark"]
-    stages = [stage for stage, _, _ in by_stage([(name, 1.0) for name in [*names, "project_vjp_kernel"]])]
-    assert stages == ["project", "project", "bin", "blend", "loss", "loss", "blend_vjp", "step"]
 
 
 def _calls(iterations: int, options: list[str], out: Path) -> Counter[str]:
@@ -134,24 +97,6 @@ def test_sets_are_options_of_training(path):
     assert read_configs(path, train.parse)
 
 
-def test_floaters_are_counted_where_nothing_was_traced(tmp_path, monkeypatch):
-    """Half transparent planes: a quarter of the columns nearer than a quarter of the extent, all else beyond all."""
-    monkeypatch.setattr(made, "_SIZE", (32, 24))
-    monkeypatch.setattr(scores, "read_scene", lambda *_, **__: SimpleNamespace(extent=4.0))
-    inverse, sky = np.full((24, 32), 0.5 / 100), []
-    inverse[:, :8] = 0.5 / 0.9
-    for place, view in enumerate(ring_views(48, 32, 24, np.random.default_rng(0))[::8]):
-        for plane, values in (("depth", inverse), ("alpha", np.full((24, 32), 0.5))):
-            (tmp_path / plane).mkdir(exist_ok=True)
-            write_plane(tmp_path / plane / f"{place:05d}.png", values)
-        rows, columns = np.indices((24, 32)) + 0.5
-        rays = view.rays(columns.ravel(), rows.ravel())
-        sky.append(np.isinf(trace(made.with_sky(None), np.float32(view.center)[:, None], rays)[0]).reshape(24, 32))
-    found = scores.floaters("sky", tmp_path, tmp_path)
-    assert found["NEAR"] == 0.25 and found["SKY"] == pytest.approx(np.mean(sky, (0, 1))[:8].sum() / np.mean(sky) / 32)
-    assert 0 < found["SKY"] < 1 and scores.floaters("clean", tmp_path, tmp_path) == {"NEAR": 0.25}
-
-
 def test_the_kernels_are_timed(colmap_scene, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(rasterizer.CPU_WORKLOADS, "S", (300, 40, 27, 2.4))
     words = "rasterizer --device cpu --workloads S --threads 1 --repeats 1"
@@ -169,33 +114,6 @@ def test_the_kernels_are_timed(colmap_scene, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", words.replace(" S ", " M+ ").split())
     with pytest.raises(UserError, match="M\\+: on this device there are S, M, L, wide"):
         rasterizer.main()
-
-
-def test_tables_of_a_gpu_have_stages_memory_and_others(monkeypatch, capsys):
-    launched = [("project_kernel", 0.25), ("sort", 0.5), ("blend_kernel", 1.0), ("blend_kernel", 0.125)]
-    times = dict.fromkeys(("forward", "+ backward", "step"), GpuTime(0.82, launched))
-    monkeypatch.setattr(rasterizer, "measure_on_gpu", lambda name, _: rasterizer.Measured(name, times, [20.0, 70.0]))
-    rasterizer.print_gpu((name, None) for name in ("S", "M", "lego"))
-    said = capsys.readouterr().out
-    assert ["blend", *["1.125"] * 3] in _rows(said, "blend ") and ["bin", *["0.500"] * 3] in _rows(said, "bin ")
-    assert ["lego", "forward", "0.820", "1.875", "", "", ""] in _rows(said, "lego ")
-    assert _rows(said, "S ") == [
-        ["S", "20", "29", "50", "70", "133", "54"],
-        ["S", "forward", "0.820", "1.875", "0.41", "1.11", "2.00"],
-        ["S", "+ backward", "0.820", "1.875", "1.16", "2.47", "0.71"],
-        ["S", "step", "0.820", "1.875", "1.21", "2.95", "0.68"],
-    ]
-
-
-@pytest.mark.parametrize("name", ["XL", "city"])
-def test_ranks_draw_together_what_one_process_draws(name, monkeypatch):
-    monkeypatch.setattr(workload, "_PIECE", 300)
-    scene = workload.ALL[name].changed(1000, (64, 40))
-    cpu = torch.device("cpu")
-    whole = scene.rows(0, 1, cpu, cpu)
-    parts = [scene.rows(rank, 3, cpu, cpu) for rank in range(3)]
-    for attribute, values in whole.items():
-        assert len(values) == 1000 and torch.equal(torch.cat([part[attribute] for part in parts]), values)
 
 
 @pytest.mark.slow
@@ -217,48 +135,6 @@ def test_steps_of_ranks_and_of_a_spilled_model_stand_beside_those_of_one_process
     steps.main()
     rows = _rows(capsys.readouterr().out, "city")
     assert rows[0][-1] == rows[1][-1] != ""
-
-
-def test_kernels_are_messages_or_pack_them_or_neither():
-    def launched(name: str, us: float) -> tuple[SimpleNamespace, SimpleNamespace]:
-        span = SimpleNamespace(elapsed_us=lambda: us)
-        on_device = SimpleNamespace(name=name, device_type=DeviceType.CUDA, time_range=span)
-        return on_device, SimpleNamespace(name=name, duration=us)
-
-    kernels = [
-        launched("void gs::list<5>(int)", 4000),
-        launched("ncclDevKernel_SendRecv(x)", 2000),
-        launched("a", 1000),
-    ]
-    inner = SimpleNamespace(name="op", device_type=DeviceType.CPU, kernels=[k[1] for k in kernels[:2]], cpu_children=[])
-    scope = SimpleNamespace(name="send_splats", device_type=DeviceType.CPU, kernels=[], cpu_children=[inner])
-    spans = [launched("send_splats", 9000)[0], launched("nccl:all_to_all", 9000)[0]]
-    found = kernels_of_steps.sums_of([*(k[0] for k in kernels), inner, scope, *spans], 2)
-    names = {"list": 2.0, "ncclDevKernel_SendRecv": 1.0, "a": 0.5}
-    assert found == {"all kernels": 3.5, "messages": 1.0, "packing": 2.0, **names}
-    assert kernels_of_steps.kernel_rows([{"all kernels": 2.0, "messages": 0.0, "packing": 0.0, "a": 1.5}, found]) == [
-        ["all kernels", "2.000", "3.500"],
-        ["messages", "0.000", "1.000"],
-        ["packing", "0.000", "2.000"],
-        ["list", "", "2.000"],
-        ["a", "1.500", "0.500"],
-        ["ncclDevKernel_SendRecv", "", "1.000"],
-    ]
-
-
-def test_bytes_of_a_gaussian_are_those_of_a_line():
-    def found(millions: int, mib: float) -> dict:
-        own = {"ms": [1.0], "peak": mib, "last": 2 * mib, "digest": "", "memory": 2**40, "far": 0.0}
-        case = {"workload": "city", "ranks": 1, "model": "gpu", "learn": False}
-        return case | {"name": "", "gaussians": millions * 2**20, "by_rank": [own]}
-
-    said = steps.bytes_each([found(1, 1000), found(3, 2000), found(2, 9999)])
-    assert said[0].startswith("city, 1 ranks, gpu: 500 bytes a Gaussian before the last step, so 2")
-    assert said[1].startswith("city, 1 ranks, gpu: 1000 bytes a Gaussian in the last step, so 1")
-
-
-def test_error_is_of_the_largest_reference_value():
-    assert oracle.error(*torch.tensor([[1.0, 2.5, -4.0], [1.0, 2.0, -5.0]]).double()) == (0.2, 0.1)
 
 
 def test_runs_agree_with_the_oracle_and_are_reported(monkeypatch, capsys):

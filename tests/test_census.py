@@ -8,11 +8,9 @@ import torch
 from diff_gaussian_rasterization import Gaussians
 from gaussians import model
 
-from benchmarks.accuracy import census, splat_shapes
-from benchmarks.accuracy.splat_shapes import Histogram, Sorted, cells, seen
-from benchmarks.accuracy.trained_models import TrainedModel, around, trained
+from benchmarks.accuracy import census
+from benchmarks.accuracy.splat_shapes import cells, seen
 from benchmarks.workloads.splat_scenes import settings
-from utils.system_utils import UserError
 
 # On the axis at depths 5 and 2, behind the camera, and not finite; flat ones as seen by the camera.
 SCALES = torch.tensor([[0.5, 0.004, 0.1], [0.2, 0.2, 0.016], [1, 1, 1], [1, 1, 1]])
@@ -49,27 +47,6 @@ def test_numbers_of_splats_on_the_axis():
     assert [float(value[0]) for value in same] == pytest.approx([float(value[0]) for value in splats], rel=1e-4)
 
 
-def test_chunks_and_all_at_once_agree(monkeypatch):
-    monkeypatch.setattr(splat_shapes, "ROWS", 1)
-    one_by_one = list(seen(GAUSSIANS, settings(100, 100)))
-    assert [part.row.tolist() for part in one_by_one] == [[0], [1], [], []]
-
-
-def test_distributions_tell_quantiles_and_what_lies_beyond():
-    numbers = torch.logspace(-3, 5, 1001, dtype=torch.float64)
-    counted = Histogram("cpu")
-    for part in numbers.split(100):
-        counted.add(part)
-    for found, error in ((Sorted(numbers.flip(0)), 1e-9), (counted, 0.024)):
-        for share in (0.0, 0.1, 0.5, 0.999, 1.0):
-            assert found.quantile(share) == pytest.approx(10 ** (-3 + 8 * share), rel=error)
-        assert found.beyond(10.0) == pytest.approx(0.5, abs=2e-3)
-        assert found.beyond(1e-2, below=True) == pytest.approx(1 / 8, abs=2e-3)
-        assert (found.beyond(math.inf), found.beyond(1e-9), found.beyond(1e-9, below=True)) == (0, 1, 0)
-        places, above = found.curve()
-        assert all(found.beyond(x) == pytest.approx(y, abs=2e-3) for x, y in zip(places[::9], above[::9], strict=True))
-
-
 def test_the_command_prints_quantiles_cases_and_what_no_case_covers(tmp_path, monkeypatch, capsys):
     gaussians = model(50)
     with torch.no_grad():
@@ -87,30 +64,3 @@ def test_the_command_prints_quantiles_cases_and_what_no_case_covers(tmp_path, mo
     assert case[1].startswith("100 (")
     assert [row for row in rows if row[0] == "thin" and row[-1].endswith("%")]
     assert (tmp_path / "a.png").stat().st_size > 10_000
-
-
-def test_made_cameras_look_at_the_middle_from_around_it():
-    gaussians = model(500)
-    rows = Gaussians(gaussians.raw("xyz").detach(), None, sh_rest=gaussians.raw("f_rest"))
-    cameras = around(rows)
-    middle = rows.means.double().median(0).values
-    seen_at = torch.stack([torch.cat([middle, torch.ones(1)]).double() @ camera.viewmatrix for camera in cameras])
-    distance = 2 * (rows.means.double() - middle).norm(dim=1).median()
-    expected = torch.stack([0 * distance, 0 * distance, distance, torch.ones(())]).expand(8, 4)
-    torch.testing.assert_close(seen_at, expected, rtol=1e-6, atol=1e-6)
-    places = torch.stack([camera.campos for camera in cameras])
-    torch.testing.assert_close(places.mean(0), middle, rtol=1e-6, atol=1e-6)
-
-
-def test_a_ply_of_a_training_must_lie_in_its_iterations_folder(tmp_path):
-    (tmp_path / "cfg_args").write_text("Namespace()")
-    gaussians = model(5)
-    gaussians.save_ply(tmp_path / "point_cloud/best/point_cloud.ply")
-    with pytest.raises(UserError, match="is in no folder iteration_N"):
-        trained(str(tmp_path / "point_cloud/best/point_cloud.ply"), "cpu")
-
-
-def test_a_model_that_no_view_shows_is_refused():
-    behind = GAUSSIANS._replace(means=torch.full((4, 3), -5.0))
-    with pytest.raises(UserError, match="no view shows a Gaussian of empty"):
-        census.census(TrainedModel("empty", behind, [settings(100, 100)], []))

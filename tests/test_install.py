@@ -15,7 +15,6 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
-import torch
 
 ROOT = Path(__file__).resolve().parent.parent
 COMMON = ROOT / "submodules" / "common"
@@ -102,22 +101,6 @@ def test_variables_and_torchs_own_cuda_decide(environment, release, of_torch, ex
         return
     with pytest.raises(SystemExit, match=f"^error: .*{expected}"):
         builder.find_nvcc(of_torch)
-
-
-def test_root_from_nvcc_behind_a_wrapper(builder, tmp_path):
-    nvcc = fake_nvcc(tmp_path / "cuda")
-    wrapper = tmp_path / "nvcc"
-    wrapper.write_text(f'#!/bin/sh\nexec {nvcc} "$@"\n')
-    wrapper.chmod(0o755)
-    assert builder.toolkit_root(str(wrapper)) == (tmp_path / "cuda").resolve()
-
-
-@pytest.mark.parametrize(("release", "seeded"), [("12.8", False), ("12.9", True)])
-def test_only_an_nvcc_that_knows_seeds_gets_one(release, seeded, builder, tmp_path):
-    nvcc, csrc = str(fake_nvcc(tmp_path, release)), ROOT / "submodules" / "simple-knn" / "csrc"
-    plan = builder.compilations(torch, ["c++"], nvcc, csrc, tmp_path)
-    kernels = [one for one in plan if one.source.suffix == ".cu"]
-    assert kernels and all((f"-frandom-seed={one.source.stem}" in one.command) == seeded for one in kernels)
 
 
 def test_architectures(builder, monkeypatch, tmp_path):
@@ -209,16 +192,6 @@ def test_a_build_has_every_instruction_set_and_the_same_bytes_wherever_it_is_mad
         assert library[f"lanes_{isa}"]() == lanes
 
 
-@pytest.mark.slow
-def test_compile_error_ends_without_traceback(tmp_path: Path) -> None:
-    write_extension(tmp_path, "int broken() { return no_such_name; }")
-    done = build_extension(tmp_path)
-    assert done.returncode == 1
-    assert "kernel_isa.cpp:1:23: error:" in done.stderr  # the compiler's own message
-    assert "Traceback" not in done.stderr
-    assert not (tmp_path / "toy" / "_backend.so").exists()
-
-
 def copy_modules(package: str, folder: Path) -> None:
     """Copy an extension's modules, and those that all share, as its build does."""
     source = ROOT / "submodules" / package.replace("_", "-") / package
@@ -245,34 +218,6 @@ def test_an_extension_without_torch_says_what_to_do(package: str, tmp_path: Path
     assert last_line(f"import {package}", tmp_path) == f"ImportError: {package} needs torch: {remedy}"
     torch_py.write_text("import part_of_torch")
     assert last_line(f"import {package}", tmp_path) == "ModuleNotFoundError: No module named 'part_of_torch'"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("statement", "package", "lacking"),
-    [
-        ("from utils.loss_utils import ssim", "fused_ssim", "backend.py"),
-        ("from gaussian_renderer import render", "diff_gaussian_rasterization", "rasterizer.py"),
-        ("from scene.gaussian_model import GaussianModel", "diff_gaussian_rasterization", "optim.py"),
-    ],
-)
-def test_an_older_extension_ends_in_the_remedy(statement: str, package: str, lacking: str, tmp_path: Path) -> None:
-    copy_modules(package, tmp_path)
-    (tmp_path / package / lacking).unlink()
-    assert last_line(statement, tmp_path) == (
-        f"ImportError: the installed {package} does not fit this checkout (it has no {lacking}): "
-        f"run `pip install ./submodules/{package.replace('_', '-')}` in the repository"
-    )
-
-
-def test_build_fetches_torch_only_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    backend = load("backend")
-    monkeypatch.setattr(backend.build_meta, "get_requires_for_build_wheel", lambda settings: [])
-    assert backend.get_requires_for_build_wheel() == []
-    monkeypatch.setattr(backend, "find_spec", lambda name: None)
-    (pin,) = backend.get_requires_for_build_wheel()
-    assert pin in (ROOT / "requirements.txt").read_text().splitlines() and pin.startswith("torch==")
 
 
 def test_requirements_are_pinned() -> None:

@@ -11,6 +11,7 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+from lenses import opencv_pixels
 
 from integrations.nerfbaselines.datasets import MODELS, scene_of, view_of
 from scene.readers.start_cloud import OWN_POINTS
@@ -111,15 +112,6 @@ def test_a_loaded_model_renders_the_same_and_is_saved_as_the_same_files(method, 
         assert path.read_bytes() == (tmp_path / "second" / path.relative_to(tmp_path / "first")).read_bytes()
 
 
-def test_options_that_need_files_are_refused(method):
-    with pytest.raises(method.UserError, match="--init_ply needs the scene"):
-        method.words_of({"init_ply": "model.ply"})
-    assert method.words_of({"random_background": "True", "quiet": False, "sh_degree": 1}) == [
-        "--random_background",
-        "--sh_degree=1",
-    ]
-
-
 @pytest.mark.parametrize(
     "given",
     [("keep_unseen", True), ("keep_unseen", "true"), ("options", "auto"), ("advise", True),
@@ -156,24 +148,7 @@ def test_lenses_project_as_colmap(model):
     params = [50.0, 55.0, 33.0, 23.0, *(distortion[place] for place in places)]
     camera = pycolmap.Camera(model=name, width=64, height=48, params=params)
     points = np.array([[0.1, 0.2, 1.0], [-0.4, 0.3, 1.2], [0.3, -0.3, 0.9]])
-    np.testing.assert_allclose(_projected(view.native, points), camera.img_from_cam(points), atol=1e-9)
-
-
-def _projected(lens, points):
-    """Pixels of points, pixel centres at .5, by the formulas of OpenCV's models in float64."""
-    x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
-    r2 = x * x + y * y
-    if lens.chart == "equidistant":
-        angle = np.arctan(np.sqrt(r2))
-        scale = angle * (1 + sum(k * angle ** (2 * i + 2) for i, k in enumerate(lens.radial))) / np.sqrt(r2)
-        x, y = x * scale, y * scale
-    else:
-        scale = 1 + sum(k * r2 ** (i + 1) for i, k in enumerate(lens.radial))
-        scale = scale / (1 + sum(k * r2 ** (i + 1) for i, k in enumerate(lens.divisor)))
-        p1, p2 = lens.tangential
-        x, y = (x * scale + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * scale + 2 * p2 * x * y + p1 * (r2 + 2 * y * y))
-    (fx, fy), (cx, cy) = lens.focal, lens.center
-    return np.stack([fx * x + cx + 0.5, fy * y + cy + 0.5], -1)
+    np.testing.assert_allclose(opencv_pixels(view.native, points), camera.img_from_cam(points), atol=1e-9)
 
 
 def test_the_spec_of_the_package_names_the_method_and_its_presets(method):

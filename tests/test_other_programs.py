@@ -1,20 +1,17 @@
 """Exports of other programs: each made from one scene, whose points must fall where pycolmap projects them."""
 
-import json
 import shutil
 from functools import partial
 from pathlib import Path
-from xml.etree import ElementTree
 
 import exports_of_programs as programs
 import numpy as np
 import pycolmap
 import pytest
+from lenses import opencv_pixels
 from PIL import Image
-from synthetic import BROWN, FakeGaussians, edit_json, make_colmap_scene, options_of, read
+from synthetic import BROWN, edit_json, make_colmap_scene, read
 
-from scene import Scene
-from scene.dataset_readers import read_scene
 from scene.readers.info import CameraInfo
 from utils.system_utils import UserError
 
@@ -54,26 +51,11 @@ def make(tmp_path, once):
 
 
 def _pixels(view: CameraInfo, points: np.ndarray) -> np.ndarray:
-    """Where a view shows points (N,3), by the formulas of OpenCV: pixels (N,2), centres at .5."""
+    """Where a view shows points (N,3): pixels (N,2), centres at .5."""
     local = points @ view.R + view.T
-    across = local[:, :2] / local[:, 2:]
-    lens = view.native
-    if lens is None:
-        return across * (view.fx, view.fy) + (view.cx, view.cy)
-    radius = np.linalg.norm(across, axis=1, keepdims=True)
-    if lens.chart == "equidistant":
-        across, radius = across * np.arctan(radius) / radius, np.arctan(radius)
-    over, under = (
-        sum(term * radius ** (2 * power) for power, term in enumerate((1.0, *terms)))
-        for terms in (lens.radial, lens.divisor)
-    )
-    p1, p2 = lens.tangential
-    x, y = across.T
-    aside = [
-        2 * p1 * x * y + p2 * (radius[:, 0] ** 2 + 2 * x * x),
-        p1 * (radius[:, 0] ** 2 + 2 * y * y) + 2 * p2 * x * y,
-    ]
-    return (across * over / under + np.column_stack(aside)) * lens.focal + np.array(lens.center) + 0.5
+    if view.native is not None:
+        return opencv_pixels(view.native, local)
+    return local[:, :2] / local[:, 2:] * (view.fx, view.fy) + (view.cx, view.cy)
 
 
 def _by_photo(info, images: Path, model: pycolmap.Reconstruction) -> list[tuple[CameraInfo, pycolmap.Image]]:
@@ -108,34 +90,6 @@ def test_points_fall_where_pycolmap_projects_them(make, once, layout):
         np.testing.assert_allclose(np.sort(info.point_cloud.points, axis=0), np.sort(points, axis=0), atol=1e-5)
 
 
-@pytest.mark.parametrize("layout", ["metashape", "metashape_fisheye"])
-def test_cameras_of_metashape_follow_its_manual(make, layout):
-    """The file, by the formulas of the appendix on camera models, shows the points where pycolmap does."""
-    folder, model, _ = make(layout)
-    chunk = ElementTree.parse(folder / "cameras.xml").getroot()[0]
-    numbers = {child.tag: float(child.text) for child in chunk.find(".//calibration[@class='adjusted']") if child.text}
-    k1, k2, k3, k4, p1, p2, b1 = (numbers.get(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2", "b1"))
-    for camera in chunk.find("cameras"):
-        if (place := camera.find("transform")) is None:
-            continue
-        pose = np.array(place.text.split(), float).reshape(4, 4)
-        image = next(i for i in model.images.values() if programs.stem_of(i) == camera.get("label").lower())
-        X, Y, Z, _ = np.linalg.inv(pose) @ np.column_stack([programs.points_of(model), np.ones(300)]).T
-        x, y = X / Z, Y / Z
-        if layout == "metashape_fisheye":
-            r0 = np.hypot(x, y)
-            x, y = x * np.arctan(r0) / r0, y * np.arctan(r0) / r0
-        r2 = x * x + y * y
-        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
-        u = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
-        v = y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
-        mine = np.column_stack([48 + numbers["cx"] + u * (numbers["f"] + b1), 32 + numbers["cy"] + v * numbers["f"]])
-        theirs = [image.project_point(point) for point in programs.points_of(model)]
-        seen = np.array([pixel is not None for pixel in theirs])
-        assert seen.sum() > 100
-        np.testing.assert_allclose(mine[seen], np.array(theirs)[seen], atol=1e-6)
-
-
 def test_what_is_left_out_is_said(make, capsys):
     folder, _, _ = make("metashape")
     read(folder)
@@ -159,26 +113,6 @@ def test_what_is_left_out_is_said(make, capsys):
     edit_json(folder / "metadata.json", lambda content: content["poses"].pop())
     assert len(read(folder, init_type="random").train_cameras) == VIEWS - 1
     assert "1 photos or cameras of" in capsys.readouterr().err
-
-
-def test_depth_maps_of_polycam(make, tmp_path):
-    """As the docs say: 1,250 millimetres are 1.25 metres."""
-    folder, _, _ = make("polycam")
-    (folder / "keyframes" / "depth" / "metric.json").write_text(json.dumps({"metres_per_step": 0.001}))
-    options = options_of(folder, tmp_path / "out", depths="keyframes/depth", init_type="random")
-    camera = Scene(options, FakeGaussians()).getTrainCameras()[0]
-    assert camera.depth_reliable and float(camera.invdepthmap.mean()) == pytest.approx(1 / 1.25, rel=1e-3)
-
-
-def test_photos_of_metashape_may_lie_elsewhere(make):
-    folder, _, _ = make("metashape")
-    (folder / "images").rename(folder / "photos")
-    assert len(read(folder).train_cameras) == VIEWS  # anywhere below
-    (folder / "copies").mkdir()
-    shutil.copy(folder / "photos" / "left" / "V00.JPG", folder / "copies" / "v00.jpg")
-    with pytest.raises(UserError, match="the photo V00 of .* may be any of .*; name the folder .* with -i"):
-        read(folder)
-    assert len(read_scene(folder, "photos", False).train_cameras) == VIEWS
 
 
 def _replaced(name: str, old: str, new: str):
