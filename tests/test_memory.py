@@ -11,11 +11,11 @@ from gaussians import model, needs_59_values, options
 
 import train
 from scene.images import decode
-from splatting.files.plain_files import plain
 from splatting.findings import resources
 from splatting.findings.resources import training_bytes
 from splatting.host import memory
 from splatting.host.memory import free_memory, gib, is_out_of_memory
+from splatting.training import loop
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]
@@ -110,7 +110,7 @@ def test_a_training_says_what_did_not_fit(colmap_scene, tmp_path, monkeypatch):
     """A full GPU in a step, and photos that are too large for the host."""
     said = r"training ran out of memory \(%s.* free on the CPU; 300 Gaussians; images of 24 x 16\); lower .*resume"
     for of, name, error, words in (
-        (plain, "render", ON_A_GPU, "20.0 GiB asked for, "),
+        (loop, "render", ON_A_GPU, "20.0 GiB asked for, "),
         (decode, "_to_rgb_or_rgba", MemoryError(), r"not enough memory for .*[vV]\d\d.png at 24 x 16 pixels"),
     ):
         with monkeypatch.context() as patch, pytest.raises(UserError, match=said % words):
@@ -119,7 +119,7 @@ def test_a_training_says_what_did_not_fit(colmap_scene, tmp_path, monkeypatch):
 
 
 def test_other_errors_of_a_training_stay_what_they_are(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(plain, "render", _failing(plain.render, 3, RuntimeError("shapes differ")))
+    monkeypatch.setattr(loop, "render", _failing(plain.render, 3, RuntimeError("shapes differ")))
     with pytest.raises(RuntimeError, match="shapes differ"):
         _train(colmap_scene, tmp_path, "--plain_step")
     assert not list(tmp_path.glob("*.pth"))
