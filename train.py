@@ -16,11 +16,11 @@ import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
 
 from arguments import write_cfg_args, write_model_json
+from arguments.launch import launch_options, training_parser
 from scene.readers.scene_folder import is_scene
 from splatting.registry import check_together, chosen, tools
 from splatting.training.agreement import agree_on_options
 from splatting.training.folder import folder_of, new_folder, own_folder, records_kept, resolve_lenses
-from splatting.training.launch import launch_options, training_parser
 from splatting.training.loop import run_training, standard_observers
 from splatting.training.run import Run
 from splatting.training.scores import training_report
@@ -35,7 +35,7 @@ def train(
 ) -> None:
     """Train from the options of the three groups; write model, checkpoints and log to dataset.model_path.
 
-    launch: the options of splatting/training/launch.py.
+    launch: the options of arguments/launch.py.
     """
     if not all([prepare(dataset, opt, launch) for prepare in tools("prepare")]):
         return

@@ -119,7 +119,7 @@ def test_a_training_says_what_did_not_fit(colmap_scene, tmp_path, monkeypatch):
 
 
 def test_other_errors_of_a_training_stay_what_they_are(colmap_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(loop, "render", _failing(plain.render, 3, RuntimeError("shapes differ")))
+    monkeypatch.setattr(loop, "render", _failing(loop.render, 3, RuntimeError("shapes differ")))
     with pytest.raises(RuntimeError, match="shapes differ"):
         _train(colmap_scene, tmp_path, "--plain_step")
     assert not list(tmp_path.glob("*.pth"))

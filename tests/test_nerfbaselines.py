@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from lenses import opencv_pixels
 
+from arguments.launch import launch_options
 from integrations.nerfbaselines.datasets import MODELS, scene_of, view_of
 from scene.readers.start_cloud import OWN_POINTS
-from splatting.training.launch import launch_options
 
 pycolmap = pytest.importorskip("pycolmap")
 SPEC = Path(__file__).resolve().parents[1] / "integrations" / "nerfbaselines" / "spec.py"

@@ -128,7 +128,7 @@ for room in words:
         if not module.endswith("__main__") and not module.startswith(left_out):
             import_module(module)
 from arguments import OPTIONS
-from splatting.training.launch import launch_options
+from arguments.launch import launch_options
 print(*(option.name for option in OPTIONS), *vars(launch_options()))
 """
 

@@ -8,6 +8,5 @@ steps/                 faster forms of a step, to the same bytes: fused, capture
 log, scores, save, watch
                        what watches every training: records, scores, saves and checkpoints, refusals
 folder                 the folder of a training, and what earlier runs in it allow
-launch                 options of train.py besides the three groups
 agreement              several processes: what they share before and in each iteration
 """

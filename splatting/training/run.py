@@ -68,7 +68,7 @@ class Run:
     ) -> None:
         """Read and check everything that can be refused; nothing is written. UserError for what is refused.
 
-        launch: the options of splatting/training/launch.py.
+        launch: the options of arguments/launch.py.
         """
         given, opt = opt, copy.copy(opt)  # of which the strategy, and windows by the clock, are decided here
         self.opt, self.pipe, self.launch = opt, pipe, launch

@@ -19,11 +19,11 @@ from viewer_client import Viewer, as_bytes, packed, request
 from waiting import LIMIT, wait_for
 
 import train
+from arguments.launch import launch_options
 from gaussian_renderer import network_gui, network_transfer, render
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
 from splatting.part import Part
-from splatting.training.launch import launch_options
 
 ITERATIONS = 60
 OPTIONS = (), ("--train_test_exp", "--antialiasing", "-w", "--random_background", "--convert_SHs_python")

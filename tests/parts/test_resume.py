@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from trainings import train_on
 
+from arguments.launch import launch_options
 from scene.gaussians.checkpoint import load_checkpoint
 from splatting.files.json_files import read_model_json
 from splatting.parts.resume import part as resume
 from splatting.parts.resume.end import finished
 from splatting.training.folder import REPLACED, new_folder
-from splatting.training.launch import launch_options
 from utils.system_utils import UserError
 
 WORDS = ("-r", 24, "--no_curve", "--disable_viewer", "--test_iterations", -1)
